@@ -51,30 +51,6 @@ with logs.McapRecorder(sys.argv[1], robot_name="made_up") as recorder:
 """
 
 
-def answers(log: logs.Log) -> dict[str, Any]:
-    """Everything a log says, as bytes."""
-    tables = {"solves": log.solves(), "iterations": log.iterations(), "events": log.events()}
-    found: dict[str, Any] = {
-        name: [(part.method, part.labels, part.rows.tobytes()) for part in table.parts]
-        for name, table in tables.items()
-    }
-    found["times"] = [
-        (part.solve_id.tobytes(), part.iteration.tobytes())
-        for table in tables.values()
-        for part in table.parts
-    ]
-    return found | {"metadata": dict(log.metadata), "urdf": log.attachment("robot.urdf")}
-
-
-def said_of(path: Path) -> Any:
-    """Everything a log says, or the one error."""
-    try:
-        return answers(logs.open(path))
-    except (errors.LogError, errors.UnknownNameError) as error:
-        assert error.args[0].count("\n") == 0  # noqa: PT017
-        return error.args[0]
-
-
 @pytest.fixture
 def whole(write: Write, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A log of several chunks and two methods."""
@@ -237,17 +213,6 @@ def test_every_chunk_that_was_written_is_kept(tmp_path: Path) -> None:
             path.write_bytes(data[:length])
             logs.finish_log(path)
             assert read_messages(path) == expected
-
-
-def test_a_finished_log_is_a_log(write: Write) -> None:
-    path = write(make_block(50, 50))
-    data, messages = path.read_bytes(), read_messages(path)
-    assert not logs.finish_log(path).changed
-    assert path.read_bytes() == data
-    path.write_bytes(data[:-40])
-    done = logs.finish_log(path)
-    assert done.changed
-    assert read_messages(path) == messages
 
 
 def test_a_log_that_is_being_written_is_left_alone(tmp_path: Path) -> None:
@@ -636,13 +601,6 @@ def test_any_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str], seed: int)
     struct.pack_into("<I", data, index.chunk_start_offset + RECORD.size + 24, crc)
     path.write_bytes(data)
     ask_everything(path, capsys)
-
-
-def test_a_question_in_python_is_refused_the_same(small: bytes, tmp_path: Path) -> None:
-    path = crafted(small, tmp_path / "log.mcap", {"parameters": '{"tolerance": 5}'})
-    assert len(logs.open(path).solves()) == 4
-    with pytest.raises(errors.CasadiIKError):
-        logs.one_solve(logs.open(path), 9)
 
 
 GIGABYTES = 3 * 10**9

@@ -86,73 +86,88 @@ def where(events: tuple[Event, ...], kind: logs.EventKind) -> list[int]:
     return [event.iteration for event in events if event.kind is kind]
 
 
-def test_phase_changes_and_restarts() -> None:
-    layout, trace = trace_of(phase=[0, 0, 1, 1, 0, 2], restart=[0, 0, 0, 0, 1, 1])
-    events = found_in(layout, trace, {"phase": ("reach", "align", "refine")})
-    assert events == (
-        Event(2, logs.EventKind.PHASE_CHANGE, "reach -> align", 1.0, 0.0),
-        Event(4, logs.EventKind.RESTART, "0 -> 1", 1.0, 0.0),
-        Event(4, logs.EventKind.PHASE_CHANGE, "align -> reach", 0.0, 1.0),
-        Event(5, logs.EventKind.PHASE_CHANGE, "reach -> refine", 2.0, 0.0),
-    )
-    assert found_in(layout, trace)[0].subject == "0 -> 1"
-    assert found_in(layout, trace, {"phase": ("", "a")})[0].subject == "0 -> a"
+PHASES = ("reach", "align", "refine")
+KIND = logs.EventKind
+K = np.arange(40)
 
 
-def test_limits_hit_and_left() -> None:
-    q = [[0.1, 2.0], [0.2, 1.9], [0.3, 1.8], [0.3, 1.7]]
-    layout, trace = trace_of(q=q, limit_mask=[0b10, 0b00, 0b01, 0b01])
-    events = found_in(layout, trace, {"q": ("elbow", "wrist")})
-    assert events == (
-        Event(0, logs.EventKind.LIMIT_HIT, "wrist", 2.0, 2.0, ("wrist",)),
-        Event(1, logs.EventKind.LIMIT_LEFT, "wrist", 1.9, 2.0, ("wrist",)),
-        Event(2, logs.EventKind.LIMIT_HIT, "elbow", 0.3, 0.3, ("elbow",)),
-    )
+@pytest.mark.parametrize(
+    ("columns", "labels", "expected"),
+    [
+        (
+            {"phase": [0, 0, 1, 1, 0, 2], "restart": [0, 0, 0, 0, 1, 1]},
+            {"phase": PHASES},
+            [
+                Event(2, KIND.PHASE_CHANGE, "reach -> align", 1.0, 0.0),
+                Event(4, KIND.RESTART, "0 -> 1", 1.0, 0.0),
+                Event(4, KIND.PHASE_CHANGE, "align -> reach", 0.0, 1.0),
+                Event(5, KIND.PHASE_CHANGE, "reach -> refine", 2.0, 0.0),
+            ],
+        ),
+        ({"phase": [0, 1]}, {}, [Event(1, KIND.PHASE_CHANGE, "0 -> 1", 1.0, 0.0)]),
+        ({"phase": [0, 1]}, {"phase": ("", "a")}, [Event(1, KIND.PHASE_CHANGE, "0 -> a", 1, 0)]),
+        (  # limits hit and left
+            {"q": [[0.1, 2.0], [0.2, 1.9], [0.3, 1.8], [0.3, 1.7]], "limit_mask": [2, 0, 1, 1]},
+            {"q": ("elbow", "wrist")},
+            [
+                Event(0, KIND.LIMIT_HIT, "wrist", 2.0, 2.0, ("wrist",)),
+                Event(1, KIND.LIMIT_LEFT, "wrist", 1.9, 2.0, ("wrist",)),
+                Event(2, KIND.LIMIT_HIT, "elbow", 0.3, 0.3, ("elbow",)),
+            ],
+        ),
+        (  # a rounding error does not leave a limit
+            {"q": [[0.0], [1e-16], [1e-9], [0.0], [0.1], [0.0]], "limit_mask": [1, 0, 0, 1, 0, 1]},
+            {"q": ("a",)},
+            [
+                Event(0, KIND.LIMIT_HIT, "a", 0.0, 0.0, ("a",)),
+                Event(4, KIND.LIMIT_LEFT, "a", 0.1, 0.0, ("a",)),
+                Event(5, KIND.LIMIT_HIT, "a", 0.0, 0.0, ("a",)),
+            ],
+        ),
+        (  # the active set
+            {"active_mask": [0b001, 0b001, 0b110, 0b110]},
+            {"q": ("a", "b", "c")},
+            [
+                Event(2, KIND.ACTIVATED, "b, c", 2.0, 1.0, ("b", "c")),
+                Event(2, KIND.RELEASED, "a", 2.0, 1.0, ("a",)),
+            ],
+        ),
+        # nothing happens while it converges, stands at zero or makes progress to and fro
+        ({"q": np.stack([1 - 0.5**K, 0.5**K], axis=1), "cost": 0.5**K}, {}, []),
+        ({"cost": np.zeros(40)}, {}, []),
+        ({"q": 0.1 * (-0.8) ** K[:, None], "cost": 0.1 * 0.8**K}, {}, []),
+        ({"q": 1e-6 * (-1.0) ** K[:, None]}, {}, []),
+        ({"q": np.where(K < 5, 0.1 * (-1.0) ** K, 0.0)[:, None]}, {}, []),
+        # nor in what is no number, or in fields of others
+        ({"q": np.zeros((1, 2)), "cost": [1.0], "phase": [0]}, {}, []),
+        ({"cost": np.full(40, np.inf), "q": np.full((40, 2), np.nan)}, {}, []),
+        ({"sigma_arm": np.full(40, np.nan)}, {}, []),
+        ({"damping": np.ones(40)}, {}, []),
+    ],
+)
+def test_events_of_a_trace(columns: dict, labels: dict, expected: list) -> None:
+    assert found_in(*trace_of(**columns), labels) == tuple(expected)
 
 
-def test_a_rounding_error_does_not_leave_a_limit() -> None:
-    layout, trace = trace_of(
-        q=np.array([[0.0], [1e-16], [1e-9], [0.0], [0.1], [0.0]]), limit_mask=[1, 0, 0, 1, 0, 1]
-    )
-    events = found_in(layout, trace)
-    assert [(e.iteration, e.kind) for e in events] == [
-        (0, logs.EventKind.LIMIT_HIT),
-        (4, logs.EventKind.LIMIT_LEFT),
-        (5, logs.EventKind.LIMIT_HIT),
-    ]
-
-
-def test_limits_without_coordinates() -> None:
-    layout, trace = trace_of(limit_mask=[1, 0, 2])
-    assert [(e.iteration, e.kind) for e in found_in(layout, trace)] == [
-        (0, logs.EventKind.LIMIT_HIT),
-        (1, logs.EventKind.LIMIT_LEFT),
-        (2, logs.EventKind.LIMIT_HIT),
-    ]
-
-
-def test_the_highest_bits_and_wide_masks() -> None:
+def test_limits_without_coordinates_and_the_highest_bits() -> None:
     masks = np.zeros((3, 2), np.uint32)
-    masks[1, 0] = 1 << 31
-    masks[2, 1] = 1 << 5
+    masks[0, 0], masks[1, 0], masks[2, 1] = 1, 1 << 31, 1 << 5
     layout = Layout.record(Field("limit_mask", (2,), "u4"))
     trace = np.zeros(3, layout.dtype)
     trace["limit_mask"] = masks
     events = found_in(layout, trace)
     assert [(e.iteration, e.kind, e.subject) for e in events] == [
-        (1, logs.EventKind.LIMIT_HIT, "coordinate 31"),
-        (2, logs.EventKind.LIMIT_HIT, "coordinate 37"),
-        (2, logs.EventKind.LIMIT_LEFT, "coordinate 31"),
+        (0, KIND.LIMIT_HIT, "coordinate 0"),
+        (1, KIND.LIMIT_HIT, "coordinate 31"),
+        (1, KIND.LIMIT_LEFT, "coordinate 0"),
+        (2, KIND.LIMIT_HIT, "coordinate 37"),
+        (2, KIND.LIMIT_LEFT, "coordinate 31"),
     ]
 
 
-def test_active_set() -> None:
-    layout, trace = trace_of(active_mask=[0b001, 0b001, 0b110, 0b110])
-    events = found_in(layout, trace, {"q": ("a", "b", "c")})
-    assert events == (
-        Event(2, logs.EventKind.ACTIVATED, "b, c", 2.0, 1.0, ("b", "c")),
-        Event(2, logs.EventKind.RELEASED, "a", 2.0, 1.0, ("a",)),
-    )
+def test_a_stall_ends_with_its_phase() -> None:
+    layout, trace = trace_of(cost=np.ones(36), phase=np.arange(36) // 9)
+    assert where(found_in(layout, trace), KIND.STALL) == []
 
 
 def test_near_singular_on_entry_only() -> None:
@@ -220,13 +235,6 @@ def test_a_singular_row_of_a_known_jacobian() -> None:
     assert {e.joints for e in events} == {("shoulder", "elbow")}
 
 
-def test_no_events_while_converging() -> None:
-    decay = 0.5 ** np.arange(40)
-    q = np.stack([1 - decay, decay], axis=1)
-    layout, trace = trace_of(q=q, cost=decay, sigma_arm=np.full(40, 0.3))
-    assert found_in(layout, trace, jacobians={"arm": RecordedJacobian(singular=0.1)}) == ()
-
-
 def test_stall_once_per_standstill() -> None:
     cost = np.concatenate([np.linspace(2, 1, 20), np.ones(30), np.linspace(0.9, 0.5, 5)])
     layout, trace = trace_of(cost=cost)
@@ -248,12 +256,6 @@ def test_stall_by_errors_when_one_finger_is_stuck() -> None:
     assert where(found_in(*trace_of(position_error=stuck)), logs.EventKind.STALL) == [10]
     free = np.stack([np.full(40, 0.3), np.full(40, np.nan)], axis=1)
     assert where(found_in(*trace_of(position_error=free)), logs.EventKind.STALL) == [10]
-
-
-def test_no_stall_at_zero_error_or_across_phases() -> None:
-    assert found_in(*trace_of(cost=np.zeros(40))) == ()
-    layout, trace = trace_of(cost=np.ones(36), phase=np.arange(36) // 9)
-    assert where(found_in(layout, trace), logs.EventKind.STALL) == []
 
 
 def test_oscillation_names_the_joints() -> None:
@@ -285,35 +287,6 @@ def test_a_standstill_names_the_singularity_and_the_limits_it_is_at() -> None:
     ]
     far = found_in(layout, trace, labels, {"arm": RecordedJacobian(singular=0.01)})
     assert {e.jacobian for e in far} == {""}
-
-
-def test_oscillation_with_progress_is_none() -> None:
-    k = np.arange(30)
-    q = 0.1 * (-0.8) ** k
-    assert found_in(*trace_of(q=q[:, None], cost=np.abs(q))) == ()
-
-
-def test_five_swings_or_tiny_ones_are_no_oscillation() -> None:
-    k = np.arange(30)
-    q = np.where(k < 6, 0.1 * (-1.0) ** k, 0.0)[:, None]
-    assert where(found_in(*trace_of(q=q)), logs.EventKind.OSCILLATION) == [6]
-    q = np.where(k < 5, 0.1 * (-1.0) ** k, 0.0)[:, None]
-    assert where(found_in(*trace_of(q=q)), logs.EventKind.OSCILLATION) == []
-    tiny = 1e-6 * (-1.0) ** k[:, None]
-    assert found_in(*trace_of(q=tiny)) == ()
-
-
-def test_a_short_or_empty_or_foreign_trace() -> None:
-    layout, trace = trace_of(q=np.zeros((1, 2)), cost=[1.0], phase=[0])
-    assert found_in(layout, trace) == ()
-    assert found_in(layout, trace[:0]) == ()
-    assert found_in(*trace_of(damping=np.ones(40))) == ()
-
-
-def test_non_finite_numbers_are_no_event() -> None:
-    cost = np.full(40, np.inf)
-    q = np.full((40, 2), np.nan)
-    assert found_in(*trace_of(cost=cost, q=q, sigma_arm=np.full(40, np.nan))) == ()
 
 
 def test_windows_are_checked() -> None:

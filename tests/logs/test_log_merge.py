@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 from made_up_solves import LABELS, T0, Field, Layout, SolveBlock, TraceFormat, make_block, make_rows
 from mcap.reader import make_reader
@@ -70,17 +69,6 @@ def test_chunks_are_copied_as_they_are_and_others_can_read_the_result(
         assert sum(1 for _ in reader.messages()) == messages
 
 
-def test_where_the_shards_come_from_is_kept(write: Write, tmp_path: Path) -> None:
-    shards = [
-        write(one(i), name=f"{i}.mcap", compression=compression)
-        for i, compression in enumerate(("none", "lz4", "zstd"))
-    ]
-    log = logs.open(logs.merge_logs(shards, tmp_path / "all.mcap").path)
-    assert '"file": "2.mcap"' in log.metadata["shards"]
-    assert '"compression": "lz4"' in log.metadata["shards"]
-    assert len(log.iterations().rows) == 150
-
-
 def test_one_solve_in_two_shards_is_refused(write: Write, tmp_path: Path) -> None:
     first = write(one(0), one(1), name="a.mcap")
     second = write(one(1), one(2), one(0), name="b.mcap")
@@ -92,16 +80,6 @@ def test_one_solve_in_two_shards_is_refused(write: Write, tmp_path: Path) -> Non
             f"{shards[1]}: solve 1 of enhanced-dls is in {first} too ({number} such solves)"
         )
     assert not target.exists()
-
-
-def test_the_same_number_under_two_methods_is_no_doubling(write: Write, tmp_path: Path) -> None:
-    both = (one(0), one(0, "hand-first"))
-    first = write(*both, name="a.mcap")
-    second = write(one(1), one(1, "hand-first"), name="b.mcap")
-    assert logs.merge_logs([first, second], tmp_path / "all.mcap").solves == {
-        "enhanced-dls": 2,
-        "hand-first": 2,
-    }
 
 
 def test_shards_that_contradict_are_refused(write: Write, tmp_path: Path) -> None:
@@ -151,17 +129,3 @@ def test_shards_that_cannot_be_read(write: Write, tmp_path: Path) -> None:
     with pytest.raises(errors.LogError, match="cannot write the merged log: No such file"):
         logs.merge_logs([good], tmp_path / "nowhere" / "all.mcap")
     assert not (tmp_path / "all.mcap").exists()
-
-
-def test_a_bit_flip_in_a_chunk_of_a_shard_is_refused(write: Write, tmp_path: Path) -> None:
-    shard = write(make_block(500, first=0), compression="none")
-    data = bytearray(shard.read_bytes())
-    rng = np.random.default_rng(2)
-    data[int(rng.integers(len(data) // 2, len(data) // 2 + 1000))] ^= 1
-    shard.write_bytes(data)
-    target = tmp_path / "all.mcap"
-    with pytest.raises(
-        errors.LogError, match=rf"^{shard}: the chunk at byte \d+ fails its checksum"
-    ):
-        logs.merge_logs([shard, write(one(1), name="b.mcap")], target)
-    assert not target.exists()

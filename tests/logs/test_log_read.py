@@ -153,6 +153,11 @@ def test_files_that_do_not_belong_together(write: Write, tmp_path: Path) -> None
         logs.open([first, third]).iterations()
     with pytest.raises(errors.LogError, match="no log was named"):
         logs.open([])
+    (tmp_path / "only").mkdir()
+    for i, data in enumerate((b"", MAGIC[:3], MAGIC)):
+        (tmp_path / "only" / f"{i}.mcap").write_bytes(data)
+    with pytest.raises(errors.LogError, match=r"0\.mcap: nothing in it is whole, nor in 2 others"):
+        logs.open(tmp_path / "only")
 
 
 def test_a_policy_keeps_what_it_says(write: Write) -> None:
@@ -470,14 +475,6 @@ def test_what_the_shell_says(
     assert "6 of enhanced-dls" in merged
     assert "empty.mcap:nothinginitiswhole" in merged.replace(" ", "")
     assert f"solve 1 of {NAMES[1]}" in said("why", tmp_path / "all.mcap", 3)
-
-
-def test_only_the_beginning_of_a_file(tmp_path: Path) -> None:
-    """A folder of nothing but such files holds no log."""
-    for i, data in enumerate((b"", MAGIC[:3], MAGIC)):
-        (tmp_path / f"{i}.mcap").write_bytes(data)
-    with pytest.raises(errors.LogError, match=r"0\.mcap: nothing in it is whole, nor in 2 others"):
-        logs.open(tmp_path)
 
 
 def test_a_motion_is_read_back_or_refused(tmp_path: Path) -> None:

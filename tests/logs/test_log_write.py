@@ -327,12 +327,6 @@ def test_log_times_are_arithmetic() -> None:
         clock.check(3, np.array([5, 6]))
 
 
-def test_two_logs_share_one_time(tmp_path: Path, write: Write) -> None:
-    """So that shards can be joined as they are."""
-    clocks = {logs.McapRecorder(tmp_path / name, robot_name="r").clock for name in "ab"}
-    assert len(clocks) == 1
-
-
 LIMIT = 3 * 2**21
 
 
