@@ -40,10 +40,10 @@ COMMANDS = {
     "batch": ("batch.batch", "solve many targets of one robot"),
     "follow": ("motion.follow", "follow a moving hand, or moving contacts"),
     "reach": ("motion.reach", "find the timed motion from where the robot is to a grasp"),
-    "choose": ("choose.choose", "find the best of many grasps of one object"),
+    "choose": ("solve.choose", "find the best of many grasps of one object"),
     "import": ("own_robot.import_robot", "describe your robot from its URDF or MJCF files"),
-    "export": ("export.export", "write a robot's solver as plain C or WebAssembly"),
-    "compile": ("export.compile_ahead", "compile robots' kernels ahead of use"),
+    "export": ("own_robot.export", "write a robot's solver as plain C or WebAssembly"),
+    "compile": ("own_robot.compile_ahead", "compile robots' kernels ahead of use"),
     "schemas": ("lists.schemas", "write JSON Schemas of robot, grasp and other files"),
     "calibrate": ("own_robot.calibrate", "estimate a hand's dimensions from measured poses"),
     "robots": ("lists.robots", "list the shipped robots: fingers and actuators"),
@@ -63,7 +63,7 @@ COMMANDS = {
     "log finish": ("log.finish", "repair logs in place whose writer was killed"),
     "log merge": ("log.merge", "join the shards of a study, without recompressing"),
     "view": ("view.view", "drag contacts in the browser, arm and hand follow; play a log"),
-    "completion": ("completion.completion", "complete words in bash, zsh or fish with TAB"),
+    "completion": ("lists.completion", "complete words in bash, zsh or fish with TAB"),
 }
 """What is said: module and function in this folder, and what it does, in a few words."""
 

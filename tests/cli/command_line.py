@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+
+import casadi_ik as ik
 
 FAST = ("--method", "enhanced-dls", "--finger-step", "closed-form")
 POSTURE = np.r_[
@@ -34,3 +37,8 @@ class Run:
 
 
 Command = Callable[..., Run]
+
+
+def solvable(robot: ik.ArmHand, count: int) -> tuple[Any, Any]:
+    """Points and normals of a posture that the robot can reach, so many times."""
+    return robot.contacts(np.tile(POSTURE, (count, 1)))

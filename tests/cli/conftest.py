@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from command_line import POSTURE, Command, Run
+from command_line import POSTURE, Command, Run, solvable
 
 import casadi_ik as ik
 from casadi_ik.cli.main import main
@@ -85,26 +85,26 @@ def target_file(tmp_path: Path, robot: ik.ArmHand) -> Callable[..., Path]:
     """Writes three targets that can be reached; keyword arguments replace arrays."""
 
     def write(name: str = "targets.npz", count: int = 3, **changes: Any) -> Path:
-        points, normals = robot.contacts(np.tile(POSTURE, (count, 1)))
-        arrays: dict[str, Any] = {"points": points, "normals": normals} | changes
+        points, normals = solvable(robot, count)
         path = tmp_path / name
-        with path.open("wb") as stream:
-            np.savez(stream, **{k: v for k, v in arrays.items() if v is not None})
+        np.savez(path, **{"points": points, "normals": normals} | changes)
         return path
 
     return write
 
 
-@pytest.fixture
-def refused(run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
-    """Calls `solve` or `batch` with outputs and gives the refusal; nothing may be left."""
-
-    def call(command: str, subject: object, *words: object) -> str:
-        before = sorted(tmp_path.rglob("*"))
-        kind = "npz" if command == "batch" else "json"
-        outputs = ("--out", tmp_path / f"new.{kind}", "--log", tmp_path / "new.mcap")
-        error = run(command, subject, *outputs, *words).error
-        assert sorted(tmp_path.rglob("*")) == before
-        return error
-
-    return call
+@pytest.fixture(scope="session")
+def ranked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Answers of `choose`, on a table."""
+    folder = tmp_path_factory.mktemp("ranked")
+    contacts = {
+        name: {"point": contact.point.tolist(), "normal": contact.normal.tolist()}
+        for name, contact in ik.load_grasp("cup").contacts.items()
+    }
+    data = {"candidates": [{"contacts": contacts}]}
+    (folder / "candidates.yaml").write_text(yaml.safe_dump(data))
+    words = ["choose", folder / "candidates.yaml", "--robot", "kuka_lwr_barrett", "--scene"]
+    words += ["table", "--limit", "3", "--per-candidate", "3", "--out", folder / "ranked.json"]
+    command = [sys.executable, "-m", "casadi_ik", *map(str, words)]
+    subprocess.run(command, check=True, capture_output=True)
+    return folder / "ranked.json"

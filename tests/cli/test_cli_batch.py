@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 from command_line import FAST, Command
 
@@ -23,6 +25,7 @@ def test_all_solved(
     assert (done.exit, done.err) == (0, "")
     assert done.out.startswith("SOLVED  3 of 3 targets (100.0 %) of targets.npz: enhanced-dls")
     assert "99th percentile" in done.out
+    assert "collision   not checked" in done.out
     with np.load(out, allow_pickle=False) as data:
         assert {key: data[key].shape for key in data} == {
             "q": (3, 14),
@@ -38,27 +41,6 @@ def test_all_solved(
         assert data["success"].dtype == bool
     assert len(ik.logs.open(log).solves()) == 3
     assert len(list(tmp_path.iterdir())) == 3
-
-
-def test_a_file_of_directions(
-    run: Command, target_file: TargetFile, robot: ik.ArmHand, tmp_path: Path
-) -> None:
-    with np.load(target_file()) as data:
-        points, normals = data["points"].copy(), data["normals"].copy()
-    directions = np.full_like(normals, np.nan)
-    directions[1:] = normals[1:]
-    points[1:] = normals[1:] = np.nan
-    file, out = tmp_path / "ways.npz", tmp_path / "solved.npz"
-    directions[2, 0, 1] = np.nan
-    np.savez(file, points=points, normals=normals, directions=directions)
-    done = run("batch", file, *ROBOT, "--out", out)
-    assert done.exit == 1
-    assert "directions: row 2, finger 0 is partly NaN" in done.err
-    with np.load(out) as data:
-        assert data["status"].tolist() == ["SOLVED", "SOLVED", "INVALID"]
-        assert np.isnan(data["position_error"][1]).all()
-        _, reached = robot.contacts(data["q"][1])
-    assert (np.sum(reached * directions[1], axis=1) > np.cos(ik.Tolerance().angle)).all()
 
 
 def test_not_all_solved_names_rows(
@@ -162,6 +144,33 @@ def test_diagnoses_are_written_if_asked_for(
     assert "reasons" in done.out
 
 
+def test_a_table_of_answers(
+    run: Command, target_file: TargetFile, robot: ik.ArmHand, tmp_path: Path
+) -> None:
+    path, words = target_file(), (*ROBOT, "--diagnose", "--scene", "table")
+    for out in ("o.npz", "o.parquet"):
+        assert "scene table" in run("batch", path, *words, "--out", tmp_path / out).out
+    rows = pl.read_parquet(tmp_path / "o.parquet")
+    with np.load(tmp_path / "o.npz") as data:
+        motors = [f"q_{name}" for name in robot.actuators]
+        np.testing.assert_array_equal(rows.select(motors).to_numpy(), data["q"])
+        errors = [f"{name}_angle_error" for name in robot.fingers]
+        np.testing.assert_array_equal(rows.select(errors).to_numpy(), data["angle_error"])
+        assert rows["status"].to_list() == data["status"].tolist()
+        assert data["clearance"].shape == (3,)
+        assert set(data.files) - {"q", "nearest_q", "position_error", "angle_error"} < set(
+            rows.columns
+        )
+
+
+def test_a_table_needs_polars(
+    run: Command, target_file: TargetFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "polars", None)
+    error = run("batch", target_file(), *ROBOT, "--out", tmp_path / "o.parquet").error
+    assert error == "--out: Parquet files need polars: pip install 'casadi-ik[dataframes]'"
+
+
 def test_process(run_process: Command, target_file: TargetFile, tmp_path: Path) -> None:
     """A damaged end of the file is found before anything is solved, and nothing is left."""
     path, out = target_file(count=50), tmp_path / "o.npz"
@@ -193,18 +202,3 @@ def test_targets_in_the_frame_of_an_object(
         assert (normals * (data["normals"] @ turn)).sum(axis=-1).min() > np.cos(
             ik.Tolerance().angle
         )
-
-
-def test_batches_have_clearances(run: Command, tmp_path: Path) -> None:
-    robot = ik.load_robot("kuka_lwr_barrett")
-    arrays = [ik.load_grasp(name).arrays(robot.fingers) for name in ("cup", "mug")]
-    points, normals = (np.stack(parts) for parts in zip(*arrays, strict=True))
-    targets, out = tmp_path / "targets.npz", tmp_path / "out.npz"
-    np.savez(targets, points=points, normals=normals)
-    assert run("batch", targets, *ROBOT, "--out", out, "--scene", "table").exit == 0
-    with np.load(out) as found:
-        assert found["clearance"].shape == (2,)
-        assert (found["clearance"] >= 0).all()
-    assert "not checked" in run("batch", targets, *ROBOT, "--out", out).out
-    with np.load(out) as found:
-        assert "clearance" not in found

@@ -100,47 +100,6 @@ def test_none_found_counts_the_reasons(run: Command, candidates: Path, tmp_path:
     assert sum(found["failures"].values()) == 4
 
 
-def test_bad_input_is_one_line_and_writes_nothing(run: Command, tmp_path: Path) -> None:
-    out, words = tmp_path / "ranked.json", ("--robot", ROBOT, *PLACE)
-    bad = tmp_path / "bad.yaml"
-    for text, expected in (
-        ("candidates: []\n", "bad.yaml: candidates: found none, expected at least one grasp"),
-        ("candidates: 3\n", "bad.yaml: candidates: expected `array`, got `int`"),
-        (
-            "candidates:\n- contacts: {thumb: {point: [.nan, 0, 0]}}\n",
-            "bad.yaml: candidates[0].contacts.thumb.point: found [nan, 0.0, 0.0]",
-        ),
-        (
-            "candidates:\n- contacts: {elbow: {point: [0, 0, 0]}}\n",
-            "bad.yaml: bad[0]: contacts.elbow: no such finger",
-        ),
-    ):
-        bad.write_text(text)
-        error = run("choose", bad, *words, "--out", out).error
-        assert expected in error
-    empty = tmp_path / "empty"
-    empty.mkdir()
-    rows = tmp_path / "rows.npz"
-    np.savez(rows, points=np.full((1, 3, 3), np.nan), normals=np.full((1, 3, 3), np.nan))
-    in_mm = tmp_path / "in_mm.npz"
-    np.savez(in_mm, points=np.full((1, 3, 3), 300.0), normals=np.full((1, 3, 3), np.nan))
-    for path, expected in (
-        (empty, "empty: found no YAML file, expected grasp files"),
-        (tmp_path / "none.yaml", "none.yaml: no such file or folder"),
-        (rows, "rows.npz: row 0: contacts: found none"),
-        (in_mm, "point: found 519.6 m away, expected at most 5 m (numbers in mm?)"),
-    ):
-        assert expected in run("choose", path, *words, "--out", out).error
-    bad.write_text(yaml.safe_dump({"candidates": [entry(0.0)]}))
-    for more, expected in (
-        (("--prefer", "best"), "--prefer: found 'best'"),
-        (("--prefer", "clearance"), "needs a solver with a scene"),
-        (("--limit", "0"), "--limit: found '0'"),
-    ):
-        assert expected in run("choose", bad, *words, *more, "--out", out).error
-    assert not out.exists()
-
-
 def test_palms_of_a_table(run: Command, tmp_path: Path) -> None:
     """A table's hands stay as they are; where their palms came to is in what is written."""
     robot, out = ik.load_robot(ROBOT), tmp_path / "ranked.json"

@@ -72,7 +72,7 @@ def test_why(run_process: Command, folder: Path) -> None:
     assert (good.exit, good.err) == (0, "")
     assert "enhanced-dls, solve 1: solved after" in good.out
     assert "every contact is within tolerance" in good.out
-    bad = run_process("log", "why", folder / "enhanced-dls.mcap", "4")
+    bad = run_process("log", "why", folder / "enhanced-dls.mcap", "--solve", "4")
     text = " ".join(bad.out.split())
     assert bad.exit == 0
     assert "enhanced-dls, solve 4: not solved" in text
@@ -95,10 +95,13 @@ def test_compare(run: Command, folder: Path) -> None:
 
 def test_plot(run: Command, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    done = run("log", "plot", folder / "enhanced-dls.mcap", 2)
-    assert (done.exit, done.err) == (0, "")
-    assert done.out.split() == ["plot", "enhanced-dls-enhanced-dls-2.png"]
-    assert (tmp_path / "enhanced-dls-enhanced-dls-2.png").read_bytes()[:4] == b"\x89PNG"
+    for solve in (("--solve", 2), (2,)):
+        done = run("log", "plot", folder / "enhanced-dls.mcap", *solve)
+        assert (done.exit, done.err) == (0, "")
+        assert done.out.split() == ["plot", "enhanced-dls-enhanced-dls-2.png"]
+        picture = tmp_path / "enhanced-dls-enhanced-dls-2.png"
+        assert picture.read_bytes()[:4] == b"\x89PNG"
+        picture.unlink()
 
 
 def test_export_for_a_viewer(run_process: Command, folder: Path, tmp_path: Path) -> None:
@@ -145,53 +148,3 @@ def test_finish_and_merge(run: Command, folder: Path, tmp_path: Path) -> None:
     assert (done.exit, done.err) == (0, "")
     assert "of enhanced-dls" in done.out
     assert len(ik.logs.open(tmp_path / "all.mcap").solves()) == 4
-
-
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        ("solves {log} --status SOLV", "{log}: no status 'SOLV'; there are: "),
-        ("solves {log} --method paper", "{log}: no method 'paper'; the log holds: enhanced-dls"),
-        ("solves {log} --solve 0", "--solve: found '0', expected a whole number >= 1"),
-        ("solves {log} --most 0", "--most: found '0', expected a whole number >= 1"),
-        ("events {log} --event BOOM", "{log}: no event 'BOOM'; there are: "),
-        ("events {log} --phase nap", "{log}: no phase 'nap'; there are: "),
-        ("why {log} 99", "{log}: no solve 99; the log holds: enhanced-dls solves 1 to 4"),
-        ("why {log}", "{log}: which solve?; the log holds: enhanced-dls solves 1 to 4"),
-        ("why {folder}/nothing.mcap", "{folder}/nothing.mcap: cannot read the log: No such file"),
-        ("plot {log} 1 --out {folder}/a.jpg", "--out: found '{folder}/a.jpg', expected a"),
-        ("plot {log} 1 --out {folder}/no/a.png", "{folder}/no/a.png: --out: cannot be"),
-        ("compare {log}", "the logs hold enhanced-dls, expected two methods (say --methods)"),
-        ("compare {log} --methods paper hand-first", "--methods: found 'paper', the logs hold"),
-        ("export {log} --solve 1 --out {folder}/a.txt", "--out: found '{folder}/a.txt', expected"),
-        ("export {log} --solve 1 --out {log}", "{log}: --out: found the file of the input"),
-        ("export {log} --out {folder}/view.mcap", "{log}: which solve?; the log holds"),
-        (
-            "export {log} --solve 1 --robot nobody --out {folder}/view.mcap",
-            "{log}: robot (say --robot): no shipped arm-hand is called 'nobody'",
-        ),
-        (
-            "export {log} --solve 1 --robot kuka_lwr_barrett_coupled --out {folder}/view.mcap",
-            "{log}: the robot 'kuka_lwr_barrett_coupled' is not the one in the log",
-        ),
-        ("export {log} --what rows --out {folder}/a.csv", "--what: found 'rows', expected one of"),
-        ("finish {folder}/nothing.mcap", "{folder}/nothing.mcap: cannot finish the log: No such"),
-        ("merge {log} {log} --out {folder}/all.mcap", "{log}: solve 1 of enhanced-dls is in {log}"),
-        ("merge {log} --out {log}", "{log}: --out: found the file of the input"),
-        ("merge {log}", "the following arguments are required: --out"),
-        ("wonder {log}", "COMMAND: found 'wonder', expected one of info, solves"),
-    ],
-)
-def test_bad_input_is_one_line_and_leaves_nothing(
-    words: str, expected: str, run: Command, folder: Path
-) -> None:
-    before = sorted(folder.rglob("*"))
-    log = folder / "enhanced-dls.mcap"
-    line = [word.format(log=log, folder=folder) for word in words.split()]
-    error = run("log", *line).error
-    assert error.startswith(expected.format(log=log, folder=folder)), error
-    assert sorted(folder.rglob("*")) == before
-
-
-def test_bad_input_of_a_process(run_process: Command, folder: Path) -> None:
-    assert "no solve 99" in run_process("log", "why", folder / "hand-first.mcap", 99).error

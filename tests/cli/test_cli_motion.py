@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import copy
 import csv
 import json
-import subprocess
-import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from command_line import POSTURE, Command
 from made_up_hand import hand
 from mcap_ros2.reader import read_ros2_messages
@@ -123,47 +118,6 @@ def test_image_landmarks_are_one_line(run: Command, tmp_path: Path) -> None:
     assert sorted(tmp_path.iterdir()) == [frames]
 
 
-@pytest.mark.parametrize(
-    ("arrays", "words", "message"),
-    [
-        ({"keypoints": np.zeros((4, 20, 3))}, (), "keypoints: found shape (4, 20, 3), expected"),
-        ({"other": np.zeros(3)}, (), "expected keypoints (k, 21, 3) or points (k, 3, 3); found"),
-        ({"points": np.zeros((0, 3, 3))}, (), "points: found shape (0, 3, 3), expected"),
-        ({"points": np.full((2, 3, 3), "a")}, (), "points: found values of type"),
-        ({"points": np.full((2, 3, 3), 300.0)}, (), "expected at most 5 m (numbers in mm?)"),
-        ({"keypoints": 80.0 * np.eye(21)[None, :, :3]}, (), "m from the middle of the hand"),
-        (
-            {"points": np.zeros((2, 3, 3)), "times": [1.0, 0.0]},
-            (),
-            "times: expected 2 growing numbers",
-        ),
-        ({"points": np.zeros((2, 3, 3)), "extra": [1.0]}, (), "extra: unknown, expected"),
-        ({"keypoints": np.zeros((2, 21, 3))}, ("--period", "0"), "--period: found '0'"),
-        ({"keypoints": np.zeros((2, 21, 3))}, ("--retarget", "no.yaml"), "no.yaml: cannot be read"),
-        ({"keypoints": np.zeros((2, 21, 3))}, ("--robot", "nobody"), "--robot: "),
-    ],
-)
-def test_bad_input_is_one_line_and_leaves_nothing(
-    run: Command, tmp_path: Path, arrays: Any, words: Any, message: str
-) -> None:
-    frames = write(tmp_path, **arrays)
-    out = tmp_path / "motion.mcap"
-    error = run("follow", frames, "--robot", "kuka_lwr_barrett", "--out", out, *words).error
-    assert message in error
-    assert sorted(tmp_path.iterdir()) == [frames]
-
-
-def test_files_that_are_none(run: Command, tmp_path: Path) -> None:
-    torn = tmp_path / "torn.npz"
-    torn.write_bytes(b"PK")
-    words = ("--robot", "kuka_lwr_barrett", "--out", tmp_path / "motion.mcap")
-    assert "torn.npz: not an npz file" in run("follow", torn, *words).error
-    assert "cannot be read" in run("follow", tmp_path / "nothing.npz", *words).error
-    error = run("follow", torn, *words[:2], "--out", tmp_path / "motion.txt").error
-    assert "expected a name ending in .mcap, .npz, .csv" in error
-    assert "--robot" in run("follow", torn, *words[2:]).error
-
-
 def test_the_motion_is_written(run: Command, tmp_path: Path) -> None:
     robot, out = ik.load_robot("kuka_lwr_barrett"), tmp_path / "way.mcap"
     gif = tmp_path / "way.gif"
@@ -199,40 +153,6 @@ def test_a_grasp_that_is_too_far(run: Command, tmp_path: Path) -> None:
     assert not out.exists()
 
 
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (("cup", "--q0", "1", "2"), "--q0: found 2 numbers, expected 14"),
-        (("teacup",), "no shipped grasp is called 'teacup'"),
-        (("cup", "--scene", "nowhere"), "--scene: no shipped scene is called 'nowhere'"),
-    ],
-)
-def test_bad_input_of_reach(
-    run: Command, words: tuple[str, ...], says: str, tmp_path: Path
-) -> None:
-    name, *more = words
-    done = run("reach", name, "--out", tmp_path / "way.npz", *more)
-    assert done.exit == 2
-    assert says in done.error
-
-
-@pytest.fixture(scope="module")
-def ranked(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Answers of `choose`, on a table."""
-    folder = tmp_path_factory.mktemp("ranked")
-    contacts = {
-        name: {"point": contact.point.tolist(), "normal": contact.normal.tolist()}
-        for name, contact in ik.load_grasp("cup").contacts.items()
-    }
-    data = {"candidates": [{"contacts": contacts}]}
-    (folder / "candidates.yaml").write_text(yaml.safe_dump(data))
-    words = ["choose", folder / "candidates.yaml", "--robot", "kuka_lwr_barrett", "--scene"]
-    words += ["table", "--limit", "3", "--per-candidate", "3", "--out", folder / "ranked.json"]
-    command = [sys.executable, "-m", "casadi_ik", *map(str, words)]
-    subprocess.run(command, check=True, capture_output=True)
-    return folder / "ranked.json"
-
-
 def test_what_was_chosen_is_reached(run: Command, ranked: Path, tmp_path: Path) -> None:
     """The first of several, or another, by the very posture; with the object in the hand."""
     out, entries = tmp_path / "way.npz", json.loads(ranked.read_text())["ranked"]
@@ -252,32 +172,3 @@ def test_what_was_chosen_is_reached(run: Command, ranked: Path, tmp_path: Path) 
     found = np.load(out)
     assert set(found["part"]) == {"going", "coming", "closing", "lifting", "retreating"}
     assert (found["q"] == entry["solution"]["q"]).all(axis=1).any()
-
-
-def test_what_ranked_files_are_refused(run: Command, ranked: Path, tmp_path: Path) -> None:
-    whole, out = json.loads(ranked.read_text()), tmp_path / "way.npz"
-    path = tmp_path / "other.json"
-
-    def says(change: Callable[[dict[str, Any]], object], *words: str) -> str:
-        data = copy.deepcopy(whole)
-        change(data)
-        path.write_text(json.dumps(data))
-        done = run("reach", path, "--out", out, *words)
-        assert done.exit == 2
-        assert not out.exists()
-        return done.error
-
-    def first(data: dict[str, Any]) -> dict[str, Any]:
-        return data["ranked"][0]
-
-    assert "ranked: found none" in says(lambda data: data["ranked"].clear())
-    assert "ranked[0].grasp: missing" in says(lambda data: first(data).pop("grasp"))
-    wrong = says(lambda data: first(data)["grasp"]["contacts"]["thumb"].pop("point"))
-    assert "ranked[0].grasp.contacts.thumb.point: missing" in wrong
-    assert "q: found shape (3,)" in says(lambda data: first(data)["solution"].update(q=[1, 2, 3]))
-    assert "Expected `float`" in says(lambda data: first(data)["solution"].update(q=["a"] * 14))
-    assert "has 3 answers" in says(lambda data: None, "--rank", "4")
-    assert "--object-pose" in says(lambda data: None, "--object-pose", "0 0 0 0 0 0")
-    assert "--direction: found 1 numbers, expected 3" in says(lambda data: None, "--direction", "1")
-    done = run("reach", "cup", "--rank", "2", "--out", out)
-    assert (done.exit, "--rank: expected it with" in done.error) == (2, True)

@@ -361,12 +361,3 @@ def test_bad_csv(text: str, fragment: str, refused: Callable[..., str], tmp_path
     error = refused(path)
     assert error.startswith(f"{path}:")
     assert fragment in error
-
-
-def test_bad_options(refused: Callable[..., str], poses: Path, tmp_path: Path) -> None:
-    assert "No such file" in refused(tmp_path / "x.csv")
-    assert "no shipped" in refused(poses, robot="hand")
-    assert "found 'median'" in refused(poses, "--loss", "median")
-    assert "found 'screws'" in refused(poses, "--estimate", "screws")
-    assert "cannot be written" in refused(poses, out="no/out.yaml")
-    assert "expected a name ending in .yaml" in refused(poses, out="out.json")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -39,6 +40,8 @@ def test_robots(run: Command, robot: ik.ArmHand) -> None:
     [
         ("methods", ik.METHODS),
         ("grasps", (*ik.shipped_names("grasps"), ROBOT, "baxter_ar10")),
+        ("objects", ik.shipped_names("objects")),
+        ("scenes", ik.shipped_names("scenes")),
     ],
 )
 def test_lists(command: str, names: tuple[str, ...], run: Command) -> None:
@@ -76,6 +79,45 @@ def test_help_loads_neither_casadi_nor_rich() -> None:
     words = [sys.executable, "-c", code]
     done = subprocess.run(words, capture_output=True, text=True, check=True)
     assert not {"casadi", "numpy", "rich"}.intersection(done.stdout.split())
+
+
+BASH = """
+source <("{python}" -m casadi_ik completion bash)
+COMP_WORDS=(casadi-ik {words}) COMP_CWORD={place}
+_casadi_ik
+echo "${{COMPREPLY[@]}}"
+"""
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        ("sol", {"solve"}),
+        ("log ev", {"events"}),
+        ("solve cu", {"cup"}),
+        ("solve cup --tol", {"--tolerance-position", "--tolerance-angle"}),
+        ("solve cup --scene ta", {"table"}),
+        ("batch x --limits en", {"enforce"}),
+        ("log plot a.mcap --r", {"--range"}),
+        ("export ku", {"kuka_lwr_barrett", "kuka_lwr_barrett_coupled"}),
+    ],
+)
+def test_words_are_completed(words: str, found: set[str], tmp_path: Path) -> None:
+    script = BASH.format(python=sys.executable, words=words, place=len(words.split()))
+    done = subprocess.run(
+        ["bash", "-c", script], capture_output=True, text=True, check=True, cwd=tmp_path
+    )
+    assert (set(done.stdout.split()), done.stderr) == (found, "")
+
+
+def test_completion_of_every_command(run: Command) -> None:
+    for shell, start in (("bash", "_casadi_ik()"), ("zsh", "autoload"), ("fish", "complete -c")):
+        done = run("completion", shell)
+        assert (done.exit, done.err) == (0, "")
+        assert done.out.startswith(start)
+        for command in commands(run):
+            assert command.rpartition(" ")[2] in done.out
 
 
 def test_exit_codes(
