@@ -146,7 +146,12 @@ class BatchFolder:
         mine = json.loads(json.dumps({"format": 1, **question}))
         path = self.path / MANIFEST
         if path.exists():
-            kept = self._read(path)
+            try:
+                kept = json.loads(path.read_text(encoding="utf-8"))
+            except (OSError, ValueError) as error:
+                raise InputError(f"{path}: cannot be read: {error}") from error
+            if not isinstance(kept, dict):
+                raise InputError(f"{path}: found {type(kept).__name__}, expected an object")
             for key, value in mine.items():
                 if kept.get(key) != value:
                     raise InputError(
@@ -198,23 +203,20 @@ class BatchFolder:
         Raises:
             InputError: Its file is damaged, or has the answers to other targets.
         """
-        arrays = self._arrays(number)
+        path = self.part(number)
+        try:
+            with np.load(path, allow_pickle=False) as stored:
+                arrays = {name: stored[name] for name in stored.files}
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            raise InputError(f"{path}: damaged ({error}); remove it and go on") from error
         rows = arrays.pop("row", np.zeros(0))
         if not np.array_equal(rows, first_row + np.arange(count)):
             found = f"{len(rows)} targets from {rows[0]} on" if len(rows) else "no row"
             raise InputError(
-                f"{self.part(number)}: row: found {found}, expected {count} targets from "
+                f"{path}: row: found {found}, expected {count} targets from "
                 f"{first_row} on; remove it and go on"
             )
         return arrays
-
-    def _arrays(self, number: int) -> dict[str, np.ndarray]:
-        path = self.part(number)
-        try:
-            with np.load(path, allow_pickle=False) as arrays:
-                return {name: arrays[name] for name in arrays.files}
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-            raise InputError(f"{path}: damaged ({error}); remove it and go on") from error
 
     def remove(self) -> None:
         """Remove the parts, and the folders if there is nothing else in them."""
@@ -224,15 +226,6 @@ class BatchFolder:
         for folder in filter(None, (self.path, self.logs)):
             if not any(folder.iterdir()):
                 folder.rmdir()
-
-    def _read(self, path: Path) -> dict[str, Any]:
-        try:
-            kept = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise InputError(f"{path}: cannot be read: {error}") from error
-        if not isinstance(kept, dict):
-            raise InputError(f"{path}: found {type(kept).__name__}, expected an object")
-        return kept
 
 
 def _brief(value: Any) -> str:
@@ -336,19 +329,18 @@ def columns(solved: BatchSolution) -> dict[str, np.ndarray]:
 
 def _diagnoses(diagnoses: tuple[Diagnosis | None, ...], n: int) -> dict[str, np.ndarray]:
     count = len(diagnoses)
-    reason = np.zeros(count, dtype=REASON)
-    nearest, enough = np.full((count, n), np.nan), np.full((count, 2), np.nan)
-    for row, diagnosis in enumerate(diagnoses):
-        if diagnosis is not None:
-            reason[row] = diagnosis.reason.name
-            nearest[row] = diagnosis.q
-            enough[row] = diagnosis.enough.position, diagnosis.enough.angle
-    return {
-        "reason": reason,
-        "nearest_q": nearest,
-        "enough_position": enough[:, 0],
-        "enough_angle": enough[:, 1],
+    found = {
+        "reason": np.zeros(count, dtype=REASON),
+        "nearest_q": np.full((count, n), np.nan),
+        "enough_position": np.full(count, np.nan),
+        "enough_angle": np.full(count, np.nan),
     }
+    for row, each in enumerate(diagnoses):
+        if each is not None:
+            values = each.reason.name, each.q, each.enough.position, each.enough.angle
+            for array, value in zip(found.values(), values, strict=True):
+                array[row] = value
+    return found
 
 
 @cache

@@ -268,14 +268,15 @@ def test_an_extra_that_is_missing_leaves_nothing(
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_answers_are_an_npz_or_a_folder(targets: Path, tmp_path: Path, capsys):
-    """Another suffix would be a wrong one: a zip is no Parquet file."""
-    for name in ("out.parquet", "out.csv"):
-        assert main(["batch", str(targets), *ROBOT, "--out", str(tmp_path / name)]) == 2
-        error = capsys.readouterr().err
-        assert f"{name}', expected OUT.npz or a folder" in error
-        assert error.count("\n") == 1
+def test_answers_are_an_npz_a_table_or_a_folder(targets: Path, tmp_path: Path, capsys, whole):
+    assert main(["batch", str(targets), *ROBOT, "--out", str(tmp_path / "out.csv")]) == 2
+    error = capsys.readouterr().err
+    assert "out.csv', expected OUT.npz" in error
+    assert error.count("\n") == 1
     assert not list(tmp_path.iterdir())
+    out = tmp_path / "out.parquet"
+    assert main(["batch", str(targets), *ROBOT, "--out", str(out)]) == 1
+    np.testing.assert_array_equal(pl.read_parquet(out)["success"], whole["success"])
 
 
 @pytest.mark.parametrize("wait_for", ["out.npz.parts", "out.npz.parts/part-*.npz"])

@@ -436,7 +436,7 @@ def ask_everything(path: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
         ("info", path),
         ("solves", path),
         ("events", path),
-        ("why", path, 0, "--method", "enhanced-dls"),
+        ("why", path, 1, "--method", "enhanced-dls"),
         ("merge", path, "--out", path.with_name("all.mcap")),
         ("export", path, "--what", "events", "--out", path.with_name("a.csv")),
     ):
