@@ -306,6 +306,6 @@ if __name__ == "__main__":
     for draw in FIGURES:
         drawn = draw()
         path = DOCS / "concepts" / f"{draw.__name__}.svg"
-        drawn.savefig(path, transparent=True, metadata={"Date": None})
+        drawn.savefig(path, transparent=True, bbox_inches="tight", metadata={"Date": None})
         plt.close(drawn)
     social()
