@@ -263,6 +263,9 @@ def one_solve(
     )
 
 
+NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+"""A number in a URDF."""
+
 _AS_LOGGED = ("position_error", "angle_error", "target_points", "target_normals")
 
 
@@ -277,21 +280,14 @@ def check_robot(robot: ArmHand, urdf: str, where: str) -> None:
     Raises:
         LogError: They differ by more than rounding.
     """
-    found, expected = (re.split(r'[\s"]+', text) for text in (robot.urdf(), urdf))
-    if len(found) != len(expected) or not all(map(_same, found, expected)):
+    texts = robot.urdf(), urdf
+    frame, expected_frame = (NUMBER.sub("#", text) for text in texts)
+    values, expected = (np.array(NUMBER.findall(text), float) for text in texts)
+    if frame != expected_frame or not np.allclose(values, expected, rtol=1e-9, atol=1e-9):
         raise LogError(
             f"{where}: the robot {robot.name!r} is not the one in the log (its URDF differs);"
             " give the description that was solved for (--robot)"
         )
-
-
-def _same(first: str, second: str) -> bool:
-    try:
-        return first == second or bool(
-            np.isclose(float(first), float(second), rtol=1e-9, atol=1e-9)
-        )
-    except ValueError:
-        return False
 
 
 def _asked(part: MethodRows) -> Asked:
