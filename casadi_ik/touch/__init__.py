@@ -1,0 +1,1 @@
+"""From an object's surface to grasps that an arm-hand can make."""

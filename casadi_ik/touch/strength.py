@@ -1,0 +1,101 @@
+"""How well contacts hold an object: loads per newton of squeeze, for many grasps at once."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from casadi_ik.arrays import Array
+
+EDGES = 8
+"""Edges of the pyramid within a friction cone."""
+
+DIRECTIONS = np.concatenate([np.eye(6), -np.eye(6)])
+"""(12, 6) wrenches: forces along and torques about the axes, both ways."""
+
+
+def generators(points: Array, normals: Array, mu: float, center: Array, length: float) -> Array:
+    """Wrenches of the friction cones' edges with a normal force of 1.
+
+    Args:
+        points: (k, c, 3) contacts [m].
+        normals: (k, c, 3) unit, into the object.
+        mu: Friction coefficient.
+        center: (3,) about which torques are [m].
+        length: By which torques are divided [m].
+
+    Returns:
+        (k, 6, c * EDGES).
+    """
+    k, c = points.shape[:2]
+    least = np.abs(normals).argmin(axis=-1)
+    first = np.cross(normals, np.eye(3)[least])
+    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    second = np.cross(normals, first)
+    angle = 2 * np.pi * np.arange(EDGES) / EDGES
+    round_ = first[..., None, :] * np.cos(angle)[:, None] + second[..., None, :] * np.sin(angle)[:, None]
+    force = normals[..., None, :] + mu * round_
+    torque = np.cross((points - center)[..., None, :], force) / length
+    return np.concatenate([force, torque], axis=-1).reshape(k, c * EDGES, 6).swapaxes(1, 2)
+
+
+def loads(wrenches: Array, directions: Array = DIRECTIONS, steps: int = 25) -> Array:
+    """Largest s with -s d = W x, x >= 0, sum x <= 1: what a squeeze of 1 N holds against d.
+
+    All linear programs are solved side by side by Mehrotra's predictor and corrector.
+
+    Args:
+        wrenches: (k, 6, g) of the cones' edges.
+        directions: (d, 6).
+        steps: Of the interior-point method.
+
+    Returns:
+        (k, d) loads [N per N]; 0 where nothing is held.
+    """
+    k, _, g = wrenches.shape
+    d = len(directions)
+    # min -s: columns x (g), s, slack; rows: W x + s d = 0, sum x + slack = 1.
+    count = k * d
+    matrix = np.zeros((count, 7, g + 2))
+    matrix[:, :6, :g] = np.repeat(wrenches, d, axis=0)
+    matrix[:, :6, g] = np.tile(directions, (k, 1))
+    matrix[:, 6, :g] = matrix[:, 6, g + 1] = 1.0
+    right = np.zeros(7)
+    right[6] = 1.0
+    cost = np.zeros(g + 2)
+    cost[g] = -1.0
+    x = np.full((count, g + 2), 1.0 / (g + 2))
+    z, y = np.ones_like(x), np.zeros((count, 7))
+    for _ in range(steps):
+        primal = right - np.einsum("kij,kj->ki", matrix, x)
+        dual = cost - np.einsum("kij,ki->kj", matrix, y) - z
+        gap = (x * z).mean(axis=1)
+        scaled = x / z
+        normal = np.einsum("kij,kj,klj->kil", matrix, scaled, matrix)
+        # Contacts on a line leave rows that depend on each other.
+        normal[:, range(7), range(7)] += 1e-12 * (1.0 + np.trace(normal, axis1=1, axis2=2))[:, None]
+
+        def step(target: Array) -> tuple[Array, Array, Array]:
+            """Newton's step towards x z = target."""
+            rest = dual - target / x + z  # noqa: B023
+            side = primal + np.einsum("kij,kj->ki", matrix, scaled * rest)  # noqa: B023
+            dy = np.linalg.solve(normal, side[..., None])[..., 0]  # noqa: B023
+            dx = scaled * (np.einsum("kij,ki->kj", matrix, dy) - rest)  # noqa: B023
+            return dx, dy, (target - z * dx) / x - z  # noqa: B023
+
+        dx, _, dz = step(np.zeros_like(x))
+        ahead = _longest(x, dx), _longest(z, dz)
+        after = ((x + ahead[0][:, None] * dx) * (z + ahead[1][:, None] * dz)).mean(axis=1)
+        center = (after / np.maximum(gap, 1e-300)) ** 3
+        dx, dy, dz = step((center * gap)[:, None] - dx * dz)
+        a, b = 0.99 * _longest(x, dx), 0.99 * _longest(z, dz)
+        x = np.maximum(x + a[:, None] * dx, 1e-14)
+        y, z = y + b[:, None] * dy, np.maximum(z + b[:, None] * dz, 1e-14)
+        if gap.max() < 1e-9:
+            break
+    return np.maximum(x[:, g], 0.0).reshape(k, d)
+
+
+def _longest(value: Array, way: Array) -> Array:
+    """How far to go so that all stays positive, at most 1, (k,)."""
+    ratio = np.where(way < 0, -value / np.minimum(way, -1e-300), np.inf)
+    return np.minimum(1.0, ratio.min(axis=1))

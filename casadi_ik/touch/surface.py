@@ -1,0 +1,183 @@
+"""Surfaces of objects as oriented samples: where a fingertip may touch, and how far points are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.arrays import Array, Bools
+from casadi_ik.errors import InputError
+from casadi_ik.grasps.objects import GraspObject, load_object
+
+
+@dataclass(frozen=True)
+class SurfaceParameters:
+    """How finely a surface is looked at (lengths of Drost et al. 2010, scaled to fingertips).
+
+    Attributes:
+        samples: Points on the surface.
+        smoothing: Normals are means over this radius [m], about that of a fingertip's pad.
+        patch: A point is inside a face if all samples of this radius about it [m] ...
+        bend: ... have normals within this angle of its own [rad].
+        step: Edge of a cell of the distance grid [m].
+        around: How far beyond the object the grid reaches [m].
+        cells: Most cells along an edge of the grid; large objects get larger cells.
+    """
+
+    samples: int = 6000
+    smoothing: float = 4e-3
+    patch: float = 5e-3
+    bend: float = float(np.deg2rad(25.0))
+    step: float = 3e-3
+    around: float = 30e-3
+    cells: int = 96
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """An object's surface.
+
+    Attributes:
+        name: As `load_object` takes it, with its scale.
+        object: The object.
+        points: (m, 3) samples [m], object frame.
+        normals: (m, 3) unit outward normals, smoothed.
+        faces: (m, 3) unit outward normals of the triangles themselves.
+        inside: (m,) whether a fingertip's pad fits: no edge of the surface is near.
+        parameters: How it was sampled.
+    """
+
+    name: str
+    object: GraspObject
+    points: Array
+    normals: Array
+    faces: Array
+    inside: Bools
+    parameters: SurfaceParameters
+
+    @cached_property
+    def size(self) -> float:
+        """Diagonal of the box around it [m]."""
+        return float(np.linalg.norm(np.ptp(self.points, axis=0)))
+
+    @cached_property
+    def tree(self):  # noqa: ANN201
+        """Nearest samples of points."""
+        from scipy.spatial import cKDTree  # noqa: PLC0415
+
+        return cKDTree(self.points)
+
+    @cached_property
+    def _grid(self) -> tuple[Array, float, Array, NDArray[np.int32]]:
+        """Lower corner (3,), edge of a cell [m], heights and nearest samples of cells' middles."""
+        low = self.points.min(axis=0) - self.parameters.around
+        span = np.ptp(self.points, axis=0) + 2 * self.parameters.around
+        step = max(self.parameters.step, float(span.max()) / self.parameters.cells)
+        counts = np.ceil(span / step).astype(int)
+        axes = [low[i] + step * (np.arange(counts[i]) + 0.5) for i in range(3)]
+        middles = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+        height, sample = self.foot(middles.reshape(-1, 3))
+        apart = np.linalg.norm(middles.reshape(-1, 3) - self.points[sample], axis=1)
+        height = np.append(np.copysign(apart, height), self.parameters.around)
+        return low, step, height, np.append(sample, 0).astype(np.int32), counts
+
+    @property
+    def step(self) -> float:
+        """Edge of a cell of the distance grid [m]."""
+        return self._grid[1]
+
+    def roughly(self, points: Array) -> tuple[Array, NDArray[np.int32]]:
+        """Heights (...) and samples about nearest to points (..., 3), to within `step`."""
+        low, step, height, sample, counts = self._grid
+        index = np.floor((points - low) / step).astype(np.int32)
+        within = ((index >= 0) & (index < counts)).all(axis=-1)
+        flat = (index[..., 0] * counts[1] + index[..., 1]) * counts[2] + index[..., 2]
+        flat = np.where(within, flat, len(height) - 1)
+        return height[flat], sample[flat]
+
+    def foot(self, points: Array) -> tuple[Array, NDArray[np.intp]]:
+        """Nearest points of the surface: heights (...) [m], negative inside, and samples (...)."""
+        _, sample = self.tree.query(points)
+        height = ((points - self.points[sample]) * self.faces[sample]).sum(axis=-1)
+        return height, sample
+
+
+def load_surface(
+    name_or_path: str | Path,
+    scale: float = 1.0,
+    seed: int = 0,
+    parameters: SurfaceParameters | None = None,
+) -> Surface:
+    """Sample the surface of an object.
+
+    Args:
+        name_or_path: A shipped object, the path of an object's file, or of a mesh in metres (STL,
+            OBJ, PLY, ...).
+        scale: Of a mesh: its unit in metres (0.001 for millimetres).
+        seed: Of the samples.
+        parameters: How finely; None: `SurfaceParameters()`.
+
+    Raises:
+        UnknownNameError: No shipped object has that name.
+        DescriptionError: The file is missing or malformed.
+        InputError: A scale for an object that is no mesh, or a surface too large for a hand.
+
+    Example:
+        >>> surface = ik.load_surface("tomato_soup_can")
+        >>> surface.points.shape
+        (6000, 3)
+    """
+    chosen = parameters or SurfaceParameters()
+    name = str(name_or_path) if scale == 1.0 else f"{name_or_path}@{scale:g}"
+    thing = load_object(name)
+    vertices, triangles = thing.mesh(resolution=96)
+    corners = vertices[triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    doubled = np.linalg.norm(normals, axis=1)
+    if not doubled.sum() > 0:
+        raise InputError(f"{name}: found a surface without area, expected a mesh of a body")
+    if np.ptp(vertices, axis=0).max() > 2.0:
+        raise InputError(
+            f"{name}: found a size of {np.ptp(vertices, axis=0).max():.3g} m, expected metres and "
+            "at most 2 m; scale=0.001 is for millimetres"
+        )
+    rng = np.random.default_rng(seed)
+    face = rng.choice(len(triangles), chosen.samples, p=doubled / doubled.sum())
+    u, v = np.sqrt(rng.random(chosen.samples)), rng.random(chosen.samples)
+    weights = np.stack([1 - u, u * (1 - v), u * v], axis=1)
+    points = (corners[face] * weights[..., None]).sum(axis=1)
+    own = normals[face] / doubled[face, None]
+    return _smoothed(name, thing, points, own, chosen)
+
+
+def _smoothed(
+    name: str, thing: GraspObject, points: Array, faces: Array, chosen: SurfaceParameters
+) -> Surface:
+    """The surface of samples whose normals are averaged over their neighbours."""
+    from scipy.spatial import cKDTree  # noqa: PLC0415
+
+    tree = cKDTree(points)
+
+    def links(radius: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        pairs = tree.query_pairs(radius, output_type="ndarray")
+        every = np.arange(len(points))
+        return (
+            np.concatenate([pairs[:, 0], pairs[:, 1], every]),
+            np.concatenate([pairs[:, 1], pairs[:, 0], every]),
+        )
+
+    # Sides of a thin wall that face away from each other are no neighbours.
+    one, other = links(chosen.smoothing)
+    alike = (faces[one] * faces[other]).sum(axis=1) > 0
+    normals = np.zeros_like(points)
+    np.add.at(normals, one[alike], faces[other[alike]])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    one, other = links(chosen.patch)
+    bent = (normals[one] * faces[other]).sum(axis=1) < np.cos(chosen.bend)
+    inside = np.ones(len(points), dtype=bool)
+    inside[one[bent]] = False
+    return Surface(name, thing, points, normals, faces, inside, chosen)

@@ -1,0 +1,424 @@
+"""Grasps of a surface: oriented point pairs of hand and object that fit, made exact, and reached.
+
+Geometric hashing of oriented point pairs (Drost et al. 2010) between two opposing fingertips and
+two patches of the object gives palm poses; further fingers are looked up in the hand's table. The
+palm and the hand are then moved until every fingertip touches; the arm and the scene come last,
+through `Solver.solve_palms` and `Solver.solve_batch`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.arrays import Array, Bools
+from casadi_ik.collision.distances import Table, pose_row
+from casadi_ik.collision.model import pair_table
+from casadi_ik.problem.clearance import SceneCheck, Surroundings
+from casadi_ik.touch.hand_table import HandTable, inverse, rigid
+from casadi_ik.touch.strength import generators, loads
+from casadi_ik.touch.surface import Surface
+
+
+@dataclass(frozen=True)
+class TouchParameters:
+    """How grasps are looked for.
+
+    Attributes:
+        facing: Two patches oppose each other if both normals are within this angle of the line
+            between them [rad].
+        object_pairs: Pairs of patches that are drawn.
+        attempts: Pairs of hand and object that are tried at once.
+        lean: Fingertips lean by at most this angle at first [rad].
+        near: A further fingertip is at most this far from the surface at first [m].
+        steps: Of damped least squares on palm and hand.
+        free_lean: Within this angle a pad leans for nothing [rad].
+        slide: Weight of sliding along the surface beside leaving it.
+        turn: Metres that count as much as a radian of lean.
+        touch: What a fingertip may be off the surface at last [m].
+        last_lean: What it may lean at last [rad].
+        apart: Two grasps differ if a fingertip or the palm is so far elsewhere [m] ...
+        turned: ... or the palm is turned by so much [rad].
+    """
+
+    facing: float = float(np.deg2rad(45.0))
+    object_pairs: int = 400_000
+    attempts: int = 50_000
+    lean: float = float(np.deg2rad(25.0))
+    near: float = 4e-3
+    clear: float = 8e-3
+    tries: int = 8
+    together: int = 2000
+    steps: int = 6
+    free_lean: float = float(np.deg2rad(8.0))
+    slide: float = 0.05
+    turn: float = 0.02
+    touch: float = 1e-3
+    last_lean: float = float(np.deg2rad(15.0))
+    apart: float = 0.010
+    turned: float = float(np.deg2rad(15.0))
+
+
+@dataclass
+class Candidates:
+    """Palms and hands, k of them, in the object's frame.
+
+    Attributes:
+        palm: (k, 4, 4) pose of the palm in the object's frame.
+        hand: (k, m) positions of the fingers' motors [rad or m].
+        used: (k, f) which fingers touch.
+    """
+
+    palm: Array
+    hand: Array
+    used: Bools
+
+    def __len__(self) -> int:
+        return len(self.hand)
+
+    def rows(self, rows: NDArray) -> Candidates:
+        """Some of them."""
+        return Candidates(self.palm[rows], self.hand[rows], self.used[rows])
+
+
+@dataclass
+class Generator:
+    """Candidates of one surface and one hand.
+
+    Attributes:
+        table: The hand's.
+        surface: The object's.
+        fingers: How many fingertips touch.
+        parameters: How they are looked for.
+        rng: Random numbers.
+        counts: How many passed each stage.
+    """
+
+    table: HandTable
+    surface: Surface
+    fingers: int
+    parameters: TouchParameters
+    rng: np.random.Generator
+    clear: HandCheck
+    counts: dict[str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        surface, chosen = self.surface, self.parameters
+        good = np.flatnonzero(surface.inside)
+        self._pairs = np.zeros((0, 2), dtype=np.intp)
+        if len(good) < 2:
+            return
+        i, j = self.rng.choice(good, (2, chosen.object_pairs))
+        way = surface.points[j] - surface.points[i]
+        length = np.linalg.norm(way, axis=1)
+        way /= np.maximum(length, 1e-9)[:, None]
+        first = -(way * surface.normals[i]).sum(axis=1)
+        second = (way * surface.normals[j]).sum(axis=1)
+        facing = (np.minimum(first, second) > np.cos(chosen.facing)) & (length > 5e-3)
+        key = self.table.key(length[facing], first[facing], second[facing])
+        start, count = self.table.cells(key)
+        has = count > 0
+        self._pairs = np.stack([i[facing], j[facing]], axis=1)[has]
+        self._start, self._count = start[has], count[has]
+
+    @property
+    def fits(self) -> bool:
+        """Whether any two opposing patches have the distance and angles of two fingertips."""
+        return len(self._pairs) > 0
+
+    def counted(self, stage: str, number: int) -> None:
+        """Count what passed a stage."""
+        self.counts[stage] = self.counts.get(stage, 0) + int(number)
+
+    def draw(self) -> Candidates:
+        """Candidates of one round: two fingertips fit, the others find something to touch."""
+        table, surface, chosen, rng = self.table, self.surface, self.parameters, self.rng
+        row = rng.integers(len(self._pairs), size=chosen.attempts)
+        cell = self._start[row] + (rng.random(len(row)) * self._count[row]).astype(np.intp)
+        share, other, a, b = table.pairs[cell].T
+        thumb = table.robot.fingers.index(table.robot.thumb)
+        self.counted("attempts", len(row))
+        hand_points = np.stack([table.points[share, a, thumb], table.points[share, b, other]], 1)
+        hand_normals = np.stack([table.normals[share, a, thumb], table.normals[share, b, other]], 1)
+        samples = self._pairs[row]
+        palm, lean = _matched(
+            hand_points, hand_normals, surface.points[samples], -surface.normals[samples]
+        )
+        kept = np.flatnonzero((lean < chosen.lean).all(axis=1))
+        share, other, a, b, palm = (x[kept] for x in (share, other, a, b, palm))
+        self.counted("two fingertips fit", len(kept))
+        names = table.robot.fingers
+        some = Candidates(palm, table.q[share, a].copy(), np.zeros((len(palm), len(names)), bool))
+        some.used[:, thumb] = True
+        for number in set(other.tolist()):
+            rows = np.flatnonzero(other == number)
+            some.used[rows, number] = True
+            self._put(some.hand, rows, table.q[share[rows], b[rows]], names[number])
+        kept = np.flatnonzero(self.clear(some, some.used))
+        self.counted("they are clear", len(kept))
+        some, share = some.rows(kept), share[kept]
+        placed = some.used.copy()
+        for number in rng.permutation(len(names)):
+            for start in range(0, len(share), chosen.together):
+                rows = np.arange(start, min(start + chosen.together, len(share)))
+                rows = rows[placed[rows].any(axis=1) & ~placed[rows, number]]
+                if len(rows):
+                    self._place(some, placed, share, rows, number)
+        kept = np.flatnonzero(placed.all(axis=1) & (some.used.sum(axis=1) == self.fingers))
+        self.counted(f"{self.fingers} fingertips touch, all clear", len(kept))
+        return some.rows(kept)
+
+    def _place(
+        self, some: Candidates, placed: Bools, share: NDArray[np.intp], rows: NDArray[np.intp], number: int
+    ) -> None:
+        """Give a finger a posture that touches, where more are wanted, else one that is clear.
+
+        A row for which none is found is given up: none of its fingers counts as placed.
+        """
+        chosen, name = self.parameters, self.table.robot.fingers[number]
+        height, touch = self._looked_up(some.palm[rows], share[rows], number)
+        wanted = some.used[rows].sum(axis=1) < self.fingers
+        rank = self.rng.random(touch.shape)
+        rank = np.where(touch & wanted[:, None], 2.0 + rank, np.where(height > chosen.clear, rank, -1.0))
+        left = np.arange(len(rows))
+        for _ in range(chosen.tries):
+            best = rank[left].argmax(axis=1)
+            value = rank[left, best]
+            left, best, value = left[value >= 0], best[value >= 0], value[value >= 0]
+            if not len(left):
+                break
+            here = rows[left]
+            trial = some.rows(here)
+            self._put(trial.hand, np.arange(len(here)), self.table.q[share[here], best], name)
+            trial.used[:, number] = value >= 2.0
+            present = placed[here].copy()
+            present[:, number] = True
+            ok = self.clear(trial, present)
+            some.hand[here[ok]], some.used[here[ok]] = trial.hand[ok], trial.used[ok]
+            placed[here[ok], number] = True
+            rank[left, best] = -1.0
+            left = left[~ok]
+        placed[rows[~placed[rows, number]]] = False
+
+    def _put(self, hand: Array, rows: NDArray[np.intp], posture: Array, finger: str) -> None:
+        """Take a finger's own motors from a posture."""
+        columns = np.flatnonzero(np.isin(self.table.motors, self.table.of_finger[finger]))
+        hand[np.ix_(rows, columns)] = posture[:, columns]
+
+    def _looked_up(self, palm: Array, share: NDArray[np.intp], number: int) -> tuple[Array, Bools]:
+        """Of all postures of a finger at palms: heights (k, n) of the tip, and which ones touch."""
+        table, surface, chosen = self.table, self.surface, self.parameters
+        points, normals = table.points[share, :, number], table.normals[share, :, number]
+        rotation, origin = palm[:, :3, :3], palm[:, :3, 3]
+        tips = points @ rotation.swapaxes(1, 2) + origin[:, None]
+        height, sample = surface.roughly(tips)
+        ok = np.abs(height) < chosen.near + surface.step
+        row, posture = np.nonzero(ok)
+        chosen_samples = sample[row, posture]
+        normal = surface.normals[chosen_samples]
+        exact = ((tips[row, posture] - surface.points[chosen_samples]) * normal).sum(axis=-1)
+        pads = np.einsum("kij,kj->ki", rotation[row], normals[row, posture])
+        ok[row, posture] = (
+            (np.abs(exact) < chosen.near)
+            & surface.inside[chosen_samples]
+            & (-(pads * normal).sum(axis=-1) > np.cos(chosen.lean))
+        )
+        return height, ok
+
+
+def _matched(
+    hand: Array, hand_normals: Array, object_: Array, object_normals: Array
+) -> tuple[Array, Array]:
+    """Palms (k, 4, 4) that bring two points (k, 2, 3) onto two others, and how pads lean (k, 2)."""
+    frames = []
+    for points, normals in ((hand, hand_normals), (object_, object_normals)):
+        line = points[:, 1] - points[:, 0]
+        line /= np.linalg.norm(line, axis=1, keepdims=True)
+        # The turn about the line brings the sums of both normals' parts across it together.
+        across = normals - (normals * line[:, None]).sum(axis=-1, keepdims=True) * line[:, None]
+        frames.append((line, across))
+    (line, across), (goal, wanted) = frames
+    least = np.eye(3)[np.abs(line).argmin(axis=1)]
+    x = np.cross(line, least)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    from_ = np.stack([x, np.cross(line, x), line], axis=-1)
+    least = np.eye(3)[np.abs(goal).argmin(axis=1)]
+    u = np.cross(goal, least)
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    v = np.cross(goal, u)
+    to = np.stack([u, v, goal], axis=-1)
+    flat = np.einsum("kji,kcj->kci", from_, across)[..., :2]
+    aim = np.einsum("kji,kcj->kci", to, wanted)[..., :2]
+    cosine = (flat * aim).sum(axis=(1, 2))
+    sine = (flat[..., 0] * aim[..., 1] - flat[..., 1] * aim[..., 0]).sum(axis=1)
+    turn = np.arctan2(sine, cosine)
+    spin = np.zeros((len(turn), 3, 3))
+    spin[:, 0, 0] = spin[:, 1, 1] = np.cos(turn)
+    spin[:, 1, 0], spin[:, 0, 1], spin[:, 2, 2] = np.sin(turn), -np.sin(turn), 1.0
+    rotation = to @ spin @ from_.swapaxes(1, 2)
+    middle = object_.mean(axis=1) - np.einsum("kij,kj->ki", rotation, hand.mean(axis=1))
+    turned = np.einsum("kij,kcj->kci", rotation, hand_normals)
+    lean = np.arccos(np.clip((turned * object_normals).sum(axis=-1), -1, 1))
+    return rigid(rotation, middle), lean
+
+
+@dataclass(frozen=True)
+class Touching:
+    """Where fingertips are on a surface.
+
+    Attributes:
+        points: (k, f, 3) fingertips [m], object frame.
+        normals: (k, f, 3) pad normals.
+        height: (k, f) distance from the surface [m].
+        sample: (k, f) nearest samples.
+        lean: (k, f) between pad normals and the surface's [rad].
+    """
+
+    points: Array
+    normals: Array
+    height: Array
+    sample: NDArray[np.intp]
+    lean: Array
+
+
+def touching(table: HandTable, surface: Surface, some: Candidates) -> tuple[Touching, Array, Array]:
+    """Where fingertips are, and their Jacobians (k, f, 3, m) in the object's frame."""
+    points, normals, linear, angular = table.at(some.hand)
+    rotation, origin = some.palm[:, None, :3, :3], some.palm[:, None, :3, 3]
+    points = np.einsum("kfij,kfj->kfi", np.broadcast_to(rotation, linear.shape[:2] + (3, 3)), points)
+    points = points + origin
+    turn = np.broadcast_to(rotation, linear.shape[:2] + (3, 3))
+    normals = np.einsum("kfij,kfj->kfi", turn, normals)
+    height, sample = surface.foot(points)
+    lean = np.arccos(np.clip(-(normals * surface.normals[sample]).sum(axis=-1), -1, 1))
+    return Touching(points, normals, height, sample, lean), turn @ linear, turn @ angular
+
+
+def snapped(table: HandTable, surface: Surface, some: Candidates, chosen: TouchParameters) -> Candidates:
+    """Palms and hands moved until every fingertip touches: damped least squares, limits kept.
+
+    Rows of a fingertip: its height over the surface, sliding along it (nearly free), and the part
+    of its lean that is beyond what a pad does for nothing.
+    """
+    k, m = some.hand.shape
+    lower, upper = table.robot.lower[table.motors], table.robot.upper[table.motors]
+    for _ in range(chosen.steps):
+        here, linear, angular = touching(table, surface, some)
+        about = some.palm[:, None, :3, 3]
+        normal = surface.normals[here.sample]
+        f = normal.shape[1]
+        # Of a twist of the palm (v, w): a point moves by v + w x r, a normal by w x n.
+        arms = here.points - about
+        to_points = np.concatenate([np.broadcast_to(np.eye(3), (k, f, 3, 3)), -_cross(arms), linear], -1)
+        to_turns = np.concatenate(
+            [np.zeros((k, f, 3, 3)), np.broadcast_to(np.eye(3), (k, f, 3, 3)), angular], -1
+        )
+        excess = np.maximum(here.lean - chosen.free_lean, 0.0)
+        axis = np.cross(here.normals, -normal)
+        axis *= (excess / np.maximum(np.linalg.norm(axis, axis=-1), 1e-9))[..., None]
+        off = here.points - surface.points[here.sample]
+        along = off - (off * normal).sum(-1, keepdims=True) * normal
+        rows = [
+            np.einsum("kfi,kfij->kfj", normal, to_points)[:, :, None],
+            chosen.slide * to_points,
+            chosen.turn * to_turns,
+        ]
+        goal = [
+            -here.height[..., None],
+            np.broadcast_to(-chosen.slide * 0.0 * along, along.shape),
+            chosen.turn * axis,
+        ]
+        weight = some.used[..., None, None]
+        matrix = (np.concatenate(rows, axis=2) * weight).reshape(k, -1, 6 + m)
+        right = (np.concatenate(goal, axis=2) * weight[..., 0]).reshape(k, -1)
+        free = np.ones((k, 6 + m), dtype=bool)
+        for _ in range(2):  # motors that would leave their range stay at its end
+            bound = matrix * free[:, None]
+            square = bound.swapaxes(1, 2) @ bound
+            square[:, range(6 + m), range(6 + m)] += np.where(free, _damping(m), 1.0)
+            step = np.linalg.solve(square, (bound.swapaxes(1, 2) @ right[..., None]))[..., 0]
+            after = some.hand + step[:, 6:]
+            stopped = (after < lower) | (after > upper)
+            if not (stopped & free[:, 6:]).any():
+                break
+            free[:, 6:] &= ~stopped
+        hand = np.clip(some.hand + np.clip(step[:, 6:], -0.3, 0.3), lower, upper)
+        twist = step[:, :6]
+        turn = _rotation(np.clip(twist[:, 3:], -0.5, 0.5))
+        palm = rigid(turn @ some.palm[:, :3, :3], some.palm[:, :3, 3] + np.clip(twist[:, :3], -0.02, 0.02))
+        some = Candidates(palm, hand, some.used)
+    return some
+
+
+def _damping(m: int) -> Array:
+    """(6 + m,) of metres, radians of the palm and motors."""
+    return np.concatenate([np.full(3, 1e-4), np.full(3, 1e-6), np.full(m, 1e-6)])
+
+
+def _cross(vectors: Array) -> Array:
+    """(..., 3, 3) matrices of the cross product."""
+    zero = np.zeros(vectors.shape[:-1])
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*zero.shape, 3, 3)
+
+
+def _rotation(vectors: Array) -> Array:
+    """(k, 3, 3) of rotation vectors."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415
+
+    return Rotation.from_rotvec(vectors).as_matrix()
+
+
+class HandCheck:
+    """Whether palms and hands hit the object, what stands about it, or themselves; arms aside.
+
+    The arm stays at home and the world is moved instead, so that the collision kernel of solves
+    serves before there is an arm.
+    """
+
+    def __init__(self, table: HandTable, check: SceneCheck, pose: Array) -> None:
+        """Take over the scene of a solver.
+
+        Args:
+            table: The hand's.
+            check: Of the scene in which the object is grasped.
+            pose: (4, 4) of the object in the base frame.
+        """
+        self.table, self.check, self.pose = table, check, pose
+        self._tables: dict[tuple[bytes, bytes], Table] = {}
+
+    def __call__(self, some: Candidates, present: Bools | None = None) -> Bools:
+        """(k,) which are clear; of fingers that are not present nothing counts."""
+        q = self.table.configuration(some.hand)
+        world = self.table.palm @ inverse(self.pose @ some.palm)
+        if present is None:
+            present = np.ones_like(some.used)
+        ok = np.zeros(len(some), dtype=bool)
+        patterns, which = np.unique(
+            np.concatenate([some.used, present], axis=1), axis=0, return_inverse=True
+        )
+        for number, pattern in enumerate(patterns):
+            rows = np.flatnonzero(which.ravel() == number)
+            table = self._table(*np.split(pattern, 2))
+            at = table.poses(self.check.scene.items)
+            poses = pose_row(world[rows, None] @ rigid(at[:, :9].reshape(-1, 3, 3), at[:, 9:]))
+            around = Surroundings(self.check.kernel, table, poses, self.check.scene.margin)
+            ok[rows] = around.free(q[rows])
+        return ok
+
+    def _table(self, used: Bools, present: Bools) -> Table:
+        key = used.tobytes(), present.tobytes()
+        if key not in self._tables:
+            robot, motors = self.table.robot, self.table.of_finger
+            touched = [self.check.bodies_of_fingers[n] for n, on in zip(robot.fingers, used, strict=True) if on]
+            table = pair_table(self.check.model, self.check.scene, sorted(frozenset().union(*touched))).held
+            there = {i for n, on in zip(robot.fingers, present, strict=True) if on for i in motors[n]}
+            absent = {i for own in motors.values() for i in own} - there
+            links = robot.description.links_moved(absent) - robot.description.links_moved(there)
+            self._tables[key] = table.only(
+                np.array([links.isdisjoint(pair) for pair in table.names], dtype=bool)
+            )
+        return self._tables[key]
