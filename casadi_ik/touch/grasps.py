@@ -3,84 +3,387 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, overload
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from casadi_ik.answers.solution import Solution
-from casadi_ik.api import Solver
+from casadi_ik.answers.solution import BatchSolution, Solution
+from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import InputError
-from casadi_ik.grasps import Contact, Grasp
-from casadi_ik.grasps.grasp import Tolerance
+from casadi_ik.grasps import Contact, Grasp, Tolerance
+from casadi_ik.grasps.pose import one_pose
 from casadi_ik.problem.clearance import SceneCheck
-from casadi_ik.touch.hand_table import HandTable
-from casadi_ik.touch.strength import generators, loads
-from casadi_ik.touch.surface import Surface
-from casadi_ik.touch.synthesis import (
+from casadi_ik.touch.candidates import (
     Candidates,
     Generator,
     HandCheck,
     TouchParameters,
-    snapped,
     touching,
 )
+from casadi_ik.touch.hand_table import HandTable
+from casadi_ik.touch.strength import generators, loads
+from casadi_ik.touch.surface import Surface
+
+if TYPE_CHECKING:
+    from casadi_ik.api import Solver
 
 GRAVITY = 9.80665
 """Standard acceleration of free fall [m/s^2]."""
 
+OPENINGS = (0.025, 0.015, 0.008)
+"""How far fingertips are from the object before they close, the first that is clear [m]."""
 
-def find(solver, surface, pose=None, fingers=3, mu=0.5, hold=None, limit=200, seed=0, rounds=60, parameters=None):
-    chosen = parameters or TouchParameters()
-    place = np.eye(4) if pose is None else np.asarray(pose, float)
+RETREAT = 0.06
+"""How far the palm is back before it comes to the grasp [m]."""
+
+Judgement = str | Callable[[ArmHand, Array], ArrayLike]
+"""What grasps are ranked by: a name of `RANKINGS`, or scores (m,) of configurations (m, n)."""
+
+RANKINGS = ("load", "clearance", "limits", "q0")
+
+
+@dataclass(frozen=True, eq=False)
+class FoundGrasp:
+    """A grasp that the arm-hand can make.
+
+    Attributes:
+        grasp: Contacts in the base frame: where fingertips are and their pads face; with the
+            object's name and pose, the hand's posture, and the same hand before (`pregrasp`) and as
+            it squeezes (`squeeze`), as palms and postures.
+        solution: How it is made, judged in the scene.
+        load: Weight that the worst of six directions holds per newton of squeeze (the sum of the
+            normal forces) with friction [N/N].
+        closure: The same over forces and torques (about the middle of the object, divided by half
+            its size); above 0 the grasp is force-closed.
+        score: What it was ranked by, higher is better.
+    """
+
+    grasp: Grasp
+    solution: Solution
+    load: float
+    closure: float
+    score: float
+
+    @property
+    def q(self) -> Array:
+        """(n,) the posture: what `Solver.reach` goes to."""
+        return self.solution.q
+
+    @property
+    def clearance(self) -> float | None:
+        """Smallest distance of a pair that must not touch [m]."""
+        return self.solution.clearance
+
+    @property
+    def pregrasp(self) -> Grasp | None:
+        """Palm and posture before it; None: no opening of the hand was clear."""
+        return self.grasp.pregrasp
+
+
+@dataclass(frozen=True, eq=False)
+class FoundGrasps(Sequence[FoundGrasp]):
+    """Distinct grasps of an object, best first.
+
+    Attributes:
+        entries: The grasps; itself a sequence of them.
+        counts: How many candidates passed each stage, in order.
+        prefer: What they are ranked by.
+        time: Processor time [s].
+        reason: Why there is none; "" if there are some.
+    """
+
+    entries: tuple[FoundGrasp, ...]
+    counts: Mapping[str, int]
+    prefer: str
+    time: float
+    reason: str = ""
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+    def __iter__(self) -> Iterator[FoundGrasp]:
+        return iter(self.entries)
+
+    @overload
+    def __getitem__(self, place: int) -> FoundGrasp: ...
+
+    @overload
+    def __getitem__(self, place: slice) -> tuple[FoundGrasp, ...]: ...
+
+    def __getitem__(self, place: int | slice) -> FoundGrasp | tuple[FoundGrasp, ...]:
+        return self.entries[place]
+
+    @property
+    def grasps(self) -> tuple[Grasp, ...]:
+        """The grasps, for `Solver.choose`."""
+        return tuple(one.grasp for one in self.entries)
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """The same in short lines."""
+        lines = [f"{len(self)} distinct grasps in {self.time:.2f} s of processor time"]
+        lines += [f"  {number:>9,} {stage}" for stage, number in self.counts.items()]
+        if self.reason:
+            return (*lines, f"none: {self.reason}")
+        lines.append(f"best by {self.prefer}:")
+        for place, one in enumerate(self.entries[:10], 1):
+            room = "" if one.clearance is None else f", clearance {1e3 * one.clearance:.1f} mm"
+            lines.append(f"  {place}. {one.score:.4g}, load {one.load:.3f} N/N{room}")
+        return tuple(lines)
+
+    def __str__(self) -> str:
+        return "\n".join(self.lines)
+
+    def __repr__(self) -> str:
+        return f"<FoundGrasps: {len(self)} by {self.prefer}>"
+
+
+@dataclass(frozen=True, eq=False)
+class _Made:
+    """Grasps of a round that pass all: k of them."""
+
+    batch: BatchSolution
+    rows: NDArray[np.intp]
+    some: Candidates
+    loads: Array
+
+
+def grasps_of(
+    solver: Solver,
+    surface: Surface,
+    pose: ArrayLike | None = None,
+    fingers: int = 3,
+    mu: float = 0.5,
+    hold: tuple[float, float] | None = None,
+    limit: int = 200,
+    jobs: int = 1,
+    seed: int = 0,
+    prefer: Judgement = "load",
+    q0: ArrayLike | None = None,
+    parameters: TouchParameters | None = None,
+) -> FoundGrasps:
+    """Find grasps of an object, see `Solver.grasps_of`.
+
+    Raises:
+        InputError: See there.
+        UnsupportedError: The hand has one finger, or no shapes.
+    """
+    begin, chosen = time.process_time(), parameters or TouchParameters()
     robot = solver.robot
-    table = HandTable(robot, seed)
+    place = np.eye(4) if pose is None else one_pose(pose)
+    _check(fingers, mu, hold, limit, prefer)
+    fingers = min(fingers, len(robot.fingers))
+    table = HandTable.of(robot)
     scene = (solver.scene or Scene()).holding(surface.name, place)
-    check = SceneCheck(robot, scene)
-    rng = np.random.default_rng(seed)
-    generator = Generator(table, surface, fingers, chosen, rng, HandCheck(table, check, place))
-    counts = generator.counts
-    T = {}
-    def tick(name, t0):
-        T[name] = T.get(name, 0) + time.process_time() - t0
-    arm = Solver(robot, options={"max_rounds": 1}, tolerance=Tolerance(1e-3, 0.02))
-    judge = Solver(robot, options={"max_rounds": 1}, tolerance=Tolerance(1e-3, 0.02), scene=scene)
-    q_all, tip_all, palms = [], [], []
-    results = []
-    center = surface.points.mean(0)
-    length = surface.size / 2
-    for _ in range(rounds):
-        t0 = time.process_time(); c = generator.draw(); tick("draw", t0)
-        if not len(c): continue
-        t0 = time.process_time(); c = snapped(table, surface, c, chosen); tick("snap", t0)
-        t0 = time.process_time()
-        here, _, _ = touching(table, surface, c)
-        ok = (~c.used | ((abs(here.height) < chosen.touch) & (here.lean < chosen.last_lean) & surface.inside[here.sample])).all(1)
-        rows = np.flatnonzero(ok); c = c.rows(rows); generator.counted("on the surface", len(c))
-        rows = np.flatnonzero(generator.clear(c)); c = c.rows(rows); generator.counted("clear again", len(c)); tick("verdict", t0)
-        if not len(c): continue
-        t0 = time.process_time()
-        got = arm.solve_palms(place @ c.palm, table.configuration(c.hand)); tick("arm", t0)
-        rows = np.flatnonzero(got.success); generator.counted("arm reaches", len(rows))
-        if not len(rows): continue
-        c = c.rows(rows); q = got.q[rows]
-        t0 = time.process_time()
-        points, normals = robot.contacts(q)
-        points = np.where(c.used[..., None], points, np.nan); normals = np.where(c.used[..., None], normals, np.nan)
-        final = judge.solve_batch(points, normals, q0=q, object_pose=place); tick("judge", t0)
-        rows = np.flatnonzero(final.success); generator.counted("free", len(rows))
-        if not len(rows): continue
-        t0 = time.process_time()
-        c = c.rows(rows); here, _, _ = touching(table, surface, c)
-        order = np.argsort(~c.used, axis=1, kind="stable")[:, :fingers]
-        pick = np.take_along_axis(here.sample, order, 1)
-        W = generators(surface.points[pick], -surface.faces[pick], mu, center, length)
-        L = loads(W); tick("load", t0)
-        closed = L.min(1) > 1e-4
-        generator.counted("closed", closed.sum())
-        results.append((final.q[rows][closed], L[closed][:, [0,1,2,6,7,8]].min(1)))
-        if counts["closed"] >= limit: break
-    print(T); print(counts)
-    return results
+    hands = HandCheck(table, SceneCheck(robot, scene), place)
+    generator = Generator(table, surface, fingers, chosen, np.random.default_rng(seed), hands)
+    kinds = {"tolerance": Tolerance(chosen.touch, chosen.turned / 15), "options": {"max_rounds": 1}}
+    arms, judge = type(solver)(robot, **kinds), type(solver)(robot, scene=scene, **kinds)
+    start = None if q0 is None else robot.configuration(q0)
+    parts: list[_Made] = []
+    attempts = chosen.attempts // 5
+    distinct, tried = 0, 0
+    while generator.fits and distinct < limit and tried < chosen.most:
+        some = generator.candidates(attempts)
+        tried, attempts = tried + attempts, chosen.attempts
+        made = _made(generator, some, arms, judge, place, mu, hold, jobs, start)
+        if made is not None:
+            parts.append(made)
+            distinct = len(
+                _distinct(parts, np.arange(sum(len(p.rows) for p in parts)), limit, chosen)
+            )
+    return _ranked(
+        robot, generator, hands, parts, place, limit, prefer, start, time.process_time() - begin
+    )
+
+
+def _check(
+    fingers: int,
+    mu: float,
+    hold: tuple[float, float] | None,
+    limit: int,
+    prefer: Judgement,
+) -> None:
+    """Refuse what cannot be asked for."""
+    if not isinstance(fingers, int) or fingers < 2:
+        raise InputError(f"fingers: found {fingers!r}, expected an integer >= 2")
+    if not 0 < mu < np.inf:
+        raise InputError(f"mu: found {mu!r}, expected a friction coefficient > 0")
+    if hold is not None and not (len(hold) == 2 and min(hold) > 0):
+        raise InputError(f"hold: found {hold!r}, expected a mass [kg] and a squeeze [N], both > 0")
+    if not isinstance(limit, int) or limit < 1:
+        raise InputError(f"limit: found {limit!r}, expected an integer >= 1")
+    if not callable(prefer) and prefer not in RANKINGS:
+        raise InputError(f"prefer: found {prefer!r}, expected {', '.join(RANKINGS)} or a function")
+
+
+def _made(
+    generator: Generator,
+    some: Candidates,
+    arms: Solver,
+    judge: Solver,
+    place: Array,
+    mu: float,
+    hold: tuple[float, float] | None,
+    jobs: int,
+    start: Array | None,
+) -> _Made | None:
+    """Those that the arm reaches, that are free in the scene, and that hold."""
+    robot, table, surface = arms.robot, generator.table, generator.surface
+    if not len(some):
+        return None
+    hands = table.configuration(some.hand)
+    reached = arms.solve_palms(place @ some.palm, hands, start, jobs=jobs)
+    rows = np.flatnonzero(reached.success)
+    generator.counted("arm reaches", len(rows))
+    some, q = some.rows(rows), reached.q[rows]
+    if not len(rows):
+        return None
+    points, normals = (np.where(some.used[..., None], part, np.nan) for part in robot.contacts(q))
+    batch = judge.solve_batch(points, normals, q0=q, jobs=jobs)
+    rows = np.flatnonzero(batch.success)
+    generator.counted("free in the scene", len(rows))
+    some = some.rows(rows)
+    found = np.zeros((0, 12))
+    if len(rows):
+        here, _, _ = touching(table, surface, some)
+        order = np.argsort(~some.used, axis=1, kind="stable")[:, : generator.fingers]
+        sample = np.take_along_axis(here.sample, order, axis=1)
+        center, length = surface.middle, surface.size / 2
+        wrenches = generators(surface.points[sample], -surface.faces[sample], mu, center, length)
+        found = loads(wrenches)
+        held = found.min(axis=1) > CLOSED
+        generator.counted("force-closed", int(held.sum()))
+        if hold is not None:
+            held &= found[:, FORCES].min(axis=1) * hold[1] >= hold[0] * GRAVITY
+            generator.counted(f"hold {hold[0]:g} kg at {hold[1]:g} N", int(held.sum()))
+        rows, some, found = rows[held], some.rows(np.flatnonzero(held)), found[held]
+    return _Made(batch, rows, some, found)
+
+
+CLOSED = 1e-4
+"""Load from which a grasp counts as force-closed [N/N]."""
+
+FORCES = [0, 1, 2, 6, 7, 8]
+"""Columns of `strength.DIRECTIONS` that are forces."""
+
+
+def _distinct(
+    parts: list[_Made], order: NDArray[np.intp], limit: int, chosen: TouchParameters
+) -> list[int]:
+    """Of all grasps in an order the first of those that are alike, at most so many."""
+    if not parts:
+        return []
+    palm = np.concatenate([part.some.palm for part in parts])
+    used = np.concatenate([part.some.used for part in parts])
+    tips = np.concatenate([part.some.tips for part in parts])
+    kept: list[int] = []
+    for row in order.tolist():
+        if len(kept) >= limit:
+            break
+        others = np.array(kept, dtype=np.intp)
+        turn = np.einsum("kij,ij->k", palm[others, :3, :3], palm[row, :3, :3])
+        turned = np.arccos(np.clip((turn - 1) / 2, -1, 1)) < chosen.turned
+        near = np.linalg.norm(palm[others, :3, 3] - palm[row, :3, 3], axis=1) < chosen.apart
+        off = np.linalg.norm(tips[others] - tips[row], axis=-1)
+        both = used[others] & used[row]
+        alike = (np.where(both, off, 0.0) < chosen.apart).all(axis=1)
+        same = (used[others] == used[row]).all(axis=1)
+        if not (turned & near & alike & same).any():
+            kept.append(row)
+    return kept
+
+
+def _ranked(
+    robot: ArmHand,
+    generator: Generator,
+    hands: HandCheck,
+    parts: list[_Made],
+    place: Array,
+    limit: int,
+    prefer: Judgement,
+    start: Array | None,
+    seconds: float,
+) -> FoundGrasps:
+    """The distinct ones, best first."""
+    where = [(part, i) for part in parts for i in range(len(part.rows))]
+    name = prefer if isinstance(prefer, str) else "own"
+    if not where:
+        return FoundGrasps((), generator.counts, name, seconds, generator.why_none())
+    q = np.concatenate([part.batch.q[part.rows] for part in parts])
+    found = np.concatenate([part.loads for part in parts])
+    load, closure = found[:, FORCES].min(axis=1), found.min(axis=1)
+    clearance = np.concatenate([np.asarray(part.batch.clearance)[part.rows] for part in parts])
+    span = robot.upper - robot.lower
+    scores = {
+        "load": lambda: load,
+        "clearance": lambda: clearance,
+        "limits": lambda: (np.minimum(q - robot.lower, robot.upper - q) / span).min(axis=1),
+        "q0": lambda: -np.abs((q - (robot.home if start is None else start)) / span).max(axis=1),
+    }
+    score = (
+        scores[prefer]() if isinstance(prefer, str) else np.asarray(prefer(robot, q), dtype=float)
+    )
+    if score.shape != (len(q),):
+        raise InputError(f"prefer: gave shape {score.shape}, expected ({len(q)},)")
+    kept = _distinct(parts, np.argsort(-score, kind="stable"), limit, generator.parameters)
+    generator.counted("distinct", len(kept))
+    entries = []
+    for row in kept:
+        part, i = where[row]
+        solution = part.batch.solution(int(part.rows[i]))
+        grasp = _grasp(robot, generator, hands, part.some.rows(np.array([i])), solution, place)
+        entries.append(
+            FoundGrasp(grasp, solution, float(load[row]), float(closure[row]), float(score[row]))
+        )
+    return FoundGrasps(tuple(entries), generator.counts, name, seconds)
+
+
+def _grasp(
+    robot: ArmHand,
+    generator: Generator,
+    hands: HandCheck,
+    one: Candidates,
+    solution: Solution,
+    place: Array,
+) -> Grasp:
+    """The grasp of a solution, with the hand before it and as it squeezes."""
+    points, normals = robot.contacts(solution.q)
+    contacts = {
+        name: Contact(points[i], normals[i])
+        for i, name in enumerate(robot.fingers)
+        if one.used[0, i]
+    }
+    table, surface = generator.table, generator.surface
+    motors = [robot.actuators[i] for i in table.motors]
+
+    def posture(hand: Array) -> dict[str, float]:
+        return dict(zip(motors, hand.tolist(), strict=True))
+
+    own = replace(one, hand=solution.q[table.motors][None])
+    grasp = Grasp(
+        contacts,
+        robot=robot.name,
+        name=f"{surface.object.name} {'+'.join(contacts)}",
+        object=surface.name,
+        object_pose=place,
+        posture=posture(own.hand[0]),
+    )
+    palm = place @ own.palm[0]
+    squeezed = table.opened(own, -0.005)
+    before = None
+    for opening in OPENINGS:
+        opened = table.opened(own, opening)
+        if hands(opened).all():
+            back = palm.copy()
+            away = palm[:3, 3] - np.mean([one.point for one in contacts.values()], axis=0)
+            back[:3, 3] += RETREAT * away / max(float(np.linalg.norm(away)), 1e-9)
+            before = Grasp(robot=robot.name, palm=back, posture=posture(opened.hand[0]))
+            break
+    squeeze = Grasp(robot=robot.name, palm=palm, posture=posture(squeezed.hand[0]))
+    return replace(grasp, pregrasp=before, squeeze=squeeze)

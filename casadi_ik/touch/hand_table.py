@@ -1,8 +1,11 @@
-"""What a hand's fingertips can do by themselves: postures, pairs that oppose each other, Jacobians."""
+"""What a hand's fingertips can do by themselves: postures, opposing pairs, Jacobians."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
 
 import casadi as ca
 import numpy as np
@@ -11,11 +14,13 @@ from numpy.typing import NDArray
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import UnsupportedError
-from casadi_ik.grasps.pose import inverse
 from casadi_ik.kernels.function_kernel import FunctionKernel
 from casadi_ik.kernels.graphs import FunctionGraph, recipe
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.kinematics import actuated
+
+if TYPE_CHECKING:
+    from casadi_ik.touch.candidates import Candidates
 
 
 @dataclass(frozen=True)
@@ -68,18 +73,38 @@ class HandTable:
         shared = np.array([users.count(i) > 1 for i in self.motors])
         self.kernel = hand_kernel(description)
         self.palm = robot.palm(robot.home)
-        values = chosen.shared if shared.any() else 1
+        # Where fingers share all motors (a gripper) a posture is a value of these.
+        count = 1 if shared.all() else chosen.postures
+        values = chosen.postures if shared.all() else chosen.shared if shared.any() else 1
         lower, upper = robot.lower[self.motors], robot.upper[self.motors]
-        drawn = _sobol(len(self.motors), chosen.postures, seed)
-        self.q = np.tile(lower + drawn * (upper - lower), (values, 1, 1))
+        self.q = np.tile(lower + _sobol(len(lower), count, seed) * (upper - lower), (values, 1, 1))
         if shared.any():
             common = _sobol(int(shared.sum()), values, seed + 1)
-            span = (upper - lower)[shared]
-            self.q[:, :, shared] = (lower[shared] + common * span)[:, None]
+            self.q[:, :, shared] = (lower[shared] + common * (upper - lower)[shared])[:, None]
         points, normals, _, _ = self.at(self.q.reshape(-1, len(self.motors)))
-        shape = (values, chosen.postures, len(robot.fingers), 3)
+        shape = (values, count, len(robot.fingers), 3)
         self.points, self.normals = points.reshape(shape), normals.reshape(shape)
         self._sort_pairs()
+
+    @classmethod
+    def of(cls, robot: ArmHand) -> HandTable:
+        """The table of a robot, made once per process."""
+        if robot not in _TABLES:
+            _TABLES[robot] = cls(robot)
+        return _TABLES[robot]
+
+    def opened(self, some: Candidates, opening: float) -> Candidates:
+        """The same palms with fingertips moved back from what they touch [m]; negative: into it."""
+        hand = some.hand
+        lower, upper = self.robot.lower[self.motors], self.robot.upper[self.motors]
+        for _ in range(4):
+            _, normals, linear, _ = self.at(hand)
+            rows = (linear * some.used[..., None, None]).reshape(len(hand), -1, len(self.motors))
+            goal = (-0.25 * opening * normals * some.used[..., None]).reshape(len(hand), -1)
+            square = rows.swapaxes(1, 2) @ rows + 1e-5 * np.eye(len(self.motors))
+            step = np.linalg.solve(square, rows.swapaxes(1, 2) @ goal[..., None])[..., 0]
+            hand = np.clip(hand + step, lower, upper)
+        return replace(some, hand=hand)
 
     def configuration(self, hands: Array) -> Array:
         """(k, n) configurations with hands (k, m), the arm at home."""
@@ -118,7 +143,9 @@ class HandTable:
                 first = np.einsum("ijk,ik->ij", way, n)
                 second = -np.einsum("ijk,jk->ij", way, o)
                 i, j = np.nonzero((first > least) & (second > least))
-                found.append(np.stack([np.full(len(i), share), np.full(len(i), other), i, j], axis=1))
+                found.append(
+                    np.stack([np.full(len(i), share), np.full(len(i), other), i, j], axis=1)
+                )
                 keys.append(self.key(length[i, j], first[i, j], second[i, j]))
         pairs, key = np.concatenate(found), np.concatenate(keys)
         if len(pairs) > chosen.pairs:
@@ -142,8 +169,11 @@ class HandTable:
         return first, np.searchsorted(self._keys, key, "right") - first
 
 
+_TABLES: WeakKeyDictionary[ArmHand, HandTable] = WeakKeyDictionary()
+
+
 def hand_kernel(robot: RobotDescription) -> FunctionKernel:
-    """Contacts and their Jacobians over the fingers' motors, in the palm frame, as a kernel of q."""
+    """Contacts and their Jacobians over the fingers' motors, in the palm frame, of q."""
     motors = sorted({i for name in robot.finger_names for i in robot.finger_actuators(name)})
     f, m, n = len(robot.finger_names), len(motors), len(robot.actuators)
     name = ca.Function.fix_name(f"{robot.name}_hand_contacts")
@@ -152,7 +182,6 @@ def hand_kernel(robot: RobotDescription) -> FunctionKernel:
         q = ca.SX.sym("q", n)
         moving = actuated(robot, q)
         palm = moving.kinematics.palm
-        base, turn = moving.twist(robot.palm_link, palm.origin, motors)
         parts: list[list[ca.SX]] = [[], [], [], []]
         for finger in robot.finger_names:
             point, normal = moving.kinematics.contact(finger)
@@ -161,7 +190,6 @@ def hand_kernel(robot: RobotDescription) -> FunctionKernel:
             parts[1].append((palm.rotation.T @ normal).T)
             parts[2].append(palm.rotation.T @ linear)
             parts[3].append(palm.rotation.T @ angular)
-        del base, turn
         outputs = [ca.densify(ca.vertcat(*part)) for part in parts]
         return ca.Function(name, [q], outputs, ["q"], ["points", "normals", "linear", "angular"])
 
@@ -171,10 +199,9 @@ def hand_kernel(robot: RobotDescription) -> FunctionKernel:
 
 def _sobol(dimensions: int, count: int, seed: int) -> Array:
     """(count, dimensions) points of [0, 1]."""
-    from scipy.stats import qmc  # noqa: PLC0415
-
     power = int(np.ceil(np.log2(max(count, 2))))
-    return qmc.Sobol(dimensions, seed=seed).random_base2(power)[:count]
+    qmc: Any = import_module("scipy.stats").qmc
+    return qmc.Sobol(dimensions, rng=seed).random_base2(power)[:count]
 
 
 def rigid(rotation: Array, origin: Array) -> Array:
@@ -182,6 +209,3 @@ def rigid(rotation: Array, origin: Array) -> Array:
     pose = np.zeros((*origin.shape[:-1], 4, 4))
     pose[..., :3, :3], pose[..., :3, 3], pose[..., 3, 3] = rotation, origin, 1.0
     return pose
-
-
-__all__ = ["HandTable", "HandTableParameters", "hand_kernel", "inverse", "rigid"]

@@ -13,8 +13,10 @@ DIRECTIONS = np.concatenate([np.eye(6), -np.eye(6)])
 """(12, 6) wrenches: forces along and torques about the axes, both ways."""
 
 
-def generators(points: Array, normals: Array, mu: float, center: Array, length: float) -> Array:
-    """Wrenches of the friction cones' edges with a normal force of 1.
+def generators(
+    points: Array, normals: Array, mu: float, center: Array, length: float, patch: float = 0.005
+) -> Array:
+    """Wrenches of soft fingers with a normal force of 1: the edges of their friction cones.
 
     Args:
         points: (k, c, 3) contacts [m].
@@ -22,20 +24,26 @@ def generators(points: Array, normals: Array, mu: float, center: Array, length: 
         mu: Friction coefficient.
         center: (3,) about which torques are [m].
         length: By which torques are divided [m].
+        patch: Radius of a pad's contact patch [m]: it holds 2/3 mu patch about its normal
+            (Coulomb friction under even pressure).
 
     Returns:
-        (k, 6, c * EDGES).
+        (k, 6, c * (EDGES + 2)).
     """
     k, c = points.shape[:2]
-    least = np.abs(normals).argmin(axis=-1)
-    first = np.cross(normals, np.eye(3)[least])
+    first = np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=-1)])
     first /= np.linalg.norm(first, axis=-1, keepdims=True)
     second = np.cross(normals, first)
     angle = 2 * np.pi * np.arange(EDGES) / EDGES
-    round_ = first[..., None, :] * np.cos(angle)[:, None] + second[..., None, :] * np.sin(angle)[:, None]
-    force = normals[..., None, :] + mu * round_
+    along = first[..., None, :] * np.cos(angle)[:, None]
+    along = along + second[..., None, :] * np.sin(angle)[:, None]
+    normal = normals[..., None, :]
+    force = np.concatenate([normal + mu * along, normal, normal], axis=-2)
     torque = np.cross((points - center)[..., None, :], force) / length
-    return np.concatenate([force, torque], axis=-1).reshape(k, c * EDGES, 6).swapaxes(1, 2)
+    spin = 2 / 3 * mu * patch / length * normals
+    torque[..., -2, :] += spin
+    torque[..., -1, :] -= spin
+    return np.concatenate([force, torque], axis=-1).reshape(k, c * (EDGES + 2), 6).swapaxes(1, 2)
 
 
 def loads(wrenches: Array, directions: Array = DIRECTIONS, steps: int = 25) -> Array:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,25 +67,28 @@ class Surface:
         return float(np.linalg.norm(np.ptp(self.points, axis=0)))
 
     @cached_property
-    def tree(self):  # noqa: ANN201
-        """Nearest samples of points."""
-        from scipy.spatial import cKDTree  # noqa: PLC0415
-
-        return cKDTree(self.points)
+    def middle(self) -> Array:
+        """(3,) mean of the samples [m]: about where the centre of mass is."""
+        return self.points.mean(axis=0)
 
     @cached_property
-    def _grid(self) -> tuple[Array, float, Array, NDArray[np.int32]]:
-        """Lower corner (3,), edge of a cell [m], heights and nearest samples of cells' middles."""
+    def tree(self):
+        """Nearest samples of points."""
+        return _tree(self.points)
+
+    @cached_property
+    def _grid(self) -> tuple[Array, float, Array, NDArray[np.int32], NDArray[np.int32]]:
+        """Lower corner (3,), edge of a cell [m], and of cells heights, nearest samples, counts."""
         low = self.points.min(axis=0) - self.parameters.around
         span = np.ptp(self.points, axis=0) + 2 * self.parameters.around
         step = max(self.parameters.step, float(span.max()) / self.parameters.cells)
-        counts = np.ceil(span / step).astype(int)
+        counts = np.ceil(span / step).astype(np.int32)
         axes = [low[i] + step * (np.arange(counts[i]) + 0.5) for i in range(3)]
         middles = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
         height, sample = self.foot(middles.reshape(-1, 3))
         apart = np.linalg.norm(middles.reshape(-1, 3) - self.points[sample], axis=1)
         height = np.append(np.copysign(apart, height), self.parameters.around)
-        return low, step, height, np.append(sample, 0).astype(np.int32), counts
+        return low, step, height, np.append(sample, 0).astype(np.int32), counts  # the last: beyond
 
     @property
     def step(self) -> float:
@@ -93,9 +98,12 @@ class Surface:
     def roughly(self, points: Array) -> tuple[Array, NDArray[np.int32]]:
         """Heights (...) and samples about nearest to points (..., 3), to within `step`."""
         low, step, height, sample, counts = self._grid
-        index = np.floor((points - low) / step).astype(np.int32)
-        within = ((index >= 0) & (index < counts)).all(axis=-1)
-        flat = (index[..., 0] * counts[1] + index[..., 1]) * counts[2] + index[..., 2]
+        flat, within = np.zeros(points.shape[:-1], dtype=np.int32), True
+        for axis in range(3):
+            index = ((points[..., axis] - low[axis]) / step).astype(np.int32)
+            # What is below is beyond the last cell as an unsigned number.
+            within = within & (index.view(np.uint32) < counts[axis])
+            flat = flat * counts[axis] + index
         flat = np.where(within, flat, len(height) - 1)
         return height[flat], sample[flat]
 
@@ -104,6 +112,10 @@ class Surface:
         _, sample = self.tree.query(points)
         height = ((points - self.points[sample]) * self.faces[sample]).sum(axis=-1)
         return height, sample
+
+
+def _tree(points: Array) -> Any:
+    return import_module("scipy.spatial").cKDTree(points)
 
 
 def load_surface(
@@ -158,9 +170,7 @@ def _smoothed(
     name: str, thing: GraspObject, points: Array, faces: Array, chosen: SurfaceParameters
 ) -> Surface:
     """The surface of samples whose normals are averaged over their neighbours."""
-    from scipy.spatial import cKDTree  # noqa: PLC0415
-
-    tree = cKDTree(points)
+    tree = _tree(points)
 
     def links(radius: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         pairs = tree.query_pairs(radius, output_type="ndarray")

@@ -8,8 +8,7 @@ through `Solver.solve_palms` and `Solver.solve_batch`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +16,9 @@ from numpy.typing import NDArray
 from casadi_ik.arrays import Array, Bools
 from casadi_ik.collision.distances import Table, pose_row
 from casadi_ik.collision.model import pair_table
-from casadi_ik.problem.clearance import SceneCheck, Surroundings
-from casadi_ik.touch.hand_table import HandTable, inverse, rigid
-from casadi_ik.touch.strength import generators, loads
+from casadi_ik.grasps.pose import inverse
+from casadi_ik.problem.clearance import CollisionQuery, SceneCheck
+from casadi_ik.touch.hand_table import HandTable, rigid
 from casadi_ik.touch.surface import Surface
 
 
@@ -31,9 +30,14 @@ class TouchParameters:
         facing: Two patches oppose each other if both normals are within this angle of the line
             between them [rad].
         object_pairs: Pairs of patches that are drawn.
-        attempts: Pairs of hand and object that are tried at once.
+        attempts: Pairs of hand and object that are tried at once; a fifth of it at first.
+        most: Attempts after which no more are made.
         lean: Fingertips lean by at most this angle at first [rad].
         near: A further fingertip is at most this far from the surface at first [m].
+        clear: Fingertips that do not touch are at least this far from it [m].
+        looked: Postures of a further finger that are looked at.
+        tries: Of them that are tried against collisions.
+        together: Candidates whose further fingers are looked up at once.
         steps: Of damped least squares on palm and hand.
         free_lean: Within this angle a pad leans for nothing [rad].
         slide: Weight of sliding along the surface beside leaving it.
@@ -46,10 +50,12 @@ class TouchParameters:
 
     facing: float = float(np.deg2rad(45.0))
     object_pairs: int = 400_000
-    attempts: int = 50_000
+    attempts: int = 20_000
+    most: int = 1_000_000
     lean: float = float(np.deg2rad(25.0))
     near: float = 4e-3
     clear: float = 8e-3
+    looked: int = 192
     tries: int = 8
     together: int = 2000
     steps: int = 6
@@ -62,7 +68,7 @@ class TouchParameters:
     turned: float = float(np.deg2rad(15.0))
 
 
-@dataclass
+@dataclass(frozen=True, eq=False)
 class Candidates:
     """Palms and hands, k of them, in the object's frame.
 
@@ -70,18 +76,21 @@ class Candidates:
         palm: (k, 4, 4) pose of the palm in the object's frame.
         hand: (k, m) positions of the fingers' motors [rad or m].
         used: (k, f) which fingers touch.
+        tips: (k, f, 3) fingertips [m]; empty where they were not looked up.
     """
 
     palm: Array
     hand: Array
     used: Bools
+    tips: Array = field(default_factory=lambda: np.zeros(0))
 
     def __len__(self) -> int:
         return len(self.hand)
 
     def rows(self, rows: NDArray) -> Candidates:
         """Some of them."""
-        return Candidates(self.palm[rows], self.hand[rows], self.used[rows])
+        tips = self.tips[rows] if len(self.tips) else self.tips
+        return Candidates(self.palm[rows], self.hand[rows], self.used[rows], tips)
 
 
 @dataclass
@@ -133,10 +142,36 @@ class Generator:
         """Count what passed a stage."""
         self.counts[stage] = self.counts.get(stage, 0) + int(number)
 
-    def draw(self) -> Candidates:
-        """Candidates of one round: two fingertips fit, the others find something to touch."""
+    def candidates(self, attempts: int) -> Candidates:
+        """Palms and hands whose fingertips touch, clear of all but the arm."""
+        table, surface, chosen = self.table, self.surface, self.parameters
+        some = self.draw(attempts)
+        if len(some):
+            some = snapped(table, surface, some, chosen)
+            here, _, _ = touching(table, surface, some)
+            ok = np.abs(here.height) < chosen.touch
+            ok &= (here.lean < chosen.last_lean) & surface.inside[here.sample]
+            rows = np.flatnonzero((ok | ~some.used).all(axis=1))
+            some = replace(some, tips=here.points).rows(rows)
+        self.counted("made exact", len(some))
+        some = some.rows(np.flatnonzero(self.clear(some)))
+        self.counted("still clear", len(some))
+        return some
+
+    def why_none(self) -> str:
+        """What no candidate passed."""
+        if not self.fits:
+            return (
+                "no two patches of the object are as far apart, and face each other as well, as "
+                "the thumb and another fingertip can"
+            )
+        stage = next((name for name, number in self.counts.items() if not number), "")
+        return f"of {self.counts['attempts']:,} attempts none came to: {stage}"
+
+    def draw(self, count: int) -> Candidates:
+        """Candidates of some attempts: two fingertips fit, the others find something to touch."""
         table, surface, chosen, rng = self.table, self.surface, self.parameters, self.rng
-        row = rng.integers(len(self._pairs), size=chosen.attempts)
+        row = rng.integers(len(self._pairs), size=count)
         cell = self._start[row] + (rng.random(len(row)) * self._count[row]).astype(np.intp)
         share, other, a, b = table.pairs[cell].T
         thumb = table.robot.fingers.index(table.robot.thumb)
@@ -148,7 +183,8 @@ class Generator:
             hand_points, hand_normals, surface.points[samples], -surface.normals[samples]
         )
         kept = np.flatnonzero((lean < chosen.lean).all(axis=1))
-        share, other, a, b, palm = (x[kept] for x in (share, other, a, b, palm))
+        share, other, a, b = (column[kept] for column in (share, other, a, b))
+        palm = palm[kept]
         self.counted("two fingertips fit", len(kept))
         names = table.robot.fingers
         some = Candidates(palm, table.q[share, a].copy(), np.zeros((len(palm), len(names)), bool))
@@ -160,29 +196,43 @@ class Generator:
         kept = np.flatnonzero(self.clear(some, some.used))
         self.counted("they are clear", len(kept))
         some, share = some.rows(kept), share[kept]
+        own = table.normals[share, a[kept], thumb]
+        pads = np.einsum("kij,kj->ki", some.palm[:, :3, :3], own)
         placed = some.used.copy()
         for number in rng.permutation(len(names)):
             for start in range(0, len(share), chosen.together):
                 rows = np.arange(start, min(start + chosen.together, len(share)))
                 rows = rows[placed[rows].any(axis=1) & ~placed[rows, number]]
                 if len(rows):
-                    self._place(some, placed, share, rows, number)
+                    self._place(some, placed, share, rows, number, pads)
         kept = np.flatnonzero(placed.all(axis=1) & (some.used.sum(axis=1) == self.fingers))
         self.counted(f"{self.fingers} fingertips touch, all clear", len(kept))
         return some.rows(kept)
 
     def _place(
-        self, some: Candidates, placed: Bools, share: NDArray[np.intp], rows: NDArray[np.intp], number: int
+        self,
+        some: Candidates,
+        placed: Bools,
+        share: NDArray[np.intp],
+        rows: NDArray[np.intp],
+        number: int,
+        thumb: Array,
     ) -> None:
         """Give a finger a posture that touches, where more are wanted, else one that is clear.
 
         A row for which none is found is given up: none of its fingers counts as placed.
         """
         chosen, name = self.parameters, self.table.robot.fingers[number]
-        height, touch = self._looked_up(some.palm[rows], share[rows], number)
+        every = self.table.q.shape[1]
+        postures = self.rng.choice(every, min(chosen.looked, every), replace=False)
+        height, touch, against = self._looked_up(
+            some.palm[rows], thumb[rows], share[rows], number, postures
+        )
         wanted = some.used[rows].sum(axis=1) < self.fingers
-        rank = self.rng.random(touch.shape)
-        rank = np.where(touch & wanted[:, None], 2.0 + rank, np.where(height > chosen.clear, rank, -1.0))
+        # Of postures that touch rather one that pushes against the thumb.
+        chance = self.rng.random(touch.shape)
+        idle = np.where(height > chosen.clear, chance, -1.0)
+        rank = np.where(touch & wanted[:, None], 4.0 + chance + 2.0 * against, idle)
         left = np.arange(len(rows))
         for _ in range(chosen.tries):
             best = rank[left].argmax(axis=1)
@@ -192,8 +242,10 @@ class Generator:
                 break
             here = rows[left]
             trial = some.rows(here)
-            self._put(trial.hand, np.arange(len(here)), self.table.q[share[here], best], name)
-            trial.used[:, number] = value >= 2.0
+            self._put(
+                trial.hand, np.arange(len(here)), self.table.q[share[here], postures[best]], name
+            )
+            trial.used[:, number] = value > 1.0
             present = placed[here].copy()
             present[:, number] = True
             ok = self.clear(trial, present)
@@ -208,10 +260,23 @@ class Generator:
         columns = np.flatnonzero(np.isin(self.table.motors, self.table.of_finger[finger]))
         hand[np.ix_(rows, columns)] = posture[:, columns]
 
-    def _looked_up(self, palm: Array, share: NDArray[np.intp], number: int) -> tuple[Array, Bools]:
-        """Of all postures of a finger at palms: heights (k, n) of the tip, and which ones touch."""
+    def _looked_up(
+        self,
+        palm: Array,
+        thumb: Array,
+        share: NDArray[np.intp],
+        number: int,
+        postures: NDArray[np.intp],
+    ) -> tuple[Array, Bools, Array]:
+        """Of postures of a finger at palms, (k, n) each.
+
+        Returns:
+            Heights of the tip over the surface [m], which ones touch, and minus the cosine of their
+            pads' normals with the thumb's axis: what they do against it.
+        """
         table, surface, chosen = self.table, self.surface, self.parameters
-        points, normals = table.points[share, :, number], table.normals[share, :, number]
+        points = table.points[share[:, None], postures, number]
+        normals = table.normals[share[:, None], postures, number]
         rotation, origin = palm[:, :3, :3], palm[:, :3, 3]
         tips = points @ rotation.swapaxes(1, 2) + origin[:, None]
         height, sample = surface.roughly(tips)
@@ -226,7 +291,9 @@ class Generator:
             & surface.inside[chosen_samples]
             & (-(pads * normal).sum(axis=-1) > np.cos(chosen.lean))
         )
-        return height, ok
+        against = np.zeros(ok.shape)
+        against[row, posture] = -np.einsum("ki,ki->k", pads, thumb[row])
+        return height, ok, against
 
 
 def _matched(
@@ -288,16 +355,17 @@ def touching(table: HandTable, surface: Surface, some: Candidates) -> tuple[Touc
     """Where fingertips are, and their Jacobians (k, f, 3, m) in the object's frame."""
     points, normals, linear, angular = table.at(some.hand)
     rotation, origin = some.palm[:, None, :3, :3], some.palm[:, None, :3, 3]
-    points = np.einsum("kfij,kfj->kfi", np.broadcast_to(rotation, linear.shape[:2] + (3, 3)), points)
-    points = points + origin
-    turn = np.broadcast_to(rotation, linear.shape[:2] + (3, 3))
+    turn = np.broadcast_to(rotation, (*points.shape, 3))
+    points = np.einsum("kfij,kfj->kfi", turn, points) + origin
     normals = np.einsum("kfij,kfj->kfi", turn, normals)
     height, sample = surface.foot(points)
     lean = np.arccos(np.clip(-(normals * surface.normals[sample]).sum(axis=-1), -1, 1))
     return Touching(points, normals, height, sample, lean), turn @ linear, turn @ angular
 
 
-def snapped(table: HandTable, surface: Surface, some: Candidates, chosen: TouchParameters) -> Candidates:
+def snapped(
+    table: HandTable, surface: Surface, some: Candidates, chosen: TouchParameters
+) -> Candidates:
     """Palms and hands moved until every fingertip touches: damped least squares, limits kept.
 
     Rows of a fingertip: its height over the surface, sliding along it (nearly free), and the part
@@ -312,15 +380,15 @@ def snapped(table: HandTable, surface: Surface, some: Candidates, chosen: TouchP
         f = normal.shape[1]
         # Of a twist of the palm (v, w): a point moves by v + w x r, a normal by w x n.
         arms = here.points - about
-        to_points = np.concatenate([np.broadcast_to(np.eye(3), (k, f, 3, 3)), -_cross(arms), linear], -1)
+        to_points = np.concatenate(
+            [np.broadcast_to(np.eye(3), (k, f, 3, 3)), -_cross(arms), linear], -1
+        )
         to_turns = np.concatenate(
             [np.zeros((k, f, 3, 3)), np.broadcast_to(np.eye(3), (k, f, 3, 3)), angular], -1
         )
         excess = np.maximum(here.lean - chosen.free_lean, 0.0)
         axis = np.cross(here.normals, -normal)
         axis *= (excess / np.maximum(np.linalg.norm(axis, axis=-1), 1e-9))[..., None]
-        off = here.points - surface.points[here.sample]
-        along = off - (off * normal).sum(-1, keepdims=True) * normal
         rows = [
             np.einsum("kfi,kfij->kfj", normal, to_points)[:, :, None],
             chosen.slide * to_points,
@@ -328,29 +396,35 @@ def snapped(table: HandTable, surface: Surface, some: Candidates, chosen: TouchP
         ]
         goal = [
             -here.height[..., None],
-            np.broadcast_to(-chosen.slide * 0.0 * along, along.shape),
+            np.zeros_like(normal),
             chosen.turn * axis,
         ]
         weight = some.used[..., None, None]
         matrix = (np.concatenate(rows, axis=2) * weight).reshape(k, -1, 6 + m)
         right = (np.concatenate(goal, axis=2) * weight[..., 0]).reshape(k, -1)
-        free = np.ones((k, 6 + m), dtype=bool)
-        for _ in range(2):  # motors that would leave their range stay at its end
-            bound = matrix * free[:, None]
-            square = bound.swapaxes(1, 2) @ bound
-            square[:, range(6 + m), range(6 + m)] += np.where(free, _damping(m), 1.0)
-            step = np.linalg.solve(square, (bound.swapaxes(1, 2) @ right[..., None]))[..., 0]
-            after = some.hand + step[:, 6:]
-            stopped = (after < lower) | (after > upper)
-            if not (stopped & free[:, 6:]).any():
-                break
-            free[:, 6:] &= ~stopped
+        step = _bounded_step(matrix, right, some.hand, lower, upper)
         hand = np.clip(some.hand + np.clip(step[:, 6:], -0.3, 0.3), lower, upper)
         twist = step[:, :6]
         turn = _rotation(np.clip(twist[:, 3:], -0.5, 0.5))
-        palm = rigid(turn @ some.palm[:, :3, :3], some.palm[:, :3, 3] + np.clip(twist[:, :3], -0.02, 0.02))
+        shift = np.clip(twist[:, :3], -0.02, 0.02)
+        palm = rigid(turn @ some.palm[:, :3, :3], some.palm[:, :3, 3] + shift)
         some = Candidates(palm, hand, some.used)
     return some
+
+
+def _bounded_step(matrix: Array, right: Array, hand: Array, lower: Array, upper: Array) -> Array:
+    """Damped least-squares steps (k, 6 + m); motors that would leave their range stay."""
+    k, m = hand.shape
+    free, damping = np.ones((k, 6 + m), dtype=bool), _damping(m)
+    step: Array = np.zeros((k, 6 + m))
+    for _ in range(2):
+        kept = matrix * free[:, None]
+        square = kept.swapaxes(1, 2) @ kept
+        square[:, range(6 + m), range(6 + m)] += np.where(free, damping, 1.0)
+        step[:] = np.linalg.solve(square, kept.swapaxes(1, 2) @ right[..., None])[..., 0]
+        after = hand + step[:, 6:]
+        free[:, 6:] &= (after >= lower) & (after <= upper)
+    return step
 
 
 def _damping(m: int) -> Array:
@@ -367,7 +441,7 @@ def _cross(vectors: Array) -> Array:
 
 def _rotation(vectors: Array) -> Array:
     """(k, 3, 3) of rotation vectors."""
-    from scipy.spatial.transform import Rotation  # noqa: PLC0415
+    from scipy.spatial.transform import Rotation
 
     return Rotation.from_rotvec(vectors).as_matrix()
 
@@ -388,7 +462,10 @@ class HandCheck:
             pose: (4, 4) of the object in the base frame.
         """
         self.table, self.check, self.pose = table, check, pose
-        self._tables: dict[tuple[bytes, bytes], Table] = {}
+        self._every = pair_table(check.model, check.scene, ()).held
+        at = self._every.poses(check.scene.items)
+        self._items = rigid(at[:, :9].reshape(-1, 3, 3), at[:, 9:])
+        self._tables: dict[bytes, Table] = {}
 
     def __call__(self, some: Candidates, present: Bools | None = None) -> Bools:
         """(k,) which are clear; of fingers that are not present nothing counts."""
@@ -397,28 +474,31 @@ class HandCheck:
         if present is None:
             present = np.ones_like(some.used)
         ok = np.zeros(len(some), dtype=bool)
-        patterns, which = np.unique(
-            np.concatenate([some.used, present], axis=1), axis=0, return_inverse=True
-        )
-        for number, pattern in enumerate(patterns):
-            rows = np.flatnonzero(which.ravel() == number)
-            table = self._table(*np.split(pattern, 2))
-            at = table.poses(self.check.scene.items)
-            poses = pose_row(world[rows, None] @ rigid(at[:, :9].reshape(-1, 3, 3), at[:, 9:]))
-            around = Surroundings(self.check.kernel, table, poses, self.check.scene.margin)
+        both = np.concatenate([some.used, present], axis=1)
+        code = both @ (1 << np.arange(both.shape[1]))
+        for value in set(code.tolist()):
+            rows = np.flatnonzero(code == value)
+            table = self._table(*np.split(both[rows[0]], 2))
+            poses = pose_row(world[rows, None] @ self._items)
+            around = CollisionQuery(self.check.kernel, table, poses, self.check.scene.margin)
             ok[rows] = around.free(q[rows])
         return ok
 
     def _table(self, used: Bools, present: Bools) -> Table:
-        key = used.tobytes(), present.tobytes()
+        """The pairs that count: fingertips that are used may touch the object."""
+        key = np.concatenate([used, present]).tobytes()
         if key not in self._tables:
             robot, motors = self.table.robot, self.table.of_finger
-            touched = [self.check.bodies_of_fingers[n] for n, on in zip(robot.fingers, used, strict=True) if on]
-            table = pair_table(self.check.model, self.check.scene, sorted(frozenset().union(*touched))).held
-            there = {i for n, on in zip(robot.fingers, present, strict=True) if on for i in motors[n]}
+            names = list(zip(robot.fingers, used, present, strict=True))
+            pads = [self.check.bodies_of_fingers[name] for name, on, _ in names if on]
+            touched, grasped = frozenset[str]().union(*pads), self.check.scene.grasped
+            there = {i for name, _, on in names if on for i in motors[name]}
             absent = {i for own in motors.values() for i in own} - there
-            links = robot.description.links_moved(absent) - robot.description.links_moved(there)
-            self._tables[key] = table.only(
-                np.array([links.isdisjoint(pair) for pair in table.names], dtype=bool)
-            )
+            moved = robot.description.links_moved
+            links = moved(absent) - moved(there)
+            kept = [
+                links.isdisjoint(pair) and not (pair[1] == grasped and pair[0] in touched)
+                for pair in self._every.names
+            ]
+            self._tables[key] = self._every.only(np.array(kept, dtype=bool))
         return self._tables[key]
