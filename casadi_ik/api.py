@@ -33,6 +33,8 @@ from casadi_ik.solving.fast import FastSolver
 from casadi_ik.solving.run import Run
 from casadi_ik.solving.sensitivity import Sensitivity
 from casadi_ik.solving.stream import SolvedBlock, Stream
+from casadi_ik.touch.grasps import FoundGrasps, grasps_of
+from casadi_ik.touch.surface import Surface
 
 
 class Solver(MovingSolver):
@@ -523,6 +525,57 @@ class Solver(MovingSolver):
         found = kernel(targets.rows(rows), every[rows], np.tile(np.eye(n), (k, 1)))
         f = len(self.robot.fingers)
         return Sensitivity(found.points.reshape(k, n, f, 3), found.normals.reshape(k, n, f, 3))
+
+    def grasps_of(
+        self,
+        surface: Surface,
+        pose: ArrayLike | None = None,
+        fingers: int = 3,
+        mu: float = 0.5,
+        hold: tuple[float, float] | None = None,
+        limit: int = 200,
+        jobs: int = 1,
+        seed: int = 0,
+        prefer: Judgement = "load",
+        q0: ArrayLike | None = None,
+    ) -> FoundGrasps:
+        """Find grasps of an object that the arm and the hand can make, free of collision.
+
+        Two opposing fingertips are matched with two opposing patches of the surface, the others
+        look for something to touch, palm and hand are moved until all touch within 1 mm and 15 deg,
+        the arm follows, and what remains is judged in the scene and ranked.
+
+        Args:
+            surface: From `load_surface`.
+            pose: (4, 4) of the object in the base frame; None: the identity.
+            fingers: How many fingertips touch, the thumb among them; of a hand with fewer, all.
+            mu: Friction coefficient between fingertips and object.
+            hold: Mass [kg], and the squeeze [N] with which it has to be held in each of six
+                directions; None: it is enough that the grasp is force-closed.
+            limit: How many distinct grasps at most.
+            jobs: Threads; the answer does not depend on them.
+            seed: Of all random numbers.
+            prefer: What comes first: "load", "clearance", "limits", "q0", or a function of the
+                robot and configurations (m, n) that gives scores (m,), higher is better.
+            q0: (n,) where the robot is [rad or m]; None is `robot.home`.
+
+        Returns:
+            The grasps, best first, with how many candidates passed each stage.
+
+        Raises:
+            InputError: Bad numbers, or no rigid pose.
+            UnsupportedError: The hand has one finger, robot or hand have no shapes, or the method
+                cannot solve palms.
+
+        Example:
+            >>> pose = np.eye(4)
+            >>> pose[:3, 3] = [0.55, 0.1, 0.2]
+            >>> gripper = ik.Solver(ik.load_robot("panda+panda_hand"))
+            >>> found = gripper.grasps_of(ik.load_surface("tomato_soup_can"), pose, limit=5)
+            >>> len(found), bool(found[0].load >= found[4].load)
+            (5, True)
+        """
+        return grasps_of(self, surface, pose, fingers, mu, hold, limit, jobs, seed, prefer, q0)
 
     def moved(self, name: str, pose: ArrayLike) -> Self:
         """The same solver with something in its scene elsewhere, in less than a millisecond.

@@ -11,6 +11,7 @@ from casadi_ik.files.shipped import shipped_names
 from casadi_ik.grasps import Contact, Grasp, Tolerance, load_grasp, shipped_grasps
 from casadi_ik.problem.status import Status
 from casadi_ik.registry import METHODS, register_method
+from casadi_ik.touch.surface import Surface, load_surface
 
 SUBMODULES = ("answers", "errors", "logs", "motion", "papers")
 """Where the other public names are."""
@@ -27,6 +28,7 @@ __all__ = [
     "Solution",
     "Solver",
     "Status",
+    "Surface",
     "Tolerance",
     "answers",
     "errors",
@@ -34,6 +36,7 @@ __all__ = [
     "load_grasp",
     "load_robot",
     "load_scene",
+    "load_surface",
     "logs",
     "motion",
     "papers",

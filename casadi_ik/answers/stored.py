@@ -17,6 +17,7 @@ from casadi_ik.answers.solution import Ranking, Solution
 from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError, InputError
 from casadi_ik.files.limits import LIMITS, RAISED, limit
+from casadi_ik.files.npz import read_npz
 from casadi_ik.grasps import Grasp
 from casadi_ik.grasps.load import GraspFile, grasp_data, grasp_of
 
@@ -74,6 +75,10 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return _plain(value.tolist())
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+RANKED_MEMBER = "ranked"
+"""Name of the array that holds the ranked answers of an npz file, as bytes of JSON."""
 
 
 class RankedSolution(msgspec.Struct, frozen=True):
@@ -159,6 +164,19 @@ def chosen_posture(path: Path, rank: int) -> ChosenPosture:
     return ChosenPosture(grasp, np.array(one.solution.q), one.solution.robot)
 
 
+def _member(path: Path) -> bytes:
+    """The ranked answers that ``casadi-ik grasp`` has written beside its arrays."""
+    try:
+        arrays = read_npz(path, LIMITS.npz_bytes)
+    except DescriptionError as error:
+        raise InputError(str(error)) from error
+    if RANKED_MEMBER not in arrays:
+        raise InputError(
+            f"{path}: {RANKED_MEMBER}: missing, expected what `casadi-ik grasp` writes"
+        )
+    return arrays[RANKED_MEMBER].astype(np.uint8).tobytes()
+
+
 def read_ranked(path: Path) -> list[RankedEntry]:
     """The answers of a file, best first, at least one.
 
@@ -173,7 +191,8 @@ def read_ranked(path: Path) -> list[RankedEntry]:
         size, most = path.stat().st_size, limit(LIMITS.ranked_bytes)
         if size > most:
             raise InputError(f"{path}: found {size} bytes, expected at most {most} {RAISED}")
-        found = msgspec.json.decode(path.read_bytes(), type=_RankedFile).ranked
+        held = path.read_bytes() if path.suffix.lower() != ".npz" else _member(path)
+        found = msgspec.json.decode(held, type=_RankedFile).ranked
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:

@@ -224,9 +224,11 @@ def _asked(said: Said) -> tuple[Path, Grasp | ChosenPosture]:
         CasadiIKError: See `the_grasp` and `chosen_posture`, or an option that does not fit.
     """
     path = Path(said.grasp)
-    if path.suffix.lower() != ".json":
+    if path.suffix.lower() not in (".json", ".npz"):
         if said.rank is not None:
-            raise InputError("--rank: expected it with what `casadi-ik choose` writes (.json)")
+            raise InputError(
+                "--rank: expected it with what `casadi-ik choose` (.json) or `grasp` (.npz) writes"
+            )
         return the_grasp(said)
     if said.object_pose is not None:
         raise InputError(f"--object-pose: {path} says where its objects are")

@@ -40,6 +40,7 @@ COMMANDS = {
     "batch": ("batch.batch", "solve many targets of one robot"),
     "follow": ("motion.follow", "follow a moving hand, or moving contacts"),
     "reach": ("motion.reach", "find the timed motion from where the robot is to a grasp"),
+    "grasp": ("grasp.grasp", "find grasps of an object's mesh that the robot can make"),
     "choose": ("solve.choose", "find the best of many grasps of one object"),
     "import": ("own_robot.import_robot", "describe your robot from its URDF or MJCF files"),
     "export": ("own_robot.export", "write a robot's solver as plain C or WebAssembly"),

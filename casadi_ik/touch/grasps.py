@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, overload
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,9 +28,6 @@ from casadi_ik.touch.candidates import (
 from casadi_ik.touch.hand_table import HandTable
 from casadi_ik.touch.strength import generators, loads
 from casadi_ik.touch.surface import Surface
-
-if TYPE_CHECKING:
-    from casadi_ik.api import Solver
 
 GRAVITY = 9.80665
 """Standard acceleration of free fall [m/s^2]."""
@@ -154,7 +151,7 @@ class _Made:
 
 
 def grasps_of(
-    solver: Solver,
+    solver: Any,
     surface: Surface,
     pose: ArrayLike | None = None,
     fingers: int = 3,
@@ -168,6 +165,8 @@ def grasps_of(
     parameters: TouchParameters | None = None,
 ) -> FoundGrasps:
     """Find grasps of an object, see `Solver.grasps_of`.
+
+    The solver is a `Solver`, which knows this function and is not known here.
 
     Raises:
         InputError: See there.
@@ -225,8 +224,8 @@ def _check(
 def _made(
     generator: Generator,
     some: Candidates,
-    arms: Solver,
-    judge: Solver,
+    arms: Any,
+    judge: Any,
     place: Array,
     mu: float,
     hold: tuple[float, float] | None,
