@@ -167,7 +167,7 @@ def chosen_posture(path: Path, rank: int) -> ChosenPosture:
 def _member(path: Path) -> bytes:
     """The ranked answers that ``casadi-ik grasp`` has written beside its arrays."""
     try:
-        arrays = read_npz(path, LIMITS.npz_bytes)
+        arrays = read_npz(path, LIMITS.ranked_bytes)
     except DescriptionError as error:
         raise InputError(str(error)) from error
     if RANKED_MEMBER not in arrays:

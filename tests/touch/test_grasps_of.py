@@ -1,0 +1,182 @@
+"""Grasps of surfaces, confirmed by the public solver, exact distances and linear programs."""
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.optimize import linprog
+
+import casadi_ik as ik
+from casadi_ik import errors
+
+PLACE = np.eye(4)
+PLACE[:3, 3] = [0.5, 0.1, 0.055]
+
+
+def solver_of(robot):
+    return ik.Solver(ik.load_robot(robot), scene=ik.load_scene("table"))
+
+
+@pytest.fixture(scope="module")
+def can(tmp_path_factory):
+    path = tmp_path_factory.mktemp("touch") / "can.stl"
+    trimesh.creation.cylinder(0.033, 0.1, sections=128).export(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def surface(can):
+    return ik.load_surface(can)
+
+
+@pytest.fixture(scope="module", params=["panda+panda_hand", "panda+allegro_right"])
+def found(request, surface):
+    solver = solver_of(request.param)
+    return solver, solver.grasps_of(surface, PLACE, limit=12, seed=1)
+
+
+def test_samples_lie_on_the_surface_and_face_outwards(surface):
+    radius = np.linalg.norm(surface.points[:, :2], axis=1)
+    rim = np.abs(surface.points[:, 2]) > 0.05 - 1e-9
+    side = surface.inside & ~rim
+    assert np.abs(radius[~rim] - 0.033).max() < 5e-5  # flat facets
+    outward = (surface.normals[side, :2] * surface.points[side, :2]).sum(axis=1) / radius[side]
+    assert outward.min() > 0.995
+    near_edge = ~rim & (np.abs(surface.points[:, 2]) > 0.048)
+    assert not surface.inside[near_edge].any()
+
+
+def test_every_grasp_is_confirmed_in_the_scene(found):
+    solver, grasps = found
+    assert len(grasps) == 12
+    for one in grasps:
+        assert solver.solve(one.grasp, q0=one.q).success
+        assert one.clearance >= 0
+        assert list(grasps.counts.values()) == sorted(grasps.counts.values(), reverse=True)
+
+
+def test_fingertips_touch_the_mesh(found):
+    """By distances to the exact cylinder."""
+    solver, grasps = found
+    inverse = np.linalg.inv(PLACE)
+    for one in grasps:
+        points, normals = solver.robot.contacts(one.q)
+        used = [solver.robot.fingers.index(name) for name in one.grasp.contacts]
+        local = points[used] @ inverse[:3, :3].T + inverse[:3, 3]
+        off = np.linalg.norm(local[:, :2], axis=1) - 0.033, np.abs(local[:, 2]) - 0.05
+        assert np.abs(np.maximum(*off)).max() < 1.1e-3
+        face = np.where((np.abs(local[:, 2]) > 0.0495)[:, None], [0, 0, 1], local * [1, 1, 0])
+        face = np.sign(local[:, 2:]) ** (face[:, 2:] == 1) * face
+        face /= np.linalg.norm(face, axis=1, keepdims=True)
+        lean = np.degrees(np.arccos(-(normals[used] * face).sum(axis=1)))
+        assert lean.max() < 16
+
+
+def test_loads_are_those_of_linear_programs(found):
+    """With the same soft fingers, on the exact cylinder: close, since normals are sampled."""
+    one = found[1][0]
+    points = np.array([c.point for c in one.grasp.contacts.values()]) - PLACE[:3, 3]
+    normals = -points * [1, 1, 0]
+    if np.abs(points[:, 2]).max() > 0.0495:
+        pytest.skip("a contact on the lid")
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    columns = []
+    for p, n in zip(points, normals, strict=True):
+        x = np.cross(n, [0, 0, 1.0])
+        for angle in np.arange(8) * np.pi / 4:
+            force = n + 0.5 * (np.cos(angle) * x + np.sin(angle) * np.cross(n, x))
+            columns.append(np.concatenate([force, np.cross(p, force)]))
+        for sign in (1, -1):
+            spin = sign * 2 / 3 * 0.5 * 0.005 * n
+            columns.append(np.concatenate([n, np.cross(p, n) + spin]))
+    wrenches = np.array(columns).T
+    held = []
+    for direction in np.concatenate([np.eye(3), -np.eye(3)]):
+        whole = np.column_stack([wrenches, np.concatenate([direction, np.zeros(3)])])
+        cost = np.zeros(whole.shape[1])
+        cost[-1] = -1
+        most = [[1.0] * wrenches.shape[1] + [0.0]]
+        held.append(-linprog(cost, most, [1.0], whole, np.zeros(6)).fun)
+    assert one.load == pytest.approx(min(held), rel=0.25, abs=0.02)
+
+
+def test_grasps_differ_and_are_ranked(found):
+    solver, grasps = found
+    assert [one.score for one in grasps] == sorted((one.score for one in grasps), reverse=True)
+    poses = [solver.robot.palm(one.q) for one in grasps]
+    tips = [solver.robot.contacts(one.q)[0] for one in grasps]
+    for i in range(len(grasps)):
+        for j in range(i):
+            turned = np.arccos(
+                np.clip((np.trace(poses[i][:3, :3].T @ poses[j][:3, :3]) - 1) / 2, -1, 1)
+            )
+            apart = np.abs(poses[i][:3, 3] - poses[j][:3, 3]).max(), np.abs(tips[i] - tips[j]).max()
+            assert turned > 0.25 or max(apart) > 0.005
+
+
+def test_open_before_and_squeezing_after(found):
+    solver, grasps = found
+    opened = [one for one in grasps if one.pregrasp is not None]
+    assert opened
+    for one in opened:
+        assert one.grasp.squeeze is not None
+        palm = solver.robot.palm(one.q)
+        assert np.linalg.norm(one.pregrasp.palm[:3, 3] - palm[:3, 3]) == pytest.approx(0.06)
+
+
+@pytest.mark.parametrize("found", ["panda+allegro_right"], indirect=True)
+def test_there_is_a_way_to_a_found_grasp(found):
+    solver, grasps = found
+    one, way = next((one, way) for one in grasps if (way := solver.reach(one)).success)
+    np.testing.assert_allclose(way.motion.q[-1], one.q, atol=1e-6)
+
+
+def test_seeds_decide_and_jobs_do_not(found, surface):
+    solver, grasps = found
+    again = solver.grasps_of(surface, PLACE, limit=12, seed=1, jobs=2)
+    assert all(np.array_equal(a.q, b.q) for a, b in zip(grasps, again, strict=True))
+    other = solver.grasps_of(surface, PLACE, limit=12, seed=2)
+    assert not all(np.array_equal(a.q, b.q) for a, b in zip(grasps, other, strict=True))
+
+
+def test_what_has_to_be_held_is_held(surface):
+    found = solver_of("panda+panda_hand").grasps_of(surface, PLACE, limit=5, hold=(0.1, 18.0))
+    assert len(found)
+    assert all(one.load * 18.0 >= 0.1 * 9.8 for one in found)
+
+
+def test_a_function_may_rank(surface):
+    found = solver_of("panda+panda_hand").grasps_of(
+        surface, PLACE, limit=5, prefer=lambda robot, q: robot.palm(q)[:, 2, 3]
+    )
+    assert [one.score for one in found] == sorted((one.score for one in found), reverse=True)
+
+
+def test_what_is_too_large_says_so(tmp_path):
+    trimesh.creation.box((0.5, 0.5, 0.5)).export(tmp_path / "box.stl")
+    solver = ik.Solver(ik.load_robot("panda+panda_hand"))
+    found = solver.grasps_of(ik.load_surface(tmp_path / "box.stl"), PLACE)
+    assert not len(found)
+    assert "no two patches" in found.reason
+
+
+@pytest.mark.parametrize(
+    ("asked", "expected"),
+    [
+        ({"fingers": 1}, "fingers: found 1, expected an integer >= 2"),
+        ({"mu": 0.0}, "mu: found 0.0, expected a friction coefficient > 0"),
+        ({"hold": (0.2, -1.0)}, "hold: found"),
+        ({"limit": 0}, "limit: found 0"),
+        ({"prefer": "best"}, "prefer: found 'best'"),
+        ({"pose": np.zeros((4, 4))}, "pose: its first three columns"),
+    ],
+)
+def test_bad_questions_are_refused(surface, asked, expected):
+    with pytest.raises(errors.InputError, match=expected.replace("(", r"\(")):
+        solver_of("panda+panda_hand").grasps_of(surface, **{"pose": PLACE, **asked})
+
+
+def test_millimetres_are_told(tmp_path):
+    trimesh.creation.cylinder(33, 100).export(tmp_path / "can.stl")
+    with pytest.raises(errors.InputError, match=r"scale=0\.001 is for millimetres"):
+        ik.load_surface(tmp_path / "can.stl")
+    assert ik.load_surface(tmp_path / "can.stl", scale=0.001).size == pytest.approx(0.137, abs=2e-3)
