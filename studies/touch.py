@@ -13,6 +13,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
+from rich.progress import track
 from runner.figures import RESULTS
 from runner.report import (
     Metric,
@@ -28,7 +29,6 @@ from runner.report import (
 from runner.study import robot_of
 
 import casadi_ik as ik
-from casadi_ik.progress import progress
 
 ROBOTS = (
     "panda+allegro_right",
@@ -76,7 +76,7 @@ def main(arguments: list[str] | None = None) -> None:
             surfaces[options.objects[0]], placed(surfaces[options.objects[0]], 0.0), limit=1
         )
         counts, times, firsts, loads, confirmed = [], [], [], [], []
-        for name, turn in progress([(n, t) for n in options.objects for t in TURNS], robot):
+        for name, turn in track([(n, t) for n in options.objects for t in TURNS], robot):
             surface = surfaces[name]
             pose = placed(surface, turn)
             first = solver.grasps_of(surface, pose, limit=1, seed=options.seed)
