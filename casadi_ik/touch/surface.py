@@ -51,6 +51,12 @@ class Surface:
         faces: (m, 3) unit outward normals of the triangles themselves.
         inside: (m,) whether a fingertip's pad fits: no edge of the surface is near.
         parameters: How it was sampled.
+
+    Example:
+        >>> surface = ik.load_surface("tomato_soup_can")
+        >>> height, _ = surface.foot(np.array([0.0, 0.0, 1.0]))
+        >>> bool(height > 0.9)
+        True
     """
 
     name: str
