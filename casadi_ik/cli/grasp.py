@@ -22,9 +22,7 @@ from casadi_ik.touch.surface import load_surface
 
 
 @command(
-    opt.Option(
-        "OBJECT", "a mesh in metres (stl, obj, ...), a shipped object or its YAML file"
-    ),
+    opt.Option("OBJECT", "a mesh in metres (stl, obj, ...), a shipped object or its YAML file"),
     opt.THE_ROBOT,
     opt.Option("--scale S", "unit of the mesh in metres: 0.001 for millimetres", 1.0, opt.positive),
     opt.OBJECT_POSE,
