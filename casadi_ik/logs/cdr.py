@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mcap.writer import Writer
 
+from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import LogError
 from casadi_ik.logs.chunks import CDR_HEADER, MESSAGE
@@ -96,6 +98,34 @@ def cdr(values: Iterable[Value]) -> bytes:
                 data = text.encode() + b"\0"
                 out += bytes(-len(out) % 4) + struct.pack("<I", len(data)) + data
     return bytes(out)
+
+
+def ros_channel(writer: Writer, topic: str, definition: tuple[str, str]) -> int:
+    """Register a channel of ROS 2 messages, defined by the name and the text of their schema."""
+    name, text = definition
+    schema = writer.register_schema(name, "ros2msg", text.encode())
+    return writer.register_channel(topic, "cdr", schema, {"offered_qos_profiles": ""})
+
+
+def write_postures(writer: Writer, robot: ArmHand, q: Array, stamps: Sequence[int]) -> None:
+    """Write the robot as URDF, once, and its joints after the couplings at each of k times.
+
+    Args:
+        writer: Of the file.
+        robot: The robot.
+        q: (k, n) [rad or m].
+        stamps: (k,) times [ns].
+    """
+    described = ros_channel(writer, "/robot_description", STRING)
+    first = min(stamps, default=0)
+    writer.add_message(described, first, cdr_message(robot.urdf()), first)
+    joints, none = robot.joints(q), np.zeros(0)
+    positions = np.stack([np.atleast_1d(values) for values in joints.values()], axis=1)
+    channel = ros_channel(writer, "/joint_states", JOINT_STATE)
+    for i, stamp in enumerate(stamps):
+        header = divmod(stamp, 1_000_000_000), robot.description.root
+        state = cdr_message(*header, list(joints), positions[i], none, none)
+        writer.add_message(channel, stamp, state, stamp, sequence=i)
 
 
 @dataclass(frozen=True, eq=False)

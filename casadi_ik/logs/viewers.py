@@ -33,7 +33,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import LogError, MissingExtraError
 from casadi_ik.files.shipped import models_folder
 from casadi_ik.files.writing import written_whole
-from casadi_ik.logs.cdr import JOINT_STATE, STRING, cdr_message
+from casadi_ik.logs.cdr import ros_channel, write_postures
 from casadi_ik.logs.chunks import CDR_HEADER
 from casadi_ik.logs.events import SERIOUS, errors_text, told
 from casadi_ik.logs.format import schema_name, schema_text
@@ -96,18 +96,12 @@ class _View:
 
     def write(self) -> None:
         """All topics, each in its order; a reader sorts by time."""
-        self._add(self._ros("/robot_description", STRING), 0, cdr_message(self.robot.urdf()))
+        write_postures(self.writer, self.robot, self.q, self.times.tolist())
         self._targets()
         self._transforms()
-        self._joint_states()
         self._contacts()
         self._iterations()
         self._messages()
-
-    def _ros(self, topic: str, definition: tuple[str, str]) -> int:
-        name, text = definition
-        number = self.writer.register_schema(name, "ros2msg", text.encode())
-        return self.writer.register_channel(topic, "cdr", number, {"offered_qos_profiles": ""})
 
     def _protobuf(self, topic: str, found: Schema) -> int:
         number = self.writer.register_schema(found.name, found.encoding, found.data)
@@ -145,16 +139,6 @@ class _View:
                 for parent, child, positions, rotations in frames
             ]
             self._add(channel, i, fox.FrameTransforms(transforms=transforms).encode())
-
-    def _joint_states(self) -> None:
-        joints = self.robot.joints(self.q)
-        positions = np.stack([np.atleast_1d(values) for values in joints.values()], axis=1)
-        channel = self._ros("/joint_states", JOINT_STATE)
-        none = np.zeros(0)
-        for i, time in enumerate(self.times.tolist()):
-            stamp = divmod(time, 1_000_000_000)
-            state = cdr_message(stamp, self.root, list(joints), positions[i], none, none)
-            self._add(channel, i, state)
 
     def _targets(self) -> None:
         solve = self.solve
@@ -205,7 +189,7 @@ class _View:
         solve = self.solve
         name = schema_name("iteration", solve.method, solve.layout, len(solve.fingers))
         text = schema_text(solve.layout, solve.labels)
-        channel = self._ros("/ik/iteration", (name, text))
+        channel = ros_channel(self.writer, "/ik/iteration", (name, text))
         for i, row in enumerate(solve.rows):
             self._add(channel, i, CDR_HEADER + row.tobytes())
 

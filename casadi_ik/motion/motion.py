@@ -14,7 +14,7 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.files.writing import written_whole
-from casadi_ik.logs.cdr import JOINT_STATE, JOINT_TRAJECTORY, STRING, cdr_message
+from casadi_ik.logs.cdr import JOINT_TRAJECTORY, cdr_message, ros_channel, write_postures
 from casadi_ik.motion.timing import differences
 
 SUFFIXES = (".npz", ".csv", ".mcap")
@@ -146,26 +146,13 @@ class Motion:
             writer.finish()
 
     def _messages(self, writer: Writer) -> None:
-        def channel(topic: str, definition: tuple[str, str]) -> int:
-            name, text = definition
-            schema = writer.register_schema(name, "ros2msg", text.encode())
-            return writer.register_channel(topic, "cdr", schema, {"offered_qos_profiles": ""})
-
         robot, none = self.robot, np.zeros(0)
         root, stamps = robot.description.root, np.rint(self.times * BILLION).astype(np.int64)
-        described = channel("/robot_description", STRING)
-        writer.add_message(described, 0, cdr_message(robot.urdf()), 0)
         points: list[str | list[str] | Array | tuple[int, int] | int] = []
         rows = zip(stamps.tolist(), self.q, self.velocity, self.acceleration, strict=True)
         for stamp, *values in rows:
             points += [*values, none, divmod(stamp, BILLION)]
         whole = cdr_message((0, 0), root, list(robot.actuators), len(self), *points)
-        writer.add_message(channel("/joint_trajectory", JOINT_TRAJECTORY), 0, whole, 0)
-        joints = robot.joints(self.q)
-        positions = np.stack([np.atleast_1d(values) for values in joints.values()], axis=1)
-        states = channel("/joint_states", JOINT_STATE)
-        for i, stamp in enumerate(stamps.tolist()):
-            state = cdr_message(
-                divmod(stamp, BILLION), root, list(joints), positions[i], none, none
-            )
-            writer.add_message(states, stamp, state, stamp, sequence=i)
+        channel = ros_channel(writer, "/joint_trajectory", JOINT_TRAJECTORY)
+        writer.add_message(channel, 0, whole, 0)
+        write_postures(writer, robot, self.q, stamps.tolist())
