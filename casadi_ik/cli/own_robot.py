@@ -74,7 +74,8 @@ def import_robot(said: Said) -> Answer:
       casadi-ik import my_robot.yaml --picture my_robot.png    a guess was corrected
       casadi-ik solve my_grasp.yaml --robot my_robot.yaml
 
-    Files are URDF, xacro (needs casadi-ik[xacro]) or MJCF (needs casadi-ik[mujoco]).
+    Files are URDF, xacro (needs casadi-ik[xacro]) or MJCF (needs casadi-ik[mujoco]); names
+    such as panda_description are looked up by casadi-ik[robot-descriptions].
     What no file says (fingertips, where a pad is and which way it faces, the thumb,
     palm, home) is guessed; each guess is marked in the description, and --picture
     shows them. The description points to the files.
@@ -82,7 +83,8 @@ def import_robot(said: Said) -> Answer:
     exit codes: 0 written, 1 --check found a difference, 2 bad input (nothing is
     written)
     """
-    first, hand = Path(said.first), said.hand and Path(said.hand)
+    first = imported.file_of(said.first)
+    hand = said.hand and imported.file_of(said.hand, "HAND")
     arm, hand = (first, hand) if hand else (None, first)
     if first.suffix in (".yaml", ".yml"):
         return _drawn_again(first, said)

@@ -6,11 +6,12 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.errors import DescriptionError, InputError
+from casadi_ik.errors import DescriptionError, InputError, MissingExtraError
 from casadi_ik.files.reading import read_yaml
 from casadi_ik.importing.guess import (
     Branch,
@@ -344,3 +345,33 @@ def described_surfaces(path: Path) -> dict[str, Surface]:
     palm = palm["link"] if isinstance(palm, dict) else palm
     links = {palm, *(joint.child for joint in tree.below(palm))}
     return link_surfaces(tree, links)[0]
+
+
+def file_of(name: str, key: str = "ROBOT") -> Path:
+    """A robot's file by its path, or by its name in the package robot_descriptions.
+
+    Args:
+        name: A path, or a name such as "panda_description", whose files that package downloads.
+        key: Of the argument, for messages.
+
+    Raises:
+        InputError: That package knows no such name, or cannot download it.
+        MissingExtraError: It is not installed.
+    """
+    path = Path(name)
+    if path.suffix or not re.fullmatch(r"\w+_description", name) or path.exists():
+        return path
+    try:
+        module = import_module(f"robot_descriptions.{name}")
+    except ModuleNotFoundError as error:
+        if error.name == "robot_descriptions":
+            raise MissingExtraError(
+                f"{key}: {name!r} is no file; to look for it by name: "
+                "pip install 'casadi-ik[robot-descriptions]'"
+            ) from error
+        raise InputError(f"{key}: robot_descriptions has no {name!r}") from error
+    except Exception as error:  # of git, of the network, of the disk
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise InputError(f"{key}: {name}: cannot be downloaded: {reason}") from error
+    found = (getattr(module, f"{kind}_PATH", None) for kind in ("URDF", "MJCF", "XACRO"))
+    return Path(next(filter(None, found), name))

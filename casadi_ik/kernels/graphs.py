@@ -16,7 +16,7 @@ from casadi_ik.errors import InputError
 from casadi_ik.kernels.layout import Layout
 
 BUILD_NO_GRAPHS = (
-    *("cli", "drawing", "exporting", "files", "importing"),
+    *("adapters", "cli", "drawing", "exporting", "files", "importing"),
     *("palette.py", "viewing", "views"),
 )
 """What has no code that can change a graph; the code of every other part may, a new one included.

@@ -190,7 +190,7 @@ def read_motion(path: str | os.PathLike[str]) -> RecordedMotion:
         if len(found) < len(wanted):
             raise LogError(f"no motion: found {', '.join(topics.values()) or 'no topic'}")
         try:
-            description, trajectory = (_Reader(found[topic]) for topic in wanted)
+            description, trajectory = (CdrReader(found[topic]) for topic in wanted)
             robot = re.search(r'<robot\s[^>]*?name="([^"<]*)"', description.text())
             trajectory.place = 8
             trajectory.text()
@@ -212,7 +212,7 @@ def read_motion(path: str | os.PathLike[str]) -> RecordedMotion:
         return motion
 
 
-class _Reader:
+class CdrReader:
     """Values of a message, one after the other; the inverse of `cdr`."""
 
     def __init__(self, data: bytes) -> None:

@@ -361,3 +361,36 @@ def test_bad_csv(text: str, fragment: str, refused: Callable[..., str], tmp_path
     error = refused(path)
     assert error.startswith(f"{path}:")
     assert fragment in error
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Modules as robot_descriptions has them once files are downloaded; not the package itself."""
+    folder = tmp_path / "site" / "robot_descriptions"
+    folder.mkdir(parents=True)
+    (folder / "__init__.py").touch()
+    (folder / "jaws_description.py").write_text(f"URDF_PATH = {str(gripper(tmp_path))!r}\n")
+    (folder / "far_description.py").write_text("raise OSError('no route\\nto host')\n")
+    monkeypatch.syspath_prepend(folder.parent)
+    return folder
+
+
+def test_a_name_is_its_file(run: Command, tmp_path: Path, package: Path) -> None:
+    done = run("import", "jaws_description", "--out", tmp_path / "mine.yaml")
+    assert (done.exit, done.err) == (0, ""), done
+    assert len(ik.load_robot(tmp_path / "mine.yaml").fingers) == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("none_description", "ROBOT: robot_descriptions has no 'none_description'"),
+        ("far_description", "far_description: cannot be downloaded: no route to host"),
+    ],
+)
+def test_what_is_not_there_is_said_in_a_line(
+    run: Command, tmp_path: Path, package: Path, name: str, says: str
+) -> None:
+    done = run("import", name, "--out", tmp_path / "mine.yaml")
+    assert done.exit == 2
+    assert says in done.error

@@ -1,0 +1,1 @@
+"""Arm-hand kinematics inside other people's systems: a module each, which imports that system."""

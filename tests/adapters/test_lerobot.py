@@ -1,0 +1,101 @@
+"""Steps of LeRobot with our kinematics; runs where `lerobot` is installed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import casadi_ik as ik
+
+pytest.importorskip("lerobot.processor")
+from lerobot.configs.types import PipelineFeatureType
+from lerobot.processor import RobotProcessorPipeline
+from lerobot.processor.converters import (
+    robot_action_observation_to_transition,
+    transition_to_robot_action,
+)
+from lerobot.robots.so_follower.robot_kinematic_processor import (
+    InverseKinematicsEEToJoints,
+)
+from lerobot.utils.rotation import Rotation
+
+from casadi_ik.adapters.lerobot import ArmKinematics, ContactsToJoints
+
+
+@pytest.fixture(scope="module")
+def arm() -> ArmKinematics:
+    return ArmKinematics(ik.Solver(ik.load_robot("ur5e")))
+
+
+def pipeline(*steps):
+    return RobotProcessorPipeline(
+        list(steps),
+        to_transition=robot_action_observation_to_transition,
+        to_output=transition_to_robot_action,
+    )
+
+
+def test_a_pose_of_the_tool_through_lerobots_own_step(arm, rng):
+    names = [*arm.joint_names, "gripper"]
+    step = InverseKinematicsEEToJoints(kinematics=arm, motor_names=names)
+    robot = ik.load_robot("ur5e")
+    positions = [*np.rad2deg(robot.home), 30.0]
+    here = {f"{name}.pos": value for name, value in zip(names, positions, strict=True)}
+    for q in robot.random(rng, 10):
+        pose = arm.forward_kinematics(np.rad2deg(q))
+        np.testing.assert_allclose(pose, robot.palm(q), atol=1e-9)
+        action = {f"ee.{key}": value for key, value in zip("xyz", pose[:3, 3], strict=True)}
+        turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec()
+        action |= {f"ee.w{key}": value for key, value in zip("xyz", turn, strict=True)}
+        done = pipeline(step)((action | {"ee.gripper_pos": 42.0}, here))
+        assert arm.status is ik.Status.SOLVED
+        assert done.pop("gripper.pos") == 42.0
+        there = robot.palm(np.deg2rad([done[f"{name}.pos"] for name in arm.joint_names]))
+        assert np.linalg.norm(there[:3, 3] - pose[:3, 3]) < 5e-3
+        assert np.linalg.norm(there[:3, :3] - pose[:3, :3]) < 0.1
+
+
+def test_the_palm_of_an_arm_with_a_hand(rng):
+    robot = ik.load_robot("panda+allegro_right")
+    arm = ArmKinematics(ik.Solver(robot))
+    assert arm.joint_names == list(robot.actuators[:7])
+    q = robot.random(rng, 1)[0][:7]
+    pose = arm.forward_kinematics(np.rad2deg(q))
+    found = arm.inverse_kinematics(np.rad2deg(robot.home[:7]), pose)
+    assert arm.status is ik.Status.SOLVED
+    np.testing.assert_allclose(arm.forward_kinematics(found)[:3, 3], pose[:3, 3], atol=5e-3)
+    with pytest.raises(ik.errors.InputError, match="expected an arm without a hand"):
+        arm.inverse_kinematics(found, pose, orientation_weight=0)
+
+
+def test_poses_of_a_position_alone_and_out_of_reach(arm):
+    robot = ik.load_robot("ur5e")
+    now = np.array([*np.rad2deg(robot.home), 30.0])
+    pose = np.eye(4)
+    pose[:3, 3] = 0.4, 0.2, 0.5
+    found = arm.inverse_kinematics(now, pose, orientation_weight=0.0)
+    np.testing.assert_allclose(arm.forward_kinematics(found)[:3, 3], pose[:3, 3], atol=5e-3)
+    assert found[-1] == 30.0
+    pose[:3, 3] = 9, 9, 9
+    np.testing.assert_array_equal(arm.inverse_kinematics(now, pose), now)
+    assert arm.status is not ik.Status.SOLVED
+
+
+def test_contacts_of_an_action_become_targets_of_the_motors(rng):
+    robot = ik.load_robot("panda+allegro_right")
+    step = ContactsToJoints(ik.Solver(robot))
+    points, normals = robot.contacts(robot.random(rng, 1)[0])
+    action = {}
+    for name, point, normal in zip(robot.fingers, points, normals, strict=True):
+        action |= {f"{name}.{key}": value for key, value in zip("xyz", point, strict=True)}
+        action |= {f"{name}.n{key}": value for key, value in zip("xyz", normal, strict=True)}
+    done = pipeline(step)((action | {"speed": 1.0}, {}))
+    assert set(done) == {f"{name}.pos" for name in robot.actuators} | {"speed"}
+    there, _ = robot.contacts(np.array([done[f"{name}.pos"] for name in robot.actuators]))
+    assert np.linalg.norm(there - points, axis=1).max() < 5e-3
+    far = {key: value + 9 for key, value in action.items()}
+    assert pipeline(step)((far, {})) == {key: done[key] for key in done if key != "speed"}
+    features = step.transform_features({PipelineFeatureType.ACTION: dict.fromkeys(action)})
+    assert set(features[PipelineFeatureType.ACTION]) == set(done) - {"speed"}
+    step.reset()
+    assert step.q is None
