@@ -47,6 +47,8 @@ class ArmSearchParameters:
     Attributes:
         samples: Values of the redundancy looked at in a trial.
         iterative_samples: As many of an iterative family: each of them costs more.
+        joint_samples: As many where several joints are locked, in so many more trials: three of four
+            places that a locked joint may be in leave the others within their limits.
         block: Breakpoints looked at in a trial.
         placement: Trials for an arm far from its limits. Of 20,000 random poses of a Panda 2,427
             need more than the first, 369 more than two, 6 more than all.
@@ -65,6 +67,7 @@ class ArmSearchParameters:
 
     samples: int = 6
     iterative_samples: int = 3
+    joint_samples: int = 1
     block: int = 8
     placement: tuple[Level, ...] = (
         *(Level(False, 0.0), Level(True, 1.0), Level(False, 1 / 3), Level(True, 1 / 2)),
@@ -237,6 +240,9 @@ class ArmTrials:
 
     @property
     def _levels(self) -> tuple[Level, ...]:
+        if not self.is_nearest and self._varied > 1:
+            times = PARAMETERS.samples // self._samples
+            return tuple(level for level in PARAMETERS.placement for _ in range(times))
         if not self.is_nearest:
             return PARAMETERS.placement
         return PARAMETERS.swivels if _break_count(self.family) else PARAMETERS.choice
@@ -264,6 +270,8 @@ class ArmTrials:
     def _samples(self) -> int:
         if not self._varied:
             return 1
+        if self._varied > 1:
+            return PARAMETERS.joint_samples
         iterative = self.family.is_iterative
         return PARAMETERS.iterative_samples if iterative else PARAMETERS.samples
 
@@ -320,7 +328,8 @@ class ArmTrials:
         width: Expr = ca.SX(1)
         for i, level in enumerate(self._levels):
             if level.around:
-                width = ca.if_else(trial == i, (level.by / samples) ** (1 / size), width)
+                part = (level.by / PARAMETERS.samples) ** (1 / size)
+                width = ca.if_else(trial == i, part, width)
         centre = ca.if_else(width < 1, here, (low + high) / 2)
         values = []
         for i in range(samples):
