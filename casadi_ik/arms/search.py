@@ -47,8 +47,8 @@ class ArmSearchParameters:
     Attributes:
         samples: Values of the redundancy looked at in a trial.
         iterative_samples: As many of an iterative family: each of them costs more.
-        joint_samples: As many where several joints are locked, in so many more trials: three of four
-            places that a locked joint may be in leave the others within their limits.
+        joint_samples: As many where several joints are locked, in as many more trials: for most
+            palm poses one of the first places is within limits.
         block: Breakpoints looked at in a trial.
         placement: Trials for an arm far from its limits. Of 20,000 random poses of a Panda 2,427
             need more than the first, 369 more than two, 6 more than all.

@@ -10,6 +10,8 @@ import ctypes
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
 from functools import cache
 from importlib import resources
 from typing import Any
@@ -127,8 +129,41 @@ def meaning(form: Form) -> str:
     )
 
 
-def step_source(function: ca.Function, form: Form) -> str:
+@dataclass(frozen=True, eq=False)
+class Stages:
+    """An iteration that C decides on: the functions it calls, and its text.
+
+    Attributes:
+        functions: By members of an enum, whose names the text calls them by; dense vectors.
+        text: Defines ``iterate(real *state, const real *parameters, real *state_after,
+            real *record, real *status, int wanted)``; `record` may be NULL.
+    """
+
+    functions: Mapping[Enum, ca.Function]
+    text: str
+
+    def source(self, form: Form) -> str:
+        """C code, as of `step_source`."""
+        text, names = emit(list(self.functions.values()), form)
+        behind = ", wanted" if form.lanes > 1 else ""
+        calls = "".join(
+            f"#define {stage.name}(...) {name}(__VA_ARGS__{behind})\n"
+            for stage, name in zip(self.functions, names, strict=True)
+        )
+        step = "iterate((real *) (arg)[0], (arg)[1], (res)[0], (res)[1], (res)[2], wanted)"
+        return (
+            text
+            + calls
+            + self.text
+            + f"#define STEP(arg, res, wanted) {step}\n"
+            + define({"STEP_IN": 2, "STEP_OUT": 3})
+        )
+
+
+def step_source(function: ca.Function | Stages, form: Form) -> str:
     """C code of a function, which drivers call by the macro `STEP(arg, res, wanted)`."""
+    if isinstance(function, Stages):
+        return function.source(form)
     text, (name,) = emit([function], form)
     n_in, n_out = function.n_in(), function.n_out()
     given = [*(f"(arg)[{i}]" for i in range(n_in)), *(f"(res)[{i}]" for i in range(n_out))]
@@ -142,13 +177,13 @@ def step_source(function: ca.Function, form: Form) -> str:
     )
 
 
-def standing_alone(function: ca.Function, form: Form) -> str:
+def standing_alone(function: ca.Function | Stages, form: Form) -> str:
     """C code of a function and of all it needs."""
     return meaning(form) + step_source(function, form)
 
 
 def library_source(
-    function: ca.Function, driver: str, lanes: int = 1, wide: bool = False, loops: bool = False
+    function: ca.Function | Stages, driver: str, lanes: int = 1, wide: bool = False, loops: bool = False
 ) -> str:
     """The text of a whole library: the function's code, what drivers share, a driver.
 

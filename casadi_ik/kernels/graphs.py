@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 
 from casadi_ik.errors import InputError
+from casadi_ik.kernels.codegen import Stages
 from casadi_ik.kernels.layout import Layout
 
 BUILD_NO_GRAPHS = (
@@ -157,16 +158,19 @@ class StepGraph:
         stage: Name of the number in the state by which the step chooses what to do, "" if it does
             the same always. Solves in the same stage are made side by side.
         recipe: See `recipe`; a library of the same recipe is taken without building the function.
+        virtual: Of stages: the iteration without a compiler, with arrays `inputs` and `outputs` as
+            of the function; a call is one, False if it fails.
     """
 
     name: str
-    source: ca.Function | Callable[[], ca.Function]
+    source: ca.Function | Callable[[], ca.Function | Stages]
     state: Layout
     parameters: Layout
     record: Layout
     compilable: bool = True
     stage: str = ""
     recipe: str = ""
+    virtual: Callable[[], Any] | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.source, ca.Function):
@@ -178,13 +182,15 @@ class StepGraph:
         return self.state.slice(self.stage).start if self.stage else -1
 
     @cached_property
-    def function(self) -> ca.Function:
-        """The function, checked against the layouts.
+    def function(self) -> ca.Function | Stages:
+        """The function, checked against the layouts; or stages, which are not.
 
         Raises:
             InputError: Its sizes are others.
         """
         function = self.source if isinstance(self.source, ca.Function) else self.source()
+        if isinstance(function, Stages):
+            return function
         found = (
             [function.numel_in(i) for i in range(function.n_in())],
             [function.numel_out(i) for i in range(function.n_out())],

@@ -25,7 +25,7 @@ from casadi_ik.kernels.cancellation import (
     check,
     stop_if_cancelled,
 )
-from casadi_ik.kernels.codegen import c_struct, define, driver_text, row_major
+from casadi_ik.kernels.codegen import Stages, c_struct, define, driver_text, row_major
 from casadi_ik.kernels.function_kernel import BufferedFunction, doubles, machine_lanes, memory
 from casadi_ik.kernels.graphs import RUNNING, StepGraph
 from casadi_ik.kernels.layout import opaque, row_driver, split_rows, store_rows
@@ -81,7 +81,7 @@ class LoopResult:
 
 def run_vm(
     step: StepGraph,
-    function: ca.Function,
+    function: Any,
     result: LoopResult,
     parameters: NDArray[np.float64],
     max_iterations: int,
@@ -90,12 +90,12 @@ def run_vm(
 
     Args:
         step: The step.
-        function: Its function, row-major.
+        function: Its function, row-major; of stages not looked at.
         result: As `LoopKernel.run` makes it.
         parameters: Shape (k, np) or (np,).
         max_iterations: Budget of each solve.
     """
-    call = BufferedFunction(function)
+    call = step.virtual() if step.virtual else BufferedFunction(function)
     state, constants = call.inputs
     new_state, record, code = call.outputs
     records = None if result.rows is None else _Records(step, result.rows)
@@ -384,9 +384,10 @@ class LoopKernel:
         return define(self.constants) + row_driver(self.step.record) + "".join(texts)
 
     @cached_property
-    def function(self) -> ca.Function:
+    def function(self) -> ca.Function | Stages:
         """The step, row-major."""
-        return row_major(self.step.function)
+        function = self.step.function
+        return function if isinstance(function, Stages) else row_major(function)
 
     def run(
         self, states: Any, parameters: Any, max_iterations: int, trace: bool = False
@@ -428,7 +429,7 @@ class LoopKernel:
             raise InputError(f"{self.step.name}: max_iterations is {max_iterations}, expected >= 0")
         result = self._empty(first.copy(), trace)
         if not self.compiled:
-            run_vm(self.step, self.function, result, given, max_iterations)
+            run_vm(self.step, None if self.step.virtual else self.function, result, given, max_iterations)
             return result
         if not max_iterations:
             return replace(result, rows=np.empty(0, self.step.record.dtype) if trace else None)

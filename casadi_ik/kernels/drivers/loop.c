@@ -23,7 +23,7 @@
  * taken up again by calling once more, in either form of the loop.
  */
 
-#define STAGES 8
+#define STAGES 12
 #define NOBODY (-1)
 
 #ifndef LANES

@@ -8,10 +8,12 @@ solves a nominal arm beside the real one, Newton's steps lead from there to the 
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import casadi as ca
 import numpy as np
 
+from casadi_ik.arrays import Array
 from casadi_ik.methods.common.bounded_step import Bounded, clip, damped_step
 from casadi_ik.methods.common.contact_fit import FIT, Tried
 from casadi_ik.problem.contacts import LENGTH
@@ -46,6 +48,21 @@ PASSES = 2
 """Corrections of the active set in a step."""
 
 
+@cache
+def start_table(robot: RobotDescription) -> tuple[Array, Array]:
+    """Configurations of the arm (`TABLE`, a) to start from, and their palms (`TABLE`, 12).
+
+    Of a palm the rotation, row by row, and the origin / `LENGTH`.
+    """
+    columns = list(robot.arm_actuators)
+    spread = evenly(TABLE, len(columns))
+    arms = robot.lower[columns] + spread * (robot.upper - robot.lower)[columns]
+    q = ca.SX.sym("q", len(columns))
+    palm = _palm(robot, q)
+    features = ca.vertcat(ca.vec(palm.rotation.T), palm.origin / LENGTH)
+    return arms, np.array(ca.Function("features", [q], [features])(arms.T)).T
+
+
 def nearest_start(robot: RobotDescription) -> ca.Function:
     """The next start for a palm pose.
 
@@ -53,16 +70,10 @@ def nearest_start(robot: RobotDescription) -> ca.Function:
         ``(rotation, origin, passed) -> (arm, distance)``: the configuration whose palm is nearest
         of those farther than `passed`, and its distance.
     """
-    columns = list(robot.arm_actuators)
-    spread = evenly(TABLE, len(columns))
-    arms = robot.lower[columns] + spread * (robot.upper - robot.lower)[columns]
-    q = ca.SX.sym("q", len(columns))
-    palm = _palm(robot, q)
-    features = ca.Function("features", [q], [_features(palm.rotation, palm.origin)])
-    table = np.array(features(arms.T)).T
+    arms, table = start_table(robot)
     rotation, origin = ca.MX.sym("rotation", 3, 3), ca.MX.sym("origin", 3)
     passed = ca.MX.sym("passed")
-    wanted = _features(rotation, origin)
+    wanted = ca.vertcat(ca.vec(rotation.T), origin / LENGTH)
     distances = ca.DM((table**2).sum(axis=1)) - 2 * ca.DM(table) @ wanted
     index, distance = _next_nearest(distances + ca.sumsqr(wanted), passed)
     arm = ca.DM(arms.T) @ (ca.DM(range(TABLE)) == index)
@@ -81,8 +92,8 @@ def _next_nearest(distances: Expr, passed: Expr) -> tuple[Expr, Expr]:
     return ca.find(masked <= nearest), nearest
 
 
-def other_side(robot: RobotDescription, arm: Expr, turned: Expr, p: dict[str, Expr]) -> Expr:
-    """The next joint at an end of its range sent to the other end.
+def next_at_end(robot: RobotDescription, arm: Expr, turned: Expr, p: dict[str, Expr]) -> Expr:
+    """The next joint that rests at an end of its range and may be sent to the other one.
 
     Args:
         robot: The description.
@@ -91,21 +102,19 @@ def other_side(robot: RobotDescription, arm: Expr, turned: Expr, p: dict[str, Ex
         p: Parameters.
 
     Returns:
-        (a + 1, 1): the arm, and how many joints are seen to now; 0 if none is left.
+        Its number in the arm, from 1; 0 if none is left.
     """
     columns = list(robot.arm_actuators)
     lower, upper = p["lower"][columns], p["upper"][columns]
-    found, sent = ca.SX(0), list(ca.vertsplit(arm))
+    found: Expr = ca.SX(0)
     for i, column in enumerate(columns):
         if robot.actuators[column].unit != "rad":
             continue
         gap = 2 * np.pi - (upper[i] - lower[i])
         ends = ca.logic_or(arm[i] - lower[i] <= AT_END, upper[i] - arm[i] <= AT_END)
         due = ca.logic_and(ca.logic_and(ends, ca.fabs(gap) < GAP), turned <= i)
-        due = ca.logic_and(due, found <= 0)
-        sent[i] = ca.if_else(due, lower[i] + upper[i] - arm[i], arm[i])
-        found = ca.if_else(due, i + 1, found)
-    return ca.vertcat(*sent, found)
+        found = ca.if_else(ca.logic_and(due, found <= 0), i + 1, found)
+    return found
 
 
 def pose_step(

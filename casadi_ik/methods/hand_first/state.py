@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 from functools import cached_property
 
 import casadi as ca
@@ -38,6 +39,26 @@ STAGES = (
     *(Phase.BALANCE, Phase.ARM_CHOICE),
 )
 """The stages in the order of their codes."""
+
+
+class Stage(IntEnum):
+    """What a solve does next: `phase` of the state. Codes are those of `Phase` where it has them."""
+
+    START = 0
+    REFINEMENT = Phase.REFINEMENT
+    CANDIDATE = Phase.CANDIDATE
+    HAND_FIT = Phase.HAND_FIT
+    ARM_PLACEMENT = Phase.ARM_PLACEMENT
+    BALANCE = Phase.BALANCE
+    ARM_CHOICE = Phase.ARM_CHOICE
+    ARM_STEPS = max(Phase) + 1
+
+
+PLACES = {stage: STAGES.index(Phase(stage)) for stage in Stage if stage in STAGES} | {
+    Stage.START: STAGES.index(Phase.REFINEMENT),
+    Stage.ARM_STEPS: STAGES.index(Phase.ARM_PLACEMENT),
+}
+"""Where a stage is counted."""
 
 STAGE_LABELS = tuple(stage.label for stage in STAGES)
 
@@ -157,30 +178,23 @@ class HandFirstLayouts:
         rows = list(self.robot.hand_actuators)
         return Bounded(q[rows], p["lower"][rows], p["upper"][rows], first)
 
-    def counted(self, s: dict[str, Expr], stage: Phase) -> dict[str, Expr]:
-        """The state with one more iteration spent in a stage."""
-        one = ca.DM([float(stage == other) for other in STAGES])
-        return s | {"counts": s["counts"] + one}
-
     def row(
         self,
         s: dict[str, Expr],
         p: dict[str, Expr],
         q: Expr,
         phase: Phase,
-        status: Expr,
         tried: Tried | None = None,
         accepted: Expr = 0.0,
         margin: Expr = NOTHING,
     ) -> Expr:
-        """What is logged at q (n, 1).
+        """What is logged at q (n, 1), but for the status.
 
         Args:
             s: State before the iteration.
             p: Parameters.
             q: The configuration.
             phase: The stage.
-            status: Whether the solve goes on.
             tried: The damped step, if the stage makes one.
             accepted: Whether it was taken.
             margin: Of the arm, if the stage places it.
@@ -207,7 +221,7 @@ class HandFirstLayouts:
                 "restart": s["earlier"] + ca.fmax(s["candidate"], 0.0),
                 "accepted": accepted,
                 "phase": float(phase),
-                "status": status,
+                "status": 0.0,  # filled in by the iteration
             }
         )
 
@@ -300,7 +314,7 @@ def _build(name: str, layouts: HandFirstLayouts) -> ca.Function:
             "best_cost": sys.float_info.max,
             "least": sys.float_info.max,
             "held": _is_held(robot, t),
-            "phase": ca.if_else(t["nearest"], float(Phase.REFINEMENT), float(Phase.CANDIDATE)),
+            "phase": ca.if_else(t["nearest"], float(Stage.START), float(Stage.CANDIDATE)),
             "candidate": -t["nearest"],
         }
         | fresh_fit()

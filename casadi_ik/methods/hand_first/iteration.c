@@ -1,0 +1,266 @@
+/* One iteration of hand first: what the stage of a solve computes, and which stage comes next.
+ *
+ * Of each hand posture of a round a solve takes the palm pose that suits it best (candidate), and
+ * fits palm and hand to the contacts as if the hand could fly (hand fit). The arm carries the palm
+ * there: in closed form (arm placement, or arm choice if what is near to where the robot is is
+ * wanted), or step by step (arm steps). Where it cannot follow exactly, all motors move (refinement),
+ * and where that misses by little the largest error is brought down (balance). What does not lead to
+ * a solution ends with the next posture; after the last one the best there was is left.
+ *
+ * The capital names with arguments are the functions of step.py: from state x and parameters p they
+ * make state y, what they say of it, and the record of the iteration. The solves in the lanes are all
+ * in the same stage (loop.c); each goes on by itself. Constants come from iteration.py.
+ */
+
+#ifdef LANES
+#define WIDTH LANES
+#else
+#define WIDTH 1
+#endif
+
+/* The numbers of one lane. */
+typedef struct {
+  double *x, *y, *said;
+  const double *p;
+} solve;
+
+#define X(field) s.x[STATE_##field * WIDTH]
+#define Y(field) s.y[STATE_##field * WIDTH]
+#define P(field) s.p[PARAMETERS_##field * WIDTH]
+#define SAYS(what) (s.said[SAID_##what * WIDTH] > 0)
+#define SAID(what) s.said[SAID_##what * WIDTH]
+#define ENTRY(first, i) (&(first))[(i) * WIDTH]
+
+static int goes_to(solve s, int stage) {
+  Y(PHASE) = stage;
+  return RUNNING_STATUS;
+}
+
+static int to_next_candidate(solve s) {
+  Y(CANDIDATE) = X(CANDIDATE) + 1;
+  return goes_to(s, CANDIDATE_STAGE);
+}
+
+static void begin_fit(solve s) {
+  Y(DAMPING) = FIT_DAMPING;
+  Y(GROWTH) = FIT_GROWTH;
+  Y(WAITED) = Y(SPENT) = 0;
+}
+
+/* Whether the cost of a fit is another than that of the fit that was balanced before. */
+static int differs(double cost, double before) {
+  const double off = cost - before;
+  return (off < 0 ? -off : off) > SAME_COST * before;
+}
+
+static void keep_best(solve s, double cost) {
+  int i;
+  if (!(cost < X(BEST_COST))) return;
+  Y(BEST_COST) = cost;
+  for (i = 0; i < N_MOTORS; ++i) ENTRY(Y(BEST_Q), i) = ENTRY(Y(Q), i);
+}
+
+/* The best arm so far, within its bounds. */
+static void set_arm(solve s) {
+  int i;
+  for (i = 0; i < N_ARM; ++i) {
+    const int k = ARM[i];
+    const double low = ENTRY(P(LOWER), k), high = ENTRY(P(UPPER), k), at = ENTRY(Y(ARM), i);
+    ENTRY(Y(Q), k) = at < low ? low : at > high ? high : at;
+  }
+}
+
+static int after_start(solve s) {
+  const double cost = SAID(COST);
+  if (cost < X(BEST_COST)) Y(BEST_COST) = cost;
+  if (SAYS(WITHIN)) return SOLVED_STATUS;
+  if (HAS_ARM && cost > WHOLE) return to_next_candidate(s);
+  return goes_to(s, REFINEMENT_STAGE);
+}
+
+static void before_candidate(solve s, double *hand) {
+  const int last = N_CANDIDATES - 1, at = X(CANDIDATE) < last ? (int) X(CANDIDATE) : last;
+  int i;
+  for (i = 0; i < N_HAND; ++i) hand[i * WIDTH] = ENTRY(P(POSTURES), at * N_HAND + i);
+}
+
+static int after_candidate(solve s) {
+  int i;
+  if (X(CANDIDATE) < N_CANDIDATES) return goes_to(s, HAS_ARM ? HAND_FIT_STAGE : REFINEMENT_STAGE);
+  for (i = 0; i < N_MOTORS; ++i) ENTRY(Y(Q), i) = ENTRY(X(BEST_Q), i);
+  return STALLED_STATUS;
+}
+
+/* A family is searched in closed form; what that missed in earlier rounds step by step. */
+static int placement(solve s) {
+  const int searched = NEAR_IS_SEARCHED && P(NEAREST) > 0;
+  if (IS_COMPLETE || (HAS_FAMILY && !(X(EARLIER) > 0) && !searched)) return ARM_PLACEMENT_STAGE;
+  return ARM_STEPS_STAGE;
+}
+
+static int after_hand_fit(solve s) {
+  /* The last goes on to the arm even if it does not fit: refinement starts from the nearest. */
+  const int last = X(CANDIDATE) + 1 >= N_CANDIDATES, alone = P(ALONE) > 0;
+  const int first = X(CANDIDATE) + X(EARLIER) <= 0 && X(SPENT) < 1;
+  int goes_on = SAYS(WITHIN) || last;
+  /* The hand as it is is only worth a fit if its contacts are shaped a little like these. */
+  if (N_CANDIDATES > 1 && P(NEAREST) > 0 && first && SAID(COST) > OWN_HAND) {
+    return to_next_candidate(s);
+  }
+  if (!SAYS(SETTLED)) return goes_to(s, HAND_FIT_STAGE);
+  if (!SAYS(WITHIN) && SAYS(NEAR)) {
+    /* Nor does one that fits nearly have to fit, if it is another than before: it is balanced. */
+    if (!differs(Y(COST), X(NEAR))) {
+      Y(RETURNS) = X(RETURNS) + 1;
+    } else if (!alone) {
+      Y(NEAR) = Y(COST);
+      goes_on = 1;
+    }
+  }
+  if (!goes_on) return to_next_candidate(s);
+  goes_to(s, HAS_CHOICE && P(NEAREST) > 0 ? ARM_CHOICE_STAGE : placement(s));
+  return !alone ? RUNNING_STATUS : SAYS(WITHIN) ? SOLVED_STATUS : STALLED_STATUS;
+}
+
+static int after_placement(solve s) {
+  const int over = Y(SPENT) >= (X(EARLIER) > 0 ? ALL_PLACEMENTS : PLACEMENTS);
+  if (!SAYS(WITHIN) && !over) return goes_to(s, ARM_PLACEMENT_STAGE);
+  set_arm(s);
+  Y(SPENT) = 0;
+  goes_to(s, REFINEMENT_STAGE);
+  return SAYS(WITHIN) && SAYS(NEAR) && X(FITS) > 0 ? SOLVED_STATUS : RUNNING_STATUS;
+}
+
+static int after_choice(solve s) {
+  if (!SAYS(WITHIN)) {
+    if (Y(SPENT) < CHOICE_PATIENCE) return goes_to(s, ARM_CHOICE_STAGE);
+    Y(MARGIN) = NO_MARGIN;
+    Y(SPENT) = 0;
+    return goes_to(s, placement(s));
+  }
+  if (Y(SPENT) < CHOICES) return goes_to(s, ARM_CHOICE_STAGE);
+  set_arm(s);
+  Y(SPENT) = 0;
+  goes_to(s, REFINEMENT_STAGE);
+  return IS_EXACT && X(FITS) > 0 ? SOLVED_STATUS : RUNNING_STATUS;
+}
+
+#if N_STARTS
+/* The arm begins at the next row of the table: the nearest to the palm pose that is farther than the
+ * last one; of all, after the last. If what is near is wanted it begins as it is. */
+static void before_arm_steps(solve s) {
+  double distance[N_STARTS], nearest = 1e300, again = 1e300;
+  int i, k, found = 0, first = 0;
+  if (X(SPENT) >= 1 || X(TURNED) > 0 || (P(NEAREST) > 0 && X(STARTS) < 1)) return;
+  for (i = 0; i < N_STARTS; ++i) distance[i] = 0;
+  for (k = 0; k < 12; ++k) {
+    const double wanted = k < 9 ? ENTRY(X(PALM_ROTATION), k) : ENTRY(X(PALM_ORIGIN), k - 9) / LENGTH;
+    for (i = 0; i < N_STARTS; ++i) {
+      distance[i] += (START_PALMS[k][i] - wanted) * (START_PALMS[k][i] - wanted);
+    }
+  }
+  for (i = 0; i < N_STARTS; ++i) {
+    if (distance[i] < again) again = distance[first = i];
+    if (distance[i] > X(PASSED) && distance[i] < nearest) nearest = distance[found = i];
+  }
+  if (nearest >= 1e300) nearest = distance[found = first];
+  for (i = 0; i < N_ARM; ++i) ENTRY(X(Q), ARM[i]) = START_ARMS[found][i];
+  Y(PASSED) = X(PASSED) = nearest;
+}
+
+static int after_arm_steps(solve s) {
+  const int settled = SAYS(SETTLED), exact = SAID(COST) < EXACT_COST;
+  /* What the first round missed may lie beyond the gap between two limits of a joint. */
+  const int sent = settled && X(EARLIER) > 0 ? (int) SAID(AT_END) : 0;
+  if (sent) {
+    const int k = ARM[sent - 1];
+    ENTRY(Y(Q), k) = ENTRY(P(LOWER), k) + ENTRY(P(UPPER), k) - ENTRY(Y(Q), k);
+  }
+  if (settled) Y(TURNED) = sent;
+  Y(STARTS) = X(STARTS) + (settled && !sent);
+  /* In the first round what is left of an arm of too few motors is for arm and hand together. */
+  if (!(exact || (settled && SAYS(NEAR) && X(EARLIER) < 1) || Y(STARTS) >= MOST_STARTS)) {
+    return goes_to(s, ARM_STEPS_STAGE);
+  }
+  set_arm(s);
+  Y(TURNED) = 0;
+  goes_to(s, REFINEMENT_STAGE);
+  return exact && X(FITS) > 0 ? SOLVED_STATUS : RUNNING_STATUS;
+}
+#endif
+
+static int after_refinement(solve s) {
+  keep_best(s, Y(COST));
+  if (!SAYS(SETTLED)) return goes_to(s, REFINEMENT_STAGE);
+  if (SAYS(WITHIN)) return SOLVED_STATUS;
+  if (!SAYS(NEAR)) return to_next_candidate(s);
+  if (!differs(Y(COST), X(BALANCED))) {
+    Y(RETURNS) = X(RETURNS) + 1;
+    return to_next_candidate(s);
+  }
+  Y(BALANCED) = Y(COST);
+  return goes_to(s, BALANCE_STAGE);
+}
+
+static int after_balance(solve s) {
+  const double largest = SAID(COST);
+  if (SAYS(WITHIN)) return SOLVED_STATUS;
+  if (!SAYS(SETTLED)) return goes_to(s, BALANCE_STAGE);
+  begin_fit(s);
+  Y(POWER) = 0;
+  Y(RETURNS) = X(RETURNS) + (largest > CLOSER * X(LEAST));
+  if (largest < X(LEAST)) Y(LEAST) = largest;
+  return to_next_candidate(s);
+}
+
+static solve solve_in(int lane, real *x, const real *p, real *y, real *said) {
+  solve s;
+  s.x = (double *) x + lane;
+  s.p = (const double *) p + lane;
+  s.y = (double *) y + lane;
+  s.said = (double *) said + lane;
+  return s;
+}
+
+/* The iteration; `wanted` has a bit for each lane in which there is a solve. */
+CODE void iterate(real *x, const real *p, real *y, real *record, real *status, int wanted) {
+  real said[N_SAID], hand[N_HAND + 1];
+  int lane = 0, stage;
+  while (!(wanted >> lane & 1)) ++lane;
+  stage = (int) solve_in(lane, x, p, y, said).x[STATE_PHASE * WIDTH];
+#define EACH for (lane = 0; lane < WIDTH; ++lane) if (wanted >> lane & 1)
+#define SOLVE solve_in(lane, x, p, y, said)
+  if (stage == CANDIDATE_STAGE) EACH before_candidate(SOLVE, (double *) hand + lane);
+#if N_STARTS
+  if (stage == ARM_STEPS_STAGE) EACH before_arm_steps(SOLVE);
+#endif
+  switch (stage) {
+    case START_STAGE: START(x, p, y, said, record); break;
+    case CANDIDATE_STAGE: CANDIDATE(x, p, hand, y, said, record); break;
+    case HAND_FIT_STAGE: HAND_FIT(x, p, y, said, record); break;
+    case ARM_PLACEMENT_STAGE: ARM_PLACEMENT(x, p, y, said, record); break;
+    case ARM_STEPS_STAGE: ARM_STEPS(x, p, y, said, record); break;
+    case ARM_CHOICE_STAGE: ARM_CHOICE(x, p, y, said, record); break;
+    case BALANCE_STAGE: BALANCE(x, p, y, said, record); break;
+    default: REFINEMENT(x, p, y, said, record);
+  }
+  EACH {
+    const solve s = SOLVE;
+    int code;
+    switch (stage) {
+      case START_STAGE: code = after_start(s); break;
+      case CANDIDATE_STAGE: code = after_candidate(s); break;
+      case HAND_FIT_STAGE: code = after_hand_fit(s); break;
+      case ARM_PLACEMENT_STAGE: code = after_placement(s); break;
+#if N_STARTS
+      case ARM_STEPS_STAGE: code = after_arm_steps(s); break;
+#endif
+      case ARM_CHOICE_STAGE: code = after_choice(s); break;
+      case BALANCE_STAGE: code = after_balance(s); break;
+      default: code = after_refinement(s);
+    }
+    ENTRY(Y(COUNTS), PLACE_OF_STAGE[stage]) = ENTRY(X(COUNTS), PLACE_OF_STAGE[stage]) + 1;
+    ((double *) status)[lane] = code;
+    if (record) ((double *) record)[RECORD_STATUS * WIDTH + lane] = code;
+  }
+}

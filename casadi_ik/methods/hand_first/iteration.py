@@ -1,0 +1,296 @@
+"""What comes next in an iteration of hand-first: constants of iteration.c, and the same without C.
+
+Where there is no compiler, `Iteration` calls the stages' functions in CasADi's virtual machine and
+decides as iteration.c does.
+"""
+
+from __future__ import annotations
+
+from importlib import resources
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from casadi_ik.arms.search import PARAMETERS as ARM_SEARCH
+from casadi_ik.arrays import Array
+from casadi_ik.kernels.codegen import define, define_arrays, number, row_major
+from casadi_ik.kernels.function_kernel import BufferedFunction
+from casadi_ik.methods.common.contact_fit import BALANCE, FIT, fresh_fit
+from casadi_ik.methods.common.numeric_arm import STARTS, start_table
+from casadi_ik.methods.hand_first.state import PLACES, STAGES, Stage
+from casadi_ik.problem.contacts import LENGTH
+from casadi_ik.problem.status import Status
+
+if TYPE_CHECKING:
+    from casadi_ik.methods.hand_first.step import HandFirstStep
+
+OWN_HAND = 0.5
+"""Cost, with the best palm, up to which the hand as it is is fitted before other hands."""
+
+WHOLE = 0.5
+"""Cost up to which a start is refined as a whole (three contacts off by 4 cm each)."""
+
+
+def text(step: HandFirstStep) -> str:
+    """The text of iteration.c with its constants for a robot."""
+    from casadi_ik.methods.hand_first.step import SAID
+
+    layouts, robot = step.layouts, step.robot
+    numeric = Stage.ARM_STEPS in step.functions
+    whole = {
+        f"{label}_{field.name.upper()}": layout.slice(field.name).start
+        for label, layout in (
+            ("STATE", layouts.state),
+            ("PARAMETERS", layouts.parameters),
+            ("SAID", SAID),
+            ("RECORD", layouts.record),
+        )
+        for field in layout
+    }
+    whole |= {f"{stage.name}_STAGE": int(stage) for stage in Stage}
+    whole |= {f"{status.name}_STATUS": int(status) for status in Status}
+    placements, choices = step.placements, step.choices
+    whole |= {
+        "N_SAID": SAID.size,
+        "N_MOTORS": len(robot.actuators),
+        "N_ARM": len(robot.arm_actuators),
+        "N_HAND": len(robot.hand_actuators),
+        "N_CANDIDATES": layouts.candidates,
+        "N_STARTS": len(start_table(robot)[0]) if numeric else 0,
+        "MOST_STARTS": STARTS,
+        "HAS_ARM": bool(robot.arm_actuators),
+        "HAS_FAMILY": placements is not None,
+        "HAS_CHOICE": choices is not None,
+        "IS_COMPLETE": not numeric,
+        "IS_EXACT": step.arm is not None and step.arm.exact,
+        "NEAR_IS_SEARCHED": step.searched_if_near,
+        "PLACEMENTS": placements.trials if placements else 0,
+        "ALL_PLACEMENTS": placements.all_trials if placements else 0,
+        "CHOICES": choices.trials if choices else 0,
+        "CHOICE_PATIENCE": choices.patience if choices else 0,
+    }
+    numbers = {
+        "LENGTH": LENGTH,
+        "FIT_DAMPING": FIT.damping,
+        "FIT_GROWTH": FIT.growth,
+        "SAME_COST": BALANCE.same,
+        "CLOSER": BALANCE.closer,
+        "OWN_HAND": OWN_HAND,
+        "WHOLE": WHOLE,
+        "EXACT_COST": FIT.exact * FIT.exact,
+        "NO_MARGIN": ARM_SEARCH.no_margin,
+    }
+    places = np.zeros(max(Stage) + 1, dtype=np.int64)
+    places[list(PLACES)] = list(PLACES.values())
+    arrays = {"ARM": np.array([*robot.arm_actuators, 0]), "PLACE_OF_STAGE": places}
+    if numeric:
+        arms, palms = start_table(robot)
+        arrays |= {"START_ARMS": arms, "START_PALMS": palms.T}
+    missing = [stage.name for stage in Stage if stage not in step.functions]
+    source = resources.files("casadi_ik.methods.hand_first") / "iteration.c"
+    return "".join(
+        (
+            define({name: int(value) for name, value in whole.items()}),
+            *(f"#define {name} {number(value)}\n" for name, value in numbers.items()),
+            *(f"#define {name}(...) ((void) 0)\n" for name in missing),
+            define_arrays(arrays),
+            source.read_text(encoding="utf-8"),
+        )
+    )
+
+
+class Iteration:
+    """An iteration in the virtual machine.
+
+    Attributes:
+        inputs: State and parameters; write into them.
+        outputs: State, record and status; a call overwrites them.
+    """
+
+    def __init__(self, step: HandFirstStep) -> None:
+        """Make the arrays; functions are readied when first needed."""
+        layouts = step.layouts
+        self._step = step
+        self._stages: dict[Stage, BufferedFunction] = {}
+        self.inputs = [np.zeros(layouts.state.size), np.zeros(layouts.parameters.size)]
+        self.outputs = [np.zeros(layouts.state.size), np.zeros(layouts.record.size), np.zeros(1)]
+        self._x, self._p = (
+            layout.unpack(array)
+            for layout, array in zip((layouts.state, layouts.parameters), self.inputs, strict=True)
+        )
+        self._y = layouts.state.unpack(self.outputs[0])
+        self._arm = list(step.robot.arm_actuators)
+
+    def __call__(self) -> bool:
+        """One iteration; False if a function reports a failure."""
+        from casadi_ik.methods.hand_first.step import SAID
+
+        stage = Stage(int(self._x["phase"][()]))
+        if stage == Stage.ARM_STEPS:
+            self._begin_arm()
+        call = self._stages.get(stage)
+        if call is None:
+            call = BufferedFunction(row_major(self._step.functions[stage]))
+            self._stages[stage] = call
+        call.inputs[0][:], call.inputs[1][:] = self.inputs
+        if stage == Stage.CANDIDATE:
+            last = self._step.layouts.candidates - 1
+            call.inputs[2][:] = self._p["postures"][min(int(self._x["candidate"][()]), last)]
+        if not call():
+            return False
+        said = dict(zip(SAID.names, call.outputs[1].tolist(), strict=True))
+        self.outputs[0][:], self.outputs[1][:] = call.outputs[0], call.outputs[2]
+        x = {name: float(value) for name, value in self._x.items() if not value.ndim}
+        status = self._followed(stage, x, self._y, said)
+        self._y["counts"][PLACES[stage]] += 1
+        self.outputs[1][self._step.layouts.record.slice("status")] = status
+        self.outputs[2][0] = status
+        return True
+
+    def _begin_arm(self) -> None:
+        """The arm begins at the next row of the table, or as it is."""
+        x, p = self._x, self._p
+        own = p["nearest"][()] > 0 and x["starts"][()] < 1
+        if x["spent"][()] >= 1 or x["turned"][()] > 0 or own:
+            return
+        arms, palms = start_table(self._step.robot)
+        wanted = np.concatenate([x["palm_rotation"].ravel(), x["palm_origin"] / LENGTH])
+        distance = np.square(palms - wanted).sum(axis=1)
+        beyond = np.where(distance > x["passed"][()], distance, np.inf)
+        found = int(np.argmin(beyond if np.isfinite(beyond).any() else distance))
+        x["q"][self._arm], x["passed"][()] = arms[found], distance[found]
+
+    def _followed(
+        self, stage: Stage, x: dict[str, float], y: dict[str, Array], said: dict[str, float]
+    ) -> Status:
+        """What iteration.c says of a stage, see there.
+
+        Args:
+            stage: It.
+            x: Numbers of the state before.
+            y: The state after; changed.
+            said: What the stage says.
+        """
+        step, p = self._step, self._p
+        candidates, nearest = step.layouts.candidates, p["nearest"][()] > 0
+        settled, within, near = (said[name] > 0 for name in ("settled", "within", "near"))
+        cost = float(y["cost"][()])
+
+        def put(**values: float) -> None:
+            for name, value in values.items():
+                y[name][...] = value
+
+        def goes_to(next_stage: Stage, status: Status = Status.RUNNING) -> Status:
+            put(phase=next_stage)
+            return status
+
+        def to_next_candidate() -> Status:
+            put(candidate=x["candidate"] + 1)
+            return goes_to(Stage.CANDIDATE)
+
+        def with_arm(solved: bool) -> Status:
+            low, high = p["lower"][self._arm], p["upper"][self._arm]
+            y["q"][self._arm] = np.clip(y["arm"], low, high)
+            return goes_to(Stage.REFINEMENT, Status.SOLVED if solved else Status.RUNNING)
+
+        def placement() -> Stage:
+            complete = Stage.ARM_STEPS not in step.functions
+            searched = x["earlier"] > 0 or (step.searched_if_near and nearest)
+            closed = complete or (step.arm is not None and not searched)
+            return Stage.ARM_PLACEMENT if closed else Stage.ARM_STEPS
+
+        def differs(before: float) -> bool:
+            return abs(cost - before) > BALANCE.same * before
+
+        match stage:
+            case Stage.START:
+                put(best_cost=min(said["cost"], x["best_cost"]))
+                if within:
+                    return Status.SOLVED
+                if self._arm and said["cost"] > WHOLE:
+                    return to_next_candidate()
+                return goes_to(Stage.REFINEMENT)
+            case Stage.CANDIDATE:
+                if x["candidate"] < candidates:
+                    return goes_to(Stage.HAND_FIT if self._arm else Stage.REFINEMENT)
+                y["q"][:] = self._x["best_q"]
+                return Status.STALLED
+            case Stage.HAND_FIT:
+                last, alone = x["candidate"] + 1 >= candidates, p["alone"][()] > 0
+                first = x["candidate"] + x["earlier"] <= 0 and x["spent"] < 1
+                if candidates > 1 and nearest and first and said["cost"] > OWN_HAND:
+                    return to_next_candidate()
+                if not settled:
+                    return goes_to(Stage.HAND_FIT)
+                goes_on = within or last
+                if near and not within:
+                    if not differs(x["near"]):
+                        put(returns=x["returns"] + 1)
+                    elif not alone:
+                        put(near=cost)
+                        goes_on = True
+                if not goes_on:
+                    return to_next_candidate()
+                ended = Status.SOLVED if within else Status.STALLED
+                chooses = step.choices is not None and nearest
+                following = Stage.ARM_CHOICE if chooses else placement()
+                return goes_to(following, ended if alone else Status.RUNNING)
+            case Stage.ARM_PLACEMENT:
+                search = step.placements
+                assert search is not None
+                trials = search.all_trials if x["earlier"] > 0 else search.trials
+                if not within and y["spent"][()] < trials:
+                    return goes_to(Stage.ARM_PLACEMENT)
+                put(spent=0)
+                return with_arm(within and near and x["fits"] > 0)
+            case Stage.ARM_CHOICE:
+                search = step.choices
+                assert search is not None
+                if y["spent"][()] < (search.trials if within else search.patience):
+                    return goes_to(Stage.ARM_CHOICE)
+                put(spent=0)
+                if not within:
+                    put(margin=ARM_SEARCH.no_margin)
+                    return goes_to(placement())
+                return with_arm(search.family.exact and x["fits"] > 0)
+            case Stage.ARM_STEPS:
+                exact = said["cost"] < FIT.exact * FIT.exact
+                sent = int(said["at_end"]) if settled and x["earlier"] > 0 else 0
+                if sent:
+                    k = self._arm[sent - 1]
+                    y["q"][k] = p["lower"][k] + p["upper"][k] - y["q"][k]
+                put(
+                    turned=sent if settled else x["turned"],
+                    starts=x["starts"] + (settled and not sent),
+                )
+                few = settled and near and x["earlier"] < 1
+                if not (exact or few or y["starts"][()] >= STARTS):
+                    return goes_to(Stage.ARM_STEPS)
+                put(turned=0)
+                return with_arm(exact and x["fits"] > 0)
+            case Stage.REFINEMENT:
+                if cost < x["best_cost"]:
+                    put(best_cost=cost)
+                    y["best_q"][:] = y["q"]
+                if not settled:
+                    return goes_to(Stage.REFINEMENT)
+                if within:
+                    return Status.SOLVED
+                if near and differs(x["balanced"]):
+                    put(balanced=cost)
+                    return goes_to(Stage.BALANCE)
+                put(returns=x["returns"] + near)
+                return to_next_candidate()
+            case Stage.BALANCE:
+                if within:
+                    return Status.SOLVED
+                if not settled:
+                    return goes_to(Stage.BALANCE)
+                vain = said["cost"] > BALANCE.closer * x["least"]
+                put(**fresh_fit(), power=0, returns=x["returns"] + vain)
+                put(least=min(said["cost"], x["least"]))
+                return to_next_candidate()
+        raise AssertionError(stage)
+
+
+assert len(STAGES) == len(set(PLACES.values()))
