@@ -11,7 +11,6 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from enum import Enum
 from functools import cache
 from importlib import resources
 from typing import Any
@@ -135,11 +134,12 @@ class Stages:
 
     Attributes:
         functions: By members of an enum, whose names the text calls them by; dense vectors.
-        text: Defines ``iterate(real *state, const real *parameters, real *state_after,
-            real *record, real *status, int wanted)``; `record` may be NULL.
+        text: Defines ``iterate(real *state, const real *parameters, const double *const *own, real
+            *state_after, real *record, real *status, int wanted)``: `own` are the parameters of
+            each lane by themselves, `record` may be NULL.
     """
 
-    functions: Mapping[Enum, ca.Function]
+    functions: Mapping[Any, ca.Function]
     text: str
 
     def source(self, form: Form) -> str:
@@ -150,7 +150,8 @@ class Stages:
             f"#define {stage.name}(...) {name}(__VA_ARGS__{behind})\n"
             for stage, name in zip(self.functions, names, strict=True)
         )
-        step = "iterate((real *) (arg)[0], (arg)[1], (res)[0], (res)[1], (res)[2], wanted)"
+        given = "(real *) (arg)[0], (arg)[1], (const double *const *) (arg)[2]"
+        step = f"iterate({given}, (res)[0], (res)[1], (res)[2], wanted)"
         return (
             text
             + calls
@@ -183,7 +184,11 @@ def standing_alone(function: ca.Function | Stages, form: Form) -> str:
 
 
 def library_source(
-    function: ca.Function | Stages, driver: str, lanes: int = 1, wide: bool = False, loops: bool = False
+    function: ca.Function | Stages,
+    driver: str,
+    lanes: int = 1,
+    wide: bool = False,
+    loops: bool = False,
 ) -> str:
     """The text of a whole library: the function's code, what drivers share, a driver.
 

@@ -158,6 +158,7 @@ class StepGraph:
         stage: Name of the number in the state by which the step chooses what to do, "" if it does
             the same always. Solves in the same stage are made side by side.
         recipe: See `recipe`; a library of the same recipe is taken without building the function.
+        apart: Name of the last parameter, if only C reads it: lanes do without it.
         virtual: Of stages: the iteration without a compiler, with arrays `inputs` and `outputs` as
             of the function; a call is one, False if it fails.
     """
@@ -170,6 +171,7 @@ class StepGraph:
     compilable: bool = True
     stage: str = ""
     recipe: str = ""
+    apart: str = ""
     virtual: Callable[[], Any] | None = None
 
     def __post_init__(self) -> None:
@@ -180,6 +182,11 @@ class StepGraph:
     def stage_place(self) -> int:
         """Where in the state the stage is, -1 if there is none."""
         return self.state.slice(self.stage).start if self.stage else -1
+
+    @property
+    def seated(self) -> int:
+        """How many of the parameters lanes need."""
+        return self.parameters.slice(self.apart).start if self.apart else self.parameters.size
 
     @cached_property
     def function(self) -> ca.Function | Stages:

@@ -13,7 +13,6 @@ from functools import cached_property
 from time import perf_counter
 from typing import Any
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -80,8 +79,7 @@ class LoopResult:
 
 
 def run_vm(
-    step: StepGraph,
-    function: Any,
+    kernel: LoopKernel,
     result: LoopResult,
     parameters: NDArray[np.float64],
     max_iterations: int,
@@ -89,13 +87,13 @@ def run_vm(
     """Solve a batch; `result` has the first states and gets everything else.
 
     Args:
-        step: The step.
-        function: Its function, row-major; of stages not looked at.
+        kernel: Of the step.
         result: As `LoopKernel.run` makes it.
         parameters: Shape (k, np) or (np,).
         max_iterations: Budget of each solve.
     """
-    call = step.virtual() if step.virtual else BufferedFunction(function)
+    step = kernel.step
+    call: Any = step.virtual() if step.virtual else BufferedFunction(kernel.function)
     state, constants = call.inputs
     new_state, record, code = call.outputs
     records = None if result.rows is None else _Records(step, result.rows)
@@ -369,6 +367,7 @@ class LoopKernel:
         return {
             "N_STATE": self.step.state.size,
             "N_PARAMETERS": self.step.parameters.size,
+            "N_SEATED": self.step.seated,
             "RUNNING": RUNNING,
             "NON_FINITE": NON_FINITE,
             "REPEATED": REPEATED,
@@ -384,8 +383,8 @@ class LoopKernel:
         return define(self.constants) + row_driver(self.step.record) + "".join(texts)
 
     @cached_property
-    def function(self) -> ca.Function | Stages:
-        """The step, row-major."""
+    def function(self) -> Any:
+        """The step, row-major, or its stages."""
         function = self.step.function
         return function if isinstance(function, Stages) else row_major(function)
 
@@ -429,7 +428,7 @@ class LoopKernel:
             raise InputError(f"{self.step.name}: max_iterations is {max_iterations}, expected >= 0")
         result = self._empty(first.copy(), trace)
         if not self.compiled:
-            run_vm(self.step, None if self.step.virtual else self.function, result, given, max_iterations)
+            run_vm(self, result, given, max_iterations)
             return result
         if not max_iterations:
             return replace(result, rows=np.empty(0, self.step.record.dtype) if trace else None)

@@ -16,7 +16,8 @@
  * such iteration in it that is no smaller than its length. It begins at FIRST_MARK: most solves end
  * before, and keeping states for a comparison costs.
  *
- * Expects the macros N_STATE, N_PARAMETERS, N_RECORD, ROW_BYTES, RUNNING, NON_FINITE,
+ * Expects the macros N_STATE, N_PARAMETERS, N_SEATED (those of the parameters that lanes need; a step
+ * of stages finds the others in a third argument), N_RECORD, ROW_BYTES, RUNNING, NON_FINITE,
  * REPEATED, CODE_LIMIT, SLOTS, FIRST_MARK, STAGE (the place in the state of the number that tells
  * the stages apart, -1 if there is none) and the function store_row(record, row). Everything that
  * must survive a pause lives in the job's arrays: a call that returns SLICE_OVER or ROWS_FULL is
@@ -48,6 +49,7 @@ typedef struct {
   int queue;                   /* where its like wait */
   int outcome;                 /* DONE, or why the loop stops */
   lanes *now, *next, *parameters, *record;
+  const double *own[LANES];    /* parameters of each lane's solve */
 } bench;
 
 /* Rows stand by slot where a method writes them, else by solve. */
@@ -116,8 +118,9 @@ static void sit_down(bench *b, const loop_job *job, int lane, int slot) {
 #if LANES == 1
   b->parameters = (lanes *) given;
 #else
-  for (k = 0; k < N_PARAMETERS; ++k) LANE(b->parameters, k, lane) = given[k];
+  for (k = 0; k < N_SEATED; ++k) LANE(b->parameters, k, lane) = given[k];
 #endif
+  b->own[lane] = given;
   b->slot[lane] = slot;
 }
 
@@ -296,6 +299,7 @@ EXPORT LANES_TARGET int casadi_ik_loop(loop_job *job) {
       if (b.outcome != DONE) break;
       space.arg[0] = (const real *) b.now;
       space.arg[1] = (const real *) b.parameters;
+      space.arg[2] = (const real *) b.own;
       space.res[0] = (real *) b.next;
       space.res[1] = job->rows ? (real *) b.record : NULL;
       space.res[2] = (real *) &code;

@@ -21,7 +21,7 @@
 /* The numbers of one lane. */
 typedef struct {
   double *x, *y, *said;
-  const double *p;
+  const double *p, *own;       /* parameters; the same in a row, with the postures */
 } solve;
 
 #define X(field) s.x[STATE_##field * WIDTH]
@@ -81,7 +81,7 @@ static int after_start(solve s) {
 static void before_candidate(solve s, double *hand) {
   const int last = N_CANDIDATES - 1, at = X(CANDIDATE) < last ? (int) X(CANDIDATE) : last;
   int i;
-  for (i = 0; i < N_HAND; ++i) hand[i * WIDTH] = ENTRY(P(POSTURES), at * N_HAND + i);
+  for (i = 0; i < N_HAND; ++i) hand[i * WIDTH] = s.own[PARAMETERS_POSTURES + at * N_HAND + i];
 }
 
 static int after_candidate(solve s) {
@@ -213,23 +213,25 @@ static int after_balance(solve s) {
   return to_next_candidate(s);
 }
 
-static solve solve_in(int lane, real *x, const real *p, real *y, real *said) {
+static solve solve_in(int lane, real *x, const real *p, const double *own, real *y, real *said) {
   solve s;
   s.x = (double *) x + lane;
   s.p = (const double *) p + lane;
+  s.own = own;
   s.y = (double *) y + lane;
   s.said = (double *) said + lane;
   return s;
 }
 
 /* The iteration; `wanted` has a bit for each lane in which there is a solve. */
-CODE void iterate(real *x, const real *p, real *y, real *record, real *status, int wanted) {
+CODE void iterate(real *x, const real *p, const double *const *own, real *y, real *record, real *status,
+                  int wanted) {
   real said[N_SAID], hand[N_HAND + 1];
   int lane = 0, stage;
   while (!(wanted >> lane & 1)) ++lane;
-  stage = (int) solve_in(lane, x, p, y, said).x[STATE_PHASE * WIDTH];
+  stage = (int) solve_in(lane, x, p, own[lane], y, said).x[STATE_PHASE * WIDTH];
 #define EACH for (lane = 0; lane < WIDTH; ++lane) if (wanted >> lane & 1)
-#define SOLVE solve_in(lane, x, p, y, said)
+#define SOLVE solve_in(lane, x, p, own[lane], y, said)
   if (stage == CANDIDATE_STAGE) EACH before_candidate(SOLVE, (double *) hand + lane);
 #if N_STARTS
   if (stage == ARM_STEPS_STAGE) EACH before_arm_steps(SOLVE);

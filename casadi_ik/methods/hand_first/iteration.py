@@ -7,7 +7,7 @@ decides as iteration.c does.
 from __future__ import annotations
 
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from casadi_ik.kernels.codegen import define, define_arrays, number, row_major
 from casadi_ik.kernels.function_kernel import BufferedFunction
 from casadi_ik.methods.common.contact_fit import BALANCE, FIT, fresh_fit
 from casadi_ik.methods.common.numeric_arm import STARTS, start_table
-from casadi_ik.methods.hand_first.state import PLACES, STAGES, Stage
+from casadi_ik.methods.hand_first.state import PLACES, SAID, Stage
 from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.problem.status import Status
 
@@ -33,8 +33,6 @@ WHOLE = 0.5
 
 def text(step: HandFirstStep) -> str:
     """The text of iteration.c with its constants for a robot."""
-    from casadi_ik.methods.hand_first.step import SAID
-
     layouts, robot = step.layouts, step.robot
     numeric = Stage.ARM_STEPS in step.functions
     whole = {
@@ -123,8 +121,6 @@ class Iteration:
 
     def __call__(self) -> bool:
         """One iteration; False if a function reports a failure."""
-        from casadi_ik.methods.hand_first.step import SAID
-
         stage = Stage(int(self._x["phase"][()]))
         if stage == Stage.ARM_STEPS:
             self._begin_arm()
@@ -291,6 +287,3 @@ class Iteration:
                 put(least=min(said["cost"], x["least"]))
                 return to_next_candidate()
         raise AssertionError(stage)
-
-
-assert len(STAGES) == len(set(PLACES.values()))

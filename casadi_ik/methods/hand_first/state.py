@@ -42,7 +42,7 @@ STAGES = (
 
 
 class Stage(IntEnum):
-    """What a solve does next: `phase` of the state. Codes are those of `Phase` where it has them."""
+    """What a solve does next, `phase` of the state; where `Phase` has it by its code."""
 
     START = 0
     REFINEMENT = Phase.REFINEMENT
@@ -53,6 +53,17 @@ class Stage(IntEnum):
     ARM_CHOICE = Phase.ARM_CHOICE
     ARM_STEPS = max(Phase) + 1
 
+
+SAID = Layout(
+    (
+        Field("settled", doc="whether the fit or the balance is at its end"),
+        Field("within", doc="whether contacts are within tolerance; of an arm, within its bounds"),
+        Field("near", doc="whether it misses by little; of an arm, whether it is the real one"),
+        Field("cost", doc="before a fit of the hand; of an arm's step; largest part of a balance"),
+        Field("at_end", doc="joint of the arm, from 1, to be sent to the other end; 0: none"),
+    )
+)
+"""What a stage says of where it leads."""
 
 PLACES = {stage: STAGES.index(Phase(stage)) for stage in Stage if stage in STAGES} | {
     Stage.START: STAGES.index(Phase.REFINEMENT),

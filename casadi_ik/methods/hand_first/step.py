@@ -23,7 +23,6 @@ from casadi_ik.arms.family import ArmFamily
 from casadi_ik.arms.search import PARAMETERS, ArmTrials, Farthest, Nearest, is_allowed
 from casadi_ik.kernels.codegen import Stages
 from casadi_ik.kernels.graphs import StepGraph, recipe
-from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.methods.common.contact_fit import (
     Tried,
     WholeStep,
@@ -43,7 +42,7 @@ from casadi_ik.methods.common.numeric_arm import (
 from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
 from casadi_ik.methods.hand_first import iteration
 from casadi_ik.methods.hand_first.hand_fit import PalmAndHand, fit_step
-from casadi_ik.methods.hand_first.state import HandFirstLayouts, Stage, with_rows
+from casadi_ik.methods.hand_first.state import SAID, HandFirstLayouts, Stage, with_rows
 from casadi_ik.problem.contacts import LENGTH, Kinds, chord, suffix, within_tolerance
 from casadi_ik.problem.status import Phase
 from casadi_ik.robots.description import RobotDescription
@@ -53,17 +52,6 @@ from casadi_ik.symbolic.smooth import Expr, shared
 BEFORE_THE_ARM = 0.999
 """Part of the tolerances that a hand is fitted to: the arm that follows it adds its rounding, which
 at 1e-6 has made an answer of 1.0000006e-6."""
-
-SAID = Layout(
-    (
-        Field("settled", doc="whether the fit or the balance is at its end"),
-        Field("within", doc="whether contacts are within tolerance; of an arm, within its bounds"),
-        Field("near", doc="whether it misses by little; of an arm, whether it is the real one"),
-        Field("cost", doc="before a fit of the hand; of an arm's step; largest part of a balance"),
-        Field("at_end", doc="joint of the arm, from 1, to be sent to the other end; 0: none"),
-    )
-)
-"""What a stage says of where it leads."""
 
 
 class HandFirstStep:
@@ -101,6 +89,7 @@ class HandFirstStep:
             layouts.record,
             stage="phase",
             recipe=recipe(name, self.robot, layouts.candidates, layouts.kinds),
+            apart="postures",
             virtual=lambda: iteration.Iteration(self),
         )
 
@@ -152,7 +141,11 @@ class HandFirstStep:
         layouts = self.layouts
         state = kind.sym("state", layouts.state.size)
         parameters = kind.sym("parameters", layouts.parameters.size)
-        return [state, parameters], layouts.state.unpack(state), layouts.parameters.unpack(parameters)
+        return (
+            [state, parameters],
+            layouts.state.unpack(state),
+            layouts.parameters.unpack(parameters),
+        )
 
     def _function(
         self,
@@ -261,9 +254,7 @@ class HandFirstStep:
         return ca.Function("arm_choice", inputs, list(outputs))
 
     def _kept(self, stage: Stage, search: ArmTrials) -> ca.Function:
-        """Keep the best arm so far; the last input says whether it brings the palm where it was
-        asked for.
-        """
+        """Keep the best arm so far; the last input says whether it is the real one."""
         inputs, s, p = self._vectors()
         columns, near = self.robot.arm_actuators, search.is_nearest
         arm = ca.SX.sym("arm", len(columns))
@@ -286,7 +277,8 @@ class HandFirstStep:
             "swivel": ca.if_else(better, swivel, s["swivel"]),
         }
         phase = Phase.ARM_CHOICE if near else Phase.ARM_PLACEMENT
-        record = self.layouts.row(s, p, q, phase, **({} if near else {"margin": best_score}))
+        margin = float("nan") if near else best_score
+        record = self.layouts.row(s, p, q, phase, margin=margin)
         said = {"within": allowed, "near": hits}
         given = [*inputs, arm, score, swivel, hits]
         return self._function(stage, given, s, changed, said, record)
