@@ -222,11 +222,10 @@ class SolverSources:
             self._part("begin", "map", plan.begin),
             self._part("solve", "loop", plan.solve, loop, 2 * n_state),
             self._part("contacts", "map", plan.contacts),
-            self._part("valley", "map", plan.seeds.valley),
             self._part("judge", "map", plan.judge),
         )
         if plan.mends:
-            parts += (self._part("each_finger", "map", plan.seeds.each_finger),)
+            parts += (self._part("seen", "map", plan.seeds.seen),)
         return parts + self._scene_parts()
 
     def _scene_parts(self) -> tuple[Part, ...]:

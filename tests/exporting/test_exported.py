@@ -209,9 +209,9 @@ def test_other_hands_are_looked_at_as_in_python(tmp_path):
 @needs_gcc
 def test_no_state_outside_the_struct(plain_project):
     project = plain_project
-    compiled(project, "-O1", "-c", "src/arm_look_up.c", "src/arm_solver.c", "src/arm_valley.c")
+    compiled(project, "-O1", "-c", "src/arm_look_up.c", "src/arm_solver.c", "src/arm_judge.c")
     listed = subprocess.run(
-        ["nm", "-P", "arm_look_up.o", "arm_solver.o", "arm_valley.o"],
+        ["nm", "-P", "arm_look_up.o", "arm_solver.o", "arm_judge.o"],
         cwd=project,
         capture_output=True,
         text=True,

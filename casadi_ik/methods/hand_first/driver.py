@@ -23,15 +23,15 @@ from casadi_ik.errors import KernelError
 from casadi_ik.grasps.grasp import LARGE, SMALL, UNIT
 from casadi_ik.kernels import REPEATED, RUNNING, FunctionKernel, LoopKernel
 from casadi_ik.kernels.cancellation import SLICE, DriverCode, check
-from casadi_ik.kernels.codegen import define, define_arrays, driver_text, number
-from casadi_ik.kernels.function_kernel import memory
+from casadi_ik.kernels.codegen import LOOPS, WIDE, define, define_arrays, driver_text, number
+from casadi_ik.kernels.function_kernel import machine_lanes, memory
 from casadi_ik.kernels.graphs import recipe
 from casadi_ik.kernels.libraries import load_library
 from casadi_ik.kernels.loop import SLOTS, UNBEGUN, Followed
 from casadi_ik.made import made
 from casadi_ik.methods.common.contact_fit import fresh_fit
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
-from casadi_ik.methods.hand_first.seeds import Seeds
+from casadi_ik.methods.hand_first.seeds import FEATURES, Seeds
 from casadi_ik.methods.hand_first.state import (
     CARRIED,
     STAGE_LABELS,
@@ -60,8 +60,7 @@ KERNELS = {
     "begin": "map_job",
     "solve": "loop_job",
     "contacts": "map_job",
-    "valley": "map_job",
-    "each_finger": "map_job",
+    "seen": "map_job",
     "judge": "map_job",
 }
 """The compiled functions it calls, and what they work on."""
@@ -125,10 +124,9 @@ class SearchPlan:
             "begin": self.begin,
             "solve": self.solve,
             "contacts": self.contacts,
-            "valley": seeds.valley,
             "judge": self.judge,
         }
-        return found | ({"each_finger": seeds.each_finger} if self.mends else {})
+        return found | ({"seen": seeds.seen} if self.mends else {})
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -233,6 +231,7 @@ class SearchPlan:
             "ALL_ROUNDS": self.rounds,
             "FIRST_RUGGED": self.options.first_rugged,
             "MENDS": int(self.mends),
+            "FINGER_FEATURES": FEATURES,
             "ENFORCE_LIMITS": int(self.enforce_limits),
             "HAS_ARM": int(bool(robot.arm_actuators)),
             "N_CARRIED": len(self._carried),
@@ -294,10 +293,27 @@ class SearchPlan:
             "ALL_STEPS": even_steps(len(robot.actuators)),
             "ANYWHERE_LOWER": lower,
             "ANYWHERE_RANGE": upper - lower,
+            **(self._finger_tables() if self.mends else {}),
             "TABLE_LOWER": np.array([spread.lower[hand] for spread in spreads]),
             "TABLE_RANGE": np.array([(spread.upper - spread.lower)[hand] for spread in spreads]),
             "TABLE_SQUEEZE": np.array([1 - spread.at_limits for spread in spreads]),
             "TABLE_ROWS": np.array([spread.count for spread in spreads]),
+        }
+
+    def _finger_tables(self) -> dict[str, NDArray[Any]]:
+        """Those by which postures are mended, filled up with zeros."""
+        tables = self.seeds.fingers
+        most = max(len(table.places) for table in tables)
+        places = np.zeros((len(tables), most), dtype=np.int64)
+        postures = np.zeros((len(tables), len(tables[0].postures), most))
+        for i, table in enumerate(tables):
+            places[i, : len(table.places)] = table.places
+            postures[i, :, : len(table.places)] = table.postures
+        return {
+            "FINGER_MOTORS": np.array([len(table.places) for table in tables]),
+            "FINGER_PLACES": places,
+            "FINGER_POSTURES": postures,
+            "FINGER_TIPS": np.array([table.features for table in tables]),
         }
 
 
@@ -549,6 +565,8 @@ def _text(plan: SearchPlan) -> str:
     codes = {code.name: int(code) for code in DriverCode} | {"MALFORMED": MALFORMED}
     return "".join(
         (
+            WIDE if machine_lanes() else "",
+            LOOPS,
             "#include <math.h>\n#include <stdint.h>\n#include <string.h>\n",
             define(codes | {"FOREVER": FOREVER}),
             *jobs,

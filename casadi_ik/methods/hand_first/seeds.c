@@ -8,8 +8,8 @@
  * next round begins along it, to either side of the best fit so far. Or no table holds its like:
  * then postures drawn from anywhere follow, and a whole configuration of arm and hand.
  *
- * The kernels are called by the macros LOOK_UP, CONTACTS, VALLEY and EACH_FINGER (if MENDS), which
- * take a pointer to a job of the drivers; the constants come from driver.py.
+ * The kernels are called by the macros LOOK_UP, CONTACTS and SEEN (if MENDS), which take a pointer to
+ * a job of the drivers; the constants come from driver.py.
  */
 
 #ifndef NUDGE
@@ -17,6 +17,10 @@
 #endif
 #define AT_END 1e-6            /* this near to a limit [rad or m] a motor stays there in a valley */
 #define HELD 1e6               /* what holds it, in a matrix of squared slopes of order one */
+#define FLAT 1e-12             /* squared slope below which directions are alike */
+#define DEPENDENT 1e-9         /* part of a direction that must be left for it to be one of its own */
+#define SQUARINGS 7            /* the flattest one then counts (ratio of squared slopes)^128 times */
+#define GOLDEN 0.6180339887
 
 static const int64_t ALONE[] = {0, 0, 0, 0, 0, 0, 0, 0};
 
@@ -74,23 +78,52 @@ static double apart(const double *one, const double *other) {
 }
 
 #if MENDS
-/* Every finger of the pool's postures chosen by itself; those of which least is left come first. */
-static int mend(search *job, int64_t pool) {
-  static const int64_t in[] = {0, 0, N_HAND}, out[] = {N_HAND, 1};
+/* A table of whole hands is thin where there are many motors: of 16 motors thousands of postures are
+ * fewer than two for each. Seen from a palm, though, the fingers know nothing of each other, and a
+ * small table of every finger together stands for all combinations of its rows. So a posture is
+ * mended in turns: the palm pose that suits it best, then for that pose the best row of each finger.
+ * `left` is what is left of its contacts' squared errors with the best palm. */
+static int mend_one(search *job, double *hand, double *left) {
+  double wanted[FINGER_FEATURES * N_FINGERS], own[N_FINGERS], distance[FINGER_ROWS];
   const double *inputs[3];
-  double *outputs[2];
-  map_job map = mapping(pool, inputs, in, outputs, out);
-  int64_t i, place;
-  int code;
+  double *outputs[3];
+  int turn, finger, i, k, code;
   inputs[0] = job->points;
   inputs[1] = job->normals;
-  inputs[2] = job->near;
-  outputs[0] = job->mended;
-  outputs[1] = job->left;
-  do code = EACH_FINGER(&map);
-  while (code == SLICE_OVER);
-  if (code != DONE) return code;
+  inputs[2] = hand;
+  outputs[0] = wanted;
+  outputs[1] = own;
+  outputs[2] = left;
+  for (turn = 0; turn <= FINGER_TURNS; ++turn) {
+    map_job map = mapping(1, inputs, ALONE, outputs, ALONE);
+    code = SEEN(&map);
+    if (code != DONE) return code;
+    for (finger = 0; turn < FINGER_TURNS && finger < N_FINGERS; ++finger) {
+      int best = 0;
+      for (i = 0; i < FINGER_ROWS; ++i) distance[i] = 0.0;
+      for (k = 0; k < FINGER_FEATURES; ++k) {
+        const double factor = wanted[k * N_FINGERS + finger];
+        for (i = 0; i < FINGER_ROWS; ++i) distance[i] += FINGER_TIPS[finger][k][i] * factor;
+      }
+      for (i = 1; i < FINGER_ROWS; ++i) {
+        if (distance[i] < distance[best]) best = i;
+      }
+      if (!(distance[best] < own[finger])) continue;
+      for (k = 0; k < FINGER_MOTORS[finger]; ++k) {
+        hand[FINGER_PLACES[finger][k]] = FINGER_POSTURES[finger][best][k];
+      }
+    }
+  }
+  return DONE;
+}
+
+/* The pool's postures mended; those of which least is left come first. */
+static int mend(search *job, int64_t pool) {
+  int64_t i, place;
+  memcpy(job->mended, job->near, (size_t) pool * N_HAND * sizeof(double));
   for (i = 0; i < pool; ++i) {
+    const int code = mend_one(job, job->mended + i * N_HAND, job->left + i);
+    if (code != DONE) return code;
     for (place = i; place > 0 && job->left[i] < job->left[job->found[place - 1]]; --place) {
       job->found[place] = job->found[place - 1];
     }
@@ -262,12 +295,81 @@ static int find_slopes(search *job, const double *q) {
   return DONE;
 }
 
+static double product(const double *one, const double *other, int count) {
+  double sum = 0.0;
+  int i;
+  for (i = 0; i < count; ++i) sum += one[i] * other[i];
+  return sum;
+}
+
+/* What is left of a vector beside a direction. */
+static void without(double *vector, const double *direction, int count) {
+  const double along = product(vector, direction, count);
+  int i;
+  for (i = 0; i < count; ++i) vector[i] -= along * direction[i];
+}
+
+/* The direction in which the hand moves while its contacts hardly do, the palm following as well as
+ * it can; 1 for the motor that moves most. The slopes change on the way. */
+static void find_valley(search *job) {
+  const int rows = 6 * N_FINGERS;
+  double square[N_HAND * N_HAND + 1], inverse[N_HAND * N_HAND + 1], most = 0.0;
+  int i, j, k, m, turn;
+  for (i = 0; i < 6; ++i) {
+    double *base = job->rigid + i * rows;
+    const double whole = sqrt(product(base, base, rows));
+    double left;
+    for (j = 0; j < i; ++j) without(base, job->rigid + j * rows, rows);
+    left = sqrt(product(base, base, rows));
+    /* One that depends on those before is none. */
+    for (k = 0; k < rows; ++k) base[k] = left > DEPENDENT * whole ? base[k] / left : 0.0;
+    for (k = 0; k < N_HAND; ++k) without(job->slopes + k * rows, base, rows);
+  }
+  /* The inverse of the squares' matrix, by elimination in place: it is positive definite. */
+  for (i = 0; i < N_HAND; ++i) {
+    for (j = 0; j < N_HAND; ++j) {
+      inverse[i * N_HAND + j] = product(job->slopes + i * rows, job->slopes + j * rows, rows)
+                              + (i == j ? job->held[i] + FLAT : 0.0);
+    }
+  }
+  for (k = 0; k < N_HAND; ++k) {
+    const double pivot = 1.0 / inverse[k * N_HAND + k];
+    inverse[k * N_HAND + k] = 1.0;
+    for (j = 0; j < N_HAND; ++j) inverse[k * N_HAND + j] *= pivot;
+    for (i = 0; i < N_HAND; ++i) {
+      const double factor = inverse[i * N_HAND + k];
+      if (i == k) continue;
+      inverse[i * N_HAND + k] = 0.0;
+      for (j = 0; j < N_HAND; ++j) inverse[i * N_HAND + j] -= factor * inverse[k * N_HAND + j];
+    }
+  }
+  /* With every squaring the largest eigenvalue stands out twice as much. */
+  for (turn = 0; turn < SQUARINGS; ++turn) {
+    double trace = 0.0;
+    for (i = 0; i < N_HAND; ++i) trace += inverse[i * N_HAND + i];
+    for (i = 0; i < N_HAND * N_HAND; ++i) square[i] = inverse[i] / trace;
+    for (i = 0; i < N_HAND; ++i) {
+      for (j = 0; j < N_HAND; ++j) {
+        double sum = 0.0;
+        for (m = 0; m < N_HAND; ++m) sum += square[i * N_HAND + m] * square[m * N_HAND + j];
+        inverse[i * N_HAND + j] = sum;
+      }
+    }
+  }
+  /* Of any vector that no symmetry of a hand makes orthogonal to the direction. */
+  for (k = 0; k < N_HAND; ++k) {
+    job->motion[k] = 0.0;
+    for (j = 0; j < N_HAND; ++j) {
+      job->motion[k] += inverse[k * N_HAND + j] * (0.5 + even(j, GOLDEN));
+    }
+    if (fabs(job->motion[k]) > most) most = fabs(job->motion[k]);
+  }
+  for (k = 0; k < N_HAND; ++k) job->motion[k] /= most;
+}
+
 /* Postures to either side of a fit that came to rest. */
 static int along_valley(search *job, int64_t which) {
   const double *q = job->last + STATE_BEST_Q;
-  const double *inputs[3];
-  double *outputs[1];
-  map_job map = mapping(1, inputs, ALONE, outputs, ALONE);
   int code = find_slopes(job, q), i, k;
   if (code != DONE) return code;
   for (k = 0; k < N_HAND; ++k) {
@@ -275,12 +377,7 @@ static int along_valley(search *job, int64_t which) {
     const double end = below < above ? below : above;
     job->held[k] = which % 2 == 0 && end < AT_END ? HELD : 0.0;
   }
-  inputs[0] = job->rigid;
-  inputs[1] = job->slopes;
-  inputs[2] = job->held;
-  outputs[0] = job->motion;
-  code = VALLEY(&map);
-  if (code != DONE) return code;
+  find_valley(job);
   for (i = 0; i < N_CANDIDATES; ++i) {
     for (k = 0; k < N_HAND; ++k) {
       const double step = job->motion[k] * SIZE[k];

@@ -21,7 +21,6 @@ from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.even_spread import evenly
 from casadi_ik.symbolic.kinematics import actuated
-from casadi_ik.symbolic.linear_algebra import solve_spd
 from casadi_ik.symbolic.se3 import align
 from casadi_ik.symbolic.smooth import Expr, shared
 
@@ -30,16 +29,6 @@ FEATURES = 8
 
 ROOM = 1e-12
 """Smallest sum of weights that is divided by."""
-
-
-FLAT = 1e-12
-"""Squared slope below which directions are alike."""
-
-DEPENDENT = 1e-9
-"""Part of a column that must be left for it to be a direction of its own."""
-
-SQUARINGS = 7
-"""Of the inverse: the flattest direction then counts (ratio of squared slopes)^128 times."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,9 +118,16 @@ class Seeds:
         return self._options.is_many(robot) and len(fingers) > 1 and len(hand) == len(set(hand))
 
     @cached_property
-    def each_finger(self) -> FunctionKernel:
-        """Mends postures of such a hand."""
-        return FunctionKernel(each_finger(self._robot.description, self._options), self._compiled)
+    def seen(self) -> FunctionKernel:
+        """What mending asks of a posture of such a hand."""
+        return FunctionKernel(seen(self._robot.description), self._compiled)
+
+    @property
+    def fingers(self) -> list[FingerRows]:
+        """Tables of such a hand's fingers."""
+        robot = self._robot.description
+        tips, count = _tips(robot), len(robot.finger_names)
+        return [_rows(robot, tips, finger, self._options) for finger in range(count)]
 
     @property
     def pool(self) -> int:
@@ -140,12 +136,6 @@ class Seeds:
         wanted = options.candidates * max(options.rounds - 1, 1)
         fresh = max(options.fresh_pool, options.late_pool) if self.mends else 0
         return max(options.pool * wanted, fresh)
-
-    @cached_property
-    def valley(self) -> FunctionKernel:
-        """Finds the direction in which the contacts move least, from their slopes."""
-        rows = 6 * len(self._robot.fingers)
-        return FunctionKernel(valley(rows, len(self._hand)), self._compiled)
 
     def strides(self, which: int) -> Array:
         """(candidates,) how far the hands of a round begin along their valley."""
@@ -183,7 +173,7 @@ class FingerRows:
     Attributes:
         places: Of its motors among the hand's.
         postures: (t, m).
-        features: (t, `FEATURES`).
+        features: (`FEATURES`, t) of the tip.
     """
 
     places: tuple[int, ...]
@@ -191,64 +181,20 @@ class FingerRows:
     features: Array
 
 
-def each_finger(robot: RobotDescription, options: HandFirstParameters) -> FunctionGraph:
-    """Mends hand postures for a target: every finger by itself takes the posture that fits best.
-
-    A table of whole hands is thin where there are many motors: of 16 motors thousands of postures
-    are fewer than two for each. Seen from a palm, though, the fingers know nothing of each other,
-    and a small table of every finger together stands for all combinations of its rows. So a posture
-    is mended in turns: the palm pose that suits it best, then for that pose the best row of each
-    finger.
-
-    Args:
-        robot: Its fingers have motors of their own.
-        options: How many postures a finger has, and how often it is chosen.
+def seen(robot: RobotDescription) -> FunctionGraph:
+    """A target seen from the palm pose that suits a posture best.
 
     Returns:
-        points (f, 3) [m] and normals (f, 3), NaN where free, posture (hand, 1) -> the posture
-        mended, (hand, 1), and what is left of its contacts' squared errors with the best palm.
+        points (f, 3) [m] and normals (f, 3), NaN where free, posture (hand, 1) -> what the rows of
+        a finger's table are multiplied with (`FEATURES`, f) for their squared distances, without
+        the part that all rows share; these distances of the posture itself (f, 1), without that
+        part; their sum with it.
     """
     f, hand = len(robot.finger_names), len(robot.hand_actuators)
-    name = ca.Function.fix_name(f"each_finger_{robot.name}")
+    name = ca.Function.fix_name(f"seen_{robot.name}")
     inputs = {"points": (f, 3), "normals": (f, 3), "posture": (hand, 1)}
-    outputs = ((hand, 1), (1, 1))
-    return FunctionGraph(
-        name,
-        lambda: _each_finger(name, robot, options),
-        inputs,
-        outputs,
-        recipe(name, robot, options),
-        loops=True,
-    )
-
-
-def _each_finger(name: str, robot: RobotDescription, options: HandFirstParameters) -> ca.Function:
-    f, hand = len(robot.finger_names), len(robot.hand_actuators)
-    points, normals = ca.MX.sym("points", f, 3), ca.MX.sym("normals", f, 3)
-    posture = ca.MX.sym("posture", hand)
-    tips = _tips(robot)
-    seen = _seen(robot, tips)
-    tables = [_rows(robot, tips, finger, options) for finger in range(f)]
-    choices = [_row(table.postures) for table in tables]
-    q = posture
-    for _ in range(options.finger_turns):
-        wanted, own, _ = seen(points, normals, q)
-        mended = ca.MX(q)
-        for finger, table in enumerate(tables):
-            distances = ca.DM(table.features) @ wanted[:, finger]
-            least = ca.mmin(distances)
-            row = choices[finger](ca.find(distances <= least))
-            places = list(table.places)
-            mended[places] = ca.if_else(least < own[finger], row, q[places])
-        q = mended
-    _, _, left = seen(points, normals, q)
-    return ca.Function(name, [points, normals, posture], [ca.densify(q), ca.densify(left)])
-
-
-def _row(postures: Array) -> ca.Function:
-    """Number -> the posture (m, 1): a branch for each, which costs less than a product with all."""
-    rows = [ca.Function("row", [], [ca.SX(row)]) for row in postures]
-    return ca.Function.conditional("posture", rows[:-1], rows[-1])
+    outputs = ((FEATURES, f), (f, 1), (1, 1))
+    return FunctionGraph(name, lambda: _seen(name, robot), inputs, outputs, recipe(name, robot))
 
 
 def _tips(robot: RobotDescription) -> ca.Function:
@@ -267,18 +213,11 @@ def _tips(robot: RobotDescription) -> ca.Function:
     return ca.Function("tips", [hand], [ca.densify(ca.horzcat(*columns))])
 
 
-def _seen(robot: RobotDescription, tips: ca.Function) -> ca.Function:
-    """The target seen from the palm pose that suits a posture best.
-
-    Returns:
-        points, normals, posture -> what the rows of a table are multiplied with (`FEATURES`, f)
-        for their squared distances, without the part that all rows share; these distances of the
-        posture itself (f, 1), without that part; their sum with it.
-    """
+def _seen(name: str, robot: RobotDescription) -> ca.Function:
     f = len(robot.finger_names)
     points, normals = ca.SX.sym("points", f, 3), ca.SX.sym("normals", f, 3)
     hand = ca.SX.sym("posture", len(robot.hand_actuators))
-    here = tips(hand)
+    here = _tips(robot)(hand)
     weights = [[_known(part[i, 0]) for part in (points, normals)] for i in range(f)]
     goals = [
         [ca.if_else(w, part[i, :].T, 0.0) for w, part in zip(weights[i], parts, strict=True)]
@@ -300,7 +239,7 @@ def _seen(robot: RobotDescription, tips: ca.Function) -> ca.Function:
         own.append(ca.dot(factors, _features(here[:, i])))
         cost += own[i] + w_point * ca.sumsqr(point) + w_normal * ca.sumsqr(normal)
     outputs = ca.horzcat(*wanted), ca.vertcat(*own), cost
-    return ca.Function("seen", [points, normals, hand], shared(*outputs))
+    return ca.Function(name, [points, normals, hand], shared(*outputs))
 
 
 def _features(tip: Expr) -> Expr:
@@ -320,74 +259,9 @@ def _rows(
     postures[places] = (lower + np.clip(spread, 0.0, 1.0) * (upper - lower)).T
     columns = np.array(tips.map(count)(postures)).reshape(6, count, -1)[:, :, finger]
     squares = [np.square(part).sum(axis=0) for part in (columns[:3], columns[3:])]
-    return FingerRows(tuple(places), postures[places].T, np.vstack([columns, *squares]).T)
+    return FingerRows(tuple(places), postures[places].T, np.vstack([columns, *squares]))
 
 
 def _known(x: Expr) -> Expr:
     """1 where x is a number, 0 where NaN; written so that it is not simplified to 1."""
     return ca.logic_or(x <= 0, x > 0)
-
-
-def valley(rows: int, hand: int) -> FunctionGraph:
-    """The direction in which a hand moves while its contacts hardly do, the palm following.
-
-    Args:
-        rows: How many numbers the contacts have.
-        hand: How many motors the hand has.
-
-    Returns:
-        slopes (6, rows) of the contacts as the palm moves as a whole, zero for a palm that cannot;
-        slopes (hand, rows) as the motors do; what holds each motor (hand, 1), squared -> (hand, 1)
-        motion of the motors, 1 for the one that moves most.
-    """
-    name = f"valley_{rows}_{hand}"
-    inputs = {"rigid": (6, rows), "slopes": (hand, rows), "held": (hand, 1)}
-    return FunctionGraph(
-        name, lambda: _valley(name, rows, hand), inputs, ((hand, 1),), recipe(name)
-    )
-
-
-def _valley(name: str, rows: int, hand: int) -> ca.Function:
-    """As operations on whole matrices: unrolled they would be tens of thousands."""
-    rigid, given = ca.MX.sym("rigid", 6, rows), ca.MX.sym("slopes", hand, rows)
-    held, slopes = ca.MX.sym("held", hand), given.T
-    if not hand:  # a tool
-        return ca.Function(name, [rigid, given, held], [ca.MX(0, 1)])
-    # The palm follows as well as it can: what is left of a motor's motion counts.
-    for base in _orthonormal(rigid.T):
-        slopes = slopes - base @ (base.T @ slopes)
-    inverse = _inverse(hand)(slopes.T @ slopes + ca.diag(held + FLAT))
-    # With every squaring the largest eigenvalue stands out twice as much.
-    for _ in range(SQUARINGS):
-        inverse = inverse / ca.trace(inverse)
-        inverse = inverse @ inverse
-    # Any vector that no symmetry of a hand makes orthogonal to the direction.
-    first = ca.DM((1 + np.arange(hand) * 0.6180339887 % 1.0).tolist())
-    direction = inverse @ first
-    motion = direction / ca.norm_inf(direction)
-    return ca.Function(name, [rigid, given, held], [ca.densify(motion)])
-
-
-def _inverse(n: int) -> ca.Function:
-    """(n, n) -> its inverse, of a symmetric positive definite matrix."""
-    a, b = ca.SX.sym("a", n, n), ca.SX.sym("b", n)
-    one = ca.Function("one", [a, b], [solve_spd(a, b)])
-    matrix = ca.MX.sym("matrix", n, n)
-    columns = ca.MX(ca.DM.eye(n))
-    return ca.Function(
-        "inverse", [matrix], [one.map("columns", "serial", n, [0], [])(matrix, ca.densify(columns))]
-    )
-
-
-def _orthonormal(columns: Expr) -> list[Expr]:
-    """Orthonormal columns that span the same, zero for one that depends on those before."""
-    found: list[Expr] = []
-    for i in range(columns.shape[1]):
-        column = columns[:, i]
-        whole = ca.norm_2(column)
-        for base in found:
-            column = column - base * ca.dot(base, column)
-        left = ca.norm_2(column)
-        own = left > DEPENDENT * whole
-        found.append(column * ca.if_else(own, 1 / ca.if_else(own, left, 1.0), 0.0))
-    return found
