@@ -142,7 +142,12 @@ def test_evenly(dimensions):
     np.testing.assert_array_equal(points[:10], evenly(10, dimensions))
 
 
-def test_later_rounds_begin_from_hands_that_differ(robot, method, rng):
+def target(robot, rng, count):
+    return Problems(*robot.contacts(robot.random(rng, count)), ik.Tolerance(), True)
+
+
+def test_later_rounds_begin_from_hands_that_differ(robot, rng):
+    method = HandFirstMethod(robot.description, HandFirstParameters())
     asked = target(robot, rng, 60)
     first, second = (method.postures(asked, number) for number in (0, 1))
     ranges = (robot.upper - robot.lower)[list(HAND)]
