@@ -143,7 +143,7 @@ def test_evenly(dimensions):
 
 
 def target(robot, rng, count):
-    return Problems(*robot.contacts(robot.random(rng, count)), ik.Tolerance(), True)
+    return TargetBatch(*robot.contacts(robot.random(rng, count)), ik.Tolerance(), True)
 
 
 def test_later_rounds_begin_from_hands_that_differ(robot, rng):
