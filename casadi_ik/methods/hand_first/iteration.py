@@ -47,7 +47,8 @@ def text(step: HandFirstStep) -> str:
     }
     whole |= {f"{stage.name}_STAGE": int(stage) for stage in Stage}
     whole |= {f"{status.name}_STATUS": int(status) for status in Status}
-    placements, choices = step.placements, step.choices
+    trials = ("PLACEMENTS", "ALL_PLACEMENTS", "CHOICES", "CHOICE_PATIENCE")
+    whole |= dict(zip(trials, step.trials, strict=True))
     whole |= {
         "N_SAID": SAID.size,
         "N_MOTORS": len(robot.actuators),
@@ -57,15 +58,11 @@ def text(step: HandFirstStep) -> str:
         "N_STARTS": len(start_table(robot)[0]) if numeric else 0,
         "MOST_STARTS": STARTS,
         "HAS_ARM": bool(robot.arm_actuators),
-        "HAS_FAMILY": placements is not None,
-        "HAS_CHOICE": choices is not None,
+        "HAS_FAMILY": step.placements is not None,
+        "HAS_CHOICE": step.choices is not None,
         "IS_COMPLETE": not numeric,
         "IS_EXACT": step.arm is not None and step.arm.exact,
         "NEAR_IS_SEARCHED": step.searched_if_near,
-        "PLACEMENTS": placements.trials if placements else 0,
-        "ALL_PLACEMENTS": placements.all_trials if placements else 0,
-        "CHOICES": choices.trials if choices else 0,
-        "CHOICE_PATIENCE": choices.patience if choices else 0,
     }
     numbers = {
         "LENGTH": LENGTH,
@@ -232,23 +229,18 @@ class Iteration:
                 following = Stage.ARM_CHOICE if chooses else placement()
                 return goes_to(following, ended if alone else Status.RUNNING)
             case Stage.ARM_PLACEMENT:
-                search = step.placements
-                assert search is not None
-                trials = search.all_trials if x["earlier"] > 0 else search.trials
-                if not within and y["spent"][()] < trials:
+                if not within and y["spent"][()] < step.trials[x["earlier"] > 0]:
                     return goes_to(Stage.ARM_PLACEMENT)
                 put(spent=0)
                 return with_arm(within and near and x["fits"] > 0)
             case Stage.ARM_CHOICE:
-                search = step.choices
-                assert search is not None
-                if y["spent"][()] < (search.trials if within else search.patience):
+                if y["spent"][()] < step.trials[2 if within else 3]:
                     return goes_to(Stage.ARM_CHOICE)
                 put(spent=0)
                 if not within:
                     put(margin=ARM_SEARCH.no_margin)
                     return goes_to(placement())
-                return with_arm(search.family.exact and x["fits"] > 0)
+                return with_arm(step.arm is not None and step.arm.exact and x["fits"] > 0)
             case Stage.ARM_STEPS:
                 exact = said["cost"] < FIT.exact * FIT.exact
                 sent = int(said["at_end"]) if settled and x["earlier"] > 0 else 0

@@ -113,6 +113,13 @@ class HandFirstStep:
         return ArmTrials(self.arm, Nearest.by_ranges(ranges))
 
     @cached_property
+    def trials(self) -> tuple[int, int, int, int]:
+        """Trials of a placement, of one in later rounds, of a choice, of one that finds nothing."""
+        far, near = self.placements, self.choices
+        of_placement = (far.trials, far.all_trials) if far else (0, 0)
+        return *of_placement, *((near.trials, near.patience) if near else (0, 0))
+
+    @cached_property
     def functions(self) -> dict[Stage, ca.Function]:
         """(state, parameters) -> state, `SAID`, record; a candidate's posture is a third input."""
         found = {
