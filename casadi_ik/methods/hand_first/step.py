@@ -113,7 +113,7 @@ class HandFirstStep:
         return ArmTrials(self.arm, Nearest.by_ranges(ranges))
 
     @cached_property
-    def trials(self) -> tuple[int, int, int, int]:
+    def trials(self) -> tuple[int, ...]:
         """Trials of a placement, of one in later rounds, of a choice, of one that finds nothing."""
         far, near = self.placements, self.choices
         of_placement = (far.trials, far.all_trials) if far else (0, 0)
