@@ -59,19 +59,21 @@ def define(constants: Mapping[str, int]) -> str:
     return "".join(f"#define {name} ({value})\n" for name, value in constants.items())
 
 
-def row_major(function: ca.Function) -> ca.Function:
+def row_major(function: Any) -> Any:
     """The same function with dense inputs and outputs whose memory is row by row.
 
     CasADi works on the nonzeros of matrices, column by column. Transposing inside the graph costs
     nothing in an SX graph and lets numpy memory go in and out as it is.
 
     Args:
-        function: Any CasADi Function.
+        function: Any CasADi Function, or stages.
 
     Returns:
-        The function itself where it is dense and has vectors only; otherwise a function of the
-        same name and argument names, in which an r x c matrix is declared c x r.
+        Stages, and the function itself where it is dense and has vectors only; otherwise a function
+        of the same name and argument names, in which an r x c matrix is declared c x r.
     """
+    if isinstance(function, Stages):
+        return function
     count_in, count_out = function.n_in(), function.n_out()
     shapes_in = [function.size_in(i) for i in range(count_in)]
     shapes_out = [function.size_out(i) for i in range(count_out)]

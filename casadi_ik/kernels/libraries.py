@@ -38,7 +38,7 @@ from casadi_ik.kernels.cancellation import (
     is_virtual,
     stop_if_cancelled,
 )
-from casadi_ik.kernels.codegen import library_source, row_major
+from casadi_ik.kernels.codegen import Stages, library_source, row_major
 from casadi_ik.kernels.compiler import (
     Compiler,
     UnloadableError,
@@ -70,7 +70,7 @@ class NotCachedError(Exception):
 
 def load_function(
     name: str,
-    build: Callable[[], ca.Function],
+    build: Callable[[], ca.Function | Stages],
     driver: str,
     symbol: str,
     recipe: str = "",

@@ -24,7 +24,7 @@ from casadi_ik.kernels.cancellation import (
     check,
     stop_if_cancelled,
 )
-from casadi_ik.kernels.codegen import Stages, c_struct, define, driver_text, row_major
+from casadi_ik.kernels.codegen import c_struct, define, driver_text, row_major
 from casadi_ik.kernels.function_kernel import BufferedFunction, doubles, machine_lanes, memory
 from casadi_ik.kernels.graphs import RUNNING, StepGraph
 from casadi_ik.kernels.layout import opaque, row_driver, split_rows, store_rows
@@ -385,8 +385,7 @@ class LoopKernel:
     @cached_property
     def function(self) -> Any:
         """The step, row-major, or its stages."""
-        function = self.step.function
-        return function if isinstance(function, Stages) else row_major(function)
+        return row_major(self.step.function)
 
     def run(
         self, states: Any, parameters: Any, max_iterations: int, trace: bool = False

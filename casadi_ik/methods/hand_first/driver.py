@@ -349,7 +349,8 @@ class Searches:
         robot = plan.layouts.robot
         self.plan = plan
         self._name = ca.Function.fix_name(f"hand_first_search_{robot.name}")
-        known = recipe(robot, plan.options, plan.layouts.kinds, plan.budget, plan.enforce_limits)
+        given = robot, plan.options, plan.layouts.kinds, plan.budget, plan.enforce_limits
+        known = recipe(*given, machine_lanes() > 0)
         library = load_library(self._name, lambda: _text(plan), "casadi_ik_search", known)
         if library is None:
             raise KernelError(f"{self._name}: the compiler that made the other kernels is gone")
