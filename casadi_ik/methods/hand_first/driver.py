@@ -350,8 +350,9 @@ class Searches:
         self.plan = plan
         self._name = ca.Function.fix_name(f"hand_first_search_{robot.name}")
         given = robot, plan.options, plan.layouts.kinds, plan.budget, plan.enforce_limits
-        known = recipe(*given, machine_lanes() > 0)
-        library = load_library(self._name, lambda: _text(plan), "casadi_ik_search", known)
+        wide = machine_lanes() > 0
+        known = recipe(*given, wide)
+        library = load_library(self._name, lambda: _text(plan, wide), "casadi_ik_search", known)
         if library is None:
             raise KernelError(f"{self._name}: the compiler that made the other kernels is gone")
         self._search: Any = library["casadi_ik_search"]
@@ -558,7 +559,7 @@ def _is_array(name: str, kind: str, length: int) -> bool:
     return bool(length) or (kind == "double" and name != "beyond")
 
 
-def _text(plan: SearchPlan) -> str:
+def _text(plan: SearchPlan, wide: bool) -> str:
     """The C text of the library."""
     jobs = (driver_text(name) for name in ("loop_job", "map_job", "lookup_job"))
     pointers = "".join(f"  int (*{name})({job} *);\n" for name, job in KERNELS.items())
@@ -566,7 +567,7 @@ def _text(plan: SearchPlan) -> str:
     codes = {code.name: int(code) for code in DriverCode} | {"MALFORMED": MALFORMED}
     return "".join(
         (
-            WIDE if machine_lanes() else "",
+            WIDE if wide else "",
             LOOPS,
             "#include <math.h>\n#include <stdint.h>\n#include <string.h>\n",
             define(codes | {"FOREVER": FOREVER}),
