@@ -41,6 +41,7 @@ def uses(robot: ArmHand, everything: bool = False) -> Iterator[tuple[str, Callab
 
     yield "forward kinematics", targets
     yield "one target", lambda: solver.solve(grasp())
+    yield "limits ignored", lambda: Solver(robot, limits="ignore").solve(grasp())
     yield "batches", lambda: solver.solve_batch(*targets())
     if not everything:
         return

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import importlib.util
+import os
 import runpy
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -75,6 +78,36 @@ def test_stored_targets_bit_for_bit_under_sanitizers(project):
     foreign = {name for name in wanted if not name.startswith(("arm_", "__asan", "__ubsan"))}
     assert "sin" in foreign
     assert foreign <= LIBM | COMPILERS
+
+
+WINE = shutil.which("wine64") or shutil.which("wine64", path="/usr/lib/wine")
+
+
+@pytest.mark.skipif(importlib.util.find_spec("ziglang") is None, reason="needs ziglang")
+@pytest.mark.parametrize(
+    ("target", "program", "runner"),
+    [
+        ("aarch64-linux-musl", "stored", shutil.which("qemu-aarch64")),
+        ("x86_64-windows-gnu", "stored.exe", WINE),
+    ],
+)
+def test_stored_targets_bit_for_bit_on_other_machines(
+    plain_project, tmp_path, target, program, runner
+):
+    """Emulated: apt-get install qemu-user, wine64."""
+    if runner is None:
+        pytest.skip("no emulator")
+    sources = [*sorted(plain_project.glob("src/*.c")), plain_project / "test" / "test.c"]
+    folders = [f"-I{plain_project / name}" for name in ("include", "src", "test")]
+    command = [sys.executable, "-m", "ziglang", "cc", "-target", target, "-std=c11", "-O1"]
+    command += ["-ffp-contract=off", "-fno-sanitize=all", *folders, *map(str, sources)]
+    made = tmp_path / program
+    subprocess.run([*command, "-o", str(made), "-lm"], check=True, capture_output=True)
+    own = {"WINEPREFIX": str(tmp_path / "wine"), "WINEDEBUG": "-all"}
+    done = subprocess.run([runner, made], capture_output=True, text=True, env=os.environ | own)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "1000 targets" in done.stdout
+    assert "wrong: 0" in done.stdout
 
 
 def test_in_a_scene_arms_swing_out_of_the_way(robot):

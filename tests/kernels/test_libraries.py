@@ -16,6 +16,7 @@ import textwrap
 import threading
 import time
 import warnings
+import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -24,6 +25,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
+from build_kernels import wheel
 
 import casadi_ik as ik
 from casadi_ik.kernels import (
@@ -218,12 +220,17 @@ def test_kernels_made_ahead_serve_without_a_compiler(
     texts: dict[str, str] = {}
     monkeypatch.setattr(libraries, "on_text", [texts.__setitem__])
     assert works()
-    folder = tmp_path / "site" / libraries.AHEAD
-    folder.mkdir(parents=True)
-    (folder / "__init__.py").write_text("")
-    (folder / "made_for").write_text(package_sources() if made_for == "these sources" else "0")
-    (name,) = texts
-    kept(directory, ".so")[0].rename(folder / f"{name}.so")
+    (name,), (library,) = texts, kept(directory, ".so")
+    files = {
+        "__init__.py": b"",
+        "made_for": package_sources().encode() if made_for == "these sources" else b"0",
+        f"{name}.so": library.read_bytes(),
+    }
+    library.unlink()
+    with zipfile.ZipFile(wheel(files, "linux_x86_64", tmp_path)) as archive:
+        archive.extractall(tmp_path / "site")
+        record = archive.read(f"{libraries.AHEAD}-{ik.__version__}.dist-info/RECORD").decode()
+        assert {line.split(",")[0] for line in record.splitlines()} == set(archive.namelist())
     monkeypatch.syspath_prepend(str(tmp_path / "site"))
     libraries.ahead_folder.cache_clear()
     monkeypatch.setenv("CC", "none")

@@ -348,13 +348,9 @@ class Searches:
         """
         robot = plan.layouts.robot
         self.plan = plan
-        self._name = ca.Function.fix_name(f"hand_first_search_{robot.name}")
-        given = robot, plan.options, plan.layouts.kinds, plan.budget, plan.enforce_limits
-        wide = machine_lanes() > 0
-        known = recipe(*given, wide)
-        library = load_library(self._name, lambda: _text(plan, wide), "casadi_ik_search", known)
+        self._name, library = _library(plan)
         if library is None:
-            raise KernelError(f"{self._name}: the compiler that made the other kernels is gone")
+            raise KernelError(f"{self._name}: no compiler, and no kernel made ahead")
         self._search: Any = library["casadi_ik_search"]
         self._decide: Any = library["casadi_ik_decide"]
         self._find_postures: Any = library["casadi_ik_postures"]
@@ -553,6 +549,21 @@ class SearchPool:
             searches = Searches(self._plan(enforce_limits), size)
         yield searches
         free.append(searches)
+
+
+def can_search(plan: SearchPlan) -> bool:
+    """Whether there is compiled code of a search and of all that it calls."""
+    return all(kernel.entry for kernel in plan.kernels.values()) and _library(plan)[1] is not None
+
+
+def _library(plan: SearchPlan) -> tuple[str, ctypes.CDLL | None]:
+    """Name and compiled code of a search."""
+    robot = plan.layouts.robot
+    name = ca.Function.fix_name(f"hand_first_search_{robot.name}")
+    given = robot, plan.options, plan.layouts.kinds, plan.budget, plan.enforce_limits
+    wide = machine_lanes() > 0
+    known = recipe(*given, wide)
+    return name, load_library(name, lambda: _text(plan, wide), "casadi_ik_search", known)
 
 
 def _is_array(name: str, kind: str, length: int) -> bool:

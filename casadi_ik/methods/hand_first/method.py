@@ -18,7 +18,7 @@ from casadi_ik.kernels.loop import UNBEGUN, Stepper
 from casadi_ik.kernels.robot_kernels import RobotKernels
 from casadi_ik.methods.common.limits import coupling_jacobian
 from casadi_ik.methods.common.looped_method import LoopedMethod, Start
-from casadi_ik.methods.hand_first.driver import Searches, SearchPlan, SearchPool
+from casadi_ik.methods.hand_first.driver import Searches, SearchPlan, SearchPool, can_search
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.seeds import Seeds
 from casadi_ik.methods.hand_first.state import CARRIED, STAGES, beginning
@@ -83,6 +83,11 @@ class HandFirstMethod(LoopedMethod):
             return self
         return HandFirstMethod(self.robot, self.options, self._compiled, kinds)
 
+    @cached_property
+    def is_compiled(self) -> bool:
+        """Whether all that a search calls is compiled: made ahead some may be missing."""
+        return self.kernel.compiled and can_search(self.plan(enforce_limits=True))
+
     def in_virtual_machine(self) -> HandFirstMethod:
         """The same, never compiled."""
         return HandFirstMethod(self.robot, self.options, False, self._kinds)
@@ -94,7 +99,7 @@ class HandFirstMethod(LoopedMethod):
     def prepare(self) -> None:
         """Build and compile what one target takes, and fill the table of the first round."""
         _ = self.seeds.table, self.first
-        if self.kernel.compiled:
+        if self.is_compiled:
             with self._searches.lent(enforce_limits=True):
                 pass
 
@@ -132,7 +137,7 @@ class HandFirstMethod(LoopedMethod):
         """
         del seed
         self._check(targets)
-        if not self.kernel.compiled:
+        if not self.is_compiled:
             return self._run_from_tables(targets, q0, trace, rounds)
         most = np.full(len(targets), self._rounds_for(targets))
         if rounds is not None:
@@ -145,7 +150,7 @@ class HandFirstMethod(LoopedMethod):
 
     def quick(self, targets: TargetBatch, q0: Array) -> Quick | None:
         """The answer to one target; see `QuickMethod.quick`."""
-        if not self.kernel.compiled:
+        if not self.is_compiled:
             return None
         with self._searches.lent(targets.enforce_limits) as search:
             search.ask(targets, 0, q0, self.terms(targets))
@@ -155,7 +160,7 @@ class HandFirstMethod(LoopedMethod):
     def alone(self, enforce_limits: bool) -> Searches | None:
         """Memory for one search after the other; None without a compiler."""
         self.prepare()
-        return Searches(self.plan(enforce_limits), 1) if self.kernel.compiled else None
+        return Searches(self.plan(enforce_limits), 1) if self.is_compiled else None
 
     def stepper(self, targets: TargetBatch, q0: Array) -> Stepper:
         """One target, one iteration at a time; see `Method.stepper`."""
@@ -182,7 +187,7 @@ class HandFirstMethod(LoopedMethod):
             number: The round, below `options.rounds`.
         """
         count, terms = self.options.candidates, self.terms(targets)
-        if not number or not self.kernel.compiled:
+        if not number or not self.is_compiled:
             table, most = self.seeds.table, (number + 1) * count
             return table.nearest(targets.points, targets.normals, most)[:, -count:]
         every = np.broadcast_to(terms, (len(targets), terms.shape[-1]))
