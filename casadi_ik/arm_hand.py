@@ -14,11 +14,11 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.grasps.grasp import real_array
 from casadi_ik.kernels.robot_kernels import RobotKernels
-from casadi_ik.on_demand import on_demand
+from casadi_ik.on_demand import Shown, on_demand
 from casadi_ik.robots import RobotDescription, load_description, to_urdf
 
 
-class ArmHand:
+class ArmHand(Shown):
     """An arm-hand (or a hand on a fixed base), ready to be asked.
 
     Attributes:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
 
 from casadi_ik.arrays import Array
+from casadi_ik.on_demand import Shown
 from casadi_ik.problem.targets import Tolerance
 from casadi_ik.problem.verdict import ContactVerdict, PalmVerdict
 from casadi_ik.proofs.proof import Proof
@@ -151,8 +152,8 @@ class Lazy:
         return {"found": self.found}
 
 
-@dataclass(frozen=True, eq=False)
-class Diagnosis:
+@dataclass(frozen=True, eq=False, repr=False)
+class Diagnosis(Shown):
     """Why a grasp was not solved, with evidence.
 
     What would help (`reliefs`, `freed`, and `lines`, which tells of them) is looked for when first
@@ -191,8 +192,11 @@ class Diagnosis:
     nearest: Mapping[str, NearContact]
     q: Array
     time: float
-    lazy: Lazy = field(repr=False)
+    lazy: Lazy
     palm: PalmVerdict | None = None
+
+    def __repr__(self) -> str:
+        return f"<Diagnosis {self.reason.name}>"  # no search for remedies
 
     @property
     def established(self) -> bool:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import html
 import math
+import re
 import textwrap
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,8 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from casadi_ik.answers.solution import BatchSolution, Ranking, Solution
+from casadi_ik.answers.diagnosis import Diagnosis
+from casadi_ik.answers.solution import BatchSolution, Choice, Ranking, Solution
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arms.recognise import family_in_words
 from casadi_ik.problem.status import Status
@@ -34,6 +37,9 @@ AT_LIMIT = 1e-6
 
 ROWS_SHOWN = 10
 """How many unsolved rows of a batch are named."""
+
+LINES = 25
+"""Of a report that is printed."""
 
 MEANING = {
     Status.INVALID: "a number was no longer finite",
@@ -101,6 +107,17 @@ def duration(seconds: float) -> str:
     return f"{seconds * 1e6:.3g} us"
 
 
+def as_text(part: RenderableType) -> str:
+    """A report as plain text, `LINES` at most."""
+    console = Console(width=80, color_system=None, file=StringIO(), force_jupyter=False)
+    with console.capture() as captured:
+        console.print(part)
+    text = re.sub(r"\n(?: *\n)+", "\n\n", captured.get().strip("\n"))
+    lines = [line.rstrip() for line in text.split("\n")]
+    rest = len(lines) - LINES + 1
+    return "\n".join(lines if rest < 2 else [*lines[: LINES - 1], f"  ... {rest} more lines"])
+
+
 def as_html(part: RenderableType) -> str:
     """A report, made of the above, as HTML without scripts or style sheets."""
     if isinstance(part, Group):
@@ -146,6 +163,26 @@ def clearance(solution: Solution, units: Units = HUMAN) -> str:
         return "nothing there to touch"
     distance = _number(solution.clearance, "m", units, 2)
     return f"clearance {distance}: {' and '.join(solution.closest)}"
+
+
+def report_of(answer: object) -> Group:
+    """What there is to say about an answer, or about a robot."""
+    match answer:
+        case Solution():
+            return solution_report(answer)
+        case BatchSolution():
+            scene = None if answer.clearance is None else "given"
+            return Totals.of(answer).report(answer.method, answer.robot, scene)
+        case Choice():
+            score = f"candidate {answer.candidate}, score {answer.score:.4g}"
+            return solution_report(answer.solution, name=score)
+        case Ranking():
+            return ranking_report(answer)
+        case Diagnosis():
+            return Group(*map(Text, answer.lines))
+        case ArmHand():
+            return robot_report(answer.description)
+    raise TypeError(f"no report of {type(answer).__name__}")
 
 
 def solution_report(
@@ -246,9 +283,12 @@ def _actuators(
 ) -> Table:
     """Positions; with limits where the robot is known."""
     if robot is None:
-        rows = table("actuator", "position [rad or m]", right=("position [rad or m]",))
-        for name, value in zip(solution.actuators, solution.q, strict=True):
-            rows.add_row(name, f"{value:.6f}")
+        names, values = solution.actuators, [f"{value:.6f}" for value in solution.q]
+        half = (len(names) + 1) // 2
+        rows = table(*("actuator", "rad or m") * 2, right=("rad or m",))
+        for i in range(half):
+            pairs = zip(names[i::half], values[i::half], strict=True)
+            rows.add_row(*(cell for pair in pairs for cell in pair))
         return rows
     right = ("position", "lower", "upper")
     rows = table("actuator", *right, "limit", right=right)

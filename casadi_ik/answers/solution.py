@@ -15,6 +15,7 @@ from casadi_ik.answers.diagnosis import Diagnosis
 from casadi_ik.arm_hand import ArmHand, load_robot
 from casadi_ik.arrays import Array
 from casadi_ik.grasps import Grasp, Tolerance
+from casadi_ik.on_demand import Shown
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.verdict import ContactVerdict, PalmVerdict
 
@@ -92,8 +93,8 @@ class CollisionReport:
         return tuple(lines) if self.way_out is None else (*lines, *self.way_out.lines)
 
 
-@dataclass(frozen=True, eq=False)
-class Solution:
+@dataclass(frozen=True, eq=False, repr=False)
+class Solution(Shown):
     """The answer to one grasp.
 
     Attributes:
@@ -162,8 +163,8 @@ class Solution:
         return (robot or load_robot(self.robot)).view(self.q, **options)
 
 
-@dataclass(frozen=True, eq=False)
-class BatchSolution:
+@dataclass(frozen=True, eq=False, repr=False)
+class BatchSolution(Shown):
     """The answers to a batch of k targets; the fields of `Solution` as arrays.
 
     Attributes:
@@ -355,8 +356,8 @@ class Chosen(Protocol):
         ...
 
 
-@dataclass(frozen=True, eq=False)
-class Choice:
+@dataclass(frozen=True, eq=False, repr=False)
+class Choice(Shown):
     """One of the answers of a `Ranking`.
 
     Attributes:
@@ -386,8 +387,8 @@ class Choice:
         return self.solution.q
 
 
-@dataclass(frozen=True, eq=False)
-class Ranking(Sequence[Choice]):
+@dataclass(frozen=True, eq=False, repr=False)
+class Ranking(Shown, Sequence[Choice]):
     """Answers to the question which of many grasps to take, best first.
 
     Attributes:
@@ -439,9 +440,6 @@ class Ranking(Sequence[Choice]):
             room = "" if clear is None else f", clearance {1e3 * clear:.1f} mm"
             lines.append(f"  {place}. candidate {one.candidate}: {one.score:.4g}{room}")
         return tuple(lines)
-
-    def __str__(self) -> str:
-        return "\n".join(self.lines)
 
 
 @dataclass(frozen=True)
