@@ -234,7 +234,7 @@ class Solver(MovingSolver):
         if object_pose is not None:
             targets = targets.holding(grasped_in(self.scene), object_pose)
         with recorder_of(self, log, seed, keep, compression) as recorder:
-            return self._engine.solve(targets, Run(q0, seed, jobs, recorder, diagnose))
+            return self._engine.solve(targets, Run(q0, seed, jobs, recorder, diagnose, shown=True))
 
     def solve_blocks(
         self,
@@ -413,7 +413,7 @@ class Solver(MovingSolver):
         hands = hand_postures(self._request.robot, postures, len(poses))
         preferred = self._engine.preference(prefer, q0 is not None)
         targets = self._request.of_palms(poses, hands, fixed, preferred)
-        return self._engine.solve(targets, Run(q0, seed, jobs, None, diagnose))
+        return self._engine.solve(targets, Run(q0, seed, jobs, None, diagnose, shown=True))
 
     def choose(
         self,

@@ -33,4 +33,4 @@ class Shown:
 
     def _repr_html_(self) -> str:
         reports: Any = on_demand("casadi_ik.answers.report")
-        return str(reports.as_html(reports.report_of(self)))
+        return str(reports.page_of(self))

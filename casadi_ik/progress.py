@@ -17,12 +17,16 @@ SAID_EVERY = 10.0
 
 @contextmanager
 def progress(
-    count: int, done: int = 0, say: Callable[[str], object] | None = None
+    count: int,
+    shown: bool = True,
+    done: int = 0,
+    say: Callable[[str], object] | None = None,
 ) -> Iterator[Callable[[int], None]]:
     """Show how far it is, as soon as that takes longer than a second.
 
     Args:
         count: Targets in all.
+        shown: Whether it may be shown.
         done: Of those, done before.
         say: What is called with a line where there is neither a terminal nor a notebook, every ten
             seconds; None: nothing is said there.
@@ -31,16 +35,16 @@ def progress(
         Moves it on by so many targets.
     """
     began = last = time.monotonic()
-    total, shown = done, None
-    draw = _bar(count)
+    total, drawn = done, None
+    draw = _bar(count) if shown else None
 
     def move(more: int) -> None:
-        nonlocal total, last, shown
+        nonlocal total, last, drawn
         total += more
         now = time.monotonic()
         rate = (total - done) / max(now - began, 1e-9)
         if draw is not None and now - began > PATIENCE:
-            shown = draw
+            drawn = draw
             draw(total, rate)
         elif draw is None and say is not None and now - last > SAID_EVERY:
             last = now
@@ -49,8 +53,8 @@ def progress(
     try:
         yield move
     finally:
-        if shown is not None:
-            shown(None, 0.0)
+        if drawn is not None:
+            drawn(None, 0.0)
 
 
 def _left(targets: int, rate: float) -> str:
@@ -66,12 +70,19 @@ def _left(targets: int, rate: float) -> str:
 
 def _bar(count: int) -> Callable[[int | None, float], None] | None:
     """What draws a bar, and takes it away for None; None: there is nothing to draw on."""
-    shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
-    if type(shell).__name__ == "ZMQInteractiveShell":
+    if _in_notebook():
         return _notebook(count)
-    if sys.stderr is not None and sys.stderr.isatty():
-        return _terminal(count)
-    return None
+    return _terminal(count) if someone_looks_on() else None
+
+
+def someone_looks_on() -> bool:
+    """Whether there is a notebook or a terminal to show something on."""
+    return _in_notebook() or (sys.stderr is not None and sys.stderr.isatty())
+
+
+def _in_notebook() -> bool:
+    shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
+    return type(shell).__name__ == "ZMQInteractiveShell"
 
 
 def _notebook(count: int) -> Callable[[int | None, float], None]:

@@ -6,6 +6,7 @@ import html
 import math
 import re
 import textwrap
+from base64 import b64encode
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from io import StringIO
@@ -16,6 +17,7 @@ import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console, Group, RenderableType
 from rich.padding import Padding
+from rich.style import Style
 from rich.table import Table
 from rich.text import Text
 
@@ -23,6 +25,7 @@ from casadi_ik.answers.diagnosis import Diagnosis
 from casadi_ik.answers.solution import BatchSolution, Choice, Ranking, Solution
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arms.recognise import family_in_words
+from casadi_ik.on_demand import on_demand
 from casadi_ik.problem.status import Status
 from casadi_ik.robots import RobotDescription
 
@@ -144,9 +147,10 @@ def _cell(kind: str, side: str, content: RenderableType) -> str:
 def _inline(text: RenderableType) -> str:
     if not isinstance(text, Text):
         return html.escape(str(text).strip()).replace("\n", "<br>")
-    parts = []
-    for segment in text.render(Console(), end=""):
-        style = "" if segment.style is None else segment.style.get_html_style()
+    console, parts = Console(), []
+    whole = console.get_style(text.style)
+    for segment in text.render(console, end=""):
+        style = (whole + (segment.style or Style())).get_html_style()
         content = html.escape(segment.text)
         parts.append(f'<span style="{style}">{content}</span>' if style else content)
     return "".join(parts)
@@ -165,17 +169,40 @@ def clearance(solution: Solution, units: Units = HUMAN) -> str:
     return f"clearance {distance}: {' and '.join(solution.closest)}"
 
 
-def report_of(answer: object) -> Group:
+def page_of(answer: object) -> str:
+    """The report as HTML, a robot with a small picture where pictures can be drawn."""
+    robot, q = None, None
+    match answer:
+        case Choice():
+            robot, q = answer.solution.arm_hand, answer.q
+        case Solution():
+            robot, q = answer.arm_hand, answer.q
+        case ArmHand():
+            robot, q = answer, answer.home
+    text = as_html(report_of(answer, robot))
+    if robot is None or q is None or not np.isfinite(q).all():
+        return text
+    try:
+        image = on_demand("casadi_ik.views.thumbnail").thumbnail(robot, q)
+    except ImportError:  # the extra is not installed
+        return text
+    source = f"data:image/png;base64,{b64encode(image).decode()}"
+    picture = f'<img src="{source}" alt="{html.escape(robot.name)}" style="max-width: 100%">'
+    beside = "display: flex; flex-wrap: wrap; gap: 1em; align-items: flex-start"
+    return f'<div style="{beside}"><div>{text}</div>{picture}</div>'
+
+
+def report_of(answer: object, robot: ArmHand | None = None) -> Group:
     """What there is to say about an answer, or about a robot."""
     match answer:
         case Solution():
-            return solution_report(answer)
+            return solution_report(answer, robot)
         case BatchSolution():
             scene = None if answer.clearance is None else "given"
             return Totals.of(answer).report(answer.method, answer.robot, scene)
         case Choice():
             score = f"candidate {answer.candidate}, score {answer.score:.4g}"
-            return solution_report(answer.solution, name=score)
+            return solution_report(answer.solution, robot, score)
         case Ranking():
             return ranking_report(answer)
         case Diagnosis():

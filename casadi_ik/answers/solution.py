@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import chain
+from os import PathLike
 from typing import Any, Protocol, overload
 
 import numpy as np
@@ -14,8 +15,8 @@ from numpy.typing import NDArray
 from casadi_ik.answers.diagnosis import Diagnosis
 from casadi_ik.arm_hand import ArmHand, load_robot
 from casadi_ik.arrays import Array
-from casadi_ik.grasps import Grasp, Tolerance
-from casadi_ik.on_demand import Shown
+from casadi_ik.grasps import Contact, Grasp, Tolerance
+from casadi_ik.on_demand import Shown, on_demand
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.verdict import ContactVerdict, PalmVerdict
 
@@ -118,6 +119,7 @@ class Solution(Shown):
         collision: Why all answers touch something, if that is the status and a diagnosis was asked
             for.
         palm: How far the palm is from where it was asked; None where contacts were asked for.
+        arm_hand: The robot; None: not known.
 
     Example:
         >>> solution = solver.solve(grasp)
@@ -144,12 +146,39 @@ class Solution(Shown):
     closest: Pair | None = None
     collision: CollisionReport | None = None
     palm: PalmVerdict | None = None
+    arm_hand: ArmHand | None = None
+
+    def draw(
+        self,
+        grasp: Grasp | None = None,
+        path: str | PathLike[str] | None = None,
+        **options: Any,
+    ) -> Any:
+        """Draw it; needs the extra `plots`.
+
+        Args:
+            grasp: What was asked for; None: the contacts that are reached are shown.
+            path: PNG file to write, if any.
+            options: As `casadi_ik.views.draw_solution` has them: scene, view, dpi, dark.
+
+        Returns:
+            The matplotlib figure, which notebooks show.
+
+        Raises:
+            MissingExtraError: matplotlib or PyVista is not installed.
+            PictureError: The file cannot be written, or there is no OpenGL to draw with.
+        """
+        robot = self.arm_hand or load_robot(self.robot)
+        if grasp is None:
+            reached = zip(robot.fingers, *robot.contacts(self.q), strict=True)
+            grasp = Grasp({name: Contact(point, normal) for name, point, normal in reached})
+        return on_demand("casadi_ik.views").draw_solution(robot, self, grasp, path, **options)
 
     def view(self, robot: ArmHand | None = None, **options: Any) -> Any:
         """Show it in the browser, and in a notebook; needs the extra `view`.
 
         Args:
-            robot: The robot that was solved for; None: the shipped one of that name.
+            robot: The robot that was solved for; None: the one that the answer knows.
             options: As `casadi_ik.viewing.view_grasp` has them; `grasp` is what was asked for
                 (without it the contacts that are reached are shown), `scene` what stands about.
 
@@ -160,7 +189,8 @@ class Solution(Shown):
             MissingExtraError: viser is not installed.
             UnknownNameError: No shipped robot has that name: give the robot.
         """
-        return (robot or load_robot(self.robot)).view(self.q, **options)
+        robot = robot or self.arm_hand or load_robot(self.robot)
+        return robot.view(self.q, **options)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -192,6 +222,7 @@ class BatchSolution(Shown):
         palm_position_error: (k,) [m]; None where contacts were asked for, not palms.
         palm_angle_error: (k,) [rad], likewise.
         palm_ok: (k,) bool, likewise.
+        arm_hand: The robot; None: not known.
 
     Example:
         >>> points, normals = robot.contacts(robot.random(np.random.default_rng(1), 200))
@@ -223,6 +254,7 @@ class BatchSolution(Shown):
     palm_position_error: Array | None = None
     palm_angle_error: Array | None = None
     palm_ok: NDArray[np.bool_] | None = None
+    arm_hand: ArmHand | None = None
 
     @classmethod
     def invalid(
@@ -258,6 +290,7 @@ class BatchSolution(Shown):
             clearance=np.full(count, np.nan) if checked else None,
             closest=(None,) * count if checked else (),
             collisions=(None,) * count if checked else (),
+            arm_hand=robot,
         )
 
     def __len__(self) -> int:
@@ -333,6 +366,7 @@ class BatchSolution(Shown):
             closest=self.closest[row] if self.closest else None,
             collision=self.collisions[row] if self.collisions else None,
             palm=self._palm(row),
+            arm_hand=self.arm_hand,
         )
 
     def _palm(self, row: int) -> PalmVerdict | None:

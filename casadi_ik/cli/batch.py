@@ -261,7 +261,7 @@ def _solve_parts(
     for number in done.intersection(range(len(source.sizes))):
         _answers(folder, source, number)  # before hours are spent on the rest
     before = sum(source.sizes[number] for number in done)
-    show_progress = progress(count, before, partial(say, "progress"))
+    show_progress = progress(count, done=before, say=partial(say, "progress"))
     with show_progress as show, writing(folder.path, "--out"):
         try:
             for part in solve_parts(solver, source, asked, folder, said.jobs, said.dask, pose):

@@ -116,6 +116,7 @@ def judged(
         palm_position_error=None if palm is None else palm.position_error,
         palm_angle_error=None if palm is None else palm.angle_error,
         palm_ok=None if palm is None else palm.ok,
+        arm_hand=robot,
     )
 
 
@@ -137,18 +138,19 @@ FIRST_PART = 64
 class BatchParts:
     """The parts of a batch in order; iterating may go on while finished parts are learned from."""
 
-    def __init__(self, count: int, jobs: int, trace: bool) -> None:
+    def __init__(self, count: int, jobs: int, trace: bool, watched: bool = False) -> None:
         """Cut.
 
         Args:
             count: Targets.
             jobs: Threads.
             trace: Whether all iterations are kept.
+            watched: Whether someone wants to see how far it is.
         """
         self._count = count
-        self._trace = trace
+        self._trace, self._watched = trace, watched
         self._largest = max(1, -(-count // jobs))
-        self._size = min(FIRST_PART, self._largest) if trace else self._largest
+        self._size = min(FIRST_PART, self._largest) if trace or watched else self._largest
 
     def __iter__(self) -> Iterator[slice]:
         """The parts; a single empty one if there are no targets.
@@ -165,6 +167,11 @@ class BatchParts:
             start = stop
             if start == self._count:
                 return
+
+    def pace(self, seconds: float) -> None:
+        """Take note of how long a part took: those that someone watches take a quarter second."""
+        if self._watched and not self._trace and seconds < 0.25:
+            self._size = min(4 * self._size, self._largest)
 
     def learn(self, solves: int, size: int) -> None:
         """Take note of how many bytes of iterations so many solves had."""

@@ -28,6 +28,7 @@ from casadi_ik.problem.request import CLEARANCE, NO_PREFERENCE, preference
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import judge_errors, judge_one
+from casadi_ik.progress import progress, someone_looks_on
 from casadi_ik.solving.alternatives.finder import AlternativeFinder
 from casadi_ik.solving.alternatives.free import (
     RANKED,
@@ -240,6 +241,7 @@ class Engine:
             actuators=robot.actuators,
             clearance=distance,
             closest=closest,
+            arm_hand=robot,
         )
 
     def solve(self, targets: TargetBatch, run: Run, known: Outcome | None = None) -> BatchSolution:
@@ -262,8 +264,9 @@ class Engine:
         if recorder is not None and (measures := self.method.trace_format.measures) is not None:
             measures.prepare()
         batches = []
-        with InBackground() as background:
+        with InBackground() as background, progress(len(targets), run.shown) as show:
             for part in self._parts(targets, starts, run, known):
+                show(len(part.batch))
                 if recorder is not None:
                     form = self.method.trace_format
                     background.do(partial(part.record, recorder, form, run.seed))
@@ -275,6 +278,7 @@ class Engine:
     ) -> Iterator[SolvedPart]:
         """Parts of the batch in order, solved, judged and diagnosed side by side."""
         trace, jobs, diagnose = run.recorder is not None, run.jobs, run.diagnose
+        parts = BatchParts(len(targets), jobs, trace, run.shown and someone_looks_on())
 
         def method(kinds: Kinds) -> Method:
             return self.of_kinds(kinds).method
@@ -301,6 +305,7 @@ class Engine:
                 batch = self._diagnosed(asked, starts[rows], outcome, batch)
                 if self.check is not None and len(targets) == 1:
                     batch = with_way_out(self.solve, self.check, asked, starts[0], run.seed, batch)
+            parts.pace(1e-9 * (time.time_ns() - started))
             return SolvedPart(asked, starts[rows], started, outcome, batch, query)
 
         if diagnose:
@@ -310,10 +315,6 @@ class Engine:
             for kinds, _, _ in by_kinds(targets):
                 if self._own_hands is not None:
                     _ = self.of_kinds(kinds).finder
-        if jobs == 1 and not trace:
-            yield solve(slice(0, len(targets)))
-            return
-        parts = BatchParts(len(targets), jobs, trace)
         if jobs == 1:
             yield from map(solve, parts)
             return

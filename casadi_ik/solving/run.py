@@ -23,6 +23,7 @@ class Run:
         jobs: Threads, at least 1; compiled loops run side by side.
         recorder: Keeps the iterations; None: they are not kept.
         diagnose: Whether to find the reason where a target is not solved.
+        shown: Whether to show how far it is, where someone looks on.
     """
 
     q0: ArrayLike | None = None
@@ -30,6 +31,7 @@ class Run:
     jobs: int = 1
     recorder: Recorder | None = None
     diagnose: bool = False
+    shown: bool = False
 
     def __post_init__(self) -> None:
         for name, least in (("jobs", 1), ("seed", 0)):

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
 import casadi_ik as ik
+
+TERMINAL = os.environ | {"TERM": "xterm", "COLUMNS": "80"}
+WITH_PICTURE = (ik.ArmHand, ik.Solution, ik.answers.Choice)
 
 
 def answers(name):
@@ -34,6 +41,7 @@ def test_short(name):
         page = answer._repr_html_()
         assert page.count("<table") == page.count("</table>")
         assert "<script" not in page
+        assert ("data:image/png;base64," in page) == isinstance(answer, WITH_PICTURE)
 
 
 def test_what_is_said(robot):
@@ -51,3 +59,52 @@ def test_what_is_said(robot):
     assert "3 of 3 candidates have an answer" in str(ranked)
     assert f"candidate {best.candidate}" in str(best)
     assert "thumb (placed first)" in str(robot)
+
+
+def test_tables_need_no_drawing(robot, monkeypatch):
+    solution = ik.Solver(robot).solve(ik.load_grasp("cup"))
+    monkeypatch.setitem(sys.modules, "casadi_ik.views.thumbnail", None)
+    page = solution._repr_html_()
+    assert "<img" not in page
+    assert "<th" in page
+    assert "bh_spread" in page
+    assert "at lower" in page  # limits are known
+
+
+@pytest.mark.opengl
+def test_a_solution_draws_itself(own_robot, tmp_path):
+    """Also of a robot that is not shipped; what is reached, unless it is said what was asked."""
+    solution = ik.Solver(ik.load_robot(own_robot)).solve(ik.load_grasp("cup"))
+    path = tmp_path / "cup.png"
+    assert solution.draw(path=path, dpi=40).axes
+    assert path.read_bytes().startswith(b"\x89PNG")
+    assert solution.draw(ik.load_grasp("cup"), dpi=40).axes
+
+
+PROGRAM = """
+import sys
+import numpy as np
+import casadi_ik as ik
+from casadi_ik import progress
+progress.PATIENCE = 0.0
+robot = ik.load_robot("kuka_lwr_barrett")
+points, normals = robot.contacts(robot.random(np.random.default_rng(0), 400))
+batch = ik.Solver(robot).solve_batch(points, normals, jobs=int(sys.argv[1]))
+print(batch.success.sum(), batch.q.sum())
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminals")
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_progress_is_shown_on_a_terminal_and_changes_no_answer(jobs):
+    words = [sys.executable, "-c", PROGRAM, str(jobs)]
+    piped = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert piped.stderr == ""
+    ours, theirs = os.openpty()
+    shown = subprocess.run(
+        words, stdout=subprocess.PIPE, stderr=theirs, text=True, check=True, env=TERMINAL
+    )
+    os.close(theirs)
+    assert b"/400" in os.read(ours, 100_000)
+    os.close(ours)
+    assert shown.stdout == piped.stdout
