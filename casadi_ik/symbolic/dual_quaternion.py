@@ -61,13 +61,6 @@ def norm(x: Expr) -> Expr:
     return ca.vertcat(length, ca.dot(x[:4], x[4:]) / length)
 
 
-def normalise(x: Expr) -> Expr:
-    """Unit dual quaternion (8, 1) next to x (8, 1), whose real part must not vanish."""
-    scale = 1 / ca.sqrt(ca.dot(x[:4], x[:4]))
-    real, dual = scale * x[:4], scale * x[4:]
-    return ca.vertcat(real, dual - ca.dot(real, dual) * real)
-
-
 def from_pose(R: Expr, p: Expr) -> Expr:
     """Unit dual quaternion (8, 1) of R (3, 3) and p (3, 1) [m]; its sign is not fixed."""
     return from_quaternion(quaternion_from_matrix(R), p)
@@ -238,14 +231,3 @@ def screw_error_norm(e: Expr) -> Expr:
     """Norm sqrt(|w|^2 + |v|^2) of log(e), Chandra eq. (17); it adds rad^2 to m^2 as they do."""
     w, v = log(e)
     return safe_sqrt(ca.dot(w, w) + ca.dot(v, v))
-
-
-def power(x: Expr, exponent: Expr) -> Expr:
-    """x^t (8, 1): the fraction t of the screw displacement x, the short way round."""
-    w, v = log(x)
-    return exp(exponent * w, exponent * v)
-
-
-def sclerp(a: Expr, b: Expr, fraction: Expr) -> Expr:
-    """Screw interpolation a (a* b)^t (8, 1) from pose a (t = 0) to pose b (t = 1)."""
-    return multiply(a, power(multiply(conjugate(a), b), fraction))

@@ -91,15 +91,6 @@ def theta3_rate(phi: Expr, bar: Linkage) -> Expr:
     return (2 * bar.g * bar.q) * s / (bar.branch * root)
 
 
-def psi_rate(phi: Expr, bar: Linkage) -> Expr:
-    """Rod rate d psi / d phi = p sin(theta3) / [q sin(phi + theta3 - psi)]. Dimensionless."""
-    (c, s), root = _rod(phi, bar)
-    cp, sp = ca.cos(phi), ca.sin(phi)
-    # h sin(theta3): the component of PQ across the crank.
-    across = (bar.q * s - bar.p * sp) * cp - (bar.g + bar.q * c - bar.p * cp) * sp
-    return 2 * bar.p * across / (bar.branch * root)
-
-
 def phi_from_theta3(theta: Expr, bar: Linkage, inverse_branch: Expr, reference: Expr = 0.0) -> Expr:
     """Crank angle phi [rad] of a given theta3 [rad]: the inverse of eq. (9).
 

@@ -120,15 +120,6 @@ class Screws:
         return ca.densify(ca.horzcat(ca.DM.zeros(6, 0), *columns))
 
 
-def screw_chain_to_link(robot: RobotDescription, link: str) -> ScrewChain:
-    """The chain to a link's frame.
-
-    Raises:
-        UnknownNameError: There is no such link.
-    """
-    return _chain(robot, link, np.eye(4))
-
-
 def screw_chain_to_contact(robot: RobotDescription, finger: str) -> ScrewChain:
     """The chain to a finger's contact frame.
 

@@ -35,28 +35,6 @@ def skew(w: Expr) -> Expr:
     return ca.densify(ca.skew(w))
 
 
-def unskew(S: Expr) -> Expr:
-    """Return the vector (3, 1) of the skew part of S (3, 3): the inverse of `skew`."""
-    return 0.5 * ca.vertcat(S[2, 1] - S[1, 2], S[0, 2] - S[2, 0], S[1, 0] - S[0, 1])
-
-
-def rotation_about_axis(axis: Expr, angle: Expr) -> Expr:
-    """Rotation by an angle about a fixed unit axis (Rodrigues).
-
-    Written as `u u' + cos (I - u u') + sin [u]`, which folds to the few nonzero terms when the
-    axis is a numeric coordinate axis.
-
-    Args:
-        axis: (3, 1), unit.
-        angle: scalar [rad].
-
-    Returns:
-        R (3, 3).
-    """
-    outer = ca.mtimes(axis, axis.T)
-    return ca.densify(outer + ca.cos(angle) * (ca.DM.eye(3) - outer) + ca.sin(angle) * skew(axis))
-
-
 def exp_so3(w: Expr) -> Expr:
     """Rotation matrix (3, 3) of the rotation vector w (3, 1) [rad]."""
     return quaternion_to_matrix(quaternion_exp(w))
@@ -129,18 +107,6 @@ def quaternion_to_matrix(q: Expr) -> Expr:
     )
 
 
-def rpy_to_matrix(rpy: Expr) -> Expr:
-    """R = Rz(yaw) Ry(pitch) Rx(roll) (3, 3) of rpy (3, 1) [rad]: URDF's fixed-axis convention."""
-    sr, cr = ca.sin(rpy[0]), ca.cos(rpy[0])
-    sp, cp = ca.sin(rpy[1]), ca.cos(rpy[1])
-    sy, cy = ca.sin(rpy[2]), ca.cos(rpy[2])
-    return ca.vertcat(
-        ca.horzcat(cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
-        ca.horzcat(sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
-        ca.horzcat(-sp, cp * sr, cp * cr),
-    )
-
-
 def matrix_to_rpy(R: Expr) -> Expr:
     """Roll, pitch, yaw (3, 1) [rad] of R (3, 3), pitch in [-pi/2, pi/2].
 
@@ -163,22 +129,6 @@ def euler_zyx(R: Expr) -> Expr:
     """
     rpy = matrix_to_rpy(R)
     return ca.vertcat(rpy[2], rpy[1], rpy[0])
-
-
-def euler_zyx_to_angular_velocity(angles: Expr) -> Expr:
-    """Matrix E (3, 3) with omega = E d(angles)/dt, omega in the outer frame.
-
-    Args:
-        angles: (alpha, beta, gamma) (3, 1) [rad] as in `euler_zyx`.
-
-    Returns:
-        E (3, 3), with determinant -cos(beta).
-    """
-    sa, ca_ = ca.sin(angles[0]), ca.cos(angles[0])
-    sb, cb = ca.sin(angles[1]), ca.cos(angles[1])
-    return ca.vertcat(
-        ca.horzcat(0.0, -sa, ca_ * cb), ca.horzcat(0.0, ca_, sa * cb), ca.horzcat(1.0, 0.0, -sb)
-    )
 
 
 def angular_velocity_to_euler_zyx(angles: Expr, min_cosine: float = 1e-6) -> Expr:
@@ -287,20 +237,6 @@ def to_matrix(transform: Transform) -> Expr:
 def from_matrix(T: Expr) -> Transform:
     """Transform of a homogeneous matrix (4, 4)."""
     return T[:3, :3], T[:3, 3]
-
-
-def adjoint(transform: Transform) -> Expr:
-    """Matrix (6, 6) that takes a twist [v; w] from the moved to the outer frame.
-
-    [[R, [p] R], [0, R]]: both twists describe the same motion, each at its own frame's origin.
-    """
-    R, p = transform
-    return ca.densify(
-        ca.vertcat(
-            ca.horzcat(R, ca.mtimes(skew(p), R)),
-            ca.horzcat(ca.DM.zeros(3, 3), R),
-        )
-    )
 
 
 def exp_se3(twist: Expr) -> Transform:

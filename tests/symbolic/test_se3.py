@@ -1,6 +1,5 @@
 """Rigid transforms against pinocchio (whose Motion is [v; w] as well)."""
 
-import casadi as ca
 import numpy as np
 import pinocchio as pin
 from algebra_samples import (
@@ -18,7 +17,6 @@ from casadi_ik.symbolic import se3
 V, M, W, H = (3, 1), (3, 3), (6, 1), (4, 4)
 exp = graph(se3.exp_se3, W)
 log = graph(lambda R, p: se3.log_se3((R, p)), M, V)
-adjoint = graph(lambda R, p: se3.adjoint((R, p)), M, V)
 compose = graph(lambda R, p, Q, q: se3.compose((R, p), (Q, q)), M, V, M, V)
 inverse = graph(lambda R, p: se3.inverse((R, p)), M, V)
 act = graph(lambda R, p, x: se3.act((R, p), x), M, V, (3, 2))
@@ -69,18 +67,6 @@ def test_group_operations(wa, pa, wb, pb, x):
 
 
 @PROPERTY
-@given(rotation_vectors, vectors, vectors, rotation_vectors)
-def test_adjoint_is_pinocchios_action(wa, pa, v, w):
-    A = transform(wa, pa)
-    Ad = adjoint(A.rotation, pa).full()
-    assert np.allclose(Ad, A.action, rtol=0, atol=2e-15)
-    # Ad(T) moves a twist: exp(Ad xi) = T exp(xi) T^-1.
-    left = exp(Ad @ np.concatenate([v, w]))
-    right = A * pin.exp6(pin.Motion(v, w)) * A.inverse()
-    assert np.allclose(to_matrix(*left).full(), right.homogeneous, rtol=0, atol=2e-14)
-
-
-@PROPERTY
 @given(vectors, rotation_vectors.filter(lambda w: np.linalg.norm(w) < 3.0))
 def test_derivatives(v, w):
     twist = np.concatenate([v, w])
@@ -96,10 +82,3 @@ def test_derivative_of_log_is_finite_at_the_identity_and_at_half_turns():
         assert df(R, [0.1, 0.2, 0.3]).is_regular()
         assert df(R, [0, 0, 0]).is_regular()
     assert exp_gradient(np.zeros(6)).is_regular()
-
-
-def test_transforms_take_mx():
-    xi = ca.MX.sym("xi", 6)
-    f = ca.Function("f", [xi], [se3.log_se3(se3.exp_se3(xi)), se3.adjoint(se3.exp_se3(xi))])
-    twist = np.array([0.1, -0.2, 0.3, 0.4, 0.5, -0.6])
-    assert np.allclose(f(twist)[0].full()[:, 0], twist, rtol=0, atol=1e-15)

@@ -24,18 +24,15 @@ from scipy.spatial.transform import Rotation
 from casadi_ik.symbolic import se3
 from casadi_ik.symbolic.se3 import align
 
-V, M, Q, S = (3, 1), (3, 3), (4, 1), (1, 1)
+V, M, Q = (3, 1), (3, 3), (4, 1)
 exp = graph(se3.exp_so3, V)
 log = graph(se3.log_so3, M)
-about = graph(se3.rotation_about_axis, V, S)
 quaternion_exp = graph(se3.quaternion_exp, V)
 quaternion_log = graph(se3.quaternion_log, Q)
 from_matrix = graph(se3.quaternion_from_matrix, M)
 to_matrix = graph(se3.quaternion_to_matrix, Q)
-rpy = graph(se3.rpy_to_matrix, V)
 to_rpy = graph(se3.matrix_to_rpy, M)
 euler = graph(se3.euler_zyx, M)
-euler_matrix = graph(se3.euler_zyx_to_angular_velocity, V)
 euler_inverse = graph(se3.angular_velocity_to_euler_zyx, V)
 mean = graph(se3.mean_rotation, M, M)
 project = graph(se3.project_to_rotation, M)
@@ -70,25 +67,9 @@ def test_log_of_half_a_turn_is_one_of_its_two_vectors(axis):
 
 
 @PROPERTY
-@given(unit_vectors, st.floats(-7, 7))
-def test_rotation_about_an_axis_is_the_exponential(axis, angle):
-    assert np.allclose(about(axis, angle).full(), exp(angle * axis).full(), rtol=0, atol=3e-15)
-
-
-def test_rotation_about_a_coordinate_axis_folds_to_four_entries():
-    angle = ca.SX.sym("angle")
-    R = se3.rotation_about_axis(ca.DM([0, 0, 1]), angle)
-    assert R.is_dense()
-    assert str(R[2, 2]) == "1"
-    assert str(R[0, 2]) == str(R[2, 1]) == "0"
-    assert ca.Function("f", [angle], [R]).n_instructions() < 20
-
-
-@PROPERTY
 @given(vectors, vectors)
 def test_skew_is_the_cross_product(a, b):
     assert np.allclose(se3.skew(ca.DM(a)).full() @ b, np.cross(a, b), rtol=0, atol=1e-15)
-    assert np.array_equal(se3.unskew(se3.skew(ca.DM(a))).full()[:, 0], a)
 
 
 @PROPERTY
@@ -105,33 +86,31 @@ def test_quaternions_agree_with_scipy(w):
 @PROPERTY
 @given(st.tuples(st.floats(-3.1, 3.1), st.floats(-1.57, 1.57), st.floats(-3.1, 3.1)))
 def test_rpy_is_the_urdf_convention(rpy_angles):
-    R = rpy(rpy_angles).full()
-    assert np.allclose(R, pin.rpy.rpyToMatrix(np.array(rpy_angles)), rtol=0, atol=1e-15)
+    R = pin.rpy.rpyToMatrix(np.array(rpy_angles))
     assert np.allclose(to_rpy(R).full()[:, 0], rpy_angles, rtol=0, atol=1e-12)
     assert np.allclose(euler(R).full()[::-1, 0], rpy_angles, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("pitch", [np.pi / 2, -np.pi / 2])
 def test_gimbal_lock_keeps_the_rotation(pitch):
-    R = rpy([0.4, pitch, -0.3])
+    R = pin.rpy.rpyToMatrix(0.4, pitch, -0.3)
     found = to_rpy(R).full()[:, 0]
     assert found[0] == 0
-    assert np.allclose(rpy(found).full(), R.full(), rtol=0, atol=1e-15)
+    assert np.allclose(pin.rpy.rpyToMatrix(found), R, rtol=0, atol=1e-15)
     assert gradient(se3.matrix_to_rpy, M)(R).is_regular()
     assert euler_inverse([0.4, pitch, 0.1]).is_regular()
 
 
 @PROPERTY
 @given(st.tuples(st.floats(-3, 3), st.floats(-1.5, 1.5), st.floats(-3, 3)))
-def test_euler_rates(rpy_angles):
-    E, inverse = euler_matrix(rpy_angles).full(), euler_inverse(rpy_angles).full()
-    assert np.allclose(E @ inverse, np.eye(3), rtol=0, atol=1e-13)
-    alpha, beta, gamma = rpy_angles
-    R = rpy([gamma, beta, alpha]).full()
-    dR = central_difference(rpy, np.array([gamma, beta, alpha]))[:, ::-1]
-    for k in range(3):
-        spin = dR[:, k].reshape(3, 3, order="F") @ R.T
-        assert np.allclose(se3.unskew(ca.DM(spin)).full()[:, 0], E[:, k], rtol=0, atol=1e-9)
+def test_euler_rates(zyx):
+    inverse, order = euler_inverse(zyx).full(), np.eye(3)[::-1]
+    R = pin.rpy.rpyToMatrix(order @ zyx)
+    for k, step in enumerate(1e-6 * np.eye(3)):
+        high, low = (pin.rpy.rpyToMatrix(order @ (np.array(zyx) + s)) for s in (step, -step))
+        spin = (high - low) @ R.T / 2e-6
+        omega = [spin[2, 1], spin[0, 2], spin[1, 0]]
+        assert np.allclose(inverse @ omega, np.eye(3)[k], rtol=0, atol=1e-7)
 
 
 @PROPERTY
@@ -174,17 +153,9 @@ def test_derivatives_are_finite_at_the_identity_and_at_half_turns():
         assert log_gradient(R).is_regular()
         assert mean_gradient(R, turns[0]).is_regular()
     assert gradient(se3.project_to_rotation, M)(np.eye(3)).is_regular()
-    assert gradient(se3.rotation_about_axis, V, S)([0, 0, 1], 0).is_regular()
     half_turn = gradient(se3.quaternion_log, Q)
     assert half_turn([0, 1, 0, 0]).is_regular()
     assert half_turn([-1, 0, 0, 0]).is_regular()
-
-
-def test_graphs_take_mx_and_dm():
-    x = ca.MX.sym("x", 3)
-    f = ca.Function("f", [x], [se3.log_so3(se3.exp_so3(x))])
-    assert np.allclose(f([0.1, 0.2, 0.3]).full()[:, 0], [0.1, 0.2, 0.3], rtol=0, atol=1e-15)
-    assert isinstance(se3.exp_so3(ca.DM([0.1, 0.2, 0.3])), ca.DM)
 
 
 V = (3, 1)
@@ -252,10 +223,7 @@ def test_equal_normals_have_no_error(n):
     assert np.array_equal(error(n, n).full()[:, 0], np.zeros(3))
     assert float(angle(n, n)) < 1e-149
     assert np.allclose(rotation(n, n).full(), np.eye(3), rtol=0, atol=2e-15)
-
-
-def test_lengths_do_not_matter_to_the_angle():
-    assert float(angle([3, 0, 0], [0, 0, 0.1])) == pytest.approx(np.pi / 2, abs=1e-15)
+    assert abs(float(angle(3 * n, -0.1 * n)) - np.pi) < 1e-15  # lengths do not matter
 
 
 @PROPERTY
@@ -317,19 +285,10 @@ def test_as_good_as_scipy(best, rng, count, noise):
     assert clear > 10
 
 
-def test_any_scale(best, rng):
-    a, turn = rng.normal(size=(4, 3)), Rotation.random(rng=rng).as_matrix()
-    B = (a @ turn.T).T @ a
-    for scale in (1e-6, 1.0, 1e6):
-        np.testing.assert_allclose(best(scale * B), best(B), atol=1e-9)
-
-
-def test_half_a_turn(best):
+def test_half_a_turn_at_any_scale_one_vector_and_nothing(best):
     turn = Rotation.from_rotvec([0, 0, np.pi]).as_matrix()
-    np.testing.assert_allclose(best(turn), turn, atol=1e-9)
-
-
-def test_one_vector_and_nothing_give_a_rotation(best):
+    for scale in (1e-6, 1.0, 1e6):
+        np.testing.assert_allclose(best(scale * turn), turn, atol=1e-9)
     for B in (np.outer([0, 0, 1.0], [1.0, 0, 0]), np.zeros((3, 3))):
         R = best(B)
         np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
