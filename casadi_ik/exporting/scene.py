@@ -26,6 +26,7 @@ from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.problem.clearance import ROUNDING, SceneCheck
 from casadi_ik.solving.alternatives.arm_search import SearchValues
 from casadi_ik.solving.alternatives.free import PARAMETERS as FREE
+from casadi_ik.solving.alternatives.unconstrained_fingers import PARAMETERS as FINGERS
 from casadi_ik.symbolic.even_spread import even_steps
 
 MOST = 1000
@@ -283,18 +284,18 @@ class SceneSources:
         hand = list(about.hand_actuators)
         fingers = [about.finger_actuators(name) for name in robot.fingers]
         moved = [about.links_moved([motor]) for motor in hand]
-        whole = {"N_HAND": len(hand), "N_PARTS": len(FREE.idle_parts)}
-        whole |= {"N_IDLE": FREE.idle_postures, "N_IDLE_CLOSER": FREE.idle_closer}
+        whole = {"N_HAND": len(hand), "N_PARTS": len(FINGERS.parts)}
+        whole |= {"N_IDLE": FINGERS.postures, "N_IDLE_CLOSER": FINGERS.closer}
         return (
             define(whole)
-            + f"#define IDLE_NEAR {number(FREE.idle_near)}\n"
+            + f"#define IDLE_NEAR {number(FINGERS.near)}\n"
             + define_arrays(
                 {
                     "HAND": np.array(hand),
                     "HAND_LOWER": robot.lower[hand],
                     "HAND_RANGE": (robot.upper - robot.lower)[hand],
                     "HAND_SPREAD": even_steps(len(robot.lower))[hand],
-                    "IDLE_PARTS": np.array(FREE.idle_parts),
+                    "IDLE_PARTS": np.array(FINGERS.parts),
                     "FINGER_MOVED": np.array([[int(m in some) for m in hand] for some in fingers]),
                     "LINK_MOVED": np.array(
                         [[int(link in some) for some in moved] for link in self.links]

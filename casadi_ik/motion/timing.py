@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -91,67 +92,44 @@ def differences(q: Array, period: float) -> tuple[Array, Array]:
     return steps / period, np.diff(around, axis=0) / period**2
 
 
-def each(robot: ArmHand, name: str, value: Any) -> Array:
-    """One positive number per motor.
+def checked(
+    name: str, value: Any, shape: tuple[int, ...], fits: Callable[[Array], Any], expected: str
+) -> Array:
+    """Finite numbers of a shape that fit.
 
     Raises:
-        InputError: Something else.
+        InputError: Something else; the message says what was expected.
     """
-    n = len(robot.actuators)
     try:
-        array = np.array(np.broadcast_to(np.asarray(value, dtype=float), (n,)))
-    except (TypeError, ValueError) as error:
-        raise InputError(
-            f"{name}: found {value!r}, expected a number > 0, or {n} of them"
-        ) from error
-    if not (np.isfinite(array).all() and (array > 0).all()):
-        raise InputError(f"{name}: found {value!r}, expected a number > 0, or {n} of them")
+        array = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        array = np.zeros(0)
+    if array.shape != shape or not np.isfinite(array).all() or not np.all(fits(array)):
+        raise InputError(f"{name}: found {value!r}, expected {expected}")
     return array
 
 
-def seconds(name: str, value: Any) -> float:
-    """A positive number of seconds.
+def each(robot: ArmHand, name: str, value: Any) -> Array:
+    """One positive number per motor, see `checked`."""
+    n = len(robot.actuators)
+    shape, expected = () if np.ndim(value) == 0 else (n,), f"a number > 0, or {n} of them"
+    found = checked(name, value, shape, lambda array: array > 0, expected)
+    return np.array(np.broadcast_to(found, (n,)))
 
-    Raises:
-        InputError: Something else.
-    """
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = math.nan
-    if not 0 < number < math.inf:
-        raise InputError(f"{name}: found {value!r}, expected a number of seconds > 0")
-    return number
+
+def seconds(name: str, value: Any) -> float:
+    """A positive number of seconds, see `checked`."""
+    return float(checked(name, value, (), lambda x: x > 0, "a number of seconds > 0"))
 
 
 def length(name: str, value: Any) -> float:
-    """A number of metres >= 0.
-
-    Raises:
-        InputError: Something else.
-    """
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = math.nan
-    if not 0 <= number < math.inf:
-        raise InputError(f"{name}: found {value!r}, expected a number of metres >= 0")
-    return number
+    """A number of metres >= 0, see `checked`."""
+    return float(checked(name, value, (), lambda x: x >= 0, "a number of metres >= 0"))
 
 
 def a_direction(name: str, value: Any) -> Array:
-    """(3,) a direction.
-
-    Raises:
-        InputError: Something else.
-    """
-    try:
-        way = np.asarray(value, dtype=float)
-    except (TypeError, ValueError):
-        way = np.zeros(0)
-    if way.shape != (3,) or not np.isfinite(way).all() or not way.any():
-        raise InputError(f"{name}: found {value!r}, expected three numbers, not all zero")
-    return way
+    """(3,) a direction, see `checked`."""
+    return checked(name, value, (3,), np.any, "three numbers, not all zero")
 
 
 def unbounded(robot: ArmHand) -> Rates:

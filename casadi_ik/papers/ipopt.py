@@ -1,7 +1,6 @@
 """The method `ipopt`: the whole arm-hand as one nonlinear program, the slow, trusted reference.
 
-Ipopt solves it from q0 and then from random starts. The residuals of the contacts have formulas of
-their own, so that an error in the conditions of the other methods shows.
+Ipopt solves it from q0 and then from random starts.
 """
 
 from __future__ import annotations
@@ -28,7 +27,8 @@ from casadi_ik.kernels.cancellation import (
 )
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.kernels.loop import Stepper
-from casadi_ik.problem.contacts import Kinds, usual
+from casadi_ik.methods.common.contact_fit import whole_residual
+from casadi_ik.problem.contacts import LENGTH, ContactRows, Kinds, usual
 from casadi_ik.problem.jacobian_measures import JacobianMeasures
 from casadi_ik.problem.method import Outcome
 from casadi_ik.problem.status import Phase, Status
@@ -49,7 +49,6 @@ from casadi_ik.problem.trace import (
 )
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.couplings import joint_positions
-from casadi_ik.symbolic.kinematics import Kinematics, actuated
 
 
 @dataclass(frozen=True)
@@ -80,100 +79,12 @@ class IpoptParameters:
             raise InputError(f"optimality: found {value!r}, expected a number > 0")
 
 
-LENGTH = 0.1
-"""Position errors are divided by this [m], so that they weigh like the normals' (unit vectors)."""
-
-PLACES = {"point": 3, "line": 3, "plane": 1}
-FACINGS = {"normal": 3, "frame": 9}
-"""Rows by condition."""
-
-
-@dataclass(frozen=True)
-class NlpContacts:
-    """Residuals of all contacts: places by `LENGTH` of all fingers, then facings.
-
-    Attributes:
-        kinds: By finger.
-
-    Raises:
-        UnsupportedError: A condition that the program has no formula for.
-    """
-
-    kinds: Kinds
-
-    def __post_init__(self) -> None:
-        for kind in self.kinds:
-            if kind.place not in PLACES or kind.facing not in FACINGS:
-                raise UnsupportedError(
-                    f"method 'ipopt' knows no contacts of the kind {kind.place} and {kind.facing}"
-                )
-
-    @property
-    def sizes(self) -> list[int]:
-        """Rows of each place, then of each facing."""
-        places = [PLACES[kind.place] for kind in self.kinds]
-        return places + [FACINGS[kind.facing] for kind in self.kinds]
-
-    @property
-    def fields(self) -> tuple[Field, ...]:
-        """Targets and weights."""
-        f = len(self.kinds)
-        asked = {name for kind in self.kinds for name in (kind.place, kind.facing)}
-        own = {"frame": "tangents", "line": "lines", "plane": "planes"}
-        return (
-            Field("points", (f, 3), unit="m", doc="contact points, base frame; 0 if free"),
-            Field("normals", (f, 3), doc="outward pad normals, base frame; 0 if free"),
-            *(
-                Field(array, (f, 3), doc="unit vectors, base frame; 0 if free")
-                for name, array in own.items()
-                if name in asked
-            ),
-            Field("weights", (f, 2), doc="1 where point, normal count, 0 where free"),
-        )
-
-    def residual(self, robot: RobotDescription, q: ca.SX, p: dict[str, ca.SX]) -> ca.SX:
-        """All rows at q (n, 1)."""
-        kinematics = actuated(robot, q).kinematics
-        places, facings = [], []
-        for i, (name, kind) in enumerate(zip(robot.finger_names, self.kinds, strict=True)):
-            point, normal = kinematics.contact(name)
-            off = (point - p["points"][i, :].T) / LENGTH
-            if kind.place == "line":
-                # What is left of the way to the line's point without its part along the line.
-                along = p["lines"][i, :].T
-                off = off - along @ (along.T @ off)
-            elif kind.place == "plane":
-                off = p["planes"][i, :] @ off
-            places.append(off * p["weights"][i, 0])
-            facing = normal - p["normals"][i, :].T
-            if kind.facing == "frame":
-                tangent = p["tangents"][i, :].T
-                facing = _turned(kinematics, name, p["normals"][i, :].T, tangent)
-            facings.append(facing * p["weights"][i, 1])
-        return ca.vertcat(*places, *facings)
-
-    def errors(self, residuals: Array) -> tuple[Array, Array]:
-        """Distances [m] and angles [rad], (k, f) each and zero where free, of residuals (k, r)."""
-        ends = np.cumsum(self.sizes)[:-1]
-        parts = np.split(residuals, ends, axis=1)
-        lengths = np.stack([np.linalg.norm(part, axis=1) for part in parts], axis=1)
-        f = len(self.kinds)
-        return lengths[:, :f] * LENGTH, 2 * np.arcsin(np.minimum(lengths[:, f:] / 2, 1.0))
-
-
-def _turned(kinematics: Kinematics, finger: str, normal: ca.SX, tangent: ca.SX) -> ca.SX:
-    """Difference (9, 1) of two frames; its length is the chord of the angle between them.
-
-    Two rotations that differ by an angle a differ by 8 sin(a / 2)^2 in squares of all entries. A
-    tangent of zero is free: then the difference of the normals alone.
-    """
-    own, facing = kinematics.tangent(finger), kinematics.contact(finger)[1]
-    given = ca.dot(tangent, tangent)
-    half = ca.sqrt(ca.SX(2)) / 2
-    first = (facing - normal) * ca.if_else(given > 0.5, half, 1.0)
-    second = (own - tangent) * half
-    third = (ca.cross(facing, own) - ca.cross(normal, tangent)) * half
-    return ca.vertcat(first, *(ca.if_else(given > 0.5, rows, 0.0) for rows in (second, third)))
+def contact_errors(contacts: ContactRows, residuals: Array) -> tuple[Array, Array]:
+    """Distances [m] and angles [rad], (k, f) each and zero where free, of residuals (k, r)."""
+    parts = [residuals[:, own] for own in contacts.slices]
+    lengths = np.stack([np.linalg.norm(part, axis=1) for part in parts], axis=1)
+    f = len(contacts.kinds)
+    return lengths[:, :f] * LENGTH, 2 * np.arcsin(np.minimum(lengths[:, f:] / 2, 1.0))
 
 
 NEAR = 0.1
@@ -236,9 +147,9 @@ class WholeNlp:
     def __init__(self, robot: RobotDescription, options: IpoptParameters, kinds: Kinds) -> None:
         """Build the graphs and both solvers, cold and warm."""
         n = len(robot.actuators)
-        self.contacts = NlpContacts(kinds)
+        self.contacts = ContactRows(kinds)
         self.parameters = Layout(self.contacts.fields)
-        self._n, self._rows = n, sum(self.contacts.sizes)
+        self._n, self._rows = n, self.contacts.size
         self._lower = robot.lower
         # Sliders of millimetres and joints of radians move the contacts alike once scaled.
         metres = np.array([actuator.unit == "m" for actuator in robot.actuators])
@@ -250,7 +161,7 @@ class WholeNlp:
         )
 
         q, p = ca.SX.sym("q", n), self.parameters.symbols("p")
-        residual = self.contacts.residual(robot, q, self.parameters.unpack(p))
+        residual = whole_residual(robot, self.contacts, q, self.parameters.unpack(p))
         joints = joint_positions(robot, q)[limited]
         self.residual = ca.Function("residual", [q, p], [residual], ["q", "p"], ["r"])
         self._joints = ca.Function("joints", [q], [ca.densify(joints)])
@@ -637,7 +548,7 @@ class IpoptMethod:
         rows = np.zeros(sum(len(run.path) for run in runs), dtype=self.record.dtype)
         residuals = np.concatenate([run.residuals for run in runs])
         q = np.concatenate([run.path for run in runs])
-        distances, angles = self.program.contacts.errors(residuals)
+        distances, angles = contact_errors(self.program.contacts, residuals)
         at_limit = (q <= self._robot.lower + AT_LIMIT) | (q >= self._robot.upper - AT_LIMIT)
         rows["q"] = q
         rows["cost"] = np.sum(residuals**2, axis=1)
@@ -657,9 +568,9 @@ def _step_sizes(path: Array) -> Array:
     return np.append(np.abs(np.diff(path, axis=0)).max(axis=1), np.nan)
 
 
-def _ending(run: NlpRun, targets: TargetBatch, contacts: NlpContacts) -> Status:
+def _ending(run: NlpRun, targets: TargetBatch, contacts: ContactRows) -> Status:
     """How a run ended: solved if every contact is within tolerance, whatever Ipopt thinks."""
-    distances, angles = contacts.errors(run.residual[None])
+    distances, angles = contact_errors(contacts, run.residual[None])
     met = np.all(distances <= targets.position_tolerance)
     met = met and np.all(angles <= targets.angle_tolerance)
     return Status.SOLVED if met and run.inside else run.status

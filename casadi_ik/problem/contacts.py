@@ -9,8 +9,8 @@ polynomial in the vectors, its length the distance or the chord 2 sin(angle / 2)
 false zero at a half turn: the form for least squares. As a rotation vector (`error`, `across`) it
 is what Newton's method on the angle needs.
 
-The verdict (`problem.verdict`) and the method `ipopt` have formulas of their own, on purpose:
-they are what this file is checked against.
+The verdict (`problem.verdict`) has formulas of its own, on purpose: it is what this file is checked
+against.
 """
 
 from __future__ import annotations

@@ -35,9 +35,10 @@ from casadi_ik.solving.alternatives.finder import (
     AlternativeFinder,
     checked_distance,
 )
-from casadi_ik.solving.alternatives.free import Deduplicator, free_answers
+from casadi_ik.solving.alternatives.free import free_answers
 from casadi_ik.solving.batch_parts import judged
 from casadi_ik.solving.engine import Engine
+from casadi_ik.solving.trials import Deduplicator
 
 Judgement: TypeAlias = str | Callable[[ArmHand, Array], ArrayLike]
 """One of `PREFERENCES`, or what gives configurations (m, n) of a robot their scores (m,)."""

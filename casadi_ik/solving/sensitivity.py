@@ -21,10 +21,11 @@ from casadi_ik.arrays import Array
 from casadi_ik.kernels import FunctionGraph
 from casadi_ik.kernels.function_kernel import MeasureKernel
 from casadi_ik.kernels.graphs import recipe
-from casadi_ik.problem.contacts import ContactRows, Kinds, suffix, tip_vectors
+from casadi_ik.methods.common.contact_fit import whole_residual
+from casadi_ik.problem.contacts import ContactRows, Kinds, suffix
 from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.kinematics import actuated, motor_scales
+from casadi_ik.symbolic.kinematics import motor_scales
 from casadi_ik.symbolic.linear_algebra import solve_spd
 
 AT_LIMIT = 1e-9
@@ -86,10 +87,7 @@ class SensitivityKernel:
         for name, (rows, columns) in self._inputs.items():
             own = column[first : first + rows * columns]
             given[name], first = ca.reshape(own, columns, rows).T, first + rows * columns
-        kinematics = actuated(robot, given["q"]).kinematics
-        tips = [tip_vectors(kinematics, finger) for finger in robot.finger_names]
-        goals = self._contacts.goals(given)
-        residual = self._contacts.residual(tips, goals, given["weights"])
+        residual = whole_residual(robot, self._contacts, given["q"], given)
         scales = given["free"] * motor_scales(robot)
         rates = ca.jacobian(residual, given["q"]) @ ca.diag(scales)
         square = ca.densify(rates.T @ rates + DAMPING * ca.DM.eye(len(robot.actuators)))

@@ -10,12 +10,8 @@ from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.problem.request import PREFERENCES
 from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.solving.alternatives.arm_search import ArmSearch
-from casadi_ik.solving.alternatives.free import (
-    Deduplicator,
-    UnconstrainedFingers,
-    best_of_each,
-    first_of_each,
-)
+from casadi_ik.solving.alternatives.unconstrained_fingers import UnconstrainedFingers
+from casadi_ik.solving.trials import Deduplicator, best_of_each, first_of_each
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,15 @@ import pytest
 from toy_robots import replace, write_coupled_robot
 
 import casadi_ik as ik
-from casadi_ik.methods.common.contact_fit import whole_residual
-from casadi_ik.papers.ipopt import EXACT, LENGTH, IpoptParameters, WholeNlp, limited_joints
-from casadi_ik.problem.contacts import ContactRows, usual
+from casadi_ik.papers.ipopt import (
+    EXACT,
+    LENGTH,
+    IpoptParameters,
+    WholeNlp,
+    contact_errors,
+    limited_joints,
+)
+from casadi_ik.problem.contacts import usual
 from casadi_ik.problem.targets import TargetBatch
 
 
@@ -48,24 +54,10 @@ def middle(robot, rng, part=0.6):
     return centre + part * half * rng.uniform(-1, 1, len(centre))
 
 
-def test_residual_is_that_of_the_other_methods(robot, program, rng):
-    """The reference has its own residual; it had better be the same question."""
-    q, p = (
-        robot.random(rng, 1)[0],
-        program.targets(robot.random(rng, 1)[0], [[1, 1], [1, 0], [0, 0]]),
-    )
-    symbols = ca.SX.sym("q", len(q))
-    other = whole_residual(
-        robot.description, ContactRows(usual(3)), symbols, program.nlp.parameters.unpack(ca.SX(p))
-    )
-    other = ca.Function("other", [symbols], [other])
-    np.testing.assert_allclose(program.nlp.residual(q, p), other(q), atol=1e-14)
-
-
 def test_errors_of_a_residual_are_distances_and_angles(robot, program, rng):
     q, goal = robot.random(rng, 2)
     residual = np.array(program.nlp.residual(q, program.targets(goal))).ravel()
-    distances, angles = program.nlp.contacts.errors(residual[None])
+    distances, angles = contact_errors(program.nlp.contacts, residual[None])
     points, normals = robot.contacts(q)
     target_points, target_normals = robot.contacts(goal)
     expected = np.linalg.norm(points - target_points, axis=1)

@@ -1,4 +1,4 @@
-"""State, parameters and record of the enhanced methods, and the numbers that go in and come out."""
+"""The enhanced methods of Qiu & Kermani 2021: thumb reaching, then hand alignment."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import casadi as ca
 import numpy as np
 
 from casadi_ik.arrays import Array
-from casadi_ik.kernels.graphs import StepGraph, recipe
-from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.kernels.layout import Field
 from casadi_ik.methods.common.limits import kept_within, limit_mask
 from casadi_ik.papers.qiu.finger_step import finger_step_function, planar_fingers
 from casadi_ik.papers.qiu.parameters import QiuParameters
 from casadi_ik.papers.qiu.tasks import (
     MILLIMETRE,
+    QiuStep,
     Task,
     TaskSolver,
     combine,
@@ -27,25 +27,10 @@ from casadi_ik.papers.qiu.tasks import (
     weighted,
     weighted_damped,
 )
-from casadi_ik.problem.contacts import (
-    contact_errors,
-    goal_contacts,
-    target_fields,
-    target_values,
-    within_tolerance,
-)
+from casadi_ik.problem.contacts import contact_errors, goal_contacts, within_tolerance
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.problem.targets import TargetBatch
-from casadi_ik.problem.trace import (
-    ANGLE_ERROR,
-    LIMIT_MASK,
-    PHASE,
-    POSITION_ERROR,
-    STATUS,
-    STEP_SIZE,
-    Q,
-    RecordedJacobian,
-)
+from casadi_ik.problem.trace import STEP_SIZE, RecordedJacobian
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.closed_chain import VIRTUAL, closed_chain, split
 from casadi_ik.symbolic.kinematics import actuated
@@ -55,63 +40,44 @@ from casadi_ik.symbolic.smooth import Expr, safe_norm, shared
 NOT_MEASURED = float("nan")
 
 
-class EnhancedLayouts:
-    """The three layouts for one robot.
+class EnhancedStep(QiuStep[QiuParameters]):
+    """Builds the step graph of an enhanced method for one robot.
 
     Attributes:
-        robot: The description.
-        options: The structural choices and the numbers.
         chain: Active and passive joints of the closed chain.
-        state: What an iteration hands to the next.
-        parameters: The problem and the numbers of the method.
-        record: What is logged of an iteration.
     """
+
+    family, stage = "enhanced", "phase"
 
     def __init__(self, robot: RobotDescription, options: QiuParameters) -> None:
         """Lay out state, parameters and record.
 
-        Args:
-            robot: The description.
-            options: The structural choices; numbers are parameters of the graph.
-
         Raises:
             UnsupportedError: The robot is not of the kind the method needs.
         """
-        n = len(robot.actuators)
-        self.robot = robot
-        self.options = options
         self.chain = split(robot, options.borrowed)
+        self.compilable = options.finger_step != "ipopt"
         planar_fingers(robot)  # refused now rather than when the graph is built
-        self.state = Layout(
-            (
-                Field("q", (n,)),
-                Field("phase"),
-                Field("best", doc="smallest summed error of thumb reaching so far"),
-                Field("waited", doc="iterations since `best` fell"),
-                Field("reached", doc="iterations spent in thumb reaching"),
-            )
+        state = (
+            Field("phase"),
+            Field("best", doc="smallest summed error of thumb reaching so far"),
+            Field("waited", doc="iterations since `best` fell"),
+            Field("reached", doc="iterations spent in thumb reaching"),
         )
-        self.parameters = Layout(
-            (
-                *target_fields(robot),
-                Field("enforce_limits", doc="1: q is kept within its limits, 0: it is not"),
-                Field("reaching_damping"),
-                Field("chain_damping"),
-                Field("chain_lever", unit="mm"),
-                Field("reaching_gamma"),
-                Field("chain_gamma"),
-                Field("longest_error", unit="mm"),
-                Field("widest_error", unit="rad"),
-                Field("weights", (len(self.chain.active),)),
-                Field("reaching_patience"),
-                Field("reaching_iterations"),
-                Field("step_cap"),
-            )
+        numbers = (
+            Field("reaching_damping"),
+            Field("chain_damping"),
+            Field("chain_lever", unit="mm"),
+            Field("reaching_gamma"),
+            Field("chain_gamma"),
+            Field("longest_error", unit="mm"),
+            Field("widest_error", unit="rad"),
+            Field("weights", (len(self.chain.active),)),
+            Field("reaching_patience"),
+            Field("reaching_iterations"),
+            Field("step_cap"),
         )
-        self.record = Layout.record(
-            Q.of(robot),
-            POSITION_ERROR.of(robot),
-            ANGLE_ERROR.of(robot),
+        measured = (
             Field("palm_error", (), "f4", "rad", "palm orientation task error (phase 1)"),
             Field("palm_motion", (2,), "f4", "mm, rad", "palm motion demanded (phase 2)"),
             STEP_SIZE.of(robot, "largest motor change of this iteration"),
@@ -119,10 +85,8 @@ class EnhancedLayouts:
             Field("sigma_palm", (), "f4", "", "smallest singular value, palm task (phase 1)"),
             Field("sigma_closed_chain", (), "f4", "", "smallest singular value of H_p (phase 2)"),
             Field("condition_closed_chain", (), "f4", "", "condition number of H_p (phase 2)"),
-            LIMIT_MASK.of(robot),
-            PHASE.of(robot),
-            STATUS.of(robot),
         )
+        super().__init__(robot, options, state, numbers, measured)
 
     @property
     def jacobians(self) -> dict[str, RecordedJacobian]:
@@ -146,26 +110,17 @@ class EnhancedLayouts:
     def parameter_values(self, targets: TargetBatch) -> dict[str, float | list[float] | Array]:
         """Values of all parameter fields for a batch."""
         options = self.options
-        named = (name for name in self.parameters.names if hasattr(options, name))
-        return {
-            **target_values(targets),
-            "enforce_limits": float(targets.enforce_limits),
-            "weights": [
-                options.virtual_weight if column == VIRTUAL else options.joint_weight
-                for column in self.chain.active
-            ],
-            **{name: float(getattr(options, name)) for name in named},
-        }
+        weights = [
+            options.virtual_weight if column == VIRTUAL else options.joint_weight
+            for column in self.chain.active
+        ]
+        return super().parameter_values(targets) | {"weights": weights}
 
     def first_state(self, starts: Array) -> dict[str, float | Array]:
         """Values of all state fields for starts (k, n)."""
-        return {
-            "q": starts,
-            "phase": float(Phase.THUMB_REACHING),
-            "best": float(np.finfo(float).max),
-            "waited": 0.0,
-            "reached": 0.0,
-        }
+        most = float(np.finfo(float).max)
+        begun = {"phase": float(Phase.THUMB_REACHING), "best": most, "waited": 0.0, "reached": 0.0}
+        return super().first_state(starts) | begun
 
     def row(
         self, q: Expr, positions: Expr, angles: Expr, *, phase: Phase, **measured: Expr
@@ -193,27 +148,6 @@ class EnhancedLayouts:
         }
         return self.record.pack(values | measured)
 
-
-class EnhancedStep(EnhancedLayouts):
-    """Builds the step graph of an enhanced method for one robot."""
-
-    def graph(self) -> StepGraph:
-        """The whole iteration; compilable unless the finger step calls Ipopt."""
-        return StepGraph(
-            self._name,
-            self._iteration,
-            self.state,
-            self.parameters,
-            self.record,
-            self.options.finger_step != "ipopt",
-            stage="phase",
-            recipe=recipe(self._name, self.robot, self.options),
-        )
-
-    @property
-    def _name(self) -> str:
-        return ca.Function.fix_name(f"enhanced_{self.options.steps}_{self.robot.name}")
-
     def _iteration(self) -> ca.Function:
         state = ca.MX.sym("state", self.state.size)
         parameters = ca.MX.sym("parameters", self.parameters.size)
@@ -227,10 +161,6 @@ class EnhancedStep(EnhancedLayouts):
         in_reaching = state[self.state.slice("phase")] < Phase.HAND_ALIGNMENT
         outputs = choose(in_reaching, state, parameters)
         return ca.Function(self._name, [state, parameters], list(outputs))
-
-    def _inputs(self) -> tuple[ca.SX, ca.SX, dict[str, ca.SX], dict[str, ca.SX]]:
-        state, parameters = self.state.symbols("state"), self.parameters.symbols("parameters")
-        return state, parameters, self.state.unpack(state), self.parameters.unpack(parameters)
 
     def _palm_view(self) -> ca.Function:
         """Targets of the fingers but the thumb, seen from the palm: what eq. (5) works with."""

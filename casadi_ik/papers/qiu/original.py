@@ -6,12 +6,11 @@ from functools import cached_property
 
 import casadi as ca
 
-from casadi_ik.arrays import Array
-from casadi_ik.kernels.graphs import StepGraph, recipe
-from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.kernels.layout import Field
 from casadi_ik.methods.common.limits import kept_within, limit_mask
 from casadi_ik.papers.qiu.parameters import OriginalParameters
 from casadi_ik.papers.qiu.tasks import (
+    QiuStep,
     Task,
     combine,
     contact_tasks,
@@ -21,85 +20,34 @@ from casadi_ik.papers.qiu.tasks import (
     selective,
     thumb_first,
 )
-from casadi_ik.problem.contacts import (
-    contact_errors,
-    goal_contacts,
-    target_fields,
-    target_values,
-    within_tolerance,
-)
+from casadi_ik.problem.contacts import contact_errors, goal_contacts, within_tolerance
 from casadi_ik.problem.status import Phase, Status
-from casadi_ik.problem.targets import TargetBatch
-from casadi_ik.problem.trace import (
-    ANGLE_ERROR,
-    LIMIT_MASK,
-    PHASE,
-    POSITION_ERROR,
-    STATUS,
-    STEP_SIZE,
-    Q,
-)
+from casadi_ik.problem.trace import STEP_SIZE
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.kinematics import actuated
 from casadi_ik.symbolic.linear_algebra import damped_pinv_times
 from casadi_ik.symbolic.smooth import shared
 
 
-class OriginalStep:
+class OriginalStep(QiuStep[OriginalParameters]):
     """Builds the step graph of an original method for one robot.
 
-    Attributes:
-        options: The structural choices; numbers are parameters of the graph.
-        state: Layout of the state.
-        parameters: Layout of the parameters.
-        record: Layout of the record: q and its errors before the step.
+    What repeats, the solving of a task, is a function that is called: written out once per task it
+    made the C compiler slow. Only the columns of the actuators that move a task are worked on.
     """
+
+    family = "original"
 
     def __init__(self, robot: RobotDescription, options: OriginalParameters) -> None:
         """Lay out state, parameters and record."""
-        n = len(robot.actuators)
-        self.robot = robot
-        self.options = options
-        self.state = Layout((Field("q", (n,)),))
-        self.parameters = Layout(
-            (
-                *target_fields(robot),
-                Field("enforce_limits", doc="1: q is kept within its limits, 0: it is not"),
-                Field("damping"),
-                Field("gamma"),
-                Field("longest_error", unit="mm"),
-                Field("widest_error", unit="rad"),
-            )
+        numbers = (
+            Field("damping"),
+            Field("gamma"),
+            Field("longest_error", unit="mm"),
+            Field("widest_error", unit="rad"),
         )
-        self.record = Layout.record(
-            Q.of(robot),
-            POSITION_ERROR.of(robot),
-            ANGLE_ERROR.of(robot),
-            STEP_SIZE.of(robot, "largest motor change of this iteration"),
-            LIMIT_MASK.of(robot),
-            PHASE.of(robot),
-            STATUS.of(robot),
-        )
-
-    def graph(self) -> StepGraph:
-        """The whole iteration.
-
-        What repeats, the solving of a task, is a function that is called: written out once per
-        task it made the C compiler slow. Only the columns of the actuators that move a task are
-        worked on.
-        """
-        return StepGraph(
-            self._name,
-            self._iteration,
-            self.state,
-            self.parameters,
-            self.record,
-            recipe=recipe(self._name, self.robot, self.options),
-        )
-
-    @property
-    def _name(self) -> str:
-        return ca.Function.fix_name(f"original_{self.options.steps}_{self.robot.name}")
+        moved = STEP_SIZE.of(robot, "largest motor change of this iteration")
+        super().__init__(robot, options, (), numbers, (moved,))
 
     def _iteration(self) -> ca.Function:
         state = ca.MX.sym("state", self.state.size)
@@ -120,23 +68,6 @@ class OriginalStep:
             step = self._combined()(*pairs, *steps)
         outputs = self._ending()(state, parameters, errors, step)
         return ca.Function(self._name, [state, parameters], list(outputs))
-
-    def first_state(self, starts: Array) -> dict[str, float | Array]:
-        """Values of all state fields for starts (k, n)."""
-        return {"q": starts}
-
-    def parameter_values(self, targets: TargetBatch) -> dict[str, float | Array]:
-        """Values of all parameter fields for a batch."""
-        named = (name for name in self.parameters.names if hasattr(self.options, name))
-        return {
-            **target_values(targets),
-            "enforce_limits": float(targets.enforce_limits),
-            **{name: float(getattr(self.options, name)) for name in named},
-        }
-
-    def _inputs(self) -> tuple[ca.SX, ca.SX, dict[str, ca.SX], dict[str, ca.SX]]:
-        state, parameters = self.state.symbols("state"), self.parameters.symbols("parameters")
-        return state, parameters, self.state.unpack(state), self.parameters.unpack(parameters)
 
     @cached_property
     def _kinds(self) -> list[tuple[bool, tuple[int, ...]]]:

@@ -22,7 +22,14 @@ from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import ContactVerdict, judge
 from casadi_ik.solving.alternatives.arm_search import ArmSearch, Preference
 from casadi_ik.solving.alternatives.branches import ArmBranches
-from casadi_ik.solving.trials import Bounds, HandMethod, LocalRefinement, Subproblems, repeated
+from casadi_ik.solving.trials import (
+    Bounds,
+    HandMethod,
+    LocalRefinement,
+    Subproblems,
+    distinct,
+    repeated,
+)
 from casadi_ik.symbolic.kinematics import actuated
 from casadi_ik.symbolic.singular_values import manipulability
 
@@ -344,17 +351,6 @@ class AlternativeFinder:
             manipulability=float(self._measured(q)[0]),
             distance=float(-self.score(q, q0, "q0")[0]),
         )
-
-
-def distinct(parts: Array, apart: float, limit: int | None = None) -> list[int]:
-    """Rows of parts (k, n) that differ from all chosen before them, in their order."""
-    kept: list[int] = []
-    for i in range(len(parts)):
-        if len(kept) == limit:
-            break
-        if (np.abs(parts[i] - parts[kept]).max(axis=1, initial=0.0) >= apart).all():
-            kept.append(i)
-    return kept
 
 
 def checked_distance(apart: float) -> float:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.answers.solution import BatchSolution, CollisionReport
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.arrays import Array, Bools
+from casadi_ik.arrays import Array
 from casadi_ik.problem.clearance import ROUNDING, Clearances, CollisionQuery
 from casadi_ik.problem.contacts import by_kinds
 from casadi_ik.problem.method import Outcome
@@ -30,8 +30,9 @@ from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import SolvedVerdict, judge_one
 from casadi_ik.solving.alternatives.arm_search import Preference
 from casadi_ik.solving.alternatives.finder import AlternativeFinder
+from casadi_ik.solving.alternatives.unconstrained_fingers import UnconstrainedFingers
 from casadi_ik.solving.batch_parts import judged
-from casadi_ik.solving.trials import LocalRefinement
+from casadi_ik.solving.trials import Deduplicator, LocalRefinement, best_of_each, first_of_each
 from casadi_ik.symbolic.even_spread import even_steps
 
 USUAL = "limits"
@@ -58,10 +59,6 @@ class FreeSearchParameters:
         gain: What a step away has to gain at least, of what there is to gain.
         hopeful: Hands with most room that are looked at for why there is no answer.
         least_range: What stands for the range of a motor that has none [rad or m].
-        idle_postures: Of unconstrained fingers that are looked at, evenly spread over their limits.
-        idle_closer: As many about the best of them, where they have too little room, ever closer.
-        idle_parts: How far about [of the motors' ranges].
-        idle_near: Room [m] that can be gained about a posture.
     """
 
     together: int = 128
@@ -76,10 +73,6 @@ class FreeSearchParameters:
     gain: float = 0.1
     hopeful: int = 4
     least_range: float = 1e-9
-    idle_postures: int = 48
-    idle_closer: int = 24
-    idle_parts: tuple[float, ...] = (0.5, 0.25, 0.12)
-    idle_near: float = 0.02
 
 
 PARAMETERS = FreeSearchParameters()
@@ -428,141 +421,6 @@ def _shifted(robot: ArmHand, seed: int, numbers: NDArray[np.intp], count: int) -
     shift = numbers[:, None] * even_steps(len(robot.lower))
     part = (cloud + shift[:, None]) % 1.0
     return robot.lower + part * (robot.upper - robot.lower)
-
-
-class UnconstrainedFingers:
-    """The motors of k targets' hands that move no finger with a contact."""
-
-    def __init__(self, robot: ArmHand, targets: TargetBatch) -> None:
-        self._description = description = robot.description
-        free = np.isnan(targets.points[..., 0]) & np.isnan(targets.normals[..., 0])
-        for more in targets.more.values():
-            free &= np.isnan(more[..., 0])
-        busy = np.zeros((len(description.finger_names), len(robot.lower)), dtype=bool)
-        for finger, name in enumerate(description.finger_names):
-            busy[finger, list(description.finger_actuators(name))] = True
-        hand = np.zeros(len(robot.lower), dtype=bool)
-        hand[list(description.hand_actuators)] = True
-        self._motors: Bools = hand & ~(~free[:, :, None] & busy).any(axis=1)
-        if targets.fixed is not None:
-            self._motors &= np.isnan(targets.fixed)
-        parts = (
-            0.5 + np.arange(PARAMETERS.idle_postures)[:, None] * even_steps(len(robot.lower))
-        ) % 1.0
-        ranges = robot.upper - robot.lower
-        self._limits = robot.lower, robot.upper
-        self._places = robot.lower + parts * ranges
-        about = (parts[: PARAMETERS.idle_closer] - 0.5) * ranges
-        self._spread = (None, *(part * about for part in PARAMETERS.idle_parts))
-
-    def aside(self, q: Array, owner: NDArray[np.intp], query: CollisionQuery) -> Array:
-        """Hands, those that touch something by themselves with their idle fingers elsewhere.
-
-        Args:
-            q: (m, n) configurations.
-            owner: (m,) their targets.
-            query: What hands by themselves are checked against.
-
-        Returns:
-            (m, n) each as it is, or with the idle fingers where they have most room.
-        """
-        some = np.flatnonzero(self._motors[owner].any(axis=1))
-        if not len(some):
-            return q
-        of_idle, others = query.parted(self._links)
-        # What the idle fingers have no part in they do not help.
-        some = some[others.rows(owner[some]).free(q[some])]
-        before = of_idle.rows(owner[some]).check(q[some]).surplus
-        touching = before < -ROUNDING
-        some, before = some[touching], before[touching]
-        if not len(some):
-            return q
-        moved = q.copy()
-        for places in self._spread:
-            motors = self._motors[owner[some]]
-            about = moved[some][:, None]
-            there = self._places if places is None else about + places
-            tried = np.where(motors[:, None], np.clip(there, *self._limits), about)
-            count = tried.shape[1]
-            rows = np.repeat(owner[some], count)
-            surplus = (
-                of_idle.rows(rows).check(tried.reshape(-1, q.shape[1])).surplus.reshape(-1, count)
-            )
-            best = surplus.argmax(axis=1)
-            each = np.arange(len(some))
-            most = surplus[each, best]
-            better = most > before
-            moved[some[better]] = tried[each, best][better]
-            before = np.maximum(before, most)
-            near = (before < -ROUNDING) & (before > -PARAMETERS.idle_near)
-            some, before = some[near], before[near]
-            if not len(some):
-                break
-        return moved
-
-    @cached_property
-    def _links(self) -> frozenset[str]:
-        """Links that a motor moves which is idle in one of the targets."""
-        idle = np.flatnonzero(self._motors.any(axis=0)).tolist()
-        return self._description.links_moved(idle)
-
-
-def best_of_each(owner: NDArray[np.intp], value: Array, than: Array) -> NDArray[np.intp]:
-    """The row of the largest value (m,) of each owner (m,), where it exceeds what that has (k,)."""
-    order = np.lexsort((value, owner))
-    last = order[np.append(owner[order][1:] != owner[order][:-1], True)]
-    return last[value[last] > than[owner[last]]]
-
-
-def first_of_each(owner: NDArray[np.intp], order: NDArray[np.intp], count: int) -> NDArray[np.intp]:
-    """So many rows of each owner, the first in an order that goes owner by owner."""
-    sorted_owner = owner[order]
-    rank = np.arange(len(order)) - np.searchsorted(sorted_owner, sorted_owner)
-    return order[rank < count]
-
-
-class Deduplicator:
-    """The rows that each of k owners has had so far, none like another."""
-
-    def __init__(self, count: int, size: int, apart: float) -> None:
-        """Begin with none.
-
-        Args:
-            count: Owners.
-            size: Numbers of a row.
-            apart: Rows all of whose numbers differ by less are alike.
-        """
-        self._rows = np.full((count, 0, size), np.nan)
-        self._apart = apart
-
-    def add(self, rows: Array, owner: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Take rows (m, size) in; (m,) whether each is unlike all before it."""
-        order = np.argsort(owner, kind="stable")
-        mine = owner[order]
-        rank = np.arange(len(order)) - np.searchsorted(mine, mine)
-        whose, place = np.unique(mine, return_inverse=True)
-        most, before = int(rank.max(initial=-1)) + 1, self._rows.shape[1]
-        if not before and most <= 1:
-            self._rows = np.full((len(self._rows), most, rows.shape[1]), np.nan)
-            self._rows[whose, :1] = rows[order][:, None]
-            return np.ones(len(rows), dtype=bool)
-        new = np.full((len(whose), most, rows.shape[1]), np.nan)
-        new[place, rank] = rows[order]
-        every = np.concatenate([self._rows[whose], new], axis=1)
-        # Of rows that are not there the distance is NaN, which is not near. Number by number: the
-        # largest along a short last axis costs several times as much.
-        near = np.ones((len(whose), most, before + most), dtype=bool)
-        for one, known in zip(np.moveaxis(new, 2, 0), np.moveaxis(every, 2, 0), strict=True):
-            near &= np.abs(one[:, :, None] - known[:, None]) < self._apart
-        fresh = np.asarray(~near[:, :, :before].any(axis=2))
-        for i in range(1, most):
-            fresh[:, i] &= ~(near[:, i, before : before + i] & fresh[:, :i]).any(axis=1)
-        added = np.full((len(self._rows), most, rows.shape[1]), np.nan)
-        added[whose] = np.where(fresh[:, :, None], new, np.nan)
-        self._rows = np.concatenate([self._rows, added], axis=1)
-        found = np.zeros(len(rows), dtype=bool)
-        found[order] = fresh[place, rank]
-        return found
 
 
 def resolve_collisions(
