@@ -12,9 +12,9 @@ from casadi_ik.kernels.layout import Field
 from casadi_ik.methods.common.limits import kept_within, limit_mask
 from casadi_ik.papers.qiu.finger_step import finger_step_function, planar_fingers
 from casadi_ik.papers.qiu.parameters import QiuParameters
+from casadi_ik.papers.qiu.step import QiuStep
 from casadi_ik.papers.qiu.tasks import (
     MILLIMETRE,
-    QiuStep,
     Task,
     TaskSolver,
     combine,

@@ -9,8 +9,8 @@ import casadi as ca
 from casadi_ik.kernels.layout import Field
 from casadi_ik.methods.common.limits import kept_within, limit_mask
 from casadi_ik.papers.qiu.parameters import OriginalParameters
+from casadi_ik.papers.qiu.step import QiuStep
 from casadi_ik.papers.qiu.tasks import (
-    QiuStep,
     Task,
     combine,
     contact_tasks,
