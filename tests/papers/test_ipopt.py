@@ -17,7 +17,6 @@ from casadi_ik.papers.ipopt import (
     limited_joints,
 )
 from casadi_ik.problem.contacts import usual
-from casadi_ik.problem.targets import TargetBatch
 
 
 class Program:
@@ -112,33 +111,6 @@ def test_ipopt_is_given_the_exact_hessian(robot, program):
     assert stats["n_call_nlp_hess_l"] == len(run.path) - 1 > 2
 
 
-def test_rows_of_a_run(robot, program):
-    goal = np.clip(robot.home + 0.15, robot.lower, robot.upper)
-    parameters = program.targets(goal)
-    run = program.solve(robot.home, parameters)
-    assert run.cost < EXACT**2
-    np.testing.assert_allclose(run.path[0], robot.home, atol=1e-7)
-    np.testing.assert_allclose(run.path[-1], run.q, atol=1e-12)
-    for q, residual in zip(run.path, run.residuals, strict=True):
-        np.testing.assert_allclose(
-            program.nlp.residual(q, parameters), residual[:, None], atol=1e-12
-        )
-    assert np.all((run.path >= robot.lower) & (run.path <= robot.upper))
-    rows = len(run.path)
-    for column in (run.barrier, run.infeasibility, run.regularization):
-        assert column.shape == (rows,)
-        assert np.all(np.isfinite(column))
-    assert np.all(np.diff(run.barrier) <= 0)
-
-
-def test_a_start_at_the_solution_is_left_where_it_is(robot, program, rng):
-    for q in robot.random(rng, 5):
-        run = program.solve(q, program.targets(q))
-        assert len(run.path) == 1
-        np.testing.assert_array_equal(run.q, q)
-        assert np.all(np.isnan(run.barrier))
-
-
 def test_a_start_close_to_the_solution_stays_close(robot, program, rng):
     """A small barrier and a slight pull: no detour along the arm's self-motion."""
     rows, moved = [], []
@@ -186,13 +158,6 @@ def test_joint_limits_are_kept(tmp_path, rng):
         assert run.inside
         assert robot.joints(run.q)["left_3"] <= 0.25 + 1e-9
         assert (run.cost > 1e-6) == out
-
-
-def test_budget(robot, program, rng):
-    short = Program(robot, max_iterations=3)
-    run = short.solve(robot.home, short.targets(middle(robot, rng)))
-    assert run.status is ik.Status.ITERATION_LIMIT
-    assert len(run.path) == 4
 
 
 def test_numbers_that_are_not_finite_are_a_status(robot, program):
@@ -320,51 +285,6 @@ def test_limits_are_never_left(robot, tmp_path, targets):
     free = ik.Solver(robot, "ipopt", limits="ignore").solve_batch(*beyond)
     assert free.success[0]
     assert not free.limits_ok[0]
-
-
-def test_a_row_draws_the_same_numbers_in_any_part_of_the_batch(robot, solver, targets):
-    method = solver._engine.method
-    problems = TargetBatch(*targets, ik.Tolerance(), True)
-    q0 = np.tile(robot.home, (10, 1))
-    whole = method.run(problems, q0, 3, False)
-    again = np.flatnonzero(whole.restarts > 0)
-    assert len(again) >= 2, "targets that need a restart"
-    for row in again[:2]:
-        part = slice(int(row), int(row) + 1)
-        alone = method.run(problems.rows(part), q0[part], 3, False)
-        np.testing.assert_array_equal(alone.q[0], whole.q[row])
-        assert alone.iterations[0] == whole.iterations[row]
-    other = method.run(problems, q0, 4, False)
-    assert np.any(other.q[again] != whole.q[again])
-    once = np.flatnonzero(whole.restarts == 0)
-    np.testing.assert_array_equal(other.q[once], whole.q[once])
-
-
-def test_the_trace(robot, solver, targets):
-    method = solver._engine.method
-    problems = TargetBatch(*targets, ik.Tolerance(), True)
-    outcome = method.run(problems, np.tile(robot.home, (10, 1)), 0, True)
-    assert outcome.restarts.max() >= 1
-    for row, trace in enumerate(outcome.trace):
-        assert len(trace) == outcome.iterations[row]
-        assert trace["restart"][-1] == outcome.restarts[row]
-        np.testing.assert_array_equal(
-            np.unique(trace["restart"]), np.arange(outcome.restarts[row] + 1)
-        )
-        assert np.all(trace["phase"] == ik.answers.Phase.WHOLE_SYSTEM)
-        assert np.all(trace["status"][:-1] == ik.Status.RUNNING)
-        assert trace["status"][-1] == outcome.status[row] == ik.Status.SOLVED
-        points, normals = robot.contacts(trace["q"])
-        distances = np.linalg.norm(points - targets[0][row], axis=2)
-        np.testing.assert_allclose(trace["position_error"], distances, atol=1e-6)
-        chords = np.linalg.norm(normals - targets[1][row], axis=2)
-        np.testing.assert_allclose(
-            trace["cost"], np.sum((distances / 0.1) ** 2 + chords**2, axis=1), rtol=1e-6, atol=1e-12
-        )
-        np.testing.assert_allclose(trace["q"][-1], outcome.q[row], atol=1e-12)
-        starts = np.flatnonzero(np.diff(trace["restart"])) + 1
-        assert np.all(trace["barrier"][[0, *starts]] == 0.1)
-        assert np.all(np.isnan(trace["step_size"][[*(starts - 1), -1]]))
 
 
 def test_no_restarts_and_a_small_budget(robot, targets):

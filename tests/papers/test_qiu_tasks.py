@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import casadi as ca
 import numpy as np
 import pinocchio as pin
@@ -37,10 +35,6 @@ def estimate(robot: ik.ArmHand, points: np.ndarray) -> np.ndarray:
 
 def rotation(rng) -> np.ndarray:
     return pin.exp3(rng.normal(size=3))
-
-
-def test_bases_of_the_barrett_hand_span_the_palm_frame(robot):
-    np.testing.assert_allclose(base_axes(robot.description), np.eye(3), atol=1e-15)
 
 
 def test_symmetric_pinch_gives_the_palm_itself(robot, rng):
@@ -253,16 +247,9 @@ def displaced(robot, q, translation, rotation):
     return points[1:] @ moved.rotation.T + moved.translation, normals[1:] @ moved.rotation.T
 
 
-def test_nothing_to_do_at_the_contacts(robot, motion, rng):
-    for q in robot.random(rng, 10):
-        translation, rotation = motion(q, *displaced(robot, q, np.zeros(3), np.zeros(3)))
-        np.testing.assert_allclose(translation, 0, atol=1e-9)
-        np.testing.assert_allclose(rotation, 0, atol=1e-12)
-
-
 def test_translations_are_found_exactly(robot, motion, rng):
     for q in robot.random(rng, 10):
-        shift = rng.normal(scale=0.05, size=3)
+        shift = rng.normal(scale=0.05, size=3) * rng.integers(2)  # nothing to do, now and then
         translation, rotation = motion(q, *displaced(robot, q, shift, np.zeros(3)))
         np.testing.assert_allclose(translation, 1e3 * shift, atol=1e-9)
         np.testing.assert_allclose(rotation, 0, atol=1e-12)
@@ -350,12 +337,6 @@ def test_defaults_are_the_papers():
     assert options.borrowed == 1
 
 
-def test_every_field_is_explained():
-    text = QiuParameters.__doc__ or ""
-    for entry in dataclasses.fields(QiuParameters):
-        assert f"{entry.name}:" in text
-
-
 @pytest.mark.parametrize(
     ("options", "says"),
     [
@@ -377,7 +358,3 @@ def test_impossible_values(options, says):
     with pytest.raises(ik.errors.InputError) as caught:
         QiuParameters(**options)
     assert says in str(caught.value)
-
-
-def test_zero_where_it_means_something():
-    assert QiuParameters(borrowed=0).borrowed == 0

@@ -183,5 +183,5 @@ def test_a_quick_answer_has_every_field(robot: ik.ArmHand) -> None:
         names = {f.name for f in dataclasses.fields(one)}
         assert needed <= vars(one).keys() <= names
         again = dataclasses.replace(one)
-        assert repr(again) == repr(one)
-        assert repr(pickle.loads(pickle.dumps(one))) == repr(one)
+        assert repr(vars(again)) == repr(vars(one))
+        assert repr(vars(pickle.loads(pickle.dumps(one)))) == repr(vars(one))

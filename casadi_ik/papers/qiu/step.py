@@ -1,4 +1,4 @@
-"""What the steps of the methods of Qiu & Kermani 2021 share: layouts, and the numbers that go in."""
+"""What the steps of Qiu & Kermani 2021 share: layouts, and the numbers that go in."""
 
 from __future__ import annotations
 
