@@ -206,12 +206,6 @@ class ActuatedKinematics:
         """Geometric Jacobian of the palm frame, as `twist`."""
         return self.twist(self.robot.palm_link, self.kinematics.palm.origin, actuators)
 
-    def palm_body_jacobian(self, actuators: Sequence[int]) -> ca.SX:
-        """Body Jacobian of the palm (6, k): twist [v; w] of the palm expressed in the palm."""
-        linear, angular = self.palm_jacobian(actuators)
-        rotation = self.kinematics.palm.rotation
-        return ca.vertcat(rotation.T @ linear, rotation.T @ angular)
-
     def palm_euler_jacobian(self, actuators: Sequence[int]) -> ca.SX:
         """Analytic Jacobian (3, k) of the palm's ZYX Euler angles; rates per unit of q."""
         _, angular = self.palm_jacobian(actuators)

@@ -29,13 +29,11 @@ def chain(request, robot):
     rotation = body.kinematics.palm.rotation
     outputs = {
         "motors": closed.motor_steps(step, 14),
-        "constraint": closed.constraint,
         "J_cc": closed.J_cc,
         "H": closed.H,
         "platform": ca.vertcat(rotation.T @ linear, rotation.T @ angular),
         "thumb": ca.vertcat(*body.contact_jacobian("thumb", columns)),
         "normal": body.kinematics.contact("thumb")[1],
-        "palm": body.palm_body_jacobian(columns),
     }
     f = ca.Function(
         "f", [q, step], [ca.densify(x) for x in outputs.values()], ["q", "step"], list(outputs)
@@ -123,22 +121,6 @@ def test_jacobian_is_the_platforms_twist(chain, robot, rng):
         np.testing.assert_array_less(np.abs(values["J_cc"] @ step - expected), 1e-9 * scale)
 
 
-def test_constraint_vanishes_on_motor_steps(chain, robot, rng):
-    """Eq. (6) over the coordinates of both legs."""
-    parts, _, evaluate = chain
-    for _, step, values in samples(robot, rng, evaluate, 5):
-        motors = values["motors"].ravel()
-        coordinates = [
-            step[parts.active.index(VIRTUAL)]
-            if column == VIRTUAL
-            else (-1 if column in parts.reversed_leg else 1) * motors[column]
-            for column in parts.columns
-        ]
-        scale = np.abs(values["constraint"]) @ np.abs(coordinates)
-        residual = np.abs(values["constraint"] @ coordinates)
-        np.testing.assert_array_less(residual, 1e-9 * scale)
-
-
 def ranks(jacobian) -> int:
     s = np.linalg.svd(jacobian, compute_uv=False)
     return int(np.sum(s > 1e-9 * s[0]))
@@ -169,55 +151,6 @@ def test_orientation_has_nothing_left_of_the_palms_position(robot, rng):
                 remainders.append(np.linalg.norm(J[3:] @ null) / np.linalg.norm(J[3:]))
         assert len(remainders) > 5
         assert (max(remainders) < 1e-8) if vanishes else (np.median(remainders) > 1e-2)
-
-
-def test_palm_twists_are_the_thumb_tasks_null_space(robot, rng):
-    """Facts on methods, section 2: the chain is one parametrisation of that null space."""
-    q, step = ca.SX.sym("q", 14), ca.SX.sym("step", 4)
-    body = actuated(robot.description, q)
-    closed = closed_chain(body, split(robot.description))
-    arm_thumb = [*range(7), THUMB_1, THUMB_2]
-    linear, angular = body.contact_jacobian("thumb", arm_thumb)
-    f = ca.Function(
-        "f",
-        [q, step],
-        [
-            closed.motor_steps(step, 14),
-            linear,
-            angular,
-            body.kinematics.contact("thumb")[1],
-            closed.H,
-        ],
-    )
-    checked = 0
-    for row in robot.random(rng, 40):
-        steps = []
-        for unit in np.eye(4):
-            motors, linear_, angular_, normal, H = (
-                np.array(x) for x in f.call([ca.DM(row), ca.DM(unit)])
-            )
-            steps.append(motors.ravel()[arm_thumb])
-        if np.abs(H).max() > 50:
-            continue
-        n = normal.ravel()
-        task = np.vstack([linear_, (np.eye(3) - np.outer(n, n)) @ angular_])
-        assert ranks(np.array(steps)) == 4
-        assert ranks(task) == 5
-        assert np.abs(task @ np.array(steps).T).max() < 1e-9 * np.abs(steps).max()
-        checked += 1
-    assert checked > 5
-
-
-def test_length_scales_the_linear_rows_only(robot, rng):
-    q = ca.SX.sym("q", 14)
-    body = actuated(robot.description, q)
-    metres, millimetres = (
-        closed_chain(body, split(robot.description), length).J_cc for length in (1.0, 1e-3)
-    )
-    f = ca.Function("f", [q], [metres, millimetres])
-    m, mm = (np.array(x) for x in f.call([ca.DM(robot.home)]))
-    np.testing.assert_allclose(mm[:3], 1e3 * m[:3], rtol=1e-8, atol=1e-9)
-    np.testing.assert_allclose(mm[3:], m[3:], rtol=1e-8, atol=1e-12)
 
 
 LENGTH = 0.1
@@ -329,7 +262,8 @@ def test_rows_two_to_six_of_h_are_the_arms(robot, rng):
     thumb_1 = robot.actuators.index("bh_thumb_proximal")
     order = [thumb_1, 0, 1, 2, 3, 4]
     H = chain.H[[parts.passive.index(c) for c in order], :]
-    twist = body.palm_body_jacobian(range(6))
+    turned = body.kinematics.palm.rotation.T
+    twist = ca.vertcat(*(turned @ rows for rows in body.palm_jacobian(range(6))))
     last = ca.DM([[0, 0, 0, 1]])
     assert parts.active == (VIRTUAL, robot.actuators.index("bh_thumb_distal"), 6, 5)
     right, printed = (twist @ ca.vertcat(rows, last) for rows in (H[1:, :], H[:5, :]))

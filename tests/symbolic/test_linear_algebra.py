@@ -112,20 +112,6 @@ def test_pseudoinverse_and_null_space(shape):
         assert np.allclose(found, np.linalg.pinv(J) @ e, rtol=0, atol=10 * tolerance)
 
 
-def test_solves_take_mx_and_dm():
-    A, b = ca.MX.sym("A", 3, 3), ca.MX.sym("b", 3)
-    f = ca.Function("f", [A, b], [la.solve(A, b), la.solve_spd(A, b), la.null_projector(A)])
-    M = np.diag([1.0, 2.0, 4.0])
-    assert np.allclose(f(M, [1, 1, 1])[0].full()[:, 0], [1, 0.5, 0.25])
-    assert np.allclose(la.solve(ca.DM(M), ca.DM([1, 1, 1])).full()[:, 0], [1, 0.5, 0.25])
-
-
-def test_instruction_counts_stay_small():
-    assert solve.n_instructions() < 960
-    assert solve_spd.n_instructions() < 430
-    assert graph(la.damped_pinv_times, WIDE, (3, 1), (1, 1)).n_instructions() < 230
-
-
 SHAPES = [(3, 9), (2, 9), (6, 4), (6, 6), (3, 3), (1, 5), (6, 14)]
 SVD = {shape: graph(sv.svd, shape) for shape in SHAPES}
 VALUES = {shape: graph(sv.singular_values, shape) for shape in SHAPES}
@@ -166,18 +152,6 @@ def test_svd_against_numpy(shape):
         assert np.array_equal(VALUES[shape](A).full()[:, 0], s)
 
 
-def test_default_sweeps_leave_a_margin():
-    """One sweep fewer than the default is already good to 1e-4: the last one squares that."""
-    for m, n in [(3, 9), (6, 4), (6, 6)]:
-        fewer = graph(
-            lambda J: sv.singular_values(J, sv.SWEEPS[min(J.shape)] - 1),
-            (m, n),
-        )
-        for A in samples(np.random.default_rng(6), m, n, 100):
-            expected = np.linalg.svd(A, compute_uv=False)
-            assert np.abs(fewer(A).full()[:, 0] - expected).max() <= 1e-4 * max(expected[0], 1e-30)
-
-
 def test_condition_number_is_capped():
     s = ca.SX.sym("s", 3)
     f = ca.Function("f", [s], [sv.condition_number(s, 1e6)])
@@ -203,13 +177,6 @@ def test_manipulability(shape):
     A[1] = A[0]
     assert float(f(A)) < 1e-6
     assert df(A).is_regular()
-
-
-def test_instruction_counts_of_singular_values_stay_small():
-    counts = {shape: f.n_instructions() for shape, f in SVD.items()}
-    assert counts[3, 9] < 1400
-    assert counts[6, 4] < 3300
-    assert counts[6, 6] < 9800
 
 
 def function(m: int, n: int) -> ca.Function:
