@@ -31,7 +31,7 @@ ROBOT, GRASP = "kuka_lwr_barrett", "cup"
 WHOLE, CLOSE, BESIDE = (470, 400), (290, 290), 55
 """Of the robot and of the hand from close by [pixels]; how far the second is below the top."""
 
-PICTURES, SECONDS = 72, 6.5
+PICTURES, SECONDS = 68, 6.3
 """Of a round."""
 
 SWAY = np.array([0.09, -0.15, 0.12])

@@ -35,10 +35,8 @@ from casadi_ik.importing import imported
 from casadi_ik.importing.capsules import worst
 from casadi_ik.importing.check import largest_difference
 from casadi_ik.importing.imported import Imported
-from casadi_ik.importing.surfaces import Surface
 from casadi_ik.kernels import cache_directory
 from casadi_ik.kernels.compiler import find_compiler
-from casadi_ik.robots.parts import PREFIX
 
 SAME = 1e-9
 """Poses that differ by no more [m, or in their axes] are the same."""
@@ -119,7 +117,7 @@ def import_robot(said: Said) -> Answer:
         if said.check:
             differences.update(_differences(robots[0], found))
         if draw is not None:
-            draw(robots[0], found.surfaces, said.picture)
+            draw(robots[0], said.picture)
 
     write_output(said.out, "--out", write)
     same = all(value <= SAME for value in differences.values())
@@ -134,7 +132,7 @@ def _drawn_again(path: Path, said: Said) -> Answer:
     outputs = {"--picture": said.picture}
     check_outputs(outputs, inputs=[path])
     draw, robot = _drawing(), imported.loaded(path)
-    draw(robot, imported.described_surfaces(path), said.picture)
+    draw(robot, said.picture)
     what = f"{robot.name}: {len(robot.fingers)} pads"
     return Answer.solved(True, headline(True, "DRAWN", what), *files(outputs))
 
@@ -150,17 +148,11 @@ def _command(said: Said) -> str:
     return shlex.join(words)
 
 
-def _drawing() -> Callable[[ArmHand, dict[str, Surface], Path], object]:
+def _drawing() -> Callable[[ArmHand, Path], object]:
     """The function that draws the pads, after making sure that it can."""
     with located("--picture", (MissingExtraError,)):
         from casadi_ik.views import draw_pads
-
-    def draw(robot: ArmHand, surfaces: dict[str, Surface], path: Path) -> object:
-        links = robot.description.links
-        named = {PREFIX + link if PREFIX + link in links else link: link for link in surfaces}
-        return draw_pads(robot, {ours: surfaces[link] for ours, link in named.items()}, path)
-
-    return draw
+    return draw_pads
 
 
 def _differences(robot: ArmHand, found: Imported) -> dict[str, float]:

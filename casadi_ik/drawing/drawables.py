@@ -90,7 +90,10 @@ def side_of(description: RobotDescription) -> dict[str, str]:
     """By link "arm" or "hand"."""
     first = "arm" if description.arm_actuators else "hand"
     return {description.root: first} | {
-        joint.child: "hand" if joint.part == "hand" else "arm" for joint in description.joints
+        joint.child: "hand"
+        if joint.part == "hand" or joint.child == description.palm_link
+        else "arm"
+        for joint in description.joints
     }
 
 
@@ -202,8 +205,11 @@ def _arm_link(description: RobotDescription, joint: Joint, end: Array) -> list[D
         # The round end of the lowest link must not come out below the foot.
         lowest = joint.parent == description.root
         begin = min(1.0, ARM_RADIUS / length) * end if lowest else np.zeros(3)
-        tube = rod(begin, end, ARM_RADIUS)
-        found.append(Drawable(f"tube {joint.name}", tube, palette.ARM, joint.parent, "arm"))
+        # What holds the hand is thinner, as the palm at its end would not be seen.
+        mount = joint.part == "mount"
+        tube = rod(begin, end, (0.6 if mount else 1.0) * ARM_RADIUS)
+        color = palette.ARM_JOINT if mount else palette.ARM
+        found.append(Drawable(f"tube {joint.name}", tube, color, joint.parent, "arm"))
     if joint.type == "revolute":
         # A roll joint is a band around the tube, a pitch joint a drum across it.
         way = joint.placement[:3, :3].T @ end

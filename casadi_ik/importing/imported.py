@@ -12,7 +12,6 @@ from typing import Any
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import DescriptionError, InputError, MissingExtraError
-from casadi_ik.files.reading import read_yaml
 from casadi_ik.importing.guess import (
     Branch,
     Pad,
@@ -328,23 +327,6 @@ def tree_of(path: Path, entry: Mapping[str, Any]) -> RobotTree:
     """
     file = path.parent / Path(str(entry["file"])).expanduser()
     return read_tree(file, entry.get("xacro") is True)
-
-
-def described_surfaces(path: Path) -> dict[str, Surface]:
-    """Shapes of the hand's links of a description, if its hand stands in somebody's file.
-
-    Raises:
-        CasadiIKError: A file cannot be read.
-    """
-    raw = read_yaml(path)
-    entry = raw.get("hand") or raw.get("robot")
-    if not isinstance(entry, dict) or "file" not in entry:
-        return {}
-    tree = tree_of(path, entry)
-    palm = entry.get("palm") or tree.root
-    palm = palm["link"] if isinstance(palm, dict) else palm
-    links = {palm, *(joint.child for joint in tree.below(palm))}
-    return link_surfaces(tree, links)[0]
 
 
 def file_of(name: str, key: str = "ROBOT") -> Path:

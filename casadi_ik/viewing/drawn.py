@@ -28,7 +28,7 @@ from casadi_ik.drawing.drawables import (
     placed,
     reached_marks,
 )
-from casadi_ik.drawing.surfaces import coarser, joined, mesh_of, sharp
+from casadi_ik.drawing.surfaces import joined, mesh_of, sharp
 from casadi_ik.grasps.pose import rotations_of
 from casadi_ik.problem.clearance import Closest
 from casadi_ik.problem.verdict import ContactVerdict
@@ -473,11 +473,12 @@ class DrawnClosest:
 
 
 class Ghosts:
-    """A robot several times, each seen through and in a colour of its own."""
+    """An arm, or a hand alone, several times, seen through, each in a colour of its own."""
 
     def __init__(self, server: viser.ViserServer, robot: ArmHand) -> None:
         """Draw nothing yet."""
         self._server, self._robot, self._drawn = server, robot, []
+        self._role = "arm" if robot.description.arm_actuators else "hand"
 
     def show(self, many: Sequence[tuple[Array, str]]) -> None:
         """Draw the robot at each q (n,) in a colour; of none nothing."""
@@ -486,10 +487,10 @@ class Ghosts:
                 one.remove()
             self._drawn = []
             for i, (q, color) in enumerate(many):
-                parts = [one.surface for one in placed(self._robot, q, bodies(self._robot))]
-                whole = mesh_of(coarser(joined(parts), 4000))
-                ghost = Drawable("ghost", whole, color)
-                look = {"opacity": 0.22, "cast_shadow": False, "receive_shadow": False}
+                seen = [one for one in bodies(self._robot) if one.role == self._role]
+                parts = [one.surface for one in placed(self._robot, q, seen)]
+                ghost = Drawable("ghost", mesh_of(joined(parts)), color)
+                look = {"opacity": 0.25, "cast_shadow": False, "receive_shadow": False}
                 self._drawn.append(add_drawable(self._server, f"/ghosts/{i}", ghost, **look))
 
 

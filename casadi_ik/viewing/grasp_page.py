@@ -88,7 +88,7 @@ PREFER = {
 
 SKINS = ("bodies", "collision shapes")
 
-MOST_GHOSTS = 16
+MOST_GHOSTS = 10
 
 Candidates = Mapping[str, Callable[[], tuple[PageRequest, Array]]]
 """Other requests to choose from, by name: each gives it, and a start."""
@@ -128,8 +128,7 @@ class GraspPage(DraggedPage):
         answer = self._answerer.solve if solved else self._answerer.judged
         answer(asked, q)  # what the first one takes is the loading of kernels
         self.answer = answer(asked, q)
-        title = f"{asked.name} · {robot.name}" if asked.name else robot.name
-        super().__init__(server, robot, asked, title, lowest(asked.scene), dark)
+        super().__init__(server, robot, asked, asked.name or robot.name, lowest(asked.scene), dark)
         self._first_q, self.candidates = q, dict(candidates or {})
         self._answered_for: PageRequest | None = asked
         self._listed_for: PageRequest | None = None
@@ -404,7 +403,6 @@ class Panel:
         tabs = gui.add_tab_group()
         with tabs.add_tab("Results"):
             self._results = gui.add_html(results_block(page.answer))
-            self._beside = gui.add_html("")
             with gui.add_folder("Solutions", expand_by_default=False):
                 self._slider = gui.add_slider("Solution", 1, 2, 1, 1, disabled=True)
                 on_set(self._slider, lambda number: page.show_solution(int(number) - 1))
@@ -414,6 +412,7 @@ class Panel:
                 on_set(ghosts, page.show_ghosts)
                 self._solution = gui.add_html(block("found when nothing moves"))
             gui.add_html(legend(LEGEND))
+            self._beside = gui.add_html("")
         with tabs.add_tab("Solve"):
             self._add_settings(page.asked.settings, page.asked.scene is not None)
         with tabs.add_tab("Motors"):
@@ -466,9 +465,11 @@ class Panel:
     def tell_motors(self, q: Array) -> None:
         """Show where motors and joints are."""
         low, high = self._ranges
-        values = np.clip(q * self._scales, low, high)
-        for slider, value, wide in zip(self._motors, values.tolist(), high - low, strict=True):
-            if abs(slider.value - value) > 1e-6 * wide:
+        self._exact = np.clip(q * self._scales, low, high)
+        # More digits would not fit in the box.
+        self._shown = np.clip(np.round(self._exact, 1), low, high)
+        for slider, value in zip(self._motors, self._shown.tolist(), strict=True):
+            if slider.value != value:
                 slider.value = value
         robot = self._page.robot
         self._bars.content = bars(robot.description, robot.joints(q))
@@ -530,7 +531,8 @@ class Panel:
         self._motors: list[Any] = []
 
         def moved(_: Any) -> None:
-            q = usable([one.value for one in self._motors], len(self._motors)) / self._scales
+            values = usable([one.value for one in self._motors], len(self._motors))
+            q = np.where(values == self._shown, self._exact, values) / self._scales
             page.drag_motors(np.clip(q, robot.lower, robot.upper))
 
         with gui.add_folder("Motors", expand_by_default=True):

@@ -32,6 +32,9 @@ TRACK = "rgba(128,140,152,0.28)"
 """Colour behind bars and lines, on light and on dark pages."""
 
 
+UNITS = ((1e6, "µs"), (1e3, "ms"), (1.0, "s"))
+
+
 def on_set(handle: Any, do: Callable[[Any], None]) -> None:
     """Tell of a control's value when a person, not the program, has changed it."""
 
@@ -77,8 +80,8 @@ def legend(entries: Iterable[tuple[str, str]]) -> str:
 def verdict_block(answer: Answer) -> str:
     """How it ended, in a word and a sentence; always of the same height."""
     color = palette.MET if answer.success else palette.MISSED
-    took = f"{1e3 * answer.seconds:.3g} ms" if answer.seconds >= 1e-3 else ""
-    took = f"{1e6 * answer.seconds:.0f} µs" if 0 < answer.seconds < 1e-3 else took
+    scale, unit = next(one for one in UNITS if answer.seconds * one[0] < 1000 or one[0] == 1)
+    took = f"{scale * answer.seconds:.3g} {unit}" if answer.seconds else ""
     head = (
         '<div style="display:flex;justify-content:space-between;align-items:baseline">'
         f'<b style="font-size:1.25em;color:{color}" class="ik-status">{answer.headline}</b>'

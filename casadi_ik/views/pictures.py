@@ -6,6 +6,7 @@ import io
 import threading
 from collections.abc import Mapping, Sequence
 from contextlib import closing
+from dataclasses import replace
 from os import PathLike
 
 import numpy as np
@@ -34,11 +35,10 @@ from casadi_ik.drawing.drawables import (
     target_place,
     with_object,
 )
-from casadi_ik.drawing.surfaces import arrow, ball, mesh_of
+from casadi_ik.drawing.surfaces import arrow, ball
 from casadi_ik.errors import InputError
 from casadi_ik.grasps import Grasp
 from casadi_ik.grasps.pose import inverse
-from casadi_ik.importing.surfaces import Surface
 from casadi_ik.motion.motion import Motion
 from casadi_ik.problem.clearance import closest_points
 from casadi_ik.views.charts import DARK, DPI, LIGHT, Ground, new_figure, save_picture
@@ -257,29 +257,31 @@ def draw_motion(
 def _shots(robot: ArmHand, q: Array, grasp: Grasp, scene: Scene | None) -> list[Image]:
     """Images (h, w, 3) of postures (k, n)."""
     end, sizes = q[-1], ((420, 420), (340, 420))
+    around = 0.15 * np.vstack([np.eye(3), -np.eye(3)])
     passed = [one for row in q[:: max(len(q) // 8, 1)] for one in _body(robot, row)]
     there = _object(grasp)
     tips = robot.contacts(end)[0]
-    close_up = tips.mean(axis=0) + 0.11 * np.vstack([np.eye(3), -np.eye(3)])
     marks = contact_marks(robot, end, grasp, dict.fromkeys(robot.fingers, palette.MET))
     found = []
     with _one_at_a_time, closing(Stage()) as stage:
-        foot = robot.links(q[0])[robot.description.root]
-        stage.add_floor(float(foot[2, 3]), passed[:1] + there)
+        foot, every = robot.links(q[0])[robot.description.root], points_of(passed + there)
         stage.add("object", there, OPACITY["object"])
         stage.add("marks", marks)
         if scene is not None:
             about = scene_of(with_object(scene, grasp), foot[:3, 3], grasp.object)
             stage.add("scene", about, OPACITY["scene"])
         view = close_view(robot, end)
-        seen = (
-            (whole_view(tips.mean(axis=0), view), points_of(passed + there), sizes[0]),
-            (view, np.vstack([close_up, points_of(there or marks)]), sizes[1]),
-        )
+        whole = whole_view(tips.mean(axis=0), view)
         for row in q:
-            stage.replace("robot", _body(robot, row))
+            shown = _body(robot, row)
+            stage.replace("robot", shown)
+            stage.add_floor(float(foot[2, 3]), shown + there, every, texels=512)
+            hand = (robot.contacts(row)[0].mean(axis=0) + robot.palm(row)[:3, 3]) / 2
             panels = []
-            for where, points, pixels in seen:
+            for where, points, pixels in (
+                (whole, every, sizes[0]),
+                (view, hand + around, sizes[1]),
+            ):
                 stage.aim(where, points, pixels, (0.04, 0.04))
                 panels.append(np.clip(over(1.0, stage.shoot()), 0.0, 1.0))
             found.append(np.concatenate(panels, axis=1))
@@ -311,6 +313,11 @@ def animated(images: Sequence[Image], milliseconds: Sequence[int], colors: int =
         shaded = np.repeat(np.clip(shades, 0, 255).astype(np.uint8), 24, axis=0)
         sheet.paste(Pillow.fromarray(shaded), (0, height * len(some) + 24 * i))
     shared = sheet.quantize(colors)
+    # The paper keeps its very colour, or a page would show the picture's edge.
+    entries = np.reshape(shared.getpalette() or [], (-1, 3))
+    paper = np.array(whole[0].getpixel((width - 1, 0)))
+    entries[np.abs(entries - paper).sum(axis=1).argmin()] = paper
+    shared.putpalette(entries.ravel().tolist())
     frames = [one.quantize(palette=shared, dither=Pillow.Dither.NONE) for one in whole]
     written = io.BytesIO()
     frames[0].save(
@@ -327,18 +334,12 @@ def animated(images: Sequence[Image], milliseconds: Sequence[int], colors: int =
 
 
 def draw_pads(
-    robot: ArmHand,
-    surfaces: Mapping[str, Surface],
-    path: str | PathLike[str] | None = None,
-    *,
-    dpi: float = DPI,
+    robot: ArmHand, path: str | PathLike[str] | None = None, *, dpi: float = DPI
 ) -> Figure:
     """Draw the hand of a robot at home from two sides, with a mark at every pad.
 
     Args:
         robot: The robot.
-        surfaces: Shapes of the hand's links in the links' frames, by link of the robot; without
-            any the hand is drawn from its joints.
         path: PNG file to write, if any.
         dpi: Dots per inch.
 
@@ -349,14 +350,11 @@ def draw_pads(
         PictureError: The file cannot be written, or there is no OpenGL to draw with.
     """
     # In the palm frame, whose z is up and whose y goes to the thumb.
-    back, links = inverse(robot.palm(robot.home)), robot.links(robot.home)
+    back = inverse(robot.palm(robot.home))
     hand = [
-        Drawable(link, mesh_of(surface).moved(back @ links[link]), palette.HAND)
-        for link, surface in surfaces.items()
-        if link in links and len(surface.triangles)
-    ]
-    hand = hand or [
-        one.at(back) for one in _body(robot, robot.home) if one.role not in ("arm", "pad")
+        replace(one.at(back), color=palette.HAND)
+        for one in _body(robot, robot.home)
+        if one.role == "hand"
     ]
     size = float(np.ptp(points_of(hand), axis=0).max())
     frames, marks = back @ robot.contact_frames(robot.home), []
@@ -370,7 +368,7 @@ def draw_pads(
         box = (left, 0.0, 0.5, 0.88)
         pixels = _pixels(figure, box)
         with _one_at_a_time, closing(Stage()) as stage:
-            stage.add("hand", hand, orient=bool(surfaces))
+            stage.add("hand", hand, orient=robot.description.path is not None)
             stage.add("marks", marks)
             view = float(np.deg2rad(turn)), float(np.deg2rad(20.0))
             stage.aim(view, points_of(hand + marks), pixels, (0.12, 0.04))
@@ -474,11 +472,10 @@ def _label_fingers(
     height, width = axes.images[0].get_size()
     asked = grasp.contacts or places  # of a palm that is given all fingers follow
     seen = {finger: place for finger, place in places.items() if finger in asked}
-    middle = (min(x for x, _ in seen.values()) + max(x for x, _ in seen.values())) / 2
     lowest = {"left": -np.inf, "right": -np.inf}
     for finger, (x, y) in sorted(seen.items(), key=lambda item: item[1][1]):
         verdict = solution.contacts[finger]
-        side = "right" if x > middle else "left"
+        side = "right" if x > width / 2 else "left"
         level = lowest[side] = max(y, lowest[side] + 0.12 * height, 0.08 * height)
         edge, shoulder = (0.985, 0.825) if side == "right" else (0.015, 0.175)
         above = {"ha": side, "va": "bottom", "size": 11, "color": ground.ink, "weight": "bold"}
