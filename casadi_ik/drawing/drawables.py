@@ -45,6 +45,9 @@ from casadi_ik.robots.parts import PREFIX
 ARM_RADIUS, FINGER_RADIUS = 0.048, 0.009
 """Of an arm's tubes, and of a finger whose pad does not say how far from its axis it is [m]."""
 
+MOUNT = 0.09
+"""How much of what holds a hand is thinner than the arm, or it would hide the palm [m]."""
+
 BEYOND = 0.04
 """How far a line is drawn past what it is given by and reached at; radius of a plane's ring [m]."""
 
@@ -205,11 +208,14 @@ def _arm_link(description: RobotDescription, joint: Joint, end: Array) -> list[D
         # The round end of the lowest link must not come out below the foot.
         lowest = joint.parent == description.root
         begin = min(1.0, ARM_RADIUS / length) * end if lowest else np.zeros(3)
-        # What holds the hand is thinner, as the palm at its end would not be seen.
-        mount = joint.part == "mount"
-        tube = rod(begin, end, (0.6 if mount else 1.0) * ARM_RADIUS)
-        color = palette.ARM_JOINT if mount else palette.ARM
-        found.append(Drawable(f"tube {joint.name}", tube, color, joint.parent, "arm"))
+        thin = min(MOUNT, length) if joint.part == "mount" else 0.0
+        middle = (1 - thin / length) * end
+        if thin < length:
+            tube = rod(begin, middle, ARM_RADIUS)
+            found.append(Drawable(f"tube {joint.name}", tube, palette.ARM, joint.parent, "arm"))
+        if thin > 0:
+            tube = rod(middle, end, 0.6 * ARM_RADIUS)
+            found.append(Drawable("mount", tube, palette.ARM_JOINT, joint.parent, "arm"))
     if joint.type == "revolute":
         # A roll joint is a band around the tube, a pitch joint a drum across it.
         way = joint.placement[:3, :3].T @ end

@@ -268,8 +268,11 @@ class Viewer:
             >>> text = viewer.to_html()
             >>> viewer.stop()
         """
+        held = self.page.held
+        self.page.select("")  # nobody can drag there
         self.page.work.settle()
         text = self._server.scene.as_html(dark_mode=dark)
+        self.page.select(held)
         text = text.replace("<title>Viser</title>", f"<title>{self._server.access.title}</title>")
         if path is not None:
             with written_whole(Path(path)) as part:

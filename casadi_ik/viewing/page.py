@@ -54,6 +54,11 @@ class Page:
         self.ended = True
         self.work.stop()
 
+    held = ""
+
+    def select(self, name: str) -> None:
+        """Give something its handles, on pages that have some."""
+
     def add_dark(self) -> None:
         """A switch between light and dark."""
         title, floor = self._stage
@@ -71,6 +76,7 @@ class DraggedPage(Page):
     Attributes:
         robot: The robot.
         asked: What is asked now.
+        held: What has handles; "": nothing.
     """
 
     def __init__(
@@ -85,6 +91,7 @@ class DraggedPage(Page):
         """An empty page, see `Page`."""
         super().__init__(server, title, floor, dark)
         self.robot, self.asked, self._dragged = robot, asked, ""
+        self.held = ""
         self._past: list[Any] = []
         self._future: list[Any] = []
         self.drags = Drags(self.drag_control, self.drag_point, self.drag_normal, self.select)
@@ -127,7 +134,12 @@ class DraggedPage(Page):
 
     def select(self, name: str) -> None:
         """Give something its handles; "" takes them all away."""
-        self.work.put("selected", lambda: self.selected(name))
+
+        def work() -> None:
+            self.held = name
+            self.selected(name)
+
+        self.work.put("selected", work)
 
     def undo(self) -> None:
         """Take the last step back."""

@@ -212,7 +212,7 @@ def chart(
         return ""
     least, most = float(values.min()), float(values.max())
     if linear:
-        low, high = least - 1e-9, max(most, least + 1e-6) + 1e-9
+        low, high = least, max(most, least + 1e-6)
         ticks = [low, (low + high) / 2, high]
     else:
         low = math.floor(math.log10(max(least, most * 1e-9)))
@@ -247,13 +247,16 @@ def chart(
     ]
     for value in ticks:
         at = f'x="{LEFT - 4}" y="{float(y(value)) + 3:.1f}" text-anchor="end"'
-        parts.append(across(value, f'stroke="{TRACK}"') + f"<text {at}>{value:.3g}</text>")
+        parts.append(
+            across(value, f'stroke="{TRACK}"')
+            + f"<text {at}>{value:{'.0f' if linear else '.3g'}}</text>"
+        )
     if bound is not None:
         parts.append(across(bound, f'stroke="{palette.FAINT}" stroke-dasharray="4 3"'))
     names = []
     for i, (name, line) in enumerate(lines.items()):
         color = palette.LINES[i % len(palette.LINES)]
-        value = f"{line[now]:.3g}" if math.isfinite(line[now]) else ""
+        value = f"{line[now]:{'.1f' if linear else '.3g'}}" if math.isfinite(line[now]) else ""
         parts.append(path(line, color))
         names.append(
             f'<span style="margin-right:0.8em;white-space:nowrap"><span style="color:{color}">━'

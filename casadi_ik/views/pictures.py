@@ -250,7 +250,9 @@ def draw_motion(
     q = np.stack([np.interp(times, motion.times, column) for column in motion.q.T], axis=1)
     step = max(round(1e3 * seconds / (count - 1)), 20)
     pictures = _shots(motion.robot, q, grasp, scene)
-    save_picture(animated(pictures, [*[step] * (count - 1), 1500]), path)  # the last one stays [ms]
+    save_picture(
+        animated(pictures, [*[step] * (count - 1), 1500], 128), path
+    )  # the last one stays [ms]
     return count
 
 
