@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from enum import Enum
@@ -117,6 +118,28 @@ class RankedEntry(msgspec.Struct, frozen=True):
         """It in a few words."""
         return f"{self.name or 'candidate'} ({self.candidate}), score {self.score:.4g}"
 
+    def placed(self, path: Path, place: int) -> Grasp:
+        """The grasp, with the hand before it if that is known.
+
+        Args:
+            path: Its file.
+            place: Its place there, from 1.
+
+        Raises:
+            DescriptionError: It is missing or malformed.
+        """
+        where = f"ranked[{place - 1}]."
+        if self.grasp is None:
+            expected = "expected what `casadi-ik choose` writes now"
+            raise DescriptionError(f"{path}: {where}grasp: missing, {expected}")
+        grasp = grasp_of(
+            self.grasp, path, self.name or f"{path.stem}[{place - 1}]", f"{where}grasp."
+        )
+        if self.pregrasp is None:
+            return grasp
+        before = grasp_of(self.pregrasp, path, grasp.name, f"{where}pregrasp.")
+        return replace(grasp, pregrasp=before)
+
 
 class _RankedFile(msgspec.Struct, frozen=True):
     ranked: list[RankedEntry]
@@ -151,17 +174,19 @@ def chosen_posture(path: Path, rank: int) -> ChosenPosture:
     found = read_ranked(path)
     if rank > len(found):
         raise InputError(f"--rank: found {rank}, but {path} has {len(found)} answers")
-    one, where = found[rank - 1], f"ranked[{rank - 1}]."
-    if one.grasp is None:
-        raise DescriptionError(
-            f"{path}: {where}grasp: missing, expected what `casadi-ik choose` writes now"
-        )
-    name = one.name or f"{path.stem}[{rank - 1}]"
-    grasp = grasp_of(one.grasp, path, name, f"{where}grasp.")
-    if one.pregrasp is not None:
-        before = grasp_of(one.pregrasp, path, name, f"{where}pregrasp.")
-        grasp = replace(grasp, pregrasp=before)
-    return ChosenPosture(grasp, np.array(one.solution.q), one.solution.robot)
+    one = found[rank - 1]
+    return ChosenPosture(one.placed(path, rank), np.array(one.solution.q), one.solution.robot)
+
+
+def is_ranked(path: Path) -> bool:
+    """Whether a file holds ranked answers: of ``casadi-ik choose``, or of ``casadi-ik grasp``."""
+    if path.suffix.lower() != ".npz":
+        return path.suffix.lower() == ".json"
+    try:
+        with zipfile.ZipFile(path) as members:
+            return f"{RANKED_MEMBER}.npy" in members.namelist()
+    except (OSError, zipfile.BadZipFile):
+        return False  # whoever reads it says best what is wrong
 
 
 def _member(path: Path) -> bytes:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from casadi_ik import logs
-from casadi_ik.answers.stored import read_ranked
+from casadi_ik.answers.stored import RankedEntry, is_ranked, read_ranked
 from casadi_ik.arm_hand import ArmHand, load_robot
 from casadi_ik.arrays import Array
 from casadi_ik.cli import options as opt
@@ -83,6 +83,7 @@ def view(said: Said) -> Answer:
       casadi-ik view cup --scene table          drag contacts, the cup, the table
       casadi-ik view panda+allegro_right        a robot as it stands at home
       casadi-ik view ranked.json                answers of `casadi-ik choose`
+      casadi-ik view found.npz                  answers of `casadi-ik grasp`
       casadi-ik view candidates.yaml --robot R  each solved when it is chosen
       casadi-ik view cup.mcap                   play a solve; of two side by side
       casadi-ik view way.mcap                   play what `reach` or `follow` wrote
@@ -147,7 +148,7 @@ def opened(said: Said) -> Viewer:
         with located(str(path)):
             grasp.arrays(robot.fingers)
         return viewing.view_grasp(robot, grasp, **more)
-    ranked = path.suffix == ".json"
+    ranked = is_ranked(path)
     robot, choices = (_ranked if ranked else _candidates)(path, said, scene, settings)
     first, q = next(iter(choices.values()))()
     q = q if ranked else None
@@ -249,7 +250,7 @@ def _candidates(
 def _ranked(
     path: Path, said: Said, scene: Scene | None, settings: Settings
 ) -> tuple[ArmHand, Choices]:
-    """The answers of `casadi-ik choose`: the contacts that each one reaches are what is asked.
+    """The answers of `casadi-ik choose` and `grasp`, each with its grasp, else what it reaches.
 
     Raises:
         InputError: The file is none of that kind, or has no answers.
@@ -264,8 +265,11 @@ def _ranked(
         with located(f"{path}: ranked[{place - 1}].solution.q"):
             q = robot.configuration(np.array([one.solution.q]))[0]
 
-        def ask(q: Array = q) -> tuple[PageRequest, Array]:
-            return request_of(robot, None, q, scene, settings), q
+        def ask(
+            q: Array = q, one: RankedEntry = one, place: int = place
+        ) -> tuple[PageRequest, Array]:
+            grasp = None if one.grasp is None else one.placed(path, place)
+            return request_of(robot, grasp, q, scene, settings), q
 
         choices[f"{place}. {one.label}"] = ask
     return robot, choices
