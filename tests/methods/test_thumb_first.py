@@ -12,7 +12,7 @@ from samplers import shipped_hands
 
 import casadi_ik as ik
 from casadi_ik.methods.thumb_first.method import ThumbFirstMethod
-from casadi_ik.methods.thumb_first.parameters import ThumbFirstParameters
+from casadi_ik.methods.thumb_first.state import ThumbFirstParameters
 from casadi_ik.problem.targets import TargetBatch, fixed_array, target_arrays
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.run import Run

@@ -6,6 +6,7 @@ what the linear model promised (Nielsen 1999: Damping parameter in Marquardt's m
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 import casadi as ca
 
 from casadi_ik.kernels.layout import Layout
-from casadi_ik.methods.common.bounded_step import in_box
+from casadi_ik.methods.common.bounded_step import Bounded, damped_step, in_box
 from casadi_ik.problem.contacts import (
     LENGTH,
     ContactRows,
@@ -127,6 +128,34 @@ class Tried:
     size: Expr
 
 
+def lm_step(
+    before: Expr,
+    jacobian: Expr,
+    damping: Expr,
+    bounds: Bounded,
+    moved: Callable[[Expr], Any],
+    residual: Callable[[Any], Expr],
+    motors: Callable[[Any], Expr],
+) -> Tried:
+    """One damped least-squares step within bounds: of palm and hand, or of the arm alone.
+
+    Args:
+        before: (m, 1) residual where it begins.
+        jacobian: (m, n).
+        damping: Scalar.
+        bounds: Of the motors.
+        moved: From a step (n, 1) to where it leads.
+        residual: (m, 1) of that.
+        motors: (k, 1) of that.
+    """
+    damped = damped_step(jacobian, before, damping, bounds, FIT.passes)
+    reached = moved(damped.step)
+    change = ca.fabs(motors(reached) - bounds.value)
+    # A tool has no motors that could move.
+    size = ca.mmax(change) if change.numel() else ca.SX(0)
+    return Tried(reached, before, residual(reached), damped.promised, size)
+
+
 @dataclass(frozen=True, eq=False)
 class Judged:
     """A damped step after it was judged by its cost; `fit` goes into the state."""
@@ -223,46 +252,6 @@ def whole_jacobian(robot: RobotDescription, rows: ContactRows, q: Expr, p: dict[
     return rows.jacobian(tips, rates, goals, resting(goals, n), p["weights"])
 
 
-@dataclass(frozen=True, eq=False)
-class WholeStep:
-    """A step of all motors that was tried.
-
-    Attributes:
-        reached: (n, 1) where it leads, within bounds.
-        before: Residual where it begins.
-        there: Residual where it leads.
-        promised: By how much the linear model says the cost falls; 0 for a balance.
-    """
-
-    reached: Expr
-    before: Expr
-    there: Expr
-    promised: Expr
-
-    def as_inputs(self) -> tuple[WholeStep, list[ca.SX]]:
-        """The same as symbols, and these: for a function that judges the step."""
-        symbols = [
-            ca.SX.sym(name, value.numel())
-            for name, value in (
-                ("reached", self.reached),
-                ("before", self.before),
-                ("there", self.there),
-                ("promised", self.promised),
-            )
-        ]
-        return WholeStep(*symbols), symbols
-
-    @property
-    def parts(self) -> list[Expr]:
-        """What `as_inputs` stands for."""
-        return [self.reached, self.before, self.there, self.promised]
-
-    def tried(self, q: Expr) -> Tried:
-        """As a step from q (n, 1)."""
-        size = ca.mmax(ca.fabs(self.reached - q))
-        return Tried(self.reached, self.before, self.there, self.promised, size)
-
-
 class WholeContacts:
     """Functions of q (n, 1) and of a method's parameters."""
 
@@ -276,22 +265,33 @@ class WholeContacts:
         """
         self._robot, self._rows, self._layout = robot, rows, parameters
 
-    def fitted(self, q: Expr, damping: Expr, parameters: Expr) -> WholeStep:
+    def tried(self, q: ca.SX) -> tuple[list[ca.SX], Tried]:
+        """Symbols of what `fitted` and `balanced` give, and these as a step from q (n, 1)."""
+        n, m = q.numel(), self._rows.size
+        sizes = {"reached": n, "before": m, "there": m, "promised": 1}
+        symbols = [ca.SX.sym(name, size) for name, size in sizes.items()]
+        return symbols, Tried(*symbols, ca.mmax(ca.fabs(symbols[0] - q)))
+
+    def fitted(self, q: Expr, damping: Expr, parameters: Expr) -> list[Expr]:
         """One damped least-squares step within the bounds.
 
         Args:
             q: (n, 1) where it begins.
             damping: Scalar.
             parameters: Of the method.
+
+        Returns:
+            Where it leads (n, 1), residuals before and there, and by how much the linear model says
+            the cost falls.
         """
         before, slopes = self._at(q, parameters)
         normal, gradient = self._squares(before, slopes)
         reached = self._box(normal, gradient, damping, q, parameters)
         promised = self._promise(before, slopes, q, reached)
-        return WholeStep(reached, before, self.residual(reached, parameters), promised)
+        return [reached, before, self.residual(reached, parameters), promised]
 
-    def balanced(self, q: Expr, damping: Expr, number: Expr, parameters: Expr) -> WholeStep:
-        """One step towards the smallest largest error, see `balance`.
+    def balanced(self, q: Expr, damping: Expr, number: Expr, parameters: Expr) -> list[Expr]:
+        """One step towards the smallest largest error, see `balanced`; returns as `fitted`.
 
         Args:
             q: (n, 1) where it begins.
@@ -304,7 +304,7 @@ class WholeContacts:
         normal, gradient = self._squares(right, rows)
         normal = self._stretched(normal, stretched)
         reached = self._box(normal, gradient, BALANCE.damping * damping, q, parameters)
-        return WholeStep(reached, before, self.residual(reached, parameters), ca.MX(0))
+        return [reached, before, self.residual(reached, parameters), ca.MX(0)]
 
     @cached_property
     def residual(self) -> ca.Function:
@@ -390,7 +390,6 @@ class Balanced:
     """A step that was tried and what comes of it.
 
     Attributes:
-        tried: The step, with the residuals of the contacts.
         q: (n, 1) where it leads, or where it began if it gained nothing.
         accepted: Whether it gained.
         within: Whether every contact is met at q.
@@ -399,7 +398,6 @@ class Balanced:
         fit: Damping, power and steps spent, for the state.
     """
 
-    tried: Tried
     q: Expr
     accepted: Expr
     within: Expr
@@ -509,7 +507,6 @@ def balanced(
         "spent": spent,
     }
     return Balanced(
-        tried=tried,
         q=ca.if_else(accepted, tried.reached, value),
         accepted=accepted,
         within=ca.mmax(left) <= 1,

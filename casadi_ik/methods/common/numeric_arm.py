@@ -14,8 +14,8 @@ import casadi as ca
 import numpy as np
 
 from casadi_ik.arrays import Array
-from casadi_ik.methods.common.bounded_step import Bounded, clip, damped_step
-from casadi_ik.methods.common.contact_fit import FIT, Tried
+from casadi_ik.methods.common.bounded_step import Bounded, clip
+from casadi_ik.methods.common.contact_fit import FIT, Tried, lm_step
 from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.even_spread import evenly
@@ -43,9 +43,6 @@ AT_END = 1e-6
 
 FAR = 1e30
 """Farther than any palm."""
-
-PASSES = 2
-"""Corrections of the active set in a step."""
 
 
 @cache
@@ -123,11 +120,15 @@ def pose_step(
     """One damped step of the arm (a, 1) towards a palm pose."""
     columns = list(robot.arm_actuators)
     bounds = Bounded(arm, p["lower"][columns], p["upper"][columns], first=0)
-    before = _error(_palm(robot, arm), palm)
-    damped = damped_step(pose_jacobian(robot, arm), before, damping, bounds, PASSES)
-    reached = clip(arm + damped.step, bounds)
-    there = _error(_palm(robot, reached), palm)
-    return Tried(reached, before, there, damped.promised, ca.mmax(ca.fabs(reached - arm)))
+
+    def residual(reached: Expr) -> Expr:
+        return _error(_palm(robot, reached), palm)
+
+    def moved(step: Expr) -> Expr:
+        return clip(arm + step, bounds)
+
+    jacobian = pose_jacobian(robot, arm)
+    return lm_step(residual(arm), jacobian, damping, bounds, moved, residual, lambda there: there)
 
 
 def newton_polish(robot: RobotDescription, model_error: float) -> ca.Function:

@@ -12,17 +12,14 @@ from dataclasses import dataclass
 import casadi as ca
 
 from casadi_ik.arms.family import ArmFamily
-from casadi_ik.methods.common.bounded_step import clip, damped_step
-from casadi_ik.methods.common.contact_fit import Tried
+from casadi_ik.methods.common.bounded_step import clip
+from casadi_ik.methods.common.contact_fit import Tried, lm_step
 from casadi_ik.methods.common.palm_fit import HandContacts, hand_contacts
 from casadi_ik.methods.hand_first.state import HandFirstLayouts
 from casadi_ik.problem.contacts import LENGTH, ContactRows, Vectors
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.se3 import compose, exp_se3, skew
 from casadi_ik.symbolic.smooth import Expr
-
-PASSES = 2
-"""Corrections of the active set in a step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,13 +125,15 @@ def fit_step(
     """
     before, jacobian = _rows(layouts, arm, x, p)
     bounds = layouts.hand_bounds(q, p, first=6)
-    damped = damped_step(jacobian, before, damping, bounds, PASSES)
-    rotation, origin = compose((x.rotation, x.origin), exp_se3(damped.step[:6]))
-    reached = PalmAndHand(rotation, origin, clip(x.hand + damped.step[6:], bounds))
-    there, _ = _rows(layouts, arm, reached, p)
-    # A tool has no motors that could move.
-    size = ca.mmax(ca.fabs(reached.hand - x.hand)) if x.hand.numel() else ca.SX(0)
-    return Tried(reached, before, there, damped.promised, size)
+
+    def moved(step: Expr) -> PalmAndHand:
+        rotation, origin = compose((x.rotation, x.origin), exp_se3(step[:6]))
+        return PalmAndHand(rotation, origin, clip(x.hand + step[6:], bounds))
+
+    def residual(reached: PalmAndHand) -> Expr:
+        return _rows(layouts, arm, reached, p)[0]
+
+    return lm_step(before, jacobian, damping, bounds, moved, residual, lambda there: there.hand)
 
 
 def _rows(

@@ -25,7 +25,6 @@ from casadi_ik.kernels.codegen import Stages
 from casadi_ik.kernels.graphs import StepGraph, recipe
 from casadi_ik.methods.common.contact_fit import (
     Tried,
-    WholeStep,
     balanced,
     fresh_fit,
     judge,
@@ -322,13 +321,12 @@ class HandFirstStep:
     def _refinement(self) -> ca.Function:
         inputs, s, _ = self._vectors(ca.MX)
         step = self.layouts.whole.fitted(s["q"], s["damping"], inputs[1])
-        outputs = self._refined(step)(*inputs, *step.parts)
+        outputs = self._refined()(*inputs, *step)
         return ca.Function("refinement", inputs, list(outputs))
 
-    def _refined(self, step: WholeStep) -> ca.Function:
+    def _refined(self) -> ca.Function:
         inputs, s, p = self._vectors()
-        given, symbols = step.as_inputs()
-        tried = given.tried(s["q"])
+        symbols, tried = self.layouts.whole.tried(s["q"])
         judged = judge_contacts(s, p, tried, self.layouts.contacts)
         changed = {"q": ca.if_else(judged.accepted, tried.reached, s["q"])} | judged.fit
         said = {
@@ -342,14 +340,14 @@ class HandFirstStep:
     def _balance(self) -> ca.Function:
         inputs, s, _ = self._vectors(ca.MX)
         step = self.layouts.whole.balanced(s["q"], s["damping"], s["power"], inputs[1])
-        outputs = self._weighed(step)(*inputs, *step.parts)
+        outputs = self._weighed()(*inputs, *step)
         return ca.Function("balance", inputs, list(outputs))
 
-    def _weighed(self, step: WholeStep) -> ca.Function:
+    def _weighed(self) -> ca.Function:
         inputs, s, p = self._vectors()
-        given, symbols = step.as_inputs()
-        found = balanced(s["q"], given.tried(s["q"]), self.layouts.contacts, s, p)
+        symbols, tried = self.layouts.whole.tried(s["q"])
+        found = balanced(s["q"], tried, self.layouts.contacts, s, p)
         said = {"settled": found.over, "within": found.within, "cost": found.largest}
-        record = self.layouts.row(s, p, s["q"], Phase.BALANCE, found.tried, found.accepted)
+        record = self.layouts.row(s, p, s["q"], Phase.BALANCE, tried, found.accepted)
         changed = {"q": found.q} | found.fit
         return self._function(Stage.BALANCE, [*inputs, *symbols], s, changed, said, record)

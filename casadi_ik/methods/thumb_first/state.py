@@ -1,16 +1,16 @@
-"""State, parameters and record of the thumb-first method."""
+"""State, parameters and record of the thumb-first method, and its numbers."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import casadi as ca
 
+from casadi_ik.errors import InputError
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.methods.common.limits import bits
 from casadi_ik.methods.thumb_first.closed_chain_step import Merit
-from casadi_ik.methods.thumb_first.parameters import ThumbFirstParameters
 from casadi_ik.problem.contacts import ContactRows, Kinds
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.trace import (
@@ -29,6 +29,46 @@ from casadi_ik.problem.trace import (
 )
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.smooth import Expr
+
+STEPS = ("freeze", "proxqp")
+"""How a step keeps to the limits."""
+
+
+@dataclass(frozen=True)
+class ThumbFirstParameters:
+    """Parameters of the method.
+
+    Attributes:
+        starts: Palm estimates a solve may begin from, each from another hand posture.
+        table: Hand postures that the target's shape is compared with to find them.
+        pull: How much a posture's distance from the start's hand counts along with the shape.
+        step: "freeze": the joint that violates its limits most is fixed there and the step is
+            solved again. "proxqp": the same problem as a quadratic program (ProxQP, Bambade et
+            al. 2022), in CasADi's virtual machine; slower.
+        damping: Damping [-] of the first step of a start; residuals are in 0.1 m and rad.
+        step_cap: Longest change of any motor in one iteration [rad, or part of a slider's range].
+    """
+
+    starts: int = 32
+    table: int = 8192
+    pull: float = 6.0
+    step: str = "freeze"
+    damping: float = 0.03
+    step_cap: float = 0.3
+
+    def __post_init__(self) -> None:
+        if self.step not in STEPS:
+            known = ", ".join(STEPS)
+            raise InputError(f"step: found {self.step!r}, expected one of {known}")
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if entry.type == "int" and not (type(value) is int and value >= 1):
+                raise InputError(f"{entry.name}: found {value!r}, expected a whole number >= 1")
+            if entry.type == "float" and not (type(value) in (int, float) and value > 0):
+                raise InputError(f"{entry.name}: found {value!r}, expected a number > 0")
+        if self.starts > self.table:
+            raise InputError(f"table: found {self.table}, expected at least starts = {self.starts}")
+
 
 STAGES = (Phase.HAND_ALIGNMENT, Phase.CANDIDATE, Phase.ARM_PLACEMENT, Phase.BALANCE)
 """What an iteration may be, the most frequent first."""

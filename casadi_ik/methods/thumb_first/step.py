@@ -29,7 +29,6 @@ from casadi_ik.methods.common.contact_fit import (
     BALANCE,
     FIT,
     WholeContacts,
-    WholeStep,
     balanced,
     differs,
     fresh_fit,
@@ -346,16 +345,16 @@ def balance_stage(layouts: ThumbFirstLayouts) -> ca.Function:
     s = layouts.state.unpack(state)
     whole = WholeContacts(layouts.robot, layouts.contacts, layouts.parameters)
     step = whole.balanced(s["q"], s["damping"], s["power"], parameters)
-    outputs = _judged(layouts, step)(state, parameters, *step.parts)
+    outputs = _judged(layouts, whole)(state, parameters, *step)
     return ca.Function("balance", [state, parameters], list(outputs))
 
 
-def _judged(layouts: ThumbFirstLayouts, step: WholeStep) -> ca.Function:
+def _judged(layouts: ThumbFirstLayouts, whole: WholeContacts) -> ca.Function:
     """Go on from where a step leads if it gained."""
     state, parameters = layouts.state.symbols("state"), layouts.parameters.symbols("parameters")
     s, p = layouts.state.unpack(state), layouts.parameters.unpack(parameters)
-    given, symbols = step.as_inputs()
-    found = balanced(s["q"], given.tried(s["q"]), layouts.contacts, s, p)
+    symbols, tried = whole.tried(s["q"])
+    found = balanced(s["q"], tried, layouts.contacts, s, p)
     failed = ca.logic_and(found.over, ca.logic_not(found.within))
     after = layouts.after(
         s,
@@ -375,7 +374,7 @@ def _judged(layouts: ThumbFirstLayouts, step: WholeStep) -> ca.Function:
         status,
         there,
         damping=s["damping"],
-        step_size=found.tried.size,
+        step_size=tried.size,
         accepted=found.accepted,
     )
     return ca.Function("balanced", [state, parameters, *symbols], shared(after, record, status))
