@@ -13,6 +13,7 @@ from samplers import HARD, near_limits
 import casadi_ik as ik
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
+from casadi_ik.methods.hand_first.state import STAGES
 from casadi_ik.problem.targets import TargetBatch, fixed_array, target_arrays
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.run import Run
@@ -76,13 +77,29 @@ def test_the_same_twice_alone_and_in_a_batch(robot, method, rng):
         assert alone.restarts[0] == batch.restarts[row]
 
 
-def test_without_a_compiler_the_answers_are_the_same(robot, method, rng):
-    asked = problems(robot, robot.random(rng, 3))
-    starts = np.tile(robot.home, (3, 1))
-    slow = HandFirstMethod(robot.description, HandFirstParameters(), compiled=False)
-    np.testing.assert_allclose(
-        slow.run(asked, starts, 0, False).q, method.run(asked, starts, 0, False).q, atol=1e-9
-    )
+def stages_made_alike(method, asked, starts):
+    """The stages of a first round, which the virtual machine makes as compiled code does."""
+    slow = HandFirstMethod(method.robot, method.options, compiled=False)
+    rows = method.rows(asked, starts, method.postures(asked, 0))
+    fast, slow = (each.run_rows(*rows, trace=True) for each in (method, slow))
+    np.testing.assert_array_equal(fast.status, slow.status)
+    np.testing.assert_array_equal(fast.iterations, slow.iterations)
+    np.testing.assert_allclose(fast.states, slow.states, atol=1e-7)
+    for name in ("phase", "status", "accepted", "restart"):
+        np.testing.assert_array_equal(fast.rows[name], slow.rows[name])
+    return {ik.answers.Phase(phase) for phase in fast.rows["phase"]}
+
+
+def test_without_a_compiler_every_stage_is_the_same(robot, method, rng):
+    q = robot.random(rng, 25)
+    points, normals = robot.contacts(q)
+    points += rng.normal(0, 0.005, points.shape)
+    starts = np.where(np.arange(25)[:, None] % 2, robot.home, q + 0.02)
+    targets, seen = target_arrays(points, normals, 3), set()
+    for prefer in ("limits", "q0"):
+        asked = TargetBatch(*targets, ik.Tolerance(), True, prefer=prefer)
+        seen |= stages_made_alike(method, asked, starts)
+    assert seen == set(STAGES)
 
 
 def test_traces(robot, method, rng):
@@ -224,6 +241,7 @@ def test_an_arm_without_a_closed_form(tmp_path_factory, tolerance):
     q = robot.random(np.random.default_rng(5), 60)
     batch = solve(robot, other, problems(robot, q, TOLERANCES[tolerance]))
     assert batch.success.all()
+    stages_made_alike(other, problems(robot, q[:12], TOLERANCES[tolerance]), q[12:24])
     # Nearly all by the arm stage, not by the whole-system stage.
     assert np.mean(batch.phases["refinement"] == 0) > 0.9
 

@@ -5,8 +5,8 @@
  * suits it best (candidate), fits palm and hand to the contacts as if the hand could fly (hand
  * fit), has the arm carry the palm there in closed form (arm placement, or arm choice if what is
  * near q0 is wanted), moves all motors where the arm cannot follow exactly (refinement), and brings
- * the largest error down where contacts contradict each other (balance): one iteration of the
- * compiled step in whichever stage the solve is (step.py).
+ * the largest error down where contacts contradict each other (balance). An iteration is one step of
+ * the stage that the solve is in, and the choice of the next stage: iteration.c.
  *
  * The loop (kernels/drivers/loop.c) makes the iterations, of many targets side by side or of one,
  * and asks `follow` whenever they end. A batch, one target, `fast`, a solve by steps and an
