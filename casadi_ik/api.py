@@ -38,7 +38,7 @@ from casadi_ik.touch.surface import Surface
 
 
 class Solver(MovingSolver):
-    """A method on a robot, with a tolerance; build it once and use it for every grasp.
+    """Solves grasps of one robot by one method; build it once and use it for every grasp.
 
     Attributes:
         robot: The robot.

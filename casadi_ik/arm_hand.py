@@ -19,7 +19,7 @@ from casadi_ik.robots import RobotDescription, load_description, to_urdf
 
 
 class ArmHand(Shown):
-    """An arm-hand (or a hand on a fixed base), ready to be asked.
+    """A robot: an arm with a hand, an arm alone, or a hand on a fixed base.
 
     Attributes:
         description: The frozen data behind it.

@@ -98,7 +98,7 @@ def register_method(
     fixed: Mapping[str, Any] | None = None,
     replace: bool = False,
 ) -> None:
-    """Make a method known to `Solver` by its name, in this process.
+    """Register a method for `Solver` under a name, in this process.
 
     Args:
         name: What it is called; also `Method.name` of what `build` makes.

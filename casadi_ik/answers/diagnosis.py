@@ -18,7 +18,7 @@ Point = tuple[float, float, float]
 
 
 class Reason(StrEnum):
-    """Why a grasp is not solved: established by a proof, else what is likely.
+    """Cause of an unsolved grasp: proved, or likely.
 
     Example:
         >>> far.diagnosis.reason is ik.answers.Reason.REACH
@@ -154,7 +154,7 @@ class Lazy:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Diagnosis(Shown):
-    """Why a grasp was not solved, with evidence.
+    """Cause of an unsolved grasp, with evidence.
 
     What would help (`reliefs`, `freed`, and `lines`, which tells of them) is looked for when first
     asked for, which takes some milliseconds; everything else is there at once.

@@ -53,7 +53,7 @@ class SuggestedFix:
 
 @dataclass(frozen=True)
 class CollisionReport:
-    """Why no answer is free.
+    """Why every answer of a grasp collides.
 
     Attributes:
         pair: The pair that is in the way in the best answer: two links, or a link and a solid.
@@ -423,7 +423,7 @@ class Choice(Shown):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Ranking(Shown, Sequence[Choice]):
-    """Answers to the question which of many grasps to take, best first.
+    """Ranked answers to many candidate grasps, best first.
 
     Attributes:
         entries: The answers; itself a sequence of them.
@@ -478,7 +478,7 @@ class Ranking(Shown, Sequence[Choice]):
 
 @dataclass(frozen=True)
 class ArmBranch:
-    """One way to bend an arm, and how far it may be varied.
+    """One branch of an arm, and the range of its redundancy.
 
     Attributes:
         shoulder: +1 or -1. Of an arm with a spherical shoulder, elbow and spherical wrist (S-R-S):

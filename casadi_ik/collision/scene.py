@@ -383,7 +383,7 @@ class Item:
 
 
 class Scene:
-    """What stands about a robot, in its base frame.
+    """Obstacles around a robot, in its base frame.
 
     Attributes:
         items: What stands there, by name.

@@ -60,7 +60,7 @@ READING = Reading()
 
 @dataclass(frozen=True, eq=False)
 class Candidates(Sequence[Grasp]):
-    """Grasps of a file, in its order; itself a sequence of them.
+    """A sequence of grasps in the order of their file.
 
     Attributes:
         grasps: The grasps.
@@ -279,7 +279,7 @@ def load_candidates(
     scale: float | None = None,
     invalid: Invalid = "error",
 ) -> Candidates:
-    """Grasps of a file or a folder, as `Solver.choose` takes them.
+    """Load the grasps of a file or a folder for `Solver.choose`.
 
     Where the data have joints free that are coupled in the hand, the posture is the one whose
     fingertips are nearest to those of the data; how far they are away is `Candidates.shift`.

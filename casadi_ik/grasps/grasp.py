@@ -18,7 +18,7 @@ from casadi_ik.grasps.pose import inverse, one_pose
 
 @dataclass(frozen=True)
 class Tolerance:
-    """When a contact counts as reached.
+    """Largest errors at which a contact is reached.
 
     Attributes:
         position: Distance of the contact point [m].
@@ -159,7 +159,7 @@ FREE = np.full(3, np.nan)
 
 @dataclass(frozen=True, eq=False)
 class Contact:
-    """Where one fingertip must touch, in the robot's base frame.
+    """Desired contact of one fingertip, in the robot's base frame.
 
     Attributes:
         point: (3,) contact point [m].
@@ -264,7 +264,7 @@ class Contact:
 
 @dataclass(frozen=True, eq=False)
 class Grasp:
-    """A contact per finger, a finger left out is free; or a palm and the posture of its hand.
+    """A contact for each finger (omitted fingers are free), or a palm pose and a hand posture.
 
     Attributes:
         contacts: Contact by finger name; none where a palm is given.

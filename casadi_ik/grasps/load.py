@@ -197,7 +197,7 @@ def _numbers(values: Array) -> list[float]:
 
 
 def shipped_grasps(robot: str) -> tuple[str, ...]:
-    """Names of the shipped grasps that were made for a robot.
+    """Names of the shipped grasps for a robot.
 
     Args:
         robot: Name of the robot.

@@ -130,7 +130,7 @@ def write_postures(writer: Writer, robot: ArmHand, q: Array, stamps: Sequence[in
 
 @dataclass(frozen=True, eq=False)
 class RecordedMotion:
-    """A motion out of a file: what `reach` and `follow` write, and `ik.motion.Motion.write`.
+    """A motion read from a file of `reach`, `follow` or `ik.motion.Motion.write`.
 
     Attributes:
         robot: Name of the robot, as its URDF in the file has it.

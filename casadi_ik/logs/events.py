@@ -23,7 +23,7 @@ from casadi_ik.problem.trace import (
 
 
 class EventKind(IntEnum):
-    """What happened in an iteration: its code, how it is told, and how it is drawn.
+    """Kind of an event in an iteration: its code, phrase and colour.
 
     "Value against threshold" in the docstrings is what the event's two numbers are.
 

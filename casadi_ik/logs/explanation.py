@@ -33,7 +33,7 @@ STILL_FALLING = 0.05
 
 @dataclass(frozen=True)
 class Explanation:
-    """The story of a solve, each part a few lines.
+    """Explanation of a solve in a few lines per part.
 
     Attributes:
         headline: How it ended.
@@ -514,7 +514,7 @@ class Matched:
 
 
 def matched(logs: Sequence[Log], first: str, second: str) -> Matched:
-    """Find solves of two methods that were asked the same.
+    """Find solves of two methods with the same question.
 
     A target that one method was given several times is taken once, the first time.
 

@@ -197,7 +197,7 @@ class OneSolve:
 def one_solve(
     log: Log, solve: int | None = None, method: str | None = None, counted_from: int = 0
 ) -> OneSolve:
-    """Take one solve out of a log.
+    """Read one solve from a log.
 
     Args:
         log: The log.

@@ -20,7 +20,7 @@ from casadi_ik.problem.verdict import TOLERANCE_SLACK
 
 
 class FollowStatus(Enum):
-    """How a cycle went.
+    """Result of a cycle.
 
     Example:
         >>> ik.motion.FollowStatus.LATE.name
@@ -42,7 +42,7 @@ class FollowStatus(Enum):
 
 @dataclass(frozen=True, eq=False)
 class FollowState:
-    """How the last cycle went.
+    """State after the last cycle.
 
     Attributes:
         status: In one word.
@@ -88,7 +88,7 @@ PALM_WEIGHT = 0.1
 
 
 class Follower:
-    """Follows contacts from cycle to cycle; what it returns is safe to be sent to the motors.
+    """Follows moving contacts cycle by cycle, within the limits of the motors.
 
     Whatever the targets do: positions, velocities and accelerations stay within limits, the
     posture stays on its branch, and where the solver has a scene the robot can always come to rest
@@ -310,7 +310,7 @@ class Follower:
 
     @property
     def state(self) -> FollowState:
-        """How the last cycle went."""
+        """State after the last cycle."""
         n, asked = self._n, self._asked
         q, moved, goal = (part.copy() for part in asked.run.state[: 3 * n].reshape(3, n))
         free = asked.views["weights"].T == 0

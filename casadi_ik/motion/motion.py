@@ -25,7 +25,7 @@ BILLION = 1_000_000_000
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Where the motors are at k times.
+    """A timed motion: motor positions at k times.
 
     Attributes:
         robot: The robot.

@@ -129,7 +129,7 @@ class Closer:
 
 
 class ReachStatus(Enum):
-    """How it went.
+    """Result of planning a motion.
 
     Example:
         >>> solver.reach(grasp).status is ik.motion.ReachStatus.REACHED
@@ -150,7 +150,7 @@ class ReachStatus(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Approach:
-    """The last part of the way to a grasp.
+    """The last part of a motion to a grasp.
 
     Attributes:
         status: REACHED, NO_APPROACH or NOT_SOLVED.
@@ -391,7 +391,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True, eq=False)
 class Reach:
-    """The way to a grasp, or to a posture.
+    """A timed motion to a grasp or to a posture.
 
     Attributes:
         status: How it went.

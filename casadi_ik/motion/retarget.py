@@ -78,7 +78,7 @@ class Retarget(Struct, frozen=True, kw_only=True):
 
 
 def load_retarget(path: str | Path) -> Retarget:
-    """Read a configuration.
+    """Read a retargeting file.
 
     Raises:
         DescriptionError: The file is missing or malformed; the message names file and key.
@@ -145,7 +145,7 @@ class Wanted:
 
 
 class Retargeter:
-    """Turns the frames of one stream into what a robot is to do.
+    """Turns keypoints of a person's hand into targets of a robot.
 
     Called once a frame, or once a cycle of a follower with the newest frame and the cycle's time:
     then what is smoothed moves on between the frames.

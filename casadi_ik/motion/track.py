@@ -130,7 +130,7 @@ class PathTracker:
 
 @dataclass(frozen=True)
 class Jump:
-    """A place where no continuous motion goes on.
+    """A place in a path where no continuous motion exists.
 
     Attributes:
         index: The grasp that is not reached continuously from the one before.

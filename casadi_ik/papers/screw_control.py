@@ -36,7 +36,7 @@ UNLIMITED = 1e9
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """What the control law made of one target; s steps were made.
+    """Trajectory of the control law for one target, in s steps.
 
     Attributes:
         times: (s + 1,) [s], the start first.
@@ -80,7 +80,7 @@ class Trajectory:
 
 
 class ScrewControl:
-    """The screw control law of Chandra et al. 2019 (14), for whole poses and for less.
+    """The screw control law of Chandra et al. 2019 (14), for whole poses and parts of them.
 
     Attributes:
         robot: The robot.

@@ -37,7 +37,7 @@ from casadi_ik.symbolic.smooth import Expr, safe_norm, shared
 
 @dataclass(frozen=True)
 class ScrewTask:
-    """What a fingertip is to do.
+    """Desired motion of a fingertip.
 
     Attributes:
         kind: "pose", "position", "planar-pose" (position in a plane and angle about its normal),

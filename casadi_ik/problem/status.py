@@ -56,7 +56,7 @@ class Status(IntEnum):
 
 
 class Phase(IntEnum):
-    """What an iteration is working on.
+    """Phase of an iteration.
 
     Example:
         >>> ik.answers.Phase.HAND_FIT.label

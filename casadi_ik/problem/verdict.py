@@ -27,7 +27,7 @@ TOLERANCE_SLACK = 1e-9
 
 @dataclass(frozen=True)
 class ContactVerdict:
-    """How well one finger meets its contact.
+    """Errors of one finger's contact.
 
     Attributes:
         position_error: Distance from the contact point [m]; NaN if the finger is free.
@@ -49,7 +49,7 @@ class ContactVerdict:
 
 @dataclass(frozen=True)
 class PalmVerdict:
-    """How well the palm is where it was asked.
+    """Errors of the palm's pose.
 
     Attributes:
         position_error: Distance of its origin [m].

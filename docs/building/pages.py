@@ -31,7 +31,7 @@ ROOT = Path(__file__).parents[2]
 
 def _other_pages(*known: str) -> str:
     """The pages in docs/ that no list of pages names."""
-    lists = ("index.md", "extending.md")
+    lists = ("index.md", "extending.md", "community.md")
     text = "\n".join((ROOT / "docs" / name).read_text(encoding="utf-8") for name in lists)
     named = set(re.findall(r"^(?:.*<)?(?:/docs/)?([a-z_0-9/]+)>?$", text, re.MULTILINE))
     pages = sorted(path.stem for path in (ROOT / "docs").glob("*.md"))
