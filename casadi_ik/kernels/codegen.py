@@ -190,7 +190,6 @@ def library_source(
     driver: str,
     lanes: int = 1,
     wide: bool = False,
-    loops: bool = False,
 ) -> str:
     """The text of a whole library: the function's code, what drivers share, a driver.
 
@@ -199,13 +198,11 @@ def library_source(
         driver: C text of the driver, with its constants.
         lanes: How many solves are made side by side.
         wide: Whether the machine has wide registers.
-        loops: Whether loops over tables are most of the work.
     """
     form = Form(lanes)
     return "\n".join(
         (
             WIDE if wide else "",
-            LOOPS if loops else "",
             standing_alone(function, form),
             driver_text("common"),
             driver,

@@ -188,9 +188,7 @@ class FunctionKernel:
     def _load(self) -> ctypes.CDLL | None:
         driver = define(self.constants) + driver_text("map_job") + driver_text("map")
         graph = self._graph
-        return load_function(
-            self.name, lambda: graph.function, driver, SYMBOL, graph.recipe, loops=graph.loops
-        )
+        return load_function(self.name, lambda: graph.function, driver, SYMBOL, graph.recipe)
 
     @property
     def constants(self) -> dict[str, int]:

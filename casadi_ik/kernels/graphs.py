@@ -97,7 +97,6 @@ class FunctionGraph:
         inputs: Rows and columns by argument name.
         outputs: Rows and columns of the results.
         recipe: See `recipe`; a library of the same recipe is taken without building the function.
-        loops: Whether loops over tables are most of its work.
     """
 
     name: str
@@ -105,7 +104,6 @@ class FunctionGraph:
     inputs: Mapping[str, Shape]
     outputs: tuple[Shape, ...]
     recipe: str = ""
-    loops: bool = False
 
     @classmethod
     def of(cls, function: ca.Function) -> FunctionGraph:

@@ -76,7 +76,6 @@ def load_function(
     recipe: str = "",
     lanes: int = 1,
     wide: bool = False,
-    loops: bool = False,
 ) -> ctypes.CDLL | None:
     """The compiled library of a function and a driver; see `load_library`.
 
@@ -88,13 +87,12 @@ def load_function(
         recipe: What the function follows from (`graphs.recipe`), "" if that is not known.
         lanes: As for `library_source`, like those below.
         wide: Likewise.
-        loops: Likewise.
     """
 
     def text() -> str:
-        return library_source(row_major(build()), driver, lanes, wide, loops)
+        return library_source(row_major(build()), driver, lanes, wide)
 
-    form = f"{recipe} {lanes} {wide} {loops} {driver}" if recipe else ""
+    form = f"{recipe} {lanes} {wide} {driver}" if recipe else ""
     return load_library(name, text, symbol, form)
 
 
