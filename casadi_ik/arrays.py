@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 """Numbers: coordinates, vectors, matrices."""
@@ -16,3 +16,10 @@ Bools = NDArray[np.bool_]
 
 Rows = NDArray[np.intp]
 """Positions in another array."""
+
+
+def frozen(values: ArrayLike) -> Array:
+    """Numbers as an array that cannot be changed."""
+    array = np.asarray(values, dtype=float)
+    array.flags.writeable = False
+    return array

@@ -14,7 +14,7 @@ from casadi_ik.arrays import Array, Bools
 from casadi_ik.errors import DescriptionError
 from casadi_ik.grasps.pose import inverse
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.robots.poses import link_poses
+from casadi_ik.robots.poses import link_poses, motion
 
 
 @dataclass(frozen=True)
@@ -226,13 +226,8 @@ class HandPoses:
 
 def of_fixed_axes(angles: Array) -> Array:
     """(k, 3, 3) rotations about fixed axes by (k, 3) roll, pitch, yaw [rad], as URDF has them."""
-    (sr, sp, sy), (cr, cp, cy) = np.sin(angles).T, np.cos(angles).T
-    rows = [
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ]
-    return np.stack([np.stack(row, axis=1) for row in rows], axis=1)
+    x, y, z = (motion("revolute", axis, angles[:, i]) for i, axis in enumerate(np.eye(3)))
+    return (z @ y @ x)[:, :3, :3]
 
 
 def of_two_columns(columns: Array) -> Array:

@@ -11,18 +11,17 @@ import io
 import math
 import pickle
 import re
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
-from zipfile import BadZipFile, ZipFile, is_zipfile
+from zipfile import ZipFile, is_zipfile
 
 import numpy as np
 
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.limits import LIMITS
-from casadi_ik.files.npz import refuse_giants
+from casadi_ik.files.npz import UNREADABLE, refuse_giants
 
 TYPES = re.compile(r"^[<>|=]?([biufcSUO]\d{0,5}|b1|\?)$")
 """Element types that arrays may have."""
@@ -186,21 +185,7 @@ def reading(path: Path, kind: str) -> Iterator[None]:
             f"{path}: its pickle holds {_line(error)}, expected arrays, containers, texts and "
             "numbers only"
         ) from error
-    except (
-        ValueError,
-        TypeError,
-        AttributeError,
-        IndexError,
-        KeyError,
-        EOFError,
-        MemoryError,
-        OverflowError,
-        NotImplementedError,
-        RecursionError,
-        UnicodeError,
-        BadZipFile,
-        zlib.error,
-    ) as error:
+    except (*UNREADABLE, AttributeError, KeyError, IndexError, TypeError) as error:
         raise DescriptionError(f"{path}: damaged, expected {kind}: {_line(error)}") from error
 
 

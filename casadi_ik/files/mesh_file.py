@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.limits import LIMITS, RAISED, limit
+from casadi_ik.files.reading import read_bytes
 
 FORMATS = (".stl", ".obj", ".ply", ".dae", ".off", ".glb")
 """Names' ends of what is read."""
@@ -41,14 +42,7 @@ def read_mesh(path: Path, where: str) -> tuple[Array, NDArray[np.int64]]:
     where = f"{where}: {path.name}"
     if kind not in FORMATS:
         raise DescriptionError(f"{where}: found {kind!r}, expected one of {', '.join(FORMATS)}")
-    try:
-        with path.open("rb") as stream:
-            data = stream.read(limit(LIMITS.mesh_bytes) + 1)
-    except OSError as error:
-        raise DescriptionError(f"{where}: cannot be read: {error.strerror}") from error
-    if len(data) > limit(LIMITS.mesh_bytes):
-        most = f"{limit(LIMITS.mesh_bytes) / 2**20:.3g} MiB"
-        raise DescriptionError(f"{where}: cannot be read: is larger than {most} {RAISED}")
+    data = read_bytes(path, where, limit(LIMITS.mesh_bytes), RAISED)
     try:
         points, triangles = _parsed(data, kind[1:])
     except Exception as error:  # whatever a broken file leads a reader into

@@ -64,24 +64,49 @@ class _UniqueKeyLoader(_SafeLoader):
         return super().construct_mapping(node, deep)
 
 
+def read_bytes(path: Path, where: str, most: int, note: str = "") -> bytes:
+    """All of a file.
+
+    Args:
+        path: The file.
+        where: What to call it in a message.
+        most: Bytes that it may have.
+        note: How that is raised, for the message.
+
+    Raises:
+        DescriptionError: It cannot be read, or is larger.
+    """
+    try:
+        with path.open("rb") as stream:
+            data = stream.read(most + 1)
+    except (OSError, ValueError) as error:
+        reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
+        raise DescriptionError(f"{where}: cannot be read: {reason}") from error
+    if len(data) > most:
+        size = f"{most / 2**20:.3g} MiB {note}".rstrip()
+        raise DescriptionError(f"{where}: cannot be read: is larger than {size}")
+    return data
+
+
+def read_text(path: Path, most: int, note: str = "", encoding: str = "utf-8") -> str:
+    """The text of a file; see `read_bytes`.
+
+    Raises:
+        DescriptionError: As there, or it is no text.
+    """
+    try:
+        return read_bytes(path, str(path), most, note).decode(encoding)
+    except UnicodeDecodeError as error:
+        raise DescriptionError(f"{path}: cannot be read: not UTF-8 text") from error
+
+
 def parse_yaml(path: Path) -> Any:
     """Parse a YAML file.
 
     Raises:
         DescriptionError: The file is missing, unreadable, not UTF-8, not YAML, or beyond a limit.
     """
-    try:
-        with path.open("rb") as stream:
-            data = stream.read(LARGEST_FILE + 1)
-    except (OSError, ValueError) as error:
-        reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
-        raise DescriptionError(f"{path}: cannot be read: {reason}") from error
-    if len(data) > LARGEST_FILE:
-        raise DescriptionError(f"{path}: cannot be read: is larger than {LARGEST_FILE >> 20} MiB")
-    try:
-        text = data.decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise DescriptionError(f"{path}: cannot be read: not UTF-8 text") from error
+    text = read_text(path, LARGEST_FILE)
     try:
         _check_events(text)
         found = yaml.load(text, Loader=_UniqueKeyLoader)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from casadi_ik.arrays import Array, Bools
+from casadi_ik.arrays import Array, Bools, frozen
 from casadi_ik.errors import InputError
 from casadi_ik.grasps.pose import inverse, one_pose
 
@@ -214,7 +214,7 @@ class Contact:
             ]
             if others:
                 raise InputError(f"direction: found it beside {others[0]}, expected it alone")
-            object.__setattr__(self, "point", _frozen(np.full(3, np.nan)))
+            object.__setattr__(self, "point", frozen(np.full(3, np.nan)))
             object.__setattr__(self, "normal", _unit(direction, "direction"))
             return
         if point is None:
@@ -225,7 +225,7 @@ class Contact:
         if problem:
             raise InputError(problem)
         if "tangent" in vectors:
-            vectors["tangent"] = _frozen(squared(vectors["tangent"], vectors["normal"]))
+            vectors["tangent"] = frozen(squared(vectors["tangent"], vectors["normal"]))
         for name, vector in vectors.items():
             object.__setattr__(self, name, vector)
 
@@ -306,7 +306,7 @@ class Grasp:
 
     def __post_init__(self) -> None:
         if self.palm is not None:
-            object.__setattr__(self, "palm", _frozen(one_pose(self.palm, "palm").copy()))
+            object.__setattr__(self, "palm", frozen(one_pose(self.palm, "palm").copy()))
             if self.contacts:
                 raise InputError("palm: found it beside contacts, expected one of them")
             if not self.posture:
@@ -436,12 +436,7 @@ def _unit(value: Any, name: str) -> Array:
     vector, zero = unit_vectors(_vector(value, name))
     if zero:
         raise InputError(f"{name}: found [0.0, 0.0, 0.0], expected a direction, not zero")
-    return _frozen(vector)
-
-
-def _frozen(vector: Array) -> Array:
-    vector.flags.writeable = False
-    return vector
+    return frozen(vector)
 
 
 def _vector(value: Any, name: str) -> Array:
@@ -453,5 +448,4 @@ def _vector(value: Any, name: str) -> Array:
         raise InputError(f"{name}: found shape {array.shape}, expected (3,)")
     if not np.all(np.isfinite(array)):
         raise InputError(f"{name}: found {array.tolist()}, expected finite numbers")
-    array.flags.writeable = False
-    return array
+    return frozen(array)

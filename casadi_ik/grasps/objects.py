@@ -16,6 +16,7 @@ from casadi_ik.files.reading import Struct, read
 from casadi_ik.files.shipped import resolve
 from casadi_ik.files.units import Mass
 from casadi_ik.grasps.shapes import Mesh, MeshShape, Shape, load_mesh_shape
+from casadi_ik.robots.parts import known_source
 
 
 class MassEntry(Struct, frozen=True):
@@ -135,7 +136,7 @@ def load_object(name_or_path: str | Path) -> GraspObject:
             f"{path}: mass.value: found {entry.mass.value}, expected a positive finite mass"
         )
     for key, tags in (("shape", entry.shape.source), ("mass", entry.mass.source)):
-        _known_source(tags, entry.sources, f"{path}: {key}.source")
+        known_source(tags, entry.sources, f"{path}: {key}.source")
     shape = entry.shape
     if isinstance(shape, MeshFileEntry):
         names = [shape.file] if isinstance(shape.file, str) else shape.file
@@ -170,12 +171,3 @@ def _of_mesh(name: str) -> GraspObject:
         raise DescriptionError(f"{name}: found factor {factor!r}, expected a number > 0")
     shape = load_mesh_shape([Path(one).expanduser() for one in files], scale, name)
     return GraspObject(name, "A mesh.", "that of the mesh", shape, np.nan, {})
-
-
-def _known_source(tags: str, sources: dict[str, str], where: str) -> None:
-    names = tags.replace(",", " ").split()
-    if not names:
-        raise DescriptionError(f"{where}: is empty; every number needs its source")
-    for tag in names:
-        if tag not in sources:
-            raise DescriptionError(f"{where}: unknown tag {tag!r}; sources: {', '.join(sources)}")

@@ -12,8 +12,7 @@ import numpy as np
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import MissingExtraError
-from casadi_ik.importing.robot_shapes import hand_links
-from casadi_ik.robots.parts import PREFIX
+from casadi_ik.importing.robot_shapes import hand_links, name_in_robot
 from casadi_ik.robots.robot_files.mjcf_file import joint_name
 from casadi_ik.robots.robot_files.tree import RobotTree
 
@@ -66,12 +65,13 @@ def largest_difference(
     """
     known = oracle(tree)
     taken = set() if beside is None else _names(beside)
-    links = {link: _ours(link, robot.description.links, taken) for link in tree.links}
+    links = {link: name_in_robot(link, robot.description.links, taken) for link in tree.links}
     if beside is not None or carried is not None:
         hand = hand_links(robot.description)
         links = {link: ours for link, ours in links.items() if (ours in hand) == (carried is None)}
     joints = {
-        one.name: _ours(one.name, robot.description.joint_names, taken) for one in tree.joints
+        one.name: name_in_robot(one.name, robot.description.joint_names, taken)
+        for one in tree.joints
     }
     worst = 0.0
     for configuration in q:
@@ -93,12 +93,6 @@ def largest_difference(
 
 def _names(tree: RobotTree) -> set[str]:
     return {*tree.links, *tree.by_name}
-
-
-def _ours(name: str, names: tuple[str, ...], taken: set[str]) -> str:
-    """What a link or joint of a file is called in the robot."""
-    prefixed = PREFIX + name
-    return prefixed if prefixed in names and name in taken else name
 
 
 def _value(

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from casadi_ik.arrays import Array
-from casadi_ik.robots.description import Joint
+from casadi_ik.robots.description import Actuator, Joint
 from casadi_ik.robots.poses import link_poses
 
 
@@ -23,6 +23,11 @@ class Jointed(Protocol):
     @property
     def joints(self) -> Sequence[Joint]:
         """The joints, parents before children."""
+        ...
+
+    @property
+    def actuators(self) -> Sequence[Actuator]:
+        """The motors."""
         ...
 
 

@@ -9,7 +9,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +16,12 @@ from numpy.typing import NDArray
 from casadi_ik.arrays import Array
 from casadi_ik.collision.distances import between_segments
 from casadi_ik.importing.capsules import FIT, Rows, fitted
-from casadi_ik.importing.posture import Jointed, Postures
+from casadi_ik.importing.posture import Jointed
 from casadi_ik.importing.surfaces import Surface, link_surfaces
 from casadi_ik.robots.collision import Touching, capsules_of
 from casadi_ik.robots.description import Actuator, Joint, RobotDescription
 from casadi_ik.robots.parts import PREFIX
-from casadi_ik.robots.poses import joint_positions
+from casadi_ik.robots.poses import joint_positions, link_poses
 from casadi_ik.robots.robot_files.tree import RobotTree
 from casadi_ik.robots.schema import ShapeEntry
 
@@ -62,17 +61,8 @@ class ContactSampling:
 SAMPLING = ContactSampling()
 
 
-class Moved(Jointed, Protocol):
-    """Links, joints and motors: a part, or a robot."""
-
-    @property
-    def actuators(self) -> Sequence[Actuator]:
-        """The motors."""
-        ...
-
-
 def may_touch(
-    part: Moved, shapes: Mapping[str, Sequence[ShapeEntry]], surfaces: Mapping[str, Surface]
+    part: Jointed, shapes: Mapping[str, Sequence[ShapeEntry]], surfaces: Mapping[str, Surface]
 ) -> list[Touching]:
     """Pairs of links that may touch, and why.
 
@@ -81,10 +71,13 @@ def may_touch(
         shapes: By link its shapes.
         surfaces: By link the meshes they hold.
     """
-    postures, rng = Postures(part), np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     joints = {joint.name: joint for joint in part.joints}
     motors = list(part.actuators)
-    poses = [postures.poses(_values(joints, motors, rng)) for _ in range(SAMPLING.samples)]
+    poses = [
+        link_poses(part.root, part.joints, _values(joints, motors, rng))
+        for _ in range(SAMPLING.samples)
+    ]
     bodies = {part.root: part.root}
     neighbours = set()
     for joint in part.joints:
@@ -284,7 +277,7 @@ def robot_shapes(
     for file in files:
         if file is None:
             continue
-        ours = {link: _ours(link, robot.links, taken) for link in file.links}
+        ours = {link: name_in_robot(link, robot.links, taken) for link in file.links}
         wanted = {
             link: name
             for link, name in ours.items()
@@ -301,7 +294,7 @@ def robot_shapes(
     return shapes, may_touch(robot, shapes, surfaces), notes
 
 
-def _ours(link: str, links: tuple[str, ...], taken: set[str]) -> str:
-    """What a link of a file is called in the robot."""
-    prefixed = PREFIX + link
-    return prefixed if prefixed in links and link in taken else link
+def name_in_robot(name: str, names: tuple[str, ...], taken: set[str]) -> str:
+    """What a link or joint of a file is called in the robot."""
+    prefixed = PREFIX + name
+    return prefixed if prefixed in names and name in taken else name

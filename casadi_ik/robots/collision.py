@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from casadi_ik.arrays import Array
+from casadi_ik.arrays import Array, frozen
 from casadi_ik.errors import DescriptionError
-from casadi_ik.files.reading import Frame, Point, frame_matrix
-from casadi_ik.robots.robot_files.tree import attribute, parse_xml, read_text
+from casadi_ik.files.reading import Frame, frame_matrix
+from casadi_ik.robots.robot_files.tree import attribute, parse_xml, read_robot_file
 from casadi_ik.robots.schema import (
     BoxEntry,
     CapsuleEntry,
@@ -29,7 +29,7 @@ def srdf_pairs(path: Path) -> list[tuple[tuple[str, str], str]]:
     Raises:
         DescriptionError: The file cannot be read, is no SRDF, or a pair lacks a link.
     """
-    element = parse_xml(read_text(path), path)
+    element = parse_xml(read_robot_file(path), path)
     if element.tag != "robot":
         raise DescriptionError(f"{path}: found <{element.tag}>, expected <robot> of an SRDF")
     found: list[tuple[tuple[str, str], str]] = []
@@ -189,11 +189,10 @@ def link_shapes(entry: CollisionEntry | None, links: Iterable[str], path: Path) 
 
 
 def _solid(link: str, shape: BoxEntry | CylinderEntry) -> LinkSolid:
-    pose = frame_matrix(Frame(shape.xyz, shape.rpy))
-    pose.flags.writeable = False
+    pose = frozen(frame_matrix(Frame(shape.xyz, shape.rpy)))
     if isinstance(shape, BoxEntry):
-        return LinkSolid(link, "box", _frozen(shape.size), pose)
-    return LinkSolid(link, "cylinder", _frozen((shape.radius, shape.length, 0.0)), pose)
+        return LinkSolid(link, "box", frozen(shape.size), pose)
+    return LinkSolid(link, "cylinder", frozen((shape.radius, shape.length, 0.0)), pose)
 
 
 def capsules_of(shape: ShapeEntry) -> list[tuple[Array, Array, float]]:
@@ -205,10 +204,10 @@ def capsules_of(shape: ShapeEntry) -> list[tuple[Array, Array, float]]:
     box.
     """
     if isinstance(shape, SphereEntry):
-        return [(_frozen(shape.center), _frozen(np.zeros(3)), shape.radius)]
+        return [(frozen(shape.center), frozen(np.zeros(3)), shape.radius)]
     if isinstance(shape, CapsuleEntry):
         one, other = np.array(shape.ends[0]), np.array(shape.ends[1])
-        return [(_frozen((one + other) / 2), _frozen((other - one) / 2), shape.radius)]
+        return [(frozen((one + other) / 2), frozen((other - one) / 2), shape.radius)]
     pose = frame_matrix(Frame(shape.xyz, shape.rpy))
     if isinstance(shape, CylinderEntry):
         if shape.length < 2 * shape.radius:
@@ -249,7 +248,7 @@ def _bar(
         best = min(best, (volume, inside, radius))
     _, inside, radius = best
     rotation = pose[:3, :3]
-    return _frozen(rotation @ center + pose[:3, 3]), _frozen(rotation @ axis * inside), radius
+    return frozen(rotation @ center + pose[:3, 3]), frozen(rotation @ axis * inside), radius
 
 
 def _fault(shape: ShapeEntry) -> str:
@@ -267,9 +266,3 @@ def _fault(shape: ShapeEntry) -> str:
 def _known(link: str, known: list[str], where: str) -> None:
     if link not in known:
         raise DescriptionError(f"{where}: unknown link {link!r}; known: {', '.join(known)}")
-
-
-def _frozen(values: Point | Array) -> Array:
-    array = np.array(values, dtype=float)
-    array.flags.writeable = False
-    return array

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from casadi_ik.arrays import Array
+from casadi_ik.arrays import Array, frozen
 from casadi_ik.errors import UnknownNameError, UnsupportedError
 from casadi_ik.robots.collision import NO_SHAPES, Shapes
 from casadi_ik.robots.couplings import Coupling
@@ -307,10 +307,3 @@ class RobotDescription:
             source = joint.name if joint.coupling is None else joint.coupling.of
             found.add(self.actuator_index(source))
         return found
-
-
-def frozen(values: Sequence[float] | Array) -> Array:
-    """An array that cannot be changed."""
-    array = np.asarray(values, dtype=float)
-    array.flags.writeable = False
-    return array

@@ -7,15 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
-from casadi_ik.arrays import Array
+from casadi_ik.arrays import frozen
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.reading import Frame, frame_matrix
 from casadi_ik.robots.collision import NO_SHAPES, Shapes, link_shapes
 from casadi_ik.robots.couplings import Coupling, Linear
-from casadi_ik.robots.description import Actuator, Joint, frozen
-from casadi_ik.robots.parts import HandPart, Part, check_couplings
+from casadi_ik.robots.description import Actuator, Joint
+from casadi_ik.robots.parts import Part, check_couplings
+from casadi_ik.robots.poses import motion
 from casadi_ik.robots.robot_files.read import read_tree
-from casadi_ik.robots.robot_files.tree import RobotTree, TreeJoint, turned
+from casadi_ik.robots.robot_files.tree import RobotTree, TreeJoint
 from casadi_ik.robots.schema import (
     ArmFromFile,
     CollisionEntry,
@@ -69,7 +70,7 @@ def arm_from_file(entry: ArmFromFile, key: str, beside: Path) -> Part:
 
 def hand_from_file(
     entry: HandFromFile, pads: dict[str, ContactEntry | PadEntry], key: str, beside: Path
-) -> HandPart:
+) -> Part:
     """Everything below the palm, and the chain that leads to it.
 
     Args:
@@ -98,7 +99,7 @@ def hand_from_file(
                 f"{palm.link!r} of {tree.path.name}; write another link or another palm"
             )
     joints, actuators = _Chosen(tree, entry, chain, below, where).parts()
-    return HandPart(
+    return Part(
         tree.path.stem,
         str(beside),
         root,
@@ -190,11 +191,12 @@ class _Chosen:
         part = "arm" if joint.name in self._arm else "hand"
         coupling = self._coupling(joint)
         held = self._held(joint.name)
+        moves = "prismatic" if joint.type == "prismatic" else "revolute"
         placement, kind, low, high = joint.placement, "fixed", 0.0, 0.0
         if held is not None:
-            placement, coupling = placement @ _motion(joint, held), None
+            placement, coupling = placement @ motion(moves, joint.axis, held), None
         elif joint.type != "fixed":
-            kind = "prismatic" if joint.type == "prismatic" else "revolute"
+            kind = moves
             low, high = self._limits(joint.name)
         return Joint(
             joint.name,
@@ -306,12 +308,3 @@ class _Chosen:
         slides = leader is not None and leader.type == "prismatic"
         velocity = math.inf if leader is None else leader.velocity
         self._extra[name] = Actuator(name, "m" if slides else "rad", low, high, velocity, "hand")
-
-
-def _motion(joint: TreeJoint, value: float) -> Array:
-    """(4, 4) what a joint does at a position [rad or m]."""
-    if joint.type == "prismatic":
-        pose = np.eye(4)
-        pose[:3, 3] = joint.axis * value
-        return pose
-    return turned(joint.axis, value)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from casadi_ik.arrays import Array
+from casadi_ik.arrays import Array, frozen
 from casadi_ik.errors import DescriptionError, UnknownNameError
 from casadi_ik.files.reading import (
     Frame,
@@ -22,11 +22,10 @@ from casadi_ik.files.reading import (
 )
 from casadi_ik.files.shipped import resolve, resolve_robot
 from casadi_ik.robots.collision import link_shapes
-from casadi_ik.robots.description import Actuator, Finger, Joint, RobotDescription, frozen
+from casadi_ik.robots.description import Actuator, Finger, Joint, RobotDescription
 from casadi_ik.robots.file_parts import arm_from_file, hand_from_file
 from casadi_ik.robots.motor_ranges import motor_ranges
 from casadi_ik.robots.parts import (
-    HandPart,
     Part,
     arm_part,
     hand_part,
@@ -84,7 +83,7 @@ ALONG = 0.995
 
 
 def the_fingers(
-    names: list[str], thumb: str | None, hand: HandPart, flat: FlatJoints, where: str
+    names: list[str], thumb: str | None, hand: Part, flat: FlatJoints, where: str
 ) -> tuple[Finger, ...]:
     """The fingers that a robot uses.
 
@@ -115,7 +114,7 @@ def the_fingers(
     return tuple(_finger(name, hand, flat) for name in names)
 
 
-def _finger(name: str, hand: HandPart, flat: FlatJoints) -> Finger:
+def _finger(name: str, hand: Part, flat: FlatJoints) -> Finger:
     entry = hand.pads[name]
     where = f"{hand.where}: fingers.{name}"
     link = known_link(entry.link, hand.root, hand.joints, f"{where}.link")
@@ -222,7 +221,7 @@ def load_description(name_or_path: str | Path) -> RobotDescription:
     return _pair(*found) if isinstance(found, tuple) else _robot(found)
 
 
-FLANGE = HandPart(
+FLANGE = Part(
     "flange",
     "flange",
     "flange",
@@ -283,7 +282,7 @@ def _arm(arm: str | ArmFromFile, beside: Path) -> Part:
     return arm_part(_read(path, ArmFile)[0], path)
 
 
-def _hand(hand: str | HandFile, beside: Path) -> HandPart:
+def _hand(hand: str | HandFile, beside: Path) -> Part:
     if not isinstance(hand, str):
         return hand_part(hand, beside)
     path = _file_of(hand, "hand", beside)
@@ -307,7 +306,7 @@ def _joined(
     name: str,
     arm: Part | None,
     mount: Array,
-    hand: HandPart,
+    hand: Part,
     fingers: list[str],
     thumb: str | None,
     home: dict[str, float],
@@ -350,7 +349,7 @@ def _joined(
     )
 
 
-def _with_wrist(hand: HandPart) -> HandPart:
+def _with_wrist(hand: Part) -> Part:
     """The hand, of which what moves the palm itself counts as arm, if all fingers are beyond it."""
     by_child = {joint.child: joint for joint in hand.joints}
 

@@ -10,12 +10,13 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from casadi_ik.arrays import Array
+from casadi_ik.arrays import Array, frozen
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.limits import LIMITS
 from casadi_ik.files.reading import Frame, frame_matrix
 from casadi_ik.robots.collision import NO_SHAPES, Shapes, link_shapes
-from casadi_ik.robots.description import Actuator, Joint, frozen
+from casadi_ik.robots.description import Actuator, Joint
+from casadi_ik.robots.robot_files.tree import parents_first
 from casadi_ik.robots.schema import (
     ActuatorEntry,
     ArmFile,
@@ -136,7 +137,7 @@ PREFIX = "hand_"
 
 @dataclass(frozen=True)
 class Part:
-    """An arm, or what all parts have.
+    """An arm or a hand.
 
     Attributes:
         name: What it is called.
@@ -149,6 +150,9 @@ class Part:
         tip: (4, 4) pose of the tip or palm frame in that link.
         home: Positions of some motors.
         shapes: Of its links, for collisions.
+        pads: A hand's contact frames, by finger.
+        thumb: The finger placed first, if it says so itself.
+        mount: (4, 4) pose of a hand's root on an arm's tip, if the robot says nothing.
     """
 
     name: str
@@ -161,24 +165,12 @@ class Part:
     tip: Array
     home: dict[str, float]
     shapes: Shapes = NO_SHAPES
-
-
-@dataclass(frozen=True)
-class HandPart(Part):
-    """A hand.
-
-    Attributes:
-        pads: Its contact frames, by finger.
-        thumb: The finger placed first, if it says so itself.
-        mount: (4, 4) pose of its root on an arm's tip, if the robot says nothing.
-    """
-
     pads: dict[str, ContactEntry | PadEntry] = field(default_factory=dict)
     thumb: str | None = None
     mount: Array = field(default_factory=lambda: np.eye(4))
 
 
-def told_apart(hand: HandPart, arm: Part) -> HandPart:
+def told_apart(hand: Part, arm: Part) -> Part:
     """The hand, with `PREFIX` before every name of a link, joint or motor that the arm has too."""
     links = {arm.root, *(joint.child for joint in arm.joints)}
     movers = {joint.name for joint in arm.joints} | {one.name for one in arm.actuators} | {"mount"}
@@ -253,7 +245,7 @@ def arm_part(arm: ArmFile, path: Path) -> Part:
     )
 
 
-def hand_part(hand: HandFile, path: Path) -> HandPart:
+def hand_part(hand: HandFile, path: Path) -> Part:
     """A hand, checked.
 
     Raises:
@@ -265,7 +257,7 @@ def hand_part(hand: HandFile, path: Path) -> HandPart:
     known_source(hand.palm.source, hand.sources, f"{path}: palm.source")
     for name, finger in hand.fingers.items():
         known_source(finger.source, hand.sources, f"{path}: fingers.{name}.source")
-    return HandPart(
+    return Part(
         hand.name,
         str(path),
         hand.root,
@@ -312,37 +304,16 @@ def _joints(
         known_source(entry.source, sources, f"{where}: source")
         if entry.coupling is not None:
             entry.coupling.check(f"{where}: coupling")
-    by_parent: dict[str, list[JointEntry]] = {}
-    for entry in entries:
-        by_parent.setdefault(entry.parent, []).append(entry)
-    ordered: list[JointEntry] = []
-    frontier = [root]
-    while frontier:
-        children = by_parent.pop(frontier.pop(0), [])
-        ordered += children
-        frontier += [entry.child for entry in children]
-    if by_parent:
-        stray = next(iter(by_parent.values()))[0]
+    ordered = parents_first(entries, root)
+    stray = next((entry for entry in entries if entry not in ordered), None)
+    if stray is not None:
         links = {entry.child for entry in entries}
         problem = "is part of a frame cycle" if stray.parent in links else "is no link"
         raise DescriptionError(
             f"{path}: joint {stray.name!r}: parent: {stray.parent!r} {problem}; "
             f"expected a chain of joints down to the root {root!r}"
         )
-    ordered.sort(key=lambda entry: names.index(entry.name))
-    return [_joint(entry, part) for entry in _parents_first(ordered, root)]
-
-
-def _parents_first(entries: list[JointEntry], root: str) -> list[JointEntry]:
-    """The file's own order, moved only where a child stands before its parent."""
-    placed, known = [], {root}
-    waiting = list(entries)
-    while waiting:
-        entry = next(item for item in waiting if item.parent in known)
-        waiting.remove(entry)
-        placed.append(entry)
-        known.add(entry.child)
-    return placed
+    return [_joint(entry, part) for entry in ordered]
 
 
 def _joint(entry: JointEntry, part: str) -> Joint:

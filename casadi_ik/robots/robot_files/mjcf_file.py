@@ -12,6 +12,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.limits import LIMITS
 from casadi_ik.robots.couplings import Coupling, Linear, Polynomial
+from casadi_ik.robots.poses import motion
 from casadi_ik.robots.robot_files.confined import MODEL, confined
 from casadi_ik.robots.robot_files.tree import (
     RobotTree,
@@ -19,7 +20,6 @@ from casadi_ik.robots.robot_files.tree import (
     check_size,
     fixed,
     mjcf_shapes,
-    turned,
 )
 
 WORLD = "world"
@@ -109,7 +109,7 @@ def _of_body(
         zero = float(model.qpos0[model.jnt_qposadr[joint]])
         if kind in ("revolute", "continuous"):
             # The axis goes through the anchor: the link's frame is there while the joint turns.
-            pose = placement @ anchor @ turned(axis, -zero)
+            pose = placement @ anchor @ motion("revolute", axis, -zero)
             after: Array = np.asarray(np.linalg.inv(anchor), dtype=np.float64)
         else:
             pose, after = placement.copy(), np.eye(4)

@@ -8,7 +8,7 @@ from pathlib import Path
 from casadi_ik.errors import DescriptionError
 from casadi_ik.robots.robot_files.confined import MACROS, confined
 from casadi_ik.robots.robot_files.mjcf_file import read_mjcf
-from casadi_ik.robots.robot_files.tree import RobotTree, parse_xml, read_text
+from casadi_ik.robots.robot_files.tree import RobotTree, parse_xml, read_robot_file
 from casadi_ik.robots.robot_files.urdf_file import read_urdf
 
 MACRO_TAGS = ("{http://www.ros.org/wiki/xacro}", "{http://ros.org/wiki/xacro}")
@@ -35,7 +35,7 @@ def read_tree(path: Path, xacro: bool = False) -> RobotTree:
 
 @lru_cache(maxsize=8)
 def _read(path: Path, _: int, xacro: bool) -> RobotTree:
-    text = read_text(path)
+    text = read_robot_file(path)
     element = parse_xml(text, path)
     if xacro and element.tag == "robot":
         element = parse_xml(confined(MACROS, path).decode(), path)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 from xml.etree import ElementTree
 from xml.parsers import expat
 
@@ -16,7 +16,7 @@ import numpy as np
 from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.limits import LIMITS, RAISED, limit
-from casadi_ik.files.reading import Frame, frame_matrix, roll_pitch_yaw
+from casadi_ik.files.reading import Frame, frame_matrix, read_text, roll_pitch_yaw
 from casadi_ik.robots.couplings import Coupling
 from casadi_ik.robots.schema import BoxEntry, CapsuleEntry, CylinderEntry, ShapeEntry, SphereEntry
 
@@ -27,25 +27,13 @@ class _ForbiddenError(ValueError):
     pass
 
 
-def read_text(path: Path) -> str:
+def read_robot_file(path: Path) -> str:
     """The text of a file.
 
     Raises:
         DescriptionError: It cannot be read, or is larger than any robot.
     """
-    try:
-        with path.open("rb") as stream:
-            data = stream.read(limit(LIMITS.robot_bytes) + 1)
-    except (OSError, ValueError) as error:
-        reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
-        raise DescriptionError(f"{path}: cannot be read: {reason}") from error
-    if len(data) > limit(LIMITS.robot_bytes):
-        most = f"{limit(LIMITS.robot_bytes) / 2**20:.3g} MiB"
-        raise DescriptionError(f"{path}: cannot be read: is larger than {most} {RAISED}")
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise DescriptionError(f"{path}: cannot be read: not UTF-8 text") from error
+    return read_text(path, limit(LIMITS.robot_bytes), RAISED, "utf-8-sig")
 
 
 def parse_xml(text: str, path: Path) -> Element:
@@ -409,9 +397,30 @@ class RobotTree:
         return _known(joint, moving, "joint", where)
 
 
-def parents_first(joints: Iterable[TreeJoint], root: str) -> tuple[TreeJoint, ...]:
-    """The order of the file, moved only where a child stands before its parent."""
-    known, placed, waiting = {root}, [], list(joints)
+class Linking(Protocol):
+    """What hangs a link on another one."""
+
+    @property
+    def parent(self) -> str:
+        """The link above."""
+        ...
+
+    @property
+    def child(self) -> str:
+        """The link below."""
+        ...
+
+
+L = TypeVar("L", bound=Linking)
+
+
+def parents_first(joints: Iterable[L], root: str) -> tuple[L, ...]:
+    """The order of the file, moved only where a child stands before its parent.
+
+    Joints that do not hang on the root are left out.
+    """
+    known, waiting = {root}, list(joints)
+    placed: list[L] = []
     while waiting:
         joint = next((one for one in waiting if one.parent in known), None)
         if joint is None:
@@ -426,16 +435,6 @@ def fixed(name: str, parent: str, child: str, placement: Array) -> TreeJoint:
     """A joint that does not move."""
     axis = np.array([0.0, 0.0, 1.0])
     return TreeJoint(name, parent, child, "fixed", placement, axis, None, math.inf, None)
-
-
-def turned(axis: Array, angle: float) -> Array:
-    """(4, 4) rotation about an axis through the origin."""
-    pose = np.eye(4)
-    if angle:
-        x, y, z = axis
-        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        pose[:3, :3] += math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
-    return pose
 
 
 def _known(name: str, names: Iterable[str], noun: str, where: str) -> str:
