@@ -270,7 +270,8 @@ class WholeContacts:
         n, m = q.numel(), self._rows.size
         sizes = {"reached": n, "before": m, "there": m, "promised": 1}
         symbols = [ca.SX.sym(name, size) for name, size in sizes.items()]
-        return symbols, Tried(*symbols, ca.mmax(ca.fabs(symbols[0] - q)))
+        reached, before, there, promised = symbols
+        return symbols, Tried(reached, before, there, promised, ca.mmax(ca.fabs(reached - q)))
 
     def fitted(self, q: Expr, damping: Expr, parameters: Expr) -> list[Expr]:
         """One damped least-squares step within the bounds.
