@@ -34,7 +34,7 @@ WHOLE = 0.5
 def text(step: HandFirstStep) -> str:
     """The text of iteration.c with its constants for a robot."""
     layouts, robot = step.layouts, step.robot
-    numeric = Stage.ARM_STEPS in step.functions
+    numeric = Stage.ARM_STEPS in step.stages
     whole = {
         f"{label}_{field.name.upper()}": layout.slice(field.name).start
         for label, layout in (
@@ -81,7 +81,7 @@ def text(step: HandFirstStep) -> str:
     if numeric:
         arms, palms = start_table(robot)
         arrays |= {"START_ARMS": arms, "START_PALMS": palms.T}
-    missing = [stage.name for stage in Stage if stage not in step.functions]
+    missing = [stage.name for stage in Stage if stage not in step.stages]
     source = resources.files("casadi_ik.methods.hand_first") / "iteration.c"
     return "".join(
         (
@@ -123,7 +123,7 @@ class Iteration:
             self._begin_arm()
         call = self._stages.get(stage)
         if call is None:
-            call = BufferedFunction(row_major(self._step.functions[stage]))
+            call = BufferedFunction(row_major(self._step.function(stage)))
             self._stages[stage] = call
         call.inputs[0][:], call.inputs[1][:] = self.inputs
         if stage == Stage.CANDIDATE:
@@ -187,7 +187,7 @@ class Iteration:
             return goes_to(Stage.REFINEMENT, Status.SOLVED if solved else Status.RUNNING)
 
         def placement() -> Stage:
-            complete = Stage.ARM_STEPS not in step.functions
+            complete = Stage.ARM_STEPS not in step.stages
             searched = x["earlier"] > 0 or (step.searched_if_near and nearest)
             closed = complete or (step.arm is not None and not searched)
             return Stage.ARM_PLACEMENT if closed else Stage.ARM_STEPS

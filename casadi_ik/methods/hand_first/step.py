@@ -15,7 +15,8 @@ balance     one step of all motors towards the smallest largest error.
 
 from __future__ import annotations
 
-from functools import cached_property
+from collections.abc import Callable
+from functools import cached_property, partial
 
 import casadi as ca
 
@@ -39,8 +40,8 @@ from casadi_ik.methods.common.numeric_arm import (
     pose_step,
 )
 from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
-from casadi_ik.methods.hand_first import iteration
 from casadi_ik.methods.hand_first.hand_fit import PalmAndHand, fit_step
+from casadi_ik.methods.hand_first.iteration import Iteration, text
 from casadi_ik.methods.hand_first.state import SAID, HandFirstLayouts, Stage, with_rows
 from casadi_ik.problem.contacts import LENGTH, Kinds, chord, suffix, within_tolerance
 from casadi_ik.problem.status import Phase
@@ -75,6 +76,7 @@ class HandFirstStep:
         self.robot = robot
         self.arm = arm
         self.layouts = HandFirstLayouts(robot, candidates, kinds)
+        self._built: dict[Stage, ca.Function] = {}
 
     def graph(self) -> StepGraph:
         """The whole iteration."""
@@ -82,14 +84,14 @@ class HandFirstStep:
         name = ca.Function.fix_name(f"hand_first_{self.robot.name}{suffix(layouts.kinds)}")
         return StepGraph(
             name,
-            lambda: Stages(self.functions, iteration.text(self)),
+            lambda: Stages({each: self.function(each) for each in self.stages}, text(self)),
             layouts.state,
             layouts.parameters,
             layouts.record,
             stage="phase",
             recipe=recipe(name, self.robot, layouts.candidates, layouts.kinds),
             apart="postures",
-            virtual=lambda: iteration.Iteration(self),
+            virtual=lambda: Iteration(self),
         )
 
     @property
@@ -119,26 +121,32 @@ class HandFirstStep:
         return *of_placement, *((near.trials, near.patience) if near else (0, 0))
 
     @cached_property
-    def functions(self) -> dict[Stage, ca.Function]:
-        """(state, parameters) -> state, `SAID`, record; a candidate's posture is a third input."""
-        found = {
-            Stage.START: self._start(),
-            Stage.CANDIDATE: self._candidate(),
-            Stage.REFINEMENT: self._refinement(),
-            Stage.BALANCE: self._balance(),
+    def stages(self) -> dict[Stage, Callable[[], ca.Function]]:
+        """What builds the functions of the stages that solves of the robot may be in."""
+        found: dict[Stage, Callable[[], ca.Function]] = {
+            Stage.START: self._start,
+            Stage.CANDIDATE: self._candidate,
+            Stage.REFINEMENT: self._refinement,
+            Stage.BALANCE: self._balance,
         }
         if self.robot.arm_actuators:
-            found[Stage.HAND_FIT] = self._hand_fit()
+            found[Stage.HAND_FIT] = self._hand_fit
             # What no place of locked joints brought within limits is searched in later rounds, and
             # so is what Newton's steps did not lead to from the nominal arm: near a singularity
             # they lead nowhere near.
             if self.arm is None or not self.arm.complete:
-                found[Stage.ARM_STEPS] = self._arm_step()
+                found[Stage.ARM_STEPS] = self._arm_step
         if self.placements is not None:
-            found[Stage.ARM_PLACEMENT] = self._placement(self.placements)
+            found[Stage.ARM_PLACEMENT] = partial(self._placement, self.placements)
         if self.choices is not None:
-            found[Stage.ARM_CHOICE] = self._choice(self.choices)
+            found[Stage.ARM_CHOICE] = partial(self._choice, self.choices)
         return found
+
+    def function(self, stage: Stage) -> ca.Function:
+        """(state, parameters) -> state, `SAID`, record; a candidate's posture is a third input."""
+        if stage not in self._built:
+            self._built[stage] = self.stages[stage]()
+        return self._built[stage]
 
     def _vectors(
         self, kind: type[ca.SX] | type[ca.MX] = ca.SX
