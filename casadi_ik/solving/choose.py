@@ -421,15 +421,11 @@ class _Part:
             return q, rows  # a hand that is given has no other posture
         some = self.targets.rows(rows)
         postures = self.trials.method.postures(some, 0)
-        count, n = postures.shape[1], q.shape[1]
-        owner = np.repeat(rows, count)
-        asked = self.targets.rows(owner)
-        starts = self.limits.of(owner).clip(self.begin[owner])
-        flat = postures.reshape(len(owner), postures.shape[2])
-        turns = np.tile(np.arange(count), len(rows))
-        ends = self.trials.run(*self.trials.posture_rows(asked, starts, flat, turns))
+        starts = self.limits.clip(self.begin)
+        owner, *begun = self.trials.hand_rows(self.targets, rows, starts, postures)
+        ends, asked = self.trials.run(*begun), self.targets.rows(owner)
         ends[~self.trials.solved(asked, ends, asked.enforce_limits)] = np.nan
-        every = np.concatenate([q[:, None], ends.reshape(len(rows), count, n)], axis=1)
+        every = np.concatenate([q[:, None], ends.reshape(len(rows), -1, q.shape[1])], axis=1)
         kept: Bools = np.all(np.isfinite(every), axis=2)
         place, which = np.nonzero(kept)
         found, owner = every[place, which], rows[place]

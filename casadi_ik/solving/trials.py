@@ -161,6 +161,26 @@ class Subproblems:
         states[:, self.state.slice("turn").start] = turns
         return states, parameters
 
+    def hand_rows(
+        self, targets: TargetBatch, rows: Rows, starts: Array, postures: Array, first: int = 0
+    ) -> tuple[Rows, Array, Array]:
+        """Rows of the loop for several hand postures of each of some targets.
+
+        Args:
+            targets: k targets.
+            rows: (c,) those of them.
+            starts: (k, n) of each target.
+            postures: (c, p, hand) of those.
+            first: Turn of the first posture, see `posture_rows`.
+
+        Returns:
+            The target of each row, (c p,), states and parameters.
+        """
+        count = postures.shape[1]
+        owner, turns = np.repeat(rows, count), first + np.tile(np.arange(count), len(rows))
+        flat = postures.reshape(len(owner), postures.shape[2])
+        return owner, *self.posture_rows(targets.rows(owner), starts[owner], flat, turns)
+
     def solved(self, targets: TargetBatch, q: Array, limits: bool) -> NDArray[np.bool_]:
         """(k,) whether configurations meet their targets, and if asked the robot's limits."""
         return judge(self.robot, targets, q).solved(limits)

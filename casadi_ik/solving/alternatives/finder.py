@@ -28,7 +28,6 @@ from casadi_ik.solving.trials import (
     LocalRefinement,
     Subproblems,
     distinct,
-    repeated,
 )
 from casadi_ik.symbolic.kinematics import actuated
 from casadi_ik.symbolic.singular_values import manipulability
@@ -171,10 +170,8 @@ class AlternativeFinder:
         trials, method = self.trials, self.trials.method
         rounds = range(method.options.rounds)
         postures = np.concatenate([method.postures(targets, number)[0] for number in rounds])
-        starts = np.tile(limits.clip(q0), (len(postures), 1))
-        asked = repeated(targets, len(postures))
-        turns = np.arange(len(postures))
-        states, parameters = trials.posture_rows(asked, starts, postures, turns)
+        start, first = limits.clip(q0)[None], np.zeros(1, dtype=np.intp)
+        _, states, parameters = trials.hand_rows(targets, first, start, postures[None])
         loose = parameters.copy()
         trials.set_tolerance(parameters, CLOSE)
         q = trials.run(states, parameters)

@@ -301,15 +301,10 @@ class FreeSearch:
             if not len(rows):
                 break
             self._fresh[:] = False
-            some = self.targets.rows(rows)
-            postures = method.postures(some, number)
-            count = postures.shape[1]
-            owner = np.repeat(rows, count)
-            starts = self.limits.of(owner).clip(self.starts[owner])
-            flat = postures.reshape(len(owner), postures.shape[2])
-            asked = self.targets.rows(owner)
-            turns = number * count + np.tile(np.arange(count), len(rows))
-            ends = self.trials.run(*self.trials.posture_rows(asked, starts, flat, turns))
+            postures = method.postures(self.targets.rows(rows), number)
+            first, starts = number * postures.shape[1], self.limits.clip(self.starts)
+            owner, *begun = self.trials.hand_rows(self.targets, rows, starts, postures, first)
+            ends = self.trials.run(*begun)
             yield self._solved(ends, owner)
 
     def _from_anywhere(self) -> Iterator[tuple[Array, NDArray[np.intp]]]:

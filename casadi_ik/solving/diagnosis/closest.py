@@ -246,10 +246,7 @@ class FloatingPalmFit:
     def _fitted(self, targets: TargetBatch, q0: Array, chosen: Rows, postures: Array) -> HandFits:
         """Fit postures (c, p, hand) to c of the targets."""
         trials = self._trials
-        owner = np.repeat(chosen, postures.shape[1])
-        start, flat = q0[owner], postures.reshape(len(owner), postures.shape[2])
-        turns = np.tile(np.arange(postures.shape[1]), len(chosen))
-        states, parameters = trials.posture_rows(targets.rows(owner), start, flat, turns)
+        owner, states, parameters = trials.hand_rows(targets, chosen, q0, postures)
         parameters[:, trials.parameters.slice("alone")] = 1.0
         parameters[:, trials.parameters.slice("reach")] = 0.0
         return self._run(targets, owner, states, parameters)
