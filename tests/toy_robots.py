@@ -5,6 +5,9 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import numpy as np
+
+import casadi_ik as ik
 from casadi_ik.files.shipped import models_folder
 
 COUPLED_HAND = """\
@@ -94,3 +97,14 @@ def replace(path: Path, old: str, new: str) -> None:
     text = path.read_text()
     assert old in text, f"{path} has no {old!r}"
     path.write_text(text.replace(old, new, 1))
+
+
+def grasp_of(robot: ik.ArmHand, points: np.ndarray, normals: np.ndarray) -> ik.Grasp:
+    """A contact for every finger, from arrays (f, 3)."""
+    contacts = map(ik.Contact, points, normals)
+    return ik.Grasp(dict(zip(robot.fingers, contacts, strict=True)))
+
+
+def grasp_at(robot: ik.ArmHand, q: np.ndarray) -> ik.Grasp:
+    """The contacts of a configuration."""
+    return grasp_of(robot, *robot.contacts(q))

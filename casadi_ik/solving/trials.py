@@ -346,6 +346,10 @@ class Deduplicator:
 
 def distinct(parts: Array, apart: float, limit: int | None = None) -> list[int]:
     """Rows of parts (k, n) that differ from all chosen before them, in their order."""
-    owner = np.zeros(len(parts), dtype=np.intp)
-    fresh = Deduplicator(1, parts.shape[1], apart).add(parts, owner)
-    return np.flatnonzero(fresh)[:limit].tolist()
+    kept: list[int] = []
+    for i in range(len(parts)):
+        if len(kept) == limit:
+            break
+        if (np.abs(parts[i] - parts[kept]).max(axis=1, initial=0.0) >= apart).all():
+            kept.append(i)
+    return kept

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from toy_robots import grasp_of
 
 import casadi_ik as ik
 from casadi_ik.motion.track import TUNING
@@ -22,10 +23,7 @@ def solver(robot) -> ik.Solver:
 def grasps(robot, path) -> list[ik.Grasp]:
     """The contacts of configurations (k, n), which need not be within limits."""
     points, normals = robot.contacts(path)
-    return [
-        ik.Grasp({name: ik.Contact(p[i], n[i]) for i, name in enumerate(robot.fingers)})
-        for p, n in zip(points, normals, strict=True)
-    ]
+    return [grasp_of(robot, *pair) for pair in zip(points, normals, strict=True)]
 
 
 def largest_step(robot, track) -> float:
@@ -105,12 +103,7 @@ def test_a_grasp_out_of_reach_is_come_near_to(robot, solver):
     """On the way out of the workspace and back: the contacts are missed there and met again."""
     points, normals = robot.contacts(robot.home)
     away = 0.8 * np.sin(np.linspace(0, np.pi, 40))
-    moving = [
-        ik.Grasp(
-            {n: ik.Contact(points[i] - [s, 0, 0], normals[i]) for i, n in enumerate(robot.fingers)}
-        )
-        for s in away
-    ]
+    moving = [grasp_of(robot, points - [s, 0, 0], normals) for s in away]
     reachable = [solver.solve(one, diagnose=False).success for one in moving]
     assert not all(reachable)
     track = solver.track(moving)

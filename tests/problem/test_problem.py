@@ -112,15 +112,6 @@ def test_default_tolerance_is_the_papers():
     assert ik.Tolerance() == ik.Tolerance(position=0.005, angle=np.deg2rad(3))
 
 
-def test_rows_of_a_batch():
-    problems = TargetBatch(*arrays(k=4), ik.Tolerance(), True)
-    part = problems.rows(slice(1, 3))
-    assert len(problems) == 4
-    assert len(part) == 2
-    np.testing.assert_array_equal(part.points, problems.points[1:3])
-    assert part.enforce_limits
-
-
 def test_parts_of_a_batch_keep_the_numbers_of_their_targets():
     points = np.zeros((10, 3, 3))
     problems = TargetBatch(points, points, ik.Tolerance(), True, first_row=100)
@@ -208,22 +199,3 @@ def test_limits_of_a_coupled_joint(own_robot):
     q = np.tile(robot.home, (2, 1))
     q[:, 7] = np.radians([59, 61])
     np.testing.assert_array_equal(limits_ok(robot, q), [True, False])
-
-
-@pytest.mark.parametrize("limits", ["enforce", "ignore"])
-def test_success_counts_limits_only_where_they_are_enforced(robot, limits):
-    """A start that meets every contact from beyond a limit."""
-    q = robot.home.copy()
-    q[6] = robot.upper[6] + 0.1
-    points, normals = robot.contacts(q)
-    solver = ik.Solver(robot, "enhanced-dls", limits=limits, finger_step="closed-form")
-    batch = solver.solve_batch(points[None], normals[None], q0=q)
-    if limits == "ignore":
-        assert batch.success[0]
-        assert not batch.limits_ok[0]
-        np.testing.assert_allclose(batch.q[0, 6], q[6], atol=0.2)
-    else:
-        assert batch.limits_ok[0]
-    assert batch.success[0] == bool(
-        batch.ok[0].all() and (limits == "ignore" or batch.limits_ok[0])
-    )

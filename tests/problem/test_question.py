@@ -103,9 +103,7 @@ def test_fixed_actuators_stay_where_they_are(robot, method):
 
 def test_a_spread_that_does_not_fit_is_found_out(robot):
     """With the hand's spread held elsewhere the contacts cannot be met, and the verdict says so."""
-    points, normals = robot.contacts(robot.home)
-    asked = ik.Grasp({n: ik.Contact(points[i], normals[i]) for i, n in enumerate(robot.fingers)})
-    solution = ik.Solver(robot).solve(asked, fixed={"bh_spread": 2.5})
+    solution = ik.Solver(robot).solve(grasp(robot, robot.home), fixed={"bh_spread": 2.5})
     assert not solution.success
     assert solution.status in (ik.Status.UNREACHABLE, ik.Status.NOT_FOUND)
     assert solution.q[robot.actuators.index("bh_spread")] == 2.5

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from robot_variants import derived_robot
+from toy_robots import grasp_at, grasp_of
 
 import casadi_ik as ik
 
@@ -22,13 +23,6 @@ def solver(robot) -> ik.Solver:
     return ik.Solver(robot)
 
 
-def grasp(robot, q) -> ik.Grasp:
-    points, normals = robot.contacts(q)
-    return ik.Grasp(
-        {name: ik.Contact(points[i], normals[i]) for i, name in enumerate(robot.fingers)}
-    )
-
-
 def contains(interval, swivels):
     start, end = interval
     return np.mod(swivels - start, 2 * np.pi) <= end - start
@@ -37,7 +31,7 @@ def contains(interval, swivels):
 def test_they_are_solutions_and_they_differ(robot, solver):
     points_asked = robot.random(np.random.default_rng(11), 5)
     for q in points_asked:
-        found = solver.solve_all(grasp(robot, q), limit=100, apart=0)
+        found = solver.solve_all(grasp_at(robot, q), limit=100, apart=0)
         assert len(found) > 3
         configurations = np.stack([one.q for one in found])
         points, normals = robot.contacts(q)
@@ -91,7 +85,7 @@ def test_the_answers_for_the_cup_are_different_ones(robot, solver, prefer):
 def test_how_different_they_are_is_a_parameter():
     """On a robot whose arm is only nearly of a closed form."""
     robot = ik.load_robot("baxter_ar10")
-    asked = grasp(robot, robot.random(np.random.default_rng(1), 1)[0])
+    asked = grasp_at(robot, robot.random(np.random.default_rng(1), 1)[0])
     solver = ik.Solver(robot)
     counts = []
     for apart in (0.0, 0.25, 0.6, 1.0):
@@ -113,27 +107,27 @@ def test_how_different_they_are_is_a_parameter():
 )
 def test_the_preferred_comes_first(robot, solver, prefer, measure):
     q = robot.random(np.random.default_rng(21), 1)[0]
-    every = solver.solve_all(grasp(robot, q), limit=100, prefer=prefer, q0=q)
+    every = solver.solve_all(grasp_at(robot, q), limit=100, prefer=prefer, q0=q)
     values = [measure(one) for one in every]
     assert values == sorted(values, reverse=True)
     others = [p for p in ("limits", "manipulability", "q0") if p != prefer]
     for other in others:
-        for one in solver.solve_all(grasp(robot, q), limit=100, prefer=other, q0=q):
+        for one in solver.solve_all(grasp_at(robot, q), limit=100, prefer=other, q0=q):
             assert measure(one) <= values[0] + 1e-3 * abs(values[0])
-    few = solver.solve_all(grasp(robot, q), limit=2, prefer=prefer, q0=q)
+    few = solver.solve_all(grasp_at(robot, q), limit=2, prefer=prefer, q0=q)
     assert [one.branch for one in few] == [one.branch for one in every[:2]]
 
 
 def test_the_robot_is_close_to_itself(robot, solver):
     q = robot.random(np.random.default_rng(31), 1)[0]
-    nearest = solver.solve_all(grasp(robot, q), prefer="q0", q0=q)[0]
+    nearest = solver.solve_all(grasp_at(robot, q), prefer="q0", q0=q)[0]
     assert nearest.distance < 0.01
     np.testing.assert_allclose(nearest.q, q, atol=0.05)
 
 
 def test_manipulability_is_yoshikawas(robot, solver):
     q = robot.random(np.random.default_rng(41), 1)[0]
-    one = solver.solve_all(grasp(robot, q), prefer="q0", q0=q)[0]
+    one = solver.solve_all(grasp_at(robot, q), prefer="q0", q0=q)[0]
     step, columns = 1e-6, []
     palm = robot.palm(one.q)
     for i in range(7):
@@ -148,7 +142,7 @@ def test_manipulability_is_yoshikawas(robot, solver):
 def test_a_held_elbow_leaves_single_swivels(robot, solver):
     q = robot.random(np.random.default_rng(51), 1)[0]
     fixed = {"lwr_joint_3": float(q[2])}
-    found = solver.solve_all(grasp(robot, q), fixed=fixed)
+    found = solver.solve_all(grasp_at(robot, q), fixed=fixed)
     assert found
     for one in found:
         assert one.q[2] == pytest.approx(q[2], abs=1e-9)
@@ -158,7 +152,7 @@ def test_a_held_elbow_leaves_single_swivels(robot, solver):
 def test_an_arm_without_a_closed_form(tmp_path_factory):
     robot = derived_robot(tmp_path_factory.mktemp("offset"), wrist_offset=0.045)
     q = robot.random(np.random.default_rng(5), 1)[0]
-    found = ik.Solver(robot).solve_all(grasp(robot, q), seed=1)
+    found = ik.Solver(robot).solve_all(grasp_at(robot, q), seed=1)
     assert len(found) > 1
     assert all(one.branch is None and one.swivel is None for one in found)
     reached = robot.contacts(np.stack([one.q for one in found]))
@@ -169,14 +163,11 @@ def test_an_arm_without_a_closed_form(tmp_path_factory):
 
 def test_none_where_there_is_none(robot, solver):
     points, normals = robot.contacts(robot.home)
-    far = ik.Grasp(
-        {n: ik.Contact(points[i] + [5.0, 0, 0], normals[i]) for i, n in enumerate(robot.fingers)}
-    )
-    assert solver.solve_all(far) == ()
+    assert solver.solve_all(grasp_of(robot, points + 5.0, normals)) == ()
 
 
 def test_what_is_refused(robot, solver):
-    asked = grasp(robot, robot.home)
+    asked = grasp_at(robot, robot.home)
     with pytest.raises(ik.errors.InputError, match="limit: found 0, expected an integer >= 1"):
         solver.solve_all(asked, limit=0)
     for apart in (-0.1, 1.5, float("nan"), "far", True):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from toy_robots import grasp_at
 
 import casadi_ik as ik
 from casadi_ik import errors
@@ -35,7 +36,7 @@ def test_what_solves_already_is_not_moved(robot, rng):
     assert batch.success.all()
     np.testing.assert_array_equal(batch.q, q)
     assert batch.iterations.max() <= 1
-    alone = solver.solve(_grasp(robot, q[0]), q0=q[0])
+    alone = solver.solve(grasp_at(robot, q[0]), q0=q[0])
     np.testing.assert_array_equal(alone.q, q[0])
 
 
@@ -70,7 +71,7 @@ def test_nearest_of_those_that_are_seen(robot, rng):
     solver = ik.Solver(robot, tolerance=EXACT, compiled=False)
     batch = solver.solve_batch(*robot.contacts(q), q0=q0)
     found = [
-        solver.solve_all(_grasp(robot, one), prefer="q0", q0=start, limit=1)[0].distance
+        solver.solve_all(grasp_at(robot, one), prefer="q0", q0=start, limit=1)[0].distance
         for one, start in zip(q, q0, strict=True)
     ]
     ratio = distance(robot, batch.q, q0) / np.array(found)
@@ -83,7 +84,7 @@ def test_alone_and_in_a_batch_the_same(robot, rng):
     solver = ik.Solver(robot)
     batch = solver.solve_batch(*robot.contacts(q), q0=q0)
     for row in range(8):
-        alone = solver.solve(_grasp(robot, q[row]), q0=q0[row])
+        alone = solver.solve(grasp_at(robot, q[row]), q0=q0[row])
         np.testing.assert_allclose(alone.q, batch.q[row], atol=1e-6)
         assert alone.iterations == batch.iterations[row]
 
@@ -102,13 +103,6 @@ def test_manipulability(robot, rng):
 def test_what_cannot_be_preferred(robot):
     q = robot.home
     with pytest.raises(errors.InputError, match="prefer: found 'near', expected one of"):
-        ik.Solver(robot, compiled=False).solve(_grasp(robot, q), prefer="near")
+        ik.Solver(robot, compiled=False).solve(grasp_at(robot, q), prefer="near")
     with pytest.raises(errors.UnsupportedError, match="method 'ipopt' cannot choose"):
-        ik.Solver(robot, "ipopt").solve(_grasp(robot, q), q0=q, prefer="q0")
-
-
-def _grasp(robot, q):
-    points, normals = robot.contacts(q)
-    return ik.Grasp(
-        {name: ik.Contact(points[i], normals[i]) for i, name in enumerate(robot.fingers)}
-    )
+        ik.Solver(robot, "ipopt").solve(grasp_at(robot, q), q0=q, prefer="q0")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from toy_robots import grasp_of
 
 import casadi_ik as ik
 
@@ -37,10 +38,7 @@ def starts(robot, rng):
 
 
 def grasps_of(robot, points, normals):
-    return [
-        ik.Grasp({name: ik.Contact(p[i], n[i]) for i, name in enumerate(robot.fingers)})
-        for p, n in zip(points, normals, strict=True)
-    ]
+    return [grasp_of(robot, *pair) for pair in zip(points, normals, strict=True)]
 
 
 def targets(solver, rng):

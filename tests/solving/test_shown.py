@@ -8,6 +8,7 @@ import sys
 
 import numpy as np
 import pytest
+from toy_robots import grasp_of
 
 import casadi_ik as ik
 
@@ -22,10 +23,7 @@ def answers(name):
     points, normals = robot.contacts(q)
     points[7] += 9.0
     batch = solver.solve_batch(points, normals, diagnose=True)
-    grasps = [
-        ik.Grasp({f: ik.Contact(*pair) for f, *pair in zip(robot.fingers, *both, strict=True)})
-        for both in zip(points[:3], normals[:3], strict=True)
-    ]
+    grasps = [grasp_of(robot, *pair) for pair in zip(points[:3], normals[:3], strict=True)]
     ranked = solver.choose(grasps)
     return robot, batch.solution(0), batch.solution(7), batch, batch.diagnoses[7], ranked, ranked[0]
 
