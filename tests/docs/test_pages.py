@@ -259,12 +259,14 @@ def test_pages_are_gone_through(page: str, count: int, folder: Path) -> None:
     assert len(gone_through(path, folder)) >= count
 
 
-def test_the_readme_is_short() -> None:
+def test_the_readme_is_short_and_says_what_is_so(folder: Path) -> None:
     text = PAGES[0].read_text(encoding="utf-8")
     assert text.count("\n") <= 120
     cells = [c for line in text.splitlines() if line.startswith("|") for c in line.split("|")]
     assert max(len(cell.split()) for cell in cells) <= 20
     assert ", ".join(f"{name} {label(mean)}" for name, mean in means().items()) in text
+    kernels = importlib.import_module("build_kernels")
+    assert ", ".join(kernels.ROBOTS) in " ".join(text.split())
 
 
 def test_every_public_name_is_on_a_page_of_the_reference() -> None:
