@@ -465,7 +465,7 @@ def _lines(solve: OneSolve) -> dict[str, str]:
     }
     kinds = Counter(event.kind for event in solve.events)
     for kind in ("NEAR_SINGULAR", "LIMIT_HIT", "STALL", "OSCILLATION"):
-        lines[plain_name(kind.lower())] = f"{kinds[kind]} times" if kinds[kind] else "never"
+        lines[kind] = f"{kinds[kind]} times" if kinds[kind] else "never"
     return lines
 
 

@@ -2,7 +2,7 @@
 
 Execute them anew, outputs included, with
 
-    jupyter execute --inplace notebooks/*.ipynb
+    make notebooks
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ LARGEST = 3_000_000
 """All notebooks together [bytes]."""
 
 
-def test_there_are_notebooks_and_they_are_small() -> None:
-    assert NOTEBOOKS
+def test_notebooks_are_numbered_and_small() -> None:
+    numbers = [path.name.partition("_")[0] for path in NOTEBOOKS]
+    assert numbers == [f"{i:02d}" for i in range(1, len(NOTEBOOKS) + 1)]
     assert sum(path.stat().st_size for path in NOTEBOOKS) < LARGEST
 
 
@@ -34,7 +35,9 @@ def test_notebook_runs(path: Path, tmp_path: Path) -> None:
     ).execute()
     for cell in notebook.cells:
         for output in cell.get("outputs", []):
-            assert output.get("name") != "stderr", output
+            said = output["text"] if output.get("name") == "stderr" else ""
+            # Where no kernel is compiled yet.
+            assert all("once per machine" in line for line in said.split("\n") if line), said
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
