@@ -88,23 +88,6 @@ def test_palm_stands_on_frame_w_on_the_flange(robot, rng):
     np.testing.assert_allclose(robot.palm(np.zeros(14))[:3, 3], [0, 0, 1.2585], atol=1e-15)
 
 
-@pytest.mark.parametrize(("finger", "sign"), [("finger_2", 1.0), ("finger_3", -1.0), ("thumb", 0)])
-def test_normal_formula_of_qiu(robot, rng, finger, sign):
-    """[-s1 s23, c1 s23, c23] with theta_1 = +spread, -spread and pi (facts, section 2)."""
-    column = robot.fingers.index(finger)
-    for q in robot.random(rng, 20):
-        _, normals = robot.contacts(q)
-        theta_1 = sign * q[7] if sign else np.pi
-        theta_23 = q[8 + 2 * column] + q[9 + 2 * column] + 40 * DEG
-        expected = [
-            -np.sin(theta_1) * np.sin(theta_23),
-            np.cos(theta_1) * np.sin(theta_23),
-            np.cos(theta_23),
-        ]
-        palm = robot.palm(q)[:3, :3]
-        np.testing.assert_allclose(palm.T @ normals[column], expected, atol=1e-12)
-
-
 def test_published_tips_of_the_open_hand(robot):
     """Facts, section 2: tips and normals at spread 0, proximal 0."""
     palm = robot.links(np.zeros(14))["bh_base"]
