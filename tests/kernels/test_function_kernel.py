@@ -156,23 +156,6 @@ def test_any_number_of_samples(count, compiled):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
 
 
-def test_all_quarters_of_a_turn_and_their_edges():
-    angles = np.concatenate([np.arange(-16, 17) * np.pi / 4 + d for d in (-1e-9, 0.0, 1e-9)])
-    x = np.zeros((len(angles), 3))
-    x[:, 0] = angles
-    found = MeasureKernel(graph())(x)
-    np.testing.assert_allclose(found[:, 0], np.sin(angles), rtol=0, atol=4e-16)
-    np.testing.assert_allclose(found[:, 1], np.cos(angles), rtol=0, atol=4e-16)
-
-
-def test_what_is_no_number_is_none():
-    x = np.array([[np.nan, 1.0, 2.0], [np.inf, 1.0, 2.0], [0.5, np.nan, 2.0]])
-    found = MeasureKernel(graph())(x)
-    assert np.isnan(found[:2, :2]).all()
-    assert np.isnan(found[2, 2])
-    assert found[0, 2] == 2.0
-
-
 pytestmark = needs_compiler
 
 OF_ONE = ("sin", "cos", "tan", "asin", "acos", "atan")
