@@ -52,7 +52,9 @@ def torch_layer(solver: Solver, **options: Any) -> Callable[[Any, Any], tuple[An
     return Solve.apply
 
 
-def jax_layer(solver: Solver, **options: Any) -> Callable[[Any, Any], tuple[Any, Any]]:
+def jax_layer(
+    solver: Solver, reverse_only: bool = False, **options: Any
+) -> Callable[[Any, Any], tuple[Any, Any]]:
     """``layer(points, normals) -> (q, solved)`` on arrays of JAX, by a `jax.custom_jvp`.
 
     It can be compiled, mapped (`jax.vmap`) and differentiated in both directions; either takes all
@@ -61,6 +63,8 @@ def jax_layer(solver: Solver, **options: Any) -> Callable[[Any, Any], tuple[Any,
 
     Args:
         solver: As for `torch_layer`.
+        reverse_only: Whether to make a `jax.custom_vjp`: `jax.grad` then asks for the gradient
+            alone, a few per cent of the solve, and there is no forward mode.
         options: As for `torch_layer`.
 
     Raises:
@@ -79,10 +83,23 @@ def jax_layer(solver: Solver, **options: Any) -> Callable[[Any, Any], tuple[Any,
     def shape(like: Any, *size: int, dtype: Any = None) -> Any:
         return jax.ShapeDtypeStruct((*like.shape[:-2], *size), dtype or like.dtype)
 
-    @jax.custom_jvp
-    def layer(points: Any, normals: Any) -> Any:
+    def solve(points: Any, normals: Any) -> Any:
         shapes = shape(points, n), shape(points, dtype=bool)
         return outside(lambda *given: _solve(solver, options, *given), shapes, points, normals)
+
+    def forward(points: Any, normals: Any) -> Any:
+        found = solve(points, normals)
+        return found, (points, normals, *found)
+
+    def backward(saved: Any, gradients: Any) -> Any:
+        shapes = (shape(saved[0], *saved[0].shape[-2:]),) * 2
+        return outside(lambda *given: _rates(solver, *given), shapes, *saved, gradients[0])
+
+    if reverse_only:
+        reverse = jax.custom_vjp(solve)
+        reverse.defvjp(forward, backward)
+        return reverse
+    layer = jax.custom_jvp(solve)
 
     @layer.defjvp
     def _(primals: Any, tangents: Any) -> Any:

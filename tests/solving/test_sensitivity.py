@@ -131,9 +131,10 @@ def test_torch(robot, targets, expected):
         np.testing.assert_allclose(tensor.grad.numpy(), rate, 1e-6)
 
 
-def test_jax(robot, targets, expected):
+@pytest.mark.parametrize("reverse_only", [False, True])
+def test_jax(robot, targets, expected, reverse_only):
     jax = pytest.importorskip("jax")
-    layer = differentiable.jax_layer(ik.Solver(robot), q0=robot.home)
+    layer = differentiable.jax_layer(ik.Solver(robot), reverse_only, q0=robot.home)
     batch, *rates = expected
 
     def loss(points, normals):
@@ -148,6 +149,6 @@ def test_jax(robot, targets, expected):
                 np.testing.assert_allclose(one, rate, 1e-6, 1e-9)
         ways = [
             way(lambda points: layer(points, given[1][0])[0])(given[0][0])
-            for way in (jax.jacfwd, jax.jacrev)
+            for way in (jax.jacrev if reverse_only else jax.jacfwd, jax.jacrev)
         ]
         np.testing.assert_allclose(*ways, 1e-6, 1e-9)
