@@ -20,14 +20,18 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 import casadi_ik as ik
 from casadi_ik import palette
 from casadi_ik.collision.solids import EXPORTED, of_object, stated
+from casadi_ik.drawing.cameras import close_view, whole_view
+from casadi_ik.drawing.drawables import bodies, with_object
 from casadi_ik.exporting.project import checked_prefix, wasm_project, write_folder
 from casadi_ik.grasps.load import shipped_grasps
 from casadi_ik.grasps.objects import load_object
+from casadi_ik.kernels.robot_kernels import RobotKernels
 
 HERE = Path(__file__).parent
 
@@ -39,14 +43,8 @@ ROBOTS = {
 }
 """What can be chosen, and what it is called there."""
 
-COLORS = {
-    "arm": palette.ARM,
-    "hand": palette.HAND,
-    "object": palette.OBJECT,
-    "scene": palette.SCENE,
-    "touching": palette.NEAREST,
-}
-"""Of what the page draws."""
+COLORS = {"object": palette.OBJECT, "scene": palette.SCENE, "touching": palette.NEAREST}
+"""Of what the page draws beside robots."""
 
 CAPACITY = 8
 """Solids of a scene: an object of several parts, and the obstacle."""
@@ -76,10 +74,15 @@ def of_grasps(robot: ik.ArmHand, name: str) -> list[dict[str, Any]]:
         parts = of_object(load_object(grasp.object).shape)
         if len(parts) >= CAPACITY or any(solid.kind not in EXPORTED for solid, _ in parts):
             continue
+        # As the page answers, bit for bit: cameras look at that.
+        solver = ik.Solver(robot, scene=with_object(ik.Scene(), grasp))
+        close = close_view(robot, solver.solve_batch(points[None], normals[None]).q[0])
+        middle = np.nanmean(points, axis=0)
         found.append(
             {
                 "name": file,
                 "object": grasp.object.replace("_", " "),
+                "views": {"close": close, "whole": whole_view(middle, close)},
                 "points": [None if np.isnan(p).any() else p.tolist() for p in points],
                 "normals": [None if np.isnan(n).any() else n.tolist() for n in normals],
                 "solids": [
@@ -113,6 +116,9 @@ def about(robot: ik.ArmHand, name: str) -> dict[str, Any]:
         "name": robot.name,
         "title": ROBOTS.get(name, name),
         "arm": arm_links(robot),
+        "armMotors": list(robot.description.arm_actuators),
+        "links": list(robot.description.links),
+        "bodies": [one.data() for one in bodies(robot)],
         "prismatic": [bool(kind == "m") for kind in units(robot)],
         "grasps": of_grasps(robot, name),
         **reached(robot),
@@ -133,6 +139,55 @@ def units(robot: ik.ArmHand) -> list[str]:
         "m" if driven.get(name) == "prismatic" or "slider" in name else "rad"
         for name in robot.actuators
     ]
+
+
+UNARY = {
+    ca.OP_ASSIGN: "{}", ca.OP_NEG: "-{}", ca.OP_SQ: "{0}*{0}", ca.OP_TWICE: "2*{}",
+    ca.OP_INV: "1/{}", ca.OP_NOT: "+!{}", ca.OP_SQRT: "Math.sqrt({})", ca.OP_SIN: "Math.sin({})",
+    ca.OP_COS: "Math.cos({})", ca.OP_TAN: "Math.tan({})", ca.OP_ASIN: "Math.asin({})",
+    ca.OP_ACOS: "Math.acos({})", ca.OP_ATAN: "Math.atan({})", ca.OP_FABS: "Math.abs({})",
+    ca.OP_SIGN: "Math.sign({})",
+}  # fmt: skip
+BINARY = {
+    ca.OP_ADD: "{}+{}", ca.OP_SUB: "{}-{}", ca.OP_MUL: "{}*{}", ca.OP_DIV: "{}/{}",
+    ca.OP_LT: "+({}<{})", ca.OP_LE: "+({}<={})", ca.OP_EQ: "+({}==={})", ca.OP_NE: "+({}!=={})",
+    ca.OP_AND: "+({}&&{})", ca.OP_OR: "+({}||{})", ca.OP_IF_ELSE_ZERO: "{}?{}:0",
+    ca.OP_FMIN: "Math.min({},{})", ca.OP_FMAX: "Math.max({},{})",
+    ca.OP_ATAN2: "Math.atan2({},{})", ca.OP_HYPOT: "Math.hypot({},{})",
+}  # fmt: skip
+"""JavaScript of CasADi's operations."""
+
+
+def kinematics(robot: ik.ArmHand) -> str:
+    """An ES module whose `links(q)` gives the poses of all links, as the page has poses.
+
+    Raises:
+        KeyError: The kinematics have an operation that no JavaScript is written for.
+    """
+    q = ca.SX.sym("q", len(robot.actuators))
+    # A kernel's function has its matrices transposed.
+    frames = ca.horzsplit(RobotKernels(robot.description).links.function(q), 4)
+    rows = [ca.vertcat(ca.vec(frame[:3, :3]), frame[3, :3].T) for frame in frames]
+    function = ca.Function("links", [q], [ca.densify(ca.vertcat(*rows))], {"cse": True})
+    lines = []
+    for i in range(function.n_instructions()):
+        op, to = function.instruction_id(i), function.instruction_output(i)
+        given = function.instruction_input(i)
+        if op == ca.OP_CONST:
+            lines.append(f"w[{to[0]}]={function.instruction_constant(i)!r}")
+        elif op == ca.OP_INPUT:
+            lines.append(f"w[{to[0]}]=q[{given[1]}]")
+        elif op == ca.OP_OUTPUT:
+            lines.append(f"o[{to[1]}]=w[{given[0]}]")
+        else:
+            form = UNARY.get(op) or BINARY[op]
+            lines.append(f"w[{to[0]}]=" + form.format(*(f"w[{k}]" for k in given)))
+    return (
+        f"const w = new Float64Array({function.sz_w()});\n"
+        f"export function links(q) {{\nconst o = new Float64Array({12 * len(frames)});\n"
+        + ";\n".join(lines)
+        + ";\nreturn o;\n}\n"
+    )
 
 
 def run(*command: str) -> None:
@@ -165,13 +220,15 @@ def build_robot(name: str, out: Path, keep: Path | None) -> dict[str, Any]:
         place = (keep or Path(folder)) / prefix
         write_folder(place, wasm_project(robot, prefix, CAPACITY))
         (place / "about.json").write_text(json.dumps(data), encoding="utf-8")
+        (place / "kinematics.js").write_text(kinematics(robot), encoding="utf-8")
         entry = place / "entry.js"
         entry.write_text(
             f'import * as solver from "./{prefix}.js";\n'
             f'import wasm from "./{prefix}.wasm";\n'
             'import about from "./about.json";\n'
+            'import { links } from "./kinematics.js";\n'
             f"globalThis.casadiIkRobots ??= {{}};\n"
-            f"globalThis.casadiIkRobots[{json.dumps(name)}] = {{ solver, wasm, about }};\n",
+            f"globalThis.casadiIkRobots[{json.dumps(name)}] = {{ solver, wasm, about, links }};\n",
             encoding="utf-8",
         )
         script = out / "robots" / f"{prefix}.js"

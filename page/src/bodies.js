@@ -1,5 +1,6 @@
 // What is drawn: the robot's shapes, solids, contacts.
 import * as THREE from "three";
+import { toCreasedNormals } from "three/addons/utils/BufferGeometryUtils.js";
 
 /* global PALETTE */
 // By the solver's names of kinds: what a solid looks like, along z where it is along anything.
@@ -14,6 +15,7 @@ const GEOMETRY = {
     new THREE.CylinderGeometry(radius, radius, length, 48).rotateX(UPRIGHT),
 };
 const UP = new THREE.Vector3(0, 1, 0);
+const CREASE = 0.6; // [rad] at which a surface has an edge
 
 export const COLORS = ["#f0a400", "#2f7fd6", "#16a39a", "#b04fc9", "#e0528a"];
 
@@ -37,52 +39,103 @@ export function poseOf(matrix) {
   return [m[0], m[4], m[8], m[1], m[5], m[9], m[2], m[6], m[10], m[12], m[13], m[14]];
 }
 
+// What is drawn of a robot, as `casadi_ik.drawing` has it: by numbers, or as triangles.
+const DRAWN = {
+  capsule: GEOMETRY.CAPSULE,
+  drum: ([radius, length]) => {
+    const edge = 0.12 * Math.min(radius, length), rise = [];
+    for (let i = 0; i < 5; ++i) {
+      const bow = (i / 4) * UPRIGHT, out = radius - edge + edge * Math.sin(bow);
+      rise.push(new THREE.Vector2(out, -length / 2 + edge - edge * Math.cos(bow)));
+    }
+    const fall = rise.map(({ x, y }) => new THREE.Vector2(x, -y)).reverse();
+    const profile = [new THREE.Vector2(0, -length / 2), ...rise, ...fall, new THREE.Vector2(0, length / 2)];
+    return new THREE.LatheGeometry(profile, 32).rotateX(UPRIGHT);
+  },
+  mesh: (_, { points, triangles }) => {
+    const geometry = new THREE.BufferGeometry().setIndex(triangles);
+    geometry.setAttribute("position", new THREE.Float32BufferAttribute(points, 3));
+    return toCreasedNormals(geometry, CREASE);
+  },
+};
+
+// A robot as it looks, and the shapes that collisions are checked with about it.
 export class RobotBody extends THREE.Group {
-  constructor(shapes, armLinks, places) {
+  constructor({ about, links, shapes }) {
     super();
-    const arm = new Set(armLinks);
-    this.parts = [];
-    const materials = {
-      arm: solid(PALETTE.arm), hand: solid(PALETTE.hand), touching: solid(PALETTE.touching),
-    };
-    this.materials = materials;
-    const put = (mesh, link, at, isSolid) => {
-      const usual = arm.has(link) ? materials.arm : materials.hand;
-      mesh.material = usual;
-      this.parts.push({ mesh, link, at, isSolid, usual });
-      this.add(mesh);
-    };
-    shapes.capsules.forEach((capsule, i) => {
-      if (!capsule.shown) return;
-      const half = Math.hypot(...places.slice(6 * i + 3, 6 * i + 6));
-      put(meshOf("CAPSULE", [capsule.radius, 2 * half], null), capsule.link, 6 * i, false);
+    this.frames = Object.fromEntries(about.links.map((name, i) => [name, 12 * i]));
+    this.links = links;
+    this.parts = about.bodies.map((one) => {
+      const mesh = new THREE.Mesh(DRAWN[one.kind](one.size, one), solid(one.color));
+      mesh.geometry.applyMatrix4(matrixOf(one.pose));
+      return this.part(mesh, one);
     });
-    const first = 6 * shapes.capsules.length;
-    shapes.solids.forEach((one, i) => {
-      put(meshOf(one.kind.toUpperCase(), one.size, null), one.link, first + 12 * i, true);
-    });
-    this.place(places);
+    this.capsules = shapes.capsules.map((one, i) => ({ ...one, i })).filter((one) => one.shown);
+    this.touching = solid(PALETTE.touching);
+    this.around = new THREE.Group();
+    this.around.visible = false;
+    this.shapes = shapes;
+    this.add(this.around);
   }
 
-  place(places) {
-    const way = new THREE.Vector3();
-    const along = new THREE.Vector3(0, 0, 1);
-    for (const { mesh, at, isSolid } of this.parts) {
-      if (isSolid) {
-        matrixOf(places.subarray(at, at + 12)).decompose(mesh.position, mesh.quaternion, mesh.scale);
-      } else {
-        mesh.position.set(places[at], places[at + 1], places[at + 2]);
-        way.set(places[at + 3], places[at + 4], places[at + 5]);
-        if (way.lengthSq() > 1e-18) mesh.quaternion.setFromUnitVectors(along, way.normalize());
-      }
+  part(mesh, { frame, role, color }) {
+    mesh.castShadow = mesh.receiveShadow = true;
+    this.add(mesh);
+    return { mesh, link: frame, role, usual: mesh.material, color };
+  }
+
+  place(q) {
+    const poses = this.links(q);
+    for (const { mesh, link } of this.parts) {
+      const at = this.frames[link];
+      matrixOf(poses.subarray(at, at + 12)).decompose(mesh.position, mesh.quaternion, mesh.scale);
     }
   }
 
-  // Links that touch something are red.
+  // Made when they are first shown; `places` as the solver gives them.
+  placeShapes(places) {
+    const { capsules, solids } = this.shapes, { around } = this, first = 6 * capsules.length;
+    if (!around.children.length) {
+      const material = Object.assign(solid("#8d99a6"), { transparent: true, opacity: 0.35, depthWrite: false });
+      for (const { i, radius } of this.capsules) {
+        const half = Math.hypot(...places.slice(6 * i + 3, 6 * i + 6));
+        around.add(new THREE.Mesh(GEOMETRY.CAPSULE([radius, 2 * half]), material));
+      }
+      for (const one of solids) around.add(new THREE.Mesh(GEOMETRY[one.kind.toUpperCase()](one.size), material));
+    }
+    const way = new THREE.Vector3(), along = new THREE.Vector3(0, 0, 1);
+    this.capsules.forEach(({ i }, k) => {
+      const mesh = around.children[k];
+      mesh.position.fromArray(places, 6 * i);
+      way.fromArray(places, 6 * i + 3);
+      if (way.lengthSq() > 1e-18) mesh.quaternion.setFromUnitVectors(along, way.normalize());
+    });
+    solids.forEach((_, k) => {
+      const mesh = around.children[this.capsules.length + k], at = first + 12 * k;
+      matrixOf(places.subarray(at, at + 12)).decompose(mesh.position, mesh.quaternion, mesh.scale);
+    });
+  }
+
+  // Links that touch something have a colour of their own.
   mark(links) {
     for (const part of this.parts) {
-      part.mesh.material = links.includes(part.link) ? this.materials.touching : part.usual;
+      part.mesh.material = links.includes(part.link) ? this.touching : part.usual;
     }
+  }
+
+  // Corners of what is drawn, of all or of the hand: a camera is to see them.
+  corners(handOnly) {
+    const found = [], box = new THREE.Box3();
+    for (const { mesh, role } of this.parts) {
+      if (handOnly && role === "arm") continue;
+      mesh.updateMatrixWorld();
+      mesh.geometry.boundingBox ?? mesh.geometry.computeBoundingBox();
+      box.copy(mesh.geometry.boundingBox);
+      for (const x of [box.min.x, box.max.x]) for (const y of [box.min.y, box.max.y]) {
+        for (const z of [box.min.z, box.max.z]) found.push(new THREE.Vector3(x, y, z).applyMatrix4(mesh.matrixWorld));
+      }
+    }
+    return found;
   }
 }
 
@@ -91,7 +144,7 @@ export class Things extends THREE.Group {
   constructor(solids, isObject) {
     super();
     this.material = solid(isObject ? PALETTE.object : PALETTE.scene);
-    if (isObject) Object.assign(this.material, { transparent: true, opacity: 0.55, depthWrite: false });
+    if (isObject) Object.assign(this.material, { transparent: true, opacity: 0.6, depthWrite: false });
     this.solids = solids;
     for (const one of solids) {
       const mesh = meshOf(one.shape, one.size, this.material);
@@ -105,6 +158,33 @@ export class Things extends THREE.Group {
       const mesh = this.children[i];
       matrixOf(one.pose).decompose(mesh.position, mesh.quaternion, mesh.scale);
     });
+  }
+}
+
+// By what the object is taken: a disc with a rim at its middle, seen through everything.
+export class Knob extends THREE.Group {
+  constructor() {
+    super();
+    const seen = { depthTest: false, transparent: true, toneMapped: false };
+    const disc = (radius, color) =>
+      new THREE.Mesh(new THREE.CircleGeometry(radius, 40), new THREE.MeshBasicMaterial({ ...seen, color }));
+    const bar = (turn) => {
+      const mesh = new THREE.Mesh(
+        new THREE.PlaneGeometry(1.2, 0.24), new THREE.MeshBasicMaterial({ ...seen, color: "#ffffff" }),
+      );
+      mesh.rotation.z = turn;
+      return mesh;
+    };
+    [disc(1.22, "#ffffff"), disc(1, "#1b6ea8"), bar(0), bar(UPRIGHT)].forEach((mesh, i) => {
+      mesh.renderOrder = 20 + i;
+      this.add(mesh);
+    });
+  }
+
+  place(at, size, camera) {
+    this.position.copy(at);
+    this.scale.setScalar(size);
+    this.quaternion.copy(camera.quaternion);
   }
 }
 

@@ -1,10 +1,12 @@
 // A hand on the picture: what is under the pointer, and where it is dragged to.
 import * as THREE from "three";
 
-const NEAR = { mouse: 16, pen: 20, touch: 30 };
+// How far from what is seen it is taken hold of [pixels]: at once, and where nothing else is.
+const NEAR = { mouse: [8, 16], pen: [10, 20], touch: [14, 30] };
+const AROUND = [[0, 0], [9, 0], [-9, 0], [0, 9], [0, -9]];
 
-// Watches the pointer. `handles` gives what can be taken: points that are seen, { at, name }, and
-// meshes, { mesh, name }; `move` is told the name, how far it went [m] and how far on the screen.
+// Watches the pointer. `handles` gives what can be taken: points that are seen, { at, name, wide },
+// and meshes, { mesh, name }; `move` is told the name, how far it went [m] and how far on the screen.
 export class Grip {
   constructor(stage, handles, move) {
     Object.assign(this, { stage, handles, move });
@@ -18,18 +20,32 @@ export class Grip {
     }
   }
 
+  // First what is right there, the object's knob before all; then bodies, a little larger than they
+  // are seen; then what is near.
   under(x, y, pointer) {
-    const { points, meshes } = this.handles();
-    let best = null, nearest = NEAR[pointer] ?? NEAR.mouse;
-    for (const one of points) {
-      const [px, py] = this.stage.pixel(one.at), away = Math.hypot(px - x, py - y);
-      if (away < nearest) [best, nearest] = [one, away];
+    const { points, meshes } = this.handles(), [tight, wide] = NEAR[pointer] ?? NEAR.mouse;
+    const away = points.map((one) => {
+      const [px, py] = this.stage.pixel(one.at);
+      return { one, away: Math.hypot(px - x, py - y) };
+    });
+    const nearest = (reach) => {
+      const found = away.filter((each) => each.away < reach(each.one));
+      found.sort((a, b) => a.away - b.away);
+      return found[0] && { name: found[0].one.name, at: found[0].one.at.clone() };
+    };
+    return nearest((one) => (one.wide ? one.wide : 0)) ?? nearest(() => tight)
+      ?? this.body(x, y, meshes) ?? nearest(() => wide) ?? null;
+  }
+
+  body(x, y, meshes) {
+    const all = meshes.map((one) => one.mesh);
+    for (const [dx, dy] of AROUND) {
+      const hit = this.stage.ray(x + dx, y + dy).intersectObjects(all, true)[0];
+      if (!hit) continue;
+      const owner = meshes.find((one) => one.mesh === hit.object || one.mesh === hit.object.parent);
+      return { name: owner.name, at: hit.point.clone() };
     }
-    if (best) return { name: best.name, at: best.at.clone() };
-    const hit = this.stage.ray(x, y).intersectObjects(meshes.map((one) => one.mesh), true)[0];
-    if (!hit) return null;
-    const owner = meshes.find((one) => one.mesh === hit.object || one.mesh === hit.object.parent);
-    return { name: owner.name, at: hit.point.clone() };
+    return undefined;
   }
 
   take(event) {
@@ -44,6 +60,7 @@ export class Grip {
     this.stage.controls.enabled = false;
     this.stage.canvas.setPointerCapture(event.pointerId);
     this.stage.canvas.classList.add("held");
+    this.stage.canvas.focus({ preventScroll: true });
     event.stopImmediatePropagation();
     event.preventDefault();
   }

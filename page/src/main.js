@@ -1,62 +1,110 @@
 // The page: a robot that follows contacts.
 import * as THREE from "three";
-import { COLORS, ContactMark, RobotBody, Things, matrixOf, poseOf } from "./bodies.js";
+import { COLORS, ContactMark, Knob, RobotBody, Things, matrixOf, poseOf } from "./bodies.js";
 import { Grip } from "./grip.js";
-import { Panel } from "./panel.js";
+import { Panel, copied, note } from "./panel.js";
+import { Past, address, asked, robotOf } from "./question.js";
 import { FREE, Solving } from "./solving.js";
 import { Stage } from "./stage.js";
+import { flip, plain } from "./words.js";
 
 /* global ROBOTS */
 const by = (id) => document.getElementById(id);
 const V = (numbers) => new THREE.Vector3(...numbers);
 const UP = new THREE.Vector3(0, 0, 1);
 const JUMP = 0.35; // [rad or dm] by which a motor moves at once, unless it is shown how it gets there
+const STEP = { far: 5e-3, near: 1e-3, turn: Math.PI / 60 }; // of keys [m, rad]
+const POST = [0.08, 0.08, 0.32]; // the obstacle [m]
 const still = matchMedia("(prefers-reduced-motion: reduce)");
+const narrow = matchMedia("(max-width: 760px)");
 
-const stage = new Stage(by("canvas"));
-const panel = new Panel(ROBOTS, choose);
+// What went wrong, where everybody sees it.
+function fail(words, error) {
+  by("loading").hidden = false;
+  by("loading").textContent = words;
+  if (error) console.error(error);
+}
+
+function madeStage() {
+  try {
+    return new Stage(by("canvas"));
+  } catch (error) {
+    fail("This browser shows no 3D graphics (WebGL). Please switch hardware acceleration on, or use another browser.");
+    throw error;
+  }
+}
+
+const stage = madeStage();
+const panel = new Panel(ROBOTS, (robot) => choose(robot));
+const past = new Past(() => {
+  by("undo").disabled = !past.back;
+  by("redo").disabled = !past.again;
+});
 const loaded = new Map();
 const world = new THREE.Group();
+const knob = new Knob();
 stage.scene.add(world);
 
 // Everything about what is shown now.
-const now = { solving: null, points: [], normals: [], object: null, obstacle: null, answer: null, shown: null };
+const now = {
+  solving: null, robot: null, grasp: null, points: [], normals: [], moved: new THREE.Matrix4(),
+  object: null, obstacle: null, answer: null, shown: null, start: null, selected: "object",
+};
 
 // A script of its own per robot, loaded once; from disk, too.
 function load(robot) {
   if (!loaded.has(robot.name)) {
-    const ready = new Promise((resolve, fail) => {
+    const ready = new Promise((resolve, refuse) => {
       const script = document.createElement("script");
       script.src = robot.script;
       script.onload = resolve;
-      script.onerror = () => fail(new Error(`${robot.script} cannot be loaded`));
+      script.onerror = () => refuse(new Error(`The file ${robot.script} is missing beside this page.`));
       document.head.append(script);
-    }).then(() => Solving.of(globalThis.casadiIkRobots[robot.name]));
+    }).then(() => {
+      if (!globalThis.WebAssembly) throw new Error("This browser has no WebAssembly, which the solver needs.");
+      return Solving.of(globalThis.casadiIkRobots[robot.name]);
+    });
     ready.catch(() => loaded.delete(robot.name));
     loaded.set(robot.name, ready);
   }
   return loaded.get(robot.name);
 }
 
+// Shows a robot: what is to be asked of it (a question, or the address it is read from), or the
+// first of its grasps that is solved with nothing touching.
 let wanted = "";
-async function choose(robot) {
+async function choose(robot, question = null, hash = "") {
   wanted = robot.name;
   panel.chosen(robot.name);
   by("loading").hidden = false;
-  by("loading").textContent = `loading ${robot.title} (${(robot.size / 1e6).toFixed(1)} MB) …`;
+  by("loading").textContent = `Loading ${robot.title} (${(robot.size / 1e6).toFixed(1)} MB) …`;
   let solving;
   try {
     solving = await load(robot);
   } catch (error) {
-    by("loading").textContent = error.message;
-    console.error(error);
-    return;
+    return fail(error.message, error);
   }
   if (wanted !== robot.name) return;
   by("loading").hidden = true;
-  now.solving = solving;
-  panel.robot(solving.robot);
-  take(Math.max(solving.robot.about.grasps.findIndex(isFree), 0), true);
+  if (now.robot !== robot) {
+    Object.assign(now, { solving, robot, answer: null, shown: null });
+    now.body = new RobotBody({ ...solving.robot, links: solving.links });
+    panel.robot(solving.robot);
+  }
+  const first = now.grasp === null;
+  if (hash.includes("=")) {
+    try {
+      const read = asked(hash, solving.robot);
+      question = read && { ...read, robot: robot.name };
+    } catch (error) {
+      note(`The link cannot be read: ${error.message}.`, 20);
+    }
+  }
+  const { grasps } = solving.robot.about;
+  question ??= asMade(grasps[Math.max(grasps.findIndex(isFree), 0)]);
+  stand(question);
+  lookAtAll();
+  if (!question.kept || first) keep();
 }
 
 // Whether a grasp is solved with its object there, and nothing touching: the first such is shown.
@@ -67,50 +115,91 @@ function isFree(grasp) {
   return solving.ask(...flat, null, object).status === solving.robot.Status.SOLVED;
 }
 
-// A shipped grasp, as it was made.
-function take(number, look) {
-  const { robot, solver } = now.solving, grasp = robot.about.grasps[number];
-  by("grasp").value = String(number);
-  // A finger without a contact is free, and so is one without a normal in how it turns.
-  now.points = grasp.points.map((p) => p && V(p));
-  now.normals = grasp.normals.map((n) => n && V(n).normalize());
-  now.start = now.answer = null;
-  world.clear();
-  now.body = new RobotBody(robot.shapes, robot.about.arm, solver.shapes(robot.home));
-  now.object = new Things(grasp.solids.map((one) => ({ ...one, pose: [...one.pose] })), true);
-  now.marks = robot.fingers.map((_, i) => new ContactMark(COLORS[i % COLORS.length]));
-  world.add(now.body, now.object, ...now.marks);
-  now.shown = null;
-  now.obstacle = null;
-  solve();
-  if (by("obstacle").checked) put();
-  if (look) lookAtAll();
+// The question of a shipped grasp.
+const asMade = ({ name, points, normals }) => ({
+  robot: now.robot.name, grasp: name, points, normals, object: [0, 0, 0, 0], obstacle: null, q0: null,
+});
+
+// What is asked now, as numbers: the object as it was moved, and turned about the vertical.
+function question() {
+  const m = now.moved.elements;
+  return {
+    robot: now.robot.name,
+    grasp: now.grasp.name,
+    points: now.points.map((p) => p?.toArray() ?? null),
+    normals: now.normals.map((n) => n?.toArray() ?? null),
+    object: [m[12], m[13], m[14], Math.atan2(m[1], m[0])],
+    obstacle: now.obstacle?.solids[0].pose.slice(9) ?? null,
+    q0: now.start && [...now.start],
+  };
 }
 
-// The camera, so that robot and object fill the picture.
-function lookAtAll() {
-  const box = new THREE.Box3();
-  for (const { mesh } of now.body.parts) box.expandByPoint(mesh.position);
-  for (const point of placed()) box.expandByPoint(point);
-  const ball = box.getBoundingSphere(new THREE.Sphere());
-  const goal = middleOf(placed());
-  // Hand and object are small beside an arm: they are nearer to the middle than it is.
-  stage.look(ball.center.lerp(goal, 0.25), 0.98 * ball.radius, Math.min(box.min.z, 0), goal);
+const keep = (kind) => past.keep(question(), kind);
+
+// Everything stands as a question says.
+function stand(asked_) {
+  const { robot } = now.solving, { grasps } = robot.about;
+  now.grasp = grasps.find(({ name }) => name === asked_.grasp);
+  by("grasp").value = String(grasps.indexOf(now.grasp));
+  // A finger without a contact is free, and so is one without a normal in how it turns.
+  now.points = asked_.points.map((p) => p && V(p));
+  now.normals = asked_.normals.map((n) => n && V(n).normalize());
+  now.start = asked_.q0 && Float64Array.from(asked_.q0);
+  const [x, y, z, turn] = asked_.object;
+  now.moved = new THREE.Matrix4().makeTranslation(x, y, z).multiply(new THREE.Matrix4().makeRotationZ(turn));
+  world.clear();
+  now.object = new Things(now.grasp.solids.map((one) => ({ ...one, pose: [...one.pose] })), true);
+  for (const one of now.object.solids) shift(one, now.moved);
+  now.obstacle = asked_.obstacle && post(asked_.obstacle);
+  by("obstacle").checked = Boolean(now.obstacle);
+  now.marks = robot.fingers.map((_, i) => new ContactMark(COLORS[i % COLORS.length]));
+  world.add(now.body, now.object, ...now.marks, knob);
+  if (now.obstacle) world.add(now.obstacle);
+  document.title = `${now.grasp.object} · ${now.robot.title} · casadi_ik`;
+  offerHandles();
+  solve();
+}
+
+function post(at) {
+  const kind = now.solving.robot.Kind.BOX, pose = poseOf(new THREE.Matrix4().makeTranslation(...at));
+  return new Things([{ kind, shape: "BOX", size: POST, pose }], false);
+}
+
+// The camera: hand and object fill the picture, the whole robot is in the corner; or the other way.
+function lookAtAll(whole = false) {
+  now.body.place(now.answer.q);
+  const { close, whole: far } = now.grasp.views, object = cornersOf(now.object);
+  const all = [...now.body.corners(false), ...object];
+  const hand = [...now.body.corners(true), ...object, ...placed()];
+  stage.near = !whole;
+  by("inset").hidden = false;
+  by("inset").className = whole ? "swap" : "inset";
+  by("inset").firstElementChild.textContent = whole ? "Show the hand" : "whole robot";
+  by("inset").setAttribute("aria-label", whole ? "Show the hand" : "Show the whole robot");
+  stage.lookWhole(far, all);
+  stage.look(whole ? far : close, whole ? all : hand);
   draw();
 }
 
-// An obstacle: a post beside the middle of the arm, where nothing is.
+function cornersOf(things) {
+  const found = [];
+  things.updateMatrixWorld(true);
+  for (const mesh of things.children) {
+    const box = new THREE.Box3().setFromObject(mesh), { min, max } = box;
+    for (let i = 0; i < 8; ++i) found.push(V([i & 1 ? min.x : max.x, i & 2 ? min.y : max.y, i & 4 ? min.z : max.z]));
+  }
+  return found;
+}
+
+// An obstacle: a post beside the hand, where nothing is, in sight.
 function put() {
-  const kind = now.solving.robot.Kind.BOX, arm = new Set(now.solving.robot.about.arm);
-  const held = now.body.parts.filter((part) => arm.has(part.link)).map((part) => part.mesh.position);
-  const middle = held[Math.floor(held.length / 2)] ?? placed()[0];
-  const goal = middleOf(placed()), side = V([goal.y, -goal.x, 0]).normalize();
-  if (side.dot(stage.camera.position.clone().sub(goal)) < 0) side.negate();
-  const at = middle.clone().lerp(goal, 0.35).addScaledVector(side, 0.26);
-  const turn = new THREE.Matrix4().makeTranslation(at);
-  now.obstacle = new Things([{ kind, shape: "BOX", size: [0.08, 0.08, 0.32], pose: poseOf(turn) }], false);
+  const goal = middleOf(placed()), side = V([0, 0, 0]).setFromMatrixColumn(stage.camera.matrixWorld, 0).setZ(0).normalize();
+  const arm = now.body.parts.filter(({ role }) => role === "arm").map(({ mesh }) => mesh.position);
+  const middle = middleOf(arm.length ? arm : placed());
+  if (side.dot(middle.sub(goal)) > 0) side.negate();
+  const reach = 0.1 + Math.max(...cornersOf(now.object).map((one) => one.sub(goal).dot(side)));
+  now.obstacle = post(goal.addScaledVector(side, Math.max(reach, 0.16)).toArray());
   world.add(now.obstacle);
-  solve();
 }
 
 function solids() {
@@ -120,12 +209,12 @@ function solids() {
 }
 
 const placed = () => now.points.filter(Boolean);
-const question = () => [now.points, now.normals].map((all) => all.map((v) => v?.toArray() ?? FREE));
+const targets = () => [now.points, now.normals].map((all) => all.map((v) => v?.toArray() ?? FREE));
 
 // Asks for what stands there now. Where the robot is is where the last solved answer was.
 function solve() {
   const { solving } = now, parts = now.object.solids.length;
-  const [points, normals] = question();
+  const [points, normals] = targets();
   now.asked = now.start;
   const answer = solving.ask(points, normals, now.start, solids());
   now.answer = answer;
@@ -135,25 +224,30 @@ function solve() {
     return number ? (Number(number[1]) < parts ? "the object" : "the obstacle") : name;
   };
   panel.answer(solving, { points, called }, answer);
-  show(answer.q);
+  const flipped = now.shown ? flip(solving.robot, now.shown, answer.q) : "";
+  if (flipped) note(flipped, 8);
+  show(answer.q, flipped ? 900 : 320);
   clearTimeout(later);
-  later = setTimeout(measure, 250);
+  later = setTimeout(rest, 250);
 }
 
-// What a solve takes is told once more when nothing moves: by then the browser has compiled it well.
+// When nothing moves: the address says what is asked, and what a solve takes is told once more, as
+// by then the browser has compiled it well.
 let later = 0;
-function measure() {
+function rest() {
   if (grip.held) return;
-  const { solving, answer } = now, again = solving.timed(...question(), now.asked);
+  const { solving, answer } = now;
+  history.replaceState(null, "", address(question()));
+  const again = solving.timed(...targets(), now.asked);
   if (answer === now.answer) {
     Object.assign(answer, again);
     panel.time(answer);
   }
 }
 
-// The robot where it is to be; a jump is shown as a way.
+// The robot where it is to be; a jump is shown as a way, so many milliseconds long.
 let under_way = 0;
-function show(q) {
+function show(q, whole) {
   cancelAnimationFrame(under_way);
   const from = now.shown;
   const far = from ? Math.max(...q.map((value, i) => Math.abs(value - from[i]))) : 0;
@@ -162,7 +256,7 @@ function show(q) {
     draw();
     return;
   }
-  const begun = performance.now(), whole = 320;
+  const begun = performance.now();
   const go = (time) => {
     const part = Math.min(Math.max((time - begun) / whole, 0), 1), s = part * part * (3 - 2 * part);
     now.shown = part < 1 ? q.map((value, i) => from[i] + s * (value - from[i])) : q;
@@ -175,18 +269,23 @@ function show(q) {
 function draw() {
   const { solver, robot } = now.solving, { Status } = robot;
   const tips = solver.contacts(now.shown).points;
-  now.body.place(solver.shapes(now.shown));
+  now.body.place(now.shown);
+  now.body.around.visible = by("shapes").checked;
+  if (by("shapes").checked) now.body.placeShapes(solver.shapes(now.shown));
   const touching = now.answer.status === Status.COLLISION && now.shown === now.answer.q;
   now.body.mark(touching ? now.answer.closest : []);
   now.object.place();
   now.obstacle?.place();
+  const chosen = grip.held?.name ?? now.selected;
   now.marks.forEach((mark, i) => {
     mark.visible = Boolean(now.points[i]);
     if (!mark.visible) return;
-    const tip = V(tips.slice(3 * i, 3 * i + 3)), held = grip.held?.name;
-    const size = stage.metres(8, now.points[i]);
-    mark.place(now.points[i], now.normals[i], tip, size, held === `point ${i}`);
+    const tip = V(tips.slice(3 * i, 3 * i + 3));
+    const size = stage.metres(5, now.points[i]);
+    mark.place(now.points[i], now.normals[i], tip, size, chosen === `point ${i}`);
   });
+  const middle = middleOf(places(now.object.solids));
+  knob.place(middle, stage.metres(chosen === "object" ? 13 : 11, middle), stage.camera);
   stage.draw();
 }
 stage.controls.addEventListener("change", () => now.shown && draw());
@@ -194,7 +293,7 @@ stage.controls.addEventListener("change", () => now.shown && draw());
 // What the pointer may take hold of.
 function handles() {
   if (!now.answer) return { points: [], meshes: [] };
-  const points = [];
+  const points = [{ name: "object", at: middleOf(places(now.object.solids)), wide: 15 }];
   now.marks.forEach((mark, i) => {
     if (now.points[i]) points.push({ name: `point ${i}`, at: now.points[i] });
     if (now.normals[i]) points.push({ name: `normal ${i}`, at: mark.end });
@@ -202,6 +301,25 @@ function handles() {
   const meshes = [{ name: "object", mesh: now.object }];
   if (now.obstacle) meshes.push({ name: "obstacle", mesh: now.obstacle });
   return { points, meshes };
+}
+
+function offerHandles() {
+  const { fingers } = now.solving.robot, names = ["object"], words = ["the object"];
+  now.points.forEach((point, i) => {
+    if (point) [names[names.length], words[words.length]] = [`point ${i}`, `contact ${i + 1}: ${plain(fingers[i])}`];
+  });
+  if (now.obstacle) [names[names.length], words[words.length]] = ["obstacle", "the obstacle"];
+  if (!names.includes(now.selected)) now.selected = "object";
+  panel.selectable(names, words);
+  by("selected").value = now.selected;
+}
+
+function select(name) {
+  now.selected = name;
+  by("selected").value = name;
+  const said = by("selected").selectedOptions[0]?.textContent;
+  if (said) note(`Keys move ${said}.`);
+  draw();
 }
 
 function shift(solid, moved) {
@@ -215,43 +333,164 @@ function middleOf(points) {
 
 const places = (solids) => solids.map((one) => V(one.pose.slice(9)));
 
+// About the vertical through the middle of something.
+function turned(middle, angle) {
+  const moved = new THREE.Matrix4().makeTranslation(middle);
+  moved.multiply(new THREE.Matrix4().makeRotationAxis(UP, angle));
+  return moved.multiply(new THREE.Matrix4().makeTranslation(middle.clone().negate()));
+}
+
+// Moves the object with its contacts, or the obstacle.
+function carry(what, moved) {
+  for (const one of now[what].solids) shift(one, moved);
+  if (what !== "object") return;
+  now.moved.premultiply(moved);
+  for (const point of placed()) point.applyMatrix4(moved);
+  for (const normal of now.normals) normal?.transformDirection(moved);
+}
+
 function move(name, by_, screen) {
-  if (!by_) return draw();
   const [what, number] = name.split(" "), i = Number(number);
+  by("hint").hidden = true;
+  if (!by_) {
+    const chosen = what === "normal" ? `point ${i}` : name;
+    now.selected = by("selected").value = chosen;
+    if (now.answer) keep();
+    return draw();
+  }
   if (what === "point") now.points[i].add(by_);
   else if (what === "normal") {
     const end = now.marks[i].end.clone().add(by_);
     now.normals[i].copy(end.sub(now.points[i]).normalize());
     now.marks[i].end = now.points[i].clone().addScaledVector(now.normals[i], now.marks[i].length);
   } else {
-    const solids = now[what].solids;
     const turning = what === "object" && (screen.shift || by("turn").checked);
-    let moved = new THREE.Matrix4().makeTranslation(by_);
-    if (turning) {
-      const middle = middleOf(places(solids));
-      moved = new THREE.Matrix4().makeTranslation(middle);
-      moved.multiply(new THREE.Matrix4().makeRotationAxis(UP, 0.012 * screen.x));
-      moved.multiply(new THREE.Matrix4().makeTranslation(middle.negate()));
-    }
-    for (const one of solids) shift(one, moved);
-    if (what === "object") {
-      for (const point of placed()) point.applyMatrix4(moved);
-      for (const normal of now.normals) normal?.transformDirection(moved);
-    }
+    const middle = middleOf(places(now[what].solids));
+    carry(what, turning ? turned(middle, 0.012 * screen.x) : new THREE.Matrix4().makeTranslation(by_));
   }
   // Once a frame, however many events there are.
   stage.draw(solve);
 }
 
+// Keys move what is selected as it is seen: to the sides, up and down, to and fro.
+const WAYS = {
+  ArrowLeft: [-1, 0, 0], ArrowRight: [1, 0, 0], ArrowUp: [0, 1, 0], ArrowDown: [0, -1, 0],
+  PageUp: [0, 0, 1], PageDown: [0, 0, -1],
+};
+function nudge(event) {
+  if (!now.answer || event.ctrlKey || event.metaKey || event.altKey) return;
+  const { key } = event, name = now.selected, [what, number] = name.split(" "), i = Number(number);
+  const sign = { "+": 1, "=": 1, "-": -1, "_": -1 }[key];
+  if (key === "Escape") select("object");
+  else if (key === "n" || key === "N") {
+    const names = [...by("selected").options].map((one) => one.value);
+    select(names[(names.indexOf(name) + 1) % names.length]);
+  } else if (WAYS[key]) {
+    const [x, y, z] = WAYS[key], size = event.shiftKey ? STEP.near : STEP.far;
+    const right = V([0, 0, 0]).setFromMatrixColumn(stage.camera.matrixWorld, 0).setZ(0).normalize();
+    const by_ = right.clone().multiplyScalar(x).addScaledVector(UP, y).addScaledVector(UP.clone().cross(right), z);
+    move(name, by_.multiplyScalar(size), { x: 0, shift: false });
+    stage.draw(() => (solve(), keep(`keys ${name}`)));
+  } else if (sign && what !== "obstacle") {
+    if (what === "object") carry("object", turned(middleOf(places(now.object.solids)), sign * STEP.turn));
+    else now.normals[i]?.applyAxisAngle(UP, sign * STEP.turn);
+    stage.draw(() => (solve(), keep(`turn ${name}`)));
+  } else return;
+  event.preventDefault();
+}
+
+// One step back or forward.
+function go(by_) {
+  const step = past.go(by_);
+  if (!step) return;
+  const robot = ROBOTS.find(({ name }) => name === step.robot);
+  if (robot !== now.robot) choose(robot, { ...step, kept: true });
+  else {
+    const other = step.grasp !== now.grasp.name;
+    stand(step);
+    if (other) lookAtAll();
+  }
+}
+
+function takeGrasp() {
+  stand(asMade(now.solving.robot.about.grasps[Number(by("grasp").value)]));
+  lookAtAll();
+  keep();
+}
+
+// The answer as a program takes it: radians or degrees, what slides in metres.
+function copyAnswer() {
+  const [form, unit] = by("format").value.split(" "), { motors, about } = now.solving.robot;
+  const values = [...now.answer.q].map((value, i) => {
+    const one = unit === "deg" && !about.prismatic[i] ? (180 / Math.PI) * value : value;
+    return Number(one.toFixed(unit === "deg" ? 4 : 6));
+  });
+  const text = form === "list" ? `[${values.join(", ")}]`
+    : `{${motors.map((name, i) => `${JSON.stringify(name)}: ${values[i]}`).join(", ")}}`;
+  const solved = now.answer.status === now.solving.robot.Status.SOLVED;
+  copied(text, solved ? `q (${values.length} motors)` : "q, which does not solve this question,");
+}
+
+// Light or dark: as the system has it, until it is chosen here.
+const system = matchMedia("(prefers-color-scheme: dark)");
+function paint(dark) {
+  by("dark").checked = dark;
+  document.documentElement.dataset.theme = dark ? "dark" : "light";
+  stage.paint(dark);
+}
+system.addEventListener("change", () => paint(system.matches));
+paint(system.matches);
+
+function fold(folded) {
+  document.body.classList.toggle("folded", folded);
+  by("fold").textContent = folded ? "Show panel" : "Hide panel";
+  by("fold").setAttribute("aria-expanded", String(!folded));
+}
+fold(narrow.matches);
+
 const grip = new Grip(stage, handles, move);
-by("grasp").addEventListener("change", (event) => take(Number(event.target.value), false));
-by("reset").addEventListener("click", () => take(Number(by("grasp").value), true));
-by("obstacle").addEventListener("change", (event) => {
-  if (event.target.checked) return put();
-  now.obstacle?.removeFromParent();
-  now.obstacle = null;
-  return solve();
+by("canvas").addEventListener("keydown", nudge);
+by("grasp").addEventListener("change", takeGrasp);
+by("reset").addEventListener("click", () => now.answer && takeGrasp());
+by("undo").addEventListener("click", () => go(-1));
+by("redo").addEventListener("click", () => go(1));
+by("copy").addEventListener("click", () => now.answer && copyAnswer());
+by("link").addEventListener("click", () => {
+  if (!now.answer) return;
+  history.replaceState(null, "", address(question()));
+  copied(location.href, "Link");
 });
+by("selected").addEventListener("change", (event) => select(event.target.value));
+by("shapes").addEventListener("change", () => now.answer && draw());
+by("dark").addEventListener("change", (event) => paint(event.target.checked));
+by("fold").addEventListener("click", () => fold(!document.body.classList.contains("folded")));
+by("inset").addEventListener("click", () => now.answer && lookAtAll(stage.near));
+by("obstacle").addEventListener("change", (event) => {
+  if (!now.answer) return;
+  if (event.target.checked) put();
+  else {
+    now.obstacle?.removeFromParent();
+    now.obstacle = null;
+  }
+  offerHandles();
+  solve();
+  keep();
+});
+addEventListener("keydown", (event) => {
+  if (!(event.ctrlKey || event.metaKey) || event.altKey || !now.answer) return;
+  const key = event.key.toLowerCase();
+  if (key !== "z" && key !== "y") return;
+  event.preventDefault();
+  go(key === "y" || event.shiftKey ? 1 : -1);
+});
+
+// The robot that an address asks for, else the first.
+function read() {
+  const name = robotOf(location.hash), robot = ROBOTS.find((one) => one.name === name);
+  if (name && !robot) note(`The link asks for the robot "${name.slice(0, 60)}", which is not on this page.`, 20);
+  choose(robot ?? ROBOTS[0], null, robot ? location.hash : "");
+}
+addEventListener("hashchange", read);
 
 // For whoever looks from outside: what is shown, and where.
 globalThis.casadiIk = {
@@ -266,4 +505,4 @@ globalThis.casadiIk = {
     return stage.pixel(middleOf(places(mesh.solids)));
   },
 };
-choose(ROBOTS.find((robot) => `#${robot.name}` === location.hash) ?? ROBOTS[0]);
+read();

@@ -1,6 +1,6 @@
 // What is said beside the picture.
 import { COLORS } from "./bodies.js";
-import { degrees, millimetres, plain, reason } from "./words.js";
+import { clear, degrees, millimetres, plain, reason } from "./words.js";
 
 const MET = { position: 5e-3, angle: (3 * Math.PI) / 180 };
 const by = (id) => document.getElementById(id);
@@ -38,14 +38,19 @@ export class Panel {
       }),
     );
     by("motors").replaceChildren(
-      ...motors.map((name) => {
+      ...motors.map((name, i) => {
         const row = document.createElement("div");
         row.className = "motor";
         row.innerHTML = "<span></span><div class=bar><i></i></div><output></output>";
-        row.firstChild.textContent = row.firstChild.title = name;
+        row.firstChild.textContent = row.firstChild.title = `${i + 1} ${name}`;
         return row;
       }),
     );
+  }
+
+  // What keys may move, by name and in words.
+  selectable(names, words) {
+    by("selected").replaceChildren(...names.map((name, i) => new Option(words[i], name)));
   }
 
   answer(solving, question, answer) {
@@ -56,8 +61,8 @@ export class Panel {
     badge.className = `badge ${solved ? "good" : touches ? "warn" : "bad"}`;
     this.time(answer);
     const why = by("reason");
-    why.hidden = solved;
-    if (!solved) why.textContent = reason(robot, question, answer, solving.atEnds(answer.q));
+    why.className = solved ? "good" : "bad";
+    why.textContent = solved ? clear(question, answer) : reason(robot, question, answer, solving.atEnds(answer.q));
     [...by("fingers").rows].forEach((row, i) => {
       const off = answer.positionError[i], turned = answer.angleError[i];
       // What is free is NaN.
@@ -69,8 +74,9 @@ export class Panel {
     });
     const judged = (solved || touches) && answer.closest;
     const names = judged ? judged.map((name) => plain(question.called(name))) : null;
-    by("clearance").textContent = names ? `${millimetres(answer.clearance)}, ${names.join(" – ")}` : "–";
-    by("iterations").textContent = `${answer.iterations}, ${answer.restarts} restarts`;
+    by("clearance").textContent = names ? `${millimetres(answer.clearance)}, ${names.join(" – ")}` : "collision not checked";
+    const { iterations, restarts } = answer;
+    by("iterations").textContent = `${iterations}, ${restarts} ${restarts === 1 ? "restart" : "restarts"}`;
     [...by("motors").children].forEach((row, i) => {
       const part = (answer.q[i] - lower[i]) / (upper[i] - lower[i]);
       row.children[1].firstChild.style.left = `${100 * Math.min(Math.max(part, 0), 1)}%`;
@@ -82,6 +88,30 @@ export class Panel {
   time({ time, counted }) {
     const digits = time < 100 ? 1 : 0;
     by("time").textContent = time < 1000 ? `${time.toFixed(digits)} µs` : `${(time / 1000).toFixed(1)} ms`;
-    by("share").title = counted > 1 ? `median over lots of in all ${counted} solves of this target` : "one solve";
+    by("share").title = counted > 1 ? `Median over lots of ${counted} solves of this target in all` : "One solve";
   }
+}
+
+// Something that happened, said below the verdict, where there is always room for it.
+let silence = 0;
+export function note(text, seconds = 6) {
+  by("note").textContent = text;
+  clearTimeout(silence);
+  silence = setTimeout(() => (by("note").textContent = ""), 1e3 * seconds);
+}
+
+// Text to the clipboard; where the browser does not let a page do that, the old way.
+export async function copied(text, what) {
+  try {
+    await navigator.clipboard.writeText(text);
+  } catch {
+    const area = document.createElement("textarea");
+    area.value = text;
+    document.body.append(area);
+    area.select();
+    const done = document.execCommand("copy");
+    area.remove();
+    if (!done) return note(`The browser does not allow copying: ${text}`, 60);
+  }
+  return note(`${what} copied.`);
 }

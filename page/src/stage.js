@@ -2,6 +2,10 @@
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
+const FLOOR = { light: [0xaab4be, 0xd3dae1, 0.18], dark: [0x4b5a69, 0x28323c, 0.4] };
+const AROUND = 1.2; // of what has to be seen, left free about it
+const INSET = { part: 0.3, most: 230, edge: 12 }; // of the width; [pixels]
+
 export class Stage {
   constructor(canvas) {
     this.canvas = canvas;
@@ -9,9 +13,12 @@ export class Stage {
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
     this.renderer.shadowMap.enabled = true;
     this.renderer.shadowMap.type = THREE.PCFShadowMap;
+    this.renderer.autoClear = false;
     this.scene = new THREE.Scene();
     this.camera = new THREE.PerspectiveCamera(32, 1, 0.02, 30);
+    this.far = new THREE.PerspectiveCamera(32, 1, 0.02, 30);
     this.camera.up.set(0, 0, 1);
+    this.far.up.set(0, 0, 1);
     this.controls = new OrbitControls(this.camera, canvas);
     this.scene.add(new THREE.HemisphereLight(0xffffff, 0xb9c2ca, 2.3));
     this.sun = new THREE.DirectionalLight(0xffffff, 1.7);
@@ -20,16 +27,24 @@ export class Stage {
     this.sun.shadow.bias = -0.0008;
     this.sun.shadow.normalBias = 0.01;
     this.scene.add(this.sun, this.sun.target);
-    const dark = matchMedia("(prefers-color-scheme: dark)").matches;
-    this.grid = new THREE.GridHelper(4, 40, dark ? 0x4b5a69 : 0xaab4be, dark ? 0x28323c : 0xd3dae1);
-    this.grid.rotation.x = Math.PI / 2;
-    const shadows = new THREE.ShadowMaterial({ opacity: dark ? 0.4 : 0.18 });
-    this.floor = new THREE.Mesh(new THREE.PlaneGeometry(8, 8), shadows);
+    this.floor = new THREE.Mesh(new THREE.PlaneGeometry(8, 8), new THREE.ShadowMaterial());
     this.floor.receiveShadow = true;
-    this.scene.add(this.grid, this.floor);
+    this.scene.add(this.floor);
     this.frames = [];
     new ResizeObserver(() => this.fit()).observe(canvas.parentElement);
     this.fit();
+  }
+
+  paint(dark) {
+    const [lines, faint, shade] = FLOOR[dark ? "dark" : "light"];
+    this.grid?.removeFromParent();
+    this.grid?.dispose();
+    this.grid = new THREE.GridHelper(4, 40, lines, faint);
+    this.grid.rotation.x = Math.PI / 2;
+    this.grid.position.z = this.floor.position.z;
+    this.floor.material.opacity = shade;
+    this.scene.add(this.grid);
+    this.draw();
   }
 
   fit() {
@@ -38,21 +53,62 @@ export class Stage {
     this.renderer.setSize(width, height, false);
     this.camera.aspect = width / height;
     this.camera.updateProjectionMatrix();
+    const side = Math.round(Math.min(INSET.part * width, 0.42 * height, INSET.most));
+    this.inset = { side, x: INSET.edge, y: height - side - INSET.edge };
+    this.canvas.parentElement.style.setProperty("--inset", `${side}px`);
     this.draw();
   }
 
-  // Looks at a ball in which everything of interest is.
-  look(center, radius, floor, goal) {
-    // From ahead of the robot and a little to its side, so that the hand is before the arm.
-    const ahead = Math.atan2(goal.y, goal.x) - 0.95;
-    const way = new THREE.Vector3(Math.cos(ahead), Math.sin(ahead), 0.42).normalize();
-    const narrow = Math.min(1, this.camera.aspect);
-    const away = radius / Math.sin((this.camera.fov * Math.PI) / 360) / narrow;
+  // Puts a camera where it sees all points from a side, and nothing else fits.
+  aim(camera, [azimuth, elevation], points) {
+    const flat = Math.cos(elevation);
+    const out = new THREE.Vector3(flat * Math.cos(azimuth), flat * Math.sin(azimuth), Math.sin(elevation));
+    const right = new THREE.Vector3(-Math.sin(azimuth), Math.cos(azimuth), 0);
+    const up = out.clone().cross(right);
+    const tall = Math.tan((camera.fov * Math.PI) / 360) / AROUND, wide = tall * camera.aspect;
+    const center = new THREE.Box3().setFromPoints(points).getCenter(new THREE.Vector3());
+    let away = 0;
+    for (let round = 0; round < 4; ++round) {
+      // As far as the sides of the picture allow; then the middle of what is seen, and again.
+      const least = { x: Infinity, y: Infinity }, most = { x: -Infinity, y: -Infinity };
+      away = 0;
+      const seen = points.map((point) => point.clone().sub(center));
+      for (const one of seen) {
+        away = Math.max(away, one.dot(out) + Math.abs(one.dot(right)) / wide, one.dot(out) + Math.abs(one.dot(up)) / tall);
+      }
+      for (const one of seen) {
+        const depth = away - one.dot(out), x = one.dot(right) / depth, y = one.dot(up) / depth;
+        Object.assign(least, { x: Math.min(least.x, x), y: Math.min(least.y, y) });
+        Object.assign(most, { x: Math.max(most.x, x), y: Math.max(most.y, y) });
+      }
+      if (round === 3) break;
+      center.addScaledVector(right, (away * (least.x + most.x)) / 2);
+      center.addScaledVector(up, (away * (least.y + most.y)) / 2);
+    }
+    camera.position.copy(center).addScaledVector(out, away);
+    camera.lookAt(center);
+    camera.updateMatrixWorld();
+    return { center, away };
+  }
+
+  // Looks at points from a side.
+  look(side, points) {
+    const { center, away } = this.aim(this.camera, side, points);
     this.controls.target.copy(center);
-    this.camera.position.copy(center).addScaledVector(way, away);
     this.controls.minDistance = 0.1 * away;
-    this.controls.maxDistance = 4 * away;
-    this.grid.position.z = this.floor.position.z = floor;
+    this.controls.maxDistance = 12 * away;
+    this.controls.update();
+    this.camera.updateMatrixWorld();
+    this.draw();
+  }
+
+  // The picture in the corner, and the light of everything in it.
+  lookWhole(side, points) {
+    this.aim(this.far, side, points);
+    const box = new THREE.Box3().setFromPoints(points), floor = Math.min(box.min.z, 0);
+    const { center, radius } = box.getBoundingSphere(new THREE.Sphere());
+    this.floor.position.z = floor;
+    if (this.grid) this.grid.position.z = floor;
     this.sun.position.copy(center).add(new THREE.Vector3(0.6 * radius, -1.2 * radius, 2.6 * radius));
     this.sun.target.position.copy(center);
     const lit = this.sun.shadow.camera;
@@ -61,8 +117,6 @@ export class Stage {
     lit.near = 0.1 * radius;
     lit.far = 6 * radius;
     lit.updateProjectionMatrix();
-    this.controls.update();
-    this.camera.updateMatrixWorld();
     this.draw();
   }
 
@@ -75,10 +129,27 @@ export class Stage {
       this.before = null;
       work?.();
       this.asked = 0;
-      this.renderer.render(this.scene, this.camera);
+      this.render();
       if (work) this.frames.push(performance.now() - begun);
       if (this.frames.length > 100) this.frames.shift();
     });
+  }
+
+  // The large picture; where it shows the hand, the whole robot in a corner of it.
+  render() {
+    const { renderer, scene, canvas } = this, { x, y, side } = this.inset;
+    renderer.setScissorTest(false);
+    renderer.setViewport(0, 0, canvas.clientWidth, canvas.clientHeight);
+    renderer.clear();
+    renderer.render(scene, this.camera);
+    if (!this.near) return;
+    renderer.shadowMap.autoUpdate = false;
+    renderer.setViewport(x, y, side, side);
+    renderer.setScissor(x, y, side, side);
+    renderer.setScissorTest(true);
+    renderer.clear();
+    renderer.render(scene, this.far);
+    renderer.shadowMap.autoUpdate = true;
   }
 
   // How many metres so many pixels are, where a point is.

@@ -80,12 +80,27 @@ def the_page_follows(page: Page, robot: ik.ArmHand) -> None:
     q = np.array(page.evaluate("[...casadiIk.now.shown]"))
     points, _ = robot.contacts(q)
     assert np.linalg.norm(points - after, axis=1).max() <= 5.001e-3
+    drawn = page.evaluate(
+        "casadiIk.now.body.parts.map(({ link, mesh }) => [link, mesh.position.toArray()])"
+    )
+    poses = robot.links(q)
+    assert len(drawn) > 20
+    for link, place in drawn:
+        assert np.allclose(place, poses[link][:3, 3], atol=1e-9)
+
+
+def the_collision_shapes_are_the_solver_s(page: Page, robot: ik.ArmHand) -> None:
+    page.evaluate("document.getElementById('shapes').click()")
+    settled(page)
+    q = np.array(page.evaluate("[...casadiIk.now.shown]"))
     drawn = page.evaluate("[...casadiIk.now.solving.solver.shapes(casadiIk.now.shown)]")
     (placed,) = ClearanceKernel(robot.description).placed(q[None])
     assert np.abs(np.array(drawn) - placed.ravel()).max() < 1e-12
-    mesh = page.evaluate("casadiIk.now.body.parts.find((p) => !p.isSolid).mesh.position.toArray()")
-    first = page.evaluate("casadiIk.now.body.parts.find((p) => !p.isSolid).at")
-    assert np.allclose(mesh, placed.ravel()[first : first + 3])
+    (mesh, at), *_ = page.evaluate(
+        "casadiIk.now.body.capsules.map(({ i }, k) =>"
+        " [casadiIk.now.body.around.children[k].position.toArray(), 6 * i])"
+    )
+    assert np.allclose(mesh, placed.ravel()[at : at + 3])
 
 
 def a_normal_turns(page: Page) -> None:
@@ -102,9 +117,7 @@ def a_normal_turns(page: Page) -> None:
 def the_object_takes_its_contacts_along(page: Page) -> None:
     before = asked(page)
     x, y = page.evaluate("casadiIk.pixel('object')")
-    around = [(x + 3 * i, y + 3 * k) for i in range(-12, 13) for k in range(-12, 13)]
-    script = f"{json.dumps(around)}.find(([x, y]) => casadiIk.under(x, y) === 'object')"
-    x, y = page.evaluate(script)
+    assert page.evaluate(f"casadiIk.under({x}, {y})") == "object"
     page.drag((x, y), (x + 25, y), steps=4)
     settled(page)
     moved = asked(page) - before
@@ -112,17 +125,83 @@ def the_object_takes_its_contacts_along(page: Page) -> None:
     assert np.ptp(moved, axis=0).max() < 1e-9
 
 
+def steps_are_taken_back(page: Page) -> None:
+    """Keys move the object 5 mm up; undone, done again."""
+    before = asked(page)
+    page.evaluate("document.getElementById('canvas').focus()")
+    pressed(page, "Escape")
+    pressed(page, "ArrowUp")
+    settled(page)
+    up = [0.0, 0.0, 5e-3]
+    assert np.allclose(asked(page) - before, up, atol=1e-9)
+    pressed(page, "z", CONTROL)
+    settled(page)
+    assert np.allclose(asked(page), before, atol=1e-9)
+    pressed(page, "z", CONTROL + SHIFT)
+    settled(page)
+    assert np.allclose(asked(page) - before, up, atol=1e-9)
+
+
+CONTROL, SHIFT = 2, 8
+"""As DevTools counts what is held."""
+
+
+def pressed(page: Page, key: str, held: int = 0) -> None:
+    for kind in ("keyDown", "keyUp"):
+        page.call("Input.dispatchKeyEvent", type=kind, key=key, code=key, modifiers=held)
+
+
+def copied(page: Page, button: str) -> str:
+    """What a button would put into the clipboard."""
+    page.evaluate(
+        "globalThis.clip = '';"
+        "Object.defineProperty(navigator, 'clipboard', { configurable: true,"
+        " value: { writeText: async (text) => { globalThis.clip = text; } } })"
+    )
+    page.evaluate(f"document.getElementById('{button}').click()")
+    return str(page.wait("globalThis.clip"))
+
+
+def the_answer_is_copied(page: Page) -> None:
+    page.evaluate("document.getElementById('format').value = 'dict rad'")
+    named = json.loads(copied(page, "copy"))
+    assert list(named) == page.evaluate("casadiIk.now.solving.robot.motors")
+    q = page.evaluate("[...casadiIk.now.answer.q]")
+    assert np.allclose(list(named.values()), q, atol=1e-6)
+
+
+def a_link_has_the_question(page: Page, browser: Browser, url: str) -> None:
+    """What is asked is asked by whoever opens the link; a broken one is said to be broken."""
+    other = opened(browser, copied(page, "link"), 900, 600)
+    assert np.allclose(asked(other), asked(page), atol=1e-4)
+    assert now(other, "answer.status") == ik.Status.SOLVED
+    said = "document.getElementById('note').textContent"
+    other = opened(browser, f"{url}#robot={ROBOT}&grasp=apple&points=1,nan,2", 900, 600)
+    assert "points: found 1 of the 3 fingers" in other.evaluate(said)
+    other = opened(browser, f"{url}#robot=<b>none</b>&grasp=apple", 900, 600)
+    assert "is not on this page" in other.evaluate(said)
+
+
 def out_of_reach_is_explained(page: Page) -> None:
+    height = "document.querySelector('.verdict').offsetHeight"
+    before = page.evaluate(height)
+    for _ in range(3):
+        x, y = page.evaluate("casadiIk.pixel('object')")
+        page.mouse("Wheel", x, y, deltaX=0, deltaY=240)
+    settled(page)
     x, y = page.evaluate("casadiIk.pixel('point 0')")
-    page.drag((x, y), (x - 200, y + 90), steps=3)
+    page.drag((x, y), (530 if x < 270 else 10, 590 if y < 300 else 10), steps=3)
     settled(page)
     assert page.evaluate("document.getElementById('status').textContent") == "not reached"
     said = page.evaluate("document.getElementById('reason').textContent")
     assert said.startswith("Out of reach: ")
     assert "apart" in said
+    assert page.evaluate(height) == before
+    unchecked = page.evaluate("document.getElementById('clearance').textContent")
+    assert unchecked == "collision not checked"
     page.evaluate("document.getElementById('reset').click()")
     settled(page)
-    assert page.evaluate("document.getElementById('reason').hidden") is True
+    assert page.evaluate("document.getElementById('status').textContent") == "solved"
 
 
 def an_obstacle_is_kept_clear_of(page: Page, robot: ik.ArmHand) -> None:
@@ -153,15 +232,20 @@ def an_obstacle_is_kept_clear_of(page: Page, robot: ik.ArmHand) -> None:
     assert ik.Status.SOLVED in ends
 
 
-def used_by_mouse(page: Page, robot: ik.ArmHand) -> None:
+def used_by_mouse(page: Page, robot: ik.ArmHand, browser: Browser, url: str) -> None:
     assert now(page, "answer.status") == ik.Status.SOLVED
+    assert page.evaluate("document.title").startswith("apple · ")
     the_page_follows(page, robot)
     page.wait("/^[0-9.]+ (µs|ms)$/.test(document.getElementById('time').textContent)")
     a_normal_turns(page)
     the_object_takes_its_contacts_along(page)
+    steps_are_taken_back(page)
+    the_answer_is_copied(page)
+    the_collision_shapes_are_the_solver_s(page, robot)
     out_of_reach_is_explained(page)
     an_obstacle_is_kept_clear_of(page, robot)
     assert page.complaints == []
+    a_link_has_the_question(page, browser, url)
 
 
 def used_on_a_phone(page: Page) -> None:
@@ -195,5 +279,5 @@ def test_page(
     as_in_python(kept / ROBOT)
     browser: Browser = request.getfixturevalue("browser")
     url = (out / "index.html").as_uri()
-    used_by_mouse(opened(browser, url, 900, 600), robot)
+    used_by_mouse(opened(browser, url, 900, 600), robot, browser, url)
     used_on_a_phone(opened(browser, url, 360, 740, phone=True))
