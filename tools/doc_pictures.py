@@ -62,7 +62,8 @@ def shot(
     """A robot with what it grasps and what stands about it, on white."""
     body = placed(robot, q, bodies(robot))
     thing = None if grasp is None else object_of(grasp.object)
-    things = [] if thing is None or grasp is None else [thing.at(grasp.object_pose)]
+    pose = None if grasp is None else grasp.object_pose
+    things = [] if thing is None or pose is None else [thing.at(pose)]
     with closing(Stage()) as stage:
         stage.add("robot", body)
         stage.add("object", things, 0.6)

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image as Pillow
 
 from casadi_ik.cli.main import main as command
 from casadi_ik.cli.table import parse
@@ -74,14 +75,31 @@ def seen(page: Any, path: Path) -> None:
         page.evaluate("new Promise(done => requestAnimationFrame(() => setTimeout(done)))")
     page.evaluate("window.painted?.(document.querySelector('canvas'))")
     page.screenshot(path)
+    Pillow.open(path).convert("RGB").save(path, optimize=True)
     page.call("Page.navigate", url="about:blank")
     print(path)
+
+
+def moved(*by: float) -> Use:
+    """The object dragged so far [m], in steps as a hand does."""
+
+    def use(shown: GraspPage, _: Any) -> None:
+        start = shown.asked.object_pose
+        assert start is not None
+        for part in np.linspace(0.25, 1.0, 4):
+            pose = start.copy()
+            pose[:3, 3] += part * np.array(by)
+            shown.drag_thing("object", pose)
+            shown.work.settle()
+
+    return use
 
 
 def dragged(finger: str, *by: float) -> Use:
     """A contact dragged so far [m], in steps as a hand does."""
 
     def use(shown: GraspPage, _: Any) -> None:
+        shown.select(finger)
         start = shown.asked.held[finger].control
         for part in np.linspace(0.25, 1.0, 4):
             pose = start.copy()
@@ -93,16 +111,22 @@ def dragged(finger: str, *by: float) -> Use:
 
 
 def gone_through(shown: GraspPage, page: Any) -> None:
-    """The best of the choices, and all its solutions."""
+    """The best of the choices, and all its solutions at once, seen with the whole arm."""
     shown.choose(next(iter(shown.candidates)))
     shown.work.settle()
-    time.sleep(2.0)  # the verdict has grown: what is below it has moved
-    box = page.evaluate(
-        "(({x, y, width, height}) => [x + width / 2, y + height / 2])"
-        "([...document.querySelectorAll('[role=tab]')]"
-        ".find(t => t.innerText.trim() === 'Solutions').getBoundingClientRect())"
-    )
-    page.click(*box)
+    time.sleep(2.0)
+    for found in (
+        "[...document.querySelectorAll('.mantine-Paper-root *')]"
+        ".findLast(one => one.innerText?.trim() === 'Solutions')",
+        "document.querySelector('input[type=checkbox]')",
+        "[...document.querySelectorAll('button')].find(one => one.innerText.trim() === 'Robot')",
+    ):
+        box = page.evaluate(
+            "(({x, y, width, height}) => [x + width / 2, y + height / 2])"
+            f"({found}.getBoundingClientRect())"
+        )
+        page.click(*box)
+        time.sleep(1.5)
 
 
 def chosen(folder: Path) -> list[str]:
@@ -155,14 +179,14 @@ def main(arguments: list[str] | None = None) -> None:
     with BENCH.browser_tools().Browser() as browser, tempfile.TemporaryDirectory() as name:
         folder, cup = Path(name), ["cup", "--scene", "table"]
         pictures: dict[str, tuple[Callable[[], list[str]], Use]] = {
-            "view": (lambda: cup, dragged("thumb", 0.004, 0.006, 0.004)),
+            "view": (lambda: cup, moved(0.02, 0.03, 0.01)),
             "view_missed": (lambda: cup, dragged("thumb", 0.0, 0.0, 0.05)),
             "view_choices": (lambda: chosen(folder), gone_through),
             "view_log": (lambda: logged(folder), lambda shown, _: shown.show(ITERATION)),
         }
         if options.hand is not None:
             pads = imported(options.hand, folder)
-            pictures["view_pads"] = (lambda: pads, lambda shown, _: shown.select("index"))
+            pictures["view_pads"] = (lambda: pads, lambda shown, _: shown.select("finger_1"))
         for name, (words, use) in pictures.items():
             if not wanted or name in wanted:
                 taken(browser, words(), options.out / f"{name}.png", use)

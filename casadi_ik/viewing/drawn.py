@@ -594,16 +594,13 @@ class Camera:
             client.camera.look_at = self.target + lower
 
 
-def cameras(
-    robot: ArmHand, q: Array, things: Sequence[Drawable] = (), count: int = 1
-) -> dict[str, Camera]:
+def cameras(robot: ArmHand, q: Array, things: Sequence[Drawable] = ()) -> dict[str, Camera]:
     """Where a robot at q (n,) is seen from: its hand with what it grasps, and the whole of it.
 
     Args:
         robot: The robot.
         q: (n,) [rad or m].
         things: What is grasped, in the base frame.
-        count: How many robots stand side by side.
     """
     body = placed(robot, q, bodies(robot))
     hand = [one for one in body if one.role != "arm"]
@@ -614,7 +611,7 @@ def cameras(
     for name, parts, view, room in seen:
         points = np.concatenate([one.surface.points for one in parts])
         middle = (points.min(axis=0) + points.max(axis=0)) / 2
-        radius = room * count * float(np.linalg.norm(points - middle, axis=1).max())
+        radius = room * float(np.linalg.norm(points - middle, axis=1).max())
         found[name] = Camera(middle, max(radius, 0.05), axes_of(view)[2])
     return found
 

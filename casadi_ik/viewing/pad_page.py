@@ -18,6 +18,7 @@ from casadi_ik import palette
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.drawing.drawables import bodies, collision_bodies, placed
+from casadi_ik.drawing.surfaces import facing
 from casadi_ik.errors import CasadiIKError, DescriptionError
 from casadi_ik.files.reading import Frame, frame_matrix, read_yaml
 from casadi_ik.files.writing import written_whole
@@ -344,7 +345,8 @@ def _number(value: float) -> str:
 def on_skin(surface: Surface, point: Array, normal: Array) -> tuple[Array, Array] | None:
     """The point where a pad's normal comes out of the skin, and the skin's normal there.
 
-    The skin is looked for from 6 cm along the normal; what is within 4 mm says which way it faces.
+    The skin is looked for from 6 cm along the normal; how it faces is told by four points 2 mm
+    about.
 
     Args:
         surface: Of what moves with the pad.
@@ -354,27 +356,15 @@ def on_skin(surface: Surface, point: Array, normal: Array) -> tuple[Array, Array
     Returns:
         (3,) and (3,); None: the normal's line does not meet the skin.
     """
-    found = surface.hit(point + 0.06 * normal, -normal)
+    start = point + 0.06 * normal
+    found = surface.hit(start, -normal)
     if found is None:
         return None
-    a, b, c = (surface.points[surface.triangles[:, i]] for i in range(3))
-    ways = np.cross(b - a, c - a)
-    near = np.linalg.norm((a + b + c) / 3 - found, axis=1) <= 0.004
-    # Of large triangles the middle is far from the pad: then it is the one under the pad.
-    chosen = near | _holds(a, b, c, ways, found)
-    ways = ways[chosen] / np.maximum(np.linalg.norm(ways[chosen], axis=1), 1e-30)[:, None] ** 0.5
-    cosines = ways @ normal
-    total = (ways * np.sign(cosines)[:, None])[np.abs(cosines) > 0].sum(axis=0)
-    length = float(np.linalg.norm(total))
-    return found, total / length if length > 0 else normal
-
-
-def _holds(a: Array, b: Array, c: Array, ways: Array, point: Array) -> Array:
-    """(t,) whether a point lies on triangles."""
-    areas = np.maximum((ways * ways).sum(axis=1), 1e-30)
-    flat = np.abs(((point - a) * ways).sum(axis=1)) <= 1e-7 * np.sqrt(areas)
-    parts = [
-        (np.cross(two - one, point - one) * ways).sum(axis=1) / areas
-        for one, two in ((a, b), (b, c), (c, a))
-    ]
-    return flat & (np.min(parts, axis=0) >= -1e-6)
+    x, y = 0.002 * facing(point, normal)[:3, 1:3].T
+    hits = (surface.hit(start + step, -normal) for step in (x, y, -x, -y))
+    about = [one for one in hits if one is not None]
+    if len(about) < 4:
+        return found, normal
+    right, up, left, down = about
+    way = np.cross(right - left, up - down)
+    return found, way / np.linalg.norm(way)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -289,8 +289,9 @@ class PlayPage(Page):
         super().__init__(server, _title(tracks), lowest(scene), dark)
         self.tracks, self.now, self._scene = tuple(tracks), 0.0, scene
         first = tracks[0]
-        self._camera = cameras(first.robot, first.q[len(first) // 2], count=len(tracks))["Robot"]
-        self._camera.show(server)
+        self._camera = cameras(first.robot, first.q[len(first) // 2])["Robot"]
+        wider = 1.0 if len(tracks) == 1 else 1.5
+        replace(self._camera, radius=wider * self._camera.radius).show(server)
         light_lamp(server, self._camera)
         self._shown = [self._add(i, track) for i, track in enumerate(tracks)]
         self.start = float(first.times[0])
@@ -367,8 +368,8 @@ class PlayPage(Page):
     def _aside(self, number: int) -> Array:
         """Where a robot stands."""
         right = np.array([-self._camera.view[1], self._camera.view[0], 0.0])
-        size = self._camera.radius / len(self.tracks)
-        return (number - (len(self.tracks) - 1) / 2) * 1.5 * size * right / np.linalg.norm(right)
+        away = 1.5 * self._camera.radius * (number - (len(self.tracks) - 1) / 2)
+        return away * right / np.linalg.norm(right)
 
     def _add_panel(self) -> None:
         gui, unit = self.server.gui, self.tracks[0].unit

@@ -112,6 +112,19 @@ def test_logs_play_side_by_side(view, robot: ik.ArmHand, tmp_path: Path) -> None
     assert page.now in {one for track in page.tracks for one in track.eventful}
 
 
+def test_motions_play(view, robot: ik.ArmHand, tmp_path: Path) -> None:
+    times = np.linspace(0.0, 2.0, 41)
+    q = robot.home + 0.1 * np.sin(times)[:, None] * (np.arange(len(robot.home)) == 2)
+    ik.motion.Motion(robot, times, q, 0 * q, 0 * q).write(tmp_path / "way.mcap")
+    page = view(str(tmp_path / "way.mcap")).page
+    page.show(1.23)
+    assert page.work.settle()
+    ((drawn, _),) = page._shown
+    assert np.allclose(drawn.q, q[24])
+    assert "1.20</b> of 2.00 s" in page._told.content
+    assert "lwr_joint_3" in page._charts.content
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

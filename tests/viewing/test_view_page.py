@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import socket
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -60,33 +62,6 @@ def test_links_stand_where_they_hang(cup: viewing.Viewer, rng: np.random.Generat
     for name, place in places.items():
         if name != "/robot":
             assert np.abs(place - links[name.rpartition("/")[2]]).max() < 1e-8
-
-
-def test_an_answer_is_a_turn_a_joint_and_nothing_that_can_wait(
-    cup: viewing.Viewer, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    page, sent, drawn = cup.page, [], []
-    queue, draw = cup._server._websock_server.queue_message, page.draw
-    pose = shifted(page.asked.held["thumb"].control, 0.004, 0.008, 0.004)
-
-    def counted(answer) -> None:
-        sent.clear()
-        draw(answer)
-        drawn.append(list(sent))
-
-    monkeypatch.setattr(page, "draw", counted)
-    monkeypatch.setattr(
-        cup._server._websock_server, "queue_message", lambda m: (sent.append(m), queue(m))
-    )
-    page.drag_control("thumb", pose)
-    assert page.work.settle()
-    kinds = [[type(message).__name__ for message in messages] for messages in drawn]
-    robot = [m for m in drawn[0] if getattr(m, "name", "").startswith("/robot")]
-    assert len(drawn) == 1
-    assert 0 < len(robot) <= len(page.robot.description.movable)
-    # Of the panel the verdict; motors and solutions come once it is drawn.
-    assert kinds[0].count("GuiUpdateMessage") == 2
-    assert len(drawn[0]) < len(robot) + 14
 
 
 def test_a_dragged_normal_is_faced(cup: viewing.Viewer) -> None:
@@ -185,6 +160,86 @@ def test_all_solutions_can_be_gone_through(cup: viewing.Viewer) -> None:
     apart = [np.abs(a - b).max() for i, a in enumerate(shown) for b in shown[:i]]
     assert min(apart) > 0.01
     assert f"{len(shown)} of {len(shown)}" in page._panel._solution.content
+
+
+def test_all_solutions_and_another_method_are_seen_at_once(cup: viewing.Viewer) -> None:
+    page, scene = cup.page, cup._server.scene
+    page.show_ghosts(True)
+    page.compare("enhanced-dls")
+    assert page.work.settle()
+    drawn = set(scene._handle_from_node_name)
+    assert sum(name.startswith("/ghosts/") for name in drawn) == min(len(page.solutions), 10)
+    assert any(name.startswith("/beside/robot/") for name in drawn)
+    assert "enhanced-dls" in page._panel._beside.content
+    page.show_ghosts(False)
+    page.compare("nothing")
+    assert page.work.settle()
+    left = set(scene._handle_from_node_name)
+    assert not any(name.startswith(("/ghosts/", "/beside")) for name in left)
+
+
+def test_steps_are_taken_back_and_done_again(cup: viewing.Viewer) -> None:
+    page = cup.page
+    places = [page.asked.object_pose[:3, 3]]
+    for step in (0.01, 0.02):
+        page.drag_thing("object", shifted(page.asked.object_pose, 0.0, step, 0.0))
+        assert page.work.settle()
+        places.append(page.asked.object_pose[:3, 3])
+    for do, expected in ((page.undo, 1), (page.undo, 0), (page.redo, 1), (page.reset, 0)):
+        do()
+        assert page.work.settle()
+        assert np.allclose(page.asked.object_pose[:3, 3], places[expected])
+        assert page.answer.success
+
+
+def test_a_dragged_object_is_grasped_all_the_way(cup: viewing.Viewer) -> None:
+    page = cup.page
+    start = page.asked.object_pose
+    for angle in np.linspace(0.0, 2 * np.pi, 30):
+        page.drag_thing("object", shifted(start, *(0.05 * np.cos([angle, angle - 1.6, 2 * angle]))))
+        assert page.work.settle()
+        assert page.answer.success
+
+
+def test_a_page_needs_no_server_once_it_is_written(cup: viewing.Viewer, tmp_path: Path) -> None:
+    text = cup.to_html(tmp_path / "scene.html")
+    assert (tmp_path / "scene.html").read_text(encoding="utf-8") == text
+    assert "<title>cup</title>" in text
+    assert "__VISER_EMBED_DATA__" in text
+    assert not re.search(r'(src|href)="https?://', text)
+
+
+def test_another_robot_grasp_and_scene_are_opened(robot: ik.ArmHand) -> None:
+    viewer = viewing.view_grasp(robot, ik.load_grasp("cup"))
+    assert "collision not checked" in viewer.page.answer.sentence
+    opened = (
+        ({"scene": "table"}, "cup", "table"),
+        ({"grasp": "mug"}, "mug", "table"),
+        ({"robot": "ar10"}, "", "table"),
+        ({"scene": ""}, "", None),
+    )
+    for wanted, grasp, scene in opened:
+        before = viewer.page
+        before.open(**wanted)
+        before.work.settle()
+        page = viewer.page
+        assert page is not before
+        assert page.asked.name == grasp
+        assert (page.asked.scene and page.asked.scene.name) == scene
+        assert page.answer.success
+    viewer.page.open(robot="no such robot")
+    assert viewer.page.work.settle()
+    assert viewer.page.robot.name == "ar10"
+    viewer.stop()
+
+
+def test_a_moved_scene_is_saved_as_it_stands(cup: viewing.Viewer, tmp_path: Path) -> None:
+    page = cup.page
+    page.drag_thing("table", shifted(page.asked.scene.items["table"].pose, 0.1, 0.0, -0.05))
+    assert page.work.settle()
+    (tmp_path / "moved.yaml").write_text(page.asked.scene.text())
+    again = ik.load_scene(tmp_path / "moved.yaml")
+    assert np.allclose(again.items["table"].pose, page.asked.scene.items["table"].pose)
 
 
 def test_motors_moved_by_hand_are_judged_and_not_solved(cup: viewing.Viewer) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 import casadi_ik as ik
 from casadi_ik.drawing.drawables import bodies, item_of
-from casadi_ik.drawing.surfaces import arrow, ball, facing, sharp
+from casadi_ik.drawing.surfaces import arrow, sharp
 from casadi_ik.files.reading import Frame, frame_matrix
 from casadi_ik.kernels.cancellation import stop_if_cancelled
 from casadi_ik.viewing import request_of
@@ -35,39 +35,6 @@ def test_quaternions_are_those_of_rotations_of_any_angle(rng: np.random.Generato
     poses = np.array([pose_of(np.zeros(3), one) for one in wxyz])
     again = np.array([pose_of(np.zeros(3), one) for one in quaternions(poses[:, :3, :3])])
     assert np.allclose(again, poses, atol=1e-12)
-
-
-def test_a_control_faces_along_the_normal(rng: np.random.Generator) -> None:
-    for normal in (*rng.normal(size=(20, 3)), *np.eye(3), *-np.eye(3)):
-        pose = facing(np.ones(3), normal)
-        assert np.allclose(pose[:3, 0], normal / np.linalg.norm(normal))
-        assert np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
-        assert np.linalg.det(pose[:3, :3]) > 0
-
-
-def test_dragging_a_control_moves_all_that_the_contact_asks_for(robot: ik.ArmHand) -> None:
-    contact = ik.Contact([0.5, 0.1, 0.6], [0, 0, 1], line=[1, 0, 0])
-    asked = request_of(robot, ik.Grasp({"thumb": contact}), None)
-    step = turned(0.1, 0.0, -0.1)
-    moved = asked.with_control("thumb", step @ asked.held["thumb"].control)
-    found, expected = moved.grasp.contacts["thumb"], contact.at(step)
-    for name in ("point", "normal", "line"):
-        assert np.allclose(getattr(found, name), getattr(expected, name))
-    assert list(moved.grasp.contacts) == ["thumb"]
-
-
-def test_contacts_move_with_the_object(robot: ik.ArmHand) -> None:
-    grasp = ik.load_grasp("cup")
-    asked, pose = request_of(robot, grasp, None), turned(-0.7, 0.2, 0.5)
-    moved = asked
-    for share in (0.25, 0.5, 1.0):  # in steps, as a drag comes
-        here = pose.copy()
-        here[:3, 3] = share * pose[:3, 3] + (1 - share) * grasp.object_pose[:3, 3]
-        moved = moved.with_object(here)
-    expected = grasp.in_object_frame().at(pose)
-    for finger, contact in expected.contacts.items():
-        assert np.allclose(moved.grasp.contacts[finger].point, contact.point, atol=1e-9)
-        assert np.allclose(moved.grasp.contacts[finger].normal, contact.normal, atol=1e-9)
 
 
 def test_a_finger_may_be_left_free_but_not_all(robot: ik.ArmHand) -> None:
@@ -144,19 +111,6 @@ def test_what_can_wait_is_given_up_when_the_hand_moves_on() -> None:
     work.stop()
 
 
-def test_what_can_wait_is_begun_each_after_its_time() -> None:
-    soon, done = threading.Event(), []
-    later = (0.005, soon.set), (60.0, lambda: done.append("later"))
-    work = Newest(lambda: done.append("drawn"), later)
-    work.put("thumb", lambda: None)
-    assert soon.wait(10)
-    assert done == ["drawn"]
-    # Whoever waits for everything does not wait for that.
-    assert work.settle(10)
-    assert done == ["drawn", "later"]
-    work.stop()
-
-
 def test_a_change_that_fails_does_not_end_the_page(caplog: pytest.LogCaptureFixture) -> None:
     done = []
     work = Newest(lambda: done.append("drawn"))
@@ -190,13 +144,6 @@ def test_bodies_are_closed_and_wind_outwards() -> None:
             assert np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6 > 0
             # What is closed has no area in sum.
             assert np.allclose(np.cross(b - a, c - a).sum(axis=0), 0, atol=1e-9)
-
-
-def test_edges_are_sharp_and_round_sides_are_not() -> None:
-    (box,) = ik.Scene({"box": {"kind": "box", "size": [1, 1, 1]}}).items.values()
-    (body,) = item_of(box, np.zeros(3))
-    assert len(sharp(body.surface).points) == 6 * 4 + 2  # lids have a middle
-    assert len(sharp(ball(1.0).surface).points) == len(ball(1.0).surface.points)
 
 
 def test_nothing_is_written_where_pads_are_not_stated(description: Path) -> None:

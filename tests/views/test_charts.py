@@ -146,15 +146,3 @@ def test_a_threshold_that_was_passed_is_a_line_with_a_name(long_log):
         r for r in long_log.events(event="NEAR_SINGULAR").records() if r["jacobian"] == "arm"
     ][:1]
     assert set(named["arm: near singular"].get_ydata()) == {event["threshold"]}
-
-
-def test_no_two_lines_of_a_panel_look_alike(long_log):
-    axes = next(
-        axes for axes in drawn(long_log).axes if axes.get_title("left").startswith("actuators")
-    )
-    looks = {
-        (line.get_color(), str(line._dash_pattern))
-        for line in axes.lines
-        if len(line.get_ydata()) > 2
-    }
-    assert len(looks) == long_log.iterations().rows["q"].shape[1]
