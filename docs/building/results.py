@@ -24,7 +24,8 @@ def results_table() -> str:
 
 
 def _reports() -> list[Path]:
-    return sorted([*FOLDER.rglob("report.md"), *FOLDER.rglob("README.md")])
+    found = [*FOLDER.rglob("report.md"), *FOLDER.rglob("README.md")]
+    return sorted(found, key=lambda report: report.parent)
 
 
 @cache
