@@ -456,15 +456,11 @@ def pieces_of(points: Array, triangles: NDArray[np.int64]) -> list[Mesh]:
     of_triangle = np.arange(len(edges)) % len(triangles)
     order = np.lexsort((of_triangle, edges))
     of_two = of_triangle[order[counts[edges[order]] % 2 == 0]].reshape(-1, 2)
-    labels = np.arange(len(triangles))
-    while True:
-        least = labels[of_two].min(axis=1)
-        new = labels.copy()
-        np.minimum.at(new, of_two.ravel(), np.repeat(least, 2))
-        new = new[new]
-        if (new == labels).all():
-            break
-        labels = new
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    meeting = coo_array((np.ones(len(of_two)), of_two.T), shape=(len(triangles),) * 2)
+    _, labels = connected_components(meeting, directed=False)
     found: list[Mesh] = []
     for label in np.unique(labels):
         kept, numbers = np.unique(triangles[labels == label], return_inverse=True)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -245,19 +244,7 @@ def cut(triangles: Array) -> Array:
     return np.asarray(finer[0][finer[1]], dtype=float)
 
 
-class Holder(Protocol):
-    """A shape that holds part of a mesh."""
-
-    def skin(self) -> Array:
-        """(k, 3) points of its surface."""
-        ...
-
-    def beyond(self, points: Array) -> Array:
-        """(k,) positive for points (k, 3) outside."""
-        ...
-
-
-def excess(shapes: Sequence[Holder], points: Array) -> float:
+def excess(shapes: Sequence[FittedCapsule | FittedBox], points: Array) -> float:
     """By how much shapes stand out beyond a mesh of points [m], as far as samples show."""
     skin = np.concatenate([one.skin() for one in shapes])
     inside = np.min([one.beyond(skin) for one in shapes], axis=0) < -1e-6

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
@@ -15,26 +15,6 @@ from casadi_ik.errors import MissingExtraError
 from casadi_ik.importing.robot_shapes import hand_links, name_in_robot
 from casadi_ik.robots.robot_files.mjcf_file import joint_name
 from casadi_ik.robots.robot_files.tree import RobotTree
-
-
-class Oracle(Protocol):
-    """Poses of a file's links as its own library finds them."""
-
-    def poses(self, values: Mapping[str, float]) -> dict[str, Array]:
-        """(4, 4) poses of the links, in any one frame, from the positions of the file's joints."""
-        ...
-
-
-def oracle(tree: RobotTree) -> Oracle:
-    """Pinocchio for URDF, MuJoCo for MJCF.
-
-    Raises:
-        MissingExtraError: The library is not installed.
-    """
-    if tree.model is not None:
-        return _MuJoCo(*tree.model)
-    assert tree.element is not None
-    return _Pinocchio(tree.element)
 
 
 def largest_difference(
@@ -63,7 +43,7 @@ def largest_difference(
     Raises:
         MissingExtraError: Its library is not installed.
     """
-    known = oracle(tree)
+    known = _MuJoCo(*tree.model) if tree.model is not None else _Pinocchio(tree.element)
     taken = set() if beside is None else _names(beside)
     links = {link: name_in_robot(link, robot.description.links, taken) for link in tree.links}
     if beside is not None or carried is not None:
@@ -128,20 +108,17 @@ def _bare(element: Element) -> Element:
     return plain
 
 
-def _pinocchio() -> Any:
-    try:
-        import pinocchio as module
-    except ImportError as error:
-        raise MissingExtraError(
-            "URDF files are checked by pinocchio, which is not installed (there is none for "
-            "Windows): pip install 'casadi-ik[reference]'"
-        ) from error
-    return module
-
-
 class _Pinocchio:
-    def __init__(self, element: ElementTree.Element) -> None:
-        self._pin: Any = _pinocchio()
+    def __init__(self, element: Element | None) -> None:
+        assert element is not None  # of a URDF
+        try:
+            import pinocchio
+        except ImportError as error:
+            raise MissingExtraError(
+                "URDF files are checked by pinocchio, which is not installed (there is none for "
+                "Windows): pip install 'casadi-ik[reference]'"
+            ) from error
+        self._pin: Any = pinocchio
         text = ElementTree.tostring(_bare(element), encoding="unicode")
         self._model = self._pin.buildModelFromXML(text)
         self._data = self._model.createData()
