@@ -111,14 +111,13 @@ def dragged(finger: str, *by: float) -> Use:
 
 
 def gone_through(shown: GraspPage, page: Any) -> None:
-    """The best of the choices, and all its solutions at once, seen with the whole arm."""
+    """The best of the choices, and its solutions, seen with the whole arm."""
     shown.choose(next(iter(shown.candidates)))
     shown.work.settle()
     time.sleep(2.0)
     for found in (
         "[...document.querySelectorAll('.mantine-Paper-root *')]"
         ".findLast(one => one.innerText?.trim() === 'Solutions')",
-        "document.querySelector('input[type=checkbox]')",
         "[...document.querySelectorAll('button')].find(one => one.innerText.trim() === 'Robot')",
     ):
         box = page.evaluate(

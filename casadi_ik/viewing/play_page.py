@@ -290,7 +290,7 @@ class PlayPage(Page):
         self.tracks, self.now, self._scene = tuple(tracks), 0.0, scene
         first = tracks[0]
         self._camera = cameras(first.robot, first.q[len(first) // 2])["Robot"]
-        wider = 1.0 if len(tracks) == 1 else 1.5
+        wider = 1.0 if len(tracks) == 1 else 1.65
         replace(self._camera, radius=wider * self._camera.radius).show(server)
         light_lamp(server, self._camera)
         self._shown = [self._add(i, track) for i, track in enumerate(tracks)]

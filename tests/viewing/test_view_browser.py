@@ -16,7 +16,8 @@ from browser import CHROMIUM, Browser, Page
 import casadi_ik as ik
 from casadi_ik import viewing
 
-SIZE, pose_of = viewing.drawn.CONTACT_CONTROL, viewing.drawn.pose_of
+SIZE, THING = viewing.drawn.CONTACT_CONTROL, viewing.drawn.THING_CONTROL
+pose_of = viewing.drawn.pose_of
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium (Debian: apt chromium)")
 
@@ -99,8 +100,9 @@ def press(page: Page, label: str, of: str = "button") -> None:
     """Press what has a label, by mouse, once it stays where it is."""
     where = (
         f"(() => {{ const b = [...document.querySelectorAll({of!r})]"
-        f".find(b => b.innerText.trim() === {label!r})?.getBoundingClientRect();"
-        " return b && b.width && [b.x + b.width / 2, b.y + b.height / 2]; })()"
+        f".find(b => b.innerText.trim() === {label!r}); b?.scrollIntoView({{block: 'center'}});"
+        " const r = b?.getBoundingClientRect();"
+        " return r && r.width && [r.x + r.width / 2, r.y + r.height / 2]; })()"
     )
     place, before = page.wait(where), None
     while place != before:
@@ -117,11 +119,26 @@ def arrived(file: Path) -> None:
     assert file.is_file(), sorted(one.name for one in file.parent.iterdir())
 
 
-def test_a_contact_is_dragged_by_mouse_and_reached(cup: viewing.Viewer, browser: Browser) -> None:
+def test_object_and_contact_are_dragged_by_mouse_and_reached(
+    cup: viewing.Viewer, browser: Browser
+) -> None:
     page, client = opened(browser, cup)
     time.sleep(1.5)  # the camera comes to rest
     assert said(page, ".ik-status") == "SOLVED"
     shown, robot = cup.page, cup.page.robot
+    # The object is the first handle, and takes its contacts along.
+    place = shown.asked.object_pose[:3, 3]
+    before = shown.asked.grasp.contacts["thumb"].point
+    drag_along(page, client, shown.asked.object_pose, 0.02, THING)
+    page.wait("document.querySelector('.ik-status') !== null")
+    assert shown.work.settle()
+    gone = shown.asked.object_pose[:3, 3] - place
+    assert 0.004 < np.linalg.norm(gone) < 0.06
+    assert np.allclose(shown.asked.grasp.contacts["thumb"].point - before, gone, atol=1e-9)
+    assert shown.answer.success
+    shown.select("thumb")
+    assert shown.work.settle()
+    time.sleep(0.5)
     before = shown.asked.grasp.contacts["thumb"].point
     drag_along(page, client, shown.asked.held["thumb"].control, 0.012)
     page.wait("document.querySelector('.ik-status') !== null")
