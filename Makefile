@@ -76,7 +76,7 @@ bench: $(VENV)/dev.stamp
 	$(BIN)/python studies/bench.py --report out/bench
 
 notebooks: $(VENV)/dev.stamp
-	$(BIN)/jupyter execute --inplace notebooks/*.ipynb
+	CASADI_IK_COMPILE=wait $(BIN)/jupyter execute --inplace notebooks/*.ipynb
 
 clean:
 	rm -rf $(VENV) out

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
 
@@ -192,7 +192,7 @@ class Diagnosis(Shown):
     nearest: Mapping[str, NearContact]
     q: Array
     time: float
-    lazy: Lazy
+    lazy: Lazy = field(repr=False)
     palm: PalmVerdict | None = None
 
     def __repr__(self) -> str:

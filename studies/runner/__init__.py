@@ -3,9 +3,13 @@
 Needs the extra `studies`.
 """
 
+import os
 from importlib.util import find_spec
 
 from casadi_ik.errors import MissingExtraError
+
+# What is timed is compiled.
+os.environ.setdefault("CASADI_IK_COMPILE", "wait")
 
 for _name in ("joblib", "markdown_it", "matplotlib", "polars"):
     if find_spec(_name) is None:
