@@ -168,7 +168,7 @@ function post(at) {
 // The camera: hand and object fill the picture, the whole robot is in the corner; or the other way.
 function lookAtAll(whole = false) {
   now.body.place(now.answer.q);
-  const { close, whole: far } = now.grasp.views, object = cornersOf(now.object);
+  const { close: preferred, whole: far } = now.grasp.views, object = cornersOf(now.object);
   const all = [...now.body.corners(false), ...object];
   const hand = [...now.body.corners(true), ...object, ...placed()];
   stage.near = !whole;
@@ -176,8 +176,10 @@ function lookAtAll(whole = false) {
   by("inset").className = whole ? "swap" : "inset";
   by("inset").firstElementChild.textContent = whole ? "Show the hand" : "whole robot";
   by("inset").setAttribute("aria-label", whole ? "Show the hand" : "Show the whole robot");
+  const stands = now.obstacle ? places(now.obstacle.solids) : [];
+  const close = stage.side(preferred, [...placed(), ...object], now.body.parts.map(({ mesh }) => mesh));
   stage.lookWhole(far, all);
-  stage.look(whole ? far : close, whole ? all : hand);
+  stage.look(whole ? far : close, [...(whole ? all : hand), ...stands]);
   draw();
 }
 
@@ -467,8 +469,10 @@ by("fold").addEventListener("click", () => fold(!document.body.classList.contain
 by("inset").addEventListener("click", () => now.answer && lookAtAll(stage.near));
 by("obstacle").addEventListener("change", (event) => {
   if (!now.answer) return;
-  if (event.target.checked) put();
-  else {
+  if (event.target.checked) {
+    put();
+    lookAtAll(!stage.near);
+  } else {
     now.obstacle?.removeFromParent();
     now.obstacle = null;
   }

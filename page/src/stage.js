@@ -6,6 +6,14 @@ const FLOOR = { light: [0xaab4be, 0xd3dae1, 0.18], dark: [0x4b5a69, 0x28323c, 0.
 const AROUND = 1.2; // of what has to be seen, left free about it
 const INSET = { part: 0.3, most: 230, edge: 12 }; // of the width; [pixels]
 
+const TIP = 0.02; // how far what touches a point may be from it [m]
+
+// To where a picture is taken from: by azimuth and elevation [rad].
+function outOf([azimuth, elevation]) {
+  const flat = Math.cos(elevation);
+  return new THREE.Vector3(flat * Math.cos(azimuth), flat * Math.sin(azimuth), Math.sin(elevation));
+}
+
 export class Stage {
   constructor(canvas) {
     this.canvas = canvas;
@@ -60,9 +68,8 @@ export class Stage {
   }
 
   // Puts a camera where it sees all points from a side, and nothing else fits.
-  aim(camera, [azimuth, elevation], points) {
-    const flat = Math.cos(elevation);
-    const out = new THREE.Vector3(flat * Math.cos(azimuth), flat * Math.sin(azimuth), Math.sin(elevation));
+  aim(camera, side, points) {
+    const out = outOf(side), [azimuth] = side;
     const right = new THREE.Vector3(-Math.sin(azimuth), Math.cos(azimuth), 0);
     const up = out.clone().cross(right);
     const tall = Math.tan((camera.fov * Math.PI) / 360) / AROUND, wide = tall * camera.aspect;
@@ -89,6 +96,26 @@ export class Stage {
     camera.lookAt(center);
     camera.updateMatrixWorld();
     return { center, away };
+  }
+
+  // The side near a preferred one from which most of some points are seen past bodies.
+  side(preferred, points, bodies) {
+    const caster = new THREE.Raycaster(), way = outOf(preferred);
+    const seen = (out) =>
+      points.filter((point) => {
+        // Fingertips that touch a point do not hide it.
+        caster.set(point.clone().addScaledVector(out, TIP), out);
+        return !caster.intersectObjects(bodies, false).length;
+      }).length;
+    let best = preferred, most = -Infinity;
+    for (let i = 0; i < 16; ++i) {
+      for (const elevation of [0.15, 0.35, 0.6]) {
+        const side = i ? [preferred[0] + (i * Math.PI) / 8, elevation] : preferred, out = outOf(side);
+        const score = seen(out) / points.length + 0.1 * out.dot(way);
+        if (score > most + 1e-9) [best, most] = [side, score];
+      }
+    }
+    return best;
   }
 
   // Looks at points from a side.
