@@ -60,9 +60,7 @@ export class Grip {
     this.stage.controls.enabled = false;
     this.stage.canvas.setPointerCapture(event.pointerId);
     this.stage.canvas.classList.add("held");
-    this.stage.canvas.focus({ preventScroll: true });
     event.stopImmediatePropagation();
-    event.preventDefault();
   }
 
   at(event) {

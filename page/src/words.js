@@ -4,7 +4,7 @@ export const millimetres = mm;
 export const degrees = (angle) => `${((180 / Math.PI) * angle).toFixed(1)}°`;
 export const plain = (name) => name.replaceAll("_", " ");
 
-const FLIP = 0.8; // [rad] of one motor of the arm at once
+const FLIP = Math.PI / 4; // [rad] of one motor of the arm at once
 const apart = (a, b) => Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]);
 
 // What is nearest to touching when all is met.

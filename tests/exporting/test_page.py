@@ -172,8 +172,13 @@ def the_answer_is_copied(page: Page) -> None:
 
 def a_link_has_the_question(page: Page, browser: Browser, url: str) -> None:
     """What is asked is asked by whoever opens the link; a broken one is said to be broken."""
+    shown = "[...casadiIk.now.shown]"
+    page.evaluate("document.getElementById('reset').click()")
+    pressed(page, "ArrowUp")
+    settled(page)
     other = opened(browser, copied(page, "link"), 900, 600)
     assert np.allclose(asked(other), asked(page), atol=1e-4)
+    assert np.allclose(other.evaluate(shown), page.evaluate(shown), atol=2e-3)
     assert now(other, "answer.status") == ik.Status.SOLVED
     said = "document.getElementById('note').textContent"
     other = opened(browser, f"{url}#robot={ROBOT}&grasp=apple&points=1,nan,2", 900, 600)
@@ -210,7 +215,7 @@ def an_obstacle_is_kept_clear_of(page: Page, robot: ik.ArmHand) -> None:
     settled(page)
     goal = page.evaluate("casadiIk.pixel('point 0')")
     ends = set()
-    for part in (0.3, 0.7):
+    for part in (0.05, 0.7):
         x, y = page.evaluate("casadiIk.pixel('obstacle')")
         page.drag((x, y), (x + part * (goal[0] - x), y + part * (goal[1] - y)), steps=3)
         settled(page)
