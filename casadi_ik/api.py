@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Generator, Iterable, Mapping, Sequence
-from copy import copy
 from os import PathLike
 from typing import Any, Self
 
@@ -599,11 +598,18 @@ class Solver(MovingSolver):
         check = self._engine.check
         if check is None:
             raise InputError(f"{name!r} cannot be moved: the solver has no scene")
-        other = copy(self)
+        # Not `copy`, which builds what is unpickled anew.
+        other = object.__new__(type(self))
+        other.__dict__.update(self.__dict__)
         moved = check.moved(name, one_pose(pose))
         other.scene, other._engine = moved.scene, self._engine.about(moved)
         other._asked = (*self._asked[:-1], moved.scene)
         return other
+
+    @property
+    def scene_check(self) -> SceneCheck | None:
+        """What tells whether configurations touch anything; None without a scene."""
+        return self._engine.check
 
     def check(self, q: ArrayLike, grasp: Grasp) -> Clearances | None:
         """How far configurations are from touching anything they must not touch.

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, overload
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,7 +18,6 @@ from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import InputError
 from casadi_ik.grasps import Contact, Grasp, Tolerance
 from casadi_ik.grasps.pose import one_pose
-from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.touch.candidates import (
     Candidates,
     Generator,
@@ -178,11 +178,9 @@ def grasps_of(
     _check(fingers, mu, hold, limit, prefer)
     fingers = min(fingers, len(robot.fingers))
     table = HandTable.of(robot)
-    scene = (solver.scene or Scene()).holding(surface.name, place)
-    hands = HandCheck(table, SceneCheck(robot, scene), place)
+    arms, judge = _solvers(solver, surface, place, chosen)
+    hands = HandCheck(table, judge.scene_check, place)
     generator = Generator(table, surface, fingers, chosen, np.random.default_rng(seed), hands)
-    kinds = {"tolerance": Tolerance(chosen.touch, chosen.turned / 15), "options": {"max_rounds": 1}}
-    arms, judge = type(solver)(robot, **kinds), type(solver)(robot, scene=scene, **kinds)
     start = None if q0 is None else robot.configuration(q0)
     parts: list[_Made] = []
     attempts = chosen.attempts // 5
@@ -199,6 +197,26 @@ def grasps_of(
     return _ranked(
         robot, generator, hands, parts, place, limit, prefer, start, time.process_time() - begin
     )
+
+
+_SOLVERS: WeakKeyDictionary[Any, dict[tuple[str, TouchParameters], tuple[Any, Any]]] = (
+    WeakKeyDictionary()
+)
+
+
+def _solvers(
+    solver: Any, surface: Surface, place: Array, chosen: TouchParameters
+) -> tuple[Any, Any]:
+    """What solves palms, and what judges grasps with the object in the scene; made once."""
+    made, key = _SOLVERS.setdefault(solver, {}), (surface.name, chosen)
+    if key not in made:
+        kinds = {"tolerance": Tolerance(chosen.touch, chosen.turned / 15)}
+        kinds |= {"options": {"max_rounds": 1}}
+        scene = (solver.scene or Scene()).holding(surface.name, place)
+        one = type(solver)
+        made[key] = one(solver.robot, **kinds), one(solver.robot, scene=scene, **kinds)
+    arms, judge = made[key]
+    return arms, judge.moved(surface.name, place)
 
 
 def _check(
