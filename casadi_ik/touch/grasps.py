@@ -130,7 +130,8 @@ class FoundGrasps(Sequence[FoundGrasp]):
         lines.append(f"best by {self.prefer}:")
         for place, one in enumerate(self.entries[:10], 1):
             room = "" if one.clearance is None else f", clearance {1e3 * one.clearance:.1f} mm"
-            lines.append(f"  {place}. {one.score:.4g}, load {one.load:.3f} N/N{room}")
+            score = "" if self.prefer == "load" else f"{self.prefer} {one.score:.4g}, "
+            lines.append(f"  {place:>2}. {score}load {one.load:.3f} N/N{room}")
         return tuple(lines)
 
     def __str__(self) -> str:
