@@ -185,16 +185,18 @@ def grasps_of(
     start = None if q0 is None else robot.configuration(q0)
     parts: list[_Made] = []
     attempts = chosen.attempts // 5
-    distinct, tried = 0, 0
-    while generator.fits and distinct < limit and tried < chosen.most:
+    distinct: list[int] = []
+    seen = tried = 0
+    while generator.fits and len(distinct) < limit and tried < chosen.most:
         some = generator.candidates(attempts)
         tried, attempts = tried + attempts, chosen.attempts
         made = _made(generator, some, arms, judge, place, mu, hold, jobs, start)
         if made is not None:
             parts.append(made)
-            distinct = len(
-                _distinct(parts, np.arange(sum(len(p.rows) for p in parts)), limit, chosen)
-            )
+            new, known = np.arange(seen, seen + len(made.rows)), len(distinct)
+            distinct, seen = _distinct(parts, new, limit, chosen, distinct), seen + len(new)
+            if len(new) > limit and len(distinct) == known:
+                break  # so many grasps, and each is like one found before
     return _ranked(
         robot, generator, hands, parts, place, limit, prefer, start, time.process_time() - begin
     )
@@ -292,15 +294,19 @@ FORCES = [0, 1, 2, 6, 7, 8]
 
 
 def _distinct(
-    parts: list[_Made], order: NDArray[np.intp], limit: int, chosen: TouchParameters
+    parts: list[_Made],
+    order: NDArray[np.intp],
+    limit: int,
+    chosen: TouchParameters,
+    before: Sequence[int] = (),
 ) -> list[int]:
-    """Of all grasps in an order the first of those that are alike, at most so many."""
+    """Of all grasps in an order the first of those that are alike, after those kept before."""
     if not parts:
         return []
     palm = np.concatenate([part.some.palm for part in parts])
     used = np.concatenate([part.some.used for part in parts])
     tips = np.concatenate([part.some.tips for part in parts])
-    kept: list[int] = []
+    kept = list(before)
     for row in order.tolist():
         if len(kept) >= limit:
             break

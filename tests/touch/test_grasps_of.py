@@ -159,6 +159,14 @@ def test_what_is_too_large_says_so(tmp_path):
     assert "no two patches" in found.reason
 
 
+def test_the_search_ends_when_nothing_new_is_found(tmp_path):
+    trimesh.creation.box((0.05, 0.05, 0.12)).export(tmp_path / "box.stl")
+    solver = ik.Solver(ik.load_robot("panda+panda_hand"))
+    found = solver.grasps_of(ik.load_surface(tmp_path / "box.stl"), PLACE)
+    assert 0 < len(found) < 200
+    assert found.counts["attempts"] < 200_000
+
+
 @pytest.mark.parametrize(
     ("asked", "expected"),
     [
