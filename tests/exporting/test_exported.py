@@ -328,7 +328,9 @@ def test_kernels_compiled_ahead_with_progress(capsys):
     said = capsys.readouterr()
     assert "COMPILED  1 robot in" in said.out
     lines = [line for line in said.err.splitlines() if "kuka_lwr_barrett" in line]
-    assert [line.split()[3] for line in lines] == [f"{i}/3:" for i in (1, 2, 3)]
+    numbers = [line.split()[3] for line in lines]
+    assert len(numbers) > 1
+    assert numbers == [f"{i}/{len(numbers)}:" for i in range(1, len(numbers) + 1)]
 
 
 def test_without_a_compiler_nothing_is_compiled_ahead(monkeypatch, capsys):

@@ -88,6 +88,8 @@ def fields_equal(a: ik.BatchSolution, b: ik.BatchSolution, rows=slice(None)) -> 
             assert set(left) == set(right)
             for name in left:
                 np.testing.assert_array_equal(left[name][rows], right[name])
+        elif item.name == "arm_hand":
+            assert left.urdf() == right.urdf()
         elif not isinstance(left, np.ndarray):
             assert left == right
         elif item.name != "time":

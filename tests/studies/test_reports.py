@@ -39,7 +39,7 @@ def test_printed_table():
 
 
 def test_table_one(tmp_path, monkeypatch):
-    monkeypatch.setattr(qiu_report, "CURVES", 1)
+    monkeypatch.setattr(qiu_report, "RUNS", 1)
     monkeypatch.setattr(qiu_report, "LONGEST", 20)
     out, report = tmp_path / "results", tmp_path / "report"
     common = ["--out", str(out), "--report", str(report), "--block", "2"]
