@@ -32,6 +32,7 @@ class TouchParameters:
         object_pairs: Pairs of patches that are drawn.
         attempts: Pairs of hand and object that are tried at once; a fifth of it at first.
         most: Attempts after which no more are made.
+        lost: Hands after which no more are tried if the arm has reached none of them.
         lean: Fingertips lean by at most this angle at first [rad].
         near: A further fingertip is at most this far from the surface at first [m].
         clear: Fingertips that do not touch are at least this far from it [m].
@@ -52,6 +53,7 @@ class TouchParameters:
     object_pairs: int = 400_000
     attempts: int = 20_000
     most: int = 1_000_000
+    lost: int = 300
     lean: float = float(np.deg2rad(25.0))
     near: float = 4e-3
     clear: float = 8e-3

@@ -191,6 +191,9 @@ def grasps_of(
         some = generator.candidates(attempts)
         tried, attempts = tried + attempts, chosen.attempts
         made = _made(generator, some, arms, judge, place, mu, hold, jobs, start)
+        clear = generator.counts["still clear"]
+        if made is None and clear >= chosen.lost and not generator.counts.get("arm reaches"):
+            break
         if made is not None:
             parts.append(made)
             new, known = np.arange(seen, seen + len(made.rows)), len(distinct)

@@ -188,3 +188,12 @@ def test_millimetres_are_told(tmp_path):
     with pytest.raises(errors.InputError, match=r"scale=0\.001 is for millimetres"):
         ik.load_surface(tmp_path / "can.stl")
     assert ik.load_surface(tmp_path / "can.stl", scale=0.001).size == pytest.approx(0.137, abs=2e-3)
+
+
+def test_what_is_out_of_reach_is_given_up(surface):
+    far = PLACE.copy()
+    far[0, 3] = 5.0
+    found = ik.Solver(ik.load_robot("panda+panda_hand")).grasps_of(surface, far)
+    assert not len(found)
+    assert "none came to: arm reaches" in found.reason
+    assert found.counts["attempts"] < 100_000
