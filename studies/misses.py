@@ -508,12 +508,13 @@ def heat_map(rows: list[Row], path: Path) -> None:
             around = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
             axes.text(j, i, str(missed), ha="center", va="center", fontsize=9, color="#c0392b",
                       bbox=around)  # fmt: skip
-    scale = LogNorm(np.nanmin(ratios), np.nanmax(ratios))
+    least, most = float(np.nanmin(ratios)), float(np.nanmax(ratios))
+    scale = LogNorm(least, most)
     image = axes.imshow(ratios, cmap="YlGnBu", norm=scale, alpha=0.8, aspect="auto")
     axes.set_xticks(range(len(hands)), hands, rotation=45, ha="right")
     axes.set_yticks(range(len(arms)), arms)
     bar = drawn.colorbar(image, ax=axes, shrink=0.7)
-    ticks = [t for t in (0.5, 1, 2, 3, 5, 10, 20) if scale.vmin <= t <= scale.vmax]
+    ticks = [t for t in (0.5, 1, 2, 3, 5, 10, 20) if least <= t <= most]
     bar.set_ticks(ticks, labels=[f"{t:g}" for t in ticks])
     bar.ax.minorticks_off()
     bar.set_label(f"time of a target over that of {REFERENCE}")
