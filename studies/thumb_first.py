@@ -112,7 +112,7 @@ proxsuite {version("proxsuite")}, {platform.machine()}.
 
 Fixing the worst joint at its limit and solving again takes the same way as the quadratic program,
 which may let go of a joint again: both solve alike in as many iterations. Fixing them can be
-compiled with the rest of the iteration, and is faster in the virtual machine as well; so it is the
+compiled with the rest of the iteration, which the time shows; so it is the
 default, and ProxQP remains as `options={{"step": "proxqp"}}`.
 """
     write(given.out, "thumb_first", drawn, text)
