@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -93,8 +93,34 @@ class Finger:
 
 
 @dataclass(frozen=True, eq=False)
+class Side:
+    """An arm with a hand of a robot that has several, or that stands on a trunk.
+
+    Attributes:
+        name: Unique name ("left").
+        palm_link: Link that its palm frame sits on.
+        palm_placement: (4, 4) pose of the palm frame in that link.
+        named_thumb: Name of its finger placed first; None if the description names none.
+        fingers: Names of its fingers.
+        arm: Names of the motors between the trunk and the palm.
+        hand: Names of the motors beyond the palm.
+    """
+
+    name: str
+    palm_link: str
+    palm_placement: Array
+    named_thumb: str | None
+    fingers: tuple[str, ...]
+    arm: tuple[str, ...]
+    hand: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
 class RobotDescription:
-    """An arm-hand (or a hand alone on a fixed base).
+    """An arm-hand, a hand alone on a fixed base, or a body: arm-hands on a common trunk.
+
+    A body is one tree like any other robot. Its palm is its root and all of its motors count as
+    motors of the hand; `sides` and `trunk` say which of them are whose.
 
     Attributes:
         name: Name of the description.
@@ -109,6 +135,9 @@ class RobotDescription:
         sources: Where the numbers come from, by tag.
         shapes: Of its links, for collisions; none where they are not described.
         path: The file that it was read from; None: its parts are shipped.
+        sides: Of a body, its arm-hands; none of an arm-hand or a hand.
+        trunk: Of a body, the motors that move every palm: a waist, a lift, a mobile base.
+        trunk_link: Of a body, the link that the sides stand on.
     """
 
     name: str
@@ -123,6 +152,9 @@ class RobotDescription:
     sources: dict[str, str]
     shapes: Shapes = NO_SHAPES
     path: Path | None = None
+    sides: tuple[Side, ...] = ()
+    trunk: tuple[str, ...] = ()
+    trunk_link: str = ""
 
     @property
     def thumb(self) -> str:
@@ -259,13 +291,69 @@ class RobotDescription:
 
     @cached_property
     def arm_actuators(self) -> tuple[int, ...]:
-        """Positions in q of the arm's actuators (empty for a hand alone)."""
+        """Positions in q of the arm's actuators (empty for a hand alone, and for a body)."""
+        if self.sides:
+            return ()
         return tuple(i for i, a in enumerate(self.actuators) if a.part == "arm")
 
     @cached_property
     def hand_actuators(self) -> tuple[int, ...]:
         """Positions in q of the hand's actuators: all but the arm's."""
-        return tuple(i for i, a in enumerate(self.actuators) if a.part != "arm")
+        arm = set(self.arm_actuators)
+        return tuple(i for i in range(len(self.actuators)) if i not in arm)
+
+    def side(self, name: str) -> RobotDescription:
+        """An arm-hand of a body by itself, as it stands on the link that ends the trunk.
+
+        Its motors, fingers and links keep their names; q is ordered as in the body.
+
+        Raises:
+            UnknownNameError: There is none; the message lists the sides.
+        """
+        found = next((side for side in self.sides if side.name == name), None)
+        if found is None:
+            sides = ", ".join(side.name for side in self.sides) or "none"
+            raise UnknownNameError(f"robot {self.name!r} has no side {name!r}; its sides: {sides}")
+        parts = dict.fromkeys(found.arm, "arm") | dict.fromkeys(found.hand, "hand")
+        places = {i for i, motor in enumerate(self.actuator_names) if motor in parts}
+        kept = set(self.links_moved(places)) | {found.palm_link}
+        for finger in found.fingers:
+            kept.add(self.finger(finger).link)
+        for link in tuple(kept):
+            kept |= {joint.child for joint in self.chain(link)}
+        kept -= {joint.child for joint in self.chain(self.trunk_link)}
+        to_palm = {joint.name for joint in self.chain(found.palm_link)}
+        return replace(
+            self,
+            name=f"{self.name}.{name}",
+            root=self.trunk_link,
+            joints=tuple(joint for joint in self.joints if joint.child in kept),
+            actuators=tuple(
+                replace(motor, part=parts[motor.name])
+                for motor in self.actuators
+                if motor.name in parts
+            ),
+            fingers=tuple(
+                replace(
+                    finger,
+                    joints=tuple(
+                        joint.name
+                        for joint in self.chain(finger.link)
+                        if joint.type != "fixed" and joint.child in kept
+                        if joint.name not in to_palm
+                    ),
+                )
+                for finger in map(self.finger, found.fingers)
+            ),
+            named_thumb=found.named_thumb,
+            palm_link=found.palm_link,
+            palm_placement=found.palm_placement,
+            home=self.home[sorted(places)],
+            shapes=self.shapes.without(set(self.links) - kept - {self.trunk_link}),
+            sides=(),
+            trunk=(),
+            trunk_link="",
+        )
 
     def finger_actuators(self, name: str) -> tuple[int, ...]:
         """Positions in q of the actuators that move a finger relative to the palm.
