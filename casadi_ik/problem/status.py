@@ -73,6 +73,7 @@ class Phase(IntEnum):
     WHOLE_SYSTEM = 8
     BALANCE = 9
     ARM_CHOICE = 10
+    TRUNK = 11
 
     @property
     def label(self) -> str:

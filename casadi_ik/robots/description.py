@@ -302,6 +302,27 @@ class RobotDescription:
         arm = set(self.arm_actuators)
         return tuple(i for i in range(len(self.actuators)) if i not in arm)
 
+    @property
+    def as_hand(self) -> RobotDescription:
+        """A body as a hand on a fixed base, whose motors are all motors there are."""
+        return replace(self, sides=(), trunk=(), trunk_link="") if self.sides else self
+
+    @cached_property
+    def trunk_actuators(self) -> tuple[int, ...]:
+        """Positions in q of the motors that move every palm of a body."""
+        return tuple(self.actuator_index(name) for name in self.trunk)
+
+    @cached_property
+    def side_actuators(self) -> tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]:
+        """Positions in q of the motors of arm and hand, by side."""
+        return tuple(
+            (
+                tuple(map(self.actuator_index, side.arm)),
+                tuple(map(self.actuator_index, side.hand)),
+            )
+            for side in self.sides
+        )
+
     def side(self, name: str) -> RobotDescription:
         """An arm-hand of a body by itself, as it stands on the link that ends the trunk.
 
@@ -327,7 +348,11 @@ class RobotDescription:
             self,
             name=f"{self.name}.{name}",
             root=self.trunk_link,
-            joints=tuple(joint for joint in self.joints if joint.child in kept),
+            joints=tuple(
+                replace(joint, part="arm" if joint.name in to_palm else "hand")
+                for joint in self.joints
+                if joint.child in kept
+            ),
             actuators=tuple(
                 replace(motor, part=parts[motor.name])
                 for motor in self.actuators

@@ -93,6 +93,7 @@ class SearchPlan:
         solve: The loop.
         contacts: Contact points and normals of configurations.
         judge: Errors and excess over limits of a configuration.
+        sides: Of a body, what its sides' hands are found by.
     """
 
     layouts: HandFirstLayouts
@@ -104,6 +105,7 @@ class SearchPlan:
     solve: LoopKernel
     contacts: FunctionKernel
     judge: FunctionKernel
+    sides: tuple[SearchPlan, ...] = ()
 
     @property
     def rounds(self) -> int:
@@ -118,15 +120,14 @@ class SearchPlan:
     @property
     def kernels(self) -> dict[str, Any]:
         """Those that are called, by the names of `KERNELS`."""
-        seeds = self.seeds
-        found = {
-            "look_up": seeds.table.lookup,
-            "begin": self.begin,
-            "solve": self.solve,
-            "contacts": self.contacts,
-            "judge": self.judge,
-        }
-        return found | ({"seen": seeds.seen} if self.mends else {})
+        found = {"begin": self.begin, "solve": self.solve, "judge": self.judge}
+        return found if self.sides else found | {"contacts": self.contacts} | self.of_hands
+
+    @property
+    def of_hands(self) -> dict[str, Any]:
+        """Those that find hands."""
+        found = {"look_up": self.seeds.table.lookup}
+        return found | ({"seen": self.seeds.seen} if self.mends else {})
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -135,7 +136,7 @@ class SearchPlan:
         return {
             "N_FINGERS": len(robot.fingers),
             "N_MOTORS": len(robot.actuators),
-            "N_HAND": len(robot.hand_actuators),
+            "N_HAND": len(layouts.hand),
             "N_TERMS": terms(robot).size,
             "N_STATE": layouts.state.size,
             "N_PARAMETERS": layouts.parameters.size,
@@ -143,12 +144,13 @@ class SearchPlan:
             "N_POOL": self.seeds.pool,
             "N_MENDED": self.seeds.pool if self.mends else 1,
             "N_MORE": len(layouts.contacts.data) - 2,
+            "N_SIDES": len(self.sides),
         }
 
     @property
     def fields(self) -> dict[str, tuple[str, int, str]]:
         """Type, length and meaning of what a search has in memory, all of eight bytes each."""
-        f, n, h, _, state, parameters, candidates, pool, mended, more = self.sizes.values()
+        f, n, h, _, state, parameters, candidates, pool, mended, more, s = self.sizes.values()
         double, whole = "double", "int64_t"
         return {
             "points": (double, 3 * f, "the question: base frame, NaN = free"),
@@ -191,6 +193,7 @@ class SearchPlan:
             "slopes": (double, 6 * f * h, ""),
             "held": (double, h, ""),
             "motion": (double, h, ""),
+            **({"sides": (whole, s, "the sides' searches"), "hands": (whole, s, "")} if s else {}),
         }
 
     def members(self) -> str:
@@ -233,7 +236,7 @@ class SearchPlan:
             "MENDS": int(self.mends),
             "FINGER_FEATURES": FEATURES,
             "ENFORCE_LIMITS": int(self.enforce_limits),
-            "HAS_ARM": int(bool(robot.arm_actuators)),
+            "HAS_ARM": int(bool(layouts.arm)),
             "N_CARRIED": len(self._carried),
             "N_FRESH": len(fresh_fit()),
             "N_COUNTS": len(STAGES),
@@ -255,7 +258,7 @@ class SearchPlan:
         return found
 
     def _real_numbers(self) -> dict[str, float]:
-        options, hand = self.options, len(self.layouts.robot.hand_actuators)
+        options, hand = self.options, len(self.layouts.hand)
         return {
             "LENGTH": LENGTH,
             "ALIKE": options.similar * options.similar * hand,
@@ -276,7 +279,7 @@ class SearchPlan:
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         robot, seeds = self.layouts.robot, self.seeds
-        hand, spreads = list(robot.hand_actuators), seeds.spreads
+        hand, spreads = list(self.layouts.hand), seeds.spreads
         lower, upper = seeds.anywhere_bounds(self.enforce_limits)
         fresh, state = fresh_fit(), self.layouts.state
         return {
@@ -298,6 +301,21 @@ class SearchPlan:
             "TABLE_RANGE": np.array([(spread.upper - spread.lower)[hand] for spread in spreads]),
             "TABLE_SQUEEZE": np.array([1 - spread.at_limits for spread in spreads]),
             "TABLE_ROWS": np.array([spread.count for spread in spreads]),
+            **(self._side_tables() if self.sides else {}),
+        }
+
+    def _side_tables(self) -> dict[str, NDArray[Any]]:
+        """How a body's fingers, hands and motors are shared out; filled up with zeros."""
+        robot = self.layouts.robot
+        motors = [sorted((*arm, *hand)) for arm, hand in robot.side_actuators]
+        places = np.zeros((len(motors), max(map(len, motors))), dtype=np.int64)
+        for i, own in enumerate(motors):
+            places[i, : len(own)] = own
+        return {
+            "SIDE_FINGERS": np.array([len(side.fingers) for side in robot.sides]),
+            "SIDE_HANDS": np.array([len(hand) for _, hand in robot.side_actuators]),
+            "SIDE_MOTORS": np.array([len(own) for own in motors]),
+            "SIDE_PLACES": places,
         }
 
     def _finger_tables(self) -> dict[str, NDArray[Any]]:
@@ -355,18 +373,10 @@ class Searches:
         self._decide: Any = library["casadi_ik_decide"]
         self._find_postures: Any = library["casadi_ik_postures"]
         self._follow = ctypes.cast(library["casadi_ik_follow"], ctypes.c_void_p).value
-        kinds = {"double": np.float64, "int64_t": np.int64}
-        form: list[Any] = [
-            (name, kinds[kind], (length,) if _is_array(name, kind, length) else ())
-            for name, (kind, length, _) in plan.fields.items()
-        ]
-        form += [("tiles", np.int64, (3,)), *((name, np.int64) for name in KERNELS)]
-        self._memory = searches = np.zeros(count, dtype=form)
-        self._kept = plan.kernels, plan.seeds.tables(plan.enforce_limits)
-        for i, table in enumerate(self._kept[1]):
-            searches["tiles"][:, i] = memory(table.lookup.tiles)
-        for name, kernel in self._kept[0].items():
-            searches[name] = ctypes.cast(kernel.entry, ctypes.c_void_p).value
+        self._memory = searches = np.zeros(count, dtype=_form(plan))
+        self._kept = self._called(plan, searches, plan.kernels)
+        for i, side in enumerate(plan.sides):
+            self._kept += self._hands_of(side, i)
         f = len(robot.fingers)
         one = searches[0]
         self.points, self.normals = one["points"].reshape(f, 3), one["normals"].reshape(f, 3)
@@ -385,6 +395,31 @@ class Searches:
             for name in ("most", "iterations", "restarts", "status", "paused")
         )
         self._beyond = ctypes.c_double.from_address(base + offsets["beyond"][1])
+
+    def _called(
+        self, plan: SearchPlan, searches: NDArray[Any], kernels: dict[str, Any]
+    ) -> tuple[Any, ...]:
+        """Write down what searches call; returns what has to be kept meanwhile."""
+        tables = plan.seeds.tables(plan.enforce_limits)
+        for i, table in enumerate(tables):
+            searches["tiles"][:, i] = memory(table.lookup.tiles)
+        for name, kernel in kernels.items():
+            searches[name] = ctypes.cast(kernel.entry, ctypes.c_void_p).value
+        return kernels, tables, searches
+
+    def _hands_of(self, plan: SearchPlan, place: int) -> tuple[Any, ...]:
+        """Memory of a side's searches for hands, one for each search of the body."""
+        name, library = _library(plan)
+        if library is None:
+            raise KernelError(f"{name}: no compiler, and no kernel made ahead")
+        own = np.zeros(len(self._memory), dtype=_form(plan))
+        kept = self._called(plan, own, plan.of_hands)
+        step = own.dtype.itemsize
+        first = memory(own.view(np.uint8))
+        self._memory["sides"][:, place] = first + step * np.arange(len(own))
+        found: Any = library["casadi_ik_hands"]
+        self._memory["hands"][:, place] = ctypes.cast(found, ctypes.c_void_p).value
+        return kept
 
     def ask(self, targets: TargetBatch, row: int, here: Array, given: Array) -> None:
         """Put one of k targets in.
@@ -553,7 +588,12 @@ class SearchPool:
 
 def can_search(plan: SearchPlan) -> bool:
     """Whether there is compiled code of a search and of all that it calls."""
-    return all(kernel.entry for kernel in plan.kernels.values()) and _library(plan)[1] is not None
+    called = (
+        *plan.kernels.values(),
+        *(one for side in plan.sides for one in side.of_hands.values()),
+    )
+    libraries = (_library(one)[1] for one in (plan, *plan.sides))
+    return all(kernel.entry for kernel in called) and None not in libraries
 
 
 def _library(plan: SearchPlan) -> tuple[str, ctypes.CDLL | None]:
@@ -564,6 +604,16 @@ def _library(plan: SearchPlan) -> tuple[str, ctypes.CDLL | None]:
     wide = machine_lanes() > 0
     known = recipe(*given, wide)
     return name, load_library(name, lambda: _text(plan, wide), "casadi_ik_search", known)
+
+
+def _form(plan: SearchPlan) -> list[Any]:
+    """The memory of a search, as a record of numpy."""
+    kinds = {"double": np.float64, "int64_t": np.int64}
+    form: list[Any] = [
+        (name, kinds[kind], (length,) if _is_array(name, kind, length) else ())
+        for name, (kind, length, _) in plan.fields.items()
+    ]
+    return [*form, ("tiles", np.int64, (3,)), *((name, np.int64) for name in KERNELS)]
 
 
 def _is_array(name: str, kind: str, length: int) -> bool:

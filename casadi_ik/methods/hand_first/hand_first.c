@@ -25,11 +25,13 @@ static int begin_round(search *job) {
   memcpy(job->last, job->state, sizeof job->last);
   /* The floor of some valleys falls so little that a refinement gives up: ten of them have reached
    * the end. By turns, since what has come to a valley's lowest place has to leave it. */
-  goes_on = later >= VALLEY_ROUNDS && (later - VALLEY_ROUNDS) % 2 == 0
+  goes_on = !N_SIDES && later >= VALLEY_ROUNDS && (later - VALLEY_ROUNDS) % 2 == 0
             && job->last[STATE_BEST_COST] < FLAT_COST;
   if (later < 0 || !number) code = from_table(job, number);
+#if !N_SIDES
   else if (later < VALLEY_ROUNDS) code = along_valley(job, later);
   else if (goes_on) code = along_valley(job, VALLEY_ROUNDS + (later - VALLEY_ROUNDS) / 2);
+#endif
   else from_anywhere(job, later - VALLEY_ROUNDS, first);
 #if MENDS
   if (later >= VALLEY_ROUNDS && !goes_on) code = from_spread(job, number);

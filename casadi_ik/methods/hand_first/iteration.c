@@ -7,6 +7,10 @@
  * and where that misses by little the largest error is brought down (balance). What does not lead to
  * a solution ends with the next posture; after the last one the best there was is left.
  *
+ * Of a body every hand flies to its contacts by itself, one side after the other. Then all arms are
+ * placed at a trunk, the one where the robot is first; where they cannot all follow, trunk and arms
+ * move together with the palms kept (trunk), and where that leads nowhere another trunk is tried.
+ *
  * The capital names with arguments are the functions of step.py: from state x and parameters p they
  * make state y, what they say of it, and the record of the iteration. The solves in the lanes are all
  * in the same stage (loop.c); each goes on by itself. Constants come from iteration.py.
@@ -24,6 +28,19 @@ typedef struct {
   const double *p, *own;       /* parameters; the same in a row, with the postures */
 } solve;
 
+/* The function of the side that is at work; a robot has one side, unless it is a body. */
+#if N_SIDES > 1
+#define OF_SIDE(function, ...) \
+  do switch (side) { \
+    case 0: function(__VA_ARGS__); break; \
+    case 1: function##_1(__VA_ARGS__); break; \
+    case 2: function##_2(__VA_ARGS__); break; \
+    default: function##_3(__VA_ARGS__); \
+  } while (0)
+#else
+#define OF_SIDE(function, ...) ((void) side, function(__VA_ARGS__))
+#endif
+
 #define X(field) s.x[STATE_##field * WIDTH]
 #define Y(field) s.y[STATE_##field * WIDTH]
 #define P(field) s.p[PARAMETERS_##field * WIDTH]
@@ -36,16 +53,103 @@ static int goes_to(solve s, int stage) {
   return RUNNING_STATUS;
 }
 
-static int to_next_candidate(solve s) {
-  Y(CANDIDATE) = X(CANDIDATE) + 1;
-  return goes_to(s, CANDIDATE_STAGE);
-}
-
 static void begin_fit(solve s) {
   Y(DAMPING) = FIT_DAMPING;
   Y(GROWTH) = FIT_GROWTH;
   Y(WAITED) = Y(SPENT) = 0;
 }
+
+/* The best arm so far, within its bounds. */
+static void set_arm(solve s) {
+  int i;
+  for (i = 0; i < N_ARM; ++i) {
+    const int k = ARM[i];
+    const double low = ENTRY(P(LOWER), k), high = ENTRY(P(UPPER), k), at = ENTRY(Y(ARM), i);
+    ENTRY(Y(Q), k) = at < low ? low : at > high ? high : at;
+  }
+}
+
+#if N_SIDES
+/* The hand of a side begins from a posture. */
+static int to_side(solve s, int side, double candidate) {
+  Y(SIDE) = side;
+  Y(CANDIDATE) = candidate;
+  return goes_to(s, CANDIDATE_STAGE + BY_SIDE * side);
+}
+
+static int to_next_candidate(solve s) {
+  if (X(SIDE) < N_SIDES) return to_side(s, (int) X(SIDE), X(CANDIDATE) + 1);
+  Y(FIRST) = Y(FARTHEST) = X(FARTHEST) + 1;
+  return to_side(s, 0, Y(FIRST));
+}
+
+/* The number of a motor that a place of an even spread stands for. */
+static double spread(solve s, int motor, double step) {
+  const double x = 0.5 + X(TRUNKS) * step, low = ENTRY(P(LOWER), motor);
+  return low + (x - (double) (int64_t) x) * (ENTRY(P(UPPER), motor) - low);
+}
+
+/* Arms are placed anew, all at the trunk that q has. */
+static int to_placement(solve s) {
+  int i;
+  for (i = 0; i < N_SIDES; ++i) ENTRY(Y(MARGIN), i) = NO_MARGIN;
+  begin_fit(s);
+  return goes_to(s, ARM_PLACEMENT_STAGE);
+}
+
+/* Where a palm is now known the next side follows, and after the last one all arms. */
+static int after_side(solve s) {
+  const int side = (int) X(SIDE);
+  int i;
+  for (i = 0; i < 12; ++i) {
+    ENTRY(Y(PALM_ROTATION_0), 12 * side + i) = ENTRY(Y(PALM_ROTATION), i);
+  }
+  ENTRY(Y(FITTED), side) = Y(FITS);
+  if (X(CANDIDATE) > X(FARTHEST)) Y(FARTHEST) = X(CANDIDATE);
+  if (side + 1 < N_SIDES) return to_side(s, side + 1, X(FIRST));
+  for (i = 0; i < N_SIDES; ++i) {
+    if (!(ENTRY(Y(FITTED), i) > 0)) Y(FITS) = 0;
+  }
+  Y(SIDE) = N_SIDES;
+  Y(TRIED) = 0;
+  return to_placement(s);
+}
+
+static int after_all_placements(solve s) {
+  if (!SAYS(WITHIN) && Y(SPENT) < TRUNK_TRIALS) return goes_to(s, ARM_PLACEMENT_STAGE);
+  set_arm(s);
+  begin_fit(s);
+  if (!SAYS(NEAR)) return goes_to(s, TRUNK_STAGE);
+  goes_to(s, REFINEMENT_STAGE);
+  return X(FITS) > 0 ? SOLVED_STATUS : RUNNING_STATUS;
+}
+
+static int after_trunk(solve s) {
+  const int most = X(FIRST) + X(EARLIER) > 0 ? LATER_TRUNKS : FIRST_TRUNKS;
+  int i;
+  if (SAID(COST) < EXACT_COST) {
+    begin_fit(s);
+    goes_to(s, REFINEMENT_STAGE);
+    return X(FITS) > 0 ? SOLVED_STATUS : RUNNING_STATUS;
+  }
+  if (!SAYS(SETTLED)) return goes_to(s, TRUNK_STAGE);
+  Y(TRIED) = X(TRIED) + 1;
+  if (Y(TRIED) >= most) {
+    begin_fit(s);
+    if (X(FARTHEST) + 1 >= N_CANDIDATES) return goes_to(s, REFINEMENT_STAGE);
+    return to_next_candidate(s);
+  }
+  Y(TRUNKS) = X(TRUNKS) + 1;
+  for (i = 0; i < N_TRUNK; ++i) ENTRY(Y(Q), TRUNK_MOTORS[i]) = spread(s, TRUNK_MOTORS[i], TRUNK_STEPS[i]);
+  for (i = 0; i < N_ARM; ++i) ENTRY(Y(Q), ARM[i]) = spread(s, ARM[i], BODY_ARM_STEPS[i]);
+  return to_placement(s);
+}
+#else
+static int to_next_candidate(solve s) {
+  Y(CANDIDATE) = X(CANDIDATE) + 1;
+  return goes_to(s, CANDIDATE_STAGE);
+}
+#endif
 
 /* Whether the cost of a fit is another than that of the fit that was balanced before. */
 static int differs(double cost, double before) {
@@ -58,16 +162,6 @@ static void keep_best(solve s, double cost) {
   if (!(cost < X(BEST_COST))) return;
   Y(BEST_COST) = cost;
   for (i = 0; i < N_MOTORS; ++i) ENTRY(Y(BEST_Q), i) = ENTRY(Y(Q), i);
-}
-
-/* The best arm so far, within its bounds. */
-static void set_arm(solve s) {
-  int i;
-  for (i = 0; i < N_ARM; ++i) {
-    const int k = ARM[i];
-    const double low = ENTRY(P(LOWER), k), high = ENTRY(P(UPPER), k), at = ENTRY(Y(ARM), i);
-    ENTRY(Y(Q), k) = at < low ? low : at > high ? high : at;
-  }
 }
 
 static int after_start(solve s) {
@@ -86,6 +180,13 @@ static void before_candidate(solve s, double *hand) {
 
 static int after_candidate(solve s) {
   int i;
+#if N_SIDES
+  if (X(CANDIDATE) < N_CANDIDATES && SAYS(WITHIN)) {
+    Y(FITS) = 1;
+    return after_side(s);
+  }
+  if (X(CANDIDATE) < N_CANDIDATES) return goes_to(s, HAND_FIT_STAGE + BY_SIDE * (int) X(SIDE));
+#endif
   if (X(CANDIDATE) < N_CANDIDATES) return goes_to(s, HAS_ARM ? HAND_FIT_STAGE : REFINEMENT_STAGE);
   for (i = 0; i < N_MOTORS; ++i) ENTRY(Y(Q), i) = ENTRY(X(BEST_Q), i);
   return STALLED_STATUS;
@@ -107,7 +208,7 @@ static int after_hand_fit(solve s) {
   if (N_CANDIDATES > 1 && P(NEAREST) > 0 && first && SAID(COST) > OWN_HAND) {
     return to_next_candidate(s);
   }
-  if (!SAYS(SETTLED)) return goes_to(s, HAND_FIT_STAGE);
+  if (!SAYS(SETTLED)) return goes_to(s, (int) X(PHASE));
   if (!SAYS(WITHIN) && SAYS(NEAR)) {
     /* Nor does one that fits nearly have to fit, if it is another than before: it is balanced. */
     if (!differs(Y(COST), X(NEAR))) {
@@ -118,6 +219,9 @@ static int after_hand_fit(solve s) {
     }
   }
   if (!goes_on) return to_next_candidate(s);
+#if N_SIDES
+  return after_side(s);
+#endif
   goes_to(s, HAS_CHOICE && P(NEAREST) > 0 ? ARM_CHOICE_STAGE : placement(s));
   return !alone ? RUNNING_STATUS : SAYS(WITHIN) ? SOLVED_STATUS : STALLED_STATUS;
 }
@@ -227,9 +331,11 @@ static solve solve_in(int lane, real *x, const real *p, const double *own, real 
 CODE void iterate(real *x, const real *p, const double *const *own, real *y, real *record, real *status,
                   int wanted) {
   real said[N_SAID], hand[N_HAND + 1];
-  int lane = 0, stage;
+  int lane = 0, stage, side;
   while (!(wanted >> lane & 1)) ++lane;
   stage = (int) solve_in(lane, x, p, own[lane], y, said).x[STATE_PHASE * WIDTH];
+  side = stage / BY_SIDE;
+  stage %= BY_SIDE;
 #define EACH for (lane = 0; lane < WIDTH; ++lane) if (wanted >> lane & 1)
 #define SOLVE solve_in(lane, x, p, own[lane], y, said)
   if (stage == CANDIDATE_STAGE) EACH before_candidate(SOLVE, (double *) hand + lane);
@@ -238,12 +344,13 @@ CODE void iterate(real *x, const real *p, const double *const *own, real *y, rea
 #endif
   switch (stage) {
     case START_STAGE: START(x, p, y, said, record); break;
-    case CANDIDATE_STAGE: CANDIDATE(x, p, hand, y, said, record); break;
-    case HAND_FIT_STAGE: HAND_FIT(x, p, y, said, record); break;
+    case CANDIDATE_STAGE: OF_SIDE(CANDIDATE, x, p, hand, y, said, record); break;
+    case HAND_FIT_STAGE: OF_SIDE(HAND_FIT, x, p, y, said, record); break;
     case ARM_PLACEMENT_STAGE: ARM_PLACEMENT(x, p, y, said, record); break;
     case ARM_STEPS_STAGE: ARM_STEPS(x, p, y, said, record); break;
     case ARM_CHOICE_STAGE: ARM_CHOICE(x, p, y, said, record); break;
     case BALANCE_STAGE: BALANCE(x, p, y, said, record); break;
+    case TRUNK_STAGE: TRUNK(x, p, y, said, record); break;
     default: REFINEMENT(x, p, y, said, record);
   }
   EACH {
@@ -253,7 +360,12 @@ CODE void iterate(real *x, const real *p, const double *const *own, real *y, rea
       case START_STAGE: code = after_start(s); break;
       case CANDIDATE_STAGE: code = after_candidate(s); break;
       case HAND_FIT_STAGE: code = after_hand_fit(s); break;
+#if N_SIDES
+      case ARM_PLACEMENT_STAGE: code = after_all_placements(s); break;
+      case TRUNK_STAGE: code = after_trunk(s); break;
+#else
       case ARM_PLACEMENT_STAGE: code = after_placement(s); break;
+#endif
 #if N_STARTS
       case ARM_STEPS_STAGE: code = after_arm_steps(s); break;
 #endif

@@ -6,6 +6,7 @@ decides as iteration.c does.
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from importlib import resources
 from typing import TYPE_CHECKING
 
@@ -17,15 +18,20 @@ from casadi_ik.kernels.codegen import define, define_arrays, number, row_major
 from casadi_ik.kernels.function_kernel import BufferedFunction
 from casadi_ik.methods.common.contact_fit import BALANCE, FIT, fresh_fit
 from casadi_ik.methods.common.numeric_arm import STARTS, start_table
-from casadi_ik.methods.hand_first.state import PLACES, SAID, Stage
+from casadi_ik.methods.hand_first.parameters import BODY
+from casadi_ik.methods.hand_first.state import BY_SIDE, PLACES, SAID, Stage
 from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.problem.status import Status
+from casadi_ik.symbolic.even_spread import even_steps
 
 if TYPE_CHECKING:
     from casadi_ik.methods.hand_first.step import HandFirstStep
 
 OWN_HAND = 0.5
 """Cost, with the best palm, up to which the hand as it is is fitted before other hands."""
+
+MOST_SIDES = 4
+"""Of a body."""
 
 WHOLE = 0.5
 """Cost up to which a start is refined as a whole (three contacts off by 4 cm each)."""
@@ -52,12 +58,12 @@ def text(step: HandFirstStep) -> str:
     whole |= {
         "N_SAID": SAID.size,
         "N_MOTORS": len(robot.actuators),
-        "N_ARM": len(robot.arm_actuators),
-        "N_HAND": len(robot.hand_actuators),
+        "N_ARM": len(layouts.arm),
+        "N_HAND": len(layouts.hand),
         "N_CANDIDATES": layouts.candidates,
         "N_STARTS": len(start_table(robot)[0]) if numeric else 0,
         "MOST_STARTS": STARTS,
-        "HAS_ARM": bool(robot.arm_actuators),
+        "HAS_ARM": bool(layouts.arm),
         "HAS_FAMILY": step.placements is not None,
         "HAS_CHOICE": step.choices is not None,
         "IS_COMPLETE": not numeric,
@@ -77,11 +83,23 @@ def text(step: HandFirstStep) -> str:
     }
     places = np.zeros(max(Stage) + 1, dtype=np.int64)
     places[list(PLACES)] = list(PLACES.values())
-    arrays = {"ARM": np.array([*robot.arm_actuators, 0]), "PLACE_OF_STAGE": places}
+    arrays = {"ARM": np.array([*layouts.arm, 0]), "PLACE_OF_STAGE": places}
+    whole |= {"BY_SIDE": BY_SIDE, "N_SIDES": len(robot.sides)}
+    if robot.sides:
+        trunk = robot.trunk_actuators
+        whole |= {name.upper(): value for name, value in asdict(BODY).items()}
+        whole["N_TRUNK"] = len(trunk)
+        arrays |= {
+            "TRUNK_MOTORS": np.array([*trunk, 0]),
+            "TRUNK_STEPS": np.array([*even_steps(len(trunk)), 0.0]),
+            "BODY_ARM_STEPS": even_steps(len(layouts.arm)),
+        }
     if numeric:
         arms, palms = start_table(robot)
         arrays |= {"START_ARMS": arms, "START_PALMS": palms.T}
-    missing = [stage.name for stage in Stage if stage not in step.stages]
+    more = [f"{name}_{i}" for name in ("CANDIDATE", "HAND_FIT") for i in range(1, MOST_SIDES)]
+    known = {stage.name for stage in step.stages}
+    missing = [name for name in (*(stage.name for stage in Stage), *more) if name not in known]
     source = resources.files("casadi_ik.methods.hand_first") / "iteration.c"
     return "".join(
         (

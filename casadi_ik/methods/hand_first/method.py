@@ -18,6 +18,7 @@ from casadi_ik.kernels.loop import UNBEGUN, Stepper
 from casadi_ik.kernels.robot_kernels import RobotKernels
 from casadi_ik.methods.common.limits import coupling_jacobian
 from casadi_ik.methods.common.looped_method import LoopedMethod, Start
+from casadi_ik.methods.hand_first.body import BodyStep
 from casadi_ik.methods.hand_first.driver import Searches, SearchPlan, SearchPool, can_search
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.seeds import Seeds
@@ -65,10 +66,14 @@ class HandFirstMethod(LoopedMethod):
         kinds: Kinds | None = None,
     ) -> None:
         """Recognise the arm and lay out the step; point and normal if no kinds are given."""
+        robot = robot if compiled else robot.as_hand
         super().__init__(robot, options, compiled)
         self.options: HandFirstParameters = options
         self._kinds = kinds or usual(len(robot.fingers))
-        self.step = HandFirstStep(robot, arm_family(robot), options.candidates, self._kinds)
+        if robot.sides:
+            self.step: HandFirstStep = BodyStep(robot, options.candidates, self._kinds)
+        else:
+            self.step = HandFirstStep(robot, arm_family(robot), options.candidates, self._kinds)
         self.seeds = Seeds(robot, options, compiled)
         self._searches = SearchPool(self.plan)
         self._kept: tuple[Any, Array] | None = None
@@ -89,8 +94,8 @@ class HandFirstMethod(LoopedMethod):
         return self.kernel.compiled and can_search(self.plan(enforce_limits=True))
 
     def in_virtual_machine(self) -> HandFirstMethod:
-        """The same, never compiled."""
-        return HandFirstMethod(self.robot, self.options, False, self._kinds)
+        """The same, never compiled; a body is one hand with all motors there."""
+        return HandFirstMethod(self.robot.as_hand, self.options, False, self._kinds)
 
     def __reduce__(self) -> tuple[type[HandFirstMethod], tuple[Any, ...]]:
         """What it was made from."""
@@ -98,7 +103,9 @@ class HandFirstMethod(LoopedMethod):
 
     def prepare(self) -> None:
         """Build and compile what one target takes, and fill the table of the first round."""
-        _ = self.seeds.table, self.first
+        _ = self.first
+        if not self.robot.sides:
+            _ = self.seeds.table
         if self.is_compiled:
             with self._searches.lent(enforce_limits=True):
                 pass
@@ -121,7 +128,17 @@ class HandFirstMethod(LoopedMethod):
             solve=self.kernel,
             contacts=kernels.contacts,
             judge=kernels.deviations,
+            sides=tuple(side.plan(enforce_limits) for side in self._sides),
         )
+
+    @cached_property
+    def _sides(self) -> list[HandFirstMethod]:
+        """The same for every side of a body by itself."""
+        robot = self.robot
+        return [
+            HandFirstMethod(robot.side(side.name), self.options, self._compiled)
+            for side in robot.sides
+        ]
 
     @property
     def rounds(self) -> int:
@@ -138,7 +155,8 @@ class HandFirstMethod(LoopedMethod):
         del seed
         self._check(targets)
         if not self.is_compiled:
-            return self._run_from_tables(targets, q0, trace, rounds)
+            method = self.in_virtual_machine() if self.robot.sides else self
+            return method._run_from_tables(targets, q0, trace, rounds)
         most = np.full(len(targets), self._rounds_for(targets))
         if rounds is not None:
             most = np.minimum(most, rounds)
@@ -286,7 +304,7 @@ class HandFirstMethod(LoopedMethod):
         Returns:
             (k, ...) states and parameters.
         """
-        hand = len(self.robot.hand_actuators)
+        hand = len(self.step.layouts.hand)
         tried = np.broadcast_to(postures, (len(targets), self.options.candidates, hand))
         vectors = (targets.vectors(f"{name}s") for name in self.step.layouts.contacts.data)
         # A kernel's column is a vector: of a hand with one motor there is no second dimension.

@@ -122,3 +122,21 @@ class HandFirstParameters:
         """Rounds of all kinds at most."""
         every = self.first_rugged + self.rugged_rounds[self.is_many(robot)]
         return min(every, self.max_rounds or every)
+
+
+@dataclass(frozen=True)
+class BodyParameters:
+    """How trunks are tried.
+
+    Attributes:
+        trunk_trials: Looks at all arms' redundancies at a trunk before trunk and arms move.
+        first_trunks: Trunks tried for the palms of the first hand postures.
+        later_trunks: For those of others.
+    """
+
+    trunk_trials: int = 2
+    first_trunks: int = 48
+    later_trunks: int = 12
+
+
+BODY = BodyParameters()

@@ -216,6 +216,39 @@ static void order(search *job, int own) {
   memcpy(job->postures, sorted, sizeof sorted);
 }
 
+#if N_SIDES
+/* What the code of a side knows of hands: from its own search, points, normals and place of the
+ * robot, and the round, into the postures. */
+typedef int (*find_hands)(void *, const double *, const double *, const double *, int64_t, int64_t,
+                          double *);
+
+/* Postures of every hand whose contacts look like its part of the target. */
+static int from_table(search *job, int64_t number) {
+  double here[N_MOTORS], hands[N_CANDIDATES * N_HAND];
+  int side, i, k, finger = 0, first = 0;
+  for (side = 0; side < N_SIDES; ++side) {
+    const int fingers = SIDE_FINGERS[side], count = SIDE_HANDS[side];
+    int asked = 0, code;
+    for (i = 0; i < fingers; ++i) asked |= is_number(job->points[3 * (finger + i)]);
+    for (i = 0; i < SIDE_MOTORS[side]; ++i) here[i] = job->here[SIDE_PLACES[side][i]];
+    if (asked) {
+      const find_hands find = (find_hands) job->hands[side];
+      code = find((void *) job->sides[side], job->points + 3 * finger, job->normals + 3 * finger,
+                  here, job->terms[TERMS_NEAREST] > 0, number, hands);
+      if (code != DONE) return code;
+    }
+    for (i = 0; i < N_CANDIDATES; ++i) {
+      for (k = 0; k < count; ++k) {
+        job->postures[i * N_HAND + first + k] =
+            asked ? hands[i * count + k] : job->here[HAND[first + k]];
+      }
+    }
+    finger += fingers;
+    first += count;
+  }
+  return DONE;
+}
+#else
 /* Postures whose contacts look like the target. */
 static int from_table(search *job, int64_t number) {
   const int table = !number ? 0 : !ENFORCE_LIMITS && number % 2 ? 2 : 1;
@@ -248,6 +281,8 @@ static int from_table(search *job, int64_t number) {
   if (job->terms[TERMS_NEAREST] > 0) order(job, !number);
   return DONE;
 }
+
+#endif
 
 /* How the contacts move with palm and hand. */
 static int find_slopes(search *job, const double *q) {

@@ -17,6 +17,7 @@ from casadi_ik.kernels import FunctionGraph, FunctionKernel
 from casadi_ik.kernels.graphs import recipe
 from casadi_ik.methods.common.posture_table import PostureTable
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
+from casadi_ik.methods.hand_first.state import hand_columns
 from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.even_spread import evenly
@@ -62,7 +63,7 @@ class Seeds:
             compiled: Whether lookups run in compiled code.
         """
         self._robot = ArmHand(robot)
-        self._hand = list(robot.hand_actuators)
+        self._hand = list(hand_columns(robot))
         self._options = options
         self._compiled = compiled
 
@@ -94,7 +95,9 @@ class Seeds:
         return self._table(2)
 
     def tables(self, enforce_limits: bool) -> tuple[PostureTable, ...]:
-        """Those that are asked, in the order of `spreads`."""
+        """Those that are asked, in the order of `spreads`; of a body its sides know theirs."""
+        if self._robot.description.sides:
+            return ()
         own = (self.table, self._wide_table)
         return own if enforce_limits else (*own, self._free_table)
 

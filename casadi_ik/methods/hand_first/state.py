@@ -36,7 +36,7 @@ from casadi_ik.symbolic.smooth import Expr, shared
 
 STAGES = (
     *(Phase.REFINEMENT, Phase.CANDIDATE, Phase.HAND_FIT, Phase.ARM_PLACEMENT),
-    *(Phase.BALANCE, Phase.ARM_CHOICE),
+    *(Phase.BALANCE, Phase.ARM_CHOICE, Phase.TRUNK),
 )
 """The stages in the order of their codes."""
 
@@ -51,7 +51,12 @@ class Stage(IntEnum):
     ARM_PLACEMENT = Phase.ARM_PLACEMENT
     BALANCE = Phase.BALANCE
     ARM_CHOICE = Phase.ARM_CHOICE
+    TRUNK = Phase.TRUNK
     ARM_STEPS = max(Phase) + 1
+
+
+BY_SIDE = 32
+"""What is added to a stage's number for every side of a body before the one that it is of."""
 
 
 SAID = Layout(
@@ -98,6 +103,18 @@ class HandFirstLayouts:
     kinds: Kinds
 
     @cached_property
+    def arm(self) -> tuple[int, ...]:
+        """Positions in q of the motors of the arm, or of a body's arms."""
+        robot = self.robot
+        sides = (place for arm, _ in robot.side_actuators for place in arm)
+        return tuple(sides) if robot.sides else robot.arm_actuators
+
+    @cached_property
+    def hand(self) -> tuple[int, ...]:
+        """Positions in q of the motors of the hand, or of a body's hands."""
+        return hand_columns(self.robot)
+
+    @cached_property
     def contacts(self) -> ContactRows:
         """The contacts' rows."""
         return ContactRows(self.kinds)
@@ -106,6 +123,7 @@ class HandFirstLayouts:
     def state(self) -> Layout:
         """What an iteration hands to the next."""
         n = len(self.robot.actuators)
+        sides = (len(self.robot.sides),) if self.robot.sides else ()
         return Layout(
             (
                 Field("q", (n,), doc="arm and hand; while the hand is fitted only the hand's part"),
@@ -127,23 +145,42 @@ class HandFirstLayouts:
                 Field("least", doc="smallest largest part of the tolerances balanced to so far"),
                 Field("held", doc="1 if held motors leave hand or arm less than its motions"),
                 Field("returns", doc="how often a fit or a balance ended where one had before"),
-                Field("margin", doc="best margin of the arm so far, negative: a violation"),
-                Field("arm", (len(self.robot.arm_actuators),), doc="arm with the best margin"),
-                Field("swivel", unit="rad", doc="last number of that arm's redundancy"),
+                Field("margin", sides, doc="best margin of the arm so far, negative: a violation"),
+                Field("arm", (len(self.arm),), doc="arm with the best margin"),
+                Field("swivel", sides, unit="rad", doc="last number of that arm's redundancy"),
                 Field("starts", doc="starts of the numeric arm stage so far"),
                 Field("turned", doc="joints of this start that were sent to the other side"),
                 Field("passed", doc="how far the palm of the last start was from the one wanted"),
                 Field("best_cost", doc="smallest cost of a whole configuration so far"),
                 Field("best_q", (n,), doc="the configuration it belongs to"),
                 Field("counts", (len(STAGES),), doc="iterations by stage, in the order of STAGES"),
+                *(self._of_sides if self.robot.sides else ()),
             )
+        )
+
+    @property
+    def _of_sides(self) -> tuple[Field, ...]:
+        """What a body's solves know besides."""
+        sides = range(len(self.robot.sides))
+        palms = [
+            (Field(f"palm_rotation_{i}", (3, 3)), Field(f"palm_origin_{i}", (3,), unit="m"))
+            for i in sides
+        ]
+        return (
+            Field("side", doc="the side whose hand is fitted"),
+            Field("first", doc="index of the hand posture that every side began from"),
+            Field("farthest", doc="the largest index that a side has come to"),
+            Field("fitted", (len(sides),), doc="1 if palm and hand meet the contacts, by side"),
+            *(field for palm in palms for field in palm),
+            Field("tried", doc="trunks tried for these palms"),
+            Field("trunks", doc="trunks tried for all palms"),
         )
 
     @cached_property
     def parameters(self) -> Layout:
         """The problem and the numbers of the method."""
         n, f = len(self.robot.actuators), len(self.robot.fingers)
-        hand = len(self.robot.hand_actuators)
+        hand = len(self.hand)
         return Layout(
             (
                 *self.contacts.fields,
@@ -186,7 +223,7 @@ class HandFirstLayouts:
 
     def hand_bounds(self, q: Expr, p: dict[str, Expr], first: int) -> Bounded:
         """Bounds of the hand's actuators."""
-        rows = list(self.robot.hand_actuators)
+        rows = list(self.hand)
         return Bounded(q[rows], p["lower"][rows], p["upper"][rows], first)
 
     def row(
@@ -237,6 +274,12 @@ class HandFirstLayouts:
         )
 
 
+def hand_columns(robot: RobotDescription) -> tuple[int, ...]:
+    """Positions in q of the motors of the hand, or of a body's hands."""
+    sides = (place for _, hand in robot.side_actuators for place in hand)
+    return tuple(sides) if robot.sides else robot.hand_actuators
+
+
 def with_rows(q: Expr, rows: Sequence[int], values: Expr) -> Expr:
     """Replace some of the entries of q."""
     places = {row: i for i, row in enumerate(rows)}
@@ -278,7 +321,7 @@ def beginning(layouts: HandFirstLayouts) -> FunctionGraph:
             **{f"{vector}s": (f, 3) for vector in layouts.contacts.data},
             "here": (n, 1),
             "terms": (terms(robot).size, 1),
-            "postures": (layouts.candidates, len(layouts.robot.hand_actuators)),
+            "postures": (layouts.candidates, len(layouts.hand)),
         },
         ((layouts.state.size, 1), (layouts.parameters.size, 1)),
         recipe(name, robot, layouts.candidates, layouts.kinds),
@@ -286,7 +329,7 @@ def beginning(layouts: HandFirstLayouts) -> FunctionGraph:
 
 
 def _build(name: str, layouts: HandFirstLayouts) -> ca.Function:
-    robot, hand = layouts.robot, list(layouts.robot.hand_actuators)
+    robot, hand = layouts.robot, list(layouts.hand)
     f, n = len(robot.fingers), len(robot.actuators)
     vectors = {f"{vector}s": ca.SX.sym(f"{vector}s", f, 3) for vector in layouts.contacts.data}
     here = ca.SX.sym("q", n)
@@ -324,7 +367,7 @@ def _build(name: str, layouts: HandFirstLayouts) -> ca.Function:
             "best_q": here,
             "best_cost": sys.float_info.max,
             "least": sys.float_info.max,
-            "held": _is_held(robot, t),
+            "held": _is_held(layouts, t),
             "phase": ca.if_else(t["nearest"], float(Stage.START), float(Stage.CANDIDATE)),
             "candidate": -t["nearest"],
         }
@@ -334,14 +377,14 @@ def _build(name: str, layouts: HandFirstLayouts) -> ca.Function:
     return ca.Function(name, inputs, shared(state, parameters))
 
 
-def _is_held(robot: RobotDescription, t: dict[str, Expr]) -> Expr:
+def _is_held(layouts: HandFirstLayouts, t: dict[str, Expr]) -> Expr:
     """1 if motors of the hand are held, or the arm's free ones cannot take the palm to any pose.
 
     Fewer than six are too few, be they held, of a short arm or of a hand that stands alone.
 
     A hand that is held as a whole needs no search.
     """
-    hand, arm = list(robot.hand_actuators), list(robot.arm_actuators)
+    hand, arm = list(layouts.hand), list(layouts.arm)
     free_hand, free_arm = (
         ca.sum1(t["lower"][rows] < t["upper"][rows]) if rows else 0 for rows in (hand, arm)
     )

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property, partial
+from typing import Any
 
 import casadi as ca
 
@@ -43,7 +44,7 @@ from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
 from casadi_ik.methods.hand_first.hand_fit import PalmAndHand, fit_step
 from casadi_ik.methods.hand_first.iteration import Iteration, text
 from casadi_ik.methods.hand_first.state import SAID, HandFirstLayouts, Stage, with_rows
-from casadi_ik.problem.contacts import LENGTH, Kinds, chord, suffix, within_tolerance
+from casadi_ik.problem.contacts import LENGTH, ContactRows, Kinds, chord, suffix, within_tolerance
 from casadi_ik.problem.status import Phase
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.kinematics import Pose
@@ -76,7 +77,7 @@ class HandFirstStep:
         self.robot = robot
         self.arm = arm
         self.layouts = HandFirstLayouts(robot, candidates, kinds)
-        self._built: dict[Stage, ca.Function] = {}
+        self._built: dict[Any, ca.Function] = {}
 
     def graph(self) -> StepGraph:
         """The whole iteration."""
@@ -121,7 +122,7 @@ class HandFirstStep:
         return *of_placement, *((near.trials, near.patience) if near else (0, 0))
 
     @cached_property
-    def stages(self) -> dict[Stage, Callable[[], ca.Function]]:
+    def stages(self) -> dict[Any, Callable[[], ca.Function]]:
         """What builds the functions of the stages that solves of the robot may be in."""
         found: dict[Stage, Callable[[], ca.Function]] = {
             Stage.START: self._start,
@@ -142,7 +143,7 @@ class HandFirstStep:
             found[Stage.ARM_CHOICE] = partial(self._choice, self.choices)
         return found
 
-    def function(self, stage: Stage) -> ca.Function:
+    def function(self, stage: Any) -> ca.Function:
         """(state, parameters) -> state, `SAID`, record; a candidate's posture is a third input."""
         if stage not in self._built:
             self._built[stage] = self.stages[stage]()
@@ -163,7 +164,7 @@ class HandFirstStep:
 
     def _function(
         self,
-        stage: Stage,
+        stage: Any,
         inputs: list[Expr],
         s: dict[str, Expr],
         changed: dict[str, Expr],
@@ -178,9 +179,15 @@ class HandFirstStep:
     def _with_hand(self, q: Expr, hand: Expr) -> Expr:
         return with_rows(q, self.robot.hand_actuators, hand)
 
-    def _left(self, accepted: Expr, tried: Tried, p: dict[str, Expr]) -> Expr:
+    def _left(
+        self,
+        accepted: Expr,
+        tried: Tried,
+        p: dict[str, Expr],
+        contacts: ContactRows | None = None,
+    ) -> Expr:
         """Whether a step leaves the contacts near their tolerances."""
-        contacts = self.layouts.contacts
+        contacts = contacts or self.layouts.contacts
         left = ca.if_else(accepted, tried.there, tried.before)
         return near_tolerance(left[: contacts.size], contacts, p)
 
