@@ -83,10 +83,14 @@ static int to_next_candidate(solve s) {
   return to_side(s, 0, Y(FIRST));
 }
 
-/* The number of a motor that a place of an even spread stands for. */
+/* Where a motor begins at a trunk: evenly spread, by turns with half of the range at its ends. */
 static double spread(solve s, int motor, double step) {
   const double x = 0.5 + X(TRUNKS) * step, low = ENTRY(P(LOWER), motor);
-  return low + (x - (double) (int64_t) x) * (ENTRY(P(UPPER), motor) - low);
+  const int at_ends = (int) X(TRUNKS) % 2;
+  double part = x - (double) (int64_t) x;
+  if (at_ends) part = (part - 0.5) / (1 - AT_LIMITS) + 0.5;
+  part = part < 0 ? 0 : part > 1 ? 1 : part;
+  return low + part * (ENTRY(P(UPPER), motor) - low);
 }
 
 /* Arms are placed anew, all at the trunk that q has. */
@@ -116,7 +120,7 @@ static int after_side(solve s) {
 }
 
 static int after_all_placements(solve s) {
-  if (!SAYS(WITHIN) && Y(SPENT) < TRUNK_TRIALS) return goes_to(s, ARM_PLACEMENT_STAGE);
+  if (!SAYS(WITHIN) && Y(SPENT) < (X(AGAIN) > 0 ? AGAIN_TRIALS : TRUNK_TRIALS)) return goes_to(s, ARM_PLACEMENT_STAGE);
   set_arm(s);
   begin_fit(s);
   if (!SAYS(NEAR)) return goes_to(s, TRUNK_STAGE);
@@ -133,6 +137,12 @@ static int after_trunk(solve s) {
     return X(FITS) > 0 ? SOLVED_STATUS : RUNNING_STATUS;
   }
   if (!SAYS(SETTLED)) return goes_to(s, TRUNK_STAGE);
+  if (!(X(AGAIN) > 0) && SAID(COST) < NEARLY) {
+    /* Arms that are placed anew at the trunk found may be of other branches. */
+    Y(AGAIN) = 1;
+    return to_placement(s);
+  }
+  Y(AGAIN) = 0;
   Y(TRIED) = X(TRIED) + 1;
   if (Y(TRIED) >= most) {
     begin_fit(s);

@@ -81,13 +81,14 @@ def text(step: HandFirstStep) -> str:
         "EXACT_COST": FIT.exact * FIT.exact,
         "NO_MARGIN": ARM_SEARCH.no_margin,
     }
+    for name, value in asdict(BODY).items():
+        (whole if isinstance(value, int) else numbers)[name.upper()] = value
     places = np.zeros(max(Stage) + 1, dtype=np.int64)
     places[list(PLACES)] = list(PLACES.values())
     arrays = {"ARM": np.array([*layouts.arm, 0]), "PLACE_OF_STAGE": places}
     whole |= {"BY_SIDE": BY_SIDE, "N_SIDES": len(robot.sides)}
     if robot.sides:
         trunk = robot.trunk_actuators
-        whole |= {name.upper(): value for name, value in asdict(BODY).items()}
         whole["N_TRUNK"] = len(trunk)
         arrays |= {
             "TRUNK_MOTORS": np.array([*trunk, 0]),

@@ -132,11 +132,15 @@ class BodyParameters:
         trunk_trials: Looks at all arms' redundancies at a trunk before trunk and arms move.
         first_trunks: Trunks tried for the palms of the first hand postures.
         later_trunks: For those of others.
+        at_limits: Part of a motor's range that every second trunk moves to its limits.
     """
 
-    trunk_trials: int = 2
-    first_trunks: int = 48
-    later_trunks: int = 12
+    trunk_trials: int = 1
+    first_trunks: int = 400
+    later_trunks: int = 24
+    at_limits: float = 0.5
+    nearly: float = 0.1
+    again_trials: int = 4
 
 
 BODY = BodyParameters()
