@@ -120,7 +120,9 @@ static int after_side(solve s) {
 }
 
 static int after_all_placements(solve s) {
-  if (!SAYS(WITHIN) && Y(SPENT) < (X(AGAIN) > 0 ? AGAIN_TRIALS : TRUNK_TRIALS)) return goes_to(s, ARM_PLACEMENT_STAGE);
+  if (!SAYS(WITHIN) && X(AGAIN) > 0 && Y(SPENT) < AGAIN_TRIALS) {
+    return goes_to(s, ARM_PLACEMENT_STAGE);
+  }
   set_arm(s);
   begin_fit(s);
   if (!SAYS(NEAR)) return goes_to(s, TRUNK_STAGE);
@@ -151,8 +153,16 @@ static int after_trunk(solve s) {
   }
   Y(TRUNKS) = X(TRUNKS) + 1;
   for (i = 0; i < N_TRUNK; ++i) ENTRY(Y(Q), TRUNK_MOTORS[i]) = spread(s, TRUNK_MOTORS[i], TRUNK_STEPS[i]);
-  for (i = 0; i < N_ARM; ++i) ENTRY(Y(Q), ARM[i]) = spread(s, ARM[i], BODY_ARM_STEPS[i]);
-  return to_placement(s);
+  for (i = 0; i < N_ARM; ++i) {
+    ENTRY(Y(ARM), i) = ENTRY(Y(Q), ARM[i]) = spread(s, ARM[i], BODY_ARM_STEPS[i]);
+  }
+  for (i = 0; i < N_SIDES; ++i) ENTRY(Y(SWIVEL), i) = ENTRY(Y(ARM), i);
+  to_placement(s);
+  /* By turns arms are looked for all over their redundancy, or around one value of it, or they
+   * begin from anywhere. */
+  if ((int) Y(TRIED) % FROM_ANYWHERE == 0) return goes_to(s, TRUNK_STAGE);
+  if ((int) Y(TRIED) % 2) Y(SPENT) = AROUND;
+  return RUNNING_STATUS;
 }
 #else
 static int to_next_candidate(solve s) {

@@ -135,12 +135,13 @@ class BodyParameters:
         at_limits: Part of a motor's range that every second trunk moves to its limits.
     """
 
-    trunk_trials: int = 1
     first_trunks: int = 400
     later_trunks: int = 24
     at_limits: float = 0.5
     nearly: float = 0.1
     again_trials: int = 4
+    from_anywhere: int = 8
+    around: int = 1
 
 
 BODY = BodyParameters()
