@@ -191,7 +191,14 @@ def gains(tried: Tried) -> Expr:
     return ca.sumsqr(tried.there) < ca.sumsqr(tried.before)
 
 
-def judge(s: dict[str, Expr], tried: Tried, within: Expr, exact: Expr) -> Judged:
+def judge(
+    s: dict[str, Expr],
+    tried: Tried,
+    within: Expr,
+    exact: Expr,
+    patience: int = FIT.patience,
+    budget: int = FIT.budget,
+) -> Judged:
     """Accept a step that lowers the cost, and decide whether the fit is at its end.
 
     Args:
@@ -200,6 +207,8 @@ def judge(s: dict[str, Expr], tried: Tried, within: Expr, exact: Expr) -> Judged
         within: Whether what is left of the residual after it is good enough to stop at, should
             it fall slowly.
         exact: Whether it is so good that nothing more is to be gained.
+        patience: Evaluations with little gain before the fit is given up.
+        budget: Evaluations in all.
     """
     cost_before, cost_there = ca.sumsqr(tried.before), ca.sumsqr(tried.there)
     accepted = gains(tried)
@@ -208,7 +217,7 @@ def judge(s: dict[str, Expr], tried: Tried, within: Expr, exact: Expr) -> Judged
     waited = ca.if_else(left > FIT.slow, s["waited"] + 1, 0.0)
     spent = s["spent"] + 1
     worth = ca.if_else(cost < FIT.promising, float(FIT.persistence), 1.0)
-    over = ca.logic_or(waited >= FIT.patience * worth, spent >= FIT.budget * worth)
+    over = ca.logic_or(waited >= patience * worth, spent >= budget * worth)
     stuck = ca.logic_and(ca.logic_not(accepted), s["damping"] > FIT.damping_ceiling)
     over = ca.logic_or(over, stuck)
     slowing = ca.logic_and(within, left > FIT.quadratic)

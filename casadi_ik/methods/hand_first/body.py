@@ -22,6 +22,7 @@ from casadi_ik.methods.common.contact_fit import FIT, Tried, fresh_fit, judge, j
 from casadi_ik.methods.common.numeric_arm import newton_polish
 from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
 from casadi_ik.methods.hand_first.hand_fit import PalmAndHand, fit_step
+from casadi_ik.methods.hand_first.parameters import BODY
 from casadi_ik.methods.hand_first.state import BY_SIDE, HandFirstLayouts, Stage, with_rows
 from casadi_ik.methods.hand_first.step import BEFORE_THE_ARM, HandFirstStep
 from casadi_ik.problem.contacts import LENGTH, Kinds
@@ -303,7 +304,7 @@ class BodyStep(HandFirstStep):
         there = self._off(s, p, q, [])[0]
         size = ca.mmax(ca.fabs(q - s["q"]))
         tried = Tried(q, before, there, damped.promised, size)
-        judged = judge(s, tried, within=ca.SX(0), exact=ca.SX(0))
+        judged = judge(s, tried, ca.SX(0), ca.SX(0), BODY.patience, BODY.budget)
         now = ca.if_else(judged.accepted, q, s["q"])
         changed = {"q": now} | judged.fit
         said = {"settled": judged.settled, "cost": judged.cost}

@@ -15,6 +15,11 @@
  * BEGIN, SOLVE and JUDGE call compiled kernels, as in seeds.c; the constants come from driver.py.
  */
 
+#if N_SIDES
+#undef VALLEY_ROUNDS           /* valleys are those of one hand */
+#define VALLEY_ROUNDS 0
+#endif
+
 /* First state and parameters of the round, from its postures; what was found before stays. */
 static int begin_round(search *job) {
   const int64_t number = job->round, later = number - ROUNDS;

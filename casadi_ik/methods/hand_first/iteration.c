@@ -102,13 +102,17 @@ static int to_placement(solve s) {
 }
 
 /* Where a palm is now known the next side follows, and after the last one all arms. */
-static int after_side(solve s) {
+static int after_side(solve s, int skipped) {
   const int side = (int) X(SIDE);
+  double away = 0;
   int i;
   for (i = 0; i < 12; ++i) {
     ENTRY(Y(PALM_ROTATION_0), 12 * side + i) = ENTRY(Y(PALM_ROTATION), i);
   }
   ENTRY(Y(FITTED), side) = Y(FITS);
+  for (i = 0; i < 3; ++i) away += ENTRY(Y(PALM_ORIGIN), i) * ENTRY(Y(PALM_ORIGIN), i);
+  /* What is farther than trunk and arm drawn straight no trunk brings near. */
+  if (!skipped && away > SIDE_REACH[side] * SIDE_REACH[side]) return to_next_candidate(s);
   if (X(CANDIDATE) > X(FARTHEST)) Y(FARTHEST) = X(CANDIDATE);
   if (side + 1 < N_SIDES) return to_side(s, side + 1, X(FIRST));
   for (i = 0; i < N_SIDES; ++i) {
@@ -146,13 +150,26 @@ static int after_trunk(solve s) {
   }
   Y(AGAIN) = 0;
   Y(TRIED) = X(TRIED) + 1;
+  if (!(X(TRIED) > 0) || SAID(COST) < X(PALMS_LEAST)) {
+    Y(PALMS_LEAST) = SAID(COST);
+    for (i = 0; i < N_TRUNK; ++i) ENTRY(Y(BEST_TRUNK), i) = ENTRY(Y(Q), TRUNK_MOTORS[i]);
+  }
   if (Y(TRIED) >= most) {
     begin_fit(s);
     if (X(FARTHEST) + 1 >= N_CANDIDATES) return goes_to(s, REFINEMENT_STAGE);
     return to_next_candidate(s);
   }
   Y(TRUNKS) = X(TRUNKS) + 1;
-  for (i = 0; i < N_TRUNK; ++i) ENTRY(Y(Q), TRUNK_MOTORS[i]) = spread(s, TRUNK_MOTORS[i], TRUNK_STEPS[i]);
+  for (i = 0; i < N_TRUNK; ++i) {
+    const int k = TRUNK_MOTORS[i];
+    const double anywhere = spread(s, k, TRUNK_STEPS[i]);
+    ENTRY(Y(Q), k) = anywhere;
+    if ((int) Y(TRIED) % CLOSER_EVERY == CLOSER_EVERY - 1) {
+      /* Near the best trunk so far, the nearer the more were tried. */
+      const double best = ENTRY(Y(BEST_TRUNK), i);
+      ENTRY(Y(Q), k) = best + (anywhere - best) * BOX / (BOX + Y(TRIED));
+    }
+  }
   for (i = 0; i < N_ARM; ++i) {
     ENTRY(Y(ARM), i) = ENTRY(Y(Q), ARM[i]) = spread(s, ARM[i], BODY_ARM_STEPS[i]);
   }
@@ -203,7 +220,7 @@ static int after_candidate(solve s) {
 #if N_SIDES
   if (X(CANDIDATE) < N_CANDIDATES && SAYS(WITHIN)) {
     Y(FITS) = 1;
-    return after_side(s);
+    return after_side(s, 1);
   }
   if (X(CANDIDATE) < N_CANDIDATES) return goes_to(s, HAND_FIT_STAGE + BY_SIDE * (int) X(SIDE));
 #endif
@@ -240,7 +257,7 @@ static int after_hand_fit(solve s) {
   }
   if (!goes_on) return to_next_candidate(s);
 #if N_SIDES
-  return after_side(s);
+  return after_side(s, 0);
 #endif
   goes_to(s, HAS_CHOICE && P(NEAREST) > 0 ? ARM_CHOICE_STAGE : placement(s));
   return !alone ? RUNNING_STATUS : SAYS(WITHIN) ? SOLVED_STATUS : STALLED_STATUS;

@@ -22,6 +22,7 @@ from casadi_ik.methods.hand_first.parameters import BODY
 from casadi_ik.methods.hand_first.state import BY_SIDE, PLACES, SAID, Stage
 from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.problem.status import Status
+from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.even_spread import even_steps
 
 if TYPE_CHECKING:
@@ -93,6 +94,7 @@ def text(step: HandFirstStep) -> str:
         arrays |= {
             "TRUNK_MOTORS": np.array([*trunk, 0]),
             "TRUNK_STEPS": np.array([*even_steps(len(trunk)), 0.0]),
+            "SIDE_REACH": np.array([_reach(robot, side.palm_link) for side in robot.sides]),
             "BODY_ARM_STEPS": even_steps(len(layouts.arm)),
         }
     if numeric:
@@ -111,6 +113,14 @@ def text(step: HandFirstStep) -> str:
             source.read_text(encoding="utf-8"),
         )
     )
+
+
+def _reach(robot: RobotDescription, link: str) -> float:
+    """How far [m] a link is from the base at most: the chain drawn straight, and what slides."""
+    chain = robot.chain(link)
+    drawn = sum(float(np.linalg.norm(joint.placement[:3, 3])) for joint in chain)
+    slid = (max(abs(j.lower), abs(j.upper)) for j in chain if j.type == "prismatic")
+    return drawn + sum(slid)
 
 
 class Iteration:

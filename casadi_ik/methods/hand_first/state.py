@@ -172,6 +172,8 @@ class HandFirstLayouts:
             Field("farthest", doc="the largest index that a side has come to"),
             Field("fitted", (len(sides),), doc="1 if palm and hand meet the contacts, by side"),
             *(field for palm in palms for field in palm),
+            Field("palms_least", doc="smallest cost of trunk steps for these palms"),
+            Field("best_trunk", (len(self.robot.trunk),), doc="the trunk it belongs to"),
             Field("again", doc="1 once arms were placed anew at the trunk found"),
             Field("tried", doc="trunks tried for these palms"),
             Field("trunks", doc="trunks tried for all palms"),
