@@ -22,7 +22,7 @@ from casadi_ik.methods.hand_first.parameters import BODY
 from casadi_ik.methods.hand_first.state import BY_SIDE, PLACES, SAID, Stage
 from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.problem.status import Status
-from casadi_ik.robots.description import RobotDescription
+from casadi_ik.robots.description import RobotDescription, Side
 from casadi_ik.symbolic.even_spread import even_steps
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ def text(step: HandFirstStep) -> str:
         arrays |= {
             "TRUNK_MOTORS": np.array([*trunk, 0]),
             "TRUNK_STEPS": np.array([*even_steps(len(trunk)), 0.0]),
-            "SIDE_REACH": np.array([_reach(robot, side.palm_link) for side in robot.sides]),
+            "SIDE_REACH": np.array([_reach(robot, side) for side in robot.sides]),
             "BODY_ARM_STEPS": even_steps(len(layouts.arm)),
         }
     if numeric:
@@ -115,10 +115,11 @@ def text(step: HandFirstStep) -> str:
     )
 
 
-def _reach(robot: RobotDescription, link: str) -> float:
-    """How far [m] a link is from the base at most: the chain drawn straight, and what slides."""
-    chain = robot.chain(link)
+def _reach(robot: RobotDescription, side: Side) -> float:
+    """How far [m] a palm is from the base at most: the chain drawn straight, and what slides."""
+    chain = robot.chain(side.palm_link)
     drawn = sum(float(np.linalg.norm(joint.placement[:3, 3])) for joint in chain)
+    drawn += float(np.linalg.norm(side.palm_placement[:3, 3]))
     slid = (max(abs(j.lower), abs(j.upper)) for j in chain if j.type == "prismatic")
     return drawn + sum(slid)
 

@@ -139,7 +139,7 @@ class BodyParameters:
         patience: Steps of trunk and arms with little gain before they are given up; with 3 instead
             of 8 three times as many of these targets are missed.
         budget: Steps of trunk and arms in all, ten times as many where little is left.
-        nearly: Cost (3 cm and 18 deg) below which arms are placed anew at the trunk that steps led to.
+        nearly: Cost (3 cm and 18 deg) below which arms are placed anew at the trunk found.
         again_trials: Looks at their redundancies then.
         around: The look that begins around one value of the redundancy, of every second trunk.
         from_anywhere: Every so many trunks the arms begin from anywhere instead.
