@@ -119,8 +119,8 @@ class Side:
 class RobotDescription:
     """An arm-hand, a hand alone on a fixed base, or a body: arm-hands on a common trunk.
 
-    A body is one tree like any other robot. Its palm is its root and all of its motors count as
-    motors of the hand; `sides` and `trunk` say which of them are whose.
+    A body is one tree like any other robot, without a palm of its own: that is its root. `sides`
+    and `trunk` say which motors are whose.
 
     Attributes:
         name: Name of the description.
@@ -298,7 +298,9 @@ class RobotDescription:
 
     @cached_property
     def hand_actuators(self) -> tuple[int, ...]:
-        """Positions in q of the hand's actuators: all but the arm's."""
+        """Positions in q of the hand's actuators, all but the arm's; of a body all its hands'."""
+        if self.sides:
+            return tuple(place for _, hand in self.side_actuators for place in hand)
         arm = set(self.arm_actuators)
         return tuple(i for i in range(len(self.actuators)) if i not in arm)
 

@@ -158,6 +158,9 @@ class Subproblems:
         """
         states, parameters = self.method.rows(targets, start, postures[:, None], begun=True)
         states[:, self.state.slice("candidate")] = self.method.options.candidates - 1
+        if self.robot.description.sides:
+            # Every side begins from its part of the posture, and none follows.
+            states[:, self.state.slice("first")] = self.method.options.candidates - 1
         states[:, self.state.slice("turn").start] = turns
         return states, parameters
 

@@ -164,7 +164,7 @@ class BodyStep(HandFirstStep):
 
     def _side_candidate(self, stage: Stage | SideStage, side: BodySide) -> ca.Function:
         inputs, s, p = self._vectors()
-        hands = ca.SX.sym("hand", len(self.layouts.hand))
+        hands = ca.SX.sym("hand", len(self.layouts.robot.hand_actuators))
         hand, own = hands[side.hands], side.parameters(p)
         contacts = hand_contacts(side.robot, hand, side.robot.hand_actuators)
         number = ca.fmax(s["candidate"] + s["earlier"], 0.0) + s["turn"]
@@ -297,10 +297,17 @@ class BodyStep(HandFirstStep):
         """One damped step of trunk and arms that keeps the palms."""
         inputs, s, p = self._vectors()
         rows = [*self.robot.trunk_actuators, *self.layouts.arm]
-        bounds = Bounded(s["q"][rows], p["lower"][rows], p["upper"][rows], first=0)
+        # Where what is near is wanted the trunk moves last.
+        unit = ca.if_else(p["nearest"], BODY.trunk_unit, 1.0)
+        units = ca.vertcat(
+            ca.repmat(unit, len(self.robot.trunk), 1), ca.SX.ones(len(self.layouts.arm), 1)
+        )
+        value, lower, upper = (x[rows] / units for x in (s["q"], p["lower"], p["upper"]))
+        bounds = Bounded(value, lower, upper, first=0)
         before, slopes, turned = self._off(s, p, s["q"], rows)
+        slopes = slopes @ ca.diag(units)
         damped = damped_step(slopes, turned, s["damping"], bounds, FIT.passes)
-        q = with_rows(s["q"], rows, clip(bounds.value + damped.step, bounds))
+        q = with_rows(s["q"], rows, units * clip(value + damped.step, bounds))
         there = self._off(s, p, q, [])[0]
         size = ca.mmax(ca.fabs(q - s["q"]))
         tried = Tried(q, before, there, damped.promised, size)

@@ -136,7 +136,7 @@ class SearchPlan:
         return {
             "N_FINGERS": len(robot.fingers),
             "N_MOTORS": len(robot.actuators),
-            "N_HAND": len(layouts.hand),
+            "N_HAND": len(layouts.robot.hand_actuators),
             "N_TERMS": terms(robot).size,
             "N_STATE": layouts.state.size,
             "N_PARAMETERS": layouts.parameters.size,
@@ -258,7 +258,7 @@ class SearchPlan:
         return found
 
     def _real_numbers(self) -> dict[str, float]:
-        options, hand = self.options, len(self.layouts.hand)
+        options, hand = self.options, len(self.layouts.robot.hand_actuators)
         return {
             "LENGTH": LENGTH,
             "ALIKE": options.similar * options.similar * hand,
@@ -279,7 +279,7 @@ class SearchPlan:
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         robot, seeds = self.layouts.robot, self.seeds
-        hand, spreads = list(self.layouts.hand), seeds.spreads
+        hand, spreads = list(self.layouts.robot.hand_actuators), seeds.spreads
         lower, upper = seeds.anywhere_bounds(self.enforce_limits)
         fresh, state = fresh_fit(), self.layouts.state
         return {

@@ -120,7 +120,10 @@ static int after_side(solve s, int skipped) {
   }
   Y(SIDE) = N_SIDES;
   Y(TRIED) = 0;
-  return to_placement(s);
+  to_placement(s);
+  /* What is near is looked for from where the robot is. */
+  if (P(NEAREST) > 0) goes_to(s, TRUNK_STAGE);
+  return RUNNING_STATUS;
 }
 
 static int after_all_placements(solve s) {

@@ -60,7 +60,7 @@ def text(step: HandFirstStep) -> str:
         "N_SAID": SAID.size,
         "N_MOTORS": len(robot.actuators),
         "N_ARM": len(layouts.arm),
-        "N_HAND": len(layouts.hand),
+        "N_HAND": len(layouts.robot.hand_actuators),
         "N_CANDIDATES": layouts.candidates,
         "N_STARTS": len(start_table(robot)[0]) if numeric else 0,
         "MOST_STARTS": STARTS,

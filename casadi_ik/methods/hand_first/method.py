@@ -304,7 +304,7 @@ class HandFirstMethod(LoopedMethod):
         Returns:
             (k, ...) states and parameters.
         """
-        hand = len(self.step.layouts.hand)
+        hand = len(self.step.layouts.robot.hand_actuators)
         tried = np.broadcast_to(postures, (len(targets), self.options.candidates, hand))
         vectors = (targets.vectors(f"{name}s") for name in self.step.layouts.contacts.data)
         # A kernel's column is a vector: of a hand with one motor there is no second dimension.

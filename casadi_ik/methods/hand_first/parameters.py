@@ -144,6 +144,7 @@ class BodyParameters:
         around: The look that begins around one value of the redundancy, of every second trunk.
         from_anywhere: Every so many trunks the arms begin from anywhere instead.
         closer_every: Every so many trunks one between an even spread and the best one so far.
+        trunk_unit: What counts as a unit of the trunk where what is near is wanted; of arms 1.
         box: After so many trunks half as far from the best one.
     """
 
@@ -158,6 +159,7 @@ class BodyParameters:
     around: int = 5
     from_anywhere: int = 8
     closer_every: int = 4
+    trunk_unit: float = 0.25
     box: float = 8.0
 
 

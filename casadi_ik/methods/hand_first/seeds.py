@@ -17,7 +17,6 @@ from casadi_ik.kernels import FunctionGraph, FunctionKernel
 from casadi_ik.kernels.graphs import recipe
 from casadi_ik.methods.common.posture_table import PostureTable
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
-from casadi_ik.methods.hand_first.state import hand_columns
 from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.even_spread import evenly
@@ -63,7 +62,7 @@ class Seeds:
             compiled: Whether lookups run in compiled code.
         """
         self._robot = ArmHand(robot)
-        self._hand = list(hand_columns(robot))
+        self._hand = list(robot.hand_actuators)
         self._options = options
         self._compiled = compiled
 
@@ -116,6 +115,8 @@ class Seeds:
     def mends(self) -> bool:
         """Whether postures are mended: a hand with many motors, no two fingers share one."""
         robot = self._robot.description
+        if robot.sides:
+            return False
         fingers = [robot.finger_actuators(finger) for finger in robot.finger_names]
         hand = [a for motors in fingers for a in motors if a in robot.hand_actuators]
         return self._options.is_many(robot) and len(fingers) > 1 and len(hand) == len(set(hand))

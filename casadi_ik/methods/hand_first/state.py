@@ -110,11 +110,6 @@ class HandFirstLayouts:
         return tuple(sides) if robot.sides else robot.arm_actuators
 
     @cached_property
-    def hand(self) -> tuple[int, ...]:
-        """Positions in q of the motors of the hand, or of a body's hands."""
-        return hand_columns(self.robot)
-
-    @cached_property
     def contacts(self) -> ContactRows:
         """The contacts' rows."""
         return ContactRows(self.kinds)
@@ -183,7 +178,7 @@ class HandFirstLayouts:
     def parameters(self) -> Layout:
         """The problem and the numbers of the method."""
         n, f = len(self.robot.actuators), len(self.robot.fingers)
-        hand = len(self.hand)
+        hand = len(self.robot.hand_actuators)
         return Layout(
             (
                 *self.contacts.fields,
@@ -226,7 +221,7 @@ class HandFirstLayouts:
 
     def hand_bounds(self, q: Expr, p: dict[str, Expr], first: int) -> Bounded:
         """Bounds of the hand's actuators."""
-        rows = list(self.hand)
+        rows = list(self.robot.hand_actuators)
         return Bounded(q[rows], p["lower"][rows], p["upper"][rows], first)
 
     def row(
@@ -277,12 +272,6 @@ class HandFirstLayouts:
         )
 
 
-def hand_columns(robot: RobotDescription) -> tuple[int, ...]:
-    """Positions in q of the motors of the hand, or of a body's hands."""
-    sides = (place for _, hand in robot.side_actuators for place in hand)
-    return tuple(sides) if robot.sides else robot.hand_actuators
-
-
 def with_rows(q: Expr, rows: Sequence[int], values: Expr) -> Expr:
     """Replace some of the entries of q."""
     places = {row: i for i, row in enumerate(rows)}
@@ -324,7 +313,7 @@ def beginning(layouts: HandFirstLayouts) -> FunctionGraph:
             **{f"{vector}s": (f, 3) for vector in layouts.contacts.data},
             "here": (n, 1),
             "terms": (terms(robot).size, 1),
-            "postures": (layouts.candidates, len(layouts.hand)),
+            "postures": (layouts.candidates, len(layouts.robot.hand_actuators)),
         },
         ((layouts.state.size, 1), (layouts.parameters.size, 1)),
         recipe(name, robot, layouts.candidates, layouts.kinds),
@@ -332,7 +321,7 @@ def beginning(layouts: HandFirstLayouts) -> FunctionGraph:
 
 
 def _build(name: str, layouts: HandFirstLayouts) -> ca.Function:
-    robot, hand = layouts.robot, list(layouts.hand)
+    robot, hand = layouts.robot, list(layouts.robot.hand_actuators)
     f, n = len(robot.fingers), len(robot.actuators)
     vectors = {f"{vector}s": ca.SX.sym(f"{vector}s", f, 3) for vector in layouts.contacts.data}
     here = ca.SX.sym("q", n)
@@ -387,7 +376,7 @@ def _is_held(layouts: HandFirstLayouts, t: dict[str, Expr]) -> Expr:
 
     A hand that is held as a whole needs no search.
     """
-    hand, arm = list(layouts.hand), list(layouts.arm)
+    hand, arm = list(layouts.robot.hand_actuators), list(layouts.arm)
     free_hand, free_arm = (
         ca.sum1(t["lower"][rows] < t["upper"][rows]) if rows else 0 for rows in (hand, arm)
     )
