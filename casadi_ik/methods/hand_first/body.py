@@ -157,11 +157,6 @@ class BodyStep(HandFirstStep):
                 found[key] = partial(build, key, side)
         return found
 
-    @property
-    def trials(self) -> tuple[int, ...]:
-        """None of an arm by itself."""
-        return 0, 0, 0, 0
-
     def _side_candidate(self, stage: Stage | SideStage, side: BodySide) -> ca.Function:
         inputs, s, p = self._vectors()
         hands = ca.SX.sym("hand", len(self.layouts.robot.hand_actuators))

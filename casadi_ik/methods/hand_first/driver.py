@@ -34,8 +34,6 @@ from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.seeds import FEATURES, Seeds
 from casadi_ik.methods.hand_first.state import (
     CARRIED,
-    STAGE_LABELS,
-    STAGES,
     HandFirstLayouts,
     terms,
 )
@@ -239,7 +237,7 @@ class SearchPlan:
             "HAS_ARM": int(bool(layouts.arm)),
             "N_CARRIED": len(self._carried),
             "N_FRESH": len(fresh_fit()),
-            "N_COUNTS": len(STAGES),
+            "N_COUNTS": len(self.layouts.stages),
             **{f"{status.name}_STATUS": int(status) for status in Status},
             **{f"{phase.name}_PHASE": int(phase) for phase in Phase},
             **{k: v for k, v in self._options.items() if isinstance(v, int)},
@@ -386,6 +384,7 @@ class Searches:
         self.state, self.parameters = one["state"], one["parameters"]
         self.postures = one["postures"].reshape(plan.options.candidates, -1)
         self._one = one
+        self._labels = plan.layouts.labels
         self._counts = self.state[plan.layouts.state.slice("counts")]
         self._address = ctypes.c_void_p(memory(searches.view(np.uint8)))
         # An entry of a record costs as much as a tenth of a solve: these are read in every one.
@@ -476,7 +475,9 @@ class Searches:
             status=status,
             iterations=self._iterations.value,
             restarts=self._restarts.value,
-            phases=dict(zip(STAGE_LABELS, map(int, self._counts.tolist()), strict=True)),
+            phases=dict(
+                zip(self.plan.layouts.labels, map(int, self._counts.tolist()), strict=True)
+            ),
             errors=errors,
         )
 
@@ -527,7 +528,7 @@ class Searches:
         ]
         answers = [
             np.empty_like(q0, order="C"),
-            np.empty((count, len(STAGES))),
+            np.empty((count, len(plan.layouts.stages))),
             np.empty(count, dtype=np.int64),
         ]
         step = 0 if given.ndim == 1 else given.shape[1]
@@ -556,7 +557,7 @@ class Searches:
             iterations=result.iterations,
             restarts=restarts,
             time=result.time,
-            phases=dict(zip(STAGE_LABELS, counts.astype(np.int64).T, strict=True)),
+            phases=dict(zip(self.plan.layouts.labels, counts.astype(np.int64).T, strict=True)),
             rows=result.rows,
         )
 

@@ -22,7 +22,7 @@ from casadi_ik.methods.hand_first.body import BodyStep
 from casadi_ik.methods.hand_first.driver import Searches, SearchPlan, SearchPool, can_search
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.seeds import Seeds
-from casadi_ik.methods.hand_first.state import CARRIED, STAGES, beginning
+from casadi_ik.methods.hand_first.state import CARRIED, beginning
 from casadi_ik.methods.hand_first.step import HandFirstStep
 from casadi_ik.problem.contacts import Kinds, usual
 from casadi_ik.problem.method import Outcome, Quick
@@ -278,7 +278,7 @@ class HandFirstMethod(LoopedMethod):
         """The step counts them."""
         del iterations
         counts = states[:, self.step.layouts.state.slice("counts")].astype(np.int64)
-        return {stage: counts[:, i] for i, stage in enumerate(STAGES)}
+        return {stage: counts[:, i] for i, stage in enumerate(self.step.layouts.stages)}
 
     def restarts(self, states: Array) -> Counts:
         """Hand postures tried but the first."""

@@ -36,9 +36,9 @@ from casadi_ik.symbolic.smooth import Expr, shared
 
 STAGES = (
     *(Phase.REFINEMENT, Phase.CANDIDATE, Phase.HAND_FIT, Phase.ARM_PLACEMENT),
-    *(Phase.BALANCE, Phase.ARM_CHOICE, Phase.TRUNK),
+    *(Phase.BALANCE, Phase.ARM_CHOICE),
 )
-"""The stages in the order of their codes."""
+"""The stages of an arm-hand in the order of their codes; a body has `Phase.TRUNK` after them."""
 
 
 class Stage(IntEnum):
@@ -70,13 +70,13 @@ SAID = Layout(
 )
 """What a stage says of where it leads."""
 
-PLACES = {stage: STAGES.index(Phase(stage)) for stage in Stage if stage in STAGES} | {
+PLACES = {
+    **{stage: i for i, stage in enumerate(STAGES)},
+    Stage.TRUNK: len(STAGES),
     Stage.START: STAGES.index(Phase.REFINEMENT),
     Stage.ARM_STEPS: STAGES.index(Phase.ARM_PLACEMENT),
 }
 """Where a stage is counted."""
-
-STAGE_LABELS = tuple(stage.label for stage in STAGES)
 
 CARRIED = (
     *("passed", "near", "balanced", "least", "returns"),
@@ -108,6 +108,16 @@ class HandFirstLayouts:
         robot = self.robot
         sides = (place for arm, _ in robot.side_actuators for place in arm)
         return tuple(sides) if robot.sides else robot.arm_actuators
+
+    @cached_property
+    def stages(self) -> tuple[Phase, ...]:
+        """Those that its solves may be in, as they are counted."""
+        return (*STAGES, Phase.TRUNK) if self.robot.sides else STAGES
+
+    @cached_property
+    def labels(self) -> tuple[str, ...]:
+        """Their names."""
+        return tuple(stage.label for stage in self.stages)
 
     @cached_property
     def contacts(self) -> ContactRows:
@@ -148,7 +158,7 @@ class HandFirstLayouts:
                 Field("passed", doc="how far the palm of the last start was from the one wanted"),
                 Field("best_cost", doc="smallest cost of a whole configuration so far"),
                 Field("best_q", (n,), doc="the configuration it belongs to"),
-                Field("counts", (len(STAGES),), doc="iterations by stage, in the order of STAGES"),
+                Field("counts", (len(self.stages),), doc="iterations by stage"),
                 *(self._of_sides if self.robot.sides else ()),
             )
         )
