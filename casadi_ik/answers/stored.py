@@ -88,10 +88,12 @@ class RankedSolution(msgspec.Struct, frozen=True):
     Attributes:
         robot: Whose it is.
         q: A number per actuator [rad or m].
+        clearance: Smallest distance of a pair that must not touch [m]; None: not checked.
     """
 
     robot: str
     q: list[float]
+    clearance: float | None = None
 
 
 class RankedEntry(msgspec.Struct, frozen=True):
@@ -104,6 +106,7 @@ class RankedEntry(msgspec.Struct, frozen=True):
         name: Of its grasp.
         grasp: The grasp, where the object is; None in older files.
         pregrasp: The same hand before it, if the candidate said it.
+        load: What it holds per newton of squeeze, of answers of ``casadi-ik grasp``.
     """
 
     candidate: int
@@ -112,6 +115,7 @@ class RankedEntry(msgspec.Struct, frozen=True):
     name: str = ""
     grasp: GraspFile | None = None
     pregrasp: GraspFile | None = None
+    load: float | None = None
 
     @property
     def label(self) -> str:

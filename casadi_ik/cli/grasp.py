@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import io
 import json
+from dataclasses import replace
+from functools import partial
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -13,58 +16,74 @@ from casadi_ik.answers.report import fields, files, headline, table
 from casadi_ik.answers.solution import Choice, Ranking
 from casadi_ik.answers.stored import RANKED_MEMBER, ranking_data
 from casadi_ik.api import Solver
+from casadi_ik.arm_hand import ArmHand
 from casadi_ik.cli import options as opt
 from casadi_ik.cli.inputs import located, the_object_pose, the_robot, the_scene, the_start
+from casadi_ik.cli.options import Option
 from casadi_ik.cli.outputs import check_outputs, write_output
 from casadi_ik.cli.table import Answer, Said, command
+from casadi_ik.cli.view import serve
+from casadi_ik.collision.scene import Scene
+from casadi_ik.errors import MissingExtraError
 from casadi_ik.touch.grasps import FoundGrasps
 from casadi_ik.touch.surface import load_surface
 
 
 @command(
-    opt.Option("OBJECT", "a mesh in metres (stl, obj, ...), a shipped object or its YAML file"),
+    Option("OBJECT", "a mesh in metres (stl, obj, ...), a shipped object or its YAML file"),
     opt.THE_ROBOT,
-    opt.Option("--scale S", "unit of the mesh in metres: 0.001 for millimetres", 1.0, opt.positive),
+    Option("--scale S", "unit of the mesh in metres: 0.001 for millimetres", 1.0, opt.positive),
     opt.OBJECT_POSE,
-    opt.Option("--fingers N", "fingertips that touch", 3, opt.whole(2)),
-    opt.Option("--mu MU", "friction coefficient", 0.5, opt.positive),
-    opt.Option(
+    Option("--fingers N", "fingertips that touch", 3, opt.whole(2)),
+    Option("--mu MU", "friction coefficient", 0.5, opt.positive),
+    Option(
         "--hold KG_N...",
         "a mass [kg], and the squeeze [N] with which it has to be held",
         read=lambda words: opt.numbers(words, 2, "kg N"),
     ),
     opt.SCENE,
-    opt.Option(
+    Option(
         "--prefer load|clearance|limits|q0",
         "what comes first: most load per squeeze, far from what may be hit, from limits, or near "
         "the start",
         default="load",
     ),
-    opt.Option("--limit N", "grasps at most", 200, opt.whole(1)),
+    Option("--limit N", "grasps at most", 200, opt.whole(1)),
     opt.Q0,
     opt.SEED,
-    opt.Option("--jobs N", "threads", 1, opt.whole(1)),
+    Option("--jobs N", "threads", 1, opt.whole(1)),
     opt.out("FOUND.npz", "write the grasps"),
+    opt.picture("--picture", "draw the best nine: hand and object"),
+    Option("--view", "show the grasps in the browser afterwards (needs 'casadi-ik[view]')"),
 )
 def grasp(said: Said) -> Answer:
     r"""Find grasps of an object that the arm-hand can make, free of collision.
 
     Examples:
       casadi-ik grasp mug.obj --robot panda+allegro_right --scene table \
-          --object-pose 0.5 0.1 0.05 0 0 0 --out mug.npz
+          --object-pose 0.5 0.1 0.05 0 0 0 --out mug.npz --picture mug.png
+      casadi-ik view mug.npz --scene table
       casadi-ik reach mug.npz --rank 1 --scene table --out way.mcap
 
     Two opposing fingertips are matched with two opposing patches of the object, the
     other fingers look for something to touch, palm and hand are moved until all
     touch, the arm follows in closed form; what remains is judged in the scene and
-    ranked. FOUND.npz holds points and normals (k, f, 3), as for `casadi-ik batch`
-    and `choose`, q, load, closure and clearance, and the ranked answers for
-    `casadi-ik reach` and `view`.
+    ranked. FOUND.npz holds points and normals (k, f, 3), as for `casadi-ik batch` and
+    `choose`, q, load, closure and clearance, and the ranked answers for `casadi-ik
+    reach` and `view`. If none is found, nothing is written.
 
     exit codes: 0 at least one found, 1 none (the report says why), 2 bad input
     """
     robot, scene = the_robot(said.robot), the_scene(said)
-    check_outputs({"--out": said.out}, inputs=[Path(said.object)])
+    outputs = {"--out": said.out, "--picture": said.picture}
+    check_outputs(outputs, inputs=[Path(said.object)])
+    draw = None
+    if said.picture is not None:
+        with located("--picture", (MissingExtraError,)):
+            from casadi_ik.views import draw_grasps as draw
+    if said.view:
+        with located("--view", (MissingExtraError,)):
+            import_module("casadi_ik.viewing")
     surface = load_surface(said.object, said.scale, said.seed)
     with located(said.object):
         found = Solver(robot, scene=scene).grasps_of(
@@ -79,17 +98,29 @@ def grasp(said: Said) -> Answer:
             prefer=said.prefer,
             q0=the_start(said, robot),
         )
+    counts = fields({name: f"{number:,}" for name, number in found.counts.items()})
+    rest = f"{surface.object.name} with {robot.name}, {found.time:.2f} s of processor time"
+    if not len(found):
+        head = headline(False, "NONE FOUND", rest)
+        return Answer.solved(False, head, counts, Text(f"  {found.reason}"))
     held = found_data(found, robot.fingers)
     write_output(said.out, "--out", lambda part: part.write_bytes(held))
-    rest = f"{len(found)} grasps of {surface.object.name} in {found.time:.2f} s of processor time"
-    counts = fields({name: f"{number:,}" for name, number in found.counts.items()})
+    if draw is not None:
+        draw(robot, found, said.picture, scene=scene)
     best = table("rank", "load [N/N]", "clearance [mm]", "fingers")
     for rank, one in enumerate(found[:10], 1):
         room = "" if one.clearance is None else f"{1e3 * one.clearance:.1f}"
         best.add_row(str(rank), f"{one.load:.3f}", room, " ".join(one.grasp.contacts))
-    shown = [best] if len(found) else [Text(f"  {found.reason}")]
-    head = headline(bool(len(found)), "FOUND" if len(found) else "NONE FOUND", rest)
-    return Answer.solved(bool(len(found)), head, counts, *shown, *files({"--out": said.out}))
+    head = headline(True, f"{len(found)} FOUND", rest)
+    report = Answer.solved(True, head, counts, best, *files(outputs))
+    return replace(report, after=partial(_view, robot, found, scene)) if said.view else report
+
+
+def _view(robot: ArmHand, found: FoundGrasps, scene: Scene | None) -> None:
+    """Show the grasps in the browser until Ctrl-C."""
+    from casadi_ik.viewing import view_found
+
+    serve(view_found(robot, found, scene=scene))
 
 
 def found_data(found: FoundGrasps, fingers: tuple[str, ...]) -> bytes:
@@ -103,6 +134,8 @@ def found_data(found: FoundGrasps, fingers: tuple[str, ...]) -> bytes:
     choices = [Choice(i, one.solution, one.score, one.grasp) for i, one in enumerate(found)]
     ranking = Ranking(tuple(choices), k, k, {}, found.prefer)
     data = ranking_data(ranking, [one.grasp.name for one in found])
+    for entry, one in zip(data["ranked"], found, strict=True):
+        entry["load"] = one.load
     text = json.dumps(data, allow_nan=False)
     arrays |= {
         "q": np.array([one.q for one in found]),

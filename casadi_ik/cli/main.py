@@ -57,6 +57,8 @@ def _run(words: Sequence[str]) -> int:
             with _size_limits(getattr(said, "size_limits", None)):
                 answer = run(said)
             _show(answer.report)
+            if answer.after is not None:
+                answer.after()
             return answer.exit
         except CasadiIKError as error:
             say("error", str(error))

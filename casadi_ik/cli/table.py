@@ -129,10 +129,12 @@ class Answer:
     Attributes:
         report: What to show on stdout; a text is printed as it is.
         exit: The exit code.
+        after: What is done once the report is shown; None: nothing.
     """
 
     report: RenderableType
     exit: Exit = Exit.DONE
+    after: Callable[[], None] | None = None
 
     @staticmethod
     def solved(solved: bool, *report: RenderableType) -> Answer:

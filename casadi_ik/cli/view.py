@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,9 +40,9 @@ from casadi_ik.logs import RecordedMotion, read_motion
 from casadi_ik.logs.solve import OneSolve, one_solve
 
 if TYPE_CHECKING:
-    from casadi_ik.viewing import PageRequest, Settings, Viewer
+    from casadi_ik.viewing import Candidate, PageRequest, Settings, Viewer
 
-    Choices = dict[str, Callable[[], tuple[PageRequest, Array]]]
+    Choices = dict[str, Candidate]
 
 
 SOLVES = opt.each(opt.whole(1))
@@ -95,11 +94,15 @@ def view(said: Said) -> Answer:
 
     exit codes: 0 closed, 2 bad input
     """
-    viewer = opened(said)
+    serve(opened(said))
+    return Answer("closed\n")
+
+
+def serve(viewer: Viewer) -> None:
+    """Say where a page is, and wait until it is closed."""
     sys.stdout.write(f"{viewer.url}   (Ctrl-C ends it)\n")
     sys.stdout.flush()
     viewer.wait()
-    return Answer("closed\n")
 
 
 def opened(said: Said) -> Viewer:
@@ -150,7 +153,7 @@ def opened(said: Said) -> Viewer:
         return viewing.view_grasp(robot, grasp, **more)
     ranked = is_ranked(path)
     robot, choices = (_ranked if ranked else _candidates)(path, said, scene, settings)
-    first, q = next(iter(choices.values()))()
+    first, q = next(iter(choices.values())).ask()
     q = q if ranked else None
     return viewing.view_grasp(robot, first.grasp, q=q, candidates=choices, **more)
 
@@ -233,7 +236,7 @@ def _candidates(
     Raises:
         InputError: The file is malformed, or no robot is said.
     """
-    from casadi_ik.viewing import request_of
+    from casadi_ik.viewing import Candidate, request_of
 
     robot, pose = the_robot(said.robot, path), the_object_pose(said)
     choices: Choices = {}
@@ -243,7 +246,8 @@ def _candidates(
         def ask(placed: Any = placed) -> tuple[PageRequest, Array]:
             return request_of(robot, placed, None, scene, settings), robot.home
 
-        choices[f"{number}: {grasp.name}" if grasp.name else str(number)] = ask
+        name = f"{number}: {grasp.name}" if grasp.name else str(number)
+        choices[name] = Candidate(ask)
     return robot, choices
 
 
@@ -255,7 +259,7 @@ def _ranked(
     Raises:
         InputError: The file is none of that kind, or has no answers.
     """
-    from casadi_ik.viewing import request_of
+    from casadi_ik.viewing import Candidate, request_of
 
     found = read_ranked(path)
     with located(f"{path}: ranked[0].solution.robot"):
@@ -271,5 +275,11 @@ def _ranked(
             grasp = None if one.grasp is None else one.placed(path, place)
             return request_of(robot, grasp, q, scene, settings), q
 
-        choices[f"{place}. {one.label}"] = ask
+        drawn: tuple[Array, Array] | tuple[()] = ()
+        if one.grasp is not None and (contacts := one.placed(path, place).contacts):
+            points = np.array([contact.point for contact in contacts.values()])
+            drawn = (robot.palm(q)[:3, 3], points) if np.isfinite(points).all() else ()
+        choices[f"{place}. {one.label}"] = Candidate(
+            ask, *drawn, load=one.load, clearance=one.solution.clearance
+        )
     return robot, choices

@@ -95,6 +95,21 @@ class Candidates:
         return Candidates(self.palm[rows], self.hand[rows], self.used[rows], tips)
 
 
+WHY_NONE = {
+    "two fingertips fit": "no pads face two patches of the object well enough",
+    "they are clear": "palm or fingers would be in the object",
+    "fingertips touch": "the other fingers find nothing to touch, or are in the way; fewer "
+    "fingers may do",
+    "made exact": "fingertips do not come to rest on the surface inside a face",
+    "still clear": "palm or fingers would be in the object",
+    "arm reaches": "the object is out of the arm's reach, or only from sides that hold nothing",
+    "free in the scene": "arm or hand would hit something of the scene, or the object",
+    "force-closed": "contacts do not oppose each other within friction",
+    "hold ": "it is too heavy for that squeeze and friction",
+}
+"""What it means that nothing passes a stage."""
+
+
 @dataclass
 class Generator:
     """Candidates of one surface and one hand.
@@ -168,7 +183,8 @@ class Generator:
                 "the thumb and another fingertip can"
             )
         stage = next((name for name, number in self.counts.items() if not number), "")
-        return f"of {self.counts['attempts']:,} attempts none came to: {stage}"
+        why = next((f" ({why})" for key, why in WHY_NONE.items() if key in stage), "")
+        return f"of {self.counts['attempts']:,} attempts none came to: {stage}{why}"
 
     def draw(self, count: int) -> Candidates:
         """Candidates of some attempts: two fingertips fit, the others find something to touch."""

@@ -18,6 +18,7 @@ from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import InputError
 from casadi_ik.grasps import Contact, Grasp, Tolerance
 from casadi_ik.grasps.pose import one_pose
+from casadi_ik.progress import progress
 from casadi_ik.touch.candidates import (
     Candidates,
     Generator,
@@ -187,19 +188,21 @@ def grasps_of(
     attempts = chosen.attempts // 5
     distinct: list[int] = []
     seen = tried = 0
-    while generator.fits and len(distinct) < limit and tried < chosen.most:
-        some = generator.candidates(attempts)
-        tried, attempts = tried + attempts, chosen.attempts
-        made = _made(generator, some, arms, judge, place, mu, hold, jobs, start)
-        clear = generator.counts["still clear"]
-        if made is None and clear >= chosen.lost and not generator.counts.get("arm reaches"):
-            break
-        if made is not None:
-            parts.append(made)
-            new, known = np.arange(seen, seen + len(made.rows)), len(distinct)
-            distinct, seen = _distinct(parts, new, limit, chosen, distinct), seen + len(new)
-            if len(new) > limit and len(distinct) == known:
-                break  # so many grasps, and each is like one found before
+    with progress(limit) as show:
+        while generator.fits and len(distinct) < limit and tried < chosen.most:
+            some = generator.candidates(attempts)
+            tried, attempts = tried + attempts, chosen.attempts
+            made = _made(generator, some, arms, judge, place, mu, hold, jobs, start)
+            clear, known = generator.counts["still clear"], len(distinct)
+            if made is None and clear >= chosen.lost and not generator.counts.get("arm reaches"):
+                break
+            if made is not None:
+                parts.append(made)
+                new = np.arange(seen, seen + len(made.rows))
+                distinct, seen = _distinct(parts, new, limit, chosen, distinct), seen + len(new)
+                if len(new) > limit and len(distinct) == known:
+                    break  # so many grasps, and each is like one found before
+            show(len(distinct) - known)
     return _ranked(
         robot, generator, hands, parts, place, limit, prefer, start, time.process_time() - begin
     )

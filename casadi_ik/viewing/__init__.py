@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from os import PathLike
 from pathlib import Path
 
@@ -10,12 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from casadi_ik.arm_hand import ArmHand, load_robot
+from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene
 from casadi_ik.drawing.drawables import file_meshes
 from casadi_ik.errors import DescriptionError, InputError, MissingExtraError
 from casadi_ik.files.reading import read_yaml
 from casadi_ik.grasps import Grasp
 from casadi_ik.logs.solve import OneSolve
+from casadi_ik.touch.grasps import FoundGrasp
 
 try:
     import viser as _  # noqa: F401
@@ -26,7 +29,8 @@ except ImportError as error:
     ) from error
 
 from casadi_ik.viewing.access import HOST, LOOPBACK, PORT, Server, Viewer, serve
-from casadi_ik.viewing.grasp_page import Candidates, GraspPage
+from casadi_ik.viewing.candidates import Candidate, Candidates
+from casadi_ik.viewing.grasp_page import GraspPage
 from casadi_ik.viewing.pad_page import PadPage
 from casadi_ik.viewing.page import Page
 from casadi_ik.viewing.play_page import PlayPage, motion_track, track_of
@@ -35,10 +39,12 @@ from casadi_ik.viewing.request import PageRequest, Settings, request_of
 __all__ = [
     "HOST",
     "PORT",
+    "Candidate",
     "PageRequest",
     "Settings",
     "Viewer",
     "request_of",
+    "view_found",
     "view_grasp",
     "view_log",
     "view_motion",
@@ -67,7 +73,7 @@ def view_grasp(
             there, unless q meets the contacts already.
         scene: What stands about; None: nothing is checked.
         settings: How it is solved.
-        candidates: Other requests to choose from, by name: each gives it, and a start.
+        candidates: Other requests to choose from, by name.
         host: Who may see it; "0.0.0.0": everybody in the network.
         port: Where; None: the first free one from 8080 on.
         dark: Whether the page is dark at first.
@@ -82,6 +88,57 @@ def view_grasp(
         serve(host, port),
         lambda server: GraspPage(server, robot, asked, start, candidates, q is None, dark),
     )
+
+
+def view_found(
+    robot: ArmHand,
+    found: Sequence[FoundGrasp],
+    *,
+    scene: Scene | None = None,
+    host: str = HOST,
+    port: int | None = None,
+    dark: bool = False,
+) -> Viewer:
+    """A page on which grasps that `Solver.grasps_of` has found are filtered and looked at.
+
+    Args:
+        robot: The robot that they were found for.
+        found: The grasps, best first, at least one.
+        scene: What stands about; None: nothing is checked.
+        host: As for `view_grasp`.
+        port: As for `view_grasp`.
+        dark: As for `view_grasp`.
+
+    Raises:
+        InputError: There is none, or a port that cannot be had.
+    """
+    if not len(found):
+        raise InputError("found: there is no grasp to show, expected at least one")
+    candidates = {
+        f"{place}. {one.grasp.name}, load {one.load:.2f}": Candidate(
+            partial(_asked, robot, one, scene),
+            robot.palm(one.q)[:3, 3],
+            np.array([contact.point for contact in one.grasp.contacts.values()]),
+            one.load,
+            one.clearance,
+        )
+        for place, one in enumerate(found, 1)
+    }
+    first = found[0]
+    return view_grasp(
+        robot,
+        first.grasp,
+        q=first.q,
+        scene=scene,
+        candidates=candidates,
+        host=host,
+        port=port,
+        dark=dark,
+    )
+
+
+def _asked(robot: ArmHand, one: FoundGrasp, scene: Scene | None) -> tuple[PageRequest, Array]:
+    return request_of(robot, one.grasp, one.q, scene), one.q
 
 
 def view_log(

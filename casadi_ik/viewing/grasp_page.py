@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -24,6 +24,7 @@ from casadi_ik.problem.request import CLEARANCE, PREFERENCES
 from casadi_ik.problem.targets import LIMITS
 from casadi_ik.registry import METHODS
 from casadi_ik.viewing.access import Server
+from casadi_ik.viewing.candidates import CandidateList, Candidates
 from casadi_ik.viewing.drawn import (
     OBJECT,
     Drags,
@@ -90,9 +91,6 @@ SKINS = ("bodies", "collision shapes")
 
 MOST_GHOSTS = 10
 
-Candidates = Mapping[str, Callable[[], tuple[PageRequest, Array]]]
-"""Other requests to choose from, by name: each gives it, and a start."""
-
 
 class GraspPage(DraggedPage):
     """A robot, a grasp, a scene.
@@ -101,6 +99,7 @@ class GraspPage(DraggedPage):
         answer: What is shown.
         solutions: All solutions of what is asked, as far as they are found.
         candidates: Other requests to choose from.
+        offered: What is seen of them; None: there are none.
     """
 
     def __init__(
@@ -148,8 +147,10 @@ class GraspPage(DraggedPage):
         self._other: tuple[DrawnRobot, DrawnContacts] | None = None
         names = self._things.names
         self._panel = Panel(self, (*names, *asked.held))
+        self.offered = self._panel.candidates
         self.begin((PAUSE, self._show_motors), (REST, self._explain), (LOOKS, self._list_solutions))
-        self.select(OBJECT if OBJECT in names else robot.fingers[0])
+        first = OBJECT if OBJECT in names else robot.fingers[0]
+        self.select("" if self.candidates else first)  # handles would hide what is chosen from
 
     # What a browser asks for: put down, and done when it is its turn.
 
@@ -174,7 +175,7 @@ class GraspPage(DraggedPage):
 
         def work() -> None:
             self.remember()
-            self.restore(self.candidates[name]())
+            self.restore(self.candidates[name].ask())
 
         self.work.put("candidate", work)
 
@@ -296,6 +297,8 @@ class GraspPage(DraggedPage):
             self._contacts.place(self.asked, self._dragged)
             self._contacts.reach(self.asked, frames, answer.contacts)
             self._things.place(self.asked, self._dragged)
+            if self.offered is not None:
+                self.offered.place(self.asked.object_pose)
             closest = None if answer.closest is None else answer.closest[1]
             met = all(one.ok for one in answer.contacts.values())
             self._closest.place(closest, answer.clearance, told=met)
@@ -391,6 +394,7 @@ class Panel:
             names: What can be dragged.
         """
         self._page, self._gui = page, page.server.gui
+        self.candidates: CandidateList | None = None
         gui = self._gui
         self._verdict = gui.add_html(verdict_block(page.answer))
         self._drag = gui.add_dropdown(
@@ -401,6 +405,9 @@ class Panel:
         camera = gui.add_button_group("Camera", tuple(page.cameras))
         on_press(camera, lambda client: page.cameras[str(camera.value)].on(client))
         tabs = gui.add_tab_group()
+        if page.candidates:
+            with tabs.add_tab("Candidates"):
+                self.candidates = CandidateList(page, page.candidates)
         with tabs.add_tab("Results"):
             self._results = gui.add_html(results_block(page.answer))
             with gui.add_folder("Solutions", expand_by_default=False):
@@ -555,8 +562,6 @@ class Panel:
             gui.add_dropdown("Grasp", grasps),
             lambda name: page.open(grasp="" if name == "at home" else str(name)),
         )
-        if page.candidates:
-            on_set(gui.add_dropdown("Candidate", tuple(page.candidates)), page.choose)
         scene = page.asked.scene
         here = "none" if scene is None else scene.name
         scenes = tuple(dict.fromkeys((here, "none", *shipped_names("scenes"))))

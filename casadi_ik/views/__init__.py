@@ -17,6 +17,7 @@ except ImportError as error:
     ) from error
 
 from casadi_ik.views.charts import draw_convergence
+from casadi_ik.views.grasps import draw_grasps
 from casadi_ik.views.pictures import (
     draw_alternatives,
     draw_motion,
@@ -29,6 +30,7 @@ from casadi_ik.views.report import study_page
 __all__ = [
     "draw_alternatives",
     "draw_convergence",
+    "draw_grasps",
     "draw_motion",
     "draw_pads",
     "draw_solution",

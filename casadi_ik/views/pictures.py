@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import threading
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
@@ -42,7 +41,7 @@ from casadi_ik.grasps.pose import inverse
 from casadi_ik.motion.motion import Motion
 from casadi_ik.problem.clearance import closest_points
 from casadi_ik.views.charts import DARK, DPI, LIGHT, Ground, new_figure, save_picture
-from casadi_ik.views.stage import Image, Stage, over, points_of
+from casadi_ik.views.stage import Image, Stage, one_at_a_time, over, points_of
 
 SIZE = (12.0, 6.6)
 """Of a picture with two panels [inch]."""
@@ -55,8 +54,6 @@ CLOSE: Box = (0.40, 0.06, 0.60, 0.82)
 
 OPACITY = {"object": 0.5, "scene": 0.45, "touching": 0.35}
 """Of groups that are seen through; marks that something hides are half seen."""
-
-_one_at_a_time = threading.Lock()
 
 
 def draw_solution(
@@ -100,7 +97,7 @@ def draw_solution(
         for finger, verdict in solution.contacts.items()
     }
     q = solution.q
-    with _one_at_a_time, closing(Stage()) as stage:
+    with one_at_a_time, closing(Stage()) as stage:
         groups = _fill(stage, robot, q, grasp, colors)
         if scene is not None:
             _surround(stage, robot, solution, grasp, scene)
@@ -171,7 +168,7 @@ def draw_alternatives(
     for number, found in enumerate(alternatives):
         row, column = divmod(number, columns)
         box = (column / columns, 1 - (row + 1) / rows, 1 / columns, 0.86 / rows)
-        with _one_at_a_time, closing(Stage()) as stage:
+        with one_at_a_time, closing(Stage()) as stage:
             _fill(stage, robot, found.q, grasp, dict.fromkeys(robot.fingers, palette.MET))
             stage.aim(view, everything, _pixels(figure, box), (0.03, 0.03))
             axes = _panel(figure, box, over(1.0, stage.shoot()))
@@ -212,7 +209,7 @@ def show(
         PictureError: There is no OpenGL to draw with.
         InputError: Bad q, or the grasp has a finger that the robot has not.
     """
-    with _one_at_a_time:
+    with one_at_a_time:
         stage = Stage(off_screen=not window)
         groups = _fill(stage, robot, q, grasp, dict.fromkeys(robot.fingers, palette.INK))
         view = whole_view(robot.contacts(q)[0].mean(axis=0), close_view(robot, q))
@@ -265,7 +262,7 @@ def _shots(robot: ArmHand, q: Array, grasp: Grasp, scene: Scene | None) -> list[
     tips = robot.contacts(end)[0]
     marks = contact_marks(robot, end, grasp, dict.fromkeys(robot.fingers, palette.MET))
     found = []
-    with _one_at_a_time, closing(Stage()) as stage:
+    with one_at_a_time, closing(Stage()) as stage:
         foot, every = robot.links(q[0])[robot.description.root], points_of(passed + there)
         stage.add("object", there, OPACITY["object"])
         stage.add("marks", marks)
@@ -369,7 +366,7 @@ def draw_pads(
     for left, turn in ((0.0, 25.0), (0.5, 115.0)):
         box = (left, 0.0, 0.5, 0.88)
         pixels = _pixels(figure, box)
-        with _one_at_a_time, closing(Stage()) as stage:
+        with one_at_a_time, closing(Stage()) as stage:
             stage.add("hand", hand, orient=robot.description.path is not None)
             stage.add("marks", marks)
             view = float(np.deg2rad(turn)), float(np.deg2rad(20.0))

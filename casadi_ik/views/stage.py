@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from contextlib import closing
 from typing import cast
@@ -26,6 +27,10 @@ LIGHTS = (
 """Where from, in which frame, and how bright: a lamp, the viewer, the sky."""
 
 MATERIAL = {"ambient": 0.46, "diffuse": 1.0, "specular": 0.35, "specular_power": 40.0}
+
+
+one_at_a_time = threading.Lock()
+"""Of pictures: OpenGL is no friend of threads."""
 
 
 class Stage:

@@ -1,0 +1,169 @@
+"""Candidates on a page: each a tripod from palm to contacts, filtered, and taken by a click."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from casadi_ik import palette
+from casadi_ik.arrays import Array
+from casadi_ik.drawing.drawables import Drawable
+from casadi_ik.drawing.surfaces import ball, joined, mesh_of, rod
+from casadi_ik.grasps.pose import inverse
+from casadi_ik.viewing.drawn import add_drawable, quaternions
+from casadi_ik.viewing.panel import block, on_set
+from casadi_ik.viewing.request import PageRequest
+
+if TYPE_CHECKING:
+    from casadi_ik.viewing.grasp_page import GraspPage
+
+AT_FIRST = 20
+"""So many are shown before somebody filters."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A request to choose from.
+
+    Attributes:
+        ask: Gives it, and a start (n,) [rad or m].
+        palm: (3,) where its palm is, base frame [m]; None: it is not drawn.
+        tips: (k, 3) where it touches [m]; likewise.
+        load: What it holds per newton of squeeze; None: not known.
+        clearance: Smallest distance of a pair that must not touch [m]; None: not known.
+    """
+
+    ask: Callable[[], tuple[PageRequest, Array]]
+    palm: Array | None = None
+    tips: Array | None = None
+    load: float | None = None
+    clearance: float | None = None
+
+
+Candidates = Mapping[str, Candidate]
+"""By name."""
+
+
+class CandidateList:
+    """The candidates of a page: what is drawn of them, and the controls that filter them."""
+
+    def __init__(self, page: GraspPage, candidates: Candidates) -> None:
+        """Draw those that are shown at first.
+
+        Args:
+            page: Whose they are; told of the one that is taken.
+            candidates: The best first.
+        """
+        self._page, self._all = page, dict(candidates)
+        self._least = {"load": -np.inf, "clearance": -np.inf}
+        self._most, self._taken = min(AT_FIRST, len(self._all)), next(iter(self._all))
+        server = page.server
+        self._frame = server.scene.add_frame("/candidates", show_axes=False)
+        place = page.asked.object_pose
+        self._origin = np.eye(4) if place is None else place
+        self._meshes: dict[str, Any] = {}
+        loads = [one.load for one in self._all.values() if one.load is not None]
+        for i, (name, one) in enumerate(self._all.items()):
+            if one.palm is None or one.tips is None:
+                continue
+            part = 0.5 if one.load is None or not loads else one.load / max(*loads, 1e-9)
+            mark = Drawable("candidate", mesh_of(_tripod(one.palm, one.tips)), _shade(part))
+            node = f"/candidates/{i}"
+            mesh = add_drawable(server, node, mark, cast_shadow=False, visible=False)
+            self._meshes[name] = mesh
+
+            @mesh.on_click
+            async def _(_: Any, name: str = name) -> None:
+                self.take(name)
+
+        self._add_controls()
+        self.filter()
+
+    @property
+    def shown(self) -> tuple[str, ...]:
+        """Names of those that pass the filter, the best first."""
+        found = [
+            name
+            for name, one in self._all.items()
+            if (one.load is None or one.load >= self._least["load"])
+            and (one.clearance is None or one.clearance >= self._least["clearance"])
+        ]
+        return tuple(found[: self._most])
+
+    def place(self, pose: Array | None) -> None:
+        """Move all with the object to its (4, 4) pose."""
+        if pose is not None:
+            moved = pose @ inverse(self._origin)
+            self._frame.position, self._frame.wxyz = moved[:3, 3], quaternions(moved[:3, :3])
+
+    def take(self, name: str) -> None:
+        """Show the robot in one of them."""
+        self._taken = name
+        self._page.choose(name)
+        self.filter()
+
+    def filter(
+        self, load: float | None = None, clearance: float | None = None, most: int | None = None
+    ) -> None:
+        """Show others.
+
+        Args:
+            load: The least [N/N]; None: as before.
+            clearance: The least [m]; None: as before.
+            most: How many at most; None: as before.
+        """
+        self._least["load"] = self._least["load"] if load is None else load
+        self._least["clearance"] = self._least["clearance"] if clearance is None else clearance
+        self._most = self._most if most is None else most
+        shown = self.shown
+        with self._page.server.atomic():
+            for name, mesh in self._meshes.items():
+                mesh.visible = name in shown and name != self._taken
+            options = shown or (self._taken,)
+            self._list.options = options
+            if self._taken in options:
+                self._list.value = self._taken
+            one = self._all[self._taken]
+            words = [] if one.load is None else [f"load {one.load:.3f} N/N"]
+            words += [] if one.clearance is None else [f"clearance {1e3 * one.clearance:.1f} mm"]
+            about = f"<b>{len(shown)}</b> of {len(self._all)} shown"
+            self._told.content = block("<br>".join([about, *words]))
+
+    def _add_controls(self) -> None:
+        gui = self._page.server.gui
+        self._list = gui.add_dropdown(
+            "Candidate", tuple(self._all), hint="or click its tripod on the object"
+        )
+        on_set(self._list, lambda name: self.take(str(name)))
+        most = gui.add_slider("Best", 1, max(len(self._all), 2), 1, self._most)
+        on_set(most, lambda value: self.filter(most=int(value)))
+        for key, label, scale in (("load", "Load ≥", 1.0), ("clearance", "Clearance ≥ [mm]", 1e3)):
+            values = [getattr(one, key) for one in self._all.values()]
+            known = [scale * value for value in values if value is not None]
+            if len(known) > 1 and max(known) > min(known):
+                low, high = np.floor(100 * min(known)) / 100, np.ceil(100 * max(known)) / 100
+                slider = gui.add_slider(label, float(low), float(high), 0.01, float(low))
+                on_set(slider, partial(self._filter_by, key, scale))
+        self._told = gui.add_html("")
+
+    def _filter_by(self, key: str, scale: float, value: float) -> None:
+        self._least[key] = value / scale
+        self.filter()
+
+
+def _tripod(palm: Array, tips: Array) -> Any:
+    """Rods from the palm to every contact, a ball at each."""
+    parts = [rod(palm, tip, 0.0009).surface for tip in tips]
+    parts += [ball(0.003, tip).surface for tip in tips] + [ball(0.0045, palm).surface]
+    return joined(parts)
+
+
+def _shade(part: float) -> str:
+    """From red, nothing is held, over yellow to green, the largest load."""
+    stops = np.array([palette.rgb(one) for one in (palette.MISSED, palette.TARGET, palette.MET)])
+    values = [np.interp(part, [0.0, 0.5, 1.0], channel) for channel in stops.T]
+    return "#" + "".join(f"{round(float(value)):02x}" for value in values)

@@ -1,0 +1,99 @@
+"""Grasps that are found, as a picture, on a page, and from the command line."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from commands import main
+from PIL import Image
+
+import casadi_ik as ik
+from casadi_ik import viewing
+from casadi_ik.cli.table import parse
+from casadi_ik.cli.view import opened
+from casadi_ik.errors import InputError
+from casadi_ik.views import draw_grasps
+
+ROBOT, PLACE = "panda+panda_hand", ("0.5", "0.1", "0.051", "0", "0", "0")
+ASKED = ("grasp", "tomato_soup_can", "--robot", ROBOT, "--scene", "table", "--limit", "6")
+
+
+@pytest.fixture(scope="module")
+def solver():
+    return ik.Solver(ik.load_robot(ROBOT), scene=ik.load_scene("table"))
+
+
+@pytest.fixture(scope="module")
+def found(solver):
+    pose = np.eye(4)
+    pose[:3, 3] = [float(one) for one in PLACE[:3]]
+    return solver.grasps_of(ik.load_surface("tomato_soup_can"), pose, limit=6)
+
+
+@pytest.mark.opengl
+def test_a_picture_has_a_panel_for_each_of_the_best(solver, found, tmp_path):
+    figure = draw_grasps(solver.robot, found, tmp_path / "best.png", scene=solver.scene, most=4)
+    assert len(figure.axes) == 4
+    assert f"load {found[0].load:.2f}" in figure.axes[0].get_title()
+    image = np.asarray(Image.open(tmp_path / "best.png"))[..., :3]
+    for axes in figure.axes:  # there is something in every panel
+        (panel,) = axes.images
+        assert np.asarray(panel.get_array()).std() > 0.05
+    assert image.std() > 10
+
+
+def test_nothing_is_no_picture(solver):
+    with pytest.raises(InputError, match="there is no grasp to draw"):
+        draw_grasps(solver.robot, [])
+
+
+@pytest.mark.opengl
+def test_a_command_from_an_object_to_a_picture_and_a_page(tmp_path, capsys):
+    out, picture = tmp_path / "found.npz", tmp_path / "best.png"
+    words = [*ASKED, "--object-pose", *PLACE, "--out", str(out), "--picture", str(picture)]
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    assert "6 FOUND" in said
+    assert str(out) in said
+    assert str(picture) in said
+    assert Image.open(picture).width > 1000
+    viewer = opened(parse(["view", str(out), "--scene", "table"])[1])
+    try:
+        offered = viewer.page.offered
+        assert len(offered.shown) == 6
+        loads = np.load(out)["load"]
+        offered.filter(load=float(loads[2]))
+        assert len(offered.shown) == 3
+        offered.take(offered.shown[1])
+        assert viewer.page.work.settle()
+        np.testing.assert_allclose(viewer.page.answer.q, np.load(out)["q"][1], atol=1e-3)
+    finally:
+        viewer.stop()
+
+
+def test_none_found_says_why_and_writes_nothing(tmp_path, capsys):
+    out = tmp_path / "found.npz"
+    far = ("5", "0", "0.051", "0", "0", "0")
+    assert main([*ASKED, "--object-pose", *far, "--out", str(out)]) == 1
+    said = capsys.readouterr().out
+    assert "NONE FOUND" in said
+    assert "out of the arm's reach" in " ".join(said.split())
+    assert "found.npz" not in said
+    assert not out.exists()
+
+
+def test_a_page_filters_by_load_and_clearance(solver, found):
+    viewer = viewing.view_found(solver.robot, found, scene=solver.scene)
+    try:
+        offered, page = viewer.page.offered, viewer.page
+        clear = sorted(one.clearance for one in found)[3]
+        offered.filter(clearance=clear)
+        assert len(offered.shown) == 3
+        offered.filter(most=1)
+        assert len(offered.shown) == 1
+        offered.take(offered.shown[0])
+        assert page.work.settle()
+        assert page.answer.success
+        assert page.answer.clearance >= clear - 1e-4
+    finally:
+        viewer.stop()
