@@ -148,7 +148,8 @@ def _checked(solver: Solver) -> str:
     Option(
         "--direction X...",
         "the way the hand comes: x y z in the base frame, 0 0 -1 from above (default: from where "
-        "the grasp has its palm before it, if it says, else from the palm to the contacts)",
+        "the grasp has its palm before it, if it says, else from the palm to the contacts; where "
+        "that cannot be gone, from above or leaning)",
         read=partial(opt.numbers, count=3, meaning="x y z"),
     ),
     Option("--lift METRES", "how far the hand then goes up, with what it holds [m]", 0.0),

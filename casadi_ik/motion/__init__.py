@@ -1,8 +1,9 @@
 """Motion: targets followed cycle by cycle, known paths, teleoperation, the way to a grasp."""
 
+from casadi_ik.motion.approach import Approach, ReachStatus
 from casadi_ik.motion.follower import Follower, FollowState, FollowStatus
 from casadi_ik.motion.motion import Motion
-from casadi_ik.motion.reach import Approach, Reach, ReachStatus
+from casadi_ik.motion.reach import Reach
 from casadi_ik.motion.retarget import Retargeter, load_retarget
 from casadi_ik.motion.track import Jump, Track
 

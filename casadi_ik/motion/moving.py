@@ -16,18 +16,10 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.grasps import Grasp
 from casadi_ik.methods.hand_first.method import UNBOUNDED
+from casadi_ik.motion.approach import Approach, ApproachPlan, approach
 from casadi_ik.motion.follower import Follower
 from casadi_ik.motion.inputs import FollowPlan
-from casadi_ik.motion.reach import (
-    Approach,
-    ApproachPlan,
-    Pace,
-    Reach,
-    ReachPlan,
-    approach,
-    move,
-    reach,
-)
+from casadi_ik.motion.reach import Pace, Reach, ReachPlan, move, reach
 from casadi_ik.motion.timing import Rates, a_direction, length, rates_of, seconds, unbounded
 from casadi_ik.motion.track import PathTracker, Track, track
 from casadi_ik.problem.contacts import by_kinds
@@ -196,7 +188,8 @@ class MovingSolver:
             limit: Solutions that are tried at most.
             direction: (3,) the way the hand comes, base frame: ``[0, 0, -1]`` from above. None:
                 from where the grasp has its palm before it, if it says (`Grasp.pregrasp`), else
-                along the line from the palm to the contacts.
+                along the line from the palm to the contacts; where that cannot be gone, from above,
+                between both, or leaning to a side.
             lift: How far the hand goes straight up, along z of the base, after it closed [m].
             retreat: How far it goes back then, against the way it came [m].
 

@@ -159,13 +159,27 @@ def test_what_cannot_be_reached_is_said(robot, grasp):
     points, _ = grasp.arrays(robot.fingers)
     place = (points.mean(axis=0) + np.array([0.0, 0.0, 0.25])).tolist()
     lid = {"lid": {"kind": "box", "size": [0.6, 0.6, 0.02], "xyz": place}}
-    found = ik.Solver(robot, scene=ik.Scene(lid)).reach(grasp, distance=0.3)
+    found = ik.Solver(robot, scene=ik.Scene(lid)).reach(grasp, distance=0.3, direction=[0, 0, -1])
     assert found.status in (ik.motion.ReachStatus.NO_APPROACH, ik.motion.ReachStatus.NOT_SOLVED)
     assert found.reason
     with pytest.raises(
         ik.errors.InputError, match="distance: found -1, expected a number of metres >= 0"
     ):
         ik.Solver(robot).reach(grasp, distance=-1)
+
+
+def test_where_the_way_is_barred_the_hand_comes_another(robot, grasp):
+    """A lid over the object; from the side it can be reached."""
+    points, _ = grasp.arrays(robot.fingers)
+    place = (points.mean(axis=0) + np.array([0.0, 0.0, 0.25])).tolist()
+    lid = {"lid": {"kind": "box", "size": [0.6, 0.6, 0.02], "xyz": place}}
+    solver = ik.Solver(robot, scene=ik.Scene(lid))
+    assert not solver.approach(grasp, distance=0.3, direction=[0, 0, -1]).success
+    found = solver.reach(grasp, distance=0.3)
+    assert found.success
+    assert found.clearance >= 0
+    coming = robot.palm(found.motion.q[found.motion.notes["part"] == "coming"])[:, :3, 3]
+    assert np.linalg.norm(coming[-1] - coming[0]) == pytest.approx(0.3, abs=5e-3)
 
 
 def test_it_is_written_as_a_follower_is(robot, grasp, tmp_path):
