@@ -10,6 +10,14 @@ FOREIGN = (".urdf", ".xacro", ".xml", ".mjcf")
 """Names' ends of robots' files that are imported."""
 
 
+BODIES = "bodies"
+"""The folder of robots with several arms, or with a trunk."""
+
+
+KINDS = ("arm_hands", BODIES, "arms", "hands")
+"""The folders of robots and of what they are put together from."""
+
+
 def models_folder() -> Path:
     """The folder ``models``.
 
@@ -73,8 +81,8 @@ def resolve_robot(
     """The file of a robot, or those of an arm and a hand, of which one may stand alone.
 
     Args:
-        name_or_path: A shipped arm-hand, arm or hand, "ARM+HAND" of shipped names, or the path of
-            a YAML file.
+        name_or_path: A shipped arm-hand, body, arm or hand, "ARM+HAND" or "BODY+HAND" of shipped
+            names, or the path of a YAML file.
         beside: See `resolve`.
 
     Raises:
@@ -89,6 +97,10 @@ def resolve_robot(
             f"are: casadi-ik import {text} --out {Path(text).stem}.yaml makes one"
         )
     arm, plus, hand = text.partition("+")
+    if not path_like and text in shipped_names(BODIES):
+        return resolve(text, BODIES)
+    if not path_like and plus and arm in shipped_names(BODIES):
+        return resolve(arm, BODIES), resolve(hand, "hands")
     if not path_like and plus:
         return resolve(arm, "arms"), resolve(hand, "hands")
     if not path_like and text in shipped_names("arms"):
@@ -98,7 +110,7 @@ def resolve_robot(
     try:
         return resolve(name_or_path, "arm_hands", beside)
     except UnknownNameError:
-        known = [name for kind in ("arm_hands", "arms", "hands") for name in shipped_names(kind)]
+        known = [name for kind in KINDS for name in shipped_names(kind)]
         listed = f"shipped: {', '.join(shipped_names('arm_hands'))}"
         raise UnknownNameError(
             f"no shipped arm-hand is called {text!r}; {did_you_mean(text, known, listed)} (or give "

@@ -114,6 +114,19 @@ class Shapes:
             ),
         )
 
+    def mirrored(self) -> Shapes:
+        """Those of the mirror image, in which every link's y is turned round."""
+        mirror = np.diag([1.0, -1.0, 1.0, 1.0])
+        across = np.diagonal(mirror)[:3]
+        return Shapes(
+            tuple(
+                replace(one, center=frozen(one.center * across), half=frozen(one.half * across))
+                for one in self.capsules
+            ),
+            tuple(replace(one, pose=frozen(mirror @ one.pose @ mirror)) for one in self.solids),
+            self.touching,
+        )
+
     def without(self, links: Collection[str]) -> Shapes:
         """The same without those of some links."""
         kept = [i for i, one in enumerate(self.solids) if one.link not in links]

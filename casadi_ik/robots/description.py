@@ -388,7 +388,7 @@ class RobotDescription:
         Raises:
             UnknownNameError: There is no such finger.
         """
-        return tuple(sorted(self._driving(self.finger(name).joints)))
+        return tuple(sorted(self.driving(self.finger(name).joints)))
 
     @cached_property
     def finger_motors(self) -> tuple[str, ...]:
@@ -407,11 +407,11 @@ class RobotDescription:
         moved: set[str] = set()
         for link in self.links:
             joints = [joint.name for joint in self.chain(link) if joint.type != "fixed"]
-            if not self._driving(joints).isdisjoint(actuators):
+            if not self.driving(joints).isdisjoint(actuators):
                 moved.add(link)
         return frozenset(moved)
 
-    def _driving(self, joints: Iterable[str]) -> set[int]:
+    def driving(self, joints: Iterable[str]) -> set[int]:
         """Positions in q of the actuators of some joints."""
         by_name = {joint.name: joint for joint in self.joints}
         found: set[int] = set()

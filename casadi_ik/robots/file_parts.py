@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -69,7 +70,7 @@ def arm_from_file(entry: ArmFromFile, key: str, beside: Path) -> Part:
 
 
 def hand_from_file(
-    entry: HandFromFile, pads: dict[str, ContactEntry | PadEntry], key: str, beside: Path
+    entry: HandFromFile, pads: Mapping[str, ContactEntry | PadEntry], key: str, beside: Path
 ) -> Part:
     """Everything below the palm, and the chain that leads to it.
 
@@ -110,7 +111,7 @@ def hand_from_file(
         frame_matrix(Frame(palm.xyz, palm.rpy)),
         {},
         _shapes(tree, root, joints),
-        pads=pads,
+        pads=dict(pads),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from casadi_ik.errors import DescriptionError
 from casadi_ik.files.limits import LIMITS
 from casadi_ik.files.reading import Frame, frame_matrix
 from casadi_ik.robots.collision import NO_SHAPES, Shapes, link_shapes
+from casadi_ik.robots.couplings import Linear
 from casadi_ik.robots.description import Actuator, Joint
 from casadi_ik.robots.robot_files.tree import parents_first
 from casadi_ik.robots.schema import (
@@ -183,6 +184,98 @@ def told_apart(hand: Part, arm: Part) -> Part:
     def mover(name: str) -> str:
         return _free(name, movers, theirs)
 
+    return _renamed(hand, link, mover)
+
+
+def of_side(part: Part, side: str, shared: str | None = None) -> Part:
+    """The part, with the side's name before all names that do not begin with it.
+
+    Args:
+        part: An arm or a hand.
+        side: "left" makes "left_" of it.
+        shared: A link that keeps its name.
+    """
+
+    def own(name: str) -> str:
+        return name if name == shared or name.startswith(f"{side}_") else f"{side}_{name}"
+
+    named = _renamed(part, own, own)
+    thumb = None if part.thumb is None else own(part.thumb)
+    return replace(named, pads={own(name): pad for name, pad in named.pads.items()}, thumb=thumb)
+
+
+def mirrored(part: Part) -> Part:
+    """The part's mirror image, left for right: y is turned round in its root's frame.
+
+    Every frame of it is mirrored in its own y. A joint turns about the mirrored axis; where the
+    opposite one is nearer to what it was, it turns about that and runs the other way round, if it
+    is not coupled otherwise than linearly.
+    """
+    bent = [one for one in part.joints if one.coupling and not isinstance(one.coupling, Linear)]
+    stays = {one.name for one in bent} | {one.coupling.of for one in bent if one.coupling}
+    turned: set[str] = set()
+    joints = []
+    for joint in part.joints:
+        axis = joint.axis * ACROSS
+        if joint.type == "revolute":
+            axis = -axis
+        if joint.type != "fixed" and axis @ joint.axis < 0 and joint.name not in stays:
+            axis = -axis
+            turned.add(joint.name)
+        joints.append(replace(joint, axis=frozen(axis), placement=_mirrored(joint.placement)))
+    # A motor that is no joint runs with those that follow it.
+    followed = {j.coupling.of for j in joints if j.coupling is not None and j.name in turned}
+    turned |= followed - {joint.name for joint in joints}
+    return replace(
+        part,
+        joints=[_run_back(joint, turned) for joint in joints],
+        actuators=[
+            replace(one, lower=-one.upper, upper=-one.lower) if one.name in turned else one
+            for one in part.actuators
+        ],
+        tip=_mirrored(part.tip),
+        mount=_mirrored(part.mount),
+        home={name: -at if name in turned else at for name, at in part.home.items()},
+        shapes=part.shapes.mirrored(),
+        pads={name: _mirrored_pad(pad) for name, pad in part.pads.items()},
+    )
+
+
+ACROSS = np.array([1.0, -1.0, 1.0])
+"""What a vector is multiplied by in the mirror."""
+
+
+def _mirrored(pose: Array) -> Array:
+    mirror = np.diag([*ACROSS, 1.0])
+    return frozen(mirror @ pose @ mirror)
+
+
+def _mirrored_pad(pad: ContactEntry | PadEntry) -> ContactEntry | PadEntry:
+    def across(vector: tuple[float, ...]) -> tuple[float, ...]:
+        return vector[0], -vector[1], vector[2]
+
+    return msgspec.structs.replace(
+        pad,
+        xyz=across(pad.xyz),
+        rpy=(-pad.rpy[0], pad.rpy[1], -pad.rpy[2]),
+        normal=across(pad.normal),
+        tangent=None if pad.tangent is None else across(pad.tangent),
+    )
+
+
+def _run_back(joint: Joint, turned: set[str]) -> Joint:
+    """A joint of a mirror image whose positions, or those that it follows, change their sign."""
+    coupling, back = joint.coupling, joint.name in turned
+    if isinstance(coupling, Linear) and (back or coupling.of in turned):
+        sign = -1.0 if back else 1.0
+        ratio = coupling.ratio * sign * (-1.0 if coupling.of in turned else 1.0)
+        coupling = msgspec.structs.replace(coupling, ratio=ratio, offset=sign * coupling.offset)
+    lower, upper = (-joint.upper, -joint.lower) if back else (joint.lower, joint.upper)
+    return replace(joint, coupling=coupling, lower=lower, upper=upper)
+
+
+def _renamed(part: Part, link: Callable[[str], str], mover: Callable[[str], str]) -> Part:
+    """The part with other names of links, and of joints and motors."""
     joints = [
         replace(
             joint,
@@ -192,19 +285,20 @@ def told_apart(hand: Part, arm: Part) -> Part:
             coupling=joint.coupling
             and msgspec.structs.replace(joint.coupling, of=mover(joint.coupling.of)),
         )
-        for joint in hand.joints
+        for joint in part.joints
     ]
+    links = (part.root, *(joint.child for joint in part.joints))
     return replace(
-        hand,
-        root=link(hand.root),
+        part,
+        root=link(part.root),
         joints=joints,
-        actuators=[replace(one, name=mover(one.name)) for one in hand.actuators],
-        shapes=hand.shapes.renamed({name: link(name) for name in theirs_links}),
-        tip_link=link(hand.tip_link),
-        home={mover(name): value for name, value in hand.home.items()},
+        actuators=[replace(one, name=mover(one.name)) for one in part.actuators],
+        shapes=part.shapes.renamed({name: link(name) for name in links}),
+        tip_link=link(part.tip_link),
+        home={mover(name): value for name, value in part.home.items()},
         pads={
             name: msgspec.structs.replace(pad, link=link(pad.link))
-            for name, pad in hand.pads.items()
+            for name, pad in part.pads.items()
         },
     )
 

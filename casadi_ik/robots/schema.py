@@ -365,3 +365,91 @@ class ImportedFile(Struct, frozen=True):
     sources: dict[str, str] = msgspec.field(default_factory=dict)
     description: str = ""
     collision: CollisionEntry | None = None
+
+
+class PartSide(Struct, frozen=True):
+    """An arm-hand of a body that is put together.
+
+    Attributes:
+        arm: A shipped name, a path, or an arm in somebody's file.
+        hand: A shipped name, a path, or the hand itself; left out: the one that the robot's name
+            has after its plus sign.
+        at: Where the arm's root stands on the trunk's end; left out by all sides whose arms have
+            the same root: they share that link.
+        mount: The hand's root on the arm's tip; left out: as the hand says.
+        mirror: Which of "arm" and "hand" are mirror images of what is described, left for right.
+        fingers: The hand's fingers that take part; left out: all.
+        thumb: Finger that is placed first; left out: the hand's.
+    """
+
+    arm: str | ArmFromFile
+    hand: str | HandFile | None = None
+    at: Frame | None = None
+    mount: Frame | None = None
+    mirror: list[str] = msgspec.field(default_factory=list)
+    fingers: list[str] | None = None
+    thumb: str | None = None
+
+
+class BodyFile(Struct, frozen=True):
+    """A body that is put together: arm-hands by name on a common trunk.
+
+    Every name of a link, joint, motor or finger gets the side's name and an underscore before it,
+    unless it begins with them.
+
+    Attributes:
+        name: What the robot is called.
+        sides: Arm-hand by name.
+        trunk: What carries all arms: a shipped name of ``models/trunks``, a path, or a chain in
+            somebody's file; left out: they stand still.
+        home: Position by actuator that goes before those of the parts [rad or m].
+        sources: Where numbers are from, by tag.
+        description: What it is, the first sentence by itself.
+        collision: Shapes of its links; these go before those of its parts.
+    """
+
+    name: str
+    sides: dict[str, PartSide]
+    trunk: str | ArmFromFile | None = None
+    home: dict[str, AnyValue] = msgspec.field(default_factory=dict)
+    sources: dict[str, str] = msgspec.field(default_factory=dict)
+    description: str = ""
+    collision: CollisionEntry | None = None
+
+
+class FileSide(Struct, frozen=True):
+    """An arm-hand of a body in somebody's file.
+
+    Attributes:
+        palm: Link of its palm, or a frame on it; what is below is the hand.
+        fingers: Contact frame by finger, since no file says where a pad is.
+        thumb: Finger that is placed first.
+    """
+
+    palm: str | LinkFrame
+    fingers: dict[str, PadEntry]
+    thumb: str | None = None
+
+
+class ImportedBody(Struct, frozen=True):
+    """A body in somebody's file.
+
+    Attributes:
+        name: What the robot is called.
+        robot: The file; its ``locked`` names what does not take part, such as legs and head.
+        sides: Arm-hand by name; fingers get it and an underscore before their names.
+        trunk: Link that all sides stand on; left out: the last one that carries all palms.
+        home: Position by actuator where the robot is taken to stand [rad or m].
+        sources: Where numbers are from, by tag.
+        description: What it is, the first sentence by itself.
+        collision: Shapes of its links; these go before those of the file.
+    """
+
+    name: str
+    robot: HandFromFile
+    sides: dict[str, FileSide]
+    trunk: str | None = None
+    home: dict[str, AnyValue] = msgspec.field(default_factory=dict)
+    sources: dict[str, str] = msgspec.field(default_factory=dict)
+    description: str = ""
+    collision: CollisionEntry | None = None
