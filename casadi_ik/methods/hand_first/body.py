@@ -183,17 +183,19 @@ class BodyStep(HandFirstStep):
         q = s["q"][side.motors]
         x = PalmAndHand(s["palm_rotation"], s["palm_origin"], q[hand])
         tried = fit_step(side.layouts, None, x, s["damping"], own, q)
-        judged = judge_contacts(s, own, tried, rows, BEFORE_THE_ARM)
+        # A hand that fits its contacts by half has its palm where it need not be within reach.
+        judged = judge_contacts(s, own, tried, rows, BODY.fit_part)
+        within = judge_contacts(s, own, tried, rows, BEFORE_THE_ARM).within
         keep, reached = judged.accepted, tried.reached
         changed = {
             "q": with_rows(s["q"], side.hand, ca.if_else(keep, reached.hand, x.hand)),
             "palm_rotation": ca.if_else(keep, reached.rotation, x.rotation),
             "palm_origin": ca.if_else(keep, reached.origin, x.origin),
-            "fits": judged.within,
+            "fits": within,
         } | judged.fit
         said = {
             "settled": judged.settled,
-            "within": judged.within,
+            "within": within,
             "near": self._left(keep, tried, own, rows),
             "cost": ca.sumsqr(tried.before),
         }

@@ -138,7 +138,7 @@ static int after_all_placements(solve s) {
 }
 
 static int after_trunk(solve s) {
-  const int most = X(FIRST) + X(EARLIER) > 0 ? LATER_TRUNKS : FIRST_TRUNKS;
+  const int most = X(FIRST) > 0 ? OTHER_TRUNKS : X(EARLIER) > 0 ? LATER_TRUNKS : FIRST_TRUNKS;
   int i;
   if (SAID(COST) < EXACT_COST) {
     begin_fit(s);

@@ -22,6 +22,7 @@ from casadi_ik.methods.hand_first.body import BodyStep
 from casadi_ik.methods.hand_first.driver import Searches, SearchPlan, SearchPool, can_search
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.seeds import Seeds
+from casadi_ik.methods.hand_first.side_by_side import SideRun, side_by_side
 from casadi_ik.methods.hand_first.state import CARRIED, beginning
 from casadi_ik.methods.hand_first.step import HandFirstStep
 from casadi_ik.problem.contacts import Kinds, usual
@@ -136,7 +137,12 @@ class HandFirstMethod(LoopedMethod):
         """The same for every side of a body by itself."""
         robot = self.robot
         return [
-            HandFirstMethod(robot.side(side.name), self.options, self._compiled)
+            HandFirstMethod(
+                robot.side(side.name),
+                self.options,
+                self._compiled,
+                tuple(self._kinds[robot.finger_names.index(name)] for name in side.fingers),
+            )
             for side in robot.sides
         ]
 
@@ -152,11 +158,12 @@ class HandFirstMethod(LoopedMethod):
 
         `rounds` are so many of each search at most instead of all.
         """
-        del seed
         self._check(targets)
         if not self.is_compiled:
             method = self.in_virtual_machine() if self.robot.sides else self
             return method._run_from_tables(targets, q0, trace, rounds)
+        if self.robot.sides and not self.robot.trunk:
+            return self._side_by_side(targets, q0, seed, trace, rounds)
         most = np.full(len(targets), self._rounds_for(targets))
         if rounds is not None:
             most = np.minimum(most, rounds)
@@ -166,9 +173,26 @@ class HandFirstMethod(LoopedMethod):
         with self._searches.lent(targets.enforce_limits, len(targets)) as searches:
             return searches.batch(targets, q0, self.terms(targets), most, trace)
 
+    def _side_by_side(
+        self, targets: TargetBatch, q0: Array, seed: int, trace: bool, rounds: int | None
+    ) -> Outcome:
+        """Solve a body whose sides know nothing of each other."""
+
+        def runs(side: HandFirstMethod) -> SideRun:
+            return lambda part, here: side.run(part, here, seed, trace, rounds)
+
+        return side_by_side(
+            self.robot,
+            list(map(runs, self._sides)),
+            targets,
+            np.clip(q0, *targets.bounds(self.robot, UNBOUNDED)),
+            self.step.layouts.labels,
+            self.graph.record.dtype if trace else None,
+        )
+
     def quick(self, targets: TargetBatch, q0: Array) -> Quick | None:
         """The answer to one target; see `QuickMethod.quick`."""
-        if not self.is_compiled:
+        if not self.is_compiled or (self.robot.sides and not self.robot.trunk):
             return None
         with self._searches.lent(targets.enforce_limits) as search:
             search.ask(targets, 0, q0, self.terms(targets))

@@ -131,10 +131,12 @@ class BodyParameters:
 
     Attributes:
         rounds: Rounds of all kinds at most.
-        first_trunks: Trunks tried for the palms of the first hand postures of a round. Near limits
-            few of them lead to all palms: of 100,000 targets of a G1 at 1e-6 with half of the
-            motors within 1 % of an end 18 are missed with 48 trunks at first, 2 with these.
-        later_trunks: For those of the others.
+        fit_part: Part of the tolerances to which hands are fitted, where they can be.
+        first_trunks: Trunks tried for the palms of the first hand postures of the first round.
+        later_trunks: The same of later rounds. Near limits few trunks lead to all palms: of 100,000
+            targets of a G1 at 1e-6 with half of the motors within 1 % of an end 18 are missed
+            with 48 in all rounds, 2 to 4 with these.
+        other_trunks: For palms of hand postures that are not the first.
         at_limits: Part of a motor's range that every second trunk moves to its limits.
         patience: Steps of trunk and arms with little gain before they are given up; with 3 instead
             of 8 three times as many of these targets are missed.
@@ -149,8 +151,10 @@ class BodyParameters:
     """
 
     rounds: int = 16
-    first_trunks: int = 800
-    later_trunks: int = 24
+    fit_part: float = 0.01
+    first_trunks: int = 60
+    later_trunks: int = 800
+    other_trunks: int = 24
     at_limits: float = 0.5
     patience: int = 8
     budget: int = 25
