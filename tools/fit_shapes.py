@@ -28,7 +28,7 @@ from casadi_ik.robots.schema import ArmFile, HandFile
 def main() -> None:
     """Fit and write."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("kind", choices=("arms", "hands"))
+    parser.add_argument("kind", choices=("arms", "trunks", "hands"))
     parser.add_argument("name")
     parser.add_argument("file", type=Path)
     parser.add_argument("--names", default="")
@@ -47,7 +47,7 @@ def main() -> None:
     )
     given = parser.parse_args()
     path = resolve(given.name, given.kind)
-    if given.kind == "arms":
+    if given.kind != "hands":
         part: Any = arm_part(read(path, ArmFile)[0], path)
     else:
         part = hand_part(read(path, HandFile)[0], path)

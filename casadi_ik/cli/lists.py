@@ -19,19 +19,27 @@ from casadi_ik.collision.scene import SceneFile
 from casadi_ik.datasets.conventions import ConventionFile
 from casadi_ik.files.json_schema import json_schema
 from casadi_ik.files.reading import convert, read_yaml
-from casadi_ik.files.shipped import resolve, shipped_names
+from casadi_ik.files.shipped import BODIES, resolve, shipped_names
 from casadi_ik.files.writing import written_whole
 from casadi_ik.grasps.load import CandidatesFile, GraspFile
 from casadi_ik.grasps.objects import ObjectFile
 from casadi_ik.motion.retarget import Retarget
 from casadi_ik.registry import METHODS, method_summary
 from casadi_ik.robots import load_description
-from casadi_ik.robots.schema import ArmFile, ArmHandFile, HandFile, ImportedFile
+from casadi_ik.robots.schema import (
+    ArmFile,
+    ArmHandFile,
+    BodyFile,
+    HandFile,
+    ImportedBody,
+    ImportedFile,
+)
 
 FILES: dict[str, tuple[Any, str]] = {
     "robot": (ArmHandFile | ImportedFile, "A robot: an arm, a hand, and what joins them"),
     "arm": (ArmFile, "An arm, described in full"),
     "hand": (HandFile, "A hand, described in full"),
+    "body": (BodyFile | ImportedBody, "A body: several arm-hands, or one on a trunk"),
     "grasp": (GraspFile, "A grasp: a contact per finger, or a palm and a posture"),
     "candidates": (CandidatesFile, "Grasps, of which one is to be chosen"),
     "scene": (SceneFile, "A scene: what answers must not touch"),
@@ -56,6 +64,9 @@ def schema_of(kind: str) -> dict[str, Any]:
     if kind == "robot":
         described, imported = schema.pop("anyOf")
         schema |= {"if": IN_A_FILE, "then": imported, "else": described}
+    if kind == "body":
+        together, imported = schema.pop("anyOf")
+        schema |= {"if": {"required": ["robot"]}, "then": imported, "else": together}
     return schema
 
 
@@ -89,7 +100,16 @@ def _catalogue() -> list[RenderableType]:
         ]
         hands.add_row(name, str(len(motors)), str(len(hand.fingers)), _short(hand.description))
     example = 'any arm with any hand: load_robot("ARM+HAND"), --robot ARM+HAND, such as'
-    return [Text(f"{example} panda+allegro_right", "bold"), arms, hands]
+    bodies = table("body", "trunk", "motors", "sides", "what it is", right=("motors",))
+    for name in shipped_names(BODIES):
+        path = resolve(name, BODIES)
+        body = convert(read_yaml(path), BodyFile, path)
+        whole = all(side.hand is not None for side in body.sides.values())
+        motors = str(len(load_description(name).actuators)) if whole else "by its hand"
+        trunk = body.trunk if isinstance(body.trunk, str) else ""
+        label = name if whole else f"{name}+HAND"
+        bodies.add_row(label, trunk, motors, ", ".join(body.sides), _short(body.description))
+    return [Text(f"{example} panda+allegro_right", "bold"), arms, hands, bodies]
 
 
 def _short(description: str) -> str:

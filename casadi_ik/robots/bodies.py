@@ -70,11 +70,12 @@ def body_from_parts(
     trunk = None if body.trunk is None else a_part(body.trunk, "trunk", where)
     roots = {arm.root for arm in arms.values()}
     together = all(entry.at is None for entry in body.sides.values()) and len(roots) == 1
-    shared = roots.pop() if trunk is None and together else None
+    ends = roots if trunk is None else {trunk.tip_link}
+    shared = roots.pop() if together and roots == ends else None
     joints = [] if trunk is None else list(trunk.joints)
     actuators = [] if trunk is None else list(trunk.actuators)
     end, pose = (STANDING, np.eye(4)) if trunk is None else (trunk.tip_link, trunk.tip)
-    root = shared or (STANDING if trunk is None else trunk.root)
+    root = (shared or STANDING) if trunk is None else trunk.root
     end = shared or end
     shapes = NO_SHAPES if trunk is None else trunk.shapes
     home = {} if trunk is None else dict(trunk.home)
@@ -96,7 +97,8 @@ def body_from_parts(
             *own.joints,
         ]
         actuators += [*arm.actuators, *own.actuators]
-        kept = arm.shapes.without([shared]) if shared and sides else arm.shapes
+        known = shared and (sides or trunk is not None)
+        kept = arm.shapes.without([shared]) if known and shared else arm.shapes
         shapes = shapes + kept + own.shapes
         home |= arm.home | own.home
         for part in (arms[name], own):

@@ -19,13 +19,14 @@ from casadi_ik.cli.lists import FILES, schema_of
 from casadi_ik.files.reading import convert
 from casadi_ik.files.units import check_units, in_si
 from casadi_ik.robots.load import _imports
-from casadi_ik.robots.schema import ArmHandFile, ImportedFile
+from casadi_ik.robots.schema import ArmHandFile, BodyFile, ImportedBody, ImportedFile
 
 ROOT = Path(__file__).parents[2]
 MODELS = ROOT / "models"
 FOLDERS = {
     "robot": "arm_hands",
     "arm": "arms",
+    "body": "bodies",
     "hand": "hands",
     "grasp": "grasps",
     "object": "objects",
@@ -87,6 +88,8 @@ def reads(kind: str, data: Any) -> bool:
     type_ = FILES[kind][0]
     if kind == "robot":
         type_ = ImportedFile if _imports(data) else ArmHandFile
+    if kind == "body":
+        type_ = ImportedBody if isinstance(data, dict) and "robot" in data else BodyFile
     try:
         convert(in_si(data), type_, Path("file"))
         check_units(data, type_, Path("file"))

@@ -1,0 +1,130 @@
+"""Hand first on bodies: all hands, arms and the trunk as one problem."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import casadi_ik as ik
+
+BODIES = ("g1+dex3", "two_pandas+allegro", "two_ur10e+leap", "mobile_kuka_lwr_barrett")
+FINE = ik.Tolerance(position=1e-6, angle=1e-6)
+
+
+@pytest.fixture(scope="module", params=BODIES)
+def robot(request):
+    return ik.load_robot(request.param)
+
+
+def targets(robot, count, near=False, seed=0):
+    rng = np.random.default_rng(seed)
+    part = rng.random((count, len(robot.lower)))
+    if near:
+        at_end = rng.random(part.shape) < 0.5
+        part = np.where(at_end, np.where(part < 0.5, 0.02 * part, 1 - 0.02 * (1 - part)), part)
+    q = robot.lower + part * (robot.upper - robot.lower)
+    return q, *robot.contacts(q)
+
+
+def grasp(robot, q, fingers=None):
+    points, normals = robot.contacts(q)
+    return ik.Grasp(
+        name="body",
+        contacts={
+            finger: ik.Contact(points[i], normals[i])
+            for i, finger in enumerate(robot.fingers)
+            if fingers is None or finger in fingers
+        },
+    )
+
+
+def misses(robot, q, points):
+    return np.linalg.norm(robot.contacts(q)[0] - points, axis=-1)
+
+
+@pytest.mark.parametrize("near", [False, True])
+def test_what_is_reachable_is_solved(robot, near):
+    _, points, normals = targets(robot, 300, near)
+    for tolerance in (ik.Tolerance(), FINE):
+        found = ik.Solver(robot, tolerance=tolerance).solve_batch(points, normals)
+        assert np.all(found.status == ik.Status.SOLVED)
+        # By the robot itself, whatever the solver says.
+        assert misses(robot, found.q, points).max() <= tolerance.position * 1.001
+        assert np.all((found.q >= robot.lower - 1e-9) & (found.q <= robot.upper + 1e-9))
+
+
+def test_a_log_changes_nothing_and_has_every_iteration(robot, tmp_path: Path):
+    _, points, normals = targets(robot, 20)
+    solver, file = ik.Solver(robot), tmp_path / "body.mcap"
+    plain = solver.solve_batch(points, normals)
+    logged = solver.solve_batch(points, normals, log=file)
+    np.testing.assert_array_equal(plain.q, logged.q)
+    np.testing.assert_array_equal(plain.iterations, logged.iterations)
+    log = ik.logs.open(file)
+    assert log.solves().array()["iterations"].tolist() == plain.iterations.tolist()
+    assert len(log.iterations().array()) == plain.iterations.sum()
+
+
+def test_one_target_is_solved_as_in_a_batch(robot):
+    q, points, normals = targets(robot, 5)
+    solver = ik.Solver(robot)
+    batch = solver.solve_batch(points, normals)
+    for row in range(len(q)):
+        one = solver.solve(grasp(robot, q[row]))
+        assert one.status == ik.Status.SOLVED
+        np.testing.assert_array_equal(one.q, batch.q[row])
+
+
+def test_a_hand_without_contacts_stays(robot):
+    body = robot.description
+    side, others = body.sides[0], body.sides[1:]
+    q = targets(robot, 1)[0][0]
+    found = ik.Solver(robot).solve(grasp(robot, q, side.fingers))
+    assert found.status == ik.Status.SOLVED
+    for other in others:
+        rest = [body.actuator_index(motor) for motor in (*other.arm, *other.hand)]
+        np.testing.assert_array_equal(found.q[rest], robot.home[rest])
+
+
+def test_what_is_near_is_preferred(robot):
+    rng = np.random.default_rng(5)
+    span = robot.upper - robot.lower
+    q = robot.lower + (0.3 + 0.4 * rng.random(len(span))) * span
+    start = np.clip(q + 0.01 * span * rng.standard_normal(len(q)), robot.lower, robot.upper)
+    solver = ik.Solver(robot, tolerance=FINE)
+    near = solver.solve(grasp(robot, q), q0=start, prefer="q0")
+    assert near.status == ik.Status.SOLVED
+    assert (np.abs(near.q - start) / span).max() < 0.2
+
+
+def test_motors_are_held(robot):
+    q = targets(robot, 1, seed=3)[0][0]
+    names = [*robot.description.trunk, robot.description.sides[0].hand[0]]
+    fixed = {name: float(q[robot.description.actuator_index(name)]) for name in names}
+    found = ik.Solver(robot).solve(grasp(robot, q), fixed=fixed)
+    assert found.status == ik.Status.SOLVED
+    for name, value in fixed.items():
+        assert found.q[robot.description.actuator_index(name)] == pytest.approx(value, abs=1e-12)
+
+
+def test_what_is_out_of_reach_is_told(robot):
+    q = targets(robot, 1)[0][0]
+    far = {
+        finger: ik.Contact(np.asarray(contact.point) + 5.0, contact.normal)
+        for finger, contact in grasp(robot, q).contacts.items()
+    }
+    found = ik.Solver(robot).solve(ik.Grasp(name="far", contacts=far))
+    assert found.status != ik.Status.SOLVED
+    assert found.diagnosis is not None
+
+
+def test_without_a_compiler_there_is_an_answer():
+    robot = ik.load_robot("mobile_kuka_lwr_barrett")
+    q = robot.lower + 0.4 * (robot.upper - robot.lower)
+    found = ik.Solver(robot, compiled=False).solve(grasp(robot, q), q0=q + 0.02)
+    assert found.status == ik.Status.SOLVED
+
+
+def test_the_papers_methods_say_what_they_need(robot):
+    with pytest.raises(ik.errors.UnsupportedError):
+        ik.Solver(robot, method="thumb-first").solve(grasp(robot, robot.home))

@@ -1,0 +1,184 @@
+"""Bodies: what their files say, and that a side by itself is the body's."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import casadi_ik as ik
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.robots import load_description
+
+NAMES = [f"{name}+leap" if name == "two_ur10e" else name for name in ik.shipped_names("bodies")]
+
+
+def anywhere(robot, seed=1):
+    rng = np.random.default_rng(seed)
+    return robot.lower + rng.random(len(robot.lower)) * (robot.upper - robot.lower)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_side_by_itself_stands_as_it_does_in_the_body(name):
+    robot = ik.load_robot(name)
+    body, q = robot.description, anywhere(robot)
+    trunk = list(body.trunk_actuators)
+    assert np.all((body.lower[trunk] <= 0) & (body.upper[trunk] >= 0))
+    q[trunk] = 0.0
+    base = np.eye(4)
+    for joint in body.chain(body.trunk_link):
+        base = base @ joint.placement
+    points, normals = robot.contacts(q)
+    motors = set(body.trunk)
+    for side in body.sides:
+        alone = ArmHand(body.side(side.name))
+        assert not motors & set(alone.actuators)
+        motors |= set(alone.actuators)
+        own = [body.actuator_index(motor) for motor in alone.actuators]
+        there, facing = alone.contacts(q[own])
+        fingers = [body.finger_names.index(finger) for finger in side.fingers]
+        np.testing.assert_allclose(there @ base[:3, :3].T + base[:3, 3], points[fingers], atol=1e-9)
+        np.testing.assert_allclose(facing @ base[:3, :3].T, normals[fingers], atol=1e-9)
+    assert motors == set(robot.actuators)
+
+
+@pytest.mark.parametrize("name", ["g1+dex3", "g1+inspire", "h1_2+inspire"])
+def test_a_body_with_mirrored_sides_reflects(name):
+    """The same grasp by the other side is the mirror image of this one's."""
+    robot = ik.load_robot(name)
+    body, q = robot.description, robot.home.copy()
+    left, right = (
+        [body.actuator_index(motor) for motor in (*side.arm, *side.hand)] for side in body.sides
+    )
+    rng = np.random.default_rng(2)
+    q[left] = (body.lower + rng.random(len(q)) * (body.upper - body.lower))[left]
+    # A motor whose range is the other's turned round runs the other way; of ranges that are
+    # symmetric the axis tells.
+    for one, other in zip(left, right, strict=True):
+        joints = [
+            next(j for j in body.movable if j.name == body.actuator_names[i]) for i in (one, other)
+        ]
+        mirrored = -joints[0].axis * [1, -1, 1]
+        q[other] = q[one] * np.sign(mirrored @ joints[1].axis)
+    points, normals = robot.contacts(q)
+    half = len(points) // 2
+    across = np.array([1.0, -1.0, 1.0])
+    np.testing.assert_allclose(points[:half] * across, points[half:], atol=1e-9)
+    np.testing.assert_allclose(normals[:half] * across, normals[half:], atol=1e-9)
+    np.testing.assert_array_less(robot.lower[right] - 1e-9, q[right])
+    np.testing.assert_array_less(q[right], robot.upper[right] + 1e-9)
+
+
+BODY = """
+name: pair
+trunk: lift
+sides:
+  left: {arm: panda, hand: allegro_left, at: {xyz: [0, 0.3 m, 0.6 m]}}
+  right: {arm: panda, hand: allegro_right, at: {xyz: [0, -0.3 m, 0.6 m]}}
+"""
+
+
+def test_a_body_from_parts(tmp_path: Path):
+    path = tmp_path / "pair.yaml"
+    path.write_text(BODY)
+    body = load_description(path)
+    assert body.trunk == ("lift",)
+    assert [side.name for side in body.sides] == ["left", "right"]
+    assert body.finger_names[0] == "left_thumb"
+    assert len(body.actuators) == 1 + 2 * 23
+
+
+URDF = """
+<robot name="two">
+  <link name="base"/><link name="torso"/><link name="head"/>
+  <joint name="waist" type="revolute"><parent link="base"/><child link="torso"/>
+    <axis xyz="0 0 1"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint>
+  <joint name="neck" type="revolute"><parent link="torso"/><child link="head"/>
+    <axis xyz="0 0 1"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint>
+  {sides}
+</robot>
+"""
+SIDE = """
+  <link name="{s}_arm"/><link name="{s}_palm"/><link name="{s}_tip"/>
+  <joint name="{s}_shoulder" type="revolute"><parent link="torso"/><child link="{s}_arm"/>
+    <origin xyz="0 {y} 0.3"/><axis xyz="0 1 0"/>
+    <limit lower="-2" upper="2" velocity="1" effort="1"/></joint>
+  <joint name="{s}_wrist" type="revolute"><parent link="{s}_arm"/><child link="{s}_palm"/>
+    <origin xyz="0.3 0 0"/><axis xyz="0 0 1"/>
+    <limit lower="-2" upper="2" velocity="1" effort="1"/></joint>
+  <joint name="{s}_finger" type="revolute"><parent link="{s}_palm"/><child link="{s}_tip"/>
+    <origin xyz="0.1 0 0"/><axis xyz="0 1 0"/>
+    <limit lower="-2" upper="2" velocity="1" effort="1"/></joint>
+"""
+FILE = """
+name: two
+robot: {file: two.urdf, locked: {neck: 0}}
+sides:
+  left: {palm: left_palm, fingers: {tip: {link: left_tip, normal: [0, 0, 1]}}}
+  right: {palm: right_palm, fingers: {tip: {link: right_tip, normal: [0, 0, 1]}}}
+"""
+
+
+@pytest.fixture
+def in_a_file(tmp_path: Path) -> Path:
+    sides = "".join(SIDE.format(s=s, y=y) for s, y in (("left", 0.2), ("right", -0.2)))
+    (tmp_path / "two.urdf").write_text(URDF.format(sides=sides))
+    path = tmp_path / "two.yaml"
+    path.write_text(FILE)
+    return path
+
+
+def test_trunk_and_sides_are_found_in_a_file(in_a_file: Path):
+    body = load_description(in_a_file)
+    assert (body.trunk, body.trunk_link) == (("waist",), "torso")
+    left, right = body.sides
+    assert (left.arm, left.hand, left.fingers) == (
+        ("left_shoulder", "left_wrist"),
+        ("left_finger",),
+        ("left_tip",),
+    )
+    assert right.palm_link == "right_palm"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("locked: {neck: 0}", "locked: {}", "motor 'neck' moves no side; write locked: {neck: 0}"),
+        ("sides:", "trunk: left_arm\nsides:", "does not carry the palm of 'right'"),
+        ("link: left_tip", "link: right_tip", "fingers.tip.link: 'right_tip' does not hang on"),
+        (
+            "right: {palm: right_palm, fingers: {tip: {link: right_tip",
+            "right: {palm: left_palm, fingers: {tip: {link: left_tip",
+            "is of side 'left' and side 'right'",
+        ),
+        ("palm: left_palm", "palm: no_such", "sides.left.palm: no link 'no_such'"),
+        ("sides:", "colour: red\nsides:", "colour"),
+    ],
+)
+def test_what_is_wrong_is_said_in_a_line(in_a_file: Path, old: str, new: str, said: str):
+    in_a_file.write_text(FILE.replace(old, new, 1))
+    with pytest.raises(ik.errors.DescriptionError) as caught:
+        load_description(in_a_file)
+    assert said in str(caught.value)
+    assert "two.yaml" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("hand: allegro_left, ", "", "sides.left.hand: missing"),
+        ("arm: panda, hand: allegro_left", "arm: pandora, hand: allegro_left", "pandora"),
+        ("trunk: lift", "trunk: lyft", "trunk: no shipped trunk is called 'lyft'"),
+        ("hand: allegro_left", "hand: allegro_left, mirror: [foot]", "expected 'arm' or 'hand'"),
+    ],
+)
+def test_what_is_wrong_with_parts_is_said(tmp_path: Path, old: str, new: str, said: str):
+    path = tmp_path / "pair.yaml"
+    path.write_text(BODY.replace(old, new, 1))
+    with pytest.raises(ik.errors.DescriptionError) as caught:
+        load_description(path)
+    assert said in str(caught.value)
+
+
+def test_a_side_that_is_not_there_is_said():
+    with pytest.raises(ik.errors.UnknownNameError, match="its sides: left, right"):
+        load_description("g1+dex3").side("middle")
