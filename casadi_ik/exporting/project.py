@@ -20,7 +20,7 @@ from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import InputError, KernelError, MissingExtraError, UnsupportedError
 from casadi_ik.exporting.scene import SceneSources
-from casadi_ik.exporting.single import SinglePrecision, filled, in_single_precision
+from casadi_ik.exporting.single import SinglePrecision, filled
 from casadi_ik.exporting.solver import FollowSources, SolverSources, hand_first
 from casadi_ik.exporting.targets import (
     COUNT,
@@ -202,11 +202,10 @@ def c_project(
         "README.md": "README.md",
     }
     marks = project.marks | tested(project, IN_TEST_SINGLE if single else IN_TEST_C)
-    wrapper = filled("solver.hpp", marks)
     header = single_targets_header if single else targets_header
     return {
         **project.sources,
-        f"include/{prefix}.hpp": in_single_precision(wrapper) if single else wrapper,
+        f"include/{prefix}.hpp": filled("solver.hpp", marks),
         **{path: filled(name, marks) for path, name in files.items()},
         **project.judge,
         "test/targets.h": header(project.solver, project.scene),

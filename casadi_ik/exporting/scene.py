@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -31,8 +30,6 @@ from casadi_ik.symbolic.even_spread import even_steps
 
 MOST = 1000
 """The largest capacity: each solid costs kilobytes."""
-
-SOLID = re.compile(r"typedef struct \{[^}]*\} solid;\n", re.DOTALL)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,6 +159,7 @@ class SceneSources:
         marks = {
             "PREFIX": self.prefix,
             "GUARD": self.prefix.upper(),
+            "REAL": "double" if self.single is None else "float",
             "CAPACITY": str(self.capacity),
             "SOLIDS": str(max(self._own + self.capacity, 1)),
             "PLACED": str(6 * len(self.model.capsules) + 12 * self._own),
@@ -187,6 +185,7 @@ class SceneSources:
             "LINK_NAMES": ", ".join(json.dumps(link, ensure_ascii=False) for link in self.links),
             "SHAPES_JSON": json.dumps(self.shapes()),
         }
+        real = marks["REAL"]
         room = "double" if self.single is None else "int64_t"
         wasm, js, types = (
             filled(name, marks) for name in ("scene_wasm.c", "scene.js", "scene.d.ts")
@@ -195,7 +194,7 @@ class SceneSources:
             "SCENE_TYPES": filled("scene_types.h", marks),
             "SCENE_CALLS": filled("scene_calls.h", marks),
             "SCENE_FIELDS": (
-                "  double clearance; /* [m], negative: something touches */\n"
+                f"  {real} clearance; /* [m], negative: something touches */\n"
                 "  int64_t nearest[2]; /* places in the list of links; -1 - number: a solid */\n"
                 f"  {self.prefix}_scene scene;\n"
             ),
@@ -235,18 +234,16 @@ class SceneSources:
 
     def jobs(self) -> str:
         """What the parts of a solver know of distances."""
-        text, count = SOLID.subn(
-            f"typedef {self.prefix}_solid solid;\n", driver_text("clearance_job")
-        )
-        assert count == 1
-        return text + (
-            f"int {self.prefix}_place_kernel(const double *q, double *places, "
+        return (
+            f"#define OWN_SOLID\ntypedef {self.prefix}_solid solid;\n"
+            + driver_text("clearance_job")
+            + f"int {self.prefix}_place_kernel(const scalar *q, scalar *places, "
             f"{self.prefix}_memory *memory);\n"
             f"void {self.prefix}_scene_init({self.prefix}_solver *solver);\n"
-            f"int {self.prefix}_hand_is_free({self.prefix}_solver *solver, const double *lower, "
-            "const double *upper, double *q);\n"
-            f"int {self.prefix}_arm_is_free({self.prefix}_solver *solver, const double *lower, "
-            "const double *upper, int near, double *q);\n"
+            f"int {self.prefix}_hand_is_free({self.prefix}_solver *solver, const scalar *lower, "
+            "const scalar *upper, scalar *q);\n"
+            f"int {self.prefix}_arm_is_free({self.prefix}_solver *solver, const scalar *lower, "
+            "const scalar *upper, int near, scalar *q);\n"
         )
 
     def shapes(self) -> dict[str, Any]:

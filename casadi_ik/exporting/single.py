@@ -150,6 +150,7 @@ class SinglePrecision:
 
 IN_DOUBLE = {
     "REAL": "double",
+    "MATHS": "#include <math.h>",
     "AS_DOUBLE": "",
     "TO_REAL": "",
     "AND_SUM": ", sum = 0;",
@@ -204,6 +205,7 @@ def in_single(single: SinglePrecision) -> dict[str, str]:
     )
     return {
         "REAL": "float",
+        "MATHS": "#define SINGLE\n#include <tgmath.h>",
         "AS_DOUBLE": "(double) ",
         "TO_REAL": "(float) ",
         "AND_SUM": ";\n  double sum = 0;",

@@ -51,7 +51,7 @@ from casadi_ik.problem.verdict import LIMIT_SLACK, TOLERANCE_SLACK
 MARKS = ("PALM_CALLS", "PALM", "PALM_WASM", "PALM_JS", "PALM_DTS")
 
 
-def palm_marks(robot: ArmHand, prefix: str) -> dict[str, str]:
+def palm_marks(robot: ArmHand, prefix: str, real: str) -> dict[str, str]:
     """What stands for the marks of palms; nothing without an arm, or if contacts leave it free."""
     motors = robot.description.finger_motors
     own = np.where(np.isin(robot.actuators, motors), robot.home, np.nan)
@@ -64,7 +64,7 @@ def palm_marks(robot: ArmHand, prefix: str) -> dict[str, str]:
     )
     marks = {"PREFIX": prefix, "GUARD": prefix.upper()}
     return {
-        "PALM_CALLS": filled("palm.h", marks),
+        "PALM_CALLS": filled("palm.h", marks | {"REAL": real}),
         "PALM": "\n" + constants + filled("palm.c", marks),
         "PALM_WASM": filled("palm_wasm.c", marks),
         "PALM_JS": filled("palm.js", marks),
@@ -161,9 +161,6 @@ NO_FOLLOWER = dict.fromkeys(
 """What stands for the marks where an export does not follow."""
 
 
-SIGNATURE = re.compile(r"EXPORT (?:LANES_TARGET )?int casadi_ik_\w+\((\w+) \*job\)")
-
-
 @dataclass(frozen=True)
 class Part:
     """A kernel.
@@ -257,14 +254,12 @@ class SolverSources:
         before = {"clearance": "lanes_alone"}.get(driver)
         text = driver_text(before) if before else ""
         text += driver_text(driver)
-        # In Python a driver has its memory from the heap; here it is handed to it.
-        own = f"int {self.prefix}_{name}_kernel(\\1 *job, {self.prefix}_memory *memory)"
-        text, count = SIGNATURE.subn(own, text)
-        assert count == 1, driver
         body = "".join(
             (
                 f'#include "{self.prefix}_parts.h"\n\n',
                 standing_alone(function, self.form),
+                f"#define NAMED {self.prefix}_{name}_kernel\n",
+                f"#define MEMORY {self.prefix}_memory\n",
                 driver_text("freestanding"),
                 constants,
                 text,
@@ -292,8 +287,8 @@ class SolverSources:
             for p in self.parts
         )
         about = without_scene() if self.scene is None else self.scene.substitutes()
-        about |= NO_FOLLOWER | palm_marks(robot, self.prefix)
-        about |= IN_DOUBLE if self.single is None else in_single(self.single)
+        about |= NO_FOLLOWER | (IN_DOUBLE if self.single is None else in_single(self.single))
+        about |= palm_marks(robot, self.prefix, about["REAL"])
         lower, upper = self._bounds
         single = self.single
         changed = (None, None) if single is None else (single.reals, single.arrays)

@@ -15,9 +15,8 @@ from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene
 from casadi_ik.collision.solids import stated
 from casadi_ik.errors import DescriptionError
-from casadi_ik.exporting.single import in_single_precision
 from casadi_ik.grasps.load import load_grasp, shipped_grasps
-from casadi_ik.kernels.codegen import number, numbers
+from casadi_ik.kernels.codegen import digits, numbers
 from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.problem.request import Request
 from casadi_ik.problem.status import Status
@@ -99,7 +98,7 @@ def targets_header(solver: Solver, scene: SceneTargets | None = None) -> str:
         arrays = map(numbers, (target["points"], target["normals"], q0, target["q"]))
         if scene is not None:
             clearance = target["clearance"]
-            arrays = (*arrays, "NAN" if clearance is None else number(clearance))
+            arrays = (*arrays, "NAN" if clearance is None else digits(clearance))
         rows.append("{" + ", ".join([*(str(int(value)) for value in whole), *arrays]) + "},\n")
     return (
         "/* Targets, and what the Python package answers. */\n"
@@ -127,12 +126,12 @@ def single_targets_header(solver: Solver, scene: SceneTargets | None = None) -> 
         "typedef struct {\n  int near, status;\n"
         f"  double points[{3 * f}], normals[{3 * f}], q0[{n}];\n}} target;\n\n"
         "static const target targets[TARGETS] = {\n" + "".join(rows) + "};\n"
-    ) + ("" if scene is None else "\n" + in_single_precision(scene.header()))
+    ) + ("" if scene is None else "\n" + scene.header("float"))
 
 
 def written(array: Array) -> str:
     """An array as C text, NaN included."""
-    values = (number(v) if np.isfinite(v) else "NAN" for v in array.ravel().tolist())
+    values = (digits(v) if np.isfinite(v) else "NAN" for v in array.ravel().tolist())
     return "{" + ", ".join(values) + "}"
 
 
@@ -234,17 +233,18 @@ class SceneTargets:
             found.append(stated(solid, item.pose @ place) | {"grasped": name == self.scene.grasped})
         return found
 
-    def header(self) -> str:
-        """The scene as a C header has it."""
+    def header(self, real: str = "double") -> str:
+        """The scene as a C header has it, of such numbers."""
         rows = ",\n".join(
             f"{{{one['kind']}, {int(one['grasped'])}, {numbers(one['size'])}, "
             f"{numbers(one['pose'])}}}"
             for one in self.solids()
         )
         return (
-            "typedef struct {\n  int kind, grasped;\n  double size[3], pose[12];\n} standing;\n\n"
+            "typedef struct {\n  int kind, grasped;\n"
+            f"  {real} size[3], pose[12];\n}} standing;\n\n"
             f"enum {{ STANDING = {len(self.scene.items)} }};\n"
-            f"#define MARGIN {number(self.scene.margin)}\n"
+            f"#define MARGIN ({real}) {digits(self.scene.margin)}\n"
             f"static const standing scene[STANDING] = {{\n{rows}}};\n\n"
         )
 

@@ -44,7 +44,7 @@ def c_struct(name: str, sizes: Mapping[str, int] | None = None) -> Any:
         if called := re.search(r"\(\*(\w+)\)\(", declaration):
             fields.append((called[1], ctypes.c_void_p))
             continue
-        kind: Any = ctypes.c_double if "double" in declaration else ctypes.c_int64
+        kind: Any = ctypes.c_double if "scalar" in declaration else ctypes.c_int64
         for one in declaration.split(","):
             found = re.search(r"(\**)(\w+)(?:\[(\w+)\])?\s*$", one)
             assert found is not None, one
@@ -136,7 +136,7 @@ class Stages:
 
     Attributes:
         functions: By members of an enum, whose names the text calls them by; dense vectors.
-        text: Defines ``iterate(real *state, const real *parameters, const double *const *own, real
+        text: Defines ``iterate(real *state, const real *parameters, const scalar *const *own, real
             *state_after, real *record, real *status, int wanted)``: `own` are the parameters of
             each lane by themselves, `record` may be NULL.
     """
@@ -152,7 +152,7 @@ class Stages:
             f"#define {stage.name}(...) {name}(__VA_ARGS__{behind})\n"
             for stage, name in zip(self.functions, names, strict=True)
         )
-        given = "(real *) (arg)[0], (arg)[1], (const double *const *) (arg)[2]"
+        given = "(real *) (arg)[0], (arg)[1], (const scalar *const *) (arg)[2]"
         step = f"iterate({given}, (res)[0], (res)[1], (res)[2], wanted)"
         return (
             text
@@ -210,11 +210,16 @@ def library_source(
     )
 
 
-def number(value: float) -> str:
-    """A double as C writes it."""
+def digits(value: float) -> str:
+    """A finite number as C writes it, as a double."""
     if not math.isfinite(value):
         raise ValueError(f"{value} is no constant of C")
     return repr(float(value))
+
+
+def number(value: float) -> str:
+    """A constant of the type `scalar`, whatever its precision."""
+    return f"((scalar) {digits(value)})"
 
 
 def numbers(values: Iterable[Any]) -> str:
@@ -224,7 +229,7 @@ def numbers(values: Iterable[Any]) -> str:
         if isinstance(value, Sequence | np.ndarray)
         else str(int(value))
         if isinstance(value, int | np.integer)
-        else number(value)
+        else digits(value)
         for value in values
     ]
     lines, line = [], ""
@@ -237,11 +242,11 @@ def numbers(values: Iterable[Any]) -> str:
 
 
 def define_arrays(arrays: Mapping[str, NDArray[Any]], scope: str = "static const") -> str:
-    """Arrays of doubles, of 16-bit or of common whole numbers, by name; none is empty."""
+    """Arrays of the type `scalar`, of 16-bit or of common whole numbers, by name; none is empty."""
     text = ""
     for name, array in arrays.items():
         whole = "int16_t" if array.dtype == np.int16 else "int"
-        kind = whole if array.dtype.kind in "iu" else "double"
+        kind = whole if array.dtype.kind in "iu" else "scalar"
         sizes = "".join(f"[{size}]" for size in array.shape)
         text += f"{scope} {kind} {name}{sizes} = {numbers(array)};\n"
     return text

@@ -120,7 +120,7 @@ class _Array(NamedTuple):
     Attributes:
         name: An expression of the first one's place.
         size: How many.
-        fixed: Whether they are constants, of the type `number`.
+        fixed: Whether they are constants, of the type `scalar`.
     """
 
     name: str
@@ -199,7 +199,7 @@ class _MXBody:
             else:
                 raise _UnknownError
         tables = [
-            f"static const number {name}[]={{{text}}};" for text, name in self._constants.items()
+            f"static const scalar {name}[]={{{text}}};" for text, name in self._constants.items()
         ]
         return "".join([f"  {line}\n" for line in (*tables, *self._lines)])
 

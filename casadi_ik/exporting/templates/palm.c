@@ -1,8 +1,8 @@
 
 /* Where the fingertips are if the hand has a posture and its palm a pose; 0: that is none. */
-int @PREFIX@_touched(@PREFIX@_solver *solver, const double *palm, const double *posture,
-                     double *points, double *normals) {
-  double q[N_MOTORS], turn[9];
+int @PREFIX@_touched(@PREFIX@_solver *solver, const scalar *palm, const scalar *posture,
+                     scalar *points, scalar *normals) {
+  scalar q[N_MOTORS], turn[9];
   int i, k, m, sound = 1;
   memcpy(q, HOME, sizeof q);
   for (i = 0; i < N_MOTORS; ++i) {
@@ -13,9 +13,9 @@ int @PREFIX@_touched(@PREFIX@_solver *solver, const double *palm, const double *
   for (i = 0; i < 12; ++i) sound &= is_finite(palm[i]);
   for (i = 0; i < 3; ++i) {
     for (k = 0; k < 3; ++k) {
-      const double *a = palm + 3 * i, *b = palm + 3 * k, *home = HOME_PALM + 3 * k;
-      const double product = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] - (i == k);
-      sound &= product < 1e-6 && product > -1e-6;
+      const scalar *a = palm + 3 * i, *b = palm + 3 * k, *home = HOME_PALM + 3 * k;
+      const scalar product = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] - (i == k);
+      sound &= product < (scalar) 1e-6 && product > -(scalar) 1e-6;
       turn[3 * i + k] = a[0] * home[0] + a[1] * home[1] + a[2] * home[2];
     }
   }
@@ -25,13 +25,13 @@ int @PREFIX@_touched(@PREFIX@_solver *solver, const double *palm, const double *
   if (!sound) return @GUARD@_BAD_INPUT;
   @PREFIX@_contacts(solver, q, points, normals);
   for (i = 0; i < 3 * N_FINGERS; i += 3) {
-    double point[3], normal[3];
+    scalar point[3], normal[3];
     for (m = 0; m < 3; ++m) {
       point[m] = points[i + m] - HOME_PALM[9 + m];
       normal[m] = normals[i + m];
     }
     for (k = 0; k < 3; ++k) {
-      const double *row = turn + 3 * k;
+      const scalar *row = turn + 3 * k;
       points[i + k] = palm[9 + k] + (row[0] * point[0] + row[1] * point[1] + row[2] * point[2]);
       normals[i + k] = row[0] * normal[0] + row[1] * normal[1] + row[2] * normal[2];
     }
@@ -39,9 +39,9 @@ int @PREFIX@_touched(@PREFIX@_solver *solver, const double *palm, const double *
   return 0;
 }
 
-int @PREFIX@_begin_palm(@PREFIX@_solver *solver, const double *palm, const double *posture,
-                        const double *q0) {
-  double points[3 * N_FINGERS], normals[3 * N_FINGERS];
+int @PREFIX@_begin_palm(@PREFIX@_solver *solver, const scalar *palm, const scalar *posture,
+                        const scalar *q0) {
+  scalar points[3 * N_FINGERS], normals[3 * N_FINGERS];
   int i;
   if (@PREFIX@_touched(solver, palm, posture, points, normals)) {
     solver->status = @GUARD@_BAD_INPUT;
@@ -56,8 +56,8 @@ int @PREFIX@_begin_palm(@PREFIX@_solver *solver, const double *palm, const doubl
   return (int) solver->status;
 }
 
-int @PREFIX@_solve_palm(@PREFIX@_solver *solver, const double *palm, const double *posture,
-                        const double *q0) {
+int @PREFIX@_solve_palm(@PREFIX@_solver *solver, const scalar *palm, const scalar *posture,
+                        const scalar *q0) {
   int status = @PREFIX@_begin_palm(solver, palm, posture, q0);
   while (status == @GUARD@_RUNNING) status = @PREFIX@_run(solver, BUDGET);
   return status;

@@ -2,11 +2,13 @@
 #ifndef @GUARD@_PARTS_H
 #define @GUARD@_PARTS_H
 
-#include <math.h>
+@MATHS@
 #include <stdint.h>
 #include <string.h>
 
 #include "@PREFIX@.h"
+
+typedef @REAL@ scalar;
 
 @JOBS@
 @PARTS@

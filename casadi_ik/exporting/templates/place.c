@@ -1,5 +1,5 @@
 
-int @PREFIX@_place_kernel(const double *q, double *places, @PREFIX@_memory *memory) {
+int @PREFIX@_place_kernel(const scalar *q, scalar *places, @PREFIX@_memory *memory) {
   workspace space;
   (void) set_up(&space, 0);
   space.arg[0] = q;

@@ -24,17 +24,17 @@ void @PREFIX@_scene_init(@PREFIX@_solver *solver) {
   for (i = 0; i < @GUARD@_SCENE; ++i) solver->scene.solids[N_OWN + i].kind = @GUARD@_NOTHING;
 @FIRST_MARGIN@}
 
-int @PREFIX@_set_solid(@PREFIX@_solver *solver, int number, int kind, const double *size,
-                       const double *pose, int grasped) {
+int @PREFIX@_set_solid(@PREFIX@_solver *solver, int place, int kind, const scalar *size,
+                       const scalar *pose, int grasped) {
   @PREFIX@_solid *put;
   int k;
-  if (number < 0 || number >= @GUARD@_SCENE) return @GUARD@_BAD_INPUT;
+  if (place < 0 || place >= @GUARD@_SCENE) return @GUARD@_BAD_INPUT;
   if (kind < @GUARD@_NOTHING || kind >= N_KINDS) return @GUARD@_BAD_INPUT;
-  put = solver->scene.solids + N_OWN + number;
+  put = solver->scene.solids + N_OWN + place;
   put->kind = kind;
-  solver->scene.grasped[number] = grasped;
+  solver->scene.grasped[place] = grasped;
   if (kind == @GUARD@_NOTHING) return 0;
-  memcpy(solver->scene.poses + 12 * number, pose, 12 * sizeof(double));
+  memcpy(solver->scene.poses + 12 * place, pose, 12 * sizeof(scalar));
   put->reach = 0; /* at most: no shape reaches farther than all its sizes together */
   for (k = 0; k < 3; ++k) {
     put->size[k] = SIZE_FACTORS[kind][k] > 0 ? SIZE_FACTORS[kind][k] * size[k] : 0;
@@ -43,13 +43,13 @@ int @PREFIX@_set_solid(@PREFIX@_solver *solver, int number, int kind, const doub
   return 0;
 }
 
-void @PREFIX@_set_margin(@PREFIX@_solver *solver, double margin) { solver->scene.margin = margin@MORE_MARGIN@; }
+void @PREFIX@_set_margin(@PREFIX@_solver *solver, scalar margin) { solver->scene.margin = margin@MORE_MARGIN@; }
 
-void @PREFIX@_shapes(@PREFIX@_solver *solver, const double *q, double *places) {
+void @PREFIX@_shapes(@PREFIX@_solver *solver, const scalar *q, scalar *places) {
   (void) @PREFIX@_place_kernel(q, places, &solver->memory);
 }
 
-static void add_pair(@PREFIX@_solver *solver, int i, int j, double offset) {
+static void add_pair(@PREFIX@_solver *solver, int i, int j, scalar offset) {
   const int64_t k = solver->scene.n_pairs++;
   solver->scene.pairs[2 * k] = i;
   solver->scene.pairs[2 * k + 1] = j;
@@ -60,14 +60,14 @@ static void add_pair(@PREFIX@_solver *solver, int i, int j, double offset) {
  * touch nothing, or the arm, too. */
 enum { OF_HAND, OF_IDLE, OF_ARM };
 
-static int link_of(int number) {
-  if (number < N_CAPSULES) return LINK[number];
-  number -= N_CAPSULES;
-  return number < N_OWN ? OWN_LINK[number] : N_OWN - 1 - number;
+static int link_of(int body) {
+  if (body < N_CAPSULES) return LINK[body];
+  body -= N_CAPSULES;
+  return body < N_OWN ? OWN_LINK[body] : N_OWN - 1 - body;
 }
 
 /* Motors of the hand that move no finger with a contact, and the links that they move. */
-static void find_idle(@PREFIX@_solver *solver, const double *lower, const double *upper,
+static void find_idle(@PREFIX@_solver *solver, const scalar *lower, const scalar *upper,
                       int *motors, int *links) {
   int k, f, i;
   memset(links, 0, @GUARD@_LINKS * sizeof *links);
@@ -92,7 +92,7 @@ static void add_pairs(@PREFIX@_solver *solver, const int *idle, int part) {
       for (f = 0; f < @GUARD@_FINGERS; ++f) {
         may |= TOUCHES[f][i] && solver->points[3 * f] == solver->points[3 * f];
       }
-      if (!(may && solver->scene.grasped[k])) add_pair(solver, i, N_CAPSULES + N_OWN + k, 0.0);
+      if (!(may && solver->scene.grasped[k])) add_pair(solver, i, N_CAPSULES + N_OWN + k, 0);
     }
   }
   for (k = 0; k < N_PAIRS; ++k) {
@@ -127,9 +127,9 @@ static clearance_job about(@PREFIX@_solver *solver, const int *idle) {
   return job;
 }
 
-static double room_at(@PREFIX@_solver *solver, clearance_job *job, const double *q,
+static scalar room_at(@PREFIX@_solver *solver, clearance_job *job, const scalar *q,
                       int64_t *closest) {
-  double least = INFINITY;
+  scalar least = INFINITY;
   job->q = q;
   job->least = &least;
   job->closest = closest;
@@ -139,10 +139,10 @@ static double room_at(@PREFIX@_solver *solver, clearance_job *job, const double 
   return least - solver->scene.margin;
 }
 
-double @PREFIX@_clearance(@PREFIX@_solver *solver, const double *q) {
+scalar @PREFIX@_clearance(@PREFIX@_solver *solver, const scalar *q) {
   clearance_job job = about(solver, 0);
   int64_t closest;
-  const double room = room_at(solver, &job, q, &closest);
+  const scalar room = room_at(solver, &job, q, &closest);
   if (closest >= 0) {
     solver->nearest[0] = link_of(solver->scene.pairs[2 * closest]);
     solver->nearest[1] = link_of(solver->scene.pairs[2 * closest + 1]);
@@ -152,14 +152,14 @@ double @PREFIX@_clearance(@PREFIX@_solver *solver, const double *q) {
 
 #if HAS_CLOSED_ARM
 /* The preferred arm that touches nothing, for the hand of an answer; 0 if there is none. */
-static int choose_arm(@PREFIX@_solver *solver, const double *lower, const double *upper, int near,
-                     double *q) {
+static int choose_arm(@PREFIX@_solver *solver, const scalar *lower, const scalar *upper, int near,
+                     scalar *q) {
   clearance_job clear = about(solver, 0);
   static const int64_t columns[] = ARM_COLUMNS;
   arm_search_job job = {0};
   map_job map = {0};
-  const double *inputs[1];
-  double *outputs[1], palm[16], low[N_ARM], high[N_ARM], arm[N_ARM], score = 0;
+  const scalar *inputs[1];
+  scalar *outputs[1], palm[16], low[N_ARM], high[N_ARM], arm[N_ARM], score = 0;
   const int64_t step = 0;
   int64_t tried = 0;
   int i;
@@ -219,10 +219,10 @@ static int choose_arm(@PREFIX@_solver *solver, const double *lower, const double
 
 /* Puts idle fingers where they have most room, if the hand touches something by them alone; the room
  * that hand and palm have [m]. */
-static double put_aside(@PREFIX@_solver *solver, const double *lower, const double *upper,
-                        double *q) {
+static scalar put_aside(@PREFIX@_solver *solver, const scalar *lower, const scalar *upper,
+                        scalar *q) {
   int motors[N_HAND], links[@GUARD@_LINKS], k, closer;
-  double most, part = 0, tried[@GUARD@_MOTORS], best[@GUARD@_MOTORS];
+  scalar most, part = 0, tried[@GUARD@_MOTORS], best[@GUARD@_MOTORS];
   int64_t closest, place;
   clearance_job job;
   find_idle(solver, lower, upper, motors, links);
@@ -240,14 +240,14 @@ static double put_aside(@PREFIX@_solver *solver, const double *lower, const doub
     if (closer && !(most > -IDLE_NEAR)) break;
     if (closer) part = IDLE_PARTS[closer - 1];
     for (place = 0; place < (closer ? N_IDLE_CLOSER : N_IDLE); ++place) {
-      double room;
+      scalar room;
       memcpy(tried, q, sizeof tried);
       for (k = 0; k < N_HAND; ++k) {
         const int column = HAND[k];
-        const double x = 0.5 + (double) place * HAND_SPREAD[k], step = x - (double) (int64_t) x;
-        double to = HAND_LOWER[k] + step * HAND_RANGE[k];
+        const scalar x = (scalar) 0.5 + (scalar) place * HAND_SPREAD[k], step = x - (scalar) (int64_t) x;
+        scalar to = HAND_LOWER[k] + step * HAND_RANGE[k];
         if (!motors[k]) continue;
-        if (closer) to = q[column] + part * ((step - 0.5) * HAND_RANGE[k]);
+        if (closer) to = q[column] + part * ((step - (scalar) 0.5) * HAND_RANGE[k]);
         to = to > lower[column] ? to : lower[column];
         tried[column] = to < upper[column] ? to : upper[column];
       }
@@ -263,13 +263,13 @@ static double put_aside(@PREFIX@_solver *solver, const double *lower, const doub
   return room_at(solver, &job, q, &closest);
 }
 
-int @PREFIX@_hand_is_free(@PREFIX@_solver *solver, const double *lower, const double *upper,
-                          double *q) {
+int @PREFIX@_hand_is_free(@PREFIX@_solver *solver, const scalar *lower, const scalar *upper,
+                          scalar *q) {
   return put_aside(solver, lower, upper, q) >= -ROUNDING;
 }
 
-int @PREFIX@_arm_is_free(@PREFIX@_solver *solver, const double *lower, const double *upper, int near,
-                         double *q) {
+int @PREFIX@_arm_is_free(@PREFIX@_solver *solver, const scalar *lower, const scalar *upper, int near,
+                         scalar *q) {
 #if HAS_CLOSED_ARM
   return choose_arm(solver, lower, upper, near, q);
 #else

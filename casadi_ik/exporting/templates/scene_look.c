@@ -3,12 +3,12 @@
 
 const char *const @PREFIX@_link_names[] = {@LINK_NAMES@};
 
-static double least_room(@PREFIX@_solver *solver, const double *q) {
+static scalar least_room(@PREFIX@_solver *solver, const scalar *q) {
   return @PREFIX@_clearance(solver, q) - solver->scene.margin;
 }
 
 /* Makes a configuration the answer, if it is one; else the status is another. */
-static int answered(@PREFIX@_solver *solver, const double *q) {
+static int answered(@PREFIX@_solver *solver, const scalar *q) {
   memmove(solver->q, q, sizeof solver->q);
   solver->status = STALLED_STATUS;
   return judge(solver) == DONE && solver->status == SOLVED_STATUS;
@@ -21,7 +21,7 @@ static void end_look(@PREFIX@_solver *solver, int found) {
   @PREFIX@_scene *look = &solver->scene;
   look->looking = 0;
   if (!found && solver->terms[TERMS_NEAREST] > 0 && !look->again) {
-    solver->terms[TERMS_NEAREST] = 0.0;
+    solver->terms[TERMS_NEAREST] = 0;
     memcpy(solver->here, HOME, sizeof solver->here);
     look->again = 1;
     solver->slot = -1;
@@ -38,8 +38,8 @@ static void end_look(@PREFIX@_solver *solver, int found) {
 }
 
 /* Another arm for a hand that is free, and whether that is an answer. */
-static int swung_free(@PREFIX@_solver *solver, const double *hand) {
-  double q[N_MOTORS];
+static int swung_free(@PREFIX@_solver *solver, const scalar *hand) {
+  scalar q[N_MOTORS];
   memcpy(q, hand, sizeof q);
   return @PREFIX@_arm_is_free(solver, solver->terms + TERMS_LOWER, solver->terms + TERMS_UPPER,
                               solver->terms[TERMS_NEAREST] > 0, q)
@@ -47,8 +47,8 @@ static int swung_free(@PREFIX@_solver *solver, const double *hand) {
 }
 
 /* Whether a hand is like none before it. */
-static int is_new(const double *q, double *before, int64_t *count) {
-  double *own = before + *count * N_HAND;
+static int is_new(const scalar *q, scalar *before, int64_t *count) {
+  scalar *own = before + *count * N_HAND;
   int64_t i;
   int k;
   for (k = 0; k < N_HAND; ++k) own[k] = q[HAND[k]] / LOOK_RANGES[HAND[k]];
@@ -61,18 +61,18 @@ static int is_new(const double *q, double *before, int64_t *count) {
 }
 
 /* What is preferred of hands, higher is better; of all motors where the arm goes with the hand. */
-static double hand_rated(const @PREFIX@_solver *solver, const double *q) {
+static scalar hand_rated(const @PREFIX@_solver *solver, const scalar *q) {
   const int near = solver->terms[TERMS_NEAREST] > 0, count = HAS_CLOSED_ARM ? N_HAND : N_MOTORS;
-  double value = near ? 0.0 : INFINITY;
+  scalar value = near ? 0 : INFINITY;
   int k;
   for (k = 0; k < count; ++k) {
     const int i = HAS_CLOSED_ARM ? HAND[k] : k;
     if (near) {
-      const double part = (q[i] - solver->here[i]) / LOOK_RANGES[i];
+      const scalar part = (q[i] - solver->here[i]) / LOOK_RANGES[i];
       value -= part * part;
     } else {
-      const double below = q[i] - LOWER[i], above = UPPER[i] - q[i];
-      const double part = (below < above ? below : above) / ((UPPER[i] - LOWER[i]) / 2);
+      const scalar below = q[i] - LOWER[i], above = UPPER[i] - q[i];
+      const scalar part = (below < above ? below : above) / ((UPPER[i] - LOWER[i]) / 2);
       if (part < value) value = part;
     }
   }
@@ -81,10 +81,10 @@ static double hand_rated(const @PREFIX@_solver *solver, const double *q) {
 
 /* Takes a hand that meets the contacts in: where its idle fingers touch something they are put
  * elsewhere, and where it still does it is none. */
-static void take_hand(@PREFIX@_solver *solver, double *q) {
+static void take_hand(@PREFIX@_solver *solver, scalar *q) {
   @PREFIX@_scene *look = &solver->scene;
-  const double room = least_room(solver, q);
-  double rated;
+  const scalar room = least_room(solver, q);
+  scalar rated;
   int64_t place;
   int fits;
   if (room > look->room) {
@@ -97,7 +97,7 @@ static void take_hand(@PREFIX@_solver *solver, double *q) {
   /* Into the order in which they are looked at. */
   rated = hand_rated(solver, q);
   for (place = look->n_met++; place > 0; --place) {
-    const double before = look->rated[place - 1];
+    const scalar before = look->rated[place - 1];
     if (HAS_CLOSED_ARM ? !(rated > before) : !(rated >= before)) break;
     look->rated[place] = before;
     memcpy(look->met + place * N_MOTORS, look->met + (place - 1) * N_MOTORS, sizeof look->q);
@@ -110,8 +110,8 @@ static void take_hand(@PREFIX@_solver *solver, double *q) {
  * another arm, then (`look_on`) for other hands. */
 static void look_about(@PREFIX@_solver *solver) {
   @PREFIX@_scene *look = &solver->scene;
-  double q[N_MOTORS];
-  const double room = least_room(solver, solver->q);
+  scalar q[N_MOTORS];
+  const scalar room = least_room(solver, solver->q);
   if (!look->again) {
     look->iterations = solver->iterations;
     look->restarts = solver->restarts;
@@ -137,21 +137,21 @@ static void look_about(@PREFIX@_solver *solver) {
 /* Begins the fit of the next hand of the round. */
 static int begin_hand(search *job) {
   @PREFIX@_scene *look = &job->scene;
-  const double *inputs[5], near = job->terms[TERMS_NEAREST];
-  double *outputs[2], here[N_MOTORS];
+  const scalar *inputs[5], near = job->terms[TERMS_NEAREST];
+  scalar *outputs[2], here[N_MOTORS];
   map_job map = mapping(1, inputs, ALONE, outputs, ALONE);
   int code = DONE, i;
   if (!look->fit) {
     look->fresh = 0;
     /* The order does not matter here, and where the robot is has been looked at. */
-    job->terms[TERMS_NEAREST] = 0.0;
+    job->terms[TERMS_NEAREST] = 0;
     code = from_table(job, look->round);
     job->terms[TERMS_NEAREST] = near;
   }
   if (code != DONE) return code;
   for (i = 0; i < N_CANDIDATES; ++i) {
     memcpy(job->near + i * N_HAND, job->postures + look->fit * N_HAND,
-           N_HAND * sizeof(double));
+           N_HAND * sizeof(scalar));
   }
   for (i = 0; i < N_MOTORS; ++i) {
     here[i] = clipped(job->here[i], job->terms[TERMS_LOWER + i],
@@ -199,7 +199,7 @@ static int look_on(@PREFIX@_solver *solver, int64_t most) {
   ++look->fit;
   memcpy(solver->q, solver->state + STATE_Q, sizeof solver->q);
   if (answered(solver, solver->q)) {
-    double q[N_MOTORS];
+    scalar q[N_MOTORS];
     memcpy(q, solver->q, sizeof q);
     take_hand(solver, q);
   }

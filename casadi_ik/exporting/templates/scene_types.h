@@ -13,20 +13,20 @@ extern const char *const @PREFIX@_link_names[@GUARD@_LINKS];
 
 typedef struct {
   int64_t kind;
-  double size[3], reach;
+  @REAL@ size[3], reach;
   int64_t first, planes;
 } @PREFIX@_solid;
 
 typedef struct {
-  double margin;
+  @REAL@ margin;
   @PREFIX@_solid solids[@SOLIDS@];
-  double poses[12 * @GUARD@_SCENE];
+  @REAL@ poses[12 * @GUARD@_SCENE];
   int32_t grasped[@GUARD@_SCENE], pairs[2 * @MOST_PAIRS@];
-  double offsets[@MOST_PAIRS@];
+  @REAL@ offsets[@MOST_PAIRS@];
   int64_t n_busy, n_held, n_pairs;
   /* The search for a hand that is free, where the answer touches something. */
   int64_t looking, again, round, fit, n_met, next, iterations, restarts, fresh, n_known, n_swung;
-  double q[@GUARD@_MOTORS], room; /* the answer of largest clearance */
-  double met[@N_CANDIDATES@ * @GUARD@_MOTORS], rated[@N_CANDIDATES@];
-  double known[@N_LOOKED@ * @N_HAND@], swung[@N_LOOKED@ * @N_HAND@];
+  @REAL@ q[@GUARD@_MOTORS], room; /* the answer of largest clearance */
+  @REAL@ met[@N_CANDIDATES@ * @GUARD@_MOTORS], rated[@N_CANDIDATES@];
+  @REAL@ known[@N_LOOKED@ * @N_HAND@], swung[@N_LOOKED@ * @N_HAND@];
 } @PREFIX@_scene;

@@ -24,7 +24,7 @@ void @PREFIX@_init(@PREFIX@_solver *solver) {
   solver->status = @GUARD@_BAD_INPUT;
 @SCENE_INIT@}
 
-void @PREFIX@_set_tolerance(@PREFIX@_solver *solver, int finger, double position, double angle) {
+void @PREFIX@_set_tolerance(@PREFIX@_solver *solver, int finger, scalar position, scalar angle) {
   int i;
   for (i = 0; i < N_FINGERS; ++i) {
     if (finger >= 0 && i != finger) continue;
@@ -33,18 +33,18 @@ void @PREFIX@_set_tolerance(@PREFIX@_solver *solver, int finger, double position
   }
 }
 
-void @PREFIX@_set_range(@PREFIX@_solver *solver, int motor, double lower, double upper) {
+void @PREFIX@_set_range(@PREFIX@_solver *solver, int motor, scalar lower, scalar upper) {
   solver->ranges[motor] = lower;
   solver->ranges[N_MOTORS + motor] = upper;
 }
 
-int @PREFIX@_begin(@PREFIX@_solver *solver, const double *points, const double *normals,
-                   const double *q0) {
+int @PREFIX@_begin(@PREFIX@_solver *solver, const scalar *points, const scalar *normals,
+                   const scalar *q0) {
   memcpy(solver->points, points, sizeof solver->points);
   memcpy(solver->normals, normals, sizeof solver->normals);
   memcpy(solver->here, q0 ? q0 : HOME, sizeof solver->here);
   memcpy(solver->terms + TERMS_LOWER, solver->ranges, sizeof solver->ranges);
-  solver->terms[TERMS_NEAREST] = q0 ? 1.0 : 0.0;
+  solver->terms[TERMS_NEAREST] = q0 ? 1 : 0;
 @SCENE_BEGIN@  if (!search_begin(solver)) solver->status = @GUARD@_BAD_INPUT;
   return (int) solver->status;
 }
@@ -56,16 +56,16 @@ int @PREFIX@_run(@PREFIX@_solver *solver, int64_t iterations) {
   return (int) solver->status;
 }
 
-int @PREFIX@_solve(@PREFIX@_solver *solver, const double *points, const double *normals,
-                   const double *q0) {
+int @PREFIX@_solve(@PREFIX@_solver *solver, const scalar *points, const scalar *normals,
+                   const scalar *q0) {
   int status = @PREFIX@_begin(solver, points, normals, q0);
   while (status == @GUARD@_RUNNING) status = @PREFIX@_run(solver, BUDGET);
   return status;
 }
 
-void @PREFIX@_contacts(@PREFIX@_solver *solver, const double *q, double *points, double *normals) {
-  const double *inputs[1];
-  double *outputs[2];
+void @PREFIX@_contacts(@PREFIX@_solver *solver, const scalar *q, scalar *points, scalar *normals) {
+  const scalar *inputs[1];
+  scalar *outputs[2];
   map_job map = mapping(1, inputs, ALONE, outputs, ALONE);
   inputs[0] = q;
   outputs[0] = points;

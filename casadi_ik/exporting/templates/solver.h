@@ -37,18 +37,18 @@ enum {
  * Motors: @MOTOR_LIST@. */
 extern const char *const @PREFIX@_finger_names[@GUARD@_FINGERS];
 extern const char *const @PREFIX@_motor_names[@GUARD@_MOTORS];
-extern const double @PREFIX@_lower[@GUARD@_MOTORS], @PREFIX@_upper[@GUARD@_MOTORS];
+extern const @REAL@ @PREFIX@_lower[@GUARD@_MOTORS], @PREFIX@_upper[@GUARD@_MOTORS];
 @SCENE_TYPES@
 /* Room that the parts of a solver work in, one after the other. */
 typedef struct {
-  double w[@W@];
+  @REAL@ w[@W@];
 @SCENE_ROOM@} @PREFIX@_memory;
 
 /* A solver. Read the answer: q, position_error, angle_error, beyond (by how much the worst motor or
  * joint is beyond its limits, negative within), iterations, restarts, status. Leave the rest. */
 typedef struct {
 @STRUCT@
-  double ranges[2 * @MOTORS@]; /* what set_range said: lower ends, then upper ends */
+  @REAL@ ranges[2 * @MOTORS@]; /* what set_range said: lower ends, then upper ends */
 @SCENE_FIELDS@  @PREFIX@_memory memory;
 } @PREFIX@_solver;
 
@@ -56,18 +56,18 @@ typedef struct {
 void @PREFIX@_init(@PREFIX@_solver *solver);
 
 /* When contacts count as reached: of one finger, or of all (finger -1). */
-void @PREFIX@_set_tolerance(@PREFIX@_solver *solver, int finger, double position, double angle);
+void @PREFIX@_set_tolerance(@PREFIX@_solver *solver, int finger, @REAL@ position, @REAL@ angle);
 
 /* A narrower range of a motor; lower = upper: it stays there. */
-void @PREFIX@_set_range(@PREFIX@_solver *solver, int motor, double lower, double upper);
+void @PREFIX@_set_range(@PREFIX@_solver *solver, int motor, @REAL@ lower, @REAL@ upper);
 
 /* Takes up a target; returns @GUARD@_RUNNING or @GUARD@_BAD_INPUT.
  *
  * points and normals have three numbers a finger: where it must touch, and its outward pad normal
  * (of any length). NaN frees a normal, or the whole finger. q0: where the robot is, and then a
  * solution near it is wanted; a null pointer: it is at home, and one far from its limits is wanted. */
-int @PREFIX@_begin(@PREFIX@_solver *solver, const double *points, const double *normals,
-                   const double *q0);
+int @PREFIX@_begin(@PREFIX@_solver *solver, const @REAL@ *points, const @REAL@ *normals,
+                   const @REAL@ *q0);
 
 /* Goes on for at most so many iterations, and begins at most one round of restarts; returns the
  * status. What was not done in one call is done in the next: the answer does not depend on how it
@@ -75,12 +75,12 @@ int @PREFIX@_begin(@PREFIX@_solver *solver, const double *points, const double *
 int @PREFIX@_run(@PREFIX@_solver *solver, int64_t iterations);
 
 /* Both, to the end. */
-int @PREFIX@_solve(@PREFIX@_solver *solver, const double *points, const double *normals,
-                   const double *q0);
+int @PREFIX@_solve(@PREFIX@_solver *solver, const @REAL@ *points, const @REAL@ *normals,
+                   const @REAL@ *q0);
 
 /* Where the fingertips are and which way they face: three numbers a finger each. The solver's
  * memory is used, nothing else of it. */
-void @PREFIX@_contacts(@PREFIX@_solver *solver, const double *q, double *points, double *normals);
+void @PREFIX@_contacts(@PREFIX@_solver *solver, const @REAL@ *q, @REAL@ *points, @REAL@ *normals);
 @PALM_CALLS@@SCENE_CALLS@@FOLLOW_CALLS@
 #ifdef __cplusplus
 }

@@ -13,8 +13,8 @@ namespace @PREFIX@ {
 inline constexpr std::size_t fingers = @GUARD@_FINGERS;
 inline constexpr std::size_t motors = @GUARD@_MOTORS;
 
-using Vectors = std::array<std::array<double, 3>, fingers>;
-using Configuration = std::array<double, motors>;
+using Vectors = std::array<std::array<@REAL@, 3>, fingers>;
+using Configuration = std::array<@REAL@, motors>;
 
 enum class Status {
   bad_input = @GUARD@_BAD_INPUT,
@@ -30,10 +30,10 @@ class Solver {
  public:
   Solver() noexcept { @PREFIX@_init(&solver_); }
 
-  void set_tolerance(double position, double angle, int finger = -1) noexcept {
+  void set_tolerance(@REAL@ position, @REAL@ angle, int finger = -1) noexcept {
     @PREFIX@_set_tolerance(&solver_, finger, position, angle);
   }
-  void set_range(std::size_t motor, double lower, double upper) noexcept {
+  void set_range(std::size_t motor, @REAL@ lower, @REAL@ upper) noexcept {
     @PREFIX@_set_range(&solver_, static_cast<int>(motor), lower, upper);
   }
 
@@ -56,8 +56,8 @@ class Solver {
     for (std::size_t i = 0; i < motors; ++i) answer[i] = solver_.q[i];
     return answer;
   }
-  double position_error(std::size_t finger) const noexcept { return solver_.position_error[finger]; }
-  double angle_error(std::size_t finger) const noexcept { return solver_.angle_error[finger]; }
+  @REAL@ position_error(std::size_t finger) const noexcept { return solver_.position_error[finger]; }
+  @REAL@ angle_error(std::size_t finger) const noexcept { return solver_.angle_error[finger]; }
   std::int64_t iterations() const noexcept { return solver_.iterations; }
 
  private:

@@ -30,7 +30,7 @@ enum { DONE = 0, SLICE_OVER = 1, NO_MEMORY = -1 };
 enum { FAR_FROM_LIMITS, NEAR_START, MEASURED, CLEAREST };
 enum { PALM = 12, LEVELS = 2 };
 
-#define TURN 6.283185307179586
+#define TURN (scalar) 6.283185307179586
 
 typedef struct {
   KERNEL(arms, map_job);       /* rotation, origin, redundancy -> the arm of every side, their slacks */
@@ -42,22 +42,22 @@ typedef struct {
   int64_t n_q, n_arm, n_redundancy, n_rows;
   int64_t n_groups;            /* 1: one arm is wanted; else one of every branch, and the given one */
   int64_t n_places[LEVELS], n_closer;
-  const double *places[LEVELS]; /* rows of n_redundancy, the last of which may be varied */
-  const double *closer;        /* by how much, about what was chosen */
+  const scalar *places[LEVELS]; /* rows of n_redundancy, the last of which may be varied */
+  const scalar *closer;        /* by how much, about what was chosen */
   const int64_t *columns;      /* of the arm in q */
-  const double *lower, *upper; /* bounds of the arm */
-  const double *low, *range;   /* its limits, which order it */
-  const double *q, *palms, *starts; /* rows of n_q, 16 and n_q */
+  const scalar *lower, *upper; /* bounds of the arm */
+  const scalar *low, *range;   /* its limits, which order it */
+  const scalar *q, *palms, *starts; /* rows of n_q, 16 and n_q */
   const int64_t *owner;        /* of hands next to each other: once one has an arm the others of the
                                   same owner are left out; NULL: none is */
-  const double *caps;          /* room that no arm of the hand can exceed */
-  const double *poses;
-  int64_t pose_step;           /* doubles from one hand to the next, 0: the same for all */
-  double margin, rounding;     /* distance to keep, and what it may be short of that */
-  double allowed;              /* how far a joint may be within its bounds at least: rounding */
+  const scalar *caps;          /* room that no arm of the hand can exceed */
+  const scalar *poses;
+  int64_t pose_step;           /* numbers from one hand to the next, 0: the same for all */
+  scalar margin, rounding;     /* distance to keep, and what it may be short of that */
+  scalar allowed;              /* how far a joint may be within its bounds at least: rounding */
   int64_t count;
-  double *chosen;              /* rows of n_groups arms */
-  double *score;               /* rows of n_groups: of the arm alone; -inf: there is none */
+  scalar *chosen;              /* rows of n_groups arms */
+  scalar *score;               /* rows of n_groups: of the arm alone; -inf: there is none */
   int64_t *tried;              /* arms within bounds */
   OWN_MEMORY
 } arm_search_job;
@@ -65,14 +65,14 @@ typedef struct {
 /* Arms that were found, and their scores. */
 typedef struct {
   int64_t count;
-  double *found, *score;
+  scalar *found, *score;
   int64_t *arm, *place, *group; /* place in `found`, row of the samples, branch */
   char *used;
 } pool;
 
 typedef struct {
   pool all, near;
-  double *samples, *rows, *least;
+  scalar *samples, *rows, *least;
   int64_t *closest, *picked;
 } scratch;
 
@@ -91,7 +91,7 @@ static size_t room(const arm_search_job *job) {
   const int64_t whole = 6 * most + 2 * job->lanes;
   const int64_t numbers = 2 * most * (wide + 1) + most * (PALM + job->n_redundancy)
                         + (most + job->lanes) * job->n_q + job->lanes;
-  return (size_t) whole * sizeof(int64_t) + (size_t) numbers * sizeof(double) + 2 * (size_t) most;
+  return (size_t) whole * sizeof(int64_t) + (size_t) numbers * sizeof(scalar) + 2 * (size_t) most;
 }
 
 static void lay_out(const arm_search_job *job, scratch *space, char *next) {
@@ -110,22 +110,22 @@ static void lay_out(const arm_search_job *job, scratch *space, char *next) {
   TAKE(space->closest, int64_t, job->lanes);
   TAKE(space->picked, int64_t, job->lanes);
   for (i = 0; i < 2; ++i) {
-    TAKE(pools[i]->found, double, most * wide);
-    TAKE(pools[i]->score, double, most);
+    TAKE(pools[i]->found, scalar, most * wide);
+    TAKE(pools[i]->score, scalar, most);
   }
-  TAKE(space->samples, double, most * (PALM + job->n_redundancy));
-  TAKE(space->rows, double, (most + job->lanes) * job->n_q);
-  TAKE(space->least, double, job->lanes);
+  TAKE(space->samples, scalar, most * (PALM + job->n_redundancy));
+  TAKE(space->rows, scalar, (most + job->lanes) * job->n_q);
+  TAKE(space->least, scalar, job->lanes);
   for (i = 0; i < 2; ++i) {
     TAKE(pools[i]->used, char, most);
   }
 #undef TAKE
 }
 
-static int mapped(const arm_search_job *job, KERNEL(kernel, map_job), const double *in, int64_t wide,
-                  double *out, int64_t wide_out, int64_t count) {
-  const double *inputs[1];
-  double *outputs[1];
+static int mapped(const arm_search_job *job, KERNEL(kernel, map_job), const scalar *in, int64_t wide,
+                  scalar *out, int64_t wide_out, int64_t count) {
+  const scalar *inputs[1];
+  scalar *outputs[1];
   map_job map = {0};
   int code;
   inputs[0] = in;
@@ -135,7 +135,7 @@ static int mapped(const arm_search_job *job, KERNEL(kernel, map_job), const doub
   map.outputs = outputs;
   map.output_steps = &wide_out;
   map.count = count;
-  map.slice = 1.0;
+  map.slice = 1;
   (void) job;
   do code = CALL(kernel, &map);
   while (code == SLICE_OVER);
@@ -144,15 +144,15 @@ static int mapped(const arm_search_job *job, KERNEL(kernel, map_job), const doub
 
 /* Puts an arm into its bounds and the asked turn, that of a held joint where it is held; whether it
  * was within, as far as rounding goes. */
-static int clamp_and_check(const arm_search_job *job, double *arm, const double *start) {
+static int clamp_and_check(const arm_search_job *job, scalar *arm, const scalar *start) {
   int64_t j;
   for (j = 0; j < job->n_arm; ++j) {
-    const double low = job->lower[j], high = job->upper[j];
-    double x = arm[j];
+    const scalar low = job->lower[j], high = job->upper[j];
+    scalar x = arm[j];
     if (low >= high) {
-      x += TURN * floor((low - x) / TURN + 0.5);
+      x += TURN * floor((low - x) / TURN + (scalar) 0.5);
     } else if (job->order == NEAR_START) {
-      const double turned = x + TURN * floor((start[job->columns[j]] - x) / TURN + 0.5);
+      const scalar turned = x + TURN * floor((start[job->columns[j]] - x) / TURN + (scalar) 0.5);
       if (turned >= low && turned <= high) x = turned;
     }
     if (!(x - low >= job->allowed && high - x >= job->allowed)) return 0;
@@ -161,33 +161,33 @@ static int clamp_and_check(const arm_search_job *job, double *arm, const double 
   return 1;
 }
 
-static double rated(const arm_search_job *job, const double *arm, const double *start) {
-  double value = job->order == NEAR_START ? 0.0 : INFINITY;
+static scalar rated(const arm_search_job *job, const scalar *arm, const scalar *start) {
+  scalar value = job->order == NEAR_START ? 0 : INFINITY;
   int64_t j;
   for (j = 0; j < job->n_arm; ++j) {
-    const double range = job->range[j];
+    const scalar range = job->range[j];
     if (job->order == NEAR_START) {
-      const double part = (arm[j] - start[job->columns[j]]) / range;
+      const scalar part = (arm[j] - start[job->columns[j]]) / range;
       value -= part * part;
     } else {
-      const double below = arm[j] - job->low[j], above = job->low[j] + range - arm[j];
-      const double part = (below < above ? below : above) / (0.5 * range);
+      const scalar below = arm[j] - job->low[j], above = job->low[j] + range - arm[j];
+      const scalar part = (below < above ? below : above) / ((scalar) 0.5 * range);
       if (part < value) value = part;
     }
   }
   return value;
 }
 
-static void configuration(const arm_search_job *job, int64_t hand, const double *arm, double *q) {
+static void configuration(const arm_search_job *job, int64_t hand, const scalar *arm, scalar *q) {
   int64_t j;
-  memcpy(q, job->q + hand * job->n_q, (size_t) job->n_q * sizeof(double));
+  memcpy(q, job->q + hand * job->n_q, (size_t) job->n_q * sizeof(scalar));
   for (j = 0; j < job->n_arm; ++j) q[job->columns[j]] = arm[j];
 }
 
 static void add(const arm_search_job *job, int64_t hand, pool *to, int64_t arm, int64_t place,
                 int64_t group) {
-  const double *start = job->starts + hand * job->n_q;
-  double *found = to->found + arm;
+  const scalar *start = job->starts + hand * job->n_q;
+  scalar *found = to->found + arm;
   const int64_t i = to->count;
   if (!clamp_and_check(job, found, start)) return;
   to->score[i] = rated(job, found, start);
@@ -202,11 +202,11 @@ static void add(const arm_search_job *job, int64_t hand, pool *to, int64_t arm, 
 static int look(const arm_search_job *job, scratch *space, int64_t hand, pool *to, int64_t count,
                 int64_t side) {
   const int64_t wide = PALM + job->n_redundancy, size = job->n_rows * (job->n_arm + 1);
-  const double *palm = job->palms + 16 * hand;
+  const scalar *palm = job->palms + 16 * hand;
   int64_t i, k, s;
   int code;
   for (s = 0; s < count; ++s) {
-    double *sample = space->samples + s * wide;
+    scalar *sample = space->samples + s * wide;
     for (i = 0; i < 3; ++i) {
       for (k = 0; k < 3; ++k) sample[3 * i + k] = palm[4 * i + k];
       sample[9 + i] = palm[4 * i + 3];
@@ -216,7 +216,7 @@ static int look(const arm_search_job *job, scratch *space, int64_t hand, pool *t
   code = mapped(job, job->arms, space->samples, wide, to->found, size, count);
   if (code != DONE) return code;
   for (s = 0; s < count; ++s) {
-    const double *slack = to->found + s * size + job->n_rows * job->n_arm;
+    const scalar *slack = to->found + s * size + job->n_rows * job->n_arm;
     for (k = 0; k < job->n_rows; ++k) {
       if ((side < 0 || k == side) && slack[k] >= 0) {
         add(job, hand, to, s * size + k * job->n_arm, s, k);
@@ -238,17 +238,17 @@ static int measured(const arm_search_job *job, scratch *space, int64_t hand, poo
 
 /* The first in the asked order that is free, of a group, and better than what is there; or -1. */
 static int pick(const arm_search_job *job, scratch *space, int64_t hand, pool *from, int64_t group,
-                double *better, int64_t *chosen) {
+                scalar *better, int64_t *chosen) {
   const int clearest = job->order == CLEAREST;
   clearance_job *clear = job->clear;
   const int64_t wanted = clear ? job->lanes : 1;
   *chosen = -1;
   for (;;) {
-    const double least = clearest ? -INFINITY : *better;
+    const scalar least = clearest ? -INFINITY : *better;
     int64_t count = 0, i, n, *picked = space->picked;
     int code;
     for (i = 0; i < from->count; ++i) {
-      const double value = from->score[i];
+      const scalar value = from->score[i];
       if (from->used[i] || !(value > least)) continue;
       if (job->n_groups > 1 && from->group[i] != group) continue;
       if (count == wanted && !(value > from->score[picked[count - 1]])) continue;
@@ -281,7 +281,7 @@ static int pick(const arm_search_job *job, scratch *space, int64_t hand, pool *f
     while (code == SLICE_OVER);
     if (code != DONE) return code;
     for (n = 0; n < count; ++n) {
-      double room = space->least[n] - job->margin;
+      scalar room = space->least[n] - job->margin;
       /* Of arms with as much room as their hand has, the first in the order of limits. */
       if (clearest && room > job->caps[hand]) room = job->caps[hand];
       i = space->picked[n];
@@ -296,20 +296,20 @@ static int pick(const arm_search_job *job, scratch *space, int64_t hand, pool *f
 }
 
 /* Places about the one that an arm was found at, its branch only. */
-static int refine(const arm_search_job *job, scratch *space, int64_t hand, const double *place,
-                  int64_t group, double *better, double *arm) {
+static int refine(const arm_search_job *job, scratch *space, int64_t hand, const scalar *place,
+                  int64_t group, scalar *better, scalar *arm) {
   int64_t i, chosen;
   int code;
   for (i = 0; i < job->n_closer; ++i) {
-    double *redundancy = space->samples + i * (PALM + job->n_redundancy) + PALM;
-    memcpy(redundancy, place, (size_t) job->n_redundancy * sizeof(double));
+    scalar *redundancy = space->samples + i * (PALM + job->n_redundancy) + PALM;
+    memcpy(redundancy, place, (size_t) job->n_redundancy * sizeof(scalar));
     redundancy[job->n_redundancy - 1] += job->closer[i];
   }
   code = look(job, space, hand, &space->near, job->n_closer, group);
   if (code == DONE) code = measured(job, space, hand, &space->near);
   if (code == DONE) code = pick(job, space, hand, &space->near, group, better, &chosen);
   if (code == DONE && chosen >= 0) {
-    memcpy(arm, space->near.found + space->near.arm[chosen], (size_t) job->n_arm * sizeof(double));
+    memcpy(arm, space->near.found + space->near.arm[chosen], (size_t) job->n_arm * sizeof(scalar));
   }
   return code;
 }
@@ -322,12 +322,12 @@ static int search_level(const arm_search_job *job, scratch *space, int64_t hand,
   int code, most;
   for (i = 0; i < count; ++i) {
     memcpy(space->samples + i * wide + PALM, job->places[level] + i * job->n_redundancy,
-           (size_t) job->n_redundancy * sizeof(double));
+           (size_t) job->n_redundancy * sizeof(scalar));
   }
   code = look(job, space, hand, all, count, -1);
   if (code != DONE) return code;
   if (!level) {
-    double *own = all->found + count * size;
+    scalar *own = all->found + count * size;
     for (i = 0; i < job->n_arm; ++i) own[i] = job->q[hand * job->n_q + job->columns[i]];
     add(job, hand, all, count * size, -1, job->n_groups - 1);
   }
@@ -335,14 +335,14 @@ static int search_level(const arm_search_job *job, scratch *space, int64_t hand,
   code = measured(job, space, hand, all);
   if (code != DONE) return code;
   for (group = 0; group < job->n_groups; ++group) {
-    double *score = job->score + hand * job->n_groups + group;
-    double *arm = job->chosen + (hand * job->n_groups + group) * job->n_arm;
+    scalar *score = job->score + hand * job->n_groups + group;
+    scalar *arm = job->chosen + (hand * job->n_groups + group) * job->n_arm;
     code = pick(job, space, hand, all, group, score, &chosen);
     if (code != DONE) return code;
     if (chosen < 0) continue;
     most = job->order == CLEAREST && *score >= job->caps[hand];
     if (job->order != CLEAREST || most || *score >= -job->rounding) *any = 1;
-    memcpy(arm, all->found + all->arm[chosen], (size_t) job->n_arm * sizeof(double));
+    memcpy(arm, all->found + all->arm[chosen], (size_t) job->n_arm * sizeof(scalar));
     if (all->place[chosen] < 0 || !job->n_closer || most) continue;
     code = refine(job, space, hand, job->places[level] + all->place[chosen] * job->n_redundancy,
                   all->group[chosen], score, arm);

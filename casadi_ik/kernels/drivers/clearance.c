@@ -18,8 +18,8 @@ enum { FEW = 64 };
 enum { GROUP = 32 };
 
 /* Where tangents and function agree to this [m], the least is found. */
-#define CLOSE 1e-7
-#define TINY 1e-30
+#define CLOSE (scalar) 1e-7
+#define TINY (scalar) 1e-30
 
 typedef struct { lanes x, y, z; } vector;
 typedef struct { lanes value, slope; } along;
@@ -37,10 +37,10 @@ LANES_INLINE vector at(vector c, vector h, lanes t) {
 LANES_INLINE vector load(const lanes *from) { return (vector) {from[0], from[1], from[2]}; }
 
 /* Least distance of two segments whose middles are apart by r; a, b: squares of the half lengths. */
-LANES_INLINE lanes between(vector r, vector g, vector h, double a, double b) {
+LANES_INLINE lanes between(vector r, vector g, vector h, scalar a, scalar b) {
   const lanes both = dot(g, h), d = dot(g, r), f = dot(h, r);
   const lanes det = SPREAD(a * b) - both * both;
-  const double over_a = a > 0 ? 1 / a : 0, over_b = b > 0 ? 1 / b : 0;
+  const scalar over_a = a > 0 ? 1 / a : 0, over_b = b > 0 ? 1 / b : 0;
   lanes t = within((both * f - b * d) / larger(det, SPREAD(TINY)));
   lanes s = within((both * t + f) * over_b);
   t = within((both * s - d) * over_a);
@@ -105,7 +105,7 @@ LANES_INLINE along highest(envelope planes, lanes t) {
 }
 
 /* The lines of some planes; their highest in the middle is what is given. */
-static LANES_TARGET lanes of_planes(const double *plane, vector c, vector h, lanes *line,
+static LANES_TARGET lanes of_planes(const scalar *plane, vector c, vector h, lanes *line,
                                     int64_t first, int64_t last) {
   lanes most[4];
   int64_t i, k;
@@ -167,7 +167,7 @@ static LANES_TARGET lanes lowest(const solid *one, vector c, vector h, envelope 
     over |= lanes_not(inner) | (best - bound < SPREAD(CLOSE));
     if (cut == MOST_CUTS || lanes_all(over)) break;
     /* Where the tangents meet; every third time the middle, since flat ends creep. */
-    t = cut % 3 == 2 ? (low + high) * 0.5 : smaller(larger(meet, low), high);
+    t = cut % 3 == 2 ? (low + high) * (scalar) 0.5 : smaller(larger(meet, low), high);
     here = from_solid(one, c, h, planes, t);
     best = smaller(best, here.value);
     left_side = here.slope < zero;
@@ -183,7 +183,7 @@ static LANES_TARGET lanes lowest(const solid *one, vector c, vector h, envelope 
 }
 
 /* Square of the distance of a point from a segment about c; over: one by the square of its half. */
-LANES_INLINE lanes off_point(const double *point, vector c, vector h, double over) {
+LANES_INLINE lanes off_point(const scalar *point, vector c, vector h, scalar over) {
   const vector r = {point[0] - c.x, point[1] - c.y, point[2] - c.z};
   const lanes t = within(dot(r, h) * over);
   const vector off = minus(r, (vector) {t * h.x, t * h.y, t * h.z});
@@ -192,9 +192,9 @@ LANES_INLINE lanes off_point(const double *point, vector c, vector h, double ove
 
 /* Distance of a segment from the points of a cloud that are nearer than `near`; else anything above
  * it. What lies in groups that are farther in every lane is not looked at. */
-static LANES_TARGET lanes off_cloud(const double *row, int64_t count, vector c, vector h,
-                                    double half, lanes near) {
-  const double *end = row + 4 * count, over = half > 0 ? 1 / (half * half) : 0;
+static LANES_TARGET lanes off_cloud(const scalar *row, int64_t count, vector c, vector h,
+                                    scalar half, lanes near) {
+  const scalar *end = row + 4 * count, over = half > 0 ? 1 / (half * half) : 0;
   lanes best = SPREAD(INFINITY);
   int k;
   for (; row < end; row += 4 * (GROUP + 1)) {
@@ -209,7 +209,7 @@ static LANES_TARGET lanes off_cloud(const double *row, int64_t count, vector c, 
 /* Distance of a capsule's segment from a solid, less `radius`; where the least distances are below
  * what this can be at all, anything above them. */
 static LANES_TARGET lanes off_solid(const clearance_job *job, const solid *one, const lanes *pose,
-                                    vector c, vector h, double half, double radius, lanes least,
+                                    vector c, vector h, scalar half, scalar radius, lanes least,
                                     lanes *lines) {
   const envelope planes = {lines, one->kind == CONVEX ? one->planes : 0};
   const vector x = load(pose), y = load(pose + 3), z = load(pose + 6);
@@ -223,7 +223,7 @@ static LANES_TARGET lanes off_solid(const clearance_job *job, const solid *one, 
   sure = least + (one->reach + half + radius);
   if (lanes_all((dot(r, r) >= sure * sure) | (sure < SPREAD(0.0)))) return SPREAD(INFINITY);
   if (one->kind == CAPSULE) {
-    const double other = one->size[1];
+    const scalar other = one->size[1];
     const vector axis = {x.z * other, y.z * other, z.z * other};
     return between(r, h, axis, half * half, other * other) - (radius + one->size[0]);
   }
@@ -235,12 +235,12 @@ static LANES_TARGET lanes off_solid(const clearance_job *job, const solid *one, 
   way.y = x.y * h.x + y.y * h.y + z.y * h.z;
   way.z = x.z * h.x + y.z * h.y + z.z * h.z;
   if (one->kind == CLOUD) {
-    const double wide = radius + one->size[0];
+    const scalar wide = radius + one->size[0];
     return off_cloud(job->planes + 4 * one->first, one->planes, place, way, half, least + wide)
            - wide;
   }
   if (one->kind == CONVEX) {
-    const double *plane = job->planes + 4 * one->first;
+    const scalar *plane = job->planes + 4 * one->first;
     const int64_t some = planes.count < FEW ? planes.count : FEW;
     sure = of_planes(plane, place, way, lines, 0, some);
     if (lanes_all(sure - (half + radius) >= least)) return sure - (half + radius);
@@ -261,12 +261,12 @@ static void blocked_by(clearance_job *job, int64_t pair) {
   job->recent[RECENT - 1] = pair;
 }
 
-EXPORT LANES_TARGET int casadi_ik_clearance(clearance_job *job) {
+LANES_TARGET DRIVER(clearance, clearance_job) {
   workspace space;
   lanes *q, *placed, *poses, *lines;
   const size_t places = 6 * N_CAPSULES + 12 * (N_OWN + (size_t) job->n_solids);
   int64_t ticks = 0, most = 0, k;
-  double limit;
+  scalar limit;
   int lane, outcome;
   for (k = 0; k < N_OWN + job->n_solids; ++k) {
     if (job->solids[k].kind == CONVEX && job->solids[k].planes > most) {
@@ -289,10 +289,10 @@ EXPORT LANES_TARGET int casadi_ik_clearance(clearance_job *job) {
     }
     for (lane = 0; lane < LANES; ++lane) {
       const int64_t row = job->next + lane < job->count ? job->next + lane : job->count - 1;
-      for (k = 0; k < N_Q; ++k) ((double *) q)[k * LANES + lane] = job->q[row * N_Q + k];
+      for (k = 0; k < N_Q; ++k) ((scalar *) q)[k * LANES + lane] = job->q[row * N_Q + k];
       if (!job->pose_step) continue;
       for (k = 0; k < 12 * job->n_solids; ++k) {
-        ((double *) poses)[k * LANES + lane] = job->poses[row * job->pose_step + k];
+        ((scalar *) poses)[k * LANES + lane] = job->poses[row * job->pose_step + k];
       }
     }
     space.arg[0] = q;
@@ -304,12 +304,12 @@ EXPORT LANES_TARGET int casadi_ik_clearance(clearance_job *job) {
       if (pair < 0) continue;
       const int i = job->pairs[2 * pair], j = job->pairs[2 * pair + 1];
       const vector c = load(placed + 6 * i), h = load(placed + 6 * i + 3);
-      const double radius = job->radii[i] + job->offsets[pair], half = job->halves[i];
+      const scalar radius = job->radii[i] + job->offsets[pair], half = job->halves[i];
       const lanes enough = job->every ? SPREAD(INFINITY) : least;
       lanes distance;
       lane_mask nearer;
       if (j < N_CAPSULES) {
-        const double reach = radius + job->radii[j], other = job->halves[j];
+        const scalar reach = radius + job->radii[j], other = job->halves[j];
         const vector r = minus(c, load(placed + 6 * j));
         const lanes sure = enough + (reach + half + other);
         if (lanes_all((dot(r, r) >= sure * sure) | (sure < SPREAD(0.0)))) continue;
@@ -326,7 +326,7 @@ EXPORT LANES_TARGET int casadi_ik_clearance(clearance_job *job) {
       }
       nearer = distance < least;
       least = lanes_select(nearer, distance, least);
-      who = lanes_select(nearer, SPREAD((double) pair), who);
+      who = lanes_select(nearer, SPREAD((scalar) pair), who);
       if (lanes_all(least < SPREAD(job->enough))) break;
     }
     for (lane = 0; lane < LANES; ++lane) {

@@ -14,7 +14,10 @@
 #define EXPORT __attribute__((visibility("default")))
 #endif
 
-/* What a driver returns to Python. */
+/* The function of a driver, which Python calls. */
+#define DRIVER(name, work) EXPORT int casadi_ik_##name(work *job)
+
+/* What it returns. */
 enum { DONE = 0, SLICE_OVER = 1, ROWS_FULL = 2, GOES_ON = 3, FEW_LEFT = 4, NO_MEMORY = -1 };
 
 /* The clock is looked at once in so many evaluations: reading it costs about 25 ns. */

@@ -8,7 +8,8 @@
 
 enum { DONE = 0, SLICE_OVER = 1, ROWS_FULL = 2, GOES_ON = 3, FEW_LEFT = 4 };
 
-#define EXPORT
+/* Expects the macros NAMED and MEMORY: the driver's name and the type of its memory. */
+#define DRIVER(name, work) int NAMED(work *job, MEMORY *memory)
 #define CLOCK_INTERVAL 16
 #define monotonic() 0.0
 

@@ -11,7 +11,7 @@ typedef double lanes __attribute__((vector_size(LANES * sizeof(double))));
 typedef int64_t lane_mask __attribute__((vector_size(LANES * sizeof(double))));
 typedef lanes real;
 typedef lane_mask mask;
-typedef double number; /* of constants */
+typedef double scalar; /* of one solve */
 
 #if !defined(__x86_64__)
 #define LANES_TARGET

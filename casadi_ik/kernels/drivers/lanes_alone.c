@@ -2,7 +2,7 @@
 #define LANES 1
 #define LANES_TARGET
 #define LANES_INLINE static inline
-#define SPREAD(x) (x)
+#define SPREAD(x) ((lanes) (x))
 #define lanes_select(mask, yes, no) ((mask) ? (yes) : (no))
 #define lanes_all(mask) (mask)
 #define lanes_not(mask) (!(mask))
@@ -10,5 +10,5 @@
 #define lanes_fabs(x) fabs(x)
 #define lanes_sqrt(x) sqrt(x)
 
-typedef double lanes;
+typedef scalar lanes;
 typedef int lane_mask;

@@ -20,7 +20,7 @@ typedef struct {
 #define UNROLLED static inline __attribute__((always_inline, unused, optimize("O3")))
 #endif
 
-static void ask(const double *key, asked *pairs) {
+static void ask(const scalar *key, asked *pairs) {
   int i;
   memset(pairs, 0, PAIRS * sizeof *pairs);
   for (i = 0; i < N_KEY; ++i) {
@@ -199,11 +199,11 @@ static look_up *best_form(void) {
   return PLAIN;
 }
 
-EXPORT int casadi_ik_lookup(lookup_job *job) {
+DRIVER(lookup, lookup_job) {
   workspace space;
   int outcome = set_up(&space, N_KEY + 2 * (job->rows + TILE));
   int64_t ticks = 0;
-  double limit = 0;
+  scalar limit = 0;
   int i;
   asked pairs[PAIRS];
   int32_t *distance, *nearest;

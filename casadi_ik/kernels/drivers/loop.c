@@ -30,15 +30,15 @@
 #ifndef LANES
 #define LANES 1
 #define LANES_TARGET
-#define SPREAD(x) (x)
-typedef double lanes;
+#define SPREAD(x) ((lanes) (x))
+typedef scalar lanes;
 #endif
-#define LANE(pack, k, lane) (((double *) (pack))[(k) * LANES + (lane)])
+#define LANE(pack, k, lane) (((scalar *) (pack))[(k) * LANES + (lane)])
 
 /* Solves that wait, by stage. */
 typedef struct {
   int known;                   /* stages met so far; more than STAGES share the last place */
-  double stage[STAGES];
+  scalar stage[STAGES];
   int height[STAGES];
   int waiting[STAGES][SLOTS];  /* slots */
 } queues;
@@ -49,19 +49,19 @@ typedef struct {
   int queue;                   /* where its like wait */
   int outcome;                 /* DONE, or why the loop stops */
   lanes *now, *next, *parameters, *record;
-  const double *own[LANES];    /* parameters of each lane's solve */
+  const scalar *own[LANES];    /* parameters of each lane's solve */
 } bench;
 
 /* Rows stand by slot where a method writes them, else by solve. */
-static double *state_of(const loop_job *job, int slot) {
+static scalar *state_of(const loop_job *job, int slot) {
   return job->states + (job->follow ? slot : job->slots[slot]) * job->state_step;
 }
 
-static const double *parameters_of(const loop_job *job, int slot) {
+static const scalar *parameters_of(const loop_job *job, int slot) {
   return job->parameters + (job->follow ? slot : job->slots[slot]) * job->parameter_step;
 }
 
-static int queue_of(queues *all, double stage) {
+static int queue_of(queues *all, scalar stage) {
   int i;
   for (i = 0; i < all->known; ++i) {
     if (all->stage[i] == stage) return i;
@@ -72,7 +72,7 @@ static int queue_of(queues *all, double stage) {
 }
 
 static void queue_up(queues *all, const loop_job *job, int slot) {
-  const double stage = STAGE < 0 ? 0 : state_of(job, slot)[STAGE < 0 ? 0 : STAGE];
+  const scalar stage = STAGE < 0 ? 0 : state_of(job, slot)[STAGE < 0 ? 0 : STAGE];
   const int i = queue_of(all, stage == stage ? stage : -1);
   all->waiting[i][all->height[i]++] = slot;
 }
@@ -112,7 +112,7 @@ static void follow_up(bench *b, queues *all, loop_job *job, int slot) {
 }
 
 static void sit_down(bench *b, const loop_job *job, int lane, int slot) {
-  const double *state = state_of(job, slot), *given = parameters_of(job, slot);
+  const scalar *state = state_of(job, slot), *given = parameters_of(job, slot);
   int k;
   for (k = 0; k < N_STATE; ++k) LANE(b->now, k, lane) = state[k];
 #if LANES == 1
@@ -125,7 +125,7 @@ static void sit_down(bench *b, const loop_job *job, int lane, int slot) {
 }
 
 static void stand_up(bench *b, const loop_job *job, int lane, const lanes *state) {
-  double *to = state_of(job, b->slot[lane]);
+  scalar *to = state_of(job, b->slot[lane]);
   int k;
   for (k = 0; k < N_STATE; ++k) to[k] = LANE(state, k, lane);
   b->slot[lane] = NOBODY;
@@ -159,7 +159,7 @@ static int fill(bench *b, queues *all, const loop_job *job) {
 }
 
 static void write_row(const bench *b, loop_job *job, int lane, int64_t solve) {
-  double own[N_RECORD + 1];
+  scalar own[N_RECORD + 1];
   int k;
   for (k = 0; k < N_RECORD; ++k) own[k] = LANE(b->record, k, lane);
   job->places[2 * job->used] = solve;
@@ -187,10 +187,10 @@ static int is_marked(int64_t iteration) {
 }
 
 /* Whether the state is once more the one marked; nearly always its first numbers tell. */
-static int is_repeated(const bench *b, const double *mark, int lane) {
+static int is_repeated(const bench *b, const scalar *mark, int lane) {
   int k;
   for (k = 0; k < N_STATE; ++k) {
-    if (memcmp(&LANE(b->now, k, lane), mark + k, sizeof(double))) return 0;
+    if (memcmp(&LANE(b->now, k, lane), mark + k, sizeof(scalar))) return 0;
   }
   return 1;
 }
@@ -204,10 +204,10 @@ static void end(bench *b, queues *all, loop_job *job, int lane, int32_t status, 
 
 /* What comes of a lane's solve after a step; the state is in `now`, the one before in `next`.
  * Whether another solve may take the lane. */
-static int settle(bench *b, queues *all, loop_job *job, int lane, double code, int finite) {
+static int settle(bench *b, queues *all, loop_job *job, int lane, scalar code, int finite) {
   const int slot = b->slot[lane];
   const int64_t iteration = spent(job, slot);
-  double *mark = job->mark + slot * N_STATE;
+  scalar *mark = job->mark + slot * N_STATE;
   int32_t status;
   int k;
   /* Written so that a NaN code fails the test too. */
@@ -235,8 +235,8 @@ static int settle(bench *b, queues *all, loop_job *job, int lane, double code, i
 }
 
 /* The seconds since last time, shared by the solves that had the lanes. */
-static void share(const int64_t *solves, int busy, const loop_job *job, double *since) {
-  const double now = monotonic(), each = (now - *since) / busy;
+static void share(const int64_t *solves, int busy, const loop_job *job, scalar *since) {
+  const scalar now = monotonic(), each = (now - *since) / busy;
   int lane;
   for (lane = 0; lane < LANES; ++lane) {
     if (solves[lane] != NOBODY) job->seconds[solves[lane]] += each;
@@ -272,13 +272,13 @@ static int is_few(const loop_job *job) {
   return left < job->fewest;
 }
 
-EXPORT LANES_TARGET int casadi_ik_loop(loop_job *job) {
+LANES_TARGET DRIVER(loop, loop_job) {
   workspace space;
   queues all;
   bench b;
   lanes code, *last;
   int64_t ticks = 0, solves[LANES];
-  double limit, since;
+  scalar limit, since;
   int finite[LANES], lane, busy, outcome = set_up(&space, 2 * N_STATE + N_PARAMETERS + N_RECORD);
   if (outcome != DONE) return outcome;
   since = monotonic();

@@ -1,16 +1,20 @@
 /* What a loop works on (loop.c). */
+#ifndef SINGLE
+typedef double scalar;
+#endif
+
 typedef struct {
-  double *states;              /* N_STATE numbers of each solve, start in, end out; of each slot
+  scalar *states;              /* N_STATE numbers of each solve, start in, end out; of each slot
                                   where there is `follow`, which writes the starts */
-  double *parameters;          /* likewise */
-  int64_t state_step;          /* doubles from one to the next */
+  scalar *parameters;          /* likewise */
+  int64_t state_step;          /* numbers from one to the next */
   int64_t parameter_step;      /* likewise, 0 = the same for all */
   int64_t *iterations;         /* (count), zeros at the start */
   int32_t *status;             /* (count), at the start RUNNING; UNBEGUN where there is `follow` */
-  double *seconds;             /* (count), zeros at the start */
+  scalar *seconds;             /* (count), zeros at the start */
   int64_t *slots;              /* (slot_count) the solve in each slot, -1 = none */
   int64_t *begun;              /* (slot_count) iterations of its solve before its last start */
-  double *mark;                /* (slot_count, N_STATE) states that later ones are compared with */
+  scalar *mark;                /* (slot_count, N_STATE) states that later ones are compared with */
   int64_t slot_count;          /* solves under way at a time, at most SLOTS */
   unsigned char *rows;         /* (capacity) rows, or NULL: no trace */
   int64_t *places;             /* (capacity, 2) solve and iteration of each row */
@@ -21,7 +25,7 @@ typedef struct {
   int64_t max_iterations;      /* of one start, at least 1 */
   int64_t left;                /* steps until a pause (SLICE_OVER) */
   int64_t fewest;              /* with fewer solves left than that the loop for several stops */
-  double slice;                /* [s] after which Python gets a look at its signals */
+  scalar slice;                /* [s] after which Python gets a look at its signals */
   /* What follows when the solve in a slot has ended (its status; RUNNING: at its budget) or is new
    * (UNBEGUN): GOES_ON from the start written; DONE; or why the loop has to stop. */
   int (*follow)(void *method, int64_t slot, int64_t solve, int32_t *status);

@@ -1,10 +1,10 @@
 /* A function over a batch: expects the macros N_IN, N_OUT. */
 
-EXPORT int casadi_ik_map(map_job *job) {
+DRIVER(map, map_job) {
   workspace space;
   int outcome = set_up(&space, 0);
   int64_t ticks = 0;
-  double limit = 0;
+  scalar limit = 0;
   int i;
   if (outcome != DONE) return outcome;
   if (job->count - job->next > CLOCK_INTERVAL) limit = monotonic() + job->slice;

@@ -1,16 +1,16 @@
 /* map.c for LANES samples side by side: see there. Where the last turn has less, its last
  * sample is there several times.
  *
- * Expects the macros N_IN, N_OUT, SIZES_IN and SIZES_OUT (doubles of each, as initialisers), TOTAL
+ * Expects the macros N_IN, N_OUT, SIZES_IN and SIZES_OUT (numbers of each, as initialisers), TOTAL
  * (their sum).
  */
 
-EXPORT LANES_TARGET int casadi_ik_map_lanes(map_job *job) {
+LANES_TARGET DRIVER(map_lanes, map_job) {
   static const int sizes_in[] = SIZES_IN, sizes_out[] = SIZES_OUT;
   workspace space;
   lanes *inputs[N_IN], *outputs[N_OUT], *place;
   int64_t ticks = 0, sample[LANES];
-  double limit;
+  scalar limit;
   int i, k, lane, outcome = set_up(&space, TOTAL);
   if (outcome != DONE) return outcome;
   place = space.extra;
@@ -27,8 +27,8 @@ EXPORT LANES_TARGET int casadi_ik_map_lanes(map_job *job) {
     }
     for (i = 0; i < N_IN; ++i) {
       for (lane = 0; lane < LANES; ++lane) {
-        const double *from = job->inputs[i] + sample[lane] * job->input_steps[i];
-        for (k = 0; k < sizes_in[i]; ++k) ((double *) inputs[i])[k * LANES + lane] = from[k];
+        const scalar *from = job->inputs[i] + sample[lane] * job->input_steps[i];
+        for (k = 0; k < sizes_in[i]; ++k) ((scalar *) inputs[i])[k * LANES + lane] = from[k];
       }
     }
     for (i = 0; i < N_IN; ++i) space.arg[i] = inputs[i];
@@ -36,8 +36,8 @@ EXPORT LANES_TARGET int casadi_ik_map_lanes(map_job *job) {
     STEP(space.arg, space.res, (1 << LANES) - 1);
     for (i = 0; i < N_OUT; ++i) {
       for (lane = 0; lane < LANES; ++lane) {
-        double *to = job->outputs[i] + sample[lane] * job->output_steps[i];
-        for (k = 0; k < sizes_out[i]; ++k) to[k] = ((const double *) outputs[i])[k * LANES + lane];
+        scalar *to = job->outputs[i] + sample[lane] * job->output_steps[i];
+        for (k = 0; k < sizes_out[i]; ++k) to[k] = ((const scalar *) outputs[i])[k * LANES + lane];
       }
     }
   }

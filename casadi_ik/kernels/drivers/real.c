@@ -13,7 +13,7 @@ typedef double real;
 #endif
 
 typedef int mask;
-typedef real number; /* of constants */
+typedef real scalar; /* of one solve; `real` may be a vector (lanes.c) */
 
 #define R(x) ((real) (x))
 #define LESS(x, y) ((x) < (y))

@@ -3,19 +3,19 @@
  * Defined for every double: f4 rounds to nearest and overflows to infinity (IEC 60559); the
  * integers drop the fraction and saturate, NaN becomes 0. `rows.py` does the same in numpy.
  */
-static inline double clamped(double x, double low, double high) {
+static inline scalar clamped(scalar x, scalar low, scalar high) {
   return x >= high ? high : x > low ? x : x <= low ? low : 0;
 }
 
-static inline void store_f8(const double *from, unsigned char *to, int count) {
-  memcpy(to, from, (size_t) count * sizeof(double));
+static inline void store_f8(const scalar *from, unsigned char *to, int count) {
+  memcpy(to, from, (size_t) count * sizeof(scalar));
 }
 
 #define DEFINE_STORE(NAME, TYPE, CONVERTED)                                          \
-  static inline void store_##NAME(const double *from, unsigned char *to, int count) { \
+  static inline void store_##NAME(const scalar *from, unsigned char *to, int count) { \
     int i;                                                                           \
     for (i = 0; i < count; ++i) {                                                    \
-      const double x = from[i];                                                      \
+      const scalar x = from[i];                                                      \
       const TYPE value = (TYPE) (CONVERTED);                                         \
       memcpy(to + (size_t) i * sizeof(TYPE), &value, sizeof(TYPE));                  \
     }                                                                                \
