@@ -11,7 +11,7 @@ enum { DONE = 0, SLICE_OVER = 1, ROWS_FULL = 2, GOES_ON = 3, FEW_LEFT = 4 };
 /* Expects the macros NAMED and MEMORY: the driver's name and the type of its memory. */
 #define DRIVER(name, work) int NAMED(work *job, MEMORY *memory)
 #define CLOCK_INTERVAL 16
-#define monotonic() 0.0
+#define monotonic() ((scalar) 0)
 
 typedef struct {
   const real *arg[STEP_IN + 1];
