@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any, overload
 from weakref import WeakKeyDictionary
 
@@ -27,7 +28,8 @@ from casadi_ik.touch.candidates import (
     touching,
 )
 from casadi_ik.touch.hand_table import HandTable
-from casadi_ik.touch.strength import generators, loads
+from casadi_ik.touch.robustness import offsets, robustness
+from casadi_ik.touch.strength import FORCES, generators, loads, squeezes
 from casadi_ik.touch.surface import Surface
 
 GRAVITY = 9.80665
@@ -36,8 +38,14 @@ GRAVITY = 9.80665
 OPENINGS = (0.025, 0.015, 0.008)
 """How far fingertips are from the object before they close, the first that is clear [m]."""
 
+INWARD = 5e-3
+"""How far fingertips would go into the object to squeeze it, in the mean [m]."""
+
 RETREAT = 0.06
 """How far the palm is back before it comes to the grasp [m]."""
+
+ROUGHLY = float(np.deg2rad(3.0))
+"""How far an object may be turned that was seen by a camera [rad]."""
 
 Judgement = str | Callable[[ArmHand, Array], ArrayLike]
 """What grasps are ranked by: a name of `RANKINGS`, or scores (m,) of configurations (m, n)."""
@@ -59,6 +67,9 @@ class FoundGrasp:
         closure: The same over forces and torques (about the middle of the object, divided by half
             its size); above 0 the grasp is force-closed.
         score: What it was ranked by, higher is better.
+        forces: (3,) by finger, with which to squeeze, of the fingertip on the object, base frame:
+            the object stays at rest, and is best held against any pull. Their normal parts sum to
+            1 N.
     """
 
     grasp: Grasp
@@ -66,6 +77,7 @@ class FoundGrasp:
     load: float
     closure: float
     score: float
+    forces: Mapping[str, Array]
 
     @property
     def q(self) -> Array:
@@ -93,13 +105,19 @@ class FoundGrasps(Sequence[FoundGrasp]):
         prefer: What they are ranked by.
         time: Processor time [s].
         reason: Why there is none; "" if there are some.
+        robot: The robot.
+        surface: The object's.
+        mu: Friction coefficient.
     """
 
     entries: tuple[FoundGrasp, ...]
     counts: Mapping[str, int]
     prefer: str
     time: float
-    reason: str = ""
+    reason: str
+    robot: ArmHand
+    surface: Surface
+    mu: float
 
     def __len__(self) -> int:
         return len(self.entries)
@@ -120,6 +138,43 @@ class FoundGrasps(Sequence[FoundGrasp]):
     def grasps(self) -> tuple[Grasp, ...]:
         """The grasps, for `Solver.choose`."""
         return tuple(one.grasp for one in self.entries)
+
+    def robustness(
+        self, position: float = 5e-3, angle: float = ROUGHLY, samples: int = 64, seed: int = 0
+    ) -> Array:
+        """How the grasps bear that the object is not quite where it was thought to be.
+
+        The share of displacements at which the fingers, each moving until it touches, still close
+        on the object.
+
+        Args:
+            position: How far the object is off, in random directions [m].
+            angle: How far it is turned, about random axes [rad].
+            samples: Displacements of each grasp.
+            seed: Of their directions.
+
+        Returns:
+            (k,) shares, one for each grasp.
+
+        Raises:
+            InputError: A negative or infinite number, or no sample.
+
+        Example:
+            >>> pose = np.eye(4)
+            >>> pose[:3, 3] = [0.55, 0.1, 0.2]
+            >>> gripper = ik.Solver(ik.load_robot("panda+panda_hand"))
+            >>> found = gripper.grasps_of(ik.load_surface("tomato_soup_can"), pose, limit=3)
+            >>> found.robustness(position=0.0, angle=0.0, samples=1)
+            array([1., 1., 1.])
+        """
+        if not (0 <= position < np.inf and 0 <= angle < np.inf and samples >= 1):
+            raise InputError(
+                f"robustness: found {position!r} m, {angle!r} rad and {samples!r} samples, "
+                "expected numbers >= 0 and at least one sample"
+            )
+        off = offsets(position, angle, samples, seed, self.surface.middle)
+        shares = [robustness(self.robot, self.surface, one, self.mu, off) for one in self]
+        return np.array(shares)
 
     @property
     def lines(self) -> tuple[str, ...]:
@@ -150,6 +205,7 @@ class _Made:
     rows: NDArray[np.intp]
     some: Candidates
     loads: Array
+    wrenches: Array
 
 
 def grasps_of(
@@ -204,7 +260,7 @@ def grasps_of(
                     break  # so many grasps, and each is like one found before
             show(len(distinct) - known)
     return _ranked(
-        robot, generator, hands, parts, place, limit, prefer, start, time.process_time() - begin
+        robot, generator, hands, parts, place, limit, prefer, start, time.process_time() - begin, mu
     )
 
 
@@ -275,7 +331,7 @@ def _made(
     rows = np.flatnonzero(batch.success)
     generator.counted("free in the scene", len(rows))
     some = some.rows(rows)
-    found = np.zeros((0, 12))
+    found, wrenches = np.zeros((0, 12)), np.zeros((0, 6, 0))
     if len(rows):
         here, _, _ = touching(table, surface, some)
         order = np.argsort(~some.used, axis=1, kind="stable")[:, : generator.fingers]
@@ -289,14 +345,12 @@ def _made(
             held &= found[:, FORCES].min(axis=1) * hold[1] >= hold[0] * GRAVITY
             generator.counted(f"hold {hold[0]:g} kg at {hold[1]:g} N", int(held.sum()))
         rows, some, found = rows[held], some.rows(np.flatnonzero(held)), found[held]
-    return _Made(batch, rows, some, found)
+        wrenches = wrenches[held]
+    return _Made(batch, rows, some, found, wrenches)
 
 
 CLOSED = 1e-4
 """Load from which a grasp counts as force-closed [N/N]."""
-
-FORCES = [0, 1, 2, 6, 7, 8]
-"""Columns of `strength.DIRECTIONS` that are forces."""
 
 
 def _distinct(
@@ -339,12 +393,13 @@ def _ranked(
     prefer: Judgement,
     start: Array | None,
     seconds: float,
+    mu: float,
 ) -> FoundGrasps:
     """The distinct ones, best first."""
     where = [(part, i) for part in parts for i in range(len(part.rows))]
-    name = prefer if isinstance(prefer, str) else "own"
+    name, about = prefer if isinstance(prefer, str) else "own", (robot, generator.surface, mu)
     if not where:
-        return FoundGrasps((), generator.counts, name, seconds, generator.why_none())
+        return FoundGrasps((), generator.counts, name, seconds, generator.why_none(), *about)
     q = np.concatenate([part.batch.q[part.rows] for part in parts])
     found = np.concatenate([part.loads for part in parts])
     load, closure = found[:, FORCES].min(axis=1), found.min(axis=1)
@@ -364,14 +419,16 @@ def _ranked(
     kept = _distinct(parts, np.argsort(-score, kind="stable"), limit, generator.parameters)
     generator.counted("distinct", len(kept))
     entries = []
-    for row in kept:
-        part, i = where[row]
+    chosen = [where[row] for row in kept]
+    forces = squeezes(np.stack([part.wrenches[i] for part, i in chosen])) @ place[:3, :3].T
+    for row, (part, i), force in zip(kept, chosen, forces, strict=True):
         solution = part.batch.solution(int(part.rows[i]))
-        grasp = _grasp(robot, generator, hands, part.some.rows(np.array([i])), solution, place)
-        entries.append(
-            FoundGrasp(grasp, solution, float(load[row]), float(closure[row]), float(score[row]))
-        )
-    return FoundGrasps(tuple(entries), generator.counts, name, seconds)
+        one = part.some.rows(np.array([i]))
+        grasp = _grasp(robot, generator, hands, one, solution, place, force)
+        by_finger = MappingProxyType(dict(zip(grasp.contacts, force, strict=True)))
+        values = float(load[row]), float(closure[row]), float(score[row])
+        entries.append(FoundGrasp(grasp, solution, *values, by_finger))
+    return FoundGrasps(tuple(entries), generator.counts, name, seconds, "", *about)
 
 
 def _grasp(
@@ -381,8 +438,9 @@ def _grasp(
     one: Candidates,
     solution: Solution,
     place: Array,
+    forces: Array,
 ) -> Grasp:
-    """The grasp of a solution, with the hand before it and as it squeezes."""
+    """The grasp of a solution, with the hand before it and as it squeezes with forces (c, 3)."""
     points, normals = robot.contacts(solution.q)
     contacts = {
         name: Contact(points[i], normals[i])
@@ -405,7 +463,7 @@ def _grasp(
         posture=posture(own.hand[0]),
     )
     palm = place @ own.palm[0]
-    squeezed = table.opened(own, -0.005)
+    squeezed = table.squeezed(own, forces @ palm[:3, :3], INWARD)
     before = None
     for opening in OPENINGS:
         opened = table.opened(own, opening)
@@ -415,5 +473,5 @@ def _grasp(
             back[:3, 3] += RETREAT * away / max(float(np.linalg.norm(away)), 1e-9)
             before = Grasp(robot=robot.name, palm=back, posture=posture(opened.hand[0]))
             break
-    squeeze = Grasp(robot=robot.name, palm=palm, posture=posture(squeezed.hand[0]))
+    squeeze = Grasp(robot=robot.name, palm=palm, posture=posture(squeezed))
     return replace(grasp, pregrasp=before, squeeze=squeeze)

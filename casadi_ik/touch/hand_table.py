@@ -106,6 +106,25 @@ class HandTable:
             hand = np.clip(hand + step, lower, upper)
         return replace(some, hand=hand)
 
+    def squeezed(self, one: Candidates, forces: Array, inward: float) -> Array:
+        """(m,) a hand whose motors go on in proportion to the torques of forces.
+
+        So do motors that are held by equal springs: sent there, they exert these forces.
+
+        Args:
+            one: The hand as it touches.
+            forces: (c, 3) of those fingertips on the object, palm frame.
+            inward: How far fingertips would go, in the mean [m].
+        """
+        _, _, linear, _ = self.at(one.hand)
+        rows = linear[0, one.used[0]]
+        torque = np.einsum("cim,ci->m", rows, forces)
+        size = np.linalg.norm(forces, axis=1)
+        along = np.einsum("cim,m,ci->c", rows, torque, forces) / np.maximum(size, 1e-9)
+        step = inward / max(float(along @ size / size.sum()), 1e-9) * torque
+        lower, upper = self.robot.lower[self.motors], self.robot.upper[self.motors]
+        return np.clip(one.hand[0] + step, lower, upper)
+
     def configuration(self, hands: Array) -> Array:
         """(k, n) configurations with hands (k, m), the arm at home."""
         q = np.tile(self.robot.home, (len(hands), 1))

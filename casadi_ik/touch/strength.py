@@ -12,6 +12,9 @@ EDGES = 8
 DIRECTIONS = np.concatenate([np.eye(6), -np.eye(6)])
 """(12, 6) wrenches: forces along and torques about the axes, both ways."""
 
+FORCES = [0, 1, 2, 6, 7, 8]
+"""Those of them that are forces."""
+
 
 def generators(
     points: Array, normals: Array, mu: float, center: Array, length: float, patch: float = 0.005
@@ -49,8 +52,6 @@ def generators(
 def loads(wrenches: Array, directions: Array = DIRECTIONS, steps: int = 25) -> Array:
     """Largest s with -s d = W x, x >= 0, sum x <= 1: what a squeeze of 1 N holds against d.
 
-    All linear programs are solved side by side by Mehrotra's predictor and corrector.
-
     Args:
         wrenches: (k, 6, g) of the cones' edges.
         directions: (d, 6).
@@ -58,6 +59,34 @@ def loads(wrenches: Array, directions: Array = DIRECTIONS, steps: int = 25) -> A
 
     Returns:
         (k, d) loads [N per N]; 0 where nothing is held.
+    """
+    return np.maximum(_solved(wrenches, directions, steps)[..., -2], 0.0)
+
+
+def squeezes(wrenches: Array) -> Array:
+    """Forces at rest from which a grasp is best pulled or pushed any way.
+
+    The mean of what holds as much against each of six forces with least squeeze: as these cancel,
+    the object is at rest.
+
+    Args:
+        wrenches: (k, 6, c * (EDGES + 2)) from `generators`.
+
+    Returns:
+        (k, c, 3) forces on the object; their normal parts sum to 1 N.
+    """
+    k, _, g = wrenches.shape
+    solved = _solved(wrenches, DIRECTIONS[FORCES])
+    shares = (solved[..., :g] / np.maximum(solved[..., g : g + 1], 1e-12)).sum(axis=1)
+    shares /= shares.sum(axis=1, keepdims=True)
+    forces = wrenches[:, :3] * shares[:, None]
+    return forces.reshape(k, 3, g // (EDGES + 2), EDGES + 2).sum(axis=-1).swapaxes(1, 2)
+
+
+def _solved(wrenches: Array, directions: Array, steps: int = 25) -> Array:
+    """(k, d, g + 2) x, s and slack of the linear programs of `loads`.
+
+    All are solved side by side by Mehrotra's predictor and corrector.
     """
     k, _, g = wrenches.shape
     d = len(directions)
@@ -100,10 +129,10 @@ def loads(wrenches: Array, directions: Array = DIRECTIONS, steps: int = 25) -> A
         y, z = y + b[:, None] * dy, np.maximum(z + b[:, None] * dz, 1e-14)
         if gap.max() < 1e-9:
             break
-    return np.maximum(x[:, g], 0.0).reshape(k, d)
+    return x.reshape(k, d, g + 2)
 
 
 def _longest(value: Array, way: Array) -> Array:
     """How far to go so that all stays positive, at most 1, (k,)."""
-    ratio = np.where(way < 0, -value / np.minimum(way, -1e-300), np.inf)
+    ratio = np.where(way < 0, -value / np.minimum(way, -1e-100), np.inf)
     return np.minimum(1.0, ratio.min(axis=1))
