@@ -74,9 +74,12 @@ def test_help(run: Command) -> None:
     assert run("--version").out == f"casadi-ik {version('casadi-ik')}\n"
 
 
+AS_A_MODULE = "import runpy; runpy.run_module('casadi_ik', run_name='__main__', alter_sys=True)"
+
+
 def test_help_loads_neither_casadi_nor_rich() -> None:
-    code = "import sys; from casadi_ik.cli.main import main; main(['--help']); print(*sys.modules)"
-    words = [sys.executable, "-c", code]
+    code = "import atexit, sys; atexit.register(lambda: print(*sys.modules)); " + AS_A_MODULE
+    words = [sys.executable, "-c", code, "--help"]
     done = subprocess.run(words, capture_output=True, text=True, check=True)
     assert not {"casadi", "numpy", "rich"}.intersection(done.stdout.split())
 
@@ -171,11 +174,8 @@ def test_ctrl_c_while_modules_are_imported() -> None:
                 os.kill(os.getpid(), signal.SIGINT)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     sys.meta_path.insert(0, Finder())
-    sys.argv = ["casadi-ik", "grasps"]
-    from casadi_ik.cli.main import main
-    sys.exit(main())
-    """
-    words = [sys.executable, "-c", code]
+"""
+    words = [sys.executable, "-c", code + AS_A_MODULE, "grasps"]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (130, "")
     assert done.stderr == "casadi-ik: error: interrupted\n"

@@ -2,149 +2,70 @@
 
 from __future__ import annotations
 
-import dataclasses
-from itertools import pairwise
-
 import numpy as np
 import pytest
 from robot_variants import derived_robot
 from samplers import HARD, near_limits
+from trace_checks import Kept
 
 import casadi_ik as ik
-from casadi_ik.methods.hand_first.method import HandFirstMethod
-from casadi_ik.methods.hand_first.parameters import HandFirstParameters
-from casadi_ik.methods.hand_first.state import STAGES
-from casadi_ik.problem.targets import TargetBatch, fixed_array, target_arrays
-from casadi_ik.solving.engine import Engine
-from casadi_ik.solving.run import Run
 
 EXACT = ik.Tolerance(1e-6, 1e-6)
 TOLERANCES = {"usual": ik.Tolerance(), "exact": EXACT}
+ORDER = ("CANDIDATE", "HAND_FIT", "ARM_PLACEMENT", "REFINEMENT")
 
 
 @pytest.fixture(scope="module")
-def method(robot):
-    return HandFirstMethod(robot.description, HandFirstParameters())
-
-
-def problems(robot, q, tolerance=EXACT, enforce=True, fixed=None):
-    points, normals = robot.contacts(q)
-    targets = target_arrays(points, normals, len(robot.fingers))
-    return TargetBatch(*targets, tolerance, enforce, fixed=fixed)
-
-
-def solve(robot, method, asked):
-    return Engine(robot, method).solve(asked, Run())
+def exact(robot):
+    return ik.Solver(robot, tolerance=EXACT)
 
 
 @pytest.mark.parametrize("tolerance", TOLERANCES)
 @pytest.mark.parametrize("make", HARD, ids=lambda make: make.__name__)
-def test_every_target_is_solved_within_limits(robot, method, make, tolerance):
+def test_every_target_is_solved_within_limits(robot, make, tolerance):
     q = make(robot, np.random.default_rng(2026), 1200)
-    batch = solve(robot, method, problems(robot, q, TOLERANCES[tolerance]))
+    batch = ik.Solver(robot, tolerance=TOLERANCES[tolerance]).solve_batch(*robot.contacts(q))
     assert np.flatnonzero(~batch.success).tolist() == []
     assert (batch.q >= robot.lower).all()
     assert (batch.q <= robot.upper).all()
 
 
-def test_targets_with_a_joint_next_to_its_limit(robot, method, rng):
+def test_targets_with_a_joint_next_to_its_limit(robot, exact, rng):
     """Swivel intervals of a few thousandths of a degree: no sampling would find them."""
     q = robot.random(rng, 400)
     joint = rng.integers(0, 7, len(q))
     side = rng.integers(0, 2, len(q)).astype(bool)
     rows, near = np.arange(len(q)), np.radians(0.003)
     q[rows, joint] = np.where(side, robot.lower[joint] + near, robot.upper[joint] - near)
-    batch = solve(robot, method, problems(robot, q))
+    batch = exact.solve_batch(*robot.contacts(q))
     assert batch.success.all()
     # Most of them without the whole-system stage: the closed form found the interval.
     assert np.mean(batch.phases["refinement"] == 0) > 0.9
 
 
-def test_without_limits_everything_is_solved_too(robot, method, rng):
-    batch = solve(robot, method, problems(robot, near_limits(robot, rng, 200), enforce=False))
-    assert batch.success.all()
+def test_without_limits_everything_is_solved_too(robot, rng):
+    solver = ik.Solver(robot, tolerance=EXACT, limits="ignore")
+    assert solver.solve_batch(*robot.contacts(near_limits(robot, rng, 200))).success.all()
 
 
-def test_the_same_twice_alone_and_in_a_batch(robot, method, rng):
-    asked = problems(robot, near_limits(robot, rng, 40))
-    starts = np.tile(robot.home, (len(asked), 1))
-    batch, again = (method.run(asked, starts, 0, False) for _ in range(2))
-    np.testing.assert_array_equal(batch.q, again.q)
-    for row in range(len(asked)):
-        alone = method.run(asked.rows(slice(row, row + 1)), starts[:1], 7, False)
-        np.testing.assert_array_equal(alone.q[0], batch.q[row])
-        assert alone.iterations[0] == batch.iterations[row]
-        assert alone.restarts[0] == batch.restarts[row]
+def test_stages_come_in_their_order(robot, exact, rng):
+    kept = Kept()
+    exact.solve_batch(*robot.contacts(near_limits(robot, rng, 60)), log=kept)
+    order = np.array([ik.answers.Phase[name] for name in ORDER])
+    rows = np.concatenate([block.rows for block in kept.blocks])
+    place = (rows["phase"][:, None] == order).argmax(axis=1)
+    assert np.isin(rows["phase"], order).all()
+    later = np.diff(place)[place[1:] > 0]
+    assert np.isin(later, (0, 1)).all()
+    # A round that ends in vain says so, and the next one begins with other candidates.
+    vain = rows["status"][:-1] == ik.Status.STALLED
+    assert (place[1:][vain] == 0).all()
 
 
-def stages_made_alike(method, asked, starts):
-    """The stages of a first round, which the virtual machine makes as compiled code does."""
-    slow = HandFirstMethod(method.robot, method.options, compiled=False)
-    rows = method.rows(asked, starts, method.postures(asked, 0))
-    fast, slow = (each.run_rows(*rows, trace=True) for each in (method, slow))
-    np.testing.assert_array_equal(fast.status, slow.status)
-    np.testing.assert_array_equal(fast.iterations, slow.iterations)
-    np.testing.assert_allclose(fast.states, slow.states, atol=1e-7)
-    for name in ("phase", "status", "accepted", "restart"):
-        np.testing.assert_array_equal(fast.rows[name], slow.rows[name])
-    return {ik.answers.Phase(phase) for phase in fast.rows["phase"]}
-
-
-def test_without_a_compiler_every_stage_is_the_same(robot, method, rng):
-    q = robot.random(rng, 25)
-    points, normals = robot.contacts(q)
-    points += rng.normal(0, 0.005, points.shape)
-    starts = np.where(np.arange(25)[:, None] % 2, robot.home, q + 0.02)
-    targets, seen = target_arrays(points, normals, 3), set()
-    for prefer in ("limits", "q0"):
-        asked = TargetBatch(*targets, ik.Tolerance(), True, prefer=prefer)
-        seen |= stages_made_alike(method, asked, starts)
-    assert seen == set(STAGES)
-
-
-def test_traces(robot, method, rng):
-    """Stages come in their order, costs never rise, and a rejected step changes nothing."""
-    asked = problems(robot, near_limits(robot, rng, 60))
-    outcome = method.run(asked, np.tile(robot.home, (60, 1)), 0, True)
-    order = {
-        ik.answers.Phase.CANDIDATE: 0,
-        ik.answers.Phase.HAND_FIT: 1,
-        ik.answers.Phase.ARM_PLACEMENT: 2,
-        ik.answers.Phase.REFINEMENT: 3,
-    }
-    rejected = 0
-    for row, trace in enumerate(outcome.trace):
-        assert len(trace) == outcome.iterations[row]
-        assert trace["phase"][0] == ik.answers.Phase.CANDIDATE
-        assert trace["restart"][0] == 0
-        assert trace["status"][-1] == outcome.status[row] == ik.Status.SOLVED
-        # A round that ends in vain says so, and the next one begins with other candidates.
-        vain = trace["status"][:-1] == ik.Status.STALLED
-        assert not trace["status"][:-1][~vain].any()
-        assert (trace["phase"][:-1][vain] == ik.answers.Phase.CANDIDATE).all()
-        assert (np.diff(trace["restart"].astype(int)) >= 0).all()
-        for stage in order:
-            assert np.sum(trace["phase"] == stage) == outcome.phases[stage.label][row]
-        for one, following in pairwise(trace):
-            if following["phase"] == ik.answers.Phase.CANDIDATE:
-                assert one["restart"] != following["restart"] or one["status"]
-                continue
-            assert one["restart"] == following["restart"]
-            assert order[following["phase"]] - order[one["phase"]] in (0, 1)
-            if one["phase"] != following["phase"] or not np.isfinite(one["cost"]):
-                continue
-            assert following["cost"] <= one["cost"] * (1 + 1e-9)
-            if not one["accepted"]:
-                rejected += 1
-                assert following["cost"] == pytest.approx(one["cost"], rel=1e-9)
-                np.testing.assert_array_equal(one["q"], following["q"])
-                assert following["damping"] > one["damping"]
-    assert rejected > 0
-
-
-def test_trace_of_an_exact_fit_shows_errors_falling_to_nothing(robot, method, rng):
-    asked = problems(robot, robot.random(rng, 1))
-    trace = method.run(asked, robot.home[None], 0, True).trace[0]
+def test_trace_of_an_exact_fit_shows_errors_falling_to_nothing(robot, exact, rng):
+    kept = Kept()
+    exact.solve_batch(*robot.contacts(robot.random(rng, 1)), log=kept)
+    (trace,) = (block.rows for block in kept.blocks)
     fit = trace[trace["phase"] == ik.answers.Phase.HAND_FIT]
     assert fit["position_error"][0].max() > 1e-3
     assert fit["position_error"][-1].max() < 1e-4
@@ -152,14 +73,12 @@ def test_trace_of_an_exact_fit_shows_errors_falling_to_nothing(robot, method, rn
     assert (fit["step_size"] >= 0).all()
 
 
-def test_out_of_reach_the_contacts_come_near(robot, method, rng):
+def test_out_of_reach_the_contacts_come_near(robot, exact, rng):
     """Not solved; what comes back is finite, within limits and stretched towards the target."""
-    q = robot.random(rng, 20)
-    points, normals = robot.contacts(q)
+    points, normals = robot.contacts(robot.random(rng, 20))
     away = points.mean(axis=1, keepdims=True)
     points = points + 2.0 * away / np.linalg.norm(away, axis=2, keepdims=True)
-    asked = TargetBatch(*target_arrays(points, normals, 3), EXACT, True)
-    batch = solve(robot, method, asked)
+    batch = exact.solve_batch(points, normals)
     assert not batch.success.any()
     assert np.isfinite(batch.q).all()
     assert batch.limits_ok.all()
@@ -168,7 +87,7 @@ def test_out_of_reach_the_contacts_come_near(robot, method, rng):
 
 @pytest.mark.parametrize("free", ["finger", "normal", "all but one finger", "all normals"])
 @pytest.mark.parametrize("tolerance", TOLERANCES)
-def test_partial_grasps(robot, method, rng, free, tolerance):
+def test_partial_grasps(robot, rng, free, tolerance):
     points, normals = robot.contacts(robot.random(rng, 120))
     rows, finger = np.arange(120), rng.integers(0, 3, 120)
     if free == "finger":
@@ -179,45 +98,29 @@ def test_partial_grasps(robot, method, rng, free, tolerance):
         normals[:] = np.nan
     else:
         points[:, :2] = normals[:, :2] = np.nan
-    targets = target_arrays(points, normals, 3)
-    batch = solve(robot, method, TargetBatch(*targets, TOLERANCES[tolerance], True))
+    batch = ik.Solver(robot, tolerance=TOLERANCES[tolerance]).solve_batch(points, normals)
     assert batch.success.all()
     assert batch.limits_ok.all()
 
 
-@pytest.mark.parametrize("enforce", [True, False])
-def test_each_actuator_locked(robot, method, rng, enforce):
+@pytest.mark.parametrize("limits", ["enforce", "ignore"])
+def test_each_actuator_locked(robot, rng, limits):
+    solver = ik.Solver(robot, tolerance=EXACT, limits=limits)
     for i, name in enumerate(robot.actuators):
         q = robot.random(rng, 25)
         q[:, i] = value = rng.uniform(robot.lower[i], robot.upper[i])
-        fixed = fixed_array({name: value}, robot.actuators, robot.lower, robot.upper)
-        batch = solve(robot, method, problems(robot, q, enforce=enforce, fixed=fixed))
+        batch = solver.solve_batch(*robot.contacts(q), fixed={name: value})
         assert batch.success.all(), name
         np.testing.assert_array_equal(batch.q[:, i], value)
 
 
-def test_several_actuators_locked(robot, method, rng):
+def test_several_actuators_locked(robot, exact, rng):
     q = robot.random(rng, 25)
     names = ("lwr_joint_3", "bh_spread", "bh_thumb_distal")
     values = dict(zip(names, (0.2, 0.5, 0.3), strict=True))
     for name, value in values.items():
         q[:, robot.actuators.index(name)] = value
-    fixed = fixed_array(values, robot.actuators, robot.lower, robot.upper)
-    assert solve(robot, method, problems(robot, q, fixed=fixed)).success.all()
-
-
-def test_locked_actuators_are_checked(robot):
-    limits = robot.lower, robot.upper
-    assert fixed_array({}, robot.actuators, *limits) is None
-    with pytest.raises(
-        ik.errors.UnknownNameError, match="no actuator 'elbow', expected one of lwr_joint_1"
-    ):
-        fixed_array({"elbow": 0.0}, robot.actuators, *limits)
-    for value in (9.0, float("nan"), "much", None):
-        with pytest.raises(
-            ik.errors.InputError, match=r"fixed\.bh_spread: found .*from 0 to 3\.14"
-        ):
-            fixed_array({"bh_spread": value}, robot.actuators, *limits)
+    assert exact.solve_batch(*robot.contacts(q), fixed=values).success.all()
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -226,22 +129,17 @@ def test_robots_with_other_links_and_mounts(tmp_path, seed):
     heights = dict(zip("1234567", rng.uniform(0.08, 0.35, 7).tolist(), strict=True))
     mount = (rng.uniform(-0.1, 0.1, 3).tolist(), rng.uniform(-1.5, 1.5, 3).tolist())
     robot = derived_robot(tmp_path, heights, mount)
-    other = HandFirstMethod(robot.description, HandFirstParameters(), compiled=False)
-    assert other.step.arm is not None
-    batch = solve(robot, other, problems(robot, robot.random(rng, 12)))
-    assert batch.success.all()
+    solver = ik.Solver(robot, tolerance=EXACT, compiled=False)
+    assert solver.solve_batch(*robot.contacts(robot.random(rng, 12))).success.all()
 
 
 @pytest.mark.parametrize("tolerance", TOLERANCES)
 def test_an_arm_without_a_closed_form(tmp_path_factory, tolerance):
     robot = derived_robot(tmp_path_factory.mktemp("offset"), wrist_offset=0.045)
-    other = HandFirstMethod(robot.description, HandFirstParameters())
-    assert other.step.arm is None
     # Few enough that no second kernel is compiled for many side by side.
     q = robot.random(np.random.default_rng(5), 60)
-    batch = solve(robot, other, problems(robot, q, TOLERANCES[tolerance]))
+    batch = ik.Solver(robot, tolerance=TOLERANCES[tolerance]).solve_batch(*robot.contacts(q))
     assert batch.success.all()
-    stages_made_alike(other, problems(robot, q[:12], TOLERANCES[tolerance]), q[12:24])
     # Nearly all by the arm stage, not by the whole-system stage.
     assert np.mean(batch.phases["refinement"] == 0) > 0.9
 
@@ -268,14 +166,13 @@ def test_optimisation_changes_no_bit(robot, rng, monkeypatch):
     assert answers() == plain
 
 
-def test_parameters_are_checked():
-    with pytest.raises(
-        ik.errors.InputError, match="candidates: found 0, expected a whole number >= 1"
+def test_parameters_are_checked(robot):
+    for options, says in (
+        ({"candidates": 0}, "candidates: found 0, expected a whole number >= 1"),
+        ({"table": 4}, "table: found 4, expected at least"),
     ):
-        HandFirstParameters(candidates=0)
-    with pytest.raises(ik.errors.InputError, match="table: found 4, expected at least"):
-        HandFirstParameters(table=4)
-    assert dataclasses.asdict(HandFirstParameters())["rounds"] >= 1
+        with pytest.raises(ik.errors.InputError, match=says):
+            ik.Solver(robot, options=options)
 
 
 @pytest.mark.parametrize("name", ["hand-first", "thumb-first"])
@@ -283,9 +180,9 @@ def test_the_trace_leaves_open_what_is_free(robot, rng, name):
     points, normals = robot.contacts(robot.random(rng, 1))
     normals[:, 1] = np.nan
     points[:, 2] = normals[:, 2] = np.nan
-    method = ik.Solver(robot, name)._engine.method
-    asked = TargetBatch(*target_arrays(points, normals, 3), ik.Tolerance(), True)
-    (rows,) = method.run(asked, robot.home[None], 0, True).trace
+    kept = Kept()
+    ik.Solver(robot, name).solve_batch(points, normals, log=kept)
+    (rows,) = (block.rows for block in kept.blocks)
     measured = rows[np.isfinite(rows["position_error"][:, 0])]
     assert len(measured)
     assert np.isfinite(measured["position_error"]).all(axis=0).tolist() == [True, True, False]
@@ -295,33 +192,10 @@ def test_the_trace_leaves_open_what_is_free(robot, rng, name):
 
 
 MISSED_BY_HOLDING = (
-    1.203796547,
-    -1.750305748,
-    2.884163381,
-    -0.086668812,
-    2.896685337,
-    1.743456462,
-    2.887481234,
-    0.173290801,
-    0.277041215,
-    -0.332445893,
-    1.269565614,
-    0.011936116,
-    -0.341106403,
-    1.559533824,
-    1.567909406,
-    -0.347972917,
-    1.565004856,
-    0.502950570,
-    0.768413391,
-    -0.339814074,
-    -0.257951918,
-    0.320823905,
-    1.038616982,
-    0.007020192,
-    -0.195713141,
-    -0.688663896,
-    1.568539825,
+    *(1.203796547, -1.750305748, 2.884163381, -0.086668812, 2.896685337, 1.743456462, 2.887481234),
+    *(0.173290801, 0.277041215, -0.332445893, 1.269565614, 0.011936116, -0.341106403, 1.559533824),
+    *(1.567909406, -0.347972917, 1.565004856, 0.502950570, 0.768413391, -0.339814074, -0.257951918),
+    *(0.320823905, 1.038616982, 0.007020192, -0.195713141, -0.688663896, 1.568539825),
 )
 
 

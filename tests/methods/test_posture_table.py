@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from robot_variants import derived_robot
 from scipy.spatial.transform import Rotation
 
 import casadi_ik as ik
@@ -11,6 +12,7 @@ from casadi_ik.kernels import FunctionKernel
 from casadi_ik.methods.common.posture_table import PostureTable, contact_shape
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
+from casadi_ik.methods.hand_first.state import STAGES
 from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.symbolic.even_spread import evenly
 
@@ -144,6 +146,41 @@ def test_evenly(dimensions):
 
 def target(robot, rng, count):
     return TargetBatch(*robot.contacts(robot.random(rng, count)), ik.Tolerance(), True)
+
+
+def stages_made_alike(robot, asked, starts):
+    """The stages of a first round, which the virtual machine makes as compiled code does."""
+    method = HandFirstMethod(robot.description, HandFirstParameters())
+    slow = HandFirstMethod(robot.description, method.options, compiled=False)
+    rows = method.rows(asked, starts, method.postures(asked, 0))
+    fast, slow = (each.run_rows(*rows, trace=True) for each in (method, slow))
+    np.testing.assert_array_equal(fast.status, slow.status)
+    np.testing.assert_array_equal(fast.iterations, slow.iterations)
+    np.testing.assert_allclose(fast.states, slow.states, atol=1e-7)
+    for name in ("phase", "status", "accepted", "restart"):
+        np.testing.assert_array_equal(fast.rows[name], slow.rows[name])
+    return {ik.answers.Phase(phase) for phase in fast.rows["phase"]}
+
+
+def test_without_a_compiler_every_stage_is_the_same(robot, rng):
+    q = robot.random(rng, 25)
+    points, normals = robot.contacts(q)
+    points += rng.normal(0, 0.005, points.shape)
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    starts = np.where(np.arange(25)[:, None] % 2, robot.home, q + 0.02)
+    seen = set()
+    for prefer in ("limits", "q0"):
+        asked = TargetBatch(points, normals, ik.Tolerance(), True, prefer=prefer)
+        seen |= stages_made_alike(robot, asked, starts)
+    assert seen == set(STAGES)
+
+
+@pytest.mark.parametrize("tolerance", [ik.Tolerance(), ik.Tolerance(1e-6, 1e-6)])
+def test_without_a_compiler_an_arm_without_a_closed_form(tmp_path_factory, rng, tolerance):
+    other = derived_robot(tmp_path_factory.mktemp("offset"), wrist_offset=0.045)
+    q = other.random(rng, 24)
+    asked = TargetBatch(*other.contacts(q[:12]), tolerance, True)
+    stages_made_alike(other, asked, q[12:])
 
 
 def test_later_rounds_begin_from_hands_that_differ(robot, rng):

@@ -2,42 +2,35 @@
 
 from __future__ import annotations
 
-import dataclasses
-from itertools import pairwise
-
 import numpy as np
 import pytest
 from robot_variants import derived_robot, thumb_of
 from samplers import shipped_hands
 
 import casadi_ik as ik
-from casadi_ik.methods.thumb_first.method import ThumbFirstMethod
-from casadi_ik.methods.thumb_first.state import ThumbFirstParameters
-from casadi_ik.problem.targets import TargetBatch, fixed_array, target_arrays
-from casadi_ik.solving.engine import Engine
-from casadi_ik.solving.run import Run
 
 PAPER = ik.Tolerance()
 EXACT = ik.Tolerance(1e-6, 1e-6)
 
 
-@pytest.fixture(scope="module")
-def method(robot) -> ThumbFirstMethod:
-    return ThumbFirstMethod(robot.description, ThumbFirstParameters())
+STARTS = 32
+"""Starts of a solve, unless it is told."""
+
+
+def thumb_first(robot, tolerance=PAPER, limits="enforce", compiled=True, **options) -> ik.Solver:
+    return ik.Solver(
+        robot, "thumb-first", tolerance, limits=limits, compiled=compiled, options=options
+    )
 
 
 @pytest.fixture(scope="module")
-def once(robot) -> ThumbFirstMethod:
-    return ThumbFirstMethod(robot.description, ThumbFirstParameters(starts=1))
+def solver(robot) -> ik.Solver:
+    return thumb_first(robot)
 
 
-def problems(robot, q, tolerance=PAPER, enforce=True, fixed=None) -> TargetBatch:
-    points, normals = target_arrays(*robot.contacts(q), len(robot.fingers))
-    return TargetBatch(points, normals, tolerance, enforce, fixed=fixed)
-
-
-def solve(robot, method, asked) -> ik.BatchSolution:
-    return Engine(robot, method).solve(asked, Run())
+@pytest.fixture(scope="module")
+def once(robot) -> ik.Solver:
+    return thumb_first(robot, starts=1)
 
 
 def bent(robot, rng, count):
@@ -50,7 +43,7 @@ def bent(robot, rng, count):
 
 @pytest.mark.parametrize("hands", [shipped_hands, bent])
 def test_one_start_is_nearly_always_enough(robot, once, rng, hands):
-    batch = solve(robot, once, problems(robot, hands(robot, rng, 600)))
+    batch = once.solve_batch(*robot.contacts(hands(robot, rng, 600)))
     assert batch.success.mean() >= 0.995
     assert batch.limits_ok.all()
     assert not batch.restarts.any()
@@ -58,54 +51,29 @@ def test_one_start_is_nearly_always_enough(robot, once, rng, hands):
 
 @pytest.mark.parametrize("tolerance", [PAPER, EXACT], ids=["paper", "exact"])
 @pytest.mark.parametrize("hands", [shipped_hands, bent])
-def test_other_starts_do_the_rest(robot, method, rng, hands, tolerance):
-    batch = solve(robot, method, problems(robot, hands(robot, rng, 300), tolerance))
+def test_other_starts_do_the_rest(robot, rng, hands, tolerance):
+    solver = thumb_first(robot, tolerance)
+    batch = solver.solve_batch(*robot.contacts(hands(robot, rng, 300)))
     assert batch.success.all()
 
 
 @pytest.mark.parametrize(("tolerance", "least"), [(PAPER, 0.995), (EXACT, 0.98)])
-def test_hands_that_are_no_grasps(robot, method, rng, tolerance, least):
-    batch = solve(robot, method, problems(robot, robot.random(rng, 300), tolerance))
+def test_hands_that_are_no_grasps(robot, rng, tolerance, least):
+    solver = thumb_first(robot, tolerance)
+    batch = solver.solve_batch(*robot.contacts(robot.random(rng, 300)))
     assert batch.success.mean() >= least
 
 
-def test_limits_ignored(robot, method, rng):
-    batch = solve(robot, method, problems(robot, robot.random(rng, 100), enforce=False))
+def test_limits_ignored(robot, rng):
+    solver = thumb_first(robot, limits="ignore")
+    batch = solver.solve_batch(*robot.contacts(robot.random(rng, 100)))
     assert batch.success.all()
 
 
-def test_trace_of_a_solve(robot, method, rng):
-    """A start, then steps along the chain; only steps that lower the cost are taken."""
-    asked = problems(robot, robot.random(rng, 60), EXACT)
-    outcome = method.run(asked, np.tile(robot.home, (60, 1)), 0, True)
-    rejected = 0
-    for row, trace in enumerate(outcome.trace):
-        assert len(trace) == outcome.iterations[row]
-        assert trace["phase"][0] == ik.answers.Phase.CANDIDATE
-        assert trace["status"][-1] == outcome.status[row] == ik.Status.SOLVED
-        np.testing.assert_array_equal(trace["q"][-1], outcome.q[row])
-        assert trace["position_error"][-1].max() <= 1e-6
-        points, _ = robot.contacts(trace["q"])
-        distances = np.linalg.norm(points - asked.points[row], axis=2)
-        np.testing.assert_allclose(trace["position_error"], distances, rtol=1e-5, atol=1e-9)
-        assert ((trace["q"] >= robot.lower) & (trace["q"] <= robot.upper)).all()
-        for before, after in pairwise(trace):
-            if after["phase"] != ik.answers.Phase.HAND_ALIGNMENT:
-                assert after["restart"] == before["restart"] + 1
-                continue
-            assert after["restart"] == before["restart"]
-            if after["accepted"]:
-                assert after["cost"] < before["cost"]
-            else:
-                rejected += 1
-                np.testing.assert_array_equal(after["q"], before["q"])
-    assert rejected > 0
-
-
-def test_the_nearest_of_what_is_seen(robot, rng):
+def test_the_nearest_of_what_is_seen(robot, solver, rng):
     """It moved as far as without a start, and from some solved nothing."""
     q, q0 = robot.random(rng, 400), robot.random(rng, 400)
-    solver, targets = ik.Solver(robot, "thumb-first"), robot.contacts(q)
+    targets = robot.contacts(q)
     near = solver.solve_batch(*targets, q0=q0)
     far = solver.solve_batch(*targets, q0=q0, prefer="limits")
     assert near.success.all()
@@ -120,29 +88,28 @@ def test_the_nearest_of_what_is_seen(robot, rng):
     assert np.median(np.abs((followed.q - close) / ranges).max(axis=1)) < 0.05
 
 
-def test_contacts_that_contradict_each_other_a_little_are_balanced(robot, rng):
+def test_contacts_that_contradict_each_other_a_little_are_balanced(robot, solver, rng):
     """71 % of them were solved."""
     points, normals = robot.contacts(robot.random(rng, 500))
     points = points + rng.normal(0, 4e-3, points.shape)
     normals = normals + rng.normal(0, np.radians(2), normals.shape)
-    batch = ik.Solver(robot, "thumb-first").solve_batch(points, normals)
+    batch = solver.solve_batch(points, normals)
     assert batch.success.mean() > 0.94
     assert batch.phases["balance"].any()
     assert batch.limits_ok.all()
 
 
-def test_out_of_reach_the_best_is_kept(robot, method, rng):
-    asked = problems(robot, robot.random(rng, 10))
-    far = TargetBatch(asked.points + np.array([3.0, 0, 0]), asked.normals, PAPER, True)
-    batch = solve(robot, method, far)
+def test_out_of_reach_the_best_is_kept(robot, solver, rng):
+    points, normals = robot.contacts(robot.random(rng, 10))
+    batch = solver.solve_batch(points + np.array([3.0, 0, 0]), normals)
     assert not batch.success.any()
     assert (batch.status == ik.Status.STALLED).all()
-    assert (batch.restarts == method.options.starts - 1).all()
+    assert (batch.restarts == STARTS - 1).all()
     assert batch.limits_ok.all()
 
 
 @pytest.mark.parametrize("free", ["finger", "normal", "thumb", "all normals"])
-def test_partial_grasps(robot, method, rng, free):
+def test_partial_grasps(robot, solver, rng, free):
     """What is free has no rows, the thumb's contact too: the chain is then open."""
     points, normals = robot.contacts(robot.random(rng, 100))
     rows, finger = np.arange(100), rng.integers(0, 3, 100)
@@ -155,19 +122,17 @@ def test_partial_grasps(robot, method, rng, free):
         points[:, thumb] = normals[:, thumb] = np.nan
     else:
         normals[:] = np.nan
-    asked = TargetBatch(*target_arrays(points, normals, 3), PAPER, True)
-    batch = solve(robot, method, asked)
+    batch = solver.solve_batch(points, normals)
     assert batch.success.mean() >= 0.93
     assert batch.limits_ok.all()
 
 
-def test_locked_actuators_stay(robot, method, rng):
+def test_locked_actuators_stay(robot, solver, rng):
     for name in ("lwr_joint_3", "bh_spread", "bh_thumb_distal"):
         q = robot.random(rng, 25)
         i = robot.actuators.index(name)
         q[:, i] = value = rng.uniform(robot.lower[i], robot.upper[i])
-        fixed = fixed_array({name: value}, robot.actuators, robot.lower, robot.upper)
-        batch = solve(robot, method, problems(robot, q, fixed=fixed))
+        batch = solver.solve_batch(*robot.contacts(q), fixed={name: value})
         assert batch.success.mean() >= 0.9, name
         np.testing.assert_array_equal(batch.q[:, i], value)
 
@@ -175,37 +140,34 @@ def test_locked_actuators_stay(robot, method, rng):
 def test_the_start_chooses_between_hands(robot, once, rng):
     """Of several hands for the same contacts, the one near q0 is begun with."""
     q = robot.random(rng, 200)
-    asked = dataclasses.replace(problems(robot, q), prefer="q0")
     around = np.clip(q + rng.normal(0, 0.3, q.shape), robot.lower, robot.upper)
-    batches = [Engine(robot, once).solve(asked, Run(q0)) for q0 in (robot.home, around)]
-    hand = list(once.step.robot.hand_actuators)
+    starts = (robot.home, around)
+    batches = [once.solve_batch(*robot.contacts(q), q0=q0, prefer="q0") for q0 in starts]
+    hand = list(robot.description.hand_actuators)
     from_home, from_truth = (np.abs(batch.q - q)[:, hand].max(axis=1) for batch in batches)
     assert np.median(from_truth) < np.median(from_home)
 
 
 def test_an_arm_without_a_closed_form(tmp_path_factory):
     robot = derived_robot(tmp_path_factory.mktemp("offset"), wrist_offset=0.045)
-    other = ThumbFirstMethod(robot.description, ThumbFirstParameters())
-    assert other.step.arm is None
-    batch = solve(robot, other, problems(robot, robot.random(np.random.default_rng(5), 60)))
+    q = robot.random(np.random.default_rng(5), 60)
+    batch = thumb_first(robot).solve_batch(*robot.contacts(q))
     assert batch.success.mean() >= 0.95
     assert batch.phases["arm-placement"].all()
 
 
 def test_without_an_arm_the_palm_is_fixed(coupled_robot, rng):
-    method = ThumbFirstMethod(coupled_robot.description, ThumbFirstParameters())
     q = coupled_robot.random(rng, 100)
-    batch = solve(coupled_robot, method, problems(coupled_robot, q))
+    batch = thumb_first(coupled_robot).solve_batch(*coupled_robot.contacts(q))
     assert batch.success.mean() >= 0.95
     assert not batch.phases["arm-placement"].any()
 
 
 def test_proxqp_solves_as_well(robot, once, rng):
     """The quadratic program takes the same way: nothing is lost by fixing joints one by one."""
-    asked = problems(robot, shipped_hands(robot, rng, 60))
-    program = ThumbFirstMethod(robot.description, ThumbFirstParameters(starts=1, step="proxqp"))
-    one, other = solve(robot, once, asked), solve(robot, program, asked)
-    assert not program.kernel.compiled
+    targets = robot.contacts(shipped_hands(robot, rng, 60))
+    program = thumb_first(robot, starts=1, step="proxqp")
+    one, other = once.solve_batch(*targets), program.solve_batch(*targets)
     np.testing.assert_array_equal(one.success, other.success)
     assert other.limits_ok.all()
     assert np.mean(one.iterations == other.iterations) > 0.8
@@ -216,7 +178,7 @@ def test_proxqp_solves_as_well(robot, once, rng):
     [
         ({"step": "newton"}, "step: found 'newton', expected one of freeze, proxqp"),
         ({"starts": 0}, "starts: found 0, expected a whole number >= 1"),
-        ({"table": 8}, "table: found 8, expected at least starts = 32"),
+        ({"table": 8}, f"table: found 8, expected at least starts = {STARTS}"),
         ({"step_cap": 0.0}, "step_cap: found 0.0, expected a number > 0"),
     ],
 )
@@ -228,7 +190,7 @@ def test_parameters_are_checked(robot, options, says):
 @pytest.mark.parametrize("joints", [1, 3, 4])
 def test_thumbs_of_any_number_of_joints(tmp_path, rng, joints):
     robot = thumb_of(tmp_path, joints)
-    method = ThumbFirstMethod(robot.description, ThumbFirstParameters(starts=8), compiled=False)
-    batch = solve(robot, method, problems(robot, robot.random(rng, 20)))
+    solver = thumb_first(robot, compiled=False, starts=8)
+    batch = solver.solve_batch(*robot.contacts(robot.random(rng, 20)))
     assert batch.success.mean() >= 0.9
     assert batch.limits_ok.all()

@@ -121,49 +121,6 @@ def test_the_strokes_imply_the_joint_limits(ar10):
         assert joint.upper - 2.1e-3 < values.max() <= joint.upper
 
 
-def test_slider_to_joint_and_back(ar10):
-    q = strokes(ar10)
-    joints = ar10.joints(q)
-    for joint in ar10.description.movable:
-        coupling, values = joint.coupling, joints[joint.name]
-        if isinstance(coupling, robots.LeadScrew):
-            back = mechanisms.slider_from_angle(
-                ca.DM(values + coupling.theta_0), coupling.b, coupling.c
-            )
-            expected = q[:, ar10.actuators.index(coupling.of)]
-            np.testing.assert_allclose(np.array(back).ravel(), expected, atol=1e-15)
-        elif isinstance(coupling, robots.FourBar):
-            phi = coupling.phi_0 + joints[coupling.of]
-            bar, middle = linkage(coupling, coupling), phi.mean()
-            for value, expected in zip(values[20:], phi[20:], strict=True):
-                side = mechanisms.inverse_branch_from_pose(bar, expected)
-                back = mechanisms.phi_from_theta3(
-                    ca.DM(value + coupling.theta_3_0), bar, side, middle
-                )
-                assert float(back) == pytest.approx(expected, abs=1e-9)
-
-
-def test_jacobians_against_central_differences(ar10, rng):
-    q = ca.SX.sym("q", 10)
-    body = actuated(ar10.description, q)
-    pairs = [body.contact_jacobian(finger, range(10)) for finger in ar10.fingers]
-    linear = ca.Function("linear", [q], [ca.vertcat(*(pair[0] for pair in pairs))])
-    angular = ca.Function("angular", [q], [ca.vertcat(*(pair[1] for pair in pairs))])
-    step = 1e-7
-    for x in ar10.lower + rng.uniform(0.01, 0.99, (20, 10)) * (ar10.upper - ar10.lower):
-        _, normals = ar10.contacts(x)
-        slopes, turns = [], []
-        for i in range(10):
-            shift = step * np.eye(10)[i]
-            (p1, n1), (p0, n0) = ar10.contacts(x + shift), ar10.contacts(x - shift)
-            slopes.append((p1 - p0).ravel() / (2 * step))
-            turns.append((n1 - n0).ravel() / (2 * step))
-        np.testing.assert_allclose(np.array(linear(x)), np.transpose(slopes), atol=2e-6)
-        spin = np.array(angular(x)).reshape(5, 3, 10)
-        found = np.cross(spin, normals[:, :, None], axis=1).reshape(15, 10)
-        np.testing.assert_allclose(found, np.transpose(turns), atol=2e-4)
-
-
 def test_toggle_margins(ar10):
     """The squared sine of the transmission angle, from angles alone; far from zero everywhere."""
     q = strokes(ar10)

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.arm_hand import ArmHand
-from casadi_ik.robots import load_description
 
 NAMES = [f"{name}+leap" if name == "two_ur10e" else name for name in ik.shipped_names("bodies")]
 
@@ -30,7 +28,7 @@ def test_a_side_by_itself_stands_as_it_does_in_the_body(name):
     points, normals = robot.contacts(q)
     motors = set(body.trunk)
     for side in body.sides:
-        alone = ArmHand(body.side(side.name))
+        alone = ik.ArmHand(body.side(side.name))
         assert not motors & set(alone.actuators)
         motors |= set(alone.actuators)
         own = [body.actuator_index(motor) for motor in alone.actuators]
@@ -80,7 +78,7 @@ sides:
 def test_a_body_from_parts(tmp_path: Path):
     path = tmp_path / "pair.yaml"
     path.write_text(BODY)
-    body = load_description(path)
+    body = ik.load_robot(path).description
     assert body.trunk == ("lift",)
     assert [side.name for side in body.sides] == ["left", "right"]
     assert body.finger_names[0] == "left_thumb"
@@ -128,7 +126,7 @@ def in_a_file(tmp_path: Path) -> Path:
 
 
 def test_trunk_and_sides_are_found_in_a_file(in_a_file: Path):
-    body = load_description(in_a_file)
+    body = ik.load_robot(in_a_file).description
     assert (body.trunk, body.trunk_link) == (("waist",), "torso")
     left, right = body.sides
     assert (left.arm, left.hand, left.fingers) == (
@@ -157,7 +155,7 @@ def test_trunk_and_sides_are_found_in_a_file(in_a_file: Path):
 def test_what_is_wrong_is_said_in_a_line(in_a_file: Path, old: str, new: str, said: str):
     in_a_file.write_text(FILE.replace(old, new, 1))
     with pytest.raises(ik.errors.DescriptionError) as caught:
-        load_description(in_a_file)
+        ik.load_robot(in_a_file)
     assert said in str(caught.value)
     assert "two.yaml" in str(caught.value)
 
@@ -175,10 +173,10 @@ def test_what_is_wrong_with_parts_is_said(tmp_path: Path, old: str, new: str, sa
     path = tmp_path / "pair.yaml"
     path.write_text(BODY.replace(old, new, 1))
     with pytest.raises(ik.errors.DescriptionError) as caught:
-        load_description(path)
+        ik.load_robot(path)
     assert said in str(caught.value)
 
 
 def test_a_side_that_is_not_there_is_said():
     with pytest.raises(ik.errors.UnknownNameError, match="its sides: left, right"):
-        load_description("g1+dex3").side("middle")
+        ik.load_robot("g1+dex3").description.side("middle")
