@@ -53,7 +53,7 @@ def side_by_side(
             continue
         found = run(part_of(targets.rows(rows), fingers, motors), q[rows][:, motors])
         before = q[rows]
-        q[np.ix_(rows, motors)] = found.q
+        q[rows[:, None], motors] = found.q
         worse = (status[rows] == Status.SOLVED) & (found.status != Status.SOLVED)
         status[rows[worse]] = found.status[worse]
         iterations[rows] += found.iterations

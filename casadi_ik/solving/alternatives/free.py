@@ -30,6 +30,7 @@ from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import SolvedVerdict, judge_one
 from casadi_ik.solving.alternatives.arm_search import Preference
 from casadi_ik.solving.alternatives.finder import AlternativeFinder
+from casadi_ik.solving.alternatives.trunks import other_trunks
 from casadi_ik.solving.alternatives.unconstrained_fingers import UnconstrainedFingers
 from casadi_ik.solving.batch_parts import judged
 from casadi_ik.solving.trials import Deduplicator, LocalRefinement, best_of_each, first_of_each
@@ -50,6 +51,7 @@ class FreeSearchParameters:
         together: Targets that are worked on at once.
         rounds: Of hand postures.
         alike: Hands all of whose motors differ by less [of their ranges] have the same arms.
+        trunks: Trunks of a body that are tried with the hands that it has, one lot after the other.
         starts: Random arms that a target is solved from, where the arm is of no family.
         hands: As many where it is: then it is other hands that are looked for.
         escapes: Steps away from what is nearest.
@@ -64,6 +66,7 @@ class FreeSearchParameters:
     together: int = 128
     rounds: int = 3
     alike: float = 0.02
+    trunks: tuple[int, ...] = (4, 12, 48, 192, 768)
     starts: int = 24
     hands: int = 8
     escapes: int = 4
@@ -212,7 +215,8 @@ class FreeSearch:
     def run(self, q: Array, every: bool = False) -> None:
         """Look until all are free; or first, if asked, at the hands of a round whether or not."""
         self.try_hands(q, np.arange(len(q)))
-        for hands, owner in chain(self.other_hands(every), self._from_anywhere()):
+        others = (self._other_trunks(q), self.other_hands(every), self._from_anywhere())
+        for hands, owner in chain(*others):
             self.try_hands(hands, owner)
         blocked = np.flatnonzero(~self.free)
         if len(blocked):
@@ -291,6 +295,19 @@ class FreeSearch:
             of_one=owner if asked in ("limits", "q0") else None,
         )
         return *self._solved(found.q, owner[found.owner]), found.tried
+
+    def _other_trunks(self, q: Array) -> Iterator[tuple[Array, NDArray[np.intp]]]:
+        """Answers of a body with the same hands, at ever more other trunks."""
+        if not self.finder.robot.description.sides:
+            return
+        first = 0
+        for count in PARAMETERS.trunks:
+            rows = np.flatnonzero(~self.free)
+            if not len(rows):
+                return
+            found = other_trunks(self.trials, self.targets, q[rows], rows, first, count)
+            yield self._solved(*found)
+            first += count
 
     def other_hands(self, every: bool = False) -> Iterator[tuple[Array, NDArray[np.intp]]]:
         """Answers with other hands, of the targets that are not free, round by round."""
