@@ -108,6 +108,17 @@ class TargetBatch:
             palms=None if self.palms is None else self.palms[rows],
         )
 
+    def of_fingers(self, fingers: Sequence[int]) -> TargetBatch:
+        """The part that some fingers have, all motors free."""
+        return replace(
+            self,
+            points=self.points[:, fingers],
+            normals=self.normals[:, fingers],
+            tolerance=tuple(self.tolerances[i] for i in fingers),
+            fixed=None,
+            more={name: array[:, fingers] for name, array in self.more.items()},
+        )
+
     def holding(self, name: str, object_pose: ArrayLike) -> TargetBatch:
         """The same targets, which grasp an object at poses (4, 4) or (k, 4, 4).
 

@@ -139,7 +139,15 @@ class Proof:
             robot: The robot.
             target: One target that the proof has to be about; None: the one it names.
         """
-        return self.seal == self._seal() and _holds(self, robot.description, target)
+        description, about = robot.description, target
+        for side in description.sides:
+            # What is proved of a body is proved of one of its sides.
+            if set(self.fingers) <= set(side.fingers):
+                fingers = [robot.fingers.index(finger) for finger in side.fingers]
+                about = None if target is None else target.of_fingers(fingers)
+                description = description.side(side.name, carried=True)
+                break
+        return self.seal == self._seal() and _holds(self, description, about)
 
 
 def _holds(proof: Proof, robot: RobotDescription, target: TargetBatch | None) -> bool:

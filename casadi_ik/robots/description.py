@@ -325,10 +325,14 @@ class RobotDescription:
             for side in self.sides
         )
 
-    def side(self, name: str) -> RobotDescription:
+    def side(self, name: str, carried: bool = False) -> RobotDescription:
         """An arm-hand of a body by itself, as it stands on the link that ends the trunk.
 
         Its motors, fingers and links keep their names; q is ordered as in the body.
+
+        Args:
+            name: Of the side.
+            carried: Whether the trunk is a part of it, as the first joints of its arm.
 
         Raises:
             UnknownNameError: There is none; the message lists the sides.
@@ -337,19 +341,22 @@ class RobotDescription:
         if found is None:
             sides = ", ".join(side.name for side in self.sides) or "none"
             raise UnknownNameError(f"robot {self.name!r} has no side {name!r}; its sides: {sides}")
-        parts = dict.fromkeys(found.arm, "arm") | dict.fromkeys(found.hand, "hand")
+        root, arm = self.trunk_link, found.arm
+        if carried:
+            root, arm = self.root, (*self.trunk, *arm)
+        parts = dict.fromkeys(arm, "arm") | dict.fromkeys(found.hand, "hand")
         places = {i for i, motor in enumerate(self.actuator_names) if motor in parts}
         kept = set(self.links_moved(places)) | {found.palm_link}
         for finger in found.fingers:
             kept.add(self.finger(finger).link)
         for link in tuple(kept):
             kept |= {joint.child for joint in self.chain(link)}
-        kept -= {joint.child for joint in self.chain(self.trunk_link)}
+        kept -= {joint.child for joint in self.chain(root)}
         to_palm = {joint.name for joint in self.chain(found.palm_link)}
         return replace(
             self,
             name=f"{self.name}.{name}",
-            root=self.trunk_link,
+            root=root,
             joints=tuple(
                 replace(joint, part="arm" if joint.name in to_palm else "hand")
                 for joint in self.joints
@@ -376,7 +383,7 @@ class RobotDescription:
             palm_link=found.palm_link,
             palm_placement=found.palm_placement,
             home=self.home[sorted(places)],
-            shapes=self.shapes.without(set(self.links) - kept - {self.trunk_link}),
+            shapes=self.shapes.without(set(self.links) - kept - {root}),
             sides=(),
             trunk=(),
             trunk_link="",

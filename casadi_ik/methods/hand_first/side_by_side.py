@@ -73,15 +73,8 @@ def side_by_side(
 
 def part_of(targets: TargetBatch, fingers: Sequence[int], motors: Sequence[int]) -> TargetBatch:
     """The part of targets that is of some fingers, on a robot of some motors."""
-    fixed = targets.fixed
-    return replace(
-        targets,
-        points=targets.points[:, fingers],
-        normals=targets.normals[:, fingers],
-        tolerance=tuple(targets.tolerances[i] for i in fingers),
-        fixed=None if fixed is None else fixed[..., motors],
-        more={name: array[:, fingers] for name, array in targets.more.items()},
-    )
+    fixed = None if targets.fixed is None else targets.fixed[..., motors]
+    return replace(targets.of_fingers(fingers), fixed=fixed)
 
 
 def _of_body(

@@ -77,6 +77,6 @@ def other_trunks(
         wanted[f"palm_origin_{place}"] = np.repeat(palm[:, :3, 3], count, axis=0)
     for name, value in wanted.items():
         there = trials.state.slice(name)
-        whole = isinstance(value, np.ndarray) and value.ndim == 1
-        states[:, there] = value[:, None] if whole else value
+        numbers = np.asarray(value, dtype=float)
+        states[:, there] = numbers[:, None] if numbers.ndim == 1 else numbers
     return trials.run(states, parameters), mine

@@ -83,6 +83,10 @@ class Diagnostician:
         self._trials = Subproblems(robot, method)
         self._palm_free = FloatingPalmFit(self._trials)
         self._prover = Prover(robot.description, compiled)
+        self._sides = [
+            Prover(robot.description.side(side.name, carried=True), compiled)
+            for side in robot.description.sides
+        ]
 
     def diagnose(self, targets: TargetBatch, q0: Array, nearest: Array | None) -> list[Diagnosis]:
         """Diagnose k targets; each as if it were alone.
@@ -137,7 +141,7 @@ class Diagnostician:
         proofs: list[Proof | None] = [None] * len(every)
         rows = np.flatnonzero(~self._solved(targets, best.fair))
         if len(rows):
-            found = self._prover.prove(targets.rows(rows), most=_worth(best.ratio[rows]))
+            found = self._proofs(targets.rows(rows), _worth(best.ratio[rows]))
             for row, proof in zip(rows.tolist(), found, strict=True):
                 proofs[row] = proof
             clock.lap(rows)
@@ -186,6 +190,23 @@ class Diagnostician:
                 time=float(clock.seconds[i]),
                 lazy=Lazy(remedies.find),
             )
+
+    def _proofs(self, targets: TargetBatch, most: Counts) -> list[Proof | None]:
+        """Proofs of targets; of a body that one side cannot, wherever the trunk takes it."""
+        if not self._sides:
+            return self._prover.prove(targets, most=most)
+        robot = self.robot.description
+        proofs: list[Proof | None] = [None] * len(targets)
+        for prover, side in zip(self._sides, robot.sides, strict=True):
+            fingers = [robot.finger_names.index(name) for name in side.fingers]
+            asked = ~np.isnan(targets.points[:, fingers, 0]).all(axis=1)
+            rows = np.flatnonzero(asked & np.array([proof is None for proof in proofs]))
+            if not len(rows) or targets.fixed is not None:
+                continue
+            part = targets.rows(rows).of_fingers(fingers)
+            for row, proof in zip(rows.tolist(), prover.prove(part, most=most[rows]), strict=True):
+                proofs[row] = proof
+        return proofs
 
     def _hands(
         self, targets: TargetBatch, q0: Array
