@@ -126,6 +126,8 @@ def exported(
     Raises:
         UnsupportedError: It cannot be exported.
     """
+    # The C of sides and trunks stays here: an exported body is one hand with all motors.
+    robot = ArmHand(robot.description.as_hand) if robot.description.sides else robot
     if single and follow:
         raise UnsupportedError("--follow: computes in double precision, expected no --single")
     method, solver = hand_first(robot), Solver(robot)

@@ -22,6 +22,7 @@ from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import ContactVerdict, judge
 from casadi_ik.solving.alternatives.arm_search import ArmSearch, Preference
 from casadi_ik.solving.alternatives.branches import ArmBranches
+from casadi_ik.solving.alternatives.trunks import other_trunks
 from casadi_ik.solving.trials import (
     Bounds,
     HandMethod,
@@ -41,6 +42,9 @@ range."""
 
 APART = 0.25
 """Least difference of alternatives unless said otherwise, see `AlternativeFinder.find`."""
+
+TRUNKS = 64
+"""Trunks of a body that are tried with each hand."""
 
 ARMS = 64
 """Random arms that an arm without a closed form is solved from."""
@@ -211,7 +215,9 @@ class AlternativeFinder:
         prefer: str,
         query: CollisionQuery | None = None,
     ) -> list[_Found]:
-        """Every arm that brings the hand of q where it is."""
+        """Every arm that brings the hand of q where it is; of a body some trunks and arms."""
+        if self.robot.description.sides:
+            return [_Found(one, posture) for one in self._other_trunks(targets, q)]
         if not self._arm:
             return [_Found(q, posture)]
         if self._branches is None:
@@ -254,6 +260,14 @@ class AlternativeFinder:
         starts = np.stack([item.q for item in found])
         ends = LocalRefinement(self.trials, targets).run(np.zeros(len(found), np.intp), starts)
         return [replace(item, q=end) for item, end in zip(found, ends, strict=True)]
+
+    def _other_trunks(self, targets: TargetBatch, q: Array) -> list[Array]:
+        """Different trunks and arms of a body, its hands as in q."""
+        ends, _ = other_trunks(self.trials, targets, q[None], np.zeros(1, np.intp), 0, TRUNKS)
+        ends = np.concatenate([q[None], ends])
+        kept = ends[self.trials.solved(targets, ends, targets.enforce_limits)]
+        moving = [i for i in range(kept.shape[1]) if i not in self.hand]
+        return [kept[i] for i in distinct(self._parts(kept, moving), DISTINCT)]
 
     def _searched(self, targets: TargetBatch, q: Array, seed: int) -> list[Array]:
         """Different arms found from random ones, the hand starting as in q."""
