@@ -51,9 +51,9 @@ ALONE = 300
 
 INTRODUCTION = """
 A target is what all fingertips of a configuration touch, so it can be reached: *random* ones are
-drawn within the limits of all motors, *near limits* each motor is with probability 1/2 within 1 % of
-its range of an end. Times are processor times of one thread of this machine, of a batch per target;
-*one alone* is `Solver.fast`, the median.
+drawn within the limits of all motors, *near limits* each motor is with probability 1/2 within 1 %
+of its range of an end. Times are processor times of one thread of this machine, of a batch per
+target; *one alone* is `Solver.fast`, the median.
 """
 
 
@@ -202,8 +202,8 @@ def main(arguments: list[str] | None = None) -> None:
     parts.append(markdown_table(heads, paths))
     if rooms:
         parts.append(
-            "## Touching nothing\n\nTargets of configurations that do not touch themselves. *First*: "
-            "answers of a solver without a scene that do."
+            "## Touching nothing\n\nTargets of configurations that do not touch themselves. "
+            "*First*: answers of a solver without a scene that do."
         )
         heads = ["robot", "first answers that touch", "free answers", "a target [ms]"]
         parts.append(markdown_table(heads, rooms))
