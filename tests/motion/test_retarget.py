@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from made_up_hand import hand, like_robot
 from msgspec.structs import replace
 
 import casadi_ik as ik
-from casadi_ik.motion.retarget import Retarget, usual_retarget
 
 TEN_LINES = """\
 robot: kuka_lwr_barrett
@@ -21,6 +22,21 @@ xyz: [500 mm, 0, 600 mm]
 low_pass: 0.3
 wrist_weight: 0.02
 """
+
+
+@pytest.fixture
+def retarget(tmp_path):
+    """What a file of these keys says; of a robot: its thumb and the first two other fingers."""
+
+    def read(robot=None, **keys):
+        if robot is not None:
+            others = [name for name in robot.fingers if name != robot.thumb]
+            keys["fingers"] = dict(zip((robot.thumb, *others[:2]), (4, 8, 12), strict=True))
+        path = tmp_path / "keys.yaml"
+        path.write_text(json.dumps(keys))
+        return ik.motion.load_retarget(path)
+
+    return read
 
 
 def test_ten_lines(tmp_path):
@@ -51,14 +67,14 @@ def test_a_bad_file_is_refused_by_key(tmp_path, old, new, message):
     assert str(caught.value).startswith(str(path))
 
 
-def test_a_finger_that_the_robot_has_not(robot):
+def test_a_finger_that_the_robot_has_not(robot, retarget):
     with pytest.raises(ik.errors.InputError, match=r"fingers\.little: no such finger"):
-        ik.motion.Retargeter(Retarget(fingers={"little": 20}), robot)
+        ik.motion.Retargeter(retarget(fingers={"little": 20}), robot)
 
 
-def test_motions_are_scaled_and_turned(robot):
+def test_motions_are_scaled_and_turned(robot, retarget):
     """The wrist's way by `travel`, the hand's size by `scaling`, both turned by `rpy`."""
-    config = Retarget(
+    config = retarget(
         fingers={"thumb": 4, "finger_2": 8}, scaling=1.5, travel=2.0, rpy=(0, 0, np.pi / 2)
     )
     retargeter = ik.motion.Retargeter(config, robot)
@@ -77,7 +93,7 @@ def test_motions_are_scaled_and_turned(robot):
     assert np.arccos((np.trace(relative) - 1) / 2) == pytest.approx(0.3)
 
 
-def test_without_a_frame_the_first_one_tells_it(robot):
+def test_without_a_frame_the_first_one_tells_it(robot, retarget):
     """Fingertips of a person who holds the hand as the robot does are the robot's own."""
     points, _ = robot.contacts(robot.home)
     palm = robot.palm(robot.home)
@@ -85,7 +101,7 @@ def test_without_a_frame_the_first_one_tells_it(robot):
     turn, _ = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))
     turn *= np.sign(np.linalg.det(turn))
     frame[[4, 8, 12]] = (points - palm[:3, 3]) @ turn / 1.7 + frame[0]
-    config = replace(usual_retarget(robot), scaling=1.7)
+    config = replace(retarget(robot), scaling=1.7)
     wanted = ik.motion.Retargeter(config, robot)(frame)
     np.testing.assert_allclose(wanted.points, points, atol=1e-9)
 
@@ -98,10 +114,10 @@ def spans(frame, wanted, robot, config):
 
 
 @pytest.mark.parametrize("name", ["panda+allegro_right", "kuka_lwr_barrett", "ur5e+robotiq_3f"])
-def test_sizes_are_those_of_open_hands(name):
+def test_sizes_are_those_of_open_hands(name, retarget):
     """Neither the robot's posture nor the person's first one counts: a pinch is a pinch."""
     robot = ik.load_robot(name)
-    config, place = usual_retarget(robot), np.array([0.3, 0.1, 0.6])
+    config, place = retarget(robot), np.array([0.3, 0.1, 0.6])
     pinch = hand(0.9, place)
     pinch[4] = pinch[8] + [0.0, 0.0, -0.02]
     ratios = []
@@ -128,8 +144,8 @@ def seen_by_mediapipe(bend, wrist):
     return frame - frame.mean(axis=0) + [0.004, -0.006, 0.002]
 
 
-def test_of_world_landmarks_the_wrist_stays(robot):
-    config = usual_retarget(robot)
+def test_of_world_landmarks_the_wrist_stays(robot, retarget):
+    config = retarget(robot)
     home = robot.palm(robot.home)[:3, 3]
     ways = [(bend, np.array([0.2 * bend, 0.1, 0.5])) for bend in (0.1, 0.5, 0.9)]
     retargeter = ik.motion.Retargeter(config, robot)
@@ -152,23 +168,23 @@ def test_of_world_landmarks_the_wrist_stays(robot):
 
 
 @pytest.mark.parametrize("size", [0.35, 0.1])
-def test_image_landmarks_are_refused_in_words(robot, size):
+def test_image_landmarks_are_refused_in_words(robot, size, retarget):
     """Parts of the picture's width and height, depths from the wrist; fingers may be beyond it."""
     frame = hand(0.3, np.zeros(3)) * size / 0.09 + [0.4, 0.5, 3e-7]
     with pytest.raises(
         ik.errors.InputError, match=r"image landmarks.*expected metres: take its world landm"
     ):
-        ik.motion.Retargeter(usual_retarget(robot), robot)(frame)
+        ik.motion.Retargeter(retarget(robot), robot)(frame)
     pixels = 1800 * (hand(0.3, np.zeros(3)) + 0.2)
     with pytest.raises(
         ik.errors.InputError, match=r"a palm 163 m long, expected metres \(pixels, or mm\?\)"
     ):
-        ik.motion.Retargeter(usual_retarget(robot), robot)(pixels)
+        ik.motion.Retargeter(retarget(robot), robot)(pixels)
 
 
-def test_a_left_hand_moves_a_right_robot_hand(robot):
+def test_a_left_hand_moves_a_right_robot_hand(robot, retarget):
     """Its fingers come out as a right hand's, its wrist goes and turns as it does."""
-    config = replace(usual_retarget(robot), rpy=(0.0, 0.0, 0.0))
+    config = replace(retarget(robot), rpy=(0.0, 0.0, 0.0))
     right, left = (
         ik.motion.Retargeter(config, robot),
         ik.motion.Retargeter(replace(config, mirror=True), robot),
@@ -190,9 +206,9 @@ def test_a_left_hand_moves_a_right_robot_hand(robot):
         assert np.linalg.det(flat) == pytest.approx(-np.linalg.det(tips))
 
 
-def test_smoothing_does_not_depend_on_how_often_it_is_called(robot):
+def test_smoothing_does_not_depend_on_how_often_it_is_called(robot, retarget):
     """A frame at 30 Hz, looked at once or in every cycle of a follower at a kilohertz or two."""
-    config = replace(usual_retarget(robot), scaling=1.0, low_pass=0.3)
+    config = replace(retarget(robot), scaling=1.0, low_pass=0.3)
     frames = [hand(0.4, np.array([0.05 * i, 0.0, 0.4])) for i in range(5)]
     found = []
     for cycles in (1, 33, 66):
@@ -209,16 +225,16 @@ def test_smoothing_does_not_depend_on_how_often_it_is_called(robot):
             retargeter(frames[0], elapsed=bad)
 
 
-def test_low_pass(robot):
-    config = Retarget(fingers={"thumb": 4}, scaling=1.0, rpy=(0.0, 0.0, 0.0), low_pass=0.25)
+def test_low_pass(robot, retarget):
+    config = retarget(fingers={"thumb": 4}, scaling=1.0, rpy=(0.0, 0.0, 0.0), low_pass=0.25)
     retargeter = ik.motion.Retargeter(config, robot)
     start = retargeter(hand(0.4, np.zeros(3))).points[0]
     moved = [retargeter(hand(0.4, np.array([0.1, 0, 0]))).points[0] - start for _ in range(3)]
     np.testing.assert_allclose([m[0] for m in moved], 0.1 * (1 - 0.75 ** np.arange(1, 4)))
 
 
-def test_a_frame_with_nan_asks_for_nothing_and_is_forgotten(robot):
-    retargeter = ik.motion.Retargeter(usual_retarget(robot), robot)
+def test_a_frame_with_nan_asks_for_nothing_and_is_forgotten(robot, retarget):
+    retargeter = ik.motion.Retargeter(retarget(robot), robot)
     before = retargeter(hand(0.4, np.zeros(3)))
     bad = hand(0.4, np.zeros(3))
     bad[4, 1] = np.nan
@@ -233,12 +249,12 @@ def test_a_frame_with_nan_asks_for_nothing_and_is_forgotten(robot):
         retargeter(bad[:20])
 
 
-def test_arm_and_hand_follow_a_person(robot):
+def test_arm_and_hand_follow_a_person(robot, retarget):
     """Who moves as the robot can is followed by fingertips and wrist, whatever the scale."""
     way = 0.15 * np.sin(np.linspace(0, np.pi, 120))[:, None] * np.sin(np.arange(14))
     path = robot.home + way
     fingers = {"thumb": 4, "finger_2": 8, "finger_3": 12}
-    config = Retarget(fingers=fingers, scaling=1.7, travel=1.7)
+    config = retarget(fingers=fingers, scaling=1.7, travel=1.7)
     retargeter = ik.motion.Retargeter(config, robot)
     follower = ik.Solver(robot).follow(robot.home, 1 / 30)
     points, _ = robot.contacts(path)

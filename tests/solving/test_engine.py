@@ -7,12 +7,15 @@ import pickle
 
 import numpy as np
 import pytest
+from pinocchio_oracle import verdict
+from toy_robots import replace
 
 import casadi_ik as ik
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.problem.method import Outcome
 from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.trace import TraceFormat
+from casadi_ik.problem.verdict import judge
 from casadi_ik.solving.batch_parts import CACHED_BYTES, ENOUGH, FIRST_PART, PART_BYTES, BatchParts
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.run import Run
@@ -185,3 +188,92 @@ def test_a_quick_answer_has_every_field(robot: ik.ArmHand) -> None:
         for again in (dataclasses.replace(one), pickle.loads(pickle.dumps(one))):
             for name in names:
                 assert repr(getattr(again, name)) == repr(getattr(one, name))
+
+
+def test_parts_of_a_batch_keep_the_numbers_of_their_targets():
+    points = np.zeros((10, 3, 3))
+    problems = TargetBatch(points, points, ik.Tolerance(), True, first_row=100)
+    assert problems.rows(slice(4, 8)).first_row == 104
+    assert problems.rows(slice(4, 8)).rows(slice(1, None)).first_row == 105
+    assert problems.rows(slice(-2, None)).first_row == 108
+    assert problems.rows(slice(0, 0)).first_row == 100
+    assert len(problems.rows(np.array([7, 2]))) == 2
+    assert problems.rows(np.array([7, 2])).first_row == 0
+
+
+def problems(points, normals, **tolerance):
+    return TargetBatch(points, normals, ik.Tolerance(**tolerance), True)
+
+
+def test_errors_are_pinocchios(robot, oracle, rng):
+    q, goals = robot.random(rng, 10), robot.random(rng, 10)
+    points, normals = robot.contacts(goals)
+    found = judge(robot, problems(points, normals), q)
+    for i in range(10):
+        position, angle = verdict(oracle, q[i], points[i], normals[i])
+        np.testing.assert_allclose(found.position_error[i], position, atol=1e-12)
+        np.testing.assert_allclose(found.angle_error[i], angle, atol=1e-12)
+
+
+def test_edge_of_the_tolerances(robot):
+    q = np.tile(robot.home, (4, 1))
+    points, normals = robot.contacts(q)
+    points[0, 0] += [0.0049, 0, 0]
+    points[1, 0] += [0.0051, 0, 0]
+    for row, angle in ((2, 2.99), (3, 3.01)):
+        across = np.cross(normals[row, 1], [0.3, 0.4, 0.5])
+        across /= np.linalg.norm(across)
+        turn = np.radians(angle)
+        normals[row, 1] = np.cos(turn) * normals[row, 1] + np.sin(turn) * across
+    found = judge(robot, problems(points, normals), q)
+    np.testing.assert_array_equal(found.ok[:, 0], [True, False, True, True])
+    np.testing.assert_array_equal(found.ok[:, 1], [True, True, True, False])
+    np.testing.assert_allclose(found.angle_error[2:, 1], np.radians([2.99, 3.01]), rtol=1e-9)
+
+
+def test_small_and_opposite_angles_are_exact(robot):
+    points, normals = (x[None] for x in robot.contacts(robot.home))
+    tiny = 1e-9
+    across = np.cross(normals[0, 0], [0.3, 0.4, 0.5])
+    turned = normals.copy()
+    turned[0, 0] = normals[0, 0] + tiny * across / np.linalg.norm(across)
+    turned[0, 1] = -normals[0, 1]
+    found = judge(robot, problems(points, turned), robot.home[None])
+    np.testing.assert_allclose(found.angle_error[0, :2], [tiny, np.pi], rtol=1e-6)
+
+
+def limits_ok(robot, q):
+    points, normals = robot.contacts(robot.home)
+    return judge(robot, problems(points[None], normals[None]), q).limits_ok
+
+
+def test_what_is_free_is_met(robot):
+    points, normals = (x[None].copy() for x in robot.contacts(robot.home))
+    points[0, 0] = normals[0, 0] = normals[0, 1] = np.nan
+    points[0, 2] += 1.0
+    found = judge(robot, problems(points, normals), robot.home[None])
+    np.testing.assert_array_equal(found.ok[0], [True, True, False])
+    assert np.isnan(found.position_error[0, 0])
+    assert np.isnan(found.angle_error[0, :2]).all()
+
+
+def test_limits_of_every_motor(robot):
+    for i in range(14):
+        for limit, outward in ((robot.lower, -1), (robot.upper, 1)):
+            q = np.tile(robot.home, (2, 1))
+            q[:, i] = limit[i]
+            q[1, i] += outward * 1e-6
+            np.testing.assert_array_equal(limits_ok(robot, q), [True, False])
+
+
+def test_limits_of_a_coupled_joint(own_robot):
+    """A joint narrower than its motor counts on its own."""
+    hand = own_robot.with_name("hand.yaml")
+    text = hand.read_text()
+    at = text.index("name: bh_finger_3_spread")
+    hand.write_text(text[:at] + text[at:].replace("[0 deg, 180 deg]", "[0 deg, 60 deg]", 1))
+    replace(own_robot, "bh_spread: 30 deg", "bh_spread: 20 deg")
+    robot = ik.load_robot(own_robot)
+    q = np.tile(robot.home, (2, 1))
+    q[:, 7] = np.radians([59, 61])
+    np.testing.assert_array_equal(limits_ok(robot, q), [True, False])
