@@ -2,8 +2,9 @@
 
 Every operation is a line, on variables of the type `real`; comparisons are of the type `mask`. What
 only outputs behind the first need stands in a block that is left out where the caller gives no
-place for that output. Sines with cosines of the same angle are computed together, and up to
-`Form.width` sines or arcs that do not wait for each other in one call.
+place for that output. An operation on the same operands as an earlier one is not written again.
+Sines with cosines of the same angle are computed together, and up to `Form.width` sines or arcs that
+do not wait for each other in one call.
 """
 
 from __future__ import annotations
@@ -171,6 +172,7 @@ def _nodes(function: ca.Function, form: Form) -> tuple[list[_Node], list[list[st
     stores: list[list[str]] = [[] for _ in range(function.n_out())]
     # Of every place of the work vector: the text of what it holds, its node or -1, its type.
     held: dict[int, tuple[str, int, bool]] = {}
+    known: dict[str, tuple[str, int, bool]] = {}  # what operations gave, by their text
     identity, sources, targets = (
         function.instruction_id,
         function.instruction_input,
@@ -205,6 +207,9 @@ def _nodes(function: ca.Function, form: Form) -> tuple[list[_Node], list[list[st
             value = (MASK if is_mask else REAL)[code] % texts
         except KeyError:
             raise NoCodeError(f"operation {code} of {function.name()!r}") from None
+        if value in known:
+            held[to[0]] = known[value]
+            continue
         needs = tuple(node for _, node, _ in values if node >= 0)
         node = _Node(f"t{len(nodes)}", value, is_mask, needs)
         for need in needs:
@@ -213,7 +218,7 @@ def _nodes(function: ca.Function, form: Form) -> tuple[list[_Node], list[list[st
             node.kind, node.given = kind, _given(code, texts)
             node.after |= 1 << calls
             calls += 1
-        held[to[0]] = node.name, len(nodes), is_mask
+        held[to[0]] = known[value] = node.name, len(nodes), is_mask
         nodes.append(node)
     return nodes, stores
 
