@@ -3,8 +3,8 @@
 Every operation is a line, on variables of the type `real`; comparisons are of the type `mask`. What
 only outputs behind the first need stands in a block that is left out where the caller gives no
 place for that output. An operation on the same operands as an earlier one is not written again.
-Sines with cosines of the same angle are computed together, and up to `Form.width` sines or arcs that
-do not wait for each other in one call.
+Sines with cosines of the same angle are computed together, and up to `Form.width` sines or arcs
+that do not wait for each other in one call.
 """
 
 from __future__ import annotations
