@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, overload
 from weakref import WeakKeyDictionary
@@ -140,7 +141,12 @@ class FoundGrasps(Sequence[FoundGrasp]):
         return tuple(one.grasp for one in self.entries)
 
     def robustness(
-        self, position: float = 5e-3, angle: float = ROUGHLY, samples: int = 64, seed: int = 0
+        self,
+        position: float = 5e-3,
+        angle: float = ROUGHLY,
+        hold: tuple[float, float] | None = None,
+        samples: int = 64,
+        seed: int = 0,
     ) -> Array:
         """How the grasps bear that the object is not quite where it was thought to be.
 
@@ -150,6 +156,8 @@ class FoundGrasps(Sequence[FoundGrasp]):
         Args:
             position: How far the object is off, in random directions [m].
             angle: How far it is turned, about random axes [rad].
+            hold: Mass [kg], and the squeeze [N] with which it has to be held then, as for
+                `Solver.grasps_of`; None: it is enough that the hand closes.
             samples: Displacements of each grasp.
             seed: Of their directions.
 
@@ -157,7 +165,7 @@ class FoundGrasps(Sequence[FoundGrasp]):
             (k,) shares, one for each grasp.
 
         Raises:
-            InputError: A negative or infinite number, or no sample.
+            InputError: A negative or infinite number, no sample, or a bad `hold`.
 
         Example:
             >>> pose = np.eye(4)
@@ -172,8 +180,10 @@ class FoundGrasps(Sequence[FoundGrasp]):
                 f"robustness: found {position!r} m, {angle!r} rad and {samples!r} samples, "
                 "expected numbers >= 0 and at least one sample"
             )
+        _check_hold(hold)
         off = offsets(position, angle, samples, seed, self.surface.middle)
-        shares = [robustness(self.robot, self.surface, one, self.mu, off) for one in self]
+        least = None if hold is None else hold[0] * GRAVITY / hold[1]
+        shares = [robustness(self.robot, self.surface, one, self.mu, off, least) for one in self]
         return np.array(shares)
 
     @property
@@ -296,12 +306,16 @@ def _check(
         raise InputError(f"fingers: found {fingers!r}, expected an integer >= 2")
     if not 0 < mu < np.inf:
         raise InputError(f"mu: found {mu!r}, expected a friction coefficient > 0")
-    if hold is not None and not (len(hold) == 2 and min(hold) > 0):
-        raise InputError(f"hold: found {hold!r}, expected a mass [kg] and a squeeze [N], both > 0")
+    _check_hold(hold)
     if not isinstance(limit, int) or limit < 1:
         raise InputError(f"limit: found {limit!r}, expected an integer >= 1")
     if not callable(prefer) and prefer not in RANKINGS:
         raise InputError(f"prefer: found {prefer!r}, expected {', '.join(RANKINGS)} or a function")
+
+
+def _check_hold(hold: tuple[float, float] | None) -> None:
+    if hold is not None and not (len(hold) == 2 and min(hold) > 0):
+        raise InputError(f"hold: found {hold!r}, expected a mass [kg] and a squeeze [N], both > 0")
 
 
 def _made(
@@ -457,7 +471,7 @@ def _grasp(
     grasp = Grasp(
         contacts,
         robot=robot.name,
-        name=f"{surface.object.name} {'+'.join(contacts)}",
+        name=f"{Path(surface.object.name).stem} {'+'.join(contacts)}",
         object=surface.name,
         object_pose=place,
         posture=posture(own.hand[0]),

@@ -12,7 +12,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.grasps.pose import inverse
 from casadi_ik.touch.candidates import Candidates
 from casadi_ik.touch.hand_table import HandTable
-from casadi_ik.touch.strength import generators, loads
+from casadi_ik.touch.strength import FORCES, generators, loads
 from casadi_ik.touch.surface import Surface
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ def robustness(
     one: FoundGrasp,
     mu: float,
     offsets: Array,
+    least: float | None = None,
 ) -> float:
     """The share of places of the object at which the hand still closes on it.
 
@@ -47,6 +48,8 @@ def robustness(
         one: The grasp.
         mu: Friction coefficient.
         offsets: (k, 4, 4) where the object is really, in the frame in which it was thought to be.
+        least: Load that the contacts must have [N/N]; None: it is enough that they are
+            force-closed.
     """
     table, pose = HandTable.of(robot), one.grasp.object_pose
     assert pose is not None
@@ -86,7 +89,10 @@ def robustness(
         wrenches = generators(
             surface.points[chosen], -surface.faces[chosen], mu, surface.middle, surface.size / 2
         )
-        closed[rows] = loads(wrenches).min(axis=1) > LEAST
+        found = loads(wrenches)
+        closed[rows] = found.min(axis=1) > LEAST
+        if least is not None:
+            closed[rows] &= found[:, FORCES].min(axis=1) >= least
     return float(closed.mean())
 
 

@@ -134,5 +134,6 @@ def _solved(wrenches: Array, directions: Array, steps: int = 25) -> Array:
 
 def _longest(value: Array, way: Array) -> Array:
     """How far to go so that all stays positive, at most 1, (k,)."""
-    ratio = np.where(way < 0, -value / np.minimum(way, -1e-100), np.inf)
+    with np.errstate(over="ignore"):
+        ratio = np.where(way < 0, -value / np.minimum(way, -1e-300), np.inf)
     return np.minimum(1.0, ratio.min(axis=1))

@@ -80,7 +80,7 @@ def draw_grasps(
         axes.set_axis_off()
         axes.imshow(np.clip(_image(robot, one, scene, pixels), 0.0, 1.0))
         axes.set_title(_words(number, one), color=palette.INK, fontsize=9.5)
-    name = shown[0].grasp.object.rpartition("/")[2]
+    name = shown[0].grasp.name.partition(" ")[0]
     more = f", the best {len(shown)}" if len(found) > len(shown) else ""
     title = f"{len(found)} grasps of {name} · {robot.name}{more}"
     figure.text(0.02, 1 - 0.5 * HEAD / height, title, size=13, weight="bold", va="center")

@@ -1,0 +1,412 @@
+"""Do grasps of surfaces hold? What `grasps_of` finds, squeezed in MuJoCo, and pulled six ways.
+
+Every grasp has to hold 0.2 kg against a force as large as its weight along each axis of the base
+frame, both ways: the object moves less than 20 mm and turns less than 30 deg in a second, in all
+six. How well the load predicts that is the area under its ROC curve. Then the object is a bit
+elsewhere than the hand believes, and the hand closes on it::
+
+    python studies/touch_hold.py
+    python studies/touch_hold.py --robots panda+leap --objects cup mug --limit 20
+    python studies/touch_hold.py --objects ycb/*.obj --out results/touch_hold_ycb
+
+Needs MuJoCo (``pip install mujoco``).
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from rich.progress import track
+from runner.figures import RESULTS
+from runner.report import (
+    Metric,
+    command,
+    markdown_table,
+    program,
+    provenance,
+    rate_metric,
+    write_metrics,
+    write_page,
+)
+from runner.study import robot_of
+from touch import placed
+
+import casadi_ik as ik
+from casadi_ik.collision.solids import object_solids
+from casadi_ik.touch.grasps import FoundGrasp
+from casadi_ik.touch.robustness import offsets
+
+ROBOTS = (
+    "panda+allegro_right",
+    "panda+leap",
+    "ur5e+shadow",
+    "kuka_lwr_barrett",
+    "panda+panda_hand",
+)
+
+MASS, GRAVITY, FRICTION, PATCH = 0.2, 9.80665, 0.5, 0.005
+SQUEEZE = 18.0
+"""Sum of the normal forces [N]: 6 N a finger of three."""
+
+PAD = 0.010
+"""Radius of a pad [m]."""
+
+STIFFNESS = {"revolute": 3.0, "prismatic": 2000.0}
+"""Of a joint that a motor holds [N m/rad, N/m]."""
+
+STEP, SETTLING, TIME = 2e-3, 0.4, 1.0
+"""Of the simulation; before the force, and with it [s]."""
+
+FAR, TURNED = 0.020, np.deg2rad(30.0)
+"""What the object may move [m] and turn [rad]."""
+
+WHOLE = mujoco.mjtState.mjSTATE_INTEGRATION
+
+
+INTRODUCTION = """
+{objects}: each on the table, turned by 40 deg, 0.5 m before the arm's base and 0.1 m aside; at
+most {limit} distinct, force-closed grasps of each, the best by load of those that the first rounds
+of the search find (friction 0.5, three fingertips, or two of a gripper). In MuJoCo the palm is
+fixed, motors are springs (3 N m/rad, 2 kN/m), pads are balls of 10 mm, only pads touch the object
+(its convex parts; friction 0.5, torsional friction of a patch of 5 mm), and it weighs 0.2 kg.
+Fingers squeeze with 18 N in sum, by `FoundGrasp.forces`. *Held*: in a second the object moves less
+than 20 mm and turns less than 30 deg, for a force of its weight in each of six directions.
+*Strong*: those whose load says that they hold it. *AUC*: the chance that a grasp that holds has a
+higher load than one that does not.
+"""
+
+NOISE = """
+The object is 5 mm and 3 deg elsewhere than the hand believes ({samples} times per grasp, in random
+directions); the hand closes from its open posture. *Robustness* is `FoundGrasps.robustness`: the
+share at which the contacts that fingers come to hold 0.2 kg by their load. *Held*: the share that
+holds it against gravity in MuJoCo. *AUC*: the chance that of two grasps the one that holds more
+often has the higher robustness, or load.
+"""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Hold grasps and write the report."""
+    parser = argparse.ArgumentParser(description="Do grasps of surfaces hold?")
+    parser.add_argument("--robots", nargs="+", default=ROBOTS)
+    parser.add_argument("--objects", nargs="+", default=ik.shipped_names("objects"))
+    parser.add_argument("--limit", type=int, default=20, help="grasps of an object")
+    parser.add_argument("--samples", type=int, default=4, help="displacements of a grasp")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=RESULTS / "touch_hold")
+    options = parser.parse_args(arguments)
+    surfaces = [ik.load_surface(name, seed=options.seed) for name in options.objects]
+    names = ", ".join(name_of(surface) for surface in surfaces)
+    rows, noisy, objects, metrics = [], [], [], list[Metric]()
+    for robot in options.robots:
+        solver = ik.Solver(robot_of(robot), scene=ik.load_scene("table"))
+        tries = [
+            one
+            for surface in track(surfaces, robot)
+            for one in tried(solver, surface, options.limit, options.samples, options.seed)
+        ]
+        rows.append(row_of(robot, tries, metrics))
+        noisy.append(noise_of(robot, tries, metrics))
+        for surface in surfaces:
+            held = [one.held for one in tries if one.object == name_of(surface)]
+            objects.append([robot, name_of(surface), str(len(held)), str(sum(held))])
+    heads = ["robot", "grasps", "held", "AUC of load", "AUC of closure", "best third held"]
+    parts = [
+        INTRODUCTION.format(objects=names, limit=options.limit),
+        markdown_table([*heads, "strong", "of them held"], rows),
+        "## Noise",
+        NOISE.format(samples=options.samples),
+        markdown_table(["robot", "robustness", "held", "AUC of robustness", "AUC of load"], noisy),
+        "## By object",
+        markdown_table(["robot", "object", "grasps", "held"], objects),
+        f"## Where this comes from\n\n`{command(__file__, arguments)}`",
+        provenance({}),
+    ]
+    write_page("Do grasps of surfaces hold?", parts, options.out)
+    write_metrics(metrics, options.out / "metrics.json")
+
+
+def name_of(surface: ik.Surface) -> str:
+    """Of an object, or of a mesh without its folder."""
+    return Path(surface.object.name).stem
+
+
+@dataclass(frozen=True)
+class Tried:
+    """A grasp and how it went.
+
+    Attributes:
+        object: What is grasped.
+        load: Its load [N/N].
+        closure: Its closure.
+        held: Whether it was held six ways.
+        robustness: Of the geometry.
+        noisy: Share of displacements at which it was held.
+    """
+
+    object: str
+    load: float
+    closure: float
+    held: bool
+    robustness: float
+    noisy: float
+
+
+def tried(
+    solver: ik.Solver, surface: ik.Surface, limit: int, samples: int, seed: int
+) -> Iterator[Tried]:
+    """Grasps of an object, as they went."""
+    found = solver.grasps_of(surface, placed(surface, 0.7), limit=limit, seed=seed)
+    shares = found.robustness(hold=(MASS, SQUEEZE), seed=seed)
+    away = offsets(5e-3, np.deg2rad(3.0), samples, seed + 1, surface.middle)
+    six = np.concatenate([np.eye(3), -np.eye(3)])
+    for one, share in zip(found, shares, strict=True):
+        hold = Hold(solver.robot, one, surface)
+        noisy = [bool(hold.held(hold.settled(off), -np.eye(3)[2:]).all()) for off in away]
+        held = bool(hold.held(hold.settled(), six).all())
+        mean = float(np.mean(noisy)) if noisy else float("nan")
+        yield Tried(name_of(surface), one.load, one.closure, held, float(share), mean)
+
+
+def row_of(robot: str, tries: Sequence[Tried], metrics: list[Metric]) -> list[str]:
+    """What came of one robot."""
+    held = np.array([one.held for one in tries], dtype=bool)
+    loads = np.array([one.load for one in tries])
+    best = np.argsort(-loads, kind="stable")[: len(tries) // 3]
+    strong = loads >= MASS * GRAVITY / SQUEEZE
+    name = f"touch_hold/{robot}"
+    rates = [
+        rate_metric(f"{name}/held", int(held.sum()), len(held)),
+        rate_metric(f"{name}/best_third", int(held[best].sum()), len(best)),
+        rate_metric(f"{name}/strong", int(held[strong].sum()), int(strong.sum())),
+    ]
+    areas = auc(loads, held), auc(np.array([one.closure for one in tries]), held)
+    area = Metric(f"{name}/auc", areas[0], "", "higher", math.nan, math.nan, len(tries))
+    metrics += [*rates, area]
+    cells = [f"{int(held[rows].sum())} of {len(held[rows])}" for rows in (best, strong)]
+    shares = [f"{value:.3f}" for value in areas]
+    held_of = f"{int(held.sum())} ({rates[0].value:.0f} %)"
+    return [robot, str(len(held)), held_of, *shares, cells[0], str(int(strong.sum())), cells[1]]
+
+
+def noise_of(robot: str, tries: Sequence[Tried], metrics: list[Metric]) -> list[str]:
+    """What noise does to one robot's grasps."""
+    share = np.array([one.robustness for one in tries])
+    held = np.array([one.noisy for one in tries])
+    loads = np.array([one.load for one in tries])
+    means = float(100 * share.mean()), float(100 * held.mean())
+    for key, value in zip(("robustness", "held_with_noise"), means, strict=True):
+        name = f"touch_hold/{robot}/{key}"
+        metrics.append(Metric(name, value, "%", "higher", math.nan, math.nan, len(tries)))
+    areas = [f"{concordance(score, held):.3f}" for score in (share, loads)]
+    return [robot, *(f"{mean:.0f} %" for mean in means), *areas]
+
+
+def auc(scores: np.ndarray, held: np.ndarray) -> float:
+    """Chance that one that holds scores higher than one that does not."""
+    return concordance(scores, held.astype(float))
+
+
+def concordance(scores: np.ndarray, values: np.ndarray) -> float:
+    """Chance that of two with different values that of the larger one has the higher score."""
+    larger = values[:, None] > values
+    if not larger.any():
+        return math.nan
+    order = np.sign(scores[:, None] - scores)[larger]
+    return float((order + 1).mean() / 2)
+
+
+class Hold:
+    """A grasp in MuJoCo: the hand's palm is fixed, fingers are held by springs, pads are balls."""
+
+    def __init__(self, robot: ik.ArmHand, one: FoundGrasp, surface: ik.Surface) -> None:
+        self.robot, self.one, self.surface = robot, one, surface
+        description = robot.description
+        self.palm = robot.links(one.q)[description.palm_link]
+        self.leads = self._leads()
+        self.spec = self._spec()
+        self.model = self.spec.compile()
+        self.data = mujoco.MjData(self.model)
+        self._free = int(self.model.jnt_qposadr[self.model.body("thing").jntadr[0]])
+
+    def _leads(self) -> dict[int, dict[str, float]]:
+        """By motor of the hand the joints that it moves, and how far each goes with it."""
+        robot, q, found = self.robot, self.one.q, {}
+        start = robot.joints(q)
+        for motor in robot.description.hand_actuators:
+            step = np.zeros(len(q))
+            step[motor] = 1e-4 if q[motor] + 1e-4 <= robot.upper[motor] else -1e-4
+            end = robot.joints(q + step)
+            ratios = {name: (end[name] - start[name]) / step[motor] for name in start}
+            found[motor] = {name: value for name, value in ratios.items() if abs(value) > 1e-6}
+        return found
+
+    def _spec(self) -> Any:
+        robot, description = self.robot, self.robot.description
+        spec = mujoco.MjSpec()
+        spec.option.timestep = STEP
+        spec.option.gravity = [0, 0, 0]
+        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        spec.option.impratio = 10
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        palm = spec.worldbody.add_body(name=description.palm_link, **_frame(self.palm))
+        bodies = {description.palm_link: palm}
+        joints = robot.joints(self.one.q)
+        for joint in description.joints:
+            if joint.parent not in bodies or joint.part != "hand":
+                continue
+            body = bodies[joint.parent].add_body(name=joint.child, **_frame(joint.placement))
+            body.mass, body.inertia, body.explicitinertial = 0.02, [1e-5] * 3, True
+            bodies[joint.child] = body
+            if joint.type in ("revolute", "prismatic"):
+                slide = joint.type == "prismatic"
+                body.add_joint(
+                    name=joint.name,
+                    type=mujoco.mjtJoint.mjJNT_SLIDE if slide else mujoco.mjtJoint.mjJNT_HINGE,
+                    axis=joint.axis,
+                    armature=0.1 if slide else 1e-3,
+                    damping=30.0 if slide else 0.15,
+                )
+        friction = [FRICTION, 2 / 3 * FRICTION * PATCH, 1e-4]
+        look = {"friction": friction, "condim": 4, "solref": [0.004, 1.0]}
+        for finger in description.fingers:
+            point = finger.placement[:3, 3]
+            normal = finger.placement[:3, :3] @ finger.normal
+            bodies[finger.link].add_geom(
+                type=mujoco.mjtGeom.mjGEOM_SPHERE,
+                size=[PAD, 0, 0],
+                pos=point - PAD * normal,
+                mass=0.0,
+                contype=1,
+                conaffinity=2,
+                **look,
+            )
+        thing = spec.worldbody.add_body(name="thing", **_frame(self.one.grasp.object_pose))
+        thing.add_freejoint()
+        solids = object_solids(self.surface.name)
+        for i, (solid, pose) in enumerate(solids):
+            points, _ = solid.mesh()
+            mesh = spec.add_mesh(name=f"part_{i}", uservert=np.asarray(points, float).ravel())
+            mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+            thing.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_MESH,
+                meshname=f"part_{i}",
+                mass=MASS / len(solids),
+                contype=2,
+                conaffinity=1,
+                **_frame(pose),
+                **look,
+            )
+        kinds = {joint.name: joint.type for joint in description.joints}
+        for motor, ratios in self.leads.items():
+            ratios = {name: r for name, r in ratios.items() if spec.joint(name) is not None}
+            if not ratios:
+                continue
+            lead = max(ratios, key=lambda name: abs(ratios[name]))
+            stiff = STIFFNESS[kinds[lead]]
+            spec.add_actuator(
+                name=f"motor_{motor}",
+                target=lead,
+                trntype=mujoco.mjtTrn.mjTRN_JOINT,
+                gainprm=[stiff, *[0] * 9],
+                biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+                biasprm=[0, -stiff, *[0] * 8],
+            )
+            for name, ratio in ratios.items():
+                if name != lead:
+                    a = ratio / ratios[lead]
+                    spec.add_equality(
+                        type=mujoco.mjtEq.mjEQ_JOINT,
+                        name1=name,
+                        name2=lead,
+                        data=[joints[name] - a * joints[lead], a, *[0] * 9],
+                        objtype=mujoco.mjtObj.mjOBJ_JOINT,
+                    )
+        return spec
+
+    def targets(self) -> np.ndarray:
+        """Where the springs are to pull to, so that fingertips press as they should."""
+        robot, q, model = self.robot, self.one.q, self.model
+        joints, goals = robot.joints(q), np.zeros(model.nu)
+        for motor, ratios in self.leads.items():
+            index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, f"motor_{motor}")
+            if index < 0:
+                continue
+            step = np.zeros(len(q))
+            step[motor] = 1e-5
+            slope = (robot.contacts(q + step)[0] - robot.contacts(q - step)[0]) / 2e-5
+            torque = SQUEEZE * sum(
+                float(slope[robot.fingers.index(name)] @ force)
+                for name, force in self.one.forces.items()
+            )
+            lead = model.joint(int(model.actuator_trnid[index, 0])).name
+            stiff = model.actuator_gainprm[index, 0]
+            goals[index] = joints[lead] + torque / ratios[lead] / stiff
+        return goals
+
+    def settled(self, offset: np.ndarray | None = None) -> np.ndarray:
+        """The state once the fingers squeeze.
+
+        Args:
+            offset: (4, 4) of the object from where it is thought to be; the hand is open then.
+                None: it is there, and the fingers touch.
+        """
+        model, data, robot = self.model, self.data, self.robot
+        mujoco.mj_resetData(model, data)
+        q = self.one.q.copy()
+        if offset is not None:
+            pose = self.one.grasp.object_pose @ offset
+            data.qpos[self._free : self._free + 3] = pose[:3, 3]
+            data.qpos[self._free + 3 : self._free + 7] = _frame(pose)["quat"]
+            before = self.one.pregrasp
+            for name, value in {} if before is None else before.posture.items():
+                q[robot.actuators.index(name)] = value
+        for name, value in robot.joints(q).items():
+            index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name)
+            if index >= 0:
+                data.qpos[model.jnt_qposadr[index]] = value
+        goals = self.targets()
+        begin = np.array([data.qpos[model.jnt_qposadr[j]] for j in model.actuator_trnid[:, 0]])
+        steps = round(SETTLING / STEP)
+        for i in range(steps):
+            data.ctrl[:] = begin + min(1.0, 1.5 * (i + 1) / steps) * (goals - begin)
+            mujoco.mj_step(model, data)
+        state = np.zeros(mujoco.mj_stateSize(model, WHOLE))
+        mujoco.mj_getState(model, data, state, WHOLE)
+        return state
+
+    def held(self, state: np.ndarray, ways: np.ndarray) -> np.ndarray:
+        """(k,) whether the object stays from a state on, pulled by its weight along ways (k, 3)."""
+        model, data = self.model, self.data
+        thing = model.body("thing").id
+        found = np.zeros(len(ways), dtype=bool)
+        for k, way in enumerate(ways):
+            mujoco.mj_setState(model, data, state, WHOLE)
+            mujoco.mj_forward(model, data)
+            where, turn = data.xipos[thing].copy(), data.xmat[thing].reshape(3, 3).copy()
+            data.xfrc_applied[:] = 0.0
+            data.xfrc_applied[thing, :3] = MASS * GRAVITY * way
+            for i in range(round(TIME / STEP)):
+                mujoco.mj_step(model, data)
+                if i % 25 == 0 and np.linalg.norm(data.xipos[thing] - where) > 5 * FAR:
+                    break
+            cosine = (np.trace(turn.T @ data.xmat[thing].reshape(3, 3)) - 1) / 2
+            turned = np.arccos(np.clip(cosine, -1, 1))
+            found[k] = np.linalg.norm(data.xipos[thing] - where) < FAR and turned < TURNED
+        return found
+
+
+def _frame(pose: np.ndarray) -> dict[str, Any]:
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, np.ascontiguousarray(pose[:3, :3]).ravel())
+    return {"pos": pose[:3, 3], "quat": quat}
+
+
+if __name__ == "__main__":
+    program(main)

@@ -1,0 +1,41 @@
+"""The study of grasps in MuJoCo runs, and its committed report says what it says elsewhere."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco")
+
+import touch_hold
+
+import casadi_ik as ik
+
+
+def test_the_study_writes_its_report(tmp_path):
+    given = ["--robots", "panda+panda_hand", "--objects", "tennis_ball", "sugar_box"]
+    touch_hold.main([*given, "--limit", "3", "--samples", "1", "--out", str(tmp_path)])
+    text = (tmp_path / "report.md").read_text()
+    assert "| panda+panda_hand | tennis_ball | 3 | 3 |" in text
+    found = {one["name"]: one for one in json.loads((tmp_path / "metrics.json").read_text())}
+    assert found["touch_hold/panda+panda_hand/held"]["n"] == 6
+
+
+def test_what_is_squeezed_too_little_falls(monkeypatch):
+    solver, surface = ik.Solver(ik.load_robot("panda+panda_hand")), ik.load_surface("tennis_ball")
+    (one,) = solver.grasps_of(surface, touch_hold.placed(surface, 0.7), limit=1)
+    down = -np.eye(3)[2:]
+    hold = touch_hold.Hold(solver.robot, one, surface)
+    assert hold.held(hold.settled(), down).all()
+    monkeypatch.setattr(touch_hold, "SQUEEZE", 0.02)
+    hold = touch_hold.Hold(solver.robot, one, surface)
+    assert not hold.held(hold.settled(), down).any()
+
+
+def test_the_area_under_the_curve():
+    held = np.array([True, False, True, False])
+    assert touch_hold.auc(np.array([4.0, 1.0, 3.0, 2.0]), held) == 1.0
+    assert touch_hold.auc(np.array([1.0, 4.0, 2.0, 3.0]), held) == 0.0
+    assert touch_hold.auc(np.ones(4), held) == 0.5
