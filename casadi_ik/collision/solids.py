@@ -313,14 +313,23 @@ def hull(points: Array, where: str) -> Solid:
     return convex(points, normals, (points, triangles.astype(np.int64)))
 
 
+SPECK = 5e-3
+"""Size of what is left out of a mesh if it is flat [m]."""
+
+
 def hulls(shape: MeshShape, where: str) -> list[tuple[Solid, Array]]:
     """The convex hulls of the pieces of a mesh, each with its (4, 4) pose in the mesh's frame.
+
+    Specks that scanners leave, flat and smaller than `SPECK`, are no pieces.
 
     Raises:
         DescriptionError: A piece is flat.
     """
     found: list[tuple[Solid, Array]] = []
     for number, (points, _) in enumerate(shape.pieces):
+        flat = len(points) < 4 or np.linalg.matrix_rank(points - points[0], tol=1e-9) < 3
+        if flat and len(shape.pieces) > 1 and np.ptp(points, axis=0).max() < SPECK:
+            continue
         pose = np.eye(4)
         pose[:3, 3] = points.mean(axis=0)
         named = f"{where}: piece {number} of {len(shape.pieces)}"

@@ -195,6 +195,16 @@ def test_millimetres_are_told(tmp_path):
     assert ik.load_surface(tmp_path / "can.stl", scale=0.001).size == pytest.approx(0.137, abs=2e-3)
 
 
+def test_specks_that_a_scanner_leaves_are_no_parts(tmp_path):
+    body = trimesh.creation.cylinder(0.033, 0.1, sections=64)
+    speck = trimesh.Trimesh([[0, 0, 0.06], [1e-3, 0, 0.06], [0, 1e-3, 0.06]], [[0, 1, 2]])
+    trimesh.util.concatenate([body, speck]).export(tmp_path / "scan.stl")
+    found = solver_of("panda+panda_hand").grasps_of(
+        ik.load_surface(tmp_path / "scan.stl"), PLACE, limit=3
+    )
+    assert len(found) == 3
+
+
 def test_what_is_out_of_reach_is_given_up(surface):
     far = PLACE.copy()
     far[0, 3] = 5.0
