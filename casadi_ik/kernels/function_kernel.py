@@ -102,10 +102,28 @@ def machine_lanes() -> int:
     return 0 if library is None else int(library[SYMBOL_MACHINE]())
 
 
-SYMBOL = "casadi_ik_map"
-
+SYMBOL, SYMBOL_LANES = "casadi_ik_map", "casadi_ik_map_lanes"
 
 MapJob = c_struct("map_job")
+
+
+def _map_job(
+    inputs: Sequence[NDArray[Any]],
+    input_steps: Sequence[int],
+    outputs: Sequence[NDArray[Any]],
+    output_steps: Sequence[int],
+    count: int,
+) -> tuple[Any, tuple[Any, ...]]:
+    """A job of the map driver, and memory that has to live as long."""
+    kept = tuple(
+        (kind * len(values))(*values)
+        for arrays, steps in ((inputs, input_steps), (outputs, output_steps))
+        for kind, values in (
+            (ctypes.c_void_p, [memory(array) for array in arrays]),
+            (ctypes.c_int64, steps),
+        )
+    )
+    return MapJob(*map(ctypes.addressof, kept), count=count, next=0, slice=SLICE), kept
 
 
 class SingleCall:
@@ -127,13 +145,8 @@ class SingleCall:
         self.outputs = tuple(outputs)
         self._name = name
         self._run = run
-        sources = (ctypes.c_void_p * len(inputs))(*map(memory, inputs))
-        targets = (ctypes.c_void_p * len(outputs))(*map(memory, outputs))
-        steps = (ctypes.c_int64 * max(len(inputs), len(outputs)))()
-        self._kept = sources, targets, steps
-        self._job = MapJob(
-            *map(ctypes.addressof, (sources, steps, targets, steps)), count=1, next=0, slice=SLICE
-        )
+        zeros = [0] * max(len(inputs), len(outputs))
+        self._job, self._kept = _map_job(inputs, zeros, outputs, zeros, 1)
         self._reference = ctypes.byref(self._job)
 
     def __call__(self) -> None:
@@ -162,12 +175,19 @@ class FunctionKernel:
         entry: The compiled function, None if there is none.
     """
 
-    def __init__(self, function: ca.Function | FunctionGraph, compiled: bool = True) -> None:
+    def __init__(
+        self,
+        function: ca.Function | FunctionGraph,
+        compiled: bool = True,
+        in_lanes: bool = False,
+    ) -> None:
         """Compile the function or load it from the cache.
 
         Args:
             function: Any Function; sparse inputs and outputs are made dense.
             compiled: False keeps to the virtual machine.
+            in_lanes: Whether some samples of a batch are computed side by side, where the machine
+                has such registers; the results are the same bit for bit.
 
         Raises:
             KernelError: The function has no C code, or the compiler refused it.
@@ -179,21 +199,31 @@ class FunctionKernel:
         self._graph = graph
         self._names = tuple(graph.inputs)
         self._input_sizes = [rows * columns for rows, columns in graph.inputs.values()]
-        self._output_steps = np.array([r * c for r, c in graph.outputs], dtype=np.int64)
-        library = self._load() if compiled else None
-        self.compiled = library is not None
-        self.entry: Any = None if library is None else library[SYMBOL]
+        self._output_sizes = [rows * columns for rows, columns in graph.outputs]
+        self.entry: Any = self._load(in_lanes) if compiled else None
+        self.compiled = self.entry is not None
         self._singles: list[SingleCall] = []
 
-    def _load(self) -> ctypes.CDLL | None:
-        driver = define(self.constants) + driver_text("map_job") + driver_text("map")
-        graph = self._graph
-        return load_function(self.name, lambda: graph.function, driver, SYMBOL, graph.recipe)
+    def _load(self, in_lanes: bool) -> Any:
+        """The compiled map, None if there is none."""
+        lanes = machine_lanes() if in_lanes else 0
+        text = define({"N_IN": len(self._input_sizes), "N_OUT": len(self._output_sizes)})
+        if not lanes:
+            return self._map(self.name, text + driver_text("map_job") + driver_text("map"), SYMBOL)
+        text += define({"TOTAL": sum(self._input_sizes) + sum(self._output_sizes)})
+        for name, sizes in (("SIZES_IN", self._input_sizes), ("SIZES_OUT", self._output_sizes)):
+            text += f"#define {name} {{{', '.join(map(str, sizes))}}}\n"
+        text += driver_text("map_job") + driver_text("map_lanes")
+        try:
+            return self._map(f"{self.name}_lanes{lanes}", text, SYMBOL_LANES, lanes)
+        except KernelError as error:
+            logger.warning("%s: one sample at a time: %s", self.name, error)
+            return self._load(in_lanes=False)
 
-    @property
-    def constants(self) -> dict[str, int]:
-        """What the driver expects."""
-        return {"N_IN": len(self.input_shapes), "N_OUT": len(self.output_shapes)}
+    def _map(self, name: str, driver: str, symbol: str, lanes: int = 1) -> Any:
+        graph = self._graph
+        library = load_function(name, lambda: graph.function, driver, symbol, graph.recipe, lanes)
+        return None if library is None else library[symbol]
 
     @cached_property
     def function(self) -> ca.Function:
@@ -308,18 +338,7 @@ class FunctionKernel:
         outputs: tuple[NDArray[np.float64], ...],
         count: int,
     ) -> None:
-        sources = (ctypes.c_void_p * len(arrays))(*map(memory, arrays))
-        strides = (ctypes.c_int64 * len(arrays))(*steps)
-        targets = (ctypes.c_void_p * len(outputs))(*map(memory, outputs))
-        job = MapJob(
-            ctypes.addressof(sources),
-            ctypes.addressof(strides),
-            ctypes.addressof(targets),
-            memory(self._output_steps),
-            count,
-            0,
-            SLICE,
-        )
+        job, _kept = _map_job(arrays, steps, outputs, self._output_sizes, count)
         drive(self.name, self.entry, job)
 
     def _run_vm(
@@ -348,80 +367,6 @@ def _shape(size: tuple[int, int]) -> tuple[int, ...]:
     if columns != 1:
         return (rows, columns)
     return () if rows == 1 else (rows,)
-
-
-SYMBOL_LANES = "casadi_ik_map_lanes"
-
-
-class MeasureKernel:
-    """Evaluates a function of one vector for a batch of them; threads may call it at once."""
-
-    def __init__(self, graph: FunctionGraph, compiled: bool = True) -> None:
-        """Keep the function; it is compiled when first needed.
-
-        Args:
-            graph: One column in, one column out.
-            compiled: False keeps to the virtual machine.
-        """
-        self._graph = graph
-        self._compiled = compiled
-        ((self._n_in, _),) = graph.inputs.values()
-        ((self._n_out, _),) = graph.outputs
-
-    def prepare(self) -> None:
-        """Compile it."""
-        if self._map is None:
-            _ = self._one_by_one
-
-    @property
-    def entry(self) -> Any:
-        """The compiled map, with vectors or without; None if there is none."""
-        return self._one_by_one.entry if self._map is None else self._map
-
-    @cached_property
-    def _one_by_one(self) -> FunctionKernel:
-        """For machines without such vectors."""
-        return FunctionKernel(self._graph, self._compiled)
-
-    @cached_property
-    def _map(self) -> Any:
-        lanes = machine_lanes() if self._compiled else 0
-        if not lanes:
-            return None
-        constants = {"N_IN": 1, "N_OUT": 1, "TOTAL": self._n_in + self._n_out}
-        sizes = f"#define SIZES_IN {{{self._n_in}}}\n#define SIZES_OUT {{{self._n_out}}}\n"
-        driver = define(constants) + sizes + driver_text("map_job") + driver_text("map_lanes")
-        try:
-            name, graph = f"{self._graph.name}_lanes{lanes}", self._graph
-            library = load_function(
-                name, lambda: graph.function, driver, SYMBOL_LANES, graph.recipe, lanes
-            )
-        except KernelError as error:
-            logger.warning("%s: one sample at a time: %s", self._graph.name, error)
-            return None
-        return None if library is None else library[SYMBOL_LANES]
-
-    def __call__(self, samples: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Values (k, m) for samples (k, n).
-
-        Raises:
-            KernelError: The function itself reports a failure.
-        """
-        given = doubles(samples)
-        if self._map is None or not len(given):
-            (values,) = self._one_by_one(given)
-            return values.reshape(len(given), self._n_out)
-        values = np.empty((len(given), self._n_out))
-        steps = [(ctypes.c_int64 * 1)(size) for size in (self._n_in, self._n_out)]
-        places = [(ctypes.c_void_p * 1)(memory(array)) for array in (given, values)]
-        job = MapJob(
-            *(ctypes.addressof(item) for pair in zip(places, steps, strict=True) for item in pair),
-            len(given),
-            0,
-            SLICE,
-        )
-        drive(self._graph.name, self._map, job)
-        return values
 
 
 Array = NDArray[np.float64]
@@ -512,12 +457,9 @@ class Recurrence:
         if not count:
             return states[1:], records
         # Every sample reads its state where the one before has written it.
-        inputs = (ctypes.c_void_p * 2)(memory(states), memory(asked))
-        outputs = (ctypes.c_void_p * 2)(memory(states[1:]), memory(records))
-        sizes = states.shape[1], asked.shape[1], records.shape[1]
-        into, out = (ctypes.c_int64 * 2)(*sizes[:2]), (ctypes.c_int64 * 2)(sizes[0], sizes[2])
-        pointers = map(ctypes.addressof, (inputs, into, outputs, out))
-        job = MapJob(*pointers, count=count, next=0, slice=SLICE)
+        size, given, told = states.shape[1], asked.shape[1], records.shape[1]
+        arrays = (states, asked), (size, given), (states[1:], records), (size, told)
+        job, _kept = _map_job(*arrays, count)
         drive(self._kernel.name, self._kernel.entry, job)
         return states[1:], records
 

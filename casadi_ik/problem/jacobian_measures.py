@@ -22,13 +22,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.kernels.function_kernel import MeasureKernel
+from casadi_ik.kernels.function_kernel import FunctionKernel
 from casadi_ik.kernels.graphs import FunctionGraph, recipe
 from casadi_ik.kernels.layout import Field
 from casadi_ik.problem.contacts import LENGTH
@@ -56,14 +57,21 @@ class _Measured:
     Attributes:
         name: Its name in the fields of the trace.
         columns: Positions in q of what it depends on and maps.
-        kernel: Smallest singular value and condition number for values of these.
+        graph: Smallest singular value and condition number for values of these.
+        compiled: False keeps to the virtual machine.
         everywhere: Whether it is measured where the arm is not yet placed, too.
     """
 
     name: str
     columns: tuple[int, ...]
-    kernel: MeasureKernel
+    graph: FunctionGraph
+    compiled: bool
     everywhere: bool
+
+    @cached_property
+    def kernel(self) -> FunctionKernel:
+        """Made when first needed."""
+        return FunctionKernel(self.graph, self.compiled, in_lanes=True)
 
 
 class JacobianMeasures:
@@ -126,7 +134,7 @@ class JacobianMeasures:
     def prepare(self) -> None:
         """Compile what it needs."""
         for part in self._parts:
-            part.kernel.prepare()
+            _ = part.kernel
 
     def __call__(self, rows: NDArray[Any]) -> NDArray[np.float32]:
         """The values (m, fields) of rows (m,) that have the standard fields q and phase."""
@@ -139,9 +147,9 @@ class JacobianMeasures:
         for i, part in enumerate(self._parts):
             columns = slice(2 * i, 2 * i + 2)
             if part.everywhere or placed is None:
-                values[:, columns] = part.kernel(q)
+                (values[:, columns],) = part.kernel(q)
             else:
-                values[placed, columns] = part.kernel(np.take(q, placed, axis=0))
+                (values[placed, columns],) = part.kernel(np.take(q, placed, axis=0))
         return values
 
     def _measured(
@@ -164,8 +172,7 @@ class JacobianMeasures:
 
         inputs = {"q": (n, 1)}
         graph = FunctionGraph(full, build, inputs, ((2, 1),), recipe(full, robot))
-        kernel = MeasureKernel(graph, self._compiled)
-        return _Measured(name, columns, kernel, everywhere=name == HAND)
+        return _Measured(name, columns, graph, self._compiled, everywhere=name == HAND)
 
     def _arm(self, body: ActuatedKinematics) -> tuple[Expr, Expr]:
         columns = self._robot.arm_actuators

@@ -12,14 +12,14 @@ leave free none is made: the pseudo-inverse takes the smallest (motors as `motor
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from casadi_ik.arrays import Array
-from casadi_ik.kernels import FunctionGraph
-from casadi_ik.kernels.function_kernel import MeasureKernel
+from casadi_ik.kernels import FunctionGraph, FunctionKernel
 from casadi_ik.kernels.graphs import recipe
 from casadi_ik.methods.common.contact_fit import whole_residual
 from casadi_ik.problem.contacts import ContactRows, Kinds, suffix
@@ -62,8 +62,12 @@ class SensitivityKernel:
         size = sum(rows * columns for rows, columns in self._inputs.values())
         self._name = name = ca.Function.fix_name(f"{robot.name}_sensitivity{suffix(kinds)}")
         self._shapes, known = {"given": (size, 1)}, recipe(name, robot, kinds)
-        graph = FunctionGraph(name, self._graph, self._shapes, ((6 * f, 1),), known)
-        self._kernel = MeasureKernel(graph, compiled)
+        self._outputs, self._recipe, self._compiled = ((6 * f, 1),), known, compiled
+
+    @cached_property
+    def _kernel(self) -> FunctionKernel:
+        graph = FunctionGraph(self._name, self._graph, self._shapes, self._outputs, self._recipe)
+        return FunctionKernel(graph, self._compiled, in_lanes=True)
 
     def __call__(self, targets: TargetBatch, q: Array, gradients: Array) -> Sensitivity:
         """Derivatives of ``gradients @ q`` for answers q (k, n) to k targets, gradients (k, n)."""
@@ -75,7 +79,7 @@ class SensitivityKernel:
         for name in self._inputs.keys() - values.keys():
             values[name] = np.nan_to_num(targets.vectors(name))
         given = [values[name].reshape(len(q), -1) for name in self._inputs]
-        found = self._kernel(np.concatenate(given, axis=1, dtype=float))
+        (found,) = self._kernel(np.concatenate(given, axis=1, dtype=float))
         points, normals = np.split(found.reshape(len(q), -1, 3), 2, axis=1)
         return Sensitivity(points, normals)
 

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 import casadi_ik as ik
 from casadi_ik.kernels import FunctionGraph, FunctionKernel
-from casadi_ik.kernels.function_kernel import MeasureKernel
 
 from .graphs import needs_compiler, random_expression
 
@@ -136,7 +135,7 @@ def graph() -> FunctionGraph:
 def test_any_number_of_samples(count, compiled):
     rng = np.random.default_rng(count)
     x = rng.normal(size=(count, 3)) * [10.0 ** rng.uniform(-8, 4), 1.0, 1.0]
-    found = MeasureKernel(graph(), compiled)(x)
+    (found,) = FunctionKernel(graph(), compiled, in_lanes=True)(x)
     expected = np.stack([np.sin(x[:, 0]), np.cos(x[:, 0]), x[:, 1] * x[:, 2]], axis=1)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
 
@@ -147,17 +146,17 @@ OF_ONE = ("sin", "cos", "tan", "asin", "acos", "atan")
 
 
 @pytest.fixture(scope="module")
-def functions() -> tuple[FunctionKernel, MeasureKernel]:
+def functions() -> tuple[FunctionKernel, FunctionKernel]:
     x = ca.SX.sym("x", 2)
     values = [getattr(ca, name)(x[0]) for name in OF_ONE] + [ca.atan2(x[1], x[0])]
     function = ca.Function("elementary", [x], [ca.vertcat(*values)])
-    return FunctionKernel(function), MeasureKernel(FunctionGraph.of(function))
+    return FunctionKernel(function), FunctionKernel(function, in_lanes=True)
 
 
-def compare(functions: tuple[FunctionKernel, MeasureKernel], points: np.ndarray) -> None:
+def compare(functions: tuple[FunctionKernel, FunctionKernel], points: np.ndarray) -> None:
     alone, beside = functions
     (found,) = alone(points)
-    assert beside(points).tobytes() == found.tobytes()
+    assert beside(points)[0].tobytes() == found.tobytes()
     x, y = points.T
     with np.errstate(all="ignore"):
         expected = [getattr(np, name.replace("a", "arc", 1) if name[0] == "a" else name)(x)
@@ -173,7 +172,7 @@ def compare(functions: tuple[FunctionKernel, MeasureKernel], points: np.ndarray)
 
 
 @pytest.mark.parametrize("scale", [1e-300, 1e-8, 1e-3, 1.0, 3.0, 1e3, 4e8, 1e12, 1e300])
-def test_all_sizes(functions: tuple[FunctionKernel, MeasureKernel], scale: float) -> None:
+def test_all_sizes(functions: tuple[FunctionKernel, FunctionKernel], scale: float) -> None:
     rng = np.random.default_rng(3)
     points = rng.normal(size=(20_000, 2)) * scale
     points[:, 1] *= 10.0 ** rng.uniform(-8, 7, len(points))
@@ -181,7 +180,7 @@ def test_all_sizes(functions: tuple[FunctionKernel, MeasureKernel], scale: float
 
 
 def test_quarters_of_a_turn_and_their_edges(
-    functions: tuple[FunctionKernel, MeasureKernel],
+    functions: tuple[FunctionKernel, FunctionKernel],
 ) -> None:
     angles = np.concatenate([np.arange(-64, 65) * np.pi / 8 + d for d in (-1e-9, 0.0, 1e-9)])
     compare(functions, np.stack([angles, 1 + angles], axis=1))
@@ -189,7 +188,7 @@ def test_quarters_of_a_turn_and_their_edges(
     compare(functions, np.stack([edges, edges[::-1]], axis=1))
 
 
-def test_signs_of_zero(functions: tuple[FunctionKernel, MeasureKernel]) -> None:
+def test_signs_of_zero(functions: tuple[FunctionKernel, FunctionKernel]) -> None:
     zeros = np.array([[x, y] for x in (0.0, -0.0, 2.0, -2.0) for y in (0.0, -0.0)])
     found = functions[0](zeros)[0][:, -1]
     np.testing.assert_array_equal(found, np.arctan2(zeros[:, 1], zeros[:, 0]))
@@ -197,7 +196,7 @@ def test_signs_of_zero(functions: tuple[FunctionKernel, MeasureKernel]) -> None:
 
 
 def test_one_lane_that_is_large_changes_no_other(
-    functions: tuple[FunctionKernel, MeasureKernel],
+    functions: tuple[FunctionKernel, FunctionKernel],
 ) -> None:
     points = np.random.default_rng(5).normal(size=(64, 2))
     points[::5, 0] *= 1e11
@@ -206,11 +205,11 @@ def test_one_lane_that_is_large_changes_no_other(
 
 @settings(max_examples=300, deadline=None)
 @given(st.floats(allow_subnormal=False), st.floats(-1e6, 1e6, allow_subnormal=False))
-def test_any_number(functions: tuple[FunctionKernel, MeasureKernel], x: float, y: float) -> None:
+def test_any_number(functions: tuple[FunctionKernel, FunctionKernel], x: float, y: float) -> None:
     alone, beside = functions
     points = np.array([[x, y]] * 3)
     (found,) = alone(points)
-    assert found.tobytes() == beside(points).tobytes()
+    assert found.tobytes() == beside(points)[0].tobytes()
     if not np.isnan(x):
         assert abs(found[0, -1] - np.arctan2(y, x)) <= 1e-15 * 4
 
@@ -223,7 +222,7 @@ def agree(function: ca.Function, samples: np.ndarray, rtol: float = 1e-13) -> np
     """Values of a function of one vector: compiled, side by side and in the virtual machine."""
     (found,) = FunctionKernel(function)(samples)
     (expected,) = FunctionKernel(function, compiled=False)(samples)
-    beside = MeasureKernel(FunctionGraph.of(function))(samples)
+    (beside,) = FunctionKernel(function, in_lanes=True)(samples)
     assert beside.tobytes() == found.tobytes()
     np.testing.assert_allclose(found, expected, rtol=rtol, atol=1e-15)
     return found
@@ -284,7 +283,8 @@ def test_elementary_functions_computed_together(scale: float) -> None:
     samples = np.random.default_rng(5).normal(size=(500, COUNT)) * scale
     samples[0] = [np.nan, 0.0, -0.0, np.inf, 1.0, -1.0, 6e8]
     (whole,) = FunctionKernel(function)(samples)
-    np.testing.assert_array_equal(MeasureKernel(FunctionGraph.of(function))(samples), whole)
+    (beside,) = FunctionKernel(function, in_lanes=True)(samples)
+    np.testing.assert_array_equal(beside, whole)
     one, other = ca.SX.sym("x"), ca.SX.sym("y")
     sine = FunctionKernel(ca.Function("one_sine", [one], [ca.sin(one)]))
     angle = FunctionKernel(ca.Function("one_angle", [one, other], [ca.atan2(one, other)]))
@@ -316,7 +316,7 @@ def test_operations_on_special_numbers() -> None:
     function = ca.Function("operations", [v], [ca.vertcat(*values)])
     kernel = FunctionKernel(function)
     (found,), (expected,) = kernel(pairs), FunctionKernel(function, compiled=False)(pairs)
-    beside = MeasureKernel(FunctionGraph.of(function))(pairs)
+    (beside,) = FunctionKernel(function, in_lanes=True)(pairs)
     np.testing.assert_array_equal(beside, found)
     same = np.signbit(beside) == np.signbit(found)
     assert (same | np.isnan(found)).all()

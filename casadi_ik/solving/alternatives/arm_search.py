@@ -23,7 +23,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.kernels.cancellation import DriverCode, check
 from casadi_ik.kernels.codegen import driver_text
-from casadi_ik.kernels.function_kernel import MapJob, MeasureKernel, doubles, machine_lanes, memory
+from casadi_ik.kernels.function_kernel import MapJob, doubles, machine_lanes, memory
 from casadi_ik.kernels.graphs import recipe
 from casadi_ik.kernels.libraries import load_library
 from casadi_ik.problem.clearance import ROUNDING, CollisionQuery
@@ -186,9 +186,8 @@ class ArmSearch:
         # Of the very limits, as exports have them: the sum of low and range may differ from high.
         self.values = SearchValues.of(family, lower, upper)
         name = ca.Function.fix_name(f"{robot.name}_all_arms")
-        self._arms = MeasureKernel(
-            arms_graph(family, name, recipe(name, robot.description)), compiled
-        )
+        arms = arms_graph(family, name, recipe(name, robot.description))
+        self._arms = FunctionKernel(arms, compiled, in_lanes=True)
         self._lanes = machine_lanes() if compiled else 0
         self._run: Any = self._load() if self._lanes else None
         self._tables = tuple(map(doubles, (*self.values.levels, self.values.closer)))
@@ -349,7 +348,7 @@ class ArmSearch:
         rows, n = self._family.rows, len(self._columns)
         palm, (lower, upper) = asked.palms[hand], asked.bounds
         pose = np.tile(np.append(palm[:3, :3], palm[:3, 3]), (len(values), 1))
-        found = self._arms(np.hstack([pose, values]))
+        (found,) = self._arms(np.hstack([pose, values]))
         reached = np.append(found[:, rows * n :].ravel() >= 0, True)
         arms = np.concatenate([found[:, : rows * n].reshape(-1, n), own[None, self._columns]])
         held = arms + TURN * np.floor((lower - arms) / TURN + 0.5)
