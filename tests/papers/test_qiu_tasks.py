@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
+from scipy.linalg import logm
 from toy_robots import replace
 
 import casadi_ik as ik
@@ -255,60 +256,33 @@ def test_translations_are_found_exactly(robot, motion, rng):
         np.testing.assert_allclose(rotation, 0, atol=1e-12)
 
 
-def test_rotations_across_both_normals_are_found(robot, motion, rng):
-    """A rotation about the one axis that both normals show completely, with a translation."""
-    checked = 0
-    for q in robot.random(rng, 20):
-        palm = robot.palm(q)[:3, :3]
-        local = robot.contacts(q)[1][1:] @ palm
-        axis = np.cross(*local)
-        if np.linalg.norm(axis) < 0.1:
-            continue
-        w = 1e-4 * axis / np.linalg.norm(axis)
-        shift = rng.normal(scale=1e-5, size=3)
-        translation, rotation = motion(q, *displaced(robot, q, shift, w))
-        np.testing.assert_allclose(rotation, w, atol=1e-7)
-        np.testing.assert_allclose(translation, 1e3 * shift, atol=1e-5)
-        checked += 1
-    assert checked > 10
+def twist_of(pose):
+    """Linear and angular part of a logarithm, by scipy."""
+    twist = np.real(logm(pose))
+    return twist[:3, -1], np.array([twist[2, 1], twist[0, 2], twist[1, 0]])
 
 
-def test_first_order_of_any_motion(robot, motion, rng):
-    """A turn about a finger's normal is invisible to that finger: the paper's averages say so.
-
-    Finger i asks for w_i = w - n_i (n_i . w) and for t + (w - w_i) x p_i, which eqs. (12) and (13)
-    average.
-    """
-    for q in robot.random(rng, 10):
-        palm = pin.SE3(robot.palm(q))
-        points, normals = robot.contacts(q)
-        levers = [palm.inverse().act(p) for p in points[1:]]
-        normals = normals[1:] @ palm.rotation
-        shift, w = rng.normal(scale=1e-5, size=3), rng.normal(scale=1e-4, size=3)
-        seen = [w - n * (n @ w) for n in normals]
-        expected = np.mean(
-            [shift + np.cross(w - w_i, p) for w_i, p in zip(seen, levers, strict=True)], axis=0
-        )
-        translation, rotation = motion(q, *displaced(robot, q, shift, w))
-        np.testing.assert_allclose(rotation, np.mean(seen, axis=0), atol=2e-7)
-        np.testing.assert_allclose(translation, 1e3 * expected, atol=2e-5)
-
-
-def test_large_rotation_is_the_chordal_mean_of_the_shortest(robot, motion, rng):
-    """Eq. (12) with its projection to SO(3) by singular values."""
-    q = robot.random(rng, 1)[0]
-    palm = robot.palm(q)[:3, :3]
-    points, normals = robot.contacts(q)
-    goals = normals[1:] + rng.normal(scale=0.5, size=(2, 3))
-    goals /= np.linalg.norm(goals, axis=1)[:, None]
-    turns = []
-    for a, b in zip(normals[1:] @ palm, goals @ palm, strict=True):
-        axis = np.cross(a, b)
-        axis *= np.arctan2(np.linalg.norm(axis), a @ b) / np.linalg.norm(axis)
-        turns.append(pin.exp3(axis))
-    U, _, Vt = np.linalg.svd(sum(turns) / 2)
-    _, rotation = motion(q, points[1:], goals)
-    np.testing.assert_allclose(pin.exp3(rotation), U @ Vt, atol=1e-12)
+def test_eqs_9_to_14_literally(robot, motion, rng):
+    for q in robot.random(rng, 5):
+        points, normals = (x[1:] for x in robot.contacts(q))
+        goal_points = points + rng.normal(scale=0.02, size=(2, 3))
+        goal_normals = normals + 0.3 * rng.normal(size=(2, 3))
+        goal_normals /= np.linalg.norm(goal_normals, axis=1, keepdims=True)
+        palm = robot.palm(q)
+        R, shifts, turns = palm[:3, :3], [], []
+        for i in range(2):
+            current, desired = R.T @ normals[i], R.T @ goal_normals[i]
+            axis = np.cross(current, desired)
+            pose = np.eye(4)
+            pose[:3, :3] = pin.exp3(np.arccos(current @ desired) * axis / np.linalg.norm(axis))
+            pose[:3, 3] = 1e3 * R.T @ (goal_points[i] - points[i])
+            linear, angular = twist_of(pose)
+            shifts.append(linear - np.cross(angular, 1e3 * R.T @ (points[i] - palm[:3, 3])))
+            turns.append(pose[:3, :3])
+        U, _, V = np.linalg.svd(sum(turns) / 2)
+        translation, rotation = motion(q, goal_points, goal_normals)
+        np.testing.assert_allclose(translation, np.mean(shifts, axis=0), rtol=1e-6)
+        np.testing.assert_allclose(rotation, twist_of(U @ V)[1], rtol=1e-6)
 
 
 def test_three_fingers(robot, rng):
