@@ -111,20 +111,6 @@ def test_all_free_but_one_finger_takes_any(robot, table):
     assert table.nearest(points[None], normals[None], 4).shape == (1, 4, 7)
 
 
-@pytest.mark.parametrize("pull", [0.0, 0.3])
-def test_numpy_finds_what_compiled_code_finds(robot, rng, pull):
-    points, normals = robot.contacts(robot.random(rng, 50))
-    normals[::3, 1] = np.nan
-    near = robot.random(rng, 50)[:, HAND]
-    found = [
-        PostureTable(robot, HAND, 300, pull=pull, compiled=compiled).nearest(
-            points, normals, 20, near
-        )
-        for compiled in (True, False)
-    ]
-    np.testing.assert_array_equal(found[0], found[1])
-
-
 def test_postures_at_limits(robot):
     table = PostureTable(robot, HAND, 256, at_limits=0.5)
     at = (table.postures == robot.lower[7:]) | (table.postures == robot.upper[7:])

@@ -240,16 +240,6 @@ def test_impossible_contacts_are_met_no_worse_than_by_hand_first(robot, targets)
     assert np.all(cost(found[0]) <= cost(found[1]) * (1 + 1e-6))
 
 
-def test_a_start_at_the_solution_takes_one_iteration(robot, solver, targets):
-    first = solver.solve_batch(*targets)
-    exact = np.flatnonzero(cost(first) < 1e-16)
-    assert len(exact) >= 6
-    again = solver.solve_batch(targets[0][exact], targets[1][exact], q0=first.q[exact])
-    np.testing.assert_array_equal(again.iterations, 1)
-    np.testing.assert_array_equal(again.restarts, 0)
-    np.testing.assert_array_equal(again.q, first.q[exact])
-
-
 def test_free_fingers_and_normals(robot, solver, targets):
     """What is free is not pulled anywhere: the rest is met although it could not be."""
     points, normals = (array[:4].copy() for array in targets)

@@ -56,21 +56,11 @@ def pinch(robot, rng):
     return q
 
 
-def test_reaching_starts_from_the_recorded_configuration(robot, stepper, rng):
+def test_reaching_moves_arm_and_thumb_alone(robot, stepper, rng):
     points, normals = robot.contacts(pinch(robot, rng))
     q = robot.home
     after, record, status = stepper(stepper.state(q), stepper.parameters(points, normals))
     assert status == ik.Status.RUNNING == record["status"]
-    assert record["phase"] == ik.answers.Phase.THUMB_REACHING
-    np.testing.assert_array_equal(record["q"], q)
-    reached_points, reached_normals = robot.contacts(q)
-    np.testing.assert_allclose(
-        record["position_error"], np.linalg.norm(reached_points - points, axis=1), rtol=1e-12
-    )
-    cosine = np.einsum("ij,ij->i", reached_normals, normals)
-    np.testing.assert_allclose(record["angle_error"], np.arccos(cosine), rtol=1e-9)
-    assert record["step_size"] == pytest.approx(np.abs(after["q"] - q).max(), rel=1e-12)
-    # Only the arm and the thumb move.
     np.testing.assert_array_equal(after["q"][[7, 10, 11, 12, 13]], q[[7, 10, 11, 12, 13]])
     assert np.all(after["q"][:7] != q[:7])
     assert after["reached"] == 1
@@ -182,17 +172,6 @@ def test_alignment_keeps_the_thumb(robot, stepper, rng):
     after, _, _ = stepper(state, parameters)
     assert before > 1e-4
     assert np.linalg.norm(robot.contacts(after["q"])[0][0] - points[0]) < 0.05 * before
-
-
-def test_limits_are_kept_or_ignored(robot, stepper, rng):
-    """The same step, clamped or not."""
-    points, normals = robot.contacts(robot.random(rng, 1)[0])
-    q = robot.upper.copy()
-    free, record, _ = stepper(stepper.state(q), stepper.parameters(points, normals))
-    kept, _, _ = stepper(stepper.state(q), stepper.parameters(points, normals, True))
-    assert np.any(free["q"] > robot.upper + 1e-3)
-    np.testing.assert_array_equal(kept["q"], np.clip(free["q"], robot.lower, robot.upper))
-    assert record["limit_mask"] == 2**14 - 1
 
 
 def test_step_cap(robot, rng):

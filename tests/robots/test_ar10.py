@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import casadi as ca
 import numpy as np
 import pytest
-from scipy.optimize import brentq
 
 import casadi_ik as ik
 from casadi_ik import robots
-from casadi_ik.symbolic import mechanisms
-from casadi_ik.symbolic.couplings import linkage
-from casadi_ik.symbolic.kinematics import actuated
 
 FINGERS = ("index", "middle", "ring", "little")
 SLIDERS = (
@@ -96,7 +91,6 @@ def test_four_bars_close(ar10):
             side = np.sign(np.imag((pin - bar.g).conj() * (bar.h * np.exp(1j * beta))))
             assert set(side) == {-1.0}
             assert np.abs(np.diff(joints[joint.name])).max() < 0.02
-            assert linkage(bar, bar).branch == -1
             seen += 1
     assert seen == 4
 
@@ -142,28 +136,9 @@ def test_toggle_margins(ar10):
 
 def test_nothing_is_nan_beyond_the_toggles(ar10):
     """Sliders far beyond their strokes: flat triangles, four-bars that cannot be assembled."""
-    q = ca.SX.sym("q", 10)
-    body = actuated(ar10.description, q)
-    graph = ca.Function("graph", [q], [body.coupling, body.kinematics.contact("index")[0]])
-    for s in (0.0, 0.01, 0.0358, 0.0392, 0.0638, 0.0652, 0.1):
-        coupling, point = graph(np.full(10, s))
-        assert coupling.is_regular()
-        assert point.is_regular()
+    q = np.repeat([[0.0], [0.01], [0.0358], [0.0392], [0.0638], [0.0652], [0.1]], 10, axis=1)
+    assert np.isfinite(list(ar10.joints(q).values())).all()
+    assert np.isfinite(ar10.contacts(q)).all()
     margins = ar10.toggle_margins(np.full(10, 0.0392))  # b - c of the index's first triangle
     assert abs(margins["index_proximal"]) < 1e-15
     assert ar10.toggle_margins(np.full(10, 0.03))["index_proximal"] < 0
-
-
-def test_the_four_bar_keeps_its_branch_to_the_toggle(ar10):
-    """On the way to the toggle position the measure falls to zero and the joint never jumps."""
-    index = next(j for j in ar10.description.movable if j.name == "index_distal")
-    bar = index.coupling
-    assert isinstance(bar, robots.FourBar)
-    linked = linkage(bar, bar)
-    end = brentq(lambda phi: float(mechanisms.linkage_toggle(ca.DM(phi), linked)), 3.33, 6.2)
-    phi = np.linspace(bar.phi_0, end, 2000)
-    values = [float(mechanisms.theta3(ca.DM(x), linked, bar.theta_3_0)) for x in phi]
-    assert np.isfinite(values).all()
-    assert np.abs(np.diff(values)).max() < 0.08
-    rates = [abs(float(mechanisms.theta3_rate(ca.DM(x), linked))) for x in phi[[0, 1000, -2]]]
-    assert rates[0] < rates[1] < rates[2]

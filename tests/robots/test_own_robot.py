@@ -85,15 +85,6 @@ def test_couplings_follow_their_closed_formulas(coupled_robot, rng):
         assert np.ptp(values) > 1e-3
 
 
-def test_published_end_of_the_four_bar(coupled_robot):
-    """Facts, section 3: q3 runs from 0 to 0.606 while q2 runs from 0 to 1.225."""
-    q = np.tile(coupled_robot.home, (2, 1))
-    q[:, 2] = [0.0415, 0.0575]
-    joints = coupled_robot.joints(q)
-    np.testing.assert_allclose(joints["left_2"], [0.0, 1.225], atol=5e-3)
-    np.testing.assert_allclose(joints["left_3"], [0.0, 0.606], atol=2e-3)
-
-
 def test_actuators_of_a_finger_see_through_the_couplings(coupled_robot):
     description = coupled_robot.description
     assert description.finger_actuators("left") == (0, 1, 2)

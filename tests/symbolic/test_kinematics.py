@@ -8,7 +8,7 @@ import pinocchio as pin
 import pytest
 
 from casadi_ik.symbolic.couplings import joint_positions
-from casadi_ik.symbolic.kinematics import actuated, axis_rotation, forward
+from casadi_ik.symbolic.kinematics import actuated, forward
 from casadi_ik.symbolic.se3 import euler_zyx
 
 
@@ -116,18 +116,6 @@ def test_palm_jacobians(pair, rng):
         np.testing.assert_allclose(euler, slope, atol=1e-6)
 
 
-def test_columns_can_be_chosen(robot, rng):
-    q = robot.random(rng, 1)[0]
-    everything = range(14)
-    chosen = [9, 3, 0]
-    full, part = (
-        numbers(over_q(robot, lambda body, c=c: body.contact_jacobian("thumb", c)), q)
-        for c in (everything, chosen)
-    )
-    for whole, columns in zip(full, part, strict=True):
-        np.testing.assert_array_equal(whole[:, chosen], columns)
-
-
 def test_a_joint_that_does_not_carry_the_link_does_not_move_it(robot, rng):
     linear, angular = numbers(
         over_q(robot, lambda body: body.contact_jacobian("thumb", range(14))),
@@ -164,16 +152,6 @@ def test_expressions_of_q_may_be_given(coupled_robot, rng):
     expected = over_q(coupled_robot, lambda b: b.coupling)
     q = 1.01 * coupled_robot.home
     np.testing.assert_allclose(numbers(f, 1.01)[0], numbers(expected, q)[0], rtol=1e-13)
-
-
-def test_axis_rotation(rng):
-    for axis in [*np.eye(3), -np.eye(3)[1], np.array([1.0, 2.0, 3.0]) / np.sqrt(14)]:
-        angle = rng.uniform(-4, 4)
-        x = ca.SX.sym("x")
-        f = ca.Function("f", [x], [ca.densify(axis_rotation(axis, x))])
-        np.testing.assert_allclose(
-            numbers(f, angle)[0], pin.AngleAxis(angle, axis).toRotationMatrix(), atol=1e-15
-        )
 
 
 def test_rounded_constants_cost_nothing(robot, monkeypatch):
