@@ -16,66 +16,58 @@ BOMB = """<?xml version="1.0"?>
 <robot name="&b;"><link name="base_link"/></robot>
 """
 
-TEXTS = {
-    # what is wrong: (text in the hand's file, its replacement, what is said)
-    "no XML": ("</robot>", "<robot>", "hand.urdf: not valid XML: "),
-    "no robot": ('<robot name="hand">', "<html>", "hand.urdf: not valid XML: mismatched tag"),
-    "unknown type": ('type="revolute"', 'type="screw"', "joint 'left_spread': type: found 'screw'"),
-    "no such link": (
-        'child link="left_1"',
-        'child link="left_7"',
-        "joint 'left_spread': child: there is no link 'left_7'",
-    ),
-    "link twice": (
-        '<link name="left_2"/>',
-        '<link name="left_1"/>',
-        "link 'left_1' appears twice",
-    ),
-    "joint twice": ('name="left_bend"', 'name="left_spread"', "joint 'left_spread' appears twice"),
-    "number": ('xyz="0 0.04 0.05"', 'xyz="0 0.04 5cm"', "origin: xyz: found '0 0.04 5cm'"),
-    "infinite": ('xyz="0 0.04 0.05"', 'xyz="0 inf 0"', "expected three finite numbers"),
-    "zero axis": ('axis xyz="0 0 1"', 'axis xyz="0 0 0"', "joint 'left_spread': axis: is zero"),
-    "limits": ('lower="-1"', 'lower="2"', "joint 'left_spread': limit: lower 2 is above upper 1.5"),
-    "limit": ('lower="-1"', 'lower="x"', "limit: lower: found 'x', expected a finite number"),
-    "no limits": (
-        '<limit lower="-1" upper="1.5" velocity="2" effort="1"/>',
-        "",
-        "joint 'left_spread' of link 'left_1' states no limits; write "
-        "limits: {left_spread: [LOWER, UPPER]} under hand",
-    ),
-    "a ball": (
-        'name="left_spread" type="revolute"',
-        'name="left_spread" type="floating"',
-        "joint 'left_spread' is floating, which has no single axis; write "
-        "locked: {left_spread: 0} under hand",
-    ),
-    "two parents": (
-        'child link="right_1"',
-        'child link="left_1"',
-        "joint 'right_spread': link 'left_1' hangs on two joints, expected a tree",
-    ),
-    "two roots": (
-        '<link name="left_2"/>',
-        '<link name="left_2"/><link name="more"/>',
-        "found several base links (base_link, more), expected one: join them by a fixed joint",
-    ),
-    "mimics nothing": ('joint="left_bend"', 'joint="elbow"', "mimics 'elbow', which is no joint"),
-    "mimics itself": (
-        'joint="left_bend"',
-        'joint="left_end"',
-        "mimics in a circle: left_end -> left_end; write locked: {left_end: 0} under hand",
-    ),
-    "no name": ('<link name="left_2"/>', "<link/>", "a link: name: missing"),
-}
+TEXTS = """
+</robot> => <robot>
+    hand.urdf: not valid XML:
+<robot name="hand"> => <html>
+    hand.urdf: not valid XML: mismatched tag
+type="revolute" => type="screw"
+    joint 'left_spread': type: found 'screw'
+child link="left_1" => child link="left_7"
+    joint 'left_spread': child: there is no link 'left_7'
+<link name="left_2"/> => <link name="left_1"/>
+    link 'left_1' appears twice
+name="left_bend" => name="left_spread"
+    joint 'left_spread' appears twice
+xyz="0 0.04 0.05" => xyz="0 0.04 5cm"
+    origin: xyz: found '0 0.04 5cm'
+xyz="0 0.04 0.05" => xyz="0 inf 0"
+    expected three finite numbers
+axis xyz="0 0 1" => axis xyz="0 0 0"
+    joint 'left_spread': axis: is zero
+lower="-1" => lower="2"
+    joint 'left_spread': limit: lower 2 is above upper 1.5
+lower="-1" => lower="x"
+    limit: lower: found 'x', expected a finite number
+<limit lower="-1" upper="1.5" velocity="2" effort="1"/> =>
+    joint 'left_spread' of link 'left_1' states no limits; write limits: {left_spread: [LOWER, UPPER]} under hand
+name="left_spread" type="revolute" => name="left_spread" type="floating"
+    joint 'left_spread' is floating, which has no single axis; write locked: {left_spread: 0} under hand
+child link="right_1" => child link="left_1"
+    joint 'right_spread': link 'left_1' hangs on two joints, expected a tree
+<link name="left_2"/> => <link name="left_2"/><link name="more"/>
+    found several base links (base_link, more), expected one: join them by a fixed joint
+joint="left_bend" => joint="elbow"
+    mimics 'elbow', which is no joint
+joint="left_bend" => joint="left_end"
+    mimics in a circle: left_end -> left_end; write locked: {left_end: 0} under hand
+<link name="left_2"/> => <link/>
+    a link: name: missing
+"""  # noqa: E501
+"""Two lines each: what is changed in the hand's file, and what is said of it."""
 
 
-@pytest.mark.parametrize("case", TEXTS)
-def test_refusals(tmp_path, case):
-    old, new, says = TEXTS[case]
-    path = hand(tmp_path)
+def pairs(text: str) -> list[tuple[str, str]]:
+    lines = [line.strip() for line in text.strip().splitlines()]
+    return list(zip(lines[::2], lines[1::2], strict=True))
+
+
+@pytest.mark.parametrize(("change", "says"), pairs(TEXTS))
+def test_refusals(tmp_path, change, says):
+    path, (old, _, new) = hand(tmp_path), change.partition(" =>")
     text = path.read_text()
     assert old in text
-    path.write_text(text.replace(old, new, 1))
+    path.write_text(text.replace(old, new.strip(), 1))
     message = refusal(describe(tmp_path, "hand: {file: hand.urdf}"))
     assert "hand.urdf" in message
     assert says in message
@@ -89,60 +81,44 @@ def refusal(path: Path) -> str:
     return message
 
 
-DESCRIPTIONS = {
-    "no file": ("hand: {file: nothing.urdf}", FINGERS, "nothing.urdf: cannot be read: No such"),
-    "palm": (
-        "hand: {file: hand.urdf, palm: nowhere}",
-        FINGERS,
-        "hand.palm: hand.urdf: unknown link 'nowhere'; known: base_link, left_1",
-    ),
-    "link of a finger": (
-        "hand: {file: hand.urdf}",
-        FINGERS.replace("left_tip", "thumb_tip"),
-        "fingers.left.link: hand.urdf: unknown link 'thumb_tip'; known: base_link",
-    ),
-    "finger not on the palm": (
-        "hand: {file: hand.urdf, palm: right_1}",
-        FINGERS,
-        "fingers.left.link: 'left_tip' does not hang on the palm 'right_1' of hand.urdf",
-    ),
-    "locked": (
-        "hand: {file: hand.urdf, locked: {left_knee: 0}}",
-        FINGERS,
-        "hand.locked: hand.urdf: unknown joint 'left_knee'; known: left_spread",
-    ),
-    "root": (
-        "hand: {file: hand.urdf, root: left_1, palm: right_1}",
-        FINGERS,
-        "hand.palm: hand.urdf: link 'right_1' does not hang on link 'left_1'",
-    ),
-    "stated limits": (
-        "hand: {file: hand.urdf, limits: {left_bend: [2, 1]}}",
-        FINGERS,
-        "hand.limits.left_bend: lower 2 is not below upper 1",
-    ),
-    "two descriptions": (
-        "hand: {file: hand.urdf}\nrobot: {file: hand.urdf}",
-        FINGERS,
-        "expected either 'hand' or 'robot'",
-    ),
-    "no fingers": ("hand: {file: hand.urdf}", "fingers: {}", "fingers: found none"),
-    "finger that cannot move": (
-        "hand: {file: hand.urdf, locked: {left_spread: 0, left_bend: 0}}",
-        FINGERS,
-        "fingers.left.link: no joint moves 'left_tip' against the palm 'base_link'",
-    ),
-    "unknown key": ("hand: {file: hand.urdf, lokced: {}}", FINGERS, "lokced"),
-    "thumb": ("hand: {file: hand.urdf}\nthumb: big", FINGERS, "has no finger 'big'; it has left"),
+DESCRIPTIONS = r"""
+hand: {file: nothing.urdf}
+    nothing.urdf: cannot be read: No such
+hand: {file: hand.urdf, palm: nowhere}
+    hand.palm: hand.urdf: unknown link 'nowhere'; known: base_link, left_1
+hand: {file: hand.urdf} / left_tip: thumb_tip
+    fingers.left.link: hand.urdf: unknown link 'thumb_tip'; known: base_link
+hand: {file: hand.urdf, palm: right_1}
+    fingers.left.link: 'left_tip' does not hang on the palm 'right_1' of hand.urdf
+hand: {file: hand.urdf, locked: {left_knee: 0}}
+    hand.locked: hand.urdf: unknown joint 'left_knee'; known: left_spread
+hand: {file: hand.urdf, root: left_1, palm: right_1}
+    hand.palm: hand.urdf: link 'right_1' does not hang on link 'left_1'
+hand: {file: hand.urdf, limits: {left_bend: [2, 1]}}
+    hand.limits.left_bend: lower 2 is not below upper 1
+hand: {file: hand.urdf}\nrobot: {file: hand.urdf}
+    expected either 'hand' or 'robot'
+hand: {file: hand.urdf} / none
+    fingers: found none
+hand: {file: hand.urdf, locked: {left_spread: 0, left_bend: 0}}
+    fingers.left.link: no joint moves 'left_tip' against the palm 'base_link'
+hand: {file: hand.urdf, lokced: {}}
+    lokced
+hand: {file: hand.urdf}\nthumb: big
+    has no finger 'big'; it has left
+"""
+OTHER_FINGERS = {
+    "": FINGERS,
+    "left_tip: thumb_tip": FINGERS.replace("left_tip", "thumb_tip"),
+    "none": "fingers: {}",
 }
 
 
-@pytest.mark.parametrize("case", DESCRIPTIONS)
-def test_refused_descriptions(tmp_path, case):
-    text, fingers, says = DESCRIPTIONS[case]
+@pytest.mark.parametrize(("written", "says"), pairs(DESCRIPTIONS))
+def test_refused_descriptions(tmp_path, written, says):
+    text, _, fingers = written.replace(r"\n", "\n").partition(" / ")
     hand(tmp_path)
-    path = describe(tmp_path, text, fingers)
-    message = refusal(path)
+    message = refusal(describe(tmp_path, text, OTHER_FINGERS[fingers]))
     assert says in message
     assert message.startswith(str(tmp_path))
 
