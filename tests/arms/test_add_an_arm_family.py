@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import re
-import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import yaml
+from package_copy import blocks, package_copy, run_with
 from toy_robots import copy_shipped_robot, replace
-
-ROOT = Path(__file__).parents[2]
 
 SCRIPT = """
 import sys
@@ -52,34 +47,14 @@ def gimbal_robot(folder: Path) -> Path:
     return path
 
 
-def package_with_the_page(folder: Path) -> None:
-    """A copy of the package with the page's blocks in their places."""
-    shutil.copytree(
-        ROOT / "casadi_ik", folder / "casadi_ik", ignore=shutil.ignore_patterns("__pycache__")
-    )
-    (folder / "models").symlink_to(ROOT / "models")
-    text = (ROOT / "docs" / "add_an_arm_family.md").read_text(encoding="utf-8")
-    family, row = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    arms = folder / "casadi_ik" / "arms"
-    (arms / "gimbal.py").write_text(family)
-    registry = arms / "recognise.py"
+def test_a_family_is_added_in_two_files(tmp_path):
+    (tmp_path / "robot").mkdir()
+    package = package_copy(tmp_path)
+    family, row = blocks("add_an_arm_family.md")
+    (package / "arms" / "gimbal.py").write_text(family)
+    registry = package / "arms" / "recognise.py"
     (old,) = re.findall(r"^FAMILIES: .*$", registry.read_text(), re.MULTILINE)
     replace(registry, old, row.rstrip())
     imported = "from casadi_ik.arms.locked_joints"
     replace(registry, imported, f"from casadi_ik.arms.gimbal import Gimbal\n{imported}")
-
-
-def test_a_family_is_added_in_two_files(tmp_path):
-    (tmp_path / "robot").mkdir()
-    (tmp_path / "package").mkdir()
-    path = gimbal_robot(tmp_path / "robot")
-    package_with_the_page(tmp_path / "package")
-    done = subprocess.run(
-        [sys.executable, "-c", SCRIPT, str(path)],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(tmp_path / "package")},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    run_with(package, SCRIPT, gimbal_robot(tmp_path / "robot"))

@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import re
-import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 from capsule_arm import write_robot
+from package_copy import blocks, package_copy, run_with
 from toy_robots import replace
-
-ROOT = Path(__file__).parents[2]
 
 SCRIPT = """
 import sys
@@ -40,43 +34,24 @@ except ik.errors.DescriptionError as error:
 """
 
 
-def package_with_the_page(folder: Path) -> None:
-    """A copy of the package with the page's blocks in their places."""
-    shutil.copytree(
-        ROOT / "casadi_ik", folder / "casadi_ik", ignore=shutil.ignore_patterns("__pycache__")
-    )
-    (folder / "models").symlink_to(ROOT / "models")
-    text = (ROOT / "docs" / "add_a_shape.md").read_text(encoding="utf-8")
-    name, row, make, entry = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    distance, call = re.findall(r"```c\n(.*?)```", text, re.DOTALL)
-    solids = folder / "casadi_ik" / "collision" / "solids.py"
+def test_a_kind_is_added_in_three_files(tmp_path: Path) -> None:
+    package = package_copy(tmp_path)
+    name, row, make, entry = blocks("add_a_shape.md")
+    distance, call = blocks("add_a_shape.md", "c")
+    solids = package / "collision" / "solids.py"
     replace(solids, "    CLOUD = 5\n", f"    CLOUD = 5\n{name}")
     replace(solids, '}\n"""The kinds:', f'{row}}}\n"""The kinds:')
     replace(solids, "def half_space()", f"{make}\n\ndef half_space()")
-    driver = folder / "casadi_ik" / "kernels" / "drivers" / "clearance.c"
+    driver = package / "kernels" / "drivers" / "clearance.c"
     before = "static LANES_TARGET along from_solid("
     replace(driver, before, f"{distance}\n{before}")
     first = "  if (one->kind == BOX)"
     replace(driver, first, f"{call}{first}")
-    scene = folder / "casadi_ik" / "collision" / "scene.py"
+    scene = package / "collision" / "scene.py"
     replace(
         scene,
         "SolidEntry = (\n    BoxEntry",
         f"{entry}\n\nSolidEntry = (\n    SlabEntry | BoxEntry",
     )
     replace(scene, "    half_space,\n", "    half_space,\n    slab,\n")
-
-
-def test_a_kind_is_added_in_three_files(tmp_path: Path) -> None:
-    (tmp_path / "package").mkdir()
-    path = write_robot(tmp_path)
-    package_with_the_page(tmp_path / "package")
-    done = subprocess.run(
-        [sys.executable, "-c", SCRIPT, str(path)],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(tmp_path / "package")},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    run_with(package, SCRIPT, write_robot(tmp_path))

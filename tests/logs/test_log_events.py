@@ -209,32 +209,6 @@ def test_near_singular_from_the_start_and_per_finger() -> None:
     ]
 
 
-def test_a_singular_row_of_a_known_jacobian() -> None:
-    """The singular values of an arm of two links, elbow straight in the middle of the way."""
-    elbow = np.linspace(-0.5, 0.5, 11)
-    shoulder = 0.3
-    sigma, condition = [], []
-    for angle in elbow:
-        tip = np.exp(1j * (shoulder + angle))
-        J = np.array(
-            [
-                [-(np.exp(1j * shoulder) + tip).imag, -tip.imag],
-                [(np.exp(1j * shoulder) + tip).real, tip.real],
-            ]
-        )
-        values = np.linalg.svd(J, compute_uv=False)
-        sigma.append(values[-1])
-        condition.append(min(values[0] / values[-1] if values[-1] else np.inf, 1e12))
-    layout, trace = trace_of(sigma_arm=sigma, condition_arm=condition)
-    arm = {"arm": RecordedJacobian(("shoulder", "elbow"), singular=0.03, condition=100.0)}
-    events = found_in(layout, trace, {"q": ("shoulder", "elbow")}, arm)
-    assert [(e.iteration, e.kind) for e in events] == [
-        (5, logs.EventKind.NEAR_SINGULAR),
-        (5, logs.EventKind.ILL_CONDITIONED),
-    ]
-    assert {e.joints for e in events} == {("shoulder", "elbow")}
-
-
 def test_stall_once_per_standstill() -> None:
     cost = np.concatenate([np.linspace(2, 1, 20), np.ones(30), np.linspace(0.9, 0.5, 5)])
     layout, trace = trace_of(cost=cost)

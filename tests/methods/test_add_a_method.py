@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import importlib.util
-import re
-from pathlib import Path
 
 import numpy as np
 import pytest
+from package_copy import blocks
 
 import casadi_ik as ik
 from casadi_ik import errors, registry
-
-PAGE = Path(__file__).parents[2] / "docs" / "add_a_method.md"
 
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory):
     """The page's lines as a module; the method is known as long as these tests run."""
     path = tmp_path_factory.mktemp("page") / "example_method.py"
-    blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-    path.write_text("\n".join(blocks), encoding="utf-8")
+    path.write_text("\n".join(blocks("add_a_method.md")), encoding="utf-8")
     spec = importlib.util.spec_from_file_location("example_method", path)
     assert spec is not None
     assert spec.loader is not None

@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-import os
-import re
-import shutil
-import subprocess
-import sys
-from pathlib import Path
 
 import casadi as ca
 import numpy as np
 import pytest
+from package_copy import blocks, package_copy, run_with
 from toy_robots import replace, write_coupled_robot
 
 import casadi_ik as ik
 from casadi_ik.robots.couplings import CouplingKind
 from casadi_ik.symbolic.couplings import coupling_rate, follow, has_toggle
-
-ROOT = Path(__file__).parents[2]
 
 SCRIPT = """
 import sys
@@ -72,41 +65,22 @@ assert missed.diagnosis.proof.check(robot)
 """
 
 
-def package_with_the_page(folder: Path) -> None:
-    """A copy of the package with the page's two blocks in their places."""
-    shutil.copytree(
-        ROOT / "casadi_ik", folder / "casadi_ik", ignore=shutil.ignore_patterns("__pycache__")
-    )
-    (folder / "models").symlink_to(ROOT / "models")
-    text = (ROOT / "docs" / "add_a_coupling.md").read_text(encoding="utf-8")
-    data, row = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    described = folder / "casadi_ik" / "robots" / "couplings.py"
-    union = "Coupling = Linear | LeadScrew | FourBar"
-    replace(described, union, f"{data}\n\n{union} | Quadratic")
-    graphs = folder / "casadi_ik" / "symbolic" / "couplings.py"
-    replace(graphs, "Linear, Polynomial\n", "Linear, Polynomial, Quadratic\n")
-    replace(graphs, '}\n"""The kinds of couplings."""', f'{row}}}\n"""The kinds of couplings."""')
-
-
 def test_a_kind_is_added_in_two_files(tmp_path):
     (tmp_path / "robot").mkdir()
-    (tmp_path / "package").mkdir()
     path = write_coupled_robot(tmp_path / "robot")
     replace(
         tmp_path / "robot" / "parts" / "hand.yaml",
         "coupling: {kind: linear, of: left_3, ratio: -0.5, offset: 0.05}",
         "coupling: {kind: quadratic, of: left_3, rise: -0.5, curve: 0.2}",
     )
-    package_with_the_page(tmp_path / "package")
-    done = subprocess.run(
-        [sys.executable, "-c", SCRIPT, str(path)],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(tmp_path / "package")},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    package = package_copy(tmp_path)
+    data, row = blocks("add_a_coupling.md")
+    union = "Coupling = Linear | LeadScrew | FourBar"
+    replace(package / "robots" / "couplings.py", union, f"{data}\n\n{union} | Quadratic")
+    graphs = package / "symbolic" / "couplings.py"
+    replace(graphs, "Linear, Polynomial\n", "Linear, Polynomial, Quadratic\n")
+    replace(graphs, '}\n"""The kinds of couplings."""', f'{row}}}\n"""The kinds of couplings."""')
+    run_with(package, SCRIPT, path)
 
 
 class Wire(CouplingKind, frozen=True, tag="wire"):
