@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,8 @@ pytest.importorskip("mujoco")
 import touch_hold
 
 import casadi_ik as ik
+
+REPORT = Path(touch_hold.__file__).parent / "results" / "touch_hold"
 
 
 def test_the_study_writes_its_report(tmp_path):
@@ -39,3 +42,12 @@ def test_the_area_under_the_curve():
     assert touch_hold.auc(np.array([4.0, 1.0, 3.0, 2.0]), held) == 1.0
     assert touch_hold.auc(np.array([1.0, 4.0, 2.0, 3.0]), held) == 0.0
     assert touch_hold.auc(np.ones(4), held) == 0.5
+
+
+def test_in_the_committed_report_the_load_predicts():
+    found = {one["name"]: one["value"] for one in json.loads((REPORT / "metrics.json").read_text())}
+    areas = [value for name, value in found.items() if name.endswith("/auc")]
+    assert len(areas) == len(touch_hold.ROBOTS)
+    assert min(areas) >= 0.9
+    best = [value for name, value in found.items() if name.endswith("/best_third")]
+    assert np.mean(best) >= 90
