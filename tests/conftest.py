@@ -56,6 +56,12 @@ def robot() -> ik.ArmHand:
 
 
 @pytest.fixture(scope="session")
+def ar10() -> ik.ArmHand:
+    """The shipped AR10 hand: ten sliders, no arm."""
+    return ik.load_robot("ar10")
+
+
+@pytest.fixture(scope="session")
 def coupled_robot(tmp_path_factory: pytest.TempPathFactory) -> ik.ArmHand:
     """A small robot in which every kind of coupling and joint occurs."""
     return ik.load_robot(write_coupled_robot(tmp_path_factory.mktemp("coupled")))

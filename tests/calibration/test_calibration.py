@@ -27,11 +27,6 @@ EXACT = (1e-9, 1e-9)
 
 
 @pytest.fixture(scope="module")
-def ar10() -> ik.ArmHand:
-    return ik.load_robot("ar10")
-
-
-@pytest.fixture(scope="module")
 def index(ar10) -> HandModel:
     return HandModel(ar10.description, hand_parameters(ar10.description, ["index"]))
 

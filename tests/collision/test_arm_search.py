@@ -15,11 +15,6 @@ from casadi_ik.solving.trials import Deduplicator, best_of_each, first_of_each
 
 
 @pytest.fixture(scope="module")
-def robot() -> ik.ArmHand:
-    return ik.load_robot("kuka_lwr_barrett")
-
-
-@pytest.fixture(scope="module")
 def solver(robot) -> ik.Solver:
     pole = {"kind": "capsule", "radius": 0.05, "length": 1.0, "xyz": [0.3, 0.25, 0.5]}
     return ik.Solver(robot, scene=ik.Scene({"pole": pole}))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from capsule_arm import write_robot
 from coal_oracle import described, distance
+from toy_robots import grasp_at
 
 import casadi_ik as ik
 from casadi_ik import errors
@@ -36,10 +37,7 @@ def cloud(points: np.ndarray, **more: object) -> ik.Scene:
 
 def clearances(robot: ik.ArmHand, scene: ik.Scene, q: np.ndarray, **how: bool) -> np.ndarray:
     """(k,) with everything that is checked [m]."""
-    points, normals = robot.contacts(robot.home)
-    contacts = zip(robot.fingers, points, normals, strict=True)
-    grasp = ik.Grasp({name: ik.Contact(*contact) for name, *contact in contacts})
-    found = ik.Solver(robot, scene=scene, **how).check(q, grasp)
+    found = ik.Solver(robot, scene=scene, **how).check(q, grasp_at(robot, robot.home))
     assert found is not None
     return found.distance
 

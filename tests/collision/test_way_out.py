@@ -11,11 +11,6 @@ import casadi_ik as ik
 from casadi_ik.collision.distances import gaps
 
 
-@pytest.fixture(scope="module")
-def robot() -> ik.ArmHand:
-    return ik.load_robot("kuka_lwr_barrett")
-
-
 def test_what_is_said_to_help_does(robot) -> None:
     """A ball over the cup: it is said how far the cup has to go, and there it has an answer."""
     cup = ik.load_grasp("cup")

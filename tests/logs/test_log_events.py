@@ -296,11 +296,6 @@ def test_solves_do_not_see_each_other(seed: int, counts: list[int]) -> None:
     assert list(map(repr, together)) == list(map(repr, alone))
 
 
-@pytest.fixture(scope="module")
-def robot() -> ik.ArmHand:
-    return ik.load_robot("kuka_lwr_barrett")
-
-
 def test_entries_and_leavings() -> None:
     """Two solves: one begins touching and is free twice, the other is always free."""
     form = TraceFormat(Layout.record(Field("clearance", (), "f4", "m")))
@@ -372,11 +367,6 @@ def test_why_names_what_blocks_and_that_nothing_was_checked(robot, tmp_path: Pat
     log = logs.open(plain)
     assert "collision not checked" in logs.explain(logs.one_solve(log)).verdict
     assert "clearance" not in log.iterations().names
-
-
-@pytest.fixture(scope="module")
-def ar10() -> ik.ArmHand:
-    return ik.load_robot("ar10")
 
 
 def margins(robot, q):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from samplers import near_limits
+from toy_robots import grasp_at
 
 import casadi_ik as ik
 
@@ -137,11 +138,7 @@ def test_what_is_near_an_arm_whose_last_joint_is_searched_is_found(name):
 
 def test_all_solutions_of_a_panda(panda, solver):
     q = panda.random(np.random.default_rng(6), 1)[0]
-    points, normals = panda.contacts(q)
-    grasp = ik.Grasp(
-        {name: ik.Contact(points[i], normals[i]) for i, name in enumerate(panda.fingers)}
-    )
-    found = solver.solve_all(grasp, limit=100, apart=0)
+    found = solver.solve_all(grasp_at(panda, q), limit=100, apart=0)
     assert len(found) > 1
     for one in found:
         assert all(contact.ok for contact in one.contacts.values())

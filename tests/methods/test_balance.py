@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
+from toy_robots import grasp_of
 
 import casadi_ik as ik
 from casadi_ik.methods.common.bounded_step import Bounded, clip, damped_step, elimination
@@ -249,13 +250,7 @@ def test_alone_in_a_batch_and_in_blocks_the_answer_is_the_same(robot):
     rows = np.flatnonzero(batch.phases["balance"])[:8]
     assert len(rows)
     for row in rows:
-        grasp = ik.Grasp(
-            {
-                name: ik.Contact(points[row, i], normals[row, i])
-                for i, name in enumerate(robot.fingers)
-            }
-        )
-        alone = solver.solve(grasp, diagnose=False)
+        alone = solver.solve(grasp_of(robot, points[row], normals[row]), diagnose=False)
         # A grasp normalises its normals itself, so the last digit may differ.
         np.testing.assert_allclose(alone.q, batch.q[row], atol=1e-6)
         assert alone.success == batch.success[row]
@@ -296,8 +291,7 @@ def test_fits_that_come_back_to_a_minimum_that_misses_end_the_rounds_of_tables(r
     patient = ik.Solver(robot, options={"same_minimum": (10**6, 10**6), "far_cost": (1e9, 1e9)})
     assert not patient.solve_batch(points[missed], normals[missed]).success.any()
     row = np.flatnonzero(missed)[batch.restarts[missed] == given_up][0]
-    contacts = zip(robot.fingers, points[row], normals[row], strict=True)
-    grasp = ik.Grasp({finger: ik.Contact(point, normal) for finger, point, normal in contacts})
+    grasp = grasp_of(robot, points[row], normals[row])
     assert max(record["restart"] for record in solver.stepper(grasp)) <= given_up + 1
 
 

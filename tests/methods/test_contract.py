@@ -9,6 +9,7 @@ import pickle
 import numpy as np
 import pytest
 from pinocchio_oracle import PinocchioRobot, verdict
+from toy_robots import grasp_of
 
 import casadi_ik as ik
 from casadi_ik import registry
@@ -52,12 +53,7 @@ class Case:
         return ik.Solver(self.robot, self.method, **options)
 
     def grasp(self, row: int = 0) -> ik.Grasp:
-        return ik.Grasp(
-            {
-                finger: ik.Contact(self.points[row, i], self.normals[row, i])
-                for i, finger in enumerate(self.robot.fingers)
-            }
-        )
+        return grasp_of(self.robot, self.points[row], self.normals[row])
 
 
 @pytest.fixture(scope="module", params=CASES, ids="-".join)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from toy_robots import copy_shipped_robot
+from toy_robots import copy_shipped_robot, grasp_of
 
 import casadi_ik as ik
 
@@ -58,9 +58,9 @@ def test_the_turn_it_is_held_in_costs_neither_alternatives_nor_free_answers(comp
         q[:, 0] = turn - 2.0
         points, normals = robot.contacts(q)
         solved = free.solve_batch(points, normals, fixed=fixed).success
-        places = zip(robot.fingers, points[0], normals[0], strict=True)
-        grasp = ik.Grasp({name: ik.Contact(*place) for name, *place in places})
-        alternatives = solver.solve_all(grasp, limit=9, fixed=fixed)
+        alternatives = solver.solve_all(
+            grasp_of(robot, points[0], normals[0]), limit=9, fixed=fixed
+        )
         counts.append((len(alternatives), solved.tolist()))
     assert counts[0] == counts[1]
     assert counts[0][0] > 1

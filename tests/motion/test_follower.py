@@ -7,6 +7,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from samplers import smooth_path
+from toy_robots import grasp_at
 
 import casadi_ik as ik
 
@@ -95,9 +96,7 @@ def test_a_target_that_leaps_is_met_at_rest(robot, solver, seed):
     rng = np.random.default_rng(seed)
     start = 0.7 * robot.home + 0.3 * robot.random(rng, 1)[0]
     end = start + 0.15 * (robot.random(rng, 1)[0] - start)
-    grasp = ik.Grasp(
-        {n: ik.Contact(*pair) for n, *pair in zip(robot.fingers, *robot.contacts(end), strict=True)}
-    )
+    grasp = grasp_at(robot, end)
     follower = solver.follow(start, PERIOD)
     q = np.array([start] + [follower(grasp) for _ in range(1500)])
     check_limits(robot, follower, q)

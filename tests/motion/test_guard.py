@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from dense_ways import dense
 from samplers import smooth_path
+from toy_robots import grasp_of
 
 import casadi_ik as ik
 from casadi_ik.motion.clear import RESOLUTION, between, motor_units
@@ -75,12 +76,7 @@ def test_a_path_keeps_clear(robot, solver):
     points, normals = robot.contacts(robot.home)
     low = points[:, 2].min()
     moving = [
-        ik.Grasp(
-            {
-                n: ik.Contact(p - [0, 0, z], m)
-                for n, p, m in zip(robot.fingers, points, normals, strict=True)
-            }
-        )
+        grasp_of(robot, points - np.array([0, 0, z]), normals)
         for z in np.linspace(0, low + 0.2, 40)
     ]
     track = solver.track(moving, q0=robot.home)
@@ -123,10 +119,7 @@ def test_a_path_that_is_free_is_followed_as_without_a_scene(robot, solver):
     path = smooth_path(robot, 2, 60, 0.02, share=0.5)
     path = robot.home + 0.05 * (path - path[0])
     assert clearances(solver, path).free.all()
-    moving = [
-        ik.Grasp({n: ik.Contact(*c) for n, *c in zip(robot.fingers, *pair, strict=True)})
-        for pair in zip(*robot.contacts(path), strict=True)
-    ]
+    moving = [grasp_of(robot, *pair) for pair in zip(*robot.contacts(path), strict=True)]
     track = solver.track(moving, q0=path[0])
     assert track.success.all()
     assert track.jumps == ()

@@ -10,11 +10,6 @@ import casadi_ik as ik
 
 
 @pytest.fixture(scope="module")
-def robot() -> ik.ArmHand:
-    return ik.load_robot("kuka_lwr_barrett")
-
-
-@pytest.fixture(scope="module")
 def solver(robot) -> ik.Solver:
     return ik.Solver(robot)
 

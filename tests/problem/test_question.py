@@ -11,11 +11,6 @@ FINE = ik.Tolerance(1e-6, 1e-6)
 COARSE = ik.Tolerance(0.08, 0.5)
 
 
-@pytest.fixture(scope="module")
-def robot() -> ik.ArmHand:
-    return ik.load_robot("kuka_lwr_barrett")
-
-
 def grasp(robot, q, tolerances=None, shift=0.0) -> ik.Grasp:
     """The contacts of a configuration, the thumb's moved along its normal."""
     points, normals = robot.contacts(q)

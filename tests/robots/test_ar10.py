@@ -16,11 +16,6 @@ SLIDERS = (
 )
 
 
-@pytest.fixture(scope="module")
-def ar10() -> ik.ArmHand:
-    return ik.load_robot("ar10")
-
-
 def strokes(robot: ik.ArmHand, rows: int = 200) -> np.ndarray:
     """All sliders from shortest to longest."""
     return robot.lower + np.linspace(0, 1, rows)[:, None] * (robot.upper - robot.lower)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from imported_files import FINGERS, arm, describe, hand, joint, link, urdf
+from toy_robots import grasp_at
 
 import casadi_ik as ik
 from casadi_ik.importing.check import largest_difference
@@ -231,9 +232,7 @@ def test_a_method_that_needs_a_thumb_says_so(tmp_path):
 
 def test_a_robot_without_a_thumb_is_solved_and_logged(tmp_path, rng):
     robot = both(tmp_path)
-    points, normals = robot.contacts(robot.random(rng, 1)[0])
-    contacts = zip(robot.fingers, points, normals, strict=True)
-    grasp = ik.Grasp({name: ik.Contact(point, normal) for name, point, normal in contacts})
+    grasp = grasp_at(robot, robot.random(rng, 1)[0])
     solver = ik.Solver(robot, compiled=False)
     assert solver.solve(grasp, log=tmp_path / "solve.mcap").success
     assert (tmp_path / "solve.mcap").exists()

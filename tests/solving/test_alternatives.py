@@ -14,11 +14,6 @@ APART, DISTINCT = 0.25, 0.05
 
 
 @pytest.fixture(scope="module")
-def robot() -> ik.ArmHand:
-    return ik.load_robot("kuka_lwr_barrett")
-
-
-@pytest.fixture(scope="module")
 def solver(robot) -> ik.Solver:
     return ik.Solver(robot)
 

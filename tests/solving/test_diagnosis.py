@@ -269,17 +269,6 @@ def test_nearest_contacts(solver: ik.Solver, robot: ik.ArmHand, cup: tuple[Array
     assert again.success.all()
 
 
-def test_same_twice(solver: ik.Solver, cup: tuple[Array, Array]) -> None:
-    def once() -> ik.BatchSolution:
-        return solver.solve_batch(cup[0][None] + [0.5, 0.2, 0], cup[1][None], diagnose=True)
-
-    one, other = once().diagnoses[0], once().diagnoses[0]
-    assert one is not None
-    assert other is not None
-    assert one.lines == other.lines
-    np.testing.assert_array_equal(one.q, other.q)
-
-
 def impossible(robot: ik.ArmHand, count: int) -> tuple[Array, Array]:
     """Targets of several kinds, most of them out of reach."""
     rng = np.random.default_rng(21)

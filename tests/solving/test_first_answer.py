@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from toy_robots import grasp_of
 
 import casadi_ik as ik
 from casadi_ik.exporting.ahead import uses
@@ -100,12 +101,7 @@ def test_what_the_first_round_does_not_solve_waits(
 ) -> None:
     """So nobody's answer depends on when it was asked for."""
     points, normals = robot.contacts(robot.home)
-    grasp = ik.Grasp(
-        {
-            name: ik.Contact(point + 5.0, normal)
-            for name, point, normal in zip(robot.fingers, points, normals, strict=True)
-        }
-    )
+    grasp = grasp_of(robot, points + 5.0, normals)
     expected = ik.Solver(robot).solve(grasp)
     monkeypatch.setenv("CASADI_IK_CACHE", str(tmp_path))
     monkeypatch.setenv("CASADI_IK_COMPILE", "background")

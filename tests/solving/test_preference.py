@@ -29,17 +29,6 @@ def path(robot, rng, steps):
     return start + np.arange(steps)[:, None] * direction * 0.25e-3 / speed
 
 
-def test_what_solves_already_is_not_moved(robot, rng):
-    q = robot.random(rng, 50)
-    solver = ik.Solver(robot, compiled=False)
-    batch = solver.solve_batch(*robot.contacts(q), q0=q)
-    assert batch.success.all()
-    np.testing.assert_array_equal(batch.q, q)
-    assert batch.iterations.max() <= 1
-    alone = solver.solve(grasp_at(robot, q[0]), q0=q[0])
-    np.testing.assert_array_equal(alone.q, q[0])
-
-
 def test_along_paths_of_small_steps_nothing_jumps(robot, rng):
     """It was up to 208 degrees."""
     solver = ik.Solver(robot, tolerance=EXACT, compiled=False)

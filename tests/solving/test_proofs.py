@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from robot_variants import derived_robot
+from toy_robots import grasp_of, write_coupled_robot
 from toy_robots import replace as put
-from toy_robots import write_coupled_robot
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
@@ -401,8 +401,7 @@ def test_what_is_not_proved_is_not_unreachable(
         lambda problems, most: [None] * len(problems),
     )
     points, normals = ik.load_grasp("cup").arrays(robot.fingers)
-    far = {n: ik.Contact(points[i] - [1, 0, 0], normals[i]) for i, n in enumerate(robot.fingers)}
-    solution = solver.solve(ik.Grasp(far))
+    solution = solver.solve(grasp_of(robot, points - [1, 0, 0], normals))
     assert solution.status is ik.Status.NOT_FOUND
     diagnosis = solution.diagnosis
     assert diagnosis is not None

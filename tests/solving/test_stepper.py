@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from toy_robots import grasp_of
 
 import casadi_ik as ik
 from casadi_ik import errors
@@ -55,12 +56,7 @@ def test_steps_go_through_all_rounds(method: str, tmp_path) -> None:
     robot = ik.load_robot("kuka_lwr_barrett")
     solver = ik.Solver(robot, method)
     points, normals = ik.load_grasp("sugar_box").arrays(robot.fingers)
-    away = ik.Grasp(
-        {
-            finger: ik.Contact(point + np.array([0.0, 0.0, 3.0]), normal)
-            for finger, point, normal in zip(robot.fingers, points, normals, strict=True)
-        }
-    )
+    away = grasp_of(robot, points + np.array([0.0, 0.0, 3.0]), normals)
     solution = same_as_the_log(solver, away, tmp_path / "x.mcap")
     assert solution.status is ik.Status.STALLED
     # Six rounds of eight hands from tables, three along valleys and two from anywhere.

@@ -230,11 +230,6 @@ def test_eqs_13_14_17_the_control_twist_removes_its_part_of_the_error(w1, p1, w2
     np.testing.assert_allclose(np.array(ca.vertcat(*whole[::-1])).ravel(), twist, atol=1e-9)
 
 
-@pytest.fixture(scope="module")
-def ar10() -> ik.ArmHand:
-    return ik.load_robot("ar10")
-
-
 def joint(robot: ik.ArmHand, name: str):
     return next(each for each in robot.description.movable if each.name == name)
 
