@@ -191,6 +191,7 @@ class FoundGrasps(Sequence[FoundGrasp]):
         """The same in short lines."""
         lines = [f"{len(self)} distinct grasps in {self.time:.2f} s of processor time"]
         lines += [f"  {number:>9,} {stage}" for stage, number in self.counts.items()]
+        lines += [f"{self.surface.name}: {note}" for note in self.surface.notes]
         if self.reason:
             return (*lines, f"none: {self.reason}")
         lines.append(f"best by {self.prefer}:")

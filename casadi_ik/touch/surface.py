@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
@@ -51,6 +51,7 @@ class Surface:
         faces: (m, 3) unit outward normals of the triangles themselves.
         inside: (m,) whether a fingertip's pad fits: no edge of the surface is near.
         parameters: How it was sampled.
+        notes: What is odd about the mesh, and what was made of it; empty for a closed one.
 
     Example:
         >>> surface = ik.load_surface("tomato_soup_can")
@@ -66,6 +67,7 @@ class Surface:
     faces: Array
     inside: Bools
     parameters: SurfaceParameters
+    notes: tuple[str, ...] = ()
 
     @cached_property
     def size(self) -> float:
@@ -142,7 +144,8 @@ def load_surface(
     Raises:
         UnknownNameError: No shipped object has that name.
         DescriptionError: The file is missing or malformed.
-        InputError: A scale for an object that is no mesh, or a surface too large for a hand.
+        InputError: A scale for an object that is no mesh, or a surface that is no body's: without
+            area, flat, too large or small for a hand, or with triangles that face opposite ways.
 
     Example:
         >>> surface = ik.load_surface("tomato_soup_can")
@@ -153,23 +156,77 @@ def load_surface(
     name = str(name_or_path) if scale == 1.0 else f"{name_or_path}@{scale:g}"
     thing = load_object(name)
     vertices, triangles = thing.mesh(resolution=96)
+    vertices, triangles, notes = _body(name, vertices, triangles)
     corners = vertices[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     doubled = np.linalg.norm(normals, axis=1)
-    if not doubled.sum() > 0:
-        raise InputError(f"{name}: found a surface without area, expected a mesh of a body")
-    if np.ptp(vertices, axis=0).max() > 2.0:
-        raise InputError(
-            f"{name}: found a size of {np.ptp(vertices, axis=0).max():.3g} m, expected metres and "
-            "at most 2 m; scale=0.001 is for millimetres"
-        )
     rng = np.random.default_rng(seed)
     face = rng.choice(len(triangles), chosen.samples, p=doubled / doubled.sum())
     u, v = np.sqrt(rng.random(chosen.samples)), rng.random(chosen.samples)
     weights = np.stack([1 - u, u * (1 - v), u * v], axis=1)
     points = (corners[face] * weights[..., None]).sum(axis=1)
     own = normals[face] / doubled[face, None]
-    return _smoothed(name, thing, points, own, chosen)
+    return replace(_smoothed(name, thing, points, own, chosen), notes=notes)
+
+
+SIZES = (5e-3, 2.0)
+"""Least and largest edge of the box around an object that a hand may grasp [m]."""
+
+FLAT = 1e-4
+"""What is thinner has no two sides for a hand [m]."""
+
+DISAGREE = 0.05
+"""Share of edges whose two triangles may face opposite ways: scans have some."""
+
+
+def _body(
+    name: str, vertices: Array, triangles: NDArray[np.int64]
+) -> tuple[Array, NDArray[np.int64], tuple[str, ...]]:
+    """A mesh whose triangles face outwards, and what was odd about it.
+
+    Raises:
+        InputError: It is no body's, see `load_surface`.
+    """
+    corners = vertices[triangles]
+    crossed = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    if not np.linalg.norm(crossed, axis=1).sum() > 0:
+        raise InputError(f"{name}: found a surface without area, expected a mesh of a body")
+    largest = np.ptp(vertices, axis=0).max()
+    if not SIZES[0] <= largest <= SIZES[1]:
+        raise InputError(
+            f"{name}: found a size of {largest:.3g} m, expected metres, from {SIZES[0]:g} to "
+            f"{SIZES[1]:g} m; scale=0.001 is for millimetres"
+        )
+    middle = vertices.mean(axis=0)
+    _, axes = np.linalg.eigh(np.cov((vertices - middle).T))
+    thin = np.ptp(vertices @ axes[:, 0])
+    if thin < FLAT:
+        raise InputError(
+            f"{name}: found a flat sheet ({1e3 * thin:.2g} mm), expected a mesh of a body"
+        )
+    notes: list[str] = []
+    _, same = np.unique(np.round(vertices, 7), axis=0, return_inverse=True)
+    merged = same.reshape(-1)[triangles]
+    edges = merged[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    edges = edges[edges[:, 0] != edges[:, 1]]
+    forward = edges[:, 0] < edges[:, 1]
+    key = np.sort(edges, axis=1) @ np.array([len(vertices), 1])
+    _, edge, users = np.unique(key, return_inverse=True, return_counts=True)
+    ways = np.bincount(edge, weights=forward)
+    wrong = int(((users == 2) & (ways != 1)).sum())
+    if wrong > DISAGREE * len(users):
+        raise InputError(
+            f"{name}: found triangles that face opposite ways at {wrong:,} of {len(users):,} "
+            "edges, expected outward normals; trimesh.repair.fix_normals mends such a mesh"
+        )
+    border = int((users == 1).sum())
+    if border:
+        notes.append(f"the mesh is open: {border:,} edges have one triangle only")
+    volume = ((corners[:, 0] - middle) * crossed).sum() / 6
+    if volume < 0:
+        notes.append("the mesh was inside out: its triangles are turned")
+        triangles = triangles[:, ::-1]
+    return vertices, triangles, tuple(notes)
 
 
 def _smoothed(

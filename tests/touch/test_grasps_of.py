@@ -188,6 +188,70 @@ def test_bad_questions_are_refused(surface, asked, expected):
         solver_of("panda+panda_hand").grasps_of(surface, **{"pose": PLACE, **asked})
 
 
+def written(tmp_path, mesh):
+    mesh.export(tmp_path / "mesh.stl")
+    return tmp_path / "mesh.stl"
+
+
+def test_a_mesh_that_is_inside_out_is_turned_and_said(tmp_path, surface):
+    mesh = trimesh.creation.cylinder(0.033, 0.1, sections=128)
+    mesh.invert()
+    turned = ik.load_surface(written(tmp_path, mesh))
+    assert ((turned.faces * turned.points).sum(axis=1) > 0).all()
+    assert turned.notes == ("the mesh was inside out: its triangles are turned",)
+    assert not surface.notes
+    found = solver_of("panda+panda_hand").grasps_of(turned, PLACE, limit=3)
+    assert len(found) == 3
+    assert "inside out" in str(found)
+
+
+def test_an_open_mesh_serves_and_is_said(tmp_path):
+    mesh = trimesh.creation.cylinder(0.033, 0.1, sections=128)
+    mesh.update_faces(mesh.triangles_center[:, 2] < 0.049)
+    opened = ik.load_surface(written(tmp_path, mesh))
+    assert opened.notes == ("the mesh is open: 128 edges have one triangle only",)
+    assert len(solver_of("panda+panda_hand").grasps_of(opened, PLACE, limit=3)) == 3
+
+
+def test_triangles_that_face_opposite_ways_are_refused(tmp_path):
+    mesh = trimesh.creation.cylinder(0.033, 0.1, sections=128)
+    faces = np.array(mesh.faces)
+    faces[::2] = faces[::2, ::-1]
+    mixed = trimesh.Trimesh(mesh.vertices, faces, process=False)
+    with pytest.raises(errors.InputError, match=r"face opposite ways at .* expected outward"):
+        ik.load_surface(written(tmp_path, mixed))
+
+
+def test_sheets_and_specks_are_no_bodies(tmp_path):
+    sheet = trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0.1]], [[0, 1, 2]])
+    with pytest.raises(errors.InputError, match="found a flat sheet"):
+        ik.load_surface(written(tmp_path, sheet))
+    with pytest.raises(errors.InputError, match="found a size of 1e-06 m, expected metres"):
+        ik.load_surface(written(tmp_path, trimesh.creation.box((1e-6, 1e-6, 1e-6))))
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("# nothing\n", "is an empty mesh, expected triangles"),
+        ("v 0 0 0\nv nan 1 0\nv 0 1 1\nf 1 2 3\n", "has corners that are not finite"),
+        ("v 0 0 0\nv inf 1 0\nv 0 1 1\nf 1 2 3\n", "has corners that are not finite"),
+    ],
+)
+def test_what_is_no_mesh_is_refused(tmp_path, text, expected):
+    (tmp_path / "mesh.obj").write_text(text)
+    with pytest.raises(errors.DescriptionError, match=expected):
+        ik.load_surface(tmp_path / "mesh.obj")
+
+
+def test_many_triangles_are_sampled(tmp_path):
+    ball = trimesh.creation.icosphere(subdivisions=7, radius=0.035)
+    assert len(ball.faces) > 300_000
+    surface = ik.load_surface(written(tmp_path, ball))
+    assert surface.inside.all()
+    assert np.abs(np.linalg.norm(surface.points, axis=1) - 0.035).max() < 1e-5
+
+
 def test_millimetres_are_told(tmp_path):
     trimesh.creation.cylinder(33, 100).export(tmp_path / "can.stl")
     with pytest.raises(errors.InputError, match=r"scale=0\.001 is for millimetres"):
