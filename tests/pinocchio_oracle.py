@@ -60,3 +60,20 @@ def verdict(oracle: PinocchioRobot, q, points, normals) -> tuple[np.ndarray, np.
     cosine = np.einsum("ij,ij->i", n, normals)
     sine = np.linalg.norm(np.cross(n, normals), axis=1)
     return np.linalg.norm(p - points, axis=1), np.arctan2(sine, cosine)
+
+
+def assert_verdicts(oracle: PinocchioRobot, batch, points, normals, enforce: bool = True) -> None:
+    """Errors, limits and success of every row of a batch, recomputed from q alone."""
+    robot, model = oracle.robot, oracle.model
+    usual = ik.Tolerance()
+    for row, q in enumerate(batch.q):
+        position, angle = verdict(oracle, q, points[row], normals[row])
+        np.testing.assert_allclose(batch.position_error[row], position, atol=1e-11)
+        np.testing.assert_allclose(batch.angle_error[row], angle, atol=1e-11)
+        theta = oracle.configuration(q)
+        inside = np.all(theta >= model.lowerPositionLimit - 1e-9)
+        inside &= np.all(theta <= model.upperPositionLimit + 1e-9)
+        inside &= np.all(q >= robot.lower - 1e-9) and np.all(q <= robot.upper + 1e-9)
+        assert batch.limits_ok[row] == inside
+        met = np.all(position <= usual.position) and np.all(angle <= usual.angle)
+        assert batch.success[row] == (met and (inside or not enforce))

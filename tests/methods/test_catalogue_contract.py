@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 import re
 
 import numpy as np
 import pytest
-from pinocchio_oracle import PinocchioRobot, verdict
+from pinocchio_oracle import PinocchioRobot, assert_verdicts
 
 import casadi_ik as ik
 from casadi_ik import errors
@@ -53,15 +52,6 @@ def test_verdict_on_targets_near_home(robot, oracle, method):
     options = {"finger_step": "closed-form"} if method.startswith("enhanced") else {}
     solver = ik.Solver(robot, method, compiled=False, **options)
     batch = solver.solve_batch(points, normals)
-    for row, found in enumerate(batch.q):
-        position, angle = verdict(oracle, found, points[row], normals[row])
-        np.testing.assert_allclose(batch.position_error[row], position, atol=1e-11)
-        np.testing.assert_allclose(batch.angle_error[row], angle, atol=1e-11)
-        theta = oracle.configuration(found)
-        inside = np.all(theta >= oracle.model.lowerPositionLimit - 1e-9)
-        inside &= np.all(theta <= oracle.model.upperPositionLimit + 1e-9)
-        inside &= np.all(found >= robot.lower - 1e-9) and np.all(found <= robot.upper + 1e-9)
-        met = np.all(position <= 5e-3) and np.all(angle <= math.radians(3))
-        assert batch.success[row] == (met and inside)
+    assert_verdicts(oracle, batch, points, normals)
     if method in FINDING:
         assert batch.success.all(), batch.status_names
