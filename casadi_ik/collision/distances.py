@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import product
 
 import numpy as np
@@ -262,6 +262,7 @@ def _points_from(points: Array, pose: Array, solid: Solid) -> float:
     return float(solid.distance(points @ pose[:3, :3].T + pose[:3, 3]).min())
 
 
+@lru_cache(maxsize=256)
 def surface_points(solid: Solid, rays: int = 256, steps: int = 12) -> Array:
     """(k, 3) points of a solid's surface in its frame, along its edges too.
 

@@ -16,7 +16,7 @@ robot never comes nearer than the margin to what stands still.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -243,6 +243,34 @@ def _half_way(one: Array, other: Array) -> Array:
     return mean
 
 
+class Held(Protocol):
+    """A robot with what it holds: what is free of collisions is for it to say."""
+
+    def blocked(self, q: Array) -> str:
+        """What is in the way between postures (k, n); "": nothing."""
+        ...
+
+    def in_the_way(self, q: Array) -> str:
+        """What touches in one posture (1, n); "": nothing."""
+        ...
+
+
+def _blocked(query: CollisionQuery | Held, q: Array) -> bool:
+    """Whether anything is in the way from each of some postures (k, n) to the next."""
+    if isinstance(query, CollisionQuery):
+        return not between(query, q).free.all()
+    return bool(query.blocked(q))
+
+
+def _touching(query: CollisionQuery | Held, q: Array) -> str:
+    """What touches in one posture (1, n); "": nothing."""
+    if not isinstance(query, CollisionQuery):
+        return query.in_the_way(q)
+    if query.free(q)[0]:
+        return ""
+    return f"{' and '.join(query.check(q).pair(0) or ())} touch"
+
+
 STRIDES = (0.02, 0.005, 0.002)
 """Longest steps of a motor between postures that a planner looks at [rad, or part of its range]:
 finer ones where a way turns out not to be free between them."""
@@ -258,7 +286,7 @@ def free_way(
     robot: ArmHand,
     start: Array,
     end: Array,
-    query: CollisionQuery | None,
+    query: CollisionQuery | Held | None,
     seed: int,
     limit: float = 5.0,
 ) -> tuple[Array | None, str]:
@@ -276,12 +304,11 @@ def free_way(
         The corners, None if no way was found; and how it was found, or why not.
     """
     units, straight = motor_units(robot), np.stack([start, end])
-    if query is None or between(query, straight).free.all():
+    if query is None or not _blocked(query, straight):
         return straight, "straight"
     for posture, name in ((start, "start"), (end, "pre-grasp")):
-        found = query.check(posture[None])
-        if not found.free[0]:
-            return None, f"the {name} is not free: {' and '.join(found.pair(0) or ())} touch"
+        if touching := _touching(query, posture[None]):
+            return None, f"the {name} is not free: {touching}"
     try:
         from ompl import base, geometric, util
     except ImportError:
@@ -289,15 +316,21 @@ def free_way(
     util.setLogLevel(util.LogLevel.LOG_NONE)
     util.RNG.setSeed(seed + 1)  # OMPL takes the first of a process
     n = len(start)
+    lower, upper = robot.lower, robot.upper
+    if not (query is None or isinstance(query, CollisionQuery)):
+        # What is held stays held: but for rounding the hand does not move.
+        hand = np.isin(np.arange(n), robot.description.hand_actuators)
+        lower = np.where(hand, np.minimum(start, end) - 1e-7, lower)
+        upper = np.where(hand, np.maximum(start, end) + 1e-7, upper)
     space = base.RealVectorStateSpace(n)
     bounds = base.RealVectorBounds(n)
     for i in range(n):
-        bounds.setLow(i, float(robot.lower[i] / units[i]))
-        bounds.setHigh(i, float(robot.upper[i] / units[i]))
+        bounds.setLow(i, float(lower[i] / units[i]))
+        bounds.setHigh(i, float(upper[i] / units[i]))
     space.setBounds(bounds)
     setup = geometric.SimpleSetup(space)
     setup.setStateValidityChecker(
-        lambda state: bool(query.free(units * _numbers(state, n)[None])[0])
+        lambda state: not _touching(query, units * _numbers(state, n)[None])
     )
     states: list[Any] = []
     for posture in (start, end):
@@ -318,7 +351,7 @@ def free_way(
         found_way = setup.getSolutionPath().getStates()
         corners = units * np.array([_numbers(state, n) for state in found_way])
         corners[0], corners[-1] = start, end
-        if between(query, corners).free.all():
+        if not _blocked(query, corners):
             return corners, "OMPL, RRT-Connect"
     return None, "the ways that OMPL found are not free between the postures it looked at"
 

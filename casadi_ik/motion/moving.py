@@ -15,11 +15,13 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.grasps import Grasp
+from casadi_ik.grasps.pose import inverse, one_pose
 from casadi_ik.methods.hand_first.method import UNBOUNDED
 from casadi_ik.motion.approach import Approach, ApproachPlan, approach
 from casadi_ik.motion.follower import Follower
 from casadi_ik.motion.inputs import FollowPlan
-from casadi_ik.motion.reach import Pace, Reach, ReachPlan, move, reach
+from casadi_ik.motion.place import PlacePlan, place
+from casadi_ik.motion.reach import Carried, Pace, Reach, ReachPlan, move, reach
 from casadi_ik.motion.timing import Rates, a_direction, length, rates_of, seconds, unbounded
 from casadi_ik.motion.track import PathTracker, Track, track
 from casadi_ik.problem.contacts import by_kinds
@@ -217,6 +219,86 @@ class MovingSolver:
         solutions, why = self._solutions(grasp, last.problem, start, seed, limit)
         asked = ReachPlan(last, pace, seed, *onward)
         return reach(asked, np.clip(start, *last.plan.bounds), solutions, why)
+
+    def place(
+        self,
+        held: Chosen,
+        pose: ArrayLike,
+        q0: ArrayLike,
+        lower: float = 0.05,
+        opening: float = 0.02,
+        distance: float = 0.08,
+        velocity: ArrayLike | None = None,
+        acceleration: ArrayLike | None = None,
+        period: float = 0.01,
+        seed: int = 0,
+        limit: int = 4,
+        direction: ArrayLike | None = None,
+    ) -> Reach:
+        """The way from where the hand holds an object to where it stands elsewhere, in time.
+
+        The object is carried over its place, straight or around what is in the way; comes straight
+        down; the hand opens, and goes straight back. With a scene all of it is checked, the object
+        with the scene while it is carried, hand and object afterwards.
+
+        Args:
+            held: What was reached: an answer of `choose` or `grasps_of`, whose grasp says where its
+                object is.
+            pose: (4, 4) where the object is to stand, base frame.
+            q0: (n,) where the robot is, at rest: at the end of `reach`, say [rad or m].
+            lower: From how far above the object comes straight down [m].
+            opening: How far the fingertips are from their contacts before the hand goes [m].
+            distance: How far it goes straight [m].
+            velocity: As for `follow`.
+            acceleration: As for `follow`.
+            period: Time between two samples of the motion [s].
+            seed: Of starts and of a planner.
+            limit: Postures that are tried at most.
+            direction: (3,) against which the hand goes, as for `reach`.
+
+        Returns:
+            A `Reach` whose parts are "carrying", "lowering", "opening" and "leaving"; its `q` is
+            where the object stands and the hand has not opened yet.
+
+        Raises:
+            InputError: Bad numbers, or a grasp that does not say where its object is.
+            MissingExtraError: toppra is not installed (extra `motion`).
+            UnsupportedError: The method is not hand-first, or no arm moves the palm.
+
+        Example:
+            >>> best = solver.choose([grasp])[0]
+            >>> up = solver.reach(best, lift=0.05)
+            >>> beside = grasp.object_pose.copy()
+            >>> beside[1, 3] += 0.05
+            >>> down = solver.place(best, beside, up.motion.q[-1])
+            >>> down.status.name, down.motion.notes["part"][-1].item()
+            ('REACHED', 'leaving')
+        """
+        start, chosen, target = self._request.start(q0), held.grasp, one_pose(pose)
+        if chosen.object_pose is None:
+            raise InputError("held: found a grasp without object_pose, expected one")
+        if not self.robot.description.arm_actuators:
+            raise UnsupportedError(f"place: {self.robot.name!r} has no arm that moves its palm")
+        moved = target @ inverse(chosen.object_pose)
+        q = self._request.start(held.q, "q")
+        hand = {self.robot.actuators[i]: float(q[i]) for i in self._palm_motors}
+        palm = Grasp(robot=chosen.robot, palm=moved @ self.robot.palm(q), posture=hand)
+        there = replace(chosen.at(moved), pregrasp=None)
+        last = self._last_part(there, start, opening, distance, direction)
+        carried = None
+        if self._engine.check is not None:
+            carried = Carried(self._engine.check, self._request.of_grasps([chosen], None), q)
+        pace = Pace(rates_of(self.robot, velocity, acceleration), seconds("period", period))
+        asked = PlacePlan(last, carried, length("lower", lower), pace, seed)
+        problem = self._request.of_grasps([palm], None)
+        solutions, why = self._solutions(palm, problem, start, seed, limit)
+        return place(asked, np.clip(start, *last.plan.bounds), solutions, why)
+
+    @property
+    def _palm_motors(self) -> list[int]:
+        """Motors that move a finger."""
+        robot = self.robot.description
+        return sorted({i for name in robot.finger_names for i in robot.finger_actuators(name)})
 
     def move(
         self,

@@ -29,11 +29,13 @@ class Carried:
 
     Attributes:
         step: Motion of the palm [m] between two places where the object is compared with the scene.
+        turn: Way of the motors together between two postures that are compared [rad].
         giving: By how much it may come nearer to what it stands on, or touches, while it is taken
             away [m].
     """
 
     step = 1e-3
+    turn = 0.03
     giving = 1e-3
 
     def __init__(self, check: SceneCheck, problem: TargetBatch, q: Array) -> None:
@@ -50,11 +52,21 @@ class Carried:
         if pose is None and self._name in check.scene.items:
             pose = check.scene.items[self._name].pose
         self._in_palm = None if pose is None else inverse(self._robot.palm(q)) @ pose
+        if pose is not None:
+            self._held = check.scene.holding(self._name, np.eye(4)).items[self._name]
 
     def blocked(self, q: Array) -> str:
         """What is in the way from each of k postures (k, n) straight to the next; "": nothing."""
-        query = self._query_at(q)
-        return least_clearance(query, q)[1] or self._comes_near(q)
+        # Between postures what is held goes straight, and the palm on an arc: steps are small.
+        fine = _finely(q, q, self.turn)
+        return least_clearance(self._query_at(fine), fine)[1] or self._comes_near(q)
+
+    def in_the_way(self, q: Array) -> str:
+        """What touches in one posture (1, n); "": nothing."""
+        found = self._query_at(q).check(q)
+        if not found.free[0]:
+            return f"{' and '.join(found.pair(0) or ())} touch"
+        return self._comes_near(q, self.giving)
 
     def _query_at(self, q: Array) -> CollisionQuery:
         every = self._problem.rows(np.zeros(len(q), dtype=np.intp))
@@ -64,12 +76,16 @@ class Carried:
         held = replace(every, object=self._name, object_pose=poses)
         return self._check.collision_query(held, carried=True)
 
-    def _comes_near(self, q: Array) -> str:
-        """What in the scene the object comes too near to, as far as it is not there already."""
+    def _comes_near(self, q: Array, before: float | None = None) -> str:
+        """What in the scene the object comes too near to, as far as it is not there already.
+
+        Args:
+            q: (k, n) postures.
+            before: How near it may have been before [m]; None: as in the first posture.
+        """
         scene = self._check.scene
         if self._in_palm is None:
             return ""
-        held = scene.holding(self._name, np.eye(4)).items[self._name]
         poses = (
             self._robot.palm(_finely(q, self._robot.palm(q)[:, :3, 3], self.step)) @ self._in_palm
         )
@@ -79,8 +95,9 @@ class Carried:
             if name == self._name or pair in allowed:
                 continue
             usual = scene.margin if item.margin is None else item.margin
-            apart = gaps(held, [item], poses)
-            if apart.min() < min(scene.margins.get(pair, usual), float(apart[0]) - self.giving):
+            apart = gaps(self._held, [item], poses)
+            there = float(apart[0]) if before is None else before
+            if apart.min() < min(scene.margins.get(pair, usual), there - self.giving):
                 return f"{self._name} and {name} touch"
         return ""
 
@@ -90,8 +107,8 @@ def _finely(q: Array, places: Array, step: float) -> Array:
 
     Args:
         q: (k, n).
-        places: (k, 3) where the palm is there [m].
-        step: [m] between two of them.
+        places: (k, d) where something is there.
+        step: How far apart two of them are at most.
     """
     steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
     counts = np.maximum(np.ceil(steps / step), 1).astype(int)
@@ -190,7 +207,7 @@ def reach(asked: ReachPlan, q0: Array, solutions: Sequence[Array], why: str) -> 
         why: Why there are none.
     """
     if not solutions:
-        return _none(ReachStatus.NOT_SOLVED, why)
+        return failed(ReachStatus.NOT_SOLVED, why)
     reasons: list[tuple[ReachStatus, str]] = []
     for one in approaches(asked.approach, solutions):
         if one.last is None:
@@ -203,7 +220,7 @@ def reach(asked: ReachPlan, q0: Array, solutions: Sequence[Array], why: str) -> 
     # That which came farthest says most.
     order = list(ReachStatus)
     status, reason = max(reasons, key=lambda one: order.index(one[0]))
-    return _none(status, reason, len(solutions))
+    return failed(status, reason, len(solutions))
 
 
 def move(
@@ -220,12 +237,12 @@ def move(
     """
     corners, how = free_way(robot, *ends, query, seed)
     if corners is None:
-        return _none(ReachStatus.NO_WAY, how)
-    motion = _in_time(robot, [(GOING, np.stack(pair)) for pair in pairwise(corners)], pace)
+        return failed(ReachStatus.NO_WAY, how)
+    motion = in_time(robot, [(GOING, np.stack(pair)) for pair in pairwise(corners)], pace)
     clearance, reason = (None, "") if query is None else least_clearance(query, motion.q)
     if reason:
-        return _none(ReachStatus.NO_WAY, f"the timed motion is not free: {reason}")
-    return _reached(how, motion, ends[1], clearance, 1, pace)
+        return failed(ReachStatus.NO_WAY, f"the timed motion is not free: {reason}")
+    return reached(how, motion, ends[1], clearance, 1, pace)
 
 
 def _whole(asked: ReachPlan, q0: Array, one: Tried, last: LastPart) -> Reach:
@@ -235,13 +252,13 @@ def _whole(asked: ReachPlan, q0: Array, one: Tried, last: LastPart) -> Reach:
     carried = None if check is None else Carried(check, asked.approach.problem, one.q)
     after = _after(asked, one, last, carried)
     if isinstance(after, str):
-        return _none(ReachStatus.NO_RETREAT, after)
+        return failed(ReachStatus.NO_RETREAT, after)
     corners, how = free_way(robot, q0, last.coming[0], one.open_handed, asked.seed)
     if corners is None:
-        return _none(ReachStatus.NO_WAY, how)
+        return failed(ReachStatus.NO_WAY, how)
     going = [(GOING, np.stack(pair)) for pair in pairwise(corners)]
     parts = [*going, (COMING, last.coming), (CLOSING, last.closing), *after]
-    motion = _in_time(robot, parts, asked.pace)
+    motion = in_time(robot, parts, asked.pace)
     number = np.array([PARTS.index(part) for part in motion.notes["part"]])
     # Each begins where the one before ends.
     shut, held = (int((number <= PARTS.index(part)).sum()) for part in (COMING, CLOSING))
@@ -255,8 +272,8 @@ def _whole(asked: ReachPlan, q0: Array, one: Tried, last: LastPart) -> Reach:
         reason = reason or least_clearance(one.holding, motion.q[shut - 1 : held])[1]
         reason = reason or carried.blocked(motion.q[held - 1 :])
     if reason:
-        return _none(ReachStatus.NO_WAY, f"the timed motion is not free: {reason}")
-    return _reached(f"way there: {how}", motion, one.q, clearance, one.number, asked.pace)
+        return failed(ReachStatus.NO_WAY, f"the timed motion is not free: {reason}")
+    return reached(f"way there: {how}", motion, one.q, clearance, one.number, asked.pace)
 
 
 def _after(
@@ -281,18 +298,20 @@ def _after(
     return found
 
 
-def _none(status: ReachStatus, reason: str, tried: int = 0) -> Reach:
+def failed(status: ReachStatus, reason: str, tried: int = 0) -> Reach:
+    """A motion that there is not, and why."""
     return Reach(status, reason, None, None, None, tried)
 
 
-def _reached(
+def reached(
     reason: str, motion: Motion, q: Array, clearance: float | None, tried: int, pace: Pace
 ) -> Reach:
+    """A motion that ends in a posture (n,)."""
     taken = shares(motion.q, pace.period, pace.rates)
     return Reach(ReachStatus.REACHED, reason, motion, q, clearance, tried, *taken)
 
 
-def _in_time(robot: ArmHand, ways: Sequence[tuple[str, Array]], pace: Pace) -> Motion:
+def in_time(robot: ArmHand, ways: Sequence[tuple[str, Array]], pace: Pace) -> Motion:
     """Ways (k, n), each from where the last one ends, in time, at rest between them."""
     q, names = [ways[0][1][:1]], [ways[0][0]]
     for name, way in ways:

@@ -135,6 +135,32 @@ def test_there_is_a_way_to_most_grasps_and_up_from_there(found):
     np.testing.assert_allclose(up[:3, 3], [0, 0, 0.08], atol=3e-3)
 
 
+def test_what_is_lifted_is_placed_elsewhere(found):
+    solver, grasps = found
+    robot, to = solver.robot, PLACE.copy()
+    to[:3, 3] = [0.45, -0.15, 0.055]
+    ways = ((one, solver.reach(one, lift=0.1)) for one in grasps)
+    one, up = next((one, way) for one, way in ways if way.success)
+    down = solver.place(one, to, up.motion.q[-1])
+    assert down.success, down.reason
+    motion, part = down.motion, down.motion.notes["part"]
+    assert list(dict.fromkeys(part.tolist())) == ["carrying", "lowering", "opening", "leaving"]
+    np.testing.assert_array_equal(motion.q[0], up.motion.q[-1])
+    # The object is held as it was, and stands where it was to be.
+    in_palm = np.linalg.inv(robot.palm(one.q)) @ PLACE
+    carried = robot.palm(motion.q[(part == "carrying") | (part == "lowering")]) @ in_palm
+    np.testing.assert_allclose(carried[-1], to, atol=3e-3)
+    assert carried[:, 2, 3].min() > PLACE[2, 3] - 3e-3
+    motors = [robot.actuators.index(name) for name in one.grasp.posture]
+    np.testing.assert_allclose(
+        motion.q[part == "carrying"][:, motors],
+        np.tile(one.q[motors], ((part == "carrying").sum(), 1)),
+        atol=2e-3,
+    )
+    tips = robot.contacts(motion.q[-1])[0] - robot.contacts(down.q)[0]
+    assert np.linalg.norm(tips, axis=1).min() > 0.05
+
+
 def test_seeds_decide_and_jobs_do_not(found, surface):
     solver, grasps = found
     again = solver.grasps_of(surface, PLACE, limit=12, seed=1, jobs=2)
