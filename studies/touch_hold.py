@@ -9,7 +9,8 @@ elsewhere than the hand believes, and the hand closes on it::
     python studies/touch_hold.py --robots panda+leap --objects cup mug --limit 20
     python studies/touch_hold.py --objects ycb/*.obj --out results/touch_hold_ycb
 
-Needs MuJoCo (``pip install mujoco``).
+(with the google_16k scans of elpis-lab/ycb_dataset, MIT, whose `textured.obj` are named as their
+folders). Needs MuJoCo (``pip install mujoco``).
 """
 
 from __future__ import annotations
