@@ -44,7 +44,7 @@ def test_the_area_under_the_curve():
     assert touch_hold.auc(np.ones(4), held) == 0.5
 
 
-@pytest.mark.parametrize(("folder", "least"), [("touch_hold", 0.94), ("touch_hold_ycb", 0.89)])
+@pytest.mark.parametrize(("folder", "least"), [("touch_hold", 0.94), ("touch_hold_ycb", 0.88)])
 def test_in_the_committed_reports_the_load_predicts(folder, least):
     text = (RESULTS / folder / "metrics.json").read_text()
     found = {one["name"]: one["value"] for one in json.loads(text)}
