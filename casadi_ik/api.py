@@ -16,7 +16,7 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.collision.scene import Scene, grasped_in
 from casadi_ik.errors import InputError
 from casadi_ik.grasps import Grasp
-from casadi_ik.grasps.pose import checked_pose, one_pose
+from casadi_ik.grasps.pose import Free, checked_pose, one_pose
 from casadi_ik.kernels.loop import Stepper
 from casadi_ik.logs import Compression, Keep
 from casadi_ik.logs.writer import recorder_of
@@ -29,6 +29,7 @@ from casadi_ik.solving.alternatives.finder import APART
 from casadi_ik.solving.choose import Judgement, choose
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.fast import FastSolver
+from casadi_ik.solving.free_object import solve_with_object
 from casadi_ik.solving.run import Run
 from casadi_ik.solving.sensitivity import Sensitivity
 from casadi_ik.solving.stream import SolvedBlock, Stream
@@ -172,6 +173,17 @@ class Solver(MovingSolver):
         targets = self._request.of_grasps(
             [grasp], fixed, self._engine.preference(prefer, q0 is not None)
         )
+        if isinstance(grasp.object_pose, Free):
+            if log is not None:
+                raise InputError("log: found beside a Free object_pose, expected one of them")
+            start = self.robot.start(q0)
+            return solve_with_object(
+                lambda some, why: self._engine.solve(some, Run(start, seed, diagnose=why)),
+                targets,
+                grasp.object_pose,
+                start,
+                self.robot.upper - self.robot.lower,
+            )
         if log is None:
             return self._engine.solve_one(targets, Run(q0, seed, diagnose=diagnose))
         with recorder_of(self, log, seed) as recorder:

@@ -9,6 +9,7 @@ from casadi_ik.datasets import Candidates, load_candidates
 from casadi_ik.errors import CasadiIKError
 from casadi_ik.files.shipped import shipped_names
 from casadi_ik.grasps import Contact, Grasp, Tolerance, load_grasp, shipped_grasps
+from casadi_ik.grasps.pose import Free
 from casadi_ik.problem.status import Status
 from casadi_ik.registry import METHODS, register_method
 from casadi_ik.touch.surface import Surface, load_surface
@@ -23,6 +24,7 @@ __all__ = [
     "Candidates",
     "CasadiIKError",
     "Contact",
+    "Free",
     "Grasp",
     "Scene",
     "Solution",

@@ -120,6 +120,7 @@ class Solution(Shown):
             for.
         palm: How far the palm is from where it was asked; None where contacts were asked for.
         arm_hand: The robot; None: not known.
+        object_pose: (4, 4) where the object is, if that was looked for.
 
     Example:
         >>> solution = solver.solve(grasp)
@@ -147,6 +148,7 @@ class Solution(Shown):
     collision: CollisionReport | None = None
     palm: PalmVerdict | None = None
     arm_hand: ArmHand | None = None
+    object_pose: Array | None = None
 
     def draw(
         self,

@@ -428,8 +428,8 @@ def scene_of(scene: Scene, about: Array, without: str = "") -> list[Drawable]:
 
 def with_object(scene: Scene, grasp: Grasp | None) -> Scene:
     """The scene with what a grasp names as its object where it has it."""
-    if grasp is not None and grasp.object and grasp.object_pose is not None:
-        return scene.holding(grasp.object, grasp.object_pose)
+    if grasp is not None and grasp.object and grasp.known_pose is not None:
+        return scene.holding(grasp.object, grasp.known_pose)
     return scene
 
 

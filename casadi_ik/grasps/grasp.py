@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.arrays import Array, Bools, frozen
 from casadi_ik.errors import InputError
-from casadi_ik.grasps.pose import inverse, one_pose
+from casadi_ik.grasps.pose import Free, inverse, one_pose
 
 
 @dataclass(frozen=True)
@@ -271,7 +271,8 @@ class Grasp:
         robot: Name (or path) of the robot the grasp was made for; "" if not said.
         name: What it is called, for reports.
         object: Name of the shipped object it grasps; "" if not said.
-        object_pose: (4, 4) pose of that object in the base frame, or None.
+        object_pose: (4, 4) pose of that object in the base frame, or None. A `Free` pose is looked
+            for by `Solver.solve`: the contacts are then in the object's frame.
         posture: A hand posture by actuator that realises the contacts, where one is known; with a
             palm the posture to take, a number for every motor that moves a finger [rad or m].
         palm: (4, 4) pose of the robot's palm frame in the base frame: then the hand is as the
@@ -298,7 +299,7 @@ class Grasp:
     robot: str = ""
     name: str = ""
     object: str = ""
-    object_pose: Array | None = None
+    object_pose: Array | Free | None = None
     posture: Mapping[str, float] = field(default_factory=dict)
     palm: Array | None = None
     pregrasp: Grasp | None = None
@@ -350,7 +351,9 @@ class Grasp:
         """
         motion = one_pose(pose)
         place = self.object_pose
-        if place is not None:
+        if isinstance(place, Free):
+            place = motion
+        elif place is not None:
             place = motion @ place
         elif self.object:
             place = motion
@@ -366,6 +369,11 @@ class Grasp:
             squeeze=after,
         )
 
+    @property
+    def known_pose(self) -> Array | None:
+        """(4, 4) where the object is; None: not said, or it is looked for."""
+        return None if isinstance(self.object_pose, Free) else self.object_pose
+
     def in_object_frame(self) -> Grasp:
         """The contacts as the object sees them, to be placed by `at`.
 
@@ -377,7 +385,7 @@ class Grasp:
             ...                  grasp.contacts["thumb"].point))
             True
         """
-        return self if self.object_pose is None else self.at(inverse(self.object_pose))
+        return self if self.known_pose is None else self.at(inverse(self.known_pose))
 
     def arrays(self, fingers: Sequence[str]) -> tuple[Array, Array]:
         """Points and normals in the order of the given fingers.

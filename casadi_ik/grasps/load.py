@@ -178,7 +178,7 @@ def grasp_data(grasp: Grasp) -> dict[str, Any]:
         contacts[finger] = entry
     data: dict[str, Any] = {"robot": grasp.robot} if grasp.robot else {}
     if grasp.object:
-        pose = grasp.object_pose
+        pose = grasp.known_pose
         data["object"] = {"name": grasp.object} | ({} if pose is None else {"pose": _frame(pose)})
     data |= {"contacts": contacts} if contacts else {}
     if grasp.palm is not None:

@@ -17,7 +17,7 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, UnknownNameError
 from casadi_ik.grasps import Grasp, Tolerance
-from casadi_ik.grasps.pose import checked_pose
+from casadi_ik.grasps.pose import Free, checked_pose
 from casadi_ik.problem.contacts import LENGTH, more_arrays
 from casadi_ik.problem.targets import DIRECTIONS, TargetBatch, fixed_array, target_arrays
 
@@ -299,6 +299,8 @@ class Request:
                 raise InputError(f"grasp: found {type(grasp).__name__}, expected a Grasp")
         if any(grasp.palm is not None for grasp in grasps):
             return self._of_palm_grasps(grasps, fixed, prefer)
+        if len(grasps) > 1 and any(isinstance(grasp.object_pose, Free) for grasp in grasps):
+            raise InputError("object_pose: found a Free pose among several grasps, expected one")
         # Contacts are checked when they are made.
         arrays = [grasp.arrays(fingers) for grasp in grasps]
         more = [grasp.more(fingers) for grasp in grasps]
@@ -393,11 +395,11 @@ class Request:
 def _object_poses(grasps: Sequence[Grasp]) -> Array | None:
     """(k, 4, 4) where grasps have their object; None unless all say it, of the same object."""
     if len(grasps) == 1:
-        pose = grasps[0].object_pose
+        pose = grasps[0].known_pose
         return None if pose is None else pose[None]
     if len({grasp.object for grasp in grasps}) > 1:
         return None
-    poses = [grasp.object_pose for grasp in grasps if grasp.object_pose is not None]
+    poses = [grasp.known_pose for grasp in grasps if grasp.known_pose is not None]
     return np.stack(poses) if poses and len(poses) == len(grasps) else None
 
 

@@ -237,7 +237,7 @@ def _asked(
         if not isinstance(grasp, Grasp):
             raise InputError(f"grasps[{number}]: found {type(grasp).__name__}, expected a Grasp")
         own = tuple((name, one.tolerance) for name, one in grasp.contacts.items())
-        key = own, grasp.object, grasp.object_pose is None, grasp.palm is None
+        key = own, grasp.object, grasp.known_pose is None, grasp.palm is None
         groups.setdefault(key, []).append(number)
     for numbers in groups.values():
         some = [grasps[number] for number in numbers]
@@ -251,7 +251,7 @@ def _placed(targets: TargetBatch, grasps: Sequence[Grasp], pose: Array | None) -
     """Targets moved as a whole with the object they are on, see `Grasp.at`."""
     if pose is None:
         return targets
-    places = [grasp.object_pose for grasp in grasps if grasp.object_pose is not None]
+    places = [grasp.known_pose for grasp in grasps if grasp.known_pose is not None]
     arrays = {"points": targets.points, "normals": targets.normals, **targets.more}
     for name, array in arrays.items() if places else ():
         # Seen from the object first.

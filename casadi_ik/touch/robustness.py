@@ -51,7 +51,7 @@ def robustness(
         least: Load that the contacts must have [N/N]; None: it is enough that they are
             force-closed.
     """
-    table, pose = HandTable.of(robot), one.grasp.object_pose
+    table, pose = HandTable.of(robot), one.grasp.known_pose
     assert pose is not None
     palm = inverse(pose) @ robot.palm(one.q)
     hand = one.q[table.motors][None]

@@ -107,7 +107,7 @@ def _image(robot: ArmHand, one: FoundGrasp, scene: Scene | None, pixels: tuple[i
         if name in grasp.contacts
         for mark in reached_marks(palette.TARGET)
     ]
-    pose = grasp.object_pose
+    pose = grasp.known_pose
     things = [] if thing is None or pose is None else [thing.at(pose)]
     seen = points_of([*hand, *things])
     with one_at_a_time, closing(Stage()) as stage:

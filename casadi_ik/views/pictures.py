@@ -426,7 +426,7 @@ def _body(robot: ArmHand, q: ArrayLike) -> list[Drawable]:
 
 def _object(grasp: Grasp) -> list[Drawable]:
     """The object, if there is a description of it and its place is given."""
-    pose, found = grasp.object_pose, object_of(grasp.object)
+    pose, found = grasp.known_pose, object_of(grasp.object)
     return [] if found is None or pose is None else [found.at(pose)]
 
 
