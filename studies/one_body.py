@@ -79,9 +79,9 @@ def batches(robot: ArmHand, count: int, seed: int) -> tuple[list[list[str]], lis
             kind = "near limits" if near else "random"
             for first in track(blocks, f"{robot.name} {kind} {label}"):
                 some = min(BLOCK, count - first)
-                asked = robot.contacts(drawn(robot, some, near, seed + 2 + first))
+                points, normals = robot.contacts(drawn(robot, some, near, seed + 2 + first))
                 begun = time.process_time()
-                found = solver.solve_batch(*asked)
+                found = solver.solve_batch(points, normals)
                 spent += time.process_time() - begun
                 missed += int((found.status != ik.Status.SOLVED).sum())
             name = f"one_body/{robot.name}/{kind}/{label}"
@@ -141,12 +141,12 @@ def free(robot: ArmHand, count: int, seed: int) -> list[str] | None:
         number += 1
         if number > 1000:
             return None
-    asked = robot.contacts(np.array(kept[:count]))
-    first = solver.check(plain.solve_batch(*asked).q, about)
+    points, normals = robot.contacts(np.array(kept[:count]))
+    first = solver.check(plain.solve_batch(points, normals).q, about)
     assert first is not None
-    solver.solve_batch(*(part[:20] for part in asked))
+    solver.solve_batch(points[:20], normals[:20])
     begun = time.process_time()
-    found = solver.solve_batch(*asked)
+    found = solver.solve_batch(points, normals)
     each = 1e3 * (time.process_time() - begun) / count
     solved = int((found.status == ik.Status.SOLVED).sum())
     hits = int((first.distance <= 0).sum())
@@ -155,7 +155,7 @@ def free(robot: ArmHand, count: int, seed: int) -> list[str] | None:
 
 def peers(robot: ArmHand, count: int, seed: int) -> list[list[str]]:
     """The same targets by other ways: all motors at once, from where the robot stands."""
-    asked = robot.contacts(drawn(robot, count, False, seed))
+    points, normals = robot.contacts(drawn(robot, count, False, seed))
     one_hand = ArmHand(robot.description.as_hand)
     ways = {
         "hand first, side by side and trunk": ik.Solver(robot),
@@ -164,9 +164,9 @@ def peers(robot: ArmHand, count: int, seed: int) -> list[list[str]]:
     }
     rows = []
     for label, solver in ways.items():
-        solver.solve_batch(*(part[:2] for part in asked))
+        solver.solve_batch(points[:2], normals[:2])
         begun = time.process_time()
-        found = solver.solve_batch(*asked)
+        found = solver.solve_batch(points, normals)
         each = 1e6 * (time.process_time() - begun) / count
         solved = int((found.status == ik.Status.SOLVED).sum())
         rows.append([robot.name, label, f"{solved} of {count}", f"{each:.0f}"])

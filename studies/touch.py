@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-import numpy as np
 from rich.progress import track
 from runner.figures import RESULTS
 from runner.report import (
@@ -26,7 +25,7 @@ from runner.report import (
     write_metrics,
     write_page,
 )
-from runner.study import robot_of
+from runner.study import robot_of, standing
 
 import casadi_ik as ik
 
@@ -51,14 +50,6 @@ the grasp. Times are processor times of one thread of this machine.
 """
 
 
-def placed(surface: ik.Surface, turn: float) -> np.ndarray:
-    """(4, 4) of an object that stands on the table."""
-    pose = np.eye(4)
-    pose[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
-    pose[:3, 3] = [0.5, 0.1, 0.002 - surface.points[:, 2].min()]
-    return pose
-
-
 def main(arguments: list[str] | None = None) -> None:
     """Find grasps and write the report."""
     parser = argparse.ArgumentParser(description="Grasps of surfaces.")
@@ -73,12 +64,12 @@ def main(arguments: list[str] | None = None) -> None:
     for robot in options.robots:
         solver = ik.Solver(robot_of(robot), scene=ik.load_scene("table"))
         solver.grasps_of(
-            surfaces[options.objects[0]], placed(surfaces[options.objects[0]], 0.0), limit=1
+            surfaces[options.objects[0]], standing(surfaces[options.objects[0]], 0.0), limit=1
         )
         counts, times, firsts, loads, confirmed = [], [], [], [], []
         for name, turn in track([(n, t) for n in options.objects for t in TURNS], robot):
             surface = surfaces[name]
-            pose = placed(surface, turn)
+            pose = standing(surface, turn)
             first = solver.grasps_of(surface, pose, limit=1, seed=options.seed)
             found = solver.grasps_of(surface, pose, limit=options.limit, seed=options.seed)
             counts.append(len(found))

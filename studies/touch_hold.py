@@ -19,10 +19,10 @@ import argparse
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 from rich.progress import track
 from runner.figures import RESULTS
@@ -36,13 +36,14 @@ from runner.report import (
     write_metrics,
     write_page,
 )
-from runner.study import robot_of
-from touch import placed
+from runner.study import robot_of, standing
 
 import casadi_ik as ik
 from casadi_ik.collision.solids import object_solids
 from casadi_ik.touch.grasps import FoundGrasp
 from casadi_ik.touch.robustness import offsets
+
+mujoco: Any = import_module("mujoco")
 
 ROBOTS = (
     "panda+allegro_right",
@@ -163,7 +164,7 @@ def tried(
     solver: ik.Solver, surface: ik.Surface, limit: int, samples: int, seed: int
 ) -> Iterator[Tried]:
     """Grasps of an object, as they went."""
-    found = solver.grasps_of(surface, placed(surface, 0.7), limit=limit, seed=seed)
+    found = solver.grasps_of(surface, standing(surface, 0.7), limit=limit, seed=seed)
     shares = found.robustness(hold=(MASS, SQUEEZE), seed=seed)
     away = offsets(5e-3, np.deg2rad(3.0), samples, seed + 1, surface.middle)
     six = np.concatenate([np.eye(3), -np.eye(3)])
@@ -288,7 +289,9 @@ class Hold:
                 conaffinity=2,
                 **look,
             )
-        thing = spec.worldbody.add_body(name="thing", **_frame(self.one.grasp.object_pose))
+        pose = self.one.grasp.known_pose
+        assert pose is not None
+        thing = spec.worldbody.add_body(name="thing", **_frame(pose))
         thing.add_freejoint()
         solids = object_solids(self.surface.name)
         for i, (solid, pose) in enumerate(solids):
@@ -362,7 +365,7 @@ class Hold:
         mujoco.mj_resetData(model, data)
         q = self.one.q.copy()
         if offset is not None:
-            pose = self.one.grasp.object_pose @ offset
+            pose = self.one.grasp.known_pose @ offset
             data.qpos[self._free : self._free + 3] = pose[:3, 3]
             data.qpos[self._free + 3 : self._free + 7] = _frame(pose)["quat"]
             before = self.one.pregrasp

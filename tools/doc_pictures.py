@@ -62,7 +62,7 @@ def shot(
     """A robot with what it grasps and what stands about it, on white."""
     body = placed(robot, q, bodies(robot))
     thing = None if grasp is None else object_of(grasp.object)
-    pose = None if grasp is None else grasp.object_pose
+    pose = None if grasp is None else grasp.known_pose
     things = [] if thing is None or pose is None else [thing.at(pose)]
     with closing(Stage()) as stage:
         stage.add("robot", body)
@@ -131,7 +131,7 @@ def pairs(path: Path) -> None:
 def unreachable(path: Path) -> None:
     """A grasp that no posture meets: how far the wrist can be, the nearest posture, the reason."""
     robot, grasp = ik.load_robot("kuka_lwr_barrett"), ik.load_grasp("cup")
-    pose = grasp.object_pose
+    pose = grasp.known_pose
     assert pose is not None
     away = pose.copy()
     away[:3, 3] += [-0.35, 0.05, 0.05]

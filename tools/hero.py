@@ -43,7 +43,7 @@ TURN = 0.3
 
 def path(grasp: ik.Grasp) -> list[ik.Grasp]:
     """The grasp along a way of its object, slow at both ends."""
-    alone, start = grasp.in_object_frame(), grasp.object_pose
+    alone, start = grasp.in_object_frame(), grasp.known_pose
     assert start is not None
     found = []
     for angle in -0.8 * np.pi * np.cos(np.linspace(0.0, np.pi, PICTURES // 2 + 1)):
@@ -64,14 +64,14 @@ def pictures(
     assert thing is not None
     bodied = [placed(robot, q, bodies(robot)) for q in every_q]
     about = points_of([one for body in bodied[::3] for one in body])
-    places = np.array([one.object_pose[:3, 3] for one in grasps if one.object_pose is not None])
+    places = np.array([one.known_pose[:3, 3] for one in grasps if one.known_pose is not None])
     close = close_view(robot, every_q[0])
     whole = whole_view(places.mean(axis=0), close)
     near = 0.135 * np.vstack([np.eye(3), -np.eye(3)])
     found: tuple[list[Image], list[Image]] = ([], [])
     with closing(Stage()) as stage:
         for grasp, body, place in zip(grasps, bodied, places, strict=True):
-            pose = grasp.object_pose
+            pose = grasp.known_pose
             assert pose is not None
             far = [np.linalg.norm(one.surface.points - place, axis=1).min() > 0.3 for one in body]
             stage.replace("robot", [one for one, off in zip(body, far, strict=True) if not off])

@@ -81,7 +81,7 @@ def grasps_at(piece: Piece) -> Iterator[tuple[ik.Scene, list[ik.Grasp]]]:
         arrays = [grasp.arrays(robot.fingers) for grasp in grasps]
         points, normals = (np.stack(both) for both in zip(*arrays, strict=True))
         kept = np.flatnonzero(blind.solve_batch(points, normals).success)
-        pose, name = grasps[0].object_pose, grasps[0].object
+        pose, name = grasps[0].known_pose, grasps[0].object
         assert pose is not None
         scene = ik.Scene({**solids, name: held | {"xyz": pose[:3, 3].tolist()}}, grasped=name)
         yield scene, [grasps[i] for i in kept]
@@ -111,7 +111,7 @@ def _solved(
 ) -> list[dict[str, Any]]:
     """What comes of the same grasp turned in several ways, a row for each."""
     robot, name = without.robot, grasps[0].object
-    poses = np.stack([grasp.object_pose for grasp in grasps if grasp.object_pose is not None])
+    poses = np.stack([grasp.known_pose for grasp in grasps if grasp.known_pose is not None])
     place = {"xyz": poses[0][:3, 3].tolist()}
     scene = ik.Scene({**solids, name: held | place}, grasped=name)
     solver = ik.Solver(robot, scene=scene)
@@ -218,10 +218,10 @@ def _grasps(robot: ik.ArmHand) -> list[tuple[ik.Grasp, dict[str, Any]]]:
 
 def _moved(grasp: ik.Grasp, goal: Array, rng: np.random.Generator) -> ik.Grasp:
     """The grasp with its object at a place, turned about the vertical."""
-    assert grasp.object_pose is not None
+    assert grasp.known_pose is not None
     turn, motion = rng.uniform(-np.pi, np.pi), np.eye(4)
     motion[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
-    motion[:3, 3] = goal - motion[:3, :3] @ grasp.object_pose[:3, 3]
+    motion[:3, 3] = goal - motion[:3, :3] @ grasp.known_pose[:3, 3]
     return grasp.at(motion)
 
 

@@ -148,6 +148,14 @@ def robot_of(name_or_path: str) -> ik.ArmHand:
     return ik.load_robot(name_or_path)
 
 
+def standing(surface: ik.Surface, turn: float) -> np.ndarray:
+    """(4, 4) of an object that stands on the table."""
+    pose = np.eye(4)
+    pose[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    pose[:3, 3] = [0.5, 0.1, 0.002 - surface.points[:, 2].min()]
+    return pose
+
+
 @lru_cache(maxsize=8)
 def _solver(robot: str, setting: Setting) -> ik.Solver:
     return ik.Solver(

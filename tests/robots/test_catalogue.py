@@ -45,6 +45,8 @@ ARMS = [
     "viperx_300s",
     "puma560",
     "irb140",
+    "g1_arm",
+    "h1_2_arm",
 ]
 HANDS = [
     "barrett_bh8_280",

@@ -19,13 +19,13 @@ MAX_FRICTION = 1.5
 def problems(hand: ArmHand, path: Path) -> list[str]:
     """Everything that a grasp file gets wrong; empty if it is good."""
     grasp = load_grasp(path)
-    if grasp.object_pose is None or set(grasp.posture) != set(hand.hand_names):
+    if grasp.known_pose is None or set(grasp.posture) != set(hand.hand_names):
         return ["it lacks the object or some of the hand's actuators"]
     item = load_object(grasp.object)
     points, normals = grasp.arrays(FINGERS)
     posture = np.array([grasp.posture[name] for name in hand.hand_names])
     palm, hand_points, hand_normals, lines, _ = hand.evaluate(np.zeros(7), posture)
-    rotation, origin = grasp.object_pose[:3, :3], grasp.object_pose[:3, 3]
+    rotation, origin = grasp.known_pose[:3, :3], grasp.known_pose[:3, 3]
     local, local_normals = (points - origin) @ rotation, normals @ rotation
     # The rigid motion that carries the posture's contacts onto the file's.
     motion = _fit(
@@ -34,7 +34,7 @@ def problems(hand: ArmHand, path: Path) -> list[str]:
     )
     moved = hand_points @ motion[:3, :3].T + motion[:3, 3]
     turned = hand_normals @ motion[:3, :3].T
-    in_palm = np.linalg.inv(motion @ palm) @ grasp.object_pose
+    in_palm = np.linalg.inv(motion @ palm) @ grasp.known_pose
     local_lines = (lines - palm[:3, 3]) @ palm[:3, :3]
     gaps = clearance(item, in_palm, local_lines)
     friction = friction_needed(points, normals)
