@@ -84,7 +84,7 @@ def moved(*by: float) -> Use:
     """The object dragged so far [m], in steps as a hand does."""
 
     def use(shown: GraspPage, _: Any) -> None:
-        start = shown.asked.known_pose
+        start = shown.asked.object_pose
         assert start is not None
         for part in np.linspace(0.25, 1.0, 4):
             pose = start.copy()

@@ -275,11 +275,11 @@ class MovingSolver:
             ('REACHED', 'leaving')
         """
         start, chosen, target = self._request.start(q0), held.grasp, one_pose(pose)
-        if chosen.object_pose is None:
-            raise InputError("held: found a grasp without object_pose, expected one")
+        if chosen.known_pose is None:
+            raise InputError("held: found a grasp without a known object_pose, expected one")
         if not self.robot.description.arm_actuators:
             raise UnsupportedError(f"place: {self.robot.name!r} has no arm that moves its palm")
-        moved = target @ inverse(chosen.object_pose)
+        moved = target @ inverse(chosen.known_pose)
         q = self._request.start(held.q, "q")
         hand = {self.robot.actuators[i]: float(q[i]) for i in self._palm_motors}
         palm = Grasp(robot=chosen.robot, palm=moved @ self.robot.palm(q), posture=hand)
