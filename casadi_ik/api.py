@@ -171,7 +171,7 @@ class Solver(MovingSolver):
             0.2
         """
         targets = self._request.of_grasps(
-            [grasp], fixed, self._engine.preference(prefer, q0 is not None)
+            [grasp], fixed, self._engine.preference(prefer, q0 is not None), free=True
         )
         if isinstance(grasp.object_pose, Free):
             if log is not None:

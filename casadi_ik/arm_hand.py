@@ -280,16 +280,28 @@ class ArmHand(Shown):
         (beyond,) = self._kernels.beyond(_for_kernels(self.configuration(q)))
         return beyond
 
-    def palm(self, q: ArrayLike) -> Array:
+    def palm(self, q: ArrayLike, side: str | None = None) -> Array:
         """(4, 4) or (k, 4, 4) pose of the palm frame in the base frame.
 
+        Args:
+            q: (n,) or (k, n) actuator positions.
+            side: Of a body, whose palm.
+
         Raises:
-            InputError: See `configuration`.
+            InputError: See `configuration`; or a body without a side.
+            UnknownNameError: No such side.
 
         Example:
             >>> robot.palm(robot.home).shape
             (4, 4)
         """
+        sides = self.description.sides
+        if side is not None:
+            asked = self.description.side(side)
+            return self.links(q)[asked.palm_link] @ asked.palm_placement
+        if sides:
+            names = ", ".join(one.name for one in sides)
+            raise InputError(f"side: found None, expected one of {names}")
         (pose,) = self._kernels.palm(_for_kernels(self.configuration(q)))
         return pose
 

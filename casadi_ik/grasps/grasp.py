@@ -276,7 +276,8 @@ class Grasp:
         posture: A hand posture by actuator that realises the contacts, where one is known; with a
             palm the posture to take, a number for every motor that moves a finger [rad or m].
         palm: (4, 4) pose of the robot's palm frame in the base frame: then the hand is as the
-            posture has it, and only the arm is looked for. None: the contacts say all.
+            posture has it, and only the arm is looked for. Of a body the poses by side: hands of
+            sides that are left out stay. None: the contacts say all.
         pregrasp: The same hand before it closes, if it is known: a palm and a posture.
         squeeze: The same hand as it squeezes, if it is known: a palm and a posture.
 
@@ -301,13 +302,13 @@ class Grasp:
     object: str = ""
     object_pose: Array | Free | None = None
     posture: Mapping[str, float] = field(default_factory=dict)
-    palm: Array | None = None
+    palm: Array | Mapping[str, Array] | None = None
     pregrasp: Grasp | None = None
     squeeze: Grasp | None = None
 
     def __post_init__(self) -> None:
         if self.palm is not None:
-            object.__setattr__(self, "palm", frozen(one_pose(self.palm, "palm").copy()))
+            object.__setattr__(self, "palm", _frozen_palms(self.palm))
             if self.contacts:
                 raise InputError("palm: found it beside contacts, expected one of them")
             if not self.posture:
@@ -323,7 +324,8 @@ class Grasp:
 
     def __reduce__(self) -> tuple[type[Grasp], tuple[Any, ...]]:
         """Its fields; the mapping that cannot be changed is made anew."""
-        held = self.robot, self.name, self.object, self.object_pose, dict(self.posture), self.palm
+        palm = dict(self.palm) if isinstance(self.palm, Mapping) else self.palm
+        held = self.robot, self.name, self.object, self.object_pose, dict(self.posture), palm
         return type(self), (dict(self.contacts), *held, self.pregrasp, self.squeeze)
 
     def at(self, pose: ArrayLike) -> Grasp:
@@ -358,7 +360,11 @@ class Grasp:
         elif self.object:
             place = motion
         contacts = {finger: contact.at(motion) for finger, contact in self.contacts.items()}
-        palm = None if self.palm is None else motion @ self.palm
+        palm = self.palm
+        if isinstance(palm, Mapping):
+            palm = {side: motion @ one for side, one in palm.items()}
+        elif palm is not None:
+            palm = motion @ palm
         before, after = (one and one.at(motion) for one in (self.pregrasp, self.squeeze))
         return replace(
             self,
@@ -373,6 +379,11 @@ class Grasp:
     def known_pose(self) -> Array | None:
         """(4, 4) where the object is; None: not said, or it is looked for."""
         return None if isinstance(self.object_pose, Free) else self.object_pose
+
+    @property
+    def one_palm(self) -> Array | None:
+        """(4, 4) where the palm of a single arm has to be; None: not said, or said by side."""
+        return None if isinstance(self.palm, Mapping) else self.palm
 
     def in_object_frame(self) -> Grasp:
         """The contacts as the object sees them, to be placed by `at`.
@@ -438,6 +449,15 @@ class Grasp:
                     rows = found.setdefault(f"{name}s", np.full((len(fingers), 3), np.nan))
                     rows[fingers.index(finger)] = vector
         return found
+
+
+def _frozen_palms(palm: Any) -> Array | Mapping[str, Array]:
+    if not isinstance(palm, Mapping):
+        return frozen(one_pose(palm, "palm").copy())
+    if not palm:
+        raise InputError("palm: found no side, expected a pose by side")
+    poses = {side: frozen(one_pose(one, f"palm.{side}").copy()) for side, one in palm.items()}
+    return MappingProxyType(poses)
 
 
 def _unit(value: Any, name: str) -> Array:

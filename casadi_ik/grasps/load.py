@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +85,7 @@ class GraspFile(Struct, frozen=True):
         posture: Position by actuator of the hand that it was made from [rad or m]; with a palm the
             posture to take.
         palm: Instead of contacts where the robot's palm frame is to be.
+        palms: The same of a body, by side.
     """
 
     contacts: dict[str, ContactEntry] = msgspec.field(default_factory=dict)
@@ -93,6 +94,7 @@ class GraspFile(Struct, frozen=True):
     object: ObjectEntry | None = None
     posture: dict[str, AnyValue] = msgspec.field(default_factory=dict)
     palm: Frame | None = None
+    palms: dict[str, Frame] = msgspec.field(default_factory=dict)
 
 
 def load_grasp(name_or_path: str | Path) -> Grasp:
@@ -143,10 +145,18 @@ def grasp_of(entry: GraspFile, path: Path, name: str, where: str = "") -> Grasp:
             object=entry.object.name if entry.object else "",
             object_pose=frame_matrix(entry.object.pose) if entry.object else None,
             posture=entry.posture,
-            palm=frame_matrix(entry.palm) if entry.palm else None,
+            palm=_palm(entry),
         )
     except InputError as error:
         raise DescriptionError(f"{path}: {where}{error}") from error
+
+
+def _palm(entry: GraspFile) -> Array | dict[str, Array] | None:
+    if entry.palm and entry.palms:
+        raise InputError("palms: found it beside palm, expected one of them")
+    if entry.palms:
+        return {side: frame_matrix(frame) for side, frame in entry.palms.items()}
+    return frame_matrix(entry.palm) if entry.palm else None
 
 
 def _contact(entry: ContactEntry) -> Contact:
@@ -181,8 +191,10 @@ def grasp_data(grasp: Grasp) -> dict[str, Any]:
         pose = grasp.known_pose
         data["object"] = {"name": grasp.object} | ({} if pose is None else {"pose": _frame(pose)})
     data |= {"contacts": contacts} if contacts else {}
-    if grasp.palm is not None:
-        data["palm"] = _frame(grasp.palm)
+    if grasp.one_palm is not None:
+        data["palm"] = _frame(grasp.one_palm)
+    elif isinstance(grasp.palm, Mapping):
+        data["palms"] = {side: _frame(pose) for side, pose in grasp.palm.items()}
     if grasp.posture:
         data["posture"] = {name: float(value) for name, value in grasp.posture.items()}
     return data
@@ -220,9 +232,11 @@ def _loose_numbers(entry: GraspFile) -> Iterator[tuple[str, float]]:
         if contact.tolerance is not None:
             yield f"contacts.{name}.tolerance.position", contact.tolerance.position
             yield f"contacts.{name}.tolerance.angle", contact.tolerance.angle
-    if entry.palm is not None:
-        yield from (("palm.xyz", value) for value in entry.palm.xyz)
-        yield from (("palm.rpy", value) for value in entry.palm.rpy)
+    palms = {"palm": entry.palm} if entry.palm is not None else {}
+    palms |= {f"palms.{side}": frame for side, frame in entry.palms.items()}
+    for key, frame in palms.items():
+        yield from ((f"{key}.xyz", value) for value in frame.xyz)
+        yield from ((f"{key}.rpy", value) for value in frame.rpy)
     if entry.object is not None:
         yield from (("object.pose.xyz", value) for value in entry.object.pose.xyz)
         yield from (("object.pose.rpy", value) for value in entry.object.pose.rpy)

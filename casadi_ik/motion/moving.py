@@ -400,7 +400,7 @@ class MovingSolver:
         """What the last part of the way to a grasp keeps to."""
         asked: Any = grasp if isinstance(grasp, Grasp) else getattr(grasp, "grasp", grasp)
         problem = self._request.of_grasps([asked], None)
-        before = asked.pregrasp and asked.pregrasp.palm
+        before = asked.pregrasp and asked.pregrasp.one_palm
         return ApproachPlan(
             self._plan(
                 start, self._bounds(None), 1.0, unbounded(self.robot), start, math.inf, PATH_PULL

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, UnknownNameError
-from casadi_ik.grasps import Grasp, Tolerance
+from casadi_ik.grasps import Contact, Grasp, Tolerance
 from casadi_ik.grasps.pose import Free, checked_pose
 from casadi_ik.problem.contacts import LENGTH, more_arrays
 from casadi_ik.problem.targets import DIRECTIONS, TargetBatch, fixed_array, target_arrays
@@ -281,6 +281,7 @@ class Request:
         grasps: Sequence[Grasp],
         fixed: Mapping[str, float] | None,
         prefer: str = "limits",
+        free: bool = False,
     ) -> TargetBatch:
         """Grasps, at least one, that share the tolerances of the first.
 
@@ -288,19 +289,25 @@ class Request:
             grasps: The grasps.
             fixed: Held actuators by name.
             prefer: See `TargetBatch`.
+            free: Whether their object may have a `Free` pose.
 
         Raises:
-            InputError: Something else than a grasp, one with a finger that the robot has not, or
-                see `held`.
+            InputError: Something else than a grasp, one with a finger that the robot has not, one
+                whose palms are of other sides, or see `held`.
         """
         fingers = self.robot.fingers
         for grasp in grasps:
             if not isinstance(grasp, Grasp):
                 raise InputError(f"grasp: found {type(grasp).__name__}, expected a Grasp")
+        if not free and any(isinstance(grasp.object_pose, Free) for grasp in grasps):
+            raise InputError("object_pose: found a Free pose, which only Solver.solve looks for")
+        if any(isinstance(grasp.palm, Mapping) for grasp in grasps):
+            grasps, held = self._with_palms_met(grasps)
+            targets = self.of_grasps(grasps, None, prefer, free)
+            given = self.held(fixed) if fixed else None
+            return replace(targets, fixed=held_too(held, given, self.robot.actuators))
         if any(grasp.palm is not None for grasp in grasps):
             return self._of_palm_grasps(grasps, fixed, prefer)
-        if len(grasps) > 1 and any(isinstance(grasp.object_pose, Free) for grasp in grasps):
-            raise InputError("object_pose: found a Free pose among several grasps, expected one")
         # Contacts are checked when they are made.
         arrays = [grasp.arrays(fingers) for grasp in grasps]
         more = [grasp.more(fingers) for grasp in grasps]
@@ -331,13 +338,59 @@ class Request:
     def _of_palm_grasps(
         self, grasps: Sequence[Grasp], fixed: Mapping[str, float] | None, prefer: str
     ) -> TargetBatch:
-        palms = [grasp.palm for grasp in grasps if grasp.palm is not None]
+        palms = [grasp.one_palm for grasp in grasps if grasp.one_palm is not None]
         if len(palms) < len(grasps):
             raise InputError("grasps: found palms and contacts, expected the same in all")
+        if self.robot.description.sides:
+            names = ", ".join(side.name for side in self.robot.description.sides)
+            raise InputError(f"palm: found one pose, expected one by side: {names}")
         postures = postures_of(self.robot, [grasp.posture for grasp in grasps])
         targets = self.of_palms(np.stack(palms), postures, fixed, prefer)
         named, poses = grasps[0].object, _object_poses(grasps)
         return replace(targets, object=named, object_pose=poses)
+
+    def _with_palms_met(self, grasps: Sequence[Grasp]) -> tuple[list[Grasp], Array]:
+        """Contacts instead of palms by side, and (k, n) what hands take, NaN for other motors."""
+        robot, made = self.robot, list[Grasp]()
+        held = np.full((len(grasps), len(robot.actuators)), np.nan)
+        for row, grasp in enumerate(grasps):
+            if not isinstance(grasp.palm, Mapping):
+                raise InputError("grasps: found palms by side and others, expected the same in all")
+            contacts = dict[str, Contact]()
+            motors = {name: i for i, name in enumerate(robot.actuators)}
+            wanted = set[str]()
+            for name, pose in grasp.palm.items():
+                if name not in self._sides:
+                    known = ", ".join(self._sides) or "none"
+                    raise InputError(f"palm.{name}: no such side; the robot's sides: {known}")
+                hand = self._sides[name]
+                own = {
+                    motor: grasp.posture[motor]
+                    for motor in hand.actuators
+                    if motor in grasp.posture
+                }
+                posture = hand_posture(hand, own)
+                points, normals, more = touched(hand, pose[None], posture[None])
+                tangents = more.get("tangents", [[None] * len(hand.fingers)])[0]
+                contacts |= {
+                    finger: Contact(points[0, i], normals[0, i], tangent=tangents[i])
+                    for i, finger in enumerate(hand.fingers)
+                }
+                wanted |= set(own)
+                for motor, value in zip(hand.actuators, posture, strict=True):
+                    held[row, motors[motor]] = value
+            extra = sorted(set(grasp.posture) - wanted)
+            if extra:
+                raise InputError(
+                    f"posture.{extra[0]}: found it, expected motors of hands with palms"
+                )
+            made.append(replace(grasp, palm=None, posture={}, contacts=contacts))
+        return made, held
+
+    @cached_property
+    def _sides(self) -> dict[str, ArmHand]:
+        body = self.robot.description
+        return {side.name: ArmHand(body.side(side.name)) for side in body.sides}
 
     def of_palms(
         self,

@@ -161,3 +161,15 @@ def refused(path: Path, key: str, says: str) -> None:
     assert key in message
     assert says in message
     assert "\n" not in message
+
+
+def test_palms_by_side_are_read_from_a_file(tmp_path):
+    file = tmp_path / "both.yaml"
+    file.write_text(
+        "robot: g1+dex3\nposture: {left_dex3_thumb_0: 0.1}\n"
+        "palms: {left: {xyz: [0.3, 0.2, 0.1], rpy: [0, 0, 0]}}\n"
+    )
+    assert ik.load_grasp(file).palm["left"][:3, 3].tolist() == [0.3, 0.2, 0.1]
+    file.write_text(file.read_text() + "palm: {xyz: [0, 0, 0], rpy: [0, 0, 0]}\n")
+    with pytest.raises(ik.errors.DescriptionError, match="palms: found it beside palm"):
+        ik.load_grasp(file)

@@ -128,3 +128,100 @@ def test_without_a_compiler_there_is_an_answer():
 def test_the_papers_methods_say_what_they_need(robot):
     with pytest.raises(ik.errors.UnsupportedError):
         ik.Solver(robot, method="thumb-first").solve(grasp(robot, robot.home))
+
+
+def palm_grasp(robot, q, sides):
+    own = {side.name: side.hand for side in robot.description.sides}
+    return ik.Grasp(
+        palm={side: robot.palm(q, side) for side in sides},
+        posture={name: q[robot.actuators.index(name)] for side in sides for name in own[side]},
+    )
+
+
+def test_palms_are_given_by_side(robot):
+    q = robot.random(np.random.default_rng(5), 1)[0]
+    sides = [side.name for side in robot.description.sides]
+    found = ik.Solver(robot).solve(palm_grasp(robot, q, sides))
+    assert found.success
+    for side in sides:
+        off = robot.palm(found.q, side)[:3] - robot.palm(q, side)[:3]
+        assert np.abs(off[:, 3]).max() < 6e-3
+        assert np.abs(off[:, :3]).max() < 0.3
+    hands = [robot.actuators.index(m) for side in robot.description.sides for m in side.hand]
+    assert np.allclose(found.q[hands], q[hands])
+
+
+def test_one_palm_alone_leaves_the_other_arm():
+    robot = ik.load_robot("g1+dex3")
+    q = robot.home + 0.02
+    found = ik.Solver(robot).solve(palm_grasp(robot, q, ["left"]), q0=robot.home)
+    assert found.success
+    right = [i for i, name in enumerate(robot.actuators) if "right" in name]
+    assert np.allclose(found.q[right], robot.home[right])
+
+
+def test_palms_that_cannot_be_are_refused():
+    robot = ik.load_robot("g1+dex3")
+    solver, one = ik.Solver(robot), palm_grasp(robot, robot.home, ["left"])
+    with pytest.raises(ik.errors.InputError, match=r"palm\.middle: no such side.*left, right"):
+        solver.solve(ik.Grasp(palm={"middle": np.eye(4)}, posture=one.posture))
+    with pytest.raises(
+        ik.errors.InputError, match=r"found one pose, expected one by side: left, right"
+    ):
+        solver.solve(ik.Grasp(palm=np.eye(4), posture=one.posture))
+    with pytest.raises(
+        ik.errors.InputError, match=r"posture\..*: found it, expected motors of hands"
+    ):
+        solver.solve(ik.Grasp(palm=one.palm, posture={**one.posture, "waist_yaw_joint": 0.0}))
+    with pytest.raises(ik.errors.InputError, match=r"palm\.left: "):
+        ik.Grasp(palm={"left": 2 * np.eye(4)}, posture=one.posture)
+    with pytest.raises(ik.errors.InputError, match="side: found None, expected one of left, right"):
+        robot.palm(robot.home)
+
+
+def held_box(robot):
+    """What a body holds at home, in the frame of the contacts' middle."""
+    points, normals = robot.contacts(robot.home)
+    middle = points.mean(axis=0)
+    contacts = {
+        finger: ik.Contact(points[i] - middle, normals[i]) for i, finger in enumerate(robot.fingers)
+    }
+    return ik.Grasp(contacts), middle
+
+
+def test_an_object_is_found_where_both_hands_reach_it():
+    robot = ik.load_robot("g1+dex3")
+    box, middle = held_box(robot)
+    low, high = middle - np.array([0.3, 0.3, 0.3]), middle + np.array([0.4, 0.2, 0.3])
+    within = ik.Free([*low, 0.0, 0.0, -2.0], [*high, 0.0, 0.0, 2.0])
+    free = ik.Grasp(box.contacts, object_pose=within)
+    found = ik.Solver(robot).solve(free)
+    assert found.success
+    pose = found.object_pose
+    assert np.all(pose[:3, 3] >= low)
+    assert np.all(pose[:3, 3] <= high)
+    points, _ = box.at(pose).arrays(robot.fingers)
+    assert misses(robot, found.q, points).max() <= 5e-3
+
+
+def test_an_object_that_nobody_reaches_is_told():
+    robot = ik.load_robot("g1+dex3")
+    box, _ = held_box(robot)
+    far = ik.Free([3, 0, 0, 0, 0, 0], [4, 1, 1, 0, 0, 1])
+    found = ik.Solver(robot).solve(ik.Grasp(box.contacts, object_pose=far))
+    assert found.status is ik.Status.UNREACHABLE
+    assert np.allclose(found.object_pose[:3, 3], [3.5, 0.5, 0.5])
+
+
+def test_bounds_of_an_object_that_cannot_be_are_refused():
+    robot = ik.load_robot("g1+dex3")
+    box, _ = held_box(robot)
+    with pytest.raises(ik.errors.InputError, match=r"lower: found .* expected six finite numbers"):
+        ik.Free([0, 0, 0], [1, 1, 1])
+    with pytest.raises(ik.errors.InputError, match="expected none above"):
+        ik.Free([1, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0])
+    free = ik.Grasp(box.contacts, object_pose=ik.Free([0] * 6, [0] * 6))
+    with pytest.raises(ik.errors.InputError, match="Free pose, which only"):
+        ik.Solver(robot).choose([free])
+    with pytest.raises(ik.errors.InputError, match="log: found beside a Free"):
+        ik.Solver(robot).solve(free, log="nothing.mcap")
