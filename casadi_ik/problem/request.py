@@ -185,6 +185,10 @@ def free_palms(robot: ArmHand, targets: TargetBatch) -> NDArray[np.bool_]:
     return _leave_free(targets.points, facing)
 
 
+TURNS = np.cross(np.eye(3)[:, None], np.eye(3)[None])
+"""`v @ TURNS[i]` is the cross product of axis i with v."""
+
+
 def _leave_free(points: Array, facing: Array) -> NDArray[np.bool_]:
     """(k,) whether points (k, f, 3) [m] and directions (k, m, 3) leave the palm free; NaN: none."""
     placed, known = (~np.isnan(vectors[..., :1]) for vectors in (points, facing))
@@ -192,10 +196,10 @@ def _leave_free(points: Array, facing: Array) -> NDArray[np.bool_]:
     off = (points - np.nansum(points, axis=1, keepdims=True) / count) / LENGTH
     f = points.shape[1]
     moved = np.zeros((len(points), 6, f + facing.shape[1], 3))
+    turned = np.where(np.concatenate([placed, known], axis=1), np.hstack([off, facing]), 0.0)
     for i, axis in enumerate(np.eye(3)):
         moved[:, i, :f] = axis * placed
-        moved[:, 3 + i, :f] = np.cross(axis, np.where(placed, off, 0.0))
-        moved[:, 3 + i, f:] = np.cross(axis, np.where(known, facing, 0.0))
+        moved[:, 3 + i] = turned @ TURNS[i]
     values = np.linalg.svd(moved.reshape(len(points), 6, -1), compute_uv=False)
     return np.asarray(values[:, -1] < DETERMINED)
 
