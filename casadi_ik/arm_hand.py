@@ -305,6 +305,20 @@ class ArmHand(Shown):
         (pose,) = self._kernels.palm(_for_kernels(self.configuration(q)))
         return pose
 
+    @cached_property
+    def hands(self) -> dict[str | None, tuple[int, ...]]:
+        """Fingers, as positions in `fingers`, by side; None is the only hand of an arm.
+
+        Example:
+            >>> robot.hands
+            {None: (0, 1, 2)}
+        """
+        place = {name: i for i, name in enumerate(self.fingers)}
+        sides = self.description.sides
+        if not sides:
+            return {None: tuple(place.values())}
+        return {side.name: tuple(place[name] for name in side.fingers) for side in sides}
+
     def links(self, q: ArrayLike) -> dict[str, Array]:
         """Pose of every link frame in the base frame, by link name.
 

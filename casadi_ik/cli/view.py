@@ -27,6 +27,7 @@ from casadi_ik.cli.options import Option
 from casadi_ik.cli.table import Answer, Said, command
 from casadi_ik.collision.scene import Scene
 from casadi_ik.datasets import load_candidates
+from casadi_ik.drawing.cameras import palm_places
 from casadi_ik.errors import (
     InputError,
     LogError,
@@ -278,7 +279,9 @@ def _ranked(
         drawn: tuple[Array, Array] | tuple[()] = ()
         if one.grasp is not None and (contacts := one.placed(path, place).contacts):
             points = np.array([contact.point for contact in contacts.values()])
-            drawn = (robot.palm(q)[:3, 3], points) if np.isfinite(points).all() else ()
+            drawn = (
+                (palm_places(robot, q).mean(axis=0), points) if np.isfinite(points).all() else ()
+            )
         choices[f"{place}. {one.label}"] = Candidate(
             ask, *drawn, load=one.load, clearance=one.solution.clearance
         )

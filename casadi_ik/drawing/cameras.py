@@ -20,6 +20,11 @@ def axes_of(view: View) -> Array:
     return np.array([[-s, c, 0.0], [-se * c, -se * s, ce], [ce * c, ce * s, se]])
 
 
+def palm_places(robot: ArmHand, q: ArrayLike) -> Array:
+    """(h, 3) where the palms of all hands are, base frame [m]."""
+    return np.array([robot.palm(q, side)[:3, 3] for side in robot.hands])
+
+
 def close_view(robot: ArmHand, q: ArrayLike) -> View:
     """Where fingertips and palm are furthest apart in the image, and pads are seen from the side.
 
@@ -28,10 +33,11 @@ def close_view(robot: ArmHand, q: ArrayLike) -> View:
         q: (n,) actuator positions [rad or m].
     """
     points, normals = robot.contacts(q)
-    links, palm = robot.links(q), robot.palm(q)[:3, 3]
+    links, palms = robot.links(q), palm_places(robot, q)
+    palm = palms.mean(axis=0)
     joints = [joint for joint in robot.description.joints if joint.part != "hand"]
     arm = np.mean([links[joint.parent][:3, 3] for joint in joints] or [palm], axis=0)
-    spots = np.concatenate([points, palm[None]])
+    spots = np.concatenate([points, palms])
 
     def score(view: View) -> float:
         axes = axes_of(view)

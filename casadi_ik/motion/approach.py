@@ -8,6 +8,7 @@ from enum import Enum
 
 import numpy as np
 
+from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.collision.distances import gaps
 from casadi_ik.collision.scene import Scene
@@ -55,7 +56,7 @@ class Closer:
         q: Array,
         opening: float,
         distance: float,
-        direction: Array | None = None,
+        ways: Array,
     ) -> LastPart | None:
         """The last part of the way to a solution; None if there is none.
 
@@ -64,48 +65,73 @@ class Closer:
             q: (n,) its solution.
             opening: How far the fingertips are from their contacts while the hand is open [m].
             distance: How far it comes straight [m].
-            direction: (3,) the way it comes, base frame; None: from the palm to the contacts.
+            ways: (f, 3) unit, the way each finger's hand comes, base frame.
         """
         robot = self._robot
-        palm, (points, normals) = robot.palm(q), robot.contacts(q)
+        points, normals = robot.contacts(q)
         given = ~np.isnan(problem.points[0, :, 0])
         share = np.linspace(0.0, 1.0, self.postures)[:, None, None]
         opened = points - opening * share * normals
-        opening_way = self._walk(q, opened, np.repeat(palm[None], self.postures, axis=0), given)
+        opening_way = self._walk(q, opened, None, given)
         there = opening_way[-1]
-        if not self._asked.cycle.palm:
+        if not (self._asked.cycle.palm or robot.description.sides):
             return LastPart(there[None], opening_way[::-1])
-        here: Array = robot.contacts(there)[0][given].mean(axis=0) - palm[:3, 3]
-        way = here if direction is None else direction
-        back = -distance * way / max(float(np.linalg.norm(way)), 1e-9)
-        coming = self.straight(there, back)
+        coming = self.straight(there, -distance * ways * hands_used(robot, problem))
         return None if coming is None else LastPart(coming[::-1], opening_way[::-1])
 
     def straight(self, q: Array, shift: Array) -> Array | None:
-        """(k, n) postures from q on with palm and fingertips moved by (3,) [m]; None: it strays."""
-        robot, share = self._robot, np.linspace(0.0, 1.0, self.postures)[:, None]
-        tips = robot.contacts(q)[0]
-        palms = np.repeat(robot.palm(q)[None], self.postures, axis=0)
-        palms[:, :3, 3] += share * shift
+        """(k, n) postures from q on with all of the hand moved; None: it strays.
+
+        Args:
+            q: (n,).
+            shift: (3,), or (f, 3) the same for fingers of a hand, base frame [m].
+        """
+        robot, share = self._robot, np.linspace(0.0, 1.0, self.postures)[:, None, None]
+        tips, facing = robot.contacts(q)
+        shifts = np.broadcast_to(shift, tips.shape)
         every = np.ones(len(tips), dtype=bool)
-        found = self._walk(q, tips + share[:, None] * shift, palms, every)
+        if robot.description.sides:
+            # Fingertips that keep their points and directions carry their palm along.
+            there = tips + share * shifts
+            found = self._walk(q, there, None, every, facing)
+            off = np.linalg.norm(robot.contacts(found)[0] - there, axis=-1)
+            return None if off.max() > self.stray else found
+        palms = np.repeat(robot.palm(q)[None], self.postures, axis=0)
+        palms[:, :3, 3] += share[:, 0] * shifts[0]
+        found = self._walk(q, tips + share * shifts, palms, every)
         off = np.linalg.norm(robot.palm(found)[:, :3, 3] - palms[:, :3, 3], axis=1)
         return None if off.max() > self.stray else found
 
-    def _walk(self, q: Array, tips: Array, palms: Array, given: Array) -> Array:
-        """(k, n) postures from q on with fingertips (k, f, 3) and palm (k, 4, 4) there."""
+    def _walk(
+        self, q: Array, tips: Array, palms: Array | None, given: Array, facing: Array | None = None
+    ) -> Array:
+        """(k, n) postures from q on, with fingertips and palm where they are asked for.
+
+        Args:
+            q: (n,).
+            tips: (k, f, 3) [m].
+            palms: (k, 4, 4); None: where it is.
+            given: (f,) whether a fingertip counts.
+            facing: (f, 3) the way pads face; None: any way.
+        """
         asked, count = self._asked, len(tips)
         layout = asked.cycle.parameters
         every = np.repeat(asked.run.parameters[None], count, axis=0)
         f = len(given)
         values = {
             "points": tips,
-            "normals": np.tile(ANY, (count, f, 1)),
-            "weights": np.tile(np.stack([given, 0 * given], axis=1), (count, 1, 1)),
+            "normals": np.tile(ANY, (count, f, 1))
+            if facing is None
+            else np.tile(facing, (count, 1, 1)),
+            "weights": np.tile(
+                np.stack([given, (facing is not None) * given], axis=1), (count, 1, 1)
+            ),
             "position_tolerance": np.ones((count, f)),
             "angle_tolerance": np.ones((count, f)),
         }
         if asked.cycle.palm:
+            if palms is None:
+                palms = np.repeat(self._robot.palm(q)[None], count, axis=0)
             values |= {
                 "palm_point": palms[:, :3, 3],
                 "palm_axes": palms[:, :3, :3],
@@ -118,6 +144,14 @@ class Closer:
         found = states[self.cycles - 1 :: self.cycles, : len(q)]
         found[0] = q
         return found
+
+
+def hands_used(robot: ArmHand, problem: TargetBatch) -> Array:
+    """(f, 1) for each finger 1 if its hand touches something, 0: then the hand stays."""
+    given, used = ~np.isnan(problem.points[0, :, 0]), np.zeros((len(robot.fingers), 1))
+    for hand in map(list, robot.hands.values()):
+        used[hand] = given[hand].any()
+    return used
 
 
 LEAN = float(np.tan(np.deg2rad(35.0)))
@@ -211,16 +245,26 @@ class ApproachPlan:
     pregrasp: Array | None = None
 
     def ways(self, q: Array) -> list[Array]:
-        """(3,) unit, the ways the hand may come to a solution (n,), the first that can be gone is.
+        """(f, 3) unit, the ways hands may come to a solution (n,), the first that can be gone is.
 
         The one that was said, or: from where the grasp has its palm before it, from the palm to the
         contacts, from above, between those, and leaning to each side.
         """
-        robot, down = self.plan.robot, np.array([0.0, 0.0, -1.0])
+        robot = self.plan.robot
         if self.direction is not None:
-            return [_unit(self.direction)]
-        palm, given = robot.palm(q), ~np.isnan(self.problem.points[0, :, 0])
-        first = robot.contacts(q)[0][given].mean(axis=0) - palm[:3, 3]
+            return [np.tile(_unit(self.direction), (len(robot.fingers), 1))]
+        given, tips = ~np.isnan(self.problem.points[0, :, 0]), robot.contacts(q)[0]
+        every = dict[int, list[Array]]()
+        for side, hand in robot.hands.items():
+            fingers = [i for i in hand if given[i]]
+            ways = self._ways_of_hand(robot.palm(q, side), tips[fingers])
+            every |= dict.fromkeys(hand, ways)
+        return [np.stack(ways) for ways in zip(*(every[i] for i in sorted(every)), strict=True)]
+
+    def _ways_of_hand(self, palm: Array, tips: Array) -> list[Array]:
+        """(3,) unit, of a hand whose fingertips (k, 3) touch."""
+        down = np.array([0.0, 0.0, -1.0])
+        first = tips.mean(axis=0) - palm[:3, 3] if len(tips) else down
         if self.pregrasp is not None:
             way = palm[:3, 3] - self.pregrasp
             # A palm that is nearer to its grasp before it does not say from where it comes.
@@ -228,7 +272,7 @@ class ApproachPlan:
         first = _unit(first)
         sides = [s * palm[:3, axis] for axis in (0, 1) for s in (1.0, -1.0)]
         others = [first + down, down, *(first + LEAN * side for side in sides)]
-        return [first, *(_unit(one) for one in others if np.linalg.norm(one) > 0.1)]
+        return [first, *(_unit(one) if np.linalg.norm(one) > 0.1 else first for one in others)]
 
 
 @dataclass(frozen=True, eq=False)

@@ -212,7 +212,9 @@ class MovingSolver:
         """
         start = self._request.start(q0)
         onward = length("lift", lift), length("retreat", retreat)
-        if any(onward) and not self.robot.description.arm_actuators:
+        if any(onward) and not (
+            self.robot.description.arm_actuators or self.robot.description.sides
+        ):
             raise UnsupportedError(f"lift: {self.robot.name!r} has no arm that moves its palm")
         pace = Pace(rates_of(self.robot, velocity, acceleration), seconds("period", period))
         last = self._last_part(grasp, start, opening, distance, direction)
@@ -277,6 +279,8 @@ class MovingSolver:
         start, chosen, target = self._request.start(q0), held.grasp, one_pose(pose)
         if chosen.known_pose is None:
             raise InputError("held: found a grasp without a known object_pose, expected one")
+        if self.robot.description.sides:
+            raise UnsupportedError("place: found a body, whose hands would lose what they hold")
         if not self.robot.description.arm_actuators:
             raise UnsupportedError(f"place: {self.robot.name!r} has no arm that moves its palm")
         moved = target @ inverse(chosen.known_pose)

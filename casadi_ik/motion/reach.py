@@ -16,7 +16,14 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.collision.distances import gaps
 from casadi_ik.grasps.pose import inverse
-from casadi_ik.motion.approach import ApproachPlan, LastPart, ReachStatus, Tried, approaches
+from casadi_ik.motion.approach import (
+    ApproachPlan,
+    LastPart,
+    ReachStatus,
+    Tried,
+    approaches,
+    hands_used,
+)
 from casadi_ik.motion.clear import free_way, least_clearance
 from casadi_ik.motion.motion import Motion
 from casadi_ik.motion.timing import Rates, shares, timed
@@ -51,9 +58,17 @@ class Carried:
         pose = None if problem.object_pose is None else problem.object_pose[0]
         if pose is None and self._name in check.scene.items:
             pose = check.scene.items[self._name].pose
-        self._in_palm = None if pose is None else inverse(self._robot.palm(q)) @ pose
+        # In the hands of several sides it goes with that of the first.
+        used = hands_used(check.robot, problem)[:, 0] > 0
+        hands = check.robot.hands
+        holds = [side for side, hand in hands.items() if used[list(hand)].any()]
+        self._side = (holds or list(hands))[0]
+        self._in_palm = None if pose is None else inverse(self._palm(q)) @ pose
         if pose is not None:
             self._held = check.scene.holding(self._name, np.eye(4)).items[self._name]
+
+    def _palm(self, q: Array) -> Array:
+        return self._robot.palm(q, self._side)
 
     def blocked(self, q: Array) -> str:
         """What is in the way from each of k postures (k, n) straight to the next; "": nothing."""
@@ -72,7 +87,7 @@ class Carried:
         every = self._problem.rows(np.zeros(len(q), dtype=np.intp))
         if self._in_palm is None:
             return self._check.collision_query(every).rows(np.zeros(1, dtype=np.intp))
-        poses = self._robot.palm(q) @ self._in_palm
+        poses = self._palm(q) @ self._in_palm
         held = replace(every, object=self._name, object_pose=poses)
         return self._check.collision_query(held, carried=True)
 
@@ -86,9 +101,7 @@ class Carried:
         scene = self._check.scene
         if self._in_palm is None:
             return ""
-        poses = (
-            self._robot.palm(_finely(q, self._robot.palm(q)[:, :3, 3], self.step)) @ self._in_palm
-        )
+        poses = self._palm(_finely(q, self._palm(q)[:, :3, 3], self.step)) @ self._in_palm
         allowed = {frozenset(one.links) for one in scene.touching}
         for name, item in scene.items.items():
             pair = frozenset((name, self._name))
@@ -281,12 +294,14 @@ def _after(
 ) -> list[tuple[str, Array]] | str:
     """Ways with what the hand holds; or why there are none."""
     found: list[tuple[str, Array]] = []
-    back = asked.approach.plan.robot.palm(last.coming[[0, -1]])[:, :3, 3]
-    back = (back[0] - back[1]) / max(float(np.linalg.norm(back[0] - back[1])), 1e-9)
-    q = one.q
+    ends, _ = asked.approach.plan.robot.contacts(last.coming[[0, -1]])
+    back = ends[0] - ends[1]
+    back /= np.maximum(np.linalg.norm(back, axis=1, keepdims=True), 1e-9)
+    q, used = one.q, hands_used(asked.approach.plan.robot, asked.approach.problem)
     for name, shift in ((LIFTING, asked.lift * UP), (RETREATING, asked.retreat * back)):
         if not shift.any():
             continue
+        shift = shift * used
         way = one.closer.straight(q, shift)
         if way is None:
             return f"the arm cannot follow the straight way of {name}"

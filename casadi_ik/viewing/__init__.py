@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from casadi_ik.arm_hand import ArmHand, load_robot
 from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene
+from casadi_ik.drawing.cameras import palm_places
 from casadi_ik.drawing.drawables import file_meshes
 from casadi_ik.errors import DescriptionError, InputError, MissingExtraError
 from casadi_ik.files.reading import read_yaml
@@ -117,7 +118,7 @@ def view_found(
     candidates = {
         f"{place}. {one.grasp.name}, load {one.load:.2f}": Candidate(
             partial(_asked, robot, one, scene),
-            robot.palm(one.q)[:3, 3],
+            palm_places(robot, one.q).mean(axis=0),
             np.array([contact.point for contact in one.grasp.contacts.values()]),
             one.load,
             one.clearance,

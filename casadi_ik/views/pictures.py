@@ -22,7 +22,7 @@ from casadi_ik.answers.solution import Alternative, Solution
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene
-from casadi_ik.drawing.cameras import View, close_view, whole_view
+from casadi_ik.drawing.cameras import View, close_view, palm_places, whole_view
 from casadi_ik.drawing.drawables import (
     Drawable,
     bodies,
@@ -110,9 +110,9 @@ def draw_solution(
         _panel(figure, WHOLE, over(image, stage.shoot("marks", "nearest"), 0.45))
 
         # What reaches further than this from the palm need not be in the close-up.
-        palm = robot.palm(q)[:3, 3]
+        palms = palm_places(robot, q)
         things = groups["object"] + groups["marks"]
-        near = [one for one in things if _distances(one, palm).max() < 0.35]
+        near = [one for one in things if _distances(one, palms).max() < 0.35]
         pixels = _pixels(figure, CLOSE)
         stage.aim(view, points_of(groups["hand"] + near), pixels, (0.17, 0.02))
         # The arm is pale: it may stand in the way.
@@ -275,7 +275,7 @@ def _shots(robot: ArmHand, q: Array, grasp: Grasp, scene: Scene | None) -> list[
             shown = _body(robot, row)
             stage.replace("robot", shown)
             stage.add_floor(float(foot[2, 3]), shown + there, every, texels=512)
-            hand = (robot.contacts(row)[0].mean(axis=0) + robot.palm(row)[:3, 3]) / 2
+            hand = (robot.contacts(row)[0].mean(axis=0) + palm_places(robot, row).mean(axis=0)) / 2
             panels = []
             for where, points, pixels in (
                 (whole, every, sizes[0]),
@@ -348,6 +348,8 @@ def draw_pads(
     Raises:
         PictureError: The file cannot be written, or there is no OpenGL to draw with.
     """
+    if robot.description.sides:
+        robot = ArmHand(robot.description.side(robot.description.sides[0].name))
     # In the palm frame, whose z is up and whose y goes to the thumb.
     back = inverse(robot.palm(robot.home))
     hand = [
@@ -392,10 +394,10 @@ def _fill(
     stage: Stage, robot: ArmHand, q: ArrayLike, grasp: Grasp | None, colors: Mapping[str, str]
 ) -> dict[str, list[Drawable]]:
     """Put all there is to see on the stage, and give it back by group."""
-    body, palm = _body(robot, q), robot.palm(q)[:3, 3]
+    body, palms = _body(robot, q), palm_places(robot, q)
     groups: dict[str, list[Drawable]] = {"arm": [], "wrist": [], "hand": []}
     for one in body:  # the close-up shows what is no further than this from the palm
-        near = one.role == "arm" and _distances(one, palm).min() < 0.10
+        near = one.role == "arm" and _distances(one, palms).min() < 0.10
         groups["wrist" if near else "arm" if one.role == "arm" else "hand"].append(one)
     groups["object"] = _object(grasp) if grasp else []
     groups["marks"] = contact_marks(robot, q, grasp, colors) if grasp else []
@@ -438,8 +440,9 @@ def _middle(robot: ArmHand, q: ArrayLike, grasp: Grasp) -> Array:
     return np.mean(places or list(tips.values()), axis=0)
 
 
-def _distances(one: Drawable, place: Array) -> Array:
-    return np.linalg.norm(one.surface.points - place, axis=1)
+def _distances(one: Drawable, places: Array) -> Array:
+    """(v,) of its vertices from the nearest of places (k, 3)."""
+    return np.linalg.norm(one.surface.points[:, None] - places, axis=2).min(axis=1)
 
 
 def _inwards(pixels: tuple[int, int]) -> Image:

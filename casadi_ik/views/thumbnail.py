@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from casadi_ik import palette
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.drawing.cameras import axes_of, close_view, whole_view
+from casadi_ik.drawing.cameras import axes_of, close_view, palm_places, whole_view
 from casadi_ik.drawing.drawables import Drawable, bodies, placed
 from casadi_ik.drawing.surfaces import coarser
 
@@ -33,7 +33,7 @@ def thumbnail(robot: ArmHand, q: Array, inches: float = 2.6) -> bytes:
         inches: Of a side of each picture.
     """
     close = close_view(robot, q)
-    palm = robot.palm(q)[:3, 3]
+    palm = palm_places(robot, q).mean(axis=0)
     every = placed(robot, q, bodies(robot, q))
     hand = [one for one in every if one.role in ("hand", "pad")]
     figure = Figure((2 * inches, inches), dpi=100)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
+from casadi_ik.views import draw_solution
 
 BODIES = ("g1+dex3", "two_pandas+allegro", "two_ur10e+leap", "mobile_kuka_lwr_barrett")
 FINE = ik.Tolerance(position=1e-6, angle=1e-6)
@@ -225,3 +226,38 @@ def test_bounds_of_an_object_that_cannot_be_are_refused():
         ik.Solver(robot).choose([free])
     with pytest.raises(ik.errors.InputError, match="log: found beside a Free"):
         ik.Solver(robot).solve(free, log="nothing.mcap")
+
+
+def near_home(robot):
+    q = robot.home.copy()
+    for name, by in (("waist_yaw_joint", 0.4), ("left_elbow_joint", -0.3)):
+        q[robot.actuators.index(name)] += by
+    return q
+
+
+@pytest.mark.parametrize("sides", [("left", "right"), ("left",)])
+def test_hands_come_close_and_lift_together(sides):
+    pytest.importorskip("toppra")
+    robot = ik.load_robot("g1+dex3")
+    fingers = [name for name in robot.fingers if name.startswith(sides)]
+    asked = grasp(robot, near_home(robot), fingers)
+    found = ik.Solver(robot).reach(asked, opening=0.01, distance=0.05, lift=0.1)
+    assert found.success
+    q, parts = found.motion.q, found.motion.notes["part"]
+    rows = [robot.fingers.index(name) for name in fingers]
+    tips = robot.contacts(q)[0]
+    there = np.array([asked.contacts[name].point for name in fingers])
+    assert np.allclose(tips[-1][rows], there + np.array([0, 0, 0.1]), atol=2e-3)
+    # What both hold keeps its place in both hands while it is lifted.
+    held = tips[parts == "lifting"][:, rows]
+    assert np.abs(held - held[:, :1] - (there - there[0])).max() < 2e-3
+    came = tips[parts == "coming"][0][rows] - there
+    assert np.linalg.norm(came, axis=1).min() > 0.04
+
+
+def test_a_body_is_drawn(tmp_path):
+    robot = ik.load_robot("g1+dex3")
+    asked = grasp(robot, robot.home)
+    answer = ik.Solver(robot).solve(asked)
+    draw_solution(robot, answer, asked, tmp_path / "g1.png")
+    assert (tmp_path / "g1.png").stat().st_size > 20_000
