@@ -29,9 +29,6 @@ except ImportError as error:
         "pip install 'casadi-ik[isaac-teleop]'"
     ) from error
 
-KEYPOINTS = [1, *range(2, 6), *range(7, 11), *range(12, 16), *range(17, 21), *range(22, 26)]
-"""Joints of OpenXR that are the 21 keypoints: all but palm and metacarpals of four fingers."""
-
 
 class ArmHandRetargeter(BaseRetargeter):
     """Input "hand_left" or "hand_right" (a `HandInput`), output "joints": a number per motor.
@@ -89,9 +86,9 @@ class ArmHandRetargeter(BaseRetargeter):
 
 
 def _keypoints(hand: Any) -> np.ndarray:
-    """(21, 3) keypoints [m] in the order of MediaPipe; NaN where the hand is not tracked."""
+    """(26, 3) joints of OpenXR [m]; NaN where the hand is not tracked."""
     found = np.full((26, 3), np.nan)
     if not hand.is_none:
         valid = np.from_dlpack(hand[HandInputIndex.JOINT_VALID]).astype(bool)
         found[valid] = np.from_dlpack(hand[HandInputIndex.JOINT_POSITIONS])[valid]
-    return found[KEYPOINTS]
+    return found

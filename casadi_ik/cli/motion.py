@@ -82,7 +82,8 @@ def follow(said: Said) -> Answer:
     if not name:
         raise InputError("--robot: missing, expected it here or as robot in --retarget")
     robot = the_robot(name)
-    frames = read_frames(path, len(robot.fingers))
+    sides = [side.name for side in robot.description.sides]
+    frames = read_frames(path, len(robot.fingers), sides)
     inputs = [path] + ([Path(said.retarget)] if said.retarget else [])
     check_outputs({"--out": said.out}, inputs)
     frames.cycles(said.period)  # are not too many

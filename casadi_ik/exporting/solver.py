@@ -121,7 +121,11 @@ class FollowSources:
 
     def _constants(self, cycle: Cycle) -> str:
         robot, f = self.robot, len(self.robot.fingers)
-        places = {"N_FINGERS": f, "N_MOTORS": len(robot.actuators), "MOVES_PALM": int(cycle.palm)}
+        places = {
+            "N_FINGERS": f,
+            "N_MOTORS": len(robot.actuators),
+            "MOVES_PALM": int(bool(cycle.palms)),
+        }
         places |= _places("STATE", cycle.state) | _places("ASKED", cycle.parameters)
         numbers = {
             "TOLERANCE_SLACK": TOLERANCE_SLACK,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 
@@ -13,6 +13,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.collision.distances import gaps
 from casadi_ik.collision.scene import Scene
 from casadi_ik.motion.clear import least_clearance
+from casadi_ik.motion.cycle import of_side
 from casadi_ik.motion.inputs import ANY, FollowerInputs, FollowPlan
 from casadi_ik.problem.clearance import CollisionQuery
 from casadi_ik.problem.contacts import usual
@@ -72,9 +73,9 @@ class Closer:
         given = ~np.isnan(problem.points[0, :, 0])
         share = np.linspace(0.0, 1.0, self.postures)[:, None, None]
         opened = points - opening * share * normals
-        opening_way = self._walk(q, opened, None, given)
+        opening_way = self._walk(q, opened, {}, given)
         there = opening_way[-1]
-        if not (self._asked.cycle.palm or robot.description.sides):
+        if not self._asked.cycle.palms:
             return LastPart(there[None], opening_way[::-1])
         coming = self.straight(there, -distance * ways * hands_used(robot, problem))
         return None if coming is None else LastPart(coming[::-1], opening_way[::-1])
@@ -87,32 +88,29 @@ class Closer:
             shift: (3,), or (f, 3) the same for fingers of a hand, base frame [m].
         """
         robot, share = self._robot, np.linspace(0.0, 1.0, self.postures)[:, None, None]
-        tips, facing = robot.contacts(q)
+        tips, palms = robot.contacts(q)[0], dict[str | None, Array]()
         shifts = np.broadcast_to(shift, tips.shape)
+        for side, hand in robot.hands.items():
+            palms[side] = np.repeat(robot.palm(q, side)[None], self.postures, axis=0)
+            palms[side][:, :3, 3] += share[:, 0] * shifts[hand[0]]
         every = np.ones(len(tips), dtype=bool)
-        if robot.description.sides:
-            # Fingertips that keep their points and directions carry their palm along.
-            there = tips + share * shifts
-            found = self._walk(q, there, None, every, facing)
-            off = np.linalg.norm(robot.contacts(found)[0] - there, axis=-1)
-            return None if off.max() > self.stray else found
-        palms = np.repeat(robot.palm(q)[None], self.postures, axis=0)
-        palms[:, :3, 3] += share[:, 0] * shifts[0]
         found = self._walk(q, tips + share * shifts, palms, every)
-        off = np.linalg.norm(robot.palm(found)[:, :3, 3] - palms[:, :3, 3], axis=1)
-        return None if off.max() > self.stray else found
+        for side, poses in palms.items():
+            off = np.linalg.norm(robot.palm(found, side)[:, :3, 3] - poses[:, :3, 3], axis=1)
+            if off.max() > self.stray:
+                return None
+        return found
 
     def _walk(
-        self, q: Array, tips: Array, palms: Array | None, given: Array, facing: Array | None = None
+        self, q: Array, tips: Array, palms: Mapping[str | None, Array], given: Array
     ) -> Array:
-        """(k, n) postures from q on, with fingertips and palm where they are asked for.
+        """(k, n) postures from q on, with fingertips and palms where they are asked for.
 
         Args:
             q: (n,).
             tips: (k, f, 3) [m].
-            palms: (k, 4, 4); None: where it is.
+            palms: (k, 4, 4) by side; where they are if it is left out.
             given: (f,) whether a fingertip counts.
-            facing: (f, 3) the way pads face; None: any way.
         """
         asked, count = self._asked, len(tips)
         layout = asked.cycle.parameters
@@ -120,23 +118,20 @@ class Closer:
         f = len(given)
         values = {
             "points": tips,
-            "normals": np.tile(ANY, (count, f, 1))
-            if facing is None
-            else np.tile(facing, (count, 1, 1)),
-            "weights": np.tile(
-                np.stack([given, (facing is not None) * given], axis=1), (count, 1, 1)
-            ),
+            "normals": np.tile(ANY, (count, f, 1)),
+            "weights": np.tile(np.stack([given, 0 * given], axis=1), (count, 1, 1)),
             "position_tolerance": np.ones((count, f)),
             "angle_tolerance": np.ones((count, f)),
         }
-        if asked.cycle.palm:
-            if palms is None:
-                palms = np.repeat(self._robot.palm(q)[None], count, axis=0)
-            values |= {
-                "palm_point": palms[:, :3, 3],
-                "palm_axes": palms[:, :3, :3],
-                "palm_weight": np.ones((count, 2)),
+        for side in asked.cycle.palms:
+            stays = np.repeat(self._robot.palm(q, side)[None], count, axis=0)
+            poses = palms.get(side, stays)
+            wanted = {
+                "point": poses[:, :3, 3],
+                "axes": poses[:, :3, :3],
+                "weight": np.ones((count, 2)),
             }
+            values |= {of_side(f"palm_{name}", side): array for name, array in wanted.items()}
         for name, array in values.items():
             every[:, layout.slice(name)] = array.reshape(count, -1)
         rows = np.repeat(every, self.cycles, axis=0)

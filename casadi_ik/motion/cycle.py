@@ -36,6 +36,7 @@ from functools import cached_property
 
 import casadi as ca
 
+from casadi_ik.arrays import Array
 from casadi_ik.kernels.graphs import FunctionGraph, recipe
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.methods.common.bounded_step import Bounded, damped_step
@@ -149,7 +150,12 @@ def track_goal(s: dict[str, Expr], goal: Expr, drawn: Expr, p: dict[str, Expr]) 
 
 
 PALM_ROWS = 12
-"""Of the palm's residual: its place, and its three axes."""
+"""Of a palm's residual: its place, and its three axes."""
+
+
+def of_side(name: str, side: str | None) -> str:
+    """What a parameter of a side's palm is called; None: of the only one."""
+    return name if side is None else f"{name}_{side}"
 
 
 @dataclass(frozen=True)
@@ -171,22 +177,26 @@ class Cycle:
         """The contacts' rows."""
         return ContactRows(self.kinds)
 
-    @property
-    def palm(self) -> bool:
-        """Whether the palm moves, so that it may have a target too."""
-        return bool(self.robot.arm_actuators)
+    @cached_property
+    def palms(self) -> dict[str | None, tuple[str, Array]]:
+        """Palms that move, so that they may have targets too: link and placement, by side."""
+        if self.robot.sides:
+            return {side.name: (side.palm_link, side.palm_placement) for side in self.robot.sides}
+        if not self.robot.arm_actuators:
+            return {}
+        return {None: (self.robot.palm_link, self.robot.palm_placement)}
 
     @cached_property
     def state(self) -> Layout:
         """What a cycle hands on to the next."""
-        n, rows = len(self.robot.actuators), self.contacts.size + PALM_ROWS * self.palm
+        n, rows = len(self.robot.actuators), self.contacts.size + PALM_ROWS * len(self.palms)
         return Layout(
             (
                 Field("q", (n,), unit="rad or m", doc="where the motors are told to be"),
                 Field("moved", (n,), unit="rad or m", doc="their last step"),
                 Field("goal", (n,), unit="rad or m", doc="where they are going"),
                 Field("locked_on", doc="1: they go with the goal; 0: they run after it"),
-                Field("left", (rows,), doc="residual of contacts and palm"),
+                Field("left", (rows,), doc="residual of contacts and palms"),
             )
         )
 
@@ -208,11 +218,14 @@ class Cycle:
             Field("drift", doc="part of the way to the posture that a free motion gains"),
             Field("patience", doc="part of an error that may be left after a cycle"),
         ]
-        if self.palm:
+        for side in self.palms:
+            point, axes, weight = (
+                of_side(f"palm_{name}", side) for name in ("point", "axes", "weight")
+            )
             fields += [
-                Field("palm_point", (3,), unit="m", doc="where the palm is wanted, base frame"),
-                Field("palm_axes", (3, 3), doc="its axes as columns, base frame"),
-                Field("palm_weight", (2,), doc="of its place and its axes"),
+                Field(point, (3,), unit="m", doc="where the palm is wanted, base frame"),
+                Field(axes, (3, 3), doc="its axes as columns, base frame"),
+                Field(weight, (2,), doc="of its place and its axes"),
             ]
         if m:
             fields += [
@@ -360,25 +373,30 @@ class Cycle:
         return here + found.step * scales
 
     def _residual(self, q: Expr, p: dict[str, Expr]) -> Expr:
-        """Of contacts and palm, (rows, 1)."""
-        residual = whole_residual(self.robot, self.contacts, q, p)
-        if not self.palm:
-            return residual
-        palm, weight = actuated(self.robot, q).kinematics.palm, p["palm_weight"]
-        off = weight[0] * (palm.origin - p["palm_point"]) / LENGTH
-        return ca.vertcat(residual, off, weight[1] * ca.vec(palm.rotation - p["palm_axes"]))
+        """Of contacts and palms, (rows, 1)."""
+        rows = [whole_residual(self.robot, self.contacts, q, p)]
+        links = actuated(self.robot, q).kinematics.links
+        for side, (link, placement) in self.palms.items():
+            palm, weight = links[link].at(placement), p[of_side("palm_weight", side)]
+            rows.append(weight[0] * (palm.origin - p[of_side("palm_point", side)]) / LENGTH)
+            turned = palm.rotation - p[of_side("palm_axes", side)]
+            rows.append(weight[1] * ca.vec(turned))
+        return ca.vertcat(*rows)
 
     def _jacobian(self, q: Expr, p: dict[str, Expr]) -> Expr:
         """Its Jacobian (rows, n)."""
+        rows, body = list[Expr](), actuated(self.robot, q)
+        for side, (link, placement) in self.palms.items():
+            palm, weight = (
+                body.kinematics.links[link].at(placement),
+                p[of_side("palm_weight", side)],
+            )
+            linear, angular = body.twist(link, palm.origin, range(q.numel()))
+            axes = ca.horzsplit(palm.rotation)
+            turned = [-weight[1] * skew(axis) @ angular for axis in axes]
+            rows += [weight[0] * linear / LENGTH, *turned]
         jacobian = whole_jacobian(self.robot, self.contacts, q, p)
-        if not self.palm:
-            return jacobian
-        body, weight = actuated(self.robot, q), p["palm_weight"]
-        linear, angular = body.palm_jacobian(range(q.numel()))
-        axes = ca.horzsplit(body.kinematics.palm.rotation)
-        turned = [-weight[1] * skew(axis) @ angular for axis in axes]
-        rows = (weight[0] * linear / LENGTH, *turned)
-        return ca.vertcat(jacobian, *map(ca.sparsify, rows))
+        return ca.vertcat(jacobian, *map(ca.sparsify, rows)) if rows else jacobian
 
     def _errors(self, q: Expr, p: dict[str, Expr]) -> tuple[Expr, Expr]:
         """Distances [m] and angles [rad] of all contacts, (f, 1); 0 where free."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 
@@ -17,6 +18,9 @@ from casadi_ik.motion.clear import OBSTACLES, Guard, stopping_way
 from casadi_ik.motion.inputs import FollowerInputs, FollowPlan
 from casadi_ik.problem.contacts import Kinds, by_kinds, usual
 from casadi_ik.problem.verdict import TOLERANCE_SLACK
+
+Poses = Mapping[str | None, Array]
+"""Of palms (4, 4), by side; None: of the only one."""
 
 
 class FollowStatus(Enum):
@@ -196,7 +200,7 @@ class Follower:
         self,
         target: Grasp | ArrayLike,
         normals: ArrayLike | None = None,
-        palm: ArrayLike | None = None,
+        palm: ArrayLike | Mapping[str, ArrayLike] | None = None,
         palm_weight: tuple[float, float] = (PALM_WEIGHT, PALM_WEIGHT),
     ) -> Array:
         """One cycle.
@@ -207,7 +211,7 @@ class Follower:
             normals: (f, 3) outward pad normals of any length, NaN marks a free one; None: all are
                 free.
             palm: (4, 4) where the palm is wanted, base frame, as far as the contacts leave it
-                free; None: anywhere.
+                free; of a body by side; None: anywhere.
             palm_weight: How much its place and its axes count, a contact counting 1.
 
         Returns:
@@ -221,36 +225,37 @@ class Follower:
         self._reason = ""
         if isinstance(target, Grasp):
             self._ask_grasp(target, normals)
-            return self._step(palm, palm_weight)[: self._n].copy()
+            return self._step(self._poses(palm), palm_weight)[: self._n].copy()
+        poses = self._poses(palm)
         points = self._vectors("points", target)
         facing = None if normals is None else self._vectors("normals", normals)
         if self._asked.cycle.kinds != self._usual:
             self._take_up(self._usual)
         self._tolerances = self._own
         self._asked.ask(points, facing)
-        after = self._step(palm, palm_weight)
+        after = self._step(poses, palm_weight)
         if not self._asked.sound:
-            after = self._step_partly(points, facing, palm, palm_weight)
+            after = self._step_partly(points, facing, poses, palm_weight)
         return after[: self._n].copy()
 
-    def _step(self, palm: ArrayLike | None, palm_weight: tuple[float, float]) -> Array:
+    def _step(self, palms: Poses, palm_weight: tuple[float, float]) -> Array:
         """The state after a step towards what was asked."""
         asked = self._asked
-        if palm is not None:
-            asked.ask_palm(self._pose(palm), palm_weight)
+        if palms:
+            asked.ask_palms(palms, palm_weight)
         if self._guard is None:
             after = asked.run.step()
         else:
             after, self._stopped = self._guard.step(asked)
-        if palm is not None:
-            asked.free_palm()
+        if palms:
+            asked.free_palms()
         return after
 
     def _step_partly(
         self,
         points: Array,
         normals: Array | None,
-        palm: ArrayLike | None,
+        palms: Poses,
         palm_weight: tuple[float, float],
     ) -> Array:
         """The same instead of the last step, with contacts of which some are free or none."""
@@ -259,14 +264,14 @@ class Follower:
         free = np.full(self._shape, np.nan)
         self._reason = asked.ask_partly(points, free if normals is None else normals)
         if not self._reason:
-            after = self._step(palm, palm_weight)
+            after = self._step(palms, palm_weight)
             if asked.sound:
                 return after
             asked.run.back()
             self._reason = "a number is out of range"
         asked.ask_nothing()
         self._go_to_rest(asked)
-        return self._step(None, palm_weight)
+        return self._step({}, palm_weight)
 
     def _ask_grasp(self, grasp: Grasp, normals: ArrayLike | None) -> None:
         if normals is not None:
@@ -301,12 +306,23 @@ class Follower:
     @property
     def moves_palm(self) -> bool:
         """Whether there is an arm, so that the palm may be asked for."""
-        return "palm_weight" in self._asked.views
+        return bool(self._asked.cycle.palms)
 
-    def _pose(self, palm: ArrayLike) -> Array:
-        if not self.moves_palm:
+    def _poses(self, palm: ArrayLike | Mapping[str, ArrayLike] | None) -> Poses:
+        """By side; of an arm with a hand by None."""
+        if palm is None:
+            return {}
+        known = self._asked.cycle.palms
+        if not known:
             raise InputError("palm: found a pose for a hand that stands still, expected None")
-        return np.asarray(palm, dtype=float)
+        poses = palm if isinstance(palm, Mapping) else {None: palm}
+        for side in poses:
+            if side not in known:
+                names = ", ".join(name for name in known if name)
+                expected = f"poses by side: {names}" if names else "one pose"
+                found = "one pose" if side is None else f"side {side!r}"
+                raise InputError(f"palm: found {found}, expected {expected}")
+        return {side: np.asarray(pose, dtype=float) for side, pose in poses.items()}
 
     @property
     def state(self) -> FollowState:

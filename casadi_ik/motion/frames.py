@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,9 +13,10 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.files.limits import LIMITS, RAISED, limit
 from casadi_ik.files.npz import read_npz
+from casadi_ik.motion.cycle import of_side
 from casadi_ik.motion.follower import Follower, FollowStatus
 from casadi_ik.motion.motion import Motion
-from casadi_ik.motion.retarget import KEYPOINTS, RATE, Retargeter
+from casadi_ik.motion.retarget import KEYPOINTS, RATE, Retargeter, as_keypoints
 
 AT_ONCE = 1024
 """Cycles whose targets are in memory."""
@@ -28,14 +29,15 @@ class Frames:
     Attributes:
         path: The file they are from.
         times: (k,) [s], the first 0.
-        keypoints: (k, 21, 3) of a person's hand [m]; None: contacts are given.
+        keypoints: (k, 21, 3) by side of a person's hands [m], None is the only one; nothing:
+            contacts are given.
         points: (k, f, 3) contact points [m], base frame; nothing where keypoints are given.
         normals: (k, f, 3) outward pad normals; NaN where free.
     """
 
     path: Path
     times: Array
-    keypoints: Array | None
+    keypoints: dict[str | None, Array]
     points: Array
     normals: Array
 
@@ -66,55 +68,87 @@ class Frames:
         return period * np.arange(1, int(np.ceil(seconds / period)) + 2, dtype=float)
 
 
-def read_frames(path: Path, fingers: int) -> Frames:
+def read_frames(path: Path, fingers: int, sides: Sequence[str] = ()) -> Frames:
     """Read a stream for a robot of so many fingers.
+
+    Args:
+        path: An npz file.
+        fingers: Of the robot.
+        sides: Of a body.
 
     Raises:
         DescriptionError: Missing, damaged or too large; the message names the file.
         InputError: Other arrays than expected; the message names file and key.
     """
     arrays = read_npz(path, LIMITS.stream_bytes)
-    known = ["keypoints", "normals", "points", "times"]
-    if ("keypoints" in arrays) == ("points" in arrays):
+    hands = {of_side("keypoints", side): side for side in sides or (None,)}
+    known = [*hands, "normals", "points", "times"]
+    if any(name in arrays for name in hands) == ("points" in arrays):
         raise InputError(
-            f"{path}: expected keypoints (k, {KEYPOINTS}, 3) or points (k, {fingers}, 3); "
-            f"found {', '.join(arrays) or 'nothing'}"
+            f"{path}: expected {' and '.join(hands)} (k, {KEYPOINTS}, 3) or points "
+            f"(k, {fingers}, 3); found {', '.join(arrays) or 'nothing'}"
         )
     for name in sorted(set(arrays).difference(known)):
         raise InputError(f"{path}: {name}: unknown, expected {', '.join(known)}")
-    key = "keypoints" if "keypoints" in arrays else "points"
-    count = KEYPOINTS if key == "keypoints" else fingers
-    frames = arrays[key]
-    if frames.ndim != 3 or frames.shape[1:] != (count, 3) or not len(frames):
+    if "points" in arrays:
+        return _read_contacts(path, arrays, fingers)
+    keypoints = dict[str | None, Array]()
+    for name, side in hands.items():
+        if name not in arrays:
+            continue
+        frames = as_keypoints(arrays[name], f"{path}: {name}")
+        length = len(next(iter(keypoints.values()), frames))
+        if frames.ndim != 3 or not len(frames) or len(frames) != length:
+            expected = f"({length}, " if keypoints else "(k, "
+            raise InputError(
+                f"{path}: {name}: found shape {arrays[name].shape}, expected "
+                f"{expected}{KEYPOINTS}, 3), k >= 1"
+            )
+        with np.errstate(invalid="ignore"):  # one bad frame is no error of a stream
+            away = frames - frames.mean(axis=1, keepdims=True)
+        _check_reach(away, path, name, "middle of the hand")
+        keypoints[side] = frames
+    if "normals" in arrays:
+        raise InputError(f"{path}: normals: found them beside keypoints, expected points")
+    times = _times(path, arrays, len(next(iter(keypoints.values()))))
+    nothing = np.zeros((len(times), 0, 3))
+    return Frames(path, times, keypoints, nothing, nothing)
+
+
+def _read_contacts(path: Path, arrays: dict[str, Array], fingers: int) -> Frames:
+    points = arrays["points"]
+    if points.ndim != 3 or points.shape[1:] != (fingers, 3) or not len(points):
         raise InputError(
-            f"{path}: {key}: found shape {frames.shape}, expected (k, {count}, 3), k >= 1"
+            f"{path}: points: found shape {points.shape}, expected (k, {fingers}, 3), k >= 1"
         )
+    _check_reach(points, path, "points", "base")
+    normals = arrays.get("normals", np.full(points.shape, np.nan))
+    if normals.shape != points.shape:
+        raise InputError(f"{path}: normals: found shape {normals.shape}, expected {points.shape}")
+    return Frames(path, _times(path, arrays, len(points)), {}, points, normals)
+
+
+def _check_reach(vectors: Array, path: Path, key: str, origin: str) -> None:
     # One bad frame is no error of a stream; most of them too large are in other units.
-    middle = frames.mean(axis=1, keepdims=True) if key == "keypoints" else 0.0
     with np.errstate(invalid="ignore"):
-        away = np.linalg.norm(frames - middle, axis=2)
+        away = np.linalg.norm(vectors, axis=2)
     away = away[np.isfinite(away)]
     if len(away) and np.median(away) > LIMITS.stream_reach:
-        of = "middle of the hand" if key == "keypoints" else "base"
         raise InputError(
-            f"{path}: {key}: found {np.median(away):.4g} m from the {of}, expected at most "
+            f"{path}: {key}: found {np.median(away):.4g} m from the {origin}, expected at most "
             f"{LIMITS.stream_reach:g} m (numbers in mm?)"
         )
-    normals = arrays.get("normals")
-    if normals is not None and (key == "keypoints" or normals.shape != frames.shape):
-        expected = "points beside them" if key == "keypoints" else f"{frames.shape}"
-        raise InputError(f"{path}: normals: found shape {normals.shape}, expected {expected}")
-    times = arrays.get("times", np.arange(len(frames)) / RATE)
-    steady = times.shape == (len(frames),) and np.isfinite(times).all()
+
+
+def _times(path: Path, arrays: dict[str, Array], count: int) -> Array:
+    """(k,) [s], the first 0."""
+    times = arrays.get("times", np.arange(count) / RATE)
+    steady = times.shape == (count,) and np.isfinite(times).all()
     if not (steady and (np.diff(times) > 0).all()):
         raise InputError(
-            f"{path}: times: expected {len(frames)} growing numbers of seconds, one per frame"
+            f"{path}: times: expected {count} growing numbers of seconds, one per frame"
         )
-    if key == "keypoints":
-        nothing = np.zeros((len(frames), 0, 3))
-        return Frames(path, times - times[0], frames, nothing, nothing)
-    free = np.full(frames.shape, np.nan) if normals is None else normals
-    return Frames(path, times - times[0], None, frames, free)
+    return times - times[0]
 
 
 def follow_frames(
@@ -153,11 +187,15 @@ def _followed(
     weight = retargeter.config.wrist_weight, retargeter.config.wrist_weight
     for first in range(0, len(times), AT_ONCE):
         now = times[first : first + AT_ONCE]
-        if frames.keypoints is None:
+        if not frames.keypoints:
             both = frames.at(now, frames.points), frames.at(now, frames.normals)
             yield from (follower(*target) for target in zip(*both, strict=True))
             continue
-        for keypoints in frames.at(now, frames.keypoints):
-            wanted = retargeter(keypoints, follower.period)
+        hands = {side: frames.at(now, values) for side, values in frames.keypoints.items()}
+        for i in range(len(now)):
+            seen = {side: values[i] for side, values in hands.items()}
+            alone = seen.get(None)
+            both = {str(side): values for side, values in seen.items()}
+            wanted = retargeter(both if alone is None else alone, follower.period)
             palm = wanted.palm if follower.moves_palm else None
             yield follower(wanted.points, palm=palm, palm_weight=weight)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +14,7 @@ from casadi_ik.arrays import Array, Bools
 from casadi_ik.grasps.pose import one_pose
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.kernels.function_kernel import Recurrence
-from casadi_ik.motion.cycle import Cycle
+from casadi_ik.motion.cycle import Cycle, of_side
 from casadi_ik.motion.timing import Rates
 from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.problem.contacts import LENGTH, Kinds
@@ -166,15 +167,17 @@ class FollowerInputs:
         self._fill(**{name: values[0] for name, values in rows.items()})
         self._fill(**tolerance_rows(problem.tolerances))
 
-    def ask_palm(self, pose: Array, weight: tuple[float, float]) -> None:
-        """Ask for a pose of the palm (4, 4), as far as contacts leave it free."""
-        checked = one_pose(pose)
-        self._fill(palm_point=checked[:3, 3], palm_axes=checked[:3, :3], palm_weight=weight)
+    def ask_palms(self, poses: Mapping[str | None, Array], weight: tuple[float, float]) -> None:
+        """Ask for poses of palms (4, 4) by side, as far as contacts leave them free."""
+        for side, pose in poses.items():
+            checked = one_pose(pose, "palm" if side is None else f"palm.{side}")
+            asked = {"point": checked[:3, 3], "axes": checked[:3, :3], "weight": weight}
+            self._fill(**{of_side(f"palm_{name}", side): value for name, value in asked.items()})
 
-    def free_palm(self) -> None:
-        """Ask for no pose of the palm."""
-        if "palm_weight" in self.views:
-            self._fill(palm_weight=0.0)
+    def free_palms(self) -> None:
+        """Ask for no pose of a palm."""
+        for side in self.cycle.palms:
+            self._fill(**{of_side("palm_weight", side): 0.0})
 
     def errors(self, robot: ArmHand, q: Array) -> tuple[Array, Array]:
         """How far a posture (n,) is off what was asked last: (f,) [m], (f,) [rad], NaN if free."""
@@ -201,7 +204,7 @@ class FollowerInputs:
         """Ask for nothing: the goal stays."""
         self._mode = ""
         self._fill(points=0.0, normals=ANY, weights=0.0)
-        self.free_palm()
+        self.free_palms()
 
 
 def contact_weights(tolerances: tuple[Tolerance, ...]) -> Array:

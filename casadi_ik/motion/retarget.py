@@ -9,9 +9,11 @@ neither's posture: a person's bones and how far the robot's fingertips reach do.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -23,6 +25,16 @@ from casadi_ik.grasps.grasp import real_array
 
 KEYPOINTS = 21
 """Of a hand."""
+
+OPENXR = (1, *range(2, 6), *range(7, 11), *range(12, 16), *range(17, 21), *range(22, 26))
+"""Joints of OpenXR that are the keypoints: all but palm and metacarpals of four fingers."""
+
+LAYOUTS = {
+    KEYPOINTS: tuple(range(KEYPOINTS)),
+    26: OPENXR,
+    25: tuple(joint - 1 for joint in OPENXR),
+}
+"""Where the keypoints are among so many joints."""
 
 KNUCKLES = (5, 17)
 """Of index and little finger: with the wrist they tell how a hand is turned."""
@@ -44,11 +56,26 @@ LARGEST = 0.15
 """Of a person's palm [m]; in a picture whose size is one, hands are mostly larger."""
 
 
+class RetargetSide(Struct, frozen=True, kw_only=True):
+    """What is a side's own where two hands move a body.
+
+    Attributes:
+        fingers: Keypoint by finger of that side, with the side in its name or without.
+        mirror: As for one hand.
+        xyz: As for one hand.
+    """
+
+    fingers: dict[str, int]
+    mirror: bool = False
+    xyz: Point | None = None
+
+
 class Retarget(Struct, frozen=True, kw_only=True):
-    """How a person's hand moves a robot's.
+    """How a person's hand moves a robot's, or both hands a body's.
 
     Attributes:
         fingers: Keypoint by finger of the robot; fingers left out are free.
+        sides: Of a body instead, by side.
         wrist: Keypoint of the wrist.
         scaling: Size of the robot's hand over the person's; 0: how far both reach when they are
             open, found from the robot's fingertips and the person's bones.
@@ -65,7 +92,8 @@ class Retarget(Struct, frozen=True, kw_only=True):
         robot: Its name; the command line's goes before.
     """
 
-    fingers: dict[str, int]
+    fingers: dict[str, int] = msgspec.field(default_factory=dict)
+    sides: dict[str, RetargetSide] = msgspec.field(default_factory=dict)
     wrist: int = 0
     scaling: float = 0.0
     travel: float | None = None
@@ -75,6 +103,12 @@ class Retarget(Struct, frozen=True, kw_only=True):
     low_pass: float = 1.0
     wrist_weight: float = 0.05
     robot: str = ""
+
+    def by_side(self) -> dict[str | None, RetargetSide]:
+        """What each hand follows; None: the only one."""
+        if self.sides:
+            return {**self.sides}
+        return {None: RetargetSide(fingers=self.fingers, mirror=self.mirror, xyz=self.xyz)}
 
 
 def load_retarget(path: str | Path) -> Retarget:
@@ -97,10 +131,17 @@ def load_retarget(path: str | Path) -> Retarget:
 
 
 def _problem(config: Retarget) -> str:
-    if not config.fingers:
-        return "fingers: found none, expected a keypoint by finger"
-    for name, number in {**config.fingers, "wrist": config.wrist}.items():
-        where = name if name == "wrist" else f"fingers.{name}"
+    if config.sides:
+        for name, given in (("fingers", config.fingers), ("xyz", config.xyz)):
+            if given:
+                return f"{name}: found it beside sides, expected one for each of them"
+    numbers = {"wrist": config.wrist}
+    for side, own in config.by_side().items():
+        where = "fingers" if side is None else f"sides.{side}.fingers"
+        if not own.fingers:
+            return f"{where}: found none, expected a keypoint by finger"
+        numbers |= {f"{where}.{name}": number for name, number in own.fingers.items()}
+    for where, number in numbers.items():
         if not 0 <= number < KEYPOINTS:
             return f"{where}: found {number}, expected a keypoint from 0 to {KEYPOINTS - 1}"
     if not 0 < config.low_pass <= 1:
@@ -113,22 +154,35 @@ def _problem(config: Retarget) -> str:
 
 
 def usual_retarget(robot: ArmHand) -> Retarget:
-    """The configuration for a hand whose fingers have their usual names, or are in their order.
+    """The configuration for hands whose fingers have their usual names, or are in their order.
 
     Raises:
-        InputError: The robot has more than five fingers.
+        InputError: A hand has more than five fingers.
     """
+    body = robot.description
+    if not body.sides:
+        return Retarget(fingers=_usual_fingers(robot.fingers, robot.thumb, robot.name))
+    sides = {
+        side.name: RetargetSide(
+            fingers=_usual_fingers(side.fingers, side.named_thumb or side.fingers[0], robot.name)
+        )
+        for side in body.sides
+    }
+    return Retarget(sides=sides)
+
+
+def _usual_fingers(fingers: Sequence[str], thumb: str, robot: str) -> dict[str, int]:
     tips = {"thumb": 4, "index": 8, "middle": 12, "ring": 16, "little": 20, "pinky": 20}
-    named = {name: tips[name] for name in robot.fingers if name in tips}
-    if len(named) < len(robot.fingers):
-        others = [name for name in robot.fingers if name != robot.thumb]
-        if len(others) > 4:
-            raise InputError(
-                f"robot {robot.name!r}: has {len(robot.fingers)} fingers, expected a retarget file "
-                "that says what each follows"
-            )
-        named = {robot.thumb: 4} | dict(zip(others, (8, 12, 16, 20), strict=False))
-    return Retarget(fingers=named)
+    plain = {name: name.rsplit("_", 1)[-1] for name in fingers}
+    if all(name in tips for name in plain.values()) and len(set(plain.values())) == len(fingers):
+        return {name: tips[short] for name, short in plain.items()}
+    others = [name for name in fingers if name != thumb]
+    if len(others) > 4:
+        raise InputError(
+            f"robot {robot!r}: has {len(fingers)} fingers, expected a retarget file that says what "
+            "each follows"
+        )
+    return {thumb: 4} | dict(zip(others, (8, 12, 16, 20), strict=False))
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,23 +191,42 @@ class Wanted:
 
     Attributes:
         points: (f, 3) fingertips [m], base frame; NaN where free or where the frame is none.
-        palm: (4, 4) the wrist; None where the frame is none.
+        palm: (4, 4) the wrist; of a body by side those whose frame is one; None where the frame is
+            none.
     """
 
     points: Array
-    palm: Array | None
+    palm: Array | dict[str, Array] | None
+
+
+def as_keypoints(joints: ArrayLike, name: str = "keypoints") -> Array:
+    """(..., 21, 3) keypoints of (..., 21, 3), or of OpenXR's joints (..., 26, 3).
+
+    25 joints are those of OpenXR without the palm, as Vision Pro streams them.
+
+    Raises:
+        InputError: Another shape, or no numbers.
+    """
+    try:
+        found = real_array(joints)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: expected an array of numbers: {error}") from error
+    if found.ndim < 2 or found.shape[-1] != 3 or found.shape[-2] not in LAYOUTS:
+        raise InputError(
+            f"{name}: found shape {found.shape}, expected ({KEYPOINTS}, 3), or the 26 joints of "
+            "OpenXR, or 25 without the palm"
+        )
+    return found[..., LAYOUTS[found.shape[-2]], :]
 
 
 class Retargeter:
-    """Turns keypoints of a person's hand into targets of a robot.
+    """Turns keypoints of a person's hand, or of both, into targets of a robot.
 
     Called once a frame, or once a cycle of a follower with the newest frame and the cycle's time:
     then what is smoothed moves on between the frames.
 
     Attributes:
         config: How.
-        in_hand: Whether the keypoints' origin is in the hand (MediaPipe's world landmarks), so that
-            where the wrist is cannot be told; known from the first frame on.
 
     Example:
         >>> config = ik.motion.load_retarget("hand.yaml")
@@ -170,79 +243,169 @@ class Retargeter:
 
         Args:
             config: How.
-            robot: The robot; its fingers must be those of the configuration.
+            robot: The robot; its sides and fingers must be those of the configuration.
             q0: (n,) where it is [rad or m]; None: at home.
 
         Raises:
-            InputError: A finger that the robot has not, or bad q0.
+            InputError: A side or a finger that the robot has not, or bad q0.
         """
-        for name in config.fingers:
-            if name not in robot.fingers:
-                raise InputError(
-                    f"fingers.{name}: no such finger; the robot's fingers: "
-                    f"{', '.join(robot.fingers)}"
-                )
         self.config, self._robot = config, robot
         here = robot.configuration(q0, "q0")
-        self._palm, (self._tips, _) = robot.palm(here), robot.contacts(here)
-        rows = [robot.fingers.index(name) for name in config.fingers]
-        self._rows, self._keys = np.array(rows), np.array(list(config.fingers.values()))
-        self.in_hand = False
-        self._first: tuple[Array, Array] | None = None
-        self._smooth: Array | None = None
+        self._hands = {
+            side: _Hand(config, robot, here, side, own) for side, own in config.by_side().items()
+        }
+        self._turn: Array | None = None
 
-    def __call__(self, keypoints: ArrayLike, elapsed: float = 1 / RATE) -> Wanted:
+    @property
+    def in_hand(self) -> bool:
+        """Whether the keypoints' origin is in a hand (MediaPipe's world landmarks).
+
+        Where the wrist is cannot be told then; known from the first frame on.
+        """
+        return any(hand.in_hand for hand in self._hands.values())
+
+    def __call__(
+        self, keypoints: ArrayLike | Mapping[str, ArrayLike], elapsed: float = 1 / RATE
+    ) -> Wanted:
         """One frame.
 
         Args:
             keypoints: (21, 3) [m], in any frame that stays the same, or in one whose origin is in
-                the hand.
+                the hand; or joints of OpenXR, see `as_keypoints`. Of two hands by side, in the
+                same frame; a side left out is not seen.
             elapsed: Time since the call before [s].
 
         Raises:
-            InputError: Another shape, no numbers, places in a picture instead of metres, or a bad
-                time. NaN is no error: then nothing is wanted.
+            InputError: Another shape, no numbers, places in a picture instead of metres, a side
+                that the configuration has not, or a bad time. NaN is no error: then nothing is
+                wanted.
         """
         if not 0 < elapsed < np.inf:
             raise InputError(f"elapsed: found {elapsed}, expected seconds above 0")
-        try:
-            frame = real_array(keypoints)
-        except (TypeError, ValueError) as error:
-            raise InputError(f"keypoints: expected an array of numbers: {error}") from error
-        if frame.shape != (KEYPOINTS, 3):
-            raise InputError(f"keypoints: found shape {frame.shape}, expected ({KEYPOINTS}, 3)")
-        points = np.full((len(self._robot.fingers), 3), np.nan)
-        used = np.concatenate([frame[self._keys], frame[[self.config.wrist, *KNUCKLES]]])
-        if not np.isfinite(used).all():
+        points, frames = np.full((len(self._robot.fingers), 3), np.nan), dict[str | None, Array]()
+        for side, joints in self._by_side(keypoints).items():
+            hand = self._hands[side]
+            frame = as_keypoints(joints, "keypoints" if side is None else f"keypoints.{side}")
+            if frame.ndim != 2:
+                raise InputError(f"keypoints: found shape {frame.shape}, expected one frame")
+            if hand.sees(frame):
+                frames[side] = hand.smoothed(frame, elapsed)
+        if self._turn is None and len(frames) == len(self._hands):
+            self._turn = self._aligned(frames)
+        if self._turn is None or not frames:
             return Wanted(points, None)
-        if self._first is None:
+        palms = dict[str | None, Array]()
+        for side, frame in frames.items():
+            hand = self._hands[side]
+            points[hand.rows], palms[side] = hand.wanted(frame, self._turn)
+        if None in palms:
+            return Wanted(points, palms[None])
+        return Wanted(points, {str(side): palm for side, palm in palms.items()})
+
+    def _by_side(
+        self, keypoints: ArrayLike | Mapping[str, ArrayLike]
+    ) -> Mapping[str | None, ArrayLike]:
+        sides = ", ".join(self.config.sides)
+        if not isinstance(keypoints, Mapping):
+            if sides:
+                raise InputError(f"keypoints: found one hand, expected them by side: {sides}")
+            return {None: keypoints}
+        for side in keypoints:
+            if side not in self._hands:
+                raise InputError(f"keypoints.{side}: no such side, expected {sides or 'one hand'}")
+        return {**keypoints}
+
+    def _aligned(self, frames: Mapping[str | None, Array]) -> Array:
+        """(3, 3) from the keypoints' frame to the base frame, the same for all hands."""
+        if self.config.rpy is not None:
+            return _rotation(self.config.rpy)
+        hands = [self._hands[side] for side in frames]
+        spread = [hand.spread(frame) for hand, frame in zip(hands, frames.values(), strict=True)]
+        wrists = np.array([frame[self.config.wrist] for frame in frames.values()])
+        palms = np.array([hand.palm[:3, 3] for hand in hands])
+        # How hands stand to each other tells most of how a body stands; of one hand it is nothing.
+        spread.append((wrists - wrists.mean(axis=0), palms - palms.mean(axis=0)))
+        return _aligned(*(np.concatenate(both) for both in zip(*spread, strict=True)))
+
+
+class _Hand:
+    """A hand of the robot, and what it follows.
+
+    Attributes:
+        rows: Its fingers that follow, as positions in those of the robot.
+        palm: (4, 4) where it begins.
+        in_hand: Whether the keypoints' origin is in the hand.
+    """
+
+    def __init__(
+        self, config: Retarget, robot: ArmHand, here: Array, side: str | None, own: RetargetSide
+    ) -> None:
+        if side not in robot.hands:
+            sides = ", ".join(name for name in robot.hands if name)
+            if side is None:
+                raise InputError(f"sides: missing, expected the robot's sides: {sides}")
+            known = f"the robot's sides: {sides}" if sides else "the robot has one hand"
+            raise InputError(f"sides.{side}: no such side; {known}")
+        where = "fingers" if side is None else f"sides.{side}.fingers"
+        names, rows = [robot.fingers[i] for i in robot.hands[side]], list[int]()
+        for name in own.fingers:
+            full = name if name in names else f"{side}_{name}"
+            if full not in names:
+                raise InputError(
+                    f"{where}.{name}: no such finger; the robot's fingers: {', '.join(names)}"
+                )
+            rows.append(robot.fingers.index(full))
+        self._config, self._own, self._robot, self._side = config, own, robot, side
+        self.palm, (self._tips, _) = robot.palm(here, side), robot.contacts(here)
+        self.rows, self._keys = np.array(rows), np.array(list(own.fingers.values()))
+        self.in_hand = False
+        self._known = False
+        self._first: tuple[Array, Array] | None = None
+        self._smooth: Array | None = None
+
+    def sees(self, frame: Array) -> bool:
+        """Whether keypoints (21, 3) tell where all is that counts; the first must be in metres."""
+        used = np.concatenate([frame[self._keys], frame[[self._config.wrist, *KNUCKLES]]])
+        if not np.isfinite(used).all():
+            return False
+        if not self._known:
             self._recognise(frame)
-        if self.config.mirror:
-            frame = _mirrored(frame, self.config.wrist)
-        share = 1 - (1 - self.config.low_pass) ** (RATE * elapsed)
+            self._known = True
+        return True
+
+    def smoothed(self, frame: Array, elapsed: float) -> Array:
+        """The newest frame (21, 3) as it is followed."""
+        if self._own.mirror:
+            frame = _mirrored(frame, self._config.wrist)
+        share = 1 - (1 - self._config.low_pass) ** (RATE * elapsed)
         before = frame if self._smooth is None else self._smooth
         self._smooth = smooth = before + share * (frame - before)
-        return self._wanted(smooth, points)
+        return smooth
 
-    def _wanted(self, frame: Array, points: Array) -> Wanted:
-        config = self.config
-        wrist, tips = frame[config.wrist], frame[self._keys]
+    def spread(self, frame: Array) -> tuple[Array, Array]:
+        """(k, 3) how fingertips lie to the wrist: the person's, and the robot's at the start."""
+        tips = frame[self._keys] - frame[self._config.wrist]
+        return tips, self._tips[self.rows] - self.palm[:3, 3]
+
+    def wanted(self, frame: Array, turn: Array) -> tuple[Array, Array]:
+        """Fingertips (k, 3) and palm (4, 4) that a frame asks for, base frame."""
+        wrist, tips = frame[self._config.wrist], frame[self._keys]
         if self._first is None:
             self._begin(frame)
         assert self._first is not None
-        turn, size = self._turn, self._size
         start, first_axes = self._first
-        travel = (0.0 if self.in_hand else 1.0) if config.travel is None else config.travel
+        travel = self._config.travel
+        travel = (0.0 if self.in_hand else 1.0) if travel is None else travel
         origin = self._origin + turn @ (travel * (wrist - start))
-        points[self._rows] = origin + size * (tips - wrist) @ turn.T
-        turned = turn @ _hand_axes(frame, config.wrist) @ first_axes.T @ turn.T
+        points = origin + self._size * (tips - wrist) @ turn.T
+        turned = turn @ _hand_axes(frame, self._config.wrist) @ first_axes.T @ turn.T
         palm = np.eye(4)
-        palm[:3, :3], palm[:3, 3] = turned @ self._palm[:3, :3], origin
-        return Wanted(points, palm)
+        palm[:3, :3], palm[:3, 3] = turned @ self.palm[:3, :3], origin
+        return points, palm
 
     def _recognise(self, frame: Array) -> None:
         """Whether a first frame is in metres, and whether its origin is in the hand."""
-        wrist = frame[self.config.wrist]
+        wrist = frame[self._config.wrist]
         palm = frame[list(KNUCKLES)].mean(axis=0) - wrist
         length, seen = float(np.linalg.norm(palm)), frame[np.isfinite(frame).all(axis=1)]
         # In a picture x and y go from 0 to 1, a little beyond at its edges; depths count from the
@@ -260,25 +423,22 @@ class Retargeter:
         self.in_hand = bool(np.linalg.norm(seen.mean(axis=0)) < INSIDE * length)
 
     def _begin(self, frame: Array) -> None:
-        """How the frames lie to the robot, from the first one."""
-        config, origin = self.config, self._palm[:3, 3]
-        wrist, tips = frame[config.wrist], frame[self._keys] - frame[config.wrist]
-        own = self._tips[self._rows] - origin
+        """Where the first frame is, and how large its hand."""
+        config = self._config
         if config.scaling > 0:
-            size = config.scaling
+            self._size = config.scaling
         else:
             person = sum(_reach(frame, config.wrist, int(key)) for key in self._keys)
-            size = float(_reaches(self._robot)[self._rows].sum() / max(person, 1e-9))
-        turn = _aligned(tips, own) if config.rpy is None else _rotation(config.rpy)
-        self._origin = origin if config.xyz is None else np.array(config.xyz)
-        self._turn, self._size = turn, size
-        self._first = wrist.copy(), _hand_axes(frame, config.wrist)
+            reaches = _reaches(self._robot, self._side)[self.rows]
+            self._size = float(reaches.sum() / max(person, 1e-9))
+        self._origin = self.palm[:3, 3] if self._own.xyz is None else np.array(self._own.xyz)
+        self._first = frame[config.wrist].copy(), _hand_axes(frame, config.wrist)
 
 
-def _reaches(robot: ArmHand) -> Array:
-    """(f,) how far from its palm a robot's fingertips come [m]."""
+def _reaches(robot: ArmHand, side: str | None) -> Array:
+    """(f,) how far from a palm a robot's fingertips come [m]."""
     q = robot.random(np.random.default_rng(0), POSTURES)
-    away = robot.contacts(q)[0] - robot.palm(q)[:, None, :3, 3]
+    away = robot.contacts(q)[0] - robot.palm(q, side)[:, None, :3, 3]
     return np.linalg.norm(away, axis=2).max(axis=0)
 
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -267,3 +270,123 @@ def test_arm_and_hand_follow_a_person(robot, retarget):
         q = follower(wanted.points, palm=wanted.palm, palm_weight=(0.05, 0.05))
         assert follower.state.status is ik.motion.FollowStatus.FOLLOWING
         np.testing.assert_allclose(robot.palm(q)[:3, 3], palm[:3, 3], atol=0.02)
+
+
+KEYPOINTS = Path(__file__).parents[2] / "models" / "keypoints"
+
+
+@pytest.fixture(scope="module")
+def g1():
+    return ik.load_robot("g1+dex3")
+
+
+@pytest.fixture(scope="module")
+def both_hands():
+    """Joints by side, 30 frames a second."""
+    arrays = np.load(KEYPOINTS / "two_hands_box.npz")
+    return {side: arrays[f"keypoints_{side}"].astype(float) for side in ("left", "right")}
+
+
+def test_both_hands_move_a_body(g1, both_hands):
+    config = ik.motion.load_retarget(KEYPOINTS / "two_hands_g1.yaml")
+    retargeter = ik.motion.Retargeter(config, g1, g1.home)
+    follower = ik.Solver(g1).follow(g1.home, period=1 / 30)
+    errors, q = [], []
+    for i in range(len(both_hands["left"])):
+        wanted = retargeter({side: frames[i] for side, frames in both_hands.items()})
+        q.append(follower(wanted.points, palm=wanted.palm, palm_weight=(0.05, 0.05)))
+        errors.append(np.linalg.norm(g1.contacts(q[-1])[0] - wanted.points, axis=1))
+    assert np.median(errors) < 1e-3
+    # The box goes from side to side: with arms alone it would not.
+    assert np.ptp(np.array(q)[:, g1.actuators.index("waist_yaw_joint")]) > 0.3
+
+
+def test_a_hand_that_is_not_seen_comes_to_rest(g1, both_hands):
+    config = ik.motion.load_retarget(KEYPOINTS / "two_hands_g1.yaml")
+    retargeter = ik.motion.Retargeter(config, g1, g1.home)
+    first = {side: frames[0] for side, frames in both_hands.items()}
+    assert np.isfinite(retargeter(first).points).all()
+    wanted = retargeter({"left": first["left"]})
+    assert list(wanted.palm) == ["left"]
+    left = [name.startswith("left") for name in g1.fingers]
+    assert np.isfinite(wanted.points[left]).all()
+    assert np.isnan(wanted.points[~np.array(left)]).all()
+
+
+def test_joints_of_openxr_are_keypoints(robot, retarget):
+    config = retarget(robot)
+    joints = np.random.default_rng(0).normal(0, 0.05, (26, 3))
+    joints[:, 2] += 1.0
+    points = joints[[1, 2, 3, 4, 5, 7, 8, 9, 10, 12, 13, 14, 15, 17, 18, 19, 20, 22, 23, 24, 25]]
+    found = [
+        ik.motion.Retargeter(config, robot)(frame).points for frame in (points, joints, joints[1:])
+    ]
+    assert np.array_equal(found[0], found[1], equal_nan=True)
+    assert np.array_equal(found[0], found[2], equal_nan=True)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("sides: {middle: {fingers: {thumb: 4}}}", r"sides\.middle: no such side.*left, right"),
+        ("sides: {left: {fingers: {toe: 4}}}", r"sides\.left\.fingers\.toe: no such finger"),
+        ("fingers: {thumb: 4}", "sides: missing, expected the robot's sides: left, right"),
+    ],
+)
+def test_sides_that_a_body_has_not_are_refused(g1, tmp_path, text, message):
+    (tmp_path / "hands.yaml").write_text(text)
+    config = ik.motion.load_retarget(tmp_path / "hands.yaml")
+    with pytest.raises(ik.errors.InputError, match=message):
+        ik.motion.Retargeter(config, g1)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("sides: {left: {fingers: {}}}", r"sides\.left\.fingers: found none"),
+        (
+            "sides: {left: {fingers: {thumb: 4}}}\nfingers: {thumb: 4}",
+            "fingers: found it beside sides",
+        ),
+    ],
+)
+def test_a_bad_file_of_sides_is_refused(tmp_path, text, message):
+    (tmp_path / "hands.yaml").write_text(text)
+    with pytest.raises(ik.errors.DescriptionError, match=message):
+        ik.motion.load_retarget(tmp_path / "hands.yaml")
+
+
+def test_two_hands_are_given_by_side(g1, both_hands):
+    config = ik.motion.load_retarget(KEYPOINTS / "two_hands_g1.yaml")
+    retargeter = ik.motion.Retargeter(config, g1)
+    with pytest.raises(ik.errors.InputError, match="expected them by side: left, right"):
+        retargeter(both_hands["left"][0])
+    with pytest.raises(ik.errors.InputError, match=r"keypoints\.head: no such side"):
+        retargeter({"head": both_hands["left"][0]})
+    with pytest.raises(ik.errors.InputError, match=r"keypoints\.left: found shape \(20, 3\)"):
+        retargeter({"left": np.zeros((20, 3))})
+
+
+def test_palms_of_a_body_are_asked_by_side(g1):
+    follower = ik.Solver(g1).follow(g1.home, period=0.01)
+    points, _ = g1.contacts(g1.home)
+    with pytest.raises(ik.errors.InputError, match="palm: found one pose, expected poses by side"):
+        follower(points, palm=np.eye(4))
+    with pytest.raises(ik.errors.InputError, match=r"palm: found side 'head'"):
+        follower(points, palm={"head": np.eye(4)})
+
+
+def test_both_hands_from_a_file_on_the_command_line(tmp_path):
+    run = subprocess.run(
+        [
+            *(sys.executable, "-m", "casadi_ik", "follow", KEYPOINTS / "two_hands_box.npz"),
+            *("--retarget", KEYPOINTS / "two_hands_g1.yaml", "--period", "0.01"),
+            *("--out", tmp_path / "g1.csv"),
+        ],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert "g1+dex3" in run.stdout
+    assert run.returncode in (0, 1), run.stderr
+    assert len((tmp_path / "g1.csv").read_text().splitlines()) > 900
