@@ -51,7 +51,7 @@ SAME = 1e-9
         read=opt.file_name(".yaml", ".yml"),
     ),
     Option("--tip LINK", "link of the arm that carries the hand"),
-    Option("--palm LINK", "link that the fingers hang on"),
+    Option("--palm LINK...", "link that the fingers hang on; of a body one for each hand"),
     Option(
         "--mount POSE...",
         "the hand's base on the tip: x y z [m] roll pitch yaw [rad] (default: on it)",
@@ -63,12 +63,13 @@ SAME = 1e-9
     opt.SIZE_LIMITS,
 )
 def import_robot(said: Said) -> Answer:
-    """Describe your robot from the files of an arm and a hand, or of both in one.
+    """Describe your robot from the files of an arm and a hand, or of all in one.
 
     Examples:
       casadi-ik import arm.urdf hand.urdf --out my_robot.yaml --picture my_robot.png
       casadi-ik import arm.urdf hand.xml --mount 0 0 0.05 0 0 1.57 --out mine.yaml
       casadi-ik import whole_robot.urdf --palm left_palm --out my_robot.yaml
+      casadi-ik import humanoid.urdf --out my_humanoid.yaml    both hands, one body
       casadi-ik import my_robot.yaml --picture my_robot.png    a guess was corrected
       casadi-ik solve my_grasp.yaml --robot my_robot.yaml
 
@@ -76,7 +77,9 @@ def import_robot(said: Said) -> Answer:
     such as panda_description are looked up by casadi-ik[robot-descriptions].
     What no file says (fingertips, where a pad is and which way it faces, the thumb,
     palm, home) is guessed; each guess is marked in the description, and --picture
-    shows them. The description points to the files.
+    shows them. The description points to the files. Of a file with several arms
+    with hands becomes one body: the trunk carries them all, what moves none of them
+    (legs, head) stands still.
 
     exit codes: 0 written, 1 --check found a difference, 2 bad input (nothing is
     written)
@@ -98,7 +101,7 @@ def import_robot(said: Said) -> Answer:
         said.out,
         command=_command(said),
         tip=said.tip,
-        palm=said.palm,
+        palm=said.palm or (),
         mount=said.mount,
         shapes=draw is not None,
         xacro=said.xacro,
@@ -141,8 +144,8 @@ def _command(said: Said) -> str:
     """The command line, as it stands in the description."""
     words = [opt.PROGRAM, "import", said.first, *filter(None, [said.hand]), "--out", str(said.out)]
     for option in ("tip", "palm", "srdf"):
-        if getattr(said, option) is not None:
-            words += [f"--{option}", getattr(said, option)]
+        if (value := getattr(said, option)) is not None:
+            words += [f"--{option}", *([value] if isinstance(value, str) else value)]
     words += ["--xacro"] if said.xacro else []
     words += ["--mount", *(f"{value:g}" for value in said.mount)] if said.mount else []
     return shlex.join(words)
@@ -174,24 +177,33 @@ def _import_report(
     description, lines = robot.description, found.written
     arm = len(description.arm_actuators)
     count = len(description.actuators)
-    what = (
-        f"{lines.name}: {count} motors ({arm} arm, {count - arm} hand), {len(found.pads)} fingers"
-    )
+    motors = f"{arm} arm, {count - arm} hand"
+    if description.sides:
+        whose = [f"{len(description.trunk)} trunk"]
+        whose += [f"{s.name} {len(s.arm)} arm, {len(s.hand)} hand" for s in description.sides]
+        motors = "; ".join(whose)
+    fingers = len(description.fingers)
+    what = f"{lines.name}: {count} motors ({motors}), {fingers} fingers"
     pairs = {}
     if lines.arm is not None:
         pairs["tip"] = f"{lines.arm.end}: {lines.arm.how}"
         pairs["mount"] = lines.mount_how
-    pairs["palm"] = f"{lines.hand.end}: {lines.hand.how}"
-    pairs["closed form"] = family_in_words(description) if arm else ""
-    pairs["thumb"] = f"{lines.thumb[0]}: {lines.thumb[1]}"
+    if description.sides:
+        pairs["trunk"] = f"{description.trunk_link}: the last link that carries all palms"
+    arms = [description.side(hand.side) if hand.side else description for hand in lines.hands]
+    for hand, one in zip(lines.hands, arms, strict=True):
+        side = f"{hand.side} " if hand.side else ""
+        pairs[f"{side}palm"] = f"{hand.link}: {hand.how}"
+        pairs[f"{side}closed form"] = family_in_words(one) if one.arm_actuators else ""
+        pairs[f"{side}thumb"] = f"{hand.thumb[0]}: {hand.thumb[1]}"
     for line in filter(None, (lines.arm, lines.hand)):
         if line.limits:
             pairs["limits"] = f"assumed, since {Path(line.file).name} states none: " + ", ".join(
                 line.limits
             )
-    if lines.hand.spinning:
-        still = ", ".join(sorted(lines.hand.spinning))
-        pairs["locked"] = f"{still}: turns without end, so it is no finger and stands still"
+    for reason in dict.fromkeys(lines.hand.why.values()):
+        still = ", ".join(name for name, why in lines.hand.why.items() if why == reason)
+        pairs["locked" if "locked" not in pairs else "locked too"] = f"{still}: {reason}"
     for name, value in differences.items():
         verdict = "as its own library has it" if value <= SAME else "NOT as its own library has it"
         pairs[f"check {name}"] = f"{verdict}: poses differ by at most {value:.1e}"
@@ -202,13 +214,15 @@ def _import_report(
             f"beyond their meshes; {len(lines.touching)} pairs may touch"
         )
     rows = table("finger", "pad on link", "joints", "point [mm]", "normal", right=("joints",))
-    for branch, pad in zip(found.branches, found.pads, strict=True):
+    fingers = [(h.side, *finger) for h in lines.hands for finger in h.fingers.items()]
+    for branch, (side, name, pad) in zip(found.branches, fingers, strict=True):
         # What is rounded to -0.0 is zero.
         point = " ".join(f"{round(1e3 * value, 1) + 0.0:.1f}" for value in pad.point)
         normal = " ".join(f"{round(value, 2) + 0.0:.2f}" for value in pad.normal.tolist())
-        rows.add_row(branch.name, pad.link, str(len(branch.chain)), point, normal)
+        called = f"{side}_{name}" if side else name
+        rows.add_row(called, pad.link, str(len(branch.chain)), point, normal)
     notes = list(lines.notes)
-    if is_searched(description):
+    if any(map(is_searched, arms)):
         notes.append(
             "the arm has no known closed form: it is searched, and a solve takes several times "
             "as long"

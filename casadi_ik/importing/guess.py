@@ -455,8 +455,16 @@ TURN = np.pi / 2
 
 
 def guess_home(robot: RobotDescription) -> Array:
-    """(n,) the hand half closed, the arm well within its limits and able to move every way."""
+    """(n,) the hand half closed, the arm well within its limits and able to move every way.
+
+    Of a body side by side, with its trunk at zero.
+    """
     middle = (robot.lower + robot.upper) / 2
+    if robot.sides:
+        home = np.clip(0.0, robot.lower, robot.upper)
+        for side, (arm, hand) in zip(robot.sides, robot.side_actuators, strict=True):
+            home[sorted((*arm, *hand))] = guess_home(robot.side(side.name))
+        return home
     arm = list(robot.arm_actuators)
     if not arm:
         return _round(middle, robot)

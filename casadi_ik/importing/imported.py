@@ -10,11 +10,12 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import DescriptionError, InputError, MissingExtraError
 from casadi_ik.importing.guess import (
     Branch,
-    Pad,
     find_fingers,
     guess_home,
     guess_pads,
@@ -27,9 +28,11 @@ from casadi_ik.importing.guess import (
 from casadi_ik.importing.posture import Postures
 from casadi_ik.importing.robot_shapes import robot_shapes
 from casadi_ik.importing.surfaces import Surface, link_surfaces
-from casadi_ik.importing.write import FileLine, Written
+from casadi_ik.importing.write import FileLine, HandLines, Written
+from casadi_ik.robots.bodies import MOST_SIDES
 from casadi_ik.robots.file_parts import hand_from_file
 from casadi_ik.robots.load import load_description
+from casadi_ik.robots.parts import Part
 from casadi_ik.robots.robot_files.read import read_tree
 from casadi_ik.robots.robot_files.tree import RobotTree, TreeJoint
 from casadi_ik.robots.schema import HandFromFile
@@ -93,8 +96,45 @@ def the_palm(tree: RobotTree, palm: str | None) -> tuple[str, str]:
     return found[0], "the first link from which several chains of joints go out"
 
 
-def kept_joints(tree: RobotTree, end: str, below: bool) -> list[TreeJoint]:
-    """The joints from the root to a link, and those below it if asked."""
+def the_palms(tree: RobotTree, asked: Sequence[str]) -> dict[str, tuple[str, str]]:
+    """By side the link that its fingers hang on, and how it was found; one hand has no side.
+
+    Args:
+        tree: The file.
+        asked: Links that somebody says they are; none: they are looked for.
+
+    Raises:
+        InputError: There are no such links, or nothing says which they are.
+    """
+    several = [(link, "--palm") for link in asked]
+    all_palms = palms(tree)
+    if not asked and all_palms and holds_arms(tree, all_palms[0]):
+        hands = [link for link in all_palms if not holds_arms(tree, link)]
+        carried = {joint.child for link in hands for joint in tree.below(link)}
+        how = "several chains of joints go out, none as long as an arm"
+        several = [(link, how) for link in hands if link not in carried]
+    if not 1 < len(several) <= MOST_SIDES:
+        if len(asked) > MOST_SIDES:
+            raise InputError(f"--palm: found {len(asked)} links, expected {MOST_SIDES} at most")
+        return {"": the_palm(tree, asked[0] if asked else None)}
+    for link in asked:
+        the_palm(tree, link)
+        if any(joint.child in asked for joint in tree.below(link)) or asked.count(link) > 1:
+            raise InputError(f"--palm: {link!r} carries another palm, expected hands side by side")
+    names = [_side_name(link) for link, _ in several]
+    if "" in names or len(set(names)) < len(names):
+        names = [f"side_{i + 1}" for i in range(len(several))]
+    return dict(zip(names, several, strict=True))
+
+
+def _side_name(link: str) -> str:
+    """Left or right, as the link's name has it."""
+    found = re.search(r"left|right|(?<![a-z])[lr](?![a-z])", link.lower())
+    return {"l": "left", "r": "right"}[found[0][0]] if found else ""
+
+
+def kept_joints(tree: RobotTree, end: str, below: bool = True) -> list[TreeJoint]:
+    """The joints from the root to a link, and those below it unless it is an arm's end."""
     chain = list(tree.chain(tree.root, end, str(tree.path)))
     return chain + (list(tree.below(end)) if below else [])
 
@@ -112,6 +152,20 @@ def assumed_locks(joints: list[TreeJoint]) -> dict[str, float]:
     """Joints that have no single axis stand still."""
     single = ("fixed", "revolute", "continuous", "prismatic")
     return {joint.name: 0.0 for joint in joints if joint.type not in single}
+
+
+SPINS = "turns without end: no finger"
+"""Why a joint stands still."""
+
+
+def others(tree: RobotTree, kept: Sequence[TreeJoint]) -> dict[str, float]:
+    """Where the joints stand that are not of a body: legs, head. At zero, if they can."""
+    names = {joint.name for joint in kept}
+    return {
+        joint.name: float(np.clip(0.0, *(joint.limits or (0.0, 0.0))))
+        for joint in tree.joints
+        if joint.name not in names and joint.type != "fixed" and joint.coupling is None
+    }
 
 
 def spinners(tree: RobotTree, palm: str) -> dict[str, float]:
@@ -158,15 +212,13 @@ class Imported:
 
     Attributes:
         written: The description.
-        branches: The fingers as they were found, the thumb first.
-        pads: Their pads.
+        branches: The fingers as they were found, the thumb first, hand by hand.
         surfaces: Shapes of the hand's links, by the file's names.
         files: The arm's and the hand's file.
     """
 
     written: Written
     branches: tuple[Branch, ...]
-    pads: tuple[Pad, ...]
     surfaces: dict[str, Surface]
     files: tuple[RobotTree | None, RobotTree]
 
@@ -211,7 +263,7 @@ def import_robot(
     *,
     command: str,
     tip: str | None = None,
-    palm: str | None = None,
+    palm: Sequence[str] = (),
     mount: Sequence[float] | None = None,
     shapes: bool = False,
     xacro: bool = False,
@@ -224,7 +276,7 @@ def import_robot(
         out: Where the description will stand.
         command: What made it, for its first line.
         tip: Link of the arm that carries the hand; None: guessed.
-        palm: Link that the fingers hang on; None: guessed.
+        palm: Links that the fingers of a hand hang on, one of each; none: guessed.
         mount: (6,) pose of the hand's base on the tip [m, rad]; None: on it.
         shapes: Whether the shapes of all links are wanted, for a picture.
         xacro: Whether macros are expanded in files that are not called ``.xacro``.
@@ -238,31 +290,40 @@ def import_robot(
             "both (casadi-ik import ROBOT --palm LINK)"
         )
     tree = read_tree(hand, xacro)
-    palm_link, palm_how = the_palm(tree, palm)
-    joints = kept_joints(tree, palm_link, below=True)
-    moved = sum(joint.type != "fixed" for joint in tree.chain(tree.root, palm_link, str(hand)))
+    found = the_palms(tree, palm)
+    body = len(found) > 1
+    if arm is not None and body:
+        raise InputError(f"{hand}: has several hands, expected no other file that has the arm")
+    links = [link for link, _ in found.values()]
+    joints = list({one.name: one for link in links for one in kept_joints(tree, link)}.values())
+    moved = sum(joint.type != "fixed" for joint in tree.chain(tree.root, links[0], str(hand)))
     key = "robot" if arm is None and moved else "hand"
     limits, locked = assumed_limits(joints), assumed_locks(joints)
-    locked |= (spinning := spinners(tree, palm_link))
-    told = xacro and hand.suffix != ".xacro"
-    entry = HandFromFile(str(hand.resolve()), palm_link, None, locked, limits, told)
-    part = hand_from_file(entry, {}, key, out)
-    postures = Postures(part)
-    branches = find_fingers(postures, palm_link)
-    if not branches:
-        raise DescriptionError(f"{hand}: no joint moves below the palm {palm_link!r}; try --palm")
-    wanted = (
-        {palm_link, *(joint.child for joint in tree.below(palm_link))}
-        if shapes
-        else {one for branch in branches for one in _ends_of(postures, branch)}
+    why = dict.fromkeys(
+        still := {n: v for link in links for n, v in spinners(tree, link).items()}, SPINS
     )
-    surfaces, notes = link_surfaces(tree, wanted)
-    pads = guess_pads(postures, palm_link, branches, surfaces)
-    thumb, thumb_how = guess_thumb(postures, branches, pads)
-    frame = guess_palm_frame(postures, palm_link, branches, pads, thumb)
-    if not any(branch.name == "thumb" for branch in branches):
-        branches[thumb] = replace(branches[thumb], name="thumb")
-    order = [thumb, *(i for i in range(len(branches)) if i != thumb)]
+    if body:
+        why |= dict.fromkeys(beside := others(tree, joints), "moves no side")
+        still |= beside
+    locked |= still
+    told = xacro and hand.suffix != ".xacro"
+    hands, branches, surfaces, notes = [], [], {}, []
+    for side, (link, how) in found.items():
+        own = {one.name for one in kept_joints(tree, link)}
+        entry = HandFromFile(
+            str(hand.resolve()),
+            link,
+            None,
+            {name: value for name, value in locked.items() if name in own},
+            {name: ends for name, ends in limits.items() if name in own},
+            told,
+        )
+        part = hand_from_file(entry, {}, key, out)
+        one = _found_hand(tree, part, side, link, how, shapes)
+        hands.append(one[0])
+        branches += one[1]
+        surfaces |= one[2]
+        notes += one[3]
     arm_tree = None if arm is None else read_tree(arm, xacro)
     arm_line = None if arm_tree is None else _arm_line(arm_tree, out, tip, xacro)
     if arm is None and (tip is not None or mount is not None):
@@ -273,25 +334,45 @@ def import_robot(
         name=out.stem,
         arm=arm_line,
         hand=FileLine(
-            *(file_text(hand, out), palm_link, palm_how, limits, locked),
+            *(file_text(hand, out), links[0], hands[0].how, limits, locked),
             xacro=told,
-            spinning=frozenset(spinning),
+            why=why,
         ),
         key=key,
         mount=None if arm is None else list(mount or [0.0] * 6),
         mount_how="--mount" if mount else "GUESS: the hand's base on the arm's tip",
-        palm=frame,
-        fingers={branches[i].name: pads[i] for i in order},
-        thumb=(branches[thumb].name, thumb_how),
+        hands=hands,
         notes=notes,
     )
-    return Imported(
-        written,
-        tuple(branches[i] for i in order),
-        tuple(pads[i] for i in order),
-        surfaces,
-        (arm_tree, tree),
+    return Imported(written, tuple(branches), surfaces, (arm_tree, tree))
+
+
+def _found_hand(
+    tree: RobotTree, part: Part, side: str, palm: str, how: str, shapes: bool
+) -> tuple[HandLines, list[Branch], dict[str, Surface], list[str]]:
+    """A hand's fingers with their pads, the thumb first, its shapes, and what cannot be read."""
+    postures = Postures(part)
+    branches = find_fingers(postures, palm)
+    if not branches:
+        raise DescriptionError(f"{tree.path}: no joint moves below the palm {palm!r}; try --palm")
+    wanted = (
+        {palm, *(joint.child for joint in tree.below(palm))}
+        if shapes
+        else {one for branch in branches for one in _ends_of(postures, branch)}
     )
+    surfaces, notes = link_surfaces(tree, wanted)
+    pads = guess_pads(postures, palm, branches, surfaces)
+    thumb, thumb_how = guess_thumb(postures, branches, pads)
+    frame = guess_palm_frame(postures, palm, branches, pads, thumb)
+    names = [branch.name.removeprefix(f"{side}_") for branch in branches]
+    if "thumb" not in names:
+        names[thumb] = "thumb"
+    order = [thumb, *(i for i in range(len(branches)) if i != thumb)]
+    lines = HandLines(
+        *(side, frame, palm, how, {names[i]: pads[i] for i in order}),
+        (names[thumb], thumb_how),
+    )
+    return lines, [replace(branches[i], name=names[i]) for i in order], surfaces, notes
 
 
 def _ends_of(postures: Postures, branch: Branch) -> list[str]:

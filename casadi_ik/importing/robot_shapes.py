@@ -290,7 +290,8 @@ def robot_shapes(
         notes += said
         taken |= set(file.links)
     ordered = {link: surfaces[link] for link in robot.links if link in surfaces}
-    shapes = fitted(ordered, {robot.palm_link}, simple)
+    palms = {side.palm_link for side in robot.sides} or {robot.palm_link}
+    shapes = fitted(ordered, palms, simple)
     return shapes, may_touch(robot, shapes, surfaces), notes
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import msgspec
@@ -112,7 +112,7 @@ class FileLine:
         limits: What is assumed of joints without limits.
         locked: Joints that stand still.
         xacro: Whether its macros are expanded although it is not called so.
-        spinning: Those of them that turn without end, and so were taken for no fingers.
+        why: Why they do, by joint; what has no single axis is not among them.
     """
 
     file: str
@@ -121,7 +121,47 @@ class FileLine:
     limits: Mapping[str, tuple[float, float]]
     locked: Mapping[str, float]
     xacro: bool = False
-    spinning: frozenset[str] = frozenset()
+    why: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class HandLines:
+    """What is said of a hand.
+
+    Attributes:
+        side: What it is called, if there are several.
+        palm: (4, 4) frame of the palm in its link.
+        link: The link.
+        how: How that was found.
+        fingers: By name the pad.
+        thumb: The thumb's name, and how it was found.
+    """
+
+    side: str
+    palm: Array
+    link: str
+    how: str
+    fingers: Mapping[str, Pad]
+    thumb: tuple[str, str]
+
+    def palm_text(self) -> str:
+        """The palm's frame, in one line."""
+        return (
+            f"{{link: {scalar(self.link)}, xyz: {_vector(self.palm[:3, 3])}, "
+            f"rpy: {_vector(roll_pitch_yaw(self.palm[:3, :3]))}}}"
+        )
+
+    def finger_lines(self) -> list[str]:
+        """The thumb and all pads."""
+        lines = [f"thumb: {scalar(self.thumb[0])}  # {_guess(self.thumb[1])}"]
+        lines.append("fingers:  # xyz [m] and outward normal of the pad, in the link's frame")
+        for name, pad in self.fingers.items():
+            lines.append(f"  # GUESS: {one_line(pad.how)}")
+            lines.append(
+                f"  {scalar(name)}: {{link: {scalar(pad.link)}, xyz: {_vector(pad.point)}, "
+                f"normal: {_vector(pad.normal)}}}"
+            )
+        return lines
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,9 +177,7 @@ class Written:
         key: "hand" or "robot".
         mount: (6,) x y z roll pitch yaw; None if there is no arm.
         mount_how: How it came about.
-        palm: (4, 4) frame of the palm in its link.
-        fingers: By name the pad.
-        thumb: The thumb's name, and how it was found.
+        hands: The hand, or those of a body.
         notes: What could not be read.
         home: By actuator; empty as long as it is not known.
         shapes: By link; empty as long as they are not known.
@@ -154,9 +192,7 @@ class Written:
     key: str
     mount: Sequence[float] | None
     mount_how: str
-    palm: Array
-    fingers: Mapping[str, Pad]
-    thumb: tuple[str, str]
+    hands: Sequence[HandLines]
     notes: Sequence[str]
     home: Mapping[str, float] = field(default_factory=dict)
     shapes: Mapping[str, Sequence[ShapeEntry]] = field(default_factory=dict)
@@ -177,23 +213,22 @@ class Written:
         ]
         if self.arm is not None:
             lines += _file_lines("arm", self.arm, "tip", [scalar(self.arm.end)])
-        palm = (
-            f"{{link: {scalar(self.hand.end)}, xyz: {_vector(self.palm[:3, 3])}, "
-            f"rpy: {_vector(roll_pitch_yaw(self.palm[:3, :3]))}}}"
-        )
-        about = ["# z away from the palm, y towards the thumb, origin amid the fingers' bases"]
-        lines += _file_lines(self.key, self.hand, "palm", [palm, *about])
+        about = "# z away from the palm, y towards the thumb, origin amid the fingers' bases"
+        first, *others = self.hands
+        palm = [] if others else [first.palm_text(), about]
+        lines += _file_lines(self.key, self.hand, "palm", palm)
         if self.mount is not None:
             x = _vector(np.array(self.mount[:3])), _vector(np.array(self.mount[3:]))
             lines.append(f"mount: {{xyz: {x[0]}, rpy: {x[1]}}}  # {self.mount_how}")
-        lines.append(f"thumb: {scalar(self.thumb[0])}  # {_guess(self.thumb[1])}")
-        lines.append("fingers:  # xyz [m] and outward normal of the pad, in the link's frame")
-        for name, pad in self.fingers.items():
-            lines.append(f"  # GUESS: {one_line(pad.how)}")
-            lines.append(
-                f"  {scalar(name)}: {{link: {scalar(pad.link)}, xyz: {_vector(pad.point)}, "
-                f"normal: {_vector(pad.normal)}}}"
-            )
+        if others:
+            lines += ["sides:  # the trunk ends where the chains to the palms part", f"  {about}"]
+        for hand in self.hands if others else ():
+            lines += [
+                f"  {scalar(hand.side)}:",
+                f"    palm: {hand.palm_text()}  # {_guess(hand.how)}",
+            ]
+            lines += [f"    {line}" for line in hand.finger_lines()]
+        lines += [] if others else first.finger_lines()
         if self.home:
             lines.append("home:  # GUESS: half closed, the arm away from limits and singularities")
             lines += [f"  {scalar(name)}: {value:.6g}" for name, value in self.home.items()]
@@ -202,15 +237,14 @@ class Written:
         return "\n".join(lines) + "\n"
 
 
-def _file_lines(key: str, line: FileLine, end: str, ends: Iterable[str]) -> list[str]:
-    value, *more = ends
+def _file_lines(key: str, line: FileLine, end: str, ends: Sequence[str]) -> list[str]:
     found = [
         f"{key}:",
         f"  file: {scalar(line.file)}",
         *(["  xacro: true"] if line.xacro else []),
-        *(f"  {text}" for text in more),
-        f"  {end}: {value}  # {_guess(line.how)}",
     ]
+    for value, *more in [list(ends)] if ends else []:
+        found += [*(f"  {text}" for text in more), f"  {end}: {value}  # {_guess(line.how)}"]
     if line.limits:
         found.append("  limits:  # GUESS: the file states none")
         found += [
@@ -220,7 +254,7 @@ def _file_lines(key: str, line: FileLine, end: str, ends: Iterable[str]) -> list
     if line.locked:
         found.append("  locked:  # GUESS: these joints stand still; delete a line to let one move")
         for name, value in line.locked.items():
-            why = "turns without end: no finger" if name in line.spinning else "has no single axis"
+            why = line.why.get(name, "has no single axis")
             found.append(f"    {scalar(name)}: {value:.6g}  # {why}")
     return found
 

@@ -335,7 +335,7 @@ def animated(images: Sequence[Image], milliseconds: Sequence[int], colors: int =
 def draw_pads(
     robot: ArmHand, path: str | PathLike[str] | None = None, *, dpi: float = DPI
 ) -> Figure:
-    """Draw the hand of a robot at home from two sides, with a mark at every pad.
+    """Draw the hands of a robot at home from two sides, with a mark at every pad.
 
     Args:
         robot: The robot.
@@ -348,8 +348,26 @@ def draw_pads(
     Raises:
         PictureError: The file cannot be written, or there is no OpenGL to draw with.
     """
-    if robot.description.sides:
-        robot = ArmHand(robot.description.side(robot.description.sides[0].name))
+    whole, sides = robot.description, robot.description.sides
+    hands = [ArmHand(whole.side(side.name)) for side in sides] or [robot]
+    figure = new_figure(SIZE[0], SIZE[1] * len(hands), dpi)
+    for i, hand in enumerate(reversed(hands)):
+        _pads_of(figure, hand, i / len(hands), 0.88 / len(hands))
+    for i, hand in enumerate(hands):
+        top = 1.0 - i / len(hands)
+        at, ink = top - 0.045 / len(hands), palette.INK
+        figure.text(0.02, at, hand.name, size=15, weight="bold", color=ink, va="center")
+        note = (
+            "pads and their outward normals; the thumb is yellow; seen from two sides, palm's z up"
+        )
+        figure.text(0.02, top - 0.09 / len(hands), note, size=10, color=palette.FAINT, va="center")
+    if path is not None:
+        save_picture(figure, path)
+    return figure
+
+
+def _pads_of(figure: Figure, robot: ArmHand, bottom: float, height: float) -> None:
+    """Draw a hand with its pads from two sides, on a part of a figure as wide as that."""
     # In the palm frame, whose z is up and whose y goes to the thumb.
     back = inverse(robot.palm(robot.home))
     hand = [
@@ -364,9 +382,8 @@ def draw_pads(
         point, normal = frame[:3, 3], frame[:3, 0]
         marks.append(Drawable(name, ball(0.014 * size, point), color))
         marks.append(Drawable(name, arrow(point, normal, 0.16 * size, 0.012 * size), color))
-    figure = new_figure(*SIZE, dpi)
     for left, turn in ((0.0, 25.0), (0.5, 115.0)):
-        box = (left, 0.0, 0.5, 0.88)
+        box = (left, bottom, 0.5, height)
         pixels = _pixels(figure, box)
         with one_at_a_time, closing(Stage()) as stage:
             stage.add("hand", hand, orient=robot.description.path is not None)
@@ -379,12 +396,6 @@ def draw_pads(
             places = stage.project(frames[:, :3, 3])
         axes = _panel(figure, box, image)
         _label_pads(axes, dict(zip(robot.fingers, places, strict=True)), pixels)
-    figure.text(0.02, 0.955, robot.name, size=15, weight="bold", color=palette.INK, va="center")
-    note = "pads and their outward normals; the thumb is yellow; seen from two sides, palm's z up"
-    figure.text(0.02, 0.91, note, size=10, color=palette.FAINT, va="center")
-    if path is not None:
-        save_picture(figure, path)
-    return figure
 
 
 # What is on a picture.

@@ -165,6 +165,61 @@ def test_options_go_before_guesses(run: Command, tmp_path: Path) -> None:
     assert data["mount"] == {"xyz": [0.01, 0, -0.02], "rpy": [0, 0.5, 0]}
 
 
+def humanoid(folder: Path, robot: ik.ArmHand) -> Path:
+    """A body's file, to whose base a leg and a head are added."""
+    text = robot.urdf().replace("</robot>", "")
+    for name, kind in (("leg", "-1 -0.2"), ("head", "-0.5 0.5")):
+        text += link(name) + joint(name, robot.description.root, name, "0 0 1", "0 1 0", kind)
+    path = folder / "humanoid.urdf"
+    path.write_text(text + "</robot>")
+    return path
+
+
+def test_a_humanoid_s_trunk_and_sides_are_found(
+    run: Command, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    pytest.importorskip("pinocchio")
+    shipped, out = ik.load_robot("g1+dex3"), tmp_path / "mine.yaml"
+    done = run("import", humanoid(tmp_path, shipped), "--out", out, "--check")
+    assert (done.exit, done.err) == (0, "")
+    said = " ".join(done.out.split())
+    for words in (
+        "31 motors (3 trunk; left 7 arm, 7 hand; right 7 arm, 7 hand), 6 fingers",
+        "trunk torso_link: the last link that carries all palms",
+        "locked leg, head: moves no side",
+        "as its own library has it",
+    ):
+        assert words in said, done.out
+    robot = ik.load_robot(out)
+    assert robot.description.trunk == shipped.description.trunk
+    for ours, known in zip(robot.description.sides, shipped.description.sides, strict=True):
+        assert (ours.name, ours.arm, set(ours.hand)) == (known.name, known.arm, set(known.hand))
+        assert set(ours.fingers) == set(known.fingers)
+    assert yaml.safe_load(out.read_text())["robot"]["locked"] == {"leg": -0.2, "head": 0}
+    targets = [robot.contacts(q) for q in robot.random(rng, 20)]
+    points, normals = (np.array(one) for one in zip(*targets, strict=True))
+    assert ik.Solver(robot).solve_batch(points, normals).success.all()
+
+
+def test_palms_of_a_body_are_named(run: Command, tmp_path: Path) -> None:
+    robot = ik.load_robot("g1+dex3")
+    path, out = humanoid(tmp_path, robot), tmp_path / "mine.yaml"
+    palms = tuple(side.palm_link for side in robot.description.sides)
+    done = run("import", path, "--palm", *palms, "--out", out)
+    assert (done.exit, done.err) == (0, "")
+    sides = yaml.safe_load(out.read_text())["sides"]
+    assert tuple(side["palm"]["link"] for side in sides.values()) == palms
+    for words, says in (
+        ((palms[0], palms[0]), f"--palm: {palms[0]!r} carries another palm"),
+        (("torso_link", palms[0]), "--palm: 'torso_link' carries another palm"),
+        ((*palms, "hip"), "--palm: humanoid.urdf has no link 'hip'"),
+        ((palms * 3), "--palm: found 6 links, expected 4 at most"),
+    ):
+        refused = run("import", path, "--palm", *words, "--out", tmp_path / "other.yaml")
+        assert says in refused.error
+    assert not (tmp_path / "other.yaml").exists()
+
+
 def test_joints_without_limits_get_assumed_ones(run: Command, tmp_path: Path) -> None:
     path = hand(tmp_path)
     limit = '<limit lower="-0.3" upper="0.3" velocity="0" effort="1"/>'
@@ -206,6 +261,16 @@ def test_refusals_leave_nothing(
     error = run("import", "--out", "mine.yaml", *words).error
     assert says in error
     assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.opengl
+def test_the_picture_of_a_body_has_all_its_hands(tmp_path: Path) -> None:
+    from casadi_ik.views import draw_pads
+
+    figure = draw_pads(ik.load_robot("baxter+barrett_bh8_280"), tmp_path / "pads.png")
+    said = {text.get_text() for text in figure.texts}
+    assert {"baxter+barrett_bh8_280.left", "baxter+barrett_bh8_280.right"} <= said
+    assert (tmp_path / "pads.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.opengl
@@ -254,7 +319,7 @@ def test_a_relative_file_finds_its_meshes_and_a_propeller_is_no_thumb(
     assert (done.exit, done.err) == (0, ""), done
     said = " ".join(done.out.split())
     assert "there is no such file (mesh 'package://jaws/meshes/none.stl')" in said
-    assert "gripper: turns without end, so it is no finger and stands still" in said
+    assert "locked gripper: turns without end: no finger" in said
     robot, text = ik.load_robot("mine.yaml"), Path("mine.yaml").read_text()
     assert len(robot.fingers) == 2
     assert robot.actuators == ("j0", "j1", "j2", "j3", "j4", "j5", "left")
