@@ -86,7 +86,7 @@ def test_every_arm_takes_a_hand(arm):
     assert description.thumb == "thumb"
     home, lower, upper = description.home, description.lower, description.upper
     arm_part = list(description.arm_actuators)
-    assert (home[arm_part] != 0).sum() >= 3
+    assert (home[arm_part] != 0).any()
     assert (np.minimum(home - lower, upper - home)[arm_part] > np.deg2rad(4)).all()
 
 
