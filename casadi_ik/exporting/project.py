@@ -126,8 +126,10 @@ def exported(
     Raises:
         UnsupportedError: It cannot be exported.
     """
-    # The C of sides and trunks stays here: an exported body is one hand with all motors.
-    robot = ArmHand(robot.description.as_hand) if robot.description.sides else robot
+    as_hand = ArmHand(robot.description.as_hand) if robot.description.sides else robot
+    # Sides without a trunk are robots of their own; what knows a scene is one hand with all motors.
+    if not robot.description.trunk or single or capacity is not None:
+        robot = as_hand
     if single and follow:
         raise UnsupportedError("--follow: computes in double precision, expected no --single")
     method, solver = hand_first(robot), Solver(robot)
@@ -152,15 +154,19 @@ def exported(
     }
     more: dict[str, str] = {}
     if follow:
-        more, about_it = FollowSources(robot, prefix, tolerance).files()
+        more, about_it = FollowSources(as_hand, prefix, tolerance).files()
         marks |= about_it
-    files = more | {
-        f"include/{prefix}.h": filled("solver.h", marks),
-        f"src/{prefix}_parts.h": filled("parts.h", marks),
-        f"src/{prefix}_solver.c": filled("solver.c", marks),
-        f"src/{prefix}_tables.c": sources.tables(),
-        **{f"src/{prefix}_{part.name}.c": part.text for part in sources.parts},
-    }
+    files = (
+        more
+        | sources.side_files
+        | {
+            f"include/{prefix}.h": filled("solver.h", marks),
+            f"src/{prefix}_parts.h": filled("parts.h", marks),
+            f"src/{prefix}_solver.c": filled("solver.c", marks),
+            f"src/{prefix}_tables.c": sources.tables(),
+            **{f"src/{prefix}_{part.name}.c": part.text for part in sources.parts},
+        }
+    )
     if scene is not None:
         files[f"src/{prefix}_scene.c"] = scene.source()
     about = None if capacity is None else SceneTargets(solver, capacity)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
@@ -52,11 +54,13 @@ MARKS = ("PALM_CALLS", "PALM", "PALM_WASM", "PALM_JS", "PALM_DTS")
 
 
 def palm_marks(robot: ArmHand, prefix: str, real: str) -> dict[str, str]:
-    """What stands for the marks of palms; nothing without an arm, or if contacts leave it free."""
+    """What stands for the marks of palms; nothing for a body, without an arm, or a free palm."""
+    if not robot.description.arm_actuators or robot.description.sides:
+        return dict.fromkeys(MARKS, "")
     motors = robot.description.finger_motors
     own = np.where(np.isin(robot.actuators, motors), robot.home, np.nan)
     home = robot.palm(robot.home)
-    if not robot.description.arm_actuators or touched(robot, home[None], own[None])[2]:
+    if touched(robot, home[None], own[None])[2]:  # contacts leave it free
         return dict.fromkeys(MARKS, "")
     pose = np.concatenate([home[:3, :3].ravel(), home[:3, 3]])
     constants = f"#define POSTURE_ROUNDING {number(BEYOND)}\n" + define_arrays(
@@ -183,6 +187,83 @@ class Part:
 
 
 @dataclass(frozen=True, eq=False)
+class SideSources:
+    """What finds the hands of a side of an exported body.
+
+    Attributes:
+        plan: The search of the side by itself.
+        solver: What names of the body's solver begin with.
+        place: Of the side.
+    """
+
+    plan: SearchPlan
+    solver: str
+    place: int
+
+    @property
+    def prefix(self) -> str:
+        """What its own names begin with."""
+        return f"{self.solver}_side_{self.place}"
+
+    @property
+    def member(self) -> str:
+        """Its memory in the struct of the solver."""
+        own = f"{self.plan.members()}  {self.solver}_memory *memory;\n"
+        return f"  struct {self.prefix} {{\n{own}  }} side_{self.place};\n"
+
+    @property
+    def declared(self) -> str:
+        """Its function."""
+        return (
+            f"int {self.prefix}_hands(struct {self.prefix} *job, const scalar *points, "
+            "const scalar *normals,\n    const scalar *here, int64_t nearest, int64_t round, "
+            "scalar *postures);\n"
+        )
+
+    @property
+    def called(self) -> str:
+        """A case of what has hands found."""
+        return (
+            f"    case {self.place}:\n"
+            f"      job->side_{self.place}.memory = &job->memory;\n"
+            f"      return {self.prefix}_hands(&job->side_{self.place}, points, normals, here, "
+            "nearest, round,\n                                postures);\n"
+        )
+
+    def source(self, names: Iterable[str]) -> str:
+        """Its file, with the kernels of these names."""
+        texts = source_text("spread") + source_text("seeds")
+        calls = "".join(
+            f"#define {name.upper()}(work) {self.prefix}_{name}_kernel(work, job->memory)\n"
+            for name in names
+        )
+        return (
+            f"/* The hands of {plain(self.plan.layouts.robot.name)}. */\n"
+            f'#include "{self.solver}_parts.h"\n\n'
+            "enum { DONE = 0, SLICE_OVER = 1 };\n\n"
+            f"typedef struct {self.prefix} search;\n\n"
+            f"{tiles(self.prefix)}{calls}#define FIND_HANDS int {self.prefix}_hands\n"
+            f"{define(self.plan.sizes)}{self.plan.constants(texts)}{texts}"
+        )
+
+
+HANDS_OF = """\
+static int hands_of(search *job, int side, const scalar *points, const scalar *normals,
+                    const scalar *here, int64_t nearest, int64_t round, scalar *postures) {
+  switch (side) {
+@CASES@    default: return SLICE_OVER;
+  }
+}
+#define HANDS(side, ...) hands_of(job, side, __VA_ARGS__)
+"""
+
+
+def tiles(prefix: str) -> str:
+    """Where the search finds its tables."""
+    return f"#define TILES(table) ((table) ? {prefix}_table_1 : {prefix}_table_0)\n"
+
+
+@dataclass(frozen=True, eq=False)
 class SolverSources:
     """The sources of a solver.
 
@@ -208,26 +289,42 @@ class SolverSources:
         return self.method.plan(enforce_limits=True)
 
     @cached_property
+    def sides(self) -> tuple[SideSources, ...]:
+        """Those of a body."""
+        return tuple(SideSources(one, self.prefix, i) for i, one in enumerate(self.plan.sides))
+
+    @property
+    def _searches(self) -> dict[str, SearchPlan]:
+        """What looks hands up, by what its names begin with behind the solver's."""
+        found = {f"side_{side.place}_": side.plan for side in self.sides}
+        return found or {"": self.plan}
+
+    @cached_property
     def parts(self) -> tuple[Part, ...]:
         """The kernels."""
-        plan = self.plan
-        lookup, n_state = plan.seeds.table.lookup, plan.layouts.state.size
-        rows = max(spread.count for spread in plan.seeds.spreads[:2]) + TILE
-        # Distances of all rows and of their tiles are 32 bits each.
-        room = rows if self.single is None else rows + rows // TILE
+        plan, n_state = self.plan, self.plan.layouts.state.size
         # The record of an iteration is never asked for.
         loop = define(plan.solve.constants | {"N_RECORD": 0, "ROW_BYTES": 0})
         loop += "#define store_row(record, row) ((void) (record), (void) (row))\n"
         parts = (
-            self._part("look_up", "lookup", lookup.key, define(lookup.constants), room),
             self._part("begin", "map", plan.begin),
             self._part("solve", "loop", plan.solve, loop, 2 * n_state),
             self._part("contacts", "map", plan.contacts),
             self._part("judge", "map", plan.judge),
         )
-        if plan.mends:
-            parts += (self._part("seen", "map", plan.seeds.seen),)
+        for name, search in self._searches.items():
+            parts += self._hand_parts(name, search)
         return parts + self._scene_parts()
+
+    def _hand_parts(self, name: str, plan: SearchPlan) -> tuple[Part, ...]:
+        """Those that find hands."""
+        lookup = plan.seeds.table.lookup
+        rows = max(spread.count for spread in plan.seeds.spreads[:2]) + TILE
+        # Distances of all rows and of their tiles are 32 bits each.
+        room = rows if self.single is None else rows + rows // TILE
+        constants = define(lookup.constants)
+        found = (self._part(f"{name}look_up", "lookup", lookup.key, constants, room),)
+        return found + ((self._part(f"{name}seen", "map", plan.seeds.seen),) if plan.mends else ())
 
     def _scene_parts(self) -> tuple[Part, ...]:
         scene = self.scene
@@ -285,7 +382,7 @@ class SolverSources:
         parts = "".join(
             f"int {self.prefix}_{p.name}_kernel({p.job} *job, {self.prefix}_memory *memory);\n"
             for p in self.parts
-        )
+        ) + "".join(side.declared for side in self.sides)
         calls = "".join(
             f"#define {p.name.upper()}(work) {self.prefix}_{p.name}_kernel(work, &job->memory)\n"
             for p in self.parts
@@ -307,13 +404,17 @@ class SolverSources:
             "FINGER_NAMES": _strings(robot.fingers),
             "MOTOR_NAMES": _strings(robot.actuators),
             "W": str(max(1, *(part.work for part in self.parts))),
-            "STRUCT": self.plan.members().rstrip(),
+            "STRUCT": (self.plan.members() + "".join(side.member for side in self.sides)).rstrip(),
+            "SEEDS": self._seeds(),
+            "TABLES": "".join(
+                f"extern const int16_t {name}[];\n" for name in self._tables
+            ).rstrip(),
             "JOBS": jobs,
             "PARTS": parts,
             "CALLS": calls,
             "SIZES": define(sizes),
-            "CONSTANTS": self.plan.constants(*changed),
-            "SEARCH": source_text("seeds") + source_text("hand_first"),
+            "CONSTANTS": self.plan.constants(self.plan.source, *changed),
+            "SEARCH": self.plan.source,
             "TERMS": define_arrays({"TERMS": self._terms(), "HOME": robot.home}),
             "LIMITS": define_arrays(
                 {f"{self.prefix}_lower": lower, f"{self.prefix}_upper": upper}, "const"
@@ -322,16 +423,32 @@ class SolverSources:
             "ANGLE_TOLERANCE": repr(self.tolerance.angle),
         }
 
+    def _seeds(self) -> str:
+        """How the search comes by tables, or by the hands of its sides."""
+        if not self.sides:
+            return tiles(self.prefix)
+        return HANDS_OF.replace("@CASES@", "".join(side.called for side in self.sides))
+
+    @property
+    def side_files(self) -> dict[str, str]:
+        """Their texts by path."""
+        return {f"src/{side.prefix}.c": side.source(side.plan.of_hands) for side in self.sides}
+
+    @cached_property
+    def _tables(self) -> dict[str, NDArray[np.int16]]:
+        """The lookup tables' keys by the names of their arrays."""
+        return {
+            f"{self.prefix}_{name}table_{i}": np.ascontiguousarray(table.lookup.tiles).reshape(-1)
+            for name, plan in self._searches.items()
+            for i, table in enumerate(plan.seeds.tables(enforce_limits=True))
+        }
+
     def tables(self) -> str:
         """The file of the lookup tables' keys."""
-        tables = {
-            f"{self.prefix}_table_{i}": np.ascontiguousarray(table.lookup.tiles).reshape(-1)
-            for i, table in enumerate(self.plan.seeds.tables(enforce_limits=True))
-        }
         head = (
             f'/* Shapes of hand postures, to be compared with targets. */\n#include "{self.prefix}'
         )
-        return head + '_parts.h"\n\n' + define_arrays(tables, "const")
+        return head + '_parts.h"\n\n' + define_arrays(self._tables, "const")
 
     @property
     def _bounds(self) -> tuple[Array, Array]:

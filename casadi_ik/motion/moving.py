@@ -25,7 +25,7 @@ from casadi_ik.motion.reach import Carried, Pace, Reach, ReachPlan, move, reach
 from casadi_ik.motion.timing import Rates, a_direction, length, rates_of, seconds, unbounded
 from casadi_ik.motion.track import PathTracker, Track, track
 from casadi_ik.problem.contacts import by_kinds
-from casadi_ik.problem.request import Request
+from casadi_ik.problem.request import Request, one_palm
 from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import LIMIT_SLACK, judge
 from casadi_ik.solving.engine import Engine
@@ -279,8 +279,7 @@ class MovingSolver:
         start, chosen, target = self._request.start(q0), held.grasp, one_pose(pose)
         if chosen.known_pose is None:
             raise InputError("held: found a grasp without a known object_pose, expected one")
-        if self.robot.description.sides:
-            raise UnsupportedError("place: found a body, whose hands would lose what they hold")
+        one_palm(self.robot, "place")
         if not self.robot.description.arm_actuators:
             raise UnsupportedError(f"place: {self.robot.name!r} has no arm that moves its palm")
         moved = target @ inverse(chosen.known_pose)

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.errors import InputError, UnknownNameError
+from casadi_ik.errors import InputError, UnknownNameError, UnsupportedError
 from casadi_ik.grasps import Contact, Grasp, Tolerance
 from casadi_ik.grasps.pose import Free, checked_pose
 from casadi_ik.problem.contacts import LENGTH, more_arrays
@@ -56,6 +56,19 @@ at least."""
 
 BEYOND = 1e-6
 """A posture may be so far beyond a limit [rad or m]; it is then at the limit."""
+
+
+def one_palm(robot: ArmHand, what: str) -> None:
+    """Whether a robot has one palm, as `what` needs it.
+
+    Raises:
+        UnsupportedError: It has several.
+    """
+    if robot.description.sides:
+        sides = ", ".join(side.name for side in robot.description.sides)
+        raise UnsupportedError(
+            f"{what}: {robot.name!r} has several palms ({sides}), expected a robot with one"
+        )
 
 
 def hand_posture(robot: ArmHand, posture: Mapping[str, float], name: str = "posture") -> Array:

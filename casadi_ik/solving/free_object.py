@@ -15,9 +15,8 @@ from casadi_ik.problem.status import Status
 from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.symbolic.even_spread import evenly
 
-LOTS = (1, 15, 240, 3840)
-"""Poses that are tried at once, as long as none is solved. All of them take a G1 about 0.1 s where
-the object is within reach."""
+LOTS = (1, 15, 240)
+"""Poses that are tried at once, as long as none is solved."""
 
 
 def poses_within(free: Free, count: int) -> Array:

@@ -20,6 +20,7 @@ from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import InputError
 from casadi_ik.grasps import Contact, Grasp, Tolerance
 from casadi_ik.grasps.pose import one_pose
+from casadi_ik.problem.request import one_palm
 from casadi_ik.progress import progress
 from casadi_ik.touch.candidates import (
     Candidates,
@@ -239,8 +240,9 @@ def grasps_of(
 
     Raises:
         InputError: See there.
-        UnsupportedError: The hand has one finger, or no shapes.
+        UnsupportedError: The hand has one finger, or no shapes, or there are several.
     """
+    one_palm(solver.robot, "grasps_of")
     begin, chosen = time.process_time(), parameters or TouchParameters()
     robot = solver.robot
     place = np.eye(4) if pose is None else one_pose(pose)

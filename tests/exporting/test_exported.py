@@ -83,6 +83,19 @@ def test_stored_targets_bit_for_bit_under_sanitizers(project):
     assert foreign <= LIBM | COMPILERS
 
 
+@needs_gcc
+def test_a_body_s_sides_and_trunk_go_with_it(tmp_path):
+    """A G1's answers, without a warning; the hands of each side are found in a file of its own."""
+    write_folder(tmp_path, c_project(ik.load_robot("g1+dex3"), "g1"))
+    assert (tmp_path / "src" / "g1_side_0.c").is_file()
+    assert (tmp_path / "src" / "g1_side_1.c").is_file()
+    sources = [str(path.relative_to(tmp_path)) for path in sorted(tmp_path.glob("src/*.c"))]
+    compiled(tmp_path, "-O0", *sources, "test/test.c", "-o", "stored", "-lm")
+    done = subprocess.run([tmp_path / "stored"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "wrong: 0" in done.stdout
+
+
 WINE = shutil.which("wine64") or shutil.which("wine64", path="/usr/lib/wine")
 
 

@@ -261,3 +261,20 @@ def test_a_body_is_drawn(tmp_path):
     answer = ik.Solver(robot).solve(asked)
     draw_solution(robot, answer, asked, tmp_path / "g1.png")
     assert (tmp_path / "g1.png").stat().st_size > 20_000
+
+
+@pytest.mark.parametrize("what", ["solve_palms", "grasps_of", "place"])
+def test_what_needs_one_palm_says_so(what):
+    solver = ik.Solver(ik.load_robot("g1+dex3"))
+    q, pose = solver.robot.home, np.eye(4)
+    calls = {
+        "solve_palms": lambda: solver.solve_palms(pose[None], q),
+        "grasps_of": lambda: solver.grasps_of(ik.load_surface("tennis_ball"), pose),
+    }
+    if what == "place":
+        points, normals = solver.robot.contacts(q)
+        contacts = dict(zip(solver.robot.fingers, map(ik.Contact, points, normals), strict=True))
+        held = solver.choose([ik.Grasp(contacts, object_pose=pose)])[0]
+        calls[what] = lambda: solver.place(held, pose, q)
+    with pytest.raises(ik.errors.UnsupportedError, match=rf"{what}.*several palms \(left, right\)"):
+        calls[what]()

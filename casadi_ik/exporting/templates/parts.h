@@ -12,6 +12,6 @@ typedef @REAL@ scalar;
 
 @JOBS@
 @PARTS@
-extern const int16_t @PREFIX@_table_0[], @PREFIX@_table_1[];
+@TABLES@
 
 #endif

@@ -5,10 +5,10 @@ enum { DONE = 0, SLICE_OVER = 1, GOES_ON = 3 };
 
 typedef @PREFIX@_solver search;
 
-#define TILES(table) ((table) ? @PREFIX@_table_1 : @PREFIX@_table_0)
 @CALLS@
 @SIZES@
 @CONSTANTS@
+@SEEDS@
 @SEARCH@
 @TERMS@
 @LIMITS@

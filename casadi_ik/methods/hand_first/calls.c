@@ -1,11 +1,5 @@
 /* What Python calls of hand-first: one search, a batch of them, one decision, one round's hands. */
 
-#if defined(_WIN32)
-#define EXPORT __declspec(dllexport)
-#else
-#define EXPORT __attribute__((visibility("default")))
-#endif
-
 /* k targets; all rows are one after the other. */
 typedef struct {
   search *searches;            /* one for each slot of the loop */
@@ -58,23 +52,6 @@ EXPORT int casadi_ik_decide(search *job) {
   job->judged = 0;
   return follow(job, 0, 0, &status);
 }
-
-#if !N_SIDES
-/* The hands of a round that look like a target, for a body that the robot is a side of. */
-EXPORT int casadi_ik_hands(search *job, const double *points, const double *normals,
-                           const double *here, int64_t nearest, int64_t round, double *postures) {
-  int code;
-  memcpy(job->points, points, sizeof job->points);
-  memcpy(job->normals, normals, sizeof job->normals);
-  memcpy(job->here, here, sizeof job->here);
-  memcpy(job->terms + TERMS_LOWER, LOWER, sizeof LOWER);
-  memcpy(job->terms + TERMS_UPPER, UPPER, sizeof UPPER);
-  job->terms[TERMS_NEAREST] = (double) nearest;
-  code = from_table(job, round);
-  memcpy(postures, job->postures, sizeof job->postures);
-  return code;
-}
-#endif
 
 /* The hands of a round whose postures look like the target, into `postures`. */
 EXPORT int casadi_ik_postures(search *job) { return from_table(job, job->round); }

@@ -7,6 +7,7 @@ their memory, their constants and the kernels that they call.
 from __future__ import annotations
 
 import ctypes
+import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -63,6 +64,24 @@ KERNELS = {
 }
 """The compiled functions it calls, and what they work on."""
 
+EXPORT = """
+#if defined(_WIN32)
+#define EXPORT __declspec(dllexport)
+#else
+#define EXPORT __attribute__((visibility("default")))
+#endif
+"""
+
+HANDS = "EXPORT int casadi_ik_hands"
+"""What a body calls of its sides' libraries."""
+
+OF_SIDES = """
+typedef int (*find_hands)(void *, const double *, const double *, const double *, int64_t, int64_t,
+                          double *);
+#define HANDS(side, ...) ((find_hands) job->hands[side])((void *) job->sides[side], __VA_ARGS__)
+"""
+"""How a body does it."""
+
 STATE = (
     *("q", "phase", "candidate", "earlier", "held", "returns"),
     *("best_cost", "best_q", "counts"),
@@ -72,7 +91,7 @@ STATE = (
 
 @cache
 def source_text(name: str) -> str:
-    """The text of "seeds", "hand_first" or "calls"."""
+    """The text of one of the files beside this one, as "hand_first"."""
     source = resources.files("casadi_ik.methods.hand_first") / f"{name}.c"
     return source.read_text(encoding="utf-8")
 
@@ -128,6 +147,12 @@ class SearchPlan:
         return found | ({"seen": self.seeds.seen} if self.mends else {})
 
     @property
+    def source(self) -> str:
+        """The C of a search."""
+        seeds = ("sides",) if self.sides else ("seeds", "valley")
+        return "".join(map(source_text, ("spread", *seeds, "hand_first")))
+
+    @property
     def sizes(self) -> dict[str, int]:
         """The macros that dimensions of arrays are made of."""
         robot, layouts = self.layouts.robot, self.layouts
@@ -148,7 +173,7 @@ class SearchPlan:
     @property
     def fields(self) -> dict[str, tuple[str, int, str]]:
         """Type, length and meaning of what a search has in memory, all of eight bytes each."""
-        f, n, h, _, state, parameters, candidates, pool, mended, more, s = self.sizes.values()
+        f, n, h, _, state, parameters, candidates, pool, mended, more, _ = self.sizes.values()
         double, whole = "double", "int64_t"
         return {
             "points": (double, 3 * f, "the question: base frame, NaN = free"),
@@ -191,7 +216,6 @@ class SearchPlan:
             "slopes": (double, 6 * f * h, ""),
             "held": (double, h, ""),
             "motion": (double, h, ""),
-            **({"sides": (whole, s, "the sides' searches"), "hands": (whole, s, "")} if s else {}),
         }
 
     def members(self) -> str:
@@ -204,18 +228,22 @@ class SearchPlan:
 
     def constants(
         self,
+        source: str,
         reals: Mapping[str, float] | None = None,
         arrays: Mapping[str, NDArray[Any]] | None = None,
     ) -> str:
         """All of them but the `sizes`, as C text.
 
         Args:
-            reals: Those of them that are others than in Python.
+            source: Text in C; arrays are those that it names.
+            reals: Those of the constants that are others than in Python.
             arrays: Likewise.
         """
         numbers = self._real_numbers() | dict(reals or {})
         lines = (f"#define {name} {number(value)}\n" for name, value in numbers.items())
+        named = set(re.findall(r"\w+", source))
         tables = self._arrays() | dict(arrays or {})
+        tables = {name: array for name, array in tables.items() if name in named}
         return define(self._whole_numbers()) + "".join(lines) + define_arrays(tables)
 
     def _whole_numbers(self) -> dict[str, int]:
@@ -614,7 +642,8 @@ def _form(plan: SearchPlan) -> list[Any]:
         (name, kinds[kind], (length,) if _is_array(name, kind, length) else ())
         for name, (kind, length, _) in plan.fields.items()
     ]
-    return [*form, ("tiles", np.int64, (3,)), *((name, np.int64) for name in KERNELS)]
+    sides = [(name, np.int64, (len(plan.sides),)) for name in ("sides", "hands") if plan.sides]
+    return [*form, ("tiles", np.int64, (3,)), *sides, *((name, np.int64) for name in KERNELS)]
 
 
 def _is_array(name: str, kind: str, length: int) -> bool:
@@ -626,6 +655,8 @@ def _text(plan: SearchPlan, wide: bool) -> str:
     jobs = (driver_text(name) for name in ("loop_job", "map_job", "lookup_job"))
     pointers = "".join(f"  int (*{name})({job} *);\n" for name, job in KERNELS.items())
     calls = "".join(f"#define {name.upper()}(work) (job->{name})(work)\n" for name in KERNELS)
+    count = len(plan.sides)
+    sides = f"  int64_t sides[{count}], hands[{count}];\n" if count else ""
     codes = {code.name: int(code) for code in DriverCode} | {"MALFORMED": MALFORMED}
     return "".join(
         (
@@ -635,10 +666,13 @@ def _text(plan: SearchPlan, wide: bool) -> str:
             define(codes | {"FOREVER": FOREVER}),
             *jobs,
             f"typedef struct {{\n{plan.members()}",
-            f"  const int16_t *tiles[3];\n{pointers}}} search;\n",
+            f"  const int16_t *tiles[3];\n{sides}{pointers}}} search;\n",
             f"{calls}#define TILES(table) (job->tiles[table])\n",
             define(plan.sizes),
-            plan.constants(),
-            *map(source_text, ("seeds", "hand_first", "calls")),
+            plan.constants(plan.source),
+            EXPORT,
+            OF_SIDES if plan.sides else f"#define FIND_HANDS {HANDS}\n",
+            plan.source,
+            source_text("calls"),
         )
     )

@@ -1,12 +1,13 @@
 /* Hand first: the search for one target, from the question to the verdict.
  *
  * A search makes rounds until a target is solved or none is left that may help. A round takes up to
- * N_CANDIDATES hand postures (seeds.c), one after the other. Of each it takes the palm pose that
- * suits it best (candidate), fits palm and hand to the contacts as if the hand could fly (hand
- * fit), has the arm carry the palm there in closed form (arm placement, or arm choice if what is
- * near q0 is wanted), moves all motors where the arm cannot follow exactly (refinement), and brings
- * the largest error down where contacts contradict each other (balance). An iteration is one step of
- * the stage that the solve is in, and the choice of the next stage: iteration.c.
+ * N_CANDIDATES hand postures (seeds.c, valley.c, of a body sides.c), one after the other. Of each
+ * it takes the palm pose that suits it best (candidate), fits palm and hand to the contacts as if
+ * the hand could fly (hand fit), has the arm carry the palm there in closed form (arm placement, or
+ * arm choice if what is near q0 is wanted), moves all motors where the arm cannot follow exactly
+ * (refinement), and brings the largest error down where contacts contradict each other (balance).
+ * An iteration is one step of the stage that the solve is in, and the choice of the next stage:
+ * iteration.c.
  *
  * The loop (kernels/drivers/loop.c) makes the iterations, of many targets side by side or of one,
  * and asks `follow` whenever they end. A batch, one target, `fast`, a solve by steps and an
@@ -19,6 +20,23 @@
 #undef VALLEY_ROUNDS           /* valleys are those of one hand */
 #define VALLEY_ROUNDS 0
 #endif
+
+/* Hand postures from anywhere, and all motors of the first of them: for what no table holds. */
+static void from_anywhere(search *job, int64_t number, double *first) {
+  int i, k;
+  for (i = 0; i < N_CANDIDATES; ++i) {
+    const int64_t place = number * N_CANDIDATES + i + 1;
+    for (k = 0; k < N_HAND; ++k) {
+      const int column = HAND[k];
+      job->postures[i * N_HAND + k] =
+          ANYWHERE_LOWER[column] + even(place, ALL_STEPS[column]) * ANYWHERE_RANGE[column];
+    }
+  }
+  for (k = 0; k < N_MOTORS; ++k) {
+    first[k] = ANYWHERE_LOWER[k]
+             + even(number * N_CANDIDATES + 1, ALL_STEPS[k]) * ANYWHERE_RANGE[k];
+  }
+}
 
 /* First state and parameters of the round, from its postures; what was found before stays. */
 static int begin_round(search *job) {

@@ -266,6 +266,7 @@ static int after_hand_fit(solve s) {
   return !alone ? RUNNING_STATUS : SAYS(WITHIN) ? SOLVED_STATUS : STALLED_STATUS;
 }
 
+#if !N_SIDES
 static int after_placement(solve s) {
   const int over = Y(SPENT) >= (X(EARLIER) > 0 ? ALL_PLACEMENTS : PLACEMENTS);
   if (!SAYS(WITHIN) && !over) return goes_to(s, ARM_PLACEMENT_STAGE);
@@ -274,6 +275,7 @@ static int after_placement(solve s) {
   goes_to(s, REFINEMENT_STAGE);
   return SAYS(WITHIN) && SAYS(NEAR) && X(FITS) > 0 ? SOLVED_STATUS : RUNNING_STATUS;
 }
+#endif
 
 static int after_choice(solve s) {
   if (!SAYS(WITHIN)) {
