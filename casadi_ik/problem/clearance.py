@@ -196,10 +196,16 @@ class SceneCheck:
 
     @cached_property
     def bodies_of_fingers(self) -> dict[str, frozenset[str]]:
-        """By finger the links that may touch what it grasps: all that are fixed to its pad's."""
+        """By finger the links that may touch what it grasps: all that are fixed to its pad's.
+
+        Of a finger that no joint moves against the palm, a gripper's fixed jaw, its link alone:
+        fixed to it are the palm and the end of the arm.
+        """
         bodies = self.model.bodies
         return {
             finger.name: frozenset(k for k, v in bodies.items() if v == bodies[finger.link])
+            if finger.joints
+            else frozenset({finger.link})
             for finger in self.robot.description.fingers
         }
 

@@ -111,7 +111,8 @@ def _finger(name: str, hand: Part, flat: FlatJoints) -> Finger:
         if by_child[link].type != "fixed":
             chain.append(by_child[link].name)
         link = by_child[link].parent
-    if not chain and hand.actuators:
+    # On the palm's own link a pad is meant to stay: a jaw that is fixed.
+    if not chain and hand.actuators and entry.link != hand.tip_link:
         raise DescriptionError(
             f"{where}.link: no joint moves {entry.link!r} against the palm {hand.tip_link!r}"
         )
