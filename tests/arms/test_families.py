@@ -38,6 +38,7 @@ KINDS = {
     "baxter_right": "nearly spherical wrist, joint 1 swept",
     "puma560": "spherical wrist",
     "viperx_300s": "spherical wrist",
+    "widowx_250s": "spherical wrist",
     "jaco2": "spherical wrist",
     "irb140": "spherical wrist",
     **{f"ur{name}": "three parallel axes" for name in ("3e", "5e", "10e", "16e", "5", "10")},

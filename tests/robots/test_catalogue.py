@@ -43,6 +43,7 @@ ARMS = [
     "baxter_right",
     "baxter_left",
     "viperx_300s",
+    "widowx_250s",
     "puma560",
     "irb140",
     "g1_arm",
@@ -66,9 +67,13 @@ HANDS = [
     "unitree_dex3",
     "panda_hand",
     "robotiq_2f85",
+    "widowx_gripper",
+    "so100_jaw",
     "tool",
 ]
-FEWER = {"panda_hand": 2, "robotiq_2f85": 2, "tool": 1}
+FEWER = {"panda_hand": 2, "robotiq_2f85": 2, "widowx_gripper": 2, "so100_jaw": 2, "tool": 1}
+UNMOVED = {"tool": ("tip",), "so100_jaw": ("fixed",)}
+"""By hand the fingers that no joint moves against the palm."""
 
 PUBLISHED = json.loads(Path(__file__).with_name("published_poses.json").read_text())
 
@@ -97,7 +102,7 @@ def test_every_hand_goes_on_an_arm(hand):
     assert description.actuator_names[:6] == tuple(f"ur5e_joint_{i}" for i in range(1, 7))
     assert description.sources
     for finger in description.fingers:
-        assert finger.joints or hand == "tool"
+        assert bool(finger.joints) == (finger.name not in UNMOVED.get(hand, ()))
         np.testing.assert_allclose(np.linalg.norm(finger.normal), 1, atol=1e-12)
 
 

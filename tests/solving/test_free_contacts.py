@@ -10,6 +10,8 @@ import pytest
 
 import casadi_ik as ik
 
+GRIPPERS = ["panda+panda_hand", "ur5e+robotiq_2f85", "widowx_250s+widowx_gripper"]
+
 
 @cache
 def robot_of(name: str) -> ik.ArmHand:
@@ -21,7 +23,7 @@ def solver_of(name: str) -> ik.Solver:
     return ik.Solver(robot_of(name))
 
 
-@pytest.mark.parametrize("name", ["panda+panda_hand", "ur5e+robotiq_2f85"])
+@pytest.mark.parametrize("name", GRIPPERS)
 def test_a_palm_is_where_it_was_asked_for_though_its_contacts_leave_it_free(name):
     robot, solver = robot_of(name), solver_of(name)
     q = robot.random(np.random.default_rng(3), 60)
@@ -60,7 +62,7 @@ def test_what_contacts_leave_free_is_searched(name, fingers, count):
     assert alone.solve_batch(points[-10:], normals[-10:]).success.all()
 
 
-@pytest.mark.parametrize("name", ["panda+panda_hand", "ur5e+robotiq_2f85"])
+@pytest.mark.parametrize("name", GRIPPERS)
 def test_what_a_hand_of_one_motor_misses_is_diagnosed(name):
     robot, solver = robot_of(name), solver_of(name)
     rng = np.random.default_rng(0)
