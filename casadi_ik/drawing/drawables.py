@@ -421,8 +421,9 @@ def _placed(solid: Solid, pose: Array, near: Array) -> Shape:
 
 
 def scene_of(scene: Scene, about: Array, without: str = "") -> list[Drawable]:
-    """Everything of a scene but one item, in the base frame."""
-    items = [item for name, item in scene.items.items() if name != without]
+    """Everything of a scene but an object that is drawn by itself, in the base frame."""
+    drawn = {without} if object_of(without) is not None else set[str]()
+    items = [item for name, item in scene.items.items() if name not in drawn]
     return [one.at(item.pose) for item in items for one in item_of(item, about)]
 
 

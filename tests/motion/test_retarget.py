@@ -301,6 +301,53 @@ def test_both_hands_move_a_body(g1, both_hands):
     assert np.ptp(np.array(q)[:, g1.actuators.index("waist_yaw_joint")]) > 0.3
 
 
+def test_both_hands_drive_a_body_in_mujoco(g1, both_hands):
+    """Five seconds: springs of 31 motors take the robot where the follower says."""
+    mujoco = pytest.importorskip("mujoco")
+    spec = mujoco.MjSpec.from_string(g1.urdf())
+    spec.compiler.fusestatic = False
+    spec.compiler.boundmass, spec.compiler.boundinertia = 0.05, 1e-4
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    for geom in spec.geoms:
+        geom.contype = geom.conaffinity = 0
+    for body in spec.bodies:
+        body.gravcomp = 1
+    for joint in spec.joints:
+        if joint.name in g1.actuators:
+            of_hand = g1.actuators.index(joint.name) in g1.description.hand_actuators
+            stiff = 3.0 if of_hand else 4000.0
+            joint.armature, joint.damping = (1e-3, 0.15) if of_hand else (0.5, 200.0)
+            spec.add_actuator(
+                name=joint.name,
+                target=joint.name,
+                trntype=mujoco.mjtTrn.mjTRN_JOINT,
+                gainprm=[stiff, *[0] * 9],
+                biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+                biasprm=[0, -stiff, *[0] * 8],
+            )
+    model = spec.compile()
+    data, step = mujoco.MjData(model), model.opt.timestep
+    assert model.nu == len(g1.actuators) == 31
+    motors = [model.actuator(name).id for name in g1.actuators]
+    places = [model.joint(name).qposadr[0] for name in g1.actuators]
+    data.qpos[places] = data.ctrl[motors] = g1.home
+    config = ik.motion.load_retarget(KEYPOINTS / "two_hands_g1.yaml")
+    retargeter = ik.motion.Retargeter(config, g1, g1.home)
+    follower = ik.Solver(g1).follow(g1.home, period=step)
+    wrong = []
+    for cycle in range(int(5.0 / step)):
+        newest = {side: frames[int(cycle * step * 30)] for side, frames in both_hands.items()}
+        wanted = retargeter(newest, elapsed=step)
+        data.ctrl[motors] = follower(wanted.points, palm=wanted.palm, palm_weight=(0.05, 0.05))
+        mujoco.mj_step(model, data)
+        there, _ = g1.contacts(data.qpos[places])
+        wrong.append(np.linalg.norm(there - wanted.points, axis=1).max())
+    # The springs' lag at up to half a metre a second is most of it.
+    assert np.median(wrong) < 0.01
+    assert max(wrong) < 0.05
+    assert np.isfinite(data.qpos).all()
+
+
 def test_a_hand_that_is_not_seen_comes_to_rest(g1, both_hands):
     config = ik.motion.load_retarget(KEYPOINTS / "two_hands_g1.yaml")
     retargeter = ik.motion.Retargeter(config, g1, g1.home)

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.opengl
 
 FOLDER = Path(__file__).parents[2] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
-LARGEST = 3_000_000
+LARGEST = 3_500_000
 """All notebooks together [bytes]."""
 
 
