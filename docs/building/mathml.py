@@ -26,8 +26,6 @@ APPLY = "\u2061"
 
 THIN = "0.17em"
 
-ElementTree.register_namespace("", MATHML)
-
 
 def mathml(tex: str, display: bool) -> str:
     """A formula in TeX as MathML.
@@ -45,6 +43,8 @@ def mathml(tex: str, display: bool) -> str:
             element.tag = _tag("msub")
         elif element.tag == _tag("mo") and element.text == "‖" and "minsize" not in element.attrib:
             element.set("stretchy", "false")
+    # Here, as others take the empty prefix for theirs.
+    ElementTree.register_namespace("", MATHML)
     return ElementTree.tostring(root, encoding="unicode")
 
 
