@@ -50,7 +50,7 @@ class TouchParameters:
     """
 
     facing: float = float(np.deg2rad(45.0))
-    object_pairs: int = 400_000
+    object_pairs: int = 100_000
     attempts: int = 20_000
     most: int = 1_000_000
     lost: int = 300
@@ -121,6 +121,7 @@ class Generator:
         parameters: How they are looked for.
         rng: Random numbers.
         counts: How many passed each stage.
+        asked: How many of them the arm was asked to reach.
     """
 
     table: HandTable
@@ -130,6 +131,7 @@ class Generator:
     rng: np.random.Generator
     clear: HandCheck
     counts: dict[str, int] = field(default_factory=dict)
+    asked: int = 0
 
     def __post_init__(self) -> None:
         surface, chosen = self.surface, self.parameters
@@ -217,12 +219,13 @@ class Generator:
         own = table.normals[share, a[kept], thumb]
         pads = np.einsum("kij,kj->ki", some.palm[:, :3, :3], own)
         placed = some.used.copy()
-        for number in rng.permutation(len(names)):
+        for rest, number in zip(range(len(names))[::-1], rng.permutation(len(names)), strict=True):
             for start in range(0, len(share), chosen.together):
                 rows = np.arange(start, min(start + chosen.together, len(share)))
                 rows = rows[placed[rows].any(axis=1) & ~placed[rows, number]]
                 if len(rows):
-                    self._place(some, placed, share, rows, number, pads)
+                    short = some.used[rows].sum(axis=1) + rest < self.fingers
+                    self._place(some, placed, share, rows, number, pads, short)
         kept = np.flatnonzero(placed.all(axis=1) & (some.used.sum(axis=1) == self.fingers))
         self.counted(f"{self.fingers} fingertips touch, all clear", len(kept))
         return some.rows(kept)
@@ -235,10 +238,12 @@ class Generator:
         rows: NDArray[np.intp],
         number: int,
         thumb: Array,
+        short: Bools,
     ) -> None:
         """Give a finger a posture that touches, where more are wanted, else one that is clear.
 
-        A row for which none is found is given up: none of its fingers counts as placed.
+        It has to touch in rows that are short of fingers: those that follow are too few. A row for
+        which none is found is given up: none of its fingers counts as placed.
         """
         chosen, name = self.parameters, self.table.robot.fingers[number]
         every = self.table.q.shape[1]
@@ -249,7 +254,7 @@ class Generator:
         wanted = some.used[rows].sum(axis=1) < self.fingers
         # Of postures that touch rather one that pushes against the thumb.
         chance = self.rng.random(touch.shape)
-        idle = np.where(height > chosen.clear, chance, -1.0)
+        idle = np.where((height > chosen.clear) & ~short[:, None], chance, -1.0)
         rank = np.where(touch & wanted[:, None], 4.0 + chance + 2.0 * against, idle)
         left = np.arange(len(rows))
         for _ in range(chosen.tries):

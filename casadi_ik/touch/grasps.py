@@ -262,8 +262,8 @@ def grasps_of(
             some = generator.candidates(attempts)
             tried, attempts = tried + attempts, chosen.attempts
             made = _made(generator, some, arms, judge, place, mu, hold, jobs, start)
-            clear, known = generator.counts["still clear"], len(distinct)
-            if made is None and clear >= chosen.lost and not generator.counts.get("arm reaches"):
+            known, reached = len(distinct), generator.counts.get("arm reaches")
+            if made is None and generator.asked >= chosen.lost and not reached:
                 break
             if made is not None:
                 parts.append(made)
@@ -332,38 +332,37 @@ def _made(
     jobs: int,
     start: Array | None,
 ) -> _Made | None:
-    """Those that the arm reaches, that are free in the scene, and that hold."""
+    """Those that hold, that the arm reaches, and that are free in the scene."""
     robot, table, surface = arms.robot, generator.table, generator.surface
     if not len(some):
         return None
+    here, _, _ = touching(table, surface, some)
+    order = np.argsort(~some.used, axis=1, kind="stable")[:, : generator.fingers]
+    sample = np.take_along_axis(here.sample, order, axis=1)
+    center, length = surface.middle, surface.size / 2
+    wrenches = generators(surface.points[sample], -surface.faces[sample], mu, center, length)
+    found = loads(wrenches)
+    held = found.min(axis=1) > CLOSED
+    generator.counted("force-closed", int(held.sum()))
+    if hold is not None:
+        held &= found[:, FORCES].min(axis=1) * hold[1] >= hold[0] * GRAVITY
+        generator.counted(f"hold {hold[0]:g} kg at {hold[1]:g} N", int(held.sum()))
+    generator.asked += int(held.sum())
+    if not held.any():
+        return None
+    some, found, wrenches = some.rows(np.flatnonzero(held)), found[held], wrenches[held]
     hands = table.configuration(some.hand)
     reached = arms.solve_palms(place @ some.palm, hands, start, jobs=jobs)
     rows = np.flatnonzero(reached.success)
     generator.counted("arm reaches", len(rows))
-    some, q = some.rows(rows), reached.q[rows]
+    some, q, found, wrenches = some.rows(rows), reached.q[rows], found[rows], wrenches[rows]
     if not len(rows):
         return None
     points, normals = (np.where(some.used[..., None], part, np.nan) for part in robot.contacts(q))
     batch = judge.solve_batch(points, normals, q0=q, jobs=jobs)
     rows = np.flatnonzero(batch.success)
     generator.counted("free in the scene", len(rows))
-    some = some.rows(rows)
-    found, wrenches = np.zeros((0, 12)), np.zeros((0, 6, 0))
-    if len(rows):
-        here, _, _ = touching(table, surface, some)
-        order = np.argsort(~some.used, axis=1, kind="stable")[:, : generator.fingers]
-        sample = np.take_along_axis(here.sample, order, axis=1)
-        center, length = surface.middle, surface.size / 2
-        wrenches = generators(surface.points[sample], -surface.faces[sample], mu, center, length)
-        found = loads(wrenches)
-        held = found.min(axis=1) > CLOSED
-        generator.counted("force-closed", int(held.sum()))
-        if hold is not None:
-            held &= found[:, FORCES].min(axis=1) * hold[1] >= hold[0] * GRAVITY
-            generator.counted(f"hold {hold[0]:g} kg at {hold[1]:g} N", int(held.sum()))
-        rows, some, found = rows[held], some.rows(np.flatnonzero(held)), found[held]
-        wrenches = wrenches[held]
-    return _Made(batch, rows, some, found, wrenches)
+    return _Made(batch, rows, some.rows(rows), found[rows], wrenches[rows])
 
 
 CLOSED = 1e-4

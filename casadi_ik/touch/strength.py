@@ -102,12 +102,13 @@ def _solved(wrenches: Array, directions: Array, steps: int = 25) -> Array:
     cost[g] = -1.0
     x = np.full((count, g + 2), 1.0 / (g + 2))
     z, y = np.ones_like(x), np.zeros((count, 7))
+    solved, left = np.zeros_like(x), np.arange(count)
     for _ in range(steps):
         primal = right - np.einsum("kij,kj->ki", matrix, x)
         dual = cost - np.einsum("kij,ki->kj", matrix, y) - z
         gap = (x * z).mean(axis=1)
         scaled = x / z
-        normal = np.einsum("kij,kj,klj->kil", matrix, scaled, matrix)
+        normal = (matrix * scaled[:, None]) @ matrix.swapaxes(1, 2)
         # Contacts on a line leave rows that depend on each other.
         normal[:, range(7), range(7)] += 1e-12 * (1.0 + np.trace(normal, axis1=1, axis2=2))[:, None]
 
@@ -127,9 +128,14 @@ def _solved(wrenches: Array, directions: Array, steps: int = 25) -> Array:
         a, b = 0.99 * _longest(x, dx), 0.99 * _longest(z, dz)
         x = np.maximum(x + a[:, None] * dx, 1e-14)
         y, z = y + b[:, None] * dy, np.maximum(z + b[:, None] * dz, 1e-14)
-        if gap.max() < 1e-9:
-            break
-    return x.reshape(k, d, g + 2)
+        done = gap < 1e-9
+        if done.any():
+            solved[left[done]] = x[done]
+            left, matrix, x, y, z = (part[~done] for part in (left, matrix, x, y, z))
+            if not len(left):
+                break
+    solved[left] = x
+    return solved.reshape(k, d, g + 2)
 
 
 def _longest(value: Array, way: Array) -> Array:
