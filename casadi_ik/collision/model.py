@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -261,7 +261,9 @@ def pair_table(
     )
 
 
-def check_base(model: CollisionModel, scene: Scene, where: Array) -> None:
+def check_base(
+    model: CollisionModel, scene: Scene, where: Array, names: Collection[str]
+) -> None:
     """Refuse a scene with something in the robot's base: all would be in collision.
 
     A base's shapes are larger than the base, so that a table under it may touch them; what is
@@ -271,12 +273,14 @@ def check_base(model: CollisionModel, scene: Scene, where: Array) -> None:
         model: The robot's shapes.
         scene: The scene.
         where: Where the shapes are, as `placed` gives it.
+        names: The items that are looked at.
 
     Raises:
         DescriptionError: The middle line of a shape of the base is inside a solid.
     """
     stated = {frozenset(one.links) for one in scene.touching}
-    for name, item in scene.items.items():
+    for name in names:
+        item = scene.items[name]
         for i, link in enumerate(model.links):
             if not model.is_fixed(link) or frozenset((link, name)) in stated:
                 continue

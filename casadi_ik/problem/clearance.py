@@ -15,7 +15,7 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.collision.distances import Table, from_solid, pose_row
 from casadi_ik.collision.model import CollisionModel, check_base, collision_model, pair_table
-from casadi_ik.collision.scene import Item, Scene
+from casadi_ik.collision.scene import Scene
 from casadi_ik.collision.solids import Solid, capsule
 from casadi_ik.kernels.clearance_kernel import ClearanceKernel
 from casadi_ik.problem.targets import TargetBatch
@@ -146,10 +146,10 @@ class SceneCheck:
         self.kernel = ClearanceKernel(robot.description, compiled)
         self.model = self._as_it_stands(collision_model(robot.description))
         self._held: dict[str, Scene] = {}
-        self._tables: dict[tuple[str, frozenset[str], bool], tuple[Table, dict[str, Item]]] = {}
+        self._tables: dict[tuple[str, frozenset[str], bool], Table] = {}
         (placed,) = self.kernel.placed(robot.home)
-        check_base(self.model, scene, placed)
-        self._table(scene, frozenset())
+        check_base(self.model, scene, placed, scene.items)
+        self.table(scene, frozenset())
 
     def moved(self, name: str, pose: Array) -> SceneCheck:
         """The same with an item of the scene at another (4, 4) pose: its pairs are the same.
@@ -162,9 +162,8 @@ class SceneCheck:
         other = copy(self)
         other.scene = self.scene.moved(name, pose)
         (placed,) = self.kernel.placed(self.robot.home)
-        check_base(self.model, other.scene, placed)
-        other._held, other._tables = {}, {}
-        other._table(other.scene, frozenset())
+        check_base(self.model, other.scene, placed, {name})
+        other._held = {}
         return other
 
     def _as_it_stands(self, model: CollisionModel, samples: int = 256) -> CollisionModel:
@@ -230,9 +229,9 @@ class SceneCheck:
             name for name, on in zip(self.robot.fingers, np.atleast_1d(fingers), strict=True) if on
         ]
         touched = frozenset().union(*(self.bodies_of_fingers[name] for name in named))
-        table, items = self._table(scene, touched, carried)
-        moved = name if pose is not None else None
-        return CollisionQuery(self.kernel, table, table.poses(items, moved, pose), scene.margin)
+        table, moved = self.table(scene, touched, carried), name if pose is not None else None
+        poses = table.poses(scene.items, moved, pose)
+        return CollisionQuery(self.kernel, table, poses, scene.margin)
 
     def _holding(self, name: str, pose: Array) -> Scene:
         """The scene with an object that is grasped, wherever it was first: its pose goes aside."""
@@ -240,13 +239,17 @@ class SceneCheck:
             self._held[name] = self.scene.holding(name, pose)
         return self._held[name]
 
-    def _table(
-        self, scene: Scene, touched: frozenset[str], carried: bool = False
-    ) -> tuple[Table, dict[str, Item]]:
+    def table(self, scene: Scene, touched: frozenset[str], carried: bool = False) -> Table:
+        """The pairs of a scene that differs from this one in what is grasped and where it is.
+
+        Args:
+            scene: The scene.
+            touched: Links that may touch what is grasped.
+            carried: Whether the hand carries it.
+        """
         key = scene.grasped or "", touched, carried
         if key not in self._tables:
-            table = pair_table(self.model, scene, sorted(touched), carried)
-            self._tables[key] = table, scene.items
+            self._tables[key] = pair_table(self.model, scene, sorted(touched), carried)
         return self._tables[key]
 
 

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from casadi_ik.arrays import Array, Bools
 from casadi_ik.collision.distances import Table, pose_row
-from casadi_ik.collision.model import pair_table
 from casadi_ik.grasps.pose import inverse
 from casadi_ik.problem.clearance import CollisionQuery, SceneCheck
 from casadi_ik.touch.hand_table import HandTable, rigid
@@ -29,8 +28,9 @@ class TouchParameters:
     Attributes:
         facing: Two patches oppose each other if both normals are within this angle of the line
             between them [rad].
-        object_pairs: Pairs of patches that are drawn.
-        attempts: Pairs of hand and object that are tried at once; a fifth of it at first.
+        object_pairs: Pairs of patches that are drawn at once.
+        first: Pairs of hand and object that are tried at first.
+        attempts: Most that are tried at once.
         most: Attempts after which no more are made.
         lost: Hands after which no more are tried if the arm has reached none of them.
         lean: Fingertips lean by at most this angle at first [rad].
@@ -51,6 +51,7 @@ class TouchParameters:
 
     facing: float = float(np.deg2rad(45.0))
     object_pairs: int = 100_000
+    first: int = 2_000
     attempts: int = 20_000
     most: int = 1_000_000
     lost: int = 300
@@ -94,6 +95,16 @@ class Candidates:
         tips = self.tips[rows] if len(self.tips) else self.tips
         return Candidates(self.palm[rows], self.hand[rows], self.used[rows], tips)
 
+    def alike(self, one: int, others: NDArray[np.intp], chosen: TouchParameters) -> Bools:
+        """Which of others have palm and fingertips about where one has them."""
+        turn = np.einsum("kij,ij->k", self.palm[others, :3, :3], self.palm[one, :3, :3])
+        turned = np.arccos(np.clip((turn - 1) / 2, -1, 1)) < chosen.turned
+        near = np.linalg.norm(self.palm[others, :3, 3] - self.palm[one, :3, 3], axis=1)
+        off = np.linalg.norm(self.tips[others] - self.tips[one], axis=-1)
+        off = np.where(self.used[one], off, 0.0).max(axis=1)
+        same = (self.used[others] == self.used[one]).all(axis=1)
+        return turned & same & (np.maximum(near, off) < chosen.apart)
+
 
 WHY_NONE = {
     "two fingertips fit": "no pads face two patches of the object well enough",
@@ -102,10 +113,10 @@ WHY_NONE = {
     "fingers may do",
     "made exact": "fingertips do not come to rest on the surface inside a face",
     "still clear": "palm or fingers would be in the object",
-    "arm reaches": "the object is out of the arm's reach, or only from sides that hold nothing",
-    "free in the scene": "arm or hand would hit something of the scene, or the object",
     "force-closed": "contacts do not oppose each other within friction",
     "hold ": "it is too heavy for that squeeze and friction",
+    "arm reaches": "the object is out of the arm's reach, or only from sides that hold nothing",
+    "free in the scene": "arm or hand would hit something of the scene, or the object",
 }
 """What it means that nothing passes a stage."""
 
@@ -122,6 +133,7 @@ class Generator:
         rng: Random numbers.
         counts: How many passed each stage.
         asked: How many of them the arm was asked to reach.
+        alike: How many of the last round were like others.
     """
 
     table: HandTable
@@ -132,25 +144,30 @@ class Generator:
     clear: HandCheck
     counts: dict[str, int] = field(default_factory=dict)
     asked: int = 0
+    alike: int = 0
 
     def __post_init__(self) -> None:
+        self._pairs = np.zeros((0, 4), dtype=np.intp)
+        self.look()
+
+    def look(self) -> None:
+        """Draw more pairs of patches; those are kept that two fingertips may fit."""
         surface, chosen = self.surface, self.parameters
         good = np.flatnonzero(surface.inside)
-        self._pairs = np.zeros((0, 2), dtype=np.intp)
         if len(good) < 2:
             return
-        i, j = self.rng.choice(good, (2, chosen.object_pairs))
+        i, j = good[self.rng.integers(len(good), size=(2, chosen.object_pairs))]
         way = surface.points[j] - surface.points[i]
         length = np.linalg.norm(way, axis=1)
-        way /= np.maximum(length, 1e-9)[:, None]
-        first = -(way * surface.normals[i]).sum(axis=1)
-        second = (way * surface.normals[j]).sum(axis=1)
-        facing = (np.minimum(first, second) > np.cos(chosen.facing)) & (length > 5e-3)
-        key = self.table.key(length[facing], first[facing], second[facing])
-        start, count = self.table.cells(key)
-        has = count > 0
-        self._pairs = np.stack([i[facing], j[facing]], axis=1)[has]
-        self._start, self._count = start[has], count[has]
+        first = -np.einsum("ki,ki->k", way, surface.normals[i])
+        second = np.einsum("ki,ki->k", way, surface.normals[j])
+        facing = np.minimum(first, second) > np.cos(chosen.facing) * length
+        i, j, length, first, second = (
+            part[facing & (length > 5e-3)] for part in (i, j, length, first, second)
+        )
+        found = self.table.cells(self.table.key(length, first / length, second / length))
+        pairs = np.stack([i, j, *found], axis=1)[found[1] > 0]
+        self._pairs = np.concatenate([self._pairs, pairs])
 
     @property
     def fits(self) -> bool:
@@ -192,13 +209,14 @@ class Generator:
         """Candidates of some attempts: two fingertips fit, the others find something to touch."""
         table, surface, chosen, rng = self.table, self.surface, self.parameters, self.rng
         row = rng.integers(len(self._pairs), size=count)
-        cell = self._start[row] + (rng.random(len(row)) * self._count[row]).astype(np.intp)
+        i, j, start, number = self._pairs[row].T
+        cell = start + (rng.random(count) * number).astype(np.intp)
         share, other, a, b = table.pairs[cell].T
         thumb = table.robot.fingers.index(table.robot.thumb)
         self.counted("attempts", len(row))
         hand_points = np.stack([table.points[share, a, thumb], table.points[share, b, other]], 1)
         hand_normals = np.stack([table.normals[share, a, thumb], table.normals[share, b, other]], 1)
-        samples = self._pairs[row]
+        samples = np.stack([i, j], axis=1)
         palm, lean = _matched(
             hand_points, hand_normals, surface.points[samples], -surface.normals[samples]
         )
@@ -476,19 +494,21 @@ class HandCheck:
     serves before there is an arm.
     """
 
-    def __init__(self, table: HandTable, check: SceneCheck, pose: Array) -> None:
+    def __init__(
+        self, table: HandTable, check: SceneCheck, pose: Array, tables: dict[bytes, Table]
+    ) -> None:
         """Take over the scene of a solver.
 
         Args:
             table: The hand's.
             check: Of the scene in which the object is grasped.
             pose: (4, 4) of the object in the base frame.
+            tables: Of the same hand and object wherever it was before: pairs that count.
         """
-        self.table, self.check, self.pose = table, check, pose
-        self._every = pair_table(check.model, check.scene, ()).held
+        self.table, self.check, self.pose, self._tables = table, check, pose, tables
+        self._every = check.table(check.scene, frozenset()).held
         at = self._every.poses(check.scene.items)
         self._items = rigid(at[:, :9].reshape(-1, 3, 3), at[:, 9:])
-        self._tables: dict[bytes, Table] = {}
 
     def __call__(self, some: Candidates, present: Bools | None = None) -> Bools:
         """(k,) which are clear; of fingers that are not present nothing counts."""

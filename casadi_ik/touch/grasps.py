@@ -31,7 +31,7 @@ from casadi_ik.touch.candidates import (
 )
 from casadi_ik.touch.hand_table import HandTable
 from casadi_ik.touch.robustness import offsets, robustness
-from casadi_ik.touch.strength import FORCES, generators, loads, squeezes
+from casadi_ik.touch.strength import FORCES, closed, generators, loads, squeezes
 from casadi_ik.touch.surface import Surface
 
 GRAVITY = 9.80665
@@ -249,52 +249,53 @@ def grasps_of(
     _check(fingers, mu, hold, limit, prefer)
     fingers = min(fingers, len(robot.fingers))
     table = HandTable.of(robot)
-    arms, judge = _solvers(solver, surface, place, chosen)
-    hands = HandCheck(table, judge.scene_check, place)
+    arms, judge, hands = _solvers(solver, table, surface, place, chosen)
     generator = Generator(table, surface, fingers, chosen, np.random.default_rng(seed), hands)
     start = None if q0 is None else robot.configuration(q0)
     parts: list[_Made] = []
-    attempts = chosen.attempts // 5
-    distinct: list[int] = []
-    seen = tried = 0
+    known, tried, attempts = 0, 0, chosen.first
     with progress(limit) as show:
-        while generator.fits and len(distinct) < limit and tried < chosen.most:
+        while generator.fits and known < limit and tried < chosen.most:
+            if tried:
+                generator.look()
             some = generator.candidates(attempts)
-            tried, attempts = tried + attempts, chosen.attempts
-            made = _made(generator, some, arms, judge, place, mu, hold, jobs, start)
-            known, reached = len(distinct), generator.counts.get("arm reaches")
-            if made is None and generator.asked >= chosen.lost and not reached:
-                break
+            tried += attempts
+            before = [part.some for part in parts]
+            made = _made(generator, some, before, arms, judge, place, mu, hold, jobs, start)
             if made is not None:
                 parts.append(made)
-                new = np.arange(seen, seen + len(made.rows))
-                distinct, seen = _distinct(parts, new, limit, chosen, distinct), seen + len(new)
-                if len(new) > limit and len(distinct) == known:
-                    break  # so many grasps, and each is like one found before
-            show(len(distinct) - known)
+                show(min(len(made.rows), limit - known))
+                known += len(made.rows)
+            elif generator.alike > limit or (generator.asked >= chosen.lost and not known):
+                break  # each is like one found before, or the arm reaches none
+            wanted = 1.2 * tried * (limit - known) / known if known else tried
+            attempts = int(np.clip(wanted, chosen.first, chosen.attempts))
     return _ranked(
         robot, generator, hands, parts, place, limit, prefer, start, time.process_time() - begin, mu
     )
 
 
-_SOLVERS: WeakKeyDictionary[Any, dict[tuple[str, TouchParameters], tuple[Any, Any]]] = (
+_SOLVERS: WeakKeyDictionary[Any, dict[tuple[str, TouchParameters], tuple[Any, Any, Any]]] = (
     WeakKeyDictionary()
 )
 
 
 def _solvers(
-    solver: Any, surface: Surface, place: Array, chosen: TouchParameters
-) -> tuple[Any, Any]:
-    """What solves palms, and what judges grasps with the object in the scene; made once."""
+    solver: Any, table: HandTable, surface: Surface, place: Array, chosen: TouchParameters
+) -> tuple[Any, Any, HandCheck]:
+    """What solves palms, what judges grasps and hands with the object in the scene; made once."""
     made, key = _SOLVERS.setdefault(solver, {}), (surface.name, chosen)
     if key not in made:
         kinds = {"tolerance": Tolerance(chosen.touch, chosen.turned / 15)}
         kinds |= {"options": {"max_rounds": 1}}
         scene = (solver.scene or Scene()).holding(surface.name, place)
         one = type(solver)
-        made[key] = one(solver.robot, **kinds), one(solver.robot, scene=scene, **kinds)
-    arms, judge = made[key]
-    return arms, judge.moved(surface.name, place)
+        made[key] = one(solver.robot, **kinds), one(solver.robot, scene=scene, **kinds), {}
+    arms, judge, tables = made[key]
+    # What is worked out for the object at one place serves at the next.
+    judge = judge.moved(surface.name, place)
+    made[key] = arms, judge, tables
+    return arms, judge, HandCheck(table, judge.scene_check, place, tables)
 
 
 def _check(
@@ -324,6 +325,7 @@ def _check_hold(hold: tuple[float, float] | None) -> None:
 def _made(
     generator: Generator,
     some: Candidates,
+    before: Sequence[Candidates],
     arms: Any,
     judge: Any,
     place: Array,
@@ -332,8 +334,9 @@ def _made(
     jobs: int,
     start: Array | None,
 ) -> _Made | None:
-    """Those that hold, that the arm reaches, and that are free in the scene."""
+    """Those that are unlike those before, hold, are reached by the arm and free in the scene."""
     robot, table, surface = arms.robot, generator.table, generator.surface
+    generator.alike = 0
     if not len(some):
         return None
     here, _, _ = touching(table, surface, some)
@@ -341,27 +344,35 @@ def _made(
     sample = np.take_along_axis(here.sample, order, axis=1)
     center, length = surface.middle, surface.size / 2
     wrenches = generators(surface.points[sample], -surface.faces[sample], mu, center, length)
-    found = loads(wrenches)
-    held = found.min(axis=1) > CLOSED
-    generator.counted("force-closed", int(held.sum()))
+    firm = closed(wrenches)
+    rows = np.argsort(-firm, kind="stable")[: np.count_nonzero(firm > CLOSED)]
+    generator.counted("force-closed", len(rows))
+    new = rows[_distinct(before, some.rows(rows), generator.parameters)]
+    generator.counted("unlike each other", len(new))
+    generator.alike = len(rows) - len(new)
+    found = loads(wrenches[new])
     if hold is not None:
-        held &= found[:, FORCES].min(axis=1) * hold[1] >= hold[0] * GRAVITY
-        generator.counted(f"hold {hold[0]:g} kg at {hold[1]:g} N", int(held.sum()))
-    generator.asked += int(held.sum())
-    if not held.any():
+        held = found[:, FORCES].min(axis=1) * hold[1] >= hold[0] * GRAVITY
+        new, found = new[held], found[held]
+        generator.counted(f"hold {hold[0]:g} kg at {hold[1]:g} N", len(new))
+    generator.asked += len(new)
+    if not len(new):
         return None
-    some, found, wrenches = some.rows(np.flatnonzero(held)), found[held], wrenches[held]
-    hands = table.configuration(some.hand)
-    reached = arms.solve_palms(place @ some.palm, hands, start, jobs=jobs)
+    some, wrenches = some.rows(new), wrenches[new]
+    reached = arms.solve_palms(
+        place @ some.palm, table.configuration(some.hand), start, jobs=jobs
+    )
     rows = np.flatnonzero(reached.success)
     generator.counted("arm reaches", len(rows))
-    some, q, found, wrenches = some.rows(rows), reached.q[rows], found[rows], wrenches[rows]
     if not len(rows):
         return None
+    some, q, found, wrenches = some.rows(rows), reached.q[rows], found[rows], wrenches[rows]
     points, normals = (np.where(some.used[..., None], part, np.nan) for part in robot.contacts(q))
     batch = judge.solve_batch(points, normals, q0=q, jobs=jobs)
     rows = np.flatnonzero(batch.success)
     generator.counted("free in the scene", len(rows))
+    if not len(rows):
+        return None
     return _Made(batch, rows, some.rows(rows), found[rows], wrenches[rows])
 
 
@@ -370,33 +381,22 @@ CLOSED = 1e-4
 
 
 def _distinct(
-    parts: list[_Made],
-    order: NDArray[np.intp],
-    limit: int,
-    chosen: TouchParameters,
-    before: Sequence[int] = (),
-) -> list[int]:
-    """Of all grasps in an order the first of those that are alike, after those kept before."""
-    if not parts:
-        return []
-    palm = np.concatenate([part.some.palm for part in parts])
-    used = np.concatenate([part.some.used for part in parts])
-    tips = np.concatenate([part.some.tips for part in parts])
-    kept = list(before)
-    for row in order.tolist():
-        if len(kept) >= limit:
-            break
-        others = np.array(kept, dtype=np.intp)
-        turn = np.einsum("kij,ij->k", palm[others, :3, :3], palm[row, :3, :3])
-        turned = np.arccos(np.clip((turn - 1) / 2, -1, 1)) < chosen.turned
-        near = np.linalg.norm(palm[others, :3, 3] - palm[row, :3, 3], axis=1) < chosen.apart
-        off = np.linalg.norm(tips[others] - tips[row], axis=-1)
-        both = used[others] & used[row]
-        alike = (np.where(both, off, 0.0) < chosen.apart).all(axis=1)
-        same = (used[others] == used[row]).all(axis=1)
-        if not (turned & near & alike & same).any():
-            kept.append(row)
-    return kept
+    before: Sequence[Candidates], some: Candidates, chosen: TouchParameters
+) -> NDArray[np.intp]:
+    """Of some in their order the first of those that are alike, and unlike all before."""
+    parts = [*before, some]
+    every = Candidates(
+        *(
+            np.concatenate([getattr(part, name) for part in parts])
+            for name in ("palm", "hand", "used", "tips")
+        )
+    )
+    left, kept = np.arange(len(every)), []
+    while len(left):
+        kept.append(left[0])
+        left = left[1:][~every.alike(left[0], left[1:], chosen)]
+    first = len(every) - len(some)
+    return np.array([row - first for row in kept if row >= first], dtype=np.intp)
 
 
 def _ranked(
@@ -432,8 +432,7 @@ def _ranked(
     )
     if score.shape != (len(q),):
         raise InputError(f"prefer: gave shape {score.shape}, expected ({len(q)},)")
-    kept = _distinct(parts, np.argsort(-score, kind="stable"), limit, generator.parameters)
-    generator.counted("distinct", len(kept))
+    kept = np.argsort(-score, kind="stable")[:limit]
     entries = []
     chosen = [where[row] for row in kept]
     forces = squeezes(np.stack([part.wrenches[i] for part, i in chosen])) @ place[:3, :3].T

@@ -63,6 +63,14 @@ def loads(wrenches: Array, directions: Array = DIRECTIONS, steps: int = 25) -> A
     return np.maximum(_solved(wrenches, directions, steps)[..., -2], 0.0)
 
 
+def closed(wrenches: Array) -> Array:
+    """(k,) loads against the mean of the wrenches (k, 6, g): above 0 if a grasp is force-closed.
+
+    Only then all of them can be above 0 and in balance. One program tells it, for twelve of `loads`.
+    """
+    return np.maximum(_solved(wrenches, wrenches.mean(axis=2)[:, None])[:, 0, -2], 0.0)
+
+
 def squeezes(wrenches: Array) -> Array:
     """Forces at rest from which a grasp is best pulled or pushed any way.
 
@@ -86,15 +94,15 @@ def squeezes(wrenches: Array) -> Array:
 def _solved(wrenches: Array, directions: Array, steps: int = 25) -> Array:
     """(k, d, g + 2) x, s and slack of the linear programs of `loads`.
 
-    All are solved side by side by Mehrotra's predictor and corrector.
+    Directions are the same for all, (d, 6), or their own, (k, d, 6). All are solved side by side by Mehrotra's predictor and corrector.
     """
     k, _, g = wrenches.shape
-    d = len(directions)
+    d = directions.shape[-2]
     # min -s: columns x (g), s, slack; rows: W x + s d = 0, sum x + slack = 1.
     count = k * d
     matrix = np.zeros((count, 7, g + 2))
     matrix[:, :6, :g] = np.repeat(wrenches, d, axis=0)
-    matrix[:, :6, g] = np.tile(directions, (k, 1))
+    matrix[:, :6, g] = np.broadcast_to(directions, (k, d, 6)).reshape(-1, 6)
     matrix[:, 6, :g] = matrix[:, 6, g + 1] = 1.0
     right = np.zeros(7)
     right[6] = 1.0
