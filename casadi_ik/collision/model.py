@@ -261,9 +261,7 @@ def pair_table(
     )
 
 
-def check_base(
-    model: CollisionModel, scene: Scene, where: Array, names: Collection[str]
-) -> None:
+def check_base(model: CollisionModel, scene: Scene, where: Array, names: Collection[str]) -> None:
     """Refuse a scene with something in the robot's base: all would be in collision.
 
     A base's shapes are larger than the base, so that a table under it may touch them; what is

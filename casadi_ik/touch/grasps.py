@@ -359,9 +359,7 @@ def _made(
     if not len(new):
         return None
     some, wrenches = some.rows(new), wrenches[new]
-    reached = arms.solve_palms(
-        place @ some.palm, table.configuration(some.hand), start, jobs=jobs
-    )
+    reached = arms.solve_palms(place @ some.palm, table.configuration(some.hand), start, jobs=jobs)
     rows = np.flatnonzero(reached.success)
     generator.counted("arm reaches", len(rows))
     if not len(rows):
@@ -477,7 +475,7 @@ def _grasp(
         object_pose=place,
         posture=posture(own.hand[0]),
     )
-    palm = place @ own.palm[0]
+    palm = robot.palm(solution.q)
     squeezed = table.squeezed(own, forces @ palm[:3, :3], INWARD)
     before = None
     for opening in OPENINGS:

@@ -66,7 +66,8 @@ def loads(wrenches: Array, directions: Array = DIRECTIONS, steps: int = 25) -> A
 def closed(wrenches: Array) -> Array:
     """(k,) loads against the mean of the wrenches (k, 6, g): above 0 if a grasp is force-closed.
 
-    Only then all of them can be above 0 and in balance. One program tells it, for twelve of `loads`.
+    Only then all of them can be above 0 and in balance. One program tells it, not twelve as by
+    `loads`.
     """
     return np.maximum(_solved(wrenches, wrenches.mean(axis=2)[:, None])[:, 0, -2], 0.0)
 
@@ -94,7 +95,8 @@ def squeezes(wrenches: Array) -> Array:
 def _solved(wrenches: Array, directions: Array, steps: int = 25) -> Array:
     """(k, d, g + 2) x, s and slack of the linear programs of `loads`.
 
-    Directions are the same for all, (d, 6), or their own, (k, d, 6). All are solved side by side by Mehrotra's predictor and corrector.
+    Directions are the same for all, (d, 6), or their own, (k, d, 6). All programs are solved side
+    by side by Mehrotra's predictor and corrector.
     """
     k, _, g = wrenches.shape
     d = directions.shape[-2]
@@ -139,7 +141,8 @@ def _solved(wrenches: Array, directions: Array, steps: int = 25) -> Array:
         done = gap < 1e-9
         if done.any():
             solved[left[done]] = x[done]
-            left, matrix, x, y, z = (part[~done] for part in (left, matrix, x, y, z))
+            left = left[~done]
+            matrix, x, y, z = (part[~done] for part in (matrix, x, y, z))
             if not len(left):
                 break
     solved[left] = x

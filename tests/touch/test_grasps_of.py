@@ -195,7 +195,7 @@ def test_the_search_ends_when_nothing_new_is_found(tmp_path):
     solver = ik.Solver(ik.load_robot("panda+panda_hand"))
     found = solver.grasps_of(ik.load_surface(tmp_path / "box.stl"), PLACE)
     assert 0 < len(found) < 200
-    assert found.counts["attempts"] < 200_000
+    assert found.counts["attempts"] < 500_000  # of a million
 
 
 @pytest.mark.parametrize(
