@@ -14,8 +14,9 @@ closed_chain  motors of arm and thumb to the five rows of the thumb's contact: v
               closed chain of arm and thumb is singular
 ============  ==================================================================================
 
-A revolute motor counts by the radian, a linear one by its range. Of an r x c Jacobian the smallest
-of its min(r, c) singular values is meant.
+Of a body arm and hand of every side are measured, named ``left_arm`` and so on; the arm by itself,
+without the trunk. A revolute motor counts by the radian, a linear one by its range. Of an r x c
+Jacobian the smallest of its min(r, c) singular values is meant.
 """
 
 from __future__ import annotations
@@ -60,6 +61,7 @@ class _Measured:
         graph: Smallest singular value and condition number for values of these.
         compiled: False keeps to the virtual machine.
         everywhere: Whether it is measured where the arm is not yet placed, too.
+        thresholds: Smallest singular value and condition number at which it is near singular.
     """
 
     name: str
@@ -67,6 +69,7 @@ class _Measured:
     graph: FunctionGraph
     compiled: bool
     everywhere: bool
+    thresholds: tuple[float, float]
 
     @cached_property
     def kernel(self) -> FunctionKernel:
@@ -97,15 +100,20 @@ class JacobianMeasures:
         self._robot = robot
         self._without_arm = tuple(map(int, without_arm))
         self._compiled = compiled
-        arm, hand = robot.arm_actuators, robot.hand_actuators
-        parts = []
-        if arm:
-            parts.append(self._measured(ARM, arm, self._arm))
-        if hand:
-            parts.append(self._measured(HAND, hand, self._hand))
-        if closed_chain and arm and robot.named_thumb is not None:
-            thumb = robot.finger_actuators(robot.thumb)
-            parts.append(self._measured(CLOSED_CHAIN, (*arm, *thumb), self._thumb_contact))
+        names = list(robot.actuator_names)
+        parts: list[_Measured] = []
+        by_side = {f"{one.name}_": robot.side(one.name) for one in robot.sides}
+        for label, side in (by_side or {"": robot}).items():
+            motors = [names.index(name) for name in side.actuator_names]
+            arm, hand = side.arm_actuators, side.hand_actuators
+            if arm:
+                parts.append(self._measured(ARM, label, side, motors, arm, _arm))
+            if hand:
+                parts.append(self._measured(HAND, label, side, motors, hand, _hand))
+            if closed_chain and arm and side.named_thumb is not None:
+                both = (*arm, *side.finger_actuators(side.thumb))
+                chain = self._measured(CLOSED_CHAIN, label, side, motors, both, _thumb_contact)
+                parts.append(chain)
         self._parts = tuple(parts)
 
     @property
@@ -125,9 +133,7 @@ class JacobianMeasures:
         """The Jacobians by name: their motors and thresholds."""
         names = self._robot.actuator_names
         return {
-            part.name: RecordedJacobian(
-                tuple(names[i] for i in part.columns), *THRESHOLDS[part.name]
-            )
+            part.name: RecordedJacobian(tuple(names[i] for i in part.columns), *part.thresholds)
             for part in self._parts
         }
 
@@ -154,51 +160,60 @@ class JacobianMeasures:
 
     def _measured(
         self,
-        name: str,
+        kind: str,
+        label: str,
+        side: RobotDescription,
+        motors: Sequence[int],
         columns: tuple[int, ...],
-        extremes: Callable[[ActuatedKinematics], tuple[Expr, Expr]],
+        extremes: Callable[[RobotDescription, ActuatedKinematics], tuple[Expr, Expr]],
     ) -> _Measured:
-        robot = self._robot
-        full, n = ca.Function.fix_name(f"{robot.name}_singular_{name}"), len(robot.actuators)
+        """A Jacobian of a side, or of the robot, whose motors have places in the robot's q."""
+        robot, name, n = self._robot, f"{label}{kind}", len(self._robot.actuators)
+        full = ca.Function.fix_name(f"{robot.name}_singular_{name}")
 
         def build() -> ca.Function:
             q = ca.SX.sym("q", n)
             # What does not matter is at zero and folds away.
-            matters = ca.SX.zeros(n, 1)
+            matters = ca.SX.zeros(len(motors), 1)
             for column in columns:
-                matters[column] = q[column]
-            smallest, condition = extremes(actuated(robot, matters))
+                matters[column] = q[motors[column]]
+            smallest, condition = extremes(side, actuated(side, matters))
             return ca.Function(full, [q], [ca.vertcat(smallest, condition)], ["q"], ["out"])
 
         inputs = {"q": (n, 1)}
         graph = FunctionGraph(full, build, inputs, ((2, 1),), recipe(full, robot))
-        return _Measured(name, columns, graph, self._compiled, everywhere=name == HAND)
+        places = tuple(motors[column] for column in columns)
+        return _Measured(name, places, graph, self._compiled, kind == HAND, THRESHOLDS[kind])
 
-    def _arm(self, body: ActuatedKinematics) -> tuple[Expr, Expr]:
-        columns = self._robot.arm_actuators
-        linear, angular = body.palm_jacobian(columns)
-        return _judged(ca.vertcat(linear * (1 / LENGTH), angular), self._scales(columns))
 
-    def _hand(self, body: ActuatedKinematics) -> tuple[Expr, Expr]:
-        found = []
-        for finger in self._robot.finger_names:
-            columns = self._robot.finger_actuators(finger)
-            linear, _ = body.contact_jacobian(finger, columns)
-            found.append(_judged(linear * (1 / LENGTH), self._scales(columns)))
-        smallest, condition = (ca.vertcat(*values) for values in zip(*found, strict=True))
-        return ca.mmin(smallest), ca.mmax(condition)
+def _arm(robot: RobotDescription, body: ActuatedKinematics) -> tuple[Expr, Expr]:
+    columns = robot.arm_actuators
+    linear, angular = body.palm_jacobian(columns)
+    return _judged(ca.vertcat(linear * (1 / LENGTH), angular), _scales(robot, columns))
 
-    def _thumb_contact(self, body: ActuatedKinematics) -> tuple[Expr, Expr]:
-        thumb = self._robot.thumb
-        columns = (*self._robot.arm_actuators, *self._robot.finger_actuators(thumb))
-        linear, angular = body.contact_jacobian(thumb, columns)
-        _, normal = body.kinematics.contact(thumb)
-        first = perpendicular(normal)
-        across = ca.horzcat(first, ca.cross(normal, first)).T
-        return _judged(ca.vertcat(linear * (1 / LENGTH), across @ angular), self._scales(columns))
 
-    def _scales(self, columns: Sequence[int]) -> ca.DM:
-        return motor_scales(self._robot)[list(columns)]
+def _hand(robot: RobotDescription, body: ActuatedKinematics) -> tuple[Expr, Expr]:
+    found = []
+    for finger in robot.finger_names:
+        columns = robot.finger_actuators(finger)
+        linear, _ = body.contact_jacobian(finger, columns)
+        found.append(_judged(linear * (1 / LENGTH), _scales(robot, columns)))
+    smallest, condition = (ca.vertcat(*values) for values in zip(*found, strict=True))
+    return ca.mmin(smallest), ca.mmax(condition)
+
+
+def _thumb_contact(robot: RobotDescription, body: ActuatedKinematics) -> tuple[Expr, Expr]:
+    thumb = robot.thumb
+    columns = (*robot.arm_actuators, *robot.finger_actuators(thumb))
+    linear, angular = body.contact_jacobian(thumb, columns)
+    _, normal = body.kinematics.contact(thumb)
+    first = perpendicular(normal)
+    across = ca.horzcat(first, ca.cross(normal, first)).T
+    return _judged(ca.vertcat(linear * (1 / LENGTH), across @ angular), _scales(robot, columns))
+
+
+def _scales(robot: RobotDescription, columns: Sequence[int]) -> ca.DM:
+    return motor_scales(robot)[list(columns)]
 
 
 def _judged(jacobian: Expr, scales: ca.DM) -> tuple[Expr, Expr]:

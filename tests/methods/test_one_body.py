@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
+from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.views import draw_solution
 
 BODIES = ("g1+dex3", "two_pandas+allegro", "two_ur10e+leap", "mobile_kuka_lwr_barrett")
@@ -64,6 +65,26 @@ def test_a_log_changes_nothing_and_has_every_iteration(robot, tmp_path: Path):
     log = ik.logs.open(file)
     assert log.solves().array()["iterations"].tolist() == plain.iterations.tolist()
     assert len(log.iterations().array()) == plain.iterations.sum()
+
+
+def test_a_log_has_singular_values_by_side(tmp_path: Path):
+    robot, file = ik.load_robot("g1+dex3"), tmp_path / "body.mcap"
+    _, points, normals = targets(robot, 2)
+    ik.Solver(robot).solve_batch(points, normals, log=file)
+    rows = ik.logs.open(file).iterations().array()
+    q, step = rows["q"][-1], 1e-6
+    for side in robot.description.sides:
+        columns = []
+        for motor in map(robot.actuators.index, side.arm):
+            ends = [
+                robot.palm(q + sign * step * np.eye(len(q))[motor], side.name) for sign in (1, -1)
+            ]
+            linear = (ends[0][:3, 3] - ends[1][:3, 3]) / (2 * step) / LENGTH
+            turn = (ends[0][:3, :3] - ends[1][:3, :3]) / (2 * step) @ ends[0][:3, :3].T
+            columns.append([*linear, turn[2, 1], turn[0, 2], turn[1, 0]])
+        sigma = np.linalg.svd(np.transpose(columns), compute_uv=False).min()
+        assert rows[f"sigma_{side.name}_arm"][-1] == pytest.approx(sigma, rel=1e-3, abs=1e-4)
+        assert (rows[f"sigma_{side.name}_hand"] > 0).all()
 
 
 def test_one_target_is_solved_as_in_a_batch(robot):
