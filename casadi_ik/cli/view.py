@@ -168,7 +168,7 @@ def _motion(file: str) -> RecordedMotion | None:
     try:
         return read_motion(file)
     except LogError as error:
-        if Path(file).is_file() and not str(error).startswith("no motion"):
+        if Path(file).is_file() and "no motion: found" not in str(error):
             raise
         return None
 

@@ -112,6 +112,18 @@ def test_logs_play_side_by_side(view, robot: ik.ArmHand, tmp_path: Path) -> None
     assert page.now in {one for track in page.tracks for one in track.eventful}
 
 
+def test_the_log_of_a_solve_plays(view, tmp_path: Path) -> None:
+    """Of a body, too: one log is not taken for a motion."""
+    g1, file = ik.load_robot("g1+dex3"), tmp_path / "one.mcap"
+    points, normals = g1.contacts(g1.random(np.random.default_rng(0), 1))
+    answer = ik.Solver(g1).solve_batch(points, normals, log=file)
+    page = view(str(file)).page
+    assert page.end == len(page.tracks[0]) == answer.iterations[0]
+    page.show(3)
+    assert page.work.settle()
+    assert page.now == 3
+
+
 def test_motions_play(view, robot: ik.ArmHand, tmp_path: Path) -> None:
     times = np.linspace(0.0, 2.0, 41)
     q = robot.home + 0.1 * np.sin(times)[:, None] * (np.arange(len(robot.home)) == 2)
