@@ -351,9 +351,11 @@ def _made(
     generator.counted("unlike each other", len(new))
     generator.alike = len(rows) - len(new)
     found = loads(wrenches[new])
+    held = found.min(axis=1) > CLOSED
     if hold is not None:
-        held = found[:, FORCES].min(axis=1) * hold[1] >= hold[0] * GRAVITY
-        new, found = new[held], found[held]
+        held &= found[:, FORCES].min(axis=1) * hold[1] >= hold[0] * GRAVITY
+    new, found = new[held], found[held]
+    if hold is not None:
         generator.counted(f"hold {hold[0]:g} kg at {hold[1]:g} N", len(new))
     generator.asked += len(new)
     if not len(new):
