@@ -34,14 +34,12 @@ from casadi_ik.files.reading import (
     Frame,
     Point,
     Struct,
-    convert,
+    checked,
     frame_matrix,
     read,
-    read_yaml,
-    refuse_non_finite,
 )
 from casadi_ik.files.shipped import resolve
-from casadi_ik.files.units import Length, Pure, in_si
+from casadi_ik.files.units import Length, Pure
 from casadi_ik.grasps.pose import checked_pose, one_pose, rotations_of
 from casadi_ik.grasps.shapes import load_mesh_shape
 from casadi_ik.robots.collision import Touching
@@ -443,9 +441,7 @@ class Scene:
             "margins": [_plain(one) for one in margins],
         }
         where = Path(name)
-        raw = in_si(data)
-        refuse_non_finite(raw, where)
-        entry = convert(raw, SceneFile, where)
+        entry, _ = checked(data, SceneFile, where)
         for key, points in clouds.items():
             entry.solids[key] = msgspec.structs.replace(entry.solids[key], points=points)
         self._take(entry, where)
@@ -453,7 +449,6 @@ class Scene:
 
     @classmethod
     def _of_file(cls, path: Path) -> Scene:
-        refuse_non_finite(read_yaml(path), path)
         entry, _ = read(path, SceneFile)
         scene = cls.__new__(cls)
         scene._take(entry, path)

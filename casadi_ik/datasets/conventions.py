@@ -147,8 +147,6 @@ def load_convention(name_or_path: str | Path) -> Convention:
             raise DescriptionError(f"{path}: joints.{name}: {joint} is named twice")
         joints[name] = joint, -1.0 if said.startswith("-") else 1.0
     pose = frame_matrix(Frame(entry.frame.xyz, entry.frame.rpy))
-    if not np.isfinite(pose).all():
-        raise DescriptionError(f"{path}: frame: expected finite numbers")
     return Convention(path.stem, entry.frame.link, pose, joints, entry.wrist)
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -28,6 +27,7 @@ from casadi_ik.files.units import (
     check_units,
     in_si,
     item_name,
+    leaves,
     units_in,
 )
 
@@ -229,7 +229,21 @@ def read_yaml(path: Path) -> Any:
 
 
 def read(path: Path, type_: type[T]) -> tuple[T, dict[str, str]]:
-    """Read a YAML file of a type; every unit has to be of the dimension that its place has.
+    """Read a YAML file of a type; see `checked`.
+
+    Raises:
+        DescriptionError: With file, key, what was found and what was expected.
+    """
+    return checked(parse_yaml(path), type_, path)
+
+
+def checked(raw: Any, type_: type[T], path: Path) -> tuple[T, dict[str, str]]:
+    """Parsed YAML as a type: all numbers finite, every unit of the dimension that its place has.
+
+    Args:
+        raw: As it was parsed, units and all.
+        type_: The type.
+        path: The file.
 
     Returns:
         The entry, and the units in the file by key ("home.spread": "deg").
@@ -237,8 +251,11 @@ def read(path: Path, type_: type[T]) -> tuple[T, dict[str, str]]:
     Raises:
         DescriptionError: With file, key, what was found and what was expected.
     """
-    raw = parse_yaml(path)
-    entry = convert(in_si(raw), type_, path)
+    data = in_si(raw)
+    for key, value in leaves(data):
+        if isinstance(value, float) and not math.isfinite(value):
+            raise DescriptionError(f"{path}: {key}: found {value}, expected a finite number")
+    entry = convert(data, type_, path)
     check_units(raw, type_, path)
     return entry, units_in(raw)
 
@@ -264,28 +281,6 @@ def convert(data: Any, type_: type[T], path: Path) -> T:
                 text = f"unknown unit {match[2]!r}; known: {', '.join(filter(None, UNITS))}"
             text = f"found {value!r}, {text}"
         raise DescriptionError(f"{path}: {key or '(top level)'}: {text}") from error
-
-
-def refuse_non_finite(data: Any, path: Path) -> None:
-    """Refuse NaN and infinity anywhere in parsed YAML.
-
-    Raises:
-        DescriptionError: With file and key.
-    """
-    for key, value in _numbers(data, ""):
-        if not math.isfinite(value):
-            raise DescriptionError(f"{path}: {key}: found {value}, expected a finite number")
-
-
-def _numbers(value: Any, key: str) -> Iterator[tuple[str, float]]:
-    if isinstance(value, dict):
-        for name, item in value.items():
-            yield from _numbers(item, f"{key}.{name}" if key else str(name))
-    elif isinstance(value, list):
-        for i, item in enumerate(value):
-            yield from _numbers(item, f"{key}[{item_name(value, i)}]")
-    elif isinstance(value, float):
-        yield key, value
 
 
 def _culprit(data: Any, type_: type[Any], place: str, message: str) -> tuple[str, Any]:

@@ -83,20 +83,22 @@ def item_name(items: Any, place: int) -> str:
     return name if isinstance(name, str) else str(place)
 
 
-def units_in(value: Any, key: str = "") -> dict[str, str]:
+def units_in(value: Any) -> dict[str, str]:
     """The SI unit of every quantity that has one, by key."""
-    return {place: DIMENSIONS.get(unit, unit) for place, unit in _units(value, key)}
+    found = ((key, quantity(text)) for key, text in leaves(value))
+    return {key: DIMENSIONS.get(one[1], one[1]) for key, one in found if one and one[1]}
 
 
-def _units(value: Any, key: str) -> Iterator[tuple[str, str]]:
+def leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    """What nested data consist of, each with its key ("sides.left.at.xyz[0]")."""
     if isinstance(value, dict):
         for name, item in value.items():
-            yield from _units(item, f"{key}.{name}" if key else str(name))
+            yield from leaves(item, f"{key}.{name}" if key else str(name))
     elif isinstance(value, list):
         for i, item in enumerate(value):
-            yield from _units(item, f"{key}[{item_name(value, i)}]")
-    elif (found := quantity(value)) is not None and found[1]:
-        yield key, found[1]
+            yield from leaves(item, f"{key}[{item_name(value, i)}]")
+    else:
+        yield key, value
 
 
 def check_units(value: Any, type_: Any, path: Path, key: str = "", owner: Any = None) -> None:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +16,10 @@ from casadi_ik.files.reading import (
     Point,
     Struct,
     Vector,
+    checked,
     frame_matrix,
+    parse_yaml,
     read,
-    read_yaml,
     roll_pitch_yaw,
 )
 from casadi_ik.files.shipped import resolve, shipped_names
@@ -126,7 +126,7 @@ def grasp_of(entry: GraspFile, path: Path, name: str, where: str = "") -> Grasp:
         where: Key of the entry in the file, with a dot behind.
 
     Raises:
-        DescriptionError: A malformed contact, or a number that is not finite.
+        DescriptionError: A malformed contact.
     """
     contacts: dict[str, Contact] = {}
     for finger, contact in entry.contacts.items():
@@ -134,9 +134,6 @@ def grasp_of(entry: GraspFile, path: Path, name: str, where: str = "") -> Grasp:
             contacts[finger] = _contact(contact)
         except InputError as error:
             raise DescriptionError(f"{path}: {where}contacts.{finger}.{error}") from error
-    for key, value in _loose_numbers(entry):
-        if not math.isfinite(value):
-            raise DescriptionError(f"{path}: {where}{key}: found {value}, expected a finite number")
     try:
         return Grasp(
             contacts=contacts,
@@ -224,24 +221,6 @@ def shipped_grasps(robot: str) -> tuple[str, ...]:
     return tuple(name for name in shipped_names("grasps") if load_grasp(name).robot == robot)
 
 
-def _loose_numbers(entry: GraspFile) -> Iterator[tuple[str, float]]:
-    """The numbers beside the contacts, with their keys."""
-    for name, value in entry.posture.items():
-        yield f"posture.{name}", value
-    for name, contact in entry.contacts.items():
-        if contact.tolerance is not None:
-            yield f"contacts.{name}.tolerance.position", contact.tolerance.position
-            yield f"contacts.{name}.tolerance.angle", contact.tolerance.angle
-    palms = {"palm": entry.palm} if entry.palm is not None else {}
-    palms |= {f"palms.{side}": frame for side, frame in entry.palms.items()}
-    for key, frame in palms.items():
-        yield from ((f"{key}.xyz", value) for value in frame.xyz)
-        yield from ((f"{key}.rpy", value) for value in frame.rpy)
-    if entry.object is not None:
-        yield from (("object.pose.xyz", value) for value in entry.object.pose.xyz)
-        yield from (("object.pose.rpy", value) for value in entry.object.pose.rpy)
-
-
 class CandidatesFile(Struct, frozen=True):
     """Grasps in a list, of which one is to be chosen.
 
@@ -277,10 +256,10 @@ def load_grasp_files(path: Path) -> tuple[Grasp, ...]:
 
 
 def _of_file(path: Path) -> tuple[Grasp, ...]:
-    data = read_yaml(path)
-    if not (isinstance(data, dict) and "candidates" in data):
+    raw = parse_yaml(path)
+    if not (isinstance(raw, dict) and "candidates" in raw):
         return (load_grasp(path),)
-    file, _ = read(path, CandidatesFile)
+    file, _ = checked(raw, CandidatesFile, path)
     if not file.candidates:
         raise DescriptionError(f"{path}: candidates: found none, expected at least one grasp")
     found = []

@@ -12,12 +12,9 @@ from casadi_ik.arrays import Array, frozen
 from casadi_ik.errors import DescriptionError, UnknownNameError
 from casadi_ik.files.reading import (
     Frame,
-    T,
     Vector,
     frame_matrix,
     read,
-    read_yaml,
-    refuse_non_finite,
 )
 from casadi_ik.files.shipped import resolve
 from casadi_ik.robots.description import Actuator, Finger, Joint
@@ -207,14 +204,8 @@ def a_part(entry: str | ArmFromFile | HandFile, key: str, beside: Path) -> Part:
     except (UnknownNameError, DescriptionError) as error:
         raise DescriptionError(f"{beside}: {key}: {error}") from error
     if kind == "hand":
-        return hand_part(read_file(path, HandFile)[0], path)
-    return arm_part(read_file(path, ArmFile)[0], path)
-
-
-def read_file(path: Path, type_: type[T]) -> tuple[T, dict[str, str]]:
-    """A file as a type, and the units of its numbers."""
-    refuse_non_finite(read_yaml(path), path)
-    return read(path, type_)
+        return hand_part(read(path, HandFile)[0], path)
+    return arm_part(read(path, ArmFile)[0], path)
 
 
 def with_wrist(hand: Part) -> Part:

@@ -13,10 +13,10 @@ from casadi_ik.arrays import Array, frozen
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.reading import (
     Frame,
+    checked,
     frame_matrix,
+    parse_yaml,
     read,
-    read_yaml,
-    refuse_non_finite,
 )
 from casadi_ik.files.shipped import BODIES, resolve_robot
 from casadi_ik.robots.bodies import body_from_file, body_from_parts
@@ -28,7 +28,6 @@ from casadi_ik.robots.joining import (
     fixed_joint,
     flattened,
     own_tags,
-    read_file,
     the_fingers,
     the_home,
     with_wrist,
@@ -80,7 +79,7 @@ def load_description(name_or_path: str | Path) -> RobotDescription:
 
 def _body_with_hand(path: Path, hand: Path | None) -> RobotDescription:
     """A shipped body, each of whose arms gets a shipped hand."""
-    body, units = read_file(path, BodyFile)
+    body, units = read(path, BodyFile)
     if hand is not None:
         body = msgspec.structs.replace(body, name=f"{body.name}+{hand.stem}")
     return body_from_parts(body, path, units, None if hand is None else hand.stem)
@@ -98,18 +97,17 @@ FLANGE = Part(
 
 def _pair(arm_path: Path | None, hand_path: Path | None) -> RobotDescription:
     """A shipped arm with a shipped hand, as their files say that they are put together."""
-    arm = None if arm_path is None else arm_part(read_file(arm_path, ArmFile)[0], arm_path)
-    hand = FLANGE if hand_path is None else hand_part(read_file(hand_path, HandFile)[0], hand_path)
+    arm = None if arm_path is None else arm_part(read(arm_path, ArmFile)[0], arm_path)
+    hand = FLANGE if hand_path is None else hand_part(read(hand_path, HandFile)[0], hand_path)
     name = "+".join(path.stem for path in (arm_path, hand_path) if path is not None)
     return _joined(name, arm, hand.mount, hand, list(hand.pads), hand.thumb, {}, name, {}, {})
 
 
 def _robot(path: Path) -> RobotDescription:
-    raw = read_yaml(path)
-    refuse_non_finite(raw, path)
+    raw = parse_yaml(path)
     if isinstance(raw, dict) and "sides" in raw:
         return _body(raw, path)
-    top, units = read(path, ImportedFile if _imports(raw) else ArmHandFile)
+    top, units = checked(raw, ImportedFile if _imports(raw) else ArmHandFile, path)
     usable(top.name, f"{path}: name")
     arm = None if top.arm is None else a_part(top.arm, "arm", path)
     mount = frame_matrix(top.mount)
@@ -136,10 +134,10 @@ def _robot(path: Path) -> RobotDescription:
 
 def _body(raw: dict[str, Any], path: Path) -> RobotDescription:
     if "robot" in raw:
-        top, units = read(path, ImportedBody)
+        top, units = checked(raw, ImportedBody, path)
         robot = body_from_file(top, path, units)
     else:
-        top, units = read(path, BodyFile)
+        top, units = checked(raw, BodyFile, path)
         robot = body_from_parts(top, path, units)
     said = () if top.collision is None else top.collision.links
     more = link_shapes(top.collision, robot.links, path)

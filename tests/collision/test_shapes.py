@@ -14,8 +14,7 @@ from capsule_arm import ARM, write_robot
 import casadi_ik as ik
 from casadi_ik import robots
 from casadi_ik.collision.model import collision_model
-from casadi_ik.files.reading import Frame, convert, frame_matrix
-from casadi_ik.files.units import in_si
+from casadi_ik.files.reading import Frame, checked, frame_matrix
 from casadi_ik.importing import capsules, imported
 from casadi_ik.importing.write import collision_lines
 from casadi_ik.problem.clearance import SceneCheck
@@ -297,7 +296,7 @@ def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
         "b": [CapsuleEntry(ends=((0, 0, 0), (0, 0, 0.1)), radius=0.02)],
     }
     lines = collision_lines(shapes, [Touching(("a link", "b"), "they do", 0.003)], "shapes")
-    entry = convert(in_si(yaml.safe_load("\n".join(lines))["collision"]), CollisionEntry, tmp_path)
+    entry, _ = checked(yaml.safe_load("\n".join(lines))["collision"], CollisionEntry, tmp_path)
     assert entry.links["a link"] == shapes["a link"]
     assert entry.links["b"] == shapes["b"]
     assert entry.touching[0].depth == 0.003

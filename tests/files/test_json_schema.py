@@ -16,8 +16,7 @@ from commands import main
 
 import casadi_ik as ik
 from casadi_ik.cli.lists import FILES, schema_of
-from casadi_ik.files.reading import convert
-from casadi_ik.files.units import check_units, in_si
+from casadi_ik.files.reading import checked
 from casadi_ik.robots.load import _imports
 from casadi_ik.robots.schema import ArmHandFile, BodyFile, ImportedBody, ImportedFile
 
@@ -91,8 +90,7 @@ def reads(kind: str, data: Any) -> bool:
     if kind == "body":
         type_ = ImportedBody if isinstance(data, dict) and "robot" in data else BodyFile
     try:
-        convert(in_si(data), type_, Path("file"))
-        check_units(data, type_, Path("file"))
+        checked(data, type_, Path("file"))
     except ik.errors.DescriptionError:
         return False
     return True

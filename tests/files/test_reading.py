@@ -15,10 +15,8 @@ from casadi_ik.files.reading import (
     Frame,
     Struct,
     Vector,
-    convert,
     frame_matrix,
-    read_yaml,
-    refuse_non_finite,
+    read,
 )
 from casadi_ik.files.shipped import models_folder, resolve
 
@@ -36,9 +34,7 @@ class Entry(Struct, frozen=True):
 def entry(tmp_path: Path, text: str) -> Entry:
     path = tmp_path / "file.yaml"
     path.write_text(text)
-    data = read_yaml(path)
-    refuse_non_finite(data, path)
-    return convert(data, Entry, path)
+    return read(path, Entry)[0]
 
 
 @pytest.mark.parametrize(
@@ -120,12 +116,12 @@ def test_not_yaml(tmp_path, text, says):
 
 def test_unreadable_files(tmp_path):
     with pytest.raises(ik.errors.DescriptionError, match="cannot be read"):
-        read_yaml(tmp_path)
+        read(tmp_path, Entry)
     (tmp_path / "latin.yaml").write_bytes("text: gr\xfc\xdfe".encode("latin-1"))
     with pytest.raises(
         ik.errors.DescriptionError, match=r"latin\.yaml: cannot be read: not UTF-8 text"
     ):
-        read_yaml(tmp_path / "latin.yaml")
+        read(tmp_path / "latin.yaml", Entry)
 
 
 def test_every_unit_is_understood(tmp_path):

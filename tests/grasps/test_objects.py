@@ -165,7 +165,7 @@ def test_single_points_and_the_centre(shape: grasps.Shape) -> None:
     ("old", "new", "key", "says"),
     [
         ("diameter: 60 mm", "diameter: -60 mm", "shape.diameter", "positive finite length"),
-        ("diameter: 60 mm", "diameter: .nan", "shape.diameter", "positive finite length"),
+        ("diameter: 60 mm", "diameter: .nan", "shape.diameter", "finite number"),
         ("diameter: 60 mm", "diameter: wide", "shape.diameter", "`float`"),
         ("diameter: 60 mm", "radius: 30 mm", "shape", "diameter"),
         ("kind: sphere", "kind: blob", "shape.kind", "blob"),
