@@ -249,8 +249,14 @@ def contact(finger, q) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("name", ["thumb", "finger_2", "finger_3"])
-def test_constants_give_the_forward_kinematics(robot, rng, name):
+@pytest.mark.parametrize("coupling", ["", ", ratio: -0.5, offset: 0.3"])
+def test_constants_give_the_forward_kinematics(own_robot, rng, name, coupling):
+    plain = "coupling: {kind: linear, of: bh_spread"
+    replace(own_robot.with_name("hand.yaml"), f"{plain}}}", f"{plain}{coupling}}}")
+    robot = ik.load_robot(own_robot)
     finger = planar_finger(robot.description, name)
+    if coupling and name == "finger_2":
+        assert (finger.ratio, finger.offset) == (-0.5, 0.3)
     at = robot.fingers.index(name)
     for q in robot.random(rng, 30):
         points, normals = robot.contacts(q)
@@ -258,40 +264,6 @@ def test_constants_give_the_forward_kinematics(robot, rng, name):
         point, normal = contact(finger, q)
         np.testing.assert_allclose(palm[:3, :3] @ point + palm[:3, 3], points[at], atol=1e-12)
         np.testing.assert_allclose(palm[:3, :3] @ normal, normals[at], atol=1e-12)
-
-
-def test_constants_of_the_barrett_hand(robot):
-    second, third, thumb = (
-        planar_finger(robot.description, name) for name in ("finger_2", "finger_3", "thumb")
-    )
-    assert second.spread == third.spread == robot.actuators.index("bh_spread")
-    assert thumb.spread is None
-    for finger in (second, third, thumb):
-        assert finger.facing in (1.0, -1.0)
-        np.testing.assert_allclose(np.linalg.norm(finger.middle), 0.070, rtol=1e-12)
-        np.testing.assert_allclose(np.linalg.norm(finger.tip), np.hypot(0.05, 0.0095), rtol=1e-12)
-        np.testing.assert_allclose(np.degrees(finger.flexion_limits), [[0, 140], [0, 48]])
-    np.testing.assert_allclose(second.frame[:3, 3], [0.025, 0, 0.0754 - 0.080], atol=1e-15)
-
-
-def test_facing_is_the_side_of_the_pad(robot, rng):
-    """The pad faces the finger frame's x axis on the side that `facing` says."""
-    for name in robot.fingers:
-        finger = planar_finger(robot.description, name)
-        sums = finger.flexion_limits.sum(axis=0)
-        side = np.sin(finger.normal_angle + np.linspace(*sums, 50)) * finger.facing
-        assert np.mean(side > 0) > 0.6
-
-
-def test_ratio_and_offset_of_the_spread(own_robot, rng):
-    replace(
-        own_robot.with_name("hand.yaml"),
-        "coupling: {kind: linear, of: bh_spread}",
-        "coupling: {kind: linear, of: bh_spread, ratio: -0.5, offset: 0.3}",
-    )
-    description = robots.load_description(own_robot)
-    finger = planar_finger(description, "finger_2")
-    assert (finger.ratio, finger.offset) == (-0.5, 0.3)
 
 
 REFUSED = {

@@ -1,4 +1,7 @@
-"""Rotations and rigid transforms against pinocchio (whose Motion is [v; w] as well) and scipy."""
+"""Rotations, rigid transforms and dual quaternions against pinocchio and scipy.
+
+Pinocchio's Motion is [v; w] as well.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ from algebra_samples import (
     PROPERTY,
     angles,
     central_difference,
+    coordinate,
     gradient,
     graph,
     random_rotation,
@@ -21,6 +25,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from casadi_ik.symbolic import dual_quaternion as dq
 from casadi_ik.symbolic import se3
 from casadi_ik.symbolic.se3 import align
 
@@ -53,10 +58,12 @@ def test_exp_agrees_with_pinocchio(v, w):
 @given(vectors, rotation_vectors)
 def test_log_undoes_exp(v, w):
     twist = np.concatenate([v, w])
-    assert np.allclose(log(*exp(twist)).full()[:, 0], twist, rtol=0, atol=2e-14)
+    found = log(*exp(twist)).full()[:, 0]
+    assert np.allclose(found, twist, rtol=0, atol=2e-14)
+    assert np.allclose(found[3:], w, rtol=1e-15, atol=4e-15)
     if np.linalg.norm(w) < np.pi - 1e-3:
         expected = pin.log6(pin.exp6(pin.Motion(v, w))).vector
-        assert np.allclose(log(*exp(twist)).full()[:, 0], expected, rtol=0, atol=1e-11)
+        assert np.allclose(found, expected, rtol=0, atol=1e-11)
 
 
 @PROPERTY
@@ -86,14 +93,6 @@ def test_derivatives(v, w):
     assert np.allclose(log_of_exp_gradient(twist).full(), np.eye(6), rtol=0, atol=1e-10)
 
 
-def test_derivative_of_log_is_finite_at_the_identity_and_at_half_turns():
-    df = gradient(lambda R, p: se3.log_se3((R, p)), M, V)
-    for R in (np.eye(3), np.diag([1.0, -1, -1]), np.diag([-1.0, -1, 1])):
-        assert df(R, [0.1, 0.2, 0.3]).is_regular()
-        assert df(R, [0, 0, 0]).is_regular()
-    assert exp_gradient(np.zeros(6)).is_regular()
-
-
 Q = (4, 1)
 so3_exp = graph(se3.exp_so3, V)
 so3_log = graph(se3.log_so3, M)
@@ -106,29 +105,11 @@ euler = graph(se3.euler_zyx, M)
 euler_inverse = graph(se3.angular_velocity_to_euler_zyx, V)
 mean = graph(se3.mean_rotation, M, M)
 project = graph(se3.project_to_rotation, M)
-so3_log_of_exp_gradient = gradient(lambda w: se3.log_so3(se3.exp_so3(w)), V)
-so3_exp_gradient = gradient(se3.exp_so3, V)
 
 
 def svd_projection(A: np.ndarray) -> np.ndarray:
     U, _, Vt = np.linalg.svd(A)
     return U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
-
-
-@PROPERTY
-@given(rotation_vectors)
-def test_so3_exp_agrees_with_pinocchio(w):
-    assert np.allclose(so3_exp(w).full(), pin.exp3(w), rtol=0, atol=1.6e-15)
-
-
-@PROPERTY
-@given(rotation_vectors)
-def test_log_undoes_exp_from_zero_to_half_a_turn(w):
-    assert np.allclose(so3_log(so3_exp(w)).full()[:, 0], w, rtol=1e-15, atol=4e-15)
-    if np.linalg.norm(w) < np.pi - 1e-5:
-        assert np.allclose(
-            so3_log(so3_exp(w)).full()[:, 0], pin.log3(pin.exp3(w)), rtol=0, atol=1e-10
-        )
 
 
 @PROPERTY
@@ -210,25 +191,16 @@ def test_projection_of_random_matrices_is_the_svd_projection():
         assert np.allclose(project(A).full(), svd_projection(A), rtol=0, atol=1e-11)
 
 
-@PROPERTY
-@given(rotation_vectors.filter(lambda w: np.linalg.norm(w) < 3.0))
-def test_derivative_of_log_after_exp_is_the_identity(w):
-    assert np.allclose(so3_log_of_exp_gradient(w).full(), np.eye(3), rtol=0, atol=2e-11)
-    assert np.allclose(
-        so3_exp_gradient(w).full(), central_difference(so3_exp, w), rtol=0, atol=1e-9
-    )
-
-
 def test_derivatives_are_finite_at_the_identity_and_at_half_turns():
     rng = np.random.default_rng(1)
-    log_gradient, mean_gradient = (
-        gradient(se3.log_so3, M),
-        gradient(se3.mean_rotation, M, M),
-    )
+    log_gradient = gradient(lambda R, p: se3.log_se3((R, p)), M, V)
+    mean_gradient = gradient(se3.mean_rotation, M, M)
     turns = [np.diag(d) for d in ([1.0, 1, 1], [1.0, -1, -1], [-1.0, 1, -1], [-1.0, -1, 1])]
     for R in [*turns, *(random_rotation(rng) for _ in range(5))]:
-        assert log_gradient(R).is_regular()
+        for p in ([0.1, 0.2, 0.3], [0, 0, 0]):
+            assert log_gradient(R, p).is_regular()
         assert mean_gradient(R, turns[0]).is_regular()
+    assert exp_gradient(np.zeros(6)).is_regular()
     assert gradient(se3.project_to_rotation, M)(np.eye(3)).is_regular()
     half_turn = gradient(se3.quaternion_log, Q)
     assert half_turn([0, 1, 0, 0]).is_regular()
@@ -369,3 +341,112 @@ def test_half_a_turn_at_any_scale_one_vector_and_nothing(best):
         R = best(B)
         np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
     assert best(np.outer([0, 0, 1.0], [1.0, 0, 0]))[2, 0] == pytest.approx(1, abs=1e-9)
+
+
+X = (8, 1)
+multiply = graph(dq.multiply, X, X)
+conjugate = graph(dq.conjugate, X)
+norm = graph(dq.norm, X)
+from_pose = graph(dq.from_pose, M, V)
+from_translation = graph(dq.from_translation, V)
+from_quaternion = graph(dq.from_quaternion, Q, V)
+to_pose = graph(dq.to_pose, X)
+dq_exp = graph(dq.exp, V, V)
+dq_log = graph(dq.log, X)
+on_point = graph(dq.act_on_point, X, V)
+on_line = graph(dq.act_on_line, X, V, V)
+error_norm = graph(dq.screw_error_norm, X)
+dq_log_of_exp_gradient = gradient(lambda w, v: dq.log(dq.exp(w, v)), V, V)
+dq_exp_gradient = gradient(dq.exp, V, V)
+poses = st.builds(lambda w, p: pin.SE3(pin.exp3(w), p), rotation_vectors, vectors)
+numbers = st.tuples(*[coordinate] * 8).map(np.array)
+
+
+def number(pose: pin.SE3) -> np.ndarray:
+    return from_pose(pose.rotation, pose.translation).full()[:, 0]
+
+
+def same_pose(a: np.ndarray, b: np.ndarray, atol: float = 4e-15) -> bool:
+    return min(np.abs(a - b).max(), np.abs(a + b).max()) < atol
+
+
+def full(x) -> np.ndarray:
+    return x.full()[:, 0]
+
+
+@PROPERTY
+@given(numbers, numbers, numbers)
+def test_dual_quaternions_are_a_ring(a, b, c):
+    left, right = full(multiply(multiply(a, b), c)), full(multiply(a, multiply(b, c)))
+    assert np.allclose(left, right, rtol=0, atol=1e-14)
+    reversed_ = full(multiply(conjugate(b), conjugate(a)))
+    assert np.allclose(full(conjugate(multiply(a, b))), reversed_, rtol=0, atol=4e-15)
+    assert np.array_equal(full(multiply(a, dq.identity())), a)
+    if np.linalg.norm(a[:4]) > 0.1:
+        length = full(norm(a))
+        squared = full(multiply(a, conjugate(a)))
+        assert np.allclose(squared[[0, 4]], [length[0] ** 2, 2 * length[0] * length[1]], atol=1e-14)
+
+
+@PROPERTY
+@given(poses, poses, vectors)
+def test_poses_multiply_like_transforms(A, B, x):
+    a, b = number(A), number(B)
+    assert same_pose(full(multiply(a, b)), number(A * B))
+    assert same_pose(full(multiply(a, conjugate(a))), dq.identity().full()[:, 0])
+    assert same_pose(full(conjugate(a)), number(A.inverse()))
+    R, p = to_pose(multiply(a, b))
+    assert np.allclose(R.full(), (A * B).rotation, rtol=0, atol=4e-15)
+    assert np.allclose(full(p), (A * B).translation, rtol=0, atol=4e-15)
+    assert np.allclose(full(on_point(-a, x)), A.act(x), rtol=0, atol=4e-15)
+    rotation = from_quaternion(a[:4], np.zeros(3))
+    shift = from_translation(A.translation)
+    assert np.allclose(full(multiply(shift, rotation)), a, rtol=0, atol=1e-15)
+
+
+@PROPERTY
+@given(poses, unit_vectors, vectors)
+def test_lines_move_with_their_points(A, direction, point):
+    moment = np.cross(point, direction)
+    moved, moved_moment = (full(x) for x in on_line(number(A), direction, moment))
+    assert np.allclose(moved, A.rotation @ direction, rtol=0, atol=4e-15)
+    assert np.allclose(moved_moment, np.cross(A.act(point), moved), rtol=0, atol=6e-15)
+    # Eq. (6) literally: x s x* with the classical conjugate.
+    x = number(A)
+    s = np.concatenate([[0], direction, [0], moment])
+    literal = full(multiply(multiply(x, s), conjugate(x)))
+    assert np.allclose(literal, [0, *moved, 0, *moved_moment], rtol=0, atol=6e-15)
+
+
+@PROPERTY
+@given(rotation_vectors, vectors)
+def test_exp_and_log_are_those_of_se3(w, v):
+    x = full(dq_exp(w, v))
+    expected = pin.exp6(pin.Motion(v, w))
+    assert same_pose(x, number(expected))
+    found_w, found_v = (full(y) for y in dq_log(x))
+    assert np.allclose(found_w, w, rtol=0, atol=4e-15)
+    assert np.allclose(found_v, v, rtol=0, atol=2e-14)
+    minus_w, minus_v = (full(y) for y in dq_log(-x))
+    assert np.array_equal(minus_w, found_w)
+    assert np.array_equal(minus_v, found_v)
+    size = np.hypot(np.linalg.norm(w), np.linalg.norm(v))
+    assert abs(float(error_norm(x)) - size) < 2e-14
+
+
+@PROPERTY
+@given(rotation_vectors.filter(lambda w: np.linalg.norm(w) < 3), vectors)
+def test_derivatives_of_dual_quaternions(w, v):
+    through = dq_log_of_exp_gradient(w, v).full()
+    assert np.allclose(through, np.eye(6), rtol=0, atol=1e-10)
+    ad = dq_exp_gradient(w, v).full()
+    assert np.allclose(ad, central_difference(dq_exp, w, v), rtol=0, atol=1e-9)
+
+
+def test_derivatives_of_dual_quaternions_are_finite_at_no_rotation_and_at_half_a_turn():
+    log_gradient, norm_gradient = gradient(dq.log, X), gradient(dq.screw_error_norm, X)
+    for x in (dq.identity(), from_translation([0.1, 0.2, 0.3]), dq_exp([np.pi, 0, 0], [0, 1, 0])):
+        assert log_gradient(x).is_regular()
+        assert norm_gradient(x).is_regular()
+    assert log_gradient([0, 0, 1, 0, 0.1, 0.2, 0, 0]).is_regular()
+    assert gradient(dq.from_pose, M, V)(np.eye(3), np.zeros(3)).is_regular()
