@@ -27,10 +27,9 @@ from casadi_ik.problem.targets import LIMITS, TargetBatch, Tolerance
 from casadi_ik.registry import METHODS, build_method, with_finger_step
 from casadi_ik.solving.alternatives.finder import APART
 from casadi_ik.solving.choose import Judgement, choose
-from casadi_ik.solving.engine import Engine
+from casadi_ik.solving.engine import Engine, Run
 from casadi_ik.solving.fast import FastSolver
 from casadi_ik.solving.free_object import solve_with_object
-from casadi_ik.solving.run import Run
 from casadi_ik.solving.sensitivity import Sensitivity
 from casadi_ik.solving.stream import SolvedBlock, Stream
 from casadi_ik.touch.grasps import FoundGrasps, grasps_of

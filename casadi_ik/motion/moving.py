@@ -28,8 +28,7 @@ from casadi_ik.problem.contacts import by_kinds
 from casadi_ik.problem.request import Request, one_palm
 from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import LIMIT_SLACK, judge
-from casadi_ik.solving.engine import Engine
-from casadi_ik.solving.run import Run
+from casadi_ik.solving.engine import Engine, Run
 
 SETTLING = 0.1
 """Seconds in which motions that contacts leave free come to their posture."""

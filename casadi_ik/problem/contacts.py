@@ -500,7 +500,7 @@ def _problem(vectors: Mapping[str, Array]) -> str:
     return fault(units) or "malformed"
 
 
-def by_kinds(targets: TargetBatch) -> Iterator[tuple[Kinds, NDArray[np.intp] | None, TargetBatch]]:
+def by_kinds(targets: TargetBatch) -> Iterator[tuple[Kinds, slice | NDArray[np.intp], TargetBatch]]:
     """Targets sorted by the kinds of their contacts: what one kernel solves.
 
     The kinds of a target are its own, whatever else is in the batch. If a finger has a tangent,
@@ -508,11 +508,11 @@ def by_kinds(targets: TargetBatch) -> Iterator[tuple[Kinds, NDArray[np.intp] | N
     have to be compiled, and gains next to nothing.
 
     Yields:
-        Kinds, rows (None: all, as they are) and the targets in these rows.
+        Kinds, rows (a slice: all, as they are) and the targets in these rows.
     """
     f = targets.points.shape[1]
     if not targets.more:
-        yield usual(f), None, targets
+        yield usual(f), slice(None), targets
         return
     names = list(targets.more)
     given = np.stack([~np.isnan(targets.more[name][..., 0]) for name in names], axis=2)
@@ -529,7 +529,7 @@ def by_kinds(targets: TargetBatch) -> Iterator[tuple[Kinds, NDArray[np.intp] | N
             for row in of_fingers
         )
         if len(firsts) == 1:
-            yield kinds, None, targets
+            yield kinds, slice(None), targets
             return
         rows = np.flatnonzero(which == i)
         picked = np.array([targets.number(row) for row in rows.tolist()])

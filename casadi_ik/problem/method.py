@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,7 +108,11 @@ class Quick:
 
 
 class Method(Protocol):
-    """A named way to solve, built for one robot and kinds of contact."""
+    """A named way to solve, built for one robot and kinds of contact.
+
+    One that can prefer one of several solutions has `preferences`, too: those of `PREFERENCES` it
+    knows. "q0" it follows itself where a `TargetBatch` says so, "limits" is what it does else.
+    """
 
     name: str
 
@@ -157,31 +161,5 @@ class Method(Protocol):
 
         Raises:
             RowError: The method cannot take a target (for example a free finger).
-        """
-        ...
-
-
-@runtime_checkable
-class PreferringMethod(Protocol):
-    """A method that can prefer one of several solutions.
-
-    Attributes:
-        preferences: Those of `PREFERENCES` it knows: "q0" it follows itself where a `TargetBatch`
-            says so, "limits" is what it does else.
-    """
-
-    preferences: tuple[str, ...]
-
-
-@runtime_checkable
-class QuickMethod(Protocol):
-    """A method with a shorter way to the same answer for one target."""
-
-    def quick(self, targets: TargetBatch, q0: Array) -> Quick | None:
-        """What `run` would find; None: ask `run`.
-
-        Args:
-            targets: One target.
-            q0: (n,) configuration to start from.
         """
         ...

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import ParamSpec, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -179,34 +179,32 @@ class BatchParts:
         self._size = max(1, min(max(cached, min(ENOUGH, fitting)), self._largest))
 
 
-P = ParamSpec("P")
-T = TypeVar("T")
+Item = TypeVar("Item")
+Done = TypeVar("Done")
 
 
-class Workers:
-    """Threads for tasks, inside `workers`."""
+def in_order(task: Callable[[Item], Done], items: Iterable[Item], jobs: int) -> Iterator[Done]:
+    """What becomes of items, in order, done by so many threads.
 
-    def __init__(self, pool: ThreadPoolExecutor, cancelled: threading.Event) -> None:
-        self._pool, self._cancelled = pool, cancelled
+    If what takes the results ends by an exception (Ctrl-C), the threads are told to stop.
+    """
+    if jobs == 1:
+        yield from map(task, items)
+        return
+    cancelled, pool, ahead = threading.Event(), ThreadPoolExecutor(jobs), deque[Future[Done]]()
 
-    def submit(self, task: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> Future[T]:
-        """Have a task done as soon as a thread is free."""
+    def work(item: Item) -> Done:
+        with cancellable(cancelled):
+            stop_if_cancelled()
+            return task(item)
 
-        def work() -> T:
-            with cancellable(self._cancelled):
-                stop_if_cancelled()
-                return task(*arguments, **named)
-
-        return self._pool.submit(work)
-
-
-@contextmanager
-def workers(count: int) -> Iterator[Workers]:
-    """So many threads; if the block ends by an exception (Ctrl-C), they are told to stop."""
-    cancelled = threading.Event()
-    pool = ThreadPoolExecutor(count)
     try:
-        yield Workers(pool, cancelled)
+        for item in items:
+            ahead.append(pool.submit(work, item))
+            if len(ahead) > jobs:
+                yield ahead.popleft().result()
+        while ahead:
+            yield ahead.popleft().result()
     except BaseException:
         cancelled.set()
         raise

@@ -244,7 +244,7 @@ def _asked(
         rows = np.array(numbers, dtype=np.intp)
         targets = _placed(request.of_grasps(some, fixed), some, pose)
         for _, of_kinds, alike in by_kinds(targets):
-            yield (rows if of_kinds is None else rows[of_kinds]), alike
+            yield rows[of_kinds], alike
 
 
 def _placed(targets: TargetBatch, grasps: Sequence[Grasp], pose: Array | None) -> TargetBatch:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import Future
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from threading import Lock
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from casadi_ik.answers.diagnosis import Diagnosis, Reason
+from casadi_ik.answers.recorder import Recorder
 from casadi_ik.answers.solution import BatchSolution, Solution
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
@@ -23,7 +25,7 @@ from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.problem.clearance import CollisionQuery, SceneCheck
 from casadi_ik.problem.contacts import Kinds, by_kinds, usual
-from casadi_ik.problem.method import Method, Outcome, PreferringMethod, Quick, QuickMethod
+from casadi_ik.problem.method import Method, Outcome, Quick
 from casadi_ik.problem.request import CLEARANCE, NO_PREFERENCE, preference
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.targets import TargetBatch
@@ -36,17 +38,58 @@ from casadi_ik.solving.alternatives.free import (
     resolve_collisions,
 )
 from casadi_ik.solving.alternatives.way_out import with_way_out
-from casadi_ik.solving.batch_parts import BatchParts, SolvedPart, judged, workers
-from casadi_ik.solving.by_kinds import PerKinds
-from casadi_ik.solving.by_kinds import run as run_by_kinds
+from casadi_ik.solving.batch_parts import BatchParts, SolvedPart, in_order, judged
 from casadi_ik.solving.diagnosis.diagnostician import Diagnostician
 from casadi_ik.solving.first_answer import FirstAnswers
-from casadi_ik.solving.run import Run
 from casadi_ik.solving.sensitivity import SensitivityKernel
-from casadi_ik.solving.trials import HandMethod
 
 MANIPULABILITY = "manipulability"
 """The preference that is seen to after the solve."""
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """How targets are solved.
+
+    Attributes:
+        q0: (n,) start, or (k, n) for k targets; None is the robot's home.
+        seed: Of all random numbers, >= 0.
+        jobs: Threads, at least 1; compiled loops run side by side.
+        recorder: Keeps the iterations; None: they are not kept.
+        diagnose: Whether to find the reason where a target is not solved.
+        shown: Whether to show how far it is, where someone looks on.
+    """
+
+    q0: ArrayLike | None = None
+    seed: int = 0
+    jobs: int = 1
+    recorder: Recorder | None = None
+    diagnose: bool = False
+    shown: bool = False
+
+    def __post_init__(self) -> None:
+        for name, least in (("jobs", 1), ("seed", 0)):
+            value = getattr(self, name)
+            if type(value) is int and value >= least:
+                continue
+            if not isinstance(value, (int, np.integer)) or value < least:
+                raise InputError(f"{name}: found {value!r}, expected an integer >= {least}")
+            object.__setattr__(self, name, int(value))
+
+    def starts(self, robot: ArmHand, count: int) -> Array:
+        """(count, n) where each solve begins.
+
+        Raises:
+            InputError: Wrong shape or numbers, or not as many as targets.
+        """
+        start = robot.start(self.q0)
+        if start.ndim == 1:
+            return np.repeat(start[None], count, axis=0)
+        if len(start) != count:
+            raise InputError(
+                f"q0: found {len(start)} rows for {count} targets, expected as many, or one (n,)"
+            )
+        return start
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,54 +110,23 @@ class Engine:
     kinds: Kinds | None = None
     check: SceneCheck | None = None
 
+    _others: dict[Kinds, Engine] = field(default_factory=dict, init=False, repr=False)
+    _lock: Lock = field(default_factory=Lock, init=False, repr=False)
+
     def of_kinds(self, kinds: Kinds) -> Engine:
-        """The engine for targets whose contacts are of these kinds."""
-        own = self.kinds or usual(len(kinds))
-        return self if kinds == own else self._others.of(kinds)
+        """The engine for targets whose contacts are of these kinds; threads may share it."""
+        if kinds == (self.kinds or usual(len(kinds))):
+            return self
+        with self._lock:
+            if kinds not in self._others:
+                method = self.method.for_kinds(kinds)
+                self._others[kinds] = replace(self, method=method, kinds=kinds)
+            return self._others[kinds]
 
-    @cached_property
-    def _others(self) -> PerKinds[Engine]:
-        return PerKinds(
-            lambda kinds: replace(self, method=self.method.for_kinds(kinds), kinds=kinds)
-        )
-
-    @cached_property
-    def _first(self) -> FirstAnswers:
-        return FirstAnswers(self.method if self.compiled else None)
-
-    @cached_property
-    def _own_hands(self) -> HandMethod | None:
-        """The method, if its hands can be tried one by one."""
-        return self.method if isinstance(self.method, HandMethod) else None
-
-    @cached_property
-    def diagnostician(self) -> Diagnostician:
-        """Finds why a target was not solved, with hand-first where the method cannot."""
-        method = self._own_hands or HandFirstMethod(
-            self.robot.description, HandFirstParameters(), self.compiled, self.kinds
-        )
-        return Diagnostician(self.robot, method, self.compiled)
-
-    @property
-    def _several(self) -> HandMethod:
-        method = self._own_hands
-        if method is None:
-            raise UnsupportedError(
-                f"method {self.method.name!r} gives one solution; several need "
-                f"{HandFirstMethod.name!r}"
-            )
-        method.prepare()
-        return method
-
-    # Whether a method follows a protocol takes 20 us to ask, a fifth of a solve from Python.
-    @cached_property
-    def _quick(self) -> QuickMethod | None:
-        return self.method if isinstance(self.method, QuickMethod) else None
-
-    @cached_property
-    def _preferences(self) -> tuple[str, ...]:
-        method = self.method
-        return method.preferences if isinstance(method, PreferringMethod) else ()
+    def parted(self, targets: TargetBatch) -> Iterator[tuple[Engine, Any, TargetBatch]]:
+        """Engines for targets of any kinds, with the rows and the targets of each."""
+        for kinds, rows, some in by_kinds(targets):
+            yield self.of_kinds(kinds), rows, some
 
     def kinds_of(self, targets: TargetBatch) -> Engine:
         """The engine for targets that are all of the same kinds.
@@ -122,10 +134,39 @@ class Engine:
         Raises:
             InputError: They are of several.
         """
-        engines = {self.of_kinds(kinds) for kinds, _, _ in by_kinds(targets)}
-        if len(engines) > 1:
+        first, *others = (engine for engine, _, _ in self.parted(targets))
+        if others:
             raise InputError("grasps: found contacts of several kinds, expected the same in all")
-        return engines.pop()
+        return first
+
+    @cached_property
+    def hand_first(self) -> HandFirstMethod | None:
+        """The method, if its hands and arms can be tried one by one."""
+        method: Any = self.method
+        return method if hasattr(method, "postures") else None
+
+    @cached_property
+    def _first(self) -> FirstAnswers:
+        return FirstAnswers(self.hand_first if self.compiled else None)
+
+    @cached_property
+    def diagnostician(self) -> Diagnostician:
+        """Finds why a target was not solved, with hand-first where the method cannot."""
+        method = self.hand_first or HandFirstMethod(
+            self.robot.description, HandFirstParameters(), self.compiled, self.kinds
+        )
+        return Diagnostician(self.robot, method, self.compiled)
+
+    @property
+    def _several(self) -> HandFirstMethod:
+        method = self.hand_first
+        if method is None:
+            raise UnsupportedError(
+                f"method {self.method.name!r} gives one solution; several need "
+                f"{HandFirstMethod.name!r}"
+            )
+        method.prepare()
+        return method
 
     @cached_property
     def finder(self) -> AlternativeFinder:
@@ -145,7 +186,7 @@ class Engine:
     def about(self, check: SceneCheck) -> Engine:
         """The engine with another scene; all that was worked out for the robot stays."""
         other = copy(self)
-        vars(other).update(check=check, _others=type(self)._others.func(other))
+        vars(other).update(check=check, _others={})
         return other
 
     def collision_query(self, targets: TargetBatch) -> CollisionQuery | None:
@@ -162,11 +203,12 @@ class Engine:
         asked, method = preference(prefer, started), self.method
         if asked == CLEARANCE and self.check is None:
             raise InputError(f"prefer: found {asked!r}, which needs a solver with a scene")
-        if self._preferences:
-            if asked in self._preferences:
+        if known := getattr(method, "preferences", ()):
+            if asked in known:
                 return asked
-            known = ", ".join(self._preferences)
-            raise UnsupportedError(f"prefer: method {method.name!r} knows {known}, found {asked!r}")
+            raise UnsupportedError(
+                f"prefer: method {method.name!r} knows {', '.join(known)}, found {asked!r}"
+            )
         if prefer is None:
             return NO_PREFERENCE
         raise UnsupportedError(
@@ -184,16 +226,14 @@ class Engine:
         Raises:
             InputError: Bad q0, or a target the method cannot take.
         """
-        if targets.more:
-            ((kinds, _, _),) = by_kinds(targets)
-            if (other := self.of_kinds(kinds)) is not self:
-                return other.solve_one(targets, run)
-        method, start, known = self._quick, run.start(self.robot), None
+        if targets.more and (other := self.kinds_of(targets)) is not self:
+            return other.solve_one(targets, run)
+        method, start, known = self.hand_first, self.robot.start(run.q0), None
         plain = targets.palms is None and targets.prefer not in RANKED and start.ndim == 1
         if method is not None and plain and run.recorder is None:
             if (early := self._first.answer(targets, start, self.check)) is not None:
                 return early
-            self.method.prepare()
+            method.prepare()
             begin = time.perf_counter()
             found = method.quick(targets, start)
             if found is not None:
@@ -259,16 +299,21 @@ class Engine:
             _ = self._several  # no other method keeps every target's hand where it is
         starts, recorder = run.starts(self.robot, len(targets)), run.recorder
         # Built before the clock and the threads start: no work of a solve, nor for several at once.
-        for kinds, _, _ in by_kinds(targets):
-            self.of_kinds(kinds).method.prepare()
-        if recorder is not None and (measures := self.method.trace_format.measures) is not None:
-            measures.prepare()
+        ranked = targets.prefer == MANIPULABILITY or self.check is not None
+        for engine, _, _ in self.parted(targets):
+            engine.method.prepare()
+            if run.diagnose:
+                _ = engine.diagnostician
+            if ranked and engine.hand_first is not None:
+                _ = engine.finder
+        form = self.method.trace_format
+        if recorder is not None and form.measures is not None:
+            form.measures.prepare()
         batches = []
         with InBackground() as background, progress(len(targets), run.shown) as show:
             for part in self._parts(targets, starts, run, known):
                 show(len(part.batch))
                 if recorder is not None:
-                    form = self.method.trace_format
                     background.do(partial(part.record, recorder, form, run.seed))
                 batches.append(part.batch)
         return BatchSolution.joined(batches)
@@ -277,55 +322,49 @@ class Engine:
         self, targets: TargetBatch, starts: Array, run: Run, known: Outcome | None
     ) -> Iterator[SolvedPart]:
         """Parts of the batch in order, solved, judged and diagnosed side by side."""
-        trace, jobs, diagnose = run.recorder is not None, run.jobs, run.diagnose
-        parts = BatchParts(len(targets), jobs, trace, run.shown and someone_looks_on())
-
-        def method(kinds: Kinds) -> Method:
-            return self.of_kinds(kinds).method
-
-        def finder_of(some: TargetBatch) -> AlternativeFinder:
-            return self.kinds_of(some).finder
+        trace = run.recorder is not None
+        parts = BatchParts(len(targets), run.jobs, trace, run.shown and someone_looks_on())
 
         def solve(rows: slice) -> SolvedPart:
-            started, asked = time.time_ns(), targets.rows(rows)
-            outcome = known or run_by_kinds(method, asked, starts[rows], run.seed, trace)
+            started, asked, q0 = time.time_ns(), targets.rows(rows), starts[rows]
+            outcome = known or self._run(asked, q0, run.seed, trace)
             if outcome.rows is not None:
                 parts.learn(len(outcome.q), outcome.rows.nbytes)
             query = self.collision_query(asked)
             if query is None and targets.prefer == MANIPULABILITY:
-                outcome = self._most_manipulable(asked, starts[rows], run.seed, outcome)
+                outcome = self._most_manipulable(asked, q0, run.seed, outcome)
             batch = judged(self.robot, self.method.name, asked, outcome, query)
-            if query is not None and self._own_hands is not None:
-                q0, seed = starts[rows], run.seed
+            if query is not None and self.hand_first is not None:
                 batch = resolve_collisions(
-                    finder_of, asked, query, q0, seed, outcome, batch, diagnose
+                    lambda some: self.kinds_of(some).finder,
+                    asked,
+                    query,
+                    q0,
+                    run.seed,
+                    outcome,
+                    batch,
+                    run.diagnose,
                 )
                 outcome = replace(outcome, q=batch.q, time=batch.time)
-            if diagnose:
-                batch = self._diagnosed(asked, starts[rows], outcome, batch)
+            if run.diagnose:
+                batch = self._diagnosed(asked, q0, outcome, batch)
                 if self.check is not None and len(targets) == 1:
-                    batch = with_way_out(self.solve, self.check, asked, starts[0], run.seed, batch)
+                    again = Run(starts[0], run.seed)
+                    batch = with_way_out(
+                        lambda some: self.solve(some, again).success, self.check, asked, batch
+                    )
             parts.pace(1e-9 * (time.time_ns() - started))
-            return SolvedPart(asked, starts[rows], started, outcome, batch, query)
+            return SolvedPart(asked, q0, started, outcome, batch, query)
 
-        if diagnose:
-            for kinds, _, _ in by_kinds(targets):
-                _ = self.of_kinds(kinds).diagnostician
-        if targets.prefer == MANIPULABILITY or self.check is not None:
-            for kinds, _, _ in by_kinds(targets):
-                if self._own_hands is not None:
-                    _ = self.of_kinds(kinds).finder
-        if jobs == 1:
-            yield from map(solve, parts)
-            return
-        with workers(jobs) as threads:
-            ahead: deque[Future[SolvedPart]] = deque()
-            for part in parts:
-                ahead.append(threads.submit(solve, part))
-                if len(ahead) > jobs:
-                    yield ahead.popleft().result()
-            while ahead:
-                yield ahead.popleft().result()
+        return in_order(solve, parts, run.jobs)
+
+    def _run(self, targets: TargetBatch, starts: Array, seed: int, trace: bool) -> Outcome:
+        """Solve targets of any kinds, each by the method for its kinds."""
+        groups, outcomes = [], []
+        for engine, rows, some in self.parted(targets):
+            groups.append(rows)
+            outcomes.append(engine.method.run(some, starts[rows], seed, trace))
+        return outcomes[0] if len(outcomes) == 1 else Outcome.interleaved(groups, outcomes)
 
     def _most_manipulable(
         self, targets: TargetBatch, starts: Array, seed: int, outcome: Outcome
@@ -345,19 +384,17 @@ class Engine:
         self, targets: TargetBatch, starts: Array, outcome: Outcome, batch: BatchSolution
     ) -> BatchSolution:
         """Find the reasons; a solution found by hand-first's own diagnosis is the answer."""
-        if batch.success.all():
-            return replace(batch, diagnoses=(None,) * len(batch))
-        own = self._own_hands is not None
+        own = self.hand_first is not None
         q, seconds = outcome.q.copy(), outcome.time.copy()
         rows = np.flatnonzero(~batch.success & (batch.status != Status.COLLISION))
         if not len(rows):
             return replace(batch, diagnoses=(None,) * len(batch))
-        unbiased = replace(targets.rows(rows), prefer="limits")
         found: dict[int, Diagnosis] = {}
-        for kinds, of_kinds, some in by_kinds(unbiased):
-            chosen = rows if of_kinds is None else rows[of_kinds]
+        # Why there is no solution does not depend on which is preferred.
+        for engine, of_kinds, some in self.parted(replace(targets.rows(rows), prefer="limits")):
+            chosen = rows[of_kinds]
             ends = q[chosen] if own else None
-            diagnoses = self.of_kinds(kinds).diagnostician.diagnose(some, starts[chosen], ends)
+            diagnoses = engine.diagnostician.diagnose(some, starts[chosen], ends)
             found |= zip(chosen.tolist(), diagnoses, strict=True)
         for row, why in found.items():
             if own and why.reason is Reason.REACHABLE:

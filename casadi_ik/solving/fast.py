@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,27 +10,11 @@ from numpy.typing import ArrayLike
 from casadi_ik.arrays import Array
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.grasps.grasp import real_array
-from casadi_ik.methods.hand_first.driver import Searches
 from casadi_ik.problem.request import Request, preference
 from casadi_ik.problem.status import Status
-from casadi_ik.problem.targets import TargetBatch
-from casadi_ik.solving.engine import Engine
-from casadi_ik.solving.run import Run
+from casadi_ik.solving.engine import Engine, Run
 
 STATUSES = {int(status): status for status in Status}
-
-
-@runtime_checkable
-class FastMethod(Protocol):
-    """A method that solves one target after the other in memory made once."""
-
-    def alone(self, enforce_limits: bool) -> Searches | None:
-        """That memory; None where there is no compiler."""
-        ...
-
-    def terms(self, targets: TargetBatch) -> Array:
-        """What targets of the same tolerances and limits have in common."""
-        ...
 
 
 class FastSolver:
@@ -56,9 +40,10 @@ class FastSolver:
         """
         if engine.check is not None:
             raise UnsupportedError("fast: checks no collisions, expected a solver without a scene")
-        method = engine.method
-        if not isinstance(method, FastMethod):
-            raise UnsupportedError(f"fast: expected method 'hand-first', found {method.name!r}")
+        method = engine.hand_first
+        if method is None:
+            found = engine.method.name
+            raise UnsupportedError(f"fast: expected method 'hand-first', found {found!r}")
         self._engine, self._request = engine, request
         robot = engine.robot
         f, n = len(robot.fingers), len(robot.actuators)

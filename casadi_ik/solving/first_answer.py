@@ -16,21 +16,17 @@ import subprocess
 import sys
 import threading
 import time
-from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
 
 from casadi_ik.answers.solution import Solution
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.kernels import LoopKernel
 from casadi_ik.kernels.cancellation import cached_only, virtual_machine
 from casadi_ik.kernels.compiler import find_compiler, tell, waits
 from casadi_ik.kernels.libraries import NotCachedError
+from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.problem.clearance import SceneCheck
-from casadi_ik.problem.method import Outcome
 from casadi_ik.problem.targets import TargetBatch
-from casadi_ik.robots.description import RobotDescription
 from casadi_ik.solving.batch_parts import judged
 
 LOOK_AGAIN = 0.25
@@ -50,42 +46,13 @@ compile_in_background()
 """
 
 
-class VirtualMethod(Protocol):
-    """A method that can answer in the virtual machine until it is compiled."""
-
-    robot: RobotDescription
-
-    @property
-    def kernel(self) -> LoopKernel:
-        """Its compiled loop."""
-        ...
-
-    def prepare(self) -> None:
-        """Compile all that one target takes."""
-        ...
-
-    def in_virtual_machine(self) -> VirtualMethod:
-        """The same, never compiled."""
-        ...
-
-    def run(
-        self, targets: TargetBatch, q0: Array, seed: int, trace: bool, rounds: int | None = None
-    ) -> Outcome:
-        """Solve a batch by so many rounds."""
-        ...
-
-
 class FirstAnswers:
     """Answers of a method until its compiled code is there; threads may share it."""
 
-    def __init__(self, method: Any) -> None:
-        """Nothing is done before the first answer.
-
-        Args:
-            method: Any; only a `VirtualMethod` answers early.
-        """
-        able = hasattr(type(method), "in_virtual_machine")
-        self._method: VirtualMethod | None = method if able else None
+    def __init__(self, method: HandFirstMethod | None) -> None:
+        """Nothing is done before the first answer; without a method there is none."""
+        self._method = method
+        self._early: tuple[HandFirstMethod, ArmHand] | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._looked = 0.0
         self._lock = threading.Lock()
@@ -103,19 +70,24 @@ class FirstAnswers:
         Returns:
             The answer, or None where compiled code is there, or has to be waited for.
         """
-        if self._method is None or self._is_ready():
+        method = self._method
+        if method is None or self._is_ready(method):
             return None
         with virtual_machine():
-            outcome = self._virtual.run(targets, start[None], 0, False, rounds=1)
-            query = None if check is None else self._checked(check).collision_query(targets)
-            batch = judged(self._robot, self._name, targets, outcome, query)
+            if self._early is None:
+                virtual = method.in_virtual_machine()
+                # A robot of its own: its functions are not those of the compiled method.
+                self._early = virtual, ArmHand(virtual.robot)
+            virtual, robot = self._early
+            outcome = virtual.run(targets, start[None], 0, False, rounds=1)
+            query = None
+            if check is not None:
+                query = SceneCheck(robot, check.scene, compiled=False).collision_query(targets)
+            batch = judged(robot, virtual.name, targets, outcome, query)
         return batch.solution(0) if batch.success[0] else None
 
-    def _is_ready(self) -> bool:
+    def _is_ready(self, method: HandFirstMethod) -> bool:
         """Whether the method is compiled, or is to be waited for."""
-        method = self._method
-        if method is None:
-            return True
         with self._lock:
             process, now = self._process, time.monotonic()
             if process is not None and now - self._looked < LOOK_AGAIN:
@@ -135,25 +107,8 @@ class FirstAnswers:
                 self._method = None
             return ready
 
-    @cached_property
-    def _virtual(self) -> VirtualMethod:
-        assert self._method is not None
-        return self._method.in_virtual_machine()
 
-    @cached_property
-    def _robot(self) -> ArmHand:
-        """Of its own: its functions are not those of the compiled method."""
-        return ArmHand(self._virtual.robot)
-
-    @property
-    def _name(self) -> str:
-        return str(getattr(self._virtual, "name", ""))
-
-    def _checked(self, check: SceneCheck) -> SceneCheck:
-        return SceneCheck(self._robot, check.scene, compiled=False)
-
-
-def started(method: VirtualMethod) -> subprocess.Popen[bytes] | None:
+def started(method: HandFirstMethod) -> subprocess.Popen[bytes] | None:
     """A process that compiles a method, or None where none can be started."""
     if not Path(sys.executable or "").name.startswith("python") or find_compiler() is None:
         return None

@@ -12,8 +12,7 @@ from casadi_ik.answers.solution import BatchSolution
 from casadi_ik.errors import InputError, RowError
 from casadi_ik.grasps import Tolerance
 from casadi_ik.problem.targets import TargetBatch
-from casadi_ik.solving.engine import Engine
-from casadi_ik.solving.run import Run
+from casadi_ik.solving.engine import Engine, Run
 
 REQUIRED = ("points", "normals")
 """What every target is told by."""
@@ -63,7 +62,7 @@ class Stream:
         Raises:
             InputError: Bad q0, or a block of the wrong shape.
         """
-        if self.run.start(self.engine.robot).ndim != 1:
+        if self.engine.robot.start(self.run.q0).ndim != 1:
             raise InputError("q0: found several, expected one start for all targets")
         for given in blocks:
             named = given if isinstance(given, Mapping) else dict(zip(REQUIRED, given, strict=True))

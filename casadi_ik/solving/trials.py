@@ -4,21 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array, Rows
-from casadi_ik.kernels import LoopResult
 from casadi_ik.kernels.layout import Layout
 from casadi_ik.methods.common.contact_fit import fresh_fit
-from casadi_ik.methods.hand_first.method import UNBOUNDED
-from casadi_ik.methods.hand_first.parameters import HandFirstParameters
-from casadi_ik.methods.hand_first.step import HandFirstStep
+from casadi_ik.methods.hand_first.method import UNBOUNDED, HandFirstMethod
 from casadi_ik.problem.contacts import LENGTH
-from casadi_ik.problem.method import Outcome
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import deviations, judge
@@ -28,49 +23,6 @@ NEVER = 1e-12
 
 ALIKE = 1.001
 """Two values of a row that differ by less than this factor count as the same."""
-
-
-@runtime_checkable
-class HandMethod(Protocol):
-    """A method whose hands and arms can be tried one by one, as hand-first's.
-
-    Attributes:
-        options: Its numbers.
-        step: Its step and the layouts of that.
-    """
-
-    name: str
-    options: HandFirstParameters
-    step: HandFirstStep
-
-    @property
-    def rounds(self) -> int:
-        """How many a search has at most."""
-        ...
-
-    def prepare(self) -> None:
-        """See `Method.prepare`."""
-        ...
-
-    def postures(self, targets: TargetBatch, number: int) -> Array:
-        """Hand postures (k, candidates, hand) that a round begins from."""
-        ...
-
-    def rows(
-        self, targets: TargetBatch, q0: Array, postures: Array, begun: bool = False
-    ) -> tuple[Array, Array]:
-        """States and parameters of the loop for hand postures that are given."""
-        ...
-
-    def run_rows(self, states: Array, parameters: Array, trace: bool = False) -> LoopResult:
-        """Run the loop on such rows."""
-        ...
-
-    def run(
-        self, targets: TargetBatch, q0: Array, seed: int, trace: bool, rounds: int | None = None
-    ) -> Outcome:
-        """See `Method.run`; so many rounds of each search at most."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +64,7 @@ class Subproblems:
     """
 
     robot: ArmHand
-    method: HandMethod
+    method: HandFirstMethod
 
     @cached_property
     def state(self) -> Layout:

@@ -387,7 +387,7 @@ def test_every_target_is_in_one_group_of_its_kinds(free, line):
     asked = TargetBatch(points, points, TIGHT, enforce_limits=True, first_row=10, more=more)
     seen = []
     for kinds, rows, some in by_kinds(asked):
-        rows = np.arange(5) if rows is None else rows
+        rows = np.arange(5)[rows]
         seen += rows.tolist()
         assert [some.number(i) for i in range(len(some))] == (10 + rows).tolist()
         for name, array in more.items():

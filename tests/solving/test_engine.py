@@ -17,8 +17,7 @@ from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.trace import TraceFormat
 from casadi_ik.problem.verdict import judge
 from casadi_ik.solving.batch_parts import CACHED_BYTES, ENOUGH, FIRST_PART, PART_BYTES, BatchParts
-from casadi_ik.solving.engine import Engine
-from casadi_ik.solving.run import Run
+from casadi_ik.solving.engine import Engine, Run
 
 LAYOUT = Layout.record(Field("row", (), "f8"))
 

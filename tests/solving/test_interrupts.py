@@ -15,7 +15,7 @@ import pytest
 
 import casadi_ik as ik
 from casadi_ik.kernels.cancellation import CancelledError, stop_if_cancelled
-from casadi_ik.solving.batch_parts import workers
+from casadi_ik.solving.batch_parts import in_order
 
 pytestmark = pytest.mark.usefixtures("usual_flags")
 
@@ -87,9 +87,10 @@ def test_a_stream_has_handed_over_what_is_finished() -> None:
 
 
 def test_an_error_stops_the_others() -> None:
-    stopped = threading.Event()
+    started, stopped = threading.Event(), threading.Event()
 
     def until_told() -> None:
+        started.set()
         try:
             while True:
                 stop_if_cancelled()
@@ -99,14 +100,10 @@ def test_an_error_stops_the_others() -> None:
             raise
 
     def fail() -> None:
+        started.wait(10)
         raise ValueError("of one")
 
-    def work() -> None:
-        with workers(2) as threads:
-            threads.submit(until_told)
-            threads.submit(fail).result()
-
     with pytest.raises(ValueError, match="of one"):
-        work()
+        list(in_order(lambda task: task(), [fail, until_told], 2))
     assert stopped.is_set()
     stop_if_cancelled()  # this thread was never told

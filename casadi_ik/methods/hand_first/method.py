@@ -191,7 +191,7 @@ class HandFirstMethod(LoopedMethod):
         )
 
     def quick(self, targets: TargetBatch, q0: Array) -> Quick | None:
-        """The answer to one target; see `QuickMethod.quick`."""
+        """What `run` would find for one target from q0 (n,), sooner; None: ask `run`."""
         if not self.is_compiled or (self.robot.sides and not self.robot.trunk):
             return None
         with self._searches.lent(targets.enforce_limits) as search:

@@ -16,6 +16,7 @@ from casadi_ik.errors import InputError
 from casadi_ik.grasps import Tolerance
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.kernels.cancellation import stop_if_cancelled
+from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.problem.clearance import CollisionQuery
 from casadi_ik.problem.request import CLEARANCE, free_palms, preference
 from casadi_ik.problem.targets import TargetBatch
@@ -25,7 +26,6 @@ from casadi_ik.solving.alternatives.branches import ArmBranches
 from casadi_ik.solving.alternatives.trunks import other_trunks
 from casadi_ik.solving.trials import (
     Bounds,
-    HandMethod,
     LocalRefinement,
     Subproblems,
     distinct,
@@ -73,7 +73,7 @@ class AlternativeFinder:
         hand: Positions in q of the hand's actuators.
     """
 
-    def __init__(self, robot: ArmHand, method: HandMethod, compiled: bool = True) -> None:
+    def __init__(self, robot: ArmHand, method: HandFirstMethod, compiled: bool = True) -> None:
         """Take the robot and hand-first on it."""
         self.robot = robot
         self.trials = Subproblems(robot, method)

@@ -469,7 +469,7 @@ def resolve_collisions(
     asked = replace(targets.rows(rows), picked=numbers)
     robot = finder_of(asked.rows(slice(0, 1))).robot
     for _, of_kinds, some in by_kinds(asked):
-        chosen = rows if of_kinds is None else rows[of_kinds]
+        chosen = rows[of_kinds]
         nearby, begun = query.rows(chosen), (q[chosen], starts[chosen])
         found = free_answers(finder_of(some), some, nearby, *begun, seed, every, reasons)
         q[chosen] = found.q

@@ -17,7 +17,6 @@ from casadi_ik.collision.distances import gaps
 from casadi_ik.collision.scene import Item, Scene
 from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.problem.targets import TargetBatch
-from casadi_ik.solving.run import Run
 
 STEPS = (0.01, 0.02, 0.04, 0.08, 0.16)
 """How far the object is moved [m], until it helps."""
@@ -40,21 +39,14 @@ Free = Callable[[TargetBatch], NDArray[np.bool_]]
 
 
 def with_way_out(
-    solve: Callable[[TargetBatch, Run], BatchSolution],
-    check: SceneCheck,
-    targets: TargetBatch,
-    start: Array,
-    seed: int,
-    batch: BatchSolution,
+    free: Free, check: SceneCheck, targets: TargetBatch, batch: BatchSolution
 ) -> BatchSolution:
     """The answer to one target that touches something, with what else would do in its report.
 
     Args:
-        solve: Solves targets.
+        free: Solves targets.
         check: The scene about the robot.
         targets: The target.
-        start: (n,) where the robot is.
-        seed: Of all random numbers.
         batch: The answer.
     """
     (report,) = batch.collisions
@@ -63,10 +55,6 @@ def with_way_out(
     scene, known = check.scene, targets
     if targets.object_pose is None and scene.grasped in scene.items:
         known = targets.holding(scene.grasped or "", scene.items[scene.grasped or ""].pose)
-
-    def free(asked: TargetBatch) -> NDArray[np.bool_]:
-        return solve(asked, Run(start, seed)).success
-
     moved = _moved(known, _standing(check, known), free)
     found = SuggestedFix(moved, STEPS[-1], _fewer(known, check.robot.fingers, free))
     return replace(batch, collisions=(replace(report, way_out=found),))

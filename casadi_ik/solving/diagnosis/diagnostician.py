@@ -21,13 +21,14 @@ from casadi_ik.answers.diagnosis import (
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array, Counts
 from casadi_ik.grasps import Tolerance
+from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import Verdict, deviations, judge, judge_palms
 from casadi_ik.proofs.proof import Proof, ProofKind
 from casadi_ik.proofs.prove import EFFORT, Prover
 from casadi_ik.solving.diagnosis.closest import Closest, FloatingPalmFit, HandFits, closest
 from casadi_ik.solving.diagnosis.remedies import RemedyFinder
-from casadi_ik.solving.trials import HandMethod, LocalRefinement, Rows, Subproblems
+from casadi_ik.solving.trials import LocalRefinement, Rows, Subproblems
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ class Diagnostician:
         method: Hand-first on that robot.
     """
 
-    def __init__(self, robot: ArmHand, method: HandMethod, compiled: bool = True) -> None:
+    def __init__(self, robot: ArmHand, method: HandFirstMethod, compiled: bool = True) -> None:
         """Keep robot and method; nothing is built before the first diagnosis."""
         self.robot = robot
         self.method = method
