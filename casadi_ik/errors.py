@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import difflib
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 
 def printable(text: str, most: int = 0) -> str:
@@ -71,6 +72,20 @@ class CasadiIKError(Exception):
 
     def __str__(self) -> str:
         return shortened(super().__str__())
+
+
+@contextmanager
+def os_errors(what: str, kind: type[CasadiIKError]) -> Iterator[None]:
+    """Turn what the system refuses into an error of the package.
+
+    Args:
+        what: File and what was tried: "cup.yaml: cannot be read".
+        kind: The error.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise kind(f"{what}: {error.strerror or error}") from error
 
 
 class DescriptionError(CasadiIKError):

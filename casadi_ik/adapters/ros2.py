@@ -23,7 +23,7 @@ from casadi_ik.arm_hand import load_robot
 from casadi_ik.arrays import Array
 from casadi_ik.errors import CasadiIKError, InputError, MissingExtraError
 from casadi_ik.logs.cdr import CdrReader, cdr, cdr_message
-from casadi_ik.logs.chunks import CDR_HEADER
+from casadi_ik.logs.container import CDR_HEADER
 from casadi_ik.problem.status import Status
 
 try:

@@ -15,7 +15,7 @@ from typing import IO, TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from casadi_ik.arrays import Array
-from casadi_ik.errors import InputError, UnsupportedError
+from casadi_ik.errors import InputError, UnsupportedError, os_errors
 from casadi_ik.files.limits import RAISED, limit
 from casadi_ik.files.npz import UNREADABLE
 from casadi_ik.problem.contacts import NAMES
@@ -394,11 +394,8 @@ def source_of(path: Path, fingers: tuple[str, ...], size: int) -> Source:
 
 
 def _fingerprint(path: Path) -> str:
-    try:
-        with path.open("rb") as file:
-            size = file.seek(0, 2)
-            file.seek(max(size - 2**16, 0))
-            digest = hashlib.sha256(file.read()).hexdigest()[:16]
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    with os_errors(f"{path}: cannot be read", InputError), path.open("rb") as file:
+        size = file.seek(0, 2)
+        file.seek(max(size - 2**16, 0))
+        digest = hashlib.sha256(file.read()).hexdigest()[:16]
     return f"{path.name} {size} {digest}"

@@ -37,7 +37,7 @@ from casadi_ik.logs.explanation import Matched, explain, matched, side_by_side
 from casadi_ik.logs.repair import finish_log, merge_logs
 from casadi_ik.logs.shards import log_files
 from casadi_ik.logs.solve import OneSolve, one_solve
-from casadi_ik.logs.tables import happening
+from casadi_ik.logs.tables import happenings
 
 SHOWN = 12
 """How many of a list of names or numbers are shown."""
@@ -111,11 +111,14 @@ def events(said: Said) -> Answer:
     found = logs.open(said.files).events(**_filters(said))
     numbers = ("solve", "iteration")
     rows = table(*numbers, "method", "phase", "what happened", right=numbers)
-    for record in islice(found.records() if len(found) else (), said.most):
-        event = happening(record)
+    every = (
+        (number, part.method, event)
+        for part in found.parts
+        for number, event in zip(part.solve_id.tolist(), happenings(part), strict=True)
+    )
+    for number, method, event in islice(every, said.most):
         text = Text(told(event), "yellow" if event.kind in SERIOUS else "")
-        solve = str(record["solve_id"] + 1)
-        rows.add_row(solve, str(event.iteration + 1), record["method"], event.phase, text)
+        rows.add_row(str(number + 1), str(event.iteration + 1), method, event.phase, text)
     return Answer(Group(_only_last_wraps(rows), _count(len(found), said.most, "event")))
 
 

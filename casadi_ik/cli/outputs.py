@@ -7,12 +7,12 @@ import json
 import os
 import stat
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from casadi_ik.cli.options import PROGRAM
-from casadi_ik.errors import CasadiIKError, shortened
+from casadi_ik.errors import CasadiIKError, os_errors, shortened
 from casadi_ik.files.writing import part_of, target_of, written_whole
 
 
@@ -47,21 +47,19 @@ def check_outputs(outputs: Mapping[str, Path | None], inputs: Iterable[Path] = (
     for option, path in outputs.items():
         if path is None:
             continue
-        where = f"{path}: {option}"
-        try:
+        with writing(path, option):
             target = target_of(path)
             same = _identities(target)
             for identity in same:
                 if identity in taken:
                     owner = taken[identity]
-                    raise OutputError(f"{where}: found the file of {owner}, expected another")
+                    problem = f"found the file of {owner}, expected another"
+                    raise OutputError(f"{path}: {option}: {problem}")
             taken |= dict.fromkeys(same, option)
             _refuse_special(target)
             part = part_of(target)
             part.touch(exist_ok=False)
             part.unlink()
-        except OSError as error:
-            raise OutputError(f"{where}: cannot be written: {_reason(error)}") from error
 
 
 def write_output(path: Path, option: str, write: Callable[[Path], object]) -> None:
@@ -89,8 +87,7 @@ def write_json(path: Path, data: Any) -> None:
     write_output(path, "--out", lambda part: part.write_text(text, encoding="utf-8"))
 
 
-@contextlib.contextmanager
-def writing(path: Path, option: str) -> Iterator[None]:
+def writing(path: Path, option: str) -> contextlib.AbstractContextManager[None]:
     """Say of what the system refuses which output it concerns.
 
     Args:
@@ -100,10 +97,7 @@ def writing(path: Path, option: str) -> Iterator[None]:
     Raises:
         OutputError: The system refused.
     """
-    try:
-        yield
-    except OSError as error:
-        raise OutputError(f"{path}: {option}: cannot be written: {_reason(error)}") from error
+    return os_errors(f"{path}: {option}: cannot be written", OutputError)
 
 
 def folder_of(path: Path) -> Path:
@@ -131,7 +125,3 @@ def _refuse_special(target: Path) -> None:
         raise OSError("the path is not a regular file")
     if not os.access(target, os.W_OK):
         raise OSError("the file is read-only")
-
-
-def _reason(error: OSError) -> str:
-    return error.strerror or str(error)

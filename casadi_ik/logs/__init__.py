@@ -1,8 +1,7 @@
 """MCAP logs: every iteration into a file, and back."""
 
 from casadi_ik.logs.cdr import RecordedMotion, read_motion
-from casadi_ik.logs.detect import detect_events
-from casadi_ik.logs.events import EventKind, EventRules
+from casadi_ik.logs.events import EventKind, EventRules, detect_events
 from casadi_ik.logs.explanation import Explanation, explain, matched, side_by_side
 from casadi_ik.logs.format import LogClock
 from casadi_ik.logs.reader import Log, LogInfo

@@ -16,8 +16,7 @@ from mcap.writer import Writer
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import LogError
-from casadi_ik.logs.chunks import CDR_HEADER, MESSAGE
-from casadi_ik.logs.container import read_chunk, read_contents, reading
+from casadi_ik.logs.container import CDR_HEADER, MESSAGE, read_chunk, read_contents, reading
 
 Stamp = tuple[int, int]
 """Seconds and nanoseconds: a time, or a duration."""

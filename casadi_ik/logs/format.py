@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.errors import InputError, LogError
 from casadi_ik.kernels.layout import Field, Layout
-from casadi_ik.logs.chunks import check_size
+from casadi_ik.logs.container import check_size
 
 KINDS = ("iteration", "solve", "event")
 """The kinds of messages, each on a topic of its own per method."""

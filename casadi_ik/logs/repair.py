@@ -22,15 +22,19 @@ from mcap.records import Attachment, ChunkIndex, Metadata
 from mcap.summary import Summary
 
 from casadi_ik.arrays import Counts
-from casadi_ik.errors import LogError
+from casadi_ik.errors import LogError, os_errors
 from casadi_ik.files.writing import written_whole
-from casadi_ik.logs.chunks import COMPRESSORS, Run, Unpacked, index_messages, packed_chunk
 from casadi_ik.logs.container import (
+    COMPRESSORS,
     Contents,
+    Run,
+    Unpacked,
     add_chunk,
     beginning,
     counts_of,
     ending,
+    index_messages,
+    packed_chunk,
     read_chunk,
     read_summary,
     reading,
@@ -78,16 +82,10 @@ def finish_log(path: str | os.PathLike[str]) -> Finished:
         >>> finished = ik.logs.finish_log("cup.mcap")  # whole already: nothing is changed
     """
     path = Path(path)
-    try:
-        with path.open("rb") as stream:
-            contents = scan(stream, path)
-            whole = contents.complete and _ends_well(stream, contents)
+    with reading(path, "finish") as stream:
+        contents = scan(stream, path)
+        whole = contents.complete and _ends_well(stream, contents)
         cut = 0 if whole else _close(contents)
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise LogError(f"{path}: cannot finish the log: {reason}") from error
-    except LogError as error:
-        raise type(error)(f"{path}: {error}") from error
     return Finished(path, not whole, len(contents.chunks), sum(contents.counts.values()), cut)
 
 
@@ -168,13 +166,10 @@ def merge_logs(shards: Paths, target: str | os.PathLike[str]) -> Merged:
         _check_alike(shard, opened[0])
     merge = _Merge(Log(opened, left_out))
     solves = {part.method: len(part) for part in merge.log.solves().parts}
-    try:
-        with written_whole(path) as part, part.open("xb") as stream:
-            merge.write(stream)
-            size = stream.tell()
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise LogError(f"{path}: cannot write the merged log: {reason}") from error
+    refused = os_errors(f"{path}: cannot write the merged log", LogError)
+    with refused, written_whole(path) as part, part.open("xb") as stream:
+        merge.write(stream)
+        size = stream.tell()
     messages = sum(counts_of(merge.summary).values())
     return Merged(path, len(opened), solves, messages, size, tuple(left_out))
 

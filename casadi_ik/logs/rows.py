@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.answers.recorder import SolveBlock
 from casadi_ik.kernels.layout import Field, Layout, opaque
-from casadi_ik.logs.detect import as_matrix, words_of
-from casadi_ik.logs.events import EventKind, jacobian_names, measured_jacobians
+from casadi_ik.logs.events import EventKind, as_matrix, jacobian_names, measured_jacobians, words_of
 from casadi_ik.problem.contacts import NAMES
 from casadi_ik.problem.request import NO_PREFERENCE, PREFERENCES
 from casadi_ik.problem.status import Status

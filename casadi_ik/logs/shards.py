@@ -24,7 +24,7 @@ from numpy.lib.recfunctions import repack_fields
 from numpy.typing import NDArray
 
 from casadi_ik.arrays import Counts
-from casadi_ik.errors import LogError, UnknownNameError, printable
+from casadi_ik.errors import LogError, UnknownNameError, os_errors, printable
 from casadi_ik.kernels.layout import Field, Layout, opaque
 from casadi_ik.logs.container import (
     NothingWrittenError,
@@ -242,10 +242,8 @@ def log_files(path: Paths) -> list[tuple[Path, str]]:
         if not item.is_dir():
             files.append((item, item.name))
             continue
-        try:
+        with os_errors(f"{item}: cannot be read", LogError):
             inside = sorted(file for file in item.rglob("*.mcap") if file.name[0] != ".")
-        except OSError as error:
-            raise LogError(f"{item}: cannot be read: {error.strerror or error}") from error
         if not inside:
             raise LogError(f"{item}: no log in this folder")
         files += [(file, file.relative_to(item).as_posix()) for file in inside]

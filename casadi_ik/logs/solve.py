@@ -15,10 +15,9 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import LogError, UnknownNameError
 from casadi_ik.kernels.layout import Field, Layout
-from casadi_ik.logs.detect import bits_of
-from casadi_ik.logs.events import Happening, measured_jacobians
+from casadi_ik.logs.events import Happening, bits_of, measured_jacobians
 from casadi_ik.logs.reader import Log
-from casadi_ik.logs.tables import MethodRows, Table, element_name, happening, label_of
+from casadi_ik.logs.tables import MethodRows, Table, element_name, happenings, label_of
 from casadi_ik.problem.contacts import NAMES
 from casadi_ik.problem.request import NO_PREFERENCE
 from casadi_ik.problem.targets import Tolerance
@@ -230,7 +229,7 @@ def one_solve(
         raise LogError(f"solve {number} of {part.method}: its times or its seed are no numbers")
     record = next(Table("solve", (part,)).records())
     iterations = log.iterations(method=part.method, solve=number).part
-    events = log.events(method=part.method, solve=number)
+    events = log.events(method=part.method, solve=number).part
     sources = log.sources.sources
     source = sources[0 if part.shard is None else int(part.shard[0])]
     more = {name: row[f"target_{name}"] for name in NAMES if f"target_{name}" in part.names}
@@ -252,7 +251,7 @@ def one_solve(
         layout=_layout(iterations),
         labels=iterations.labels,
         rows=iterations.rows,
-        events=tuple(map(happening, events.records())),
+        events=tuple(happenings(events)),
         parameters=source.metadata["parameters"],
         asked=_asked(part),
         shard=source.file if len(sources) > 1 else "",

@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.errors import LogError, MissingExtraError, UnknownNameError
+from casadi_ik.errors import LogError, MissingExtraError, UnknownNameError, os_errors
 from casadi_ik.kernels.layout import opaque
-from casadi_ik.logs.detect import as_matrix, bits_of
-from casadi_ik.logs.events import MOVES, SINGULAR, EventKind, Happening
+from casadi_ik.logs.events import MOVES, SINGULAR, EventKind, Happening, as_matrix, bits_of
 
 if TYPE_CHECKING:
     import polars as pl
@@ -198,10 +197,8 @@ class Table:
             LogError: It cannot be written.
         """
         frame = self.frame()
-        try:
+        with os_errors(f"{path}: cannot be written", LogError):
             frame.write_parquet(Path(path))
-        except OSError as error:
-            raise LogError(f"{path}: cannot be written: {error.strerror or error}") from error
 
     def records(self) -> Iterator[dict[str, Any]]:
         """The rows one by one, for people: codes and masks as names.
@@ -214,7 +211,9 @@ class Table:
             if (origins := part.origins) is not None:
                 columns["shard"] = origins
             if self.kind == "event":
-                columns["subject"], columns["unit"] = _subjects(part), _units(part)
+                found = happenings(part)
+                columns["subject"] = [event.subject for event in found]
+                columns["unit"] = [event.unit for event in found]
             for values in zip(*columns.values(), strict=True):
                 yield {"method": part.method, **dict(zip(columns, values, strict=True))}
 
@@ -223,19 +222,41 @@ class Table:
         return ("solve_id",) if self.kind == "solve" else ("solve_id", "iteration")
 
 
-def happening(record: Mapping[str, Any]) -> Happening:
-    """An event as `Table.records` gives it."""
-    singular = record["kind"] in [kind.name for kind in SINGULAR]
-    return Happening(
-        iteration=record["iteration"],
-        kind=record["kind"],
-        jacobian=record["subject"] if singular else "",
-        joints=tuple(record["joint_mask"]),
-        phase=record["phase"] if isinstance(record["phase"], str) else "",
-        value=record["value"],
-        threshold=record["threshold"],
-        unit=record["unit"],
-    )
+def happenings(part: MethodRows) -> list[Happening]:
+    """The rows of events, one by one, as people have them."""
+    bits = bits_of(as_matrix(part.rows["joint_mask"]))
+    names = ("kind", "jacobian", "joint_mask", "phase", "value", "threshold")
+    columns = part.iteration.tolist(), np.argmax(bits, axis=1).tolist(), *map(part.readable, names)
+    phases, units = part.labels.get("phase", ()), part.labels.get("joint_unit", ())
+    moves, singular = ([kind.name for kind in kinds] for kinds in (MOVES, SINGULAR))
+    found = []
+    for iteration, first, kind, jacobian, joints, phase, value, threshold in zip(
+        *columns, strict=True
+    ):
+        known = EventKind.__members__.get(kind)
+        subject = ("{joints}" if known is None else known.subject).format(
+            joints=", ".join(joints),
+            jacobian=jacobian,
+            phase=phase if phase or phases else "whole solve",
+            before=_label_of_float(phases, threshold),
+            after=_label_of_float(phases, value),
+            threshold=f"{threshold:.0f}",
+            value=f"{value:.0f}",
+        )
+        found.append(
+            Happening(
+                iteration,
+                kind,
+                jacobian if kind in singular else "",
+                joints,
+                phase if isinstance(phase, str) else "",
+                value,
+                threshold,
+                units[first] if kind in moves and first < len(units) else "",
+                subject,
+            )
+        )
+    return found
 
 
 def element_name(labels: Sequence[str], index: int) -> str:
@@ -266,42 +287,10 @@ def _columns(part: MethodRows, keys: Sequence[str]) -> dict[str, Any]:
     if (origins := part.origins) is not None:
         columns["shard"] = origins
     if "joint_mask" in part.names:
-        columns["joints"] = [", ".join(names) for names in part.readable("joint_mask")]
-        columns["subject"] = _subjects(part)
+        found = happenings(part)
+        columns["joints"] = [", ".join(event.joints) for event in found]
+        columns["subject"] = [event.subject for event in found]
     return columns
-
-
-def _subjects(part: MethodRows) -> list[str]:
-    """What each event is about: the Jacobian, the joints, the phases."""
-    phases = part.labels.get("phase", ())
-    joints, jacobian = part.readable("joint_mask"), part.readable("jacobian")
-    subjects = []
-    for i, kind in enumerate(part.readable("kind")):
-        known = EventKind.__members__.get(kind)
-        subject = "{joints}" if known is None else known.subject
-        if subject == "{joints}":
-            subjects.append(", ".join(joints[i]))
-            continue
-        before, after = part.rows["threshold"][i], part.rows["value"][i]
-        phase = int(part.rows["phase"][i])
-        subjects.append(
-            subject.format(
-                jacobian=jacobian[i],
-                phase=label_of(phases, phase) if phase or phases else "whole solve",
-                before=_label_of_float(phases, before),
-                after=_label_of_float(phases, after),
-                threshold=f"{before:.0f}",
-                value=f"{after:.0f}",
-            )
-        )
-    return subjects
-
-
-def _units(part: MethodRows) -> list[str]:
-    """What the numbers of each event are measured in, as far as they are of actuators."""
-    units, bits = part.labels.get("joint_unit", ()), bits_of(as_matrix(part.rows["joint_mask"]))
-    first = np.where(np.isin(part.rows["kind"], MOVES), np.argmax(bits, axis=1), len(units))
-    return [units[i] if i < len(units) else "" for i in first.tolist()]
 
 
 def _label_of_float(labels: Sequence[str], code: float) -> str:

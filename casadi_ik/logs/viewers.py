@@ -30,11 +30,11 @@ from scipy.spatial.transform import Rotation
 from casadi_ik import palette
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.errors import LogError, MissingExtraError
+from casadi_ik.errors import LogError, MissingExtraError, os_errors
 from casadi_ik.files.shipped import models_folder
 from casadi_ik.files.writing import written_whole
 from casadi_ik.logs.cdr import ros_channel, write_postures
-from casadi_ik.logs.chunks import CDR_HEADER
+from casadi_ik.logs.container import CDR_HEADER
 from casadi_ik.logs.events import SERIOUS, errors_text, told
 from casadi_ik.logs.format import schema_name, schema_text
 from casadi_ik.logs.solve import OneSolve
@@ -72,15 +72,12 @@ def write_view(path: str | os.PathLike[str], solve: OneSolve, robot: ArmHand) ->
         raise LogError(
             f"solve {solve.solve_id + 1} of {solve.method}: the log kept no iterations of it"
         )
-    try:
-        with written_whole(Path(path)) as part, part.open("xb") as stream:
-            writer = Writer(stream)
-            writer.start(profile="ros2", library="casadi_ik")
-            _View(writer, solve, robot).write()
-            writer.finish()
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise LogError(f"{path}: cannot write the viewer file: {reason}") from error
+    refused = os_errors(f"{path}: cannot write the viewer file", LogError)
+    with refused, written_whole(Path(path)) as part, part.open("xb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2", library="casadi_ik")
+        _View(writer, solve, robot).write()
+        writer.finish()
 
 
 class _View:
@@ -256,12 +253,9 @@ def write_layout(path: str | os.PathLike[str], layout: dict[str, Any]) -> None:
     Raises:
         LogError: It cannot be written.
     """
-    try:
-        with written_whole(Path(path)) as part:
-            part.write_text(json.dumps(layout, indent=2) + "\n", encoding="utf-8")
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise LogError(f"{path}: cannot write the layout: {reason}") from error
+    refused = os_errors(f"{path}: cannot write the layout", LogError)
+    with refused, written_whole(Path(path)) as part:
+        part.write_text(json.dumps(layout, indent=2) + "\n", encoding="utf-8")
 
 
 def _lines(solve: OneSolve, name: str) -> list[tuple[str, str]]:

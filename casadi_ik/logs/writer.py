@@ -29,10 +29,18 @@ from numpy.typing import NDArray
 from casadi_ik.answers.recorder import Recorder, SolveBlock
 from casadi_ik.errors import InputError, LogError
 from casadi_ik.files.in_background import InBackground
-from casadi_ik.logs.chunks import COMPRESSORS, MESSAGE, Run, check_size, fill, packed_chunk
-from casadi_ik.logs.container import add_chunk, beginning, ending
-from casadi_ik.logs.detect import detect_events
-from casadi_ik.logs.events import SINGULAR, EventKind, EventRules, event_format
+from casadi_ik.logs.container import (
+    COMPRESSORS,
+    MESSAGE,
+    Run,
+    add_chunk,
+    beginning,
+    check_size,
+    ending,
+    fill,
+    packed_chunk,
+)
+from casadi_ik.logs.events import SINGULAR, EventKind, EventRules, detect_events, event_format
 from casadi_ik.logs.format import (
     KINDS,
     METADATA_NAME,

@@ -20,8 +20,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, PictureError
 from casadi_ik.files.writing import written_whole
 from casadi_ik.logs import Table
-from casadi_ik.logs.detect import bits_of
-from casadi_ik.logs.events import EVENT_COLORS
+from casadi_ik.logs.events import EVENT_COLORS, bits_of
 from casadi_ik.problem.targets import Tolerance
 
 DPI = 160

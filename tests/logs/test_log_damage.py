@@ -30,8 +30,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from casadi_ik import errors, logs
-from casadi_ik.logs.chunks import RECORD, RECORD_LIMIT, unpack
-from casadi_ik.logs.container import read_chunk, read_contents
+from casadi_ik.logs.container import RECORD, RECORD_LIMIT, read_chunk, read_contents, unpack
 from casadi_ik.logs.format import METADATA_NAME, signed
 from casadi_ik.logs.writer import CHUNK_SIZE
 

@@ -24,7 +24,7 @@ from casadi_ik import errors, logs
 from casadi_ik.answers.recorder import SolveBlock
 from casadi_ik.kernels.layout import STORAGE, Field, Layout
 from casadi_ik.logs import format as schema
-from casadi_ik.logs.chunks import CDR_HEADER
+from casadi_ik.logs.container import CDR_HEADER
 from casadi_ik.logs.format import KINDS, topic
 from casadi_ik.logs.rows import solve_format
 from casadi_ik.logs.writer import CHUNK_SIZE

@@ -333,7 +333,7 @@ LIMIT = 3 * 2**21
 @pytest.fixture
 def small_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Readers and writers that take little."""
-    monkeypatch.setattr("casadi_ik.logs.chunks.RECORD_LIMIT", LIMIT)
+    monkeypatch.setattr("casadi_ik.logs.container.RECORD_LIMIT", LIMIT)
 
 
 @pytest.mark.usefixtures("small_limit")
