@@ -27,7 +27,7 @@ from pathlib import Path
 from bench_parts import ABROAD, CASES, Case
 from rich.console import Console
 from runner.parts import code_version
-from runner.report import command, markdown_table, program, provenance, write_page
+from runner.report import command, markdown_table, program, publish
 
 from casadi_ik.errors import InputError
 
@@ -164,8 +164,9 @@ def main(arguments: list[str] | None = None) -> None:
         load = ", ".join(f"{value:.1f}" for value in os.getloadavg())
         parts = [INTRODUCTION.format(turns=options.turns, load=load)]
         parts += [AGAINST.format(path=options.against)] if options.against else []
-        parts += [markdown_table(heads, rows), f"`{command(__file__, arguments)}`"]
-        write_page("Timings", [*parts, provenance({"bench": code_version()})], options.report)
+        parts += [markdown_table(heads, rows)]
+        run_by = command(__file__, arguments)
+        publish("Timings", parts, options.report, run_by, {"bench": code_version()})
 
 
 if __name__ == "__main__":

@@ -39,10 +39,8 @@ from runner.report import (
     markdown_table,
     mean_metric,
     program,
-    provenance,
+    publish,
     rate_metric,
-    write_metrics,
-    write_page,
 )
 from samplers import grasps_of
 
@@ -319,10 +317,8 @@ def main(arguments: list[str] | None = None) -> None:
     peers = peer_rows(kinds["mink"])
     body += ["## Others", PEERS]
     body += [markdown_table(heads, peers) if peers else "Not run (extra `peers`)."]
-    body += ["## Where this comes from", f"`{command(__file__, arguments)}`"]
-    body += [provenance({"collision": codes or None})]
-    write_page("Free of collision", body, options.report)
-    write_metrics(metrics, options.report / "metrics.json")
+    run_by, code = command(__file__, arguments), {"collision": codes or None}
+    publish("Free of collision", body, options.report, run_by, code, metrics)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from impossible_targets import classes_of, impossible, moved
 from runner.parts import code_version
-from runner.report import command, markdown_table, program, provenance, write_page
+from runner.report import command, markdown_table, program, publish
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
@@ -223,8 +223,8 @@ def main(arguments: list[str] | None = None) -> None:
         parts += [title, AGREEMENT, markdown_table(heads, rows)]
     if options.keep:
         np.savez(options.keep, allow_pickle=False, **kept)
-    parts += [f"`{command(__file__, arguments)}`", provenance({"diagnosis": code_version()})]
-    write_page("The verdict on what cannot be solved", parts, options.report)
+    run_by, code = command(__file__, arguments), {"diagnosis": code_version()}
+    publish("The verdict on what cannot be solved", parts, options.report, run_by, code)
     print((options.report / "report.md").read_text(encoding="utf-8"))
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-from runner.report import command, markdown_table, program, write_page
+from runner.report import command, markdown_table, program, publish
 from samplers import random_arm_targets, random_hands
 
 import casadi_ik as ik
@@ -182,13 +182,13 @@ def main(arguments: list[str] | None = None) -> None:
         ik.Solver(ar10, "hand-first"),
     )
     parts = [section(solver, options.count, options.seed, options.factors) for solver in solvers]
-    text = f"""
-`{command(__file__, arguments)}`: half of the
-targets are shipped grasps on random arms, half are random hands on random arms, all reachable; one
-start from `robot.home`, within limits. A row is a threshold, the rule in bold, and the share of the
-solves that failed and of those that were solved in which the event happened at all.
+    text = """
+Half of the targets are shipped grasps on random arms, half are random hands on random arms, all
+reachable; one start from `robot.home`, within limits. A row is a threshold, the rule in bold, and
+the share of the solves that failed and of those that were solved in which the event happened at all.
 """
-    write_page("What the thresholds of events catch", [text, *parts], options.report)
+    run_by = command(__file__, arguments)
+    publish("What the thresholds of events catch", [text, *parts], options.report, run_by)
 
 
 if __name__ == "__main__":

@@ -41,10 +41,8 @@ from runner.report import (
     interval_text,
     markdown_table,
     program,
-    provenance,
+    publish,
     rate_metric,
-    write_metrics,
-    write_page,
 )
 from samplers import SAMPLERS, finger_sets, noisy, random_hands, suits
 
@@ -554,9 +552,8 @@ def write_report(options: argparse.Namespace, run_by: str) -> None:
         ]
         pl.DataFrame(every).write_csv(options.report / "misses.csv")
     code = ", ".join(sorted({codes, others} - {""})) or None
-    body += ["## Where this comes from", f"`{run_by}`", provenance({"misses": code})]
-    write_page("Reachable targets that hand-first misses", body, options.report)
-    write_metrics(metrics, options.report / "metrics.json")
+    title_ = "Reachable targets that hand-first misses"
+    publish(title_, body, options.report, run_by, {"misses": code}, metrics)
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -25,10 +25,8 @@ from runner.report import (
     mean_metric,
     median_metric,
     program,
-    provenance,
+    publish,
     rate_metric,
-    write_metrics,
-    write_page,
 )
 from samplers import grasps_of, palm_slopes, smooth_path
 
@@ -373,11 +371,9 @@ def main(arguments: list[str] | None = None) -> None:
         *("## Limits", LEAPING.format(leaps=LEAPS, wait=WAIT), limits),
         *("## Solved anew", ANEW.format(every=EVERY), anew, "## Known paths", known),
         *("## Paths that are lost", LOST, markdown_table(heads, lost)),
-        f"`{command(__file__, arguments)}`",
-        provenance({"moving": ", ".join(sorted(codes))}),
     ]
-    write_page("Moving targets", parts, options.report)
-    write_metrics(metrics, options.report / "metrics.json")
+    run_by, code = command(__file__, arguments), {"moving": ", ".join(sorted(codes))}
+    publish("Moving targets", parts, options.report, run_by, code, metrics)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from runner.report import markdown_table, write_page
+from runner.report import command, markdown_table, publish
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
@@ -128,7 +128,8 @@ def main(arguments: list[str] | None = None) -> None:
     tables.append(markdown_table(heads, jumps))
     introduction = INTRODUCTION.format(step=1e3 * options.step)
     parts = [introduction, f"Seed {options.seed}.", "## Paths", tables[0], "## Anywhere", tables[1]]
-    write_page("From q0 to the nearest solution", parts, options.report)
+    run_by = command(__file__, arguments)
+    publish("From q0 to the nearest solution", parts, options.report, run_by)
 
 
 if __name__ == "__main__":

@@ -33,10 +33,8 @@ from runner.report import (
     markdown_table,
     median_metric,
     program,
-    provenance,
+    publish,
     rate_metric,
-    write_metrics,
-    write_page,
 )
 from samplers import corners, near_limits, random_hands, singular_arms
 
@@ -236,12 +234,9 @@ def write_report(options: argparse.Namespace, run_by: str) -> None:
         *([markdown_table(["robot", "targets", "q"], shown)] if shown else []),
         "## Impossible targets",
         markdown_table([*heads, "not proved: hand", "not proved: arm"], table),
-        "## Where this comes from",
-        f"`{run_by}`",
-        provenance({"proofs": codes or None}),
     ]
-    write_page("Proofs of impossibility", body, options.report)
-    write_metrics(metrics, options.report / "metrics.json")
+    code = {"proofs": codes or None}
+    publish("Proofs of impossibility", body, options.report, run_by, code, metrics)
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from runner.parts import code_version
-from runner.report import command, markdown_table, program, provenance, write_page
+from runner.report import command, markdown_table, program, publish
 
 import casadi_ik as ik
 
@@ -133,9 +133,9 @@ def main(arguments: list[str] | None = None) -> None:
             rows += how_often(name, (double, single), options.count)
     heads = ["robot", "tolerance", "start", "double", "single", "lost", "gained", "false"]
     text = INTRODUCTION.format(count=options.count, away=AWAY)
-    parts = [text, markdown_table(heads, rows), f"`{command(__file__, arguments)}`"]
-    code = provenance({"single_precision": code_version()})
-    write_page("A solver in single precision", [*parts, code], options.report)
+    parts, run_by = [text, markdown_table(heads, rows)], command(__file__, arguments)
+    code = {"single_precision": code_version()}
+    publish("A solver in single precision", parts, options.report, run_by, code)
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from runner.report import markdown_table, write_page
+from runner.report import command, markdown_table, publish
 from samplers import smooth_path
 
 import casadi_ik as ik
@@ -283,7 +283,8 @@ def main(arguments: list[str] | None = None) -> None:
     heads += ["palm off, median [mm]", "roughness", "path's own", "time [us]", "p99 [us]"]
     peer = beside(options.peer_paths, options.count, PERIOD, SHARE)
     parts = [INTRODUCTION, markdown_table(heads, rows), "## Beside dex-retargeting", *peer]
-    write_page("Fingertip positions as targets", parts, options.report)
+    run_by = command(__file__, arguments)
+    publish("Fingertip positions as targets", parts, options.report, run_by)
 
 
 if __name__ == "__main__":

@@ -138,6 +138,30 @@ def write_page(title: str, parts: Sequence[str], folder: Path) -> None:
     (folder / "report.html").write_text(page, encoding="utf-8")
 
 
+def publish(
+    title: str,
+    parts: Sequence[str],
+    folder: Path,
+    run_by: str,
+    code: Mapping[str, str | None] | None = None,
+    metrics: Iterable[Metric] = (),
+) -> None:
+    """Write a page that ends with where it comes from, and its figures as `metrics.json`.
+
+    Args:
+        title: Title of the page.
+        parts: Markdown, one block after the other.
+        folder: Where it goes.
+        run_by: The command (`command`).
+        code: See `provenance`.
+        metrics: Figures; without any there is no file of them.
+    """
+    end = ["## Where this comes from", f"`{run_by}`", provenance(code or {})]
+    write_page(title, [*parts, *end], folder)
+    if figures := list(metrics):
+        write_metrics(figures, folder / "metrics.json")
+
+
 PACKAGES = ("casadi-ik", "casadi", "numpy", "polars", "joblib", "dask")
 
 
