@@ -185,7 +185,7 @@ def main(arguments: list[str] | None = None) -> None:
     text = """
 Half of the targets are shipped grasps on random arms, half are random hands on random arms, all
 reachable; one start from `robot.home`, within limits. A row is a threshold, the rule in bold, and
-the share of the solves that failed and of those that were solved in which the event happened at all.
+the share of the failed and of the solved ones in which the event happened at all.
 """
     run_by = command(__file__, arguments)
     publish("What the thresholds of events catch", [text, *parts], options.report, run_by)
