@@ -35,27 +35,6 @@ MANIFEST = "batch.json"
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What is asked of all parts alike, as `Solver.solve_blocks` takes it.
-
-    Attributes:
-        q0: Start (n,); None: home.
-        seed: Of all random numbers.
-        diagnose: Whether to find out why what is not solved is not.
-        fixed: Actuators that are not to move.
-        prefer: Which of several solutions.
-        log: Whether every iteration is logged.
-    """
-
-    q0: list[float] | None = None
-    seed: int = 0
-    diagnose: bool = False
-    fixed: dict[str, float] | None = None
-    prefer: str | None = None
-    log: bool = False
-
-
-@dataclass(frozen=True)
 class SolvedPart:
     """A part, solved; bytes, so that a worker needs no folder in common with who asked.
 
@@ -74,26 +53,22 @@ class SolvedPart:
     faults: dict[int, str]
 
 
-def solve_part(solver: bytes, asked: Asked, part: Part, place: str | None = None) -> SolvedPart:
+def solve_part(
+    solver: bytes, asked: Mapping[str, Any], part: Part, logged: bool, place: str | None = None
+) -> SolvedPart:
     """Solve a part.
 
     Args:
         solver: A pickled `Solver`; what it is made to is kept for the next part.
-        asked: How.
+        asked: What is asked of all parts alike, as `Solver.solve_blocks` takes it.
         part: Its targets.
+        logged: Whether every iteration is logged.
         place: Folder for what is there meanwhile; None: that of the system.
     """
     with tempfile.TemporaryDirectory(prefix="casadi_ik-part-", dir=place) as folder:
-        path = Path(folder) / "part.mcap" if asked.log else None
+        path = Path(folder) / "part.mcap" if logged else None
         (block,) = _solver(solver).solve_blocks(
-            [part.arrays],
-            asked.q0,
-            asked.seed,
-            log=path,
-            diagnose=asked.diagnose,
-            fixed=asked.fixed,
-            prefer=asked.prefer,
-            first_row=part.first_row,
+            [part.arrays], log=path, first_row=part.first_row, **asked
         )
         log = None if path is None else path.read_bytes()
     answers = io.BytesIO()
@@ -236,7 +211,7 @@ def _brief(value: Any) -> str:
 def solve_parts(
     solver: Solver,
     source: Source,
-    asked: Asked,
+    asked: Mapping[str, Any],
     folder: BatchFolder,
     jobs: int = 1,
     dask: str | None = None,
@@ -247,8 +222,8 @@ def solve_parts(
     Args:
         solver: The solver; it travels to the workers.
         source: The targets.
-        asked: What is asked of all parts alike.
-        folder: Where parts are and go; claimed already.
+        asked: What is asked of all parts alike, as `Solver.solve_blocks` takes it.
+        folder: Where parts are and go, with their logs if it has a place for them; claimed already.
         jobs: Processes on this machine.
         dask: Address of a Dask scheduler whose workers solve instead. A worker that dies costs
             what it was solving, which others do again.
@@ -278,8 +253,8 @@ def solve_parts(
         parts = source.without(done)
         if object_pose is not None:
             parts = (replace(part, arrays=moved(part.arrays, object_pose)) for part in parts)
-        place = own if dask is None else None
-        calls = (joblib.delayed(solve_part)(pickled, asked, part, place) for part in parts)
+        how = folder.logs is not None, own if dask is None else None
+        calls = (joblib.delayed(solve_part)(pickled, asked, part, *how) for part in parts)
         solved = iter(parallel(calls))
         while True:
             try:

@@ -22,7 +22,7 @@ from casadi_ik.answers.report import ROWS_SHOWN, Totals, files
 from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.batches.backend import check_installed
-from casadi_ik.batches.parts import Asked, BatchFolder, code_version, columns, solve_parts
+from casadi_ik.batches.parts import BatchFolder, code_version, columns, solve_parts
 from casadi_ik.batches.targets import Source, TargetFile, polars_module, source_of
 from casadi_ik.cli import options as opt
 from casadi_ik.cli.inputs import (
@@ -135,14 +135,13 @@ def batch(said: Said) -> Answer:
     in_parts = in_parts or file.is_dir() or not file.suffix
     in_parts = in_parts or path.is_dir() or path.suffix.lower() == ".parquet"
     robot = the_robot(said.robot)
-    asked = Asked(
-        the_start(said, robot),
-        said.seed,
-        said.diagnose,
-        the_fixed(said, robot),
-        said.prefer,
-        said.log is not None,
-    )
+    asked = {
+        "q0": the_start(said, robot),
+        "seed": said.seed,
+        "diagnose": said.diagnose,
+        "fixed": the_fixed(said, robot),
+        "prefer": said.prefer,
+    }
     totals, faults = Totals(), _Faults(path)
     solver = (_solve_parts if in_parts else _solve_blocks)(said, path, robot, asked, totals, faults)
     faults.tell(totals.count)
@@ -172,7 +171,12 @@ class _Faults:
 
 
 def _solve_blocks(
-    said: Said, path: Path, robot: ArmHand, asked: Asked, totals: Totals, faults: _Faults
+    said: Said,
+    path: Path,
+    robot: ArmHand,
+    asked: Mapping[str, Any],
+    totals: Totals,
+    faults: _Faults,
 ) -> Solver:
     """Solve an npz in this process.
 
@@ -185,16 +189,8 @@ def _solve_blocks(
     check_outputs({"--log": said.log, "--out": said.out}, inputs=[path])
     pose, solver, pace = the_object_pose(said), the_solver(said, robot), _Pace(said.jobs)
     given = targets.blocks(pace.begin)
-    blocks = solver.solve_blocks(
-        given if pose is None else (moved(block, pose) for block in given),
-        asked.q0,
-        asked.seed,
-        said.jobs,
-        said.log,
-        asked.diagnose,
-        asked.fixed,
-        asked.prefer,
-    )
+    given = given if pose is None else (moved(block, pose) for block in given)
+    blocks = solver.solve_blocks(given, jobs=said.jobs, log=said.log, **asked)
     show_progress = progress(count, say=partial(say, "progress"))
     with _growing_file(said.out, robot) as answers, closing(blocks), show_progress as show:
         try:
@@ -237,7 +233,12 @@ class _Pace:
 
 
 def _solve_parts(
-    said: Said, path: Path, robot: ArmHand, asked: Asked, totals: Totals, faults: _Faults
+    said: Said,
+    path: Path,
+    robot: ArmHand,
+    asked: Mapping[str, Any],
+    totals: Totals,
+    faults: _Faults,
 ) -> Solver:
     """Solve targets part by part.
 
@@ -291,7 +292,9 @@ def _answers(folder: BatchFolder, source: Source, number: int) -> dict[str, Any]
     return folder.answers(number, source.first_rows[number], source.sizes[number])
 
 
-def _question(said: Said, solver: Solver, source: Source, asked: Asked) -> dict[str, Any]:
+def _question(
+    said: Said, solver: Solver, source: Source, asked: Mapping[str, Any]
+) -> dict[str, Any]:
     """Everything that decides the answers, so that no part of another batch is taken for ours."""
     scene = None
     if said.scene is not None:
@@ -305,11 +308,7 @@ def _question(said: Said, solver: Solver, source: Source, asked: Asked) -> dict[
         "solver": plain(solver.parameters),
         "scene": scene,
         "object_pose": plain(the_object_pose(said)),
-        "q0": asked.q0,
-        "seed": asked.seed,
-        "diagnose": asked.diagnose,
-        "fixed": asked.fixed,
-        "prefer": asked.prefer,
+        **asked,
         "log": None if said.log is None else str(said.log),
     }
 
