@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Generator, Iterable, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping
 from os import PathLike
 from typing import Any, Self
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from casadi_ik.answers.recorder import Recorder
-from casadi_ik.answers.solution import Alternative, BatchSolution, Ranking, Solution
+from casadi_ik.answers.solution import Alternative, BatchSolution, Solution
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.collision.scene import Scene, grasped_in
 from casadi_ik.errors import InputError
@@ -26,14 +26,13 @@ from casadi_ik.problem.request import Request, hand_postures, one_palm, toleranc
 from casadi_ik.problem.targets import LIMITS, TargetBatch, Tolerance
 from casadi_ik.registry import METHODS, build_method, with_finger_step
 from casadi_ik.solving.alternatives.finder import APART
-from casadi_ik.solving.choose import Judgement, choose
+from casadi_ik.solving.choose import choose
 from casadi_ik.solving.engine import Engine, Run
 from casadi_ik.solving.fast import FastSolver
 from casadi_ik.solving.free_object import solve_with_object
 from casadi_ik.solving.sensitivity import Sensitivity
 from casadi_ik.solving.stream import SolvedBlock, Stream
-from casadi_ik.touch.grasps import FoundGrasps, grasps_of
-from casadi_ik.touch.surface import Surface
+from casadi_ik.touch.grasps import grasps_of
 
 
 class Solver(MovingSolver):
@@ -426,66 +425,8 @@ class Solver(MovingSolver):
         targets = self._request.of_palms(poses, hands, fixed, preferred)
         return self._engine.solve(targets, Run(q0, seed, jobs, None, diagnose, shown=True))
 
-    def choose(
-        self,
-        grasps: Sequence[Grasp],
-        object_pose: ArrayLike | None = None,
-        q0: ArrayLike | None = None,
-        limit: int = 10,
-        prefer: Judgement | None = None,
-        seed: int = 0,
-        fixed: Mapping[str, float] | None = None,
-        apart: float = APART,
-        per_candidate: int | None = 1,
-    ) -> Ranking:
-        """Of many grasps find those that are best to take, and how.
-
-        Of every candidate the different hands that meet its contacts are looked at, with every
-        branch of the arm all around its swivel; free of collision where the solver has a scene.
-        Which candidates have an answer depends neither on `q0` nor on `prefer`: they order.
-
-        Args:
-            grasps: The candidates.
-            object_pose: (4, 4) where the object is in the base frame; candidates that do not say
-                where theirs is are in its frame. None: they are in the base frame.
-            q0: (n,) where the robot is [rad or m]; None is `robot.home`.
-            limit: How many answers at most.
-            prefer: What comes first: "q0", "limits", "manipulability", "clearance" as for `solve`,
-                or a function of the robot and configurations (m, n) that gives their scores (m,),
-                higher is better, -inf for never. None: "q0" if q0 is given, else "limits". What is
-                given (a palm's hand, `fixed`) is no part of "limits".
-            seed: As for `solve`.
-            fixed: As for `solve`.
-            apart: How different answers are, of one candidate or several: of any two at least one
-                actuator differs by this part of its range, 0 to 1. 0: all that are not the same.
-            per_candidate: How many answers of one candidate at most; None: any number.
-
-        Returns:
-            The answers, best first, and why candidates have none.
-
-        Raises:
-            InputError: No candidates, no rigid object_pose, bad q0, limit, preference or distance,
-                or a grasp the robot cannot take.
-            UnsupportedError: The method is not hand-first.
-
-        Example:
-            >>> ranked = solver.choose([grasp, ik.load_grasp("apple")], prefer="limits")
-            >>> len(ranked), ranked.answered, ranked[0].score >= ranked[1].score
-            (2, 2, True)
-        """
-        return choose(
-            self._engine,
-            self._request,
-            grasps,
-            object_pose,
-            q0,
-            limit,
-            prefer,
-            seed,
-            fixed,
-            apart,
-            per_candidate,
-        )
+    choose = choose
+    grasps_of = grasps_of
 
     def sensitivity(
         self,
@@ -536,57 +477,6 @@ class Solver(MovingSolver):
         found = kernel(targets.rows(rows), every[rows], np.tile(np.eye(n), (k, 1)))
         f = len(self.robot.fingers)
         return Sensitivity(found.points.reshape(k, n, f, 3), found.normals.reshape(k, n, f, 3))
-
-    def grasps_of(
-        self,
-        surface: Surface,
-        pose: ArrayLike | None = None,
-        fingers: int = 3,
-        mu: float = 0.5,
-        hold: tuple[float, float] | None = None,
-        limit: int = 200,
-        jobs: int = 1,
-        seed: int = 0,
-        prefer: Judgement = "load",
-        q0: ArrayLike | None = None,
-    ) -> FoundGrasps:
-        """Find grasps of an object that the arm and the hand can make, free of collision.
-
-        Two opposing fingertips are matched with two opposing patches of the surface, the others
-        look for something to touch, palm and hand are moved until all touch within 1 mm and 15 deg,
-        the arm follows, and what remains is judged in the scene and ranked.
-
-        Args:
-            surface: From `load_surface`.
-            pose: (4, 4) of the object in the base frame; None: the identity.
-            fingers: How many fingertips touch, the thumb among them; of a hand with fewer, all.
-            mu: Friction coefficient between fingertips and object.
-            hold: Mass [kg], and the squeeze [N] with which it has to be held in each of six
-                directions; None: it is enough that the grasp is force-closed.
-            limit: How many distinct grasps at most.
-            jobs: Threads; the answer does not depend on them.
-            seed: Of all random numbers.
-            prefer: What comes first: "load", "clearance", "limits", "q0", or a function of the
-                robot and configurations (m, n) that gives scores (m,), higher is better.
-            q0: (n,) where the robot is [rad or m]; None is `robot.home`.
-
-        Returns:
-            The grasps, best first, with how many candidates passed each stage.
-
-        Raises:
-            InputError: Bad numbers, or no rigid pose.
-            UnsupportedError: The hand has one finger, robot or hand have no shapes, the robot has
-                several palms, or the method cannot solve palms.
-
-        Example:
-            >>> pose = np.eye(4)
-            >>> pose[:3, 3] = [0.55, 0.1, 0.2]
-            >>> gripper = ik.Solver(ik.load_robot("panda+panda_hand"))
-            >>> found = gripper.grasps_of(ik.load_surface("tomato_soup_can"), pose, limit=5)
-            >>> len(found), bool(found[0].load >= found[4].load)
-            (5, True)
-        """
-        return grasps_of(self, surface, pose, fingers, mu, hold, limit, jobs, seed, prefer, q0)
 
     def moved(self, name: str, pose: ArrayLike) -> Self:
         """The same solver with something in its scene elsewhere, in less than a millisecond.

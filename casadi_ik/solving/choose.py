@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum, auto
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -121,8 +121,7 @@ class Answers:
 
 
 def choose(
-    engine: Engine,
-    request: Request,
+    solver: Any,
     grasps: Sequence[Grasp],
     object_pose: ArrayLike | None = None,
     q0: ArrayLike | None = None,
@@ -133,64 +132,74 @@ def choose(
     apart: float = APART,
     per_candidate: int | None = 1,
 ) -> Ranking:
-    """Rank answers to many grasps, see `Solver.choose`.
+    """Of many grasps find those that are best to take, and how.
+
+    Of every candidate the different hands that meet its contacts are looked at, with every
+    branch of the arm all around its swivel; free of collision where the solver has a scene.
+    Which candidates have an answer depends neither on `q0` nor on `prefer`: they order.
+
+    Args:
+        solver: A `Solver`.
+        grasps: The candidates.
+        object_pose: (4, 4) where the object is in the base frame; candidates that do not say
+            where theirs is are in its frame. None: they are in the base frame.
+        q0: (n,) where the robot is [rad or m]; None is `robot.home`.
+        limit: How many answers at most.
+        prefer: What comes first: "q0", "limits", "manipulability", "clearance" as for `solve`,
+            or a function of the robot and configurations (m, n) that gives their scores (m,),
+            higher is better, -inf for never. None: "q0" if q0 is given, else "limits". What is
+            given (a palm's hand, `fixed`) is no part of "limits".
+        seed: As for `solve`.
+        fixed: As for `solve`.
+        apart: How different answers are, of one candidate or several: of any two at least one
+            actuator differs by this part of its range, 0 to 1. 0: all that are not the same.
+        per_candidate: How many answers of one candidate at most; None: any number.
+
+    Returns:
+        The answers, best first, and why candidates have none.
 
     Raises:
-        InputError: See there.
+        InputError: No candidates, no rigid object_pose, bad q0, limit, preference or distance,
+            or a grasp the robot cannot take.
         UnsupportedError: The method is not hand-first.
+
+    Example:
+        >>> ranked = solver.choose([grasp, ik.load_grasp("apple")], prefer="limits")
+        >>> len(ranked), ranked.answered, ranked[0].score >= ranked[1].score
+        (2, 2, True)
     """
     begin = time.perf_counter()
+    engine: Engine = solver._engine
+    request: Request = solver._request
     limit = _count(limit, "limit")
     most = None if per_candidate is None else _count(per_candidate, "per_candidate")
     apart, start = checked_distance(apart), request.start(q0)
     word = "own" if callable(prefer) else engine.preference(prefer, q0 is not None)
     pose = None if object_pose is None else one_pose(object_pose, "object_pose")
-
-    def placed(number: int) -> Grasp:
-        grasp = grasps[number]
-        return grasp if pose is None else grasp.in_object_frame().at(pose)
-
-    asked = list(_asked(request, grasps, pose, fixed))
     wanted: Preference = _own(prefer, engine.robot) if callable(prefer) else word
-    parts: list[tuple[NDArray[np.intp], Answers]] = []
-
-    def look(candidates: NDArray[np.bool_], which: Look, near: bool = False) -> Answers:
-        """What all looks so far have come to, after one more at some candidates."""
-        for rows, some in asked:
-            left = rows[candidates[rows]]
-            if not len(left):
-                continue
-            mine = some.rows(np.searchsorted(rows, left))
-            mine = replace(mine, picked=left, prefer="q0" if near else "limits")
-            found = answers_of(
-                engine.kinds_of(mine).finder,
-                mine,
-                engine.collision_query(mine),
-                start if near else engine.robot.home,
-                start,
-                wanted,
-                limit,
-                seed,
-                which,
-            )
-            if near:
-                found = replace(found, reasons=np.full(len(left), "", dtype=object))
-            parts.append((left, found))
-        return Answers.joined(parts, len(grasps))
-
+    asked = list(_asked(request, grasps, pose, fixed))
+    search = _Search(engine, asked, start, wanted, limit, seed)
+    every = np.ones(len(grasps), dtype=bool)
     # Neither what is preferred nor where the robot is decides which candidates have an answer.
-    answers = look(np.ones(len(grasps), dtype=bool), Look.QUICK)
+    parts = list(search.look(every, Look.QUICK))
+    answers = Answers.joined(parts, len(grasps))
     if answers.answered.sum() < min(limit, len(grasps)):
-        answers = look(~answers.answered, Look.THOROUGH)
+        parts += search.look(~answers.answered, Look.THOROUGH)
+        answers = Answers.joined(parts, len(grasps))
     if q0 is not None:
-        answers = look(answers.answered, Look.OWN, near=True)
-    entries = _Ranked(engine, asked, answers, apart, placed).best(limit, most)
+        parts += search.look(answers.answered, Look.OWN)
+        answers = Answers.joined(parts, len(grasps))
+    found = search.best(answers, apart, most)
     seconds = (time.perf_counter() - begin) / len(grasps)
+    entries = []
+    for row, solution in found:
+        owner = int(answers.owner[row])
+        grasp = grasps[owner] if pose is None else grasps[owner].in_object_frame().at(pose)
+        timed = replace(solution, time=seconds)
+        entries.append(Choice(owner, timed, float(answers.score[row]), grasp))
     reasons = [reason for reason in answers.reasons.tolist() if reason]
     return Ranking(
-        entries=tuple(
-            replace(one, solution=replace(one.solution, time=seconds)) for one in entries
-        ),
+        entries=tuple(entries),
         candidates=len(grasps),
         answered=len(grasps) - len(reasons),
         failures=dict(Counter(reasons).most_common()),
@@ -270,33 +279,56 @@ def _placed(targets: TargetBatch, grasps: Sequence[Grasp], pose: Array | None) -
     )
 
 
-class _Ranked:
-    """All answers to all candidates, best first."""
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """The search for answers to all candidates.
 
-    def __init__(
-        self,
-        engine: Engine,
-        asked: Sequence[tuple[NDArray[np.intp], TargetBatch]],
-        answers: Answers,
-        apart: float,
-        placed: Callable[[int], Grasp],
-    ) -> None:
-        self.engine, self.asked, self.answers, self.apart = engine, asked, answers, apart
-        self.placed = placed
+    Attributes:
+        engine: Solves.
+        asked: Candidates that are alike, as numbers and targets.
+        start: (n,) where the robot is; with `prefer` it says which arms are better.
+        prefer: What is preferred.
+        limit: How many answers are wanted.
+        seed: Of random arms.
+    """
 
-    def best(self, limit: int, most: int | None) -> list[Choice]:
-        """The best that differ from each other, at most so many of a candidate."""
-        answers, robot = self.answers, self.engine.robot
+    engine: Engine
+    asked: Sequence[tuple[NDArray[np.intp], TargetBatch]]
+    start: Array
+    prefer: Preference
+    limit: int
+    seed: int
+
+    def look(self, candidates: Bools, look: Look) -> Iterator[tuple[NDArray[np.intp], Answers]]:
+        """Answers to some candidates (k,), part by part, with the numbers of these."""
+        near = look is Look.OWN
+        for numbers, targets in self.asked:
+            left = numbers[candidates[numbers]]
+            if not len(left):
+                continue
+            some = targets.rows(np.searchsorted(numbers, left))
+            some = replace(some, picked=left, prefer="q0" if near else "limits")
+            engine, query = self.engine.kinds_of(some), self.engine.collision_query(some)
+            begin = self.start if near else self.engine.robot.home
+            for first in range(0, len(left), PARAMETERS.together):
+                rows = np.arange(first, min(first + PARAMETERS.together, len(left)))
+                nearby = None if query is None else query.rows(rows)
+                part = _Part(self, engine.finder, some.rows(rows), nearby, begin)
+                yield left[rows], part.run(look)
+
+    def best(self, answers: Answers, apart: float, most: int | None) -> list[tuple[int, Solution]]:
+        """Rows of the best that differ from each other, at most so many of a candidate."""
+        robot, limit = self.engine.robot, self.limit
         # Of equals that whose arm is farther from its limits, then the first candidate.
         left = np.lexsort((answers.owner, -answers.margin, -answers.score))
         parts = answers.q / (robot.upper - robot.lower)
         places = np.full(len(answers.reasons), limit if most is None else most)
-        found: list[Choice] = []
+        found: list[tuple[int, Solution]] = []
 
         def others(rows: NDArray[np.intp], row: int, places: NDArray[np.intp]) -> NDArray[np.intp]:
             off = np.abs(parts[rows] - parts[row]).max(axis=1)
             vacant = places[answers.owner[rows]] > 0
-            return rows[(off >= self.apart) & (off > 0) & vacant]
+            return rows[(off >= apart) & (off > 0) & vacant]
 
         while len(left) and len(found) < limit:
             chosen, rest, free = list[int](), left, places.copy()
@@ -305,109 +337,73 @@ class _Ranked:
                 chosen.append(row)
                 free[answers.owner[row]] -= 1
                 rest = others(rest, row, free)
-            solutions = self._judged(np.array(chosen))
+            solutions = self._judged(answers, np.array(chosen))
             left = left[~np.isin(left, chosen)]
             for row in chosen:
                 if solutions[row].success:
-                    owner = int(answers.owner[row])
-                    score, grasp = float(answers.score[row]), self.placed(owner)
-                    found.append(Choice(owner, solutions[row], score, grasp))
-                    places[owner] -= 1
+                    found.append((row, solutions[row]))
+                    places[answers.owner[row]] -= 1
                     left = others(left, row, places)
         return found
 
-    def _judged(self, rows: NDArray[np.intp]) -> dict[int, Solution]:
+    def _judged(self, answers: Answers, rows: NDArray[np.intp]) -> dict[int, Solution]:
         """Answers with the verdict on them, which has the last word."""
         found: dict[int, Solution] = {}
-        owner = self.answers.owner[rows]
         for numbers, targets in self.asked:
-            mine = rows[np.isin(owner, numbers)]
+            mine = rows[np.isin(answers.owner[rows], numbers)]
             if not len(mine):
                 continue
-            some = targets.rows(np.searchsorted(numbers, self.answers.owner[mine]))
+            some = targets.rows(np.searchsorted(numbers, answers.owner[mine]))
             none = np.zeros(len(mine), dtype=np.int64)
             status = np.full(len(mine), int(Status.SOLVED), dtype=np.int64)
-            q = self.answers.q[mine]
-            outcome = Outcome(q, status, none, none, np.zeros(len(mine)), {})
+            outcome = Outcome(answers.q[mine], status, none, none, np.zeros(len(mine)), {})
             query, method = self.engine.collision_query(some), self.engine.method.name
             batch = judged(self.engine.robot, method, some, outcome, query)
             found |= {int(row): batch.solution(i) for i, row in enumerate(mine.tolist())}
         return found
 
 
-def answers_of(
-    finder: AlternativeFinder,
-    targets: TargetBatch,
-    query: CollisionQuery | None,
-    begin: Array,
-    start: Array,
-    prefer: Preference,
-    limit: int,
-    seed: int,
-    look: Look,
-) -> Answers:
-    """Answers to k candidates.
-
-    Args:
-        finder: Of the robot, for the kinds of their contacts.
-        targets: The candidates.
-        query: What answers must not touch; None: nothing is checked.
-        begin: (n,) where hands are looked for from.
-        start: (n,) where the robot is; with `prefer` it says which arms are better.
-        prefer: What is preferred.
-        limit: How many answers are wanted.
-        seed: Of random arms.
-        look: Which hands are looked at.
-    """
-    parts = []
-    for first in range(0, len(targets), PARAMETERS.together):
-        rows = np.arange(first, min(first + PARAMETERS.together, len(targets)))
-        nearby = None if query is None else query.rows(rows)
-        part = _Part(finder, targets.rows(rows), nearby, begin, start, prefer, limit)
-        parts.append((rows, part.run(seed, look)))
-    return Answers.joined(parts, len(targets))
-
-
 class _Part:
-    """Some candidates."""
+    """Some candidates that are alike.
+
+    Hands are looked for from `begin`, (n,).
+    """
 
     def __init__(
         self,
+        search: _Search,
         finder: AlternativeFinder,
         targets: TargetBatch,
         query: CollisionQuery | None,
         begin: Array,
-        start: Array,
-        prefer: Preference,
-        limit: int,
     ) -> None:
-        self.finder, self.targets, self.query = finder, targets, query
-        self.prefer, self.limit, self.trials = prefer, limit, finder.trials
-        self.begin, self.starts = (np.tile(q, (len(targets), 1)) for q in (begin, start))
+        self.search, self.finder, self.targets, self.query = search, finder, targets, query
+        self.prefer, self.trials = search.prefer, finder.trials
+        self.begin, self.starts = (np.tile(q, (len(targets), 1)) for q in (begin, search.start))
         self.limits = self.trials.limits(targets)
         fixed = np.full(len(begin), np.nan) if targets.fixed is None else targets.fixed
         # What is given has no part in what is better.
         self.columns = np.flatnonzero(np.isnan(np.atleast_2d(fixed)).any(axis=0)).tolist()
 
-    def run(self, seed: int, look: Look) -> Answers:
+    def run(self, look: Look) -> Answers:
         """Their answers."""
         method = self.trials.method
         rounds = PARAMETERS.rounds if look is Look.THOROUGH else 1
-        outcome = method.run(self.targets, self.begin, seed, False, rounds)
+        outcome = method.run(self.targets, self.begin, self.search.seed, False, rounds)
         good = self.trials.solved(self.targets, outcome.q, self.targets.enforce_limits)
         rows = np.flatnonzero(good)
         hands = outcome.q[rows], rows
         q, owner, pairs = self._answers(*(hands if look is Look.OWN else self._hands(*hands)))
         if look is Look.THOROUGH and self.query is not None:
             left = rows[~np.isin(rows, owner)]
-            more, whose = self._further(outcome.q, left, seed)
+            more, whose = self._further(outcome.q, left, self.query)
             q, owner = np.concatenate([q, more]), np.concatenate([owner, whose])
         reasons = np.array([Status(int(code)).name for code in outcome.status], dtype=object)
         # A method that is content with what the verdict refuses has come to a standstill.
         reasons[~good & (outcome.status == Status.SOLVED)] = Status.STALLED.name
         for row, pair in pairs.items():
             reasons[row] = f"{Status.COLLISION.name}: {pair[0]} and {pair[1]}"
-        reasons[owner] = ""
+        reasons[slice(None) if look is Look.OWN else owner] = ""  # those had an answer before
         return Answers(q, owner, self._score(q, owner), self.finder.arm_margins(q), reasons)
 
     def _hands(self, q: Array, rows: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
@@ -464,7 +460,7 @@ class _Part:
         """Free arms of hands, and whose hand it is; closer where the best of them are."""
         found, hand = self._preferred(q, owner, surplus, False)
         score = self._score(found, owner[hand])
-        best = np.argsort(-score, kind="stable")[: PARAMETERS.closer * self.limit]
+        best = np.argsort(-score, kind="stable")[: PARAMETERS.closer * self.search.limit]
         again = np.unique(hand[best])
         more, mine = self._preferred(q[again], owner[again], surplus[again], True)
         others = ~np.isin(hand, again)
@@ -485,15 +481,11 @@ class _Part:
         return found.q[free], found.owner[free]
 
     def _further(
-        self, q: Array, rows: NDArray[np.intp], seed: int
+        self, q: Array, rows: NDArray[np.intp], query: CollisionQuery
     ) -> tuple[Array, NDArray[np.intp]]:
         """What a single grasp would get."""
-        assert self.query is not None
-        if not len(rows):
-            return q[rows], rows
-        query = self.query.rows(rows)
-        some = self.targets.rows(rows)
-        found = free_answers(self.finder, some, query, q[rows], self.begin[rows], seed)
+        some, nearby, begin = self.targets.rows(rows), query.rows(rows), self.begin[rows]
+        found = free_answers(self.finder, some, nearby, q[rows], begin, self.search.seed)
         return found.q[found.free], rows[found.free]
 
     def _score(self, q: Array, owner: NDArray[np.intp]) -> Array:

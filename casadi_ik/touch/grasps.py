@@ -232,18 +232,46 @@ def grasps_of(
     seed: int = 0,
     prefer: Judgement = "load",
     q0: ArrayLike | None = None,
-    parameters: TouchParameters | None = None,
 ) -> FoundGrasps:
-    """Find grasps of an object, see `Solver.grasps_of`.
+    """Find grasps of an object that the arm and the hand can make, free of collision.
 
-    The solver is a `Solver`, which knows this function and is not known here.
+    Two opposing fingertips are matched with two opposing patches of the surface, the others
+    look for something to touch, palm and hand are moved until all touch within 1 mm and 15 deg,
+    the arm follows, and what remains is judged in the scene and ranked.
+
+    Args:
+        solver: A `Solver`.
+        surface: From `load_surface`.
+        pose: (4, 4) of the object in the base frame; None: the identity.
+        fingers: How many fingertips touch, the thumb among them; of a hand with fewer, all.
+        mu: Friction coefficient between fingertips and object.
+        hold: Mass [kg], and the squeeze [N] with which it has to be held in each of six
+            directions; None: it is enough that the grasp is force-closed.
+        limit: How many distinct grasps at most.
+        jobs: Threads; the answer does not depend on them.
+        seed: Of all random numbers.
+        prefer: What comes first: "load", "clearance", "limits", "q0", or a function of the
+            robot and configurations (m, n) that gives scores (m,), higher is better.
+        q0: (n,) where the robot is [rad or m]; None is `robot.home`.
+
+    Returns:
+        The grasps, best first, with how many candidates passed each stage.
 
     Raises:
-        InputError: See there.
-        UnsupportedError: The hand has one finger, or no shapes, or there are several.
+        InputError: Bad numbers, or no rigid pose.
+        UnsupportedError: The hand has one finger, robot or hand have no shapes, the robot has
+            several palms, or the method cannot solve palms.
+
+    Example:
+        >>> pose = np.eye(4)
+        >>> pose[:3, 3] = [0.55, 0.1, 0.2]
+        >>> gripper = ik.Solver(ik.load_robot("panda+panda_hand"))
+        >>> found = gripper.grasps_of(ik.load_surface("tomato_soup_can"), pose, limit=5)
+        >>> len(found), bool(found[0].load >= found[4].load)
+        (5, True)
     """
     one_palm(solver.robot, "grasps_of")
-    begin, chosen = time.process_time(), parameters or TouchParameters()
+    begin, chosen = time.process_time(), TouchParameters()
     robot = solver.robot
     place = np.eye(4) if pose is None else one_pose(pose)
     _check(fingers, mu, hold, limit, prefer)
