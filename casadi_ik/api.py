@@ -223,6 +223,7 @@ class Solver(MovingSolver):
             object_pose: (4, 4) or (k, 4, 4) where what the scene calls grasped is, base frame.
             more: (k, f, 3) by name, NaN where free: "tangents" (second axes of
                 `ArmHand.contact_frames`), "lines", "planes" (anywhere on that through the point),
+                "balls" (outward normals of the pads' balls where they touch the points),
                 "directions" (a fingertip without a point faces this way).
 
         Returns:

@@ -101,6 +101,7 @@ def batch(said: Said) -> Answer:
                this direction
       planes   (k, f, 3) a contact may be anywhere in the plane through its point
                with this normal
+      balls    (k, f, 3) outward normal of the pad's ball where it touches its point
       directions (k, f, 3) a fingertip faces this way wherever it is; it has no
                point then
     A Parquet file has a row per target: columns FINGER_x, _y, _z, _nx, _ny, _nz for

@@ -334,8 +334,9 @@ def asked_marks(contact: Contact, tip: Array, size: float = 1.0) -> list[Drawabl
         found["plane"] = ring(place, contact.plane, BEYOND, 0.0016)
     elif not np.isnan(contact.point[0]):
         found["point"] = ball(0.0036 * size, place)
-    if contact.normal is not None:
-        found["normal"] = arrow(place, contact.normal, 0.030 * size, 0.0048 * size)
+    facing = contact.ball if contact.normal is None else contact.normal
+    if facing is not None:
+        found["normal"] = arrow(place, facing, 0.030 * size, 0.0048 * size)
     if contact.tangent is not None:
         found["tangent"] = arrow(place, contact.tangent, 0.021 * size, 0.0048 * size)
     return [Drawable(name, one, palette.TARGET, role="target") for name, one in found.items()]

@@ -97,8 +97,12 @@ MORE: Mapping[str, str] = {
     "tangent": "where the contact frame's second axis must point, across the normal",
     "line": "the contact may be anywhere on the line through the point in this direction",
     "plane": "the contact may be anywhere on the plane through the point with this normal",
+    "ball": "the pad's ball touches the point where its outward normal is this one",
 }
 """What a contact may have beside point and normal, by name; arrays have an s at the end."""
+
+PLACES = ("line", "plane", "ball")
+"""Those that say where the point is touched: a contact has one at most."""
 
 ACROSS = 1e-6
 """Largest cosine between a tangent and its normal that counts as rounding."""
@@ -113,8 +117,9 @@ def fault(vectors: Mapping[str, Array]) -> str | None:
     for name in MORE:
         if name in vectors and "point" not in vectors:
             return f"{name}: found one without a point, expected both"
-    if "line" in vectors and "plane" in vectors:
-        return "line and plane: found both, expected one of them"
+    places = [name for name in PLACES if name in vectors]
+    if len(places) > 1:
+        return f"{' and '.join(places[:2])}: found both, expected one of them"
     if "tangent" not in vectors:
         return None
     if "normal" not in vectors:
@@ -140,8 +145,9 @@ def faulty(vectors: Mapping[str, Array]) -> Bools:
     for name in MORE:
         if name in given:
             bad |= given[name] & ~given["point"]
-    if "line" in given and "plane" in given:
-        bad |= given["line"] & given["plane"]
+    places = [given[name] for name in PLACES if name in given]
+    if places:
+        bad |= np.sum(places, axis=0) > 1
     if "tangent" in given:
         cosine = np.einsum("...i,...i->...", vectors["tangent"], vectors["normal"])
         bad |= given["tangent"] & ~(np.abs(cosine) <= ACROSS)
@@ -171,6 +177,9 @@ class Contact:
             fingertip is given. None leaves the turn about the normal free.
         line: (3,) direction of a line through the point on which the contact may be anywhere.
         plane: (3,) normal of a plane through the point in which the contact may be anywhere.
+        ball: (3,) outward normal, into the object, that the pad's ball has where it touches the
+            point. The pad may roll over the point unless a normal says which way it faces; where
+            the robot's description has no ball for the pad, it touches with its point.
 
     A contact with a direction alone, wherever the fingertip is, is ``Contact(direction=...)``: its
     point is NaN and its normal that direction.
@@ -192,6 +201,7 @@ class Contact:
     tangent: Array | None = None
     line: Array | None = None
     plane: Array | None = None
+    ball: Array | None = None
 
     def __init__(
         self,
@@ -202,12 +212,13 @@ class Contact:
         tangent: ArrayLike | None = None,
         line: ArrayLike | None = None,
         plane: ArrayLike | None = None,
+        ball: ArrayLike | None = None,
         direction: ArrayLike | None = None,
     ) -> None:
         if tolerance is not None and not isinstance(tolerance, Tolerance):
             raise InputError(f"tolerance: found {tolerance!r}, expected a Tolerance")
         object.__setattr__(self, "tolerance", tolerance)
-        given = {"normal": normal, "tangent": tangent, "line": line, "plane": plane}
+        given = {"normal": normal, "tangent": tangent, "line": line, "plane": plane, "ball": ball}
         if direction is not None:
             others = [
                 name for name, value in {"point": point, **given}.items() if value is not None
@@ -435,7 +446,8 @@ class Grasp:
             fingers: The robot's fingers.
 
         Returns:
-            (f, 3) by name ("tangents", "lines", "planes"), NaN where free; only what any has.
+            (f, 3) by name ("tangents", "lines", "planes", "balls"), NaN where free; only what any
+            has.
 
         Example:
             >>> grasp.more(robot.fingers)  # points and normals are all that it asks for

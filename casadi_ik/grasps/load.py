@@ -50,6 +50,7 @@ class ContactEntry(Struct, frozen=True):
         tangent: Where the second axis of the contact frame points; it needs a normal.
         line: Direction of a line through the point on which the fingertip may be anywhere.
         plane: Normal of a plane through the point in which the fingertip may be anywhere.
+        ball: Outward normal that the pad's ball has where it touches the point.
         direction: Which way the pad faces wherever it is; it stands alone.
     """
 
@@ -59,6 +60,7 @@ class ContactEntry(Struct, frozen=True):
     tangent: Vector | None = None
     line: Vector | None = None
     plane: Vector | None = None
+    ball: Vector | None = None
     direction: Vector | None = None
 
 
@@ -165,6 +167,7 @@ def _contact(entry: ContactEntry) -> Contact:
         tangent=entry.tangent,
         line=entry.line,
         plane=entry.plane,
+        ball=entry.ball,
         direction=entry.direction,
     )
 

@@ -101,8 +101,8 @@ class OneSolve:
         asked: The question apart from its targets.
         shard: Name of the shard it comes from, if the log has several.
         number: Its number there; random numbers follow from it and the seed.
-        target_more: (f, 3) what contacts have beside ("tangents", "lines", "planes"), NaN if free;
-            nothing that is free everywhere.
+        target_more: (f, 3) what contacts have beside ("tangents", "lines", "planes", "balls"),
+            NaN if free; nothing that is free everywhere.
         clearance: Of the answer [m]; None if the solver had no scene.
         closest: The pair that is nearest to being too near; None as well if there is nothing.
 

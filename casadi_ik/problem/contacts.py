@@ -1,8 +1,9 @@
 """What a contact asks of a fingertip: a row of `CONDITIONS` each, and one definition of each.
 
-A contact asks for a place (at a point, anywhere on a line or a plane) and for a facing (a normal,
-a whole frame); either may be left out. What it asks is the contact's kind. All conditions of one
-aspect are told by one error: the distance from the place [m], the angle from the facing [rad].
+A contact asks for a place (at a point, anywhere on a line or a plane, the pad's ball against a
+point) and for a facing (a normal, a whole frame); either may be left out. What it asks is the
+contact's kind. All conditions of one aspect are told by one error: the distance from the place [m],
+the angle from the facing [rad].
 
 Each condition is there in two forms. As differences of vectors (`residual`, `jacobian`) it is
 polynomial in the vectors, its length the distance or the chord 2 sin(angle / 2), and it has no
@@ -44,8 +45,8 @@ PLACE, FACING = "place", "facing"
 Vectors = Mapping[str, Expr]
 """Vectors (3, 1) by name, in one common frame.
 
-Of a fingertip "point" [m] and the unit vectors "normal" and "tangent"; of a target the `data` of
-its conditions.
+Of a fingertip "point" [m], the unit vectors "normal" and "tangent", and "pad" from the middle of
+the pad's ball to the point [m] (zero if it has none); of a target the `data` of its conditions.
 """
 
 Rates = Mapping[str, Expr]
@@ -66,7 +67,8 @@ class Condition:
         error: ``(tip, goal) -> (3, 1)`` what is left, from the tip to the goal [m], or the rotation
             vector [rad].
         across: ``(tip, goal) -> (m, 3)`` directions in which it asks something; None: in all
-            three. With the rows of the geometric Jacobian it gives those of the error at the goal.
+            three, and the error of a place is minus its residual. With the rows of the geometric
+            Jacobian it gives those of the error at the goal.
         measure: ``(tip, goal) ->`` distance [m] or angle [rad].
     """
 
@@ -107,6 +109,18 @@ def _off_plane_rates(tip: Vectors, tip_rates: Rates, goal: Vectors, goal_rates: 
 def _back_to_line(tip: Vectors, goal: Vectors) -> Expr:
     along = goal["line"]
     return along * ca.dot(along, _beside(tip, goal)) - _beside(tip, goal)
+
+
+def _off_ball(tip: Vectors, goal: Vectors) -> Expr:
+    """From the goal's point to where the pad's ball faces as it does there."""
+    radius = ca.dot(tip["pad"], tip["normal"])
+    return _beside(tip, goal) - tip["pad"] + radius * goal["ball"]
+
+
+def _off_ball_rates(tip: Vectors, tip_rates: Rates, _goal: Vectors, goal_rates: Rates) -> Expr:
+    radius = ca.dot(tip["pad"], tip["normal"])
+    moved = tip_rates["point"] - goal_rates["point"] - tip_rates["pad"]
+    return moved + radius * goal_rates["ball"]
 
 
 def _around(direction: Expr) -> Expr:
@@ -201,6 +215,17 @@ CONDITIONS: dict[str, Condition] = {
             lambda tip, goal: ca.fabs(_off_plane(tip, goal)),
         ),
         Condition(
+            "ball",
+            PLACE,
+            ("point", "ball"),
+            3,
+            _off_ball,
+            _off_ball_rates,
+            lambda tip, goal: -_off_ball(tip, goal),
+            None,
+            lambda tip, goal: safe_norm(_off_ball(tip, goal)),
+        ),
+        Condition(
             "normal",
             FACING,
             ("normal",),
@@ -281,6 +306,7 @@ DOCS = {
     "tangent": "second axes of the contact frames, base frame; 0 if free",
     "line": "directions of lines through the points, base frame",
     "plane": "normals of planes through the points, base frame",
+    "ball": "outward normals of the pads' balls where they touch the points, base frame",
 }
 
 
@@ -405,9 +431,10 @@ def chord(angle: Expr) -> Expr:
 
 
 def tip_vectors(kinematics: Kinematics, finger: str) -> Vectors:
-    """Point, normal and tangent of a fingertip, base frame."""
+    """Point, normal, tangent and pad of a fingertip, base frame."""
     point, normal = kinematics.contact(finger)
-    return {"point": point, "normal": normal, "tangent": kinematics.tangent(finger)}
+    pad = kinematics.robot.finger(finger).radius * normal
+    return {"point": point, "normal": normal, "tangent": kinematics.tangent(finger), "pad": pad}
 
 
 def tip_rates(body: ActuatedKinematics, finger: str, actuators: Sequence[int]) -> Rates:
@@ -504,8 +531,9 @@ def by_kinds(targets: TargetBatch) -> Iterator[tuple[Kinds, slice | NDArray[np.i
     """Targets sorted by the kinds of their contacts: what one kernel solves.
 
     The kinds of a target are its own, whatever else is in the batch. If a finger has a tangent,
-    the others count as having one that is free: a kernel for each of their combinations would
-    have to be compiled, and gains next to nothing.
+    the others count as having one that is free, and if one has a ball, those without a point count
+    as having one: a kernel for each of their combinations would have to be compiled, and gains next
+    to nothing.
 
     Yields:
         Kinds, rows (a slice: all, as they are) and the targets in these rows.
@@ -519,6 +547,9 @@ def by_kinds(targets: TargetBatch) -> Iterator[tuple[Kinds, slice | NDArray[np.i
     if "tangents" in names:
         turned = given[..., names.index("tangents")]
         turned[:] = turned.any(axis=1, keepdims=True)
+    if "balls" in names:
+        rolling = given[..., names.index("balls")]
+        rolling |= rolling.any(axis=1, keepdims=True) & np.isnan(targets.points[..., 0])
     flat = given.reshape(len(given), -1)
     _, firsts, which = np.unique(
         flat @ (1 << np.arange(flat.shape[1])), return_index=True, return_inverse=True

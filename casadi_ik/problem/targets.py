@@ -32,7 +32,7 @@ class TargetBatch:
             random numbers of a target, so that a part of a batch gets those of the whole.
         fixed: (n,) or (k, n) positions of locked actuators, NaN where one may move; None: all may.
         more: (k, f, 3) what contacts have beside point and normal ("tangents", "lines",
-            "planes"), NaN where free; nothing that is free everywhere.
+            "planes", "balls"), NaN where free; nothing that is free everywhere.
         picked: (k,) numbers of the targets where they are not one after the other.
         prefer: Which of several solutions is wanted, one of `PREFERENCES`, or `NO_PREFERENCE`.
         object: Name of what is grasped, for collisions; "": not said.

@@ -210,7 +210,8 @@ def deviations(robot: ArmHand, targets: TargetBatch, q: Array) -> tuple[Array, A
         q: (k, n) or (n,); NaN gives NaN.
 
     Returns:
-        (k, f) or (f,) distances [m] from the point, line or plane; as many angles [rad] between
+        (k, f) or (f,) distances [m] from the point, line or plane (of the pad's ball, from touching
+        the point as it should); as many angles [rad] between
         the normals, or between the whole frames where there is a tangent; NaN where free; (k,) or
         () by how much the worst actuator or joint is beyond its limits [rad or m].
     """
@@ -229,6 +230,10 @@ def deviations(robot: ArmHand, targets: TargetBatch, q: Array) -> tuple[Array, A
             position = np.where(given, np.linalg.norm(np.cross(vectors, off), axis=-1), position)
         elif name == "planes":
             position = np.where(given, np.abs(np.sum(vectors * off, axis=-1)), position)
+        elif name == "balls":
+            radii = np.array([[finger.radius] for finger in robot.description.fingers])
+            rolled = radii * (vectors - frames[..., :3, 0])
+            position = np.where(given, np.linalg.norm(off + rolled, axis=-1), position)
         elif name == "tangents":
             wanted = np.stack([normals, vectors, np.cross(normals, vectors)], axis=-1)
             angle = np.where(given, _turn(frames[..., :3, :3], wanted), angle)

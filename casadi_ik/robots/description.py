@@ -82,6 +82,7 @@ class Finger:
         tangent: (3,) second axis of the pad, unit, in the contact frame and orthogonal to the
             normal: what a contact's tangent turns about the normal. If the description names
             none, the contact frame's x axis made orthogonal to the normal.
+        radius: Of the pad, a ball that touches with any point of it [m]; 0: a plane.
     """
 
     name: str
@@ -90,6 +91,7 @@ class Finger:
     normal: Array
     joints: tuple[str, ...]
     tangent: Array
+    radius: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

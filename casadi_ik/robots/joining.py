@@ -21,7 +21,7 @@ from casadi_ik.robots.description import Actuator, Finger, Joint
 from casadi_ik.robots.file_parts import arm_from_file
 from casadi_ik.robots.motor_ranges import motor_ranges
 from casadi_ik.robots.parts import Part, arm_part, hand_part, known_link, unique
-from casadi_ik.robots.schema import ArmFile, ArmFromFile, HandFile
+from casadi_ik.robots.schema import ArmFile, ArmFromFile, BallPad, HandFile, PlanePad
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +121,17 @@ def _finger(name: str, hand: Part, flat: FlatJoints) -> Finger:
         frozen(normal),
         tuple(chain[::-1]),
         frozen(_tangent(entry.tangent, normal, where)),
+        _radius(entry.pad, where),
     )
+
+
+def _radius(pad: BallPad | PlanePad, where: str) -> float:
+    """Of a pad's ball [m]; 0 of a plane."""
+    if isinstance(pad, PlanePad):
+        return 0.0
+    if not pad.radius > 0:
+        raise DescriptionError(f"{where}.pad.radius: found {pad.radius:g} m, expected one > 0")
+    return pad.radius
 
 
 def _tangent(given: Vector | None, normal: Array, where: str) -> Array:

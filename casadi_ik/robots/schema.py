@@ -168,6 +168,20 @@ class LinkFrame(Struct, frozen=True):
     source: str = ""
 
 
+class BallPad(Struct, frozen=True, tag_field="kind", tag="ball"):
+    """A pad that touches with any point of a ball; at zero lean with the contact frame's origin.
+
+    Attributes:
+        radius: Of the ball, whose middle is behind the contact frame's origin [m].
+    """
+
+    radius: Length
+
+
+class PlanePad(Struct, frozen=True, tag_field="kind", tag="plane"):
+    """A flat pad: it touches with the contact frame's origin and faces what it touches."""
+
+
 class ContactEntry(Struct, frozen=True):
     """The contact frame of a finger: where its pad touches and which way that faces.
 
@@ -180,6 +194,7 @@ class ContactEntry(Struct, frozen=True):
         xyz: Where the pad touches, in the link's frame [m].
         rpy: Angles of the contact frame about the link's fixed axes [rad].
         tangent: The pad's second axis; left out: the frame's x axis.
+        pad: What it touches with; left out: a plane.
     """
 
     link: str
@@ -188,6 +203,7 @@ class ContactEntry(Struct, frozen=True):
     xyz: Point = (0.0, 0.0, 0.0)
     rpy: Angles = (0.0, 0.0, 0.0)
     tangent: Vector | None = None
+    pad: BallPad | PlanePad = PlanePad()
 
 
 class ArmFile(Struct, frozen=True):
@@ -298,6 +314,7 @@ class PadEntry(Struct, frozen=True):
         xyz: Where the pad touches, in the link's frame [m].
         rpy: Angles of the contact frame about the link's fixed axes [rad].
         tangent: The pad's second axis; left out: the frame's x axis.
+        pad: What it touches with; left out: a plane.
     """
 
     link: str
@@ -305,6 +322,7 @@ class PadEntry(Struct, frozen=True):
     xyz: Point = (0.0, 0.0, 0.0)
     rpy: Angles = (0.0, 0.0, 0.0)
     tangent: Vector | None = None
+    pad: BallPad | PlanePad = PlanePad()
 
 
 class ArmHandFile(Struct, frozen=True):

@@ -19,6 +19,7 @@ from casadi_ik.collision.scene import Scene
 from casadi_ik.drawing.surfaces import facing
 from casadi_ik.errors import CasadiIKError, UnsupportedError
 from casadi_ik.grasps import Contact, Grasp, Tolerance
+from casadi_ik.grasps.grasp import PLACES
 from casadi_ik.grasps.pose import inverse
 from casadi_ik.problem.clearance import Closest, closest_points
 from casadi_ik.problem.request import CLEARANCE, Request, tolerances_by_finger
@@ -73,7 +74,8 @@ class Held:
         found = self.contact.at(self.control)
         if self.normal or not np.isfinite(found.point).all():
             return found
-        return Contact(found.point, tolerance=found.tolerance, line=found.line, plane=found.plane)
+        places = {name: getattr(found, name) for name in PLACES}
+        return Contact(found.point, tolerance=found.tolerance, **places)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +180,7 @@ def request_of(
         place = contact.point if np.isfinite(contact.point).all() else frame[:3, 3]
         normal = frame[:3, 0] if contact.normal is None else contact.normal
         control = facing(place, normal, frame[:3, :3])
-        if contact.normal is None and contact.line is None and contact.plane is None:
+        if contact.normal is None and all(getattr(contact, name) is None for name in PLACES):
             # Its normal is at hand if it is wanted after all.
             whole = Contact(place, normal, contact.tolerance)
             held[finger] = Held(whole.at(inverse(control)), control, used, normal=False)

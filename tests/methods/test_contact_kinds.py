@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as arrays_of
 
 import casadi_ik as ik
 from casadi_ik import logs
-from casadi_ik.grasps.grasp import MORE, fault, faulty
+from casadi_ik.grasps.grasp import MORE, PLACES, fault, faulty
 from casadi_ik.problem.contacts import CONDITIONS, NAMES, ContactKind, by_kinds, more_arrays, usual
 from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import judge
@@ -21,6 +21,8 @@ from casadi_ik.proofs.prove import Prover
 METHODS = ("hand-first", "thumb-first", "ipopt")
 PAPER = ("enhanced-dls", "enhanced-sdls", "original-dls", "original-sdls")
 SIDE, UP = np.array([0.6, 0.0, 0.8]), np.array([0.0, 0.0, 1.0])
+RADIUS = 9.5e-3
+"""Of Barrett's pads [m]."""
 TIGHT = ik.Tolerance(1e-4, 1e-3)
 
 
@@ -35,6 +37,7 @@ def contact(kind: str, frame: np.ndarray) -> ik.Contact:
     """A contact of a kind that a fingertip at this frame meets, its point elsewhere if allowed."""
     point, normal, tangent = frame[:3, 3], frame[:3, 0], frame[:3, 1]
     across = np.cross(UP, SIDE)
+    leaning = np.cos(0.6) * normal + np.sin(0.6) * tangent
     return {
         "point": lambda: ik.Contact(point),
         "point and normal": lambda: ik.Contact(point, normal),
@@ -45,13 +48,17 @@ def contact(kind: str, frame: np.ndarray) -> ik.Contact:
         "plane and pose": lambda: ik.Contact(
             point + 0.02 * across, normal, tangent=tangent, plane=UP
         ),
+        "ball": lambda: ik.Contact(point + RADIUS * (leaning - normal), ball=leaning),
+        "ball and normal": lambda: ik.Contact(
+            point + RADIUS * (leaning - normal), normal, ball=leaning
+        ),
         "direction": lambda: ik.Contact(direction=normal),
     }[kind]()
 
 
 KINDS = (
     *("point", "point and normal", "pose", "line", "line and normal", "plane"),
-    *("plane and pose", "direction"),
+    *("plane and pose", "ball", "ball and normal", "direction"),
 )
 
 
@@ -63,6 +70,9 @@ def off(frame: np.ndarray, asked: ik.Contact) -> tuple[float, float]:
         distance = float(np.linalg.norm(beside - asked.line * (asked.line @ beside)))
     if asked.plane is not None:
         distance = abs(float(asked.plane @ beside))
+    if asked.ball is not None:
+        middle = frame[:3, 3] - RADIUS * frame[:3, 0]
+        distance = float(np.linalg.norm(middle + RADIUS * asked.ball - asked.point))
     if asked.normal is not None:
         angle = float(np.arccos(np.clip(asked.normal @ frame[:3, 0], -1, 1)))
     if asked.tangent is not None:
@@ -296,6 +306,7 @@ contacts:
         ("point: [0.5, 0.1, 0.6], normal: [0, -1, 0], tangent: [0, 0, 2]", {"tangent": UP}),
         ("point: [0.5, 0.1, 0.6], line: [0, 0, 3]", {"line": UP, "normal": None}),
         ("point: [0.5, 0.1, 0.6], plane: [0, 0, 1], normal: [0, -1, 0]", {"plane": UP}),
+        ("point: [0.5, 0.1, 0.6], ball: [0, 0, 2]", {"ball": UP, "normal": None}),
         ("direction: [0, 0, 0.5]", {"normal": UP, "tangent": None}),
     ],
 )
@@ -319,6 +330,7 @@ def test_grasp_files(tmp_path: Path, thumb, expected):
         ),
         ("point: [0, 0, 1], line: [0, 0, 0]", "thumb.line: found .* expected a direction"),
         ("point: [0, 0, 1], line: [0, 0, 1], plane: [0, 0, 1]", "thumb.line and plane: found both"),
+        ("point: [0, 0, 1], plane: [0, 0, 1], ball: [0, 0, 1]", "thumb.plane and ball: found both"),
         ("point: [0, 0, 1], direction: [0, 0, 1]", "thumb.direction: found it beside point"),
         ("point: [0, 0, 1], tangents: [0, 0, 1]", "tangents"),
     ],
@@ -359,7 +371,7 @@ def test_all_contacts_at_once_are_judged_like_each():
     for name, array in whole.items():
         if name != "point":
             array /= np.linalg.norm(array, axis=1)[:, None]
-        array[rng.random(400) < 0.3] = np.nan
+        array[rng.random(400) < (0.8 if name in PLACES else 0.3)] = np.nan
     single = [
         fault({name: array[i] for name, array in whole.items() if not np.isnan(array[i, 0])})
         for i in range(400)
@@ -372,14 +384,14 @@ def test_all_contacts_at_once_are_judged_like_each():
 
 @given(
     free=arrays_of.arrays(bool, (5, 3, 3)),
-    line=st.booleans(),
+    place=st.sampled_from(PLACES),
 )
-def test_every_target_is_in_one_group_of_its_kinds(free, line):
+def test_every_target_is_in_one_group_of_its_kinds(free, place):
     """Groups are disjoint, cover the batch and have what their targets have; numbers are kept."""
     rng = np.random.default_rng(0)
     points = rng.normal(size=(5, 3, 3))
     more = {}
-    for i, name in enumerate(("tangents", "lines" if line else "planes")):
+    for i, name in enumerate(("tangents", f"{place}s")):
         array = rng.normal(size=(5, 3, 3))
         array[free[..., i]] = np.nan
         if not np.isnan(array).all():
@@ -405,7 +417,7 @@ def test_the_tables_agree():
     """Every vector that a grasp can have is needed by a condition, and the other way round."""
     needed = {name for condition in CONDITIONS.values() for name in condition.data}
     assert needed == {"point", "normal", *MORE}
-    assert NAMES == ("tangents", "lines", "planes")
+    assert NAMES == ("tangents", "lines", "planes", "balls")
     assert [kinds for kinds, _, _ in by_kinds(_plain())] == [usual(3)]
     assert ContactKind() == ContactKind("point", "normal")
 

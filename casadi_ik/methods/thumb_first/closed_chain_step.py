@@ -20,7 +20,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from casadi_ik.problem.contacts import LENGTH, PLACE, ContactRows, tip_vectors
+from casadi_ik.problem.contacts import LENGTH, PLACE, ContactRows, resting, tip_rates, tip_vectors
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.kinematics import ActuatedKinematics, actuated, motor_scales
 from casadi_ik.symbolic.linear_algebra import damped_pinv_times, project_to_null_space
@@ -202,12 +202,17 @@ def linearised(
     goals = contacts.goals(p)
     for i, (name, kind) in enumerate(zip(robot.finger_names, contacts.kinds, strict=True)):
         moved = body.contact_jacobian(name, range(q.numel()))
-        tip = tip_vectors(body.kinematics, name)
+        tip, rates = (
+            tip_vectors(body.kinematics, name),
+            tip_rates(body, name, range(q.numel())),
+        )
         mine = name == robot.thumb
         weighted = []
         for aspect, condition in enumerate(kind.conditions):
             across = condition.across(tip, goals[i]) if condition.across else None
             slope, error = moved[aspect], left[aspect][i]
+            if condition.aspect == PLACE and condition.across is None:
+                slope = condition.jacobian(tip, rates, goals[i], resting(goals, q.numel())[i])
             if across is not None:
                 slope, error = across @ slope, across @ error
             slope = p["weights"][i, aspect] * slope
