@@ -10,6 +10,7 @@ from casadi_ik.kernels import RUNNING, Field, Layout, StepGraph
 from casadi_ik.kernels.compiler import find_compiler
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="needs a C compiler")
+BOTH = pytest.mark.parametrize("compiled", [pytest.param(True, marks=needs_compiler), False])
 
 DONE = 7
 RECORD = Layout.record(

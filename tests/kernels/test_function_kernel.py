@@ -1,4 +1,4 @@
-"""Functions called as C: shapes, batches, measures, elementary functions of our own."""
+"""Functions called as C: shapes, batches, elementary functions of our own, nearest rows."""
 
 from __future__ import annotations
 
@@ -12,11 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import casadi_ik as ik
-from casadi_ik.kernels import FunctionGraph, FunctionKernel
+from casadi_ik.kernels import FunctionGraph, FunctionKernel, LookupKernel
+from casadi_ik.kernels.lookup import LARGEST, STEPS
 
-from .graphs import needs_compiler, random_expression
-
-BOTH = pytest.mark.parametrize("compiled", [pytest.param(True, marks=needs_compiler), False])
+from .graphs import BOTH, needs_compiler, random_expression
 
 
 def matrices(kind: Any) -> ca.Function:
@@ -31,7 +30,7 @@ def matrices(kind: Any) -> ca.Function:
 
 @BOTH
 @pytest.mark.parametrize("kind", [ca.SX, ca.MX])
-def test_matrices_are_row_major(compiled: bool, kind: Any) -> None:
+def test_matrices_are_row_major(compiled, kind):
     kernel = FunctionKernel(matrices(kind), compiled=compiled)
     assert kernel.compiled == compiled
     assert kernel.input_shapes == ((), (3,), (2, 3))
@@ -50,7 +49,7 @@ def test_matrices_are_row_major(compiled: bool, kind: Any) -> None:
 
 
 @BOTH
-def test_batches_broadcast(compiled: bool) -> None:
+def test_batches_broadcast(compiled):
     kernel = FunctionKernel(matrices(ca.SX), compiled=compiled)
     rng = np.random.default_rng(1)
     a, v, m = rng.normal(size=5), rng.normal(size=3), rng.normal(size=(5, 2, 3))
@@ -64,7 +63,7 @@ def test_batches_broadcast(compiled: bool) -> None:
 
 
 @BOTH
-def test_unaligned_numbers(compiled: bool) -> None:
+def test_unaligned_numbers(compiled):
     kernel = FunctionKernel(matrices(ca.SX), compiled=compiled)
     packed = np.zeros(1, dtype=[("flag", "u1"), ("v", "<f8", (3,))])
     packed["v"] = [1, 2, 3]
@@ -73,7 +72,7 @@ def test_unaligned_numbers(compiled: bool) -> None:
 
 
 @needs_compiler
-def test_pauses_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pauses_change_nothing(monkeypatch):
     x = ca.SX.sym("x")
     kernel = FunctionKernel(ca.Function("twice", [x], [2 * x]))
     points = np.arange(1000.0)
@@ -82,7 +81,7 @@ def test_pauses_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @BOTH
-def test_threads_share_a_kernel(compiled: bool) -> None:
+def test_threads_share_a_kernel(compiled):
     kernel = FunctionKernel(matrices(ca.MX), compiled=compiled)
     rng = np.random.default_rng(3)
     samples = [(rng.normal(), rng.normal(size=(40, 3)), rng.normal(size=(2, 3))) for _ in range(60)]
@@ -95,12 +94,12 @@ def test_threads_share_a_kernel(compiled: bool) -> None:
 
 
 @BOTH
-def test_no_inputs(compiled: bool) -> None:
+def test_no_inputs(compiled):
     kernel = FunctionKernel(ca.Function("constant", [], [ca.DM([1, 2])]), compiled=compiled)
     assert kernel()[0].tolist() == [1, 2]
 
 
-def test_failure_of_the_function_is_an_error() -> None:
+def test_failure_of_the_function_is_an_error():
     x = ca.MX.sym("x")
     function = ca.Function("positive", [x], [ca.sqrt(x.attachAssert(x > 0, "negative"))])
     kernel = FunctionKernel(function, compiled=False)
@@ -111,7 +110,7 @@ def test_failure_of_the_function_is_an_error() -> None:
         FunctionKernel(function)
 
 
-def test_wrong_inputs_are_named() -> None:
+def test_wrong_inputs_are_named():
     kernel = FunctionKernel(matrices(ca.SX), compiled=False)
     v, m = np.zeros(3), np.zeros((2, 3))
     with pytest.raises(ik.errors.InputError, match=r"2 inputs, expected 3 \(a, v, m\)"):
@@ -172,7 +171,7 @@ def compare(functions: tuple[FunctionKernel, FunctionKernel], points: np.ndarray
 
 
 @pytest.mark.parametrize("scale", [1e-300, 1e-8, 1e-3, 1.0, 3.0, 1e3, 4e8, 1e12, 1e300])
-def test_all_sizes(functions: tuple[FunctionKernel, FunctionKernel], scale: float) -> None:
+def test_all_sizes(functions, scale):
     rng = np.random.default_rng(3)
     points = rng.normal(size=(20_000, 2)) * scale
     points[:, 1] *= 10.0 ** rng.uniform(-8, 7, len(points))
@@ -180,15 +179,15 @@ def test_all_sizes(functions: tuple[FunctionKernel, FunctionKernel], scale: floa
 
 
 def test_quarters_of_a_turn_and_their_edges(
-    functions: tuple[FunctionKernel, FunctionKernel],
-) -> None:
+    functions,
+):
     angles = np.concatenate([np.arange(-64, 65) * np.pi / 8 + d for d in (-1e-9, 0.0, 1e-9)])
     compare(functions, np.stack([angles, 1 + angles], axis=1))
     edges = np.nextafter([1.0, 1.0, 1.0, -1.0, -1.0, -1.0], [0.0, 1.0, 2.0, 0.0, -1.0, -2.0])
     compare(functions, np.stack([edges, edges[::-1]], axis=1))
 
 
-def test_signs_of_zero(functions: tuple[FunctionKernel, FunctionKernel]) -> None:
+def test_signs_of_zero(functions):
     zeros = np.array([[x, y] for x in (0.0, -0.0, 2.0, -2.0) for y in (0.0, -0.0)])
     found = functions[0](zeros)[0][:, -1]
     np.testing.assert_array_equal(found, np.arctan2(zeros[:, 1], zeros[:, 0]))
@@ -196,8 +195,8 @@ def test_signs_of_zero(functions: tuple[FunctionKernel, FunctionKernel]) -> None
 
 
 def test_one_lane_that_is_large_changes_no_other(
-    functions: tuple[FunctionKernel, FunctionKernel],
-) -> None:
+    functions,
+):
     points = np.random.default_rng(5).normal(size=(64, 2))
     points[::5, 0] *= 1e11
     compare(functions, points)
@@ -205,7 +204,7 @@ def test_one_lane_that_is_large_changes_no_other(
 
 @settings(max_examples=300, deadline=None)
 @given(st.floats(allow_subnormal=False), st.floats(-1e6, 1e6, allow_subnormal=False))
-def test_any_number(functions: tuple[FunctionKernel, FunctionKernel], x: float, y: float) -> None:
+def test_any_number(functions, x, y):
     alone, beside = functions
     points = np.array([[x, y]] * 3)
     (found,) = alone(points)
@@ -229,13 +228,13 @@ def agree(function: ca.Function, samples: np.ndarray, rtol: float = 1e-13) -> np
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_straight_lines(seed: int) -> None:
+def test_straight_lines(seed):
     x = ca.SX.sym("x", 5)
     function = ca.Function(f"straight_{seed}", [x], [random_expression(x, 9, 150, seed)])
     agree(function, np.random.default_rng(seed).normal(size=(50, 5)))
 
 
-def test_calls_and_branches() -> None:
+def test_calls_and_branches():
     """Arguments that are parts, transposed, constant or left out; branches within branches."""
     x, y, m = ca.SX.sym("x", 3), ca.SX.sym("y"), ca.SX.sym("m", 2, 3)
     cases = [
@@ -255,7 +254,7 @@ def test_calls_and_branches() -> None:
     agree(function, samples[~np.isnan(samples).any(axis=1)])
 
 
-def test_tables() -> None:
+def test_tables():
     """The nearest row of a table, of equal ones the first."""
     table = np.random.default_rng(1).normal(size=(40, 3))
     table[7] = table[30]
@@ -273,7 +272,7 @@ def test_tables() -> None:
 
 
 @pytest.mark.parametrize("scale", [1e-9, 0.5, 3.0, 1e9])
-def test_elementary_functions_computed_together(scale: float) -> None:
+def test_elementary_functions_computed_together(scale):
     """The bits of one call each."""
     x = ca.SX.sym("x", COUNT)
     arcs = [ca.atan2(x, x[0]), ca.asin(x[:5]), ca.acos(x), ca.atan(x)]
@@ -300,7 +299,7 @@ def test_elementary_functions_computed_together(scale: float) -> None:
 SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, 0.5, -2.5, 1e-310, 1e300, np.inf, -np.inf, np.nan])
 
 
-def test_operations_on_special_numbers() -> None:
+def test_operations_on_special_numbers():
     """Every operation, on every pair of special numbers."""
     v = ca.SX.sym("v", 2)
     x, y = ca.vertsplit(v)
@@ -326,7 +325,7 @@ def test_operations_on_special_numbers() -> None:
     assert np.isfinite(found).any(axis=0).all()
 
 
-def test_what_has_no_c_code_is_named() -> None:
+def test_what_has_no_c_code_is_named():
     x = ca.MX.sym("x", 3)
     solver = ca.rootfinder("root", "newton", {"x": x, "g": x**2 - 2})
     function = ca.Function("hidden_solver", [x], [solver(x, [])])
@@ -334,12 +333,45 @@ def test_what_has_no_c_code_is_named() -> None:
         FunctionKernel(function)
 
 
-def test_solves_with_and_without_a_log_are_the_same(robot: ik.ArmHand, tmp_path) -> None:
-    """What only the log needs is computed for the log alone."""
-    solver = ik.Solver(robot)
-    points, normals = robot.contacts(robot.random(np.random.default_rng(6), 40))
-    for count in (1, 40):  # alone, and side by side
-        asked = points[:count], normals[:count]
-        plain, logged = solver.solve_batch(*asked), solver.solve_batch(*asked, log=tmp_path / "a")
-        assert plain.q.tobytes() == logged.q.tobytes()
-        np.testing.assert_array_equal(plain.iterations, logged.iterations)
+# Nearest rows, against plain sorting: with ties, unknown entries and odd table sizes.
+
+
+def identity(size: int) -> ca.Function:
+    x = ca.SX.sym("x", size)
+    return ca.Function(f"identity_{size}", [x], [x])
+
+
+def sorted_rows(table, keys, count):
+    """Exact integers and a stable sort."""
+    rounded = [np.rint(x * STEPS).clip(-LARGEST, LARGEST) for x in (table, np.nan_to_num(keys))]
+    steps, wanted = (x.astype(np.int64) for x in rounded)
+    apart = np.where(np.isnan(keys)[:, None], 0, steps[None] - wanted[:, None])
+    return (apart**2).sum(axis=2).argsort(axis=1, kind="stable")[:, :count]
+
+
+@BOTH
+@pytest.mark.parametrize(("rows", "size"), [(1, 2), (16, 3), (37, 2), (300, 7)])
+def test_nearest_in_order(compiled, rows, size, rng):
+    """Coarse entries, so that many rows are equally near."""
+    table, keys = rng.integers(-9, 10, (rows, size)) / 4, rng.normal(size=(40, size)) * 3
+    keys[::3, 0] = np.nan
+    keys[5] = 100.0
+    lookup = LookupKernel(identity(size), [table], compiled)
+    assert lookup.compiled == compiled
+    count = min(rows, 20)
+    np.testing.assert_array_equal(lookup(count, keys), sorted_rows(table, keys, count))
+    np.testing.assert_array_equal(lookup(1, keys)[:, 0], sorted_rows(table, keys, 1)[:, 0])
+
+
+@BOTH
+def test_nearest_where_nothing_is_known_is_the_first(compiled, rng):
+    lookup = LookupKernel(identity(3), [rng.normal(size=(30, 3))], compiled)
+    np.testing.assert_array_equal(lookup(4, np.full((2, 3), np.nan)), [[0, 1, 2, 3]] * 2)
+
+
+@BOTH
+def test_nearest_of_no_samples_and_of_wrong_inputs(compiled, rng):
+    lookup = LookupKernel(identity(3), [rng.normal(size=(30, 3))], compiled)
+    assert lookup(4, np.zeros((0, 3))).shape == (0, 4)
+    with pytest.raises(ik.errors.InputError, match="expected"):
+        lookup(4, np.zeros((2, 2)))

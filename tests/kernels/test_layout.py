@@ -14,7 +14,7 @@ import casadi_ik as ik
 from casadi_ik.kernels import Field, Layout, LoopKernel, StepGraph
 from casadi_ik.kernels.layout import STORAGE, store_rows
 
-from .graphs import needs_compiler
+from .graphs import BOTH
 
 shapes = st.one_of(
     st.just(()), st.tuples(st.integers(1, 4)), st.tuples(st.integers(1, 3), st.integers(1, 4))
@@ -36,7 +36,7 @@ def numbers(layout: Layout, lead: tuple[int, ...] = ()) -> dict[str, Any]:
 
 
 @given(layouts())
-def test_numbers_go_round(layout: Layout) -> None:
+def test_numbers_go_round(layout):
     values = numbers(layout)
     vector = layout.pack(values)
     np.testing.assert_array_equal(vector, np.arange(layout.size) + 0.5)
@@ -47,14 +47,14 @@ def test_numbers_go_round(layout: Layout) -> None:
 
 
 @given(layouts())
-def test_unpacking_keeps_leading_dimensions(layout: Layout) -> None:
+def test_unpacking_keeps_leading_dimensions(layout):
     batch = numbers(layout, (2, 3))
     for item in layout:
         assert batch[item.name].shape == (2, 3, *item.shape)
 
 
 @given(layouts(), st.booleans())
-def test_symbols_lie_where_numbers_lie(layout: Layout, mixed: bool) -> None:
+def test_symbols_lie_where_numbers_lie(layout, mixed):
     values = numbers(layout)
     symbols: dict[str, Any] = {
         item.name: ca.SX.sym(item.name, *(item.shape if item.shape else (1,))) for item in layout
@@ -69,7 +69,7 @@ def test_symbols_lie_where_numbers_lie(layout: Layout, mixed: bool) -> None:
 
 
 @given(layouts())
-def test_symbols_go_round(layout: Layout) -> None:
+def test_symbols_go_round(layout):
     vector = layout.symbols("v")
     again = layout.pack(layout.unpack(vector))
     assert again.sparsity().is_dense()
@@ -77,7 +77,7 @@ def test_symbols_go_round(layout: Layout) -> None:
 
 
 @given(layouts())
-def test_record_is_packed_widest_first(layout: Layout) -> None:
+def test_record_is_packed_widest_first(layout):
     record = Layout.record(*layout)
     widths = [np.dtype(item.dtype).itemsize for item in record]
     assert widths == sorted(widths, reverse=True)
@@ -86,7 +86,7 @@ def test_record_is_packed_widest_first(layout: Layout) -> None:
     assert record.dtype.names == record.names
 
 
-def test_bad_layouts_and_values_are_named() -> None:
+def test_bad_layouts_and_values_are_named():
     with pytest.raises(ik.errors.InputError, match="'a' appears twice"):
         Layout((Field("a"), Field("a")))
     with pytest.raises(ik.errors.InputError, match="'f2'"):
@@ -100,7 +100,7 @@ def test_bad_layouts_and_values_are_named() -> None:
         layout.slice("z")
 
 
-def test_step_whose_sizes_disagree_is_refused() -> None:
+def test_step_whose_sizes_disagree_is_refused():
     x = ca.SX.sym("x", 2)
     function = ca.Function("f", [x, ca.SX.sym("p")], [x, x, 0])
     two, one = Layout((Field("x", (2,)),)), Layout((Field("p"),))
@@ -145,15 +145,15 @@ def expected() -> np.ndarray:
     return row
 
 
-def test_numpy_conversion() -> None:
+def test_numpy_conversion():
     rows = np.zeros(1, LAYOUT.dtype)
     vector = np.tile(VALUES, 5)[None]
     store_rows(LAYOUT, vector, rows)
     assert rows.tobytes() == expected().tobytes()
 
 
-@pytest.mark.parametrize("compiled", [pytest.param(True, marks=needs_compiler), False])
-def test_loop_conversion(compiled: bool) -> None:
+@BOTH
+def test_loop_conversion(compiled):
     """Every storage type, every awkward double, at offsets that are not aligned."""
     layout = Layout.record(*LAYOUT, Field("odd", (2,), "u1"))
     x, p = ca.SX.sym("x"), ca.SX.sym("p", len(CASES))

@@ -112,7 +112,7 @@ def script(text: str, **changed: str) -> Iterator[subprocess.Popen[str]]:
 
 
 @needs_compiler
-def test_second_use_builds_nothing(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_second_use_builds_nothing(directory, monkeypatch):
     assert works()
     assert len(kept(directory, ".so")) == len(kept(directory, ".key")) == 1
     monkeypatch.setattr(compiler.Compiler, "build", refuse_to_build)
@@ -125,9 +125,7 @@ def test_second_use_builds_nothing(directory: Path, monkeypatch: pytest.MonkeyPa
 
 
 @needs_compiler
-def test_everything_a_library_follows_from_tells_it_apart(
-    directory: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_everything_a_library_follows_from_tells_it_apart(directory, monkeypatch):
     for factor in (2.0, 2.5):
         assert FunctionKernel(scaled(factor))(3)[0] == 3 * factor
     LoopKernel(counting_step("scaled"))
@@ -140,9 +138,7 @@ def test_everything_a_library_follows_from_tells_it_apart(
 
 @needs_compiler
 @pytest.mark.parametrize("damage", ["torn", "empty", "foreign", "other library", "gone"])
-def test_broken_library_is_rebuilt(
-    directory: Path, monkeypatch: pytest.MonkeyPatch, damage: str
-) -> None:
+def test_broken_library_is_rebuilt(directory, monkeypatch, damage):
     assert works()
     (path,) = kept(directory, ".so")
     whole = path.read_bytes()
@@ -165,9 +161,7 @@ def test_broken_library_is_rebuilt(
 
 @needs_compiler
 @pytest.mark.parametrize("note", ["012345", "0" * 32, "\N{SNOWMAN}"])
-def test_broken_note_is_written_again(
-    directory: Path, monkeypatch: pytest.MonkeyPatch, note: str
-) -> None:
+def test_broken_note_is_written_again(directory, monkeypatch, note):
     assert works()
     kept(directory, ".key")[0].write_text(note, encoding="utf-8")
     forget(monkeypatch)
@@ -176,7 +170,7 @@ def test_broken_note_is_written_again(
     assert kernel(never)(3)[0] == 6
 
 
-def test_recipes_differ_where_their_data_do() -> None:
+def test_recipes_differ_where_their_data_do():
     robot, again = (ik.load_robot("kuka_lwr_barrett").description for _ in range(2))
     moved, machine = (replace(robot, home=robot.home + by) for by in (1e-9, 1e-16))
     assert recipe(robot, 8) == recipe(again, 8) == recipe(machine, 8)
@@ -185,7 +179,7 @@ def test_recipes_differ_where_their_data_do() -> None:
 
 
 @needs_compiler
-def test_processes_that_need_the_same_build_it_once(directory: Path) -> None:
+def test_processes_that_need_the_same_build_it_once(directory):
     text = """
         import sys
         import casadi as ca
@@ -214,9 +208,7 @@ def test_processes_that_need_the_same_build_it_once(directory: Path) -> None:
 
 @needs_compiler
 @pytest.mark.parametrize("made_for", ["these sources", "others"])
-def test_kernels_made_ahead_serve_without_a_compiler(
-    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made_for: str
-) -> None:
+def test_kernels_made_ahead_serve_without_a_compiler(directory, tmp_path, monkeypatch, made_for):
     texts: dict[str, str] = {}
     monkeypatch.setattr(libraries, "on_text", [texts.__setitem__])
     assert works()
@@ -247,7 +239,7 @@ def test_kernels_made_ahead_serve_without_a_compiler(
 
 
 @needs_compiler
-def test_blocks_that_build_nothing(directory: Path) -> None:
+def test_blocks_that_build_nothing(directory):
     with virtual_machine():
         assert not kernel(never).compiled
     with cached_only(), pytest.raises(libraries.NotCachedError):
@@ -260,18 +252,8 @@ def test_blocks_that_build_nothing(directory: Path) -> None:
 # Compilers.
 
 
-@needs_compiler
-def test_compile_error_is_named(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CASADI_IK_CFLAGS", "-include does_not_exist.h")
-    with pytest.raises(ik.errors.KernelError, match=r"(?s)exit code 1.*does_not_exist\.h"):
-        kernel()
-    assert list(directory.iterdir()) == []
-
-
 @pytest.mark.parametrize("cc", ["/nowhere/cc", "false", '"x', "''", "/", "'a b' c", ""])
-def test_without_compiler_one_warning(
-    directory: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, cc: str
-) -> None:
+def test_without_compiler_one_warning(directory, monkeypatch, tmp_path, cc):
     monkeypatch.setenv("CC", cc)
     if not cc:
         monkeypatch.setenv("PATH", str(tmp_path))
@@ -291,7 +273,7 @@ def test_without_compiler_one_warning(
 
 
 @needs_compiler
-def test_cc_may_have_arguments(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cc_may_have_arguments(directory, monkeypatch):
     found = compiler.find_compiler()
     assert found is not None
     monkeypatch.setenv("CC", f"{found.command[0]} -DSOMETHING=1")
@@ -309,9 +291,7 @@ def test_cc_may_have_arguments(directory: Path, monkeypatch: pytest.MonkeyPatch)
         ("CASADI_IK_COMPILE", "later", "CASADI_IK_COMPILE='later': expected background or wait"),
     ],
 )
-def test_malformed_variables(
-    directory: Path, monkeypatch: pytest.MonkeyPatch, variable: str, value: str, said: str
-) -> None:
+def test_malformed_variables(directory, monkeypatch, variable, value, said):
     monkeypatch.setenv(variable, value)
     with pytest.raises(ik.errors.KernelError, match=said):
         _ = compiler.find_compiler(), compiler.waits(), LoopKernel(counting_step())
@@ -319,7 +299,7 @@ def test_malformed_variables(
 
 @needs_compiler
 @pytest.mark.parametrize("name", ["qsort_r", "a" * 5000])
-def test_names_of_functions(directory: Path, name: str) -> None:
+def test_names_of_functions(directory, name):
     """Of one of the C library, and too long for a file."""
     made = FunctionKernel(scaled(name=name))
     assert made.compiled
@@ -352,11 +332,10 @@ def lie(directory: Path, monkeypatch: pytest.MonkeyPatch, what: str) -> None:
         ("kill -9 $$", "failed with SIGKILL"),
         ('echo "int x;" > "$out.c"; cc -shared -o "$out" "$out.c"', "undefined symbol"),
         ("seq 100000 >&2; exit 3", "failed with exit code 3"),
+        ('echo "no such header.h" >&2; exit 1', r"exit code 1.*no such header\.h"),
     ],
 )
-def test_a_compiler_that_lies(
-    directory: Path, monkeypatch: pytest.MonkeyPatch, what: str, said: str
-) -> None:
+def test_a_compiler_that_lies(directory, monkeypatch, what, said):
     lie(directory, monkeypatch, what)
     with pytest.raises(ik.errors.KernelError, match=said) as caught:
         kernel()
@@ -370,9 +349,7 @@ def test_a_compiler_that_lies(
 @pytest.mark.parametrize("terminal", [True, False])
 @pytest.mark.parametrize("waits", [True, False])
 @pytest.mark.parametrize("size", [10, 10**6])
-def test_a_long_compilation_is_announced(
-    directory: Path, monkeypatch: pytest.MonkeyPatch, terminal: bool, waits: bool, size: int
-) -> None:
+def test_a_long_compilation_is_announced(directory, monkeypatch, terminal, waits, size):
     """Through a pseudo-terminal or a pipe; in a pipe not to those who asked to wait."""
     monkeypatch.setenv("CASADI_IK_COMPILE", "wait" if waits else "background")
     read, write = os.openpty() if terminal else os.pipe()
@@ -439,9 +416,7 @@ DANGERS = ("their file", "writable file", "link", "their folder", "writable fold
 @POSIX
 @needs_compiler
 @pytest.mark.parametrize("danger", ["none", *DANGERS])
-def test_planted_libraries_are_not_loaded(
-    directory: Path, monkeypatch: pytest.MonkeyPatch, danger: str
-) -> None:
+def test_planted_libraries_are_not_loaded(directory, monkeypatch, danger):
     """In the user's own hands alone they are: the test means something."""
     assert works()
     planted = plant(directory)
@@ -471,9 +446,7 @@ def test_planted_libraries_are_not_loaded(
 @POSIX
 @needs_compiler
 @pytest.mark.parametrize("danger", ["theirs", "writable"])
-def test_a_planted_note_is_not_believed(
-    directory: Path, monkeypatch: pytest.MonkeyPatch, danger: str
-) -> None:
+def test_a_planted_note_is_not_believed(directory, monkeypatch, danger):
     assert works()
     (note,), (library,) = kept(directory, ".key"), kept(directory, ".so")
     wrong = "0" * 32
@@ -488,7 +461,7 @@ def test_a_planted_note_is_not_believed(
     assert len(kept(directory, ".so")) == 2  # the one of the note was not taken
 
 
-def test_cache_directory(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_cache_directory(monkeypatch, tmp_path):
     monkeypatch.setenv("CASADI_IK_CACHE", str(tmp_path / "own"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
     assert cache_directory() == tmp_path / "own"
@@ -501,7 +474,7 @@ def test_cache_directory(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Non
 
 
 @POSIX
-def test_folders_are_the_users_alone(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folders_are_the_users_alone(directory, monkeypatch):
     """Made so, whatever the mask; of one above a sticky one is enough."""
     monkeypatch.setenv("CASADI_IK_CACHE", str(directory / "a"))
     before = os.umask(0)
@@ -522,9 +495,7 @@ def test_folders_are_the_users_alone(directory: Path, monkeypatch: pytest.Monkey
 @pytest.mark.parametrize(
     "place", ["file in the way", "too long", "dead link", "no name", "unreadable", "read-only"]
 )
-def test_places_that_are_no_use(
-    tmp_path: Path, directory: Path, monkeypatch: pytest.MonkeyPatch, place: str
-) -> None:
+def test_places_that_are_no_use(tmp_path, directory, monkeypatch, place):
     """One line, and a folder of the user's own among temporary files serves: the next finds it."""
     wanted = directory
     if place == "file in the way":
@@ -556,7 +527,7 @@ def test_places_that_are_no_use(
 
 
 @needs_compiler
-def test_a_full_disk(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk(directory, monkeypatch):
     """First the cache's, so that another place has to do; then every disk."""
     write = Path.write_text
 
@@ -581,9 +552,7 @@ def test_a_full_disk(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @POSIX
 @needs_compiler
-def test_a_compiler_that_finds_the_disk_full(
-    directory: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_compiler_that_finds_the_disk_full(directory, monkeypatch):
     lie(directory, monkeypatch, 'echo "as: write error: No space left on device" >&2; exit 1')
     with pytest.warns((CacheWarning, NoCompilerWarning)) as caught:
         assert not kernel().compiled
@@ -592,7 +561,7 @@ def test_a_compiler_that_finds_the_disk_full(
 
 @POSIX
 @needs_compiler
-def test_a_working_folder_that_is_gone(tmp_path: Path) -> None:
+def test_a_working_folder_that_is_gone(tmp_path):
     """A relative place cannot be found then; one line, and the answer is right all the same."""
     text = f"""
         import os
@@ -623,7 +592,7 @@ class Pressed:
 
 @needs_compiler
 @pytest.mark.parametrize("when", ["graph", "compiler"])
-def test_ctrl_c_leaves_nothing(directory: Path, monkeypatch: pytest.MonkeyPatch, when: str) -> None:
+def test_ctrl_c_leaves_nothing(directory, monkeypatch, when):
     def build() -> ca.Function:
         with suppress(TypeError):
             _ = ca.SX.sym("x") * Pressed()  # type: ignore[operator]
@@ -643,7 +612,7 @@ def test_ctrl_c_leaves_nothing(directory: Path, monkeypatch: pytest.MonkeyPatch,
 
 
 @needs_compiler
-def test_what_killed_compilations_left_goes(directory: Path) -> None:
+def test_what_killed_compilations_left_goes(directory):
     """Of dead processes after an hour, of unknown ones after a day, and nothing else."""
     gone = subprocess.Popen(["true"])
     gone.wait()
@@ -679,7 +648,7 @@ def age(path: Path, seconds: float) -> None:
 
 
 @needs_compiler
-def test_a_compilation_that_is_killed(directory: Path) -> None:
+def test_a_compilation_that_is_killed(directory):
     """What it leaves is no library and holds nobody up: the next one builds."""
     text = """
         import casadi as ca
@@ -707,7 +676,7 @@ def test_a_compilation_that_is_killed(directory: Path) -> None:
 
 @POSIX
 @needs_compiler
-def test_a_fork_while_another_thread_builds(directory: Path) -> None:
+def test_a_fork_while_another_thread_builds(directory):
     """It holds the lock of libraries, and up to Python 3.11 that of a cached property."""
     building, forked = threading.Event(), threading.Event()
 
