@@ -9,11 +9,7 @@ from scipy.optimize import lsq_linear
 from toy_robots import grasp_of
 
 import casadi_ik as ik
-from casadi_ik.methods.common.bounded_step import Bounded, clip, damped_step, elimination
-from casadi_ik.methods.common.contact_fit import BALANCE
-from casadi_ik.methods.hand_first.method import HandFirstMethod
-from casadi_ik.methods.hand_first.parameters import HandFirstParameters
-from casadi_ik.problem.targets import TargetBatch, target_arrays
+from casadi_ik.methods.common.bounded_step import Bounded, damped_step
 
 M, N, FIRST = 9, 7, 3
 
@@ -126,22 +122,7 @@ def test_a_singular_problem_is_finite(step):
     np.testing.assert_array_equal(s, 0)
 
 
-def test_clip():
-    bounds = Bounded(ca.DM.zeros(2), ca.DM([-1, -1]), ca.DM([1, 1]), 0)
-    np.testing.assert_array_equal(np.array(clip(ca.DM([3, -2]), bounds)).ravel(), [1, -1])
-
-
 FINGERS, JOINTS, PALM = 5, 4, 6
-
-
-def test_fingers_that_share_a_palm_alone_are_eliminated_one_by_one():
-    """The order of least fill: no pivot is coupled with more than its finger and the palm."""
-    normal = ca.sparsify(fingers().T @ fingers())
-    order = elimination(normal.sparsity(), PALM, 2)
-    assert not order.once
-    assert max(len(pivot.others) for pivot in order.each) == JOINTS - 1 + PALM
-    # Of few motors the palm comes first, once.
-    assert elimination(ca.Sparsity.dense(N, N), FIRST, 2).once
 
 
 def test_a_sparse_problem_has_the_solution_of_the_dense_one(rng):
@@ -254,27 +235,6 @@ def test_alone_in_a_batch_and_in_blocks_the_answer_is_the_same(robot):
         # A grasp normalises its normals itself, so the last digit may differ.
         np.testing.assert_allclose(alone.q, batch.q[row], atol=1e-6)
         assert alone.success == batch.success[row]
-
-
-def test_the_largest_part_falls_until_all_are_met(robot):
-    method = HandFirstMethod(robot.description, HandFirstParameters())
-    targets = target_arrays(*displaced(robot, np.random.default_rng(1), 1000, 0.98), 3)
-    asked = TargetBatch(*targets, TOLERANCE, True)
-    outcome = method.run(asked, np.tile(robot.home, (len(asked), 1)), 0, True)
-    seen = 0
-    for trace in outcome.trace:
-        stage = trace[trace["phase"] == ik.answers.Phase.BALANCE]
-        if not len(stage):
-            continue
-        seen += 1
-        parts = np.maximum(
-            stage["position_error"] / TOLERANCE.position,
-            np.sin(stage["angle_error"] / 2) / np.sin(TOLERANCE.angle / 2),
-        ).max(axis=1)
-        assert 1 < parts[0] < BALANCE.near
-        assert parts.min() > 1
-        assert trace["status"][-1] == ik.Status.SOLVED
-    assert seen > 5
 
 
 def test_fits_that_come_back_to_a_minimum_that_misses_end_the_rounds_of_tables(robot):

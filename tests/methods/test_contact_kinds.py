@@ -6,17 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as arrays_of
+from trace_checks import Kept
 
 import casadi_ik as ik
 from casadi_ik import logs
-from casadi_ik.grasps.grasp import MORE, PLACES, fault, faulty
-from casadi_ik.problem.contacts import CONDITIONS, NAMES, ContactKind, by_kinds, more_arrays, usual
-from casadi_ik.problem.targets import TargetBatch
-from casadi_ik.problem.verdict import judge
-from casadi_ik.proofs.prove import Prover
 
 METHODS = ("hand-first", "thumb-first", "ipopt")
 PAPER = ("enhanced-dls", "enhanced-sdls", "original-dls", "original-sdls")
@@ -127,6 +120,45 @@ def test_every_kind_is_solved(robot, oracle, solvers, method, kind):
         assert not angle > TIGHT.angle
 
 
+@pytest.mark.parametrize("free", ["finger", "normal", "thumb", "all normals", "all but one finger"])
+@pytest.mark.parametrize(
+    ("method", "tolerance", "least"),
+    [
+        ("hand-first", ik.Tolerance(), 1),
+        ("hand-first", ik.Tolerance(1e-6, 1e-6), 1),
+        ("thumb-first", ik.Tolerance(), 0.93),
+    ],
+)
+def test_what_is_free_has_no_rows(robot, rng, method, tolerance, least, free):
+    """Solved, and the log measures nothing of it."""
+    points, normals = robot.contacts(robot.random(rng, 120))
+    rows, finger = np.arange(120), rng.integers(0, 3, 120)
+    if free == "finger":
+        points[rows, finger] = normals[rows, finger] = np.nan
+    elif free == "normal":
+        normals[rows, finger] = np.nan
+    elif free == "thumb":
+        thumb = robot.fingers.index(robot.thumb)
+        points[:, thumb] = normals[:, thumb] = np.nan
+    elif free == "all normals":
+        normals[:] = np.nan
+    else:
+        points[:, :2] = normals[:, :2] = np.nan
+    solver, kept = ik.Solver(robot, method, tolerance), Kept()
+    batch = solver.solve_batch(points, normals)
+    assert batch.success.mean() >= least
+    assert batch.limits_ok.all()
+    solver.solve_batch(points[:5], normals[:5], log=kept)
+    (block,) = kept.blocks
+    given = [
+        np.repeat(~np.isnan(x[:5, :, 0]), block.batch.iterations, 0) for x in (points, normals)
+    ]
+    measured = np.isfinite(block.rows["position_error"]).any(axis=1)
+    assert measured.any()
+    for name, known in zip(("position_error", "angle_error"), given, strict=True):
+        np.testing.assert_array_equal(np.isfinite(block.rows[name])[measured], known[measured])
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_whole_poses_of_all_fingers(robot, oracle, solvers, method):
     """More is asked than the hand has joints for, so from the configuration that has them."""
@@ -136,28 +168,6 @@ def test_whole_poses_of_all_fingers(robot, oracle, solvers, method):
     assert solution.success, solution
     for frame, wanted in zip(pinocchio_frames(oracle, solution.q), at, strict=True):
         np.testing.assert_allclose(frame[:3, :3], wanted[:3, :3], atol=2e-3)
-
-
-def test_a_fingertip_turned_about_its_normal_misses_its_pose(robot):
-    """The verdict's angle of a pose is that of the whole frame."""
-    at = frames(robot)
-    q = robot.home + np.random.default_rng(3).uniform(-1, 1, 14) * 0.05 * (
-        robot.upper - robot.lower
-    )
-    q = np.clip(q, robot.lower, robot.upper)
-    points, normals, tangents = at[:, :3, 3], at[:, :3, 0], at[:, :3, 1]
-    turned = np.cos(0.3) * tangents + np.sin(0.3) * np.cross(normals, tangents)
-    for asked_for, expected in ((tangents, 0.0), (turned, 0.3)):
-        asked = TargetBatch(
-            points[None],
-            normals[None],
-            TIGHT,
-            enforce_limits=True,
-            more={"tangents": asked_for[None]},
-        )
-        found = judge(robot, asked, q[None])
-        np.testing.assert_allclose(found.angle_error, expected, atol=1e-9)
-        assert found.all_ok[0] == (expected == 0)
 
 
 @pytest.mark.parametrize("method", PAPER)
@@ -253,7 +263,7 @@ def test_what_was_asked_stands_in_the_log(robot, solvers, tmp_path: Path):
     asked = {"points": solve.target_points, "normals": solve.target_normals, **solve.target_more}
     for name, one in grasp.contacts.items():
         row = robot.fingers.index(name)
-        for vector in ("point", "normal", *MORE):
+        for vector in ("point", "normal", "tangent", "line", "plane", "ball"):
             given = getattr(one, vector)
             logged = asked.get(f"{vector}s", np.full((3, 3), np.nan))[row]
             np.testing.assert_array_equal(logged, np.full(3, np.nan) if given is None else given)
@@ -276,7 +286,7 @@ def test_what_was_asked_stands_in_the_log(robot, solvers, tmp_path: Path):
     assert second.status == first.status
 
 
-def test_why_a_pose_is_not_solved(robot, solvers):
+def test_why_a_pose_is_not_solved(robot, oracle, solvers):
     """The diagnosis asks with tangents as well: what helps is to leave one free."""
     at = frames(robot)
     normals, tangents = at[:, :3, 0], at[:, :3, 1].copy()
@@ -287,6 +297,10 @@ def test_why_a_pose_is_not_solved(robot, solvers):
     }
     solution = solvers["hand-first"].solve(ik.Grasp(contacts))
     assert not solution.success
+    for i, frame in enumerate(pinocchio_frames(oracle, solution.q)):
+        missed = solution.contacts[robot.fingers[i]]
+        expected = off(frame, contacts[robot.fingers[i]])
+        np.testing.assert_allclose((missed.position_error, missed.angle_error), expected, atol=1e-6)
     assert solution.diagnosis is not None
     assert solution.diagnosis.nearest["finger_2"].angle_error > 0.1
     assert ("normal", "finger_2") in [(one.part, one.finger) for one in solution.diagnosis.freed]
@@ -343,98 +357,46 @@ def test_bad_grasp_files(tmp_path: Path, thumb, message):
     assert str(path) in str(caught.value)
 
 
-def test_bad_arrays(robot):
-    points, normals, tangents = (frames(robot)[None, :, :3, i] for i in (3, 0, 1))
-    tilted = tangents + 0.01 * normals
-    lone = np.where(np.arange(3)[:, None] == 1, np.nan, normals)
-    for bad, facing, message in (
-        (tilted, normals, "row 4, finger 0: tangent: .* expected 90 deg"),
-        (tangents, lone, "row 4, finger 1: tangent: found one without a normal"),
-        (np.where(tangents > 0, np.nan, tangents), normals, "expected finite numbers"),
-        (0 * tangents, normals, "row 4, finger 0: tangent: .* not zero"),
+def test_bad_arrays(robot, solvers):
+    """The row and finger are named, whichever of several is wrong."""
+    usual = np.repeat(frames(robot)[None], 5, axis=0)
+    points, normals, tangents = (usual[:, :, :3, i].copy() for i in (3, 0, 1))
+    solver, lone = solvers["hand-first"], normals.copy()
+    lone[4, 1] = np.nan
+
+    def bad(value):
+        return np.concatenate([tangents[:4], value])
+
+    for more, facing, message in (
+        (
+            {"tangents": bad(tangents[4:] + 0.01 * normals[4:])},
+            normals,
+            "0: tangent: .* expected",
+        ),
+        ({"tangents": tangents}, lone, "1: tangent: found one without a normal"),
+        ({"tangents": bad(np.where(tangents[4:] > 0, np.inf, tangents[4:]))}, normals, "finite"),
+        ({"tangents": bad(0 * tangents[4:])}, normals, "0: tangent: .* not zero"),
+        ({"lines": tangents, "planes": bad(tangents[4:])}, normals, "line and plane: found both"),
     ):
         with pytest.raises(ik.errors.RowError, match=message) as caught:
-            more_arrays({"tangents": bad}, points, facing, first_row=4)
-        assert caught.value.row == 4
+            solver.solve_batch(points, facing, **more)
+        assert caught.value.row == (0 if "lines" in more else 4)
     with pytest.raises(
-        ik.errors.InputError, match=r"tangents: found shape \(1, 3\), expected \(1, 3, 3\)"
+        ik.errors.InputError, match=r"tangents: found shape \(5, 3\), expected \(5, 3, 3\)"
     ):
-        more_arrays({"tangents": tangents[..., 0]}, points, normals)
+        solver.solve_batch(points, normals, tangents=tangents[..., 0])
 
 
-def test_all_contacts_at_once_are_judged_like_each():
-    """With vectors left out at random, tangents across their normals or not."""
-    rng = np.random.default_rng(5)
-    whole = {name: rng.normal(size=(400, 3)) for name in ("point", "normal", *MORE)}
-    across = rng.random(400) < 0.7
-    whole["tangent"][across] = np.cross(whole["normal"], whole["line"])[across]
-    for name, array in whole.items():
-        if name != "point":
-            array /= np.linalg.norm(array, axis=1)[:, None]
-        array[rng.random(400) < (0.8 if name in PLACES else 0.3)] = np.nan
-    single = [
-        fault({name: array[i] for name, array in whole.items() if not np.isnan(array[i, 0])})
-        for i in range(400)
-    ]
-    expected = [problem is not None for problem in single]
-    assert 50 < sum(expected) < 350
-    assert len(set(single)) > 20
-    np.testing.assert_array_equal(faulty(whole), expected)
-
-
-@given(
-    free=arrays_of.arrays(bool, (5, 3, 3)),
-    place=st.sampled_from(PLACES),
-)
-def test_every_target_is_in_one_group_of_its_kinds(free, place):
-    """Groups are disjoint, cover the batch and have what their targets have; numbers are kept."""
-    rng = np.random.default_rng(0)
-    points = rng.normal(size=(5, 3, 3))
-    more = {}
-    for i, name in enumerate(("tangents", f"{place}s")):
-        array = rng.normal(size=(5, 3, 3))
-        array[free[..., i]] = np.nan
-        if not np.isnan(array).all():
-            more[name] = array
-    asked = TargetBatch(points, points, TIGHT, enforce_limits=True, first_row=10, more=more)
-    seen = []
-    for kinds, rows, some in by_kinds(asked):
-        rows = np.arange(5)[rows]
-        seen += rows.tolist()
-        assert [some.number(i) for i in range(len(some))] == (10 + rows).tolist()
-        for name, array in more.items():
-            given = ~np.isnan(array[rows][..., 0])
-            if name == "tangents":
-                given = np.repeat(given.any(axis=1)[:, None], 3, axis=1)
-                asks = [kind.facing == "frame" for kind in kinds]
-            else:
-                asks = [kind.place == name[:-1] for kind in kinds]
-            np.testing.assert_array_equal(given, np.tile(asks, (len(rows), 1)))
-    assert sorted(seen) == [0, 1, 2, 3, 4]
-
-
-def test_the_tables_agree():
-    """Every vector that a grasp can have is needed by a condition, and the other way round."""
-    needed = {name for condition in CONDITIONS.values() for name in condition.data}
-    assert needed == {"point", "normal", *MORE}
-    assert NAMES == ("tangents", "lines", "planes", "balls")
-    assert [kinds for kinds, _, _ in by_kinds(_plain())] == [usual(3)]
-    assert ContactKind() == ContactKind("point", "normal")
-
-
-def _plain() -> TargetBatch:
-    return TargetBatch(np.zeros((2, 3, 3)), np.zeros((2, 3, 3)), TIGHT, enforce_limits=True)
-
-
-def test_no_proof_counts_a_contact_that_may_slide(robot):
+def test_no_proof_counts_a_contact_that_may_slide(robot, solvers):
     """Its point is far out of reach; the plane through it is not."""
     at = frames(robot)
-    points, normals = at[None, :, :3, 3].copy(), at[None, :, :3, 0]
-    points[0, 0, :2] += 5.0
-    planes = np.full((1, 3, 3), np.nan)
-    planes[0, 0] = UP
-    prover = Prover(robot.description, compiled=False)
-    asked = TargetBatch(points, normals, TIGHT, enforce_limits=True)
-    assert prover.prove(asked)[0] is not None
-    slides = TargetBatch(points, normals, TIGHT, enforce_limits=True, more={"planes": planes})
-    assert prover.prove(slides)[0] is None
+    far = at[0, :3, 3] + [5.0, 5.0, 0.0]
+    others = {
+        name: ik.Contact(at[i, :3, 3], at[i, :3, 0]) for i, name in enumerate(robot.fingers) if i
+    }
+    for first, status in (
+        (ik.Contact(far, at[0, :3, 0]), ik.Status.UNREACHABLE),
+        (ik.Contact(far, at[0, :3, 0], plane=UP), ik.Status.SOLVED),
+    ):
+        asked = ik.Grasp({**others, robot.fingers[0]: first})
+        assert solvers["hand-first"].solve(asked).status is status

@@ -246,9 +246,10 @@ def test_unreachable_contacts_are_a_status(case):
 def test_a_log_changes_no_number(case, tmp_path):
     solver = case.solver()
     path = tmp_path / "solve.mcap"
-    plain = solver.solve_batch(case.points, case.normals, seed=4)
-    logged = solver.solve_batch(case.points, case.normals, seed=4, log=path)
-    fields_equal(plain, logged)
+    for count in (1, len(case.points)):  # alone, and side by side
+        asked = case.points[:count], case.normals[:count]
+        plain = solver.solve_batch(*asked, seed=4)
+        fields_equal(plain, solver.solve_batch(*asked, seed=4, log=path))
     log = ik.logs.open(path)
     solves = log.solves().rows
     np.testing.assert_array_equal(solves["solve_id"], np.arange(len(case.points)))
@@ -348,21 +349,56 @@ def test_parameters_say_everything(case):
             ik.errors.InputError,
             "finger_step: found 'fmincon', expected one of ipopt, closed-form",
         ),
-        (
-            {"method": "enhanced-dls", "options": {"chain_damping": "big"}},
-            ik.errors.InputError,
-            "chain_damping: found 'big', expected a number > 0",
-        ),
-        (
-            {"method": "enhanced-dls", "options": {"borrowed": 7}},
-            ik.errors.UnsupportedError,
-            "cannot borrow 7 arm joints",
-        ),
     ],
 )
 def test_bad_solvers(robot, arguments, error, says):
     with pytest.raises(error) as caught:
         ik.Solver(robot, **arguments)
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("method", "options", "says"),
+    [
+        ("hand-first", {"candidates": 0}, "candidates: found 0, expected a whole number >= 1"),
+        ("hand-first", {"table": 4}, "table: found 4, expected at least"),
+        ("thumb-first", {"step": "newton"}, "step: found 'newton', expected one of freeze, proxqp"),
+        ("thumb-first", {"starts": 0}, "starts: found 0, expected a whole number >= 1"),
+        ("thumb-first", {"table": 8}, "table: found 8, expected at least starts = 32"),
+        ("thumb-first", {"step_cap": 0.0}, "step_cap: found 0.0, expected a number > 0"),
+        ("ipopt", {"restarts": -1}, "restarts: found -1, expected a whole number >= 0"),
+        ("ipopt", {"restarts": True}, "restarts: found True"),
+        ("ipopt", {"max_iterations": 0}, "max_iterations: found 0, expected a whole number >= 1"),
+        ("ipopt", {"optimality": 0}, "optimality: found 0, expected a number > 0"),
+        ("ipopt", {"optimality": "small"}, "optimality: found 'small'"),
+        ("ipopt", {"optimality": math.nan}, "optimality: found nan"),
+        ("enhanced-dls", {"palm_error": 3}, "palm_error: found 3, expected one of euler"),
+        (
+            "enhanced-dls",
+            {"platform": "hand"},
+            "platform: found 'hand', expected one of arm-leg",
+        ),
+        ("enhanced-dls", {"chain_damping": 0.0}, "chain_damping: found 0.0, expected a number > 0"),
+        ("enhanced-dls", {"chain_damping": math.nan}, "chain_damping: found nan"),
+        (
+            "enhanced-dls",
+            {"reaching_damping": "much"},
+            "reaching_damping: found 'much', expected",
+        ),
+        ("enhanced-dls", {"virtual_weight": -1}, "virtual_weight: found -1"),
+        ("enhanced-dls", {"max_iterations": 0}, "max_iterations: found 0, expected an integer > 0"),
+        ("enhanced-dls", {"max_iterations": 1.5}, "max_iterations: found 1.5, expected an integer"),
+        ("enhanced-dls", {"borrowed": -1}, "borrowed: found -1, expected an integer >= 0"),
+        ("enhanced-dls", {"borrowed": True}, "borrowed: found True"),
+        ("enhanced-dls", {"borrowed": 7}, "cannot borrow 7 arm joints"),
+        ("enhanced-dls", {"step_cap": 0.0}, "step_cap: found 0.0"),
+    ],
+)
+def test_bad_options(robot, method, options, says):
+    error = ik.errors.UnsupportedError if "cannot" in says else ik.errors.InputError
+    with pytest.raises(error) as caught:
+        ik.Solver(robot, method, options=options)
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
 

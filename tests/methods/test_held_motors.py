@@ -25,6 +25,21 @@ def all_solved(
     return bool(batch.success.all())
 
 
+@pytest.mark.parametrize(
+    ("method", "limits", "least"),
+    [("hand-first", "enforce", 1), ("hand-first", "ignore", 1), ("thumb-first", "enforce", 0.9)],
+)
+def test_every_motor_may_be_held(robot, rng, method, limits, least):
+    tolerance = ik.Tolerance(1e-6, 1e-6) if method == "hand-first" else ik.Tolerance()
+    solver = ik.Solver(robot, method, tolerance, limits=limits)
+    for i, name in enumerate(robot.actuators):
+        q = robot.random(rng, 25)
+        q[:, i] = value = rng.uniform(robot.lower[i], robot.upper[i])
+        batch = solver.solve_batch(*robot.contacts(q), fixed={name: value})
+        assert batch.success.mean() >= least, name
+        np.testing.assert_array_equal(batch.q[:, i], value)
+
+
 @pytest.mark.parametrize("prefer", ["limits", "q0"])
 @pytest.mark.parametrize(
     ("name", "fixed"),
@@ -75,49 +90,6 @@ def test_a_joint_of_an_arm_with_two_spheres_may_be_held_in_another_turn(tmp_path
             joint["limits"] = ["-360 deg", "360 deg"]
     (tmp_path / "arm.yaml").write_text(yaml.safe_dump(arm))
     assert all_solved(ik.load_robot(path), {"lwr_joint_1": 4.2, "lwr_joint_7": -5.1}, prefer)
-
-
-FIXED = ("fr3_joint_3", "fr3_joint_4", "trifinger_finger_2_0")
-OTHERS_FIXED = ("fr3_joint_1", "fr3_joint_4", "trifinger_finger_1_0")
-OF_THE_ARM = ("fr3_joint_1", "fr3_joint_4")
-
-
-@pytest.mark.parametrize(
-    ("names", "q"),
-    [
-        (
-            FIXED,
-            [
-                *(1.223134, -0.000228, -0.383794, -2.444648, 2.592195, 2.932624, -2.377022),
-                *(0.83858, 0.882637, -1.144192, 0.043121, 0.387828, -1.526174),
-                *(-0.254952, 1.144506, -1.033636),
-            ],
-        ),
-        (
-            OTHERS_FIXED,
-            [
-                *(-2.230327, -0.323357, 2.518197, -0.977686, 1.282477, 1.782027, 2.46734),
-                *(0.658108, 1.06685, -1.471483, 0.719918, 0.597569, -1.089626),
-                *(0.223291, 0.098716, -0.228548),
-            ],
-        ),
-        (
-            OF_THE_ARM,
-            [
-                *(-2.090603, -0.128606, 0.883355, -1.395061, 1.718212, 3.905984, 0.543886),
-                *(0.416687, 0.965512, -0.019154, 0.334969, 1.051129, -0.369165),
-                *(0.47602, 0.889617, -0.566708),
-            ],
-        ),
-    ],
-)
-def test_several_motors_held(names, q):
-    """No table holds the hand's postures, nor has the arm all motions of a palm: more rounds."""
-    robot = ik.load_robot("fr3+trifinger")
-    points, normals = robot.contacts(np.array([q]))
-    fixed = {name: q[robot.actuators.index(name)] for name in names}
-    batch = ik.Solver(robot).solve_batch(points, normals, fixed=fixed)
-    assert batch.success.all()
 
 
 @pytest.mark.parametrize("joints", [5, 3])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from robot_variants import derived_robot, thumb_of
+from robot_variants import thumb_of
 from samplers import shipped_hands
 
 import casadi_ik as ik
@@ -108,35 +108,6 @@ def test_out_of_reach_the_best_is_kept(robot, solver, rng):
     assert batch.limits_ok.all()
 
 
-@pytest.mark.parametrize("free", ["finger", "normal", "thumb", "all normals"])
-def test_partial_grasps(robot, solver, rng, free):
-    """What is free has no rows, the thumb's contact too: the chain is then open."""
-    points, normals = robot.contacts(robot.random(rng, 100))
-    rows, finger = np.arange(100), rng.integers(0, 3, 100)
-    if free == "finger":
-        points[rows, finger] = normals[rows, finger] = np.nan
-    elif free == "normal":
-        normals[rows, finger] = np.nan
-    elif free == "thumb":
-        thumb = robot.fingers.index(robot.thumb)
-        points[:, thumb] = normals[:, thumb] = np.nan
-    else:
-        normals[:] = np.nan
-    batch = solver.solve_batch(points, normals)
-    assert batch.success.mean() >= 0.93
-    assert batch.limits_ok.all()
-
-
-def test_locked_actuators_stay(robot, solver, rng):
-    for name in ("lwr_joint_3", "bh_spread", "bh_thumb_distal"):
-        q = robot.random(rng, 25)
-        i = robot.actuators.index(name)
-        q[:, i] = value = rng.uniform(robot.lower[i], robot.upper[i])
-        batch = solver.solve_batch(*robot.contacts(q), fixed={name: value})
-        assert batch.success.mean() >= 0.9, name
-        np.testing.assert_array_equal(batch.q[:, i], value)
-
-
 def test_the_start_chooses_between_hands(robot, once, rng):
     """Of several hands for the same contacts, the one near q0 is begun with."""
     q = robot.random(rng, 200)
@@ -146,14 +117,6 @@ def test_the_start_chooses_between_hands(robot, once, rng):
     hand = list(robot.description.hand_actuators)
     from_home, from_truth = (np.abs(batch.q - q)[:, hand].max(axis=1) for batch in batches)
     assert np.median(from_truth) < np.median(from_home)
-
-
-def test_an_arm_without_a_closed_form(tmp_path_factory):
-    robot = derived_robot(tmp_path_factory.mktemp("offset"), wrist_offset=0.045)
-    q = robot.random(np.random.default_rng(5), 60)
-    batch = thumb_first(robot).solve_batch(*robot.contacts(q))
-    assert batch.success.mean() >= 0.95
-    assert batch.phases["arm-placement"].all()
 
 
 def test_without_an_arm_the_palm_is_fixed(coupled_robot, rng):
@@ -171,20 +134,6 @@ def test_proxqp_solves_as_well(robot, once, rng):
     np.testing.assert_array_equal(one.success, other.success)
     assert other.limits_ok.all()
     assert np.mean(one.iterations == other.iterations) > 0.8
-
-
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        ({"step": "newton"}, "step: found 'newton', expected one of freeze, proxqp"),
-        ({"starts": 0}, "starts: found 0, expected a whole number >= 1"),
-        ({"table": 8}, f"table: found 8, expected at least starts = {STARTS}"),
-        ({"step_cap": 0.0}, "step_cap: found 0.0, expected a number > 0"),
-    ],
-)
-def test_parameters_are_checked(robot, options, says):
-    with pytest.raises(ik.errors.InputError, match=says):
-        ik.Solver(robot, "thumb-first", options=options)
 
 
 @pytest.mark.parametrize("joints", [1, 3, 4])

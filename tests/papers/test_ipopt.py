@@ -14,7 +14,6 @@ from casadi_ik.papers.ipopt import (
     IpoptParameters,
     WholeNlp,
     contact_errors,
-    limited_joints,
 )
 from casadi_ik.problem.contacts import usual
 
@@ -102,15 +101,6 @@ def test_derivatives_are_central_differences(which, request, rng):
         )
 
 
-def test_ipopt_is_given_the_exact_hessian(robot, program):
-    """Ipopt's own counters: the graph of the Hessian is called, in every iteration."""
-    start = robot.home
-    goal = np.clip(start + 0.1, robot.lower, robot.upper)
-    run = program.solve(start, program.targets(goal))
-    stats = program.nlp._solvers[0.1].stats()
-    assert stats["n_call_nlp_hess_l"] == len(run.path) - 1 > 2
-
-
 def test_a_start_close_to_the_solution_stays_close(robot, program, rng):
     """A small barrier and a slight pull: no detour along the arm's self-motion."""
     rows, moved = [], []
@@ -123,16 +113,6 @@ def test_a_start_close_to_the_solution_stays_close(robot, program, rng):
         moved.append(np.abs(run.q - start).max())
     assert np.mean(rows) < 10
     assert max(moved) < 0.02
-
-
-def test_joint_limits_that_motors_imply_are_no_constraints(robot, coupled_robot):
-    """Spread joints follow their motor within its range; a four-bar may go anywhere."""
-    assert limited_joints(robot.description) == []
-    names = [
-        coupled_robot.description.joint_names[i] for i in limited_joints(coupled_robot.description)
-    ]
-    assert "left_3" in names
-    assert "left_spread" not in names
 
 
 def test_joint_limits_are_kept(tmp_path, rng):
@@ -164,22 +144,6 @@ def test_numbers_that_are_not_finite_are_a_status(robot, program):
     run = program.solve(robot.home, program.targets(robot.home) * 1e200)
     assert run.status is not ik.Status.SOLVED
     assert np.all(np.isfinite(run.q))
-
-
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        ({"restarts": -1}, "restarts: found -1, expected a whole number >= 0"),
-        ({"restarts": True}, "restarts: found True"),
-        ({"max_iterations": 0}, "max_iterations: found 0, expected a whole number >= 1"),
-        ({"optimality": 0}, "optimality: found 0, expected a number > 0"),
-        ({"optimality": "small"}, "optimality: found 'small'"),
-        ({"optimality": float("nan")}, "optimality: found nan"),
-    ],
-)
-def test_bad_parameters(options, says):
-    with pytest.raises(ik.errors.InputError, match=says):
-        IpoptParameters(**options)
 
 
 TIGHT = ik.Tolerance(position=1e-6, angle=1e-6)

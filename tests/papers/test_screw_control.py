@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from toy_robots import write_coupled_robot
 
 import casadi_ik as ik
 
@@ -12,9 +11,9 @@ KINDS = ("pose", "position", "planar-pose", "distance", "contact")
 
 
 @pytest.fixture(scope="module")
-def toy(tmp_path_factory) -> ik.ArmHand:
+def toy(coupled_robot) -> ik.ArmHand:
     """Sliders, a four-bar, linear couplings, a shared motor, a prismatic joint."""
-    return ik.load_robot(write_coupled_robot(tmp_path_factory.mktemp("toy")))
+    return coupled_robot
 
 
 def law(toy, kind="position", relative_to="thumb", gain=0.5, **options) -> ik.papers.ScrewControl:

@@ -11,7 +11,6 @@ import pytest
 from algebra_samples import PROPERTY, rotation_vectors, unit_vectors, vectors
 from hypothesis import given
 from hypothesis import strategies as st
-from toy_robots import write_coupled_robot
 
 import casadi_ik as ik
 from casadi_ik.symbolic import couplings, mechanisms, screws, se3
@@ -45,10 +44,10 @@ EQUATIONS = {
 }
 
 
-@pytest.fixture
-def toy(tmp_path) -> ik.ArmHand:
+@pytest.fixture(scope="module")
+def toy(coupled_robot) -> ik.ArmHand:
     """Sliders, a four-bar, linear couplings, a shared motor, a prismatic joint."""
-    return ik.load_robot(write_coupled_robot(tmp_path))
+    return coupled_robot
 
 
 def evaluated(*expressions, q, at):
