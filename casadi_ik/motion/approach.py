@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
+from typing import Any
 
 import numpy as np
 
@@ -112,29 +113,19 @@ class Closer:
             palms: (k, 4, 4) by side; where they are if it is left out.
             given: (f,) whether a fingertip counts.
         """
-        asked, count = self._asked, len(tips)
-        layout = asked.cycle.parameters
-        every = np.repeat(asked.run.parameters[None], count, axis=0)
-        f = len(given)
-        values = {
+        asked, f = self._asked, len(given)
+        values: dict[str, Any] = {
             "points": tips,
-            "normals": np.tile(ANY, (count, f, 1)),
-            "weights": np.tile(np.stack([given, 0 * given], axis=1), (count, 1, 1)),
-            "position_tolerance": np.ones((count, f)),
-            "angle_tolerance": np.ones((count, f)),
+            "normals": [ANY] * f,
+            "weights": np.stack([given, 0 * given], axis=1),
+            "position_tolerance": np.ones(f),
+            "angle_tolerance": np.ones(f),
         }
         for side in asked.cycle.palms:
-            stays = np.repeat(self._robot.palm(q, side)[None], count, axis=0)
-            poses = palms.get(side, stays)
-            wanted = {
-                "point": poses[:, :3, 3],
-                "axes": poses[:, :3, :3],
-                "weight": np.ones((count, 2)),
-            }
+            poses = palms.get(side, self._robot.palm(q, side))
+            wanted = {"point": poses[..., :3, 3], "axes": poses[..., :3, :3], "weight": np.ones(2)}
             values |= {of_side(f"palm_{name}", side): array for name, array in wanted.items()}
-        for name, array in values.items():
-            every[:, layout.slice(name)] = array.reshape(count, -1)
-        rows = np.repeat(every, self.cycles, axis=0)
+        rows = np.repeat(asked.rows(len(tips), values), self.cycles, axis=0)
         states, _ = asked.run.run(asked.state_at(q), rows)
         found = states[self.cycles - 1 :: self.cycles, : len(q)]
         found[0] = q

@@ -117,6 +117,19 @@ class FollowerInputs:
         for name, value in values.items():
             self.views[name][...] = value
 
+    def rows(self, count: int, values: Mapping[str, ArrayLike]) -> Array:
+        """(count, ...) parameters of cycles.
+
+        Args:
+            count: How many.
+            values: (count, ...) by name, or one for all of them; what is left out stays as it is.
+        """
+        every = np.repeat(self.run.parameters[None], count, axis=0)
+        for name, value in values.items():
+            own = every[:, self.cycle.parameters.slice(name)]
+            own[...] = np.reshape(value, (-1, own.shape[1]))
+        return every
+
     def ask(self, points: Array, normals: Array | None) -> None:
         """Ask for points and normals that are all there; `sound` tells if they were not.
 

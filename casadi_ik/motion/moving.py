@@ -20,9 +20,8 @@ from casadi_ik.methods.hand_first.method import UNBOUNDED
 from casadi_ik.motion.approach import Approach, ApproachPlan, approach
 from casadi_ik.motion.follower import Follower
 from casadi_ik.motion.inputs import FollowPlan
-from casadi_ik.motion.place import PlacePlan, place
-from casadi_ik.motion.reach import Carried, Pace, Reach, ReachPlan, move, reach
-from casadi_ik.motion.timing import Rates, a_direction, length, rates_of, seconds, unbounded
+from casadi_ik.motion.reach import Carried, Pace, Reach, WayPlan, move, place, reach
+from casadi_ik.motion.timing import a_direction, length, rates_of, seconds, unbounded
 from casadi_ik.motion.track import PathTracker, Track, track
 from casadi_ik.problem.contacts import by_kinds
 from casadi_ik.problem.request import Request, one_palm
@@ -85,7 +84,10 @@ class MovingSolver:
         rates = rates_of(self.robot, velocity, acceleration)
         comfortable = start if posture is None else self._request.start(posture)
         return Follower(
-            self._plan(
+            FollowPlan(
+                self._request,
+                self._engine.check,
+                self._engine.compiled,
                 start,
                 self._bounds(None),
                 seconds("period", period),
@@ -146,10 +148,7 @@ class MovingSolver:
         travel = None
         if period is not None:
             travel = rates_of(self.robot, velocity, None).steps(seconds("period", period))[0]
-        bounds, rates = self._bounds(targets), unbounded(self.robot)
-        tracker = PathTracker(
-            self._plan(start, bounds, 1.0, rates, start, math.inf, PATH_PULL), kinds
-        )
+        tracker = PathTracker(self._path_plan(start, targets), kinds)
         prefer = "limits" if q0 is None else "q0"
         return track(engine, targets, start, prefer, tracker, travel, seed)
 
@@ -215,11 +214,10 @@ class MovingSolver:
             self.robot.description.arm_actuators or self.robot.description.sides
         ):
             raise UnsupportedError(f"lift: {self.robot.name!r} has no arm that moves its palm")
-        pace = Pace(rates_of(self.robot, velocity, acceleration), seconds("period", period))
+        pace = self._pace(velocity, acceleration, period)
         last = self._last_part(grasp, start, opening, distance, direction)
-        solutions, why = self._solutions(grasp, last.problem, start, seed, limit)
-        asked = ReachPlan(last, pace, seed, *onward)
-        return reach(asked, np.clip(start, *last.plan.bounds), solutions, why)
+        asked = WayPlan(last, pace, seed, np.clip(start, *last.plan.bounds))
+        return reach(asked, *self._solutions(grasp, last.problem, start, seed, limit), *onward)
 
     def place(
         self,
@@ -283,24 +281,19 @@ class MovingSolver:
             raise UnsupportedError(f"place: {self.robot.name!r} has no arm that moves its palm")
         moved = target @ inverse(chosen.known_pose)
         q = self._request.start(held.q, "q")
-        hand = {self.robot.actuators[i]: float(q[i]) for i in self._palm_motors}
+        motors = self.robot.description.finger_motors
+        hand = {name: float(q[self.robot.actuators.index(name)]) for name in motors}
         palm = Grasp(robot=chosen.robot, palm=moved @ self.robot.palm(q), posture=hand)
         there = replace(chosen.at(moved), pregrasp=None)
         last = self._last_part(there, start, opening, distance, direction)
         carried = None
         if self._engine.check is not None:
             carried = Carried(self._engine.check, self._request.of_grasps([chosen], None), q)
-        pace = Pace(rates_of(self.robot, velocity, acceleration), seconds("period", period))
-        asked = PlacePlan(last, carried, length("lower", lower), pace, seed)
+        pace, above = self._pace(velocity, acceleration, period), length("lower", lower)
+        asked = WayPlan(last, pace, seed, np.clip(start, *last.plan.bounds))
         problem = self._request.of_grasps([palm], None)
-        solutions, why = self._solutions(palm, problem, start, seed, limit)
-        return place(asked, np.clip(start, *last.plan.bounds), solutions, why)
-
-    @property
-    def _palm_motors(self) -> list[int]:
-        """Motors that move a finger."""
-        robot = self.robot.description
-        return sorted({i for name in robot.finger_names for i in robot.finger_actuators(name)})
+        solutions = self._solutions(palm, problem, start, seed, limit)
+        return place(asked, *solutions, carried, above)
 
     def move(
         self,
@@ -347,7 +340,7 @@ class MovingSolver:
                     f"{name}: found {self.robot.actuators[i]} at {q[i]:g}, expected a number from "
                     f"{lower[i]:g} to {upper[i]:g}"
                 )
-        pace = Pace(rates_of(self.robot, velocity, acceleration), seconds("period", period))
+        pace = self._pace(velocity, acceleration, period)
         query, check = None, self._engine.check
         if check is not None:
             query = check.collision_query(self._anything(np.nan)).rows(np.zeros(1, dtype=np.intp))
@@ -391,6 +384,11 @@ class MovingSolver:
         last = self._last_part(grasp, start, opening, distance, direction)
         return approach(last, *self._solutions(grasp, last.problem, start, seed, limit))
 
+    def _pace(
+        self, velocity: ArrayLike | None, acceleration: ArrayLike | None, period: float
+    ) -> Pace:
+        return Pace(rates_of(self.robot, velocity, acceleration), seconds("period", period))
+
     def _last_part(
         self,
         grasp: Grasp | Chosen,
@@ -404,9 +402,7 @@ class MovingSolver:
         problem = self._request.of_grasps([asked], None)
         before = asked.pregrasp and asked.pregrasp.one_palm
         return ApproachPlan(
-            self._plan(
-                start, self._bounds(None), 1.0, unbounded(self.robot), start, math.inf, PATH_PULL
-            ),
+            self._path_plan(start),
             problem,
             length("opening", opening),
             length("distance", distance),
@@ -434,28 +430,12 @@ class MovingSolver:
         every = [*best.q[best.success], *(one.q for one in found)][:limit]
         return every, "" if every else "the grasp has no solution"
 
-    def _plan(
-        self,
-        q0: Array,
-        bounds: tuple[Array, Array],
-        period: float,
-        rates: Rates,
-        posture: Array,
-        settling: float,
-        pull: float,
-    ) -> FollowPlan:
-        engine = self._engine
+    def _path_plan(self, q0: Array, targets: TargetBatch | None = None) -> FollowPlan:
+        """Paths are gone along at any speed."""
+        bounds, rates = self._bounds(targets), unbounded(self.robot)
+        check, compiled = self._engine.check, self._engine.compiled
         return FollowPlan(
-            self._request,
-            engine.check,
-            engine.compiled,
-            q0,
-            bounds,
-            period,
-            rates,
-            posture,
-            settling,
-            pull,
+            self._request, check, compiled, q0, bounds, 1.0, rates, q0, math.inf, PATH_PULL
         )
 
     def _bounds(self, targets: TargetBatch | None) -> tuple[Array, Array]:

@@ -6,7 +6,7 @@ the hand holds afterwards moves with the palm, and must not touch either (`Carri
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -18,7 +18,6 @@ from casadi_ik.collision.distances import gaps
 from casadi_ik.grasps.pose import inverse
 from casadi_ik.motion.approach import (
     ApproachPlan,
-    LastPart,
     ReachStatus,
     Tried,
     approaches,
@@ -135,6 +134,9 @@ PARTS = ("going", "coming", "closing", "lifting", "retreating")
 
 GOING, COMING, CLOSING, LIFTING, RETREATING = PARTS
 
+CARRYING, LOWERING, OPENING, LEAVING = "carrying", "lowering", "opening", "leaving"
+"""Of a motion that places: over the place, straight down, off the object, straight back."""
+
 UP = np.array([0.0, 0.0, 1.0])
 """Of the base frame."""
 
@@ -192,48 +194,124 @@ class Pace:
 
 
 @dataclass(frozen=True, eq=False)
-class ReachPlan:
-    """What a way to a grasp has to keep to.
+class WayPlan:
+    """What a whole way has to keep to.
 
     Attributes:
-        approach: What its last part has to keep to.
+        approach: What its part at the object has to keep to.
         pace: Its speed.
         seed: Of a planner.
-        lift: How far the hand goes straight up after it closed [m].
-        retreat: How far it goes back then, against the way it came [m].
+        q0: (n,) where the robot is.
     """
 
     approach: ApproachPlan
     pace: Pace
     seed: int
-    lift: float = 0.0
-    retreat: float = 0.0
+    q0: Array
+
+    @property
+    def robot(self) -> ArmHand:
+        """The robot."""
+        return self.approach.plan.robot
 
 
-def reach(asked: ReachPlan, q0: Array, solutions: Sequence[Array], why: str) -> Reach:
+Way = tuple[str, Array]
+"""Name of a part, and postures (k, n) on it."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Stage:
+    """Ways that are checked against the same.
+
+    Attributes:
+        ways: The ways.
+        query: What must not be touched on them; None: nothing is checked.
+        counts: Whether their clearance is that of the motion.
+    """
+
+    ways: Sequence[Way]
+    query: CollisionQuery | Carried | None
+    counts: bool = True
+
+
+def reach(
+    asked: WayPlan, solutions: Sequence[Array], why: str, lift: float, retreat: float
+) -> Reach:
     """The way to the first of some solutions to which there is one.
 
     Args:
         asked: What to keep to.
-        q0: (n,) where the robot is.
         solutions: (n,) each, of the grasp, best first.
         why: Why there are none.
+        lift: How far the hand goes straight up after it closed [m].
+        retreat: How far it goes back then, against the way it came [m].
     """
-    if not solutions:
-        return failed(ReachStatus.NOT_SOLVED, why)
-    reasons: list[tuple[ReachStatus, str]] = []
-    for one in approaches(asked.approach, solutions):
-        if one.last is None:
-            reasons.append((ReachStatus.NO_APPROACH, one.reason))
-            continue
-        found = _whole(asked, q0, one, one.last)
-        if found.success:
-            return found
-        reasons.append((found.status, found.reason))
-    # That which came farthest says most.
-    order = list(ReachStatus)
-    status, reason = max(reasons, key=lambda one: order.index(one[0]))
-    return failed(status, reason, len(solutions))
+    check, problem, robot = asked.approach.plan.check, asked.approach.problem, asked.robot
+
+    def whole(one: Tried) -> Reach:
+        last = one.last
+        if last is None:
+            return failed(ReachStatus.NO_APPROACH, one.reason)
+        carried = None if check is None else Carried(check, problem, one.q)
+        ends, _ = robot.contacts(last.coming[[0, -1]])
+        back = ends[0] - ends[1]
+        back /= np.maximum(np.linalg.norm(back, axis=1, keepdims=True), 1e-9)
+        q, used, after = one.q, hands_used(robot, problem), list[Way]()
+        for name, shift in ((LIFTING, lift * UP), (RETREATING, retreat * back)):
+            if not shift.any():
+                continue
+            way = one.closer.straight(q, shift * used)
+            if way is None:
+                reason = f"the arm cannot follow the straight way of {name}"
+                return failed(ReachStatus.NO_RETREAT, reason)
+            if carried is not None and (reason := carried.blocked(way)):
+                return failed(ReachStatus.NO_RETREAT, f"{name} is not free: {reason}")
+            after.append((name, way))
+            q = way[-1]
+        going, how = _going(asked, GOING, last.coming[0], one.open_handed)
+        stages = (
+            _Stage(going, one.open_handed),
+            _Stage([(COMING, last.coming)], one.coming),
+            _Stage([(CLOSING, last.closing)], one.holding, counts=False),
+            _Stage(after, carried, counts=False),
+        )
+        return _in_time(robot, stages, asked.pace, how, one.q, one.number)
+
+    return _first(asked, solutions, why, whole)
+
+
+def place(
+    asked: WayPlan, solutions: Sequence[Array], why: str, carried: Carried | None, lower: float
+) -> Reach:
+    """The way to the first of some postures over which an object that is held can be placed.
+
+    Args:
+        asked: What to keep to; the hand leaves the object as it would come to it.
+        solutions: (n,) each, in which the hand has the object where it is to stand.
+        why: Why there are none.
+        carried: The robot with what it holds; None: nothing is checked.
+        lower: From how far above the object comes straight down [m].
+    """
+
+    def whole(one: Tried) -> Reach:
+        last = one.last
+        if last is None:
+            return failed(ReachStatus.NO_RETREAT, one.reason.replace("approach", "way back"))
+        up = one.closer.straight(one.q, lower * UP)
+        if up is None:
+            return failed(ReachStatus.NO_APPROACH, "the arm cannot follow the straight way down")
+        down = up[::-1]
+        if carried is not None and (reason := carried.blocked(down)):
+            return failed(ReachStatus.NO_APPROACH, f"the way down is not free: {reason}")
+        carrying, how = _going(asked, CARRYING, down[0], carried)
+        stages = (
+            _Stage([*carrying, (LOWERING, down)] if carrying else [], carried, counts=False),
+            _Stage([(OPENING, last.closing[::-1])], one.holding, counts=False),
+            _Stage([(LEAVING, last.coming[::-1])], one.coming),
+        )
+        return _in_time(asked.robot, stages, asked.pace, how, one.q, one.number)
+
+    return _first(asked, solutions, why, whole)
 
 
 def move(
@@ -249,68 +327,37 @@ def move(
         seed: Of a planner.
     """
     corners, how = free_way(robot, *ends, query, seed)
-    if corners is None:
-        return failed(ReachStatus.NO_WAY, how)
-    motion = in_time(robot, [(GOING, np.stack(pair)) for pair in pairwise(corners)], pace)
-    clearance, reason = (None, "") if query is None else least_clearance(query, motion.q)
-    if reason:
-        return failed(ReachStatus.NO_WAY, f"the timed motion is not free: {reason}")
-    return reached(how, motion, ends[1], clearance, 1, pace)
+    stages = [_Stage(_between(GOING, corners), query)]
+    return _in_time(robot, stages, pace, how, ends[1], 1)
 
 
-def _whole(asked: ReachPlan, q0: Array, one: Tried, last: LastPart) -> Reach:
-    """The way to a solution whose last part is known, and on from it."""
-    plan = asked.approach.plan
-    check, robot = plan.check, plan.robot
-    carried = None if check is None else Carried(check, asked.approach.problem, one.q)
-    after = _after(asked, one, last, carried)
-    if isinstance(after, str):
-        return failed(ReachStatus.NO_RETREAT, after)
-    corners, how = free_way(robot, q0, last.coming[0], one.open_handed, asked.seed)
-    if corners is None:
-        return failed(ReachStatus.NO_WAY, how)
-    going = [(GOING, np.stack(pair)) for pair in pairwise(corners)]
-    parts = [*going, (COMING, last.coming), (CLOSING, last.closing), *after]
-    motion = in_time(robot, parts, asked.pace)
-    number = np.array([PARTS.index(part) for part in motion.notes["part"]])
-    # Each begins where the one before ends.
-    shut, held = (int((number <= PARTS.index(part)).sum()) for part in (COMING, CLOSING))
-    clearance, reason = None, ""
-    if one.open_handed is not None and one.holding is not None and carried is not None:
-        went = int((number <= PARTS.index(GOING)).sum())
-        clearance, reason = least_clearance(one.open_handed, motion.q[:went])
-        if one.coming is not None and went < shut:
-            here, why = least_clearance(one.coming, motion.q[max(went - 1, 0) : shut])
-            clearance, reason = min(clearance, here), reason or why
-        reason = reason or least_clearance(one.holding, motion.q[shut - 1 : held])[1]
-        reason = reason or carried.blocked(motion.q[held - 1 :])
-    if reason:
-        return failed(ReachStatus.NO_WAY, f"the timed motion is not free: {reason}")
-    return reached(f"way there: {how}", motion, one.q, clearance, one.number, asked.pace)
+def _first(
+    asked: WayPlan, solutions: Sequence[Array], why: str, whole: Callable[[Tried], Reach]
+) -> Reach:
+    """The first whole way that there is; of those that there are not the reason that says most."""
+    if not solutions:
+        return failed(ReachStatus.NOT_SOLVED, why)
+    tried: list[Reach] = []
+    for one in approaches(asked.approach, solutions):
+        tried.append(whole(one))
+        if tried[-1].success:
+            return tried[-1]
+    # That which came farthest says most.
+    order = list(ReachStatus)
+    most = max(tried, key=lambda one: order.index(one.status))
+    return failed(most.status, most.reason, len(solutions))
 
 
-def _after(
-    asked: ReachPlan, one: Tried, last: LastPart, carried: Carried | None
-) -> list[tuple[str, Array]] | str:
-    """Ways with what the hand holds; or why there are none."""
-    found: list[tuple[str, Array]] = []
-    ends, _ = asked.approach.plan.robot.contacts(last.coming[[0, -1]])
-    back = ends[0] - ends[1]
-    back /= np.maximum(np.linalg.norm(back, axis=1, keepdims=True), 1e-9)
-    q, used = one.q, hands_used(asked.approach.plan.robot, asked.approach.problem)
-    for name, shift in ((LIFTING, asked.lift * UP), (RETREATING, asked.retreat * back)):
-        if not shift.any():
-            continue
-        shift = shift * used
-        way = one.closer.straight(q, shift)
-        if way is None:
-            return f"the arm cannot follow the straight way of {name}"
-        reason = "" if carried is None else carried.blocked(way)
-        if reason:
-            return f"{name} is not free: {reason}"
-        found.append((name, way))
-        q = way[-1]
-    return found
+def _going(
+    asked: WayPlan, name: str, end: Array, query: CollisionQuery | Carried | None
+) -> tuple[list[Way], str]:
+    """The free way from where the robot is, none if there is none; and how it was found, or why."""
+    corners, how = free_way(asked.robot, asked.q0, end, query, asked.seed)
+    return _between(name, corners), how if corners is None else f"way there: {how}"
+
+
+def _between(name: str, corners: Array | None) -> list[Way]:
+    return [] if corners is None else [(name, np.stack(pair)) for pair in pairwise(corners)]
 
 
 def failed(status: ReachStatus, reason: str, tried: int = 0) -> Reach:
@@ -318,20 +365,40 @@ def failed(status: ReachStatus, reason: str, tried: int = 0) -> Reach:
     return Reach(status, reason, None, None, None, tried)
 
 
-def reached(
-    reason: str, motion: Motion, q: Array, clearance: float | None, tried: int, pace: Pace
+def _in_time(
+    robot: ArmHand, stages: Sequence[_Stage], pace: Pace, how: str, q: Array, tried: int
 ) -> Reach:
-    """A motion that ends in a posture (n,)."""
-    taken = shares(motion.q, pace.period, pace.rates)
-    return Reach(ReachStatus.REACHED, reason, motion, q, clearance, tried, *taken)
+    """Stages, each from where the last one ends, in time, at rest between their ways, and checked.
 
-
-def in_time(robot: ArmHand, ways: Sequence[tuple[str, Array]], pace: Pace) -> Motion:
-    """Ways (k, n), each from where the last one ends, in time, at rest between them."""
-    q, names = [ways[0][1][:1]], [ways[0][0]]
+    Args:
+        robot: The robot.
+        stages: The stages; without a way in the first there is none.
+        pace: How fast they are.
+        how: How the way was found, or why there is none.
+        q: (n,) where the hand holds something, or the end.
+        tried: Solutions that were looked at.
+    """
+    if not stages[0].ways:
+        return failed(ReachStatus.NO_WAY, how)
+    ways = [way for stage in stages for way in stage.ways]
+    samples, names = [ways[0][1][:1]], [ways[0][0]]
     for name, way in ways:
-        samples = timed(way, pace.rates, pace.period)[1:]
-        q.append(samples)
-        names += [name] * len(samples)
-    every = np.concatenate(q)
-    return Motion.of_samples(robot, pace.period, every, {"part": np.array(names)})
+        samples.append(timed(way, pace.rates, pace.period)[1:])
+        names += [name] * len(samples[-1])
+    parts = np.array(names)
+    motion = Motion.of_samples(robot, pace.period, np.concatenate(samples), {"part": parts})
+    clearance, reason, first = None, "", 0
+    for stage in stages:
+        last = first + int(np.isin(parts, [name for name, _ in stage.ways]).sum())
+        # Each begins where the one before ends.
+        postures, first = motion.q[max(first - 1, 0) : last], last
+        if isinstance(stage.query, Carried):
+            reason = stage.query.blocked(postures)
+        elif stage.query is not None:
+            here, reason = least_clearance(stage.query, postures)
+            if stage.counts:
+                clearance = here if clearance is None else min(clearance, here)
+        if reason:
+            return failed(ReachStatus.NO_WAY, f"the timed motion is not free: {reason}")
+    taken = shares(motion.q, pace.period, pace.rates)
+    return Reach(ReachStatus.REACHED, how, motion, q, clearance, tried, *taken)

@@ -100,7 +100,8 @@ class PathTracker:
             last step second, the goal third.
         """
         asked, guard = self._asked, self._guard
-        rows = self._rows(targets)
+        asked_for = contact_rows(asked.cycle, targets) | tolerance_rows(targets.tolerances)
+        rows = asked.rows(len(targets), asked_for)
         if guard is None:
             return asked.run.run(state, np.repeat(rows, TUNING.cycles, axis=0))[0][
                 TUNING.cycles - 1 :: TUNING.cycles
@@ -114,18 +115,6 @@ class PathTracker:
                 guard.step(asked)
             found[i] = asked.run.state
         return found
-
-    def _rows(self, targets: TargetBatch) -> Array:
-        """(k, ...) parameters of the cycles."""
-        asked = self._asked
-        # What does not belong to a target stands in the memory already.
-        every = np.repeat(asked.run.parameters[None], len(targets), axis=0)
-        layout = asked.cycle.parameters
-        for name, values in contact_rows(asked.cycle, targets).items():
-            every[:, layout.slice(name)] = values.reshape(len(targets), -1)
-        for name, each in tolerance_rows(targets.tolerances).items():
-            every[:, layout.slice(name)] = each
-        return every
 
 
 @dataclass(frozen=True)
