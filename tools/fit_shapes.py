@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from shape_fitting.links import in_our_links
 from shape_fitting.writing import write
@@ -21,7 +20,7 @@ from casadi_ik.importing.capsules import FIT, fitted, worst
 from casadi_ik.importing.posture import Postures
 from casadi_ik.importing.robot_shapes import may_touch
 from casadi_ik.importing.surfaces import Surface, together
-from casadi_ik.robots.parts import arm_part, hand_part
+from casadi_ik.robots.parts import described_part
 from casadi_ik.robots.schema import ArmFile, HandFile
 
 
@@ -47,10 +46,7 @@ def main() -> None:
     )
     given = parser.parse_args()
     path = resolve(given.name, given.kind)
-    if given.kind != "hands":
-        part: Any = arm_part(read(path, ArmFile)[0], path)
-    else:
-        part = hand_part(read(path, HandFile)[0], path)
+    part = described_part(read(path, HandFile if given.kind == "hands" else ArmFile)[0], path)
     parts: dict[str, list[Surface]] = {}
     for wanted in given.shapes:
         found = in_our_links(part, given.file, set(given.without), seen=wanted == "seen")

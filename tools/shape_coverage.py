@@ -26,7 +26,7 @@ from casadi_ik.files.reading import read
 from casadi_ik.files.shipped import resolve
 from casadi_ik.importing.surfaces import Surface, together
 from casadi_ik.robots.collision import LinkCapsule, LinkSolid
-from casadi_ik.robots.parts import Part, arm_part, hand_part
+from casadi_ik.robots.parts import Part, described_part
 from casadi_ik.robots.schema import ArmFile, HandFile
 
 SHARE = "example_robot_data/cmeel.prefix/share/example-robot-data/robots"
@@ -117,11 +117,7 @@ def main() -> None:
         if given.only and name not in given.only:
             continue
         path = resolve(name, kind)
-        part: Part = (
-            arm_part(read(path, ArmFile)[0], path)
-            if kind == "arms"
-            else hand_part(read(path, HandFile)[0], path)
-        )
+        part = described_part(read(path, ArmFile if kind == "arms" else HandFile)[0], path)
         for file in files:
             place = given.folder / file
             print(name, file, flush=True)

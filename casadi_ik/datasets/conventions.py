@@ -11,13 +11,13 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.datasets.postures import HandPoses
 from casadi_ik.errors import DescriptionError, UnsupportedError
-from casadi_ik.files.reading import Angles, Frame, Point, Struct, frame_matrix, read
+from casadi_ik.files.reading import Frame, Point, Struct, frame_matrix, read
 from casadi_ik.files.shipped import resolve, shipped_names
 from casadi_ik.grasps.pose import inverse
 from casadi_ik.robots.poses import motion
 
 
-class HandFrame(Struct, frozen=True):
+class HandFrame(Frame, frozen=True, kw_only=True):
     """Where the data set's frame of the hand is, in the frame of one of the robot's links.
 
     Attributes:
@@ -27,8 +27,6 @@ class HandFrame(Struct, frozen=True):
     """
 
     link: str
-    xyz: Point = (0.0, 0.0, 0.0)
-    rpy: Angles = (0.0, 0.0, 0.0)
 
 
 class WristJoint(Struct, frozen=True):
@@ -146,8 +144,7 @@ def load_convention(name_or_path: str | Path) -> Convention:
         if joint in (other for other, _ in joints.values()):
             raise DescriptionError(f"{path}: joints.{name}: {joint} is named twice")
         joints[name] = joint, -1.0 if said.startswith("-") else 1.0
-    pose = frame_matrix(Frame(entry.frame.xyz, entry.frame.rpy))
-    return Convention(path.stem, entry.frame.link, pose, joints, entry.wrist)
+    return Convention(path.stem, entry.frame.link, frame_matrix(entry.frame), joints, entry.wrist)
 
 
 def convention_for(robot: ArmHand, layout: str, hand: str | Path | None) -> Convention:

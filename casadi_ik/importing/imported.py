@@ -311,12 +311,11 @@ def import_robot(
     for side, (link, how) in found.items():
         own = {one.name for one in kept_joints(tree, link)}
         entry = HandFromFile(
-            str(hand.resolve()),
-            link,
-            None,
-            {name: value for name, value in locked.items() if name in own},
-            {name: ends for name, ends in limits.items() if name in own},
-            told,
+            file=str(hand.resolve()),
+            palm=link,
+            locked={name: value for name, value in locked.items() if name in own},
+            limits={name: ends for name, ends in limits.items() if name in own},
+            xacro=told,
         )
         part = hand_from_file(entry, {}, key, out)
         one = _found_hand(tree, part, side, link, how, shapes)

@@ -12,7 +12,7 @@ import numpy as np
 from casadi_ik.arrays import Array, frozen
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.reading import Frame, frame_matrix
-from casadi_ik.robots.robot_files.tree import attribute, parse_xml, read_robot_file
+from casadi_ik.robots.robot_files.tree import attribute, known, parse_xml, read_robot_file
 from casadi_ik.robots.schema import (
     BoxEntry,
     CapsuleEntry,
@@ -168,11 +168,11 @@ def link_shapes(entry: CollisionEntry | None, links: Iterable[str], path: Path) 
     """
     if entry is None:
         return NO_SHAPES
-    known, where = list(links), str(path)
+    names, where = list(links), str(path)
     capsules: list[LinkCapsule] = []
     solids: list[LinkSolid] = []
     for link, shapes in entry.links.items():
-        _known(link, known, f"{where}: collision.links.{link}")
+        known(link, names, "link", f"{where}: collision.links.{link}")
         for i, shape in enumerate(shapes):
             problem = _fault(shape)
             if problem:
@@ -186,7 +186,7 @@ def link_shapes(entry: CollisionEntry | None, links: Iterable[str], path: Path) 
     for i, pair in enumerate(entry.touching):
         key = f"{where}: collision.touching[{i}]"
         for link in pair.links:
-            _known(link, known, f"{key}.links")
+            known(link, names, "link", f"{key}.links")
         if not pair.reason.strip():
             raise DescriptionError(f"{key}.reason: is empty, expected why they may touch")
         if pair.depth is not None and not pair.depth > 0:
@@ -197,7 +197,7 @@ def link_shapes(entry: CollisionEntry | None, links: Iterable[str], path: Path) 
         place = place if place.is_absolute() else path.parent / place
         pairs = srdf_pairs(place)
         # Such a file may speak of more than this robot has.
-        touching += [Touching(*one) for one in pairs if set(one[0]) <= set(known)]
+        touching += [Touching(*one) for one in pairs if set(one[0]) <= set(names)]
     return Shapes(tuple(capsules), tuple(solids), tuple(touching))
 
 
@@ -274,8 +274,3 @@ def _fault(shape: ShapeEntry) -> str:
         if name in ("radius", "length", "size") and not (numbers > 0).all():
             return f"{name}: found {value}, expected > 0"
     return ""
-
-
-def _known(link: str, known: list[str], where: str) -> None:
-    if link not in known:
-        raise DescriptionError(f"{where}: unknown link {link!r}; known: {', '.join(known)}")

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from casadi_ik.arrays import frozen
 from casadi_ik.errors import DescriptionError
-from casadi_ik.files.reading import Frame, frame_matrix
-from casadi_ik.robots.collision import NO_SHAPES, Shapes, link_shapes
+from casadi_ik.files.reading import frame_matrix
+from casadi_ik.robots.collision import NO_SHAPES, link_shapes
 from casadi_ik.robots.couplings import Coupling, Linear
 from casadi_ik.robots.description import Actuator, Joint
 from casadi_ik.robots.parts import Part, check_couplings
@@ -21,7 +22,6 @@ from casadi_ik.robots.robot_files.tree import RobotTree, TreeJoint
 from casadi_ik.robots.schema import (
     ArmFromFile,
     CollisionEntry,
-    ContactEntry,
     HandFromFile,
     LinkFrame,
     PadEntry,
@@ -48,9 +48,7 @@ def arm_from_file(entry: ArmFromFile, key: str, beside: Path) -> Part:
         DescriptionError: One line that names file, link or joint, and what to write.
         MissingExtraError: What reads the file's format is not installed.
     """
-    tree = _tree(entry, beside)
-    where = f"{beside}: {key}"
-    root = tree.known_link(entry.root or tree.root, f"{where}.root: {tree.path.name}")
+    tree, where, root = _opened(entry, key, beside)
     tip = entry.tip
     if tip is None:
         ends = leaves(tree, root)
@@ -62,15 +60,12 @@ def arm_from_file(entry: ArmFromFile, key: str, beside: Path) -> Part:
         tip = ends[0]
     tree.known_link(tip, f"{where}.tip: {tree.path.name}")
     chain = tree.chain(root, tip, f"{where}.tip: {tree.path.name}")
-    joints, actuators = _Chosen(tree, entry, chain, (), where).parts()
     source = {key: f"{tree.path.name}, links {root} to {tip}"}
-    name = tree.path.stem
-    shapes = _shapes(tree, root, joints)
-    return Part(name, where, root, joints, actuators, source, tip, np.eye(4), {}, shapes)
+    return _part(tree, entry, (chain, ()), LinkFrame(link=tip), source, where)
 
 
 def hand_from_file(
-    entry: HandFromFile, pads: Mapping[str, ContactEntry | PadEntry], key: str, beside: Path
+    entry: HandFromFile, pads: Mapping[str, PadEntry], key: str, beside: Path
 ) -> Part:
     """Everything below the palm, and the chain that leads to it.
 
@@ -84,10 +79,8 @@ def hand_from_file(
         DescriptionError: One line that names file, link or joint, and what to write.
         MissingExtraError: What reads the file's format is not installed.
     """
-    tree = _tree(entry, beside)
-    where = f"{beside}: {key}"
-    root = tree.known_link(entry.root or tree.root, f"{where}.root: {tree.path.name}")
-    palm = entry.palm if isinstance(entry.palm, LinkFrame) else LinkFrame(entry.palm or root)
+    tree, where, root = _opened(entry, key, beside)
+    palm = palm_frame(entry.palm or root)
     tree.known_link(palm.link, f"{where}.palm: {tree.path.name}")
     chain = tree.chain(root, palm.link, f"{where}.palm: {tree.path.name}")
     below = tree.below(palm.link)
@@ -99,19 +92,45 @@ def hand_from_file(
                 f"{beside}: fingers.{name}.link: {pad.link!r} does not hang on the palm "
                 f"{palm.link!r} of {tree.path.name}; write another link or another palm"
             )
-    joints, actuators = _Chosen(tree, entry, chain, below, where).parts()
+    source = {key: f"{tree.path.name}, palm {palm.link}"}
+    part = _part(tree, entry, (chain, below), palm, source, where)
+    return replace(part, where=f"{beside}: ", pads=pads)
+
+
+def palm_frame(palm: str | LinkFrame) -> LinkFrame:
+    """The frame of a palm, of which the link alone may be said."""
+    return palm if isinstance(palm, LinkFrame) else LinkFrame(link=palm)
+
+
+def _opened(entry: Entry, key: str, beside: Path) -> tuple[RobotTree, str, str]:
+    """The file, the description with the key, and the link that the part begins with."""
+    path = Path(entry.file).expanduser()
+    tree = read_tree(path if path.is_absolute() else beside.parent / path, entry.xacro)
+    where = f"{beside}: {key}"
+    return tree, where, tree.known_link(entry.root or tree.root, f"{where}.root: {tree.path.name}")
+
+
+def _part(
+    tree: RobotTree,
+    entry: Entry,
+    chosen: tuple[tuple[TreeJoint, ...], tuple[TreeJoint, ...]],
+    end: LinkFrame,
+    source: dict[str, str],
+    where: str,
+) -> Part:
+    """The joints of an arm, or of what moves a palm, and those of a hand, as a part."""
+    root = chosen[0][0].parent if chosen[0] else end.link
+    joints, actuators = _Chosen(tree, entry, *chosen, where).parts()
+    links = [root, *(joint.child for joint in joints)]
+    shapes = NO_SHAPES
+    if not tree.shapes.meshes & set(links):  # so that nothing is left out
+        simple = tree.shapes.entries
+        entries = {link: list(simple[link]) for link in links if link in simple}
+        shapes = link_shapes(CollisionEntry(links=entries), links, tree.path)
+    frame = frame_matrix(end)
     return Part(
-        tree.path.stem,
-        str(beside),
-        root,
-        joints,
-        actuators,
-        {key: f"{tree.path.name}, palm {palm.link}"},
-        palm.link,
-        frame_matrix(Frame(palm.xyz, palm.rpy)),
-        {},
-        _shapes(tree, root, joints),
-        pads=dict(pads),
+        *(tree.path.stem, f"{where}: ", root, joints, actuators, source, end.link, frame, {}),
+        shapes,
     )
 
 
@@ -120,22 +139,6 @@ def leaves(tree: RobotTree, root: str) -> list[str]:
     below = [joint.child for joint in tree.below(root)]
     parents = {joint.parent for joint in tree.joints}
     return [link for link in below if link not in parents]
-
-
-def _tree(entry: Entry, beside: Path) -> RobotTree:
-    path = Path(entry.file).expanduser()
-    return read_tree(path if path.is_absolute() else beside.parent / path, entry.xacro)
-
-
-def _shapes(tree: RobotTree, root: str, joints: list[Joint]) -> Shapes:
-    """The simple shapes of a file; none where there are meshes, so that nothing is left out."""
-    links = [root, *(joint.child for joint in joints)]
-    if tree.shapes.meshes & set(links):
-        return NO_SHAPES
-    entries = {
-        link: list(tree.shapes.entries[link]) for link in links if link in tree.shapes.entries
-    }
-    return link_shapes(CollisionEntry(links=entries), links, tree.path)
 
 
 class _Chosen:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,17 +10,14 @@ import numpy as np
 
 from casadi_ik.arrays import Array, frozen
 from casadi_ik.errors import DescriptionError, UnknownNameError
-from casadi_ik.files.reading import (
-    Frame,
-    Vector,
-    frame_matrix,
-    read,
-)
+from casadi_ik.files.reading import Vector, frame_matrix, read
 from casadi_ik.files.shipped import resolve
-from casadi_ik.robots.description import Actuator, Finger, Joint
+from casadi_ik.robots.collision import NO_SHAPES
+from casadi_ik.robots.description import Actuator, Finger, Joint, RobotDescription
 from casadi_ik.robots.file_parts import arm_from_file
 from casadi_ik.robots.motor_ranges import motor_ranges
-from casadi_ik.robots.parts import Part, arm_part, hand_part, known_link, unique
+from casadi_ik.robots.parts import Part, described_part, unique
+from casadi_ik.robots.robot_files.tree import known
 from casadi_ik.robots.schema import ArmFile, ArmFromFile, BallPad, HandFile, PlanePad
 
 
@@ -37,7 +34,7 @@ class FlatJoints:
     places: dict[str, tuple[str, Array]]
 
 
-def flattened(joints: list[Joint], root: str, kept: Collection[str]) -> FlatJoints:
+def flattened(joints: Sequence[Joint], root: str, kept: Collection[str]) -> FlatJoints:
     """Hang every joint on the nearest link above it that moves, or on root or a link that is kept.
 
     Args:
@@ -58,12 +55,72 @@ def flattened(joints: list[Joint], root: str, kept: Collection[str]) -> FlatJoin
     return FlatJoints(tuple(found), places)
 
 
+def joined(
+    name: str,
+    root: str,
+    joints: Sequence[Joint],
+    parts: Sequence[tuple[str, Part]],
+    kept: Collection[str],
+    home: dict[str, float],
+    units: dict[str, str],
+    sources: dict[str, str],
+    where: str,
+) -> tuple[RobotDescription, FlatJoints]:
+    """A robot of whose palms and fingers nothing is said yet.
+
+    Args:
+        name: What it is called.
+        root: Its base link.
+        joints: All joints, parents before children.
+        parts: What it consists of, in the order of its motors, each with the name that parts its
+            sources from those of the same tag.
+        kept: Links that stay links although they are fixed.
+        home: Positions by actuator [rad or m].
+        units: Units of numbers that were given with one, by key.
+        sources: Its own sources by tag.
+        where: Its file, for messages.
+
+    Raises:
+        DescriptionError: With file, key, what was found and what was expected.
+    """
+    actuators = [one for _, part in parts for one in part.actuators]
+    unique((one.name for one in actuators), f"{where}: actuators")
+    unique((joint.name for joint in joints), f"{where}: joints")
+    unique((root, *(joint.child for joint in joints)), f"{where}: links")
+    flat, all_sources = flattened(joints, root, kept), dict(sources)
+    for owner, part in parts:
+        # A tag that is used already gets the owner's name before it.
+        all_sources |= {
+            f"{owner}.{tag}" if tag in all_sources else tag: text
+            for tag, text in part.sources.items()
+        }
+    robot = RobotDescription(
+        name=name,
+        root=root,
+        joints=flat.joints,
+        actuators=tuple(actuators),
+        fingers=(),
+        named_thumb=None,
+        palm_link=root,
+        palm_placement=frozen(np.eye(4)),
+        home=_home(home, units, actuators, joints, where),
+        sources=all_sources,
+        shapes=sum((part.shapes for _, part in parts), NO_SHAPES),
+    )
+    return robot, flat
+
+
 ALONG = 0.995
 """Cosine with the normal above which the contact frame's x axis is no tangent."""
 
 
 def the_fingers(
-    names: list[str], thumb: str | None, hand: Part, flat: FlatJoints, where: str
+    names: Sequence[str],
+    thumb: str | None,
+    hand: Part,
+    flat: FlatJoints,
+    where: str,
+    side: str = "",
 ) -> tuple[Finger, ...]:
     """The fingers that a robot uses.
 
@@ -72,42 +129,45 @@ def the_fingers(
         thumb: The one placed first, if there is one.
         hand: The hand.
         flat: All joints of the robot.
-        where: The robot's file, for messages.
+        where: What stands before the keys ``fingers`` and ``thumb`` in messages.
+        side: What all names begin with that messages leave out.
 
     Raises:
         DescriptionError: With file, key, what was found and what was expected.
     """
-    unique(names, f"{where}: fingers")
+    unique(names, f"{where}fingers")
     if not names:
-        raise DescriptionError(f"{where}: fingers: found none, expected at least one")
+        raise DescriptionError(f"{where}fingers: found none, expected at least one")
     asked = [("fingers", name) for name in names]
     if thumb is not None:
         asked.append(("thumb", thumb))
     for key, name in asked:
         if name not in hand.pads:
             raise DescriptionError(
-                f"{where}: {key}: {hand.name} has no finger {name!r}; it has "
-                + ", ".join(hand.pads)
+                f"{where}{key}: {hand.name} has no finger {name.removeprefix(side)!r}; it has "
+                + ", ".join(one.removeprefix(side) for one in hand.pads)
             )
     if thumb is not None and thumb not in names:
-        raise DescriptionError(f"{where}: thumb: {thumb!r} is not among the fingers")
-    return tuple(_finger(name, hand, flat) for name in names)
+        raise DescriptionError(
+            f"{where}thumb: {thumb.removeprefix(side)!r} is not among the fingers"
+        )
+    return tuple(_finger(name, hand, flat, side) for name in names)
 
 
-def _finger(name: str, hand: Part, flat: FlatJoints) -> Finger:
+def _finger(name: str, hand: Part, flat: FlatJoints, side: str) -> Finger:
     entry = hand.pads[name]
-    where = f"{hand.where}: fingers.{name}"
-    link = known_link(entry.link, hand.root, hand.joints, f"{where}.link")
+    where = f"{hand.where}fingers.{name.removeprefix(side)}"
+    link, pose = flat.places[known(entry.link, hand.links, "link", f"{where}.link")]
     length = float(np.linalg.norm(entry.normal))
     if not length > 1e-9:
         raise DescriptionError(f"{where}.normal: is zero, expected a direction")
-    link, pose = flat.places[link]
     chain: list[str] = []
     by_child = {joint.child: joint for joint in flat.joints}
-    while link in by_child and link not in (flat.places[hand.root][0], hand.tip_link):
-        if by_child[link].type != "fixed":
-            chain.append(by_child[link].name)
-        link = by_child[link].parent
+    above = link
+    while above in by_child and above not in (flat.places[hand.root][0], hand.tip_link):
+        if by_child[above].type != "fixed":
+            chain.append(by_child[above].name)
+        above = by_child[above].parent
     # On the palm's own link a pad is meant to stay: a jaw that is fixed.
     if not chain and hand.actuators and entry.link != hand.tip_link:
         raise DescriptionError(
@@ -116,8 +176,8 @@ def _finger(name: str, hand: Part, flat: FlatJoints) -> Finger:
     normal = np.asarray(entry.normal, dtype=float) / length
     return Finger(
         name,
-        flat.places[entry.link][0],
-        frozen(pose @ frame_matrix(Frame(entry.xyz, entry.rpy))),
+        link,
+        frozen(pose @ frame_matrix(entry)),
         frozen(normal),
         tuple(chain[::-1]),
         frozen(_tangent(entry.tangent, normal, where)),
@@ -149,25 +209,14 @@ def _tangent(given: Vector | None, normal: Array, where: str) -> Array:
     return across / length
 
 
-def the_home(
-    home: dict[str, float],
-    units: dict[str, str],
+def _home(
+    home: Mapping[str, float],
+    units: Mapping[str, str],
     actuators: Sequence[Actuator],
     joints: Sequence[Joint],
     where: str,
 ) -> Array:
-    """The home position (n,); where nothing is said, the position nearest to zero.
-
-    Args:
-        home: Positions by actuator [rad or m].
-        units: Unit of those that were given with one, by key ("home.NAME").
-        actuators: The motors.
-        joints: All joints.
-        where: The robot's file, for messages.
-
-    Raises:
-        DescriptionError: An unknown actuator, a wrong unit, or a position beyond limits.
-    """
+    """The home position (n,); where nothing is said, the position nearest to zero."""
     names = [actuator.name for actuator in actuators]
     for name in home:
         if name not in names:
@@ -183,14 +232,13 @@ def the_home(
     asked = np.array([home.get(name, 0.0) for name in names])
     movable = [joint for joint in joints if joint.type != "fixed"]
     lower, upper = motor_ranges(movable, actuators, asked, where)
-    values = np.clip(asked, lower, upper)
     for name, value, low, high in zip(names, asked, lower, upper, strict=True):
         if name in home and not low <= value <= high:
             raise DescriptionError(
                 f"{where}: home.{name}: {value:.6g} is outside the limits [{low:.6g}, {high:.6g}] "
                 "of the actuator and its joints"
             )
-    return frozen(values)
+    return frozen(np.clip(asked, lower, upper))
 
 
 def a_part(entry: str | ArmFromFile | HandFile, key: str, beside: Path) -> Part:
@@ -207,15 +255,13 @@ def a_part(entry: str | ArmFromFile | HandFile, key: str, beside: Path) -> Part:
     if isinstance(entry, ArmFromFile):
         return arm_from_file(entry, key, beside)
     if isinstance(entry, HandFile):
-        return hand_part(entry, beside)
+        return described_part(entry, beside)
     kind = key.rpartition(".")[2]
     try:
         path = resolve(entry, f"{kind}s", beside=beside)
     except (UnknownNameError, DescriptionError) as error:
         raise DescriptionError(f"{beside}: {key}: {error}") from error
-    if kind == "hand":
-        return hand_part(read(path, HandFile)[0], path)
-    return arm_part(read(path, ArmFile)[0], path)
+    return described_part(read(path, HandFile if kind == "hand" else ArmFile)[0], path)
 
 
 def with_wrist(hand: Part) -> Part:
@@ -251,11 +297,6 @@ def with_wrist(hand: Part) -> Part:
             replace(one, part="arm") if one.name in motors else one for one in hand.actuators
         ],
     )
-
-
-def own_tags(new: dict[str, str], known: dict[str, str], owner: str) -> dict[str, str]:
-    """Sources whose tag another file uses already get the owner's name before it."""
-    return {f"{owner}.{tag}" if tag in known else tag: text for tag, text in new.items()}
 
 
 def fixed_joint(name: str, parent: str, child: str, pose: Array) -> Joint:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -13,15 +13,14 @@ import numpy as np
 from casadi_ik.arrays import Array, frozen
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.limits import LIMITS
-from casadi_ik.files.reading import Frame, frame_matrix
+from casadi_ik.files.reading import frame_matrix
 from casadi_ik.robots.collision import NO_SHAPES, Shapes, link_shapes
 from casadi_ik.robots.couplings import Linear
 from casadi_ik.robots.description import Actuator, Joint
-from casadi_ik.robots.robot_files.tree import parents_first
+from casadi_ik.robots.robot_files.tree import known, parents_first
 from casadi_ik.robots.schema import (
     ActuatorEntry,
     ArmFile,
-    ContactEntry,
     HandFile,
     JointEntry,
     PadEntry,
@@ -108,14 +107,6 @@ def usable(name: str, where: str) -> None:
         )
 
 
-def known_link(link: str, root: str, joints: list[Joint], where: str) -> str:
-    """The link, if it is the root or some joint's child."""
-    links = [root, *(joint.child for joint in joints)]
-    if link not in links:
-        raise DescriptionError(f"{where}: unknown link {link!r}; known: {', '.join(links)}")
-    return link
-
-
 def known_source(tags: str, sources: dict[str, str], where: str) -> None:
     """Refuse source tags (separated by blanks or commas) that are empty or not explained."""
     for tag in tags.replace(",", " ").split():
@@ -142,7 +133,7 @@ class Part:
 
     Attributes:
         name: What it is called.
-        where: Its file and key, for messages.
+        where: What stands before its keys in messages: its file, "arm.yaml: ".
         root: Its base link.
         joints: Its joints, parents before children.
         actuators: Its motors.
@@ -166,25 +157,29 @@ class Part:
     tip: Array
     home: dict[str, float]
     shapes: Shapes = NO_SHAPES
-    pads: dict[str, ContactEntry | PadEntry] = field(default_factory=dict)
+    pads: Mapping[str, PadEntry] = field(default_factory=dict)
     thumb: str | None = None
     mount: Array = field(default_factory=lambda: np.eye(4))
+
+    @property
+    def links(self) -> tuple[str, ...]:
+        """All links, the root first."""
+        return (self.root, *(joint.child for joint in self.joints))
+
+    @property
+    def movers(self) -> set[str]:
+        """Names of all joints and motors."""
+        return {one.name for one in (*self.joints, *self.actuators)}
 
 
 def told_apart(hand: Part, arm: Part) -> Part:
     """The hand, with `PREFIX` before every name of a link, joint or motor that the arm has too."""
-    links = {arm.root, *(joint.child for joint in arm.joints)}
-    movers = {joint.name for joint in arm.joints} | {one.name for one in arm.actuators} | {"mount"}
-    theirs = {joint.name for joint in hand.joints} | {one.name for one in hand.actuators}
-    theirs_links = {hand.root, *(joint.child for joint in hand.joints)}
-
-    def link(name: str) -> str:
-        return _free(name, links, theirs_links)
-
-    def mover(name: str) -> str:
-        return _free(name, movers, theirs)
-
-    return _renamed(hand, link, mover)
+    movers = arm.movers | {"mount"}
+    return _renamed(
+        hand,
+        lambda name: _free(name, arm.links, hand.links),
+        lambda name: _free(name, movers, hand.movers),
+    )
 
 
 def of_side(part: Part, side: str, shared: str | None = None) -> Part:
@@ -250,7 +245,7 @@ def _mirrored(pose: Array) -> Array:
     return frozen(mirror @ pose @ mirror)
 
 
-def _mirrored_pad(pad: ContactEntry | PadEntry) -> ContactEntry | PadEntry:
+def _mirrored_pad(pad: PadEntry) -> PadEntry:
     def across(vector: tuple[float, ...]) -> tuple[float, ...]:
         return vector[0], -vector[1], vector[2]
 
@@ -287,13 +282,12 @@ def _renamed(part: Part, link: Callable[[str], str], mover: Callable[[str], str]
         )
         for joint in part.joints
     ]
-    links = (part.root, *(joint.child for joint in part.joints))
     return replace(
         part,
         root=link(part.root),
         joints=joints,
         actuators=[replace(one, name=mover(one.name)) for one in part.actuators],
-        shapes=part.shapes.renamed({name: link(name) for name in links}),
+        shapes=part.shapes.renamed({name: link(name) for name in part.links}),
         tip_link=link(part.tip_link),
         home={mover(name): value for name, value in part.home.items()},
         pads={
@@ -303,7 +297,7 @@ def _renamed(part: Part, link: Callable[[str], str], mover: Callable[[str], str]
     )
 
 
-def _free(name: str, taken: set[str], own: set[str]) -> str:
+def _free(name: str, taken: Collection[str], own: Collection[str]) -> str:
     if name not in taken:
         return name
     while name in taken or name in own:
@@ -314,65 +308,42 @@ def _free(name: str, taken: set[str], own: set[str]) -> str:
 JOINT_TYPES = ("revolute", "prismatic", "fixed")
 
 
-def arm_part(arm: ArmFile, path: Path) -> Part:
-    """An arm, checked.
+def described_part(file: ArmFile | HandFile, path: Path) -> Part:
+    """An arm or a hand of a file of ours, checked.
+
+    Args:
+        file: What it says.
+        path: The file.
 
     Raises:
         DescriptionError: With file, key, what was found and what was expected.
     """
-    joints = _joints(arm.joints, arm.root, arm.sources, "arm", path)
-    actuators = _actuators(None, joints, arm.sources, "arm", path)
-    tip = known_link(arm.tip.link, arm.root, joints, f"{path}: tip.link")
-    known_source(arm.tip.source, arm.sources, f"{path}: tip.source")
-    pose = frame_matrix(Frame(arm.tip.xyz, arm.tip.rpy))
-    return Part(
-        arm.name,
-        str(path),
-        arm.root,
+    hand = isinstance(file, HandFile)
+    kind, key, end = ("hand", "palm", file.palm) if hand else ("arm", "tip", file.tip)
+    joints = _joints(file.joints, file.root, file.sources, kind, path)
+    motors = _actuators(file.actuators if hand else None, joints, file.sources, kind, path)
+    links = (file.root, *(joint.child for joint in joints))
+    known(end.link, links, "link", f"{path}: {key}.link")
+    known_source(end.source, file.sources, f"{path}: {key}.source")
+    for name, finger in file.fingers.items() if hand else ():
+        known_source(finger.source, file.sources, f"{path}: fingers.{name}.source")
+    if file.collision is not None and file.collision.links:
+        known_source(file.collision.source, file.sources, f"{path}: collision.source")
+    part = Part(
+        file.name,
+        f"{path}: ",
+        file.root,
         joints,
-        actuators,
-        arm.sources,
-        tip,
-        pose,
-        arm.home,
-        _shapes(arm, joints, path),
+        motors,
+        file.sources,
+        end.link,
+        frame_matrix(end),
+        file.home,
+        link_shapes(file.collision, links, path),
     )
-
-
-def hand_part(hand: HandFile, path: Path) -> Part:
-    """A hand, checked.
-
-    Raises:
-        DescriptionError: With file, key, what was found and what was expected.
-    """
-    joints = _joints(hand.joints, hand.root, hand.sources, "hand", path)
-    actuators = _actuators(hand.actuators, joints, hand.sources, "hand", path)
-    palm = known_link(hand.palm.link, hand.root, joints, f"{path}: palm.link")
-    known_source(hand.palm.source, hand.sources, f"{path}: palm.source")
-    for name, finger in hand.fingers.items():
-        known_source(finger.source, hand.sources, f"{path}: fingers.{name}.source")
-    return Part(
-        hand.name,
-        str(path),
-        hand.root,
-        joints,
-        actuators,
-        hand.sources,
-        palm,
-        frame_matrix(Frame(hand.palm.xyz, hand.palm.rpy)),
-        hand.home,
-        _shapes(hand, joints, path),
-        dict(hand.fingers),
-        hand.thumb,
-        frame_matrix(hand.mount),
-    )
-
-
-def _shapes(part: ArmFile | HandFile, joints: list[Joint], path: Path) -> Shapes:
-    if part.collision is not None and part.collision.links:
-        known_source(part.collision.source, part.sources, f"{path}: collision.source")
-    links = (part.root, *(joint.child for joint in joints))
-    return link_shapes(part.collision, links, path)
+    if not hand:
+        return part
+    return replace(part, pads=file.fingers, thumb=file.thumb, mount=frame_matrix(file.mount))
 
 
 def _joints(

@@ -152,7 +152,7 @@ class ActuatorEntry(Struct, frozen=True):
     source: str = ""
 
 
-class LinkFrame(Struct, frozen=True):
+class LinkFrame(Frame, frozen=True, kw_only=True):
     """A frame on a link.
 
     Attributes:
@@ -163,8 +163,6 @@ class LinkFrame(Struct, frozen=True):
     """
 
     link: str
-    xyz: Point = (0.0, 0.0, 0.0)
-    rpy: Angles = (0.0, 0.0, 0.0)
     source: str = ""
 
 
@@ -182,7 +180,7 @@ class PlanePad(Struct, frozen=True, tag_field="kind", tag="plane"):
     """A flat pad: it touches with the contact frame's origin and faces what it touches."""
 
 
-class ContactEntry(Struct, frozen=True):
+class PadEntry(Frame, frozen=True, kw_only=True):
     """The contact frame of a finger: where its pad touches and which way that faces.
 
     Normal and tangent are made orthogonal.
@@ -190,7 +188,6 @@ class ContactEntry(Struct, frozen=True):
     Attributes:
         link: Link that the pad is on.
         normal: Direction out of the pad, away from the finger, in the contact frame.
-        source: Tags of `sources` that its numbers are from.
         xyz: Where the pad touches, in the link's frame [m].
         rpy: Angles of the contact frame about the link's fixed axes [rad].
         tangent: The pad's second axis; left out: the frame's x axis.
@@ -199,190 +196,164 @@ class ContactEntry(Struct, frozen=True):
 
     link: str
     normal: Vector
-    source: str
-    xyz: Point = (0.0, 0.0, 0.0)
-    rpy: Angles = (0.0, 0.0, 0.0)
     tangent: Vector | None = None
     pad: BallPad | PlanePad = PlanePad()
 
 
-class ArmFile(Struct, frozen=True):
-    """An arm: ``models/arms/*.yaml``.
+class ContactEntry(PadEntry, frozen=True, kw_only=True):
+    """The contact frame of a finger of a described hand; see `PadEntry`.
+
+    Attributes:
+        source: Tags of `sources` that its numbers are from.
+    """
+
+    source: str
+
+
+class _Described(Struct, frozen=True, kw_only=True):
+    """What a file of ours says of whatever it describes.
 
     Attributes:
         name: What it is called.
-        root: Link that all others hang on.
-        tip: Frame that a hand is mounted on.
-        joints: From root to tip, in any order.
-        sources: Where numbers are from, by tag.
         description: What it is, the first sentence by itself.
-        home: Position by joint where it stands if its robot does not say [rad or m].
-        collision: Shapes of its links.
+        home: Position by actuator where it is taken to stand [rad or m].
+        collision: Shapes of its links; these go before those of its parts, or of its file.
+        sources: Where numbers are from, by tag.
     """
 
     name: str
-    root: str
-    tip: LinkFrame
-    joints: list[JointEntry]
-    sources: dict[str, str]
     description: str = ""
     home: dict[str, AnyValue] = msgspec.field(default_factory=dict)
     collision: CollisionEntry | None = None
 
 
-class HandFile(Struct, frozen=True):
+class _Part(_Described, frozen=True, kw_only=True):
+    """What a robot is put together from.
+
+    Attributes:
+        root: Link that all others hang on.
+        joints: In any order.
+    """
+
+    root: str
+    joints: list[JointEntry]
+    sources: dict[str, str]
+
+
+class ArmFile(_Part, frozen=True, kw_only=True):
+    """An arm: ``models/arms/*.yaml``.
+
+    Attributes:
+        tip: Frame that a hand is mounted on.
+    """
+
+    tip: LinkFrame
+
+
+class HandFile(_Part, frozen=True, kw_only=True):
     """A hand: ``models/hands/*.yaml``.
 
     ``thumb``, ``mount`` and ``home`` hold for a robot that is put together by name; others say
     them themselves.
 
     Attributes:
-        name: What it is called.
-        root: Link that all others hang on.
         palm: Frame of the palm: z away from it, y towards the thumb.
-        joints: In any order.
         fingers: Contact frame by finger.
-        sources: Where numbers are from, by tag.
         actuators: Motors by name; left out: one for each joint without coupling.
-        description: What it is, the first sentence by itself.
         thumb: Finger that is placed first.
         mount: The hand's root on an arm's tip.
-        home: Position by actuator [rad or m].
-        collision: Shapes of its links.
     """
 
-    name: str
-    root: str
     palm: LinkFrame
-    joints: list[JointEntry]
     fingers: dict[str, ContactEntry]
-    sources: dict[str, str]
     actuators: dict[str, ActuatorEntry] | None = None
-    description: str = ""
     thumb: str | None = None
     mount: Frame = Frame()
-    home: dict[str, AnyValue] = msgspec.field(default_factory=dict)
-    collision: CollisionEntry | None = None
 
 
-class ArmFromFile(Struct, frozen=True):
+class _FromFile(Struct, frozen=True, kw_only=True):
+    """What stands in somebody's file.
+
+    Attributes:
+        file: URDF, xacro or MJCF; a path counts from the description.
+        root: Link that it begins with; left out: the file's.
+        locked: Joints that stand still, and where [rad or m].
+        limits: Limits by joint that go before the file's [rad or m].
+        xacro: Whether its macros are expanded although it is not called ``.xacro``.
+    """
+
+    file: str
+    root: str | None = None
+    locked: dict[str, AnyValue] = msgspec.field(default_factory=dict)
+    limits: dict[str, tuple[AnyValue, AnyValue]] = msgspec.field(default_factory=dict)
+    xacro: bool = False
+
+
+class ArmFromFile(_FromFile, frozen=True, kw_only=True):
     """An arm in somebody's file: the chain from ``root`` to ``tip``.
 
     Attributes:
-        file: URDF, xacro or MJCF; a path counts from the description.
         tip: Link that a hand is mounted on; left out: the only end of the chain.
-        root: Link that it begins with; left out: the file's.
-        locked: Joints that stand still, and where [rad or m].
-        limits: Limits by joint that go before the file's [rad or m].
-        xacro: Whether its macros are expanded although it is not called ``.xacro``.
     """
 
-    file: str
     tip: str | None = None
-    root: str | None = None
-    locked: dict[str, AnyValue] = msgspec.field(default_factory=dict)
-    limits: dict[str, tuple[AnyValue, AnyValue]] = msgspec.field(default_factory=dict)
-    xacro: bool = False
 
 
-class HandFromFile(Struct, frozen=True):
+class HandFromFile(_FromFile, frozen=True, kw_only=True):
     """A hand in somebody's file, or a whole robot: what is above ``palm`` moves the hand.
 
     Attributes:
-        file: URDF, xacro or MJCF; a path counts from the description.
         palm: Link of the palm, or a frame on it.
-        root: Link that it begins with; left out: the file's.
-        locked: Joints that stand still, and where [rad or m].
-        limits: Limits by joint that go before the file's [rad or m].
-        xacro: Whether its macros are expanded although it is not called ``.xacro``.
     """
 
-    file: str
     palm: str | LinkFrame | None = None
-    root: str | None = None
-    locked: dict[str, AnyValue] = msgspec.field(default_factory=dict)
-    limits: dict[str, tuple[AnyValue, AnyValue]] = msgspec.field(default_factory=dict)
-    xacro: bool = False
 
 
-class PadEntry(Struct, frozen=True):
-    """The contact frame of a finger of a `HandFromFile`; see `ContactEntry`.
+class _Robot(_Described, frozen=True, kw_only=True):
+    """A robot."""
+
+    sources: dict[str, str] = msgspec.field(default_factory=dict)
+
+
+class _OnArm(_Robot, frozen=True, kw_only=True):
+    """A robot of one hand, on an arm or on a fixed base.
 
     Attributes:
-        link: Link that the pad is on.
-        normal: Direction out of the pad, away from the finger, in the contact frame.
-        xyz: Where the pad touches, in the link's frame [m].
-        rpy: Angles of the contact frame about the link's fixed axes [rad].
-        tangent: The pad's second axis; left out: the frame's x axis.
-        pad: What it touches with; left out: a plane.
+        thumb: Finger that is placed first; the paper's methods need one.
+        arm: A shipped name, a path, or an arm in somebody's file; left out: the hand stands on a
+            fixed base.
+        mount: The hand's root on the arm's tip.
     """
 
-    link: str
-    normal: Vector
-    xyz: Point = (0.0, 0.0, 0.0)
-    rpy: Angles = (0.0, 0.0, 0.0)
-    tangent: Vector | None = None
-    pad: BallPad | PlanePad = PlanePad()
+    thumb: str | None = None
+    arm: str | ArmFromFile | None = None
+    mount: Frame = Frame()
 
 
-class ArmHandFile(Struct, frozen=True):
+class ArmHandFile(_OnArm, frozen=True, kw_only=True):
     """A robot: an arm (or none), a described hand, and what joins them.
 
     Attributes:
-        name: What the robot is called.
         hand: A shipped name, a path, or the hand itself.
         fingers: The hand's fingers that take part, in their order.
-        thumb: Finger that is placed first; the paper's methods need one.
-        arm: A shipped name, a path, or an arm in somebody's file; left out: the hand stands on a
-            fixed base.
-        mount: The hand's root on the arm's tip.
-        home: Position by actuator where the robot is taken to stand [rad or m].
-        sources: Where numbers are from, by tag.
-        description: What it is, the first sentence by itself.
-        collision: Shapes of its links; these go before those of its parts.
     """
 
-    name: str
     hand: str | HandFile
     fingers: list[str]
-    thumb: str | None = None
-    arm: str | ArmFromFile | None = None
-    mount: Frame = Frame()
-    home: dict[str, AnyValue] = msgspec.field(default_factory=dict)
-    sources: dict[str, str] = msgspec.field(default_factory=dict)
-    description: str = ""
-    collision: CollisionEntry | None = None
 
 
-class ImportedFile(Struct, frozen=True):
+class ImportedFile(_OnArm, frozen=True, kw_only=True):
     """A robot whose hand is in somebody's file: either ``hand`` or ``robot``, which has an arm.
 
     Attributes:
-        name: What the robot is called.
         fingers: Contact frame by finger, since no file says where a pad is.
         hand: A hand in a file of its own.
         robot: A whole robot in one file; then there is no `arm`.
-        thumb: Finger that is placed first; the paper's methods need one.
-        arm: A shipped name, a path, or an arm in somebody's file; left out: the hand stands on a
-            fixed base.
-        mount: The hand's root on the arm's tip.
-        home: Position by actuator where the robot is taken to stand [rad or m].
-        sources: Where numbers are from, by tag.
-        description: What it is, the first sentence by itself.
-        collision: Shapes of its links; these go before those of its parts.
     """
 
-    name: str
     fingers: dict[str, PadEntry]
     hand: HandFromFile | None = None
     robot: HandFromFile | None = None
-    arm: str | ArmFromFile | None = None
-    thumb: str | None = None
-    mount: Frame = Frame()
-    home: dict[str, AnyValue] = msgspec.field(default_factory=dict)
-    sources: dict[str, str] = msgspec.field(default_factory=dict)
-    description: str = ""
-    collision: CollisionEntry | None = None
 
 
 class PartSide(Struct, frozen=True):
@@ -409,30 +380,21 @@ class PartSide(Struct, frozen=True):
     thumb: str | None = None
 
 
-class BodyFile(Struct, frozen=True):
+class BodyFile(_Robot, frozen=True, kw_only=True):
     """A body that is put together: arm-hands by name on a common trunk.
 
     Every name of a link, joint, motor or finger gets the side's name and an underscore before it,
     unless it begins with them.
 
     Attributes:
-        name: What the robot is called.
         sides: Arm-hand by name.
         trunk: What carries all arms: a shipped name of ``models/trunks``, a path, or a chain in
             somebody's file; left out: they stand still.
         home: Position by actuator that goes before those of the parts [rad or m].
-        sources: Where numbers are from, by tag.
-        description: What it is, the first sentence by itself.
-        collision: Shapes of its links; these go before those of its parts.
     """
 
-    name: str
     sides: dict[str, PartSide]
     trunk: str | ArmFromFile | None = None
-    home: dict[str, AnyValue] = msgspec.field(default_factory=dict)
-    sources: dict[str, str] = msgspec.field(default_factory=dict)
-    description: str = ""
-    collision: CollisionEntry | None = None
 
 
 class FileSide(Struct, frozen=True):
@@ -449,25 +411,15 @@ class FileSide(Struct, frozen=True):
     thumb: str | None = None
 
 
-class ImportedBody(Struct, frozen=True):
+class ImportedBody(_Robot, frozen=True, kw_only=True):
     """A body in somebody's file.
 
     Attributes:
-        name: What the robot is called.
         robot: The file; its ``locked`` names what does not take part, such as legs and head.
         sides: Arm-hand by name; fingers get it and an underscore before their names.
         trunk: Link that all sides stand on; left out: the last one that carries all palms.
-        home: Position by actuator where the robot is taken to stand [rad or m].
-        sources: Where numbers are from, by tag.
-        description: What it is, the first sentence by itself.
-        collision: Shapes of its links; these go before those of the file.
     """
 
-    name: str
     robot: HandFromFile
     sides: dict[str, FileSide]
     trunk: str | None = None
-    home: dict[str, AnyValue] = msgspec.field(default_factory=dict)
-    sources: dict[str, str] = msgspec.field(default_factory=dict)
-    description: str = ""
-    collision: CollisionEntry | None = None

@@ -17,8 +17,7 @@ from commands import main
 import casadi_ik as ik
 from casadi_ik.cli.lists import FILES, schema_of
 from casadi_ik.files.reading import checked
-from casadi_ik.robots.load import _imports
-from casadi_ik.robots.schema import ArmHandFile, BodyFile, ImportedBody, ImportedFile
+from casadi_ik.robots.load import file_type
 
 ROOT = Path(__file__).parents[2]
 MODELS = ROOT / "models"
@@ -84,11 +83,7 @@ def checker(kind: str) -> jsonschema.Draft7Validator:
 
 def reads(kind: str, data: Any) -> bool:
     """What the reader of that kind of file says."""
-    type_ = FILES[kind][0]
-    if kind == "robot":
-        type_ = ImportedFile if _imports(data) else ArmHandFile
-    if kind == "body":
-        type_ = ImportedBody if isinstance(data, dict) and "robot" in data else BodyFile
+    type_ = file_type(data) if kind in ("robot", "body") else FILES[kind][0]
     try:
         checked(data, type_, Path("file"))
     except ik.errors.DescriptionError:

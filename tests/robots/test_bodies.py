@@ -146,18 +146,52 @@ def test_trunk_and_sides_are_found_in_a_file(in_a_file: Path):
         (
             "right: {palm: right_palm, fingers: {tip: {link: right_tip",
             "right: {palm: left_palm, fingers: {tip: {link: left_tip",
-            "is of side 'left' and side 'right'",
+            "sides.left.palm: found 'left_palm', which carries the palm of 'right' too",
         ),
-        ("palm: left_palm", "palm: no_such", "sides.left.palm: no link 'no_such'"),
+        (
+            "palm: left_palm",
+            "palm: no_such",
+            "sides.left.palm: unknown link 'no_such'; known",
+        ),
+        ("link: left_tip", "link: nope", "sides.left.fingers.tip.link: unknown link 'nope'"),
+        ("{tip: {link: left_tip, normal: [0, 0, 1]}}", "{}", "sides.left.fingers: found none"),
+        ("{palm: left", "{thumb: toe, palm: left", "sides.left.thumb: side 'left' has no finger"),
+        ("sides:", "trunk: nowhere\nsides:", "trunk: unknown link 'nowhere'; known: base"),
+        ("sides:", "trunk: base\nsides:", "joint 'waist' beyond it moves every palm; expected"),
+        ("two.urdf", "two.urdf, palm: torso", "robot.palm: found one, expected it under each of"),
         ("sides:", "colour: red\nsides:", "colour"),
     ],
 )
 def test_what_is_wrong_is_said_in_a_line(in_a_file: Path, old: str, new: str, said: str):
     in_a_file.write_text(FILE.replace(old, new, 1))
+    refused(in_a_file, said)
+
+
+def refused(path: Path, said: str):
+    """One line that names the file is said of it."""
     with pytest.raises(ik.errors.DescriptionError) as caught:
-        ik.load_robot(in_a_file)
+        ik.load_robot(path)
     assert said in str(caught.value)
-    assert "two.yaml" in str(caught.value)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("follower", "leader", "said"),
+    [
+        ("finger", "left_finger", "joint 'right_finger' follows motor 'left_finger', which is of "),
+        (
+            "shoulder",
+            "waist",
+            "joint 'right_shoulder' follows motor 'waist', which is of the trunk",
+        ),
+    ],
+)
+def test_a_motor_of_two_sides_is_refused(in_a_file: Path, follower: str, leader: str, said: str):
+    file = in_a_file.with_suffix(".urdf")
+    joint = f'<joint name="right_{follower}" type="revolute">'
+    file.write_text(file.read_text().replace(joint, f'{joint}<mimic joint="{leader}"/>'))
+    refused(in_a_file, f"sides.right: {said}")
 
 
 @pytest.mark.parametrize(
@@ -167,14 +201,22 @@ def test_what_is_wrong_is_said_in_a_line(in_a_file: Path, old: str, new: str, sa
         ("arm: panda, hand: allegro_left", "arm: pandora, hand: allegro_left", "pandora"),
         ("trunk: lift", "trunk: lyft", "trunk: no shipped trunk is called 'lyft'"),
         ("hand: allegro_left", "hand: allegro_left, mirror: [foot]", "expected 'arm' or 'hand'"),
+        (
+            "hand: allegro_left",
+            "hand: allegro_left, fingers: [thumb, toe]",
+            "sides.left.fingers: allegro_left has no finger 'toe'; it has thumb, index, ",
+        ),
+        (
+            "hand: allegro_left",
+            "hand: allegro_left, fingers: [index], thumb: thumb",
+            "sides.left.thumb: 'thumb' is not among the fingers",
+        ),
     ],
 )
 def test_what_is_wrong_with_parts_is_said(tmp_path: Path, old: str, new: str, said: str):
     path = tmp_path / "pair.yaml"
     path.write_text(BODY.replace(old, new, 1))
-    with pytest.raises(ik.errors.DescriptionError) as caught:
-        ik.load_robot(path)
-    assert said in str(caught.value)
+    refused(path, said)
 
 
 def test_a_side_that_is_not_there_is_said():

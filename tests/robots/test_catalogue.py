@@ -20,7 +20,7 @@ from casadi_ik.cli.inputs import the_robot
 from casadi_ik.files.reading import read
 from casadi_ik.files.shipped import resolve
 from casadi_ik.importing.posture import Postures
-from casadi_ik.robots.parts import arm_part, hand_part
+from casadi_ik.robots.parts import described_part
 from casadi_ik.robots.schema import ArmFile, HandFile
 
 ARMS = [
@@ -110,7 +110,7 @@ def test_every_hand_goes_on_an_arm(hand):
 def test_arms_stand_where_published_files_have_them(arm):
     known = PUBLISHED["arms"][arm]
     path = resolve(arm, "arms")
-    part = arm_part(read(path, ArmFile)[0], path)
+    part = described_part(read(path, ArmFile)[0], path)
     names = [joint.name for joint in part.joints if joint.type != "fixed"]
     for q, pose in zip(known["q"], known["poses"], strict=True):
         links = Postures(part).poses(dict(zip(names, q, strict=True)))
@@ -129,7 +129,7 @@ def test_arms_stand_where_published_files_have_them(arm):
 def test_hands_stand_where_published_files_have_them(hand):
     known = PUBLISHED["hands"][hand]
     path = resolve(hand, "hands")
-    part = hand_part(read(path, HandFile)[0], path)
+    part = described_part(read(path, HandFile)[0], path)
     for q, links in zip(known["q"], known["links"], strict=True):
         found = Postures(part).poses(dict(zip(known["joints"], q, strict=True)))
         assert len(links) >= FEWER.get(hand, 3)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -383,7 +383,7 @@ class RobotTree:
         Raises:
             DescriptionError: There is none; the message lists the links.
         """
-        return _known(link, self.links, "link", where)
+        return known(link, self.links, "link", where)
 
     def known_joint(self, joint: str, where: str) -> str:
         """The joint, if there is one of that name.
@@ -394,7 +394,7 @@ class RobotTree:
         moving = [one.name for one in self.joints if one.type != "fixed"]
         if joint in self.by_name:
             return joint
-        return _known(joint, moving, "joint", where)
+        return known(joint, moving, "joint", where)
 
 
 class Linking(Protocol):
@@ -419,15 +419,15 @@ def parents_first(joints: Iterable[L], root: str) -> tuple[L, ...]:
 
     Joints that do not hang on the root are left out.
     """
-    known, waiting = {root}, list(joints)
+    hung, waiting = {root}, list(joints)
     placed: list[L] = []
     while waiting:
-        joint = next((one for one in waiting if one.parent in known), None)
+        joint = next((one for one in waiting if one.parent in hung), None)
         if joint is None:
             break
         waiting.remove(joint)
         placed.append(joint)
-        known.add(joint.child)
+        hung.add(joint.child)
     return tuple(placed)
 
 
@@ -437,7 +437,12 @@ def fixed(name: str, parent: str, child: str, placement: Array) -> TreeJoint:
     return TreeJoint(name, parent, child, "fixed", placement, axis, None, math.inf, None)
 
 
-def _known(name: str, names: Iterable[str], noun: str, where: str) -> str:
-    if name not in (known := list(names)):
-        raise DescriptionError(f"{where}: unknown {noun} {name!r}; known: {', '.join(known)}")
+def known(name: str, names: Collection[str], noun: str, where: str) -> str:
+    """The name of a link or joint, if it is among some.
+
+    Raises:
+        DescriptionError: It is not; the message lists them.
+    """
+    if name not in names:
+        raise DescriptionError(f"{where}: unknown {noun} {name!r}; known: {', '.join(names)}")
     return name
