@@ -28,7 +28,7 @@ from casadi_ik.answers.report import (
 from casadi_ik.cli import options as opt
 from casadi_ik.cli.inputs import located, robot_of_log
 from casadi_ik.cli.options import Option
-from casadi_ik.cli.outputs import check_outputs, write_output
+from casadi_ik.cli.outputs import check_outputs, write_json, write_output
 from casadi_ik.cli.table import Answer, Said, command
 from casadi_ik.errors import InputError, MissingExtraError, UnknownNameError, printable
 from casadi_ik.logs.container import NothingWrittenError
@@ -130,15 +130,9 @@ def why(said: Said) -> Answer:
     parts: list[RenderableType] = [headline(solve.success, solve.status, found.headline)]
     if solve.shard:
         parts.append(Text(f"  solve {solve.number + 1} of {solve.shard}"))
-    for title, lines in (
-        ("phases", found.phases),
-        ("fingers", found.fingers),
-        ("met on its way", found.met),
-        ("verdict", found.verdict),
-    ):
-        if lines:
-            parts.append(Text(f"  {title}", "bold"))
-            parts += [indented(line, by=4) for line in lines]
+    for title, lines in found.parts.items():
+        parts.append(Text(f"  {title}", "bold"))
+        parts += [indented(line, by=4) for line in lines]
     return Answer(Group(*parts))
 
 
@@ -308,16 +302,14 @@ def merge(said: Said) -> Answer:
 
 def _exported_view(said: Said, file: Path) -> Answer:
     with located("log export", (MissingExtraError,)):
-        from casadi_ik.logs.viewers import write_view
-    from casadi_ik.logs.viewers import layout_of, write_layout
-
+        from casadi_ik.logs.viewers import layout_of, write_view
     layout = file.with_suffix(".layout.json")
     check_outputs({"--out": file, "the layout": layout}, inputs=[Path(said.file)])
     log = logs.open(said.file)
     solve = _the_solve(said, log)
     robot = robot_of_log(log, said.file, said.robot or solve.robot)
     write_view(file, solve, robot)
-    write_layout(layout, layout_of(solve, robot))
+    write_json(layout, layout_of(solve, robot))
     return Answer(Group(*files({"viewer": file, "layout": layout})))
 
 

@@ -17,7 +17,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.logs.events import Happening, errors_text, listed, number, plain_name, plural
 from casadi_ik.logs.reader import Log
-from casadi_ik.logs.solve import OneSolve, Stretch
+from casadi_ik.logs.solve import OneSolve, Stretch, targets_beside
 from casadi_ik.problem.contacts import NAMES
 from casadi_ik.problem.trace import CLEARANCE
 
@@ -53,6 +53,17 @@ class Explanation:
     fingers: tuple[str, ...] = ()
     met: tuple[str, ...] = ()
     verdict: tuple[str, ...] = ()
+
+    @property
+    def parts(self) -> dict[str, tuple[str, ...]]:
+        """The lines of every part that has any, by its title."""
+        every = {
+            "phases": self.phases,
+            "fingers": self.fingers,
+            "met on its way": self.met,
+            "verdict": self.verdict,
+        }
+        return {title: lines for title, lines in every.items() if lines}
 
 
 def explain(solve: OneSolve) -> Explanation:
@@ -140,10 +151,7 @@ def _fingers(solve: OneSolve) -> Iterator[str]:
         tolerance = solve.tolerances[i]
         share = np.fmax(position[:, i] / tolerance.position, angle[:, i] / tolerance.angle)
         best = int(np.nanargmin(share))
-        line = (
-            f"{solve.fingers[i]} lagged: it ends"
-            f" {errors_text(float(solve.position_error[i]), float(solve.angle_error[i]))} off"
-        )
+        line = f"{solve.fingers[i]} lagged: it ends {solve.errors_of(i)} off"
         if inside[:, i].any():
             last = int(np.flatnonzero(inside[:, i])[-1])
             line += f"; it was within tolerance in {int(inside[:, i].sum())} iterations"
@@ -436,13 +444,9 @@ def _lines(solve: OneSolve) -> dict[str, str]:
         "time": f"{1e3 * solve.time:.3g} ms",
     }
     for i, finger in enumerate(solve.fingers):
-        lines[f"{finger} off by"] = errors_text(
-            float(solve.position_error[i]), float(solve.angle_error[i])
-        )
+        lines[f"{finger} off by"] = solve.errors_of(i)
     clearance = solve.clearance
-    lines["collision"] = (
-        "not checked" if clearance is None else f"clearance {1e3 * clearance:.2f} mm"
-    )
+    lines["collision"] = "not checked" if clearance is None else f"clearance {_mm(clearance)}"
     if len(solve.rows) == 0:
         return lines
     counts: Counter[str] = Counter()
@@ -542,16 +546,7 @@ def _endings(logs: Sequence[Log], method: str) -> dict[bytes, Ending]:
             continue
         part = log.solves(method=method).part
         for solve_id, row in zip(part.solve_id.tolist(), part.rows, strict=True):
-            known = row.dtype.names or ()
-            more = {name: row[f"target_{name}"] for name in NAMES if f"target_{name}" in known}
-            key = target_key(row["target_points"], row["target_normals"], more)
-            ending = Ending(
-                log,
-                method,
-                solve_id,
-                bool(row["success"]),
-                int(row["iterations"]),
-                float(row["time"]),
-            )
-            found.setdefault(key, ending)
+            key = target_key(row["target_points"], row["target_normals"], targets_beside(row))
+            success, iterations, seconds = row[["success", "iterations", "time"]].item()
+            found.setdefault(key, Ending(log, method, solve_id, success > 0, iterations, seconds))
     return found

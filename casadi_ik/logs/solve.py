@@ -15,7 +15,7 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import LogError, UnknownNameError
 from casadi_ik.kernels.layout import Field, Layout
-from casadi_ik.logs.events import Happening, bits_of, measured_jacobians
+from casadi_ik.logs.events import Happening, bits_of, errors_text, measured_jacobians
 from casadi_ik.logs.reader import Log
 from casadi_ik.logs.tables import MethodRows, Table, element_name, happenings, label_of
 from casadi_ik.problem.contacts import NAMES
@@ -162,6 +162,10 @@ class OneSolve:
         """The bits of a mask in all rows, (k, bits)."""
         return bits_of(self.rows[name].reshape(len(self.rows), -1))
 
+    def errors_of(self, finger: int) -> str:
+        """How far a finger ended from its contact, in words."""
+        return errors_text(float(self.position_error[finger]), float(self.angle_error[finger]))
+
     def name_of(self, field: str, index: int) -> str:
         """The name of an element or bit of a field, or its number."""
         names = self.labels.get(field, ())
@@ -232,7 +236,7 @@ def one_solve(
     events = log.events(method=part.method, solve=number).part
     sources = log.sources.sources
     source = sources[0 if part.shard is None else int(part.shard[0])]
-    more = {name: row[f"target_{name}"] for name in NAMES if f"target_{name}" in part.names}
+    more = targets_beside(row)
     checked = "clearance" in part.names
     closest = (record["closest_first"], record["closest_second"]) if checked else ("none", "none")
     return OneSolve(
@@ -260,6 +264,12 @@ def one_solve(
         clearance=float(row["clearance"]) if checked else None,
         closest=None if "none" in closest else closest,
     )
+
+
+def targets_beside(row: np.void) -> dict[str, Array]:
+    """(f, 3) what the contacts of a solve's row have beside points and normals, by name."""
+    names = row.dtype.names or ()
+    return {name: row[f"target_{name}"] for name in NAMES if f"target_{name}" in names}
 
 
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?")

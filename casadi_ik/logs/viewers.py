@@ -35,7 +35,7 @@ from casadi_ik.files.shipped import models_folder
 from casadi_ik.files.writing import written_whole
 from casadi_ik.logs.cdr import ros_channel, write_postures
 from casadi_ik.logs.container import CDR_HEADER
-from casadi_ik.logs.events import SERIOUS, errors_text, told
+from casadi_ik.logs.events import SERIOUS, told
 from casadi_ik.logs.format import schema_name, schema_text
 from casadi_ik.logs.solve import OneSolve
 
@@ -207,13 +207,9 @@ class _View:
         ]
         level = fox.LogLevel.Info if solve.success else fox.LogLevel.Error
         lines.append((last, level, f"{solve.status} after {solve.iterations} iterations"))
-        for finger, position, angle, ok in zip(
-            solve.fingers, solve.position_error, solve.angle_error, solve.ok, strict=True
-        ):
-            level = fox.LogLevel.Info if ok else fox.LogLevel.Error
-            lines.append(
-                (last, level, f"{finger} off by {errors_text(float(position), float(angle))}")
-            )
+        for i, finger in enumerate(solve.fingers):
+            level = fox.LogLevel.Info if solve.ok[i] else fox.LogLevel.Error
+            lines.append((last, level, f"{finger} off by {solve.errors_of(i)}"))
         channel = self._protobuf("/ik/messages", fox.Log.get_schema())
         for i, level, text in sorted(lines, key=lambda line: line[0]):
             stamp = stamp_of(int(self.times[i]))
@@ -245,17 +241,6 @@ def layout_of(solve: OneSolve, robot: ArmHand) -> dict[str, Any]:
         for i, joint in enumerate(robot.description.joint_names)
     )
     return layout
-
-
-def write_layout(path: str | os.PathLike[str], layout: dict[str, Any]) -> None:
-    """Write a layout file, to be imported by the viewer.
-
-    Raises:
-        LogError: It cannot be written.
-    """
-    refused = os_errors(f"{path}: cannot write the layout", LogError)
-    with refused, written_whole(Path(path)) as part:
-        part.write_text(json.dumps(layout, indent=2) + "\n", encoding="utf-8")
 
 
 def _lines(solve: OneSolve, name: str) -> list[tuple[str, str]]:

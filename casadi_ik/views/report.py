@@ -191,15 +191,9 @@ def _story(log: Log, group: Group, i: int) -> str:
     parts = [f"<p>{_text(found.headline)}</p>"]
     if len(solve.rows):
         parts.append(curve(worst(solve)))
-    for title, lines in (
-        ("phases", found.phases),
-        ("fingers", found.fingers),
-        ("met on its way", found.met),
-        ("verdict", found.verdict),
-    ):
-        if lines:
-            items = "".join(f"<li>{_text(line)}</li>" for line in lines)
-            parts.append(f"<h4>{title}</h4><ul>{items}</ul>")
+    for title, lines in found.parts.items():
+        items = "".join(f"<li>{_text(line)}</li>" for line in lines)
+        parts.append(f"<h4>{title}</h4><ul>{items}</ul>")
     return "".join(parts)
 
 

@@ -1,21 +1,33 @@
-"""A made-up robot of 14 coordinates and 3 fingers, and solves of it."""
+"""A made-up robot of 14 coordinates and 3 fingers, solves of it, and logs rewritten by others."""
 
 from __future__ import annotations
 
 import dataclasses
+import json
+import zlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
 
 import numpy as np
+from mcap.reader import make_reader
+from mcap.records import ChunkIndex
+from mcap.writer import Writer
 
 from casadi_ik.answers.recorder import SolveBlock
 from casadi_ik.answers.solution import BatchSolution
 from casadi_ik.cli.main import main
-from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.kernels.layout import STORAGE, Field, Layout
+from casadi_ik.logs.events import event_format
+from casadi_ik.logs.format import parse_layout, schema_name, schema_text
+from casadi_ik.problem.jacobian_measures import THRESHOLDS, JacobianMeasures
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.targets import TargetBatch, Tolerance
 from casadi_ik.problem.trace import RecordedJacobian, TraceFormat
 
-__all__ = ["Field", "Layout", "RecordedJacobian", "SolveBlock", "TraceFormat", "changed", "main"]
-__all__ += ["make_block", "make_rows"]
+__all__ = ["STORAGE", "THRESHOLDS", "Field", "JacobianMeasures", "Layout", "RecordedJacobian"]
+__all__ += ["SolveBlock", "TargetBatch", "TraceFormat", "changed", "chunks_of", "event_format"]
+__all__ += ["main", "make_block", "make_rows", "parse_layout", "rewritten", "schema_name"]
+__all__ += ["schema_text"]
 
 FINGERS = ("thumb", "finger_2", "finger_3")
 PHASES = ("thumb reaching", "hand alignment", "refinement")
@@ -113,3 +125,45 @@ def changed(block: SolveBlock, **fields: object) -> SolveBlock:
     rest = {name: value for name, value in fields.items() if name not in names}
     batch = dataclasses.replace(block.batch, **of_batch)  # type: ignore[arg-type]
     return dataclasses.replace(block, batch=batch, **rest)  # type: ignore[arg-type]
+
+
+def chunks_of(path: Path) -> list[ChunkIndex]:
+    """The chunks of a complete file, as an independent reader finds them."""
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    return summary.chunk_indexes
+
+
+def rewritten(
+    path: Path,
+    metadata: Mapping[str, str] | None = None,
+    channel: Mapping[str, str] | None = None,
+    schema: Callable[[str], str] = str,
+    **options: object,
+) -> Path:
+    """The same messages by mcap's own writer, by their times; perhaps other contents around them.
+
+    Every checksum is right.
+    """
+    copy = path.with_name("copy.mcap")
+    with path.open("rb") as source, copy.open("wb") as target:
+        reader = make_reader(source, validate_crcs=True)
+        writer = Writer(target, **options)  # type: ignore[arg-type]
+        writer.start("ros2")
+        for record in reader.iter_metadata():
+            entries = {**record.metadata, **(metadata or {})}
+            pairs = sorted(pair for pair in entries.items() if pair[0] != "crc32")
+            entries["crc32"] = f"{zlib.crc32(json.dumps(pairs).encode()):08x}"
+            writer.add_metadata(record.name, entries)
+        channels: dict[int, int] = {}
+        for form, own, message in reader.iter_messages():
+            assert form is not None
+            if own.id not in channels:
+                text, about = schema(form.data.decode()), {**own.metadata, **(channel or {})}
+                number = writer.register_schema(form.name, form.encoding, text.encode())
+                channels[own.id] = writer.register_channel(own.topic, "cdr", number, about)
+            times = message.log_time, message.data, message.publish_time
+            writer.add_message(channels[own.id], *times, message.sequence)
+        writer.finish()
+    return copy

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,17 +22,18 @@ import pytest
 import zstandard
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from made_up_solves import main, make_block
+from made_up_solves import chunks_of, main, make_block, rewritten
+from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Chunk, Footer
+from mcap.records import Chunk, DataEnd, Footer, Header, MessageIndex
 from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from casadi_ik import errors, logs
-from casadi_ik.logs.container import RECORD, RECORD_LIMIT, read_chunk, read_contents, unpack
-from casadi_ik.logs.format import METADATA_NAME, signed
-from casadi_ik.logs.writer import CHUNK_SIZE
+
+CHUNK_SIZE = 2**21
+"""Of messages that a chunk waits for [bytes]."""
 
 Write = Callable[..., Path]
 
@@ -60,19 +61,15 @@ def whole(write: Write, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_cut_log(whole: Path, seed: int) -> None:
     """Every complete chunk is read, and the log says that it is not whole."""
     rng = np.random.default_rng(seed)
-    contents = read_contents(whole)
+    chunks = chunks_of(whole)
     before = logs.open(whole)
     truth = before.iterations(method="enhanced-dls").rows
     urdf = before.attachment("robot.urdf")
     length = int(rng.integers(whole.stat().st_size))
     with whole.open("r+b") as stream:
         stream.truncate(length)
-    complete = [
-        chunk
-        for chunk in contents.chunks
-        if chunk.chunk_start_offset + chunk.chunk_length <= length
-    ]
-    if length < contents.chunks[0].chunk_start_offset:
+    complete = [one for one in chunks if one.chunk_start_offset + one.chunk_length <= length]
+    if length < chunks[0].chunk_start_offset:
         with pytest.raises(errors.LogError, match=rf"^{whole}: "):
             logs.open(whole)
         return
@@ -107,7 +104,7 @@ def test_a_killed_writer(tmp_path: Path, after: float) -> None:
     assert log.info().unfinished == (path,)
     solves = log.solves().solve_id
     np.testing.assert_array_equal(solves, np.arange(len(solves)))
-    of_a_solve = sum(chunk.uncompressed_size for chunk in read_contents(path).chunks) / len(solves)
+    of_a_solve = log.info().uncompressed / len(solves)
     assert (recorded - len(solves)) * of_a_solve < 2 * (CHUNK_SIZE + of_a_solve)
     assert len(solves) <= recorded + 20
     assert len(log.iterations()) == 400 * len(solves)
@@ -125,7 +122,7 @@ def test_a_warning_names_the_unfinished_file(whole: Path, caplog: pytest.LogCapt
     assert message.startswith(f"{whole}: not finished; ")
 
 
-FIRST_RECORD = 9
+HEAD = 9
 """Bytes in front of the content of a record."""
 
 
@@ -171,11 +168,8 @@ def test_every_chunk_that_was_written_is_kept(tmp_path: Path, compression: Compr
     original = tmp_path / "whole.mcap"
     many_chunks(original, compression)
     data, messages = original.read_bytes(), read_messages(original)
-    with original.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
-    ends = {c.chunk_start_offset + c.chunk_length: c for c in summary.chunk_indexes}
-    first = len(MCAP0_MAGIC) + FIRST_RECORD + int.from_bytes(data[9:17], "little")
+    ends = {c.chunk_start_offset + c.chunk_length: c for c in chunks_of(original)}
+    first = len(MCAP0_MAGIC) + HEAD + int.from_bytes(data[9:17], "little")
     lengths = {*np.random.default_rng(7).integers(first, len(data), 60).tolist()}
     for end, chunk in ends.items():
         lengths |= {end - 1, end, end + 1, end + chunk.message_index_length}
@@ -220,10 +214,7 @@ def test_a_damaged_summary_is_written_anew(tmp_path: Path) -> None:
 def test_damage_in_the_middle_is_refused_and_nothing_changed(tmp_path: Path, closed: bool) -> None:
     path = tmp_path / "log.mcap"
     many_chunks(path, CompressionType.ZSTD)
-    with path.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
-    chunk = summary.chunk_indexes[4]
+    chunk = chunks_of(path)[4]
     data = bytearray(path.read_bytes())
     data[chunk.chunk_start_offset + chunk.chunk_length - 10] ^= 4
     path.write_bytes(data if closed else data[:-50])
@@ -355,35 +346,10 @@ def test_a_flipped_bit_anywhere(small: bytes, tmp_path: Path) -> None:
     assert refused > len(offsets)
 
 
-def crafted(
-    data: bytes,
-    path: Path,
-    metadata: Mapping[str, str] | None = None,
-    channel: Mapping[str, str] | None = None,
-    schema: Callable[[str], str] = str,
-) -> Path:
-    """The log with other contents, every checksum right."""
+def crafted(data: bytes, path: Path, *changes: Any) -> Path:
+    """The log with other metadata, labels or schemas, every checksum right; see `rewritten`."""
     path.write_bytes(data)
-    with path.open("rb") as stream:
-        reader = make_reader(stream)
-        (record,) = (each.metadata for each in reader.iter_metadata())
-        found = list(reader.iter_messages())
-    entries = {**record, **(metadata or {})}
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start("ros2")
-        writer.add_metadata(METADATA_NAME, signed(entries))
-        numbers: dict[int, int] = {}
-        for form, own, message in found:
-            assert form is not None
-            if own.id not in numbers:
-                text, about = schema(form.data.decode()), {**own.metadata, **(channel or {})}
-                number = writer.register_schema(form.name, form.encoding, text.encode())
-                numbers[own.id] = writer.register_channel(own.topic, "cdr", number, about)
-            times = message.log_time, message.data, message.publish_time
-            writer.add_message(numbers[own.id], *times, message.sequence)
-        writer.finish()
-    return path
+    return rewritten(path, *changes).replace(path)
 
 
 def ask_everything(path: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
@@ -467,7 +433,7 @@ def test_crafted_metadata_are_refused(
 def test_crafted_labels_are_refused(
     small: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str], labels: str, reason: str
 ) -> None:
-    path = crafted(small, tmp_path / "log.mcap", channel={"labels": labels})
+    path = crafted(small, tmp_path / "log.mcap", None, {"labels": labels})
     refusals = ask_everything(path, capsys)
     assert len(refusals) == 6
     for line in refusals:
@@ -492,7 +458,7 @@ def test_crafted_schemas_are_refused(
     capsys: pytest.CaptureFixture[str],
     change: Callable[[str], str],
 ) -> None:
-    path = crafted(small, tmp_path / "log.mcap", schema=change)
+    path = crafted(small, tmp_path / "log.mcap", None, None, change)
     for line in ask_everything(path, capsys):
         assert line.startswith(f"casadi-ik: error: {path}: ")
 
@@ -546,16 +512,17 @@ def test_any_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str], seed: int)
     with logs.McapRecorder(path, robot_name="made_up", compression="none") as recorder:
         recorder.record(make_block(30, 20))
     data = bytearray(path.read_bytes())
-    (index,) = read_contents(path).chunks
+    (chunk,) = chunks_of(path)
     with path.open("rb") as stream:
-        runs = read_chunk(stream, index).runs
-    begin = index.chunk_start_offset + index.chunk_length - index.uncompressed_size
-    run = runs[seed % len(runs)]
-    for start in range(run.start, run.stop, run.size):
-        for place in rng.integers(RECORD.size + 26, run.size, 12).tolist():
+        records = list(StreamReader(stream, emit_chunks=True).records)
+    indexes = [record for record in records if isinstance(record, MessageIndex)]
+    begin = chunk.chunk_start_offset + chunk.chunk_length - chunk.uncompressed_size
+    for _, start in indexes[seed % len(indexes)].records:
+        size = HEAD + int.from_bytes(data[begin + start + 1 : begin + start + HEAD], "little")
+        for place in rng.integers(HEAD + 26, size, 12).tolist():
             data[begin + start + place] = int(rng.choice([0, 127, 240, 255]))
-    crc = zlib.crc32(data[begin : begin + index.uncompressed_size])
-    struct.pack_into("<I", data, index.chunk_start_offset + RECORD.size + 24, crc)
+    crc = zlib.crc32(data[begin : begin + chunk.uncompressed_size])
+    struct.pack_into("<I", data, chunk.chunk_start_offset + HEAD + 24, crc)
     path.write_bytes(data)
     ask_everything(path, capsys)
 
@@ -563,41 +530,56 @@ def test_any_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str], seed: int)
 GIGABYTES = 3 * 10**9
 
 
+def with_chunk(folder: Path, chunk: Chunk) -> Path:
+    """A closed file that holds nothing but a chunk."""
+    builder = RecordBuilder()
+    builder.write(MCAP0_MAGIC)
+    for record in (Header("ros2", "a test"), chunk, DataEnd(0), Footer(0, 0, 0)):
+        record.write(builder)
+    builder.write(MCAP0_MAGIC)
+    path = folder / "chunk.mcap"
+    path.write_bytes(builder.end())
+    return path
+
+
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
 @pytest.mark.parametrize("said", [GIGABYTES, 1000])
-def test_a_chunk_that_unpacks_to_too_much_is_refused(compression: str, said: int) -> None:
+def test_a_chunk_that_unpacks_to_too_much_is_refused(
+    tmp_path: Path, compression: str, said: int
+) -> None:
     """Whether it says so or not, and whether the compressed data say so or not."""
-    zeros = bytes(RECORD_LIMIT // 16)
+    zeros = bytes(2**24)
     packed = {
         "zstd": lambda: zstandard.ZstdCompressor(write_content_size=said != 1000).compress(zeros),
         "lz4": lambda: lz4.frame.compress(zeros),
     }[compression]()
     assert len(packed) < len(zeros) // 100
-    with pytest.raises(errors.LogError, match=r"the chunk at byte 0 (holds|cannot be unpacked)"):
-        unpack(Chunk(compression, packed, 0, 0, 0, said), "the chunk at byte 0")
+    with pytest.raises(errors.LogError, match=r"the chunk at byte \d+ (holds|cannot be unpacked)"):
+        logs.finish_log(with_chunk(tmp_path, Chunk(compression, packed, 0, 0, 0, said)))
 
 
-def test_what_does_not_belong_into_a_chunk_is_refused() -> None:
-    short = RECORD.pack(Opcode.MESSAGE, 4) + bytes(4)
+def test_what_does_not_belong_into_a_chunk_is_refused(tmp_path: Path) -> None:
+    def record(opcode: Opcode, length: int) -> bytes:
+        return struct.pack("<BQ", opcode, length)
+
     for data, reason in (
-        (RECORD.pack(Opcode.ATTACHMENT, 1) + b"a", r"does not belong there \(9\)"),
-        (short, r"does not belong there \(5\)"),
-        (RECORD.pack(Opcode.MESSAGE, 100) + bytes(50), "reaches beyond it"),
-        (RECORD.pack(Opcode.MESSAGE, 22)[:5], "ends within a record"),
-        (RECORD.pack(Opcode.MESSAGE, 22) + struct.pack("<HIQQ", 1, 0, 9, 0), "of other times"),
+        (record(Opcode.ATTACHMENT, 1) + b"a", r"does not belong there \(9\)"),
+        (record(Opcode.MESSAGE, 4) + bytes(4), r"does not belong there \(5\)"),
+        (record(Opcode.MESSAGE, 100) + bytes(50), "reaches beyond it"),
+        (record(Opcode.MESSAGE, 22)[:5], "ends within a record"),
+        (record(Opcode.MESSAGE, 22) + struct.pack("<HIQQ", 1, 0, 9, 0), "of other times"),
     ):
         chunk = Chunk("", data, 2, 1, zlib.crc32(data), len(data))
         with pytest.raises(errors.LogError, match=reason):
-            unpack(chunk, "the chunk")
+            logs.finish_log(with_chunk(tmp_path, chunk))
 
 
 def huge(path: Path) -> Path:
     """A log whose first chunk says that it unpacks to 3 GB, summary and all."""
-    contents = read_contents(path)
-    size = contents.chunks[0].uncompressed_size
+    size = chunks_of(path)[0].uncompressed_size
     data = path.read_bytes().replace(struct.pack("<Q", size), struct.pack("<Q", GIGABYTES))
-    magic, start = len(b"\x89MCAP0\r\n"), data.rindex(RECORD.pack(Opcode.FOOTER, 20))
-    (summary,) = struct.unpack_from("<Q", data, start + RECORD.size)
+    magic, start = len(b"\x89MCAP0\r\n"), data.rindex(struct.pack("<BQ", Opcode.FOOTER, 20))
+    (summary,) = struct.unpack_from("<Q", data, start + HEAD)
     checksum = zlib.crc32(data[summary : -magic - 4])
     path.write_bytes(data[: -magic - 4] + struct.pack("<I", checksum) + data[-magic:])
     return path

@@ -12,15 +12,22 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_up_solves import FORMAT, LABELS, main, make_block
+from made_up_solves import (
+    FORMAT,
+    LABELS,
+    THRESHOLDS,
+    Field,
+    JacobianMeasures,
+    Layout,
+    RecordedJacobian,
+    TraceFormat,
+    event_format,
+    main,
+    make_block,
+)
 
 import casadi_ik as ik
 from casadi_ik import errors, logs
-from casadi_ik.kernels.layout import Field, Layout
-from casadi_ik.logs.events import event_format
-from casadi_ik.methods.common import limits as coupling_record
-from casadi_ik.problem.jacobian_measures import THRESHOLDS, JacobianMeasures
-from casadi_ik.problem.trace import RecordedJacobian, TraceFormat
 
 STORAGE = {"phase": "u1", "restart": "u4", "limit_mask": "u4", "active_mask": "u4"}
 Names = tuple[str, ...]
@@ -395,19 +402,12 @@ def test_near_a_toggle_is_an_event_that_names_the_motors(ar10, tmp_path, monkeyp
     q = ar10.random(np.random.default_rng(1), 1)[0]
     _, events = logged(ar10, tmp_path / "clear.mcap", q)
     assert events == []
-    monkeypatch.setattr(coupling_record, "NEAR_TOGGLE", 1.0)
+    monkeypatch.setattr("casadi_ik.methods.common.limits.NEAR_TOGGLE", 1.0)
     rows, events = logged(ar10, tmp_path / "near.mcap", q)
     assert (rows["sigma_coupling"] < 1.0).all()
     assert events
     assert {event["jacobian"] for event in events} == {"coupling"}
-    named = coupling_record.coupling_jacobian(ar10.description)["coupling"].joints
-    assert set(named) == set(ar10.actuators)
-
-
-def test_a_robot_without_mechanisms_records_none():
-    barrett = ik.load_robot("kuka_lwr_barrett").description
-    assert coupling_record.coupling_fields(barrett) == ()
-    assert coupling_record.coupling_jacobian(barrett) == {}
+    assert {joint for event in events for joint in event["joint_mask"]} == set(ar10.actuators)
 
 
 LENGTH = 0.1
@@ -464,6 +464,7 @@ def test_each_row_with_a_configuration_has_the_values_it_should(robot, log):
     arm = robot.description.arm_actuators
     fingers = {name: robot.description.finger_actuators(name) for name in robot.fingers}
     unplaced = log.iterations().method == "hand-first"
+    assert "sigma_coupling" not in log.iterations().names, "it has no mechanisms"
     for row in some:
         q = row["q"].astype(float)
         hands = [spread(robot, q, name, columns) for name, columns in fingers.items()]

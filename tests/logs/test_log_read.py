@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
-from made_up_solves import FORMAT, JOINTS, LAYOUT, changed, main, make_block
+from made_up_solves import FORMAT, JOINTS, LAYOUT, changed, chunks_of, main, make_block, rewritten
 from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC as MAGIC
-from mcap.writer import CompressionType, IndexType, Writer
+from mcap.writer import CompressionType, IndexType
 
 import casadi_ik as ik
 from casadi_ik import errors, logs
@@ -70,11 +70,9 @@ def test_only_the_chunks_asked_for_are_read(write: Write) -> None:
     """Whatever is wrong with the others goes unnoticed."""
     path = write(make_block(*[10] * 20))
     log, data = logs.open(path), bytearray(path.read_bytes())
-    with path.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
-    assert log.info().chunks == len(summary.chunk_indexes) == 20
-    for i, chunk in enumerate(summary.chunk_indexes):
+    chunks = chunks_of(path)
+    assert log.info().chunks == len(chunks) == 20
+    for i, chunk in enumerate(chunks):
         data[chunk.chunk_start_offset + chunk.chunk_length - 1] ^= i not in (3, 11)
     path.write_bytes(data)
     assert len(log.iterations(solve=[3, 11])) == 20
@@ -237,29 +235,6 @@ def test_without_polars(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
         table.frame()
 
 
-def rewritten(path: Path, **options: object) -> Path:
-    """The same messages by mcap's own writer, in the order of their times."""
-    copy = path.with_name("copy.mcap")
-    with path.open("rb") as source, copy.open("wb") as target:
-        reader = make_reader(source, validate_crcs=True)
-        writer = Writer(target, chunk_size=20_000, **options)  # type: ignore[arg-type]
-        writer.start("ros2")
-        for record in reader.iter_metadata():
-            writer.add_metadata(record.name, record.metadata)
-        channels: dict[int, int] = {}
-        for schema, channel, message in reader.iter_messages():
-            assert schema is not None
-            if channel.id not in channels:
-                number = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.id] = writer.register_channel(
-                    channel.topic, channel.message_encoding, number, channel.metadata
-                )
-            times = message.log_time, message.data, message.publish_time
-            writer.add_message(channels[channel.id], *times, message.sequence)
-        writer.finish()
-    return copy
-
-
 @pytest.mark.parametrize(
     "options",
     [
@@ -271,7 +246,7 @@ def rewritten(path: Path, **options: object) -> Path:
 def test_a_log_that_other_tools_have_rearranged(write: Write, options: dict[str, object]) -> None:
     """Messages of all topics mixed, in other chunks, perhaps without their index."""
     path = write(make_block(30, 80, 3))
-    ours, theirs = logs.open(path), logs.open(rewritten(path, **options))
+    ours, theirs = logs.open(path), logs.open(rewritten(path, chunk_size=20_000, **options))
     for one, other in (
         (ours.iterations(), theirs.iterations()),
         (ours.solves(), theirs.solves()),

@@ -11,26 +11,35 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_up_solves import LABELS, LAYOUT, T0, changed, make_block
+from made_up_solves import (
+    LABELS,
+    LAYOUT,
+    STORAGE,
+    T0,
+    Field,
+    Layout,
+    SolveBlock,
+    TargetBatch,
+    changed,
+    chunks_of,
+    make_block,
+    parse_layout,
+    schema_name,
+    schema_text,
+)
 from mcap.reader import make_reader
 from mcap_ros2._dynamic import generate_dynamic
-from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.reader import read_ros2_messages
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import casadi_ik as ik
 from casadi_ik import errors, logs
-from casadi_ik.answers.recorder import SolveBlock
-from casadi_ik.kernels.layout import STORAGE, Field, Layout
-from casadi_ik.logs import format as schema
-from casadi_ik.logs.container import CDR_HEADER
-from casadi_ik.logs.format import KINDS, topic
-from casadi_ik.logs.rows import solve_format
-from casadi_ik.logs.writer import CHUNK_SIZE
-from casadi_ik.problem.targets import TargetBatch
 
 Write = Callable[..., Path]
+KINDS = ("iteration", "solve", "event")
+CDR_HEADER = b"\0\1\0\0"
+CHUNK_SIZE = 2**21
 
 
 def assert_row(message: object, row: np.void) -> None:
@@ -88,12 +97,11 @@ def test_a_chunk_ends_where_a_solve_ends(write: Write) -> None:
     single = [make_block(3000, first=i) for i in range(12)]
     parts = write(*single, name="parts.mcap")
     for path in (whole, parts):
-        log = logs.open(path)
-        contents = log.shards[0].contents
-        assert len(contents.chunks) >= 4
-        firsts = [chunk.message_start_time for chunk in contents.chunks]
+        chunks = chunks_of(path)
+        assert len(chunks) >= 4
+        firsts = [chunk.message_start_time for chunk in chunks]
         assert all((first - T0) % logs.LogClock(T0).slot == 0 for first in firsts)
-        sizes = [chunk.uncompressed_size for chunk in contents.chunks[:-1]]
+        sizes = [chunk.uncompressed_size for chunk in chunks[:-1]]
         assert all(CHUNK_SIZE <= size < CHUNK_SIZE + 3000 * 400 for size in sizes)
     found = logs.open(whole).iterations()
     assert found.rows.tobytes() == make_block(*counts).rows.tobytes()
@@ -113,10 +121,6 @@ def test_two_methods_share_a_log(write: Write) -> None:
     assert log.methods == ("enhanced-dls", "hand-first")
     with pytest.raises(errors.UnknownNameError, match="of which method"):
         _ = log.iterations().rows
-    with pytest.raises(
-        errors.UnknownNameError, match=r"no method 'ipopt'.*enhanced-dls, hand-first"
-    ):
-        log.iterations(method="ipopt")
     assert len(log.iterations(method="hand-first").rows) == 7
     assert len(log.iterations()) == 37
     assert [part.method for part in log.solves().parts] == ["enhanced-dls", "hand-first"]
@@ -125,15 +129,11 @@ def test_two_methods_share_a_log(write: Write) -> None:
     assert log.info().counts["enhanced-dls"]["solve"] == 1
 
 
-def test_a_solve_without_iterations(write: Write) -> None:
+def test_a_solve_without_iterations_and_an_empty_log(write: Write) -> None:
     log = logs.open(write(make_block(0)))
-    assert len(log.iterations().rows) == 0
+    assert len(log.iterations().rows) == len(log.events()) == 0
     assert log.solves().rows["iterations"].tolist() == [0]
     assert np.isnan(log.solves().rows["lowest_sigma"]).all()
-    assert len(log.events()) == 0
-
-
-def test_an_empty_log(write: Write) -> None:
     log = logs.open(write())
     assert log.methods == ()
     assert len(log.solves()) == len(log.iterations()) == len(log.events()) == 0
@@ -168,56 +168,46 @@ def test_the_lowest_singular_values_are_kept(write: Write) -> None:
 
 
 @pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])
-def test_mcap_and_mcap_ros2(write: Write, compression: str) -> None:
-    block = make_block(50, first=2)
-    path = write(block, compression=compression)
-    with path.open("rb") as stream:
-        reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
-        assert reader.get_header().profile == "ros2"
-        found = list(reader.iter_decoded_messages(topics="/ik/enhanced-dls/iteration"))
-    assert len(found) == 50
-    clock = logs.LogClock(T0)
-    for i, (form, channel, message, decoded) in enumerate(found):
-        assert form is not None
-        assert form.name == "casadi_ik/msg/IterationEnhancedDlsQ14F3J1"
-        assert (form.encoding, channel.message_encoding) == ("ros2msg", "cdr")
-        assert channel.metadata["offered_qos_profiles"] == ""
-        assert message.log_time == T0 + 2 * clock.slot + i * 1_000_000
-        assert message.sequence == i
-        assert_row(decoded, block.rows[i])
-    first, last = found[0][2].publish_time, found[-1][2].publish_time
-    assert block.started[0] < first < last == block.started[0] + 250_000_000
+def test_mcap_and_mcap_ros2_and_rosbags(write: Write, compression: str) -> None:
+    """Two readers that share nothing find every row; heads and constants are as viewers want."""
+    block = make_block(50, 20, first=2)
+    path = write(block, make_block(3, method="hand-first"), compression=compression)
     log = logs.open(path)
-    for kind, table in (("solve", log.solves()), ("event", log.events())):
-        messages = [m.ros_msg for m in read_ros2_messages(path, [topic("enhanced-dls", kind)])]
-        assert len(messages) == len(table) > 0
-        for message, row in zip(messages, table.rows, strict=True):
-            assert_row(message, row)
-
-
-def test_rosbags(write: Write) -> None:
-    block = make_block(30, 20, first=2)
-    path = write(block, make_block(3, method="hand-first"))
-    log = logs.open(path)
-    tables = (log.iterations, log.solves, log.events)
     rows = {
-        kind: get(method="enhanced-dls").rows
-        for kind, get in zip(("iteration", "solve", "event"), tables, strict=True)
+        kind: ask(method="enhanced-dls").rows
+        for kind, ask in zip(KINDS, (log.iterations, log.solves, log.events), strict=True)
     }
+    for kind in KINDS:
+        messages = [m.ros_msg for m in read_ros2_messages(path, [f"/ik/enhanced-dls/{kind}"])]
+        for message, row in zip(messages, rows[kind], strict=True):
+            assert_row(message, row)
     seen = dict.fromkeys(KINDS, 0)
     with AnyReader([path]) as reader:
         for connection, _, raw in reader.messages():
             _, _, method, kind = connection.topic.split("/")
             if method == "enhanced-dls":
-                message = reader.deserialize(raw, connection.msgtype)
-                assert_row(message, rows[kind][seen[kind]])
+                assert_row(reader.deserialize(raw, connection.msgtype), rows[kind][seen[kind]])
                 seen[kind] += 1
         types = reader.typestore.types
-        constants = types["casadi_ik/msg/IterationEnhancedDlsQ14F3J1"]
-        assert constants.PHASE_HAND_ALIGNMENT == 1
-        assert types["casadi_ik/msg/EventEnhancedDlsQ14F3J1"].KIND_OSCILLATION == 9
-        assert types["casadi_ik/msg/SolveEnhancedDlsQ14F3J1"].STATUS_STALLED == 2
+        for kind, constant, code in (
+            *(("Iteration", "PHASE_HAND_ALIGNMENT", 1), ("Event", "KIND_OSCILLATION", 9)),
+            ("Solve", "STATUS_STALLED", 2),
+        ):
+            assert getattr(types[f"casadi_ik/msg/{kind}EnhancedDlsQ14F3J1"], constant) == code
     assert seen == {kind: len(found) for kind, found in rows.items()}
+    assert min(seen.values()) > 0
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        assert reader.get_header().profile == "ros2"
+        found = list(reader.iter_messages(topics="/ik/enhanced-dls/iteration"))[:50]
+    for i, (form, channel, message) in enumerate(found):
+        assert form is not None
+        assert (form.encoding, channel.message_encoding) == ("ros2msg", "cdr")
+        assert channel.metadata["offered_qos_profiles"] == ""
+        assert message.log_time == T0 + 2 * logs.LogClock(T0).slot + i * 1_000_000
+        assert message.sequence == i
+    first, last = found[0][2].publish_time, found[-1][2].publish_time
+    assert block.started[0] < first < last == block.started[0] + 250_000_000
 
 
 NAME = "casadi_ik/msg/Random"
@@ -254,7 +244,7 @@ def test_a_row_is_its_own_message(layout: Layout, data: st.DataObject) -> None:
         data.draw(st.binary(min_size=layout.dtype.itemsize, max_size=layout.dtype.itemsize)),
         layout.dtype,
     )[0]
-    text = schema.schema_text(layout, dict.fromkeys(layout.names, ("a", "b c")))
+    text = schema_text(layout, dict.fromkeys(layout.names, ("a", "b c")))
     payload = CDR_HEADER + row.tobytes()
     theirs = generate_dynamic(NAME, text)[NAME](payload)
     store = get_typestore(Stores.EMPTY)
@@ -270,7 +260,7 @@ def test_a_row_is_its_own_message(layout: Layout, data: st.DataObject) -> None:
 @settings(max_examples=100)
 @given(layout=layouts())
 def test_the_layout_comes_back_from_the_schema(layout: Layout) -> None:
-    assert schema.parse_layout(schema.schema_text(layout)) == layout
+    assert parse_layout(schema_text(layout)) == layout
 
 
 @pytest.mark.parametrize(
@@ -290,7 +280,7 @@ def test_the_layout_comes_back_from_the_schema(layout: Layout) -> None:
 )
 def test_lines_that_are_no_part_of_a_layout_are_refused(line: str) -> None:
     with pytest.raises(errors.LogError, match="schema: "):
-        schema.parse_layout(f"{line}\n")
+        parse_layout(f"{line}\n")
 
 
 def test_the_schema_is_for_people_too() -> None:
@@ -300,14 +290,14 @@ def test_the_schema_is_for_people_too() -> None:
         Field("limit_mask", dtype="u4"),
     )
     labels = {"phase": ("", "thumb reaching", "hand-alignment"), "limit_mask": ("a",)}
-    assert schema.schema_text(layout, labels) == (
+    assert schema_text(layout, labels) == (
         "float64[12] pose # (3, 4) [m]\n"
         "uint32 limit_mask # []\n"
         "uint8 PHASE_THUMB_REACHING=1\n"
         "uint8 PHASE_HAND_ALIGNMENT=2\n"
         "uint8 phase # [] phase of the method\n"
     )
-    assert schema.schema_name("iteration", "hand-first", layout, 3) == (
+    assert schema_name("iteration", "hand-first", layout, 3) == (
         "casadi_ik/msg/IterationHandFirstQ0F3J0"
     )
 
@@ -324,7 +314,7 @@ def test_the_schema_is_for_people_too() -> None:
 )
 def test_layouts_that_are_no_message(layout: Layout) -> None:
     with pytest.raises(errors.LogError):
-        schema.schema_text(layout)
+        schema_text(layout)
 
 
 GRASP = ik.load_grasp("cup")
@@ -389,8 +379,9 @@ def test_held_actuators_beyond_one_word(write: Callable[..., Path]) -> None:
         starts=np.ones((1, 40)),
         targets=TargetBatch(points, normals, ik.Tolerance(), enforce_limits=False, fixed=held),
     )
-    assert solve_format(wide).layout.dtype["fixed_mask"].shape == (2,)
-    solve = logs.one_solve(logs.open(write(wide)))
+    log = logs.open(write(wide))
+    assert log.solves().rows["fixed_mask"].shape == (1, 2)
+    solve = logs.one_solve(log)
     assert list(solve.asked.fixed.values()) == [0.5, -0.25]
     assert solve.asked.limits == "ignore"
     assert solve.asked.start is not None

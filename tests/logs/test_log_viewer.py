@@ -17,11 +17,10 @@ import pinocchio
 import pytest
 from made_up_solves import make_block
 from mcap.reader import make_reader
-from viewer_reader import Decoded, decode
+from viewer_reader import Decoded, decode, layout_of, shipped_layout, write_view
 
 import casadi_ik as ik
 from casadi_ik import errors, logs
-from casadi_ik.logs.viewers import layout_of, shipped_layout, write_layout, write_view
 
 
 @pytest.fixture(scope="module")
@@ -159,17 +158,13 @@ def test_nothing_to_show_and_nowhere_to_write(
         write_view(tmp_path / "view.mcap", empty, robot)
     with pytest.raises(errors.LogError, match="cannot write the viewer file: No such file"):
         write_view(tmp_path / "nowhere" / "view.mcap", solve, robot)
-    with pytest.raises(errors.LogError, match="cannot write the layout: Is a directory"):
-        write_layout(tmp_path, {})
     assert list(tmp_path.iterdir()) == []
 
 
 def test_the_shipped_layout_is_the_one_of_the_shipped_robot(
-    solve: logs.OneSolve, robot: ik.ArmHand, tmp_path: Path
+    solve: logs.OneSolve, robot: ik.ArmHand
 ) -> None:
-    shipped = json.loads(shipped_layout().read_text())
-    write_layout(tmp_path / "layout.json", layout_of(solve, robot))
-    assert json.loads((tmp_path / "layout.json").read_text()) == shipped
+    assert layout_of(solve, robot) == json.loads(shipped_layout().read_text())
 
 
 def test_every_path_of_the_layout_is_in_the_file(view: Path, decoded: Decoded) -> None:
