@@ -18,7 +18,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.grasps import Contact, Grasp, Tolerance
 from casadi_ik.on_demand import Shown, on_demand
 from casadi_ik.problem.status import Status
-from casadi_ik.problem.verdict import ContactVerdict, PalmVerdict
+from casadi_ik.problem.verdict import ContactVerdict, PalmVerdict, contact_verdicts
 
 Pair = tuple[str, str]
 
@@ -339,17 +339,8 @@ class BatchSolution(Shown):
             >>> solver.solve_batch(points, normals).solution(0).status.name
             'SOLVED'
         """
-        verdicts = zip(
-            self.position_error[row].tolist(),
-            self.angle_error[row].tolist(),
-            self.ok[row].tolist(),
-            self.tolerances,
-            strict=True,
-        )
-        contacts = {
-            name: ContactVerdict(*verdict)
-            for name, verdict in zip(self.fingers, verdicts, strict=True)
-        }
+        errors = self.position_error[[row]], self.angle_error[[row]], self.ok[[row]]
+        (contacts,) = contact_verdicts(self.fingers, self.tolerances, *errors)
         return Solution(
             success=bool(self.success[row]),
             status=Status(int(self.status[row])),

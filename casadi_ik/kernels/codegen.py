@@ -30,18 +30,21 @@ def driver_text(name: str) -> str:
     )
 
 
-def c_struct(name: str, sizes: Mapping[str, int] | None = None) -> Any:
+def c_struct(name: str, sizes: Mapping[str, int] | None = None, driver: str = "") -> Any:
     """The struct `<name>` of `drivers/<name>.c` for ctypes; pointers of any kind are addresses.
 
     Args:
         name: As C has it.
         sizes: What names in brackets stand for.
+        driver: Whose it is, if that has another name.
     """
-    text = re.sub(r"/\*.*?\*/", "", driver_text(name), flags=re.DOTALL)
+    text = re.sub(r"/\*.*?\*/", "", driver_text(driver or name), flags=re.DOTALL)
     body = text.partition(f"}} {name};")[0].rpartition("typedef struct {")[2]
     fields: list[tuple[str, Any]] = []
     for declaration in filter(str.strip, body.split(";")):
-        if called := re.search(r"\(\*(\w+)\)\(", declaration):
+        if declaration.strip().isupper():
+            continue  # what a solver that stands alone adds
+        if called := re.search(r"(?:\(\*|KERNEL\()(\w+)", declaration):
             fields.append((called[1], ctypes.c_void_p))
             continue
         kind: Any = ctypes.c_double if "scalar" in declaration else ctypes.c_int64

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +46,22 @@ class ContactVerdict:
     angle_error: float
     ok: bool
     tolerance: Tolerance
+
+
+def contact_verdicts(
+    fingers: Sequence[str], tolerances: Sequence[Tolerance], *errors: NDArray[Any]
+) -> list[dict[str, ContactVerdict]]:
+    """Of k configurations the verdicts by finger.
+
+    Args:
+        fingers: Names.
+        tolerances: By finger.
+        errors: (k, f) distances [m], angles [rad], and whether they are within tolerance.
+    """
+    return [
+        dict(zip(fingers, map(ContactVerdict, *row, tolerances), strict=True))
+        for row in zip(*(column.tolist() for column in errors), strict=True)
+    ]
 
 
 @dataclass(frozen=True)

@@ -233,12 +233,10 @@ def smallest(owner: Rows, values: Array, most: int) -> Rows:
         most: How many rows of a target at most.
     """
     order = np.lexsort((values, owner))
-    owner, value = owner[order], values[order]
+    mine, value = owner[order], values[order]
     fresh = np.ones(len(order), dtype=bool)
-    fresh[1:] = (owner[1:] != owner[:-1]) | (value[1:] > value[:-1] * ALIKE)
-    order, owner = order[fresh], owner[fresh]
-    rank = np.arange(len(order)) - np.searchsorted(owner, owner)
-    return order[rank < most]
+    fresh[1:] = (mine[1:] != mine[:-1]) | (value[1:] > value[:-1] * ALIKE)
+    return first_of_each(owner, order[fresh], most)
 
 
 def best_of_each(owner: NDArray[np.intp], value: Array, than: Array) -> NDArray[np.intp]:
@@ -299,12 +297,7 @@ class Deduplicator:
         return found
 
 
-def distinct(parts: Array, apart: float, limit: int | None = None) -> list[int]:
+def distinct(parts: Array, apart: float) -> list[int]:
     """Rows of parts (k, n) that differ from all chosen before them, in their order."""
-    kept: list[int] = []
-    for i in range(len(parts)):
-        if len(kept) == limit:
-            break
-        if (np.abs(parts[i] - parts[kept]).max(axis=1, initial=0.0) >= apart).all():
-            kept.append(i)
-    return kept
+    nobody = np.zeros(len(parts), dtype=np.intp)
+    return np.flatnonzero(Deduplicator(1, parts.shape[1], apart).add(parts, nobody)).tolist()

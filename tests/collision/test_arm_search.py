@@ -41,7 +41,8 @@ def search(solver) -> ArmSearch:
 @pytest.fixture(scope="module")
 def plain(robot, search, solver) -> ArmSearch:
     finder = solver._engine.finder
-    return ArmSearch(robot, search._family, lambda: finder.manipulability, compiled=False)
+    parts = search._family, search.scores, lambda: finder.manipulability
+    return ArmSearch(robot, *parts, compiled=False)
 
 
 def chosen(search, robot, hands, prefer, branches=False, **words):
@@ -145,7 +146,7 @@ def test_an_arm_with_a_wrist_is_looked_at_with_the_wrist_anywhere(name, rows):
     robot = ik.load_robot(name)
     family = ik.Solver(robot)._engine.method.step.arm
     assert family.rows == rows
-    search = ArmSearch(robot, family, lambda: None, compiled=False)
+    search = ArmSearch(robot, family, lambda *_: None, lambda: None, compiled=False)
     columns = list(robot.description.arm_actuators)
     wrist = [columns[joint] for joint in family.locked]
     for level in search.values.levels:

@@ -22,7 +22,7 @@ from casadi_ik.arms.search import PARAMETERS, arms_graph
 from casadi_ik.arrays import Array
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.kernels.cancellation import DriverCode, check
-from casadi_ik.kernels.codegen import driver_text
+from casadi_ik.kernels.codegen import c_struct, driver_text
 from casadi_ik.kernels.function_kernel import MapJob, doubles, machine_lanes, memory
 from casadi_ik.kernels.graphs import recipe
 from casadi_ik.kernels.libraries import load_library
@@ -120,45 +120,7 @@ class ArmCandidates:
     tried: NDArray[np.int64]
 
 
-class ArmSearchJob(ctypes.Structure):
-    """`arm_search_job` of drivers/arm_search.c."""
-
-    _fields_ = (
-        ("arms", ctypes.c_void_p),
-        ("measure", ctypes.c_void_p),
-        ("check", ctypes.c_void_p),
-        ("clear", ctypes.c_void_p),
-        ("lanes", ctypes.c_int64),
-        ("order", ctypes.c_int64),
-        ("n_q", ctypes.c_int64),
-        ("n_arm", ctypes.c_int64),
-        ("n_redundancy", ctypes.c_int64),
-        ("n_rows", ctypes.c_int64),
-        ("n_groups", ctypes.c_int64),
-        ("n_places", ctypes.c_int64 * 2),
-        ("n_closer", ctypes.c_int64),
-        ("places", ctypes.c_void_p * 2),
-        ("closer", ctypes.c_void_p),
-        ("columns", ctypes.c_void_p),
-        ("lower", ctypes.c_void_p),
-        ("upper", ctypes.c_void_p),
-        ("low", ctypes.c_void_p),
-        ("range", ctypes.c_void_p),
-        ("q", ctypes.c_void_p),
-        ("palms", ctypes.c_void_p),
-        ("starts", ctypes.c_void_p),
-        ("owner", ctypes.c_void_p),
-        ("caps", ctypes.c_void_p),
-        ("poses", ctypes.c_void_p),
-        ("pose_step", ctypes.c_int64),
-        ("margin", ctypes.c_double),
-        ("rounding", ctypes.c_double),
-        ("allowed", ctypes.c_double),
-        ("count", ctypes.c_int64),
-        ("chosen", ctypes.c_void_p),
-        ("score", ctypes.c_void_p),
-        ("tried", ctypes.c_void_p),
-    )
+ArmSearchJob = c_struct("arm_search_job", {"LEVELS": 2}, "arm_search")
 
 
 class ArmSearch:
@@ -168,6 +130,7 @@ class ArmSearch:
         self,
         robot: ArmHand,
         family: ArmFamily,
+        scores: Callable[[Array, Array, Preference], Array],
         manipulability: Callable[[], FunctionKernel],
         compiled: bool = True,
     ) -> None:
@@ -176,10 +139,13 @@ class ArmSearch:
         Args:
             robot: The robot.
             family: Its arm's.
+            scores: Of configurations (m, n), starts (m, n) and what is preferred: the order (m,)
+                of arms of the same hand, higher is better.
             manipulability: Gives that of the arm as a function of q.
             compiled: False keeps to the virtual machine and numpy.
         """
-        self._robot, self._family, self._manipulability = robot, family, manipulability
+        self._robot, self._family = robot, family
+        self.scores, self._manipulability = scores, manipulability
         self._columns = np.array(robot.description.arm_actuators, dtype=np.int64)
         lower, upper = robot.lower[self._columns], robot.upper[self._columns]
         self._low, self._range = doubles(lower), doubles(upper - lower)
@@ -244,19 +210,6 @@ class ArmSearch:
         found = q[owner]
         found[:, self._columns] = arms[owner, group]
         return ArmCandidates(found, owner, tried)
-
-    def scores(self, q: Array, starts: Array, prefer: Preference) -> Array:
-        """(m,) the order of arms of the same hand, higher is better."""
-        if callable(prefer):
-            return np.asarray(prefer(q), dtype=float)
-        arm = q[:, self._columns]
-        if prefer == "q0":
-            away = (arm - starts[:, self._columns]) / self._range
-            return -np.square(away).sum(axis=1)
-        if prefer == "manipulability":
-            return self._manipulability()(q)[0]
-        inside = np.minimum(arm - self._low, self._low + self._range - arm)
-        return (inside / (0.5 * self._range)).min(axis=1)
 
     def _compiled(
         self,

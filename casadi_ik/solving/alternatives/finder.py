@@ -20,7 +20,7 @@ from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.problem.clearance import CollisionQuery
 from casadi_ik.problem.request import CLEARANCE, free_palms, preference
 from casadi_ik.problem.targets import TargetBatch
-from casadi_ik.problem.verdict import ContactVerdict, judge
+from casadi_ik.problem.verdict import contact_verdicts, judge
 from casadi_ik.solving.alternatives.arm_search import ArmSearch, Preference
 from casadi_ik.solving.alternatives.branches import ArmBranches
 from casadi_ik.solving.alternatives.trunks import other_trunks
@@ -93,7 +93,11 @@ class AlternativeFinder:
         family = self.trials.method.step.arm
         if family is None:
             return None
-        return ArmSearch(self.robot, family, lambda: self.manipulability, self._compiled)
+
+        def scores(q: Array, starts: Array, prefer: Preference) -> Array:
+            return self.score(q, starts, prefer, self._arm)
+
+        return ArmSearch(self.robot, family, scores, lambda: self.manipulability, self._compiled)
 
     @cached_property
     def manipulability(self) -> FunctionKernel:
@@ -149,7 +153,7 @@ class AlternativeFinder:
         keys = np.stack([self._valued(q, q0, prefer, query), self._margins(q, self._arm)])
         order = [int(i) for i in np.lexsort(-keys[::-1]) if solved[i]]
         parts = self._parts(q[order], list(range(q.shape[1])))
-        kept = distinct(parts, apart, limit)
+        kept = distinct(parts, apart)[:limit]
         return tuple(self._described(targets, found[order[i]], q0) for i in kept)
 
     def best_arm(self, targets: TargetBatch, q: Array, q0: Array, seed: int, prefer: str) -> Array:
@@ -343,18 +347,10 @@ class AlternativeFinder:
     def _described(self, targets: TargetBatch, found: _Found, q0: Array) -> Alternative:
         q = found.q[None]
         verdict = judge(self.robot, targets, q)
-        contacts = {
-            name: ContactVerdict(
-                float(verdict.position_error[0, i]),
-                float(verdict.angle_error[0, i]),
-                bool(verdict.ok[0, i]),
-                targets.tolerances[i],
-            )
-            for i, name in enumerate(self.robot.fingers)
-        }
+        errors = verdict.position_error, verdict.angle_error, verdict.ok
         return Alternative(
             q=found.q,
-            contacts=contacts,
+            contacts=contact_verdicts(self.robot.fingers, targets.tolerances, *errors)[0],
             posture=found.posture,
             branch=found.branch,
             swivel=found.swivel,

@@ -23,7 +23,7 @@ from casadi_ik.methods.common.contact_fit import fresh_fit
 from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.targets import TargetBatch
-from casadi_ik.problem.verdict import ContactVerdict, judge
+from casadi_ik.problem.verdict import contact_verdicts, judge
 from casadi_ik.solving.trials import NEVER, LocalRefinement, Rows, Subproblems, allowed, smallest
 
 
@@ -203,19 +203,10 @@ class FloatingPalmFit:
         """
         best = smallest(fits.owner, np.where(fits.ok, 0.0, 1.0 + fits.cost), 1)
         nearest = smallest(fits.owner, np.where(fits.ok, fits.outside, np.inf), 1)
-        columns = fits.position_error, fits.angle_error, fits.met
+        errors = (each[best] for each in (fits.position_error, fits.angle_error, fits.met))
+        verdicts = contact_verdicts(self._trials.robot.fingers, targets.tolerances, *errors)
         found = []
-        for row, near in zip(best.tolist(), nearest.tolist(), strict=True):
-            values = zip(
-                self._trials.robot.fingers,
-                *(column[row].tolist() for column in columns),
-                targets.tolerances,
-                strict=True,
-            )
-            contacts = {
-                name: ContactVerdict(position, angle, ok, tolerance)
-                for name, position, angle, ok, tolerance in values
-            }
+        for row, near, contacts in zip(best.tolist(), nearest.tolist(), verdicts, strict=True):
             hand, arm = HandFit(bool(fits.ok[row]), contacts), None
             if hand.fits and self._arm is not None:
                 arm = ArmReach(float(fits.distance[near]), *self._span(targets, self._arm))
