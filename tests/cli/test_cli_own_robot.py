@@ -265,9 +265,9 @@ def test_refusals_leave_nothing(
 
 @pytest.mark.opengl
 def test_the_picture_of_a_body_has_all_its_hands(tmp_path: Path) -> None:
-    from casadi_ik.views import draw_pads
+    from casadi_ik import views
 
-    figure = draw_pads(ik.load_robot("baxter+barrett_bh8_280"), tmp_path / "pads.png")
+    figure = views.draw_pads(ik.load_robot("baxter+barrett_bh8_280"), tmp_path / "pads.png")
     said = {text.get_text() for text in figure.texts}
     assert {"baxter+barrett_bh8_280.left", "baxter+barrett_bh8_280.right"} <= said
     assert (tmp_path / "pads.png").read_bytes().startswith(b"\x89PNG")

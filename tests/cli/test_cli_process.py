@@ -196,8 +196,9 @@ def test_interrupted(
 ) -> None:
     """In the middle of a long batch: the exit code of the signal, and what is finished stays.
 
-    Nothing here depends on how fast the machine is; pressed again and again, Ctrl-C may cost what
-    is just being written.
+    Nothing here depends on how fast the machine is, or how busy: not how many rows are finished,
+    nor whether all of these are solved. Pressed again and again, Ctrl-C may cost what is just being
+    written, and may come while that is cleaned up: then hidden files stay for a later batch.
     """
     robot = ik.load_robot(ROBOT)
     points, normals = robot.contacts(robot.random(np.random.default_rng(0), 30_000))
@@ -214,19 +215,21 @@ def test_interrupted(
     assert process.returncode == (130 if interrupted else 143), error
     lines = error.splitlines()
     assert (said, lines[-1]) == ("", f"casadi-ik: error: {ended}")
+    again = len(signals) > 2
+    left = {path for path in tmp_path.iterdir() if not (again and path.name.startswith("."))}
+    assert left == ({targets, out} if out.exists() else {targets})
     if not out.exists():
-        assert not finished or len(signals) > 2
-        assert list(tmp_path.iterdir()) == [targets]
+        assert again or not finished
         return
     with np.load(out) as kept:
         count = len(kept["q"])
         assert 0 < count < 30_000
         assert {len(kept[name]) for name in kept.files} == {count}
-        assert kept["success"].all()
-        reached, _ = robot.contacts(kept["q"])
-    np.testing.assert_allclose(reached, points[:count], atol=5e-3)
-    assert f"casadi-ik: interrupted: {out} keeps the first {count} of 30000 rows" in lines
-    assert sorted(tmp_path.iterdir()) == [out, targets]
+        solved, (reached, _) = kept["success"], robot.contacts(kept["q"])
+    assert solved.any()
+    np.testing.assert_allclose(reached[solved], points[:count][solved], atol=5e-3)
+    said = f"casadi-ik: interrupted: {out} keeps the first {count} of 30000 rows"
+    assert again or said in lines
 
 
 def start_batch(targets: Path, out: Path, *more: str) -> subprocess.Popen[str]:
