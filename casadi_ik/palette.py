@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 ARM, ARM_JOINT = "#e8944a", "#5f6975"
-HAND, PALM, HAND_JOINT = "#65727f", "#414c58", "#333c46"
+HAND, PALM = "#65727f", "#414c58"
 PAD = "#2fb5ad"
 
 OBJECT = "#8cc4e8"

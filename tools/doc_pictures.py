@@ -22,7 +22,6 @@ from casadi_ik.drawing.cameras import View, close_view, whole_view
 from casadi_ik.drawing.drawables import (
     Drawable,
     asked_marks,
-    bodies,
     nearest_pair,
     object_of,
     placed,
@@ -60,7 +59,7 @@ def shot(
     pair: tuple[str, str] | None = None,
 ) -> Image:
     """A robot with what it grasps and what stands about it, on white."""
-    body = placed(robot, q, bodies(robot))
+    body = placed(robot, q)
     thing = None if grasp is None else object_of(grasp.object)
     pose = None if grasp is None else grasp.known_pose
     things = [] if thing is None or pose is None else [thing.at(pose)]
@@ -70,7 +69,7 @@ def shot(
         if grasp is not None:
             marks = [one for c in grasp.contacts.values() for one in asked_marks(c, c.point)]
             stage.add("object marks", marks)
-        around = [] if scene is None else scene_of(scene, np.zeros(3), "table")
+        around = [] if scene is None else scene_of(scene, "table")
         stage.add("scene", around)
         if scene is not None and pair is not None:
             found = closest_points(robot, q, scene, pair)
@@ -143,7 +142,7 @@ def unreachable(path: Path) -> None:
     links = robot.links(q)
     shoulder, elbow, wrist = (links[f"lwr_link_{i}"][:3, 3] for i in (2, 4, 6))
     reach = float(np.linalg.norm(elbow - shoulder) + np.linalg.norm(wrist - elbow))
-    body = placed(robot, q, bodies(robot))
+    body = placed(robot, q)
     thing = object_of(far.object)
     assert thing is not None
     things = [thing.at(away)]

@@ -21,7 +21,7 @@ import casadi_ik as ik
 from casadi_ik import palette
 from casadi_ik.arrays import Array
 from casadi_ik.drawing.cameras import close_view, whole_view
-from casadi_ik.drawing.drawables import asked_marks, bodies, object_of, placed
+from casadi_ik.drawing.drawables import asked_marks, object_of, placed
 from casadi_ik.views.charts import save_picture
 from casadi_ik.views.pictures import animated
 from casadi_ik.views.stage import Image, Stage, over, points_of
@@ -62,7 +62,7 @@ def pictures(
     """Images (h, w, 3) for light and for dark pages."""
     thing = object_of(GRASP)
     assert thing is not None
-    bodied = [placed(robot, q, bodies(robot)) for q in every_q]
+    bodied = [placed(robot, q) for q in every_q]
     about = points_of([one for body in bodied[::3] for one in body])
     places = np.array([one.known_pose[:3, 3] for one in grasps if one.known_pose is not None])
     close = close_view(robot, every_q[0])

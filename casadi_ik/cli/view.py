@@ -197,7 +197,7 @@ def _kind(name: str) -> str:
         )
     if name in shipped_names("grasps"):
         return "grasp"
-    kinds = ("arm_hands", "arms", "hands")
+    kinds = ("arm_hands", "bodies", "arms", "hands")
     if "+" in name or any(name in shipped_names(kind) for kind in kinds):
         return "robot"
     known = [one for kind in ("grasps", *kinds) for one in shipped_names(kind)]

@@ -20,20 +20,22 @@ def axes_of(view: View) -> Array:
     return np.array([[-s, c, 0.0], [-se * c, -se * s, ce], [ce * c, ce * s, se]])
 
 
-def palm_places(robot: ArmHand, q: ArrayLike) -> Array:
-    """(h, 3) where the palms of all hands are, base frame [m]."""
-    return np.array([robot.palm(q, side)[:3, 3] for side in robot.hands])
+def palm_places(robot: ArmHand, q: ArrayLike, *sides: str | None) -> Array:
+    """(h, 3) where the palms of some hands are, or of all, base frame [m]."""
+    return np.array([robot.palm(q, side)[:3, 3] for side in sides or robot.hands])
 
 
-def close_view(robot: ArmHand, q: ArrayLike) -> View:
+def close_view(robot: ArmHand, q: ArrayLike, *sides: str | None) -> View:
     """Where fingertips and palm are furthest apart in the image, and pads are seen from the side.
 
     Args:
         robot: The robot.
         q: (n,) actuator positions [rad or m].
+        sides: The hands that are looked at; none: all.
     """
-    points, normals = robot.contacts(q)
-    links, palms = robot.links(q), palm_places(robot, q)
+    fingers = [finger for side in sides or robot.hands for finger in robot.hands[side]]
+    points, normals = (values[fingers] for values in robot.contacts(q))
+    links, palms = robot.links(q), palm_places(robot, q, *sides)
     palm = palms.mean(axis=0)
     joints = [joint for joint in robot.description.joints if joint.part != "hand"]
     arm = np.mean([links[joint.parent][:3, 3] for joint in joints] or [palm], axis=0)

@@ -30,7 +30,6 @@ from casadi_ik.drawing.surfaces import (
     mesh_of,
     ring,
     rod,
-    stretched,
 )
 from casadi_ik.errors import CasadiIKError, UnknownNameError
 from casadi_ik.files.reading import read_yaml
@@ -39,14 +38,11 @@ from casadi_ik.grasps.pose import inverse
 from casadi_ik.importing.imported import tree_of
 from casadi_ik.importing.surfaces import Surface, link_surfaces
 from casadi_ik.problem.clearance import Closest
-from casadi_ik.robots.description import Finger, Joint, RobotDescription
+from casadi_ik.robots.description import Finger, RobotDescription
 from casadi_ik.robots.parts import PREFIX
 
-ARM_RADIUS, FINGER_RADIUS = 0.048, 0.009
-"""Of an arm's tubes, and of a finger whose pad does not say how far from its axis it is [m]."""
-
-MOUNT = 0.09
-"""How much of what holds a hand is thinner than the arm, or it would hide the palm [m]."""
+ARM_RADIUS, FINGER_RADIUS = 0.035, 0.009
+"""Of rods that stand for links of which no shape is known [m]."""
 
 BEYOND = 0.04
 """How far a line is drawn past what it is given by and reached at; radius of a plane's ring [m]."""
@@ -89,46 +85,35 @@ class Drawable:
 # Robots.
 
 
-def side_of(description: RobotDescription) -> dict[str, str]:
-    """By link "arm" or "hand"."""
-    first = "arm" if description.arm_actuators else "hand"
-    return {description.root: first} | {
-        joint.child: "hand"
-        if joint.part == "hand" or joint.child == description.palm_link
-        else "arm"
-        for joint in description.joints
-    }
-
-
-def bodies(robot: ArmHand, q: ArrayLike | None = None) -> list[Drawable]:
+def bodies(robot: ArmHand) -> list[Drawable]:
     """A robot in the frames of its links, with a pad at each fingertip.
 
-    The links are those that the robot's files show. An arm or a hand of which they show nothing is
-    drawn by its kinematics: thick tubes for an arm, thin ones for a hand, a palm. That is not the
-    real shell, but any robot has one.
+    An arm or a hand looks as the robot's files show it, else as the shapes that collisions are
+    checked with; a link that has none is drawn as rods to the joints that it carries.
 
     Args:
         robot: The robot.
-        q: (n,) actuator positions [rad or m]: what slides is as long as it is there; None: home.
-
-    Raises:
-        InputError: Bad q.
     """
-    description = robot.description
-    sides, meshes = side_of(description), meshes_of(description)
-    shown = {sides[link] for link in meshes}
-    found = [one for one in _skeleton(robot, q) if one.role not in shown]
-    for link, surface in meshes.items():
-        dark = palette.PALM if link == description.palm_link else palette.HAND
-        color = _alternating(description, link) if sides[link] == "arm" else dark
-        found.append(Drawable(link, mesh_of(surface), color, link, sides[link]))
+    description, seen = robot.description, meshes_of(robot.description)
+    looks = _looks(description)
+    shown = {looks[link][0] for link in seen}
+    found = [_of_link(link, mesh_of(surface), looks) for link, surface in seen.items()]
+    found += [one for one in collision_bodies(robot) if one.role not in shown]
+    known, links = {one.frame for one in found}, robot.links(robot.home)
+    for joint in description.joints:
+        role, end = looks[joint.parent][0], inverse(links[joint.parent]) @ links[joint.child]
+        if role not in shown and joint.parent not in known:
+            found.append(_of_link(joint.parent, _rod_to(end[:3, 3], role), looks))
+    for finger in description.fingers:
+        if looks[finger.link][0] not in shown and finger.link not in known:
+            found.append(_of_link(finger.link, _rod_to(finger.placement[:3, 3], "hand"), looks))
     return found + [_pad(finger) for finger in description.fingers]
 
 
 def collision_bodies(robot: ArmHand) -> list[Drawable]:
     """The shapes that collisions are checked with, in the frames of links."""
     description = robot.description
-    shapes, sides = description.shapes, side_of(description)
+    shapes, looks = description.shapes, _looks(description)
     found = [
         (one.link, rod(one.center - one.half, one.center + one.half, one.radius))
         for one in shapes.capsules
@@ -136,17 +121,25 @@ def collision_bodies(robot: ArmHand) -> list[Drawable]:
     ]
     for one, solid in zip(shapes.solids, own_solids(description), strict=True):
         found.append((one.link, mesh_of(Surface(*solid.mesh())).moved(one.pose)))
-
-    def color(link: str) -> str:
-        return _alternating(description, link) if sides[link] == "arm" else palette.HAND
-
-    return [Drawable(link, shape, color(link), link, sides[link]) for link, shape in found]
+    return [_of_link(link, shape, looks) for link, shape in found]
 
 
-def placed(robot: ArmHand, q: ArrayLike, drawables: Sequence[Drawable]) -> list[Drawable]:
-    """Drawables of links where they are at q (n,) [rad or m], in the base frame."""
+def placed(
+    robot: ArmHand, q: ArrayLike, drawables: Sequence[Drawable] | None = None
+) -> list[Drawable]:
+    """Drawables of links (None: its bodies) at q (n,) [rad or m], in the base frame.
+
+    Raises:
+        InputError: Bad q.
+    """
     poses = robot.links(q)
-    return [one.at(poses[one.frame]) for one in drawables]
+    return [one.at(poses[one.frame]) for one in (bodies(robot) if drawables is None else drawables)]
+
+
+def lowest(robot: ArmHand, scene: Scene | None = None) -> float:
+    """Height of the ground [m]: that of a robot's base, or below all of it at home and a scene."""
+    things = [*placed(robot, robot.home), *([] if scene is None else scene_of(scene))]
+    return min(0.0, min(float(one.surface.points[:, 2].min()) for one in things) - 1e-3)
 
 
 def merged(drawables: Sequence[Drawable]) -> list[Drawable]:
@@ -160,100 +153,36 @@ def merged(drawables: Sequence[Drawable]) -> list[Drawable]:
     ]
 
 
-def _alternating(description: RobotDescription, link: str) -> str:
-    return palette.ARM_JOINT if description.links.index(link) % 2 == 0 else palette.ARM
-
-
-def _skeleton(robot: ArmHand, q: ArrayLike | None) -> list[Drawable]:
-    description = robot.description
-    poses = robot.links(robot.configuration(q))
-    found = [*_foot(description), *_palm(description, poses)]
+def _looks(description: RobotDescription) -> dict[str, tuple[str, str]]:
+    """By link "arm" or "hand", and its colour, another than that of the link before it."""
+    palms = {description.palm_link, *(side.palm_link for side in description.sides)}
+    depth, roles = {description.root: 0}, {description.root: "arm"}
+    if not description.arm_actuators:
+        roles[description.root] = "hand"
     for joint in description.joints:
-        end = (inverse(poses[joint.parent]) @ poses[joint.child])[:3, 3]
-        link = _finger_link if joint.part == "hand" else _arm_link
-        found += link(description, joint, end)
-    for finger in description.fingers:
-        radius = _pad_radius(finger)
-        place, normal = finger.placement[:3, 3], finger.placement[:3, :3] @ finger.normal
-        tip = rod(np.zeros(3), place - radius * normal, radius)
-        found.append(Drawable(f"tip {finger.name}", tip, palette.HAND, finger.link, "hand"))
-    return found
+        depth[joint.child] = depth[joint.parent] + 1
+        roles[joint.child] = "hand" if joint.part == "hand" or joint.child in palms else "arm"
+    colors = {"arm": (palette.ARM_JOINT, palette.ARM), "hand": (palette.HAND, palette.PALM)}
+    return {link: (role, colors[role][depth[link] % 2]) for link, role in roles.items()}
 
 
-def _pad_radius(finger: Finger) -> float:
-    """How far the pad is from the axis of the last link, along the normal [m]."""
-    height = float(finger.placement[:3, 3] @ finger.placement[:3, :3] @ finger.normal)
-    return height if 0.004 < height < 0.02 else FINGER_RADIUS
+def _of_link(link: str, shape: Shape, looks: Mapping[str, tuple[str, str]]) -> Drawable:
+    role, color = looks[link]
+    return Drawable(link, shape, color, link, role)
+
+
+def _rod_to(end: Array, role: str) -> Shape:
+    return rod(np.zeros(3), end, ARM_RADIUS if role == "arm" else FINGER_RADIUS)
 
 
 def _pad(finger: Finger) -> Drawable:
-    radius, normal = _pad_radius(finger), finger.placement[:3, :3] @ finger.normal
+    """A disc; the pad's height above the axis of its link says how large it is."""
+    normal = finger.placement[:3, :3] @ finger.normal
+    height = float(finger.placement[:3, 3] @ normal)
+    radius = height if 0.004 < height < 0.02 else FINGER_RADIUS
     center = finger.placement[:3, 3] - 0.13 * radius * normal
     pad = drum(center, normal, 0.62 * radius, 0.36 * radius)
     return Drawable(f"pad {finger.name}", pad, palette.PAD, finger.link, "pad")
-
-
-def _foot(description: RobotDescription) -> list[Drawable]:
-    """Of an arm; a hand alone stands on its palm."""
-    if not description.arm_actuators:
-        return []
-    z = np.array([0.0, 0.0, 1.0])
-    foot = drum(0.0125 * z, z, 1.9 * ARM_RADIUS, 0.025)
-    return [Drawable("foot", foot, palette.ARM_JOINT, description.root, "arm")]
-
-
-def _arm_link(description: RobotDescription, joint: Joint, end: Array) -> list[Drawable]:
-    found, length = [], float(np.linalg.norm(end))
-    if length > 2e-3:
-        # The round end of the lowest link must not come out below the foot.
-        lowest = joint.parent == description.root
-        begin = min(1.0, ARM_RADIUS / length) * end if lowest else np.zeros(3)
-        thin = min(MOUNT, length) if joint.part == "mount" else 0.0
-        middle = (1 - thin / length) * end
-        if thin < length:
-            tube = rod(begin, middle, ARM_RADIUS)
-            found.append(Drawable(f"tube {joint.name}", tube, palette.ARM, joint.parent, "arm"))
-        if thin > 0:
-            tube = rod(middle, end, 0.6 * ARM_RADIUS)
-            found.append(Drawable("mount", tube, palette.ARM_JOINT, joint.parent, "arm"))
-    if joint.type == "revolute":
-        # A roll joint is a band around the tube, a pitch joint a drum across it.
-        way = joint.placement[:3, :3].T @ end
-        along = length > 2e-3 and abs(joint.axis @ way) > 0.9 * length
-        radius, width = (1.09, 0.35) if along else (1.12, 2.5)
-        band = drum(np.zeros(3), joint.axis, radius * ARM_RADIUS, width * ARM_RADIUS)
-        found.append(Drawable(joint.name, band, palette.ARM_JOINT, joint.child, "arm"))
-    return found
-
-
-def _finger_link(description: RobotDescription, joint: Joint, end: Array) -> list[Drawable]:
-    found = []
-    if joint.parent != description.palm_link and np.linalg.norm(end) > 2e-3:
-        tube = rod(np.zeros(3), end, 1.15 * FINGER_RADIUS)
-        found.append(Drawable(f"tube {joint.name}", tube, palette.HAND, joint.parent, "hand"))
-    if joint.type == "revolute":
-        knuckle = drum(np.zeros(3), joint.axis, 1.3 * FINGER_RADIUS, 2.7 * FINGER_RADIUS)
-        found.append(Drawable(joint.name, knuckle, palette.HAND_JOINT, joint.child, "hand"))
-    return found
-
-
-def _palm(description: RobotDescription, poses: Mapping[str, Array]) -> list[Drawable]:
-    """Drums upright in the palm frame, at the palm's origin and where the fingers begin, in one."""
-    link = description.palm_link
-    back = inverse(poses[link])
-    bases = [
-        (back @ poses[joint.child])[:3, 3]
-        for joint in description.joints
-        if joint.part == "hand" and joint.parent == link
-    ]
-    if not bases:
-        return []
-    corners, up = np.array([np.zeros(3), *bases]), description.palm_placement[:3, 2]
-    heights, radius = corners @ up, 2.2 * FINGER_RADIUS
-    middle = (heights.min() + heights.max()) / 2 * up
-    block = drum(middle, up, radius, max(float(np.ptp(heights)), 2 * radius))
-    body = stretched(block.surface, corners - heights[:, None] * up)
-    return [Drawable("palm", mesh_of(body), palette.PALM, link, "hand")]
 
 
 @lru_cache(maxsize=8)
@@ -398,14 +327,9 @@ def object_of(name: str) -> Drawable | None:
     return Drawable("object", shape, palette.OBJECT, role="object")
 
 
-def item_of(item: Item, about: Array) -> list[Drawable]:
-    """Something that stands in a scene, in its frame.
-
-    Args:
-        item: The thing.
-        about: (3,) what reaches without end is drawn near this, base frame [m].
-    """
-    near = (inverse(item.pose) @ np.append(about, 1.0))[:3]
+def item_of(item: Item) -> list[Drawable]:
+    """Something that stands in a scene, in its frame; without end, the part near the base."""
+    near = inverse(item.pose)[:3, 3]
     return [
         Drawable(f"{item.name} {i}", _placed(solid, place, near), palette.SCENE, role="scene")
         for i, (solid, place) in enumerate(item.parts)
@@ -421,11 +345,11 @@ def _placed(solid: Solid, pose: Array, near: Array) -> Shape:
     return mesh_of(surface).moved(pose)
 
 
-def scene_of(scene: Scene, about: Array, without: str = "") -> list[Drawable]:
+def scene_of(scene: Scene, without: str = "") -> list[Drawable]:
     """Everything of a scene but an object that is drawn by itself, in the base frame."""
     drawn = {without} if object_of(without) is not None else set[str]()
     items = [item for name, item in scene.items.items() if name not in drawn]
-    return [one.at(item.pose) for item in items for one in item_of(item, about)]
+    return [one.at(item.pose) for item in items for one in item_of(item)]
 
 
 def with_object(scene: Scene, grasp: Grasp | None) -> Scene:

@@ -162,15 +162,6 @@ KINDS: dict[str, Callable[..., Surface]] = {
 arrow (length, width of its shaft), ring (radius, width)."""
 
 
-def stretched(convex: Surface, offsets: Array) -> Surface:
-    """The convex hull of copies of a convex surface, moved by offsets (k, 3)."""
-    corners = convex.points[convex.triangles]
-    ways = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals = np.zeros_like(convex.points)
-    np.add.at(normals, convex.triangles, ways[:, None])
-    return Surface(convex.points + offsets[(normals @ offsets.T).argmax(axis=1)], convex.triangles)
-
-
 def joined(surfaces: Sequence[Surface]) -> Surface:
     """Several surfaces as one."""
     whole = together(list(surfaces))

@@ -16,7 +16,7 @@ from casadi_ik import palette
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene
-from casadi_ik.drawing.cameras import axes_of, close_view, whole_view
+from casadi_ik.drawing.cameras import View, axes_of, close_view, whole_view
 from casadi_ik.drawing.drawables import (
     Drawable,
     asked_marks,
@@ -376,7 +376,7 @@ class DrawnThings:
             self._add(server, OBJECT, [body], drags, opacity=0.4, cast_shadow=True)
         for name, item in () if asked.scene is None else asked.scene.items.items():
             if name != asked.object:
-                bodies = item_of(item, np.zeros(3))
+                bodies = item_of(item)
                 self._add(server, name, bodies, drags, opacity=0.8, cast_shadow=False)
         self.place(asked)
 
@@ -429,17 +429,8 @@ def draw_scene(server: viser.ViserServer, scene: Scene, above: str) -> None:
     """
     look = {"opacity": 0.8, "cast_shadow": False, "receive_shadow": 0.15}
     for name, item in scene.items.items():
-        for i, one in enumerate(item_of(item, np.zeros(3))):
+        for i, one in enumerate(item_of(item)):
             add_drawable(server, f"{above}/things/{name}/{i}", one.at(item.pose), **look)
-
-
-def lowest(scene: Scene | None) -> float:
-    """Height of the ground: that of the robot's base, or below all that stands there [m]."""
-    heights = [0.0]
-    for item in () if scene is None else scene.items.values():
-        points = np.concatenate([one.surface.points for one in item_of(item, np.zeros(3))])
-        heights.append(float((points @ item.pose[2, :3]).min() + item.pose[2, 3]) - 1e-3)
-    return min(heights)
 
 
 class DrawnClosest:
@@ -595,25 +586,36 @@ class Camera:
 
 
 def cameras(robot: ArmHand, q: Array, things: Sequence[Drawable] = ()) -> dict[str, Camera]:
-    """Where a robot at q (n,) is seen from: its hand with what it grasps, and the whole of it.
+    """Where a robot at q (n,) is seen from, by name: its hand, or each, and the whole of it.
+
+    The first is where a page begins: near the only hand, else away from all of them.
 
     Args:
         robot: The robot.
         q: (n,) [rad or m].
         things: What is grasped, in the base frame.
     """
-    body = placed(robot, q, bodies(robot))
-    hand = [one for one in body if one.role != "arm"]
-    close = close_view(robot, q)
-    whole = whole_view(robot.contacts(q)[0].mean(axis=0), close)
-    found = {}
-    seen = (("Hand", [*hand, *things], close, 1.15), ("Robot", [*body, *things], whole, 1.0))
-    for name, parts, view, room in seen:
-        points = np.concatenate([one.surface.points for one in parts])
-        middle = (points.min(axis=0) + points.max(axis=0)) / 2
-        radius = room * float(np.linalg.norm(points - middle, axis=1).max())
-        found[name] = Camera(middle, max(radius, 0.05), axes_of(view)[2])
-    return found
+    seen, many = bodies(robot), len(robot.hands) > 1
+    body = placed(robot, q, seen)
+    whole = whole_view(robot.contacts(q)[0].mean(axis=0), close_view(robot, q))
+    found = {"Robot": _camera([*body, *things], whole)} if many else {}
+    for side in robot.hands:
+        links = robot.description.side(side).links if side else robot.description.links
+        hand = [
+            part
+            for one, part in zip(seen, body, strict=True)
+            if one.role != "arm" and one.frame in links
+        ]
+        name = side if side and many else "Hand"
+        found[name] = _camera([*hand, *things], close_view(robot, q, side), 1.15)
+    return found if many else found | {"Robot": _camera([*body, *things], whole)}
+
+
+def _camera(parts: Sequence[Drawable], view: View, room: float = 1.0) -> Camera:
+    points = np.concatenate([one.surface.points for one in parts])
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    radius = room * float(np.linalg.norm(points - middle, axis=1).max())
+    return Camera(middle, max(radius, 0.05), axes_of(view)[2])
 
 
 def light_lamp(server: viser.ViserServer, camera: Camera) -> None:

@@ -15,7 +15,7 @@ from casadi_ik.answers.solution import Alternative
 from casadi_ik.arm_hand import ArmHand, load_robot
 from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene, load_scene
-from casadi_ik.drawing.drawables import object_of
+from casadi_ik.drawing.drawables import lowest, object_of
 from casadi_ik.errors import CasadiIKError
 from casadi_ik.files.shipped import shipped_names
 from casadi_ik.grasps import Tolerance, load_grasp
@@ -27,6 +27,7 @@ from casadi_ik.viewing.access import Server
 from casadi_ik.viewing.candidates import CandidateList, Candidates
 from casadi_ik.viewing.drawn import (
     OBJECT,
+    Camera,
     Drags,
     DrawnClosest,
     DrawnContacts,
@@ -35,7 +36,6 @@ from casadi_ik.viewing.drawn import (
     Ghosts,
     cameras,
     light_lamp,
-    lowest,
     usable,
 )
 from casadi_ik.viewing.newest import LOOKS, PAUSE, REST
@@ -50,6 +50,7 @@ from casadi_ik.viewing.panel import (
     legend,
     on_press,
     on_set,
+    parts_of,
     q_text,
     results_block,
     save_picture,
@@ -127,18 +128,17 @@ class GraspPage(DraggedPage):
         answer = self._answerer.solve if solved else self._answerer.judged
         answer(asked, q)  # what the first one takes is the loading of kernels
         self.answer = answer(asked, q)
-        super().__init__(server, robot, asked, asked.name or robot.name, lowest(asked.scene), dark)
+        floor = lowest(robot, asked.scene)
+        super().__init__(server, robot, asked, asked.name or robot.name, floor, dark)
         self._first_q, self.candidates = q, dict(candidates or {})
         self._answered_for: PageRequest | None = asked
         self._listed_for: PageRequest | None = None
         self.solutions: tuple[Alternative, ...] = ()
         self._by_hand, self._ghostly, self.beside = not solved, False, NOTHING
         self._untold_since: float | None = None
-        thing = object_of(asked.object)
-        placed = [] if thing is None or asked.object_pose is None else [thing.at(asked.object_pose)]
-        self.cameras = cameras(robot, self.answer.q, placed)
-        self.cameras["Hand"].show(server)
-        light_lamp(server, self.cameras["Robot"])
+        self._whole = self.cameras()["Robot"]
+        next(iter(self.cameras().values())).show(server)
+        light_lamp(server, self._whole)
         self._drawn = DrawnRobot(server, robot)
         self._contacts = DrawnContacts(server, asked, self.drags)
         self._things = DrawnThings(server, asked, replace(self.drags, pose=self.drag_thing))
@@ -151,6 +151,12 @@ class GraspPage(DraggedPage):
         self.begin((PAUSE, self._show_motors), (REST, self._explain), (LOOKS, self._list_solutions))
         first = OBJECT if OBJECT in names else robot.fingers[0]
         self.select("" if self.candidates else first)  # handles would hide what is chosen from
+
+    def cameras(self) -> dict[str, Camera]:
+        """By name from where robot and object are seen as they stand now."""
+        thing, pose = object_of(self.asked.object), self.asked.object_pose
+        things = [] if thing is None or pose is None else [thing.at(pose)]
+        return cameras(self.robot, self.answer.q, things)
 
     # What a browser asks for: put down, and done when it is its turn.
 
@@ -332,7 +338,7 @@ class GraspPage(DraggedPage):
         except CasadiIKError as error:
             answer = failed(error, self.answer.q)
         if self._other is None:
-            camera, name = self.cameras["Robot"], "/beside"
+            camera, name = self._whole, "/beside"
             frame = self.server.scene.add_frame(name, show_axes=False)
             right = np.array([-camera.view[1], camera.view[0], 0.0])
             frame.position = 1.6 * camera.radius * right / np.linalg.norm(right)
@@ -378,9 +384,9 @@ def margin_color(margin: float) -> str:
 
 @lru_cache(maxsize=1)
 def robots_offered() -> tuple[str, ...]:
-    """Shipped arm-hands, and those that shipped grasps are for."""
+    """Shipped arm-hands and bodies, and those that shipped grasps are for."""
     of_grasps = {load_grasp(name).robot for name in shipped_names("grasps")}
-    return tuple(sorted(of_grasps | set(shipped_names("arm_hands"))))
+    return tuple(sorted(of_grasps.union(shipped_names("arm_hands"), shipped_names("bodies"))))
 
 
 class Panel:
@@ -402,8 +408,8 @@ class Panel:
         )
         on_set(self._drag, lambda name: page.select("" if name == NOTHING else name))
         page.add_steps()
-        camera = gui.add_button_group("Camera", tuple(page.cameras))
-        on_press(camera, lambda client: page.cameras[str(camera.value)].on(client))
+        camera = gui.add_button_group("Camera", tuple(page.cameras()))
+        on_press(camera, lambda client: page.cameras()[str(camera.value)].on(client))
         tabs = gui.add_tab_group()
         if page.candidates:
             with tabs.add_tab("Candidates"):
@@ -471,10 +477,9 @@ class Panel:
 
     def tell_motors(self, q: Array) -> None:
         """Show where motors and joints are."""
-        low, high = self._ranges
-        self._exact = np.clip(q * self._scales, low, high)
         # More digits would not fit in the box.
-        self._shown = np.clip(np.round(self._exact, 1), low, high)
+        self._exact = q * self._scales
+        self._shown = np.clip(np.round(self._exact, 1), *self._ranges)
         for slider, value in zip(self._motors, self._shown.tolist(), strict=True):
             if slider.value != value:
                 slider.value = value
@@ -529,26 +534,33 @@ class Panel:
         gui, page, robot = self._gui, self._page, self._page.robot
         motors = robot.description.actuators
         self._scales = np.array([np.rad2deg(1.0) if m.unit == "rad" else 1e3 for m in motors])
-        low, high = self._ranges = robot.lower * self._scales, robot.upper * self._scales
+        # Sliders have their ends written beside them.
+        low = np.ceil(10 * robot.lower * self._scales) / 10
+        high = np.maximum(np.floor(10 * robot.upper * self._scales) / 10, low + 0.1)
+        self._ranges = low, high
         values = np.clip(page.answer.q * self._scales, low, high)
         self._form = gui.add_dropdown("q as", Q_FORMATS)
         self._q = gui.add_html("")
         on_set(self._form, lambda _: page.work.put("form", lambda: None))
         gui.add_html(block("Moved by hand, nothing is solved; drag a contact to solve again."))
-        self._motors: list[Any] = []
+        sliders: dict[int, Any] = {}
 
         def moved(_: Any) -> None:
             values = usable([one.value for one in self._motors], len(self._motors))
             q = np.where(values == self._shown, self._exact, values) / self._scales
             page.drag_motors(np.clip(q, robot.lower, robot.upper))
 
-        with gui.add_folder("Motors", expand_by_default=True):
-            for i, motor in enumerate(motors):
-                name = f"{motor.name} [{'°' if motor.unit == 'rad' else 'mm'}]"
-                slider = gui.add_slider(name, float(low[i]), float(high[i]), 0.1, float(values[i]))
-                self._motors.append(slider)
-                on_set(slider, moved)
-        with gui.add_folder("Joints and their limits", expand_by_default=True):
+        few = len(motors) < 24
+        for part, places in parts_of(robot.description).items():
+            with gui.add_folder(part.capitalize(), expand_by_default=few):
+                for i in places:
+                    name = motors[i].name.removeprefix(f"{part.partition(' ')[0]}_")
+                    name += " [°]" if motors[i].unit == "rad" else " [mm]"
+                    ends = float(low[i]), float(high[i])
+                    sliders[i] = gui.add_slider(name, *ends, 0.1, float(values[i]))
+                    on_set(sliders[i], moved)
+        self._motors = [sliders[i] for i in range(len(motors))]
+        with gui.add_folder("Joints and their limits", expand_by_default=few):
             self._bars = gui.add_html("")
         self.tell_motors(page.answer.q)
 

@@ -17,7 +17,7 @@ import yaml
 from casadi_ik import palette
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.drawing.drawables import asked_marks, bodies, collision_bodies, placed
+from casadi_ik.drawing.drawables import asked_marks, bodies, collision_bodies, lowest
 from casadi_ik.drawing.surfaces import facing
 from casadi_ik.errors import CasadiIKError, DescriptionError
 from casadi_ik.files.reading import Frame, frame_matrix, read_yaml
@@ -76,15 +76,13 @@ class PadPage(DraggedPage):
             dark: Whether the page is dark.
         """
         skin = [one for one in bodies(robot) if one.role != "pad"]
-        points = [one.surface.points for one in placed(robot, robot.home, skin)]
-        lowest = float(np.concatenate(points)[:, 2].min())
         asked = request_of(robot, None, None)
-        super().__init__(server, robot, asked, f"pads of {robot.name}", min(lowest, 0.0), dark)
+        super().__init__(server, robot, asked, f"pads of {robot.name}", lowest(robot), dark)
         self.path, self.said, self._first = path, "", asked
         self._surfaces, self._links = dict(surfaces), robot.links(robot.home)
         contacts = asked.grasp.contacts.values()
         marks = [mark for one in contacts for mark in asked_marks(one, one.point)]
-        camera = cameras(robot, robot.home, marks)["Hand"]
+        camera = next(iter(cameras(robot, robot.home, marks).values()))
         camera.show(server)
         light_lamp(server, camera)
         self._drawn = DrawnRobot(server, robot, skin=skin)

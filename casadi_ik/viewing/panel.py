@@ -152,6 +152,21 @@ def bars(description: RobotDescription, joints: Mapping[str, float]) -> str:
     return block("".join(rows), 0.72)
 
 
+def parts_of(description: RobotDescription) -> dict[str, list[int]]:
+    """Places of the motors by what they move: arm and hand, of a body trunk and those by side."""
+    of_sides = {
+        name: f"{side.name} {part}"
+        for side in description.sides
+        for part, names in (("arm", side.arm), ("hand", side.hand))
+        for name in names
+    }
+    found: dict[str, list[int]] = {}
+    for i, motor in enumerate(description.actuators):
+        part = of_sides.get(motor.name, "trunk") if description.sides else motor.part
+        found.setdefault(part, []).append(i)
+    return found
+
+
 Q_FORMATS = ("list [rad, m]", "list [deg, mm]", "dict [rad, m]", "dict [deg, mm]")
 """How a configuration is written to be copied."""
 

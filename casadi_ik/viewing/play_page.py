@@ -14,6 +14,7 @@ from casadi_ik import palette
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene
+from casadi_ik.drawing.drawables import lowest
 from casadi_ik.errors import InputError, LogError
 from casadi_ik.grasps import Contact, Grasp
 from casadi_ik.logs.events import EVENT_COLORS, plain_name, told
@@ -27,10 +28,9 @@ from casadi_ik.viewing.drawn import (
     cameras,
     draw_scene,
     light_lamp,
-    lowest,
 )
 from casadi_ik.viewing.page import Page
-from casadi_ik.viewing.panel import block, chart, legend, on_press, on_set, verdict_rows
+from casadi_ik.viewing.panel import block, chart, legend, on_press, on_set, parts_of, verdict_rows
 from casadi_ik.viewing.request import PageRequest, request_of
 
 FRAMES = 20.0
@@ -99,8 +99,8 @@ class Track:
         motors = self.robot.description.actuators
         found = ""
         for unit, scale, shown in (("rad", np.rad2deg(1.0), "°"), ("m", 1e3, "mm")):
-            for part in ("arm", "hand"):
-                chosen = [i for i, m in enumerate(motors) if m.unit == unit and m.part == part]
+            for part, places in parts_of(self.robot.description).items():
+                chosen = [i for i in places if motors[i].unit == unit]
                 for what, values in (("", self.q), ("/s", self.velocity)):
                     lines = {motors[i].name: scale * values[:, i] for i in chosen}
                     title = f"{part} [{shown}{what}]"
@@ -286,7 +286,7 @@ class PlayPage(Page):
             scene: What stood about each robot; None: nothing.
             dark: Whether the page is dark.
         """
-        super().__init__(server, _title(tracks), lowest(scene), dark)
+        super().__init__(server, _title(tracks), lowest(tracks[0].robot, scene), dark)
         self.tracks, self.now, self._scene = tuple(tracks), 0.0, scene
         first = tracks[0]
         self._camera = cameras(first.robot, first.q[len(first) // 2])["Robot"]

@@ -15,7 +15,6 @@ from casadi_ik.collision.scene import Scene
 from casadi_ik.drawing.cameras import close_view
 from casadi_ik.drawing.drawables import (
     Drawable,
-    bodies,
     object_of,
     placed,
     reached_marks,
@@ -97,7 +96,7 @@ def _words(number: int, one: FoundGrasp) -> str:
 def _image(robot: ArmHand, one: FoundGrasp, scene: Scene | None, pixels: tuple[int, int]) -> Image:
     """(h, w, 3) hand and object, the wrist pale, contacts through both."""
     grasp, thing = one.grasp, object_of(one.grasp.object)
-    body, palm = placed(robot, one.q, bodies(robot, one.q)), robot.palm(one.q)[:3, 3]
+    body, palm = placed(robot, one.q), robot.palm(one.q)[:3, 3]
     hand = [part for part in body if part.role != "arm"]
     wrist = [part for part in body if part.role == "arm" and _apart(part, palm) < NEAR]
     frames = zip(robot.fingers, robot.contact_frames(one.q), strict=True)
@@ -116,8 +115,7 @@ def _image(robot: ArmHand, one: FoundGrasp, scene: Scene | None, pixels: tuple[i
         stage.add("object", things, 0.75)
         stage.add("marks", marks)
         if scene is not None:
-            about = scene_of(scene, palm, grasp.object)
-            stage.add("scene", about)
+            stage.add("scene", scene_of(scene, grasp.object))
         stage.aim(close_view(robot, one.q), seen, pixels, (0.04, 0.04))
         image = over(1.0, stage.shoot("scene"), 0.35) if scene is not None else 1.0
         image = over(image, stage.shoot("wrist"), 0.3)

@@ -25,8 +25,8 @@ from casadi_ik.collision.scene import Scene
 from casadi_ik.drawing.cameras import View, close_view, palm_places, whole_view
 from casadi_ik.drawing.drawables import (
     Drawable,
-    bodies,
     contact_marks,
+    lowest,
     nearest_pair,
     object_of,
     placed,
@@ -164,7 +164,7 @@ def draw_alternatives(
     first = alternatives[0].q
     target = robot.contacts(first)[0].mean(axis=0)
     view = view or whole_view(target, close_view(robot, first))
-    everything = points_of([one for a in alternatives for one in _body(robot, a.q)])
+    everything = points_of([one for a in alternatives for one in placed(robot, a.q)])
     for number, found in enumerate(alternatives):
         row, column = divmod(number, columns)
         box = (column / columns, 1 - (row + 1) / rows, 1 / columns, 0.86 / rows)
@@ -257,24 +257,24 @@ def _shots(robot: ArmHand, q: Array, grasp: Grasp, scene: Scene | None) -> list[
     """Images (h, w, 3) of postures (k, n)."""
     end, sizes = q[-1], ((420, 420), (340, 420))
     around = 0.15 * np.vstack([np.eye(3), -np.eye(3)])
-    passed = [one for row in q[:: max(len(q) // 8, 1)] for one in _body(robot, row)]
+    passed = [one for row in q[:: max(len(q) // 8, 1)] for one in placed(robot, row)]
     there = _object(grasp)
     tips = robot.contacts(end)[0]
     marks = contact_marks(robot, end, grasp, dict.fromkeys(robot.fingers, palette.MET))
     found = []
     with one_at_a_time, closing(Stage()) as stage:
-        foot, every = robot.links(q[0])[robot.description.root], points_of(passed + there)
+        every = points_of(passed + there)
         stage.add("object", there, OPACITY["object"])
         stage.add("marks", marks)
         if scene is not None:
-            about = scene_of(with_object(scene, grasp), foot[:3, 3], grasp.object)
+            about = scene_of(with_object(scene, grasp), grasp.object)
             stage.add("scene", about, OPACITY["scene"])
         view = close_view(robot, end)
-        whole = whole_view(tips.mean(axis=0), view)
+        whole, floor = whole_view(tips.mean(axis=0), view), lowest(robot)
         for row in q:
-            shown = _body(robot, row)
+            shown = placed(robot, row)
             stage.replace("robot", shown)
-            stage.add_floor(float(foot[2, 3]), shown + there, every, texels=512)
+            stage.add_floor(floor, shown + there, every, texels=512)
             hand = (robot.contacts(row)[0].mean(axis=0) + palm_places(robot, row).mean(axis=0)) / 2
             panels = []
             for where, points, pixels in (
@@ -372,7 +372,7 @@ def _pads_of(figure: Figure, robot: ArmHand, bottom: float, height: float) -> No
     back = inverse(robot.palm(robot.home))
     hand = [
         replace(one.at(back), color=palette.HAND)
-        for one in _body(robot, robot.home)
+        for one in placed(robot, robot.home)
         if one.role == "hand"
     ]
     size = float(np.ptp(points_of(hand), axis=0).max())
@@ -405,7 +405,7 @@ def _fill(
     stage: Stage, robot: ArmHand, q: ArrayLike, grasp: Grasp | None, colors: Mapping[str, str]
 ) -> dict[str, list[Drawable]]:
     """Put all there is to see on the stage, and give it back by group."""
-    body, palms = _body(robot, q), palm_places(robot, q)
+    body, palms = placed(robot, q), palm_places(robot, q)
     groups: dict[str, list[Drawable]] = {"arm": [], "wrist": [], "hand": []}
     for one in body:  # the close-up shows what is no further than this from the palm
         near = one.role == "arm" and _distances(one, palms).min() < 0.10
@@ -414,15 +414,14 @@ def _fill(
     groups["marks"] = contact_marks(robot, q, grasp, colors) if grasp else []
     for name, members in groups.items():
         stage.add(name, members, OPACITY.get(name, 1.0))
-    stage.add_floor(float(robot.links(q)[robot.description.root][2, 3]), body)
+    stage.add_floor(lowest(robot), body)
     return groups
 
 
 def _surround(stage: Stage, robot: ArmHand, solution: Solution, grasp: Grasp, scene: Scene) -> None:
     """Put what stands about on the stage, and what is nearest to touching."""
     whole = with_object(scene, grasp)
-    about = robot.links(solution.q)[robot.description.root][:3, 3]
-    stage.add("scene", scene_of(whole, about, grasp.object), OPACITY["scene"])
+    stage.add("scene", scene_of(whole, grasp.object), OPACITY["scene"])
     pair = solution.closest
     if pair is not None and np.isfinite(solution.q).all():
         found = closest_points(robot, solution.q, whole, pair)
@@ -430,11 +429,6 @@ def _surround(stage: Stage, robot: ArmHand, solution: Solution, grasp: Grasp, sc
             stage.add("nearest", nearest_pair(found))
             touching = [] if solution.success else nearest_pair(found, touching=True)
             stage.add("touching", touching, OPACITY["touching"])
-
-
-def _body(robot: ArmHand, q: ArrayLike) -> list[Drawable]:
-    """The robot at q, in the base frame."""
-    return placed(robot, q, bodies(robot, q))
 
 
 def _object(grasp: Grasp) -> list[Drawable]:

@@ -14,7 +14,7 @@ from casadi_ik import palette
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.drawing.cameras import axes_of, close_view, palm_places, whole_view
-from casadi_ik.drawing.drawables import Drawable, bodies, placed
+from casadi_ik.drawing.drawables import Drawable, placed
 from casadi_ik.drawing.surfaces import coarser
 
 LIGHT = np.array([0.3, 0.5, 0.81])
@@ -34,7 +34,7 @@ def thumbnail(robot: ArmHand, q: Array, inches: float = 2.6) -> bytes:
     """
     close = close_view(robot, q)
     palm = palm_places(robot, q).mean(axis=0)
-    every = placed(robot, q, bodies(robot, q))
+    every = placed(robot, q)
     hand = [one for one in every if one.role in ("hand", "pad")]
     figure = Figure((2 * inches, inches), dpi=100)
     FigureCanvasAgg(figure)

@@ -136,7 +136,7 @@ def test_bodies_are_closed_and_wind_outwards() -> None:
             "can": {"kind": "object", "object": "mustard_bottle"},
         }
     )
-    drawn = [one for item in scene.items.values() for one in item_of(item, np.zeros(3))]
+    drawn = [one for item in scene.items.values() for one in item_of(item)]
     bodies = [one.surface for one in drawn]
     for body in [*bodies, arrow(np.zeros(3), np.array([1.0, 0, 0]), 0.05, 0.005).surface]:
         for surface in (body, sharp(body)):

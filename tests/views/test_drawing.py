@@ -12,8 +12,16 @@ import pyvista as pv
 import casadi_ik as ik
 from casadi_ik import palette
 from casadi_ik.drawing.cameras import axes_of, close_view
-from casadi_ik.drawing.drawables import Drawable, bodies, contact_marks, placed, target_place
-from casadi_ik.drawing.surfaces import ball, drum, mesh_of, ring, rod, stretched
+from casadi_ik.drawing.drawables import (
+    Drawable,
+    bodies,
+    collision_bodies,
+    contact_marks,
+    lowest,
+    placed,
+    target_place,
+)
+from casadi_ik.drawing.surfaces import ball, drum, ring, rod
 from casadi_ik.views import draw_solution, show
 from casadi_ik.views.stage import Stage
 
@@ -21,7 +29,7 @@ pytestmark = pytest.mark.opengl
 
 AXIS = np.array([0.3, -0.5, 0.8])
 ORIGIN = np.zeros(3)
-CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+ASIDE = np.array([1.0, 0, 0])
 
 SHAPES = {
     "capsule": (
@@ -29,12 +37,8 @@ SHAPES = {
         np.pi * 1e-2 * np.linalg.norm(AXIS) + 4 / 3 * np.pi * 1e-3,
     ),
     "ball": (ball(0.1), 4 / 3 * np.pi * 1e-3),
-    "drum": (drum(CORNERS[1], AXIS, 0.1, 0.5), np.pi * 1e-2 * 0.5),
-    "prism": (
-        mesh_of(stretched(drum(ORIGIN, np.array([0, 0, 1.0]), 0.1, 1.0).surface, CORNERS)),
-        0.5 + 0.1 * (2 + np.sqrt(2)) + np.pi * 0.01,
-    ),
-    "ring": (ring(CORNERS[1], AXIS, 0.1, 0.02), 2 * np.pi**2 * 0.1 * 1e-4),
+    "drum": (drum(ASIDE, AXIS, 0.1, 0.5), np.pi * 1e-2 * 0.5),
+    "ring": (ring(ASIDE, AXIS, 0.1, 0.02), 2 * np.pi**2 * 0.1 * 1e-4),
 }
 
 
@@ -69,16 +73,32 @@ def test_drawables_are_told_in_json_as_they_are_drawn(robot) -> None:
 def test_fingertips_of_the_body_touch_their_contacts(robot) -> None:
     for q in robot.random(np.random.default_rng(1), 5):
         points, normals = robot.contacts(q)
-        pads = [one for one in placed(robot, q, bodies(robot, q)) if one.role == "pad"]
+        pads = [one for one in placed(robot, q) if one.role == "pad"]
         for one, point, normal in zip(pads, points, normals, strict=True):
             corners = one.surface.points
             assert np.linalg.norm(corners - point, axis=1).min() < 1.5e-3
             assert ((corners - point) @ normal).max() < 1e-3  # nothing beyond the pad
 
 
-def test_the_body_stands_on_the_floor(robot) -> None:
-    body = placed(robot, robot.home, bodies(robot))
-    assert min(one.surface.points[:, 2].min() for one in body) == pytest.approx(0.0, abs=1e-6)
+def test_a_link_without_a_shape_is_rods_to_what_it_carries() -> None:
+    body = ik.load_robot("two_pandas+allegro")
+    trunk, links = body.description.trunk_link, body.links(body.home)
+    assert trunk not in {one.link for one in body.description.shapes.capsules}
+    rods = [one.at(links[trunk]).surface.points for one in bodies(body) if one.frame == trunk]
+    for side in ("left", "right"):
+        for end in (links[trunk], links[f"{side}_panda_base"]):
+            away = np.linalg.norm(np.concatenate(rods) - end[:3, 3], axis=1)
+            assert away.min() < 0.036
+
+
+@pytest.mark.parametrize("name", ["kuka_lwr_barrett", "g1+dex3"])
+def test_the_ground_is_below_all_of_a_robot(name: str) -> None:
+    robot = ik.load_robot(name)
+    body = [*placed(robot, robot.home), *placed(robot, robot.home, collision_bodies(robot))]
+    heights = [one.surface.points[:, 2].min() for one in body]
+    assert -2e-3 < lowest(robot) - min(heights) < 0
+    scene = ik.Scene({"pit": {"kind": "box", "size": [1, 1, 1], "xyz": [0, 0, -3]}})
+    assert lowest(robot, scene) == pytest.approx(-3.501)
 
 
 @pytest.mark.parametrize(
