@@ -606,7 +606,7 @@ def cameras(robot: ArmHand, q: Array, things: Sequence[Drawable] = ()) -> dict[s
             for one, part in zip(seen, body, strict=True)
             if one.role != "arm" and one.frame in links
         ]
-        name = side if side and many else "Hand"
+        name = side.capitalize() if side and many else "Hand"
         found[name] = _camera([*hand, *things], close_view(robot, q, side), 1.15)
     return found if many else found | {"Robot": _camera([*body, *things], whole)}
 
