@@ -27,11 +27,10 @@ from casadi_ik.problem.targets import LIMITS, TargetBatch, Tolerance
 from casadi_ik.registry import METHODS, build_method, with_finger_step
 from casadi_ik.solving.alternatives.finder import APART
 from casadi_ik.solving.choose import choose
-from casadi_ik.solving.engine import Engine, Run
+from casadi_ik.solving.engine import Engine, Run, SolvedBlock
 from casadi_ik.solving.fast import FastSolver
 from casadi_ik.solving.free_object import solve_with_object
 from casadi_ik.solving.sensitivity import Sensitivity
-from casadi_ik.solving.stream import SolvedBlock, Stream
 from casadi_ik.touch.grasps import grasps_of
 
 
@@ -297,7 +296,7 @@ class Solver(MovingSolver):
         with recorder_of(self, log, seed) as recorder:
             tolerances = tuple(self.tolerances.values())
             run = Run(q0, seed, jobs, recorder, diagnose)
-            yield from Stream(self._engine, ask, tolerances, run).solve(blocks, first_row)
+            yield from self._engine.solve_blocks(blocks, ask, tolerances, run, first_row)
 
     def stepper(self, grasp: Grasp, q0: ArrayLike | None = None) -> Stepper:
         """Solve one grasp by hand, one iteration at a time.

@@ -152,7 +152,7 @@ class Lazy:
         return {"found": self.found}
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Diagnosis(Shown):
     """Cause of an unsolved grasp, with evidence.
 
@@ -183,16 +183,16 @@ class Diagnosis(Shown):
     """
 
     reason: Reason
-    proof: Proof | None
-    searches: int
-    hand: HandFit | None
-    reach: ArmReach | None
-    active: tuple[str, ...]
+    proof: Proof | None = None
+    searches: int = 0
+    hand: HandFit | None = None
+    reach: ArmReach | None = None
+    active: tuple[str, ...] = ()
     enough: Tolerance
     nearest: Mapping[str, NearContact]
     q: Array
     time: float
-    lazy: Lazy = field(repr=False)
+    lazy: Lazy = field(default_factory=lambda: Lazy(Remedies), repr=False)
     palm: PalmVerdict | None = None
 
     def __repr__(self) -> str:

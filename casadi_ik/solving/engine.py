@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -18,8 +18,9 @@ from casadi_ik.answers.recorder import Recorder
 from casadi_ik.answers.solution import BatchSolution, Solution
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.errors import InputError, UnsupportedError
+from casadi_ik.errors import InputError, RowError, UnsupportedError
 from casadi_ik.files.in_background import InBackground
+from casadi_ik.grasps import Tolerance
 from casadi_ik.made import made
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
@@ -90,6 +91,28 @@ class Run:
                 f"q0: found {len(start)} rows for {count} targets, expected as many, or one (n,)"
             )
         return start
+
+
+REQUIRED = ("points", "normals")
+"""What every target is told by."""
+
+Block = tuple[ArrayLike, ArrayLike] | Mapping[str, ArrayLike]
+"""Points and normals (k, f, 3) of some targets; or these and more by name."""
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedBlock:
+    """The answers to a block.
+
+    Attributes:
+        first_row: Number of its first target among all.
+        solution: A row per target; those with a fault are INVALID, with NaN for q and errors.
+        faults: What is wrong with a target, by its number among all.
+    """
+
+    first_row: int
+    solution: BatchSolution
+    faults: Mapping[int, str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,6 +340,58 @@ class Engine:
                     background.do(partial(part.record, recorder, form, run.seed))
                 batches.append(part.batch)
         return BatchSolution.joined(batches)
+
+    def solve_blocks(
+        self,
+        blocks: Iterable[Block],
+        ask: Callable[[Mapping[str, np.ndarray], int], TargetBatch],
+        tolerances: tuple[Tolerance, ...],
+        run: Run,
+        first_row: int = 0,
+    ) -> Iterator[SolvedBlock]:
+        """Solve one block after the other; a target's numbers do not depend on the blocks.
+
+        Args:
+            blocks: Arrays of targets.
+            ask: Arrays by name and the number of the first target as a checked question.
+            tolerances: When a contact counts as reached, by finger.
+            run: How targets are solved; one start (n,) for all of them.
+            first_row: Number of the first target.
+
+        Raises:
+            InputError: Bad q0, or a block of the wrong shape.
+        """
+        if self.robot.start(run.q0).ndim != 1:
+            raise InputError("q0: found several, expected one start for all targets")
+        none = self.method.name, self.robot, tolerances, run.diagnose, self.check is not None
+        for given in blocks:
+            named = given if isinstance(given, Mapping) else dict(zip(REQUIRED, given, strict=True))
+            arrays = {name: np.asanyarray(array) for name, array in named.items()}
+            count = len(arrays[REQUIRED[0]])
+            for name, array in arrays.items():
+                if len(array) != count:
+                    raise InputError(
+                        f"{REQUIRED[0]} and {name}: found {count} and {len(array)} rows, expected "
+                        "as many"
+                    )
+            parts: dict[int, BatchSolution] = {}
+            faults: dict[int, str] = {}
+            waiting = [(0, count)]
+            while waiting:
+                start, stop = waiting.pop()
+                some = {name: array[start:stop] for name, array in arrays.items()}
+                try:
+                    parts[start] = self.solve(ask(some, first_row + start), run)
+                except RowError as error:
+                    # A row with a fault parts those before it from those after it.
+                    row = error.row - first_row
+                    faults[error.row] = str(error)
+                    parts[row] = BatchSolution.invalid(1, *none)
+                    both = (row + 1, stop), (start, row)
+                    waiting += [part for part in both if part[0] < part[1]]
+            solution = BatchSolution.joined([parts[start] for start in sorted(parts)])
+            yield SolvedBlock(first_row, solution, dict(sorted(faults.items())))
+            first_row += count
 
     def _parts(
         self, targets: TargetBatch, starts: Array, run: Run, known: Outcome | None

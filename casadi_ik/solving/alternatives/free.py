@@ -30,10 +30,15 @@ from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import SolvedVerdict, judge_one
 from casadi_ik.solving.alternatives.arm_search import Preference
 from casadi_ik.solving.alternatives.finder import AlternativeFinder
-from casadi_ik.solving.alternatives.trunks import other_trunks
 from casadi_ik.solving.alternatives.unconstrained_fingers import UnconstrainedFingers
 from casadi_ik.solving.batch_parts import judged
-from casadi_ik.solving.trials import Deduplicator, LocalRefinement, best_of_each, first_of_each
+from casadi_ik.solving.trials import (
+    Deduplicator,
+    LocalRefinement,
+    best_of_each,
+    first_of_each,
+    other_trunks,
+)
 from casadi_ik.symbolic.even_spread import even_steps
 
 USUAL = "limits"

@@ -16,7 +16,6 @@ from casadi_ik.answers.diagnosis import (
     Lazy,
     NearContact,
     Reason,
-    Remedies,
 )
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array, Counts
@@ -351,14 +350,8 @@ def _reachable(
 ) -> Diagnosis:
     return Diagnosis(
         reason=Reason.REACHABLE,
-        proof=None,
-        searches=0,
-        hand=None,
-        reach=None,
-        active=(),
         enough=targets.largest_tolerance,
         nearest=near,
         q=q,
         time=float(seconds),
-        lazy=Lazy(Remedies),
     )
