@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -39,7 +39,7 @@ from casadi_ik.files.reading import (
     read,
 )
 from casadi_ik.files.shipped import resolve
-from casadi_ik.files.units import Length, Pure
+from casadi_ik.files.units import Distance, Factor, Length, Pure, Size
 from casadi_ik.grasps.pose import checked_pose, one_pose, rotations_of
 from casadi_ik.grasps.shapes import load_mesh_shape
 from casadi_ik.robots.collision import Touching
@@ -74,42 +74,24 @@ class Entry(
     quaternion_wxyz: Quaternion | None = None
     quaternion_xyzw: Quaternion | None = None
     pose: tuple[PoseRow, PoseRow, PoseRow, PoseRow] | None = None
-    margin: Length | None = None
-
-    positive: ClassVar[tuple[str, ...]] = ()
-    """Numbers that have to be above zero."""
-
-    allowed_zero: ClassVar[tuple[str, ...]] = ("margin",)
-    """Numbers that must not be below zero."""
+    margin: Distance | None = None
 
     def _solid(self) -> Solid:
         """The solid that it is, of a kind that is one by itself."""
         raise NotImplementedError
 
-    def _solids(self, where: str, folder: Path) -> list[Part]:
-        """The solids it consists of."""
-        del where, folder
-        return [(self._solid(), np.eye(4))]
-
-    def solids(self, where: str, folder: Path) -> tuple[Part, ...]:
-        """The solids it consists of, after its numbers are checked.
+    def solids(self, where: str, folder: Path) -> list[Part]:
+        """The solids it consists of.
 
         Args:
             where: File and key, for the message.
             folder: What relative paths count from.
 
         Raises:
-            DescriptionError: A number is out of range, or a file cannot be read.
+            DescriptionError: A file cannot be read, or is no solid's.
         """
-        for key in self.positive:
-            value = getattr(self, key)
-            if not 0 < (min(value) if isinstance(value, tuple) else value) < math.inf:
-                raise DescriptionError(f"{where}.{key}: found {value}, expected > 0")
-        for key in self.allowed_zero:
-            value = getattr(self, key)
-            if value is not None and not 0 <= value < math.inf:
-                raise DescriptionError(f"{where}.{key}: found {value:g}, expected >= 0 m")
-        return tuple(self._solids(where, folder))
+        del where, folder
+        return [(self._solid(), np.eye(4))]
 
     def matrix(self, where: str) -> Array:
         """(4, 4) of its pose; how it is turned may be said in one of four ways.
@@ -146,9 +128,7 @@ class BoxEntry(Entry, frozen=True, tag="box", kw_only=True):
         size: Along its own x, y and z [m].
     """
 
-    size: tuple[Length, Length, Length]
-
-    positive: ClassVar[tuple[str, ...]] = ("size",)
+    size: tuple[Size, Size, Size]
 
     def _solid(self) -> Solid:
         return box(self.size)
@@ -161,9 +141,7 @@ class SphereEntry(Entry, frozen=True, tag="sphere", kw_only=True):
         radius: [m].
     """
 
-    radius: Length
-
-    positive: ClassVar[tuple[str, ...]] = ("radius",)
+    radius: Size
 
     def _solid(self) -> Solid:
         return capsule(self.radius, 0.0)
@@ -177,10 +155,8 @@ class CylinderEntry(Entry, frozen=True, tag="cylinder", kw_only=True):
         length: [m].
     """
 
-    radius: Length
-    length: Length
-
-    positive: ClassVar[tuple[str, ...]] = ("radius", "length")
+    radius: Size
+    length: Distance
 
     def _solid(self) -> Solid:
         return cylinder(self.radius, self.length)
@@ -194,11 +170,8 @@ class CapsuleEntry(Entry, frozen=True, tag="capsule", kw_only=True):
         length: Of its segment, without the caps [m].
     """
 
-    radius: Length
-    length: Length
-
-    positive: ClassVar[tuple[str, ...]] = ("radius",)
-    allowed_zero: ClassVar[tuple[str, ...]] = ("margin", "length")
+    radius: Size
+    length: Distance
 
     def _solid(self) -> Solid:
         return capsule(self.radius, self.length / 2)
@@ -221,12 +194,11 @@ class MeshEntry(Entry, frozen=True, tag="mesh", kw_only=True):
     """
 
     file: str | list[str]
-    scale: float = 1.0
+    scale: Factor = 1.0
     parts: bool = False
 
-    positive: ClassVar[tuple[str, ...]] = ("scale",)
-
-    def _solids(self, where: str, folder: Path) -> list[Part]:
+    def solids(self, where: str, folder: Path) -> list[Part]:
+        """The hulls of its meshes."""
         files = [folder / Path(name).expanduser() for name in self._names]
         if not files:
             raise DescriptionError(f"{where}.file: found none, expected at least one")
@@ -249,7 +221,8 @@ class ConvexEntry(Entry, frozen=True, tag="convex", kw_only=True):
 
     points: list[Point]
 
-    def _solids(self, where: str, folder: Path) -> list[Part]:  # noqa: ARG002
+    def solids(self, where: str, folder: Path) -> list[Part]:  # noqa: ARG002
+        """The hull."""
         return [_centred(np.array(self.points, dtype=float), f"{where}.points")]
 
 
@@ -273,16 +246,14 @@ class PointCloudEntry(Entry, frozen=True, tag="point-cloud", kw_only=True):
         scale: Factor of a file's coordinates.
     """
 
-    radius: Length
+    radius: Size
     file: str = ""
     points: list[Point] = msgspec.field(default_factory=list)
-    voxel: Length = 0.0
-    scale: float = 1.0
+    voxel: Distance = 0.0
+    scale: Factor = 1.0
 
-    positive: ClassVar[tuple[str, ...]] = ("radius", "scale")
-    allowed_zero: ClassVar[tuple[str, ...]] = ("margin", "voxel")
-
-    def _solids(self, where: str, folder: Path) -> list[Part]:
+    def solids(self, where: str, folder: Path) -> list[Part]:
+        """Balls, in parts that lie together."""
         if (len(self.points) > 0) == bool(self.file):
             raise DescriptionError(f"{where}: expected a point cloud's file or its points")
         if self.file:
@@ -307,7 +278,8 @@ class ObjectEntry(Entry, frozen=True, tag="object", kw_only=True):
 
     object: str
 
-    def _solids(self, where: str, folder: Path) -> list[Part]:  # noqa: ARG002
+    def solids(self, where: str, folder: Path) -> list[Part]:  # noqa: ARG002
+        """Those that the object consists of."""
         try:
             return object_solids(self.object)
         except (UnknownNameError, DescriptionError) as error:
@@ -336,7 +308,7 @@ class MarginEntry(Struct, frozen=True):
     """
 
     links: tuple[str, str]
-    margin: Length
+    margin: Distance
 
 
 class SceneFile(Struct, frozen=True):
@@ -353,7 +325,7 @@ class SceneFile(Struct, frozen=True):
     """
 
     solids: dict[str, SolidEntry] = msgspec.field(default_factory=dict)
-    margin: Length = 0.0
+    margin: Distance = 0.0
     grasped: str | None = None
     margins: list[MarginEntry] = msgspec.field(default_factory=list)
     touching: list[TouchingEntry] = msgspec.field(default_factory=list)
@@ -456,13 +428,11 @@ class Scene:
         return scene
 
     def _take(self, entry: SceneFile, path: Path) -> None:
-        if not entry.margin >= 0:
-            raise DescriptionError(f"{path}: margin: found {entry.margin:g}, expected >= 0 m")
         self.margin = entry.margin
         self.items: dict[str, Item] = {}
         for name, solid in entry.solids.items():
             where = f"{path}: solids.{name}"
-            parts = solid.solids(where, path.parent)
+            parts = tuple(solid.solids(where, path.parent))
             entry_there = _located(solid, path.parent)
             self.items[name] = Item(name, parts, solid.matrix(where), solid.margin, entry_there)
         self.grasped = entry.grasped
@@ -472,13 +442,7 @@ class Scene:
                 f"{path}: grasped: unknown solid {entry.grasped!r}; the scene's: {known}"
             )
         self.touching = tuple(Touching(one.links, one.reason) for one in entry.touching)
-        self.margins: dict[frozenset[str], float] = {}
-        for i, pair in enumerate(entry.margins):
-            if not 0 <= pair.margin < math.inf:
-                raise DescriptionError(
-                    f"{path}: margins[{i}].margin: found {pair.margin:g}, expected >= 0 m"
-                )
-            self.margins[frozenset(pair.links)] = pair.margin
+        self.margins = {frozenset(pair.links): pair.margin for pair in entry.margins}
 
     def __repr__(self) -> str:
         return f"<Scene {self.name}: {', '.join(self.items) or 'empty'}, margin {self.margin:g} m>"

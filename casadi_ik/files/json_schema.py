@@ -20,6 +20,12 @@ DRAFT = "http://json-schema.org/draft-07/schema#"
 
 NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
 
+NOT_BELOW_ZERO = rf"(?!-){NUMBER}"
+
+ABOVE_ZERO = rf"(?=[^eE]*[1-9]){NOT_BELOW_ZERO}"
+
+NO_BOUND = msgspec.Meta()
+
 PLAIN = {int: "integer", bool: "boolean"}
 """JSON's names of types."""
 
@@ -70,7 +76,8 @@ def _schema(type_: Any, definitions: dict[str, Any]) -> dict[str, Any]:
     origin, args = get_origin(type_), get_args(type_)
     if origin is Annotated:
         mark = next((one for one in args[1:] if isinstance(one, Dimension)), None)
-        return _schema(args[0], definitions) if mark is None else _quantity(mark, definitions)
+        bound = next((one for one in args[1:] if isinstance(one, msgspec.Meta)), None)
+        return _quantity(mark, definitions, bound or msgspec.Meta())
     if type_ is float:
         return _quantity(None, definitions)
     if origin in (Union, UnionType):
@@ -93,18 +100,25 @@ def _schema(type_: Any, definitions: dict[str, Any]) -> dict[str, Any]:
     return {"type": PLAIN[type_]}
 
 
-def _quantity(mark: Dimension | None, definitions: dict[str, Any]) -> dict[str, Any]:
+def _quantity(
+    mark: Dimension | None, definitions: dict[str, Any], bound: msgspec.Meta = NO_BOUND
+) -> dict[str, Any]:
     """A reference to a number that may have a unit behind; any unit, if nothing is declared."""
     name = "number" if mark is None else QUANTITIES[mark]
+    limit, before = {}, NUMBER
+    if bound.gt is not None:
+        name, limit, before = f"{name} above zero", {"exclusiveMinimum": 0}, ABOVE_ZERO
+    elif bound.ge is not None:
+        name, limit, before = f"{name} not below zero", {"minimum": 0}, NOT_BELOW_ZERO
     if name not in definitions:
-        words = ["rad", "m"] if name in ("position", "velocity") else str(mark or "").split()
-        words = [f"{word}/s" for word in words] if name == "velocity" else words
+        words = str(mark or "").replace("joint", "rad m").split()
+        words = [f"{word}/s" for word in words[:-1]] if words[-1:] == ["/s"] else words
         fits = [unit for unit in UNITS if unit and DIMENSIONS.get(unit, unit) in words]
         units = [unit for unit in UNITS if unit] if mark is None else fits
         behind = rf"\s*({'|'.join(units)})?" if units else ""
-        text = {"type": "string", "pattern": rf"^\s*{NUMBER}{behind}\s*$"}
+        text = {"type": "string", "pattern": rf"^\s*{before}{behind}\s*$"}
         said = f"A number, or one with its unit: {', '.join(units)}." if units else "A number."
-        definitions[name] = {"description": said, "anyOf": [{"type": "number"}, text]}
+        definitions[name] = {"description": said, "anyOf": [{"type": "number"} | limit, text]}
     return {"$ref": f"#/definitions/{name}"}
 
 

@@ -280,6 +280,8 @@ def convert(data: Any, type_: type[T], path: Path) -> T:
             if match and "float" in text:
                 text = f"unknown unit {match[2]!r}; known: {', '.join(filter(None, UNITS))}"
             text = f"found {value!r}, {text}"
+        elif "`float` >" in text:
+            text = f"found {value:g}, {text.replace('`float` ', '').replace('0.0', '0')}"
         raise DescriptionError(f"{path}: {key or '(top level)'}: {text}") from error
 
 

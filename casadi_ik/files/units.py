@@ -1,7 +1,8 @@
 """Units in files: what they are in SI, and whether they fit where they stand.
 
 Numbers may carry a unit (``90 deg``, ``50 mm``, ``110 deg/s``); without one they are SI. A field
-declares its dimension by its type (`Length`, `Turn`, ...); a plain `float` takes any.
+declares its dimension and what it has to be above by its type (`Length`, `Size`, `Turn`, ...); a
+plain `float` takes any.
 """
 
 from __future__ import annotations
@@ -48,11 +49,14 @@ class Dimension(str):
 
 
 Length = Annotated[float, Dimension("m")]
+Size = Annotated[float, Dimension("m"), msgspec.Meta(gt=0)]
+Distance = Annotated[float, Dimension("m"), msgspec.Meta(ge=0)]
 Turn = Annotated[float, Dimension("rad")]
-Mass = Annotated[float, Dimension("kg")]
+Mass = Annotated[float, Dimension("kg"), msgspec.Meta(gt=0)]
 Pure = Annotated[float, Dimension("")]
+Factor = Annotated[float, Dimension(""), msgspec.Meta(gt=0)]
 JointValue = Annotated[float, Dimension("joint")]
-JointRate = Annotated[float, Dimension("joint /s")]
+JointRate = Annotated[float, Dimension("joint /s"), msgspec.Meta(gt=0)]
 AnyValue = Annotated[float, Dimension("rad m")]
 
 

@@ -16,7 +16,7 @@ from casadi_ik.arrays import Array, Bools
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.limits import LIMITS, RAISED, limit
 from casadi_ik.files.mesh_file import read_mesh
-from casadi_ik.files.units import Length
+from casadi_ik.files.units import Size
 
 Mesh = tuple[Array, NDArray[np.int64]]
 """Vertices (v, 3) [m] and triangles (t, 3) of vertex indices, outward by the right-hand rule."""
@@ -94,12 +94,7 @@ class Primitive(
         return self._nearest(rows)[1].reshape(shape)
 
     def check(self) -> str:
-        """What is wrong with the numbers, as "key: found, expected", or ""."""
-        for name in self.__struct_fields__:
-            value = getattr(self, name)
-            for number in value if isinstance(value, tuple) else (value,):
-                if isinstance(number, (int, float)) and not 0 < number < np.inf:
-                    return f"{name}: found {number}, expected a positive finite length"
+        """What is wrong with the numbers together, as "key: found, expected", or ""."""
         return ""
 
 
@@ -110,7 +105,7 @@ class Sphere(Primitive, frozen=True, tag="sphere", kw_only=True):
         diameter: [m].
     """
 
-    diameter: Length
+    diameter: Size
 
     def _nearest(self, points: Array) -> tuple[Array, Array]:
         distance, normal = _polar(points, np.array([0.0, 0.0, 1.0]))
@@ -133,8 +128,8 @@ class Cylinder(Primitive, frozen=True, tag="cylinder", kw_only=True):
         height: [m].
     """
 
-    diameter: Length
-    height: Length
+    diameter: Size
+    height: Size
 
     def _nearest(self, points: Array) -> tuple[Array, Array]:
         distance, normal = _polar(points[:, :2], np.array([1.0, 0.0]))
@@ -154,9 +149,9 @@ class EllipticCylinder(Primitive, frozen=True, tag="elliptic-cylinder", kw_only=
         height: [m].
     """
 
-    width: Length
-    depth: Length
-    height: Length
+    width: Size
+    depth: Size
+    height: Size
 
     def _nearest(self, points: Array) -> tuple[Array, Array]:
         distance, normal = _ellipse(points[:, :2], np.array([self.width / 2, self.depth / 2]))
@@ -175,7 +170,7 @@ class Box(Primitive, frozen=True, tag="box", kw_only=True):
         size: Along x, y and z [m].
     """
 
-    size: tuple[Length, Length, Length]
+    size: tuple[Size, Size, Size]
 
     def _nearest(self, points: Array) -> tuple[Array, Array]:
         excess = np.abs(points) - np.asarray(self.size) / 2
@@ -209,9 +204,9 @@ class BentCapsule(Primitive, frozen=True, tag="bent-capsule", kw_only=True):
         width: Along y, from the convex side's middle to the tips [m].
     """
 
-    diameter: Length
-    length: Length
-    width: Length
+    diameter: Size
+    length: Size
+    width: Size
 
     @property
     def radius(self) -> float:
@@ -225,10 +220,7 @@ class BentCapsule(Primitive, frozen=True, tag="bent-capsule", kw_only=True):
         return float(np.arcsin((self.length - self.diameter) / 2 / self.radius))
 
     def check(self) -> str:
-        """What is wrong with the numbers, as "key: found, expected", or ""."""
-        problem = super().check()
-        if problem:
-            return problem
+        """What is wrong with the numbers together, as "key: found, expected", or ""."""
         sagitta = self.width - self.diameter
         if not 0 < sagitta < (self.length - self.diameter) / 2:
             return (

@@ -173,10 +173,7 @@ def link_shapes(entry: CollisionEntry | None, links: Iterable[str], path: Path) 
     solids: list[LinkSolid] = []
     for link, shapes in entry.links.items():
         known(link, names, "link", f"{where}: collision.links.{link}")
-        for i, shape in enumerate(shapes):
-            problem = _fault(shape)
-            if problem:
-                raise DescriptionError(f"{where}: collision.links.{link}[{i}].{problem}")
+        for shape in shapes:
             covers = -1
             if isinstance(shape, BoxEntry | CylinderEntry):
                 covers = len(solids)
@@ -189,8 +186,6 @@ def link_shapes(entry: CollisionEntry | None, links: Iterable[str], path: Path) 
             known(link, names, "link", f"{key}.links")
         if not pair.reason.strip():
             raise DescriptionError(f"{key}.reason: is empty, expected why they may touch")
-        if pair.depth is not None and not pair.depth > 0:
-            raise DescriptionError(f"{key}.depth: found {pair.depth:g}, expected > 0 m")
         touching.append(Touching(pair.links, pair.reason, pair.depth or math.inf))
     if entry.srdf is not None:
         place = Path(entry.srdf).expanduser()
@@ -262,15 +257,3 @@ def _bar(
     _, inside, radius = best
     rotation = pose[:3, :3]
     return frozen(rotation @ center + pose[:3, 3]), frozen(rotation @ axis * inside), radius
-
-
-def _fault(shape: ShapeEntry) -> str:
-    """What is wrong with a shape, as "key: found, expected", or ""."""
-    for name in shape.__struct_fields__:
-        value = getattr(shape, name)
-        numbers = np.atleast_1d(np.asarray(value, dtype=float))
-        if not np.isfinite(numbers).all():
-            return f"{name}: found {numbers.ravel().tolist()}, expected finite numbers"
-        if name in ("radius", "length", "size") and not (numbers > 0).all():
-            return f"{name}: found {value}, expected > 0"
-    return ""

@@ -15,7 +15,7 @@ import numpy as np
 
 from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
-from casadi_ik.files.units import AnyValue, Length, Pure, Turn
+from casadi_ik.files.units import AnyValue, Pure, Size, Turn
 
 FLAT = 1e-16
 """A triangle's two slacks are kept above FLAT b c [m^2]."""
@@ -30,7 +30,7 @@ class CouplingKind(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_
     Attributes:
         of: Name of the actuator or joint that is followed.
         source_unit: Unit that it must have; "" any.
-        lengths: Names of the numbers that are lengths above zero [m].
+        lengths: Names of the numbers that are lengths [m].
         angles: Names of the numbers that are angles [rad]. Calibration estimates lengths and
             angles.
         monotone: Whether the joint moves to one side only while what it follows does.
@@ -54,10 +54,6 @@ class CouplingKind(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_
         Raises:
             DescriptionError: They do not.
         """
-        for name in self.lengths:
-            if not getattr(self, name) > 0:
-                found = getattr(self, name)
-                raise DescriptionError(f"{where}.{name}: found {found:.6g}, expected > 0")
 
     def check_stroke(self, name: str, lower: float, upper: float, where: str) -> None:
         """Whether the mechanism stays together over a motor's stroke.
@@ -139,8 +135,8 @@ class LeadScrew(CouplingKind, frozen=True, tag="lead-screw"):
         theta_0: Triangle angle at which the joint reads zero [rad].
     """
 
-    b: Length
-    c: Length
+    b: Size
+    c: Size
     theta_0: Turn = 0.0
 
     source_unit: ClassVar[str] = "m"
@@ -182,10 +178,10 @@ class FourBar(CouplingKind, frozen=True, tag="four-bar"):
             the loop to the last digit.
     """
 
-    p: Length
-    q: Length
-    g: Length
-    h: Length
+    p: Size
+    q: Size
+    g: Size
+    h: Size
     phi_0: Turn
     theta_3_0: Turn
 
@@ -196,8 +192,7 @@ class FourBar(CouplingKind, frozen=True, tag="four-bar"):
     periodic: ClassVar[bool] = True
 
     def check(self, where: str) -> None:
-        """Whether the lengths are above zero and the linkage closes in its known pose."""
-        super().check(where)
+        """Whether the linkage closes in its known pose."""
         # Rod and coupler have to span the distance from the crank's pin to the rod's pivot.
         p, q, g, h = self.p, self.q, self.g, self.h
         span = math.sqrt(max(p * p + g * g - 2 * p * g * math.cos(self.phi_0), 0.0))

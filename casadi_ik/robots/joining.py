@@ -18,7 +18,7 @@ from casadi_ik.robots.file_parts import arm_from_file
 from casadi_ik.robots.motor_ranges import motor_ranges
 from casadi_ik.robots.parts import Part, described_part, unique
 from casadi_ik.robots.robot_files.tree import known
-from casadi_ik.robots.schema import ArmFile, ArmFromFile, BallPad, HandFile, PlanePad
+from casadi_ik.robots.schema import ArmFile, ArmFromFile, BallPad, HandFile
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,17 +181,8 @@ def _finger(name: str, hand: Part, flat: FlatJoints, side: str) -> Finger:
         frozen(normal),
         tuple(chain[::-1]),
         frozen(_tangent(entry.tangent, normal, where)),
-        _radius(entry.pad, where),
+        entry.pad.radius if isinstance(entry.pad, BallPad) else 0.0,
     )
-
-
-def _radius(pad: BallPad | PlanePad, where: str) -> float:
-    """Of a pad's ball [m]; 0 of a plane."""
-    if isinstance(pad, PlanePad):
-        return 0.0
-    if not pad.radius > 0:
-        raise DescriptionError(f"{where}.pad.radius: found {pad.radius:g} m, expected one > 0")
-    return pad.radius
 
 
 def _tangent(given: Vector | None, normal: Array, where: str) -> Array:

@@ -116,13 +116,6 @@ def known_source(tags: str, sources: dict[str, str], where: str) -> None:
         raise DescriptionError(f"{where}: is empty; every number needs its source")
 
 
-def positive(value: float, where: str) -> float:
-    """The value, if it is above zero."""
-    if not value > 0:
-        raise DescriptionError(f"{where}: found {value:.6g}, expected > 0")
-    return value
-
-
 PREFIX = "hand_"
 """Put before a name of the hand that the arm has as well."""
 
@@ -364,8 +357,6 @@ def _joints(
             raise DescriptionError(f"{where}: limits: lower {low:.6g} is above upper {high:.6g}")
         if not np.linalg.norm(entry.axis) > 1e-9:
             raise DescriptionError(f"{where}: axis: is zero, expected a direction")
-        if entry.velocity is not None:
-            positive(entry.velocity, f"{where}: velocity")
         known_source(entry.source, sources, f"{where}: source")
         if entry.coupling is not None:
             entry.coupling.check(f"{where}: coupling")
@@ -392,7 +383,7 @@ def _joint(entry: JointEntry, part: str) -> Joint:
         axis=frozen(axis / np.linalg.norm(axis)),
         lower=entry.limits[0],
         upper=entry.limits[1],
-        velocity=math.inf if entry.velocity is None else entry.velocity,
+        velocity=entry.velocity or math.inf,
         coupling=entry.coupling,
         part=part,
     )
@@ -424,9 +415,7 @@ def _actuators(
             raise DescriptionError(
                 f"{where}: limits: lower {low:.6g} is not below upper {high:.6g}"
             )
-        velocity = joint.velocity if joint else math.inf
-        if entry.velocity is not None:
-            velocity = positive(entry.velocity, f"{where}: velocity")
+        velocity = entry.velocity or (joint.velocity if joint else math.inf)
         if entry.source or joint is None:
             known_source(entry.source, sources, f"{where}: source")
         unit = ("m" if joint.type == "prismatic" else "rad") if joint else entry.unit

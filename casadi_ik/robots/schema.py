@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from casadi_ik.files.reading import Angles, Frame, Point, Struct, Vector
-from casadi_ik.files.units import AnyValue, JointRate, JointValue, Length
+from casadi_ik.files.units import AnyValue, JointRate, JointValue, Length, Size
 from casadi_ik.robots.couplings import Coupling
 
 
@@ -25,7 +25,7 @@ class SphereEntry(_Shape, frozen=True, tag="sphere", kw_only=True):
         center: In the link's frame [m].
     """
 
-    radius: Length
+    radius: Size
     center: Point = (0.0, 0.0, 0.0)
     excess: Length = 0.0
 
@@ -39,7 +39,7 @@ class CapsuleEntry(_Shape, frozen=True, tag="capsule", kw_only=True):
     """
 
     ends: tuple[Point, Point]
-    radius: Length
+    radius: Size
     excess: Length = 0.0
 
 
@@ -52,7 +52,7 @@ class BoxEntry(_Shape, frozen=True, tag="box", kw_only=True):
         rpy: Angles about the fixed axes x, y, z [rad], as in URDF.
     """
 
-    size: tuple[Length, Length, Length]
+    size: tuple[Size, Size, Size]
     xyz: Point = (0.0, 0.0, 0.0)
     rpy: Angles = (0.0, 0.0, 0.0)
     excess: Length = 0.0
@@ -68,8 +68,8 @@ class CylinderEntry(_Shape, frozen=True, tag="cylinder", kw_only=True):
         rpy: Angles about the fixed axes x, y, z [rad], as in URDF.
     """
 
-    radius: Length
-    length: Length
+    radius: Size
+    length: Size
     xyz: Point = (0.0, 0.0, 0.0)
     rpy: Angles = (0.0, 0.0, 0.0)
     excess: Length = 0.0
@@ -89,7 +89,7 @@ class TouchingEntry(Struct, frozen=True):
 
     links: tuple[str, str]
     reason: str
-    depth: Length | None = None
+    depth: Size | None = None
 
 
 class CollisionEntry(Struct, frozen=True):
@@ -173,7 +173,7 @@ class BallPad(Struct, frozen=True, tag_field="kind", tag="ball"):
         radius: Of the ball, whose middle is behind the contact frame's origin [m].
     """
 
-    radius: Length
+    radius: Size
 
 
 class PlanePad(Struct, frozen=True, tag_field="kind", tag="plane"):

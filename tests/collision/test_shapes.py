@@ -125,7 +125,7 @@ def test_capsules_hold_boxes_and_cylinders(shape, rng):
         (
             ("links", "l1", 0, "radius"),
             -1,
-            r"collision.links.l1\[0\].radius: found -1.0, expected >",
+            r"collision.links.l1\[0\].radius: found -1, expected >",
         ),
         (("links", "l1", 0, "kind"), "cone", "'cone'"),
         (("links", "l1", 0, "radius"), "5 deg", "found '5 deg', expected m"),

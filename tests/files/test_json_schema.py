@@ -138,8 +138,8 @@ def changed(data: Any, path: tuple[Any, ...]) -> Iterator[Any]:
         inner[f"{last}_"] = inner.pop(last)
         yield whole
     # In which unit a joint's limits are is a matter of its type, which a schema does not see.
-    units = ("1 kg",) if {"limits", "velocity"} & {*path} else ("3 deg", "3 mm", "1 kg")
-    for other in ("some text", *units, 0.5, None, [1, 2], {"some": "mapping"}):
+    units = ("1 kg",) if {"limits", "velocity"} & {*path} else ("3 deg", "3 mm", "-3 mm", "1 kg")
+    for other in ("some text", *units, 0.5, -0.5, None, [1, 2], {"some": "mapping"}):
         whole, inner = copied()
         inner[last] = other
         yield whole

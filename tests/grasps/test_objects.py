@@ -164,12 +164,12 @@ def test_single_points_and_the_centre(shape: grasps.Shape) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "key", "says"),
     [
-        ("diameter: 60 mm", "diameter: -60 mm", "shape.diameter", "positive finite length"),
+        ("diameter: 60 mm", "diameter: -60 mm", "shape.diameter", "found -0.06, expected > 0"),
         ("diameter: 60 mm", "diameter: .nan", "shape.diameter", "finite number"),
         ("diameter: 60 mm", "diameter: wide", "shape.diameter", "`float`"),
         ("diameter: 60 mm", "radius: 30 mm", "shape", "diameter"),
         ("kind: sphere", "kind: blob", "shape.kind", "blob"),
-        ("0.1 kg", "0 kg", "mass.value", "positive finite mass"),
+        ("0.1 kg", "0 kg", "mass.value", "found 0, expected > 0"),
         ("source: list}\nmass", "source: guess}\nmass", "shape.source", "guess"),
         ("value: 0.1 kg, source: list", "value: 0.1 kg, source: ''", "mass.source", "empty"),
         ("name: ball", "name: ball\ncolour: red", "(top level)", "colour"),

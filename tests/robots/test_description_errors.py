@@ -37,7 +37,7 @@ hand | actuators:\n => actuators:\n  spare: {limits: [0, 1], source: mdh}\n
 hand | actuators:\n => actuators:\n  bh_finger_2_spread: {}\n
     actuators.bh_finger_2_spread | follows 'bh_spread' already
 hand | 180 deg], velocity: 2 rad/s => 180 deg], velocity: 0
-    actuators.bh_spread: velocity | expected > 0
+    actuators.bh_spread.velocity | expected > 0
 hand | source: limits assumed}\n  bh_thumb_prox => }\n  bh_thumb_prox
     actuators.bh_spread: source | is empty
 hand | 180 deg], velocity: 2 rad/s => 180 deg], unit: deg
@@ -69,7 +69,7 @@ arm | axis: [0, -1, 0] => axis: [0, 0, 0]
 arm | axis: [0, 0, 1], => axis: [0, 0, 1], type: hinge,
     joint 'lwr_joint_1': type | found 'hinge', expected one of revolute, prismatic, fixed
 arm | velocity: 110 deg/s => velocity: -1
-    joint 'lwr_joint_1': velocity | expected > 0
+    joints[lwr_joint_1].velocity | found -1, expected > 0
 arm | , source: centro} => }
     joints[lwr_joint_1] | `source`
 arm | source: centro => source: ''
@@ -131,9 +131,9 @@ coupled | of: left_2, p => of: left_4, p
 coupled | of: left_2, p => of: screw_2, p
     joint 'left_3': coupling.of | is in m
 coupled | b: 52.2 mm => b: -1
-    joint 'left_1': coupling.b | expected > 0
+    joints[left_1].coupling.b | found -1, expected > 0
 coupled | g: 0.84 cm => g: 0
-    joint 'left_3': coupling.g | expected > 0
+    joints[left_3].coupling.g | found 0, expected > 0
 coupled | p: 2.97 cm => p: 5 cm
     joint 'left_3': coupling.phi_0 | at 3.32939 rad q and h cannot span 0.0582734 m
 coupled | b: 52.2 mm => b: 35 mm
