@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array, Bools
 from casadi_ik.motion.clear import OBSTACLES, Guard, between
 from casadi_ik.motion.inputs import FollowerInputs, FollowPlan, contact_rows, tolerance_rows
@@ -195,7 +194,7 @@ class Path:
         """
         rows = np.arange(first, first + len(goals) - 1)
         leaps = self._parts(np.diff(goals, axis=0)) > TUNING.leap
-        missed = ~self._meets(rows, goals[1:])
+        missed = ~self.meets(rows, goals[1:])
         suspects = missed & ~leaps
         missed[suspects] = self._reach(rows[suspects])
         broken = np.flatnonzero(leaps | missed)
@@ -208,7 +207,7 @@ class Path:
             asked = self.targets.rows(np.array(new))
             starts = np.tile(self.engine.robot.home, (len(new), 1))
             q = self.engine.method.run(asked, starts, self.seed, trace=False).q
-            self._reachable |= zip(new, self._meets(np.array(new), q).tolist(), strict=True)
+            self._reachable |= zip(new, self.meets(np.array(new), q).tolist(), strict=True)
         return np.array([self._reachable[row] for row in rows.tolist()], dtype=bool)
 
     def _taken_up(self, i: int, before: Array, direct: Array) -> tuple[Array, Jump | None]:
@@ -217,9 +216,9 @@ class Path:
         here, rows = before[2 * n : 3 * n], np.array([i])
         settled = self.tracker.walk(before, row.rows(np.zeros(TUNING.settling, dtype=np.intp)))[-1]
         goal, held = settled[2 * n : 3 * n], None
-        if not self._meets(rows, goal[None])[0] or self._parts(goal - here) > TUNING.leap:
+        if not self.meets(rows, goal[None])[0] or self._parts(goal - here) > TUNING.leap:
             goal, held = self._in_small_steps(i, before)
-            if held is not None or not self._meets(rows, goal[None])[0]:
+            if held is not None or not self.meets(rows, goal[None])[0]:
                 if not self._reach(rows)[0]:
                     return direct, None
                 found = self.engine.finder.find(
@@ -247,7 +246,23 @@ class Path:
         leaps = np.flatnonzero(self._parts(np.diff(goals, axis=0)) > TUNING.leap)
         return goals[-1], goals[leaps[0]] if len(leaps) else None
 
-    def _meets(self, rows: NDArray[np.intp], q: Array) -> NDArray[np.bool_]:
+    def starts(self, q0: Array, prefer: str) -> Iterator[Array]:
+        """Postures the motion may begin with, the one that a solve gives first: it is quick."""
+        engine, row, first = self.engine, np.zeros(1, dtype=np.intp), self._row(0)
+        run = engine.method.run(replace(first, prefer=prefer), q0[None], self.seed, trace=False)
+        solved = bool(self.meets(row, run.q)[0])
+        if solved:
+            yield run.q[0]
+        found = engine.finder.find(
+            first, q0, self.seed, TUNING.starts, prefer, apart=0, query=self._query_at(row)
+        )
+        yield from (alternative.q for alternative in found)
+        if not (found or solved):
+            # Not to be solved: the nearest there is.
+            yield run.q[0]
+
+    def meets(self, rows: NDArray[np.intp], q: Array) -> Bools:
+        """Whether configurations meet grasps, and touch nothing."""
         targets = self.targets.rows(rows)
         solved = judge(self.engine.robot, targets, q).solved(targets.enforce_limits)
         query = self._query_at(rows)
@@ -335,14 +350,14 @@ def track(
     Raises:
         UnsupportedError: The method is not hand-first.
     """
-    begin = time.perf_counter()
+    begin, every = time.perf_counter(), np.arange(len(targets))
     query = engine.collision_query(targets)
     path = Path(engine, targets, seed, tracker, query)
     best: tuple[Array, list[Jump]] | None = None
     least = (np.inf, np.inf)
-    for start in _starts(engine, targets, q0, prefer, seed, query):
+    for start in path.starts(q0, prefer):
         q, jumps = path.follow(start)
-        missed = int((~_solved(engine.robot, targets, q, query)).sum())
+        missed = int((~path.meets(every, q)).sum())
         if query is not None and not missed:
             # A way between two postures that touches something counts as one missed.
             missed += int((~_free_between(query, q, jumps)).sum()) - len(jumps)
@@ -357,7 +372,7 @@ def track(
     verdict = judge(engine.robot, targets, q)
     return Track(
         q=q,
-        success=_solved(engine.robot, targets, q, query),
+        success=path.meets(every, q),
         position_error=verdict.position_error,
         angle_error=verdict.angle_error,
         jumps=tuple(jumps),
@@ -381,28 +396,6 @@ def _free_between(query: CollisionQuery, q: Array, jumps: Sequence[Jump]) -> Boo
     return free
 
 
-def _starts(
-    engine: Engine,
-    targets: TargetBatch,
-    q0: Array,
-    prefer: str,
-    seed: int,
-    query: CollisionQuery | None,
-) -> Iterator[Array]:
-    """Postures that the motion may begin with, the one that a solve gives first: it is quick."""
-    first = targets.rows(slice(0, 1))
-    here = None if query is None else query.rows(np.zeros(1, dtype=np.intp))
-    q = engine.method.run(replace(first, prefer=prefer), q0[None], seed, trace=False).q
-    solved = bool(_solved(engine.robot, first, q, here)[0])
-    if solved:
-        yield q[0]
-    found = engine.finder.find(first, q0, seed, TUNING.starts, prefer, apart=0, query=here)
-    yield from (alternative.q for alternative in found)
-    if not (found or solved):
-        # Not to be solved: the nearest there is.
-        yield q[0]
-
-
 def _run_after(path: Array, travel: Array) -> Array:
     """Motors (k, n) that go straight to where the path (k, n) is, as far as they come."""
     q = path.copy()
@@ -412,10 +405,3 @@ def _run_after(path: Array, travel: Array) -> Array:
         if share > 1:
             q[i] = q[i - 1] + way / share
     return q
-
-
-def _solved(
-    robot: ArmHand, targets: TargetBatch, q: Array, query: CollisionQuery | None
-) -> NDArray[np.bool_]:
-    solved = judge(robot, targets, q).solved(targets.enforce_limits)
-    return solved if query is None else solved & query.free(q)

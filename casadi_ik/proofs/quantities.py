@@ -29,7 +29,7 @@ Measure = Callable[[Balls], tuple[Array, Array]]
 
 @dataclass(frozen=True)
 class RigidInvariant:
-    """One quantity of a robot, whatever the target.
+    """What contacts keep however the palm is moved, or where the arm reaches, of one robot.
 
     Attributes:
         name: What it is, with the fingers.
@@ -49,26 +49,16 @@ class RigidInvariant:
 
 
 @dataclass(frozen=True)
-class Quantity:
-    """What contacts keep however the palm is moved, or where the arm reaches.
+class Quantity(RigidInvariant):
+    """The same with what a target asks of it.
 
     Attributes:
-        name: What it is, with the fingers.
-        unit: "m" or "rad".
         asked: Its value in the target.
         give: By how much the tolerances let it differ.
-        lower: The smallest value that the robot can make; a guaranteed bound.
-        upper: The largest.
-        reach: Whether the bounds follow from the arm, too.
     """
 
-    name: str
-    unit: str
     asked: float
     give: float
-    lower: float
-    upper: float
-    reach: bool
 
     @property
     def excess(self) -> float:
@@ -77,7 +67,8 @@ class Quantity:
 
     def agrees(self, other: Quantity) -> bool:
         """Whether both say the same, rounding aside."""
-        if (self.name, self.unit, self.reach) != (other.name, other.unit, other.reach):
+        named = (self.name, self.unit, self.fingers, self.reach)
+        if named != (other.name, other.unit, other.fingers, other.reach):
             return False
         return all(
             abs(getattr(self, part) - getattr(other, part)) <= 1e-9
@@ -136,7 +127,7 @@ def quantities_of(
         fingers: Their numbers.
     """
     return tuple(
-        Quantity(item.name, item.unit, value, loose, item.lower, item.upper, item.reach)
+        Quantity(**vars(item), asked=value, give=loose)
         for item, value, loose in zip(invariants, asked.tolist(), give.tolist(), strict=True)
         if set(item.fingers) <= set(fingers) and value == value
     )

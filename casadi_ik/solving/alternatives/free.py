@@ -98,16 +98,7 @@ class FreeAnswers:
 
     q: Array
     free: NDArray[np.bool_]
-    reports: tuple[CollisionReport | None, ...]
-
-    def with_free(self, rows: NDArray[np.intp], others: FreeAnswers) -> FreeAnswers:
-        """With the free answers that others are to some of the targets."""
-        taken = rows[others.free]
-        q, free, reports = self.q.copy(), self.free.copy(), list(self.reports)
-        q[taken], free[taken] = others.q[others.free], True
-        for row in taken.tolist():
-            reports[row] = None
-        return FreeAnswers(q, free, tuple(reports))
+    reports: NDArray[np.object_]
 
 
 def free_answers(
@@ -146,7 +137,9 @@ def free_answers(
     met = trials.solved(some, ends, some.enforce_limits)
     left, some, ends = left[met], some.rows(np.flatnonzero(met)), ends[met]
     again = _searched(finder, some, query.rows(left), ends, home[left], seed, False, False)
-    return found.with_free(left, again)
+    taken = left[again.free]
+    found.q[taken], found.free[taken], found.reports[taken] = again.q[again.free], True, None
+    return found
 
 
 def _searched(
@@ -161,7 +154,7 @@ def _searched(
 ) -> FreeAnswers:
     """One search, see `free_answers`."""
     if not len(q):
-        return FreeAnswers(q, np.zeros(0, dtype=bool), ())
+        return FreeAnswers(q, np.zeros(0, dtype=bool), np.zeros(0, dtype=object))
     parts = []
     for first in range(0, len(q), PARAMETERS.together):
         rows = np.arange(first, min(first + PARAMETERS.together, len(q)))
@@ -170,10 +163,9 @@ def _searched(
         if every:
             search.take(q[rows], np.arange(len(rows)))
         search.run(q[rows], every)
-        parts.append(search.found(reasons))
-    reports = tuple(report for part in parts for report in part.reports)
-    every_q, free = (np.concatenate([getattr(p, word) for p in parts]) for word in ("q", "free"))
-    return FreeAnswers(every_q, free, reports)
+        found = search.found(reasons)
+        parts.append((found.q, found.free, found.reports))
+    return FreeAnswers(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
 
 class FreeSearch:
@@ -390,10 +382,10 @@ class FreeSearch:
     def found(self, reasons: bool) -> FreeAnswers:
         """What it came to; whether it would work without the scene or the robot, if asked."""
         q = np.where(self.free[:, None], self.best, self.nearest)
-        reports: list[CollisionReport | None] = [None] * len(q)
+        reports = np.full(len(q), None, dtype=object)
         blocked = np.flatnonzero(~self.free)
         if not len(blocked):
-            return FreeAnswers(q, self.free, tuple(reports))
+            return FreeAnswers(q, self.free, reports)
         clear = self.query.rows(blocked).check(q[blocked])
         alone = self._possible(blocked, self.query.robot_alone) if reasons else None
         passing = self._possible(blocked, self.query.scene_alone) if reasons else None
@@ -407,7 +399,7 @@ class FreeSearch:
                 None if alone is None else bool(alone[row]),
                 None if passing is None else bool(passing[row]),
             )
-        return FreeAnswers(q, self.free, tuple(reports))
+        return FreeAnswers(q, self.free, reports)
 
     def _possible(self, rows: NDArray[np.intp], query: CollisionQuery) -> NDArray[np.bool_]:
         """(all targets,) whether one of the hands is free of some of the pairs alone."""
@@ -468,7 +460,7 @@ def resolve_collisions(
     if not len(rows):
         return batch
     begin, q = time.perf_counter(), batch.q.copy()
-    reports = list(batch.collisions)
+    reports = np.array(batch.collisions, dtype=object)
     numbers = np.array([targets.number(row) for row in rows.tolist()], dtype=np.intp)
     # A target's random numbers are its own, whichever others are looked at with it.
     asked = replace(targets.rows(rows), picked=numbers)
@@ -478,15 +470,14 @@ def resolve_collisions(
         nearby, begun = query.rows(chosen), (q[chosen], starts[chosen])
         found = free_answers(finder_of(some), some, nearby, *begun, seed, every, reasons)
         q[chosen] = found.q
-        for row, report in zip(chosen.tolist(), found.reports, strict=True):
-            reports[row] = report
+        reports[chosen] = found.reports
     seconds = batch.time.copy()
     seconds[rows] += (time.perf_counter() - begin) / len(rows)
     status = np.where(touching, int(Status.SOLVED), outcome.status)
     ended = replace(outcome, q=q, time=seconds, status=status)
     return replace(
         judged(robot, batch.method, targets, ended, query),
-        collisions=tuple(reports),
+        collisions=tuple(reports.tolist()),
     )
 
 
