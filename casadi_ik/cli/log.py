@@ -6,7 +6,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import groupby, islice
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -95,13 +95,14 @@ def solves(said: Said) -> Answer:
     parts: list[RenderableType] = []
     left = said.most
     for part in found.parts:
-        shown = islice(logs.Table("solve", (part,)).records(), left)
-        if len(part) and left:
+        shown = part.first(left)
+        left -= len(shown)
+        if len(shown):
             parts.append(Text(f"  {part.method}", "bold"))
-            for shard, records in groupby(shown, lambda record: record.get("shard")):
-                of_shard = [] if shard is None else [Text(f"  from {shard}", "dim")]
-                parts += [*of_shard, _solve_rows(part, records)]
-            left -= min(left, len(part))
+            records = logs.Table("solve", (shown,)).records()
+            for shard, of_shard in groupby(records, lambda record: record.get("shard")):
+                parts += [] if shard is None else [Text(f"  from {shard}", "dim")]
+                parts.append(_solve_rows(part, of_shard))
     return Answer(Group(*parts, _count(len(found), said.most, "solve")))
 
 
@@ -111,14 +112,10 @@ def events(said: Said) -> Answer:
     found = logs.open(said.files).events(**_filters(said))
     numbers = ("solve", "iteration")
     rows = table(*numbers, "method", "phase", "what happened", right=numbers)
-    every = (
-        (number, part.method, event)
-        for part in found.parts
-        for number, event in zip(part.solve_id.tolist(), happenings(part), strict=True)
-    )
-    for number, method, event in islice(every, said.most):
-        text = Text(told(event), "yellow" if event.kind in SERIOUS else "")
-        rows.add_row(str(number + 1), str(event.iteration + 1), method, event.phase, text)
+    for part in (each.first(said.most - len(rows.rows)) for each in found.parts):
+        for number, event in zip(part.solve_id.tolist(), happenings(part), strict=True):
+            text = Text(told(event), "yellow" if event.kind in SERIOUS else "")
+            rows.add_row(str(number + 1), str(event.iteration + 1), part.method, event.phase, text)
     return Answer(Group(_only_last_wraps(rows), _count(len(found), said.most, "event")))
 
 
@@ -427,8 +424,8 @@ def _methods(log: logs.Log, about: logs.LogInfo) -> RenderableType:
     for method, counts in about.counts.items():
         found = log.solves(method=method)
         tallies = []
-        for records, field in ((found, "status"), (log.events(method=method), "kind")):
-            tally = Counter(record[field] for record in records.records())
+        for table_of, field in ((found, "status"), (log.events(method=method), "kind")):
+            tally = Counter(table_of.part.readable(field))
             lines = (f"{count} {name}" for name, count in tally.most_common())
             tallies.append("\n".join(lines) or "none")
         numbers = str(counts["solve"]), str(counts["iteration"])

@@ -77,6 +77,10 @@ class MethodRows:
             shard=None if self.shard is None else self.shard[wanted],
         )
 
+    def first(self, count: int) -> MethodRows:
+        """So many of the rows at most, the first."""
+        return self.where(np.arange(min(count, len(self))))
+
     def readable(self, name: str) -> list[Any]:
         """A field as a person would have it: names for codes and bits."""
         values, labels = self.rows[name], self.labels.get(name, ())
