@@ -1,5 +1,17 @@
-"""The entry point of the command line, `casadi-ik`, called in this process."""
+"""The command line, `casadi-ik`, called in this process."""
 
+from __future__ import annotations
+
+from casadi_ik import viewing
+from casadi_ik.cli.lists import schema_of
 from casadi_ik.cli.main import main
+from casadi_ik.cli.table import COMMANDS, GROUPS, load, parse
 
-__all__ = ["main"]
+__all__ = ["COMMANDS", "GROUPS", "load", "main", "schema_of", "shown"]
+
+
+def shown(*words: str) -> viewing.Viewer:
+    """What `casadi-ik view` shows, without waiting until it is stopped."""
+    from casadi_ik.cli.view import opened
+
+    return opened(parse(["view", *words])[1])

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
+from processes import ROOT, python
 
 
 def blocks(page: str, language: str = "python") -> list[str]:
@@ -32,12 +29,5 @@ def run_with(package: Path, script: str, argument: Path) -> None:
     Raises:
         AssertionError: It failed; the message is what it said.
     """
-    done = subprocess.run(
-        [sys.executable, "-c", script, str(argument)],
-        cwd=package.parents[1],
-        env=os.environ | {"PYTHONPATH": str(package.parent)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = python("-c", script, argument, path=package.parent, cwd=package.parents[1])
     assert done.returncode == 0, done.stderr

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import yaml
-from toy_robots import copy_shipped_robot
+from toy_robots import copy_shipped_robot, edited
 
 import casadi_ik as ik
 
@@ -27,24 +26,36 @@ def derived_robot(
         wrist_offset: The same of axis 6: no closed form at all.
     """
     path = copy_shipped_robot(folder)
-    arm = yaml.safe_load((folder / "arm.yaml").read_text())
-    for joint in arm["joints"]:
-        number = joint["name"][-1]
-        z = (heights or {}).get(number)
-        if z is not None:
-            joint["origin"]["xyz"] = [0, 0, z]
-        if number in "45" and elbow_offset:
-            x = elbow_offset if number == "4" else -elbow_offset
-            joint["origin"]["xyz"] = [x, 0, joint["origin"]["xyz"][2]]
-        if number in "67" and wrist_offset:
-            x = wrist_offset if number == "6" else -wrist_offset
-            joint["origin"]["xyz"] = [x, 0, joint["origin"]["xyz"][2]]
-    (folder / "arm.yaml").write_text(yaml.safe_dump(arm))
+    with edited(folder / "arm.yaml") as arm:
+        for joint in arm["joints"]:
+            number, origin = joint["name"][-1], joint["origin"]
+            z = (heights or {}).get(number)
+            if z is not None:
+                origin["xyz"] = [0, 0, z]
+            for pair, offset in (("45", elbow_offset), ("67", wrist_offset)):
+                if number in pair and offset:
+                    origin["xyz"] = [offset if number == pair[0] else -offset, 0, origin["xyz"][2]]
     if mount is not None:
-        whole = yaml.safe_load(path.read_text())
-        whole["mount"] = {"xyz": mount[0], "rpy": mount[1]}
-        path.write_text(yaml.safe_dump(whole))
+        with edited(path) as whole:
+            whole["mount"] = {"xyz": mount[0], "rpy": mount[1]}
     return ik.load_robot(path)
+
+
+def part_of_the_arm(folder: Path, joints: slice) -> Path:
+    """The file of the shipped hand on some joints of the shipped arm, one after the other."""
+    path = copy_shipped_robot(folder)
+    with edited(folder / "arm.yaml") as arm:
+        arm["joints"] = arm["joints"][joints]
+        arm["joints"][0]["parent"] = arm["root"]
+        arm["tip"]["link"] = arm["joints"][-1]["child"]
+        names = [joint["name"] for joint in arm["joints"]]
+        arm["home"] = {name: value for name, value in arm["home"].items() if name in names}
+        del arm["collision"]
+    with edited(path) as whole:
+        kept = whole["home"].items()
+        whole["home"] = {n: v for n, v in kept if n in names or n.startswith("bh")}
+        whole.pop("collision", None)
+    return path
 
 
 def thumb_of(folder: Path, joints: int) -> ik.ArmHand:
@@ -54,31 +65,33 @@ def thumb_of(folder: Path, joints: int) -> ik.ArmHand:
     rolling link too for four.
     """
     path = copy_shipped_robot(folder)
-    hand = yaml.safe_load((folder / "hand.yaml").read_text())
-    proximal, distal = hand["joints"][:2]
-    if joints == 1:
-        distal |= {"type": "fixed", "limits": [0, 0]}
-        del hand["actuators"][distal["name"]]
-        whole = yaml.safe_load(path.read_text())
-        del whole["home"][distal["name"]]
-        path.write_text(yaml.safe_dump(whole))
-    more = []
-    if joints >= 3:
-        place = {"xyz": proximal["origin"]["xyz"], "rpy": [0, 0, 0]}
-        more.append(_revolute("thumb_turn", proximal["parent"], "thumb_base", [0, 0, 1], place))
-        proximal["parent"] = "thumb_base"
-        proximal["origin"]["xyz"] = [0, 0, 0]
-    if joints == 4:
-        place = {"xyz": [0.03, 0, 0], "rpy": [0, 0, 0]}
-        more.append(_revolute("thumb_roll", distal["parent"], "thumb_rolling", [1, 0, 0], place))
-        distal["parent"] = "thumb_rolling"
-        distal["origin"]["xyz"] = [0.04, 0, 0]
-    hand["joints"] = sorted(more + hand["joints"], key=lambda joint: joint["name"] != "thumb_turn")
-    if joints == 4:
-        roll = hand["joints"].index(more[1])
-        hand["joints"].insert(2, hand["joints"].pop(roll))
-    hand["actuators"] = {joint["name"]: {} for joint in more} | hand["actuators"]
-    (folder / "hand.yaml").write_text(yaml.safe_dump(hand, sort_keys=False))
+    with edited(folder / "hand.yaml") as hand:
+        proximal, distal = hand["joints"][:2]
+        if joints == 1:
+            distal |= {"type": "fixed", "limits": [0, 0]}
+            del hand["actuators"][distal["name"]]
+            with edited(path) as whole:
+                del whole["home"][distal["name"]]
+        more = []
+        if joints >= 3:
+            place = {"xyz": proximal["origin"]["xyz"], "rpy": [0, 0, 0]}
+            more.append(_revolute("thumb_turn", proximal["parent"], "thumb_base", [0, 0, 1], place))
+            proximal["parent"] = "thumb_base"
+            proximal["origin"]["xyz"] = [0, 0, 0]
+        if joints == 4:
+            place = {"xyz": [0.03, 0, 0], "rpy": [0, 0, 0]}
+            more.append(
+                _revolute("thumb_roll", distal["parent"], "thumb_rolling", [1, 0, 0], place)
+            )
+            distal["parent"] = "thumb_rolling"
+            distal["origin"]["xyz"] = [0.04, 0, 0]
+        hand["joints"] = sorted(
+            more + hand["joints"], key=lambda joint: joint["name"] != "thumb_turn"
+        )
+        if joints == 4:
+            roll = hand["joints"].index(more[1])
+            hand["joints"].insert(2, hand["joints"].pop(roll))
+        hand["actuators"] = {joint["name"]: {} for joint in more} | hand["actuators"]
     return ik.load_robot(path)
 
 

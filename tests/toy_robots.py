@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import yaml
 
 import casadi_ik as ik
 from casadi_ik.files.shipped import models_folder
@@ -97,6 +101,21 @@ def replace(path: Path, old: str, new: str) -> None:
     text = path.read_text()
     assert old in text, f"{path} has no {old!r}"
     path.write_text(text.replace(old, new, 1))
+
+
+@contextmanager
+def edited(path: Path) -> Iterator[Any]:
+    """What a YAML file holds, to be changed in place; then it is written back."""
+    data = yaml.safe_load(path.read_text())
+    yield data
+    path.write_text(yaml.safe_dump(data, sort_keys=False))
+
+
+def near_home(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> np.ndarray:
+    """(count, n) configurations that every method has a fair chance to find from home."""
+    reach = 0.05 * (robot.upper - robot.lower)
+    q = robot.home + rng.uniform(-1, 1, (count, len(reach))) * reach
+    return np.clip(q, robot.lower, robot.upper)
 
 
 def grasp_of(robot: ik.ArmHand, points: np.ndarray, normals: np.ndarray) -> ik.Grasp:

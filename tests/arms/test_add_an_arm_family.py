@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
-import yaml
 from package_copy import blocks, package_copy, run_with
-from toy_robots import copy_shipped_robot, replace
+from robot_variants import part_of_the_arm
+from toy_robots import replace
 
 SCRIPT = """
 import sys
@@ -31,22 +30,6 @@ assert found and all(one.branch.swivel is None for one in found)
 """
 
 
-def gimbal_robot(folder: Path) -> Path:
-    """The shipped hand on the wrist of the shipped arm."""
-    path = copy_shipped_robot(folder)
-    arm = yaml.safe_load((folder / "arm.yaml").read_text())
-    arm["joints"] = arm["joints"][4:]
-    arm["joints"][0]["parent"] = arm["root"]
-    arm["home"] = {}
-    arm.pop("collision")
-    (folder / "arm.yaml").write_text(yaml.safe_dump(arm))
-    whole = yaml.safe_load(path.read_text())
-    for key in ("home", "collision"):
-        whole.pop(key, None)
-    path.write_text(yaml.safe_dump(whole))
-    return path
-
-
 def test_a_family_is_added_in_two_files(tmp_path):
     (tmp_path / "robot").mkdir()
     package = package_copy(tmp_path)
@@ -57,4 +40,4 @@ def test_a_family_is_added_in_two_files(tmp_path):
     replace(registry, old, row.rstrip())
     imported = "from casadi_ik.arms.locked_joints"
     replace(registry, imported, f"from casadi_ik.arms.gimbal import Gimbal\n{imported}")
-    run_with(package, SCRIPT, gimbal_robot(tmp_path / "robot"))
+    run_with(package, SCRIPT, part_of_the_arm(tmp_path / "robot", slice(4, None)))

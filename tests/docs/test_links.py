@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from pathlib import Path
+
+from processes import python
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
 
@@ -40,8 +41,8 @@ def test_what_stands_as_it_was_written_is_named(tmp_path: Path) -> None:
 def test_the_script_ends_with_what_it_found(tmp_path: Path) -> None:
     page = tmp_path / "a.html"
     page.write_text('<p id="top"></p><a href="#top">x</a>')
-    assert subprocess.run([sys.executable, SCRIPT, tmp_path], check=False).returncode == 0
+    assert python(SCRIPT, tmp_path).returncode == 0
     page.write_text('<a href="gone.html">x</a>')
-    done = subprocess.run([sys.executable, SCRIPT, tmp_path], check=False, capture_output=True)
+    done = python(SCRIPT, tmp_path)
     assert done.returncode == 1
-    assert b"gone.html" in done.stderr
+    assert "gone.html" in done.stderr

@@ -16,12 +16,10 @@ from typing import Any
 import jsonschema
 import pytest
 import yaml
+from commands import COMMANDS, GROUPS, load, main, schema_of
 
 import casadi_ik as ik
 from casadi_ik import public
-from casadi_ik.cli.lists import schema_of
-from casadi_ik.cli.main import main
-from casadi_ik.cli.table import COMMANDS, GROUPS, load
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
 

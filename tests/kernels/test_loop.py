@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import subprocess
-import sys
-import textwrap
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import casadi as ca
 import numpy as np
 import pytest
+from processes import python
 
 import casadi_ik as ik
 from casadi_ik.kernels import (
@@ -300,9 +298,7 @@ def test_keyboard_interrupt_reaches_a_compiled_loop():
         except KeyboardInterrupt:
             print("interrupted")
     """
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, timeout=60
-    )
+    done = python("-c", script, timeout=60)
     assert done.stdout == "interrupted\n", done.stderr
 
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import importlib.util
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import python
 
 from casadi_ik.kernels import LoopKernel
 from casadi_ik.kernels.compiler import find_compiler
@@ -54,25 +52,18 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """
     tmp_path = tmp_path_factory.mktemp("zig")
     (tmp_path / "empty").mkdir()
-    changed = {"PATH": str(tmp_path / "empty"), "CASADI_IK_CACHE": str(tmp_path / "cache")}
-    here = {"PYTHONPATH": str(HERE.parents[1])}
-    return {key: value for key, value in os.environ.items() if key != "CC"} | changed | here
+    place = str(tmp_path / "empty")
+    return {"CC": "", "PATH": place, "CASADI_IK_CACHE": str(tmp_path / "cache")}
 
 
 def test_the_kernel_tests_pass(environment):
     files = ("test_loop.py", "test_function_kernel.py")
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-n", "0"]
-    done = subprocess.run(
-        [
-            *command,
-            *(str(HERE / name) for name in files),
-            "-k",
-            f"({OF_THE_COMPILER}) and not False",
-        ],
+    done = python(
+        *("-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-n", "0"),
+        *(HERE / name for name in files),
+        *("-k", f"({OF_THE_COMPILER}) and not False"),
         env=environment,
         cwd=HERE.parents[1],
-        capture_output=True,
-        text=True,
         timeout=900,
     )
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-2000:]
@@ -80,11 +71,9 @@ def test_the_kernel_tests_pass(environment):
 
 
 def test_iterates_are_those_of_any_other_compiler(environment):
-    command = [sys.executable, "-c", ITERATES]
-    told = {"capture_output": True, "cwd": HERE.parents[1], "timeout": 600}
-    zig = subprocess.run(command, env=environment, **told)
+    zig = python("-c", ITERATES, env=environment, text=False)
     assert zig.stderr.split()[:1] == [b"True"], zig.stderr
-    usual = subprocess.run(command, env=os.environ | {"PYTHONPATH": str(HERE.parents[1])}, **told)
+    usual = python("-c", ITERATES, text=False)
     if b"False" not in usual.stderr:
         pytest.skip("there is no other compiler to compare with")
     assert len(zig.stdout) > 10_000

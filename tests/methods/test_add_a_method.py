@@ -7,6 +7,7 @@ import importlib.util
 import numpy as np
 import pytest
 from package_copy import blocks
+from toy_robots import grasp_of, near_home
 
 import casadi_ik as ik
 from casadi_ik import errors, registry
@@ -29,27 +30,23 @@ def page(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def near_home(page):
-    """Targets near home: (8, f, 3) points and normals."""
-    robot = page.robot
-    shift = 0.05 * np.random.default_rng(7).uniform(-1, 1, (8, len(robot.actuators)))
-    q = np.clip(robot.home + shift * (robot.upper - robot.lower), robot.lower, robot.upper)
-    return robot.contacts(q)
+def targets(page):
+    """(8, f, 3) points and normals."""
+    return page.robot.contacts(near_home(page.robot, np.random.default_rng(7), 8))
 
 
-def test_it_solves_a_batch_side_by_side(page, near_home):
+def test_it_solves_a_batch_side_by_side(page, targets):
     kernel = page.solver._engine.method.kernel
     assert not kernel.compiled or kernel.lanes > 1
-    batch = page.solver.solve_batch(*near_home)
+    batch = page.solver.solve_batch(*targets)
     assert batch.success.all(), batch.status_names
     assert (batch.iterations > 1).all()
     assert page.solver.parameters["options"] == {"damping": 0.2, "max_iterations": 300}
 
 
-def test_it_is_logged_and_stepped(page, near_home, tmp_path):
-    points, normals = (array[0] for array in near_home)
-    contacts = zip(page.robot.fingers, points, normals, strict=True)
-    grasp = ik.Grasp({finger: ik.Contact(point, normal) for finger, point, normal in contacts})
+def test_it_is_logged_and_stepped(page, targets, tmp_path):
+    points, normals = (array[0] for array in targets)
+    grasp = grasp_of(page.robot, points, normals)
     solution = page.solver.solve(grasp, log=tmp_path / "x.mcap")
     assert solution.success
     rows = ik.logs.open(tmp_path / "x.mcap").iterations().rows
@@ -59,16 +56,16 @@ def test_it_is_logged_and_stepped(page, near_home, tmp_path):
     np.testing.assert_allclose([record["q"] for record in records], rows["q"], atol=1e-9)
 
 
-def test_a_budget_that_is_used_up_is_a_status(page, near_home):
+def test_a_budget_that_is_used_up_is_a_status(page, targets):
     solver = ik.Solver(page.robot, page.DampedLeastSquares.name, options={"max_iterations": 1})
-    batch = solver.solve_batch(*near_home)
+    batch = solver.solve_batch(*targets)
     late = ~batch.success  # the verdict is on where the last step led
     assert late.any()
     assert set(batch.status_names[late]) == {"ITERATION_LIMIT"}
 
 
-def test_a_free_finger_is_refused_by_name(page, near_home):
-    points, normals = (array.copy() for array in near_home)
+def test_a_free_finger_is_refused_by_name(page, targets):
+    points, normals = (array.copy() for array in targets)
     points[3, 1] = normals[3, 1] = np.nan
     with pytest.raises(errors.InputError, match=r"'damped-least-squares' needs a contact .* row 3"):
         page.solver.solve_batch(points, normals)

@@ -7,6 +7,7 @@ import re
 import numpy as np
 import pytest
 from pinocchio_oracle import PinocchioRobot, assert_verdicts
+from toy_robots import near_home
 
 import casadi_ik as ik
 from casadi_ik import errors
@@ -39,10 +40,7 @@ def oracle(robot) -> PinocchioRobot:
 
 @pytest.mark.parametrize("method", ik.METHODS)
 def test_verdict_on_targets_near_home(robot, oracle, method):
-    rng = np.random.default_rng(11)
-    reach = 0.05 * (robot.upper - robot.lower)
-    q = robot.home + rng.uniform(-1, 1, (2, len(reach))) * reach
-    points, normals = robot.contacts(np.clip(q, robot.lower, robot.upper))
+    points, normals = robot.contacts(near_home(robot, np.random.default_rng(11), 2))
     if method.startswith("enhanced") and robot.name not in PLANAR:
         with pytest.raises(
             errors.UnsupportedError, match=rf"'{re.escape(robot.name)}': finger .* planar"

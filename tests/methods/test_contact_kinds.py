@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from toy_robots import near_home
 from trace_checks import Kept
 
 import casadi_ik as ik
@@ -21,9 +22,7 @@ TIGHT = ik.Tolerance(1e-4, 1e-3)
 
 def frames(robot, seed=3):
     """Contact frames (f, 4, 4) of a configuration near home."""
-    spread = 0.05 * (robot.upper - robot.lower)
-    q = robot.home + np.random.default_rng(seed).uniform(-1, 1, len(spread)) * spread
-    return robot.contact_frames(np.clip(q, robot.lower, robot.upper))
+    return robot.contact_frames(near_home(robot, np.random.default_rng(seed), 1)[0])
 
 
 def contact(kind: str, frame: np.ndarray) -> ik.Contact:

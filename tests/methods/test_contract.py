@@ -9,7 +9,7 @@ import pickle
 import numpy as np
 import pytest
 from pinocchio_oracle import PinocchioRobot, assert_verdicts
-from toy_robots import grasp_of
+from toy_robots import grasp_of, near_home
 
 import casadi_ik as ik
 from casadi_ik import registry
@@ -60,12 +60,7 @@ class Case:
 def case(request) -> Case:
     method, name = request.param
     robot = ik.load_robot(name)
-    rng = np.random.default_rng(7)
-    n = len(robot.actuators)
-    # Near enough to home for every method to have a fair chance, and different enough to be work.
-    spread = 0.05 * (robot.upper - robot.lower)
-    q = robot.home + rng.uniform(-1, 1, (8, n)) * spread
-    q = np.clip(q, robot.lower, robot.upper)
+    q = near_home(robot, np.random.default_rng(7), 8)
     case = Case(robot, method, q, *robot.contacts(q), {})
     try:
         case.solver()

@@ -68,16 +68,6 @@ def test_out_of_reach_the_contacts_come_near(robot, exact, rng):
     assert (batch.position_error.mean(axis=1) < np.linalg.norm(points.mean(axis=1), axis=1)).all()
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_robots_with_other_links_and_mounts(tmp_path, seed):
-    rng = np.random.default_rng(seed)
-    heights = dict(zip("1234567", rng.uniform(0.08, 0.35, 7).tolist(), strict=True))
-    mount = (rng.uniform(-0.1, 0.1, 3).tolist(), rng.uniform(-1.5, 1.5, 3).tolist())
-    robot = derived_robot(tmp_path, heights, mount)
-    solver = ik.Solver(robot, tolerance=EXACT, compiled=False)
-    assert solver.solve_batch(*robot.contacts(robot.random(rng, 12))).success.all()
-
-
 def test_optimisation_changes_no_bit(robot, rng, monkeypatch):
     # One after the other with an arm, many at once without: each compiles the shorter half.
     hand = ik.load_robot("ar10")

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-import yaml
-from toy_robots import copy_shipped_robot, grasp_of
+from robot_variants import part_of_the_arm
+from toy_robots import copy_shipped_robot, edited, grasp_of
 
 import casadi_ik as ik
 
@@ -84,37 +82,19 @@ def test_the_turn_it_is_held_in_costs_neither_alternatives_nor_free_answers(comp
 @pytest.mark.parametrize("prefer", ["limits", "q0"])
 def test_a_joint_of_an_arm_with_two_spheres_may_be_held_in_another_turn(tmp_path, prefer):
     path = copy_shipped_robot(tmp_path)
-    arm = yaml.safe_load((tmp_path / "arm.yaml").read_text())
-    for joint in arm["joints"]:
-        if joint["name"][-1] in "17":
+    with edited(tmp_path / "arm.yaml") as arm:
+        for joint in (arm["joints"][0], arm["joints"][6]):
             joint["limits"] = ["-360 deg", "360 deg"]
-    (tmp_path / "arm.yaml").write_text(yaml.safe_dump(arm))
     assert all_solved(ik.load_robot(path), {"lwr_joint_1": 4.2, "lwr_joint_7": -5.1}, prefer)
 
 
 @pytest.mark.parametrize("joints", [5, 3])
 def test_short_arms_and_wrists_are_placed_at_once(tmp_path, joints):
     """They bring a palm where it is asked for by chance only: what is near is good enough."""
-    robot = short_arm(tmp_path, joints)
+    robot = ik.load_robot(part_of_the_arm(tmp_path, slice(joints)))
     q = robot.random(np.random.default_rng(6), 25)
     for prefer in ("limits", "q0"):
         solver = ik.Solver(robot, compiled=False)
         batch = solver.solve_batch(*robot.contacts(q), q0=robot.home, prefer=prefer)
         assert batch.success.all()
         assert np.median(batch.phases["arm-placement"]) < 50
-
-
-def short_arm(folder: Path, joints: int) -> ik.ArmHand:
-    """The shipped arm-hand with the first joints of its arm."""
-    path = copy_shipped_robot(folder)
-    arm = yaml.safe_load((folder / "arm.yaml").read_text())
-    arm["joints"] = arm["joints"][:joints]
-    names = [joint["name"] for joint in arm["joints"]]
-    arm["tip"] = {**arm["tip"], "link": arm["joints"][-1]["child"]}
-    arm["home"] = {name: value for name, value in arm.get("home", {}).items() if name in names}
-    del arm["collision"]
-    (folder / "arm.yaml").write_text(yaml.safe_dump(arm))
-    whole = yaml.safe_load(path.read_text())
-    whole["home"] = {n: v for n, v in whole["home"].items() if n in names or n.startswith("bh")}
-    path.write_text(yaml.safe_dump(whole))
-    return ik.load_robot(path)

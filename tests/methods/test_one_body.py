@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from toy_robots import grasp_at, grasp_of
 
 import casadi_ik as ik
 
@@ -27,15 +28,8 @@ def targets(robot, count, near=False, seed=0):
 
 
 def grasp(robot, q, fingers=None):
-    points, normals = robot.contacts(q)
-    return ik.Grasp(
-        name="body",
-        contacts={
-            finger: ik.Contact(points[i], normals[i])
-            for i, finger in enumerate(robot.fingers)
-            if fingers is None or finger in fingers
-        },
-    )
+    contacts = grasp_at(robot, q).contacts
+    return ik.Grasp({name: contacts[name] for name in fingers or robot.fingers}, name="body")
 
 
 def misses(robot, q, points):
@@ -203,10 +197,7 @@ def held_box(robot):
     """What a body holds at home, in the frame of the contacts' middle."""
     points, normals = robot.contacts(robot.home)
     middle = points.mean(axis=0)
-    contacts = {
-        finger: ik.Contact(points[i] - middle, normals[i]) for i, finger in enumerate(robot.fingers)
-    }
-    return ik.Grasp(contacts), middle
+    return grasp_of(robot, points - middle, normals), middle
 
 
 def test_an_object_is_found_where_both_hands_reach_it():
@@ -291,8 +282,7 @@ def test_what_needs_one_palm_says_so(what):
         "grasps_of": lambda: solver.grasps_of(ik.load_surface("tennis_ball"), pose),
     }
     if what == "place":
-        points, normals = solver.robot.contacts(q)
-        contacts = dict(zip(solver.robot.fingers, map(ik.Contact, points, normals), strict=True))
+        contacts = grasp_at(solver.robot, q).contacts
         held = solver.choose([ik.Grasp(contacts, object_pose=pose)])[0]
         calls[what] = lambda: solver.place(held, pose, q)
     with pytest.raises(ik.errors.UnsupportedError, match=rf"{what}.*several palms \(left, right\)"):

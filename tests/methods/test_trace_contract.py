@@ -14,22 +14,23 @@ from samplers import (
     random_arm_targets,
     random_hands,
 )
-from trace_checks import Kept, check_trace
-
-import casadi_ik as ik
-from casadi_ik import logs
-from casadi_ik.answers.recorder import SolveBlock
-from casadi_ik.kernels.layout import Layout
-from casadi_ik.problem.trace import (
+from trace_checks import (
     ACCEPTED,
     ACTIVE_MASK,
     COST,
     DAMPING,
     RESTART,
     STANDARD,
+    Kept,
+    Layout,
+    SolveBlock,
     StandardField,
+    check_trace,
     trace_format,
 )
+
+import casadi_ik as ik
+from casadi_ik import logs
 
 REQUIRED = {field for field in STANDARD if field.required}
 PAPER = {"finger_step": "closed-form", "max_iterations": 400}

@@ -2,148 +2,17 @@
 
 from __future__ import annotations
 
-import casadi as ca
 import numpy as np
 import pytest
 from toy_robots import replace, write_coupled_robot
 
 import casadi_ik as ik
-from casadi_ik.papers.ipopt import (
-    EXACT,
-    LENGTH,
-    IpoptParameters,
-    WholeNlp,
-    contact_errors,
-)
-from casadi_ik.problem.contacts import usual
-
-
-class Program:
-    """The program on a robot, and targets that a configuration reaches."""
-
-    def __init__(self, robot, **options):
-        self.robot = robot
-        self.nlp = WholeNlp(
-            robot.description, IpoptParameters(**options), usual(len(robot.fingers))
-        )
-
-    def targets(self, q, weights=1.0):
-        points, normals = self.robot.contacts(q)
-        weights = np.broadcast_to(weights, (len(points), 2))
-        return self.nlp.parameters.pack({"points": points, "normals": normals, "weights": weights})
-
-    def solve(self, start, parameters):
-        return self.nlp.solve(start, parameters, self.robot.lower, self.robot.upper)
-
-
-@pytest.fixture(scope="module")
-def program(robot):
-    return Program(robot)
-
-
-@pytest.fixture(scope="module")
-def coupled(coupled_robot):
-    return Program(coupled_robot)
 
 
 def middle(robot, rng, part=0.6):
     """A configuration well within the limits."""
     centre, half = (robot.lower + robot.upper) / 2, (robot.upper - robot.lower) / 2
     return centre + part * half * rng.uniform(-1, 1, len(centre))
-
-
-def test_errors_of_a_residual_are_distances_and_angles(robot, program, rng):
-    q, goal = robot.random(rng, 2)
-    residual = np.array(program.nlp.residual(q, program.targets(goal))).ravel()
-    distances, angles = contact_errors(program.nlp.contacts, residual[None])
-    points, normals = robot.contacts(q)
-    target_points, target_normals = robot.contacts(goal)
-    expected = np.linalg.norm(points - target_points, axis=1)
-    assert expected.min() > LENGTH / 100
-    np.testing.assert_allclose(distances[0], expected, rtol=1e-12)
-    cosine = np.sum(normals * target_normals, axis=1)
-    np.testing.assert_allclose(angles[0], np.arccos(cosine), rtol=1e-9)
-
-
-@pytest.mark.parametrize("which", ["program", "coupled"])
-def test_derivatives_are_central_differences(which, request, rng):
-    """Gradient, Jacobian and the exact Hessian of the Lagrangian, couplings included."""
-    program = request.getfixturevalue(which)
-    robot, nlp = program.robot, program.nlp
-    targets = program.targets(middle(robot, rng))
-    p = np.concatenate([targets, middle(robot, rng), [0.1]])  # targets, start, pull
-    size = nlp.program["x"].numel()
-    metres = np.array([actuator.unit == "m" for actuator in robot.description.actuators])
-    scale = np.where(metres, robot.upper - robot.lower, 1.0)
-    x = np.concatenate([middle(robot, rng) / scale, rng.normal(size=size - len(scale))])
-    rows = nlp.program["g"].numel()
-    multipliers = rng.normal(size=rows)
-    lagrangian = nlp.program["f"] + ca.dot(ca.DM(multipliers), nlp.program["g"])
-    inputs = [nlp.program["x"], nlp.program["p"]]
-    hessian, gradient = ca.hessian(lagrangian, nlp.program["x"])
-    constraints = ca.Function("g", inputs, [nlp.program["g"]])
-    values = ca.Function("l", inputs, [lagrangian, ca.densify(gradient), ca.densify(hessian)])
-    jacobian = ca.Function("j", inputs, [ca.densify(ca.jacobian(nlp.program["g"], inputs[0]))])
-    value, slope, curvature = (np.array(out) for out in values(x, p))
-    assert np.abs(value).max() > 0.1
-    h = 1e-6
-    for i in range(size):
-        ahead, behind = (x + sign * h * np.eye(size)[i] for sign in (1, -1))
-        upper, lower = values(ahead, p), values(behind, p)
-        found = [
-            (np.array(a) - np.array(b)).ravel() / (2 * h) for a, b in zip(upper, lower, strict=True)
-        ]
-        np.testing.assert_allclose(slope[i], found[0], atol=1e-6)
-        np.testing.assert_allclose(curvature[:, i], found[1], atol=1e-6)
-        column = (constraints(ahead, p) - constraints(behind, p)) / (2 * h)
-        np.testing.assert_allclose(
-            np.array(jacobian(x, p))[:, i], np.array(column).ravel(), atol=1e-6
-        )
-
-
-def test_a_start_close_to_the_solution_stays_close(robot, program, rng):
-    """A small barrier and a slight pull: no detour along the arm's self-motion."""
-    rows, moved = [], []
-    for _ in range(10):
-        q = middle(robot, rng)
-        start = q + 1e-3 * rng.normal(size=len(q))
-        run = program.solve(start, program.targets(q))
-        assert run.cost < EXACT**2
-        rows.append(len(run.path))
-        moved.append(np.abs(run.q - start).max())
-    assert np.mean(rows) < 10
-    assert max(moved) < 0.02
-
-
-def test_joint_limits_are_kept(tmp_path, rng):
-    """A four-bar that stops before its motor does: only a constraint can keep it there."""
-    path = write_coupled_robot(tmp_path)
-    replace(
-        tmp_path / "parts" / "hand.yaml",
-        "limits: [-0.1, 1], source",
-        "limits: [-0.1, 0.25], source",
-    )
-    robot = ik.load_robot(path)
-    program = Program(robot)
-    # Over the motors' own strokes: the robot's ranges leave out what takes a joint past its limit.
-    q = rng.uniform(*robot.description.strokes, (20, len(robot.actuators)))
-    beyond = np.asarray(robot.joints(q)["left_3"]) > 0.25
-    assert 3 <= beyond.sum() <= 18
-    start = (robot.lower + robot.upper) / 2
-    slider = robot.actuators.index("screw_2")
-    start[slider] = robot.lower[slider] + 0.002
-    assert robot.joints(start)["left_3"] < 0.25
-    for goal, out in zip(q, beyond, strict=True):
-        run = program.solve(start, program.targets(goal))
-        assert run.inside
-        assert robot.joints(run.q)["left_3"] <= 0.25 + 1e-9
-        assert (run.cost > 1e-6) == out
-
-
-def test_numbers_that_are_not_finite_are_a_status(robot, program):
-    run = program.solve(robot.home, program.targets(robot.home) * 1e200)
-    assert run.status is not ik.Status.SOLVED
-    assert np.all(np.isfinite(run.q))
 
 
 TIGHT = ik.Tolerance(position=1e-6, angle=1e-6)
@@ -165,6 +34,49 @@ def cost(batch: ik.BatchSolution) -> np.ndarray:
     """Squared errors as the method weighs them: 100 mm like one unit of the normal."""
     chords = 2 * np.sin(batch.angle_error / 2)
     return np.nansum((batch.position_error / 0.1) ** 2 + chords**2, axis=1)
+
+
+def test_a_start_close_to_the_solution_stays_close(robot, rng):
+    """A small barrier and a slight pull: no detour along the arm's self-motion."""
+    q = np.array([middle(robot, rng) for _ in range(10)])
+    starts = q + 1e-3 * rng.normal(size=q.shape)
+    batch = ik.Solver(robot, "ipopt", TIGHT).solve_batch(*robot.contacts(q), q0=starts)
+    assert batch.success.all()
+    assert not batch.restarts.any()
+    assert batch.iterations.mean() < 10
+    assert np.abs(batch.q - starts).max() < 0.02
+
+
+def test_joint_limits_are_kept(tmp_path, rng):
+    """A four-bar that stops before its motor does: only a constraint can keep it there."""
+    path = write_coupled_robot(tmp_path)
+    replace(
+        tmp_path / "parts" / "hand.yaml",
+        "limits: [-0.1, 1], source",
+        "limits: [-0.1, 0.25], source",
+    )
+    robot = ik.load_robot(path)
+    # Over the motors' own strokes: the robot's ranges leave out what takes a joint past its limit.
+    q = rng.uniform(*robot.description.strokes, (20, len(robot.actuators)))
+    beyond = np.asarray(robot.joints(q)["left_3"]) > 0.25
+    assert 3 <= beyond.sum() <= 18
+    start = (robot.lower + robot.upper) / 2
+    slider = robot.actuators.index("screw_2")
+    start[slider] = robot.lower[slider] + 0.002
+    assert robot.joints(start)["left_3"] < 0.25
+    solver = ik.Solver(robot, "ipopt", TIGHT, options={"restarts": 0})
+    batch = solver.solve_batch(*robot.contacts(q), q0=start)
+    assert batch.limits_ok.all()
+    assert (np.asarray(robot.joints(batch.q)["left_3"]) <= 0.25 + 1e-9).all()
+    np.testing.assert_array_equal(batch.success, ~beyond)
+
+
+@pytest.mark.filterwarnings("ignore:overflow")
+def test_numbers_that_are_not_finite_are_a_status(robot):
+    points, normals = robot.contacts(robot.home[None])
+    batch = ik.Solver(robot, "ipopt", options={"restarts": 0}).solve_batch(1e200 * points, normals)
+    assert not batch.success.any()
+    assert np.isfinite(batch.q).all()
 
 
 @pytest.mark.parametrize("name", ROBOTS)

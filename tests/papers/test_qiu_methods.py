@@ -5,163 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from toy_robots import replace
+from trace_checks import Kept
 
 import casadi_ik as ik
 from casadi_ik import robots
-from casadi_ik.papers.qiu.enhanced import EnhancedStep
 from casadi_ik.papers.qiu.finger_step import finger_step_function
-from casadi_ik.papers.qiu.method import EnhancedMethod
-from casadi_ik.papers.qiu.parameters import QiuParameters
-from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.symbolic.planar_finger import planar_finger
 
-
-class Stepper:
-    """Takes the step graph's iterations one at a time."""
-
-    def __init__(self, robot, **options):
-        self.step = EnhancedStep(
-            robot.description, QiuParameters(finger_step="closed-form", **options)
-        )
-        self.graph = self.step.graph()
-
-    def state(self, q, phase=ik.answers.Phase.THUMB_REACHING):
-        return self.step.state.pack(
-            {"q": q, "phase": float(phase), "best": 1e9, "waited": 0.0, "reached": 0.0}
-        )
-
-    def parameters(self, points, normals, enforce_limits=False):
-        problems = TargetBatch(points[None], normals[None], ik.Tolerance(), enforce_limits)
-        values = self.step.parameter_values(problems)
-        return self.step.parameters.pack_rows(values, 1)[0]
-
-    def __call__(self, state, parameters):
-        after, record, status = self.graph.function(state, parameters)
-        return (
-            self.step.state.unpack(np.array(after).ravel()),
-            self.step.record.unpack(np.array(record).ravel()),
-            int(status),
-        )
-
-
-@pytest.fixture(scope="module")
-def stepper(robot):
-    return Stepper(robot)
-
-
-def pinch(robot, rng):
-    """A pinching hand on a random arm."""
-    q = robot.random(rng, 1)[0]
-    q[7:] = np.radians([10, 75, 15, 75, 15, 75, 15])
-    return q
-
-
-def test_reaching_moves_arm_and_thumb_alone(robot, stepper, rng):
-    points, normals = robot.contacts(pinch(robot, rng))
-    q = robot.home
-    after, record, status = stepper(stepper.state(q), stepper.parameters(points, normals))
-    assert status == ik.Status.RUNNING == record["status"]
-    np.testing.assert_array_equal(after["q"][[7, 10, 11, 12, 13]], q[[7, 10, 11, 12, 13]])
-    assert np.all(after["q"][:7] != q[:7])
-    assert after["reached"] == 1
-    assert np.isnan(record["sigma_closed_chain"])
-    assert np.isnan(record["palm_motion"]).all()
-    assert record["sigma_thumb"] > 0
-    assert record["sigma_palm"] > 0
-
-
-def test_reaching_ends_within_tolerance_without_another_step(robot, stepper):
-    q = robot.home.copy()
-    q[7] = 0.0  # without spread the contacts' own palm estimate is the palm
-    after, record, status = stepper(stepper.state(q), stepper.parameters(*robot.contacts(q)))
-    assert record["palm_error"] < 1e-9
-    assert after["phase"] == ik.answers.Phase.HAND_ALIGNMENT
-    assert status == ik.Status.RUNNING
-    np.testing.assert_array_equal(after["q"], q)
-
-
-@pytest.mark.parametrize(
-    ("waited", "reached"), [(9.0, 20.0), (0.0, 99.0)], ids=["patience", "iterations"]
-)
-def test_reaching_gives_up_after_a_while(robot, stepper, waited, reached):
-    points, normals = robot.contacts(robot.home)
-    parameters = stepper.parameters(points + 5.0, normals)
-    state = stepper.state(robot.home)
-    layout = stepper.step.state
-    state[layout.slice("best")] = 1e-3
-    state[layout.slice("waited")] = waited - 1
-    state[layout.slice("reached")] = reached - 1
-    after, _, _ = stepper(state, parameters)
-    assert after["phase"] == ik.answers.Phase.THUMB_REACHING
-    state[layout.slice("waited")] = waited
-    state[layout.slice("reached")] = reached
-    after, _, _ = stepper(state, parameters)
-    assert after["phase"] == ik.answers.Phase.HAND_ALIGNMENT
-    assert after["waited"] == 0
-
-
-def test_alignment_closes_the_fingers_first(robot, stepper, rng):
-    """With the arm in place the fingers' own step is all there is to do."""
-    goal = pinch(robot, rng)
-    q = goal.copy()
-    q[[7, 10, 11, 12, 13]] = robot.home[[7, 10, 11, 12, 13]]
-    after, record, status = stepper(
-        stepper.state(q, ik.answers.Phase.HAND_ALIGNMENT), stepper.parameters(*robot.contacts(goal))
-    )
-    assert status == ik.Status.SOLVED == record["status"]
-    assert record["phase"] == ik.answers.Phase.HAND_ALIGNMENT
-    np.testing.assert_allclose(record["q"], goal, atol=1e-6)
-    np.testing.assert_array_equal(after["q"], record["q"])
-    assert record["position_error"].max() < 1e-8
-
-
-def test_alignment_records_the_configuration_after_the_fingers(robot, stepper, rng):
-    """The row holds the finger step's own result and its errors."""
-    fingers = finger_step_function(robot.description, "closed-form")
-    points, normals = robot.contacts(pinch(robot, rng))
-    q = robot.home
-    after, record, status = stepper(
-        stepper.state(q, ik.answers.Phase.HAND_ALIGNMENT), stepper.parameters(points, normals)
-    )
-    palm = robot.palm(q)
-    local = palm[:3, :3].T @ (points[1:] - palm[:3, 3]).T
-    closed = np.array(fingers(q, local, palm[:3, :3].T @ normals[1:].T)).ravel()
-    assert status == ik.Status.RUNNING
-    np.testing.assert_allclose(record["q"], closed, atol=1e-12)
-    np.testing.assert_allclose(
-        record["position_error"],
-        np.linalg.norm(robot.contacts(closed)[0] - points, axis=1),
-        rtol=1e-10,
-    )
-    assert np.isnan(record["palm_error"])
-    assert record["condition_closed_chain"] >= 1
-    assert record["step_size"] == pytest.approx(np.abs(after["q"] - q).max(), rel=1e-9)
-    assert np.all(record["palm_motion"] > 0)
-
-
-def test_alignment_keeps_the_thumb(robot, stepper, rng):
-    """Thumb keeping brings a thumb that is off its contact back to it."""
-    goal = pinch(robot, rng)
-    points, normals = robot.contacts(goal)
-    q = goal.copy()
-    q[:7] += rng.normal(scale=2e-3, size=7)
-    before = np.linalg.norm(robot.contacts(q)[0][0] - points[0])
-    state = stepper.state(q, ik.answers.Phase.HAND_ALIGNMENT)
-    parameters = stepper.parameters(points, normals)
-    parameters[stepper.step.parameters.slice("position_tolerance")] = 1e-9
-    after, _, _ = stepper(state, parameters)
-    assert before > 1e-4
-    assert np.linalg.norm(robot.contacts(after["q"])[0][0] - points[0]) < 0.05 * before
-
-
-def test_step_cap(robot, rng):
-    capped = Stepper(robot, step_cap=0.01)
-    points, normals = robot.contacts(pinch(robot, rng))
-    after, record, _ = capped(capped.state(robot.home), capped.parameters(points, normals))
-    assert np.abs(after["q"] - robot.home).max() == pytest.approx(0.01, rel=1e-12)
-    assert record["step_size"] == pytest.approx(0.01, rel=1e-12)
-
-
+REACHING, ALIGNMENT = ik.answers.Phase.THUMB_REACHING, ik.answers.Phase.HAND_ALIGNMENT
 SPREAD = 7
 FLEXIONS = {"finger_2": (10, 11), "finger_3": (12, 13)}
 
@@ -349,8 +200,8 @@ def test_unsupported_hands(own_robot, coupled_robot):
         finger_step_function(coupled_robot.description, "closed-form")
     replace(
         own_robot.with_name("hand.yaml"),
-        "normal: [0, 1, 0], source: pad cad}\n  finger_3",
-        "normal: [0, 1, 1], source: pad cad}\n  finger_3",
+        "  finger_2: {link: bh_finger_2_link_3, xyz: [50 mm, 9.5 mm, 0], normal: [0, 1, 0]",
+        "  finger_2: {link: bh_finger_2_link_3, xyz: [50 mm, 9.5 mm, 0], normal: [0, 1, 1]",
     )
     with pytest.raises(
         ik.errors.UnsupportedError, match="finger 'finger_2' is not a planar finger"
@@ -377,20 +228,28 @@ def pinch_targets(robot, count, seed=0):
     return robot.contacts(q)
 
 
-def method(robot, compiled=True, **options):
-    options = {"finger_step": "closed-form"} | options
-    return EnhancedMethod(robot.description, QiuParameters(**options), compiled)
-
-
-def run(built, robot, points, normals, enforce=False, q0=None):
-    problems = TargetBatch(points, normals, ik.Tolerance(), enforce)
-    start = np.tile(robot.home if q0 is None else q0, (len(points), 1))
-    return built.run(problems, start, 0, True)
+def run(robot, points, normals, limits="ignore", q0=None, step="closed-form", **options):
+    """Batch and traces of a run from home."""
+    kept, options = Kept(), {"max_iterations": 600, **options}
+    solver = ik.Solver(robot, "enhanced-dls", limits=limits, finger_step=step, options=options)
+    batch = solver.solve_batch(points, normals, q0=q0, log=kept)
+    rows = np.concatenate([block.rows for block in kept.blocks])
+    return batch, np.split(rows, np.cumsum(batch.iterations)[:-1])
 
 
 @pytest.fixture(scope="module")
-def compiled(robot):
-    return method(robot, max_iterations=600)
+def pinches(robot):
+    """Targets, batch and traces of two arms for each pinch."""
+    points, normals = pinch_targets(robot, 2)
+    return points, normals, *run(robot, points, normals)
+
+
+def of_phase(traces, phase):
+    """Rows (k,) of all solves in a phase, and the numbers (k,) of their solves."""
+    rows = [trace[trace["phase"] == phase] for trace in traces]
+    numbers = np.repeat(np.arange(len(rows)), [len(each) for each in rows])
+    assert len(numbers) > 100
+    return np.concatenate(rows), numbers
 
 
 def test_most_pinches_are_solved(robot):
@@ -421,55 +280,114 @@ def test_choices_that_matter_and_that_do_not(robot):
     assert rate(palm_error="rotation-vector") > 0.8
 
 
-def test_ipopt_iterates_as_the_closed_form(robot, compiled):
-    """The paper's own finger step, one solve: the same way to the same place."""
+def test_reaching_moves_arm_and_thumb_alone(robot, pinches):
+    rows, _ = of_phase(pinches[3], REACHING)
+    rest = [SPREAD, *FLEXIONS["finger_2"], *FLEXIONS["finger_3"]]
+    assert (rows["q"][:, rest] == robot.home[rest]).all()
+    assert (np.ptp(rows["q"][:, :7], axis=0) > 0.1).all()
+    assert np.isnan(rows["sigma_closed_chain"]).all()
+    assert np.isnan(rows["palm_motion"]).all()
+    assert (rows["sigma_thumb"] > 0).all()
+    assert (rows["sigma_palm"] > 0).all()
+
+
+def test_reaching_ends_within_tolerance_without_another_step(robot):
+    """And with the arm in place the fingers' own step is all there is to do."""
+    goal = robot.home.copy()
+    goal[7:] = np.radians([0, 75, 15, 75, 15, 75, 15])  # no spread: the palm estimate is the palm
+    q0 = goal.copy()
+    q0[[10, 11, 12, 13]] = robot.home[[10, 11, 12, 13]]
+    points, normals = robot.contacts(goal[None])
+    batch, (trace,) = run(robot, points, normals, q0=q0)
+    assert batch.success.all()
+    assert trace["phase"].tolist() == [REACHING, ALIGNMENT]
+    assert trace["palm_error"][0] < 1e-9
+    np.testing.assert_array_equal(trace["q"][0], q0)
+    np.testing.assert_allclose(trace["q"][1], goal, atol=1e-6)
+
+
+def test_reaching_gives_up_after_a_while(robot):
+    """After 100 rows, or ten that are no better than the best before them."""
     points, normals = pinch_targets(robot, 1)
-    exact = run(compiled, robot, points[:1], normals[:1])
-    paper = run(
-        method(robot, finger_step="ipopt", max_iterations=600), robot, points[:1], normals[:1]
+    _, traces = run(robot, points + 5.0, normals, max_iterations=150)
+    counts = [np.sum(trace["phase"] == REACHING) for trace in traces]
+    assert min(counts) >= 10
+    assert max(counts) <= 100
+    assert all(trace["phase"][-1] == ALIGNMENT for trace in traces)
+
+
+def test_alignment_records_the_configuration_after_the_fingers(robot, closed, pinches):
+    """The row holds the finger step's own result."""
+    points, normals, _, traces = pinches
+    rows, numbers = of_phase(traces, ALIGNMENT)
+    assert np.isnan(rows["palm_error"]).all()
+    assert (rows["condition_closed_chain"] >= 1).all()
+    assert (rows["palm_motion"] > 0).all()
+    for q, number in list(zip(rows["q"], numbers, strict=True))[::50]:
+        palm = robot.palm(q)
+        local = palm[:3, :3].T @ (points[number, 1:] - palm[:3, 3]).T
+        found = call(closed, q, local, palm[:3, :3].T @ normals[number, 1:].T)
+        np.testing.assert_allclose(q, found, atol=1e-6)
+
+
+def test_alignment_keeps_the_thumb(pinches):
+    """A thumb that is off its contact is brought back to it at once, but where a solve is lost."""
+    errors = [trace["position_error"][trace["phase"] == ALIGNMENT, 0] for trace in pinches[3]]
+    kept = [each[1] < 0.05 * each[0] for each in errors if len(each) > 2]
+    assert len(kept) > 10
+    assert np.mean(kept) > 0.9
+
+
+def test_step_cap(robot):
+    _, traces = run(robot, *pinch_targets(robot, 1), step_cap=0.01, max_iterations=50)
+    rows, _ = of_phase(traces, REACHING)
+    assert rows["step_size"].max() == pytest.approx(0.01, rel=1e-6)
+    moved = np.abs(np.diff(traces[0]["q"][:5], axis=0))
+    assert moved.max() == pytest.approx(0.01, rel=1e-6)
+
+
+def test_ipopt_iterates_as_the_closed_form(robot):
+    """The paper's own finger step, one solve: the same way to the same place."""
+    points, normals = (array[:1] for array in pinch_targets(robot, 1))
+    (exact, (ours,)), (paper, (theirs,)) = (
+        run(robot, points, normals, step=step) for step in ("closed-form", "ipopt")
     )
     assert exact.status[0] == paper.status[0] == ik.Status.SOLVED
     np.testing.assert_array_equal(exact.iterations, paper.iterations)
-    np.testing.assert_allclose(exact.trace[0]["q"], paper.trace[0]["q"], atol=1e-6)
+    np.testing.assert_allclose(ours["q"], theirs["q"], atol=1e-6)
 
 
-def test_enforced_limits_hold_in_every_iteration(robot, compiled):
-    points, normals = pinch_targets(robot, 2)
-    outcome = run(compiled, robot, points, normals, enforce=True)
-    q = np.concatenate([trace["q"] for trace in outcome.trace])
+def test_enforced_limits_hold_in_every_iteration(robot, pinches):
+    batch, traces = run(robot, *pinches[:2], limits="enforce")
+    q = np.concatenate([*(trace["q"] for trace in traces), batch.q])
     assert np.all(q >= robot.lower - 1e-12)
     assert np.all(q <= robot.upper + 1e-12)
     assert np.any(q == robot.upper) or np.any(q == robot.lower), "limits were never met"
-    assert np.all(outcome.q >= robot.lower - 1e-12)
-    assert np.all(outcome.q <= robot.upper + 1e-12)
 
 
-def test_ignored_limits_are_overstepped_by_arm_and_thumb_only(robot, compiled):
-    outcome = run(compiled, robot, *pinch_targets(robot, 2))
-    q = np.concatenate([trace["q"] for trace in outcome.trace])
+def test_ignored_limits_are_overstepped_by_arm_and_thumb_only(robot, pinches):
+    q = np.concatenate([trace["q"] for trace in pinches[3]])
     outside = np.any((q < robot.lower - 1e-3) | (q > robot.upper + 1e-3), axis=0)
     assert outside[:7].any()
     assert not outside[[7, 10, 11, 12, 13]].any(), "eq. (5) has the fingers' limits in it"
 
 
-def test_a_start_beyond_enforced_limits_is_moved_to_them(robot, compiled):
-    points, normals = pinch_targets(robot, 1)
+def test_a_start_beyond_enforced_limits_is_moved_to_them(robot):
+    points, normals = (array[:1] for array in pinch_targets(robot, 1))
     q0 = robot.home.copy()
     q0[[1, 8]] = [robot.upper[1] + 1.0, -3.0]
-    outcome = run(compiled, robot, points[:1], normals[:1], enforce=True, q0=q0)
-    np.testing.assert_array_equal(outcome.trace[0]["q"][0], np.clip(q0, robot.lower, robot.upper))
-    outcome = run(compiled, robot, points[:1], normals[:1], enforce=False, q0=q0)
-    np.testing.assert_array_equal(outcome.trace[0]["q"][0], q0)
+    for limits, first in (("enforce", np.clip(q0, robot.lower, robot.upper)), ("ignore", q0)):
+        _, (trace,) = run(robot, points, normals, limits=limits, q0=q0)
+        np.testing.assert_array_equal(trace["q"][0], first)
 
 
-def test_phases_in_their_order_end_at_the_first_configuration_that_solves(robot, compiled):
-    outcome = run(compiled, robot, *pinch_targets(robot, 2))
-    for row, trace in enumerate(outcome.trace):
-        phases = trace["phase"].astype(int)
-        assert set(phases) <= {ik.answers.Phase.THUMB_REACHING, ik.answers.Phase.HAND_ALIGNMENT}
-        assert np.all(np.diff(phases) >= 0), "thumb reaching comes first and is not returned to"
-        if outcome.status[row] == ik.Status.SOLVED:
-            before = trace[:-1][phases[:-1] == ik.answers.Phase.HAND_ALIGNMENT]
+def test_phases_in_their_order_end_at_the_first_configuration_that_solves(pinches):
+    *_, batch, traces = pinches
+    for solved, trace in zip(batch.success, traces, strict=True):
+        assert set(trace["phase"]) <= {REACHING, ALIGNMENT}
+        assert np.all(np.diff(trace["phase"].astype(int)) >= 0), "reaching is not returned to"
+        if solved:
+            before = trace[:-1][trace["phase"][:-1] == ALIGNMENT]
             off = before["position_error"].max(axis=1) > 5e-3
             assert (off | (before["angle_error"].max(axis=1) > np.radians(3))).all()
 

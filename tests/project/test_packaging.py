@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
 import pytest
 import yaml
+from processes import python
 
 import casadi_ik as ik
 
@@ -35,7 +34,7 @@ def test_the_core_asks_for_no_second_opinion():
 )
 def test_what_is_imported(program):
     more = f"; import sys; print(*(x for x in {ON_DEMAND!r}.split() if x in sys.modules))"
-    done = subprocess.run([sys.executable, "-c", program + more], capture_output=True, text=True)
+    done = python("-c", program + more)
     assert (done.stdout.strip(), done.stderr, done.returncode) == ("", "", 0)
 
 

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 from pathlib import Path
+
+from processes import python
 
 STUDIES = Path(__file__).parents[2] / "studies"
 
 
 def test_the_study_runs_and_says_what_the_committed_report_says(tmp_path):
-    run = subprocess.run(
-        [sys.executable, STUDIES / "ar10_gains.py", "--goals", "4", "--out", tmp_path],
-        capture_output=True,
-        text=True,
-    )
+    run = python(STUDIES / "ar10_gains.py", "--goals", "4", "--out", tmp_path)
     assert run.returncode == 0, run.stderr
     figures = {"index_pose.png", "relative_pose.png", "offsets.png"}
     assert {path.name for path in tmp_path.iterdir()} == {"report.md", *figures}

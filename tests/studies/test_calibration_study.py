@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from processes import python
 
 pytestmark = pytest.mark.usefixtures("usual_flags")
 
@@ -22,11 +21,7 @@ def coverages(report: str) -> list[float]:
 
 
 def test_the_study_runs(tmp_path):
-    run = subprocess.run(
-        [sys.executable, STUDIES / "calibration.py", "--hands", "2", *MORE, "--out", tmp_path],
-        capture_output=True,
-        text=True,
-    )
+    run = python(STUDIES / "calibration.py", "--hands", "2", *MORE, "--out", tmp_path)
     assert run.returncode == 0, run.stderr
     written = {path.name for path in tmp_path.iterdir()}
     assert written == {"report.md", "error_bars.png", "singular_values.png"}

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from processes import python
 
 pytestmark = pytest.mark.usefixtures("usual_flags")
 
@@ -16,12 +15,12 @@ STUDIES = Path(__file__).parents[2] / "studies"
 
 def test_the_study_agrees_with_itself_and_the_committed_report_has_no_false_alarm(tmp_path):
     kept = tmp_path / "kept.npz"
-    small = [sys.executable, STUDIES / "diagnosis.py", "--impossible", "3"]
+    small = [STUDIES / "diagnosis.py", "--impossible", "3"]
     for more in (
         ["--count", "0", "--keep", kept, "--report", tmp_path],
         ["--count", "20", "--bad-starts", "20", "--against", kept, "--report", tmp_path],
     ):
-        run = subprocess.run([*small, *more], capture_output=True, text=True)
+        run = python(*small, *more)
         assert run.returncode == 0, run.stderr
     report = (tmp_path / "report.md").read_text()
     table = report.partition("## Against")[2]

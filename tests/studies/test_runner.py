@@ -18,12 +18,12 @@ import polars as pl
 import pytest
 import small_study
 from dask_processes import scheduler_process, worker_process
+from processes import python
 from runner.report import interval_text, mean_metric, median_metric, rate_metric
 from runner.study import STUDY_FILE, claim, missing, read_results, run
 
 import casadi_ik as ik
-from casadi_ik.batches import backend
-from casadi_ik.logs import Keep
+from casadi_ik import batches
 
 STUDY = small_study.STUDY
 FOLDERS = os.pathsep.join((str(Path(small_study.__file__).parent), *sys.path))
@@ -78,13 +78,13 @@ def scheduler() -> Iterator[str]:
 
 
 def test_a_dask_cluster_without_workers_is_refused(scheduler, tmp_path, monkeypatch):
-    monkeypatch.setattr(backend, "PATIENCE", 1)
+    monkeypatch.setattr(batches.backend, "PATIENCE", 1)
     with pytest.raises(ik.errors.InputError, match="found no worker within 1 s"):
         run(STUDY, tmp_path, dask=scheduler)
 
 
 def test_no_dask_scheduler_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(backend, "PATIENCE", 1)
+    monkeypatch.setattr(batches.backend, "PATIENCE", 1)
     with pytest.raises(ik.errors.InputError, match="found no scheduler"):
         run(STUDY, tmp_path, dask="tcp://127.0.0.1:9")
 
@@ -92,11 +92,7 @@ def test_no_dask_scheduler_is_refused(tmp_path, monkeypatch):
 def test_a_dask_cluster_needs_the_installed_package_only(done, scheduler, tmp_path):
     """Scheduler and worker as the documentation starts them; the study as a program."""
     with worker_process(scheduler):
-        command = [sys.executable, str(Path(small_study.__file__)), str(tmp_path), scheduler]
-        environment = os.environ | {"PYTHONPATH": FOLDERS}
-        ended = subprocess.run(
-            command, env=environment, capture_output=True, text=True, timeout=120
-        )
+        ended = python(small_study.__file__, tmp_path, scheduler, path=FOLDERS)
         assert ended.returncode == 0, ended.stderr
     assert contents(tmp_path).equals(contents(done))
     assert len(list(tmp_path.rglob("*.mcap"))) == len(list(STUDY.blocks()))
@@ -115,7 +111,7 @@ def test_a_worker_with_another_version_is_named(monkeypatch):
     with pytest.raises(
         ik.errors.InputError, match=r"tcp://worker:1 has .*casadi-ik 0\.0\.1.*expected"
     ):
-        backend._check(Client(), "tcp://here:1", backend.PACKAGES)  # type: ignore[arg-type]
+        batches.backend._check(Client(), "tcp://here:1", batches.backend.PACKAGES)  # type: ignore[arg-type]
 
 
 def test_killed_at_random_moments_nothing_is_lost_or_doubled(done, tmp_path):
@@ -165,13 +161,14 @@ def test_as_many_targets_as_are_asked_for(done, tmp_path):
 
 
 def test_a_changed_seed_is_one_line(done):
-    script = f"from runner import report, study; import small_study as s, dataclasses, pathlib; report.program(lambda: study.run(dataclasses.replace(s.STUDY, seed=1), pathlib.Path({str(done)!r})))"  # noqa: E501
-    ended = subprocess.run(
-        [sys.executable, "-c", script],
-        env=os.environ | {"PYTHONPATH": FOLDERS},
-        capture_output=True,
-        text=True,
-    )
+    script = f"""
+        import dataclasses, pathlib
+        from runner import report, study
+        import small_study as s
+        changed = dataclasses.replace(s.STUDY, seed=1)
+        report.program(lambda: study.run(changed, pathlib.Path({str(done)!r})))
+    """
+    ended = python("-c", script, path=FOLDERS)
     assert ended.returncode == 2
     assert ended.stderr.count("\n") == 1
     assert "seed: results made with 0 are here, this study has 1" in ended.stderr
@@ -180,7 +177,7 @@ def test_a_changed_seed_is_one_line(done):
 def test_the_logs_of_a_study_are_one_log(tmp_path):
     """Of two settings, each block counting from 0 and with a sample of its own."""
     study = dataclasses.replace(STUDY, sets=STUDY.sets[:1], count=8)
-    run(study, tmp_path / "study", log=Keep())
+    run(study, tmp_path / "study", log=ik.logs.Keep())
     merged = ik.logs.merge_logs(tmp_path / "study", tmp_path / "all.mcap")
     assert merged.shards == 4
     for log in map(ik.logs.open, (tmp_path / "study", merged.path)):
@@ -193,7 +190,7 @@ def test_the_logs_of_a_study_are_one_log(tmp_path):
 
 def test_a_log_per_block_keeps_what_is_asked_for(done, tmp_path):
     study = dataclasses.replace(STUDY, settings=STUDY.settings[:1])
-    run(study, tmp_path, log=Keep(failed=True, singular=False, sample=0.25))
+    run(study, tmp_path, log=ik.logs.Keep(failed=True, singular=False, sample=0.25))
     assert contents(tmp_path, study).equals(contents(done, study))
     logs = sorted(tmp_path.rglob("*.mcap"))
     assert len(logs) == len(list(tmp_path.rglob("*.parquet"))) == len(list(study.blocks()))

@@ -12,7 +12,6 @@ from casadi_ik.methods.thumb_first.closed_chain_step import (
     THUMB_DAMPING,
     Linear,
     Room,
-    contact_errors,
     freezing,
     linearised,
     quadratic_program,
@@ -145,24 +144,6 @@ def test_palm_has_rank_three_and_link_6_rank_four(chain, robot, rng):
         assert ranks(values["J_cc"]) == expected
 
 
-def test_orientation_has_nothing_left_of_the_palms_position(robot, rng):
-    """With the palm as platform |J_o N_p| vanishes; with link 6 it does not."""
-    for platform, vanishes in (("palm", True), ("arm-leg", False)):
-        q = ca.SX.sym("q", 14)
-        closed = closed_chain(
-            actuated(robot.description, q), split(robot.description), 1.0, platform
-        )
-        f = ca.Function("f", [q], [closed.J_cc, closed.H])
-        remainders = []
-        for row in robot.random(rng, 40):
-            J, H = (np.array(x) for x in f.call([ca.DM(row)]))
-            if np.abs(H).max() < 50:
-                null = np.eye(4) - np.linalg.pinv(J[:3], rcond=1e-9) @ J[:3]
-                remainders.append(np.linalg.norm(J[3:] @ null) / np.linalg.norm(J[3:]))
-        assert len(remainders) > 5
-        assert (max(remainders) < 1e-8) if vanishes else (np.median(remainders) > 1e-2)
-
-
 def matrices(robot, platform="palm"):
     """``q -> C, J_cc, motor steps, thumb's linear and angular rows, normal`` as a Function."""
     n = len(robot.actuators)
@@ -186,28 +167,8 @@ def test_pivoting_finds_rank_and_independent_columns(rng):
         assert len(passive) == rank
         assert mobility(C) == k - rank
         assert np.linalg.matrix_rank(C[:, list(passive)]) == rank
-
-
-def test_pivoting_of_nothing():
     assert pivoted(np.zeros((6, 3))) == ((0, 1, 2), ())
     assert mobility(np.zeros((6, 0))) == 0
-
-
-def test_pivoting_conditions_better_than_a_fixed_choice(robot, rng):
-    """H_p over random configurations, lengths in 0.1 m: the paper's set against pivoting."""
-    parts, evaluate = matrices(robot)
-    fixed = [i for i, column in enumerate(parts.columns) if column in parts.passive]
-    paper, ours, rates = [], [], []
-    for q in robot.random(rng, 400):
-        C = evaluate(q)[0]
-        active, passive = (list(columns) for columns in pivoted(C))
-        paper.append(np.linalg.cond(C[:, fixed]))
-        ours.append(np.linalg.cond(C[:, passive]))
-        rates.append(np.abs(np.linalg.solve(C[:, passive], C[:, active])).max())
-    assert np.median(paper) > 3 * np.median(ours)
-    assert np.percentile(paper, 90) > 10 * np.percentile(ours, 90)
-    assert np.percentile(ours, 99) < 100
-    assert np.percentile(rates, 99) < 2
 
 
 @pytest.fixture(scope="module", params=[1, 2, 3, 4])
@@ -293,14 +254,13 @@ ROWS = ContactRows(usual(3))
 
 @pytest.fixture(scope="module")
 def problem(robot):
-    """``(q, points, normals, weights) -> linear problem, residuals`` as a Function."""
+    """``(q, points, normals, weights) -> linear problem`` as a Function."""
     q, points = ca.SX.sym("q", 14), ca.SX.sym("points", 3, 3)
     normals, weights = ca.SX.sym("normals", 3, 3), ca.SX.sym("weights", 3, 2)
     p = {"points": points, "normals": normals, "weights": weights}
     linear = linearised(robot.description, ROWS, q, p)
     outputs = [linear.thumb, linear.thumb_error, linear.others, linear.others_error]
-    residuals = ca.vertcat(*map(ca.vertcat, *contact_errors(robot.description, ROWS, q, p)))
-    return ca.Function("problem", [q, points, normals, weights], [*outputs, residuals])
+    return ca.Function("problem", [q, points, normals, weights], outputs)
 
 
 @pytest.fixture(scope="module")
@@ -320,40 +280,8 @@ def cases(robot, rng, problem, count):
         q[7:] = np.where(rng.random(7) < 0.3, robot.lower[7:] + 0.02, q[7:])
         goal = np.clip(q + rng.uniform(-0.2, 0.2, 14), robot.lower, robot.upper)
         points, normals = robot.contacts(goal)
-        *linear, _ = problem(q, points, normals, np.ones((3, 2)))
+        linear = problem(q, points, normals, np.ones((3, 2)))
         yield q, [np.array(x) for x in linear]
-
-
-def test_rows_are_the_slopes_of_the_residuals(robot, problem, rng):
-    """Five rows of the thumb and ten of the others against central differences at the target."""
-    for q in robot.random(rng, 5):
-        points, normals = robot.contacts(q)
-        target = (points, normals, np.ones((3, 2)))
-        thumb, _, others, _, _ = (np.array(x) for x in problem(q, *target))
-        slopes = np.array(
-            [
-                (np.array(problem(q - 1e-6 * e, *target)[4]) - problem(q + 1e-6 * e, *target)[4])
-                / 2e-6
-                for e in np.eye(14)
-            ]
-        )[:, :, 0].T
-        # Three rows of position and three of the normal's rotation vector per finger; two rows
-        # across the normal hold the same.
-        gram = slopes.T @ slopes
-        rows = np.vstack([thumb, others])
-        np.testing.assert_allclose(rows.T @ rows, gram, rtol=1e-6, atol=1e-5)
-
-
-def test_free_contacts_have_no_rows(robot, problem, rng):
-    points, normals = robot.contacts(robot.random(rng, 1)[0])
-    weights = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
-    thumb, thumb_error, others, others_error, _ = problem(robot.home, points, normals, weights)
-    assert not np.array(thumb).any()
-    assert not np.array(thumb_error).any()
-    assert not np.array(others)[3:5].any()
-    assert not np.array(others_error)[3:5].any()
-    assert np.array(others)[:3].any()
-    assert np.array(others)[5:].any()
 
 
 def test_unlimited_both_take_the_same_step(robot, problem, steps, rng):
@@ -396,15 +324,6 @@ def test_both_keep_to_the_limits(robot, problem, steps, rng):
     assert fixed > 10
     # Joints once fixed are not let go again, which the program may do: seldom another answer.
     assert agree > 0.7 * total
-
-
-def test_a_motor_that_cannot_move_is_held(robot, problem, steps, rng):
-    q, linear = next(cases(robot, rng, problem, 1))
-    lower, upper = robot.lower - q, robot.upper - q
-    lower[3] = upper[3] = 0.0
-    step, held = steps[0](*linear, lower, upper, 0.03)
-    assert float(step[3]) == 0.0
-    assert float(held[3]) == 1.0
 
 
 def test_units_of_sliders(robot, coupled_robot):

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from commands import main
+from commands import main, shown
 from PIL import Image
 
 import casadi_ik as ik
-from casadi_ik import viewing
-from casadi_ik.cli.table import parse
-from casadi_ik.cli.view import opened
-from casadi_ik.errors import InputError
-from casadi_ik.views import draw_grasps
+from casadi_ik import viewing, views
 
 ROBOT, PLACE = "panda+panda_hand", ("0.5", "0.1", "0.051", "0", "0", "0")
 ASKED = ("grasp", "tomato_soup_can", "--robot", ROBOT, "--scene", "table", "--limit", "6")
@@ -32,10 +28,11 @@ def found(solver):
 
 @pytest.mark.opengl
 def test_a_picture_has_a_panel_for_each_of_the_best(solver, found, tmp_path):
-    figure = draw_grasps(solver.robot, found, tmp_path / "best.png", scene=solver.scene, most=4)
+    path = tmp_path / "best.png"
+    figure = views.draw_grasps(solver.robot, found, path, scene=solver.scene, most=4)
     assert len(figure.axes) == 4
     assert f"load {found[0].load:.2f}" in figure.axes[0].get_title()
-    image = np.asarray(Image.open(tmp_path / "best.png"))[..., :3]
+    image = np.asarray(Image.open(path))[..., :3]
     for axes in figure.axes:  # there is something in every panel
         (panel,) = axes.images
         assert np.asarray(panel.get_array()).std() > 0.05
@@ -43,8 +40,8 @@ def test_a_picture_has_a_panel_for_each_of_the_best(solver, found, tmp_path):
 
 
 def test_nothing_is_no_picture(solver):
-    with pytest.raises(InputError, match="there is no grasp to draw"):
-        draw_grasps(solver.robot, [])
+    with pytest.raises(ik.errors.InputError, match="there is no grasp to draw"):
+        views.draw_grasps(solver.robot, [])
 
 
 @pytest.mark.opengl
@@ -57,7 +54,7 @@ def test_a_command_from_an_object_to_a_picture_and_a_page(tmp_path, capsys):
     assert str(out) in said
     assert str(picture) in said
     assert Image.open(picture).width > 1000
-    viewer = opened(parse(["view", str(out), "--scene", "table"])[1])
+    viewer = shown(str(out), "--scene", "table")
     try:
         offered = viewer.page.offered
         assert len(offered.shown) == 6

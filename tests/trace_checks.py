@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 import casadi_ik as ik
 from casadi_ik.answers.recorder import SolveBlock
+from casadi_ik.kernels.layout import Layout  # noqa: F401 (for test_trace_contract)
 from casadi_ik.problem.status import Phase, Status
-from casadi_ik.problem.trace import (
+from casadi_ik.problem.trace import (  # noqa: F401
     ACCEPTED,
     ACTIVE_MASK,
     ANGLE_ERROR,
@@ -25,9 +26,12 @@ from casadi_ik.problem.trace import (
     PHASE,
     POSITION_ERROR,
     RESTART,
+    STANDARD,
     STATUS,
     STEP_SIZE,
     Q,
+    StandardField,
+    trace_format,
 )
 
 LENGTH = 0.1

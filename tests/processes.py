@@ -1,0 +1,27 @@
+"""Python in processes of its own."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+
+
+def python(*words: object, path: object = ROOT, **options: Any) -> subprocess.CompletedProcess[str]:
+    """What a program said and how it ended: a file, `-m` and a module, or `-c` and its text.
+
+    Args:
+        words: Of its command line; a text may be indented.
+        path: Where it finds casadi_ik, and what else it imports.
+        options: As `subprocess.run` has them; `env` is what differs from this process.
+    """
+    changed = {"PYTHONPATH": str(path)} | options.pop("env", {})
+    asked = {"capture_output": True, "text": True, "timeout": 600, "env": os.environ | changed}
+    return subprocess.run(
+        [sys.executable, *(textwrap.dedent(str(word)) for word in words)], **asked | options
+    )
