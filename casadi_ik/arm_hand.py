@@ -297,7 +297,7 @@ class ArmHand(Shown):
         """
         sides = self.description.sides
         if side is not None:
-            asked = self.description.side(side)
+            asked = self.description.side_named(side)
             return self.links(q)[asked.palm_link] @ asked.palm_placement
         if sides:
             names = ", ".join(one.name for one in sides)

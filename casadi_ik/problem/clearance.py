@@ -95,6 +95,11 @@ class CollisionQuery:
         return CollisionQuery(self.kernel, self.table.held, self.poses, self.margin)
 
     @property
+    def swung(self) -> CollisionQuery:
+        """With the pairs alone that the arm decides which holds the palm."""
+        return CollisionQuery(self.kernel, self.table.swung, self.poses, self.margin)
+
+    @property
     def robot_alone(self) -> CollisionQuery:
         """With the pairs alone of the robot with itself."""
         return CollisionQuery(self.kernel, self.table.of_robot, self.poses, self.margin)

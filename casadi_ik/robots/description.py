@@ -327,6 +327,18 @@ class RobotDescription:
             for side in self.sides
         )
 
+    def side_named(self, name: str) -> Side:
+        """A side of a body.
+
+        Raises:
+            UnknownNameError: There is none; the message lists the sides.
+        """
+        for side in self.sides:
+            if side.name == name:
+                return side
+        sides = ", ".join(side.name for side in self.sides) or "none"
+        raise UnknownNameError(f"robot {self.name!r} has no side {name!r}; its sides: {sides}")
+
     def side(self, name: str, carried: bool = False) -> RobotDescription:
         """An arm-hand of a body by itself, as it stands on the link that ends the trunk.
 
@@ -339,10 +351,7 @@ class RobotDescription:
         Raises:
             UnknownNameError: There is none; the message lists the sides.
         """
-        found = next((side for side in self.sides if side.name == name), None)
-        if found is None:
-            sides = ", ".join(side.name for side in self.sides) or "none"
-            raise UnknownNameError(f"robot {self.name!r} has no side {name!r}; its sides: {sides}")
+        found = self.side_named(name)
         root, arm = self.trunk_link, found.arm
         if carried:
             root, arm = self.root, (*self.trunk, *arm)

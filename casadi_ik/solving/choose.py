@@ -471,13 +471,14 @@ class _Part:
     ) -> tuple[Array, NDArray[np.intp]]:
         arms = self.finder.arm_search
         assert arms is not None
-        query = None if self.query is None else self.query.rows(owner)
+        query = None if self.query is None else self.query.swung.rows(owner)
         bounds = self.limits.first.lower, self.limits.first.upper
         starts = self.starts[owner]
         found = arms.choose(q, starts, bounds, self.prefer, query, surplus, True, closer)
         if query is None or self.prefer != CLEARANCE:
             return found.q, found.owner
-        free = query.rows(found.owner).free(found.q)
+        assert self.query is not None
+        free = self.query.rows(owner[found.owner]).free(found.q)
         return found.q[free], found.owner[free]
 
     def _further(

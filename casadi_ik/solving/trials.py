@@ -17,7 +17,6 @@ from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import deviations, judge
-from casadi_ik.robots.poses import link_poses
 from casadi_ik.symbolic.even_spread import evenly
 
 NEVER = 1e-12
@@ -31,6 +30,9 @@ AT_ENDS = 2.0
 
 ALIKE = 1.001
 """Two values of a row that differ by less than this factor count as the same."""
+
+PALMS = np.array([0.1, 0.1, 0.1, 2.0])
+"""What turns [rad] and shifts [m] of a palm that is free count as, beside parts of ranges."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,6 +226,7 @@ def other_trunks(
     trials: Subproblems,
     targets: TargetBatch,
     q: Array,
+    palms: Array,
     owner: NDArray[np.intp],
     first: int,
     count: int,
@@ -235,35 +238,47 @@ def other_trunks(
     Args:
         trials: The loop.
         targets: k targets.
-        q: (m, n) answers.
+        q: (m, n) configurations whose hands are kept.
+        palms: (m, s, 4, 4) poses of the palms.
         owner: (m,) the target of each.
         first: Number of the first trunk.
         count: How many.
 
     Returns:
-        (m count, n) where the loop ended, and the target of each.
+        (m count, n) where the loop ended, and the place in q of each.
     """
-    robot, body = trials.robot, trials.robot.description
-    mine = np.repeat(owner, count)
-    starts = np.repeat(q, count, axis=0)
-    hands = starts[:, list(body.hand_actuators)]
-    states, parameters = trials.posture_rows(targets.rows(mine), starts, hands)
+    body = trials.robot.description
+    of = np.repeat(np.arange(len(q)), count)
     moving = [*body.trunk_actuators, *(place for arm, _ in body.side_actuators for place in arm)]
     spread = evenly(first + count, len(moving))[first:]
     spread[1::2] = np.clip((spread[1::2] - 0.5) * AT_ENDS + 0.5, 0.0, 1.0)
-    limits = trials.limits(targets).of(mine)
-    lower, upper = (np.broadcast_to(ends, starts.shape) for ends in (limits.lower, limits.upper))
-    begun = starts.copy()
+    limits = trials.limits(targets).of(owner[of])
+    begun = q[of]
+    lower, upper = (np.broadcast_to(ends, begun.shape) for ends in (limits.lower, limits.upper))
     steps = np.tile(spread, (len(q), 1))
     begun[:, moving] = lower[:, moving] + steps * (upper - lower)[:, moving]
-    values: dict[str, Array] = {name: np.asarray(at) for name, at in robot.joints(q).items()}
-    poses = link_poses(body.root, body.joints, values)
     placed = np.tile(np.arange(first, first + count) % 4 != 3, len(q))
+    phase = np.where(placed, float(Phase.ARM_PLACEMENT), float(Phase.TRUNK))
+    return carried(trials, targets, begun, palms[of], owner[of], phase), of
+
+
+def carried(
+    trials: Subproblems,
+    targets: TargetBatch,
+    q: Array,
+    palms: Array,
+    owner: NDArray[np.intp],
+    phase: float | Array,
+) -> Array:
+    """Configurations (m, n) in which trunk and arms, from q on, carry palms (m, s, 4, 4)."""
+    robot = trials.robot.description
+    hands = q[:, list(robot.hand_actuators)]
+    states, parameters = trials.posture_rows(targets.rows(owner), q, hands)
     wanted: dict[str, Array | float] = {
-        "q": begun,
-        "best_q": starts,
-        "phase": np.where(placed, float(Phase.ARM_PLACEMENT), float(Phase.TRUNK)),
-        "side": len(body.sides),
+        "q": q,
+        "best_q": q,
+        "phase": phase,
+        "side": len(robot.sides),
         "first": LAST,
         "farthest": LAST,
         "fits": 1.0,
@@ -271,16 +286,18 @@ def other_trunks(
         "tried": LAST,
         "again": 1.0,
     }
-    for place, side in enumerate(body.sides):
-        palm = np.broadcast_to(poses[side.palm_link] @ side.palm_placement, (len(q), 4, 4))
-        rotation = palm[:, :3, :3].reshape(len(q), 9)
-        wanted[f"palm_rotation_{place}"] = np.repeat(rotation, count, axis=0)
-        wanted[f"palm_origin_{place}"] = np.repeat(palm[:, :3, 3], count, axis=0)
+    for place in range(len(robot.sides)):
+        wanted[f"palm_rotation_{place}"] = palms[:, place, :3, :3].reshape(-1, 9)
+        wanted[f"palm_origin_{place}"] = palms[:, place, :3, 3]
     for name, value in wanted.items():
-        there = trials.state.slice(name)
         numbers = np.asarray(value, dtype=float)
-        states[:, there] = numbers[:, None] if numbers.ndim == 1 else numbers
-    return trials.run(states, parameters), mine
+        states[:, trials.state.slice(name)] = numbers[:, None] if numbers.ndim == 1 else numbers
+    return trials.run(states, parameters)
+
+
+def palms_of(robot: ArmHand, q: Array) -> Array:
+    """(k, s, 4, 4) poses of the palms of a body."""
+    return np.stack([robot.palm(q, side.name) for side in robot.description.sides], axis=1)
 
 
 def repeated(targets: TargetBatch, count: int) -> TargetBatch:
@@ -366,6 +383,11 @@ class Deduplicator:
         found = np.zeros(len(rows), dtype=bool)
         found[order] = fresh[place, rank]
         return found
+
+
+def palm_parts(palms: Array) -> Array:
+    """(k, 12) what tells poses (k, 4, 4) of palms apart, beside motors as parts of ranges."""
+    return (palms[:, :3] * PALMS).reshape(-1, 12)
 
 
 def distinct(parts: Array, apart: float) -> list[int]:

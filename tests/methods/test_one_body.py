@@ -111,6 +111,27 @@ def test_what_is_near_is_preferred(robot):
     assert (np.abs(near.q - start) / span).max() < 0.2
 
 
+@pytest.mark.parametrize("name", ["two_pandas+allegro", "g1+dex3"])
+def test_what_touches_nothing_is_found(name):
+    """Fingers of a hand touch each other, arms each other, and a hand the body."""
+    robot = ik.load_robot(name)
+    solver, about, kept = ik.Solver(robot, scene=ik.Scene()), grasp(robot, robot.home), []
+    for seed in range(30):
+        some = robot.random(np.random.default_rng(seed), 1000)
+        kept += list(some[solver.check(some, about).distance > 1e-4])
+        if len(kept) >= 20:
+            break
+    points, normals = robot.contacts(np.array(kept[:20]))
+    found = solver.solve_batch(points, normals)
+    assert (found.status == ik.Status.SOLVED).mean() >= 0.95
+    solved = found.success
+    assert (solver.check(found.q[solved], about).distance >= 0).all()
+    assert misses(robot, found.q, points)[solved].max() <= 5e-3 * 1.001
+    # Few of them come by themselves.
+    first = ik.Solver(robot).solve_batch(points, normals).q
+    assert (solver.check(first, about).distance < 0).mean() > 0.1
+
+
 def test_motors_are_held(robot):
     q = targets(robot, 1, seed=3)[0][0]
     names = [*robot.description.trunk, robot.description.sides[0].hand[0]]

@@ -229,7 +229,7 @@ class HandFirstMethod(LoopedMethod):
             number: The round, below `options.rounds`.
         """
         count, terms = self.options.candidates, self.terms(targets)
-        if not number or not self.is_compiled:
+        if not self.is_compiled or not (number or self.robot.sides):
             table, most = self.seeds.table, (number + 1) * count
             return table.nearest(targets.points, targets.normals, most)[:, -count:]
         every = np.broadcast_to(terms, (len(targets), terms.shape[-1]))

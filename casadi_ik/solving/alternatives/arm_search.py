@@ -133,30 +133,40 @@ class ArmSearch:
         scores: Callable[[Array, Array, Preference], Array],
         manipulability: Callable[[], FunctionKernel],
         compiled: bool = True,
+        side: int | None = None,
     ) -> None:
         """Compile the function of the arm and the driver, or load them from the cache.
 
         Args:
             robot: The robot.
-            family: Its arm's.
+            family: The arm's.
             scores: Of configurations (m, n), starts (m, n) and what is preferred: the order (m,)
                 of arms of the same hand, higher is better.
             manipulability: Gives that of the arm as a function of q.
             compiled: False keeps to the virtual machine and numpy.
+            side: Number of the side of a body whose arm it is; the trunk stays.
         """
         self._robot, self._family = robot, family
         self.scores, self._manipulability = scores, manipulability
-        self._columns = np.array(robot.description.arm_actuators, dtype=np.int64)
+        body, self._side = robot.description, side
+        arm = body.arm_actuators if side is None else body.side_actuators[side][0]
+        self._columns = np.array(arm, dtype=np.int64)
         lower, upper = robot.lower[self._columns], robot.upper[self._columns]
         self._low, self._range = doubles(lower), doubles(upper - lower)
         # Of the very limits, as exports have them: the sum of low and range may differ from high.
         self.values = SearchValues.of(family, lower, upper)
-        name = ca.Function.fix_name(f"{robot.name}_all_arms")
-        arms = arms_graph(family, name, recipe(name, robot.description))
+        alone = body if side is None else body.side(body.sides[side].name)
+        name = ca.Function.fix_name(f"{alone.name}_all_arms")
+        arms = arms_graph(family, name, recipe(name, alone))
         self._arms = FunctionKernel(arms, compiled, in_lanes=True)
         self._lanes = machine_lanes() if compiled else 0
         self._run: Any = self._load() if self._lanes else None
         self._tables = tuple(map(doubles, (*self.values.levels, self.values.closer)))
+
+    @property
+    def exact(self) -> bool:
+        """Whether the arms that are found carry their palms exactly."""
+        return self._family.exact
 
     def _load(self) -> Any:
         parts = map(driver_text, ("map_job", "clearance_job", "arm_search"))
@@ -183,7 +193,7 @@ class ArmSearch:
             starts: (k, n) where the robot is.
             bounds: (n,) and (n,).
             prefer: What is preferred.
-            query: What nothing may touch; None: nothing is checked.
+            query: Pairs that this arm decides, none of which may touch; None: nothing is checked.
             surplus: (k,) of what the hand alone decides [m], which no arm can exceed.
             branches: Whether to give the preferred arm of every branch, and the given one, instead
                 of one.
@@ -197,7 +207,7 @@ class ArmSearch:
         if not len(q):
             return ArmCandidates(q, np.zeros(0, np.intp), np.zeros(0, np.int64))
         inside = bounds[0][self._columns], bounds[1][self._columns]
-        asked = _Asked(q, self._robot.palm(q), starts, inside, prefer, query, surplus)
+        asked = _Asked(q, self._palm(q), starts, inside, prefer, query, surplus)
         groups = self._family.rows + 1 if branches else 1
         measure = _Measure(self, prefer)
         entries = [self._run, self._arms.entry]
@@ -210,6 +220,15 @@ class ArmSearch:
         found = q[owner]
         found[:, self._columns] = arms[owner, group]
         return ArmCandidates(found, owner, tried)
+
+    def _palm(self, q: Array) -> Array:
+        """(k, 4, 4) the palm as the arm's base sees it."""
+        if self._side is None:
+            return self._robot.palm(q)
+        body = self._robot.description
+        base = np.broadcast_to(self._robot.links(q)[body.trunk_link], (len(q), 4, 4))
+        palm = self._robot.palm(q, body.sides[self._side].name)
+        return np.asarray(np.linalg.solve(base, palm), dtype=float)
 
     def _compiled(
         self,
@@ -257,9 +276,9 @@ class ArmSearch:
                 tried=memory(tried[rows]),
             )
             query, kept = asked.query, None
-            if query is not None and len(query.table.swung.pairs):
+            if query is not None and len(query.table.pairs):
                 poses = query.poses[rows] if query.poses.ndim == 3 else query.poses
-                kernel, table = query.kernel, query.table.swung
+                kernel, table = query.kernel, query.table
                 clear, *kept = kernel.job(np.zeros((1, 1)), poses, table, 0.0, 0.0)
                 job.check, job.clear = _address(kernel.entry), ctypes.addressof(clear)
                 job.poses, job.pose_step = clear.poses, clear.pose_step
@@ -340,7 +359,6 @@ class _Asked:
         if self.query is None:
             return search.scores(q, self.starts[hand], self.prefer)
         query = self.query.rows(hand)
-        query = CollisionQuery(query.kernel, query.table.swung, query.poses, query.margin)
         if self.prefer == CLEARANCE:
             return np.minimum(query.check(q).surplus, self.surplus[hand])
         return np.where(query.free(q), search.scores(q, self.starts[hand], self.prefer), -np.inf)

@@ -19,6 +19,7 @@ from casadi_ik.errors import InputError
 from casadi_ik.grasps import Tolerance
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.kernels.cancellation import stop_if_cancelled
+from casadi_ik.methods.hand_first.body import BodyStep
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.problem.clearance import CollisionQuery
 from casadi_ik.problem.request import CLEARANCE, free_palms, preference
@@ -31,12 +32,11 @@ from casadi_ik.solving.trials import (
     Subproblems,
     distinct,
     other_trunks,
+    palm_parts,
+    palms_of,
 )
 from casadi_ik.symbolic.kinematics import Pose, actuated
 from casadi_ik.symbolic.singular_values import manipulability
-
-PALMS = np.array([0.1, 0.1, 0.1, 2.0])
-"""What turns [rad] and shifts [m] of a palm that is free count as, beside parts of ranges."""
 
 DISTINCT = 0.05
 """Hands and arms that are searched count as different if a motor differs by this part of its
@@ -95,13 +95,35 @@ class AlternativeFinder:
     def arm_search(self) -> ArmSearch | None:
         """All arms of hands; None for an arm of no family, and without an arm."""
         family = self.trials.method.step.arm
-        if family is None:
-            return None
+        return None if family is None else self._arm_search(family, self._arm)
 
+    @cached_property
+    def side_searches(self) -> list[ArmSearch]:
+        """The same for every side of a body; none where one is of no family."""
+        step, arms = self.trials.method.step, self.robot.description.side_actuators
+        families = [side.family for side in step.sides] if isinstance(step, BodyStep) else []
+        return [
+            self._arm_search(family, list(arms[side][0]), side)
+            for side, family in enumerate(families)
+            if family is not None and None not in families
+        ]
+
+    def _arm_search(self, family: ArmFamily, arm: list[int], side: int | None = None) -> ArmSearch:
         def scores(q: Array, starts: Array, prefer: Preference) -> Array:
-            return self.score(q, starts, prefer, self._arm)
+            return self.score(q, starts, prefer, arm)
 
-        return ArmSearch(self.robot, family, scores, lambda: self.manipulability, self._compiled)
+        def measure() -> FunctionKernel:
+            return self.manipulability
+
+        return ArmSearch(self.robot, family, scores, measure, self._compiled, side)
+
+    @cached_property
+    def side_links(self) -> list[tuple[frozenset[str], frozenset[str]]]:
+        """Of every side of a body the links that it moves: its arm's, and those with the palm."""
+        body = self.robot.description
+        moved = [body.links_moved(arm) for arm, _ in body.side_actuators]
+        hands = [body.links_moved(arm[-1:]) for arm, _ in body.side_actuators]
+        return [(links - hand, hand) for links, hand in zip(moved, hands, strict=True)]
 
     @cached_property
     def manipulability(self) -> FunctionKernel:
@@ -209,8 +231,8 @@ class AlternativeFinder:
         parts = self._parts(q, self.hand)
         if not free.any():
             return parts
-        palms = self.robot.palm(q)[:, :3] * PALMS
-        return np.concatenate([parts, palms.reshape(-1, 12) * free[:, None]], axis=1)
+        palms = palm_parts(self.robot.palm(q))
+        return np.concatenate([parts, palms * free[:, None]], axis=1)
 
     def _arms(
         self,
@@ -271,7 +293,8 @@ class AlternativeFinder:
 
     def _other_trunks(self, targets: TargetBatch, q: Array) -> list[Array]:
         """Different trunks and arms of a body, its hands as in q."""
-        ends, _ = other_trunks(self.trials, targets, q[None], np.zeros(1, np.intp), 0, TRUNKS)
+        palms, first = palms_of(self.robot, q[None]), np.zeros(1, np.intp)
+        ends, _ = other_trunks(self.trials, targets, q[None], palms, first, 0, TRUNKS)
         ends = np.concatenate([q[None], ends])
         kept = ends[self.trials.solved(targets, ends, targets.enforce_limits)]
         moving = [i for i in range(kept.shape[1]) if i not in self.hand]

@@ -2,9 +2,13 @@
 
 What is looked at, until one is free: all branches of the arm over all of its redundancy with the
 hand as it is; the hand postures of every round, each with all its arms; descents from random arms;
-and steps away from what is nearest, each brought back to the contacts. A hand that touches
-something by itself, wherever its unconstrained fingers are put, is discarded before any of its arms
-is looked at.
+and steps about what is nearest, each brought back to the contacts. A hand that touches something by
+itself, wherever its unconstrained fingers are put, is discarded before any of its arms is looked
+at.
+
+Of a body hands that touch something by themselves are moved by such steps first, side by side; then
+come other trunks for the hands that are left, other arms there, and so on with the hands of the
+next round (sides.py).
 """
 
 from __future__ import annotations
@@ -30,6 +34,7 @@ from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import SolvedVerdict, judge_one
 from casadi_ik.solving.alternatives.arm_search import Preference
 from casadi_ik.solving.alternatives.finder import AlternativeFinder
+from casadi_ik.solving.alternatives.sides import SideHands
 from casadi_ik.solving.alternatives.unconstrained_fingers import UnconstrainedFingers
 from casadi_ik.solving.batch_parts import judged
 from casadi_ik.solving.trials import (
@@ -56,14 +61,13 @@ class FreeSearchParameters:
         together: Targets that are worked on at once.
         rounds: Of hand postures.
         alike: Hands all of whose motors differ by less [of their ranges] have the same arms.
-        trunks: Trunks of a body that are tried with the hands that it has, one lot after the other.
+        trunks: Trunks of a body that are tried, one lot after the other, and how many ways to
+            combine hands of its sides share them. After each lot there is a round of hands.
         starts: Random arms that a target is solved from, where the arm is of no family.
         hands: As many where it is: then it is other hands that are looked for.
-        escapes: Steps away from what is nearest.
-        steps: Lengths of such a step, the best is taken; motions as parts of motors' ranges.
-        nudge: Difference [of a motor's range] from which it is taken which way there is more room.
+        steps: About what is nearest to being free, one after the other [of motors' ranges].
+        tries: Of such a step, in random directions; the best is taken.
         deep: What is farther inside something [m] is not got out of by such steps.
-        gain: What a step away has to gain at least, of what there is to gain.
         hopeful: Hands with most room that are looked at for why there is no answer.
         least_range: What stands for the range of a motor that has none [rad or m].
     """
@@ -71,14 +75,12 @@ class FreeSearchParameters:
     together: int = 128
     rounds: int = 3
     alike: float = 0.02
-    trunks: tuple[int, ...] = (4, 12, 48, 192, 768)
+    trunks: tuple[tuple[int, int], ...] = ((4, 1), (12, 2), (48, 4), (192, 8), (768, 16))
     starts: int = 24
     hands: int = 8
-    escapes: int = 4
-    steps: tuple[float, ...] = (0.1, 0.02)
-    nudge: float = 1e-5
+    steps: tuple[float, ...] = (0.3, 0.2, 0.1, 0.1, 0.1, 0.1, 0.05, 0.05)
+    tries: int = 16
     deep: float = 0.02
-    gain: float = 0.1
     hopeful: int = 4
     least_range: float = 1e-9
 
@@ -204,6 +206,10 @@ class FreeSearch:
             Deduplicator(count, size, PARAMETERS.alike) for _ in range(2)
         )
         self._fresh = np.ones(count, dtype=bool)
+        self._sides: SideHands | None = None
+        if robot.description.sides:
+            own = finder.side_links, targets, query
+            self._sides = SideHands(self.trials, *own, PARAMETERS.alike)
 
     @cached_property
     def _descent(self) -> LocalRefinement:
@@ -212,9 +218,15 @@ class FreeSearch:
     def run(self, q: Array, every: bool = False) -> None:
         """Look until all are free; or first, if asked, at the hands of a round whether or not."""
         self.try_hands(q, np.arange(len(q)))
-        others = (self._other_trunks(q), self.other_hands(every), self._from_anywhere())
-        for hands, owner in chain(*others):
-            self.try_hands(hands, owner)
+        hands, sides = self.other_hands(every), self._sides
+        for count, ways in PARAMETERS.trunks:
+            if sides is None:
+                break
+            self._free_hands(sides)
+            self._try_trunks(sides, count, ways)
+            self.try_hands(*next(hands, (q[:0], np.zeros(0, np.intp))))
+        for found, owner in chain(hands, self._from_anywhere()):
+            self.try_hands(found, owner)
         blocked = np.flatnonzero(~self.free)
         if len(blocked):
             self._find_nearest(blocked)
@@ -245,6 +257,9 @@ class FreeSearch:
         q = self._idle.aside(q, owner, self.query.held)
         if self.arm_search is None:
             self.take(q, owner)
+            if self._sides is not None:
+                for side in range(len(self._sides.hands)):
+                    self._sides.add(q, owner, side)
             self.hands.append((q, owner, np.zeros(len(q))))
             np.add.at(self.tried, owner, 1)
             self._fresh[owner] = True
@@ -287,24 +302,35 @@ class FreeSearch:
             self.starts[owner],
             (self.limits.first.lower, self.limits.first.upper),
             asked,
-            query.rows(owner),
+            query.swung.rows(owner),
             surplus,
             of_one=owner if asked in ("limits", "q0") else None,
         )
         return *self._solved(found.q, owner[found.owner]), found.tried
 
-    def _other_trunks(self, q: Array) -> Iterator[tuple[Array, NDArray[np.intp]]]:
-        """Answers of a body with the same hands, at ever more other trunks."""
-        if not self.finder.robot.description.sides:
+    def _try_trunks(self, sides: SideHands, count: int, ways: int) -> None:
+        """Look at other trunks of a body, and then at other arms there.
+
+        Args:
+            sides: The hands of its sides.
+            count: Trunks of every target.
+            ways: Of its hands, at most, which share them.
+        """
+        searches = self.finder.side_searches
+        q, palms, owner = sides.mixed(np.flatnonzero(~self.free), ways)
+        if not len(q):
             return
-        first = 0
-        for count in PARAMETERS.trunks:
-            rows = np.flatnonzero(~self.free)
-            if not len(rows):
-                return
-            found = other_trunks(self.trials, self.targets, q[rows], rows, first, count)
-            yield self._solved(*found)
-            first += count
+        first = sum(trunks for trunks, _ in PARAMETERS.trunks if trunks < count)
+        each = max(count // int(np.bincount(owner).max()), 1)
+        ends, of = other_trunks(self.trials, self.targets, q, palms, owner, first, each)
+        good = self.trials.solved(self.targets.rows(owner[of]), ends, self.targets.enforce_limits)
+        ends, of = ends[good], of[good]
+        self.take(ends, owner[of])
+        left = np.flatnonzero(~self.free[owner[of]])
+        if searches and len(left):
+            some = ends[left], palms[of[left]], owner[of[left]]
+            found = sides.arms(searches, *some, self.starts, self.targets.prefer)
+            self.take(*self._solved(*found))
 
     def other_hands(self, every: bool = False) -> Iterator[tuple[Array, NDArray[np.intp]]]:
         """Answers with other hands, of the targets that are not free, round by round."""
@@ -358,26 +384,36 @@ class FreeSearch:
         return q[mine], owner[mine], surplus[mine]
 
     def _escape(self) -> None:
-        """Steps away from what is nearest, brought back to the contacts."""
-        ranges, n = self._ranges, len(self._ranges)
-        rows = np.flatnonzero(~self.free & (self.surplus > -PARAMETERS.deep))
-        for _ in range(PARAMETERS.escapes):
+        """Steps about what is nearest to being free, each brought back to the contacts."""
+        for number in range(len(PARAMETERS.steps)):
+            rows = np.flatnonzero(~self.free & (self.surplus > -PARAMETERS.deep))
             if not len(rows):
                 return
-            before = self.surplus[rows].copy()
-            nudged = self.nearest[rows][:, None] + np.diag(PARAMETERS.nudge * ranges)
-            query = self.query.rows(np.repeat(rows, n))
-            surplus = query.check(nudged.reshape(-1, n)).surplus.reshape(-1, n)
-            way = (surplus - before[:, None]) / PARAMETERS.nudge
-            way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12)
-            owner = np.repeat(rows, len(PARAMETERS.steps))
-            steps = np.tile(PARAMETERS.steps, len(rows))[:, None]
-            there = self.nearest[owner] + steps * (way * ranges).repeat(
-                len(PARAMETERS.steps), axis=0
-            )
-            ends = self._descent.run(owner, self.limits.of(owner).clip(there))
-            self.take(*self._solved(ends, owner))
-            rows = rows[~self.free[rows] & (self.surplus[rows] > (1 - PARAMETERS.gain) * before)]
+            self.take(*self._steps_about(self.nearest[rows], rows, slice(None), number))
+
+    def _free_hands(self, sides: SideHands) -> None:
+        """The same for hands of a body's sides that touch something by themselves."""
+        for side, motors in enumerate(sides.hands):
+            for number in range(len(PARAMETERS.steps)):
+                surplus = np.where(self.free, 0.0, sides.surplus[side])
+                rows = np.flatnonzero((surplus < -ROUNDING) & (surplus > -PARAMETERS.deep))
+                if not len(rows):
+                    break
+                found = self._steps_about(sides.nearest[side][rows], rows, motors, number)
+                sides.add(*found, side, best=True)
+
+    def _steps_about(
+        self, q: Array, rows: NDArray[np.intp], motors: list[int] | slice, number: int
+    ) -> tuple[Array, NDArray[np.intp]]:
+        """Answers about answers (k, n) to some targets: steps of some motors, brought back."""
+        owner = np.repeat(rows, PARAMETERS.tries)
+        ranges = self._ranges[motors]
+        random = np.random.default_rng([self.seed, number])
+        steps = random.standard_normal((PARAMETERS.tries, len(ranges)))
+        starts = np.repeat(q, PARAMETERS.tries, axis=0)
+        starts[:, motors] += PARAMETERS.steps[number] * ranges * np.tile(steps, (len(rows), 1))
+        ends = self._descent.run(owner, self.limits.of(owner).clip(starts))
+        return self._solved(ends, owner)
 
     def found(self, reasons: bool) -> FreeAnswers:
         """What it came to; whether it would work without the scene or the robot, if asked."""
