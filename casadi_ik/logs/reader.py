@@ -211,15 +211,14 @@ class Log:
         _check_filters(filters)
         wanted = _numbers(filters.get("solve"))
         status, event, phase = (filters.get(name) for name in ("status", "event", "phase"))
-        parts = [self._read(name, "solve") for name in self._methods(filters.get("method"))]
+        methods = self._methods(filters.get("method"))
+        parts = [self._read(name, "solve", wanted) for name in methods]
         self._check_known("status", status, parts, "status")
         self._check_known("event", event, parts, "events")
         self._check_known("phase", phase, parts, "phase_iterations")
         found = []
         for part in parts:
             keep = np.ones(len(part), dtype=bool)
-            if wanted is not None:
-                keep &= np.isin(part.solve_id, wanted)
             if status is not None:
                 keep &= np.isin(part.rows["status"], _codes(part, "status", status))
             for name, values in (("events", event), ("phase_iterations", phase)):

@@ -76,6 +76,7 @@ def test_only_the_chunks_asked_for_are_read(write: Write) -> None:
         data[chunk.chunk_start_offset + chunk.chunk_length - 1] ^= i not in (3, 11)
     path.write_bytes(data)
     assert len(log.iterations(solve=[3, 11])) == 20
+    assert logs.one_solve(log, 3).iterations == len(log.solves(solve=11).rows) * 10
     assert len(log.iterations(solve=30)) == 0
     with pytest.raises(errors.LogError, match="chunk at byte"):
         log.iterations(solve=4)
