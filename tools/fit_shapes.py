@@ -17,10 +17,10 @@ from shape_fitting.writing import write
 from casadi_ik.files.reading import read
 from casadi_ik.files.shipped import resolve
 from casadi_ik.importing.capsules import FIT, fitted, worst
-from casadi_ik.importing.posture import Postures
 from casadi_ik.importing.robot_shapes import may_touch
 from casadi_ik.importing.surfaces import Surface, together
 from casadi_ik.robots.parts import described_part
+from casadi_ik.robots.poses import link_poses
 from casadi_ik.robots.schema import ArmFile, HandFile
 
 
@@ -67,7 +67,7 @@ def main() -> None:
     print(
         f"{given.name}: {len(shapes)} links, {count} shapes, at most {1e3 * worst(shapes):.0f} mm"
     )
-    print("  without:", [x for x in Postures(part).poses({}) if x not in shapes])
+    print("  without:", [x for x in link_poses(part.root, part.joints, {}) if x not in shapes])
     for one in touching:
         print("  ", one.links, one.reason)
 

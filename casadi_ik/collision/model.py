@@ -18,6 +18,7 @@ from casadi_ik.collision.solids import Solid, box, cylinder
 from casadi_ik.errors import DescriptionError, UnsupportedError
 from casadi_ik.robots.collision import LinkCapsule, Shapes, Touching
 from casadi_ik.robots.description import RobotDescription
+from casadi_ik.robots.linkage import rigid_bodies
 from casadi_ik.symbolic.kinematics import Pose, actuated
 
 
@@ -113,12 +114,7 @@ def collision_model(robot: RobotDescription) -> CollisionModel:
                 f"robot {robot.name!r}: its {name} has no shapes, which a scene needs; write "
                 "'collision:' in its description (docs/collision.md)"
             )
-    bodies = {robot.root: robot.root}
-    neighbours: set[frozenset[str]] = set()
-    for joint in robot.joints:
-        parent = bodies[joint.parent]
-        bodies[joint.child] = parent if joint.type == "fixed" else joint.child
-        neighbours.add(frozenset((parent, bodies[joint.child])))
+    bodies, neighbours = rigid_bodies(robot)
     excluded: dict[frozenset[str], Touching] = {
         frozenset(one.links): one for one in robot.shapes.touching if math.isinf(one.depth)
     }

@@ -9,11 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from casadi_ik.arrays import Array
-from casadi_ik.importing.posture import Postures
 from casadi_ik.importing.surfaces import Surface, together
 from casadi_ik.robots.description import Joint, RobotDescription
+from casadi_ik.robots.linkage import above, below, depth, moving_below, rigid
+from casadi_ik.robots.parts import Part
 from casadi_ik.robots.poses import joint_positions, link_poses
-from casadi_ik.robots.robot_files.tree import RobotTree, TreeJoint
+from casadi_ik.robots.robot_files.tree import RobotTree
 
 WORDS = {
     "thumb": r"thumb|(?<![a-z])th(?=[jb_]|dist|prox|mid|tip|hub|base|$)",
@@ -81,86 +82,44 @@ def palms(tree: RobotTree) -> list[str]:
 def holds_arms(tree: RobotTree, palm: str) -> bool:
     """Whether what hangs on a link is rather arms than fingers."""
     return any(
-        _depth(tree, joint.child) + 1 >= GUESS.arm_joints for joint in moving_below(tree, palm)
+        depth(tree, joint.child) + 1 >= GUESS.arm_joints for joint in moving_below(tree, palm)
     )
 
 
-def moving_below(tree: RobotTree, link: str) -> list[TreeJoint]:
-    """The first moving joints below a link, those behind fixed ones included."""
-    found: list[TreeJoint] = []
-    for joint in tree.joints:
-        if joint.parent == link:
-            found += [joint] if joint.type != "fixed" else moving_below(tree, joint.child)
-    return found
-
-
-def _depth(tree: RobotTree, link: str) -> int:
-    """The most moving joints in a row below a link."""
-    below = [joint for joint in tree.joints if joint.parent == link]
-    return max((_depth(tree, one.child) + (one.type != "fixed") for one in below), default=0)
-
-
-def find_fingers(postures: Postures, palm: str) -> list[Branch]:
+def find_fingers(part: Part, palm: str) -> list[Branch]:
     """The fingers below a palm, in the file's order."""
-    first = [
-        joint
-        for joint in postures.part.joints
-        if joint.type != "fixed"
-        and postures.moving_link(joint.parent) == postures.moving_link(palm)
-        and _below(postures, joint.child, palm)
-    ]
     found: list[Branch] = []
-    for joint in first:
-        for start, end in _ends(postures, joint):
-            links = [start.child]
-            for other in postures.part.joints:
-                if other.parent in links:
-                    links.append(other.child)
-            names = [*links, *(one.name for one in postures.part.joints if one.child in links)]
-            word, chain = _word(names), tuple(postures.chain(end.child, palm))
-            link = _tip(postures, end.child)
+    for joint in moving_below(part, palm):
+        for start, end in _ends(part, joint):
+            links = [start.child, *(one.child for one in below(part, start.child))]
+            names = [*links, *(one.name for one in part.joints if one.child in links)]
+            to_end = above(part, end.child, palm)
+            word, chain = _word(names), tuple(one for one in to_end if one.type != "fixed")
+            link = _tip(part, end.child)
             found.append(Branch(word or "", chain, link, tuple(links), bool(word)))
     return _called(found)
 
 
-def _ends(postures: Postures, joint: Joint) -> list[tuple[Joint, Joint]]:
+def _ends(part: Part, joint: Joint) -> list[tuple[Joint, Joint]]:
     """The fingers that a joint carries: the first joint that is one's own, and its last.
 
     Two chains of two joints or more that hang on one joint are two fingers; of shorter ones
     (linkages) the longest counts.
     """
-    next_ = _next(postures, joint)
-    long = [one for one in next_ if _length(postures, one) >= 2]
+    next_ = moving_below(part, joint.child)
+    long = [one for one in next_ if depth(part, one.child) >= 1]
     if len(long) >= 2:
-        return [pair for one in long for pair in _ends(postures, one)]
+        return [pair for one in long for pair in _ends(part, one)]
     if not next_:
         return [(joint, joint)]
-    longest = max(next_, key=lambda one: _length(postures, one))
-    further = _ends(postures, longest)
+    longest = max(next_, key=lambda one: depth(part, one.child))
+    further = _ends(part, longest)
     return further if len(further) > 1 else [(joint, further[0][1])]
 
 
-def _next(postures: Postures, joint: Joint) -> list[Joint]:
-    """The next joints that move, those behind fixed ones included."""
-    carried = postures.rigid(joint.child)
-    joints = postures.part.joints
-    return [one for one in joints if one.type != "fixed" and one.parent in carried]
-
-
-def _length(postures: Postures, joint: Joint) -> int:
-    """The most moving joints in a row, this one included."""
-    return 1 + max((_length(postures, one) for one in _next(postures, joint)), default=0)
-
-
-def _below(postures: Postures, link: str, palm: str) -> bool:
-    while link in postures.by_child and link != palm:
-        link = postures.by_child[link].parent
-    return link == palm
-
-
-def _tip(postures: Postures, link: str) -> str:
+def _tip(part: Part, link: str) -> str:
     """The last link, or the frame of a tip that is fixed to it."""
-    ends = [one for one in postures.rigid(link)[1:] if "tip" in one.lower()]
+    ends = [one for one in rigid(part, link)[1:] if "tip" in one.lower()]
     return ends[0] if len(ends) == 1 else link
 
 
@@ -202,7 +161,7 @@ def _stem(links: tuple[str, ...]) -> str:
     return re.sub(r"[^a-z0-9_]+", "_", common).strip("_")
 
 
-def guess_thumb(postures: Postures, branches: list[Branch], pads: list[Pad]) -> tuple[int, str]:
+def guess_thumb(part: Part, branches: list[Branch], pads: list[Pad]) -> tuple[int, str]:
     """The thumb's place among the fingers, and how it was found."""
     named = [i for i, branch in enumerate(branches) if branch.named and branch.name == "thumb"]
     if len(named) == 1:
@@ -212,7 +171,7 @@ def guess_thumb(postures: Postures, branches: list[Branch], pads: list[Pad]) -> 
     rng = np.random.default_rng(0)
     opposed = np.zeros(len(branches))
     for _ in range(GUESS.postures):
-        poses = postures.poses(postures.random(rng))
+        poses = _poses(part, _random(part, rng))
         normals = np.array([poses[pad.link][:3, :3] @ pad.normal for pad in pads])
         # Bent fingers all face the palm: what counts is how they face each other across it.
         reaches = [
@@ -234,10 +193,10 @@ def guess_thumb(postures: Postures, branches: list[Branch], pads: list[Pad]) -> 
 
 
 def guess_palm_frame(
-    postures: Postures, palm: str, branches: list[Branch], pads: list[Pad], thumb: int
+    part: Part, palm: str, branches: list[Branch], pads: list[Pad], thumb: int
 ) -> Array:
     """(4, 4) in the palm's link: origin amid the fingers' bases, z outwards, y to the thumb."""
-    poses = postures.poses(postures.middle())
+    poses = _poses(part, _middle(part))
     inverse = np.linalg.inv(poses[palm])
     bases = np.array([(inverse @ poses[one.chain[0].child])[:3, 3] for one in branches])
     tips = np.array([_point(poses, pad) for pad in pads]) @ inverse[:3, :3].T + inverse[:3, 3]
@@ -288,12 +247,12 @@ class Pad:
 
 
 def guess_pads(
-    postures: Postures, palm: str, branches: list[Branch], surfaces: dict[str, Surface]
+    part: Part, palm: str, branches: list[Branch], surfaces: dict[str, Surface]
 ) -> list[Pad]:
     """A pad for every finger."""
-    middle = postures.middle()
-    poses = postures.poses(middle)
-    bodies = [_body(postures, branch, surfaces) for branch in branches]
+    middle = _middle(part)
+    poses = _poses(part, middle)
+    bodies = [_body(part, branch, surfaces) for branch in branches]
     tips = [
         _apply(poses[branch.chain[index].child], tip)
         for branch, (_, tip, index) in zip(branches, bodies, strict=True)
@@ -302,7 +261,7 @@ def guess_pads(
     for i, branch in enumerate(branches):
         others = [tip for j, tip in enumerate(tips) if j != i]
         meeting = np.mean(others, axis=0) if others else poses[palm][:3, 3]
-        pads.append(_pad(postures, branch, bodies[i], meeting))
+        pads.append(_pad(part, branch, bodies[i], meeting))
     return pads
 
 
@@ -311,14 +270,14 @@ Body = tuple[Surface | None, Array, int]
 chain's joints moves it."""
 
 
-def _body(postures: Postures, branch: Branch, surfaces: dict[str, Surface]) -> Body:
-    rest = postures.poses({})
+def _body(part: Part, branch: Branch, surfaces: dict[str, Surface]) -> Body:
+    rest = _poses(part, {})
     for index in reversed(range(len(branch.chain))):
         joint = branch.chain[index]
         inverse = np.linalg.inv(rest[joint.child])
         parts = [
             surfaces[link].moved(inverse @ rest[link])
-            for link in postures.rigid(joint.child)
+            for link in rigid(part, joint.child)
             if link in surfaces
         ]
         whole = together(parts)
@@ -351,10 +310,10 @@ def _long_way(body: Surface, joint: Joint) -> Array:
     return _unit(way, np.array([0.0, 0.0, 1.0]))
 
 
-def _pad(postures: Postures, branch: Branch, body: Body, meeting: Array) -> Pad:
+def _pad(part: Part, branch: Branch, body: Body, meeting: Array) -> Pad:
     shape, end, index = body
     joint = branch.chain[index]
-    sign, why = _closing(postures, branch, index, end, meeting)
+    sign, why = _closing(part, branch, index, end, meeting)
     if joint.type == "prismatic":
         normal, u = sign * joint.axis, _unit(_across(end, joint.axis), _any_across(joint.axis))
     else:
@@ -370,10 +329,10 @@ def _pad(postures: Postures, branch: Branch, body: Body, meeting: Array) -> Pad:
             faced = _unit(_across(faced, joint.axis), normal)
         if faced @ normal > TILT:
             normal = faced
-    rest = postures.poses({})
+    rest = _poses(part, {})
     pose = np.linalg.inv(rest[branch.link]) @ rest[joint.child]
     link = branch.link
-    if not np.isfinite(pose).all() or postures.moving_link(link) != joint.child:
+    if not np.isfinite(pose).all() or _moving_link(part, link) != joint.child:
         link, pose = joint.child, np.eye(4)
     return Pad(link, _apply(pose, point), pose[:3, :3] @ normal, f"{how}; {why}")
 
@@ -402,12 +361,12 @@ def _skin(shape: Surface, u: Array, normal: Array) -> tuple[Array, str, float]:
 
 
 def _closing(
-    postures: Postures, branch: Branch, index: int, end: Array, meeting: Array
+    part: Part, branch: Branch, index: int, end: Array, meeting: Array
 ) -> tuple[float, str]:
     """Which way the last joint turns when the finger closes, and how that was decided."""
     joint = branch.chain[index]
-    middle = postures.middle()
-    poses = postures.poses(middle)
+    middle = _middle(part)
+    poses = _poses(part, middle)
     axis = poses[joint.child][:3, :3] @ joint.axis
     bending: dict[str, float] = {}
     for one in branch.chain[: index + 1]:
@@ -417,12 +376,14 @@ def _closing(
                 bending[one.name] = np.sign(cosine)
     base = next(one for one in branch.chain if one.name in bending)
 
+    joints = {one.name: one for one in part.joints}
+
     def tip(sign: float) -> tuple[Array, Array]:
         values = dict(middle)
         for name, way in bending.items():
-            one = postures.joints[name]
+            one = joints[name]
             values[name] = one.upper if way * sign > 0 else one.lower
-        found = postures.poses(values)
+        found = _poses(part, values)
         return _apply(found[joint.child], end), found[base.child][:3, 3]
 
     (plus, root), (minus, _) = tip(1.0), tip(-1.0)
@@ -435,6 +396,31 @@ def _closing(
     way = axis if joint.type == "prismatic" else np.cross(axis, place - here[:3, 3])
     sign = 1.0 if way @ (meeting - place) >= 0 else -1.0
     return sign, "faces the other fingers"
+
+
+def _middle(part: Part) -> dict[str, float]:
+    """Every joint in the middle of its range [rad or m]."""
+    return {one.name: (one.lower + one.upper) / 2 for one in part.joints if one.type != "fixed"}
+
+
+def _random(part: Part, rng: np.random.Generator) -> dict[str, float]:
+    """Every joint anywhere in the middle half of its range, couplings left out."""
+    return {
+        one.name: one.lower + (0.25 + 0.5 * rng.random()) * (one.upper - one.lower)
+        for one in part.joints
+        if one.type != "fixed"
+    }
+
+
+def _poses(part: Part, values: Mapping[str, float]) -> dict[str, Array]:
+    """(4, 4) pose of every link in the root's frame."""
+    return link_poses(part.root, part.joints, values)
+
+
+def _moving_link(part: Part, link: str) -> str:
+    """The link itself, or the next one above that a joint moves."""
+    moving = [one.child for one in above(part, link) if one.type != "fixed"]
+    return moving[-1] if moving else part.root
 
 
 def _apply(pose: Array, point: Array) -> Array:

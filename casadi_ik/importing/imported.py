@@ -22,15 +22,14 @@ from casadi_ik.importing.guess import (
     guess_palm_frame,
     guess_thumb,
     holds_arms,
-    moving_below,
     palms,
 )
-from casadi_ik.importing.posture import Postures
 from casadi_ik.importing.robot_shapes import robot_shapes
 from casadi_ik.importing.surfaces import Surface, link_surfaces
 from casadi_ik.importing.write import FileLine, HandLines, Written
 from casadi_ik.robots.bodies import MOST_SIDES
 from casadi_ik.robots.file_parts import hand_from_file
+from casadi_ik.robots.linkage import below, ends, moving_below, rigid
 from casadi_ik.robots.load import load_description
 from casadi_ik.robots.parts import Part
 from casadi_ik.robots.robot_files.read import read_tree
@@ -60,12 +59,12 @@ def the_tip(tree: RobotTree) -> tuple[str, str]:
         last = movers[0]
         link = last.child
     if last is None or (len(movers) > 1 and holds_arms(tree, link)):
-        ends = _ends(tree)
+        last_ones = ends(tree, tree.root)
         raise InputError(
             f"--tip: missing; {tree.path.name} branches at {link!r}: write the link that carries "
-            f"the hand, such as {', '.join(ends[:8])}"
+            f"the hand, such as {', '.join(last_ones[:8])}"
         )
-    fixed = _rigid(tree, last.child)
+    fixed = rigid(tree, last.child)
     for pattern in FLANGES:
         named = [one for one in fixed if re.search(pattern, one.lower())]
         if named:
@@ -110,7 +109,7 @@ def the_palms(tree: RobotTree, asked: Sequence[str]) -> dict[str, tuple[str, str
     all_palms = palms(tree)
     if not asked and all_palms and holds_arms(tree, all_palms[0]):
         hands = [link for link in all_palms if not holds_arms(tree, link)]
-        carried = {joint.child for link in hands for joint in tree.below(link)}
+        carried = {joint.child for link in hands for joint in below(tree, link)}
         how = "several chains of joints go out, none as long as an arm"
         several = [(link, how) for link in hands if link not in carried]
     if not 1 < len(several) <= MOST_SIDES:
@@ -119,7 +118,7 @@ def the_palms(tree: RobotTree, asked: Sequence[str]) -> dict[str, tuple[str, str
         return {"": the_palm(tree, asked[0] if asked else None)}
     for link in asked:
         the_palm(tree, link)
-        if any(joint.child in asked for joint in tree.below(link)) or asked.count(link) > 1:
+        if any(joint.child in asked for joint in below(tree, link)) or asked.count(link) > 1:
             raise InputError(f"--palm: {link!r} carries another palm, expected hands side by side")
     names = [_side_name(link) for link, _ in several]
     if "" in names or len(set(names)) < len(names):
@@ -133,10 +132,10 @@ def _side_name(link: str) -> str:
     return {"l": "left", "r": "right"}[found[0][0]] if found else ""
 
 
-def kept_joints(tree: RobotTree, end: str, below: bool = True) -> list[TreeJoint]:
+def kept_joints(tree: RobotTree, end: str, carried: bool = True) -> list[TreeJoint]:
     """The joints from the root to a link, and those below it unless it is an arm's end."""
     chain = list(tree.chain(tree.root, end, str(tree.path)))
-    return chain + (list(tree.below(end)) if below else [])
+    return chain + (below(tree, end) if carried else [])
 
 
 def assumed_limits(joints: list[TreeJoint]) -> dict[str, tuple[float, float]]:
@@ -191,19 +190,6 @@ def file_text(path: Path, out: Path) -> str:
         return there.relative_to(here).as_posix()
     except ValueError:
         return there.as_posix()
-
-
-def _rigid(tree: RobotTree, link: str) -> list[str]:
-    found = [link]
-    for joint in tree.joints:
-        if joint.type == "fixed" and joint.parent in found:
-            found.append(joint.child)
-    return found
-
-
-def _ends(tree: RobotTree) -> list[str]:
-    parents = {joint.parent for joint in tree.joints}
-    return [link for link in tree.links if link not in parents]
 
 
 @dataclass(frozen=True, eq=False)
@@ -350,19 +336,18 @@ def _found_hand(
     tree: RobotTree, part: Part, side: str, palm: str, how: str, shapes: bool
 ) -> tuple[HandLines, list[Branch], dict[str, Surface], list[str]]:
     """A hand's fingers with their pads, the thumb first, its shapes, and what cannot be read."""
-    postures = Postures(part)
-    branches = find_fingers(postures, palm)
+    branches = find_fingers(part, palm)
     if not branches:
         raise DescriptionError(f"{tree.path}: no joint moves below the palm {palm!r}; try --palm")
     wanted = (
-        {palm, *(joint.child for joint in tree.below(palm))}
+        {palm, *(joint.child for joint in below(tree, palm))}
         if shapes
-        else {one for branch in branches for one in _ends_of(postures, branch)}
+        else {one for branch in branches for one in _ends_of(part, branch)}
     )
     surfaces, notes = link_surfaces(tree, wanted)
-    pads = guess_pads(postures, palm, branches, surfaces)
-    thumb, thumb_how = guess_thumb(postures, branches, pads)
-    frame = guess_palm_frame(postures, palm, branches, pads, thumb)
+    pads = guess_pads(part, palm, branches, surfaces)
+    thumb, thumb_how = guess_thumb(part, branches, pads)
+    frame = guess_palm_frame(part, palm, branches, pads, thumb)
     names = [branch.name.removeprefix(f"{side}_") for branch in branches]
     if "thumb" not in names:
         names[thumb] = "thumb"
@@ -374,9 +359,9 @@ def _found_hand(
     return lines, [replace(branches[i], name=names[i]) for i in order], surfaces, notes
 
 
-def _ends_of(postures: Postures, branch: Branch) -> list[str]:
+def _ends_of(part: Part, branch: Branch) -> list[str]:
     """The links of a finger's last two phalanges, one of which has a shape, one hopes."""
-    return [link for joint in branch.chain[-2:] for link in postures.rigid(joint.child)]
+    return [link for joint in branch.chain[-2:] for link in rigid(part, joint.child)]
 
 
 def _arm_line(tree: RobotTree, out: Path, tip: str | None, xacro: bool) -> FileLine:
@@ -388,7 +373,7 @@ def _arm_line(tree: RobotTree, out: Path, tip: str | None, xacro: bool) -> FileL
         raise InputError(
             f"--tip: {tree.path.name} has no link {tip!r}; it has {', '.join(tree.links)}"
         )
-    joints = kept_joints(tree, link, below=False)
+    joints = kept_joints(tree, link, carried=False)
     limits, locked = assumed_limits(joints), assumed_locks(joints)
     told = xacro and tree.path.suffix != ".xacro"
     return FileLine(file_text(tree.path, out), link, how, limits, locked, told)

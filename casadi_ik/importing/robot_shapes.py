@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from casadi_ik.arrays import Array
 from casadi_ik.collision.distances import between_segments
 from casadi_ik.importing.capsules import FIT, Rows, fitted
-from casadi_ik.importing.posture import Jointed
 from casadi_ik.importing.surfaces import Surface, link_surfaces
 from casadi_ik.robots.collision import Touching, capsules_of
-from casadi_ik.robots.description import Actuator, Joint, RobotDescription
-from casadi_ik.robots.parts import PREFIX
+from casadi_ik.robots.description import RobotDescription
+from casadi_ik.robots.linkage import below, rigid_bodies
+from casadi_ik.robots.parts import PREFIX, Part
 from casadi_ik.robots.poses import joint_positions, link_poses
 from casadi_ik.robots.robot_files.tree import RobotTree
 from casadi_ik.robots.schema import ShapeEntry
@@ -28,12 +28,9 @@ from casadi_ik.robots.schema import ShapeEntry
 
 def hand_links(robot: RobotDescription) -> frozenset[str]:
     """The links that the mount carries: all of the hand's file; none if there is no mount."""
-    found: set[str] = set()
-    more = {joint.child for joint in robot.joints if joint.part == "mount"}
-    while more:
-        found |= more
-        more = {joint.child for joint in robot.joints if joint.parent in more}
-    return frozenset(found)
+    mounted = {joint.child for joint in robot.joints if joint.part == "mount"}
+    carried = {joint.child for link in mounted for joint in below(robot, link)}
+    return frozenset(mounted | carried)
 
 
 @dataclass(frozen=True)
@@ -62,7 +59,9 @@ SAMPLING = ContactSampling()
 
 
 def may_touch(
-    part: Jointed, shapes: Mapping[str, Sequence[ShapeEntry]], surfaces: Mapping[str, Surface]
+    part: Part | RobotDescription,
+    shapes: Mapping[str, Sequence[ShapeEntry]],
+    surfaces: Mapping[str, Surface],
 ) -> list[Touching]:
     """Pairs of links that may touch, and why.
 
@@ -72,18 +71,10 @@ def may_touch(
         surfaces: By link the meshes they hold.
     """
     rng = np.random.default_rng(0)
-    joints = {joint.name: joint for joint in part.joints}
-    motors = list(part.actuators)
     poses = [
-        link_poses(part.root, part.joints, _values(joints, motors, rng))
-        for _ in range(SAMPLING.samples)
+        link_poses(part.root, part.joints, _values(part, rng)) for _ in range(SAMPLING.samples)
     ]
-    bodies = {part.root: part.root}
-    neighbours = set()
-    for joint in part.joints:
-        parent = bodies[joint.parent]
-        bodies[joint.child] = parent if joint.type == "fixed" else joint.child
-        neighbours.add(frozenset((parent, bodies[joint.child])))
+    bodies, neighbours = rigid_bodies(part)
     capsules = {
         link: [c for one in found for c in capsules_of(one)] for link, found in shapes.items()
     }
@@ -127,12 +118,10 @@ def _verdict(
     return [Touching(links, said + ", all deeper", depth)]
 
 
-def _values(
-    joints: Mapping[str, Joint], motors: Sequence[Actuator], rng: np.random.Generator
-) -> dict[str, float]:
+def _values(part: Part | RobotDescription, rng: np.random.Generator) -> dict[str, float]:
     """Random positions of all joints, couplings minded where they are of one joint or motor."""
-    drawn = {one.name: rng.uniform(one.lower, one.upper) for one in motors}
-    found = joint_positions(joints.values(), drawn)
+    drawn = {one.name: rng.uniform(one.lower, one.upper) for one in part.actuators}
+    found = joint_positions(part.joints, drawn)
     return {name: float(value[0]) for name, value in found.items()}
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from casadi_ik.arrays import frozen
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.reading import Frame, frame_matrix
-from casadi_ik.robots.description import Finger, Joint, RobotDescription, Side
+from casadi_ik.robots.description import Finger, RobotDescription, Side
 from casadi_ik.robots.file_parts import hand_from_file, palm_frame
 from casadi_ik.robots.joining import (
     FlatJoints,
@@ -21,8 +21,8 @@ from casadi_ik.robots.joining import (
     the_fingers,
     with_wrist,
 )
+from casadi_ik.robots.linkage import above, below, known
 from casadi_ik.robots.parts import Part, mirrored, of_side, usable
-from casadi_ik.robots.robot_files.tree import known
 from casadi_ik.robots.schema import BodyFile, FileSide, ImportedBody, PartSide
 
 STANDING = Part("base", "", "base", [], [], {}, "base", np.eye(4), {})
@@ -130,12 +130,11 @@ def body_from_file(body: ImportedBody, where: Path, units: dict[str, str]) -> Ro
     if body.robot.palm is not None:
         raise DescriptionError(f"{where}: robot.palm: found one, expected it under each of 'sides'")
     whole = hand_from_file(body.robot, {}, "robot", where)
-    by_child = {joint.child: joint for joint in whole.joints}
     sides, chains = [], {}
     for name, entry in body.sides.items():
-        side, chains[name] = _side_in_file(name, entry, whole, by_child, where)
+        side, chains[name] = _side_in_file(name, entry, whole, where)
         sides.append(side)
-    end = _trunk_end(body.trunk, sides, chains, whole, by_child, where)
+    end = _trunk_end(body.trunk, sides, chains, whole, where)
     drawn = joined(
         *(body.name, whole.root, whole.joints, [("robot", whole)]),
         {end, *(side.hand.tip_link for side in sides)},
@@ -145,7 +144,7 @@ def body_from_file(body: ImportedBody, where: Path, units: dict[str, str]) -> Ro
 
 
 def _side_in_file(
-    name: str, entry: FileSide, whole: Part, by_child: dict[str, Joint], where: Path
+    name: str, entry: FileSide, whole: Part, where: Path
 ) -> tuple[_OneSide, list[str]]:
     """A side, and the links from the root to its palm."""
     key, palm = f"{where}: sides.{name}.", palm_frame(entry.palm)
@@ -153,7 +152,7 @@ def _side_in_file(
     pads = {f"{name}_{finger}": pad for finger, pad in entry.fingers.items()}
     for finger, pad in entry.fingers.items():
         known(pad.link, whole.links, "link", f"{key}fingers.{finger}.link")
-        if palm.link not in _links_to(pad.link, by_child):
+        if palm.link not in _links_to(pad.link, whole):
             raise DescriptionError(
                 f"{key}fingers.{finger}.link: {pad.link!r} does not hang on the palm "
                 f"{palm.link!r}; write another link or another palm"
@@ -167,7 +166,7 @@ def _side_in_file(
         pads=pads,
     )
     thumb = None if entry.thumb is None else f"{name}_{entry.thumb}"
-    return _OneSide(name, hand, list(pads), thumb), _links_to(palm.link, by_child)
+    return _OneSide(name, hand, list(pads), thumb), _links_to(palm.link, whole)
 
 
 def _trunk_end(
@@ -175,7 +174,6 @@ def _trunk_end(
     sides: Sequence[_OneSide],
     chains: dict[str, list[str]],
     whole: Part,
-    by_child: dict[str, Joint],
     where: Path,
 ) -> str:
     """The link that the sides stand on: what is said, or the last one that carries all palms."""
@@ -197,8 +195,7 @@ def _trunk_end(
                 f"{where}: trunk: found {end!r}, which does not carry the palm of {name!r}; "
                 f"expected a link that carries all, such as {common[-1]!r}"
             )
-    beyond = [by_child[link] for link in common[common.index(end) + 1 :]] if others else []
-    for joint in beyond:
+    for joint in above(whole, common[-1], end) if others else ():
         if joint.type != "fixed":
             raise DescriptionError(
                 f"{where}: trunk: found {end!r}, but joint {joint.name!r} beyond it moves every "
@@ -227,12 +224,9 @@ def _mirrored(part: Part, entry: PartSide, key: str, side: str, where: Path) -> 
     return mirrored(part) if key in entry.mirror else part
 
 
-def _links_to(link: str, by_child: dict[str, Joint]) -> list[str]:
+def _links_to(link: str, whole: Part) -> list[str]:
     """Links from the root to one, both included."""
-    found = [link]
-    while found[-1] in by_child:
-        found.append(by_child[found[-1]].parent)
-    return found[::-1]
+    return [whole.root, *(joint.child for joint in above(whole, link))]
 
 
 def _with_sides(
@@ -272,12 +266,8 @@ def _motors_of(
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """The motors of a side's arm and hand: between the trunk's end and the palm, and below it."""
     to_palm = _moving(robot, palm)
-    below = {
-        joint.name
-        for joint in robot.movable
-        if palm == robot.root or palm in {one.child for one in robot.chain(joint.child)}
-    }
-    beyond = below.union(*(one.joints for one in fingers)) - {*to_palm}
+    carried = {one.name for one in below(robot, palm) if one.type != "fixed"}
+    beyond = carried.union(*(one.joints for one in fingers)) - {*to_palm}
     arm = _motors(robot, {*to_palm} - {*_moving(robot, end)})
     return arm, tuple(name for name in _motors(robot, beyond) if name not in arm)
 

@@ -12,7 +12,8 @@ import numpy as np
 from casadi_ik.arrays import Array, frozen
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.reading import Frame, frame_matrix
-from casadi_ik.robots.robot_files.tree import attribute, known, parse_xml, read_robot_file
+from casadi_ik.robots.linkage import known
+from casadi_ik.robots.robot_files.tree import attribute, parse_xml, read_robot_file
 from casadi_ik.robots.schema import (
     BoxEntry,
     CapsuleEntry,

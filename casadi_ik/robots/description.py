@@ -14,6 +14,7 @@ from casadi_ik.arrays import Array, frozen
 from casadi_ik.errors import UnknownNameError, UnsupportedError
 from casadi_ik.robots.collision import NO_SHAPES, Shapes
 from casadi_ik.robots.couplings import Coupling
+from casadi_ik.robots.linkage import above, links_of
 from casadi_ik.robots.motor_ranges import motor_ranges
 
 
@@ -246,7 +247,7 @@ class RobotDescription:
     @cached_property
     def links(self) -> tuple[str, ...]:
         """All links, the root first."""
-        return (self.root, *(joint.child for joint in self.joints))
+        return links_of(self)
 
     def finger(self, name: str) -> Finger:
         """The finger of that name.
@@ -284,12 +285,7 @@ class RobotDescription:
         """
         if link not in self.links:
             raise UnknownNameError(f"robot {self.name!r} has no link {link!r}")
-        by_child = {joint.child: joint for joint in self.joints}
-        chain: list[Joint] = []
-        while link != self.root:
-            chain.append(by_child[link])
-            link = by_child[link].parent
-        return tuple(reversed(chain))
+        return tuple(above(self, link))
 
     @cached_property
     def arm_actuators(self) -> tuple[int, ...]:

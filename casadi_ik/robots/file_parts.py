@@ -15,6 +15,7 @@ from casadi_ik.files.reading import frame_matrix
 from casadi_ik.robots.collision import NO_SHAPES, link_shapes
 from casadi_ik.robots.couplings import Coupling, Linear
 from casadi_ik.robots.description import Actuator, Joint
+from casadi_ik.robots.linkage import below, ends
 from casadi_ik.robots.parts import Part, check_couplings
 from casadi_ik.robots.poses import motion
 from casadi_ik.robots.robot_files.read import read_tree
@@ -51,13 +52,13 @@ def arm_from_file(entry: ArmFromFile, key: str, beside: Path) -> Part:
     tree, where, root = _opened(entry, key, beside)
     tip = entry.tip
     if tip is None:
-        ends = leaves(tree, root)
-        if len(ends) != 1:
+        last = ends(tree, root)
+        if len(last) != 1:
             raise DescriptionError(
                 f"{where}.tip: missing; {tree.path.name} ends in several links, write one of "
-                + ", ".join(ends)
+                + ", ".join(last)
             )
-        tip = ends[0]
+        tip = last[0]
     tree.known_link(tip, f"{where}.tip: {tree.path.name}")
     chain = tree.chain(root, tip, f"{where}.tip: {tree.path.name}")
     source = {key: f"{tree.path.name}, links {root} to {tip}"}
@@ -83,8 +84,8 @@ def hand_from_file(
     palm = palm_frame(entry.palm or root)
     tree.known_link(palm.link, f"{where}.palm: {tree.path.name}")
     chain = tree.chain(root, palm.link, f"{where}.palm: {tree.path.name}")
-    below = tree.below(palm.link)
-    carried = {joint.child for joint in below}
+    hand = tuple(below(tree, palm.link))
+    carried = {joint.child for joint in hand}
     for name, pad in pads.items():
         tree.known_link(pad.link, f"{beside}: fingers.{name}.link: {tree.path.name}")
         if pad.link not in carried:
@@ -93,7 +94,7 @@ def hand_from_file(
                 f"{palm.link!r} of {tree.path.name}; write another link or another palm"
             )
     source = {key: f"{tree.path.name}, palm {palm.link}"}
-    part = _part(tree, entry, (chain, below), palm, source, where)
+    part = _part(tree, entry, (chain, hand), palm, source, where)
     return replace(part, where=f"{beside}: ", pads=pads)
 
 
@@ -132,13 +133,6 @@ def _part(
         *(tree.path.stem, f"{where}: ", root, joints, actuators, source, end.link, frame, {}),
         shapes,
     )
-
-
-def leaves(tree: RobotTree, root: str) -> list[str]:
-    """The links below a link that carry nothing."""
-    below = [joint.child for joint in tree.below(root)]
-    parents = {joint.parent for joint in tree.joints}
-    return [link for link in below if link not in parents]
 
 
 class _Chosen:

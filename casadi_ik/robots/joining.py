@@ -15,9 +15,9 @@ from casadi_ik.files.shipped import resolve
 from casadi_ik.robots.collision import NO_SHAPES
 from casadi_ik.robots.description import Actuator, Finger, Joint, RobotDescription
 from casadi_ik.robots.file_parts import arm_from_file
+from casadi_ik.robots.linkage import above, known
 from casadi_ik.robots.motor_ranges import motor_ranges
 from casadi_ik.robots.parts import Part, described_part, unique
-from casadi_ik.robots.robot_files.tree import known
 from casadi_ik.robots.schema import ArmFile, ArmFromFile, BallPad, HandFile
 
 
@@ -163,11 +163,11 @@ def _finger(name: str, hand: Part, flat: FlatJoints, side: str) -> Finger:
         raise DescriptionError(f"{where}.normal: is zero, expected a direction")
     chain: list[str] = []
     by_child = {joint.child: joint for joint in flat.joints}
-    above = link
-    while above in by_child and above not in (flat.places[hand.root][0], hand.tip_link):
-        if by_child[above].type != "fixed":
-            chain.append(by_child[above].name)
-        above = by_child[above].parent
+    here = link
+    while here in by_child and here not in (flat.places[hand.root][0], hand.tip_link):
+        if by_child[here].type != "fixed":
+            chain.append(by_child[here].name)
+        here = by_child[here].parent
     # On the palm's own link a pad is meant to stay: a jaw that is fixed.
     if not chain and hand.actuators and entry.link != hand.tip_link:
         raise DescriptionError(
@@ -257,18 +257,9 @@ def a_part(entry: str | ArmFromFile | HandFile, key: str, beside: Path) -> Part:
 
 def with_wrist(hand: Part) -> Part:
     """The hand, of which what moves the palm itself counts as arm, if all fingers are beyond it."""
-    by_child = {joint.child: joint for joint in hand.joints}
-
-    def above(link: str) -> list[Joint]:
-        chain = []
-        while link in by_child:
-            chain.append(by_child[link])
-            link = by_child[link].parent
-        return chain
-
-    wrist = {joint.name for joint in above(hand.tip_link)}
+    wrist = {joint.name for joint in above(hand, hand.tip_link)}
     beyond = all(
-        hand.tip_link == hand.root or hand.tip_link in {joint.child for joint in above(pad.link)}
+        hand.tip_link in {joint.child for joint in above(hand, pad.link)}
         for pad in hand.pads.values()
     )
     if not wrist or not beyond:

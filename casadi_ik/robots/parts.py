@@ -17,7 +17,7 @@ from casadi_ik.files.reading import frame_matrix
 from casadi_ik.robots.collision import NO_SHAPES, Shapes, link_shapes
 from casadi_ik.robots.couplings import Linear
 from casadi_ik.robots.description import Actuator, Joint
-from casadi_ik.robots.robot_files.tree import known, parents_first
+from casadi_ik.robots.linkage import known, links_of, parents_first
 from casadi_ik.robots.schema import (
     ActuatorEntry,
     ArmFile,
@@ -157,7 +157,7 @@ class Part:
     @property
     def links(self) -> tuple[str, ...]:
         """All links, the root first."""
-        return (self.root, *(joint.child for joint in self.joints))
+        return links_of(self)
 
     @property
     def movers(self) -> set[str]:

@@ -19,8 +19,8 @@ from casadi_ik import robots
 from casadi_ik.cli.inputs import the_robot
 from casadi_ik.files.reading import read
 from casadi_ik.files.shipped import resolve
-from casadi_ik.importing.posture import Postures
 from casadi_ik.robots.parts import described_part
+from casadi_ik.robots.poses import link_poses
 from casadi_ik.robots.schema import ArmFile, HandFile
 
 ARMS = [
@@ -113,7 +113,7 @@ def test_arms_stand_where_published_files_have_them(arm):
     part = described_part(read(path, ArmFile)[0], path)
     names = [joint.name for joint in part.joints if joint.type != "fixed"]
     for q, pose in zip(known["q"], known["poses"], strict=True):
-        links = Postures(part).poses(dict(zip(names, q, strict=True)))
+        links = link_poses(part.root, part.joints, dict(zip(names, q, strict=True)))
         last = np.array(known["base"]) @ links[part.tip_link]
         theirs = np.array(pose) @ np.linalg.inv(known["tip"])
         np.testing.assert_allclose(last, theirs, atol=known["tolerance"])
@@ -131,7 +131,7 @@ def test_hands_stand_where_published_files_have_them(hand):
     path = resolve(hand, "hands")
     part = described_part(read(path, HandFile)[0], path)
     for q, links in zip(known["q"], known["links"], strict=True):
-        found = Postures(part).poses(dict(zip(known["joints"], q, strict=True)))
+        found = link_poses(part.root, part.joints, dict(zip(known["joints"], q, strict=True)))
         assert len(links) >= FEWER.get(hand, 3)
         for link, pose in links.items():
             np.testing.assert_allclose(found[link][:3], pose, atol=known["tolerance"])

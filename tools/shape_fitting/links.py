@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from casadi_ik.arrays import Array
-from casadi_ik.importing.posture import Postures
 from casadi_ik.importing.surfaces import Surface, link_surfaces
+from casadi_ik.robots.linkage import below
 from casadi_ik.robots.parts import Part
+from casadi_ik.robots.poses import link_poses
 from casadi_ik.robots.robot_files.read import read_tree
 from casadi_ik.robots.robot_files.tree import RobotTree, TreeJoint
 
@@ -35,7 +36,7 @@ def in_our_links(
     """The shapes of the file's links by our link, in its frame; `seen` as for `link_surfaces`."""
     tree = read_tree(file)
     theirs = tree_poses(tree)
-    ours = Postures(part).poses({})
+    ours = link_poses(part.root, part.joints, {})
     our_axes = [
         Axis(j.name, j.parent, j.child, ours[j.child][:3, 3], ours[j.child][:3, :3] @ j.axis)
         for j in part.joints
@@ -114,7 +115,7 @@ def match(
         while above in by_child and by_child[above].name not in found:
             above = by_child[above].parent
         start = found[by_child[above].name].child if above in by_child else tree.root
-        for joint in tree.below(start):
+        for joint in below(tree, start):
             pose = base @ theirs[joint.child]
             if joint.type == "fixed" or joint in found.values():
                 continue

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any
 from xml.etree import ElementTree
 from xml.parsers import expat
 
@@ -18,6 +18,7 @@ from casadi_ik.errors import DescriptionError
 from casadi_ik.files.limits import LIMITS, RAISED, limit
 from casadi_ik.files.reading import Frame, frame_matrix, read_text, roll_pitch_yaw
 from casadi_ik.robots.couplings import Coupling
+from casadi_ik.robots.linkage import above, known, links_of
 from casadi_ik.robots.schema import BoxEntry, CapsuleEntry, CylinderEntry, ShapeEntry, SphereEntry
 
 Element = ElementTree.Element
@@ -335,12 +336,7 @@ class RobotTree:
     @cached_property
     def links(self) -> tuple[str, ...]:
         """All links, the root first."""
-        return (self.root, *(joint.child for joint in self.joints))
-
-    @cached_property
-    def carried_by(self) -> dict[str, TreeJoint]:
-        """The joint that carries a link, by link."""
-        return {joint.child: joint for joint in self.joints}
+        return links_of(self)
 
     @cached_property
     def by_name(self) -> dict[str, TreeJoint]:
@@ -358,24 +354,10 @@ class RobotTree:
         Raises:
             DescriptionError: The one is not below the other.
         """
-        chain: list[TreeJoint] = []
-        current = link
-        while current != root:
-            if current not in self.carried_by:
-                raise DescriptionError(f"{where}: link {link!r} does not hang on link {root!r}")
-            chain.append(self.carried_by[current])
-            current = chain[-1].parent
-        return tuple(reversed(chain))
-
-    def below(self, link: str) -> tuple[TreeJoint, ...]:
-        """All joints that a link carries, directly or not."""
-        carried = {link}
-        found: list[TreeJoint] = []
-        for joint in self.joints:
-            if joint.parent in carried:
-                carried.add(joint.child)
-                found.append(joint)
-        return tuple(found)
+        chain = above(self, link, root)
+        if (chain[0].parent if chain else link) != root:
+            raise DescriptionError(f"{where}: link {link!r} does not hang on link {root!r}")
+        return tuple(chain)
 
     def known_link(self, link: str, where: str) -> str:
         """The link, if there is one of that name.
@@ -397,52 +379,7 @@ class RobotTree:
         return known(joint, moving, "joint", where)
 
 
-class Linking(Protocol):
-    """What hangs a link on another one."""
-
-    @property
-    def parent(self) -> str:
-        """The link above."""
-        ...
-
-    @property
-    def child(self) -> str:
-        """The link below."""
-        ...
-
-
-L = TypeVar("L", bound=Linking)
-
-
-def parents_first(joints: Iterable[L], root: str) -> tuple[L, ...]:
-    """The order of the file, moved only where a child stands before its parent.
-
-    Joints that do not hang on the root are left out.
-    """
-    hung, waiting = {root}, list(joints)
-    placed: list[L] = []
-    while waiting:
-        joint = next((one for one in waiting if one.parent in hung), None)
-        if joint is None:
-            break
-        waiting.remove(joint)
-        placed.append(joint)
-        hung.add(joint.child)
-    return tuple(placed)
-
-
 def fixed(name: str, parent: str, child: str, placement: Array) -> TreeJoint:
     """A joint that does not move."""
     axis = np.array([0.0, 0.0, 1.0])
     return TreeJoint(name, parent, child, "fixed", placement, axis, None, math.inf, None)
-
-
-def known(name: str, names: Collection[str], noun: str, where: str) -> str:
-    """The name of a link or joint, if it is among some.
-
-    Raises:
-        DescriptionError: It is not; the message lists them.
-    """
-    if name not in names:
-        raise DescriptionError(f"{where}: unknown {noun} {name!r}; known: {', '.join(names)}")
-    return name

@@ -11,6 +11,7 @@ import numpy as np
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.limits import LIMITS
 from casadi_ik.robots.couplings import Coupling, Linear
+from casadi_ik.robots.linkage import parents_first
 from casadi_ik.robots.robot_files.tree import (
     Element,
     RobotTree,
@@ -19,7 +20,6 @@ from casadi_ik.robots.robot_files.tree import (
     check_size,
     check_vector,
     number,
-    parents_first,
     pose_of,
     urdf_shapes,
 )
