@@ -7,47 +7,29 @@ import pickle
 
 import numpy as np
 import pytest
-from pinocchio_oracle import verdict
-from toy_robots import replace
+from toy_robots import grasp_at, replace
+from trace_checks import Kept
 
 import casadi_ik as ik
-from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.problem.method import Outcome
 from casadi_ik.problem.targets import TargetBatch
-from casadi_ik.problem.trace import TraceFormat
 from casadi_ik.problem.verdict import judge
-from casadi_ik.solving.batch_parts import CACHED_BYTES, ENOUGH, FIRST_PART, PART_BYTES, BatchParts
 from casadi_ik.solving.engine import Engine, Run
-
-LAYOUT = Layout.record(Field("row", (), "f8"))
 
 
 class Answering:
     """Gives for every target the q0 it was given, and the status it was made with."""
 
-    name = "answering"
+    name, trace_format = "answering", None
 
     def __init__(self, status=ik.Status.SOLVED):
         self.status = status
-        self.prepared = 0
-        self.calls = []
-
-    @property
-    def trace_format(self):
-        return TraceFormat(LAYOUT, {"row": ("a",)})
-
-    @property
-    def parameters(self):
-        return {}
 
     def prepare(self):
-        self.prepared += 1
+        """Nothing to do."""
 
     def run(self, problems, q0, seed, trace):
-        self.calls.append((len(problems), seed, trace))
         k = len(problems)
-        rows = np.zeros(k, LAYOUT.dtype)
-        rows["row"] = problems.first_row + np.arange(k)
         return Outcome(
             q=q0,
             status=np.full(k, int(self.status)),
@@ -55,18 +37,7 @@ class Answering:
             restarts=np.zeros(k, dtype=np.int64),
             time=np.full(k, 0.5),
             phases={"only": np.ones(k, dtype=np.int64)},
-            rows=rows if trace else None,
         )
-
-
-class Keeping:
-    """A recorder that keeps what it is given."""
-
-    def __init__(self):
-        self.blocks = []
-
-    def record(self, block):
-        self.blocks.append(block)
 
 
 def targets(robot, q, enforce=True):
@@ -98,88 +69,25 @@ def test_the_verdict_outvotes_the_method(robot, status):
     np.testing.assert_array_equal(batch.success, [True, False])
 
 
-def test_threads_share_a_batch_in_order(robot, rng):
-    q = robot.random(rng, 11)
-    method = Answering()
-    batch = Engine(robot, method).solve(targets(robot, q), Run(q, 5, jobs=3))
-    assert method.prepared == 1
-    assert sorted(count for count, _, _ in method.calls) == [3, 4, 4]
-    assert {seed for _, seed, _ in method.calls} == {5}
-    np.testing.assert_array_equal(batch.q, q)
-    assert batch.success.all()
-    np.testing.assert_array_equal(batch.phases["only"], np.ones(11))
-
-
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_every_solve_is_recorded_once_and_in_order(robot, rng, jobs):
-    """In parts, the first of a fixed size, the others as large as the memory set aside for them."""
-    q = robot.random(rng, 300)
-    keeping = Keeping()
-    problems = targets(robot, q)
-    method = Answering()
-    batch = Engine(robot, method).solve(problems, Run(q, 9, jobs=jobs, recorder=keeping))
-    assert method.prepared == 1
-    assert len(keeping.blocks) > 1
-    assert keeping.blocks[0].first == 0
-    assert sum(len(block) for block in keeping.blocks) == 300
-    for block in keeping.blocks:
+    """In parts, with the rows of their own iterations."""
+    points, normals = robot.contacts(robot.random(rng, 300))
+    kept = Kept()
+    batch = ik.Solver(robot).solve_batch(points, normals, jobs=jobs, log=kept)
+    assert len(kept.blocks) > 1
+    assert sorted(i for b in kept.blocks for i in range(b.first, b.first + len(b))) == [*range(300)]
+    for block in kept.blocks:
         rows = slice(block.first, block.first + len(block))
-        assert (block.method, block.robot, block.fingers) == (
-            "answering",
-            robot.name,
-            robot.fingers,
-        )
-        assert block.batch.success.all()
-        assert block.format.labels == {"row": ("a",)}
-        np.testing.assert_array_equal(np.diff(block.started), 500_000_000)
         np.testing.assert_array_equal(block.batch.q, batch.q[rows])
-        np.testing.assert_array_equal(block.targets.points, problems.points[rows])
-        np.testing.assert_array_equal(block.rows["row"], np.arange(rows.start, rows.stop))
-
-
-@pytest.mark.parametrize(
-    ("bytes_per_solve", "size"),
-    [
-        (CACHED_BYTES // 2**10, 2**10),
-        (PART_BYTES // ENOUGH, ENOUGH),
-        (PART_BYTES // 100, 100),
-        (2**30, 1),
-        (1, 10**6),
-    ],
-)
-def test_parts_are_as_large_as_their_iterations_allow(bytes_per_solve, size):
-    parts = BatchParts(10**6, 1, trace=True)
-    found = []
-    for part in parts:
-        found.append(part)
-        parts.learn(part.stop - part.start, bytes_per_solve * (part.stop - part.start))
-        if len(found) == 3:
-            break
-    assert found[0] == slice(0, FIRST_PART)
-    assert found[1].stop - found[1].start == min(size, (10**6 - FIRST_PART) // 2)
-
-
-def test_little_is_left_to_record_when_all_are_solved():
-    parts = BatchParts(10_000, 1, trace=True)
-    sizes = []
-    for part in parts:
-        sizes.append(part.stop - part.start)
-        parts.learn(10, 10 * CACHED_BYTES // 4000)
-    assert sum(sizes) == 10_000
-    assert sizes[1:4] == [4000, 2968, 1484]
-    assert sizes[-1] <= ENOUGH
-
-
-@pytest.mark.parametrize(("count", "jobs", "sizes"), [(0, 2, [0]), (5, 2, [3, 2]), (1, 4, [1])])
-def test_without_a_trace_there_is_a_part_for_each_thread(count, jobs, sizes):
-    parts = list(BatchParts(count, jobs, trace=False))
-    assert [part.stop - part.start for part in parts] == sizes
+        np.testing.assert_array_equal(block.targets.points, points[rows])
+        assert len(block.rows) == batch.iterations[rows].sum()
+        last = block.rows[np.cumsum(batch.iterations[rows]) - 1]
+        np.testing.assert_array_equal(last["status"], batch.status[rows])
 
 
 def test_a_quick_answer_has_every_field(robot: ik.ArmHand) -> None:
-    points, normals = robot.contacts(robot.home)
-    contacts = map(ik.Contact, points, normals)
-    solution = ik.Solver(robot).solve(ik.Grasp(dict(zip(robot.fingers, contacts, strict=True))))
+    solution = ik.Solver(robot).solve(grasp_at(robot, robot.home))
     for one in (solution, *solution.contacts.values()):
         needed = {f.name for f in dataclasses.fields(one) if f.default is dataclasses.MISSING}
         names = {f.name for f in dataclasses.fields(one)}
@@ -189,29 +97,8 @@ def test_a_quick_answer_has_every_field(robot: ik.ArmHand) -> None:
                 assert repr(getattr(again, name)) == repr(getattr(one, name))
 
 
-def test_parts_of_a_batch_keep_the_numbers_of_their_targets():
-    points = np.zeros((10, 3, 3))
-    problems = TargetBatch(points, points, ik.Tolerance(), True, first_row=100)
-    assert problems.rows(slice(4, 8)).first_row == 104
-    assert problems.rows(slice(4, 8)).rows(slice(1, None)).first_row == 105
-    assert problems.rows(slice(-2, None)).first_row == 108
-    assert problems.rows(slice(0, 0)).first_row == 100
-    assert len(problems.rows(np.array([7, 2]))) == 2
-    assert problems.rows(np.array([7, 2])).first_row == 0
-
-
 def problems(points, normals, **tolerance):
     return TargetBatch(points, normals, ik.Tolerance(**tolerance), True)
-
-
-def test_errors_are_pinocchios(robot, oracle, rng):
-    q, goals = robot.random(rng, 10), robot.random(rng, 10)
-    points, normals = robot.contacts(goals)
-    found = judge(robot, problems(points, normals), q)
-    for i in range(10):
-        position, angle = verdict(oracle, q[i], points[i], normals[i])
-        np.testing.assert_allclose(found.position_error[i], position, atol=1e-12)
-        np.testing.assert_allclose(found.angle_error[i], angle, atol=1e-12)
 
 
 def test_edge_of_the_tolerances(robot):

@@ -5,13 +5,12 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import sys
-import textwrap
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import python
 from toy_robots import grasp_of
 
 import casadi_ik as ik
@@ -36,15 +35,7 @@ SOLVE = """
 def run(cache: Path, policy: str, scene: str = "None") -> tuple[np.ndarray, str]:
     """The answer of another process, and what it says."""
     changed = {"CASADI_IK_CACHE": str(cache), "CASADI_IK_COMPILE": policy}
-    root = {"PYTHONPATH": str(Path(__file__).parents[2])}
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(SOLVE.format(scene=scene))],
-        env=os.environ | changed | root,
-        capture_output=True,
-        text=True,
-        timeout=600,
-        check=True,
-    )
+    done = python("-c", SOLVE.format(scene=scene), env=changed, check=True)
     return np.array(done.stdout.split(), dtype=float), done.stderr
 
 

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
-import textwrap
 import threading
 import time
 
 import numpy as np
 import pytest
+from processes import python
 
 import casadi_ik as ik
 from casadi_ik.kernels.cancellation import CancelledError, stop_if_cancelled
@@ -53,9 +51,7 @@ def test_threads_stop(method: str, count: int, diagnose: bool, compiled: bool) -
     script = SCRIPT.format(
         method=method, count=count, diagnose=diagnose, compiled=compiled, noise=int(diagnose)
     )
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, timeout=600
-    )
+    done = python("-c", script)
     assert done.stdout, f"ended before it was interrupted: {done.stderr}"
     word, seconds, threads = done.stdout.split()
     assert word == "interrupted", done.stderr

@@ -67,17 +67,6 @@ def test_nearest_of_those_that_are_seen(robot, rng):
     assert np.median(ratio) < 1.01
 
 
-def test_alone_and_in_a_batch_the_same(robot, rng):
-    q, q0 = robot.random(rng, 8), robot.random(rng, 8)
-    q0[4:] = np.clip(q[4:] + 0.02, robot.lower, robot.upper)
-    solver = ik.Solver(robot)
-    batch = solver.solve_batch(*robot.contacts(q), q0=q0)
-    for row in range(8):
-        alone = solver.solve(grasp_at(robot, q[row]), q0=q0[row])
-        np.testing.assert_allclose(alone.q, batch.q[row], atol=1e-6)
-        assert alone.iterations == batch.iterations[row]
-
-
 def test_manipulability(robot, rng):
     q = robot.random(rng, 3)
     solver = ik.Solver(robot, compiled=False)

@@ -29,8 +29,6 @@ from casadi_ik.symbolic.couplings import ROWS, Interval
 
 pytestmark = pytest.mark.usefixtures("usual_flags")
 
-BLIND = [[0, 100, 48, 78, 48, 48, 48], [0, 90, 48, 78, 46, 60, 31], [4, 94, 48, 78, 48, 47, 48]]
-"""Hands (spread, thumb, finger 2, finger 3) [deg] that a lookup of postures tells badly apart."""
 
 ROBOTS = ["kuka_lwr_barrett", "kuka_lwr_barrett_coupled", "ar10", "baxter_ar10"]
 
@@ -111,21 +109,6 @@ def test_a_wrong_hand_is_lost(robot: ik.ArmHand, prover: Prover) -> None:
 def test_the_whole_search_finds_no_proof_either(robot: ik.ArmHand, prover: Prover) -> None:
     q = robot.random(np.random.default_rng(9), 4)
     assert prover.prove(asked(robot.contacts(q), 5e-3, np.deg2rad(3), True)) == [None] * 4
-
-
-def test_blind_hands_are_never_unreachable(robot: ik.ArmHand) -> None:
-    """Hands that the solve itself may miss: they used to be called unreachable."""
-    rng = np.random.default_rng(3)
-    q = robot.random(rng, 30)
-    q[:, 7:] = np.clip(
-        np.deg2rad(np.array(BLIND)[np.arange(30) % 3] + rng.uniform(-1, 1, (30, 7))),
-        robot.lower[7:],
-        robot.upper[7:],
-    )
-    batch = ik.Solver(robot).solve_batch(*robot.contacts(q), diagnose=True)
-    assert "UNREACHABLE" not in batch.status_names
-    missed = batch.status_names[~batch.success]
-    assert set(missed) <= {"NOT_FOUND"}
 
 
 def test_ignored_limits_and_tiny_tolerances_are_never_unreachable(robot: ik.ArmHand) -> None:
