@@ -56,6 +56,12 @@ def robot() -> ik.ArmHand:
 
 
 @pytest.fixture(scope="session")
+def solver(robot: ik.ArmHand) -> ik.Solver:
+    """Hand-first on it, as it comes."""
+    return ik.Solver(robot)
+
+
+@pytest.fixture(scope="session")
 def ar10() -> ik.ArmHand:
     """The shipped AR10 hand: ten sliders, no arm."""
     return ik.load_robot("ar10")

@@ -127,3 +127,8 @@ def grasp_of(robot: ik.ArmHand, points: np.ndarray, normals: np.ndarray) -> ik.G
 def grasp_at(robot: ik.ArmHand, q: np.ndarray) -> ik.Grasp:
     """The contacts of a configuration."""
     return grasp_of(robot, *robot.contacts(q))
+
+
+def grasps_of(robot: ik.ArmHand, points: np.ndarray, normals: np.ndarray) -> list[ik.Grasp]:
+    """The same of arrays (k, f, 3)."""
+    return [grasp_of(robot, *pair) for pair in zip(points, normals, strict=True)]

@@ -11,7 +11,6 @@ from casadi_ik.problem.request import PREFERENCES
 from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.solving.alternatives.arm_search import ArmSearch
 from casadi_ik.solving.alternatives.unconstrained_fingers import UnconstrainedFingers
-from casadi_ik.solving.trials import Deduplicator, best_of_each, first_of_each
 
 
 @pytest.fixture(scope="module")
@@ -119,17 +118,6 @@ def test_each_hand_is_looked_at_alone(search, robot, hands):
         np.testing.assert_array_equal(alone.q[alone.owner == i], together.q[together.owner == hand])
 
 
-def test_pairs_are_those_of_the_hand_or_of_the_arm(search, robot, hands):
-    table = hands[2].table
-    assert len(table.held.pairs) + len(table.swung.pairs) == len(table.pairs)
-    for first, second in table.held.names:
-        assert not {first, second} & {f"lwr_link_{i}" for i in range(1, 6)}
-    # With the hand where it is, the first do not change while the arm does.
-    found = chosen(search, robot, hands, "q0")
-    one = hands[2].rows(found.owner).held.check(found.q).surplus
-    np.testing.assert_allclose(one, hands[3][found.owner], atol=1e-8)
-
-
 def test_the_first_hand_of_a_target_with_an_arm_is_enough(search, plain, robot, hands):
     whose = np.arange(len(hands[0])) // 3
     every = chosen(search, robot, hands, "limits")
@@ -139,44 +127,6 @@ def test_the_first_hand_of_a_target_with_an_arm_is_enough(search, plain, robot, 
         found = chosen(one, robot, hands, "limits", of_one=whose)
         np.testing.assert_array_equal(found.owner, firsts)
         assert (found.tried[firsts] > 0).all()
-
-
-@pytest.mark.parametrize(("name", "rows"), [("ur5e+shadow", 8), ("xarm6+shadow", 32)])
-def test_an_arm_with_a_wrist_is_looked_at_with_the_wrist_anywhere(name, rows):
-    robot = ik.load_robot(name)
-    family = ik.Solver(robot)._engine.method.step.arm
-    assert family.rows == rows
-    search = ArmSearch(robot, family, lambda *_: None, lambda: None, compiled=False)
-    columns = list(robot.description.arm_actuators)
-    wrist = [columns[joint] for joint in family.locked]
-    for level in search.values.levels:
-        assert level.shape[1] == 2
-        assert (level >= robot.lower[wrist]).all()
-        assert (level <= robot.upper[wrist]).all()
-
-
-def test_what_is_like_an_earlier_row_of_the_same_owner_is_not_new():
-    """As one comparison after the other has it."""
-    rng = np.random.default_rng(2)
-    kept, seen = Deduplicator(5, 3, 0.3), [list[np.ndarray]() for _ in range(5)]
-    for count in (9, 0, 14, 30):
-        rows, owner = rng.random((count, 3)), rng.integers(0, 5, count)
-        expected = []
-        for row, one in zip(rows, owner, strict=True):
-            new = all(np.abs(row - other).max() >= 0.3 for other in seen[one])
-            expected.append(new)
-            if new:
-                seen[one].append(row)
-        np.testing.assert_array_equal(kept.add(rows, owner), np.array(expected, dtype=bool))
-    assert sum(map(len, seen)) > 10
-
-
-def test_the_best_and_the_first_of_each():
-    owner, value = np.array([2, 0, 2, 0, 1]), np.array([3.0, 1.0, 5.0, 4.0, 2.0])
-    rows = best_of_each(owner, value, np.array([0.0, 7.0, 0.0]))
-    assert rows.tolist() == [3, 2]
-    order = np.lexsort((-value, owner))
-    assert first_of_each(owner, order, 1).tolist() == [3, 4, 2]
 
 
 def test_only_motors_of_unconstrained_fingers_move_and_only_for_more_room():

@@ -11,20 +11,8 @@ import pytest
 import casadi_ik as ik
 from casadi_ik import grasps
 
-NAMES = (
-    "apple",
-    "banana",
-    "bleach_cleanser",
-    "cracker_box",
-    "cup",
-    "mug",
-    "mustard_bottle",
-    "orange",
-    "potted_meat_can",
-    "sugar_box",
-    "tennis_ball",
-    "tomato_soup_can",
-)
+NAMES = [name for name in ik.shipped_names("objects") if name != "golf_ball"]
+"""Those that grasps are shipped for: a golf ball is too small for most hands."""
 
 SHAPES: tuple[grasps.Shape, ...] = (
     grasps.Sphere(diameter=0.08, source="x"),
@@ -56,10 +44,6 @@ def points() -> np.ndarray:
 
 def shape_id(shape: grasps.Shape) -> str:
     return type(shape).__name__
-
-
-def test_the_twelve_objects_and_a_golf_ball_are_shipped() -> None:
-    assert set(ik.shipped_names("objects")) == {*NAMES, "golf_ball"}
 
 
 @pytest.mark.parametrize("name", NAMES)

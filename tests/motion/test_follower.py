@@ -15,11 +15,6 @@ PERIOD = 0.004
 ROUNDING = 1e-9
 
 
-@pytest.fixture(scope="module")
-def solver(robot) -> ik.Solver:
-    return ik.Solver(robot)
-
-
 def check_limits(robot, follower, q):
     """Positions, velocities and accelerations of (k, n), the robot at rest before the first."""
     assert (q >= robot.lower).all()

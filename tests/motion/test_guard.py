@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from dense_ways import dense
 from samplers import smooth_path
-from toy_robots import grasp_of
+from toy_robots import grasp_of, grasps_of
 
 import casadi_ik as ik
 from casadi_ik.motion.clear import RESOLUTION, between, motor_units
@@ -119,7 +119,7 @@ def test_a_path_that_is_free_is_followed_as_without_a_scene(robot, solver):
     path = smooth_path(robot, 2, 60, 0.02, share=0.5)
     path = robot.home + 0.05 * (path - path[0])
     assert clearances(solver, path).free.all()
-    moving = [grasp_of(robot, *pair) for pair in zip(*robot.contacts(path), strict=True)]
+    moving = grasps_of(robot, *robot.contacts(path))
     track = solver.track(moving, q0=path[0])
     assert track.success.all()
     assert track.jumps == ()

@@ -4,21 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from toy_robots import grasp_of
+from toy_robots import grasp_at, grasp_of, grasps_of
 
 import casadi_ik as ik
-
-
-@pytest.fixture(scope="module")
-def solver(robot) -> ik.Solver:
-    return ik.Solver(robot)
-
-
-def grasps(robot, path) -> list[ik.Grasp]:
-    """The contacts of configurations (k, n), which need not be within limits."""
-    points, normals = robot.contacts(path)
-    return [grasp_of(robot, *pair) for pair in zip(points, normals, strict=True)]
-
 
 LEAP = 0.05
 """A motor that moves by more of its range from one grasp to the next jumps."""
@@ -40,7 +28,7 @@ def smooth_path(robot, seed, count=60):
 
 @pytest.mark.parametrize("seed", range(8))
 def test_a_grasp_that_moves_smoothly_is_followed_smoothly(robot, solver, seed):
-    track = solver.track(grasps(robot, smooth_path(robot, seed)))
+    track = solver.track(grasps_of(robot, *robot.contacts(smooth_path(robot, seed))))
     assert track.success.all()
     assert track.jumps == ()
     assert largest_step(robot, track) <= LEAP
@@ -50,7 +38,7 @@ def test_a_grasp_that_moves_smoothly_is_followed_smoothly(robot, solver, seed):
 
 def test_it_begins_where_the_robot_is(robot, solver):
     path = smooth_path(robot, 3)
-    track = solver.track(grasps(robot, path), q0=path[0])
+    track = solver.track(grasps_of(robot, *robot.contacts(path)), q0=path[0])
     assert track.success.all()
     np.testing.assert_allclose(track.q[0], path[0], atol=0.05)
 
@@ -60,7 +48,7 @@ def test_a_jump_that_cannot_be_avoided_is_reported(robot, solver):
     turns = np.linspace(-2 * np.pi, 2 * np.pi, 160)
     path = np.tile(robot.home, (len(turns), 1))
     path[:, 6] = turns
-    track = solver.track(grasps(robot, path))
+    track = solver.track(grasps_of(robot, *robot.contacts(path)))
     assert track.success.all()
     assert track.jumps
     for jump in track.jumps:
@@ -81,7 +69,9 @@ def test_motors_keep_their_velocities_and_catch_up(robot, solver):
     path = smooth_path(robot, 1, count=10)
     path = np.concatenate([path, np.tile(path[-1], (200, 1))])
     velocity, period = 0.2, 0.05
-    track = solver.track(grasps(robot, path), q0=path[0], period=period, velocity=velocity)
+    track = solver.track(
+        grasps_of(robot, *robot.contacts(path)), q0=path[0], period=period, velocity=velocity
+    )
     assert np.abs(np.diff(track.q, axis=0)).max() <= velocity * period * (1 + 1e-9)
     assert track.success[0]
     assert not track.success[5]
@@ -93,7 +83,7 @@ def test_the_robots_own_velocities(robot, solver):
     period = 1e-3
     own = np.array([actuator.velocity for actuator in robot.description.actuators])
     path = smooth_path(robot, 2, count=20)
-    track = solver.track(grasps(robot, path), q0=path[0], period=period)
+    track = solver.track(grasps_of(robot, *robot.contacts(path)), q0=path[0], period=period)
     assert (np.abs(np.diff(track.q, axis=0)) <= own * period * (1 + 1e-9)).all()
 
 
@@ -111,7 +101,7 @@ def test_a_grasp_out_of_reach_is_come_near_to(robot, solver):
 
 
 def test_what_is_refused(robot, solver):
-    moving = grasps(robot, np.tile(robot.home, (2, 1)))
+    moving = [grasp_at(robot, robot.home)] * 2
     with pytest.raises(ik.errors.InputError, match="grasps: found none, expected at least one"):
         solver.track([])
     with pytest.raises(

@@ -68,21 +68,6 @@ def test_malformed_targets(solver, points, normals, says):
     assert "\n" not in str(caught.value)
 
 
-def test_a_direction_is_a_normal_without_a_point(robot, solver):
-    points, normals = (x[None].copy() for x in robot.contacts(robot.home))
-    directions = np.full_like(normals, np.nan)
-    directions[0, 1] = 3 * normals[0, 1]
-    points[0, 1] = normals[0, 1] = np.nan
-    batch = solver.solve_batch(points, normals, directions=directions)
-    assert batch.success.all()
-    assert np.argwhere(np.isnan(batch.position_error)).tolist() == [[0, 1]]
-    assert np.isfinite(batch.angle_error).all()
-    free = np.full((1, 3, 3), np.nan)
-    alone = solver.solve_batch(free, free, directions=robot.contacts(robot.home)[1][None])
-    assert alone.success.all()
-    assert np.isnan(alone.position_error).all()
-
-
 @pytest.mark.parametrize(
     ("directions", "says"),
     [

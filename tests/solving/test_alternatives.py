@@ -13,11 +13,6 @@ APART, DISTINCT = 0.25, 0.05
 """Least differences of answers unless said otherwise, and of hands that are searched."""
 
 
-@pytest.fixture(scope="module")
-def solver(robot) -> ik.Solver:
-    return ik.Solver(robot)
-
-
 def contains(interval, swivels):
     start, end = interval
     return np.mod(swivels - start, 2 * np.pi) <= end - start

@@ -11,18 +11,7 @@ import pytest
 import casadi_ik as ik
 from casadi_ik import errors
 
-ROBOT = "kuka_lwr_barrett"
 COUNT = 12
-
-
-@pytest.fixture(scope="module")
-def robot() -> ik.ArmHand:
-    return ik.load_robot(ROBOT)
-
-
-@pytest.fixture(scope="module")
-def solver(robot) -> ik.Solver:
-    return ik.Solver(robot)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from toy_robots import grasp_of
+from toy_robots import grasps_of
 
 import casadi_ik as ik
 
@@ -35,10 +35,6 @@ def starts(robot, rng):
         "random": robot.random(rng, 1)[0],
         "extreme": np.where(rng.random(len(robot.lower)) < 0.5, robot.lower, robot.upper),
     }
-
-
-def grasps_of(robot, points, normals):
-    return [grasp_of(robot, *pair) for pair in zip(points, normals, strict=True)]
 
 
 def targets(solver, rng):
