@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
 
 from casadi_ik.arrays import Array
 from casadi_ik.calibration.measurements import Measurements
@@ -32,43 +33,27 @@ class Loss:
     Attributes:
         cost: What a component of a measurement costs.
         weight: Weight of a measurement in the normal equations, cost' / rho.
-        slope: Its share in the mean curvature, weight + rho weight' / m over m components.
+        slope: Its share in the mean curvature, weight + rho weight' / m over m components, from
+            weight, rho and m.
     """
 
     cost: Callable[[Array], Array]
     weight: Callable[[Array], Array]
-    slope: Callable[[Array, Array], Array]
-
-
-def _cauchy_cost(rho: Array) -> Array:
-    return 0.5 * CAUCHY**2 * np.log1p((rho / CAUCHY) ** 2)
-
-
-def _cauchy_weight(rho: Array) -> Array:
-    return 1 / (1 + (rho / CAUCHY) ** 2)
-
-
-def _cauchy_slope(rho: Array, m: Array) -> Array:
-    weight = _cauchy_weight(rho)
-    return weight - 2 * (weight * rho / CAUCHY) ** 2 / m
-
-
-def _huber_cost(rho: Array) -> Array:
-    return np.where(rho <= HUBER, 0.5 * rho**2, HUBER * (rho - 0.5 * HUBER))
-
-
-def _huber_weight(rho: Array) -> Array:
-    return HUBER / np.maximum(rho, HUBER)
-
-
-def _huber_slope(rho: Array, m: Array) -> Array:
-    return np.where(rho <= HUBER, 1.0, _huber_weight(rho) * (1 - 1 / m))
+    slope: Callable[[Array, Array, Array], Array]
 
 
 LOSSES = {
-    "cauchy": Loss(_cauchy_cost, _cauchy_weight, _cauchy_slope),
-    "huber": Loss(_huber_cost, _huber_weight, _huber_slope),
-    "squares": Loss(lambda rho: 0.5 * rho**2, np.ones_like, lambda rho, _: np.ones_like(rho)),
+    "cauchy": Loss(
+        cost=lambda rho: 0.5 * CAUCHY**2 * np.log1p((rho / CAUCHY) ** 2),
+        weight=lambda rho: 1 / (1 + (rho / CAUCHY) ** 2),
+        slope=lambda weight, rho, m: weight - 2 * (weight * rho / CAUCHY) ** 2 / m,
+    ),
+    "huber": Loss(
+        cost=lambda rho: np.where(rho <= HUBER, 0.5 * rho**2, HUBER * (rho - 0.5 * HUBER)),
+        weight=lambda rho: HUBER / np.maximum(rho, HUBER),
+        slope=lambda weight, rho, m: np.where(rho <= HUBER, 1.0, weight * (1 - 1 / m)),
+    ),
+    "squares": Loss(lambda rho: 0.5 * rho**2, np.ones_like, lambda weight, *_: weight),
 }
 """The losses by name."""
 
@@ -85,7 +70,7 @@ class EstimateSettings:
         unknown: Singular value, relative to the largest, below which the data say nothing at all.
         fewest: Measured numbers beyond those that the parameters can explain, so that noise can be
             seen.
-        max_iterations: ?
+        max_iterations: Steps at most.
         smallest_step: Step at which the iteration ends, in prior standard deviations.
     """
 
@@ -254,9 +239,7 @@ class _Fit:
         rows = np.vstack([_stacked(jacobians, noise, roots), np.eye(len(x))])
         right = -np.concatenate([(roots[:, None] * white).ravel(), x])
         lower, upper = self._bounds()
-        step = np.asarray(np.linalg.lstsq(rows, right)[0], dtype=float)
-        if np.any(x + step < lower) or np.any(x + step > upper):
-            step = _in_box(rows.T @ rows, -rows.T @ right, lower - x, upper - x)
+        step = lsq_linear(rows, right, (lower - x, upper - x), method="bvls").x
         start = self._cost(x, noise)
         for _ in range(12):
             if self._cost(x + step, noise) <= start * (1 + 1e-12):
@@ -319,13 +302,13 @@ class _Fit:
             return rows.T @ rows
 
         # Sandwich of an M-estimator with a prior: curvature outside, variance of the score inside.
-        curved = _stacked(jacobians, noise, np.sqrt(self.loss.slope(rho, numbers)))
+        curved = _stacked(jacobians, noise, np.sqrt(self.loss.slope(weights, rho, numbers)))
         _, sizes, turns = np.linalg.svd(np.vstack([curved, eye]), full_matrices=False)
         outer = (turns.T / sizes**2) @ turns
         known, directions = self._known(jacobians, noise, weights)
         # Where there are too few data to see the scatter, the noise that was assumed stands for it.
         scatter = (weights * rho) ** 2 / (1 - _used(known) / self._rows())
-        share = scatter if estimated else self.loss.slope(rho, numbers)
+        share = scatter if estimated else self.loss.slope(weights, rho, numbers)
         inner = information(share) + eye
         prior = self.model.prior
         covariance = np.outer(prior, prior) * (outer @ inner @ outer)
@@ -374,14 +357,3 @@ def _each(noise: Array) -> Array:
 def _sizes(errors: Array, turned: NDArray[np.bool_]) -> Array:
     angles = np.where(turned, np.linalg.norm(errors[:, 3:], axis=1), np.nan)
     return np.column_stack([np.linalg.norm(errors[:, :3], axis=1), angles])
-
-
-def _in_box(hessian: Array, gradient: Array, lower: Array, upper: Array) -> Array:
-    """Minimiser of x' H x / 2 + g' x within bounds."""
-    import proxsuite
-
-    n = len(gradient)
-    result = proxsuite.proxqp.dense.solve(
-        hessian, gradient, None, None, np.eye(n), lower, upper, eps_abs=1e-10
-    )
-    return np.clip(np.array(result.x), lower, upper)

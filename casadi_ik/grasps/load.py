@@ -159,17 +159,10 @@ def _palm(entry: GraspFile) -> Array | dict[str, Array] | None:
 
 
 def _contact(entry: ContactEntry) -> Contact:
-    tolerance = entry.tolerance
-    return Contact(
-        entry.point,
-        entry.normal,
-        tolerance and Tolerance(tolerance.position, tolerance.angle),
-        tangent=entry.tangent,
-        line=entry.line,
-        plane=entry.plane,
-        ball=entry.ball,
-        direction=entry.direction,
-    )
+    given: dict[str, Any] = msgspec.structs.asdict(entry)
+    if entry.tolerance is not None:
+        given["tolerance"] = Tolerance(entry.tolerance.position, entry.tolerance.angle)
+    return Contact(**given)
 
 
 def grasp_data(grasp: Grasp) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from scipy.spatial import KDTree
 from trimesh.remesh import subdivide_to_size
 
 from casadi_ik.arrays import Array
+from casadi_ik.collision.solids import spread
 from casadi_ik.files.reading import roll_pitch_yaw
 from casadi_ik.importing.surfaces import Surface
 from casadi_ik.robots.schema import BoxEntry, CapsuleEntry, ShapeEntry, SphereEntry
@@ -96,17 +97,12 @@ class FittedCapsule:
         along = self.last - self.first
         length = float(np.linalg.norm(along))
         axis = along / length if length > 1e-12 else np.array([0, 0, 1.0])
-        count = 400
-        z = 1 - (2 * np.arange(count) + 1) / count
-        turn = np.pi * (3 - 5**0.5) * np.arange(count)
-        ball = np.column_stack(
-            [np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z]
-        )
+        ball = spread(400)
         up = ball @ axis
         ends = np.where((up > 0)[:, None], self.last, self.first) + self.radius * ball
         flat = ball - up[:, None] * axis
         flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
-        mantle = self.first + ((np.arange(count) * 0.618) % 1)[:, None] * along
+        mantle = self.first + ((np.arange(len(ball)) * 0.618) % 1)[:, None] * along
         return np.concatenate([ends, mantle + self.radius * flat])
 
 

@@ -17,7 +17,16 @@ from casadi_ik.files.limits import LIMITS
 from casadi_ik.files.mesh_file import read_mesh
 from casadi_ik.grasps.shapes import circle, prism_mesh
 from casadi_ik.robots.robot_files.foreign import package_folders
-from casadi_ik.robots.robot_files.tree import Element, RobotTree, pose_of, simple_shape, values_of
+from casadi_ik.robots.robot_files.tree import (
+    Element,
+    RobotTree,
+    collides,
+    mjcf_pose,
+    pose_of,
+    simple_geom,
+    simple_shape,
+    values_of,
+)
 
 AROUND = 24
 """Points around an axis."""
@@ -233,12 +242,9 @@ def _of_mjcf(mujoco: Any, model: Any, seen: bool) -> dict[str, Surface]:
         surface = _of_geom(mujoco, model, geom)
         if surface is None:
             continue
-        pose, flat = np.eye(4), np.empty(9)
-        mujoco.mju_quat2Mat(flat, model.geom_quat[geom])
-        pose[:3, :3], pose[:3, 3] = flat.reshape(3, 3), model.geom_pos[geom]
-        solid = bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
-        body = int(model.geom_bodyid[geom])
-        by_body.setdefault(body, []).append((solid, surface.moved(pose)))
+        pose = mjcf_pose(mujoco, model.geom_pos[geom], model.geom_quat[geom])
+        parts = by_body.setdefault(int(model.geom_bodyid[geom]), [])
+        parts.append((collides(model, geom), surface.moved(pose)))
     found: dict[str, Surface] = {}
     for body, parts in by_body.items():
         chosen = [one for solid, one in parts if solid != seen] or [one for _, one in parts]
@@ -249,20 +255,13 @@ def _of_mjcf(mujoco: Any, model: Any, seen: bool) -> dict[str, Surface]:
 
 
 def _of_geom(mujoco: Any, model: Any, geom: int) -> Surface | None:
-    kind, size = int(model.geom_type[geom]), np.array(model.geom_size[geom])
-    types = mujoco.mjtGeom
-    if kind == types.mjGEOM_ELLIPSOID:
+    kind, simple = int(model.geom_type[geom]), simple_geom(mujoco, model, geom)
+    if simple is not None:
+        return simple_surface(simple[0], np.array(simple[1]))
+    if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
         ball = simple_surface("sphere", np.ones(1))
-        return Surface(ball.points * size, ball.triangles)
-    simple = {
-        types.mjGEOM_BOX: ("box", 2 * size),
-        types.mjGEOM_SPHERE: ("sphere", size),
-        types.mjGEOM_CAPSULE: ("capsule", size * [1, 2, 0]),
-        types.mjGEOM_CYLINDER: ("cylinder", size * [1, 2, 0]),
-    }
-    if kind in simple:
-        return simple_surface(*simple[kind])
-    if kind != types.mjGEOM_MESH:
+        return Surface(ball.points * model.geom_size[geom], ball.triangles)
+    if kind != mujoco.mjtGeom.mjGEOM_MESH:
         return None
     mesh = int(model.geom_dataid[geom])
     start, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])

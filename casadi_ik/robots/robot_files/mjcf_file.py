@@ -19,6 +19,7 @@ from casadi_ik.robots.robot_files.tree import (
     TreeJoint,
     check_size,
     fixed,
+    mjcf_pose,
     mjcf_shapes,
 )
 
@@ -84,7 +85,7 @@ def _of_body(
     mujoco: Any, model: Any, body: int, names: list[str], couplings: dict[str, Coupling]
 ) -> list[TreeJoint]:
     """The joints of a body in order, or the fixed one that holds it."""
-    placement = _pose(mujoco, model.body_pos[body], model.body_quat[body])
+    placement = mjcf_pose(mujoco, model.body_pos[body], model.body_quat[body])
     parent = names[model.body_parentid[body]]
     first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
     if count == 0:
@@ -195,11 +196,3 @@ def _tendons(
             ratio = (end - start) / (high - low)
             couplings[joint_name(model, joint)] = Linear(name, ratio, start - ratio * low)
     return motors
-
-
-def _pose(mujoco: Any, position: Array, quaternion: Array) -> Array:
-    rotation = np.empty(9)
-    mujoco.mju_quat2Mat(rotation, np.asarray(quaternion, dtype=float))
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation.reshape(3, 3), position
-    return pose

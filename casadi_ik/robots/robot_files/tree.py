@@ -196,27 +196,39 @@ def mjcf_shapes(mujoco: Any, model: Any, names: Sequence[str]) -> FileShapes:
     types = mujoco.mjtGeom
     for geom in range(model.ngeom):
         kind, name = int(model.geom_type[geom]), names[int(model.geom_bodyid[geom])]
-        solid = bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
-        if not solid or kind in (types.mjGEOM_PLANE, types.mjGEOM_HFIELD):
+        if not collides(model, geom) or kind in (types.mjGEOM_PLANE, types.mjGEOM_HFIELD):
             continue
-        pose, flat = np.eye(4), np.empty(9)
-        mujoco.mju_quat2Mat(flat, model.geom_quat[geom])
-        pose[:3, :3], pose[:3, 3] = flat.reshape(3, 3), model.geom_pos[geom]
-        x, y, z = (float(value) for value in model.geom_size[geom])
-        match kind:
-            case types.mjGEOM_BOX:
-                shape = entry_of("box", (2 * x, 2 * y, 2 * z), pose)
-            case types.mjGEOM_SPHERE:
-                shape = entry_of("sphere", (x,), pose)
-            case types.mjGEOM_CAPSULE:
-                shape = entry_of("capsule", (x, 2 * y), pose)
-            case types.mjGEOM_CYLINDER:
-                shape = entry_of("cylinder", (x, 2 * y), pose)
-            case _:
-                meshes.add(name)
-                continue
-        entries.setdefault(name, []).append(shape)
+        shape = simple_geom(mujoco, model, geom)
+        if shape is None:
+            meshes.add(name)
+        else:
+            pose = mjcf_pose(mujoco, model.geom_pos[geom], model.geom_quat[geom])
+            entries.setdefault(name, []).append(entry_of(*shape, pose))
     return _told(entries, meshes)
+
+
+def collides(model: Any, geom: int) -> bool:
+    """Whether a geom of an MJCF is there to be collided with, not only to be seen."""
+    return bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
+
+
+def simple_geom(mujoco: Any, model: Any, geom: int) -> tuple[str, list[float]] | None:
+    """Kind and sizes [m] of a geom of an MJCF, as `entry_of` takes them; None: a mesh, or such."""
+    types, (x, y, z) = mujoco.mjtGeom, model.geom_size[geom].tolist()
+    return {
+        int(types.mjGEOM_BOX): ("box", [2 * x, 2 * y, 2 * z]),
+        int(types.mjGEOM_SPHERE): ("sphere", [x]),
+        int(types.mjGEOM_CAPSULE): ("capsule", [x, 2 * y]),
+        int(types.mjGEOM_CYLINDER): ("cylinder", [x, 2 * y]),
+    }.get(int(model.geom_type[geom]))
+
+
+def mjcf_pose(mujoco: Any, position: Array, quaternion: Array) -> Array:
+    """(4, 4) of a position (3,) [m] and a quaternion (4,), scalar first."""
+    pose, flat = np.eye(4), np.empty(9)
+    mujoco.mju_quat2Mat(flat, np.asarray(quaternion, dtype=float))
+    pose[:3, :3], pose[:3, 3] = flat.reshape(3, 3), position
+    return pose
 
 
 def entry_of(kind: str, size: Sequence[float], pose: Array) -> ShapeEntry:
