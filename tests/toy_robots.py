@@ -132,3 +132,13 @@ def grasp_at(robot: ik.ArmHand, q: np.ndarray) -> ik.Grasp:
 def grasps_of(robot: ik.ArmHand, points: np.ndarray, normals: np.ndarray) -> list[ik.Grasp]:
     """The same of arrays (k, f, 3)."""
     return [grasp_of(robot, *pair) for pair in zip(points, normals, strict=True)]
+
+
+def moved(targets, rng, metres, angle):
+    """Contacts (k, f, 3) moved and their normals turned by so much, any way."""
+    points, normals = targets
+    shift, turn = rng.normal(size=points.shape), rng.normal(size=normals.shape)
+    points = points + metres * shift / np.linalg.norm(shift, axis=2, keepdims=True)
+    turn -= (turn * normals).sum(axis=2, keepdims=True) * normals
+    turn /= np.linalg.norm(turn, axis=2, keepdims=True)
+    return points, normals * np.cos(angle) + turn * np.sin(angle)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass, replace
@@ -73,41 +72,27 @@ class CollisionQuery:
         """Those of some targets, which may be there several times."""
         if self.poses.ndim == 2:
             return self
-        if len(self.poses) == 1:
-            return CollisionQuery(self.kernel, self.table, self.poses[0], self.margin)
-        return CollisionQuery(self.kernel, self.table, self.poses[rows], self.margin)
+        poses = self.poses[0] if len(self.poses) == 1 else self.poses[rows]
+        return CollisionQuery(self.kernel, self.table, poses, self.margin)
 
-    def only(self, pairs: NDArray[np.bool_]) -> CollisionQuery:
-        """With some of the pairs."""
-        return CollisionQuery(self.kernel, self.table.only(pairs), self.poses, self.margin)
+    def among(self, table: Table) -> CollisionQuery:
+        """With the pairs of a table alone."""
+        return CollisionQuery(self.kernel, table, self.poses, self.margin)
 
     def parted(self, links: frozenset[str]) -> tuple[CollisionQuery, CollisionQuery]:
         """With the pairs alone that one of some links is in, and with all others."""
         within, others = self.table.parted(links)
-        return (
-            CollisionQuery(self.kernel, within, self.poses, self.margin),
-            CollisionQuery(self.kernel, others, self.poses, self.margin),
-        )
+        return self.among(within), self.among(others)
 
     @property
     def held(self) -> CollisionQuery:
         """With the pairs alone that the hand and its palm's pose decide."""
-        return CollisionQuery(self.kernel, self.table.held, self.poses, self.margin)
+        return self.among(self.table.held)
 
     @property
     def swung(self) -> CollisionQuery:
         """With the pairs alone that the arm decides which holds the palm."""
-        return CollisionQuery(self.kernel, self.table.swung, self.poses, self.margin)
-
-    @property
-    def robot_alone(self) -> CollisionQuery:
-        """With the pairs alone of the robot with itself."""
-        return CollisionQuery(self.kernel, self.table.of_robot, self.poses, self.margin)
-
-    @property
-    def scene_alone(self) -> CollisionQuery:
-        """With the pairs alone of the robot with what stands about it."""
-        return CollisionQuery(self.kernel, self.table.of_scene, self.poses, self.margin)
+        return self.among(self.table.swung)
 
     def check(self, q: Array) -> Clearances:
         """Clearances of configurations (k, n)."""
@@ -256,10 +241,6 @@ class SceneCheck:
         if key not in self._tables:
             self._tables[key] = pair_table(self.model, scene, sorted(touched), carried)
         return self._tables[key]
-
-
-NOTHING = math.inf
-"""Clearance where there is nothing to hit."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -104,7 +104,9 @@ def hand_posture(robot: ArmHand, posture: Mapping[str, float], name: str = "post
     return values
 
 
-def postures_of(robot: ArmHand, postures: Sequence[Mapping[str, float]]) -> Array:
+def postures_of(
+    robot: ArmHand, postures: Sequence[Mapping[str, float]], name: str = "posture"
+) -> Array:
     """(k, n) as `hand_posture` gives them, of many that name the same motors."""
     motors = robot.description.finger_motors
     columns = [robot.actuators.index(name) for name in motors]
@@ -118,7 +120,8 @@ def postures_of(robot: ArmHand, postures: Sequence[Mapping[str, float]]) -> Arra
     found[:, columns] = np.clip(given, low, high)
     for row, posture in enumerate(postures):
         if not within[row] or len(posture) != len(motors):
-            found[row] = hand_posture(robot, posture)  # which says best what is wrong
+            # Which says best what is wrong.
+            found[row] = hand_posture(robot, posture, name.format(row))
     return found
 
 
@@ -139,25 +142,18 @@ def hand_postures(
             row.
     """
     if not isinstance(postures, Mapping):
-        every = robot.configuration(postures, "postures")
+        given = robot.configuration(postures, "postures")
         motors = [robot.actuators.index(name) for name in robot.description.finger_motors]
-        postures = {robot.actuators[i]: every[..., i] for i in motors}
+        postures = {robot.actuators[i]: given[..., i] for i in motors}
     columns: dict[str, Array] = {}
     for name, value in postures.items():
         try:
             columns[name] = np.broadcast_to(np.asarray(value, dtype=float), (count,))
         except (TypeError, ValueError) as error:
             raise InputError(f"postures.{name}: expected {count} numbers, or one") from error
-    return np.array(
-        [
-            hand_posture(
-                robot,
-                {name: float(column[row]) for name, column in columns.items()},
-                f"postures: row {row}",
-            )
-            for row in range(count)
-        ]
-    )
+    rows = range(count)
+    every = [{name: float(column[row]) for name, column in columns.items()} for row in rows]
+    return postures_of(robot, every, "postures: row {}")
 
 
 def touched(robot: ArmHand, palms: Array, postures: Array) -> tuple[Array, Array, dict[str, Array]]:

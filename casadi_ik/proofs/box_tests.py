@@ -252,7 +252,7 @@ def largest_trace(S: Expr, bound: Expr, steps: int = 7) -> Expr:
         ca.horzcat(xy - yx, zx + xz, yz + zy, zz - xx - yy),
     )
     # x^4 + c2 x^2 + c1 x + c0; the trace of K is zero.
-    c2, c1, c0 = -2 * ca.sumsqr(s), -8 * _determinant(s), _determinant(K)
+    c2, c1, c0 = -2 * ca.sumsqr(s), -8 * ca.det(s), ca.det(K)
     x = ca.SX(1)
     for _ in range(steps):
         value = ((x * x + c2) * x + c1) * x + c0
@@ -282,29 +282,6 @@ def rigid_excess(contacts: list[BoxContact]) -> Expr:
     least = size - 2 * largest_trace(S, size / 2)
     # What is left of a double root in doubles, as a part of the largest terms.
     return (least - 3e-8 * size) / ca.fmax(allowed, 1.0) - 1
-
-
-def _determinant(M: Expr) -> Expr:
-    """By minors of the first rows, with few operations."""
-    if M.shape[0] == 3:
-        return (
-            M[0, 0] * (M[1, 1] * M[2, 2] - M[1, 2] * M[2, 1])
-            - M[0, 1] * (M[1, 0] * M[2, 2] - M[1, 2] * M[2, 0])
-            + M[0, 2] * (M[1, 0] * M[2, 1] - M[1, 1] * M[2, 0])
-        )
-
-    def minor(rows: tuple[int, int], a: int, b: int) -> Expr:
-        return M[rows[0], a] * M[rows[1], b] - M[rows[0], b] * M[rows[1], a]
-
-    top, low = (0, 1), (2, 3)
-    return (
-        minor(top, 0, 1) * minor(low, 2, 3)
-        - minor(top, 0, 2) * minor(low, 1, 3)
-        + minor(top, 0, 3) * minor(low, 1, 2)
-        + minor(top, 1, 2) * minor(low, 0, 3)
-        - minor(top, 1, 3) * minor(low, 0, 2)
-        + minor(top, 2, 3) * minor(low, 0, 1)
-    )
 
 
 @dataclass(frozen=True, eq=False)

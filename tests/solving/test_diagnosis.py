@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from robot_variants import derived_robot
 from scipy.optimize import least_squares
+from toy_robots import moved
 
 import casadi_ik as ik
 
@@ -62,19 +63,6 @@ def stretched(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
     cosine = ((0.999 * (a + b)) ** 2 - a * a - b * b) / (2 * a * b)
     q[:, 3] = np.arccos(cosine) * rng.choice([-1, 1], count)
     return q
-
-
-def moved_within(
-    targets: tuple[Array, Array], rng: np.random.Generator, part: float
-) -> tuple[Array, Array]:
-    """Contacts moved by a part of the tolerance: only the tolerance makes them reachable."""
-    points, normals = targets
-    shift, turn = rng.normal(size=points.shape), rng.normal(size=normals.shape)
-    points = points + part * 5e-3 * shift / np.linalg.norm(shift, axis=2, keepdims=True)
-    turn -= (turn * normals).sum(axis=2, keepdims=True) * normals
-    turn /= np.linalg.norm(turn, axis=2, keepdims=True)
-    angle = part * np.deg2rad(3)
-    return points, normals * np.cos(angle) + turn * np.sin(angle)
 
 
 def test_solved_has_none(solver: ik.Solver, cup: tuple[Array, Array]) -> None:
@@ -204,7 +192,7 @@ def test_barely_reachable_is_never_unreachable(solver: ik.Solver, robot: ik.ArmH
 def test_reachable_thanks_to_tolerance(solver: ik.Solver, robot: ik.ArmHand) -> None:
     rng = np.random.default_rng(12)
     for q in (at_limits(robot, rng, 250, 0.3), stretched(robot, rng, 250)):
-        targets = moved_within(robot.contacts(q), rng, 0.99)
+        targets = moved(robot.contacts(q), rng, 0.99 * 5e-3, 0.99 * np.deg2rad(3))
         batch = solver.solve_batch(*targets, diagnose=True)
         assert "UNREACHABLE" not in batch.status_names
         assert batch.success.mean() > 0.99

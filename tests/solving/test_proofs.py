@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from robot_variants import derived_robot
-from toy_robots import grasp_of, write_coupled_robot
+from toy_robots import grasp_of, moved, write_coupled_robot
 from toy_robots import replace as put
 
 import casadi_ik as ik
@@ -35,16 +35,6 @@ ROBOTS = ["kuka_lwr_barrett", "kuka_lwr_barrett_coupled", "ar10", "baxter_ar10"]
 
 def asked(targets: tuple[Array, Array], position: float, angle: float, limits: bool) -> TargetBatch:
     return TargetBatch(*targets, ik.Tolerance(position, angle), limits)
-
-
-def moved(targets: tuple[Array, Array], rng: np.random.Generator, metres: float, angle: float):
-    """Every contact moved and every normal turned by so much, any way."""
-    points, normals = targets
-    shift, turn = rng.normal(size=points.shape), rng.normal(size=normals.shape)
-    points = points + metres * shift / np.linalg.norm(shift, axis=2, keepdims=True)
-    turn -= (turn * normals).sum(axis=2, keepdims=True) * normals
-    turn /= np.linalg.norm(turn, axis=2, keepdims=True)
-    return points, normals * np.cos(angle) + turn * np.sin(angle)
 
 
 def wrongly(robot: ik.ArmHand, prover: Prover, q: Array, problems: TargetBatch) -> int:
@@ -121,23 +111,8 @@ def test_ignored_limits_and_tiny_tolerances_are_never_unreachable(robot: ik.ArmH
     assert "UNREACHABLE" not in strict.solve_batch(*targets, diagnose=True).status_names
 
 
-def test_coupled_mechanisms_and_other_arms(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Chains of couplings, a prismatic thumb, an arm without a closed form."""
-    coupled = ik.load_robot(write_coupled_robot(tmp_path_factory.mktemp("coupled")))
-    bent = derived_robot(tmp_path_factory.mktemp("bent"), wrist_offset=0.045)
-    for robot in (coupled, bent):
-        rng, prover = np.random.default_rng(5), Prover(robot.description)
-        q = robot.random(rng, 200)
-        q = q[robot.beyond_limits(q) <= 0][:16]
-        targets = robot.contacts(q)
-        for limits in (True, False):
-            assert wrongly(robot, prover, q, asked(targets, 1e-9, 1e-9, limits)) == 0
-        far = targets[0] + 5.0, targets[1]
-        proofs = prover.prove(asked(far, 5e-3, 0.05, True))
-        assert all(proof is not None and proof.check(robot) for proof in proofs)
-
-
 def polynomial_robot(folder: Path) -> ik.ArmHand:
+    """A hand bent by a cam, where the joint turns back within the motor's range."""
     path = write_coupled_robot(folder)
     put(
         folder / "parts" / "hand.yaml",
@@ -147,9 +122,18 @@ def polynomial_robot(folder: Path) -> ik.ArmHand:
     return ik.load_robot(path)
 
 
-def test_a_polynomial_coupling_gets_proofs(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Of hands bent by a cam, where the joint turns back within the motor's range."""
-    robot = polynomial_robot(tmp_path_factory.mktemp("cam"))
+@pytest.mark.parametrize(
+    "made",
+    [
+        lambda folder: ik.load_robot(write_coupled_robot(folder)),
+        lambda folder: derived_robot(folder, wrist_offset=0.045),
+        polynomial_robot,
+    ],
+    ids=["coupled", "bent", "cam"],
+)
+def test_coupled_mechanisms_and_other_arms(tmp_path: Path, made) -> None:
+    """Chains of couplings, a prismatic thumb, an arm without a closed form."""
+    robot = made(tmp_path)
     rng, prover = np.random.default_rng(5), Prover(robot.description)
     q = robot.random(rng, 200)
     q = q[robot.beyond_limits(q) <= 0][:16]
@@ -160,8 +144,7 @@ def test_a_polynomial_coupling_gets_proofs(tmp_path_factory: pytest.TempPathFact
     for points in (targets[0] + 5.0, centre + 9 * (targets[0] - centre)):
         proofs = prover.prove(asked((points, targets[1]), 5e-3, 0.05, True))
         assert all(proof is not None for proof in proofs)
-        assert proofs[0] is not None
-        assert proofs[0].check(robot)
+        assert all(proof.check(robot) for proof in proofs[:4])
 
 
 @settings(max_examples=200, deadline=None)

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from casadi_ik.answers.solution import BatchSolution, CollisionReport
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
+from casadi_ik.collision.distances import Table
 from casadi_ik.problem.clearance import ROUNDING, Clearances, CollisionQuery
 from casadi_ik.problem.contacts import by_kinds
 from casadi_ik.problem.method import Outcome
@@ -423,8 +424,9 @@ class FreeSearch:
         if not len(blocked):
             return FreeAnswers(q, self.free, reports)
         clear = self.query.rows(blocked).check(q[blocked])
-        alone = self._possible(blocked, self.query.robot_alone) if reasons else None
-        passing = self._possible(blocked, self.query.scene_alone) if reasons else None
+        table = self.query.table
+        alone = self._possible(blocked, table.of_robot) if reasons else None
+        passing = self._possible(blocked, table.of_scene) if reasons else None
         for i, row in enumerate(blocked.tolist()):
             pair = clear.pair(i)
             assert pair is not None
@@ -437,8 +439,9 @@ class FreeSearch:
             )
         return FreeAnswers(q, self.free, reports)
 
-    def _possible(self, rows: NDArray[np.intp], query: CollisionQuery) -> NDArray[np.bool_]:
+    def _possible(self, rows: NDArray[np.intp], table: Table) -> NDArray[np.bool_]:
         """(all targets,) whether one of the hands is free of some of the pairs alone."""
+        query = self.query.among(table)
         q, owner, surplus = self._hands_of(rows)
         possible = np.zeros(len(self.free), dtype=bool)
         if self.arm_search is None:
