@@ -30,7 +30,6 @@ from casadi_ik.exporting.targets import (
     Example,
     SceneTargets,
     example,
-    single_targets_header,
     stored,
     targets_header,
     written,
@@ -210,13 +209,12 @@ def c_project(
         "README.md": "README.md",
     }
     marks = project.marks | tested(project, IN_TEST_SINGLE if single else IN_TEST_C)
-    header = single_targets_header if single else targets_header
     return {
         **project.sources,
         f"include/{prefix}.hpp": filled("solver.hpp", marks),
         **{path: filled(name, marks) for path, name in files.items()},
         **project.judge,
-        "test/targets.h": header(project.solver, project.scene),
+        "test/targets.h": targets_header(project.solver, project.scene, single),
     }
 
 

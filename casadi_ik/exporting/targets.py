@@ -87,46 +87,35 @@ def stored(solver: Solver, scene: SceneTargets | None = None) -> list[dict[str, 
     return found if scene is None else [scene.answered(target) for target in found]
 
 
-def targets_header(solver: Solver, scene: SceneTargets | None = None) -> str:
-    """A C header with the `stored` targets."""
-    robot = solver.robot
-    f, n = len(robot.fingers), len(robot.actuators)
+def targets_header(solver: Solver, scene: SceneTargets | None = None, single: bool = False) -> str:
+    """A C header with the `stored` targets and the scene.
+
+    Args:
+        solver: Of the robot.
+        scene: What the targets are solved in.
+        single: For a solver in single precision: how targets end stands there without answers.
+    """
+    f, n = len(solver.robot.fingers), len(solver.robot.actuators)
+    whole, answer = (WHOLE[:1], "") if single else (WHOLE, f", q[{n}]")
+    clearance = scene is not None and not single
     rows = []
     for target in stored(solver, scene):
-        whole = (target["q0"] is not None, *(target[name] for name in WHOLE))
-        q0 = target["q0"] or robot.home.tolist()
-        arrays = map(numbers, (target["points"], target["normals"], q0, target["q"]))
-        if scene is not None:
-            clearance = target["clearance"]
-            arrays = (*arrays, "NAN" if clearance is None else digits(clearance))
-        rows.append("{" + ", ".join([*(str(int(value)) for value in whole), *arrays]) + "},\n")
+        q0 = target["q0"] or solver.robot.home.tolist()
+        row = [str(int(value)) for value in (bool(target["q0"]), *map(target.get, whole))]
+        row += map(numbers, (target["points"], target["normals"], q0))
+        row += [numbers(target["q"])] if answer else []
+        if clearance:
+            row.append("NAN" if target["clearance"] is None else digits(target["clearance"]))
+        rows.append("{" + ", ".join(row) + "},\n")
+    what = "how they end in double precision" if single else "what the Python package answers"
     return (
-        "/* Targets, and what the Python package answers. */\n"
+        f"/* Targets, and {what}. */\n"
         f"enum {{ TARGETS = {COUNT} }};\n\n"
-        "typedef struct {\n  int near, status, iterations, restarts;\n"
-        f"  double points[{3 * f}], normals[{3 * f}], q0[{n}], q[{n}];\n"
-        f"{'' if scene is None else '  double clearance;' + chr(10)}}} target;\n\n"
+        f"typedef struct {{\n  int near, {', '.join(whole)};\n"
+        f"  double points[{3 * f}], normals[{3 * f}], q0[{n}]{answer};\n"
+        f"{'  double clearance;' + chr(10) if clearance else ''}}} target;\n\n"
         "static const target targets[TARGETS] = {\n" + "".join(rows) + "};\n"
-    ) + ("" if scene is None else "\n" + scene.header())
-
-
-def single_targets_header(solver: Solver, scene: SceneTargets | None = None) -> str:
-    """The same for a solver in single precision: no answers, and the scene as it takes it."""
-    robot = solver.robot
-    f, n = len(robot.fingers), len(robot.actuators)
-    rows = []
-    for target in stored(solver, scene):
-        q0 = target["q0"] or robot.home.tolist()
-        arrays = map(numbers, (target["points"], target["normals"], q0))
-        whole = int(target["q0"] is not None), int(target["status"])
-        rows.append("{" + ", ".join([*map(str, whole), *arrays]) + "},\n")
-    return (
-        "/* Targets, and how they end in double precision. */\n"
-        f"enum {{ TARGETS = {COUNT} }};\n\n"
-        "typedef struct {\n  int near, status;\n"
-        f"  double points[{3 * f}], normals[{3 * f}], q0[{n}];\n}} target;\n\n"
-        "static const target targets[TARGETS] = {\n" + "".join(rows) + "};\n"
-    ) + ("" if scene is None else "\n" + scene.header("float"))
+    ) + ("" if scene is None else "\n" + scene.header("float" if single else "double"))
 
 
 def written(array: Array) -> str:
