@@ -29,9 +29,10 @@ from casadi_ik.grasps.shapes import (
     MeshShape,
     Shape,
     Sphere,
+    box_mesh,
+    capsule_mesh,
     circle,
     prism_mesh,
-    tube_mesh,
 )
 
 GROUP = 32
@@ -394,27 +395,6 @@ def _bent(shape: BentCapsule, links: int = 5) -> list[tuple[Solid, Array]]:
 
 
 # Surfaces.
-
-
-def box_mesh(half: Array, middle: Array | float = 0.0) -> Mesh:
-    """A box by half its edges (3,) [m]."""
-    x, y, z = half
-    ring = np.array([[x, y, 0.0], [-x, y, 0.0], [-x, -y, 0.0], [x, -y, 0.0]])
-    points, triangles = prism_mesh(ring, 2 * z)
-    return points + middle, triangles
-
-
-def capsule_mesh(radius: float, half: float, around: int = 32) -> Mesh:
-    """A capsule along z, or a ball, by its radius and half its segment [m]."""
-    angles = np.linspace(-np.pi / 2, np.pi / 2, around // 2 + 1)[1:-1]
-    rings = circle(around)[None] * (radius * np.cos(angles))[:, None, None]
-    rings[..., 2] = (radius * np.sin(angles) + np.where(angles < 0, -half, half))[:, None]
-    if half > 0:  # the equator twice, once at each end of the segment
-        below = rings[len(angles) // 2].copy()
-        below[..., 2] = -half
-        rings = np.insert(rings, len(angles) // 2, below, axis=0)
-    end = np.array([0.0, 0.0, radius + half])
-    return tube_mesh(rings, -end, end)
 
 
 def _seen_from_inside(solid: Solid) -> Mesh:

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from casadi_ik.arrays import Array
-from casadi_ik.collision.solids import capsule_mesh
-from casadi_ik.grasps.shapes import circle, tube_mesh
+from casadi_ik.grasps.shapes import capsule_mesh, circle, tube_mesh
 from casadi_ik.importing.surfaces import Surface, together
 
 AROUND = 32

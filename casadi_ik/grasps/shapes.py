@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
 
 import msgspec
 import numpy as np
@@ -57,23 +56,53 @@ def prism_mesh(ring: Array, height: float) -> Mesh:
     return tube_mesh(np.stack([ring - up, ring + up]), -up, up)
 
 
-class Surface(Protocol):
-    """What each shape has to say of itself; the type checker asks every member of `Shape` for it.
+def box_mesh(half: Array, middle: Array | float = 0.0) -> Mesh:
+    """A box by half its edges (3,) [m]."""
+    x, y, z = half
+    ring = np.array([[x, y, 0.0], [-x, y, 0.0], [-x, -y, 0.0], [x, -y, 0.0]])
+    points, triangles = prism_mesh(ring, 2 * z)
+    return points + middle, triangles
 
-    A Protocol, as msgspec's structs cannot have abstract methods.
-    """
+
+def capsule_mesh(radius: float, half: float, around: int = 32) -> Mesh:
+    """A capsule along z, or a ball, by its radius and half its segment [m]."""
+    angles = np.linspace(-np.pi / 2, np.pi / 2, around // 2 + 1)[1:-1]
+    rings = circle(around)[None] * (radius * np.cos(angles))[:, None, None]
+    rings[..., 2] = (radius * np.sin(angles) + np.where(angles < 0, -half, half))[:, None]
+    if half > 0:  # the equator twice, once at each end of the segment
+        below = rings[len(angles) // 2].copy()
+        below[..., 2] = -half
+        rings = np.insert(rings, len(angles) // 2, below, axis=0)
+    end = np.array([0.0, 0.0, radius + half])
+    return tube_mesh(rings, -end, end)
+
+
+class Body:
+    """What a shape says of points, once it says what of it is nearest to them."""
+
+    __slots__ = ()
 
     def _nearest(self, points: Array) -> tuple[Array, Array]:
         """Signed distance (k,) and unit outward normal (k, 3) for points (k, 3)."""
-        ...
+        raise NotImplementedError(type(self).__name__)
 
     def mesh(self, resolution: int = 32) -> Mesh:
         """Vertices (v, 3) [m] on the surface and triangles (t, 3), outward by the right hand."""
-        ...
+        raise NotImplementedError(type(self).__name__)
+
+    def signed_distance(self, points: ArrayLike) -> Array:
+        """Distance to the surface [m], negative inside: (k,) for (k, 3), () for (3,)."""
+        array = np.asarray(points, dtype=float)
+        return self._nearest(array.reshape(-1, 3))[0].reshape(array.shape[:-1])
+
+    def normal(self, points: ArrayLike) -> Array:
+        """Unit outward normal at the nearest surface point, same shape as the points."""
+        array = np.asarray(points, dtype=float)
+        return self._nearest(array.reshape(-1, 3))[1].reshape(array.shape)
 
 
 class Primitive(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", kw_only=True
+    Body, msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", kw_only=True
 ):
     """A shape of an object file.
 
@@ -82,16 +111,6 @@ class Primitive(
     """
 
     source: str
-
-    def signed_distance(self: Surface, points: ArrayLike) -> Array:
-        """Distance to the surface [m], negative inside: (k,) for (k, 3), () for (3,)."""
-        rows, shape = _rows(points)
-        return self._nearest(rows)[0].reshape(shape[:-1])
-
-    def normal(self: Surface, points: ArrayLike) -> Array:
-        """Unit outward normal at the nearest surface point, same shape as the points."""
-        rows, shape = _rows(points)
-        return self._nearest(rows)[1].reshape(shape)
 
     def check(self) -> str:
         """What is wrong with the numbers together, as "key: found, expected", or ""."""
@@ -113,11 +132,7 @@ class Sphere(Primitive, frozen=True, tag="sphere", kw_only=True):
 
     def mesh(self, resolution: int = 32) -> Mesh:
         """Rings of latitude."""
-        latitude = np.linspace(-np.pi / 2, np.pi / 2, resolution // 2 + 1)[1:-1]
-        radius = self.diameter / 2
-        rings = circle(resolution)[None] * (radius * np.cos(latitude))[:, None, None]
-        rings[..., 2] = radius * np.sin(latitude)[:, None]
-        return tube_mesh(rings, np.array([0, 0, -radius]), np.array([0, 0, radius]))
+        return capsule_mesh(self.diameter / 2, 0.0, resolution)
 
 
 class Cylinder(Primitive, frozen=True, tag="cylinder", kw_only=True):
@@ -187,9 +202,7 @@ class Box(Primitive, frozen=True, tag="box", kw_only=True):
     def mesh(self, resolution: int = 32) -> Mesh:
         """Twelve triangles; the resolution does not matter."""
         del resolution
-        x, y, z = np.asarray(self.size) / 2
-        ring = np.array([[x, y, 0.0], [-x, y, 0.0], [-x, -y, 0.0], [x, -y, 0.0]])
-        return prism_mesh(ring, 2 * z)
+        return box_mesh(np.asarray(self.size) / 2)
 
 
 class BentCapsule(Primitive, frozen=True, tag="bent-capsule", kw_only=True):
@@ -262,11 +275,6 @@ class BentCapsule(Primitive, frozen=True, tag="bent-capsule", kw_only=True):
 
 Shape = Sphere | Cylinder | EllipticCylinder | Box | BentCapsule
 """What an object may look like, beside a mesh."""
-
-
-def _rows(points: ArrayLike) -> tuple[Array, tuple[int, ...]]:
-    array = np.asarray(points, dtype=float)
-    return array.reshape(-1, 3), array.shape
 
 
 def _polar(points: Array, fallback: Array) -> tuple[Array, Array]:
@@ -352,7 +360,7 @@ RAYS = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3, 3)))[0]
 
 
 @dataclass(frozen=True, eq=False)
-class MeshShape:
+class MeshShape(Body):
     """A body bounded by triangles, in pieces that hang together.
 
     Attributes:
@@ -360,16 +368,6 @@ class MeshShape:
     """
 
     pieces: tuple[Mesh, ...]
-
-    def signed_distance(self, points: ArrayLike) -> Array:
-        """Distance to the surface [m], negative inside: (k,) for (k, 3), () for (3,)."""
-        array = np.asarray(points, dtype=float)
-        return self._nearest(array.reshape(-1, 3))[0].reshape(array.shape[:-1])
-
-    def normal(self, points: ArrayLike) -> Array:
-        """Unit outward normal at the nearest surface point, same shape as the points."""
-        array = np.asarray(points, dtype=float)
-        return self._nearest(array.reshape(-1, 3))[1].reshape(array.shape)
 
     def mesh(self, resolution: int = 32) -> Mesh:
         """Its corners and triangles; the resolution does not matter."""
