@@ -34,7 +34,7 @@ from casadi_ik.cli.inputs import (
     the_start,
 )
 from casadi_ik.cli.options import Option
-from casadi_ik.cli.outputs import check_outputs, folder_of, say, write_output, writing
+from casadi_ik.cli.outputs import check_outputs, folder_of, output, say, writing
 from casadi_ik.cli.table import Answer, Said, command
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.files.shipped import resolve
@@ -359,8 +359,8 @@ class _GrowingFile:
             for name, (_, rows) in self._grown.items()
         }
         table = self._path.suffix.lower() == ".parquet"
-        write = self._parquet if table else self._npz
-        write_output(self._path, "--out", partial(write, arrays))
+        with output(self._path) as part:
+            (self._parquet if table else self._npz)(arrays, part)
 
     def _npz(self, arrays: Mapping[str, np.ndarray], part: Path) -> None:
         with zipfile.ZipFile(part, "w") as archive:

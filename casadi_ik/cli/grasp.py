@@ -20,7 +20,7 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.cli import options as opt
 from casadi_ik.cli.inputs import located, the_object_pose, the_robot, the_scene, the_start
 from casadi_ik.cli.options import Option
-from casadi_ik.cli.outputs import check_outputs, write_output
+from casadi_ik.cli.outputs import check_outputs, output
 from casadi_ik.cli.table import Answer, Said, command
 from casadi_ik.cli.view import serve
 from casadi_ik.collision.scene import Scene
@@ -103,8 +103,8 @@ def grasp(said: Said) -> Answer:
     if not len(found):
         head = headline(False, "NONE FOUND", rest)
         return Answer.solved(False, head, counts, Text(f"  {found.reason}"))
-    held = found_data(found, robot.fingers)
-    write_output(said.out, "--out", lambda part: part.write_bytes(held))
+    with output(said.out) as part:
+        part.write_bytes(found_data(found, robot.fingers))
     if draw is not None:
         draw(robot, found, said.picture, scene=scene)
     best = table("rank", "load [N/N]", "clearance [mm]", "fingers")

@@ -13,14 +13,13 @@ from casadi_ik.answers.report import headline, robot_report, table
 from casadi_ik.arms.recognise import family_in_words
 from casadi_ik.cli import options as opt
 from casadi_ik.cli.options import PROGRAM, Option, one_of
-from casadi_ik.cli.outputs import writing
+from casadi_ik.cli.outputs import output, writing
 from casadi_ik.cli.table import COMMANDS, GROUPS, Answer, Said, command, load, names
 from casadi_ik.collision.scene import SceneFile
 from casadi_ik.datasets.conventions import ConventionFile
 from casadi_ik.files.json_schema import json_schema
 from casadi_ik.files.reading import convert, read_yaml
 from casadi_ik.files.shipped import BODIES, resolve, shipped_names
-from casadi_ik.files.writing import written_whole
 from casadi_ik.grasps.load import CandidatesFile, GraspFile
 from casadi_ik.grasps.objects import ObjectFile
 from casadi_ik.motion.retarget import Retarget
@@ -180,8 +179,8 @@ def schemas(said: Said) -> Answer:
         path = said.out / f"{kind}.json"
         with writing(path, "--out"):
             said.out.mkdir(parents=True, exist_ok=True)
-            with written_whole(path) as part:
-                part.write_text(json.dumps(schema_of(kind), indent=1) + "\n", encoding="utf-8")
+        with output(path) as part:
+            part.write_text(json.dumps(schema_of(kind), indent=1) + "\n", encoding="utf-8")
         lines.append(Text(f"  {path}  {title}"))
     return Answer(Group(headline(True, "WRITTEN", f"{len(FILES)} schemas"), *lines))
 

@@ -28,7 +28,7 @@ from casadi_ik.answers.report import (
 from casadi_ik.cli import options as opt
 from casadi_ik.cli.inputs import located, robot_of_log
 from casadi_ik.cli.options import Option
-from casadi_ik.cli.outputs import check_outputs, write_json, write_output
+from casadi_ik.cli.outputs import check_outputs, output, write_json
 from casadi_ik.cli.table import Answer, Said, command
 from casadi_ik.errors import InputError, MissingExtraError, UnknownNameError, printable
 from casadi_ik.logs.container import NothingWrittenError
@@ -216,7 +216,8 @@ def report(said: Said) -> Answer:
     check_outputs({"--out": said.out}, inputs=paths)
     title = said.title or ", ".join(path.stem for path in paths)
     page = study_page(log, title, said.most)
-    write_output(said.out, "--out", lambda part: part.write_text(page, encoding="utf-8"))
+    with output(said.out) as part:
+        part.write_text(page, encoding="utf-8")
     count = counted(sum(len(part) for part in log.solves().parts), "solve")
     return Answer(Group(Text(f"  {count}"), *files({"page": said.out})))
 
@@ -252,8 +253,8 @@ def export(said: Said) -> Answer:
     log = logs.open(said.file)
     with located("log export", (MissingExtraError,)):
         frame = getattr(log, said.what)(**_filters(said)).frame()
-    write = frame.write_parquet if kind == "parquet" else frame.write_csv
-    write_output(said.out, "--out", write)
+    with output(said.out) as part:
+        (frame.write_parquet if kind == "parquet" else frame.write_csv)(part)
     about = {"rows": f"{frame.height} {said.what}", "columns": str(frame.width)}
     return Answer(Group(fields(about), *files({kind: said.out})))
 

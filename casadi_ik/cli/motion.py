@@ -23,7 +23,7 @@ from casadi_ik.cli.inputs import (
     the_units,
 )
 from casadi_ik.cli.options import Option
-from casadi_ik.cli.outputs import check_outputs, write_output
+from casadi_ik.cli.outputs import check_outputs, output
 from casadi_ik.cli.table import Answer, Said, command
 from casadi_ik.errors import InputError, MissingExtraError
 from casadi_ik.grasps import Grasp
@@ -97,7 +97,8 @@ def follow(said: Said) -> Answer:
         motion = follow_frames(robot, follower, frames, retargeter)
     count = len(motion) - 1
     spent = (time.perf_counter() - began) / count
-    write_output(said.out, "--out", motion.write_to)
+    with output(said.out) as part:
+        motion.write_to(part)
     status, error = motion.notes["status"][1:], motion.notes["position_error"][1:]
     counts = {one.value: int((status == one.value).sum()) for one in FollowStatus}
     step = np.abs(motion.velocity) / follower.velocity
@@ -211,7 +212,8 @@ def reach(said: Said) -> Answer:
     if motion is None:
         status = found.status.name.replace("_", " ")
         return Answer.solved(False, headline(False, status, f"{name}: {found.reason}"))
-    write_output(said.out, "--out", motion.write_to)
+    with output(said.out) as part:
+        motion.write_to(part)
     if draw is not None and animation is not None:
         draw(motion, grasp, animation, solver.scene)
     head = headline(True, "REACHED", f"{name}: {robot.name}")

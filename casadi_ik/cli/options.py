@@ -86,7 +86,7 @@ class Option:
     @property
     def unit(self) -> str:
         """Of its numbers: "m", "rad", "pose" (both), "motor" (of each motor its own), or ""."""
-        return UNITS.get(self.value, "") if self.dashed else ""
+        return KINDS[self.value][1] if self.dashed and self.value in KINDS else ""
 
     @property
     def text(self) -> str:
@@ -101,9 +101,11 @@ class Option:
         Raises:
             ValueError: They are none; the message says what was found and what was expected.
         """
-        read = self.read or (KINDS.get(self.value) if self.dashed else None)
-        if self.choices and read is None:
+        read = self.read
+        if read is None and self.choices:
             read = one_of(*self.choices)
+        elif read is None and self.dashed and self.value in KINDS:
+            read = KINDS[self.value][0]
         return words if read is None else read(words)
 
 
@@ -194,26 +196,17 @@ def each(read: Callable[[str], Any]) -> Callable[[Sequence[str]], list[Any]]:
     return lambda words: [read(word) for word in words]
 
 
-KINDS: dict[str, Callable[[Any], Any]] = {
-    "N": whole(1),
-    "SECONDS": positive,
-    "METRES": positive,
-    "RADIANS": positive,
-    "FACTOR": positive,
-    "V...": numbers,
-    "NAME=V...": each(assignment),
-    "POSE...": partial(numbers, count=6, meaning="x y z [m] roll pitch yaw [rad]"),
+KINDS: dict[str, tuple[Callable[[Any], Any], str]] = {
+    "N": (whole(1), ""),
+    "SECONDS": (positive, ""),
+    "METRES": (positive, "m"),
+    "RADIANS": (positive, "rad"),
+    "FACTOR": (positive, ""),
+    "V...": (numbers, "motor"),
+    "NAME=V...": (each(assignment), "motor"),
+    "POSE...": (partial(numbers, count=6, meaning="x y z [m] roll pitch yaw [rad]"), "pose"),
 }
-"""How the value of an option is read, by what stands for it."""
-
-UNITS = {
-    "METRES": "m",
-    "RADIANS": "rad",
-    "POSE...": "pose",
-    "V...": "motor",
-    "NAME=V...": "motor",
-}
-"""Units of the values of options, by what stands for them: see `Option.unit`."""
+"""How the value of an option is read, and its `Option.unit`, by what stands for it."""
 
 IN_UNITS = (
     Option(

@@ -7,7 +7,7 @@ import json
 import os
 import stat
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -62,19 +62,19 @@ def check_outputs(outputs: Mapping[str, Path | None], inputs: Iterable[Path] = (
             part.unlink()
 
 
-def write_output(path: Path, option: str, write: Callable[[Path], object]) -> None:
-    """Have a file written beside its place and put it there once it is complete.
+@contextlib.contextmanager
+def output(path: Path, option: str = "--out") -> Iterator[Path]:
+    """Give a path beside a file's place, of the same suffix, and put the file there once complete.
 
     Args:
         path: Where it shall stand.
         option: The option that asked for it.
-        write: Writes to the path it is given, which has the same suffix.
 
     Raises:
         OutputError: It cannot be written; nothing is left behind.
     """
     with writing(path, option), written_whole(path) as part:
-        write(part)
+        yield part
 
 
 def write_json(path: Path, data: Any) -> None:
@@ -83,8 +83,8 @@ def write_json(path: Path, data: Any) -> None:
     Raises:
         OutputError: It cannot be written.
     """
-    text = json.dumps(data, indent=2, allow_nan=False) + "\n"
-    write_output(path, "--out", lambda part: part.write_text(text, encoding="utf-8"))
+    with output(path) as part:
+        part.write_text(json.dumps(data, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def writing(path: Path, option: str) -> contextlib.AbstractContextManager[None]:

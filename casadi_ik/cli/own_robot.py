@@ -19,7 +19,7 @@ from casadi_ik.arms.recognise import family_in_words, is_searched
 from casadi_ik.cli import options as opt
 from casadi_ik.cli.inputs import located, the_robot, the_units
 from casadi_ik.cli.options import Option
-from casadi_ik.cli.outputs import check_outputs, say, write_output
+from casadi_ik.cli.outputs import check_outputs, output, say
 from casadi_ik.cli.table import Answer, Said, command
 from casadi_ik.errors import InputError, MissingExtraError, UnsupportedError
 from casadi_ik.exporting.ahead import uses
@@ -106,25 +106,18 @@ def import_robot(said: Said) -> Answer:
         shapes=draw is not None,
         xacro=said.xacro,
     )
-    robots: list[ArmHand] = []
-    differences: dict[str, float] = {}
-
-    def write(part: Path) -> None:
-        nonlocal found
+    with output(said.out) as part:
         part.write_text(found.written.text(), encoding="utf-8")
         found = found.at_home(part)
         part.write_text(found.written.text(), encoding="utf-8")
         found = found.with_shapes(part, srdf)
         part.write_text(found.written.text(), encoding="utf-8")
-        robots.append(imported.loaded(part))
-        if said.check:
-            differences.update(_differences(robots[0], found))
-        if draw is not None:
-            draw(robots[0], said.picture)
-
-    write_output(said.out, "--out", write)
+        robot = imported.loaded(part)
+        differences = _differences(robot, found) if said.check else {}
+        if draw is not None and said.picture is not None:
+            draw(robot, said.picture)
     same = all(value <= SAME for value in differences.values())
-    report = _import_report(robots[0], found, differences)
+    report = _import_report(robot, found, differences)
     return Answer.solved(same, *report, *files(outputs))
 
 
@@ -295,11 +288,8 @@ def calibrate(said: Said) -> Answer:
         sigma_angle=said.noise_angle,
     )
     if found.converged:
-
-        def write(part: Path) -> None:
+        with output(said.out) as part:
             calibration.write_description(found, said.robot, part, data.name)
-
-        write_output(said.out, "--out", write)
     written = files(outputs) if found.converged else []
     return Answer.solved(found.converged, *_calibration_report(found, the_units(said)), *written)
 
