@@ -33,7 +33,7 @@ class TouchParameters:
         attempts: Most that are tried at once.
         most: Attempts after which no more are made.
         lost: Hands after which no more are tried if the arm has reached none of them.
-        lean: Fingertips lean by at most this angle at first [rad].
+        lean: Planes lean by at most this angle at first [rad]; balls may more, everywhere.
         near: A further fingertip is at most this far from the surface at first [m].
         clear: Fingertips that do not touch are at least this far from it [m].
         looked: Postures of a further finger that are looked at.
@@ -50,16 +50,16 @@ class TouchParameters:
     """
 
     facing: float = float(np.deg2rad(45.0))
-    object_pairs: int = 100_000
-    first: int = 2_000
-    attempts: int = 20_000
+    object_pairs: int = 20_000
+    first: int = 500
+    attempts: int = 60_000
     most: int = 1_000_000
     lost: int = 300
     lean: float = float(np.deg2rad(25.0))
-    near: float = 4e-3
+    near: float = 8e-3
     clear: float = 8e-3
     looked: int = 192
-    tries: int = 8
+    tries: int = 12
     together: int = 2000
     steps: int = 6
     free_lean: float = float(np.deg2rad(8.0))
@@ -121,6 +121,48 @@ WHY_NONE = {
 """What it means that nothing passes a stage."""
 
 
+class Luck:
+    """How often attempts were clear of all, by a number from 0 to 1 that they have."""
+
+    def __init__(self, bins: int = 20) -> None:
+        """Nothing is known yet."""
+        self.clear, self.tried = np.ones(bins), np.full(bins, 2.0)
+
+    def often(self, values: Array, rng: np.random.Generator) -> NDArray[np.intp]:
+        """Some of the values, the rarer the seldomer they were clear, but some of all."""
+        share = self.clear / self.tried
+        chance = np.maximum(share / share.max(), LEAST_OFTEN)
+        return np.flatnonzero(rng.random(len(values)) < chance[self._bins(values)])
+
+    def learn(self, values: Array, clear: Bools) -> None:
+        """Count which of some values were clear."""
+        bins = self._bins(values)
+        self.tried += np.bincount(bins, minlength=len(self.tried))
+        self.clear += np.bincount(bins[clear], minlength=len(self.tried))
+
+    def _bins(self, values: Array) -> NDArray[np.intp]:
+        return np.clip((values * len(self.tried)).astype(np.intp), 0, len(self.tried) - 1)
+
+
+LEAST_OFTEN = 0.03
+"""The chance of what was never clear beside what was most often."""
+
+DEEP = 0.2
+"""Most that counts of how far between two fingertips is from the palm [m]."""
+
+
+def pairs_of_fingers(table: HandTable, cells: NDArray[np.intp], palm: Array) -> Candidates:
+    """Palms (k, 4, 4) with thumb and another finger as in pairs (k,) of the table."""
+    share, other, a, b = table.pairs[cells].T
+    used = np.zeros((len(cells), len(table.radii)), dtype=bool)
+    some = Candidates(palm, table.q[share, a].copy(), used)
+    used[:, table.thumb] = used[np.arange(len(other)), other] = True
+    for number in set(other.tolist()):
+        rows = np.flatnonzero(other == number)
+        table.put(some.hand, rows, table.q[share[rows], b[rows]], number)
+    return some
+
+
 @dataclass
 class Generator:
     """Candidates of one surface and one hand.
@@ -148,6 +190,8 @@ class Generator:
 
     def __post_init__(self) -> None:
         self._pairs = np.zeros((0, 4), dtype=np.intp)
+        self.depths, self.ways = Luck(), Luck()
+        self.clear.sift()
         self.look()
 
     def look(self) -> None:
@@ -162,10 +206,18 @@ class Generator:
         first = -np.einsum("ki,ki->k", way, surface.normals[i])
         second = np.einsum("ki,ki->k", way, surface.normals[j])
         facing = np.minimum(first, second) > np.cos(chosen.facing) * length
-        i, j, length, first, second = (
-            part[facing & (length > 5e-3)] for part in (i, j, length, first, second)
+        kept = np.flatnonzero(facing & (length > 5e-3))
+        i, j, way = i[kept], j[kept], way[kept]
+        turns = np.arccos(np.clip(np.stack([first, second])[:, kept] / length[kept], -1, 1))
+        # Balls touch where they are so far from the middle, and may lean.
+        table = self.table
+        others = np.arange(len(table.radii)) != table.thumb
+        radii, roll = (
+            np.array([own[table.thumb], own[others].mean()]) for own in (table.radii, table.roll)
         )
-        found = self.table.cells(self.table.key(length, first / length, second / length))
+        way = way + radii[1] * surface.normals[j] - radii[0] * surface.normals[i]
+        turns = np.abs(turns + roll[:, None] * self.rng.uniform(-1, 1, turns.shape))
+        found = table.cells(table.key(np.linalg.norm(way, axis=1), *np.cos(turns)))
         pairs = np.stack([i, j, *found], axis=1)[found[1] > 0]
         self._pairs = np.concatenate([self._pairs, pairs])
 
@@ -186,7 +238,7 @@ class Generator:
             some = snapped(table, surface, some, chosen)
             here, _, _ = touching(table, surface, some)
             ok = np.abs(here.height) < chosen.touch
-            ok &= (here.lean < chosen.last_lean) & surface.inside[here.sample]
+            ok &= (here.lean < chosen.last_lean + table.roll) & surface.inside[here.sample]
             rows = np.flatnonzero((ok | ~some.used).all(axis=1))
             some = replace(some, tips=here.points).rows(rows)
         self.counted("made exact", len(some))
@@ -211,30 +263,33 @@ class Generator:
         row = rng.integers(len(self._pairs), size=count)
         i, j, start, number = self._pairs[row].T
         cell = start + (rng.random(count) * number).astype(np.intp)
+        lucky = self.depths.often(table.depths[cell] / DEEP, rng)
+        i, j, cell = (column[lucky] for column in (i, j, cell))
         share, other, a, b = table.pairs[cell].T
-        thumb = table.robot.fingers.index(table.robot.thumb)
-        self.counted("attempts", len(row))
+        thumb = table.thumb
+        self.counted("attempts", len(cell))
         hand_points = np.stack([table.points[share, a, thumb], table.points[share, b, other]], 1)
         hand_normals = np.stack([table.normals[share, a, thumb], table.normals[share, b, other]], 1)
         samples = np.stack([i, j], axis=1)
-        palm, lean = _matched(
-            hand_points, hand_normals, surface.points[samples], -surface.normals[samples]
-        )
-        kept = np.flatnonzero((lean < chosen.lean).all(axis=1))
-        share, other, a, b = (column[kept] for column in (share, other, a, b))
-        palm = palm[kept]
+        which = np.stack([np.full(len(cell), thumb), other], axis=1)
+        outward = surface.normals[samples]
+        middles = surface.points[samples] + table.radii[which, None] * outward
+        palm, lean = _matched(hand_points, hand_normals, middles, -outward)
+        fit = np.flatnonzero((lean < chosen.lean + table.roll[which]).all(axis=1))
+        # Where the palm's z points, up or down.
+        up = 0.5 + 0.5 * palm[fit, :3, 2] @ self.clear.pose[2, :3]
+        lucky = self.ways.often(up, rng)
+        kept, up = fit[lucky], up[lucky]
+        cell, share, a = cell[kept], share[kept], a[kept]
         self.counted("two fingertips fit", len(kept))
-        names = table.robot.fingers
-        some = Candidates(palm, table.q[share, a].copy(), np.zeros((len(palm), len(names)), bool))
-        some.used[:, thumb] = True
-        for number in set(other.tolist()):
-            rows = np.flatnonzero(other == number)
-            some.used[rows, number] = True
-            self._put(some.hand, rows, table.q[share[rows], b[rows]], names[number])
-        kept = np.flatnonzero(self.clear(some, some.used))
+        some = pairs_of_fingers(table, cell, palm[kept])
+        ok = self.clear(some, some.used)
+        self.depths.learn(table.depths[cell] / DEEP, ok)
+        self.ways.learn(up, ok)
+        kept = np.flatnonzero(ok)
         self.counted("they are clear", len(kept))
         some, share = some.rows(kept), share[kept]
-        own = table.normals[share, a[kept], thumb]
+        own, names = table.normals[share, a[kept], thumb], table.robot.fingers
         pads = np.einsum("kij,kj->ki", some.palm[:, :3, :3], own)
         placed = some.used.copy()
         for rest, number in zip(range(len(names))[::-1], rng.permutation(len(names)), strict=True):
@@ -263,7 +318,7 @@ class Generator:
         It has to touch in rows that are short of fingers: those that follow are too few. A row for
         which none is found is given up: none of its fingers counts as placed.
         """
-        chosen, name = self.parameters, self.table.robot.fingers[number]
+        chosen = self.parameters
         every = self.table.q.shape[1]
         postures = self.rng.choice(every, min(chosen.looked, every), replace=False)
         height, touch, against = self._looked_up(
@@ -283,9 +338,8 @@ class Generator:
                 break
             here = rows[left]
             trial = some.rows(here)
-            self._put(
-                trial.hand, np.arange(len(here)), self.table.q[share[here], postures[best]], name
-            )
+            posture = self.table.q[share[here], postures[best]]
+            self.table.put(trial.hand, np.arange(len(here)), posture, number)
             trial.used[:, number] = value > 1.0
             present = placed[here].copy()
             present[:, number] = True
@@ -295,11 +349,6 @@ class Generator:
             rank[left, best] = -1.0
             left = left[~ok]
         placed[rows[~placed[rows, number]]] = False
-
-    def _put(self, hand: Array, rows: NDArray[np.intp], posture: Array, finger: str) -> None:
-        """Take a finger's own motors from a posture."""
-        columns = np.flatnonzero(np.isin(self.table.motors, self.table.of_finger[finger]))
-        hand[np.ix_(rows, columns)] = posture[:, columns]
 
     def _looked_up(
         self,
@@ -321,16 +370,18 @@ class Generator:
         rotation, origin = palm[:, :3, :3], palm[:, :3, 3]
         tips = points @ rotation.swapaxes(1, 2) + origin[:, None]
         height, sample = surface.roughly(tips)
+        height = height - table.radii[number]
         ok = np.abs(height) < chosen.near + surface.step
         row, posture = np.nonzero(ok)
         chosen_samples = sample[row, posture]
         normal = surface.normals[chosen_samples]
         exact = ((tips[row, posture] - surface.points[chosen_samples]) * normal).sum(axis=-1)
+        exact -= table.radii[number]
         pads = np.einsum("kij,kj->ki", rotation[row], normals[row, posture])
         ok[row, posture] = (
             (np.abs(exact) < chosen.near)
             & surface.inside[chosen_samples]
-            & (-(pads * normal).sum(axis=-1) > np.cos(chosen.lean))
+            & (-(pads * normal).sum(axis=-1) > np.cos(chosen.lean + table.roll[number]))
         )
         against = np.zeros(ok.shape)
         against[row, posture] = -np.einsum("ki,ki->k", pads, thumb[row])
@@ -378,9 +429,9 @@ class Touching:
     """Where fingertips are on a surface.
 
     Attributes:
-        points: (k, f, 3) fingertips [m], object frame.
+        points: (k, f, 3) middles of pads' balls, of planes contact points [m], object frame.
         normals: (k, f, 3) pad normals.
-        height: (k, f) distance from the surface [m].
+        height: (k, f) distance of pads from the surface [m].
         sample: (k, f) nearest samples.
         lean: (k, f) between pad normals and the surface's [rad].
     """
@@ -401,7 +452,8 @@ def touching(table: HandTable, surface: Surface, some: Candidates) -> tuple[Touc
     normals = np.einsum("kfij,kfj->kfi", turn, normals)
     height, sample = surface.foot(points)
     lean = np.arccos(np.clip(-(normals * surface.normals[sample]).sum(axis=-1), -1, 1))
-    return Touching(points, normals, height, sample, lean), turn @ linear, turn @ angular
+    here = Touching(points, normals, height - table.radii, sample, lean)
+    return here, turn @ linear, turn @ angular
 
 
 def snapped(
@@ -427,7 +479,7 @@ def snapped(
         to_turns = np.concatenate(
             [np.zeros((k, f, 3, 3)), np.broadcast_to(np.eye(3), (k, f, 3, 3)), angular], -1
         )
-        excess = np.maximum(here.lean - chosen.free_lean, 0.0)
+        excess = np.maximum(here.lean - chosen.free_lean - table.roll, 0.0)
         axis = np.cross(here.normals, -normal)
         axis *= (excess / np.maximum(np.linalg.norm(axis, axis=-1), 1e-9))[..., None]
         rows = [
@@ -510,8 +562,24 @@ class HandCheck:
         at = self._every.poses(check.scene.items)
         self._items = rigid(at[:, :9].reshape(-1, 3, 3), at[:, 9:])
 
-    def __call__(self, some: Candidates, present: Bools | None = None) -> Bools:
-        """(k,) which are clear; of fingers that are not present nothing counts."""
+    def sift(self) -> None:
+        """Leave out the table's pairs of fingers that hit the hand or each other; once."""
+        table = self.table
+        if not table.sifted:
+            every = np.arange(len(table.pairs))
+            some = pairs_of_fingers(table, every, np.broadcast_to(np.eye(4), (len(every), 4, 4)))
+            table.keep(self(some, some.used, alone=True))
+
+    def __call__(
+        self, some: Candidates, present: Bools | None = None, alone: bool = False
+    ) -> Bools:
+        """(k,) which are clear; of fingers that are not present nothing counts.
+
+        Args:
+            some: Palms and hands.
+            present: (k, f) fingers; None: all.
+            alone: Whether there is nothing but the hand.
+        """
         q = self.table.configuration(some.hand)
         world = self.table.palm @ inverse(self.pose @ some.palm)
         if present is None:
@@ -521,15 +589,15 @@ class HandCheck:
         code = both @ (1 << np.arange(both.shape[1]))
         for value in set(code.tolist()):
             rows = np.flatnonzero(code == value)
-            table = self._table(*np.split(both[rows[0]], 2))
+            table = self._table(some.used[rows[0]], present[rows[0]], alone)
             poses = pose_row(world[rows, None] @ self._items)
             around = CollisionQuery(self.check.kernel, table, poses, self.check.scene.margin)
             ok[rows] = around.free(q[rows])
         return ok
 
-    def _table(self, used: Bools, present: Bools) -> Table:
+    def _table(self, used: Bools, present: Bools, alone: bool) -> Table:
         """The pairs that count: fingertips that are used may touch the object."""
-        key = np.concatenate([used, present]).tobytes()
+        key = np.concatenate([used, present, [alone]]).tobytes()
         if key not in self._tables:
             robot, motors = self.table.robot, self.table.of_finger
             names = list(zip(robot.fingers, used, present, strict=True))
@@ -540,7 +608,9 @@ class HandCheck:
             moved = robot.description.links_moved
             links = moved(absent) - moved(there)
             kept = [
-                links.isdisjoint(pair) and not (pair[1] == grasped and pair[0] in touched)
+                links.isdisjoint(pair)
+                and not (pair[1] == grasped and pair[0] in touched)
+                and not (alone and pair[1] in self.check.scene.items)
                 for pair in self._every.names
             ]
             self._tables[key] = self._every.only(np.array(kept, dtype=bool))

@@ -19,7 +19,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import InputError
 from casadi_ik.grasps import Contact, Grasp, Tolerance
-from casadi_ik.grasps.pose import one_pose
+from casadi_ik.grasps.pose import inverse, one_pose
 from casadi_ik.problem.request import one_palm
 from casadi_ik.progress import progress
 from casadi_ik.touch.candidates import (
@@ -236,8 +236,8 @@ def grasps_of(
     """Find grasps of an object that the arm and the hand can make, free of collision.
 
     Two opposing fingertips are matched with two opposing patches of the surface, the others
-    look for something to touch, palm and hand are moved until all touch within 1 mm and 15 deg,
-    the arm follows, and what remains is judged in the scene and ranked.
+    look for something to touch, palm and hand are moved until all touch within 1 mm and 15 deg
+    (pads that are balls 40), the arm follows, and what remains is judged in the scene and ranked.
 
     Args:
         solver: A `Solver`.
@@ -298,9 +298,8 @@ def grasps_of(
                 break  # each is like one found before, or the arm reaches none
             wanted = 1.2 * tried * (limit - known) / known if known else tried
             attempts = int(np.clip(wanted, chosen.first, chosen.attempts))
-    return _ranked(
-        robot, generator, hands, parts, place, limit, prefer, start, time.process_time() - begin, mu
-    )
+    found = _ranked(robot, generator, hands, parts, place, limit, prefer, start, mu)
+    return replace(found, time=time.process_time() - begin)
 
 
 _SOLVERS: WeakKeyDictionary[Any, dict[tuple[str, TouchParameters], tuple[Any, Any, Any]]] = (
@@ -436,14 +435,13 @@ def _ranked(
     limit: int,
     prefer: Judgement,
     start: Array | None,
-    seconds: float,
     mu: float,
 ) -> FoundGrasps:
     """The distinct ones, best first."""
     where = [(part, i) for part in parts for i in range(len(part.rows))]
     name, about = prefer if isinstance(prefer, str) else "own", (robot, generator.surface, mu)
     if not where:
-        return FoundGrasps((), generator.counts, name, seconds, generator.why_none(), *about)
+        return FoundGrasps((), generator.counts, name, 0.0, generator.why_none(), *about)
     q = np.concatenate([part.batch.q[part.rows] for part in parts])
     found = np.concatenate([part.loads for part in parts])
     load, closure = found[:, FORCES].min(axis=1), found.min(axis=1)
@@ -461,60 +459,91 @@ def _ranked(
     if score.shape != (len(q),):
         raise InputError(f"prefer: gave shape {score.shape}, expected ({len(q)},)")
     kept = np.argsort(-score, kind="stable")[:limit]
-    entries = []
     chosen = [where[row] for row in kept]
-    forces = squeezes(np.stack([part.wrenches[i] for part, i in chosen])) @ place[:3, :3].T
-    for row, (part, i), force in zip(kept, chosen, forces, strict=True):
-        solution = part.batch.solution(int(part.rows[i]))
-        one = part.some.rows(np.array([i]))
-        grasp = _grasp(robot, generator, hands, one, solution, place, force)
-        by_finger = MappingProxyType(dict(zip(grasp.contacts, force, strict=True)))
+    some = Candidates(
+        place @ np.stack([part.some.palm[i] for part, i in chosen]),
+        np.take(q[kept], generator.table.motors, axis=1),
+        np.stack([part.some.used[i] for part, i in chosen]),
+    )
+    # Of the fingertips that touch, in the order of the fingers.
+    forces = np.zeros((*some.used.shape, 3))
+    wrenches = np.stack([part.wrenches[i] for part, i in chosen])
+    forces[some.used] = (squeezes(wrenches) @ place[:3, :3].T).reshape(-1, 3)
+    solutions = [part.batch.solution(int(part.rows[i])) for part, i in chosen]
+    grasps = _grasps(robot, generator, hands, some, q[kept], place, forces)
+    entries = []
+    for i, (row, solution, grasp) in enumerate(zip(kept, solutions, grasps, strict=True)):
+        by_finger = {name: forces[i, robot.fingers.index(name)] for name in grasp.contacts}
         values = float(load[row]), float(closure[row]), float(score[row])
-        entries.append(FoundGrasp(grasp, solution, *values, by_finger))
-    return FoundGrasps(tuple(entries), generator.counts, name, seconds, "", *about)
+        entries.append(FoundGrasp(grasp, solution, *values, MappingProxyType(by_finger)))
+    return FoundGrasps(tuple(entries), generator.counts, name, 0.0, "", *about)
 
 
-def _grasp(
+def _grasps(
     robot: ArmHand,
     generator: Generator,
     hands: HandCheck,
-    one: Candidates,
-    solution: Solution,
+    some: Candidates,
+    q: Array,
     place: Array,
     forces: Array,
-) -> Grasp:
-    """The grasp of a solution, with the hand before it and as it squeezes with forces (c, 3)."""
-    points, normals = robot.contacts(solution.q)
-    contacts = {
-        name: Contact(points[i], normals[i])
-        for i, name in enumerate(robot.fingers)
-        if one.used[0, i]
-    }
+) -> list[Grasp]:
+    """The grasps of postures q (k, n), with the hand before each and as it squeezes.
+
+    Args:
+        robot: The robot.
+        generator: Of the candidates.
+        hands: Tells which hands are clear.
+        some: The hands as they touch, palms in the base frame.
+        q: (k, n) the postures.
+        place: (4, 4) of the object.
+        forces: (k, f, 3) on the object, base frame.
+    """
     table, surface = generator.table, generator.surface
-    motors = [robot.actuators[i] for i in table.motors]
-
-    def posture(hand: Array) -> dict[str, float]:
-        return dict(zip(motors, hand.tolist(), strict=True))
-
-    own = replace(one, hand=solution.q[table.motors][None])
-    grasp = Grasp(
-        contacts,
-        robot=robot.name,
-        name=f"{Path(surface.object.name).stem} {'+'.join(contacts)}",
-        object=surface.name,
-        object_pose=place,
-        posture=posture(own.hand[0]),
+    points, normals = robot.contacts(q)
+    radii = table.radii[:, None]
+    middles = points - radii * normals
+    _, sample = surface.foot((middles - place[:3, 3]) @ place[:3, :3])
+    into = -surface.faces[sample] @ place[:3, :3].T
+    touched = np.where(radii > 0, middles + radii * into, points)
+    palms = robot.palm(q)
+    seen_forces, seen_pads = (
+        np.einsum("kfi,kij->kfj", one, palms[:, :3, :3]) for one in (forces, touched - middles)
     )
-    palm = robot.palm(solution.q)
-    squeezed = table.squeezed(own, forces @ palm[:3, :3], INWARD)
-    before = None
+    squeezed = table.squeezed(some, seen_pads, seen_forces, INWARD)
+    opened, known = some.hand.copy(), np.zeros(len(some), dtype=bool)
+    seen = replace(some, palm=inverse(place) @ palms)
     for opening in OPENINGS:
-        opened = table.opened(own, opening)
-        if hands(opened).all():
-            back = palm.copy()
-            away = palm[:3, 3] - np.mean([one.point for one in contacts.values()], axis=0)
-            back[:3, 3] += RETREAT * away / max(float(np.linalg.norm(away)), 1e-9)
-            before = Grasp(robot=robot.name, palm=back, posture=posture(opened.hand[0]))
-            break
-    squeeze = Grasp(robot=robot.name, palm=palm, posture=posture(squeezed))
-    return replace(grasp, pregrasp=before, squeeze=squeeze)
+        left = np.flatnonzero(~known)
+        if len(left):
+            tried = table.opened(seen.rows(left), opening)
+            clear = hands(tried)
+            opened[left[clear]], known[left[clear]] = tried.hand[clear], True
+    motors = [robot.actuators[i] for i in table.motors]
+    stem = Path(surface.object.name).stem
+    found = []
+    for i in range(len(some)):
+        contacts = {}
+        for j in np.flatnonzero(some.used[i]):
+            ball = into[i, j] if table.radii[j] else None
+            contacts[robot.fingers[j]] = Contact(touched[i, j], normals[i, j], ball=ball)
+        back = palms[i].copy()
+        away = back[:3, 3] - np.mean([one.point for one in contacts.values()], axis=0)
+        back[:3, 3] += RETREAT * away / max(float(np.linalg.norm(away)), 1e-9)
+        hand, before, after = (
+            dict(zip(motors, one[i].tolist(), strict=True)) for one in (some.hand, opened, squeezed)
+        )
+        pregrasp = Grasp(robot=robot.name, palm=back, posture=before) if known[i] else None
+        found.append(
+            Grasp(
+                contacts,
+                robot=robot.name,
+                name=f"{stem} {'+'.join(contacts)}",
+                object=surface.name,
+                object_pose=place,
+                posture=hand,
+                pregrasp=pregrasp,
+                squeeze=Grasp(robot=robot.name, palm=palms[i], posture=after),
+            )
+        )
+    return found

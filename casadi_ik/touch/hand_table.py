@@ -12,12 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.arrays import Array
+from casadi_ik.arrays import Array, Bools
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.kernels.function_kernel import FunctionKernel
 from casadi_ik.kernels.graphs import FunctionGraph, recipe
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.kinematics import actuated
+from casadi_ik.symbolic.se3 import skew
 
 if TYPE_CHECKING:
     from casadi_ik.touch.candidates import Candidates
@@ -31,7 +32,8 @@ class HandTableParameters:
         postures: Of each finger, for each value of the motors that it shares with others.
         shared: Values of the motors that fingers share.
         facing: Two fingertips oppose each other if both normals are within this angle of the line
-            between them [rad].
+            between them [rad]; of balls so much farther as they may lean more.
+        roll: By so much more than a plane a pad leans that is a ball [rad].
         cell: Edge of a cell of distances [m].
         turn: Edge of a cell of angles [rad].
         pairs: Most pairs that are kept.
@@ -40,9 +42,10 @@ class HandTableParameters:
     postures: int = 512
     shared: int = 12
     facing: float = float(np.deg2rad(48.0))
+    roll: float = float(np.deg2rad(25.0))
     cell: float = 4e-3
     turn: float = float(np.deg2rad(12.0))
-    pairs: int = 2_000_000
+    pairs: int = 200_000
 
 
 class HandTable:
@@ -52,8 +55,13 @@ class HandTable:
         robot: The robot.
         motors: Positions in q of the motors that move fingers.
         q: (s, n, m) positions of these motors, for s values of the shared ones.
-        tips: By finger (s, n, 3) contact points in the palm frame [m].
-        normals: By finger (s, n, 3) outward pad normals in the palm frame.
+        radii: (f,) of the pads' balls [m], 0 of planes.
+        roll: (f,) by how much more than a plane they may lean [rad].
+        points: (s, n, f, 3) middles of pads' balls, of planes contact points, palm frame [m].
+        pairs: (p, 4) of thumb and another finger: shared value, finger, posture of either.
+        depths: (p,) how far between their pads is from the palm frame [m].
+        sifted: Whether pairs that hit the hand or each other are left out.
+        normals: (s, n, f, 3) outward pad normals in the palm frame.
     """
 
     def __init__(
@@ -72,6 +80,9 @@ class HandTable:
         self.motors = np.array(sorted(set(users)), dtype=np.intp)
         shared = np.array([users.count(i) > 1 for i in self.motors])
         self.kernel = hand_kernel(description)
+        self.thumb, self.sifted = robot.fingers.index(robot.thumb), False
+        self.radii = np.array([description.finger(name).radius for name in robot.fingers])
+        self.roll = np.where(self.radii > 0, chosen.roll, 0.0)
         self.palm = robot.palm(robot.home)
         # Where fingers share all motors (a gripper) a posture is a value of these.
         count = 1 if shared.all() else chosen.postures
@@ -93,6 +104,12 @@ class HandTable:
             _TABLES[robot] = cls(robot)
         return _TABLES[robot]
 
+    def put(self, hand: Array, rows: NDArray[np.intp], posture: Array, finger: int) -> None:
+        """Take a finger's own motors from a posture."""
+        own = self.of_finger[self.robot.fingers[finger]]
+        columns = np.flatnonzero(np.isin(self.motors, own))
+        hand[np.ix_(rows, columns)] = posture[:, columns]
+
     def opened(self, some: Candidates, opening: float) -> Candidates:
         """The same palms with fingertips moved back from what they touch [m]; negative: into it."""
         hand = some.hand
@@ -106,24 +123,25 @@ class HandTable:
             hand = np.clip(hand + step, lower, upper)
         return replace(some, hand=hand)
 
-    def squeezed(self, one: Candidates, forces: Array, inward: float) -> Array:
-        """(m,) a hand whose motors go on in proportion to the torques of forces.
+    def squeezed(self, some: Candidates, touched: Array, forces: Array, inward: float) -> Array:
+        """(k, m) hands whose motors go on in proportion to the torques of forces.
 
         So do motors that are held by equal springs: sent there, they exert these forces.
 
         Args:
-            one: The hand as it touches.
-            forces: (c, 3) of those fingertips on the object, palm frame.
+            some: The hands as they touch.
+            touched: (k, f, 3) where their pads do, from the middles [m], palm frame.
+            forces: (k, f, 3) of fingertips on the object, palm frame; 0 of those that do not touch.
             inward: How far fingertips would go, in the mean [m].
         """
-        _, _, linear, _ = self.at(one.hand)
-        rows = linear[0, one.used[0]]
-        torque = np.einsum("cim,ci->m", rows, forces)
-        size = np.linalg.norm(forces, axis=1)
-        along = np.einsum("cim,m,ci->c", rows, torque, forces) / np.maximum(size, 1e-9)
-        step = inward / max(float(along @ size / size.sum()), 1e-9) * torque
+        _, _, linear, angular = self.at(some.hand)
+        linear = linear + np.cross(angular, touched[..., None], axis=2)
+        torque = np.einsum("kfim,kfi->km", linear, forces)
+        along = np.einsum("kfim,km,kfi->k", linear, torque, forces)
+        along /= np.linalg.norm(forces, axis=2).sum(axis=1)
+        step = inward / np.maximum(along, 1e-9)[:, None] * torque
         lower, upper = self.robot.lower[self.motors], self.robot.upper[self.motors]
-        return np.clip(one.hand[0] + step, lower, upper)
+        return np.clip(some.hand + step, lower, upper)
 
     def configuration(self, hands: Array) -> Array:
         """(k, n) configurations with hands (k, m), the arm at home."""
@@ -132,11 +150,11 @@ class HandTable:
         return q
 
     def at(self, hands: Array) -> tuple[Array, Array, Array, Array]:
-        """Contacts of hands (k, m) in the palm frame.
+        """Pads of hands (k, m) in the palm frame.
 
         Returns:
-            Points (k, f, 3) [m], outward normals (k, f, 3), and Jacobians (k, f, 3, m) of points
-            and of rotations over the fingers' motors.
+            Middles of balls, of planes contact points (k, f, 3) [m], outward normals (k, f, 3), and
+            Jacobians (k, f, 3, m) of these points and of rotations over the fingers' motors.
         """
         f, m = len(self.robot.fingers), len(self.motors)
         flat = self.kernel(self.configuration(hands))
@@ -147,9 +165,9 @@ class HandTable:
     def _sort_pairs(self) -> None:
         """Pairs of a posture of the thumb and one of another finger that oppose each other."""
         robot, chosen = self.robot, self.parameters
-        thumb = robot.fingers.index(robot.thumb)
+        thumb = self.thumb
         found, keys = [], []
-        least = np.cos(chosen.facing)
+        least = np.cos(chosen.facing + self.roll)
         for share in range(len(self.q)):
             a, n = self.points[share, :, thumb], self.normals[share, :, thumb]
             for other in range(len(robot.fingers)):
@@ -161,7 +179,7 @@ class HandTable:
                 way /= np.maximum(length, 1e-9)[..., None]
                 first = np.einsum("ijk,ik->ij", way, n)
                 second = -np.einsum("ijk,jk->ij", way, o)
-                i, j = np.nonzero((first > least) & (second > least))
+                i, j = np.nonzero((first > least[thumb]) & (second > least[other]))
                 found.append(
                     np.stack([np.full(len(i), share), np.full(len(i), other), i, j], axis=1)
                 )
@@ -172,6 +190,16 @@ class HandTable:
             pairs, key = pairs[kept], key[kept]
         order = np.argsort(key, kind="stable")
         self.pairs, self._keys = pairs[order], key[order]
+        share, other, a, b = self.pairs.T
+        middles = (self.points[share, a, thumb] + self.points[share, b, other]) / 2
+        self.depths = np.linalg.norm(middles, axis=1)
+
+    def keep(self, rows: Bools) -> None:
+        """Keep some of the pairs for good."""
+        self.pairs, self._keys, self.depths = (
+            column[rows] for column in (self.pairs, self._keys, self.depths)
+        )
+        self.sifted = True
 
     def key(self, length: Array, first: Array, second: Array) -> NDArray[np.int64]:
         """Cells of pairs: distance [m] and the cosines of both normals with the line."""
@@ -192,7 +220,7 @@ _TABLES: WeakKeyDictionary[ArmHand, HandTable] = WeakKeyDictionary()
 
 
 def hand_kernel(robot: RobotDescription) -> FunctionKernel:
-    """Contacts and their Jacobians over the fingers' motors, in the palm frame, of q."""
+    """Pads and their Jacobians over the fingers' motors, in the palm frame, of q."""
     motors = sorted({i for name in robot.finger_names for i in robot.finger_actuators(name)})
     f, m, n = len(robot.finger_names), len(motors), len(robot.actuators)
     name = ca.Function.fix_name(f"{robot.name}_hand_contacts")
@@ -205,7 +233,10 @@ def hand_kernel(robot: RobotDescription) -> FunctionKernel:
         for finger in robot.finger_names:
             point, normal = moving.kinematics.contact(finger)
             linear, angular = moving.contact_jacobian(finger, motors)
-            parts[0].append(palm.inverse_apply(point).T)
+            # The middle of a ball is so far behind the point.
+            behind = robot.finger(finger).radius * normal
+            linear = linear + skew(behind) @ angular
+            parts[0].append(palm.inverse_apply(point - behind).T)
             parts[1].append((palm.rotation.T @ normal).T)
             parts[2].append(palm.rotation.T @ linear)
             parts[3].append(palm.rotation.T @ angular)

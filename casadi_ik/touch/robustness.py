@@ -69,6 +69,7 @@ def robustness(
     tips = np.einsum("kij,scj->ksci", seen[:, :3, :3], points) + seen[:, None, None, :3, 3]
     faces = np.einsum("kij,scj->ksci", seen[:, :3, :3], normals)
     height, sample = surface.foot(tips)
+    height = height - table.radii[which]
     within = height <= 0
     first = within.argmax(axis=1)  # (k, c)
     touches = within.any(axis=1) & (first > 0)

@@ -53,20 +53,31 @@ def test_every_grasp_is_confirmed_in_the_scene(found):
 
 
 def test_fingertips_touch_the_mesh(found):
-    """By distances to the exact cylinder."""
+    """By distances of the pads, balls or points, to the exact cylinder."""
     solver, grasps = found
     inverse = np.linalg.inv(PLACE)
     for one in grasps:
-        points, normals = solver.robot.contacts(one.q)
-        used = [solver.robot.fingers.index(name) for name in one.grasp.contacts]
-        local = points[used] @ inverse[:3, :3].T + inverse[:3, 3]
-        off = np.linalg.norm(local[:, :2], axis=1) - 0.033, np.abs(local[:, 2]) - 0.05
-        assert np.abs(np.maximum(*off)).max() < 1.1e-3
-        face = np.where((np.abs(local[:, 2]) > 0.0495)[:, None], [0, 0, 1], local * [1, 1, 0])
-        face = np.sign(local[:, 2:]) ** (face[:, 2:] == 1) * face
-        face /= np.linalg.norm(face, axis=1, keepdims=True)
-        lean = np.degrees(np.arccos(-(normals[used] * face).sum(axis=1)))
-        assert lean.max() < 16
+        frames = solver.robot.contact_frames(one.q)
+        for name, contact in one.grasp.contacts.items():
+            finger = solver.robot.description.finger(name)
+            tip = frames[solver.robot.fingers.index(name)]
+            middle = tip[:3, 3] - finger.radius * tip[:3, 0]
+            local = inverse[:3, :3] @ middle + inverse[:3, 3]
+            off = np.array([np.linalg.norm(local[:2]) - 0.033, abs(local[2]) - 0.05])
+            far = np.linalg.norm(np.maximum(off, 0)) + min(off.max(), 0)
+            assert far == pytest.approx(finger.radius, abs=1.1e-3)
+            lid = off[1] > off[0]
+            face = [0, 0, np.sign(local[2])] if lid else local * [1, 1, 0]
+            face = inverse[:3, :3].T @ face / np.linalg.norm(face)
+            lean = np.degrees(np.arccos(-tip[:3, 0] @ face))
+            assert lean < (41 if finger.radius else 16)
+            if finger.radius:
+                assert np.degrees(np.arccos(-contact.ball @ face)) < 4
+                np.testing.assert_allclose(
+                    contact.point, middle + finger.radius * contact.ball, atol=1e-12
+                )
+            else:
+                np.testing.assert_array_equal(contact.point, tip[:3, 3])
 
 
 def test_loads_are_those_of_linear_programs(found):
@@ -188,13 +199,15 @@ def test_motors_squeeze_as_equal_springs_do(found):
         posture = one.grasp.squeeze.posture
         columns = [robot.actuators.index(name) for name in posture]
         moved = np.array(list(posture.values())) - one.q[columns]
-        torques = []
+        torques, here, pressed = [], robot.contact_frames(one.q), []
+        for name, force in one.forces.items():
+            i, point = robot.fingers.index(name), one.grasp.contacts[name].point
+            pressed.append((i, np.linalg.inv(here[i]) @ np.append(point, 1), force))
         for column in columns:
             step = np.zeros(len(one.q))
             step[column] = 1e-6
-            slope = (robot.contacts(one.q + step)[0] - robot.contacts(one.q - step)[0]) / 2e-6
-            pairs = one.forces.items()
-            torques.append(sum(slope[robot.fingers.index(name)] @ f for name, f in pairs))
+            slope = (robot.contact_frames(one.q + step) - robot.contact_frames(one.q - step)) / 2e-6
+            torques.append(sum((slope[i] @ at)[:3] @ f for i, at, f in pressed))
         inside = (np.array(list(posture.values())) > robot.lower[columns] + 1e-6) & (
             np.array(list(posture.values())) < robot.upper[columns] - 1e-6
         )
