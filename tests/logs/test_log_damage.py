@@ -58,7 +58,7 @@ def whole(write: Write, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize("seed", range(100))
-def test_a_cut_log(whole: Path, seed: int) -> None:
+def test_a_cut_log(whole: Path, seed: int, caplog: pytest.LogCaptureFixture) -> None:
     """Every complete chunk is read, and the log says that it is not whole."""
     rng = np.random.default_rng(seed)
     chunks = chunks_of(whole)
@@ -74,6 +74,8 @@ def test_a_cut_log(whole: Path, seed: int) -> None:
             logs.open(whole)
         return
     log = logs.open(whole)
+    (message,) = caplog.messages
+    assert message.startswith(f"{whole}: not finished; ")
     assert log.info().unfinished == (whole,)
     assert log.info().chunks == len(complete)
     if not complete:
@@ -114,14 +116,6 @@ def test_a_killed_writer(tmp_path: Path, after: float) -> None:
         pass
 
 
-def test_a_warning_names_the_unfinished_file(whole: Path, caplog: pytest.LogCaptureFixture) -> None:
-    with whole.open("r+b") as stream:
-        stream.truncate(whole.stat().st_size - 4)
-    logs.open(whole)
-    (message,) = caplog.messages
-    assert message.startswith(f"{whole}: not finished; ")
-
-
 HEAD = 9
 """Bytes in front of the content of a record."""
 
@@ -141,14 +135,13 @@ def read_messages(path: Path) -> list[tuple[str, int, bytes]]:
     return found
 
 
-def many_chunks(path: Path, compression: CompressionType) -> list[int]:
-    """A file of 12 chunks with an attachment in between; gives where each chunk is whole."""
+def many_chunks(path: Path, compression: CompressionType, whose: str = "casadi_ik") -> None:
+    """A file of 12 chunks with an attachment in between."""
     rng = np.random.default_rng(3)
-    whole: list[int] = []
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=1, compression=compression)
         writer.start("ros2", "a test")
-        writer.add_metadata("casadi_ik", {"robot": "made_up"})
+        writer.add_metadata(whose, {"robot": "made_up"})
         schema = writer.register_schema("x", "ros2msg", b"float64 x\n")
         channels = [writer.register_channel(f"/{i}", "cdr", schema) for i in range(3)]
         for i in range(12):
@@ -157,9 +150,7 @@ def many_chunks(path: Path, compression: CompressionType) -> list[int]:
             for channel in channels:
                 data = rng.bytes(int(rng.integers(10, 300)))
                 writer.add_message(channel, 1000 * i + channel, data, 0)
-            whole.append(stream.tell())
         writer.finish()
-    return whole
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))
@@ -226,25 +217,31 @@ def test_damage_in_the_middle_is_refused_and_nothing_changed(tmp_path: Path, clo
     assert path.read_bytes() == before
 
 
-def test_what_is_no_log(tmp_path: Path, write: Write) -> None:
-    (tmp_path / "empty").write_bytes(b"")
-    (tmp_path / "text").write_text("robot: ar10\n")
-    (tmp_path / "magic").write_bytes(MCAP0_MAGIC)
-    (tmp_path / "zeros").write_bytes(MCAP0_MAGIC + bytes(5000))
+def test_what_is_no_log(tmp_path: Path) -> None:
+    """It is neither opened nor finished."""
+    files = {"empty": b"", "text": b"robot: ar10\n", "magic": MCAP0_MAGIC}
+    files |= {"zeros": MCAP0_MAGIC + bytes(5000)}
+    for name, data in files.items():
+        (tmp_path / name).write_bytes(data)
     (tmp_path / "folder").mkdir()
-    cases = {
-        "missing": "cannot finish the log: No such file",
-        "folder": "cannot finish the log: Is a directory",
-        "empty": "not an MCAP file: it is empty",
-        "text": "not an MCAP file: it begins with b'robot: a'",
-        "magic": "none of its 8 bytes is a whole record",
-        "zeros": "none of its 5008 bytes is a whole record",
-    }
-    for name, reason in cases.items():
+    many_chunks(tmp_path / "foreign", CompressionType.NONE, "somebody")
+    cases = (
+        ("missing", logs.finish_log, "cannot finish the log: No such file"),
+        ("missing", logs.open, "No such file"),
+        ("folder", logs.finish_log, "cannot finish the log: Is a directory"),
+        ("folder", logs.open, "no log in this folder"),
+        ("foreign", logs.open, r"not a log of casadi_ik: no .* 'casadi_ik' \(found: somebody\)"),
+        *(("empty", ask, "not an MCAP file: it is empty") for ask in (logs.finish_log, logs.open)),
+        ("text", logs.finish_log, "not an MCAP file: it begins with b'robot: a'"),
+        ("text", logs.open, "not an MCAP file: it begins with b'robot: a'"),
+        ("magic", logs.finish_log, "none of its 8 bytes is a whole record"),
+        ("zeros", logs.finish_log, "none of its 5008 bytes is a whole record"),
+    )
+    for name, ask, reason in cases:
         with pytest.raises(errors.LogError, match=reason) as caught:
-            logs.finish_log(tmp_path / name)
+            ask(tmp_path / name)
         assert str(caught.value).startswith(f"{tmp_path / name}: ")
-    assert (tmp_path / "text").read_text() == "robot: ar10\n"
+    assert (tmp_path / "text").read_bytes() == files["text"]
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")

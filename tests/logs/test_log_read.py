@@ -1,4 +1,4 @@
-"""Questions to a log: filters, several files as one, dataframes, where solves come from."""
+"""Questions to a log: filters, several files as one, dataframes, origins; logs merged."""
 
 from __future__ import annotations
 
@@ -10,10 +10,26 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
-from made_up_solves import FORMAT, JOINTS, LAYOUT, changed, chunks_of, main, make_block, rewritten
+from made_up_solves import (
+    FORMAT,
+    JOINTS,
+    LABELS,
+    LAYOUT,
+    T0,
+    Field,
+    Layout,
+    SolveBlock,
+    TraceFormat,
+    changed,
+    chunks_of,
+    main,
+    make_block,
+    rewritten,
+)
 from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC as MAGIC
 from mcap.writer import CompressionType, IndexType
+from rosbags.highlevel import AnyReader
 
 import casadi_ik as ik
 from casadi_ik import errors, logs
@@ -135,10 +151,11 @@ def test_files_that_do_not_belong_together(write: Write, tmp_path: Path) -> None
     first = write(make_block(5, 6), name="0.mcap")
     copy = tmp_path / "1.mcap"
     copy.write_bytes(first.read_bytes())
-    with pytest.raises(
-        errors.LogError, match=r"1\.mcap: solve 1 of enhanced-dls is in .*0\.mcap too"
-    ):
-        logs.open([first, copy]).solves()
+    for ask in (lambda files: logs.open(files).solves(), lambda files: logs.merge_logs(files, "m")):
+        with pytest.raises(errors.LogError) as caught:
+            ask([first, copy])
+        says = f"{copy}: solve 1 of enhanced-dls is in {first} too (2 such solves)"
+        assert str(caught.value) == says
     other = write(make_block(6, first=2), name="2.mcap", robot_name="ar10")
     with pytest.raises(
         errors.LogError, match=r"2\.mcap: robot 'ar10', but .*0\.mcap has 'made_up'"
@@ -479,3 +496,84 @@ def test_a_motion_is_read_back_or_refused(tmp_path: Path) -> None:
     ik.Solver(robot).solve(ik.load_grasp("cup"), log=solved)
     with pytest.raises(errors.LogError, match=r"log\.mcap: no motion: found /ik/hand-first"):
         logs.read_motion(solved)
+
+
+def one(number: int) -> SolveBlock:
+    """A block of one solve of 50 iterations."""
+    return make_block(50, first=number)
+
+
+def test_chunks_are_copied_as_they_are_and_others_can_read_the_result(
+    write: Write, tmp_path: Path
+) -> None:
+    shards = [write(one(i), name=f"{i}.mcap", urdf="<robot/>") for i in range(3)]
+    target = tmp_path / "all.mcap"
+    merged = logs.merge_logs(shards, target)
+    data = target.read_bytes()
+    assert merged.size == len(data)
+    for shard in shards:
+        whole = shard.read_bytes()
+        for chunk in chunks_of(shard):
+            begin = chunk.chunk_start_offset
+            length = chunk.chunk_length + chunk.message_index_length
+            assert whole[begin : begin + length] in data
+    assert logs.open(target).attachment("robot.urdf") == b"<robot/>"
+    with target.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        messages = len(list(reader.iter_messages()))
+        summary = reader.get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    assert messages == merged.messages == summary.statistics.message_count
+    with AnyReader([target]) as reader:
+        assert reader.message_count == messages
+        assert sum(1 for _ in reader.messages()) == messages
+
+
+def test_shards_that_contradict_are_refused(write: Write, tmp_path: Path) -> None:
+    first = write(one(0), name="first.mcap", urdf="<robot/>")
+    layout = Layout.record(Field("q", (3,)), Field("phase", dtype="u1"))
+    other = TraceFormat(layout, LABELS)
+    clock = logs.LogClock(T0 + 10**9)
+    cases = {
+        f"t0_ns: found {T0 + 10**9}, expected {T0}": write(one(1), name="late.mcap", clock=clock),
+        "robot: found ar10, expected made_up": write(one(1), name="robot.mcap", robot_name="ar10"),
+        "seed: found 5, expected 0": write(one(1), name="seed.mcap", seed=5),
+        "method 'enhanced-dls' has other fields or names than in": write(
+            make_block(50, first=1, form=other), name="layout.mcap", urdf="<robot/>"
+        ),
+        "the attachment 'robot.urdf' is not the same": write(
+            one(1), name="urdf.mcap", urdf="<other/>"
+        ),
+    }
+    before = sorted(tmp_path.iterdir())
+    for reason, shard in cases.items():
+        with pytest.raises(errors.LogError) as caught:
+            logs.merge_logs([first, shard], tmp_path / "all.mcap")
+        assert reason in str(caught.value)
+        assert str(shard) in str(caught.value)
+        assert str(first) in str(caught.value)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_shards_that_cannot_be_read(write: Write, tmp_path: Path) -> None:
+    good = write(one(0))
+    torn = tmp_path / "torn.mcap"
+    torn.write_bytes(write(one(1), name="1.mcap").read_bytes()[:-30])
+    (tmp_path / "text").write_text("robot: ar10 and some more\n")
+    (tmp_path / "nothing").mkdir()
+    cases = {
+        torn: "truncated or damaged .*log finish",
+        tmp_path / "missing": "cannot read the log: No such file",
+        tmp_path / "nothing": "no log in this folder",
+        tmp_path / "text": "not an MCAP file",
+    }
+    for shard, reason in cases.items():
+        with pytest.raises(errors.LogError, match=reason) as caught:
+            logs.merge_logs([good, shard], tmp_path / "all.mcap")
+        assert str(caught.value).startswith(f"{shard}: ")
+    with pytest.raises(errors.LogError, match="found no shards"):
+        logs.merge_logs([], tmp_path / "all.mcap")
+    with pytest.raises(errors.LogError, match="cannot write the merged log: No such file"):
+        logs.merge_logs([good], tmp_path / "nowhere" / "all.mcap")
+    assert not (tmp_path / "all.mcap").exists()

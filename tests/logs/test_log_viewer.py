@@ -256,34 +256,30 @@ def test_mcap_core_and_rosmsg2_serialization(
     assert times == sorted(times)
 
 
-def test_the_viewer_file(packages: Path, tmp_path: Path, robot: ik.ArmHand) -> None:
-    """Every topic is deserialised, and tells what the solver did."""
-    log, view = tmp_path / "cup.mcap", tmp_path / "view.mcap"
-    grasp = ik.load_grasp("cup")
-    ik.Solver(robot).solve(grasp, log=log)
-    solve = logs.one_solve(logs.open(log))
-    write_view(view, solve, robot)
-    messages = read(packages, view)
+def test_the_viewer_file(packages: Path, view: Path, decoded: Decoded) -> None:
+    """Every message of every topic is deserialised, to the same values."""
     topics: dict[str, list[dict[str, Any]]] = {}
-    for message in messages:
+    for message in read(packages, view):
         topics.setdefault(message["topic"], []).append(message["values"])
-    assert {topic: len(found) for topic, found in topics.items() if topic != "/ik/messages"} == {
-        **dict.fromkeys(("/robot_description", "/ik/targets"), 1),
-        **dict.fromkeys(("/tf", "/joint_states", "/ik/contacts", "/ik/iteration"), len(solve.rows)),
+    assert {name: len(found) for name, found in topics.items()} == {
+        name: len(found) for name, found in decoded.topics.items()
     }
-    assert topics["/robot_description"][0]["data"] == robot.urdf()
-    targets = {entity["id"]: entity for entity in topics["/ik/targets"][0]["entities"]}
-    for finger, contact in grasp.contacts.items():
-        position = targets[f"{finger} target"]["spheres"][0]["pose"]["position"]
-        np.testing.assert_allclose([position[axis] for axis in "xyz"], contact.point)
-    for row in (0, -1):
-        joints = topics["/joint_states"][row]
-        found = dict(zip(joints["name"], joints["position"], strict=True))
-        assert found == pytest.approx(robot.joints(solve.rows["q"][row]))
-        children = {frame["child_frame_id"] for frame in topics["/tf"][row]["transforms"]}
-        assert children >= {f"{finger}_contact" for finger in robot.fingers}
+    ours = {name: decoded.topics[name][-1][1] for name in topics}
+    theirs = {name: found[-1] for name, found in topics.items()}
+    assert theirs["/robot_description"]["data"] == ours["/robot_description"].data
+    assert theirs["/joint_states"]["name"] == list(ours["/joint_states"].name)
+    for topic, name in (("/joint_states", "position"), ("/ik/iteration", "q")):
         np.testing.assert_array_equal(
-            numbers(topics["/ik/iteration"][row]["q"]), solve.rows["q"][row]
+            numbers(theirs[topic][name]), np.asarray(getattr(ours[topic], name))
         )
-    lines = [values["message"] for values in topics["/ik/messages"]]
-    assert any(line.startswith("SOLVED after") for line in lines)
+    for message, expected in zip(
+        theirs["/ik/targets"]["entities"], ours["/ik/targets"].entities, strict=True
+    ):
+        position, ours_at = message["spheres"][0]["pose"]["position"], expected.spheres[0].pose
+        assert message["id"] == expected.id
+        assert [position[axis] for axis in "xyz"] == [
+            getattr(ours_at.position, axis) for axis in "xyz"
+        ]
+    children = [frame["child_frame_id"] for frame in theirs["/tf"]["transforms"]]
+    assert children == [frame.child_frame_id for frame in ours["/tf"].transforms]
+    assert theirs["/ik/messages"]["message"] == ours["/ik/messages"].message

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 from made_up_solves import LABELS, T0, Field, Layout, TraceFormat, changed, make_block
-from mcap.writer import Writer
 
 from casadi_ik import errors, logs
 
@@ -248,29 +247,6 @@ def test_unknown_compression(tmp_path: Path) -> None:
 def test_bad_policies_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(errors.InputError, match=rf"keep\.{next(iter(options))}: found"):
         logs.Keep(**options)
-
-
-def test_files_that_are_no_log(tmp_path: Path) -> None:
-    foreign = tmp_path / "foreign.mcap"
-    with foreign.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        writer.add_metadata("somebody", {"a": "b"})
-        writer.finish()
-    (tmp_path / "empty").write_bytes(b"")
-    (tmp_path / "text").write_text("robot: ar10\n")
-    (tmp_path / "folder").mkdir()
-    cases = {
-        tmp_path / "missing": "No such file",
-        tmp_path / "folder": "no log in this folder",
-        tmp_path / "empty": "not an MCAP file: it is empty",
-        tmp_path / "text": "not an MCAP file: it begins with b'robot: a'",
-        foreign: r"not a log of casadi_ik: no metadata 'casadi_ik' \(found: somebody\)",
-    }
-    for path, reason in cases.items():
-        with pytest.raises(errors.LogError, match=reason) as caught:
-            logs.open(path)
-        assert str(caught.value).startswith(f"{path}: ")
 
 
 def test_metadata_is_complete(write: Write) -> None:
