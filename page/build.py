@@ -20,18 +20,16 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 import casadi_ik as ik
 from casadi_ik import palette
 from casadi_ik.collision.solids import EXPORTED, of_object, stated
 from casadi_ik.drawing.cameras import close_view, whole_view
-from casadi_ik.drawing.drawables import bodies, with_object
+from casadi_ik.drawing.drawables import looks_of, with_object
 from casadi_ik.exporting.project import checked_prefix, wasm_project, write_folder
 from casadi_ik.grasps.load import shipped_grasps
 from casadi_ik.grasps.objects import load_object
-from casadi_ik.kernels.robot_kernels import RobotKernels
 
 HERE = Path(__file__).parent
 
@@ -43,7 +41,12 @@ ROBOTS = {
 }
 """What can be chosen, and what it is called there."""
 
-COLORS = {"object": palette.OBJECT, "scene": palette.SCENE, "touching": palette.NEAREST}
+COLORS = {
+    "object": palette.OBJECT,
+    "scene": palette.SCENE,
+    "touching": palette.NEAREST,
+    "pad": palette.PAD,
+}
 """Of what the page draws beside robots."""
 
 CAPACITY = 8
@@ -61,8 +64,8 @@ SPANS = 20_000
 
 
 def of_grasps(robot: ik.ArmHand, name: str) -> list[dict[str, Any]]:
-    """The robot's shipped grasps whose objects an export can have in its scene."""
-    found = []
+    """The robot's shipped grasps with objects as an export has them; else its contacts at home."""
+    found: list[dict[str, Any]] = []
     for file in shipped_grasps(name):
         grasp = ik.load_grasp(file)
         points, normals = grasp.arrays(robot.fingers)
@@ -92,7 +95,11 @@ def of_grasps(robot: ik.ArmHand, name: str) -> list[dict[str, Any]]:
             }
         )
     if not found:
-        raise SystemExit(f"{name}: no shipped grasp for the page")
+        points, normals = (values.tolist() for values in robot.contacts(robot.home))
+        close = close_view(robot, robot.home)
+        views = {"close": close, "whole": whole_view(np.mean(points, axis=0), close)}
+        asked = {"points": points, "normals": normals, "views": views}
+        found.append({"name": "home", "object": "", "solids": [], **asked})
     return found
 
 
@@ -115,79 +122,12 @@ def about(robot: ik.ArmHand, name: str) -> dict[str, Any]:
     return {
         "name": robot.name,
         "title": ROBOTS.get(name, name),
-        "arm": arm_links(robot),
         "armMotors": list(robot.description.arm_actuators),
-        "links": list(robot.description.links),
-        "bodies": [one.data() for one in bodies(robot)],
-        "prismatic": [bool(kind == "m") for kind in units(robot)],
+        "looks": looks_of(robot.description),
+        "prismatic": [motor.unit == "m" for motor in robot.description.actuators],
         "grasps": of_grasps(robot, name),
         **reached(robot),
     }
-
-
-def arm_links(robot: ik.ArmHand) -> list[str]:
-    """Links up to what the arm's last motor moves; what is fixed to that is the hand's."""
-    joints = [joint for joint in robot.description.joints if joint.part == "arm"]
-    last = max((i for i, joint in enumerate(joints) if joint.type != "fixed"), default=-1)
-    return [robot.description.root, *(joint.child for joint in joints[: last + 1])]
-
-
-def units(robot: ik.ArmHand) -> list[str]:
-    """Per actuator "m" where it slides."""
-    driven = {joint.name: joint.type for joint in robot.description.movable}
-    return [
-        "m" if driven.get(name) == "prismatic" or "slider" in name else "rad"
-        for name in robot.actuators
-    ]
-
-
-UNARY = {
-    ca.OP_ASSIGN: "{}", ca.OP_NEG: "-{}", ca.OP_SQ: "{0}*{0}", ca.OP_TWICE: "2*{}",
-    ca.OP_INV: "1/{}", ca.OP_NOT: "+!{}", ca.OP_SQRT: "Math.sqrt({})", ca.OP_SIN: "Math.sin({})",
-    ca.OP_COS: "Math.cos({})", ca.OP_TAN: "Math.tan({})", ca.OP_ASIN: "Math.asin({})",
-    ca.OP_ACOS: "Math.acos({})", ca.OP_ATAN: "Math.atan({})", ca.OP_FABS: "Math.abs({})",
-    ca.OP_SIGN: "Math.sign({})",
-}  # fmt: skip
-BINARY = {
-    ca.OP_ADD: "{}+{}", ca.OP_SUB: "{}-{}", ca.OP_MUL: "{}*{}", ca.OP_DIV: "{}/{}",
-    ca.OP_LT: "+({}<{})", ca.OP_LE: "+({}<={})", ca.OP_EQ: "+({}==={})", ca.OP_NE: "+({}!=={})",
-    ca.OP_AND: "+({}&&{})", ca.OP_OR: "+({}||{})", ca.OP_IF_ELSE_ZERO: "{}?{}:0",
-    ca.OP_FMIN: "Math.min({},{})", ca.OP_FMAX: "Math.max({},{})",
-    ca.OP_ATAN2: "Math.atan2({},{})", ca.OP_HYPOT: "Math.hypot({},{})",
-}  # fmt: skip
-"""JavaScript of CasADi's operations."""
-
-
-def kinematics(robot: ik.ArmHand) -> str:
-    """An ES module whose `links(q)` gives the poses of all links, as the page has poses.
-
-    Raises:
-        KeyError: The kinematics have an operation that no JavaScript is written for.
-    """
-    q = ca.SX.sym("q", len(robot.actuators))
-    # A kernel's function has its matrices transposed.
-    frames = ca.horzsplit(RobotKernels(robot.description).links.function(q), 4)
-    rows = [ca.vertcat(ca.vec(frame[:3, :3]), frame[3, :3].T) for frame in frames]
-    function = ca.Function("links", [q], [ca.densify(ca.vertcat(*rows))], {"cse": True})
-    lines = []
-    for i in range(function.n_instructions()):
-        op, to = function.instruction_id(i), function.instruction_output(i)
-        given = function.instruction_input(i)
-        if op == ca.OP_CONST:
-            lines.append(f"w[{to[0]}]={function.instruction_constant(i)!r}")
-        elif op == ca.OP_INPUT:
-            lines.append(f"w[{to[0]}]=q[{given[1]}]")
-        elif op == ca.OP_OUTPUT:
-            lines.append(f"o[{to[1]}]=w[{given[0]}]")
-        else:
-            form = UNARY.get(op) or BINARY[op]
-            lines.append(f"w[{to[0]}]=" + form.format(*(f"w[{k}]" for k in given)))
-    return (
-        f"const w = new Float64Array({function.sz_w()});\n"
-        f"export function links(q) {{\nconst o = new Float64Array({12 * len(frames)});\n"
-        + ";\n".join(lines)
-        + ";\nreturn o;\n}\n"
-    )
 
 
 def run(*command: str) -> None:
@@ -220,15 +160,13 @@ def build_robot(name: str, out: Path, keep: Path | None) -> dict[str, Any]:
         place = (keep or Path(folder)) / prefix
         write_folder(place, wasm_project(robot, prefix, CAPACITY))
         (place / "about.json").write_text(json.dumps(data), encoding="utf-8")
-        (place / "kinematics.js").write_text(kinematics(robot), encoding="utf-8")
         entry = place / "entry.js"
         entry.write_text(
             f'import * as solver from "./{prefix}.js";\n'
             f'import wasm from "./{prefix}.wasm";\n'
             'import about from "./about.json";\n'
-            'import { links } from "./kinematics.js";\n'
             f"globalThis.casadiIkRobots ??= {{}};\n"
-            f"globalThis.casadiIkRobots[{json.dumps(name)}] = {{ solver, wasm, about, links }};\n",
+            f"globalThis.casadiIkRobots[{json.dumps(name)}] = {{ solver, wasm, about }};\n",
             encoding="utf-8",
         )
         script = out / "robots" / f"{prefix}.js"

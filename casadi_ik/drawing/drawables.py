@@ -1,7 +1,7 @@
 """What there is to draw: named shapes, made alike for pictures, for the viewer and for pages.
 
 Every function gives drawables in a frame that it names. Pictures put them there at once; pages make
-a node of the frame and move that. `Drawable.data` is what a page takes, as JSON.
+a node of the frame and move that.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -76,11 +75,6 @@ class Drawable:
         """The same in the base frame, in which its frame has a (4, 4) pose."""
         return replace(self, shape=self.shape.moved(pose), frame="")
 
-    def data(self) -> dict[str, Any]:
-        """Name, role, colour, frame and shape as JSON has them."""
-        own = {"name": self.name, "role": self.role, "color": self.color, "frame": self.frame}
-        return own | self.shape.data()
-
 
 # Robots.
 
@@ -95,7 +89,7 @@ def bodies(robot: ArmHand) -> list[Drawable]:
         robot: The robot.
     """
     description, seen = robot.description, meshes_of(robot.description)
-    looks = _looks(description)
+    looks = looks_of(description)
     shown = {looks[link][0] for link in seen}
     found = [_of_link(link, mesh_of(surface), looks) for link, surface in seen.items()]
     found += [one for one in collision_bodies(robot) if one.role not in shown]
@@ -113,7 +107,7 @@ def bodies(robot: ArmHand) -> list[Drawable]:
 def collision_bodies(robot: ArmHand) -> list[Drawable]:
     """The shapes that collisions are checked with, in the frames of links."""
     description = robot.description
-    shapes, looks = description.shapes, _looks(description)
+    shapes, looks = description.shapes, looks_of(description)
     found = [
         (one.link, rod(one.center - one.half, one.center + one.half, one.radius))
         for one in shapes.capsules
@@ -153,7 +147,7 @@ def merged(drawables: Sequence[Drawable]) -> list[Drawable]:
     ]
 
 
-def _looks(description: RobotDescription) -> dict[str, tuple[str, str]]:
+def looks_of(description: RobotDescription) -> dict[str, tuple[str, str]]:
     """By link "arm" or "hand", and its colour, another than that of the link before it."""
     palms = {description.palm_link, *(side.palm_link for side in description.sides)}
     depth, roles = {description.root: 0}, {description.root: "arm"}

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -66,19 +65,6 @@ class Shape:
     def moved(self, pose: Array) -> Shape:
         """The same in another frame, in which its own has a (4, 4) pose."""
         return replace(self, pose=pose @ self.pose)
-
-    def data(self) -> dict[str, Any]:
-        """Kind, size and pose (rotation row by row, then the origin); of a mesh its triangles."""
-        rotation, origin = self.pose[:3, :3].ravel(), self.pose[:3, 3]
-        found = {
-            "kind": self.kind,
-            "size": [float(value) for value in self.size],
-            "pose": [*rotation.tolist(), *origin.tolist()],
-        }
-        if self.mesh is not None:
-            found["points"] = np.round(self.mesh.points, 6).ravel().tolist()
-            found["triangles"] = self.mesh.triangles.ravel().tolist()
-        return found
 
 
 def mesh_of(surface: Surface) -> Shape:

@@ -1,6 +1,5 @@
 // What is drawn: the robot's shapes, solids, contacts.
 import * as THREE from "three";
-import { toCreasedNormals } from "three/addons/utils/BufferGeometryUtils.js";
 
 /* global PALETTE */
 // By the solver's names of kinds: what a solid looks like, along z where it is along anything.
@@ -15,7 +14,8 @@ const GEOMETRY = {
     new THREE.CylinderGeometry(radius, radius, length, 48).rotateX(UPRIGHT),
 };
 const UP = new THREE.Vector3(0, 1, 0);
-const CREASE = 0.6; // [rad] at which a surface has an edge
+const ALONG = new THREE.Vector3(0, 0, 1);
+const PAD = [0.0056, 0.003]; // radius and thickness [m]
 
 export const COLORS = ["#f0a400", "#2f7fd6", "#16a39a", "#b04fc9", "#e0528a"];
 
@@ -39,81 +39,46 @@ export function poseOf(matrix) {
   return [m[0], m[4], m[8], m[1], m[5], m[9], m[2], m[6], m[10], m[12], m[13], m[14]];
 }
 
-// What is drawn of a robot, as `casadi_ik.drawing` has it: by numbers, or as triangles.
-const DRAWN = {
-  capsule: GEOMETRY.CAPSULE,
-  drum: ([radius, length]) => {
-    const edge = 0.12 * Math.min(radius, length), rise = [];
-    for (let i = 0; i < 5; ++i) {
-      const bow = (i / 4) * UPRIGHT, out = radius - edge + edge * Math.sin(bow);
-      rise.push(new THREE.Vector2(out, -length / 2 + edge - edge * Math.cos(bow)));
-    }
-    const fall = rise.map(({ x, y }) => new THREE.Vector2(x, -y)).reverse();
-    const profile = [new THREE.Vector2(0, -length / 2), ...rise, ...fall, new THREE.Vector2(0, length / 2)];
-    return new THREE.LatheGeometry(profile, 32).rotateX(UPRIGHT);
-  },
-  mesh: (_, { points, triangles }) => {
-    const geometry = new THREE.BufferGeometry().setIndex(triangles);
-    geometry.setAttribute("position", new THREE.Float32BufferAttribute(points, 3));
-    return toCreasedNormals(geometry, CREASE);
-  },
-};
-
-// A robot as it looks, and the shapes that collisions are checked with about it.
+// A robot as the shapes that collisions are checked with, a pad at each fingertip.
 export class RobotBody extends THREE.Group {
-  constructor({ about, links, shapes }) {
+  constructor({ about, shapes, fingers }) {
     super();
-    this.frames = Object.fromEntries(about.links.map((name, i) => [name, 12 * i]));
-    this.links = links;
-    this.parts = about.bodies.map((one) => {
-      const mesh = new THREE.Mesh(DRAWN[one.kind](one.size, one), solid(one.color));
-      mesh.geometry.applyMatrix4(matrixOf(one.pose));
-      return this.part(mesh, one);
+    const shown = shapes.capsules.map((one, i) => ({ ...one, at: 6 * i, kind: "capsule" })).filter((one) => one.shown);
+    const first = 6 * shapes.capsules.length;
+    const solids = shapes.solids.map((one, i) => ({ ...one, at: first + 12 * i }));
+    const pads = fingers.map((_, i) => ({ kind: "pad", at: 3 * i, link: "" }));
+    this.parts = [...shown, ...solids, ...pads].map((one) => {
+      const [role, color] = about.looks[one.link] ?? ["pad", PALETTE.pad], usual = solid(color);
+      const mesh = new THREE.Mesh(undefined, usual);
+      mesh.castShadow = mesh.receiveShadow = true;
+      this.add(mesh);
+      return { ...one, role, usual, mesh };
     });
-    this.capsules = shapes.capsules.map((one, i) => ({ ...one, i })).filter((one) => one.shown);
     this.touching = solid(PALETTE.touching);
-    this.around = new THREE.Group();
-    this.around.visible = false;
-    this.shapes = shapes;
-    this.add(this.around);
   }
 
-  part(mesh, { frame, role, color }) {
-    mesh.castShadow = mesh.receiveShadow = true;
-    this.add(mesh);
-    return { mesh, link: frame, role, usual: mesh.material, color };
-  }
-
-  place(q) {
-    const poses = this.links(q);
-    for (const { mesh, link } of this.parts) {
-      const at = this.frames[link];
-      matrixOf(poses.subarray(at, at + 12)).decompose(mesh.position, mesh.quaternion, mesh.scale);
-    }
-  }
-
-  // Made when they are first shown; `places` as the solver gives them.
-  placeShapes(places) {
-    const { capsules, solids } = this.shapes, { around } = this, first = 6 * capsules.length;
-    if (!around.children.length) {
-      const material = Object.assign(solid("#8d99a6"), { transparent: true, opacity: 0.35, depthWrite: false });
-      for (const { i, radius } of this.capsules) {
-        const half = Math.hypot(...places.slice(6 * i + 3, 6 * i + 6));
-        around.add(new THREE.Mesh(GEOMETRY.CAPSULE([radius, 2 * half]), material));
+  // As the solver has it: where its shapes are, and what its fingertips reach.
+  place(q, solver) {
+    const places = solver.shapes(q), { points, normals } = solver.contacts(q);
+    const way = new THREE.Vector3();
+    const turn = (mesh, size) => {
+      if (!mesh.geometry.parameters) mesh.geometry = size();
+      if (way.lengthSq() > 1e-18) mesh.quaternion.setFromUnitVectors(ALONG, way.normalize());
+    };
+    for (const { mesh, kind, at, size, radius } of this.parts) {
+      if (kind === "capsule") {
+        mesh.position.fromArray(places, at);
+        way.fromArray(places, at + 3);
+        turn(mesh, () => GEOMETRY.CAPSULE([radius, 2 * way.length()]));
+      } else if (kind === "pad") {
+        mesh.position.fromArray(points, at);
+        way.fromArray(normals, at);
+        turn(mesh, () => GEOMETRY.CYLINDER(PAD));
+      } else {
+        if (!mesh.geometry.parameters) mesh.geometry = GEOMETRY[kind.toUpperCase()](size);
+        matrixOf(places.subarray(at, at + 12)).decompose(mesh.position, mesh.quaternion, mesh.scale);
       }
-      for (const one of solids) around.add(new THREE.Mesh(GEOMETRY[one.kind.toUpperCase()](one.size), material));
     }
-    const way = new THREE.Vector3(), along = new THREE.Vector3(0, 0, 1);
-    this.capsules.forEach(({ i }, k) => {
-      const mesh = around.children[k];
-      mesh.position.fromArray(places, 6 * i);
-      way.fromArray(places, 6 * i + 3);
-      if (way.lengthSq() > 1e-18) mesh.quaternion.setFromUnitVectors(along, way.normalize());
-    });
-    solids.forEach((_, k) => {
-      const mesh = around.children[this.capsules.length + k], at = first + 12 * k;
-      matrixOf(places.subarray(at, at + 12)).decompose(mesh.position, mesh.quaternion, mesh.scale);
-    });
   }
 
   // Links that touch something have a colour of their own.

@@ -88,7 +88,7 @@ async function choose(robot, question = null, hash = "") {
   by("loading").hidden = true;
   if (now.robot !== robot) {
     Object.assign(now, { solving, robot, answer: null, shown: null });
-    now.body = new RobotBody({ ...solving.robot, links: solving.links });
+    now.body = new RobotBody(solving.robot);
     panel.robot(solving.robot);
   }
   const first = now.grasp === null;
@@ -155,7 +155,7 @@ function stand(asked_) {
   now.marks = robot.fingers.map((_, i) => new ContactMark(COLORS[i % COLORS.length]));
   world.add(now.body, now.object, ...now.marks, knob);
   if (now.obstacle) world.add(now.obstacle);
-  document.title = `${now.grasp.object} · ${now.robot.title} · casadi_ik`;
+  document.title = `${now.grasp.object || "at home"} · ${now.robot.title} · casadi_ik`;
   offerHandles();
   solve();
 }
@@ -167,7 +167,7 @@ function post(at) {
 
 // The camera: hand and object fill the picture, the whole robot is in the corner; or the other way.
 function lookAtAll(whole = false) {
-  now.body.place(now.answer.q);
+  now.body.place(now.answer.q, now.solving.solver);
   const { close: preferred, whole: far } = now.grasp.views, object = cornersOf(now.object);
   const all = [...now.body.corners(false), ...object];
   const hand = [...now.body.corners(true), ...object, ...placed()];
@@ -271,9 +271,7 @@ function show(q, whole) {
 function draw() {
   const { solver, robot } = now.solving, { Status } = robot;
   const tips = solver.contacts(now.shown).points;
-  now.body.place(now.shown);
-  now.body.around.visible = by("shapes").checked;
-  if (by("shapes").checked) now.body.placeShapes(solver.shapes(now.shown));
+  now.body.place(now.shown, solver);
   const touching = now.answer.status === Status.COLLISION && now.shown === now.answer.q;
   now.body.mark(touching ? now.answer.closest : []);
   now.object.place();
@@ -286,7 +284,7 @@ function draw() {
     const size = stage.metres(5, now.points[i]);
     mark.place(now.points[i], now.normals[i], tip, size, chosen === `point ${i}`);
   });
-  const middle = middleOf(places(now.object.solids));
+  const middle = middleOf(standing("object"));
   knob.place(middle, stage.metres(chosen === "object" ? 13 : 11, middle), stage.camera);
   stage.draw();
 }
@@ -295,7 +293,7 @@ stage.controls.addEventListener("change", () => now.shown && draw());
 // What the pointer may take hold of.
 function handles() {
   if (!now.answer) return { points: [], meshes: [] };
-  const points = [{ name: "object", at: middleOf(places(now.object.solids)), wide: 15 }];
+  const points = [{ name: "object", at: middleOf(standing("object")), wide: 15 }];
   now.marks.forEach((mark, i) => {
     if (now.points[i]) points.push({ name: `point ${i}`, at: now.points[i] });
     if (now.normals[i]) points.push({ name: `normal ${i}`, at: mark.end });
@@ -306,7 +304,8 @@ function handles() {
 }
 
 function offerHandles() {
-  const { fingers } = now.solving.robot, names = ["object"], words = ["the object"];
+  const { fingers } = now.solving.robot, names = ["object"];
+  const words = [now.object.solids.length ? "the object" : "all contacts"];
   now.points.forEach((point, i) => {
     if (point) [names[names.length], words[words.length]] = [`point ${i}`, `contact ${i + 1}: ${plain(fingers[i])}`];
   });
@@ -334,6 +333,8 @@ function middleOf(points) {
 }
 
 const places = (solids) => solids.map((one) => V(one.pose.slice(9)));
+// Of what has no solids the contacts.
+const standing = (what) => (now[what].solids.length ? places(now[what].solids) : placed());
 
 // About the vertical through the middle of something.
 function turned(middle, angle) {
@@ -367,7 +368,7 @@ function move(name, by_, screen) {
     now.marks[i].end = now.points[i].clone().addScaledVector(now.normals[i], now.marks[i].length);
   } else {
     const turning = what === "object" && (screen.shift || by("turn").checked);
-    const middle = middleOf(places(now[what].solids));
+    const middle = middleOf(standing(what));
     carry(what, turning ? turned(middle, 0.012 * screen.x) : new THREE.Matrix4().makeTranslation(by_));
   }
   // Once a frame, however many events there are.
@@ -394,7 +395,7 @@ function nudge(event) {
     move(name, by_.multiplyScalar(size), { x: 0, shift: false });
     stage.draw(() => (solve(), keep(`keys ${name}`)));
   } else if (sign && what !== "obstacle") {
-    if (what === "object") carry("object", turned(middleOf(places(now.object.solids)), sign * STEP.turn));
+    if (what === "object") carry("object", turned(middleOf(standing("object")), sign * STEP.turn));
     else now.normals[i]?.applyAxisAngle(UP, sign * STEP.turn);
     stage.draw(() => (solve(), keep(`turn ${name}`)));
   } else return;
@@ -463,7 +464,6 @@ by("link").addEventListener("click", () => {
   copied(location.href, "Link");
 });
 by("selected").addEventListener("change", (event) => select(event.target.value));
-by("shapes").addEventListener("change", () => now.answer && draw());
 by("dark").addEventListener("change", (event) => paint(event.target.checked));
 by("fold").addEventListener("click", () => fold(!document.body.classList.contains("folded")));
 by("inset").addEventListener("click", () => now.answer && lookAtAll(stage.near));

@@ -27,7 +27,7 @@ export class Panel {
 
   robot({ about, fingers, motors }) {
     by("grasp").replaceChildren(
-      ...about.grasps.map((grasp, i) => new Option(grasp.object, String(i))),
+      ...about.grasps.map((grasp, i) => new Option(grasp.object || "at home", String(i))),
     );
     by("fingers").replaceChildren(
       ...fingers.map((name, i) => {

@@ -8,8 +8,8 @@ const LONG = 25;
 export const FREE = [NaN, NaN, NaN];
 
 export class Solving {
-  constructor(robot, solver, links) {
-    Object.assign(this, { robot, solver, links });
+  constructor(robot, solver) {
+    Object.assign(this, { robot, solver });
     this.warm();
   }
 
@@ -25,9 +25,9 @@ export class Solving {
   }
 
   static async of(loaded) {
-    const { about, solver: module, wasm, links } = loaded;
+    const { about, solver: module, wasm } = loaded;
     const solver = await module.Solver.load(wasm);
-    return new Solving({ ...module, about }, solver, links);
+    return new Solving({ ...module, about }, solver);
   }
 
   // Points and normals as lists of three numbers; solids as { kind, size, pose, grasped }.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import closing
 
 import numpy as np
@@ -51,23 +50,6 @@ def test_shapes_are_closed_and_of_their_size(name: str) -> None:
     corners = surface.points[surface.triangles]  # outwards: the volume is positive
     volume = np.linalg.det(corners - surface.points.mean(axis=0)).sum() / 6
     assert volume == pytest.approx(expected, rel=0.05)
-
-
-def test_drawables_are_told_in_json_as_they_are_drawn(robot) -> None:
-    kinds = set()
-    for one in bodies(robot):
-        told = json.loads(json.dumps(one.data()))
-        assert told["frame"] in robot.description.links
-        assert told["role"] in ("arm", "hand", "pad")
-        kinds.add(told["kind"])
-        if told["kind"] == "capsule":
-            place, (radius, length) = np.array(told["pose"]), told["size"]
-            along = place[:9].reshape(3, 3)[:, 2]
-            far = (one.surface.points - place[9:]) @ along
-            assert np.abs(far).max() == pytest.approx(length / 2 + radius, rel=1e-6)
-        elif told["kind"] == "mesh":
-            assert len(told["points"]) == one.surface.points.size
-    assert kinds == {"capsule", "drum", "mesh"}
 
 
 def test_fingertips_of_the_body_touch_their_contacts(robot) -> None:
