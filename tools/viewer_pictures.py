@@ -80,31 +80,16 @@ def seen(page: Any, path: Path) -> None:
     print(path)
 
 
-def moved(*by: float) -> Use:
-    """The object dragged so far [m], in steps as a hand does."""
+def dragged(name: str, *by: float) -> Use:
+    """The object or a contact dragged so far [m], in steps as a hand does."""
 
     def use(shown: GraspPage, _: Any) -> None:
-        start = shown.asked.object_pose
-        assert start is not None
+        shown.select(name)
+        start = shown.asked.places[name]
         for part in np.linspace(0.25, 1.0, 4):
             pose = start.copy()
             pose[:3, 3] += part * np.array(by)
-            shown.drag_thing("object", pose)
-            shown.work.settle()
-
-    return use
-
-
-def dragged(finger: str, *by: float) -> Use:
-    """A contact dragged so far [m], in steps as a hand does."""
-
-    def use(shown: GraspPage, _: Any) -> None:
-        shown.select(finger)
-        start = shown.asked.held[finger].control
-        for part in np.linspace(0.25, 1.0, 4):
-            pose = start.copy()
-            pose[:3, 3] += part * np.array(by)
-            shown.change(finger, lambda asked, pose=pose: asked.with_control(finger, pose))
+            shown.change(name, lambda asked, pose=pose: asked.moved(name, pose))
             shown.work.settle()
 
     return use
@@ -178,7 +163,7 @@ def main(arguments: list[str] | None = None) -> None:
     with BENCH.browser_tools().Browser() as browser, tempfile.TemporaryDirectory() as name:
         folder, cup = Path(name), ["cup", "--scene", "table"]
         pictures: dict[str, tuple[Callable[[], list[str]], Use]] = {
-            "view": (lambda: cup, moved(0.02, 0.03, 0.01)),
+            "view": (lambda: cup, dragged("object", 0.02, 0.03, 0.01)),
             "view_missed": (lambda: cup, dragged("thumb", 0.0, 0.0, 0.05)),
             "view_choices": (lambda: chosen(folder), gone_through),
             "view_log": (lambda: logged(folder), lambda shown, _: shown.show(ITERATION)),

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import viser
@@ -15,7 +15,6 @@ from viser.transforms import SO3
 from casadi_ik import palette
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.collision.scene import Scene
 from casadi_ik.drawing.cameras import View, axes_of, close_view, whole_view
 from casadi_ik.drawing.drawables import (
     Drawable,
@@ -33,13 +32,10 @@ from casadi_ik.grasps.pose import rotations_of
 from casadi_ik.problem.clearance import Closest
 from casadi_ik.problem.verdict import ContactVerdict
 from casadi_ik.viewing.access import Server
-from casadi_ik.viewing.request import Held, PageRequest
+from casadi_ik.viewing.request import OBJECT, Held, PageRequest
 
-OBJECT = "object"
-"""What the object is called among the things that can be dragged."""
-
-CONTACT_CONTROL, THING_CONTROL = 0.05, 0.07
-"""Sizes of the controls of contacts and of things [m]: smaller than hands are."""
+if TYPE_CHECKING:
+    from casadi_ik.viewing.page import DraggedPage
 
 
 def add_drawable(server: viser.ViserServer, name: str, one: Drawable, **look: Any) -> Any:
@@ -101,7 +97,6 @@ class DrawnRobot:
         robot: ArmHand,
         name: str = "/robot",
         skin: Sequence[Drawable] | None = None,
-        **look: Any,
     ) -> None:
         """Draw it at home.
 
@@ -110,10 +105,8 @@ class DrawnRobot:
             robot: The robot.
             name: Of its node.
             skin: What it is drawn with, in the frames of links; None: its bodies.
-            look: As `add_mesh_simple` of viser has it.
         """
         self._server, self._robot = server, robot
-        self._look = {"side": "double", "receive_shadow": False, **look}
         links, before = robot.description.links, _hung_on(robot)
         nodes: list[str] = []
         for link, on in zip(links, before, strict=True):
@@ -138,7 +131,7 @@ class DrawnRobot:
     def _add_skin(self, name: str, skin: Sequence[Drawable]) -> None:
         nodes = [f"{self._nodes[one.frame]}/{name}_{i}" for i, one in enumerate(merged(skin))]
         self._skins[name] = [
-            add_drawable(self._server, node, one, **self._look)
+            add_drawable(self._server, node, one, side="double", receive_shadow=False)
             for node, one in zip(nodes, merged(skin), strict=True)
         ]
 
@@ -169,31 +162,56 @@ def _hung_on(robot: ArmHand) -> list[int]:
 
 
 class Control:
-    """A frame with arrows and rings to be dragged by, shown while it is selected."""
+    """A frame that drawables hang on, with arrows and rings to be dragged by while it is selected.
+
+    Attributes:
+        meshes: What hangs on it, by name.
+    """
 
     def __init__(
-        self, server: viser.ViserServer, name: str, size: float, moved: Callable[[Array], None]
+        self,
+        server: viser.ViserServer,
+        name: str,
+        what: str,
+        drawables: Sequence[Drawable],
+        page: DraggedPage | None,
+        size: float,
+        **look: Any,
     ) -> None:
         """Make it.
 
         Args:
             server: The page.
             name: Of its node.
-            size: [m].
-            moved: Told of its (4, 4) pose when somebody drags it.
+            what: What it is called.
+            drawables: In its frame.
+            page: Told where it is dragged, and that it is clicked; None: nobody.
+            size: Of the arrows [m].
+            look: As `add_mesh_simple` of viser has it.
         """
         self._pose: Array | None = None
         self.handle = server.scene.add_transform_controls(
             name, scale=size, line_width=3.0, depth_test=False
         )
         self.select(False)
+        self.meshes = {
+            one.name: add_drawable(server, f"{name}/{one.name}", one, **look) for one in drawables
+        }
+        if page is None:
+            return
 
         # Asynchronous callbacks keep their order; they only put down what is to be done. What is
         # no place is left out: viser would tell the terminal.
         @self.handle.on_update
         async def _(_: Any) -> None:
             with suppress(ValueError):
-                moved(pose_of(self.handle.position, self.handle.wxyz))
+                page.drag(what, pose_of(self.handle.position, self.handle.wxyz))
+
+        for mesh in self.meshes.values():
+
+            @mesh.on_click
+            async def _(_: Any) -> None:
+                page.select(what)
 
     def place(self, pose: Array, held: bool) -> None:
         """Put it at a (4, 4) pose, unless a hand holds it: then it is where the hand has it."""
@@ -209,58 +227,88 @@ class Control:
         handle.disable_axes = handle.disable_sliders = handle.disable_rotations = not on
 
 
-@dataclass(frozen=True)
-class Drags:
-    """Who is told of drags: of a finger or a thing, and where it is put.
-
-    Attributes:
-        pose: Told of a (4, 4) pose.
-        point: Of a finger's point (3,).
-        normal: Of a finger's normal (3,), of any length.
-        selected: Of what is clicked.
-    """
-
-    pose: Callable[[str, Array], None] = lambda *_: None
-    point: Callable[[str, Array], None] = lambda *_: None
-    normal: Callable[[str, Array], None] = lambda *_: None
-    selected: Callable[[str], None] = lambda *_: None
-
-
-class DrawnContacts:
-    """What is asked of all fingers, to be dragged, and what is reached."""
+class Handles:
+    """What can be dragged: contacts asked for, the object, the items of a scene."""
 
     def __init__(
         self,
         server: viser.ViserServer,
         asked: PageRequest,
-        drags: Drags,
-        name: str = "",
-        tips: bool = True,
-        size: float = 1.0,
+        page: DraggedPage | None = None,
+        above: str = "",
     ) -> None:
         """Draw them.
 
         Args:
             server: The page.
             asked: What is asked first.
-            drags: Who is told.
-            name: Of the node that they hang on; "": the base frame.
-            tips: Whether what is reached is drawn too.
-            size: Of the marks, as a part of the usual.
+            page: Told of drags; None: nobody.
+            above: The node that they hang on; "": the base frame.
         """
-        self._targets = {
-            finger: _Target(server, finger, held, drags, f"{name}/contacts/{finger}", size)
-            for finger, held in asked.held.items()
+        self._controls: dict[str, Control] = {}
+        for name, held in asked.held.items():
+            marks = asked_marks(held.contact, np.zeros(3))
+            node = f"{above}/contacts/{name}"
+            self._controls[name] = Control(server, node, name, marks, page, 0.05, cast_shadow=False)
+        if page is not None:
+            for finger in asked.held:
+                self._drag_parts(finger, page)
+        things = {} if asked.scene is None else dict(asked.scene.items)
+        things.pop(asked.object, None)
+        looks: dict[str, tuple[list[Drawable], dict[str, Any]]] = {
+            name: (item_of(item), {"opacity": 0.8, "cast_shadow": False})
+            for name, item in things.items()
         }
-        self._tips = {finger: _Tip(server, finger, name) for finger in asked.held if tips}
+        body = object_of(asked.object)
+        if body is not None and asked.object_pose is not None:
+            looks = {OBJECT: ([body], {"opacity": 0.4, "cast_shadow": True})} | looks
+        for name, (shapes, look) in looks.items():
+            node = f"{above}/things/{name}"
+            self._controls[name] = Control(
+                server, node, name, shapes, page, 0.07, receive_shadow=0.15, **look
+            )
+        self.names = (*looks, *asked.held)
         self.place(asked)
 
-    def place(self, asked: PageRequest, dragged: str = "") -> None:
-        """Put the targets where they are; one that is being dragged is where the hand has it."""
-        for finger, held in asked.held.items():
-            self._targets[finger].place(held, finger == dragged)
+    def _drag_parts(self, finger: str, page: DraggedPage) -> None:
+        """The ball of a contact moves it, the tip of its arrow turns it."""
+        control = self._controls[finger]
+        for part, mesh in control.meshes.items():
 
-    def reach(
+            @mesh.on_drag("left")
+            async def _(event: Any, part: str = part) -> None:
+                with suppress(ValueError):
+                    end = usable(event.end_position, 3)
+                    if part != "normal":
+                        page.drag_point(finger, end)
+                        return
+                    way = end - usable(control.handle.position, 3)
+                    if np.linalg.norm(way) > 1e-3:
+                        page.drag_normal(finger, way)
+
+    def place(self, asked: PageRequest, dragged: str = "") -> None:
+        """Put them where they are; what is being dragged is where the hand has it."""
+        for name, pose in asked.places.items():
+            if name in self._controls:
+                self._controls[name].place(pose, name == dragged)
+        for finger, held in asked.held.items():
+            for part, mesh in self._controls[finger].meshes.items():
+                mesh.visible = held.used and (held.normal or part not in ("normal", "tangent"))
+
+    def select(self, name: str) -> None:
+        """Give one its arrows and rings to be dragged by; "": none."""
+        for other, control in self._controls.items():
+            control.select(other == name)
+
+
+class Tips:
+    """What the fingers reach, and by how much each misses."""
+
+    def __init__(self, server: viser.ViserServer, asked: PageRequest, above: str = "") -> None:
+        """Draw them; `above`: the node that they hang on."""
+        self._tips = {finger: _Tip(server, finger, above) for finger in asked.held}
+
+    def place(
         self,
         asked: PageRequest,
         frames: Mapping[str, Array],
@@ -270,53 +318,6 @@ class DrawnContacts:
         for finger, tip in self._tips.items():
             held = asked.held[finger]
             tip.place(frames[finger], held, verdicts.get(finger) if held.used else None)
-
-    def select(self, finger: str) -> None:
-        """Give one contact its arrows and rings to be dragged by; "" none."""
-        for name, target in self._targets.items():
-            target.control.select(name == finger)
-
-
-class _Target:
-    """What is asked of a finger."""
-
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        finger: str,
-        held: Held,
-        drags: Drags,
-        name: str,
-        size: float,
-    ) -> None:
-        self.control = Control(
-            server, name, size * CONTACT_CONTROL, lambda pose: drags.pose(finger, pose)
-        )
-        self._meshes = {
-            one.name: add_drawable(server, f"{name}/{one.name}", one, cast_shadow=False)
-            for one in asked_marks(held.contact, np.zeros(3), size)
-        }
-        for part, mesh in self._meshes.items():
-
-            @mesh.on_drag("left")
-            async def _(event: Any, part: str = part) -> None:
-                with suppress(ValueError):
-                    end = usable(event.end_position, 3)
-                    if part != "normal":
-                        drags.point(finger, end)
-                        return
-                    way = end - usable(self.control.handle.position, 3)
-                    if np.linalg.norm(way) > 1e-3:
-                        drags.normal(finger, way)
-
-            @mesh.on_click
-            async def _(_: Any) -> None:
-                drags.selected(finger)
-
-    def place(self, held: Held, dragged: bool) -> None:
-        self.control.place(held.control, dragged)
-        for part, mesh in self._meshes.items():
-            mesh.visible = held.used and (held.normal or part not in ("normal", "tangent"))
 
 
 class _Tip:
@@ -357,80 +358,6 @@ def _segment(server: viser.ViserServer, name: str, color: str, width: float) -> 
     return server.scene.add_line_segments(
         name, points, palette.rgb(color), thickness=width, visible=False
     )
-
-
-class DrawnThings:
-    """The object that is grasped and the items of the scene, to be dragged."""
-
-    def __init__(self, server: viser.ViserServer, asked: PageRequest, drags: Drags) -> None:
-        """Draw them.
-
-        Args:
-            server: The page.
-            asked: What is asked first.
-            drags: Who is told.
-        """
-        self._controls: dict[str, Control] = {}
-        body = object_of(asked.object)
-        if body is not None and asked.object_pose is not None:
-            self._add(server, OBJECT, [body], drags, opacity=0.4, cast_shadow=True)
-        for name, item in () if asked.scene is None else asked.scene.items.items():
-            if name != asked.object:
-                bodies = item_of(item)
-                self._add(server, name, bodies, drags, opacity=0.8, cast_shadow=False)
-        self.place(asked)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """What can be dragged."""
-        return tuple(self._controls)
-
-    def place(self, asked: PageRequest, dragged: str = "") -> None:
-        """Put everything where it is; what is being dragged is where the hand has it."""
-        items = {} if asked.scene is None else asked.scene.items
-        for name, control in self._controls.items():
-            if name == OBJECT and asked.object_pose is not None:
-                control.place(asked.object_pose, name == dragged)
-            elif name in items:
-                control.place(items[name].pose, name == dragged)
-
-    def select(self, name: str) -> None:
-        """Give one thing its arrows and rings to be dragged by."""
-        for other, control in self._controls.items():
-            control.select(other == name)
-
-    def _add(
-        self,
-        server: viser.ViserServer,
-        name: str,
-        bodies: Sequence[Drawable],
-        drags: Drags,
-        **look: Any,
-    ) -> None:
-        node = f"/things/{name}"
-        self._controls[name] = Control(
-            server, node, THING_CONTROL, lambda pose: drags.pose(name, pose)
-        )
-        for i, one in enumerate(bodies):
-            mesh = add_drawable(server, f"{node}/{i}", one, receive_shadow=0.15, **look)
-
-            @mesh.on_click
-            async def _(_: Any) -> None:
-                drags.selected(name)
-
-
-def draw_scene(server: viser.ViserServer, scene: Scene, above: str) -> None:
-    """Draw what stands about a robot, to be looked at only.
-
-    Args:
-        server: The page.
-        scene: The scene.
-        above: The node that the robot's base is.
-    """
-    look = {"opacity": 0.8, "cast_shadow": False, "receive_shadow": 0.15}
-    for name, item in scene.items.items():
-        for i, one in enumerate(item_of(item)):
-            add_drawable(server, f"{above}/things/{name}/{i}", one.at(item.pose), **look)
 
 
 class DrawnClosest:

@@ -26,14 +26,12 @@ from casadi_ik.registry import METHODS
 from casadi_ik.viewing.access import Server
 from casadi_ik.viewing.candidates import CandidateList, Candidates
 from casadi_ik.viewing.drawn import (
-    OBJECT,
     Camera,
-    Drags,
     DrawnClosest,
-    DrawnContacts,
     DrawnRobot,
-    DrawnThings,
     Ghosts,
+    Handles,
+    Tips,
     cameras,
     light_lamp,
     usable,
@@ -59,6 +57,7 @@ from casadi_ik.viewing.panel import (
     verdict_block,
 )
 from casadi_ik.viewing.request import (
+    OBJECT,
     Answer,
     Answerer,
     PageRequest,
@@ -140,16 +139,14 @@ class GraspPage(DraggedPage):
         next(iter(self.cameras().values())).show(server)
         light_lamp(server, self._whole)
         self._drawn = DrawnRobot(server, robot)
-        self._contacts = DrawnContacts(server, asked, self.drags)
-        self._things = DrawnThings(server, asked, replace(self.drags, pose=self.drag_thing))
+        self._handles, self._tips = Handles(server, asked, self), Tips(server, asked)
         self._closest = DrawnClosest(server)
         self._ghosts = Ghosts(server, robot)
-        self._other: tuple[DrawnRobot, DrawnContacts] | None = None
-        names = self._things.names
-        self._panel = Panel(self, (*names, *asked.held))
+        self._other: tuple[DrawnRobot, Handles, Tips] | None = None
+        self._panel = Panel(self, self._handles.names)
         self.offered = self._panel.candidates
         self.begin((PAUSE, self._show_motors), (REST, self._explain), (LOOKS, self._list_solutions))
-        first = OBJECT if OBJECT in names else robot.fingers[0]
+        first = OBJECT if OBJECT in self._handles.names else robot.fingers[0]
         self.select("" if self.candidates else first)  # handles would hide what is chosen from
 
     def cameras(self) -> dict[str, Camera]:
@@ -159,13 +156,6 @@ class GraspPage(DraggedPage):
         return cameras(self.robot, self.answer.q, things)
 
     # What a browser asks for: put down, and done when it is its turn.
-
-    def drag_thing(self, name: str, pose: Array) -> None:
-        """The object or something in the scene dragged to a (4, 4) pose."""
-        if name == OBJECT:
-            self.change(name, lambda asked: asked.with_object(pose), name)
-        else:
-            self.change(name, lambda asked: asked.with_item(name, pose), name)
 
     def drag_motors(self, q: Array) -> None:
         """The motors set by hand to q (n,): nothing is solved."""
@@ -265,8 +255,7 @@ class GraspPage(DraggedPage):
 
     def selected(self, name: str) -> None:
         """Show what has handles."""
-        self._contacts.select(name)
-        self._things.select(name)
+        self._handles.select(name)
         self._panel.selected(name)
 
     def state(self) -> tuple[PageRequest, Array]:
@@ -300,9 +289,8 @@ class GraspPage(DraggedPage):
         frames = self._frames(answer.q)
         with self.server.atomic():
             self._drawn.place(answer.q)
-            self._contacts.place(self.asked, self._dragged)
-            self._contacts.reach(self.asked, frames, answer.contacts)
-            self._things.place(self.asked, self._dragged)
+            self._handles.place(self.asked, self._dragged)
+            self._tips.place(self.asked, frames, answer.contacts)
             if self.offered is not None:
                 self.offered.place(self.asked.object_pose)
             closest = None if answer.closest is None else answer.closest[1]
@@ -344,12 +332,13 @@ class GraspPage(DraggedPage):
             frame.position = 1.6 * camera.radius * right / np.linalg.norm(right)
             self._other = (
                 DrawnRobot(self.server, self.robot, f"{name}/robot"),
-                DrawnContacts(self.server, asked, Drags(), name),
+                Handles(self.server, replace(asked, scene=None), None, name),
+                Tips(self.server, asked, name),
             )
-        drawn, contacts = self._other
+        drawn, handles, tips = self._other
         drawn.place(answer.q)
-        contacts.place(asked)
-        contacts.reach(asked, self._frames(answer.q), answer.contacts)
+        handles.place(asked)
+        tips.place(asked, self._frames(answer.q), answer.contacts)
         self._panel.tell_beside(answer)
 
     def _list_solutions(self) -> None:

@@ -26,7 +26,7 @@ from casadi_ik.grasps.pose import inverse
 from casadi_ik.importing.surfaces import Surface, together
 from casadi_ik.robots.load import load_description
 from casadi_ik.viewing.access import Server
-from casadi_ik.viewing.drawn import DrawnContacts, DrawnRobot, cameras, light_lamp
+from casadi_ik.viewing.drawn import DrawnRobot, Handles, cameras, light_lamp
 from casadi_ik.viewing.page import DraggedPage
 from casadi_ik.viewing.panel import block, legend, on_press, on_set
 from casadi_ik.viewing.request import PageRequest, request_of
@@ -86,14 +86,14 @@ class PadPage(DraggedPage):
         camera.show(server)
         light_lamp(server, camera)
         self._drawn = DrawnRobot(server, robot, skin=skin)
-        self._contacts = DrawnContacts(server, asked, self.drags, tips=False, size=1.0)
+        self._handles = Handles(server, asked, self)
         self._add_panel(writable)
         self.begin()
         self.select(robot.fingers[0])
 
     def selected(self, name: str) -> None:
         """Show which pad has handles."""
-        self._contacts.select(name)
+        self._handles.select(name)
         if self._chosen.value != name:
             self._chosen.value = name
 
@@ -189,7 +189,7 @@ class PadPage(DraggedPage):
     def refresh(self) -> None:
         """Draw the pads and what is said of them."""
         with self.server.atomic():
-            self._contacts.place(self.asked, self._dragged)
+            self._handles.place(self.asked, self._dragged)
             self._told.content = self._words()
         self.server.flush()
         self._dragged = ""

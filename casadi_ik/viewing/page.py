@@ -8,7 +8,7 @@ from typing import Any
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.viewing.access import Server
-from casadi_ik.viewing.drawn import Drags, set_stage
+from casadi_ik.viewing.drawn import set_stage
 from casadi_ik.viewing.newest import REST, Newest, Work
 from casadi_ik.viewing.panel import on_press
 from casadi_ik.viewing.request import PageRequest
@@ -94,7 +94,6 @@ class DraggedPage(Page):
         self.held = ""
         self._past: list[Any] = []
         self._future: list[Any] = []
-        self.drags = Drags(self.drag_control, self.drag_point, self.drag_normal, self.select)
 
     def begin(self, *later: tuple[float, Work]) -> None:
         """Start its thread; where it stands is where everything can be taken back to."""
@@ -103,9 +102,9 @@ class DraggedPage(Page):
 
     # What a browser asks for: put down, and done when it is its turn.
 
-    def drag_control(self, finger: str, pose: Array) -> None:
-        """A contact dragged by its control to a (4, 4) pose."""
-        self.change(finger, lambda asked: asked.with_control(finger, pose), finger)
+    def drag(self, name: str, pose: Array) -> None:
+        """A contact, the object or something in the scene dragged to a (4, 4) pose."""
+        self.change(name, lambda asked: asked.moved(name, pose), name)
 
     def drag_point(self, finger: str, point: Array) -> None:
         """A contact dragged by its ball to a point (3,)."""

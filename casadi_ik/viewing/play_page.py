@@ -22,11 +22,10 @@ from casadi_ik.logs.solve import OneSolve
 from casadi_ik.problem.verdict import ContactVerdict
 from casadi_ik.viewing.access import Server
 from casadi_ik.viewing.drawn import (
-    Drags,
-    DrawnContacts,
     DrawnRobot,
+    Handles,
+    Tips,
     cameras,
-    draw_scene,
     light_lamp,
 )
 from casadi_ik.viewing.page import Page
@@ -58,14 +57,14 @@ class Track:
         label: What it is called.
         times: (k,) increasing.
         q: (k, n) [rad or m].
-        asked: Contacts that are shown; None: none.
+        asked: Contacts that are shown.
     """
 
     robot: ArmHand
     label: str
     times: Array
     q: Array
-    asked: PageRequest | None
+    asked: PageRequest
 
     unit = "s"
 
@@ -259,7 +258,7 @@ def motion_track(
     q, times = robot.configuration(np.atleast_2d(q)), np.asarray(times, float)
     if times.shape != (len(q),) or not len(q) or not (np.diff(times) > 0).all():
         raise InputError(f"times: found shape {times.shape}, expected ({len(q)},) that increase")
-    asked = None if grasp is None else request_of(robot, grasp, q[-1])
+    asked = PageRequest({}) if grasp is None else request_of(robot, grasp, q[-1])
     return Track(robot, label or robot.name, times, q, asked)
 
 
@@ -337,13 +336,12 @@ class PlayPage(Page):
         """Draw the time that is shown."""
         told, charts = [], []
         with self.server.atomic():
-            for track, (drawn, contacts) in zip(self.tracks, self._shown, strict=True):
+            for track, (drawn, tips) in zip(self.tracks, self._shown, strict=True):
                 row = track.at(self.now)
                 drawn.place(track.q[row])
-                if contacts is not None and track.asked is not None:
-                    frames = track.robot.contact_frames(track.q[row])
-                    by_finger = dict(zip(track.robot.fingers, frames, strict=True))
-                    contacts.reach(track.asked, by_finger, track.verdicts(row))
+                frames = track.robot.contact_frames(track.q[row])
+                by_finger = dict(zip(track.robot.fingers, frames, strict=True))
+                tips.place(track.asked, by_finger, track.verdicts(row))
                 told.append(track.told(row, self.now))
                 charts.append(track.charts(row))
             self._told.content, self._charts.content = "".join(told), "".join(charts)
@@ -351,19 +349,17 @@ class PlayPage(Page):
                 self._slider.value = self.now
         self.server.flush()
 
-    def _add(self, number: int, track: Track) -> tuple[DrawnRobot, DrawnContacts | None]:
+    def _add(self, number: int, track: Track) -> tuple[DrawnRobot, Tips]:
         name = f"/track_{number}"
         frame = self.server.scene.add_frame(name, show_axes=False)
         frame.position = self._aside(number)
         drawn = DrawnRobot(self.server, track.robot, f"{name}/robot")
-        contacts = track.asked and DrawnContacts(self.server, track.asked, Drags(), name)
-        if self._scene is not None:
-            draw_scene(self.server, self._scene, name)
+        Handles(self.server, replace(track.asked, scene=self._scene), None, name)
         if len(self.tracks) > 1:
             self.server.scene.add_label(
                 f"{name}/label", track.label, position=(0.0, 0.0, 0.02), anchor="top-center"
             )
-        return drawn, contacts
+        return drawn, Tips(self.server, track.asked, name)
 
     def _aside(self, number: int) -> Array:
         """Where a robot stands."""
@@ -385,7 +381,7 @@ class PlayPage(Page):
         speeds: Mapping[str, float] = SPEEDS[unit]
         self._speed = gui.add_dropdown("Speed", tuple(speeds), initial_value=list(speeds)[solves])
         self._told, self._charts = gui.add_html(""), gui.add_html("")
-        if any(track.asked is not None for track in self.tracks):
+        if any(track.asked.held for track in self.tracks):
             gui.add_html(legend(LEGEND))
         self.add_dark()
         on_set(self._slider, lambda time: self.show(float(time)))

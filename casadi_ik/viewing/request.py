@@ -27,6 +27,9 @@ from casadi_ik.problem.status import Status
 from casadi_ik.problem.verdict import ContactVerdict, judge
 from casadi_ik.registry import METHODS
 
+OBJECT = "object"
+"""What the object is called among the things that can be moved."""
+
 NOT_MET = "NOT MET"
 """Said of a configuration that has not all it is asked for."""
 
@@ -106,44 +109,47 @@ class PageRequest:
         contacts = {name: one.placed for name, one in self.held.items() if one.used}
         return Grasp(contacts, self.robot, self.name, self.object, self.object_pose)
 
-    def with_control(self, finger: str, pose: Array) -> PageRequest:
-        """A contact dragged: its control is at another (4, 4) pose."""
-        return self._held(finger, replace(self.held[finger], control=pose))
+    @property
+    def places(self) -> dict[str, Array]:
+        """(4, 4) poses of all that can be moved, by name: contacts, the object, items."""
+        found = {finger: one.control for finger, one in self.held.items()}
+        if self.object_pose is not None:
+            found[OBJECT] = self.object_pose
+        items = {} if self.scene is None else self.scene.items
+        return {name: item.pose for name, item in items.items()} | found
+
+    def moved(self, name: str, pose: Array) -> PageRequest:
+        """One of them at another (4, 4) pose; the object takes all contacts along.
+
+        Raises:
+            CasadiIKError: There is no such thing.
+        """
+        if name in self.held:
+            return self._held(name, replace(self.held[name], control=pose))
+        if name != OBJECT or self.object_pose is None:
+            return replace(self, scene=(self.scene or Scene()).moved(name, pose))
+        step = pose @ inverse(self.object_pose)
+        held = {
+            finger: replace(one, control=_rigid(step @ one.control))
+            for finger, one in self.held.items()
+        }
+        return replace(self, held=held, object_pose=pose)
 
     def with_point(self, finger: str, point: Array) -> PageRequest:
         """A contact moved to a point (3,) [m], facing as before."""
         pose = self.held[finger].control.copy()
         pose[:3, 3] = point
-        return self.with_control(finger, pose)
+        return self.moved(finger, pose)
 
     def with_normal(self, finger: str, normal: Array) -> PageRequest:
         """A contact turned so that its control's x axis, its normal, faces another way (3,)."""
         pose = self.held[finger].control
-        return self.with_control(finger, facing(pose[:3, 3], normal, pose[:3, :3]))
+        return self.moved(finger, facing(pose[:3, 3], normal, pose[:3, :3]))
 
     def with_use(self, finger: str, used: bool, normal: bool) -> PageRequest:
         """A finger taken in or left free; as it is if it is the last one that is used."""
         changed = self._held(finger, replace(self.held[finger], used=used, normal=normal))
         return changed if any(one.used for one in changed.held.values()) else self
-
-    def with_object(self, pose: Array) -> PageRequest:
-        """The object moved to a (4, 4) pose, and all contacts with it."""
-        assert self.object_pose is not None
-        step = pose @ inverse(self.object_pose)
-        held = {
-            name: replace(one, control=_rigid(step @ one.control))
-            for name, one in self.held.items()
-        }
-        return replace(self, held=held, object_pose=pose)
-
-    def with_item(self, name: str, pose: Array) -> PageRequest:
-        """Something in the scene moved to a (4, 4) pose.
-
-        Raises:
-            CasadiIKError: There is no such thing.
-        """
-        assert self.scene is not None
-        return replace(self, scene=self.scene.moved(name, pose))
 
     def _held(self, finger: str, one: Held) -> PageRequest:
         return replace(self, held={**self.held, finger: one})

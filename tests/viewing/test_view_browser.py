@@ -16,7 +16,6 @@ from browser import CHROMIUM, Browser, Page
 import casadi_ik as ik
 from casadi_ik import viewing
 
-SIZE, THING = viewing.drawn.CONTACT_CONTROL, viewing.drawn.THING_CONTROL
 pose_of = viewing.drawn.pose_of
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium (Debian: apt chromium)")
@@ -72,14 +71,9 @@ def pixel(page: Page, client: Any, point: np.ndarray) -> np.ndarray:
     return np.array(box[:2]) + np.array(box[2:]) / 2 + focal * seen[:2] / seen[2]
 
 
-def drag_along(
-    page: Page,
-    client: Any,
-    pose: np.ndarray,
-    far: float,
-    size: float = SIZE,
-) -> None:
-    """Drag that arrow of a control at a pose that is seen longest, so far [m]."""
+def drag_along(page: Page, client: Any, shown: Any, name: str, far: float) -> None:
+    """Drag that arrow of what is called so that is seen longest, so far [m]."""
+    pose, size = shown.asked.places[name], shown._handles._controls[name].handle.scale
     here = pixel(page, client, pose[:3, 3])
     tips = [pixel(page, client, pose[:3, 3] + size * pose[:3, i]) for i in range(3)]
     axis = int(np.argmax([np.linalg.norm(tip - here) for tip in tips]))
@@ -129,7 +123,7 @@ def test_object_and_contact_are_dragged_by_mouse_and_reached(
     # The object is the first handle, and takes its contacts along.
     place = shown.asked.object_pose[:3, 3]
     before = shown.asked.grasp.contacts["thumb"].point
-    drag_along(page, client, shown.asked.object_pose, 0.02, THING)
+    drag_along(page, client, shown, "object", 0.02)
     page.wait("document.querySelector('.ik-status') !== null")
     assert shown.work.settle()
     gone = shown.asked.object_pose[:3, 3] - place
@@ -140,7 +134,7 @@ def test_object_and_contact_are_dragged_by_mouse_and_reached(
     assert shown.work.settle()
     time.sleep(0.5)
     before = shown.asked.grasp.contacts["thumb"].point
-    drag_along(page, client, shown.asked.held["thumb"].control, 0.012)
+    drag_along(page, client, shown, "thumb", 0.012)
     page.wait("document.querySelector('.ik-status') !== null")
     assert shown.work.settle()
     wanted = shown.asked.grasp.contacts["thumb"].point
@@ -149,7 +143,7 @@ def test_object_and_contact_are_dragged_by_mouse_and_reached(
     tip = robot.contacts(shown.answer.q)[0][robot.fingers.index("thumb")]
     assert np.linalg.norm(tip - wanted) <= 5e-3
     # And far away: why not is on the page.
-    drag_along(page, client, shown.asked.held["thumb"].control, 0.3)
+    drag_along(page, client, shown, "thumb", 0.3)
     page.wait("(document.querySelector('.ik-why')?.innerText ?? '').includes('the contacts')")
     assert shown.work.settle()
     assert not shown.answer.success
@@ -168,7 +162,7 @@ def test_two_browsers_see_one_drag_and_save_it(
     before = said(other, ".ik-finger")
     pose = shown.asked.held["thumb"].control.copy()
     pose[:3, 3] += [0.006, 0.0, 0.01]
-    shown.drag_control("thumb", pose)
+    shown.drag("thumb", pose)
     told = "document.querySelector('.ik-finger').innerText"
     for one in (other, page):
         one.wait(f"{told} !== {before!r}")
@@ -200,7 +194,7 @@ def test_guessed_pads_are_corrected_by_mouse_and_saved(description: Path, browse
     time.sleep(1.0)  # the camera comes to rest
     shown = viewer.page
     # One by its arrows, which it has from the beginning, the other's normal by its own arrow.
-    drag_along(page, client, shown.asked.held["first"].control, 0.004)
+    drag_along(page, client, shown, "first", 0.004)
     pose = shown.asked.held["second"].control
     tip = pixel(page, client, pose[:3, 3] + 0.02 * pose[:3, 0])
     aside = pixel(page, client, pose[:3, 3] + 0.02 * pose[:3, 0] + 0.012 * pose[:3, 2])

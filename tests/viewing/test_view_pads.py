@@ -25,7 +25,7 @@ def test_dragged_pads_are_saved_and_read_back(viewer: viewing.Viewer, descriptio
     points, normals = before.contacts(before.home)
     pose = page.asked.held["first"].control.copy()
     pose[:3, 3] += [0.001, 0.002, 0.003]
-    page.drag_control("first", pose)
+    page.drag("first", pose)
     page.drag_normal("second", np.array([0.1, -0.9, 0.3]))
     page.save()
     assert page.work.settle()

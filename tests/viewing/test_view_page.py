@@ -37,7 +37,7 @@ def test_the_page_begins_solved_and_serves_this_machine_only(cup: viewing.Viewer
 def test_a_dragged_contact_is_reached(cup: viewing.Viewer) -> None:
     page, robot = cup.page, cup.page.robot
     before = page.answer.q
-    page.drag_control("thumb", shifted(page.asked.held["thumb"].control, 0.004, 0.008, 0.004))
+    page.drag("thumb", shifted(page.asked.held["thumb"].control, 0.004, 0.008, 0.004))
     assert page.work.settle()
     assert page.answer.success
     tip = robot.contacts(page.answer.q)[0][robot.fingers.index("thumb")]
@@ -76,7 +76,7 @@ def test_a_dragged_normal_is_faced(cup: viewing.Viewer) -> None:
 
 def test_an_unreachable_contact_shows_why_and_what_is_nearest(cup: viewing.Viewer) -> None:
     page, robot = cup.page, cup.page.robot
-    page.drag_thing("object", shifted(page.asked.object_pose, -0.6, 0.0, 0.0))
+    page.drag("object", shifted(page.asked.object_pose, -0.6, 0.0, 0.0))
     assert page.work.settle()
     answer = page.answer
     assert not answer.success
@@ -95,7 +95,7 @@ def test_a_drag_beyond_reach_does_not_wait_for_the_reason(
 ) -> None:
     page, drawn, draw = cup.page, [], cup.page.draw
     monkeypatch.setattr(page, "draw", lambda answer: (drawn.append(answer), draw(answer)))
-    page.drag_control("thumb", shifted(page.asked.held["thumb"].control, 0.0, 0.0, 0.05))
+    page.drag("thumb", shifted(page.asked.held["thumb"].control, 0.0, 0.0, 0.05))
     assert page.work.settle()
     at_once, at_rest = drawn
     assert at_once.headline == "NOT MET"
@@ -116,7 +116,7 @@ def test_a_drag_beyond_reach_does_not_wait_for_the_reason(
 def test_the_object_takes_its_contacts_along(cup: viewing.Viewer) -> None:
     page = cup.page
     before = {name: one.point for name, one in page.asked.grasp.contacts.items()}
-    page.drag_thing("object", shifted(page.asked.object_pose, 0.02, -0.03, 0.04))
+    page.drag("object", shifted(page.asked.object_pose, 0.02, -0.03, 0.04))
     assert page.work.settle()
     assert page.answer.success
     for name, contact in page.asked.grasp.contacts.items():
@@ -126,7 +126,7 @@ def test_the_object_takes_its_contacts_along(cup: viewing.Viewer) -> None:
 def test_a_dragged_table_is_what_answers_keep_off(cup: viewing.Viewer) -> None:
     page = cup.page
     pose = page.asked.scene.items["table"].pose
-    page.drag_thing("table", shifted(pose, -1.3, 0.0, 0.36))
+    page.drag("table", shifted(pose, -1.3, 0.0, 0.36))
     assert page.work.settle()
     scene = page.asked.scene
     fresh = ik.Solver(page.robot, scene=scene)
@@ -137,10 +137,10 @@ def test_a_dragged_table_is_what_answers_keep_off(cup: viewing.Viewer) -> None:
     assert page.answer.headline == "COLLISION"
     assert any("answers touch something" in line for line in page.answer.lines)
     # Into the robot's foot it cannot go: the page says so, and goes on.
-    page.drag_thing("table", shifted(pose, 0.0, 0.0, 0.07))
+    page.drag("table", shifted(pose, 0.0, 0.0, 0.07))
     assert page.work.settle()
     assert page.answer.headline == "NOT ASKED"
-    page.drag_thing("table", pose)
+    page.drag("table", pose)
     assert page.work.settle()
     assert page.answer.success
 
@@ -148,7 +148,7 @@ def test_a_dragged_table_is_what_answers_keep_off(cup: viewing.Viewer) -> None:
 def test_all_solutions_can_be_gone_through(cup: viewing.Viewer) -> None:
     page = cup.page
     # Listed once nothing moves, so after the drag is answered.
-    page.drag_control("thumb", shifted(page.asked.held["thumb"].control, 0.0, 0.0, 0.001))
+    page.drag("thumb", shifted(page.asked.held["thumb"].control, 0.0, 0.0, 0.001))
     assert page.work.settle()
     assert len(page.solutions) > 1
     shown = []
@@ -182,7 +182,7 @@ def test_steps_are_taken_back_and_done_again(cup: viewing.Viewer) -> None:
     page = cup.page
     places = [page.asked.object_pose[:3, 3]]
     for step in (0.01, 0.02):
-        page.drag_thing("object", shifted(page.asked.object_pose, 0.0, step, 0.0))
+        page.drag("object", shifted(page.asked.object_pose, 0.0, step, 0.0))
         assert page.work.settle()
         places.append(page.asked.object_pose[:3, 3])
     for do, expected in ((page.undo, 1), (page.undo, 0), (page.redo, 1), (page.reset, 0)):
@@ -196,7 +196,7 @@ def test_a_dragged_object_is_grasped_all_the_way(cup: viewing.Viewer) -> None:
     page = cup.page
     start = page.asked.object_pose
     for angle in np.linspace(0.0, 2 * np.pi, 30):
-        page.drag_thing("object", shifted(start, *(0.05 * np.cos([angle, angle - 1.6, 2 * angle]))))
+        page.drag("object", shifted(start, *(0.05 * np.cos([angle, angle - 1.6, 2 * angle]))))
         assert page.work.settle()
         assert page.answer.success
 
@@ -235,7 +235,7 @@ def test_another_robot_grasp_and_scene_are_opened(robot: ik.ArmHand) -> None:
 
 def test_a_moved_scene_is_saved_as_it_stands(cup: viewing.Viewer, tmp_path: Path) -> None:
     page = cup.page
-    page.drag_thing("table", shifted(page.asked.scene.items["table"].pose, 0.1, 0.0, -0.05))
+    page.drag("table", shifted(page.asked.scene.items["table"].pose, 0.1, 0.0, -0.05))
     assert page.work.settle()
     (tmp_path / "moved.yaml").write_text(page.asked.scene.text())
     again = ik.load_scene(tmp_path / "moved.yaml")

@@ -82,7 +82,7 @@ def pads(description: Path) -> Iterator[viewing.Viewer]:
 
 def dragged(viewer: viewing.Viewer) -> dict[str, Any]:
     """What a browser sends when the first contact is moved."""
-    control = viewer.page._contacts._targets[viewer.page.robot.fingers[0]].control.handle
+    control = viewer.page._handles._controls[viewer.page.robot.fingers[0]].handle
     moved = control.position + np.array([0.0, 0.002, 0.0])
     return {
         "type": "TransformControlsUpdateMessage",
@@ -181,8 +181,8 @@ def test_malformed_messages_neither_end_the_page_nor_fill_the_terminal(tmp_path:
     code = (
         "from casadi_ik import viewing; import casadi_ik as ik, sys\n"
         "viewer = viewing.view_grasp(ik.load_robot('kuka_lwr_barrett'), ik.load_grasp('cup'))\n"
-        "panel, targets = viewer.page._panel, viewer.page._contacts._targets\n"
-        "print(viewer.url, panel._drag._impl.uuid, targets['thumb'].control.handle.name,\n"
+        "panel, controls = viewer.page._panel, viewer.page._handles._controls\n"
+        "print(viewer.url, panel._drag._impl.uuid, controls['thumb'].handle.name,\n"
         "      panel._motors[0]._impl.uuid, flush=True)\n"
         "sys.stdin.read(); assert viewer.page.work.settle(); viewer.stop()\n"
         "print(viewer.page.asked.grasp.contacts['thumb'].point.tolist())\n"
