@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+import numpy as np
+
 ARM, ARM_JOINT = "#e8944a", "#5f6975"
 HAND, PALM = "#65727f", "#414c58"
 PAD = "#2fb5ad"
@@ -41,6 +43,13 @@ def method_colors(methods: Iterable[str]) -> dict[str, str]:
     """A colour for each of some methods: its own, or one that no other of them has."""
     free = iter([color for color in LINES[::-1] if color not in METHODS.values()] * 9)
     return {name: METHODS[name] if name in METHODS else next(free) for name in methods}
+
+
+def shade(value: float, stops: tuple[float, float, float] = (0.0, 0.5, 1.0)) -> str:
+    """From red at the first of some values over yellow to green at the last."""
+    channels = np.array([rgb(one) for one in (MISSED, TARGET, MET)]).T
+    mixed = [round(float(np.interp(value, stops, channel))) for channel in channels]
+    return "#{:02x}{:02x}{:02x}".format(*mixed)
 
 
 def rgb(color: str) -> tuple[int, int, int]:

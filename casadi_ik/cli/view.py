@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from casadi_ik import logs
-from casadi_ik.answers.stored import RankedEntry, is_ranked, read_ranked
+from casadi_ik.answers.stored import is_ranked, read_ranked
 from casadi_ik.arm_hand import ArmHand, load_robot
-from casadi_ik.arrays import Array
 from casadi_ik.cli import options as opt
 from casadi_ik.cli.inputs import (
     located,
@@ -25,9 +24,7 @@ from casadi_ik.cli.inputs import (
 )
 from casadi_ik.cli.options import Option
 from casadi_ik.cli.table import Answer, Said, command
-from casadi_ik.collision.scene import Scene
 from casadi_ik.datasets import load_candidates
-from casadi_ik.drawing.cameras import palm_places
 from casadi_ik.errors import (
     InputError,
     LogError,
@@ -41,7 +38,7 @@ from casadi_ik.logs import RecordedMotion, read_motion
 from casadi_ik.logs.solve import OneSolve, one_solve
 
 if TYPE_CHECKING:
-    from casadi_ik.viewing import Candidate, PageRequest, Settings, Viewer
+    from casadi_ik.viewing import Candidate, Viewer
 
     Choices = dict[str, Candidate]
 
@@ -152,11 +149,9 @@ def opened(said: Said) -> Viewer:
         with located(str(path)):
             grasp.arrays(robot.fingers)
         return viewing.view_grasp(robot, grasp, **more)
-    ranked = is_ranked(path)
-    robot, choices = (_ranked if ranked else _candidates)(path, said, scene, settings)
-    first, q = next(iter(choices.values())).ask()
-    q = q if ranked else None
-    return viewing.view_grasp(robot, first.grasp, q=q, candidates=choices, **more)
+    robot, choices = (_ranked if is_ranked(path) else _candidates)(path, said)
+    first = next(iter(choices.values()))
+    return viewing.view_grasp(robot, first.grasp, q=first.q, candidates=choices, **more)
 
 
 def _is_log(path: Path) -> bool:
@@ -229,38 +224,29 @@ def _the_logs(said: Said) -> list[tuple[OneSolve, ArmHand]]:
     return found
 
 
-def _candidates(
-    path: Path, said: Said, scene: Scene | None, settings: Settings
-) -> tuple[ArmHand, Choices]:
+def _candidates(path: Path, said: Said) -> tuple[ArmHand, Choices]:
     """The grasps of a file of candidates, and their robot.
 
     Raises:
         InputError: The file is malformed, or no robot is said.
     """
-    from casadi_ik.viewing import Candidate, request_of
+    from casadi_ik.viewing import Candidate
 
     robot, pose = the_robot(said.robot, path), the_object_pose(said)
     choices: Choices = {}
     for number, grasp in enumerate(load_candidates(path, robot), 1):
-        placed = grasp if pose is None else grasp.in_object_frame().at(pose)
-
-        def ask(placed: Any = placed) -> tuple[PageRequest, Array]:
-            return request_of(robot, placed, None, scene, settings), robot.home
-
         name = f"{number}: {grasp.name}" if grasp.name else str(number)
-        choices[name] = Candidate(ask)
+        choices[name] = Candidate(grasp if pose is None else grasp.in_object_frame().at(pose))
     return robot, choices
 
 
-def _ranked(
-    path: Path, said: Said, scene: Scene | None, settings: Settings
-) -> tuple[ArmHand, Choices]:
+def _ranked(path: Path, said: Said) -> tuple[ArmHand, Choices]:
     """The answers of `casadi-ik choose` and `grasp`, each with its grasp, else what it reaches.
 
     Raises:
         InputError: The file is none of that kind, or has no answers.
     """
-    from casadi_ik.viewing import Candidate, request_of
+    from casadi_ik.viewing import Candidate
 
     found = read_ranked(path)
     with located(f"{path}: ranked[0].solution.robot"):
@@ -269,20 +255,6 @@ def _ranked(
     for place, one in enumerate(found, 1):
         with located(f"{path}: ranked[{place - 1}].solution.q"):
             q = robot.configuration(np.array([one.solution.q]))[0]
-
-        def ask(
-            q: Array = q, one: RankedEntry = one, place: int = place
-        ) -> tuple[PageRequest, Array]:
-            grasp = None if one.grasp is None else one.placed(path, place)
-            return request_of(robot, grasp, q, scene, settings), q
-
-        drawn: tuple[Array, Array] | tuple[()] = ()
-        if one.grasp is not None and (contacts := one.placed(path, place).contacts):
-            points = np.array([contact.point for contact in contacts.values()])
-            drawn = (
-                (palm_places(robot, q).mean(axis=0), points) if np.isfinite(points).all() else ()
-            )
-        choices[f"{place}. {one.label}"] = Candidate(
-            ask, *drawn, load=one.load, clearance=one.solution.clearance
-        )
+        grasp = None if one.grasp is None else one.placed(path, place)
+        choices[f"{place}. {one.label}"] = Candidate(grasp, q, one.load, one.solution.clearance)
     return robot, choices

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from os import PathLike
 from pathlib import Path
 
@@ -11,9 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from casadi_ik.arm_hand import ArmHand, load_robot
-from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene
-from casadi_ik.drawing.cameras import palm_places
 from casadi_ik.drawing.drawables import file_meshes
 from casadi_ik.errors import DescriptionError, InputError, MissingExtraError
 from casadi_ik.files.reading import read_yaml
@@ -116,14 +113,7 @@ def view_found(
     if not len(found):
         raise InputError("found: there is no grasp to show, expected at least one")
     candidates = {
-        f"{place}. {one.grasp.name}, load {one.load:.2f}": Candidate(
-            partial(_asked, robot, one, scene),
-            palm_places(robot, one.q).mean(axis=0),
-            np.array([contact.point for contact in one.grasp.contacts.values()]),
-            one.load,
-            one.clearance,
-        )
-        for place, one in enumerate(found, 1)
+        f"{place}. {one.grasp.name}, load {one.load:.2f}": one for place, one in enumerate(found, 1)
     }
     first = found[0]
     return view_grasp(
@@ -136,10 +126,6 @@ def view_found(
         port=port,
         dark=dark,
     )
-
-
-def _asked(robot: ArmHand, one: FoundGrasp, scene: Scene | None) -> tuple[PageRequest, Array]:
-    return request_of(robot, one.grasp, one.q, scene), one.q
 
 
 def view_log(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -10,13 +10,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from casadi_ik import palette
+from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.drawing.drawables import Drawable
-from casadi_ik.drawing.surfaces import ball, joined, mesh_of, rod
+from casadi_ik.drawing.surfaces import Shape, ball, joined, mesh_of, rod
+from casadi_ik.grasps import Grasp
 from casadi_ik.grasps.pose import inverse
+from casadi_ik.importing.surfaces import Surface
+from casadi_ik.touch.grasps import FoundGrasp
 from casadi_ik.viewing.drawn import add_drawable, quaternions
 from casadi_ik.viewing.panel import block, on_set
-from casadi_ik.viewing.request import PageRequest
 
 if TYPE_CHECKING:
     from casadi_ik.viewing.grasp_page import GraspPage
@@ -27,24 +30,22 @@ AT_FIRST = 20
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A request to choose from.
+    """A grasp to choose from; one that `Solver.grasps_of` has found is such as it is.
 
     Attributes:
-        ask: Gives it, and a start (n,) [rad or m].
-        palm: (3,) where its palm is, base frame [m]; None: it is not drawn.
-        tips: (k, 3) where it touches [m]; likewise.
+        grasp: What is asked; None: what q reaches.
+        q: (n,) where it is reached [rad or m]; None: it is not solved yet, and not drawn.
         load: What it holds per newton of squeeze; None: not known.
         clearance: Smallest distance of a pair that must not touch [m]; None: not known.
     """
 
-    ask: Callable[[], tuple[PageRequest, Array]]
-    palm: Array | None = None
-    tips: Array | None = None
+    grasp: Grasp | None
+    q: Array | None = None
     load: float | None = None
     clearance: float | None = None
 
 
-Candidates = Mapping[str, Candidate]
+Candidates = Mapping[str, Candidate | FoundGrasp]
 """By name."""
 
 
@@ -68,10 +69,11 @@ class CandidateList:
         self._meshes: dict[str, Any] = {}
         loads = [one.load for one in self._all.values() if one.load is not None]
         for i, (name, one) in enumerate(self._all.items()):
-            if one.palm is None or one.tips is None:
+            tripod = _tripods(page.robot, one)
+            if not tripod:
                 continue
             part = 0.5 if one.load is None or not loads else one.load / max(*loads, 1e-9)
-            mark = Drawable("candidate", mesh_of(_tripod(one.palm, one.tips)), _shade(part))
+            mark = Drawable("candidate", mesh_of(joined(tripod)), palette.shade(part))
             node = f"/candidates/{i}"
             mesh = add_drawable(server, node, mark, cast_shadow=False, visible=False)
             self._meshes[name] = mesh
@@ -155,15 +157,16 @@ class CandidateList:
         self.filter()
 
 
-def _tripod(palm: Array, tips: Array) -> Any:
-    """Rods from the palm to every contact, a ball at each."""
-    parts = [rod(palm, tip, 0.0009).surface for tip in tips]
-    parts += [ball(0.003, tip).surface for tip in tips] + [ball(0.0045, palm).surface]
-    return joined(parts)
-
-
-def _shade(part: float) -> str:
-    """From red, nothing is held, over yellow to green, the largest load."""
-    stops = np.array([palette.rgb(one) for one in (palette.MISSED, palette.TARGET, palette.MET)])
-    values = [np.interp(part, [0.0, 0.5, 1.0], channel) for channel in stops.T]
-    return "#" + "".join(f"{round(float(value)):02x}" for value in values)
+def _tripods(robot: ArmHand, one: Candidate | FoundGrasp) -> list[Surface]:
+    """Rods from the palm of every hand to its contacts, a ball at each; none if one is nowhere."""
+    contacts = {} if one.grasp is None else one.grasp.contacts
+    if one.q is None or not all(np.isfinite(contact.point).all() for contact in contacts.values()):
+        return []
+    shapes: list[Shape] = []
+    for side, fingers in robot.hands.items():
+        names = [robot.fingers[i] for i in fingers]
+        tips = [contacts[name].point for name in names if name in contacts]
+        palm = robot.palm(one.q, side)[:3, 3]
+        shapes += [shape for tip in tips for shape in (rod(palm, tip, 0.0009), ball(0.003, tip))]
+        shapes += [ball(0.0045, palm)] if tips else []
+    return [shape.surface for shape in shapes]

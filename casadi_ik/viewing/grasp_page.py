@@ -171,7 +171,9 @@ class GraspPage(DraggedPage):
 
         def work() -> None:
             self.remember()
-            self.restore(self.candidates[name].ask())
+            one, now = self.candidates[name], self.asked
+            q = self.robot.home if one.q is None else one.q
+            self.restore((request_of(self.robot, one.grasp, q, now.scene, now.settings), q))
 
         self.work.put("candidate", work)
 
@@ -356,19 +358,13 @@ class GraspPage(DraggedPage):
     def _draw_ghosts(self) -> None:
         """Green far from limits, yellow, red at one."""
         seen = self.solutions[:MOST_GHOSTS] if self._ghostly else ()
-        self._ghosts.show([(one.q, margin_color(one.margin)) for one in seen])
+        ghosts = [(one.q, palette.shade(one.margin, (0.0, 0.15, 0.4))) for one in seen]
+        self._ghosts.show(ghosts)
 
     def _show_motors(self) -> None:
         with self.server.atomic():
             self._panel.tell_motors(self.answer.q)
         self._untold_since = None
-
-
-def margin_color(margin: float) -> str:
-    """From red at a limit over yellow to green at half of the way to the middle of the range."""
-    stops = np.array([palette.rgb(one) for one in (palette.MISSED, palette.TARGET, palette.MET)])
-    values = [np.interp(margin, [0.0, 0.15, 0.4], channel) for channel in stops.T]
-    return "#" + "".join(f"{round(float(value)):02x}" for value in values)
 
 
 @lru_cache(maxsize=1)
