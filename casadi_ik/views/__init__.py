@@ -17,14 +17,8 @@ except ImportError as error:
     ) from error
 
 from casadi_ik.views.charts import draw_convergence
-from casadi_ik.views.grasps import draw_grasps
-from casadi_ik.views.pictures import (
-    draw_alternatives,
-    draw_motion,
-    draw_pads,
-    draw_solution,
-    show,
-)
+from casadi_ik.views.grasps import draw_alternatives, draw_grasps
+from casadi_ik.views.pictures import draw_motion, draw_pads, draw_solution, show
 from casadi_ik.views.report import study_page
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""Pictures of robots: at the contacts of a grasp, several answers, in motion; pads of hands."""
+"""Pictures of robots: at the contacts of a grasp, in motion; pads of hands."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from PIL import Image as Pillow
 
 from casadi_ik import palette
-from casadi_ik.answers.solution import Alternative, Solution
+from casadi_ik.answers.solution import Solution
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene
@@ -35,7 +35,6 @@ from casadi_ik.drawing.drawables import (
     with_object,
 )
 from casadi_ik.drawing.surfaces import arrow, ball
-from casadi_ik.errors import InputError
 from casadi_ik.grasps import Grasp
 from casadi_ik.grasps.pose import inverse
 from casadi_ik.motion.motion import Motion
@@ -98,27 +97,27 @@ def draw_solution(
     }
     q = solution.q
     with one_at_a_time, closing(Stage()) as stage:
-        groups = _fill(stage, robot, q, grasp, colors)
+        groups = fill(stage, robot, q, grasp, colors)
         if scene is not None:
             _surround(stage, robot, solution, grasp, scene)
         view = view or close_view(robot, q)
-        pixels = _pixels(figure, WHOLE)
+        pixels = pixels_of(figure, WHOLE)
         everything = points_of([one for group in groups.values() for one in group])
         stage.aim(whole_view(_middle(robot, q, grasp), view), everything, pixels, (0.03, 0.10))
         image = over(paper, stage.shoot("floor"), _inwards(pixels))
         image = over(image, stage.shoot(*groups, "scene", "nearest", "touching"))
-        _panel(figure, WHOLE, over(image, stage.shoot("marks", "nearest"), 0.45))
+        panel(figure, WHOLE, over(image, stage.shoot("marks", "nearest"), 0.45))
 
         # What reaches further than this from the palm need not be in the close-up.
         palms = palm_places(robot, q)
         things = groups["object"] + groups["marks"]
         near = [one for one in things if _distances(one, palms).max() < 0.35]
-        pixels = _pixels(figure, CLOSE)
+        pixels = pixels_of(figure, CLOSE)
         stage.aim(view, points_of(groups["hand"] + near), pixels, (0.17, 0.02))
         # The arm is pale: it may stand in the way.
         image = over(paper, stage.shoot("wrist"), 0.3 * _inwards(pixels))
         image = over(image, stage.shoot("hand", "object", "marks", "nearest", "touching"))
-        axes = _panel(figure, CLOSE, over(image, stage.shoot("marks", "nearest"), 0.45))
+        axes = panel(figure, CLOSE, over(image, stage.shoot("marks", "nearest"), 0.45))
         seen = stage.project(robot.contacts(q)[0])
     _label_fingers(axes, dict(zip(robot.fingers, seen, strict=True)), solution, grasp, ground)
     _add_title(figure, solution, grasp, ground)
@@ -126,69 +125,6 @@ def draw_solution(
     if path is not None:
         save_picture(figure, path)
     return figure
-
-
-def draw_alternatives(
-    robot: ArmHand,
-    alternatives: Sequence[Alternative],
-    grasp: Grasp,
-    path: str | PathLike[str] | None = None,
-    *,
-    columns: int = 4,
-    view: View | None = None,
-    dpi: float = DPI,
-) -> Figure:
-    """Draw several solutions of a grasp side by side, all seen from the same place.
-
-    Args:
-        robot: The robot that was solved for.
-        alternatives: The solutions, at least one.
-        grasp: The question; if it names an object that has a description, that is drawn too.
-        path: PNG file to write, if any.
-        columns: Pictures in a row.
-        view: Azimuth and elevation [rad] of the camera; None: chosen for the first solution.
-        dpi: Dots per inch.
-
-    Returns:
-        The figure, which belongs to no pyplot window.
-
-    Raises:
-        PictureError: The file cannot be written, or there is no OpenGL to draw with.
-        DescriptionError: The description of the object is malformed.
-        InputError: No solution, or the grasp has a finger that the robot has not.
-    """
-    if not alternatives:
-        raise InputError("alternatives: found none, expected at least one")
-    rows = -(-len(alternatives) // columns)
-    figure = new_figure(3.2 * columns, 3.4 * rows, dpi)
-    first = alternatives[0].q
-    target = robot.contacts(first)[0].mean(axis=0)
-    view = view or whole_view(target, close_view(robot, first))
-    everything = points_of([one for a in alternatives for one in placed(robot, a.q)])
-    for number, found in enumerate(alternatives):
-        row, column = divmod(number, columns)
-        box = (column / columns, 1 - (row + 1) / rows, 1 / columns, 0.86 / rows)
-        with one_at_a_time, closing(Stage()) as stage:
-            _fill(stage, robot, found.q, grasp, dict.fromkeys(robot.fingers, palette.MET))
-            stage.aim(view, everything, _pixels(figure, box), (0.03, 0.03))
-            axes = _panel(figure, box, over(1.0, stage.shoot()))
-        axes.set_title(_bent(found), color=palette.INK, fontsize=9)
-    if path is not None:
-        save_picture(figure, path)
-    return figure
-
-
-def _bent(found: Alternative) -> str:
-    """How the arm is bent, and how far its elbow may swing."""
-    branch = found.branch
-    if branch is None:
-        return f"hand posture {found.posture + 1}"
-    pairs = (("shoulder", branch.shoulder), ("elbow", branch.elbow), ("wrist", branch.wrist))
-    signs = ", ".join(f"{name} {'+' if sign > 0 else '−'}" for name, sign in pairs)
-    if branch.swivel is None:
-        return signs
-    start, end = branch.swivel
-    return f"{signs}\nelbow swings {np.rad2deg(end - start):.0f}°"
 
 
 def show(
@@ -211,7 +147,7 @@ def show(
     """
     with one_at_a_time:
         stage = Stage(off_screen=not window)
-        groups = _fill(stage, robot, q, grasp, dict.fromkeys(robot.fingers, palette.INK))
+        groups = fill(stage, robot, q, grasp, dict.fromkeys(robot.fingers, palette.INK))
         view = whole_view(robot.contacts(q)[0].mean(axis=0), close_view(robot, q))
         everything = points_of([one for group in groups.values() for one in group])
         stage.aim(view, everything, (1200, 900), (0.05, 0.05))
@@ -384,7 +320,7 @@ def _pads_of(figure: Figure, robot: ArmHand, bottom: float, height: float) -> No
         marks.append(Drawable(name, arrow(point, normal, 0.16 * size, 0.012 * size), color))
     for left, turn in ((0.0, 25.0), (0.5, 115.0)):
         box = (left, bottom, 0.5, height)
-        pixels = _pixels(figure, box)
+        pixels = pixels_of(figure, box)
         with one_at_a_time, closing(Stage()) as stage:
             stage.add("hand", hand, orient=robot.description.path is not None)
             stage.add("marks", marks)
@@ -394,17 +330,31 @@ def _pads_of(figure: Figure, robot: ArmHand, bottom: float, height: float) -> No
             image = over(over(1.0, stage.shoot("hand")), stage.shoot("marks"), 0.55)
             image = over(image, stage.shoot("hand", "marks"), 0.45)
             places = stage.project(frames[:, :3, 3])
-        axes = _panel(figure, box, image)
+        axes = panel(figure, box, image)
         _label_pads(axes, dict(zip(robot.fingers, places, strict=True)), pixels)
 
 
 # What is on a picture.
 
 
-def _fill(
-    stage: Stage, robot: ArmHand, q: ArrayLike, grasp: Grasp | None, colors: Mapping[str, str]
+def fill(
+    stage: Stage,
+    robot: ArmHand,
+    q: ArrayLike,
+    grasp: Grasp | None,
+    colors: Mapping[str, str],
+    floor: bool = True,
 ) -> dict[str, list[Drawable]]:
-    """Put all there is to see on the stage, and give it back by group."""
+    """Put robot, object and contacts on the stage, and give them back by group.
+
+    Args:
+        stage: Where.
+        robot: The robot.
+        q: (n,) where it is [rad or m].
+        grasp: What is asked; None: nothing.
+        colors: Of what is reached, by finger.
+        floor: Whether there is a floor below the robot.
+    """
     body, palms = placed(robot, q), palm_places(robot, q)
     groups: dict[str, list[Drawable]] = {"arm": [], "wrist": [], "hand": []}
     for one in body:  # the close-up shows what is no further than this from the palm
@@ -414,7 +364,8 @@ def _fill(
     groups["marks"] = contact_marks(robot, q, grasp, colors) if grasp else []
     for name, members in groups.items():
         stage.add(name, members, OPACITY.get(name, 1.0))
-    stage.add_floor(lowest(robot), body)
+    if floor:
+        stage.add_floor(lowest(robot), body)
     return groups
 
 
@@ -457,12 +408,14 @@ def _inwards(pixels: tuple[int, int]) -> Image:
     return y[:, None, None] * x[:, None]
 
 
-def _pixels(figure: Figure, box: Box) -> tuple[int, int]:
+def pixels_of(figure: Figure, box: Box) -> tuple[int, int]:
+    """Width and height of a part of a figure."""
     width, height = figure.get_size_inches() * figure.dpi
     return round(width * box[2]), round(height * box[3])
 
 
-def _panel(figure: Figure, box: Box, image: Image) -> Axes:
+def panel(figure: Figure, box: Box, image: Image) -> Axes:
+    """An image on a part of a figure."""
     axes = figure.add_axes(box)
     axes.set_axis_off()
     axes.imshow(np.clip(image, 0.0, 1.0))
