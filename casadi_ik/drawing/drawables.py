@@ -150,9 +150,8 @@ def merged(drawables: Sequence[Drawable]) -> list[Drawable]:
 def looks_of(description: RobotDescription) -> dict[str, tuple[str, str]]:
     """By link "arm" or "hand", and its colour, another than that of the link before it."""
     palms = {description.palm_link, *(side.palm_link for side in description.sides)}
-    depth, roles = {description.root: 0}, {description.root: "arm"}
-    if not description.arm_actuators:
-        roles[description.root] = "hand"
+    alone = not (description.arm_actuators or description.sides)
+    depth, roles = {description.root: 0}, {description.root: "hand" if alone else "arm"}
     for joint in description.joints:
         depth[joint.child] = depth[joint.parent] + 1
         roles[joint.child] = "hand" if joint.part == "hand" or joint.child in palms else "arm"

@@ -73,6 +73,19 @@ def test_a_link_without_a_shape_is_rods_to_what_it_carries() -> None:
             assert away.min() < 0.036
 
 
+@pytest.mark.parametrize(
+    ("name", "arm", "hand"),
+    [
+        ("kuka_lwr_barrett", {"lwr_base", "lwr_link_3"}, {"bh_base"}),
+        ("g1+dex3", {"pelvis", "torso_link", "left_elbow_link"}, {"left_dex3_base"}),
+        ("allegro_right", set(), {"allegro_base"}),
+    ],
+)
+def test_links_are_of_the_arm_or_of_a_hand(name: str, arm: set[str], hand: set[str]) -> None:
+    roles = {one.frame: one.role for one in bodies(ik.load_robot(name)) if one.role != "pad"}
+    assert {link for link in arm | hand if roles[link] == "arm"} == arm
+
+
 @pytest.mark.parametrize("name", ["kuka_lwr_barrett", "g1+dex3"])
 def test_the_ground_is_below_all_of_a_robot(name: str) -> None:
     robot = ik.load_robot(name)
