@@ -89,7 +89,7 @@ def the_page_follows(page: Page, robot: ik.ArmHand) -> None:
     told = page.evaluate("[...casadiIk.now.solving.solver.shapes(casadiIk.now.shown)]")
     assert np.abs(np.array(told) - placed.ravel()).max() < 1e-12
     assert len(drawn) > 20
-    assert {kind for kind, _, _ in drawn} == {"capsule", "box", "pad"}
+    assert {kind for kind, _, _ in drawn} == {"capsule", "box", "cylinder", "pad"}
     for kind, at, place in drawn:
         where = placed.ravel()[at:] if kind == "capsule" else placed.ravel()[at + 9 :]
         found = points.ravel()[at:] if kind == "pad" else where
