@@ -119,7 +119,7 @@ class _View:
             for finger in description.fingers
         ]
         frames = [
-            (parent, child, pose[:, :3, 3], quaternions(pose[:, :3, :3]))
+            (parent, child, pose[:, :3, 3], Rotation.from_matrix(pose[:, :3, :3]).as_quat())
             for parent, child, pose in poses
         ]
         channel = self._protobuf("/tf", fox.FrameTransforms.get_schema())
@@ -139,7 +139,7 @@ class _View:
 
     def _targets(self) -> None:
         solve = self.solve
-        turned = quaternions(along(solve.target_normals))
+        turned = along(solve.target_normals)
         contacts = [
             (f"{finger} target", solve.target_points[j], turned[j], palette.TARGET)
             for j, finger in enumerate(solve.fingers)
@@ -151,7 +151,7 @@ class _View:
     def _contacts(self) -> None:
         solve = self.solve
         points, normals = self.robot.contacts(self.q)
-        turned = quaternions(along(normals.reshape(-1, 3))).reshape(*normals.shape[:2], 4)
+        turned = along(normals.reshape(-1, 3)).reshape(*normals.shape[:2], 4)
         missed = (solve.rows["position_error"] > solve.position_tolerance) | (
             solve.rows["angle_error"] > solve.angle_tolerance
         )
@@ -285,21 +285,12 @@ def quaternion_of(values: Array) -> fox.Quaternion:
     return fox.Quaternion(x=x, y=y, z=z, w=w)
 
 
-def quaternions(rotations: Array) -> Array:
-    """Unit quaternions (k, 4), scalar last, of rotations (k, 3, 3); NaN where those are."""
-    known = np.isfinite(rotations).all(axis=(1, 2))
-    found = np.full((len(rotations), 4), np.nan)
-    found[known] = Rotation.from_matrix(rotations[known]).as_quat()
-    return found
-
-
 def along(normals: Array) -> Array:
-    """Rotations (k, 3, 3) whose x axes are unit vectors (k, 3); NaN where those are."""
-    other = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
-    y = np.cross(normals, other)
-    y = y / np.linalg.norm(y, axis=1, keepdims=True)
-    z = np.cross(normals, y)
-    return np.stack([normals, y, z], axis=2).astype(np.float64)
+    """Quaternions (k, 4), scalar last, that turn x axes to unit vectors (k, 3); NaN of NaN."""
+    x, y, z = normals.T
+    turned = np.stack([0 * x, -z, y, 1 + x], axis=1)
+    turned[~turned.any(axis=1)] = 0, 0, 1, 0
+    return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True), np.float64)
 
 
 def color_of(color: str) -> fox.Color:

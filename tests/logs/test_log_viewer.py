@@ -17,7 +17,7 @@ import pinocchio
 import pytest
 from made_up_solves import make_block
 from mcap.reader import make_reader
-from viewer_reader import Decoded, decode, layout_of, shipped_layout, write_view
+from viewer_reader import Decoded, decode, layout_of, matrix, shipped_layout, write_view
 
 import casadi_ik as ik
 from casadi_ik import errors, logs
@@ -105,9 +105,11 @@ def test_contacts_turn_green_when_they_are_reached(decoded: Decoded, solve: logs
     assert contacts[0] == [False, False, False]
     targets = decoded.last("/ik/targets").entities
     assert [entity.id for entity in targets] == [f"{name} target" for name in solve.fingers]
-    for entity, point in zip(targets, solve.target_points, strict=True):
-        position = entity.arrows[0].pose.position
-        np.testing.assert_allclose([position.x, position.y, position.z], point)
+    for entity, point, normal in zip(
+        targets, solve.target_points, solve.target_normals, strict=True
+    ):
+        pose = matrix(entity.arrows[0].pose.position, entity.arrows[0].pose.orientation)
+        np.testing.assert_allclose(pose[:3, [3, 0]].T, [point, normal], atol=1e-12)
 
 
 def test_messages_tell_the_story(decoded: Decoded, solve: logs.OneSolve) -> None:
