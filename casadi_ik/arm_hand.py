@@ -65,6 +65,32 @@ class ArmHand(Shown):
         return self.description.actuator_names
 
     @property
+    def sides(self) -> tuple[str, ...]:
+        """Names of the sides of a body; () of an arm with one hand.
+
+        Example:
+            >>> robot.sides
+            ()
+        """
+        return tuple(side.name for side in self.description.sides)
+
+    @property
+    def trunk(self) -> tuple[str, ...]:
+        """Names of the actuators that move every palm of a body."""
+        return self.description.trunk
+
+    def side(self, name: str) -> ArmHand:
+        """An arm-hand of a body by itself, the trunk as the first joints of its arm.
+
+        Its base is the body's, its motors, links and fingers keep their names. All other sides are
+        left out: collisions with them are not checked.
+
+        Raises:
+            UnknownNameError: There is none; the message lists the sides.
+        """
+        return type(self)(self.description.side(name, carried=True))
+
+    @property
     def lower(self) -> Array:
         """(n,) lower limits of the actuators [rad or m], those of their joints included."""
         return self.description.lower

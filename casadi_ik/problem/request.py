@@ -65,9 +65,9 @@ def one_palm(robot: ArmHand, what: str) -> None:
         UnsupportedError: It has several.
     """
     if robot.description.sides:
-        sides = ", ".join(side.name for side in robot.description.sides)
         raise UnsupportedError(
-            f"{what}: {robot.name!r} has several palms ({sides}), expected a robot with one"
+            f"{what}: {robot.name!r} has several palms ({', '.join(robot.sides)}), expected a "
+            f"robot with one, as robot.side({robot.sides[0]!r}) is"
         )
 
 

@@ -353,7 +353,8 @@ class RobotDescription:
             root, arm = self.root, (*self.trunk, *arm)
         parts = dict.fromkeys(arm, "arm") | dict.fromkeys(found.hand, "hand")
         places = {i for i, motor in enumerate(self.actuator_names) if motor in parts}
-        kept = set(self.links_moved(places)) | {found.palm_link}
+        others = self.links_moved(set(range(len(self.actuators))) - places)
+        kept = set(self.links_moved(places) - (others if carried else set())) | {found.palm_link}
         for finger in found.fingers:
             kept.add(self.finger(finger).link)
         for link in tuple(kept):

@@ -308,3 +308,28 @@ def test_what_needs_one_palm_says_so(what):
         calls[what] = lambda: solver.place(held, pose, q)
     with pytest.raises(ik.errors.UnsupportedError, match=rf"{what}.*several palms \(left, right\)"):
         calls[what]()
+
+
+def test_a_side_by_itself_is_an_arm_hand():
+    body = ik.load_robot("mobile_kuka_lwr_barrett")
+    (name,) = body.sides
+    side = body.side(name)
+    assert side.sides == ()
+    assert set(body.trunk) < set(side.actuators)
+    q = body.random(np.random.default_rng(2), 20)
+    own = q[:, [body.actuators.index(motor) for motor in side.actuators]]
+    np.testing.assert_allclose(side.palm(own), body.palm(q, name), atol=1e-12)
+    np.testing.assert_allclose(side.contacts(own)[0], body.contacts(q)[0], atol=1e-12)
+    found = ik.Solver(side).solve_palms(side.palm(own), own)
+    assert found.success.all()
+    with pytest.raises(ik.errors.UnknownNameError, match="no side 'middle'; its sides: "):
+        body.side("middle")
+
+
+def test_a_side_leaves_the_others_out():
+    body = ik.load_robot("g1+dex3")
+    assert body.sides == ("left", "right")
+    left = body.side("left")
+    assert left.fingers == body.fingers[:3]
+    assert not [name for name in (*left.actuators, *left.description.links) if "right" in name]
+    np.testing.assert_allclose(left.palm(left.home), body.palm(body.home, "left"), atol=1e-12)
