@@ -12,17 +12,8 @@ import numpy as np
 
 from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
-from casadi_ik.files.limits import RAISED, limit
+from casadi_ik.files.limits import LIMITS, RAISED, limit
 from casadi_ik.files.npz import UNREADABLE, read_npz
-
-MOST = 10_000_000
-"""Points of a file."""
-
-MOST_BYTES = 2**30
-"""Of a file."""
-
-LONGEST_HEAD = 200
-"""Lines of the head of a PLY or PCD file."""
 
 PLY_TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -76,8 +67,8 @@ def read_points(path: Path, where: str) -> Array:
     if not path.is_file():
         raise DescriptionError(f"{where}: no such file {str(path)!r}")
     try:
-        if path.stat().st_size > limit(MOST_BYTES):
-            raise ValueError(f"found more than {limit(MOST_BYTES)} bytes {RAISED}")
+        if path.stat().st_size > limit(LIMITS.cloud_bytes):
+            raise ValueError(f"found more than {limit(LIMITS.cloud_bytes)} bytes {RAISED}")
         found = reader(path)
     except DescriptionError as error:
         raise DescriptionError(f"{where}: {error}") from error
@@ -105,8 +96,10 @@ def finite_points(points: np.ndarray, where: str) -> Array:
 
 
 def _at_most(count: int) -> int:
-    if not 0 <= count <= limit(MOST):
-        raise ValueError(f"found {count} points, expected at most {limit(MOST)} {RAISED}")
+    if not 0 <= count <= limit(LIMITS.cloud_points):
+        raise ValueError(
+            f"found {count} points, expected at most {limit(LIMITS.cloud_points)} {RAISED}"
+        )
     return count
 
 
@@ -117,7 +110,7 @@ def _npy(path: Path) -> Array:
 
 
 def _npz(path: Path) -> Array:
-    arrays = read_npz(path, 24 * MOST)
+    arrays = read_npz(path, 24 * LIMITS.cloud_points)
     if len(arrays) > 1 and "points" not in arrays:
         raise ValueError(f"found {', '.join(arrays)}, expected one array, or one called points")
     return arrays["points"] if "points" in arrays else next(iter(arrays.values()))
@@ -130,7 +123,7 @@ def _table(path: Path) -> Array:
 
 def _numbers(stream: IO[bytes], columns: list[int], count: int | None) -> Array:
     """Columns of a table with blanks or commas between its numbers."""
-    rows, most = (line.replace(b",", b" ") for line in stream), limit(MOST) + 1
+    rows, most = (line.replace(b",", b" ") for line in stream), limit(LIMITS.cloud_points) + 1
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # nothing in it: told by the caller
         found = np.loadtxt(rows, comments=["#", "//"], usecols=columns, max_rows=most, ndmin=2)
@@ -172,7 +165,7 @@ def _ply_head(stream: IO[bytes]) -> _Head:
         raise ValueError("no PLY file")
     forms = {"ascii": "ascii", "binary_little_endian": "<", "binary_big_endian": ">"}
     head, elements = _Head([], 0, ""), 0
-    for _ in range(LONGEST_HEAD):
+    for _ in range(LIMITS.cloud_head):
         match _lines(stream):
             case ["format", form, _]:
                 head.form = forms[form]
@@ -194,7 +187,7 @@ def _ply_head(stream: IO[bytes]) -> _Head:
 
 def _pcd_head(stream: IO[bytes]) -> _Head:
     said: dict[str, list[str]] = {}
-    for _ in range(LONGEST_HEAD):
+    for _ in range(LIMITS.cloud_head):
         words = _lines(stream)
         if words and not words[0].startswith("#"):
             said[words[0].upper()] = words[1:]

@@ -28,6 +28,7 @@ from casadi_ik.collision.solids import (
     thinned,
 )
 from casadi_ik.errors import DescriptionError, InputError, UnknownNameError
+from casadi_ik.files.limits import LIMITS
 from casadi_ik.files.mesh_file import read_mesh
 from casadi_ik.files.reading import (
     Angles,
@@ -44,9 +45,6 @@ from casadi_ik.grasps.pose import checked_pose, one_pose, rotations_of
 from casadi_ik.grasps.shapes import load_mesh_shape
 from casadi_ik.robots.collision import Touching
 from casadi_ik.robots.schema import TouchingEntry
-
-MOST_BALLS = 100_000
-"""Of a point cloud."""
 
 Part = tuple[Solid, Array]
 """A solid and its (4, 4) pose in the frame of what it is part of."""
@@ -262,9 +260,10 @@ class PointCloudEntry(Entry, frozen=True, tag="point-cloud", kw_only=True):
         else:
             found = finite_points(np.asarray(self.points), f"{where}.points")
         found, wider = thinned(found, self.voxel) if self.voxel > 0 else (found, 0.0)
-        if len(found) > MOST_BALLS:
+        if len(found) > LIMITS.cloud_balls:
             raise DescriptionError(
-                f"{where}: found {len(found)} points, expected at most {MOST_BALLS} (see 'voxel')"
+                f"{where}: found {len(found)} points, expected at most {LIMITS.cloud_balls} "
+                "(see 'voxel')"
             )
         return cloud(found, self.radius + wider)
 

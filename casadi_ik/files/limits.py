@@ -22,6 +22,7 @@ class FileLimits:
     Sizes, counts, time and memory go through `limit`, so that `CASADI_IK_LIMITS` raises them.
 
     Attributes:
+        yaml_bytes: Bytes of a YAML file.
         yaml_text: Characters of one text or number.
         yaml_depth: Lists and mappings inside one another.
         yaml_values: Values in a file, those counted again that an alias repeats.
@@ -30,7 +31,12 @@ class FileLimits:
         mesh_bytes: Bytes of a mesh file.
         mesh_faces: Triangles of a mesh.
         mesh_coordinate: Largest coordinate of a corner [m, or what the file counts in].
+        link_triangles: Triangles of one link; of a finer mesh only the points are kept.
         object_pieces: Pieces of a grasped object.
+        cloud_bytes: Bytes of a file of points.
+        cloud_points: Points of a file.
+        cloud_head: Lines of the head of a PLY or PCD file.
+        cloud_balls: Balls of a point cloud in a scene.
         robot_bytes: Bytes of a URDF, xacro or MJCF file.
         robot_number: Largest length or angle of a robot [m or rad].
         joint_limit: Largest limit of a joint [rad or m]; beyond it there is none, since some
@@ -53,6 +59,7 @@ class FileLimits:
             stream [m]; beyond it the numbers are in other units.
     """
 
+    yaml_bytes: int = 4 * 2**20
     yaml_text: int = 10_000
     yaml_depth: int = 50
     yaml_values: int = 200_000
@@ -61,7 +68,12 @@ class FileLimits:
     mesh_bytes: int = 64 * 2**20
     mesh_faces: int = 2_000_000
     mesh_coordinate: float = 1e6
+    link_triangles: int = 200_000
     object_pieces: int = 256
+    cloud_bytes: int = 2**30
+    cloud_points: int = 10_000_000
+    cloud_head: int = 200
+    cloud_balls: int = 100_000
     robot_bytes: int = 16 * 2**20
     robot_number: float = 1e6
     joint_limit: float = 1e3

@@ -31,9 +31,6 @@ from casadi_ik.files.units import (
     units_in,
 )
 
-LARGEST_FILE = 4 * 2**20
-"""Bytes of a file."""
-
 MERGE = "tag:yaml.org,2002:merge"
 
 # libyaml where PyYAML has it: a tenth of the time.
@@ -106,7 +103,7 @@ def parse_yaml(path: Path) -> Any:
     Raises:
         DescriptionError: The file is missing, unreadable, not UTF-8, not YAML, or beyond a limit.
     """
-    text = read_text(path, LARGEST_FILE)
+    text = read_text(path, LIMITS.yaml_bytes)
     try:
         _check_events(text)
         found = yaml.load(text, Loader=_UniqueKeyLoader)

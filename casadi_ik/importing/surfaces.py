@@ -30,9 +30,6 @@ from casadi_ik.robots.robot_files.tree import (
 AROUND = 24
 """Points around an axis."""
 
-MOST_TRIANGLES = 200_000
-"""Of one link; of a finer mesh only the points are kept."""
-
 Triangles = NDArray[np.int64]
 
 
@@ -203,7 +200,7 @@ def _of_mesh(element: Element, missing: Missing) -> Surface | None:
     except DescriptionError as error:
         missing.broken(str(error))
         return None
-    if len(triangles) > MOST_TRIANGLES:
+    if len(triangles) > LIMITS.link_triangles:
         triangles = triangles[:0]
     if len(scale) != 3 or max(map(abs, scale)) > LIMITS.mesh_coordinate:
         missing.broken(f"{missing.path.name}: mesh {name!r}: scale: expected three finite numbers")
