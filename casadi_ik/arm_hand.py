@@ -180,8 +180,10 @@ class ArmHand(Shown):
             >>> print(round(np.rad2deg(joints["lwr_joint_2"]), 6))
             30.0
         """
-        (theta,) = self._kernels.joints(_for_kernels(self.configuration(q)))
-        return _by_name(self.description.joint_names, theta)
+        configuration, names = self.configuration(q), self.description.joint_names
+        (theta,) = self._kernels.joints(_for_kernels(configuration))
+        # Of a robot of one joint kernels give a single number.
+        return _by_name(names, theta.reshape(*configuration.shape[:-1], len(names)))
 
     def toggle_margins(self, q: ArrayLike) -> dict[str, Any]:
         """How far every lead screw and four-bar is from its singular (toggle) position.

@@ -26,6 +26,13 @@ def test_a_hand_alone_is_a_robot(name: str, rng: np.random.Generator) -> None:
     assert np.linalg.norm(there - points, axis=2).max() <= 5e-3
 
 
+def test_a_hand_of_one_joint_says_where_it_is() -> None:
+    robot = ik.load_robot("so100_jaw")
+    assert robot.joints([0.2]) == {"so100_jaw": 0.2}
+    np.testing.assert_array_equal(robot.joints([[0.2], [0.3]])["so100_jaw"], [0.2, 0.3])
+    assert ik.load_robot("tool").joints(np.zeros((2, 0))) == {}
+
+
 def test_an_arm_alone_is_a_robot_whose_fingertip_is_its_tip(rng: np.random.Generator) -> None:
     robot = ik.load_robot("ur5e")
     assert (robot.name, robot.fingers, len(robot.actuators)) == ("ur5e", ("flange",), 6)
