@@ -52,23 +52,29 @@ def _four_bar(bar: FourBar, phi: np.ndarray) -> np.ndarray:
 
 def contacts(robot: ik.ArmHand, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points and normals as `ArmHand.contacts`."""
-    values = joint_positions(robot, q)
-    poses = {robot.description.root: np.tile(np.eye(4), (len(q), 1, 1))}
-    for joint in robot.description.joints:
-        pose = poses[joint.parent] @ joint.placement
-        if joint.type == "prismatic":
-            moved = np.tile(np.eye(4), (len(q), 1, 1))
-            moved[:, :3, 3] = values[joint.name][:, None] * joint.axis
-            pose = pose @ moved
-        elif joint.type == "revolute":
-            pose = pose @ _turned(joint.axis, values[joint.name])
-        poses[joint.child] = pose
+    poses = links(robot, joint_positions(robot, q))
     points, normals = [], []
     for finger in robot.description.fingers:
         pose = poses[finger.link] @ finger.placement
         points.append(pose[:, :3, 3])
         normals.append(pose[:, :3, :3] @ finger.normal)
     return np.stack(points, axis=1), np.stack(normals, axis=1)
+
+
+def links(robot: ik.ArmHand, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Poses (k, 4, 4) of links by name, of all joints' positions (k,), whatever couples them."""
+    count = len(next(iter(values.values()), [0]))
+    poses = {robot.description.root: np.tile(np.eye(4), (count, 1, 1))}
+    for joint in robot.description.joints:
+        pose = poses[joint.parent] @ joint.placement
+        if joint.type == "prismatic":
+            moved = np.tile(np.eye(4), (count, 1, 1))
+            moved[:, :3, 3] = values[joint.name][:, None] * joint.axis
+            pose = pose @ moved
+        elif joint.type == "revolute":
+            pose = pose @ _turned(joint.axis, values[joint.name])
+        poses[joint.child] = pose
+    return poses
 
 
 def _turned(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:

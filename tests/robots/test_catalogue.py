@@ -11,18 +11,16 @@ import json
 from pathlib import Path
 
 import numpy as np
+import numpy_oracle
 import pytest
 import yaml
+from commands import main
+from toy_robots import grasp_at
 
 import casadi_ik as ik
 from casadi_ik import robots
-from casadi_ik.cli.inputs import the_robot
-from casadi_ik.files.reading import read
-from casadi_ik.files.shipped import resolve
-from casadi_ik.robots.parts import described_part
-from casadi_ik.robots.poses import link_poses
-from casadi_ik.robots.schema import ArmFile, HandFile
 
+MODELS = Path(__file__).parents[2] / "models"
 ARMS, HANDS = ik.shipped_names("arms"), ik.shipped_names("hands")
 FEWER = {"panda_hand": 2, "robotiq_2f85": 2, "widowx_gripper": 2, "so100_jaw": 2, "tool": 1}
 UNMOVED = {"tool": ("tip",), "so100_jaw": ("fixed",)}
@@ -57,32 +55,29 @@ def test_every_hand_goes_on_an_arm(hand):
 @pytest.mark.parametrize("arm", PUBLISHED["arms"])
 def test_arms_stand_where_published_files_have_them(arm):
     known = PUBLISHED["arms"][arm]
-    path = resolve(arm, "arms")
-    part = described_part(read(path, ArmFile)[0], path)
-    names = [joint.name for joint in part.joints if joint.type != "fixed"]
+    robot = ik.load_robot(arm)
+    tip = robot.description.joints[-1]  # fixed to the arm's last link
     for q, pose in zip(known["q"], known["poses"], strict=True):
-        links = link_poses(part.root, part.joints, dict(zip(names, q, strict=True)))
-        last = np.array(known["base"]) @ links[part.tip_link]
+        last = np.array(known["base"]) @ robot.links(q)[tip.parent]
         theirs = np.array(pose) @ np.linalg.inv(known["tip"])
         np.testing.assert_allclose(last, theirs, atol=known["tolerance"])
         if "flange" in known:  # the published link is the flange, perhaps with its axes turned
             turned = np.eye(4)
             turned[:3, :3] = known["flange"]
             np.testing.assert_allclose(
-                last @ part.tip, np.array(pose) @ turned, atol=known["tolerance"]
+                last @ tip.placement, np.array(pose) @ turned, atol=known["tolerance"]
             )
 
 
 @pytest.mark.parametrize("hand", PUBLISHED["hands"])
 def test_hands_stand_where_published_files_have_them(hand):
     known = PUBLISHED["hands"][hand]
-    path = resolve(hand, "hands")
-    part = described_part(read(path, HandFile)[0], path)
-    for q, links in zip(known["q"], known["links"], strict=True):
-        found = link_poses(part.root, part.joints, dict(zip(known["joints"], q, strict=True)))
+    robot, q = ik.load_robot(hand), np.array(known["q"])
+    found = numpy_oracle.links(robot, dict(zip(known["joints"], q.T, strict=True)))
+    for i, links in enumerate(known["links"]):
         assert len(links) >= FEWER.get(hand, 3)
         for link, pose in links.items():
-            np.testing.assert_allclose(found[link][:3], pose, atol=known["tolerance"])
+            np.testing.assert_allclose(found[link][i, :3], pose, atol=known["tolerance"])
 
 
 def test_unknown_arms_and_hands_are_named():
@@ -98,9 +93,116 @@ def test_unknown_arms_and_hands_are_named():
         ik.load_robot("a+b/robot.yaml")
 
 
-def test_a_grasp_file_may_name_a_pair(tmp_path):
+def test_a_grasp_file_may_name_a_pair(tmp_path, capsys):
     """The command line counts a path from the file, but a pair is no path."""
     contact = {"point": [0.4, 0.1, 0.5], "normal": [0, 0, 1]}
     path = tmp_path / "grasp.yaml"
     path.write_text(yaml.safe_dump({"robot": "panda+leap", "contacts": {"thumb": contact}}))
-    assert the_robot(None, path, ik.load_grasp(path)).name == "panda+leap"
+    assert main(["solve", str(path), "--q0", "1"]) == 2
+    assert "--q0: found 1 numbers, expected 23: panda_joint_1, " in capsys.readouterr().err
+
+
+# Arms and hands by themselves.
+
+
+@pytest.mark.parametrize("name", ["allegro_right", "panda_hand"])
+def test_a_hand_alone_is_a_robot(name: str, rng: np.random.Generator) -> None:
+    robot = ik.load_robot(name)
+    assert robot.name == name
+    assert len(robot.description.arm_actuators) == 0
+    paired = ik.load_robot(f"panda+{name}")
+    assert robot.fingers == paired.fingers
+    q = robot.random(rng, 20)
+    points, normals = robot.contacts(q)
+    assert robot.contacts(q[0])[0].shape == (len(robot.fingers), 3)
+    assert (robot.beyond_limits(q) <= 1e-9).all()
+    assert robot.palm(robot.home).shape == (4, 4)
+    solved = ik.Solver(robot).solve_batch(points, normals)
+    assert solved.success.all()
+    there, _ = robot.contacts(solved.q)
+    assert np.linalg.norm(there - points, axis=2).max() <= 5e-3
+
+
+def test_a_hand_of_one_joint_says_where_it_is() -> None:
+    robot = ik.load_robot("so100_jaw")
+    assert robot.joints([0.2]) == {"so100_jaw": 0.2}
+    np.testing.assert_array_equal(robot.joints([[0.2], [0.3]])["so100_jaw"], [0.2, 0.3])
+    assert ik.load_robot("tool").joints(np.zeros((2, 0))) == {}
+
+
+def test_an_arm_alone_is_a_robot_whose_fingertip_is_its_tip(rng: np.random.Generator) -> None:
+    robot = ik.load_robot("ur5e")
+    assert (robot.name, robot.fingers, len(robot.actuators)) == ("ur5e", ("flange",), 6)
+    q = robot.random(rng, 5)
+    points, normals = robot.contacts(q)
+    palm = robot.palm(q)
+    np.testing.assert_allclose(points[:, 0], palm[:, :3, 3], atol=1e-12)
+    np.testing.assert_allclose(normals[:, 0], palm[:, :3, 2], atol=1e-12)
+    assert ik.Solver(robot).solve_batch(points, normals).success.all()
+
+
+@pytest.mark.parametrize("name", ["arm.urdf", "some/hand.xacro", "hand.xml"])
+def test_a_robots_file_is_led_to_its_import(name: str) -> None:
+    with pytest.raises(
+        ik.errors.DescriptionError, match=f"casadi-ik import {name} --out .*yaml makes one"
+    ):
+        ik.load_robot(name)
+
+
+def test_unknown_names_are_told_what_there_is() -> None:
+    with pytest.raises(ik.errors.UnknownNameError, match="ARM\\+HAND"):
+        ik.load_robot("no_such_robot")
+
+
+# Grippers: pads that face each other, and a jaw that no joint moves.
+
+OPENED = {
+    "widowx_gripper": ((0.015, 0.012), (0.037, 0.056)),
+    "so100_jaw": ((0.0, 0.0158),),
+}
+"""By gripper the motor's position and how far apart [m] its parallel pads then are."""
+
+
+@pytest.mark.parametrize("gripper", OPENED)
+def test_pads_face_each_other(gripper: str) -> None:
+    robot = ik.load_robot(gripper)
+    for motor, apart in OPENED[gripper]:
+        points, normals = robot.contacts(np.array([motor]))
+        np.testing.assert_allclose(points[0] + apart * normals[0], points[1], atol=1e-6)
+        np.testing.assert_allclose(points[1] + apart * normals[1], points[0], atol=1e-6)
+
+
+@pytest.mark.parametrize("pair", ["ur5e+so100_jaw", "widowx_250s+widowx_gripper"])
+def test_random_contacts_are_solved(pair: str, rng: np.random.Generator) -> None:
+    robot = ik.load_robot(pair)
+    batch = ik.Solver(robot).solve_batch(*robot.contacts(robot.random(rng, 100)))
+    assert batch.success.all()
+
+
+def test_what_is_held_may_touch_the_fixed_jaw_but_not_what_it_is_fixed_to() -> None:
+    """A ball between the tips is free; as far in as the motor it is not."""
+    robot = ik.load_robot("ur5e+so100_jaw")
+    q = robot.home.copy()
+    q[robot.actuators.index("so100_jaw")] = 0.2
+    grasp, palm = grasp_at(robot, q), robot.palm(q)
+    ball = {"kind": "sphere", "radius": 0.015}
+    free = []
+    for out in (0.077, 0.0):
+        pose = palm.copy()
+        pose[:3, 3] = palm[:3, 3] + out * palm[:3, 2]
+        scene = ik.Scene({"ball": {**ball, "pose": pose}}, grasped="ball")
+        free.append(ik.Solver(robot, scene=scene).check(q, grasp).distance > 0)
+    assert free == [True, False]
+
+
+def test_a_pad_that_no_joint_moves_is_on_the_palms_link(tmp_path: Path) -> None:
+    text = (MODELS / "hands" / "so100_jaw.yaml").read_text()
+    (tmp_path / "hand.yaml").write_text(
+        text.replace("palm: {link: so100_fixed_jaw", "palm: {link: so100_gripper")
+    )
+    (tmp_path / "robot.yaml").write_text(
+        "name: changed\narm: ur5e\nhand: hand.yaml\nmount: {xyz: [0, 0, 0]}\n"
+        "fingers: [moving, fixed]\nthumb: moving\n"
+    )
+    with pytest.raises(ik.errors.DescriptionError, match="no joint moves 'so100_fixed_jaw'"):
+        ik.load_robot(tmp_path / "robot.yaml")

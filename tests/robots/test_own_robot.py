@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
+import yaml
 from toy_robots import copy_shipped_robot, replace, write_coupled_robot
 
 import casadi_ik as ik
+
+ROOT = Path(__file__).parents[2]
+MODELS = ROOT / "models"
 
 
 def test_copy_with_relative_paths_is_the_same_robot(own_robot, robot, rng, monkeypatch):
@@ -137,3 +145,63 @@ def test_any_name_of_robot_and_fingers_will_do(tmp_path, rng):
 def test_load_robot_says_what_is_wrong():
     with pytest.raises(ik.CasadiIKError, match="no shipped arm-hand is called 'kuka'"):
         ik.load_robot("kuka")
+
+
+def test_the_documented_robot_is_solved(tmp_path):
+    """The robot of docs/add_a_robot.md is what the page says."""
+    page = (ROOT / "docs" / "add_a_robot.md").read_text(encoding="utf-8")
+    (text,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    path = tmp_path / "pincher.yaml"
+    path.write_text(text, encoding="utf-8")
+    documented = ik.load_robot(str(path))
+    assert documented.fingers == ("left", "right")
+    assert len(documented.actuators) == 7 + 3
+    joints = documented.joints(documented.home)
+    assert joints["right_tip"] == pytest.approx(np.deg2rad(10))
+    q = documented.random(np.random.default_rng(0), 20)
+    assert ik.Solver(documented).solve_batch(*documented.contacts(q)).success.all()
+
+
+# A hand that stands in the robot's file in full, instead of by name.
+
+
+def in_full(folder: Path, name: str = "kuka_lwr_barrett", **changes: Any) -> Path:
+    """A shipped robot with its hand written out; keyword arguments replace the hand's keys."""
+    robot = yaml.safe_load((MODELS / "arm_hands" / f"{name}.yaml").read_text())
+    hand = yaml.safe_load((MODELS / "hands" / f"{robot['hand']}.yaml").read_text())
+    path = folder / "whole.yaml"
+    path.write_text(yaml.safe_dump(robot | {"hand": hand | changes}, sort_keys=False))
+    return path
+
+
+@pytest.mark.parametrize("name", ["kuka_lwr_barrett", "ar10"])
+def test_it_is_the_same_robot(name, tmp_path, rng):
+    whole, named = ik.load_robot(in_full(tmp_path, name)), ik.load_robot(name)
+    assert whole.actuators == named.actuators
+    q = named.random(rng, 5)
+    for ours, theirs in zip(whole.contacts(q), named.contacts(q), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"palm": {"link": "nowhere", "source": "jhu"}}, "palm.link: unknown link 'nowhere'"),
+        ({"joints": [1]}, r"hand\.joints\[0\]: expected `object`, got `int`"),
+        ({"colour": "red"}, "hand: object contains unknown field `colour`"),
+    ],
+)
+def test_its_errors_name_the_file_and_the_key(changes, words, tmp_path):
+    path = in_full(tmp_path, **changes)
+    with pytest.raises(ik.errors.DescriptionError, match=words) as caught:
+        ik.load_robot(path)
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+def test_neither_a_name_nor_a_hand(tmp_path):
+    path = tmp_path / "whole.yaml"
+    path.write_text("name: a\nhand: 3\nthumb: b\nfingers: [b]\n")
+    with pytest.raises(
+        ik.errors.DescriptionError, match=r"hand: expected `str \| object`, got `int`"
+    ):
+        ik.load_robot(path)

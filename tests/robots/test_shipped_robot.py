@@ -1,4 +1,4 @@
-"""The shipped robot against the published tables, computed here a second time."""
+"""The shipped robots against the published tables, computed here a second time."""
 
 from __future__ import annotations
 
@@ -31,13 +31,28 @@ def shift(axis: int, length: float) -> np.ndarray:
     return pose
 
 
-def lwr(theta: np.ndarray) -> np.ndarray:
-    """Flange pose by standard DH: Rz(theta) Tz(d) Tx(0) Rx(alpha)."""
+# Offset of theta [deg], d [m], a [m], alpha [deg]; standard DH.
+LWR = [
+    *((0, 0.3105, 0, 90), (0, 0, 0, -90), (0, 0.4, 0, -90), (0, 0, 0, 90)),
+    *((0, 0.39, 0, 90), (0, 0, 0, -90), (0, 0.078, 0, 0)),
+]
+BAXTER = [
+    *((0, 0.27035, 0.069, -90), (90, 0, 0, 90), (0, 0.36442, 0.069, -90), (0, 0, 0, 90)),
+    *((0, 0.37429, 0.010, -90), (0, 0, 0, 90), (0, 0.229525, 0, 0)),
+]
+
+
+def chain(thetas: np.ndarray, table: list[tuple[float, ...]]) -> np.ndarray:
+    """Pose of the last frame by standard DH: Rz(theta) Tz(d) Tx(a) Rx(alpha)."""
     pose = np.eye(4)
-    table = [(0.3105, 90), (0, -90), (0.4, -90), (0, 90), (0.39, 90), (0, -90), (0.078, 0)]
-    for angle, (d, alpha) in zip(theta, table, strict=True):
-        pose = pose @ rot(2, angle) @ shift(2, d) @ rot(0, alpha * DEG)
+    for theta, (offset, d, a, alpha) in zip(thetas, table, strict=True):
+        pose = pose @ rot(2, theta + offset * DEG) @ shift(2, d) @ shift(0, a) @ rot(0, alpha * DEG)
     return pose
+
+
+def lwr(theta: np.ndarray) -> np.ndarray:
+    """Flange pose."""
+    return chain(theta, LWR)
 
 
 R_SIGN, J_SIGN = {1: -1, 2: 1, 3: 0}, {1: 1, 2: 1, 3: -1}
@@ -240,3 +255,103 @@ def test_what_was_worked_out_of_a_description_is_no_part_of_it() -> None:
     assert description.arm_actuators
     assert pickle.dumps(description) == before
     assert pickle.loads(before).actuator_names == description.actuator_names
+
+
+# Baxter's right arm with the AR10.
+
+
+@pytest.fixture(scope="module")
+def baxter() -> ik.ArmHand:
+    return ik.load_robot("baxter_ar10")
+
+
+def test_arm_and_mount(baxter, rng):
+    base = rot(2, -0.7854)
+    base[:3, 3] = 0.024645, -0.219645, 0.118588
+    base = base @ shift(0, 0.055695) @ shift(2, 0.011038)
+    for q in baxter.random(rng, 20):
+        hand = base @ chain(q[:7], BAXTER) @ shift(2, -0.0021) @ rot(2, -np.pi / 2)
+        np.testing.assert_allclose(baxter.links(q)["hand_base"], hand, atol=1e-14)
+
+
+def test_the_hand_is_the_ar10(baxter, rng):
+    alone = ik.load_robot("ar10")
+    assert baxter.actuators[7:] == alone.actuators
+    assert baxter.actuators[:7] == (
+        "right_s0", "right_s1", "right_e0", "right_e1", "right_w0", "right_w1", "right_w2",
+    )  # fmt: skip
+    assert baxter.fingers == alone.fingers
+    q = baxter.random(rng, 20)
+    hand = baxter.links(q)["hand_base"]
+    points, normals = alone.contacts(q[:, 7:])
+    found_points, found_normals = baxter.contacts(q)
+    moved = np.einsum("kij,kfj->kfi", hand[:, :3, :3], points) + hand[:, None, :3, 3]
+    np.testing.assert_allclose(found_points, moved, atol=1e-14)
+    turned_normals = np.einsum("kij,kfj->kfi", hand[:, :3, :3], normals)
+    np.testing.assert_allclose(found_normals, turned_normals, atol=1e-14)
+    np.testing.assert_allclose(baxter.palm(q), hand @ alone.palm(alone.home), atol=1e-14)
+
+
+# The Barrett hand as it is driven: four motors, distal joints a third of the proximal ones.
+
+BARRETT_FINGERS = ("thumb", "finger_2", "finger_3")
+
+
+@pytest.fixture(scope="module")
+def coupled() -> ik.ArmHand:
+    return ik.load_robot("kuka_lwr_barrett_coupled")
+
+
+def independent(coupled: ik.ArmHand, robot: ik.ArmHand, q: np.ndarray) -> np.ndarray:
+    """The same posture in the coordinates of the hand with independent distal joints."""
+    joints = coupled.joints(q)
+    known = dict(zip(coupled.actuators, q.T, strict=True)) | joints
+    return np.stack([known[name] for name in robot.actuators], axis=1)
+
+
+def test_eleven_motors(coupled, robot):
+    names = [name for name in robot.actuators if not name.endswith("distal")]
+    assert list(coupled.actuators) == names
+    assert coupled.fingers == BARRETT_FINGERS
+    for end in ("lower", "upper"):
+        values = dict(zip(robot.actuators, getattr(robot, end), strict=True))
+        np.testing.assert_array_equal(getattr(coupled, end), [values[name] for name in names])
+
+
+def test_distal_joints_follow_within_their_limits(coupled, rng):
+    q = np.concatenate([coupled.random(rng, 20), coupled.upper[None], coupled.lower[None]])
+    joints = coupled.joints(q)
+    limits = {joint.name: (joint.lower, joint.upper) for joint in coupled.description.movable}
+    for finger in BARRETT_FINGERS:
+        distal, proximal = (joints[f"bh_{finger}_{name}"] for name in ("distal", "proximal"))
+        np.testing.assert_allclose(distal, proximal / 3, rtol=1e-15)
+        assert np.all(distal <= limits[f"bh_{finger}_distal"][1])
+    np.testing.assert_allclose(np.degrees(joints["bh_thumb_distal"][-2]), 140 / 3, rtol=1e-12)
+
+
+def test_the_same_hand_otherwise(coupled, robot, rng):
+    q = coupled.random(rng, 20)
+    ours, theirs = coupled.contacts(q), robot.contacts(independent(coupled, robot, q))
+    np.testing.assert_allclose(ours[0], theirs[0], atol=1e-14)
+    np.testing.assert_allclose(ours[1], theirs[1], atol=1e-14)
+    np.testing.assert_allclose(
+        coupled.palm(q), robot.palm(independent(coupled, robot, q)), atol=1e-14
+    )
+
+
+@pytest.mark.parametrize("method", ["enhanced-dls", "enhanced-sdls"])
+def test_the_papers_methods_say_why_not(coupled, method):
+    """Eq. (5) distributes a sum over two flexions; here there is nothing to distribute."""
+    with pytest.raises(ik.errors.UnsupportedError) as caught:
+        ik.Solver(coupled, method)
+    assert str(caught.value) == (
+        "robot 'kuka_lwr_barrett_coupled': finger 'finger_2' is not a planar finger: "
+        "bh_finger_2_distal follows 'bh_finger_2_proximal'; expected its own motor"
+    )
+
+
+def test_other_grasps_are_out_of_its_reach(coupled, robot):
+    """Fifteen equations for eleven motors: a cup pinched with free distal joints does not fit."""
+    grasp = ik.load_grasp("cup")
+    assert ik.Solver(robot).solve(grasp).success
+    assert not ik.Solver(coupled, tolerance=ik.Tolerance(1e-4, 1e-3)).solve(grasp).success
