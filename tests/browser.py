@@ -28,7 +28,7 @@ FLAGS = (
     *("--disable-extensions", "--disable-background-networking", "--remote-debugging-port=0"),
 )
 
-PATIENCE = 30.0
+PATIENCE = 180.0
 """How long [s] anything may take."""
 
 

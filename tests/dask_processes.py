@@ -35,7 +35,7 @@ def dask_process(*words: str, says: str) -> Iterator[tuple[subprocess.Popen[str]
         # What it says meanwhile may be as much as a pipe holds.
     finally:
         process.terminate()
-        process.communicate(timeout=30)
+        process.communicate(timeout=180)
 
 
 @contextmanager

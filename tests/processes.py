@@ -25,3 +25,14 @@ def python(*words: object, path: object = ROOT, **options: Any) -> subprocess.Co
     return subprocess.run(
         [sys.executable, *(textwrap.dedent(str(word)) for word in words)], **asked | options
     )
+
+
+def said(*words: object, **options: Any) -> str:
+    """What a program says that ends well; options as `subprocess.run` has them.
+
+    Raises:
+        AssertionError: It does not; the message is what it said.
+    """
+    done = subprocess.run(list(map(str, words)), capture_output=True, **options)
+    assert done.returncode == 0, (done.stdout + done.stderr).decode()[:2000]
+    return done.stdout.decode()

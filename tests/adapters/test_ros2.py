@@ -97,7 +97,7 @@ def test_a_process_asks_and_another_answers(node, rng):
             points, normals = robot.contacts(q)
             begin = time.perf_counter()
             publisher.put(encode_contacts(points, normals))
-            message = store.deserialize_cdr(answers.get(timeout=20), "sensor_msgs/msg/JointState")
+            message = store.deserialize_cdr(answers.get(timeout=180), "sensor_msgs/msg/JointState")
             times.append(time.perf_counter() - begin)
             assert message.name == list(robot.actuators)
             there, _ = robot.contacts(np.array(message.position))

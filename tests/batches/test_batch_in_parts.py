@@ -69,7 +69,7 @@ def begun(*words: object) -> subprocess.Popen[str]:
 
 def wait_for_parts(folder: Path, least: int, process: subprocess.Popen[str]) -> list[Path]:
     """Wait until so many parts are there, or the process has ended."""
-    end = time.monotonic() + 120
+    end = time.monotonic() + 6000
     while time.monotonic() < end:
         parts = sorted(folder.glob("part-*.npz"))
         if len(parts) >= least or process.poll() is not None:
@@ -112,11 +112,11 @@ def test_terminated(targets: Path, tmp_path: Path):
     process = begun(targets, *ROBOT, *PARTS, "--resume", "--jobs", "2", "--out", out)
     wait_for_parts(out, 3, process)
     process.terminate()
-    _, error = process.communicate(timeout=60)
+    _, error = process.communicate(timeout=600)
     assert process.returncode == 143
     assert error.splitlines()[-1] == "casadi-ik: error: terminated"
     assert len(list(out.glob("part-*.npz"))) >= 3
-    end = time.monotonic() + 60
+    end = time.monotonic() + 600
     while alive(process.pid) and time.monotonic() < end:
         time.sleep(0.05)
     assert not alive(process.pid)
@@ -152,7 +152,7 @@ def test_a_cluster_that_loses_a_worker_then_its_scheduler(
     there = len(wait_for_parts(out, 12, process))
     assert there >= 12
     scheduler.kill()
-    report, error = process.communicate(timeout=120)
+    report, error = process.communicate(timeout=6000)
     if process.returncode == 2:
         assert report == ""
         assert f"casadi-ik: error: --dask {address}: the cluster went away" in error
@@ -289,7 +289,7 @@ def test_terminated_leaves_nothing_half_written(
     while process.poll() is None and not list(tmp_path.glob(wait_for)):
         time.sleep(0.01)
     process.terminate()
-    said = process.communicate(timeout=120)
+    said = process.communicate(timeout=6000)
     assert process.returncode == 143, said
     parts = sorted((tmp_path / "out.npz.parts").glob("part-*.npz"))
     left = {path for path in tmp_path.rglob("*") if path.is_file()}

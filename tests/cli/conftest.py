@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from command_line import POSTURE, Command, Run, solvable
+from processes import python
 
 import casadi_ik as ik
 from casadi_ik.cli.main import main
@@ -34,14 +33,7 @@ def run_process(tmp_path: Path) -> Command:
     """Calls the command line in a process of its own."""
 
     def call(*words: object, **options: Any) -> Run:
-        done = subprocess.run(
-            [sys.executable, "-m", "casadi_ik", *map(str, words)],
-            capture_output=True,
-            text=True,
-            cwd=tmp_path,
-            timeout=120,
-            **options,
-        )
+        done = python("-m", "casadi_ik", *words, cwd=tmp_path, **options)
         return Run(done.returncode, done.stdout, done.stderr)
 
     return call
@@ -105,6 +97,5 @@ def ranked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "candidates.yaml").write_text(yaml.safe_dump(data))
     words = ["choose", folder / "candidates.yaml", "--robot", "kuka_lwr_barrett", "--scene"]
     words += ["table", "--limit", "3", "--per-candidate", "3", "--out", folder / "ranked.json"]
-    command = [sys.executable, "-m", "casadi_ik", *map(str, words)]
-    subprocess.run(command, check=True, capture_output=True)
+    python("-m", "casadi_ik", *words, check=True)
     return folder / "ranked.json"

@@ -7,13 +7,13 @@ import os
 import re
 import runpy
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from commands import main
+from processes import said
 
 import casadi_ik as ik
 from casadi_ik.exporting.project import MARK, c_project, checked_prefix, write_folder
@@ -50,9 +50,7 @@ def plain_project(tmp_path_factory) -> Path:
 
 
 def compiled(project: Path, *flags: str) -> None:
-    command = ["gcc", *STRICT, *flags, "-Iinclude", "-Isrc", "-Itest"]
-    done = subprocess.run(command, cwd=project, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[:2000]
+    said("gcc", *STRICT, *flags, "-Iinclude", "-Isrc", "-Itest", cwd=project)
 
 
 @needs_gcc
@@ -66,18 +64,10 @@ def test_stored_targets_bit_for_bit_under_sanitizers(project):
     objects = [Path(name).with_suffix(".o").name for name in sources]
     for program, text in (("stored", "test/test.c"), ("shown", "example/main.c")):
         compiled(project, *SANITIZERS, text, *objects, "-o", program, "-lm")
-    done = subprocess.run([project / "stored"], capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "1000 targets, 401 solved" in done.stdout
-    shown = subprocess.run([project / "shown"], capture_output=True, text=True)
-    assert shown.returncode == 0
-    assert "solved after" in shown.stdout
-
-    listed = subprocess.run(
-        ["nm", "-u", "-P", *objects], cwd=project, capture_output=True, text=True, check=True
-    )
-    wanted = {line.split()[0] for line in listed.stdout.splitlines() if line.endswith(" U")}
-    wanted |= {line.split()[0] for line in listed.stdout.splitlines() if " U " in line}
+    assert "1000 targets, 401 solved" in said(project / "stored")
+    assert "solved after" in said(project / "shown")
+    listed = said("nm", "-u", "-P", *objects, cwd=project).splitlines()
+    wanted = {line.split()[0] for line in listed if line.endswith(" U") or " U " in line}
     foreign = {name for name in wanted if not name.startswith(("arm_", "__asan", "__ubsan"))}
     assert "sin" in foreign
     assert foreign <= LIBM | COMPILERS
@@ -91,9 +81,7 @@ def test_a_body_s_sides_and_trunk_go_with_it(tmp_path):
     assert (tmp_path / "src" / "g1_side_1.c").is_file()
     sources = [str(path.relative_to(tmp_path)) for path in sorted(tmp_path.glob("src/*.c"))]
     compiled(tmp_path, "-O0", *sources, "test/test.c", "-o", "stored", "-lm")
-    done = subprocess.run([tmp_path / "stored"], capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "wrong: 0" in done.stdout
+    assert "wrong: 0" in said(tmp_path / "stored")
 
 
 WINE = shutil.which("wine64") or shutil.which("wine64", path="/usr/lib/wine")
@@ -118,12 +106,11 @@ def test_stored_targets_bit_for_bit_on_other_machines(
     command = [sys.executable, "-m", "ziglang", "cc", "-target", target, "-std=c11", "-O1"]
     command += ["-ffp-contract=off", "-fno-sanitize=all", *folders, *map(str, sources)]
     made = tmp_path / program
-    subprocess.run([*command, "-o", str(made), "-lm"], check=True, capture_output=True)
+    said(*command, "-o", made, "-lm")
     own = {"WINEPREFIX": str(tmp_path / "wine"), "WINEDEBUG": "-all"}
-    done = subprocess.run([runner, made], capture_output=True, text=True, env=os.environ | own)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "1000 targets" in done.stdout
-    assert "wrong: 0" in done.stdout
+    found = said(runner, made, env=os.environ | own)
+    assert "1000 targets" in found
+    assert "wrong: 0" in found
 
 
 def test_in_a_scene_arms_swing_out_of_the_way(robot):
@@ -185,10 +172,8 @@ def test_malformed_targets_end_as_in_python(plain_project):
     compiled(plain_project, "-O1", "asked.c", *sources, "-o", "asked", "-lm")
     points, normals, q0, near = malformed(robot, count)
     rows = np.hstack([near[:, None], *(a.reshape(count, -1) for a in (points, normals, q0))])
-    done = subprocess.run([plain_project / "asked"], input=rows.tobytes(), capture_output=True)
-    assert done.returncode == 0, done.stderr[:2000]
-    found = [line.split() for line in done.stdout.decode().splitlines()]
-
+    lines = said(plain_project / "asked", input=rows.tobytes()).splitlines()
+    found = [line.split() for line in lines]
     fast, refused, ends = ik.Solver(robot).fast(), 0, set()
     for row in range(count):
         status, *words = found[row]
@@ -246,9 +231,9 @@ def test_other_hands_are_looked_at_as_in_python(tmp_path):
         vectors = [v or free for name in ("points", "normals") for v in one[name]]
         numbers = [[len(solids)], *solids, *vectors]
         asked += b"".join(np.array(part, dtype=float).tobytes() for part in numbers)
-    done = subprocess.run([out / "grasped"], input=asked, capture_output=True, check=True)
+    lines = said(out / "grasped", input=asked).splitlines()
     solver = ik.Solver(robot, scene=ik.Scene({}))
-    for one, line in zip(grasps, done.stdout.decode().splitlines(), strict=True):
+    for one, line in zip(grasps, lines, strict=True):
         status, *words = line.split()
         answer = solver.solve(ik.load_grasp(one["name"]), diagnose=False)
         assert int(status) == answer.status == ik.Status.SOLVED, one["name"]
@@ -259,14 +244,8 @@ def test_other_hands_are_looked_at_as_in_python(tmp_path):
 def test_no_state_outside_the_struct(plain_project):
     project = plain_project
     compiled(project, "-O1", "-c", "src/arm_look_up.c", "src/arm_solver.c", "src/arm_judge.c")
-    listed = subprocess.run(
-        ["nm", "-P", "arm_look_up.o", "arm_solver.o", "arm_judge.o"],
-        cwd=project,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    kinds = {line.split()[1]: line.split()[0] for line in listed.stdout.splitlines() if " " in line}
+    listed = said("nm", "-P", "arm_look_up.o", "arm_solver.o", "arm_judge.o", cwd=project)
+    kinds = {line.split()[1]: line.split()[0] for line in listed.splitlines() if " " in line}
     assert "T" in kinds
     assert not set(kinds) & set("bBCsSgG"), kinds
 
@@ -281,10 +260,7 @@ def test_wrapper_in_cpp(project, tmp_path):
         "  return solver.solve(p, n, &q0) == arm::Status::solved ? 0 : 1;\n}\n"
     )
     flags = ["-std=c++17", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-fsyntax-only"]
-    done = subprocess.run(
-        ["g++", *flags, f"-I{project / 'include'}", str(text)], capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
+    said("g++", *flags, f"-I{project / 'include'}", text)
 
 
 @pytest.mark.parametrize(
@@ -341,9 +317,9 @@ def test_names_from_files_end_no_comment():
 
 def test_kernels_compiled_ahead_with_progress(capsys):
     assert main(["compile", "kuka_lwr_barrett"]) == 0
-    said = capsys.readouterr()
-    assert "COMPILED  1 robot in" in said.out
-    lines = [line for line in said.err.splitlines() if "kuka_lwr_barrett" in line]
+    told = capsys.readouterr()
+    assert "COMPILED  1 robot in" in told.out
+    lines = [line for line in told.err.splitlines() if "kuka_lwr_barrett" in line]
     numbers = [line.split()[3] for line in lines]
     assert len(numbers) > 1
     assert numbers == [f"{i}/{len(numbers)}:" for i in range(1, len(numbers) + 1)]
@@ -385,11 +361,6 @@ int main(void) {
 """
 
 
-def compiled_c(place: Path, *words: str) -> None:
-    done = subprocess.run(["gcc", *words], cwd=place, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[:2000]
-
-
 @pytest.mark.parametrize(
     ("double", "single"),
     [
@@ -418,9 +389,11 @@ def test_limits_are_moved_inwards(robot):
 @needs_gcc
 def test_sines_and_arcs_to_their_last_places(tmp_path):
     (tmp_path / "places.c").write_text(driver_text("elementary_single") + LAST_PLACES)
-    compiled_c(tmp_path, *WARNED, "-O1", "-ffp-contract=off", "places.c", "-o", "places", "-lm")
-    said = subprocess.run([tmp_path / "places"], capture_output=True, text=True, check=True).stdout
-    worst, special = (list(map(float, line.split())) for line in said.splitlines())
+    said(
+        "gcc", *WARNED, "-O1", "-ffp-contract=off", "places.c", "-o", "places", "-lm", cwd=tmp_path
+    )
+    lines = said(tmp_path / "places").splitlines()
+    worst, special = (list(map(float, line.split())) for line in lines)
     assert max(worst[:2]) < 2
     assert max(worst[2:]) < 4
     assert special == pytest.approx([0.0, -np.pi, np.sin(1e6)], abs=1e-5)
@@ -448,20 +421,19 @@ def test_what_it_solves_is_solved_in_double_precision(single_project):
         f"src/{path.name}" for path in single_project.glob("src/*.c") if "_solve.c" not in path.name
     ]
     places = ("-Iinclude", "-Isrc", "-Itest", "-ffp-contract=off")
-    compiled_c(single_project, *WARNED, *places, "-O0", "-c", "src/arm_solve.c")
+    said("gcc", *WARNED, *places, "-O0", "-c", "src/arm_solve.c", cwd=single_project)
     tests = ("test/test.c", "test/judge.c")
     command = (*WARNED, *SANITIZERS, *places, "-O0", *tests, *rest, "arm_solve.o")
-    compiled_c(single_project, *command, "-lm", "-o", "stored")
-    done = subprocess.run([single_project / "stored"], capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
-    solved, wanted = re.findall(r"(\d+) solved of (\d+) that", done.stdout)[0]
+    said("gcc", *command, "-lm", "-o", "stored", cwd=single_project)
+    found = said(single_project / "stored")
+    solved, wanted = re.findall(r"(\d+) solved of (\d+) that", found)[0]
     assert int(wanted) == 401
     assert int(solved) >= int(wanted)
-    assert ", 0 missed, " in done.stdout
-    assert "wrong: 0" in done.stdout
+    assert ", 0 missed, " in found
+    assert "wrong: 0" in found
 
     for program in ("example/main.c", "bench/bench.c"):
-        compiled_c(single_project, *WARNED, "-Iinclude", "-fsyntax-only", program)
+        said("gcc", *WARNED, "-Iinclude", "-fsyntax-only", program, cwd=single_project)
 
 
 def test_webassembly_has_doubles(tmp_path, capsys):

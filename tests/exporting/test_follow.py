@@ -5,12 +5,12 @@ from __future__ import annotations
 import importlib.util
 import json
 import shutil
-import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
 from commands import main
+from processes import said
 
 import casadi_ik as ik
 
@@ -66,17 +66,14 @@ def built(out: Path, name: str, text: str, sources: str, *flags: str) -> Path:
     (out / f"{name}.c").write_text(text.replace("PERIOD", repr(PERIOD)))
     files = [str(path.relative_to(out)) for path in out.glob(f"src/{sources}.c")]
     command = ["gcc", *STRICT, *flags, "-Iinclude", f"{name}.c", *files, "-o", name, "-lm"]
-    done = subprocess.run(command, cwd=out, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[:2000]
+    said(*command, cwd=out)
     return out / name
 
 
 def asked(program: Path, *arrays: np.ndarray) -> tuple[list[int], np.ndarray]:
     """What it says: a status and a configuration a line."""
     data = b"".join(np.ascontiguousarray(array, dtype=float).tobytes() for array in arrays)
-    done = subprocess.run([program], input=data, capture_output=True)
-    assert done.returncode == 0, done.stderr[:2000]
-    lines = [line.split() for line in done.stdout.decode().splitlines()]
+    lines = [line.split() for line in said(program, input=data).splitlines()]
     return [int(line[0]) for line in lines], np.array(
         [[float.fromhex(word) for word in line[1:]] for line in lines]
     )
@@ -202,12 +199,10 @@ def test_in_javascript_too(tmp_path):
     words = ["export", "ar10", "--prefix", "arm", "--target", "wasm", "--follow"]
     assert main([*words, "--out", str(out)]) == 0
     (out / "use.mjs").write_text(USED)
-    done = subprocess.run(["node", "use.mjs"], cwd=out, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    said = json.loads(done.stdout)
-    assert (said["ended"], said["refused"], said["length"]) == (True, True, True)
+    found = json.loads(said("node", "use.mjs", cwd=out))
+    assert (found["ended"], found["refused"], found["length"]) == (True, True, True)
     robot = ik.load_robot("ar10")
     follower = ik.Solver(robot).follow(q0=robot.home, period=0.004)
-    for i, row in enumerate(said["rows"]):
+    for i, row in enumerate(found["rows"]):
         targets = robot.contacts(robot.home + 5e-4 * i * (robot.upper - robot.home))
         np.testing.assert_allclose(row, follower(*targets), atol=1e-9)

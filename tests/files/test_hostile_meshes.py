@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import random
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from processes import python
 
 import casadi_ik as ik
 
@@ -105,7 +104,7 @@ def test_broken_meshes_end_no_process(tmp_path: Path) -> None:
             path = tmp_path / f"{kind}_{i}.{kind.removeprefix('ascii_')}"
             path.write_bytes(damaged(data, rng))
             paths.append(str(scene(path)))
-    done = subprocess.run([sys.executable, "-c", SCENE, *paths], capture_output=True, text=True)
+    done = python("-c", SCENE, *paths)
     assert (done.returncode, done.stdout, done.stderr) == (0, "lived\n", "")
 
 

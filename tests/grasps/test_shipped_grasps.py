@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 from functools import cache
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import python
 
 import casadi_ik as ik
 from casadi_ik import grasps
@@ -152,8 +152,7 @@ def test_solved_exactly_and_on_a_table_nothing_touches_but_the_pads(name: str) -
 
 
 def run(script: str, *words: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, str(TOOLS / script), *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+    return python(TOOLS / script, *words)
 
 
 def test_the_script_agrees_and_refuses_a_broken_file(tmp_path: Path) -> None:

@@ -682,18 +682,18 @@ def test_a_fork_while_another_thread_builds(directory):
 
     def slow() -> ca.Function:
         building.set()
-        forked.wait(60)
+        forked.wait(300)
         return scaled(name="slow")
 
     graph = FunctionGraph("slow", slow, {"x": (1, 1)}, ((1, 1),))
     thread = threading.Thread(target=FunctionKernel, args=(graph,))
     thread.start()
-    assert building.wait(60)
+    assert building.wait(300)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # a fork of a process with threads
         child = multiprocessing.get_context("fork").Process(target=works_or_dies)
         child.start()
-    child.join(30)
+    child.join(180)
     alive = child.is_alive()
     if alive:
         child.kill()

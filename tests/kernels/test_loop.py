@@ -298,7 +298,7 @@ def test_keyboard_interrupt_reaches_a_compiled_loop():
         except KeyboardInterrupt:
             print("interrupted")
     """
-    done = python("-c", script, timeout=60)
+    done = python("-c", script)
     assert done.stdout == "interrupted\n", done.stderr
 
 

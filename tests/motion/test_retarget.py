@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from made_up_hand import hand, like_robot
 from msgspec.structs import replace
+from processes import python
 
 import casadi_ik as ik
 
@@ -424,15 +423,10 @@ def test_palms_of_a_body_are_asked_by_side(g1):
 
 
 def test_both_hands_from_a_file_on_the_command_line(tmp_path):
-    run = subprocess.run(
-        [
-            *(sys.executable, "-m", "casadi_ik", "follow", KEYPOINTS / "two_hands_box.npz"),
-            *("--retarget", KEYPOINTS / "two_hands_g1.yaml", "--period", "0.01"),
-            *("--out", tmp_path / "g1.csv"),
-        ],
-        capture_output=True,
-        text=True,
-        check=False,
+    run = python(
+        *("-m", "casadi_ik", "follow", KEYPOINTS / "two_hands_box.npz"),
+        *("--retarget", KEYPOINTS / "two_hands_g1.yaml", "--period", "0.01"),
+        *("--out", tmp_path / "g1.csv"),
     )
     assert "g1+dex3" in run.stdout
     assert run.returncode in (0, 1), run.stderr

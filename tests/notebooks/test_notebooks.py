@@ -33,7 +33,7 @@ def test_notebook_runs(path: Path, tmp_path: Path) -> None:
     if any("import mujoco" in cell.source for cell in notebook.cells):
         pytest.importorskip("mujoco")
     NotebookClient(
-        notebook, timeout=120, kernel_name="python3", resources={"metadata": {"path": tmp_path}}
+        notebook, timeout=900, kernel_name="python3", resources={"metadata": {"path": tmp_path}}
     ).execute()
     for cell in notebook.cells:
         for output in cell.get("outputs", []):

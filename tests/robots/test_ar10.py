@@ -60,36 +60,6 @@ def test_pads_face_where_the_fingers_flex(ar10):
         np.testing.assert_allclose(moved / np.linalg.norm(moved), normal, atol=2e-3)
 
 
-def test_triangles_obey_the_cosine_rule(ar10):
-    q = strokes(ar10)
-    joints = ar10.joints(q)
-    seen = 0
-    for joint in ar10.description.movable:
-        if isinstance(coupling := joint.coupling, robots.LeadScrew):
-            s, b, c = q[:, ar10.actuators.index(coupling.of)], coupling.b, coupling.c
-            theta = joints[joint.name] + coupling.theta_0
-            np.testing.assert_allclose(s**2, b**2 + c**2 - 2 * b * c * np.cos(theta), atol=1e-16)
-            seen += 1
-    assert seen == 10
-
-
-def test_four_bars_close(ar10):
-    """Closure from the positions of the pins alone; and one branch throughout."""
-    joints = ar10.joints(strokes(ar10))
-    seen = 0
-    for joint in ar10.description.movable:
-        if isinstance(bar := joint.coupling, robots.FourBar):
-            phi = bar.phi_0 + joints[bar.of]
-            beta = phi + joints[joint.name] + bar.theta_3_0
-            pin = bar.p * np.exp(1j * phi) + bar.h * np.exp(1j * beta)
-            np.testing.assert_allclose(np.abs(pin - bar.g), bar.q, atol=1e-15)
-            side = np.sign(np.imag((pin - bar.g).conj() * (bar.h * np.exp(1j * beta))))
-            assert set(side) == {-1.0}
-            assert np.abs(np.diff(joints[joint.name])).max() < 0.02
-            seen += 1
-    assert seen == 4
-
-
 def test_published_ranges(ar10):
     """What Chandra's code gives: 1.531 and 1.222 rad, distal 0 to 0.606; thumb 1.623, 0.848."""
     ends = ar10.joints(np.stack([ar10.lower, ar10.upper]))

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from imported_files import FINGERS, describe, hand, joint, link, urdf
+from processes import python
 
 import casadi_ik as ik
 
@@ -164,7 +163,7 @@ def test_formats_whose_reader_is_missing_name_the_extra(tmp_path, module, name):
         f"import casadi_ik as ik\ntry: ik.load_robot({str(path)!r})\n"
         "except ImportError as error: print(error)"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    done = python("-c", program)
     assert f"pip install 'casadi-ik[{module}]'" in done.stdout, done
 
 

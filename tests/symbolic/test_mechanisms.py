@@ -316,22 +316,6 @@ def test_other_fingers_are_refused_with_the_reason(own_robot, case):
     assert says in message
 
 
-def test_coupled_flexion_is_refused(own_robot):
-    """The real Barrett hand's distal joints follow the proximal ones."""
-    hand = own_robot.with_name("hand.yaml")
-    replace(hand, "  bh_finger_2_distal: {}\n", "")
-    limits = "limits: [0 deg, 48 deg], velocity: 2 rad/s, source: mdh cad limits assumed"
-    text = hand.read_text()
-    at = text.index(limits, text.index("name: bh_finger_2_distal"))
-    follower = ",\n     coupling: {kind: linear, of: bh_finger_2_proximal, ratio: 0.3333}"
-    hand.write_text(text[: at + len(limits)] + follower + text[at + len(limits) :])
-    replace(own_robot, "  bh_finger_2_distal: 10 deg\n", "")
-    with pytest.raises(
-        ik.errors.UnsupportedError, match="follows 'bh_finger_2_proximal'; expected its own"
-    ):
-        planar_finger(robots.load_description(own_robot), "finger_2")
-
-
 def test_long_and_short_chains_are_refused(coupled_robot):
     with pytest.raises(
         ik.errors.UnsupportedError, match=r"it has joints \['left_spread', 'left_1', .*; exp"

@@ -49,7 +49,7 @@ def opened(browser: Browser, viewer: viewing.Viewer, painted: bool = False) -> t
     viewer._server.scene.add_light_directional("/light/lamp", position=(0.9, -0.7, 3.2))
     page.go(viewer.url)
     page.wait("document.querySelector('canvas') !== null")
-    server, end = viewer._server, time.monotonic() + 30
+    server, end = viewer._server, time.monotonic() + 180
     while not server.get_clients() and time.monotonic() < end:
         time.sleep(0.1)
     client = list(server.get_clients().values())[-1]
@@ -107,7 +107,7 @@ def press(page: Page, label: str, of: str = "button") -> None:
 
 def arrived(file: Path) -> None:
     """A file that the browser saves is there."""
-    end = time.monotonic() + 30
+    end = time.monotonic() + 180
     while not file.is_file() and time.monotonic() < end:
         time.sleep(0.05)
     assert file.is_file(), sorted(one.name for one in file.parent.iterdir())

@@ -75,12 +75,12 @@ def test_only_the_newest_change_of_a_key_is_done() -> None:
 
     def first() -> None:
         begun.set()
-        go_on.wait(10)
+        go_on.wait(120)
         done.append("first")
 
     work = Newest(lambda: done.append("drawn"), ((REST, lambda: done.append("later")),))
     work.put("thumb", first)
-    assert begun.wait(10)
+    assert begun.wait(120)
     for i in range(5):
         work.put("thumb", lambda i=i: done.append(f"thumb {i}"))
     work.put("cup", lambda: done.append("cup"))
@@ -104,7 +104,7 @@ def test_what_can_wait_is_given_up_when_the_hand_moves_on() -> None:
 
     work = Newest(lambda: None, ((REST, long),))
     work.put("thumb", lambda: None)
-    assert begun.wait(10)
+    assert begun.wait(120)
     work.put("thumb", lambda: done.append("thumb"))
     assert work.settle(10)
     assert done == ["thumb", "later"]

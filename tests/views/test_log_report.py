@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import python
 
 import casadi_ik as ik
 from casadi_ik import logs, views
@@ -84,8 +83,7 @@ def test_most(study: Path) -> None:
 )
 def test_refusals(words: list[str], says: str, study: Path, tmp_path: Path) -> None:
     named = [str(study) if word == "STUDY" else word for word in words]
-    command = [sys.executable, "-m", "casadi_ik", "log", "report", *named]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = python("-m", "casadi_ik", "log", "report", *named, cwd=tmp_path)
     assert done.returncode == 2
     assert says in done.stderr
     assert not list(tmp_path.iterdir())

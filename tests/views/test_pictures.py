@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
-import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import matplotlib.colors as mcolors
@@ -13,6 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.image import imread
+from processes import python
 
 import casadi_ik as ik
 from casadi_ik import errors, palette, views
@@ -155,10 +153,7 @@ def test_headless_pictures_say_nothing_and_leave_pyplot_alone() -> None:
         "import matplotlib.pyplot as plt\n"
         "sys.exit(len(plt.get_fignums()))"
     )
-    headless = {name: value for name, value in os.environ.items() if name != "DISPLAY"}
-    done = subprocess.run(
-        [sys.executable, "-c", code], check=True, capture_output=True, text=True, env=headless
-    )
+    done = python("-c", code, check=True, env={"DISPLAY": ""})
     assert done.stdout + done.stderr == ""
 
 
@@ -170,7 +165,7 @@ def test_without_the_extra_the_error_says_what_to_install(missing: str) -> None:
         "try: import casadi_ik.views\n"
         "except casadi_ik.CasadiIKError as error: print(type(error).__name__, error)"
     )
-    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    done = python("-c", code, check=True)
     assert done.stdout.startswith(f"MissingExtraError pictures need {missing},")
     assert "pip install 'casadi-ik[plots]'" in done.stdout
     assert done.stdout.count("\n") == 1
