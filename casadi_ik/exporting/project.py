@@ -173,11 +173,12 @@ def exported(
     return Exported(solver, shown, marks, sources.final(files), about, judge)
 
 
-def tested(project: Exported, pieces: Mapping[str, str]) -> dict[str, str]:
-    """What a test has in addition where there is a scene."""
+def _tested(project: Exported, pieces: Mapping[str, str]) -> dict[str, str]:
+    """The marks of a project, and those that its test has in addition where there is a scene."""
     if project.scene is None:
-        return dict.fromkeys(pieces, "")
-    return {name: piece.replace("@P", project.marks["PREFIX"]) for name, piece in pieces.items()}
+        return project.marks
+    prefix = project.marks["PREFIX"]
+    return project.marks | {name: piece.replace("@P", prefix) for name, piece in pieces.items()}
 
 
 def c_project(
@@ -208,7 +209,7 @@ def c_project(
         "Makefile": "Makefile",
         "README.md": "README.md",
     }
-    marks = project.marks | tested(project, IN_TEST_SINGLE if single else IN_TEST_C)
+    marks = _tested(project, IN_TEST_SINGLE if single else IN_TEST_C)
     return {
         **project.sources,
         f"include/{prefix}.hpp": filled("solver.hpp", marks),
@@ -273,17 +274,13 @@ def wasm_project(
     if importlib.util.find_spec("ziglang") is None:
         raise MissingExtraError("--target wasm needs ziglang: pip install 'casadi-ik[compiler]'")
     project = exported(robot, prefix, capacity, follow=follow)
-    marks = (
-        project.marks
-        | tested(project, IN_TEST_MJS)
-        | {
-            "LOWER_JSON": json.dumps(robot.lower.tolist()),
-            "UPPER_JSON": json.dumps(robot.upper.tolist()),
-            "HOME_JSON": json.dumps(robot.home.tolist()),
-            "EXAMPLE_POINTS_JSON": _numbers(project.example.points.ravel().tolist()),
-            "EXAMPLE_NORMALS_JSON": _numbers(project.example.normals.ravel().tolist()),
-        }
-    )
+    marks = _tested(project, IN_TEST_MJS) | {
+        "LOWER_JSON": json.dumps(robot.lower.tolist()),
+        "UPPER_JSON": json.dumps(robot.upper.tolist()),
+        "HOME_JSON": json.dumps(robot.home.tolist()),
+        "EXAMPLE_POINTS_JSON": _numbers(project.example.points.ravel().tolist()),
+        "EXAMPLE_NORMALS_JSON": _numbers(project.example.normals.ravel().tolist()),
+    }
     files = {
         f"{prefix}.js": "solver.js",
         f"{prefix}.d.ts": "solver.d.ts",

@@ -141,7 +141,7 @@ class SceneSources:
     def margin(self) -> dict[str, str]:
         """What stands for the marks of the distance to keep: in single precision rounding more."""
         if self.single is None:
-            return {"MORE_MARGIN": "", "FIRST_MARGIN": ""}
+            return {}
         more = number(self.single.tolerance.position)
         return {
             "MORE_MARGIN": f" + {more}",
@@ -360,17 +360,5 @@ class SceneSources:
         return define(whole) + text + define_arrays(arrays) + self._idle_constants()
 
 
-WITHOUT = (
-    *("SCENE_TYPES", "SCENE_CALLS", "SCENE_FIELDS", "SCENE_ROOM", "SCENE_INIT", "SCENE_WASM"),
-    "SCENE_BEGIN",
-    *("SCENE_JS", "SCENE_DTS", "SCENE_SHAPES_JS", "SCENE_SHAPES_DTS", "SCENE_STATUS_JS"),
-    *("SCENE_STATUS_TYPE", "SCENE_STATUS_DTS", "SCENE_ANSWER_JS", "SCENE_ANSWER_DTS"),
-)
-"""Marks that stand for nothing where there is no scene."""
-
-
-def without_scene() -> dict[str, str]:
-    """What stands for the marks where an export knows no scene."""
-    return dict.fromkeys(WITHOUT, "") | {
-        "SCENE_LOOK": "#define run_on(solver, most) search_run(solver, most, 1)\n"
-    }
+WITHOUT_SCENE = {"SCENE_LOOK": "#define run_on(solver, most) search_run(solver, most, 1)\n"}
+"""What stands for the marks where an export knows no scene."""

@@ -151,22 +151,13 @@ class SinglePrecision:
 IN_DOUBLE = {
     "REAL": "double",
     "MATHS": "#include <math.h>",
-    "AS_DOUBLE": "",
-    "TO_REAL": "",
     "AND_SUM": ", sum = 0;",
-    "LESS_POSITION": "",
-    "LESS_ANGLE": "",
-    "STRICTER": "",
-    "JUDGE": "",
-    "PRECISION": "",
-    "PRECISION_NOTE": "",
     "ANSWERS": (
         "The answers are bit for bit those of the Python package (method hand-first) on a machine "
         "of the same\narithmetic, whatever the optimisation, as long as multiply-adds are not "
         "fused (`-ffp-contract=off`).\n"
     ),
     "COMPARED": "answers compared bit for bit",
-    "ABOUT_PRECISION": "",
 }
 """What stands for the marks in double precision."""
 
@@ -224,14 +215,16 @@ def in_single(single: SinglePrecision) -> dict[str, str]:
     }
 
 
-MARK = re.compile("@([A-Z_]+)@")
+MARK = re.compile(r"@([A-Z_]+)(\??)@")
 
 
 def filled(name: str, substitutes: Mapping[str, str]) -> str:
     """The text of `templates/<name>` with every mark replaced.
 
+    A mark with a question mark stands for nothing where an export has no such thing.
+
     Raises:
-        KeyError: A mark stands for nothing.
+        KeyError: Another mark stands for nothing.
     """
     text = (resources.files("casadi_ik.exporting") / "templates" / name).read_text(encoding="utf-8")
-    return MARK.sub(lambda mark: substitutes[mark[1]], text)
+    return MARK.sub(lambda m: substitutes.get(m[1], "") if m[2] else substitutes[m[1]], text)

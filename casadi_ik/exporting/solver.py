@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.exporting.scene import SceneSources, without_scene
+from casadi_ik.exporting.scene import WITHOUT_SCENE, SceneSources
 from casadi_ik.exporting.single import (
     FOLLOWING,
     IN_DOUBLE,
@@ -50,18 +50,16 @@ from casadi_ik.problem.request import BEYOND, touched
 from casadi_ik.problem.targets import TargetBatch, Tolerance
 from casadi_ik.problem.verdict import LIMIT_SLACK, TOLERANCE_SLACK
 
-MARKS = ("PALM_CALLS", "PALM", "PALM_WASM", "PALM_JS", "PALM_DTS")
-
 
 def palm_marks(robot: ArmHand, prefix: str, real: str) -> dict[str, str]:
     """What stands for the marks of palms; nothing for a body, without an arm, or a free palm."""
     if not robot.description.arm_actuators or robot.description.sides:
-        return dict.fromkeys(MARKS, "")
+        return {}
     motors = robot.description.finger_motors
     own = np.where(np.isin(robot.actuators, motors), robot.home, np.nan)
     home = robot.palm(robot.home)
     if touched(robot, home[None], own[None])[2]:  # contacts leave it free
-        return dict.fromkeys(MARKS, "")
+        return {}
     pose = np.concatenate([home[:3, :3].ravel(), home[:3, 3]])
     constants = f"#define POSTURE_ROUNDING {number(BEYOND)}\n" + define_arrays(
         {"HOME_PALM": pose, "OF_HAND": np.isin(robot.actuators, motors).astype(int)}
@@ -157,16 +155,6 @@ class FollowSources:
 
 def _places(label: str, layout: Layout) -> dict[str, int]:
     return {f"{label}_{one.name.upper()}": layout.slice(one.name).start for one in layout}
-
-
-NO_FOLLOWER = dict.fromkeys(
-    (
-        *("FOLLOW_CALLS", "FOLLOW_WASM", "FOLLOW_JS"),
-        *("FOLLOW_DTS", "FOLLOW_STATUS_JS", "FOLLOW_STATUS_DTS"),
-    ),
-    "",
-)
-"""What stands for the marks where an export does not follow."""
 
 
 @dataclass(frozen=True)
@@ -387,8 +375,8 @@ class SolverSources:
             f"#define {p.name.upper()}(work) {self.prefix}_{p.name}_kernel(work, &job->memory)\n"
             for p in self.parts
         )
-        about = without_scene() if self.scene is None else self.scene.substitutes()
-        about |= NO_FOLLOWER | (IN_DOUBLE if self.single is None else in_single(self.single))
+        about = dict(WITHOUT_SCENE) if self.scene is None else self.scene.substitutes()
+        about |= IN_DOUBLE if self.single is None else in_single(self.single)
         about |= palm_marks(robot, self.prefix, about["REAL"])
         lower, upper = self._bounds
         single = self.single

@@ -101,7 +101,7 @@ def targets_header(solver: Solver, scene: SceneTargets | None = None, single: bo
     rows = []
     for target in stored(solver, scene):
         q0 = target["q0"] or solver.robot.home.tolist()
-        row = [str(int(value)) for value in (bool(target["q0"]), *(target[name] for name in whole))]
+        row = [str(int(target["q0"] is not None)), *(str(target[name]) for name in whole)]
         row += map(numbers, (target["points"], target["normals"], q0))
         row += [numbers(target["q"])] if answer else []
         if clearance:

@@ -45,13 +45,13 @@ int main(int count, char **words) {
   for (n = 0; n < most && now(CLOCK_MONOTONIC) - begun < seconds * 1e6; ++n) {
     double start;
     for (i = 0; i < @GUARD@_MOTORS; ++i) {
-      q[i] = @PREFIX@_lower[i] + @TO_REAL@random_part() * (@PREFIX@_upper[i] - @PREFIX@_lower[i]);
+      q[i] = @PREFIX@_lower[i] + @TO_REAL?@random_part() * (@PREFIX@_upper[i] - @PREFIX@_lower[i]);
     }
     @PREFIX@_contacts(&solver, q, points, normals);
     start = now(CLOCK_MONOTONIC);
     solved += @PREFIX@_solve(&solver, points, normals, 0) == @GUARD@_SOLVED;
     times[n] = (float) (now(CLOCK_MONOTONIC) - start);
-    sum += @AS_DOUBLE@times[n];
+    sum += @AS_DOUBLE?@times[n];
     memcpy(kept[n % SAMPLE], points, sizeof points);
     memcpy(kept[n % SAMPLE] + 3 * @GUARD@_FINGERS, normals, sizeof normals);
   }
@@ -64,8 +64,8 @@ int main(int count, char **words) {
   qsort(times, (size_t) n, sizeof *times, compare);
   printf("{\"targets\": %ld, \"solved\": %ld, \"cpu_mean\": %.3f, \"mean\": %.3f, \"median\": %.3f, \"p99\": %.3f, "
          "\"p99.9\": %.3f, \"max\": %.3f, \"unit\": \"us\", \"solver_bytes\": %ld}\n",
-         n, solved, cpu, sum / (double) n, @AS_DOUBLE@times[n / 2], @AS_DOUBLE@times[n * 99 / 100], @AS_DOUBLE@times[n * 999 / 1000],
-         @AS_DOUBLE@times[n - 1], (long) sizeof solver);
+         n, solved, cpu, sum / (double) n, @AS_DOUBLE?@times[n / 2], @AS_DOUBLE?@times[n * 99 / 100], @AS_DOUBLE?@times[n * 999 / 1000],
+         @AS_DOUBLE?@times[n - 1], (long) sizeof solver);
   free(times);
   return 0;
 }

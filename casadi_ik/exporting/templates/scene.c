@@ -22,7 +22,7 @@ void @PREFIX@_scene_init(@PREFIX@_solver *solver) {
     own->reach = OWN_REACH[i];
   }
   for (i = 0; i < @GUARD@_SCENE; ++i) solver->scene.solids[N_OWN + i].kind = @GUARD@_NOTHING;
-@FIRST_MARGIN@}
+@FIRST_MARGIN?@}
 
 int @PREFIX@_set_solid(@PREFIX@_solver *solver, int place, int kind, const scalar *size,
                        const scalar *pose, int grasped) {
@@ -43,7 +43,7 @@ int @PREFIX@_set_solid(@PREFIX@_solver *solver, int place, int kind, const scala
   return 0;
 }
 
-void @PREFIX@_set_margin(@PREFIX@_solver *solver, scalar margin) { solver->scene.margin = margin@MORE_MARGIN@; }
+void @PREFIX@_set_margin(@PREFIX@_solver *solver, scalar margin) { solver->scene.margin = margin@MORE_MARGIN?@; }
 
 void @PREFIX@_shapes(@PREFIX@_solver *solver, const scalar *q, scalar *places) {
   (void) @PREFIX@_place_kernel(q, places, &solver->memory);

@@ -22,14 +22,14 @@ void @PREFIX@_init(@PREFIX@_solver *solver) {
   memcpy(solver->ranges, TERMS + TERMS_LOWER, sizeof solver->ranges);
   solver->most = ALL_ROUNDS;
   solver->status = @GUARD@_BAD_INPUT;
-@SCENE_INIT@}
+@SCENE_INIT?@}
 
 void @PREFIX@_set_tolerance(@PREFIX@_solver *solver, int finger, scalar position, scalar angle) {
   int i;
   for (i = 0; i < N_FINGERS; ++i) {
     if (finger >= 0 && i != finger) continue;
-    solver->terms[i] = position@LESS_POSITION@;
-    solver->terms[N_FINGERS + i] = angle@LESS_ANGLE@;
+    solver->terms[i] = position@LESS_POSITION?@;
+    solver->terms[N_FINGERS + i] = angle@LESS_ANGLE?@;
   }
 }
 
@@ -45,7 +45,7 @@ int @PREFIX@_begin(@PREFIX@_solver *solver, const scalar *points, const scalar *
   memcpy(solver->here, q0 ? q0 : HOME, sizeof solver->here);
   memcpy(solver->terms + TERMS_LOWER, solver->ranges, sizeof solver->ranges);
   solver->terms[TERMS_NEAREST] = q0 ? 1 : 0;
-@SCENE_BEGIN@  if (!search_begin(solver)) solver->status = @GUARD@_BAD_INPUT;
+@SCENE_BEGIN?@  if (!search_begin(solver)) solver->status = @GUARD@_BAD_INPUT;
   return (int) solver->status;
 }
 
@@ -72,4 +72,4 @@ void @PREFIX@_contacts(@PREFIX@_solver *solver, const scalar *q, scalar *points,
   outputs[1] = normals;
   (void) @PREFIX@_contacts_kernel(&map, &solver->memory);
 }
-@PALM@
+@PALM?@

@@ -7,7 +7,7 @@ export const motors: readonly string[];
 export const lower: readonly number[];
 export const upper: readonly number[];
 export const home: readonly number[];
-@SCENE_SHAPES_DTS@
+@SCENE_SHAPES_DTS?@
 export const Status: {
   /** The target or q0 is malformed; nothing was solved. */
   readonly BAD_INPUT: -2;
@@ -21,16 +21,16 @@ export const Status: {
   readonly STALLED: 2;
   /** The budget of iterations is used up. */
   readonly ITERATION_LIMIT: 3;
-@SCENE_STATUS_DTS@};
-@FOLLOW_STATUS_DTS@
+@SCENE_STATUS_DTS?@};
+@FOLLOW_STATUS_DTS?@
 export interface Answer {
-  status: -2 | -1 | 0 | 1 | 2 | 3@SCENE_STATUS_TYPE@;
+  status: -2 | -1 | 0 | 1 | 2 | 3@SCENE_STATUS_TYPE?@;
   q: Float64Array;
   positionError: Float64Array;
   angleError: Float64Array;
   iterations: number;
   restarts: number;
-@SCENE_ANSWER_DTS@}
+@SCENE_ANSWER_DTS?@}
 
 export class Solver {
   /**
@@ -56,4 +56,4 @@ export class Solver {
   run(iterations: number): Answer;
   /** Where the fingertips are and which way they face. */
   contacts(q: ArrayLike<number>): { points: Float64Array; normals: Float64Array };
-@PALM_DTS@@SCENE_DTS@@FOLLOW_DTS@}
+@PALM_DTS?@@SCENE_DTS?@@FOLLOW_DTS?@}

@@ -11,7 +11,7 @@
  *
  * No heap, no locks, no input or output, no state outside the struct: solvers of several threads
  * do not know of each other. Lengths in metres, angles in radians, the robot's base frame.
-@PRECISION_NOTE@ */
+@PRECISION_NOTE?@ */
 #ifndef @GUARD@_H
 #define @GUARD@_H
 
@@ -38,18 +38,18 @@ enum {
 extern const char *const @PREFIX@_finger_names[@GUARD@_FINGERS];
 extern const char *const @PREFIX@_motor_names[@GUARD@_MOTORS];
 extern const @REAL@ @PREFIX@_lower[@GUARD@_MOTORS], @PREFIX@_upper[@GUARD@_MOTORS];
-@SCENE_TYPES@
+@SCENE_TYPES?@
 /* Room that the parts of a solver work in, one after the other. */
 typedef struct {
   @REAL@ w[@W@];
-@SCENE_ROOM@} @PREFIX@_memory;
+@SCENE_ROOM?@} @PREFIX@_memory;
 
 /* A solver. Read the answer: q, position_error, angle_error, beyond (by how much the worst motor or
  * joint is beyond its limits, negative within), iterations, restarts, status. Leave the rest. */
 typedef struct {
 @STRUCT@
   @REAL@ ranges[2 * @MOTORS@]; /* what set_range said: lower ends, then upper ends */
-@SCENE_FIELDS@  @PREFIX@_memory memory;
+@SCENE_FIELDS?@  @PREFIX@_memory memory;
 } @PREFIX@_solver;
 
 /* Makes a solver ready: tolerances @POSITION_TOLERANCE@ m and @ANGLE_TOLERANCE@ rad, the robot's limits. */
@@ -81,7 +81,7 @@ int @PREFIX@_solve(@PREFIX@_solver *solver, const @REAL@ *points, const @REAL@ *
 /* Where the fingertips are and which way they face: three numbers a finger each. The solver's
  * memory is used, nothing else of it. */
 void @PREFIX@_contacts(@PREFIX@_solver *solver, const @REAL@ *q, @REAL@ *points, @REAL@ *normals);
-@PALM_CALLS@@SCENE_CALLS@@FOLLOW_CALLS@
+@PALM_CALLS?@@SCENE_CALLS?@@FOLLOW_CALLS?@
 #ifdef __cplusplus
 }
 #endif

@@ -6,7 +6,7 @@ export const motors = Object.freeze([@MOTOR_NAMES@]);
 export const lower = Object.freeze(@LOWER_JSON@);
 export const upper = Object.freeze(@UPPER_JSON@);
 export const home = Object.freeze(@HOME_JSON@);
-@SCENE_SHAPES_JS@
+@SCENE_SHAPES_JS?@
 export const Status = Object.freeze({
   BAD_INPUT: -2,
   INVALID: -1,
@@ -14,8 +14,8 @@ export const Status = Object.freeze({
   SOLVED: 1,
   STALLED: 2,
   ITERATION_LIMIT: 3,
-@SCENE_STATUS_JS@});
-@FOLLOW_STATUS_JS@
+@SCENE_STATUS_JS?@});
+@FOLLOW_STATUS_JS?@
 async function compiled(source) {
   if (source instanceof WebAssembly.Module) return source;
   if (source === undefined) {
@@ -89,7 +89,7 @@ export class Solver {
     this._wasm.contacts();
     return { points: this._points.slice(), normals: this._normals.slice() };
   }
-@PALM_JS@@SCENE_JS@@FOLLOW_JS@
+@PALM_JS?@@SCENE_JS?@@FOLLOW_JS?@
   _ask(points, normals, q0) {
     filled(this._points, points, "points");
     filled(this._normals, normals, "normals");
@@ -104,6 +104,6 @@ export class Solver {
       angleError: this._angleError.slice(),
       iterations: this._wasm.iterations(),
       restarts: this._wasm.restarts(),
-@SCENE_ANSWER_JS@    };
+@SCENE_ANSWER_JS?@    };
   }
 }

@@ -12,7 +12,7 @@ static @PREFIX@_solver one, other;
 static int is_as_stored(const @PREFIX@_solver *solver, const target *stored) {
   return solver->status == stored->status && solver->iterations == stored->iterations
       && solver->restarts == stored->restarts
-@SCENE_TEST_SAME@      && (@SCENE_TEST_OR@!memcmp(solver->q, stored->q, sizeof stored->q));
+@SCENE_TEST_SAME?@      && (@SCENE_TEST_OR?@!memcmp(solver->q, stored->q, sizeof stored->q));
 }
 
 int main(void) {
@@ -20,7 +20,7 @@ int main(void) {
   double nothing[3 * @GUARD@_FINGERS] = {0};
   @PREFIX@_init(&one);
   @PREFIX@_init(&other);
-@SCENE_TEST_SET@  for (i = 0; i < TARGETS; ++i) {
+@SCENE_TEST_SET?@  for (i = 0; i < TARGETS; ++i) {
     const target *now = targets + i, *before = targets + (i + TARGETS - 1) % TARGETS;
     const double *q0 = now->near ? now->q0 : 0;
     solved += @PREFIX@_solve(&one, now->points, now->normals, q0) == @GUARD@_SOLVED;

@@ -5,13 +5,13 @@ import { Solver, Status } from "./@PREFIX@.js";
 const targets = JSON.parse(await readFile(new URL("./targets.json", import.meta.url), "utf8"));
 const solver = await Solver.load();
 const other = await Solver.load();
-@SCENE_TEST_SET@
+@SCENE_TEST_SET?@
 function differs(answer, target) {
   return (
     answer.status !== target.status ||
     answer.iterations !== target.iterations ||
     answer.restarts !== target.restarts ||
-@SCENE_TEST_SAME@    @SCENE_TEST_OR@target.q.some((value, i) => !Object.is(value, answer.q[i]))
+@SCENE_TEST_SAME?@    @SCENE_TEST_OR?@target.q.some((value, i) => !Object.is(value, answer.q[i]))
   );
 }
 

@@ -22,7 +22,7 @@ static int is_met(const @PREFIX@_solver *solver, const target *stored) {
   for (i = 0; i < @GUARD@_MOTORS; ++i) q[i] = (double) solver->q[i];
   if (judge(q, stored->points, stored->normals, position, angle, &beyond)) return 0;
   for (i = 0; i < @GUARD@_FINGERS; ++i) met &= position[i] <= POSITION && angle[i] <= ANGLE;
-@SCENE_TEST_SAME@  return met && beyond <= LIMITS;
+@SCENE_TEST_SAME?@  return met && beyond <= LIMITS;
 }
 
 int main(void) {
@@ -30,7 +30,7 @@ int main(void) {
   float nothing[3 * @GUARD@_FINGERS] = {0};
   @PREFIX@_init(&one);
   @PREFIX@_init(&other);
-@SCENE_TEST_SET@  for (i = 0; i < TARGETS; ++i) {
+@SCENE_TEST_SET?@  for (i = 0; i < TARGETS; ++i) {
     const target *now = targets + i, *before = targets + (i + TARGETS - 1) % TARGETS;
     float points[3 * @GUARD@_FINGERS], normals[3 * @GUARD@_FINGERS], here[@GUARD@_MOTORS];
     const float *q0 = now->near ? here : 0;

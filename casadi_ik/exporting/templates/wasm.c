@@ -47,4 +47,4 @@ void set_tolerance(int finger, double position, double angle) {
 void set_range(int motor, double lower, double upper) {
   @PREFIX@_set_range(&solver, motor, lower, upper);
 }
-@PALM_WASM@@SCENE_WASM@@FOLLOW_WASM@
+@PALM_WASM?@@SCENE_WASM?@@FOLLOW_WASM?@
