@@ -8,6 +8,8 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
+from trimesh import Trimesh
+from trimesh.graph import smooth_shade
 
 from casadi_ik.arrays import Array
 from casadi_ik.grasps.shapes import capsule_mesh, circle, tube_mesh
@@ -161,29 +163,8 @@ def sharp(body: Surface, degrees: float = 35.0) -> Surface:
         body: The surface.
         degrees: Faces that meet at a larger angle meet at an edge.
     """
-    corners = body.points[body.triangles]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    areas = np.linalg.norm(normals, axis=1)
-    kept = areas > 1e-12
-    corners = corners[kept].reshape(-1, 3)
-    normals = np.repeat(normals[kept] / areas[kept, None], 3, axis=0)
-    # Places and sides as whole numbers of 63 bits, which are sorted ten times as fast as rows.
-    steps = (2**21 - 1) / max(float(np.ptp(corners, axis=0).max()), 1e-9)
-    cells = np.round(steps * (corners - corners.min(axis=0))).astype(np.int64)
-    cells = cells @ np.array([2**42, 2**21, 1])
-    _, place, counts = np.unique(cells, return_inverse=True, return_counts=True)
-    # All pairs of corners at the same place: corners of one side have the same mean normal.
-    size, order = counts[place], np.argsort(place, kind="stable")
-    one = np.repeat(np.arange(len(place)), size)
-    rank = np.arange(len(one)) - np.repeat(np.cumsum(size) - size, size)
-    other = order[(np.cumsum(counts) - counts)[place[one]] + rank]
-    alike = (normals[one] * normals[other]).sum(axis=1) > np.cos(np.deg2rad(degrees))
-    mean = np.zeros_like(normals)
-    np.add.at(mean, one[alike], normals[other[alike]])
-    mean /= np.linalg.norm(mean, axis=1, keepdims=True)
-    sides = np.round(1e3 * (mean + 1)).astype(np.int64) @ np.array([2**22, 2**11, 1])
-    _, first, of = np.unique(place * 2**33 + sides, return_index=True, return_inverse=True)
-    return Surface(corners[first], of.reshape(-1, 3))
+    found = smooth_shade(Trimesh(body.points, body.triangles), angle=np.deg2rad(degrees))
+    return Surface(np.asarray(found.vertices), np.asarray(found.faces))
 
 
 def coarser(body: Surface, most: int = 3000) -> Surface:

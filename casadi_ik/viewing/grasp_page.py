@@ -37,7 +37,7 @@ from casadi_ik.viewing.drawn import (
     usable,
 )
 from casadi_ik.viewing.newest import LOOKS, PAUSE, REST
-from casadi_ik.viewing.page import DraggedPage
+from casadi_ik.viewing.page import DraggedPage, in_turn
 from casadi_ik.viewing.panel import (
     Q_FORMATS,
     bars,
@@ -155,28 +155,21 @@ class GraspPage(DraggedPage):
         things = [] if thing is None or pose is None else [thing.at(pose)]
         return cameras(self.robot, self.answer.q, things)
 
-    # What a browser asks for: put down, and done when it is its turn.
-
+    @in_turn
     def drag_motors(self, q: Array) -> None:
         """The motors set by hand to q (n,): nothing is solved."""
+        self._by_hand = True
+        self.answer = self._answerer.judged(self.asked, q)
 
-        def work() -> None:
-            self._by_hand = True
-            self.answer = self._answerer.judged(self.asked, q)
-
-        self.work.put("motors", work)
-
+    @in_turn
     def choose(self, name: str) -> None:
         """Another of the candidates."""
+        self.remember()
+        one, now = self.candidates[name], self.asked
+        q = self.robot.home if one.q is None else one.q
+        self.restore((request_of(self.robot, one.grasp, q, now.scene, now.settings), q))
 
-        def work() -> None:
-            self.remember()
-            one, now = self.candidates[name], self.asked
-            q = self.robot.home if one.q is None else one.q
-            self.restore((request_of(self.robot, one.grasp, q, now.scene, now.settings), q))
-
-        self.work.put("candidate", work)
-
+    @in_turn
     def open(
         self, robot: str | None = None, grasp: str | None = None, scene: str | None = None
     ) -> None:
@@ -184,17 +177,13 @@ class GraspPage(DraggedPage):
 
         A robot comes with the first of its grasps, or as it stands at home.
         """
-
-        def work() -> None:
-            try:
-                page = self._opened(robot, grasp, scene)
-            except CasadiIKError as error:
-                for client in self.server.get_clients().values():
-                    client.add_notification("Cannot be opened", str(error), color="red")
-                return
-            self.opened(page)
-
-        self.work.put("open", work)
+        try:
+            page = self._opened(robot, grasp, scene)
+        except CasadiIKError as error:
+            for client in self.server.get_clients().values():
+                client.add_notification("Cannot be opened", str(error), color="red")
+            return
+        self.opened(page)
 
     def _opened(self, robot: str | None, grasp: str | None, scene: str | None) -> GraspPage:
         body = self.robot if robot is None else load_robot(robot)
@@ -214,40 +203,32 @@ class GraspPage(DraggedPage):
         self.work.stop()
         return page
 
+    @in_turn
     def show_solution(self, number: int) -> None:
         """One of the solutions, from 0."""
+        if number < len(self.solutions):
+            chosen = self.solutions[number]
+            self._by_hand = True
+            found = self._answerer.judged(self.asked, chosen.q)
+            word = "SOLVED" if found.success else found.headline
+            self.answer = replace(found, headline=word)
+            self._panel.tell_solution(number, chosen)
 
-        def work() -> None:
-            if number < len(self.solutions):
-                chosen = self.solutions[number]
-                self._by_hand = True
-                found = self._answerer.judged(self.asked, chosen.q)
-                word = "SOLVED" if found.success else found.headline
-                self.answer = replace(found, headline=word)
-                self._panel.tell_solution(number, chosen)
-
-        self.work.put("solution", work)
-
+    @in_turn
     def show_ghosts(self, on: bool) -> None:
         """Show all solutions at once, or one."""
+        self._ghostly = on
+        self._draw_ghosts()
 
-        def work() -> None:
-            self._ghostly = on
-            self._draw_ghosts()
-
-        self.work.put("ghosts", work)
-
+    @in_turn
     def compare(self, method: str) -> None:
         """Show beside it what another method answers to the same request; "nothing": none."""
+        self.beside = method
 
-        def work() -> None:
-            self.beside = method
-
-        self.work.put("beside", work)
-
+    @in_turn
     def show_skin(self, name: str) -> None:
         """Draw the robot by its bodies, or by what collisions are checked with."""
-        self.work.put("skin", lambda: self._drawn.skin(name))
+        self._drawn.skin(name)
 
     # What the thread does.
 

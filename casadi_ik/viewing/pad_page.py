@@ -27,7 +27,7 @@ from casadi_ik.importing.surfaces import Surface, together
 from casadi_ik.robots.load import load_description
 from casadi_ik.viewing.access import Server
 from casadi_ik.viewing.drawn import DrawnRobot, Handles, cameras, light_lamp
-from casadi_ik.viewing.page import DraggedPage
+from casadi_ik.viewing.page import DraggedPage, in_turn
 from casadi_ik.viewing.panel import block, legend, on_press, on_set
 from casadi_ik.viewing.request import PageRequest, request_of
 
@@ -124,23 +124,20 @@ class PadPage(DraggedPage):
 
         self.change(f"skin {finger}", put)
 
+    @in_turn
     def save(self) -> None:
         """Write what was changed into the description."""
-
-        def work() -> None:
-            changed = {name: self.pads(self.asked)[name] for name in self.changed}
-            if not changed:
-                self.said = "nothing was changed"
-                return
-            try:
-                save_pads(self.path, changed)
-            except CasadiIKError as error:
-                self.said = str(error)
-                return
-            self._first = self.asked
-            self.said = f"saved to {self.path.name}: {', '.join(changed)}"
-
-        self.work.put("save", work)
+        changed = {name: self.pads(self.asked)[name] for name in self.changed}
+        if not changed:
+            self.said = "nothing was changed"
+            return
+        try:
+            save_pads(self.path, changed)
+        except CasadiIKError as error:
+            self.said = str(error)
+            return
+        self._first = self.asked
+        self.said = f"saved to {self.path.name}: {', '.join(changed)}"
 
     @property
     def changed(self) -> list[str]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from functools import partial, wraps
+from typing import Any, Concatenate, ParamSpec
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
@@ -15,6 +16,22 @@ from casadi_ik.viewing.request import PageRequest
 
 KEPT = 200
 """Steps that can be taken back."""
+
+
+P = ParamSpec("P")
+
+
+def in_turn(method: Callable[Concatenate[Any, P], None]) -> Callable[Concatenate[Any, P], None]:
+    """A page's method that a browser asks for: put down, done by the page's thread in its turn.
+
+    Of several calls that wait the newest counts.
+    """
+
+    @wraps(method)
+    def put(page: Page, *args: P.args, **named: P.kwargs) -> None:
+        page.work.put(method.__name__, partial(method, page, *args, **named))
+
+    return put
 
 
 class Page:
@@ -100,8 +117,6 @@ class DraggedPage(Page):
         self._past = [self.state()]
         super().begin(*later, (REST, self.remember))
 
-    # What a browser asks for: put down, and done when it is its turn.
-
     def drag(self, name: str, pose: Array) -> None:
         """A contact, the object or something in the scene dragged to a (4, 4) pose."""
         self.change(name, lambda asked: asked.moved(name, pose), name)
@@ -131,45 +146,33 @@ class DraggedPage(Page):
 
         self.work.put(key, work)
 
+    @in_turn
     def select(self, name: str) -> None:
         """Give something its handles; "" takes them all away."""
+        self.held = name
+        self.selected(name)
 
-        def work() -> None:
-            self.held = name
-            self.selected(name)
-
-        self.work.put("selected", work)
-
+    @in_turn
     def undo(self) -> None:
         """Take the last step back."""
+        self.remember()
+        if len(self._past) > 1:
+            self._future.append(self._past.pop())
+            self.restore(self._past[-1])
 
-        def work() -> None:
-            self.remember()
-            if len(self._past) > 1:
-                self._future.append(self._past.pop())
-                self.restore(self._past[-1])
-
-        self.work.put("undo", work)
-
+    @in_turn
     def redo(self) -> None:
         """Do again what was taken back."""
+        self.remember()
+        if self._future:
+            self._past.append(self._future.pop())
+            self.restore(self._past[-1])
 
-        def work() -> None:
-            self.remember()
-            if self._future:
-                self._past.append(self._future.pop())
-                self.restore(self._past[-1])
-
-        self.work.put("redo", work)
-
+    @in_turn
     def reset(self) -> None:
         """Back to what was asked first; that can be taken back, too."""
-
-        def work() -> None:
-            self.remember()
-            self.restore(self._past[0])
-
-        self.work.put("reset", work)
+        self.remember()
+        self.restore(self._past[0])
 
     def add_steps(self) -> None:
         """Buttons that take steps back, do them again and begin anew; keys for the first two."""

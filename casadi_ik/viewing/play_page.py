@@ -28,7 +28,7 @@ from casadi_ik.viewing.drawn import (
     cameras,
     light_lamp,
 )
-from casadi_ik.viewing.page import Page
+from casadi_ik.viewing.page import Page, in_turn
 from casadi_ik.viewing.panel import block, chart, legend, on_press, on_set, parts_of, verdict_rows
 from casadi_ik.viewing.request import PageRequest, request_of
 
@@ -302,13 +302,10 @@ class PlayPage(Page):
         self._player.start()
         self.show(self.start)
 
+    @in_turn
     def show(self, time: float) -> None:
         """Show an iteration or a time."""
-
-        def work() -> None:
-            self.now = min(max(time, self.start), self.end)
-
-        self.work.put("time", work)
+        self.now = min(max(time, self.start), self.end)
 
     def play(self, on: bool) -> None:
         """Play on from here, from the beginning if this is the end; or stop."""

@@ -16,6 +16,7 @@ from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene
+from casadi_ik.drawing.drawables import with_object
 from casadi_ik.drawing.surfaces import facing
 from casadi_ik.errors import CasadiIKError, UnsupportedError
 from casadi_ik.grasps import Contact, Grasp, Tolerance
@@ -261,9 +262,7 @@ class Answerer:
         """Take the robot."""
         self.robot = robot
         self._solver = lru_cache(maxsize=16)(self._built)
-        # An object's file is read once, wherever it is dragged to.
-        self._alone = lru_cache(maxsize=16)(lambda name: Scene().holding(name, np.eye(4)))
-        self._in_scene: tuple[Scene | None, Solver] | None = None
+        self._in_scene: tuple[Settings, Scene, Solver] | None = None
 
     def solver(self, asked: PageRequest) -> Solver:
         """The solver for a question; one in the scene of the last is that one with things moved.
@@ -274,20 +273,17 @@ class Answerer:
         settings, scene = asked.settings, asked.scene
         if scene is None:
             return self._solver(settings, None)
-        known = self._in_scene
-        if known is None or not _alike(known[1], settings, known[0], scene):
+        if self._in_scene is None or not _alike(self._in_scene, settings, scene):
             solver = self._solver(settings, scene)
         else:
-            solver = known[1]
+            _, before, solver = self._in_scene
             for name, item in scene.items.items():
-                before = known[0]
-                assert before is not None
                 if item is not before.items[name]:
                     solver = solver.moved(name, item.pose)
-        self._in_scene = scene, solver
+        self._in_scene = settings, scene, solver
         return solver
 
-    def solve(self, asked: PageRequest, q: Array, solver: Solver | None = None) -> Answer:
+    def solve(self, asked: PageRequest, q: Array, diagnose: bool = False) -> Answer:
         """The answer nearest to q, or the preferred one, or the nearest to one that was found.
 
         Why there is none takes up to a second to find out: `explain` tells.
@@ -295,7 +291,25 @@ class Answerer:
         Raises:
             CasadiIKError: The question is malformed.
         """
-        return self._answered(asked, q, solver or self.solver(asked), diagnose=False)
+        solution = self._preferred(asked, q, diagnose)
+        shown = solution.q
+        if solution.diagnosis is not None and solution.status is not Status.COLLISION:
+            shown = solution.diagnosis.q
+        if not np.isfinite(shown).all():
+            shown = q
+        words = f"{solution.method} · {counted(solution.iterations, 'iteration')}"
+        if solution.restarts:
+            words += f" · {counted(solution.restarts, 'restart')}"
+        missed = not (diagnose or solution.success or solution.status is Status.COLLISION)
+        return replace(
+            self.judged(asked, shown),
+            success=solution.success,
+            headline=NOT_MET if missed else solution.status.name.replace("_", " "),
+            lines=why_not(solution),
+            seconds=solution.time,
+            how=words,
+            unexplained=not (diagnose or solution.success),
+        )
 
     def explain(self, asked: PageRequest, q: Array) -> Answer:
         """The same with why a grasp is not solved and what would help.
@@ -306,44 +320,13 @@ class Answerer:
         Raises:
             CasadiIKError: The question is malformed.
         """
-        solver = self.solver(asked)
-        found = self._answered(asked, q, solver, diagnose=True)
-        if found.success:
+        found, shown = self.solve(asked, q, diagnose=True), self.judged(asked, q)
+        if found.success or _missed(shown) > 1.02 * _missed(found):
             return found
-        shown = self.judged(asked, q, solver)
-        if _missed(shown) > 1.02 * _missed(found):
-            return found
-        return replace(
-            found,
-            q=q,
-            contacts=shown.contacts,
-            clearance=shown.clearance,
-            closest=shown.closest,
-        )
+        kept = {name: getattr(shown, name) for name in ("contacts", "clearance", "closest")}
+        return replace(found, q=q, **kept)
 
-    def _answered(self, asked: PageRequest, q: Array, solver: Solver, diagnose: bool) -> Answer:
-        solution = self._preferred(solver, asked.grasp, q, asked, diagnose)
-        shown = solution.q
-        if solution.diagnosis is not None and solution.status is not Status.COLLISION:
-            shown = solution.diagnosis.q
-        if not np.isfinite(shown).all():
-            shown = q
-        found = self.judged(asked, shown, solver)
-        words = f"{solution.method} · {counted(solution.iterations, 'iteration')}"
-        if solution.restarts:
-            words += f" · {counted(solution.restarts, 'restart')}"
-        missed = not (diagnose or solution.success or solution.status is Status.COLLISION)
-        return replace(
-            found,
-            success=solution.success,
-            headline=NOT_MET if missed else solution.status.name.replace("_", " "),
-            lines=why_not(solution),
-            seconds=solution.time,
-            how=words,
-            unexplained=not (diagnose or solution.success),
-        )
-
-    def judged(self, asked: PageRequest, q: Array, solver: Solver | None = None) -> Answer:
+    def judged(self, asked: PageRequest, q: Array) -> Answer:
         """How a configuration meets what is asked."""
         tolerances = tolerances_by_finger(asked.settings.tolerance, self.robot.fingers)
         enforced = asked.settings.limits == "enforce"
@@ -358,48 +341,42 @@ class Answerer:
             )
             for i, finger in enumerate(self.robot.fingers)
         }
-        clearance, closest, free = self._clear(asked, q, solver)
-        met = bool(verdict.solved(enforced)[0]) and free
-        word = "MET" if met else NOT_MET
-        checked = asked.scene is not None
-        return Answer(q, met, word, contacts, clearance=clearance, closest=closest, checked=checked)
+        found = Answer(q, bool(verdict.solved(enforced)[0]), "", contacts, checked=False)
+        if asked.scene is not None:
+            found = self._clear(asked, found)
+        return replace(found, headline="MET" if found.success else NOT_MET)
 
     def every(self, asked: PageRequest, q: Array) -> tuple[Alternative, ...]:
         """All solutions, by arm branch, swivel and hand posture; none from other methods."""
-        settings = asked.settings
         try:
-            return self.solver(asked).solve_all(asked.grasp, 64, settings.prefer, q)
+            return self.solver(asked).solve_all(asked.grasp, 64, asked.settings.prefer, q)
         except UnsupportedError:
             return ()
 
-    def _clear(
-        self, asked: PageRequest, q: Array, solver: Solver | None
-    ) -> tuple[float | None, tuple[tuple[str, str], Closest] | None, bool]:
-        if asked.scene is None:
-            return None, None, True
-        clear = (solver or self.solver(asked)).check(q, asked.grasp)
+    def _clear(self, asked: PageRequest, found: Answer) -> Answer:
+        """What is judged, with how far it is from touching something."""
+        clear = self.solver(asked).check(found.q, asked.grasp)
         pair = None if clear is None else clear.pair(0)
-        if clear is None or pair is None:
-            return None, None, True
-        distance, free = float(clear.distance[0]), bool(clear.free[0])
-        scene, other = asked.scene, pair[1]
-        if other == asked.object and asked.object_pose is not None:
-            known = scene if other in scene.items else self._alone(other)
-            scene = known.moved(other, asked.object_pose)
-        found = closest_points(self.robot, q, scene, pair)
-        return distance, None if found is None else (pair, found), free
+        if asked.scene is None or clear is None or pair is None:
+            return replace(found, checked=True)
+        points = closest_points(self.robot, found.q, with_object(asked.scene, asked.grasp), pair)
+        return replace(
+            found,
+            success=found.success and bool(clear.free[0]),
+            clearance=float(clear.distance[0]),
+            closest=None if points is None else (pair, points),
+            checked=True,
+        )
 
-    def _preferred(
-        self, solver: Solver, grasp: Grasp, q: Array, asked: PageRequest, diagnose: bool
-    ) -> Solution:
-        prefer = asked.settings.prefer
+    def _preferred(self, asked: PageRequest, q: Array, diagnose: bool) -> Solution:
+        solver, prefer = self.solver(asked), asked.settings.prefer
         if prefer == CLEARANCE and asked.scene is None:
             prefer = "q0"
         try:
-            return solver.solve(grasp, q, prefer=prefer, diagnose=diagnose)
+            return solver.solve(asked.grasp, q, prefer=prefer, diagnose=diagnose)
         except UnsupportedError:
             # A method that cannot choose takes the solution it comes to.
-            return solver.solve(grasp, q, diagnose=diagnose)
+            return solver.solve(asked.grasp, q, diagnose=diagnose)
 
     def _built(self, settings: Settings, scene: Scene | None) -> Solver:
         return Solver(self.robot, settings.method, settings.tolerance, settings.limits, scene=scene)
@@ -432,13 +409,11 @@ def why_not(solution: Solution) -> tuple[str, ...]:
     return (TOUCHES if solution.status is Status.COLLISION else MISSES,)
 
 
-def _alike(solver: Solver, settings: Settings, before: Scene | None, scene: Scene) -> bool:
+def _alike(known: tuple[Settings, Scene, Solver], settings: Settings, scene: Scene) -> bool:
     """Whether a solver differs from the one wanted in nothing but where things stand."""
+    solved_by, before, _ = known
     return (
-        before is not None
-        and solver.method == settings.method
-        and solver.limits == settings.limits
-        and set(solver.tolerances.values()) == {settings.tolerance}
+        replace(solved_by, prefer=settings.prefer) == settings
         and before.items.keys() == scene.items.keys()
         and before.margin == scene.margin
         and all(before.items[name].parts is one.parts for name, one in scene.items.items())
