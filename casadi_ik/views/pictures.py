@@ -119,7 +119,16 @@ def draw_solution(
         image = over(image, stage.shoot("hand", "object", "marks", "nearest", "touching"))
         axes = panel(figure, CLOSE, over(image, stage.shoot("marks", "nearest"), 0.45))
         seen = stage.project(robot.contacts(q)[0])
-    _label_fingers(axes, dict(zip(robot.fingers, seen, strict=True)), solution, grasp, ground)
+    asked = grasp.contacts or robot.fingers  # of a palm that is given all fingers follow
+    told = {
+        finger: (
+            _errors(verdict.position_error, verdict.angle_error),
+            palette.MET if verdict.ok else palette.MISSED,
+        )
+        for finger, verdict in solution.contacts.items()
+    }
+    spots = {one: place for one, place in zip(robot.fingers, seen, strict=True) if one in asked}
+    _label(axes, spots, 0.12, ground, told)
     _add_title(figure, solution, grasp, ground)
     _add_legend(figure, solution, grasp, bool(groups["object"]), scene is not None, ground)
     if path is not None:
@@ -331,7 +340,7 @@ def _pads_of(figure: Figure, robot: ArmHand, bottom: float, height: float) -> No
             image = over(image, stage.shoot("hand", "marks"), 0.45)
             places = stage.project(frames[:, :3, 3])
         axes = panel(figure, box, image)
-        _label_pads(axes, dict(zip(robot.fingers, places, strict=True)), pixels)
+        _label(axes, dict(zip(robot.fingers, places, strict=True)), 0.06)
 
 
 # What is on a picture.
@@ -425,41 +434,37 @@ def panel(figure: Figure, box: Box, image: Image) -> Axes:
 # What is written on it.
 
 
-def _label_fingers(
-    axes: Axes, places: dict[str, Array], solution: Solution, grasp: Grasp, ground: Ground
+def _label(
+    axes: Axes,
+    places: Mapping[str, Array],
+    step: float,
+    ground: Ground = LIGHT,
+    below: Mapping[str, tuple[str, str]] | None = None,
 ) -> None:
-    """Name and errors of every finger, at the edge of the picture with a line to its contact."""
+    """The fingers' names at the edges of a picture, a line from each to its place.
+
+    Args:
+        axes: With the picture.
+        places: (2,) by finger [pixel].
+        step: Between two names, as a part of the picture's height.
+        ground: What the picture is drawn on.
+        below: What is said below a name, and its colour.
+    """
     height, width = axes.images[0].get_size()
-    asked = grasp.contacts or places  # of a palm that is given all fingers follow
-    seen = {finger: place for finger, place in places.items() if finger in asked}
+    middle = float(np.median([x for x, _ in places.values()]))
     lowest = {"left": -np.inf, "right": -np.inf}
-    for finger, (x, y) in sorted(seen.items(), key=lambda item: item[1][1]):
-        verdict = solution.contacts[finger]
-        side = "right" if x > width / 2 else "left"
-        level = lowest[side] = max(y, lowest[side] + 0.12 * height, 0.08 * height)
+    for finger, (x, y) in sorted(places.items(), key=lambda item: float(item[1][1])):
+        side = "right" if x > middle else "left"
+        level = lowest[side] = max(y, lowest[side] + step * height, 0.67 * step * height)
         edge, shoulder = (0.985, 0.825) if side == "right" else (0.015, 0.175)
         above = {"ha": side, "va": "bottom", "size": 11, "color": ground.ink, "weight": "bold"}
         axes.text(edge * width, level - 0.006 * height, finger, **above)
-        color = palette.MET if verdict.ok else palette.MISSED
-        below = {"ha": side, "va": "top", "size": 9.5, "color": color}
-        errors = _errors(verdict.position_error, verdict.angle_error)
-        axes.text(edge * width, level + 0.006 * height, errors, **below)
+        if below is not None:
+            said, color = below[finger]
+            look = {"ha": side, "va": "top", "size": 9.5, "color": color}
+            axes.text(edge * width, level + 0.006 * height, said, **look)
         line = [edge * width, shoulder * width, x], [level, level, y]
         axes.plot(*line, color=ground.faint, lw=0.8, alpha=0.8)
-
-
-def _label_pads(axes: Axes, places: Mapping[str, Array], pixels: tuple[int, int]) -> None:
-    """The fingers' names at the edges, a line from each to its pad."""
-    width, height = pixels
-    middle = float(np.median([x for x, _ in places.values()]))
-    for side, edge, sign in (("left", 0.01, 1), ("right", 0.99, -1)):
-        chosen = [item for item in places.items() if (item[1][0] <= middle) == (side == "left")]
-        level = 0.0
-        for name, (x, y) in sorted(chosen, key=lambda item: float(item[1][1])):
-            level = max(float(y), level + 0.06 * height, 0.03 * height)
-            axes.text(edge * width, level, name, ha=side, va="center", size=10, color=palette.INK)
-            start = (edge + sign * 0.011 * len(name) + sign * 0.02) * width
-            axes.plot([start, x], [level, y], color=palette.FAINT, lw=0.8)
     axes.set_xlim(0, width)
     axes.set_ylim(height, 0)
 

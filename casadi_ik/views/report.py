@@ -283,16 +283,13 @@ def groups_of(log: Log) -> tuple[Group, ...]:
     """
     found = []
     for part in log.solves().parts:
-        whole = _group(part)
-        origins = part.origins
-        folders = [ALL] if origins is None else [str(PurePath(name).parent) for name in origins]
-        names = [ALL if folder == "." else folder for folder in folders]
-        known = list(dict.fromkeys(names))
+        folders = [str(PurePath(name).parent) for name in part.origins or ()]
+        known = list(dict.fromkeys(folders))
         if len(known) <= 1:
-            found.append(whole)
+            found.append(_group(part, ALL))
             continue
-        kept = np.array(names)
-        found += [_rows(whole, name, kept == name) for name in known]
+        of = np.array(folders)
+        found += [_group(part.where(of == name), ALL if name == "." else name) for name in known]
     return tuple(found)
 
 
@@ -320,7 +317,7 @@ def _error(group: Group) -> Array:
     return np.where(group.success, 0.0, np.nan_to_num(group.worst, nan=0.0))
 
 
-def _group(part: MethodRows) -> Group:
+def _group(part: MethodRows, name: str) -> Group:
     rows = part.rows
     known = list(part.labels["events"])
     hits, leavings = (
@@ -330,24 +327,22 @@ def _group(part: MethodRows) -> Group:
         for kind in (EventKind.LIMIT_HIT, EventKind.LIMIT_LEFT)
     )
     singular = [known.index(kind.name) for kind in SINGULAR if kind.name in known]
-    share = np.fmax(
-        _largest(rows["position_error"] / rows["position_tolerance"]),
-        _largest(rows["angle_error"] / rows["angle_tolerance"]),
-    )
+    # What is free is NaN and counts for nothing.
+    shares = [rows[f"{kind}_error"] / rows[f"{kind}_tolerance"] for kind in ("position", "angle")]
     points = rows["target_points"]
     there: Bools = np.all(np.isfinite(points), axis=2)
     total = np.where(there[:, :, None], points, 0.0).sum(axis=1)
     counted = there.sum(axis=1)[:, None]
     return Group(
         method=part.method,
-        name=ALL,
+        name=name,
         solve_id=part.solve_id,
         success=rows["success"] > 0,
         singular=np.any(rows["events"][:, singular], axis=1),
         iterations=rows["iterations"].astype(np.int64),
         restarts=rows["restarts"].astype(np.int64),
         time=rows["time"].astype(float),
-        worst=share,
+        worst=np.fmax.reduce(np.concatenate(shares, axis=1), axis=1),
         centre=np.where(counted > 0, total / np.maximum(counted, 1), np.nan),
         status=np.array(part.labels["status"])[rows["status"]],
         fingers=tuple(part.labels["position_error"]),
@@ -355,18 +350,6 @@ def _group(part: MethodRows) -> Group:
         limited=(rows["limits_ok"] == 0) | (hits > leavings),
         touching=rows["clearance"] < 0 if "clearance" in part.names else rows["success"] > 1,
     )
-
-
-def _largest(values: Array) -> Array:
-    """(k,) of (k, f), free ones aside; NaN where all are."""
-    return np.fmax.reduce(values, axis=1)
-
-
-def _rows(group: Group, name: str, chosen: Bools) -> Group:
-    arrays = {
-        key: value[chosen] for key, value in vars(group).items() if isinstance(value, np.ndarray)
-    }
-    return Group(method=group.method, name=name, fingers=group.fingers, **arrays)
 
 
 # Figures.
