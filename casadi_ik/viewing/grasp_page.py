@@ -15,7 +15,7 @@ from casadi_ik.answers.solution import Alternative
 from casadi_ik.arm_hand import ArmHand, load_robot
 from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene, load_scene
-from casadi_ik.drawing.drawables import lowest, object_of
+from casadi_ik.drawing.drawables import lowest, meshes_of, object_of
 from casadi_ik.errors import CasadiIKError
 from casadi_ik.files.shipped import shipped_names
 from casadi_ik.grasps import Tolerance, load_grasp
@@ -547,7 +547,8 @@ class Panel:
             gui.add_dropdown("Scene", scenes),
             lambda name: page.open(scene="" if name == "none" else str(name)),
         )
-        on_set(gui.add_dropdown("Robot as", SKINS), page.show_skin)
+        if meshes_of(robot.description):  # else its bodies are what collisions are checked with
+            on_set(gui.add_dropdown("Robot as", SKINS), page.show_skin)
         page.add_dark()
         on_press(gui.add_button("Save grasp (YAML)", icon=None), self._save_grasp)
         if isinstance(scene, Scene):
