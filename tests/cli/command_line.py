@@ -24,6 +24,11 @@ class Run:
     out: str
     err: str
 
+    def fine(self) -> Run:
+        """The same, after making sure that it is done without a word on stderr."""
+        assert (self.exit, self.err) == (0, ""), self
+        return self
+
     @property
     def error(self) -> str:
         """The one line of a refusal, behind the program's name."""

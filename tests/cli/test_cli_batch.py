@@ -21,8 +21,7 @@ def test_all_solved(
     run: Command, target_file: TargetFile, robot: ik.ArmHand, tmp_path: Path
 ) -> None:
     out, log = tmp_path / "solved.npz", tmp_path / "solved.mcap"
-    done = run("batch", target_file(), *ROBOT, *FAST, "--out", out, "--log", log)
-    assert (done.exit, done.err) == (0, "")
+    done = run("batch", target_file(), *ROBOT, *FAST, "--out", out, "--log", log).fine()
     assert done.out.startswith("SOLVED  3 of 3 targets (100.0 %) of targets.npz: enhanced-dls")
     assert "99th percentile" in done.out
     assert "collision   not checked" in done.out
@@ -174,8 +173,7 @@ def test_a_table_needs_polars(
 def test_process(run_process: Command, target_file: TargetFile, tmp_path: Path) -> None:
     """A damaged end of the file is found before anything is solved, and nothing is left."""
     path, out = target_file(count=50), tmp_path / "o.npz"
-    done = run_process("batch", path, *ROBOT, "--out", out)
-    assert (done.exit, done.err) == (0, "")
+    done = run_process("batch", path, *ROBOT, "--out", out).fine()
     assert sorted(file.name for file in tmp_path.iterdir()) == ["o.npz", "targets.npz"]
     out.unlink()
     data = bytearray(path.read_bytes())

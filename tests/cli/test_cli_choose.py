@@ -42,8 +42,7 @@ def candidates(tmp_path: Path) -> Path:
 def test_the_best_are_written(run: Command, candidates: Path, tmp_path: Path) -> None:
     out = tmp_path / "ranked.json"
     words = ("choose", candidates, "--robot", ROBOT, *PLACE, "--out", out)
-    done = run(*words, "--limit", "3", "--per-candidate", "2")
-    assert (done.exit, done.err) == (0, "")
+    done = run(*words, "--limit", "3", "--per-candidate", "2").fine()
     assert done.out.startswith("FOUND")
     assert "collision not checked" in done.out
     found = json.loads(out.read_text())
@@ -112,8 +111,7 @@ def test_palms_of_a_table(run: Command, tmp_path: Path) -> None:
     path = tmp_path / "grasps.csv"
     path.write_text("\n".join(rows))
     words = ("choose", path, "--robot", ROBOT, "--out", out)
-    done = run(*words, "--limit", "3", "--per-candidate", "2")
-    assert (done.exit, done.err) == (0, "")
+    run(*words, "--limit", "3", "--per-candidate", "2").fine()
     found = json.loads(out.read_text())
     assert (found["candidates"], found["answered"]) == (8, 8)
     for one in found["ranked"]:

@@ -154,8 +154,7 @@ def test_what_robots_are_written_with_is_expanded(
         '<joint name="${name}_fixed" type="fixed"><parent link="palm"/><child link="${name}"/>'
         "</joint></xacro:macro></robot>"
     )
-    done = run("import", path, "--out", out, "--check")
-    assert (done.exit, done.err) == (0, ""), done
+    run("import", path, "--out", out, "--check").fine()
     found = ik.load_robot(out)
     assert found.links(found.home)["left_1"][2, 3] == pytest.approx(0.1)
     assert "more" in found.links(found.home)

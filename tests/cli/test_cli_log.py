@@ -33,8 +33,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory, robot: ik.ArmHand) -> Path:
 
 
 def test_solves_as_a_table(run_process: Command, folder: Path) -> None:
-    done = run_process("log", "solves", folder / "enhanced-dls.mcap", folder / "hand-first.mcap")
-    assert (done.exit, done.err) == (0, "")
+    done = run_process(
+        "log", "solves", folder / "enhanced-dls.mcap", folder / "hand-first.mcap"
+    ).fine()
     lines = done.out.splitlines()
     assert max(map(len, lines)) <= 80
     assert [line.strip() for line in lines if "-" in line and " " not in line.strip()] == [
@@ -59,8 +60,7 @@ def test_solves_tell_what_was_held(run: Command, robot: ik.ArmHand, tmp_path: Pa
 
 
 def test_events_as_a_table(run: Command, folder: Path) -> None:
-    done = run("log", "events", folder / "enhanced-dls.mcap", "--event", "PHASE_CHANGE")
-    assert (done.exit, done.err) == (0, "")
+    done = run("log", "events", folder / "enhanced-dls.mcap", "--event", "PHASE_CHANGE").fine()
     assert "on to hand alignment" in done.out
     assert max(map(len, done.out.splitlines())) <= 80
     none = run("log", "events", folder / "hand-first.mcap", "--event", "STALL", "--solve", 1)
@@ -68,8 +68,7 @@ def test_events_as_a_table(run: Command, folder: Path) -> None:
 
 
 def test_why(run_process: Command, folder: Path) -> None:
-    good = run_process("log", "why", folder / "enhanced-dls.mcap", "1")
-    assert (good.exit, good.err) == (0, "")
+    good = run_process("log", "why", folder / "enhanced-dls.mcap", "1").fine()
     assert "enhanced-dls, solve 1: solved after" in good.out
     assert "every contact is within tolerance" in good.out
     bad = run_process("log", "why", folder / "enhanced-dls.mcap", "--solve", "4")
@@ -82,8 +81,7 @@ def test_why(run_process: Command, folder: Path) -> None:
 
 def test_compare(run: Command, folder: Path) -> None:
     files = [folder / "hand-first.mcap", folder / "enhanced-dls.mcap"]
-    many = run("log", "compare", *files)
-    assert (many.exit, many.err) == (0, "")
+    many = run("log", "compare", *files).fine()
     assert "solved by both 3, by neither 1" in many.out
     one = run("log", "compare", *files, "--solve", 4)
     assert "hand-first, solve 4" in one.out
@@ -96,8 +94,7 @@ def test_compare(run: Command, folder: Path) -> None:
 def test_plot(run: Command, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for solve in (("--solve", 2), (2,)):
-        done = run("log", "plot", folder / "enhanced-dls.mcap", *solve)
-        assert (done.exit, done.err) == (0, "")
+        done = run("log", "plot", folder / "enhanced-dls.mcap", *solve).fine()
         assert done.out.split() == ["plot", "enhanced-dls-enhanced-dls-2.png"]
         picture = tmp_path / "enhanced-dls-enhanced-dls-2.png"
         assert picture.read_bytes()[:4] == b"\x89PNG"
@@ -106,8 +103,7 @@ def test_plot(run: Command, folder: Path, tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_export_for_a_viewer(run_process: Command, folder: Path, tmp_path: Path) -> None:
     log = folder / "enhanced-dls.mcap"
-    done = run_process("log", "export", log, "--solve", 1, "--out", "view.mcap")
-    assert (done.exit, done.err) == (0, "")
+    done = run_process("log", "export", log, "--solve", 1, "--out", "view.mcap").fine()
     assert done.out.split() == ["viewer", "view.mcap", "layout", "view.layout.json"]
     with (tmp_path / "view.mcap").open("rb") as stream:
         summary = make_reader(stream, validate_crcs=True).get_summary()
@@ -124,8 +120,7 @@ def test_export_of_tables(run: Command, folder: Path, tmp_path: Path) -> None:
         table = getattr(ik.logs.open(log), what)()
         for suffix, read in ((".parquet", pl.read_parquet), (".csv", pl.read_csv)):
             path = tmp_path / f"{what}{suffix}"
-            done = run("log", "export", log, "--what", what, "--out", path)
-            assert (done.exit, done.err) == (0, "")
+            run("log", "export", log, "--what", what, "--out", path).fine()
             assert read(path).height == len(table)
     path = tmp_path / "other"
     run("log", "export", log, "--to", "csv", "--phase", "hand-alignment", "--out", path)
@@ -144,7 +139,6 @@ def test_finish_and_merge(run: Command, folder: Path, tmp_path: Path) -> None:
     torn.write_bytes((folder / "torn" / "torn.mcap").read_bytes())
     assert "cut" in run("log", "finish", torn).out
     assert "whole already" in run("log", "finish", torn).out
-    done = run("log", "merge", torn, "--out", tmp_path / "all.mcap")
-    assert (done.exit, done.err) == (0, "")
+    done = run("log", "merge", torn, "--out", tmp_path / "all.mcap").fine()
     assert "of enhanced-dls" in done.out
     assert len(ik.logs.open(tmp_path / "all.mcap").solves()) == 4

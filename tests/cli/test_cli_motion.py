@@ -40,8 +40,7 @@ def test_contacts_are_followed_and_others_read_the_motion(
     found = {}
     for suffix in ("mcap", "npz", "csv"):
         out = tmp_path / f"motion.{suffix}"
-        done = run(*words, "--out", out)
-        assert (done.exit, done.err) == (0, "")
+        done = run(*words, "--out", out).fine()
         assert "following" in done.out
         found[suffix] = out
     arrays = np.load(found["npz"])
@@ -122,8 +121,7 @@ def test_the_motion_is_written(run: Command, tmp_path: Path) -> None:
     robot, out = ik.load_robot("kuka_lwr_barrett"), tmp_path / "way.mcap"
     gif = tmp_path / "way.gif"
     words = ("reach", "cup", "--scene", "table", "--out", out, "--period", "0.02")
-    done = run(*words, "--animation", gif)
-    assert (done.exit, done.err) == (0, "")
+    done = run(*words, "--animation", gif).fine()
     with Image.open(gif) as picture:
         assert (picture.format, picture.n_frames > 2) == ("GIF", True)
         first, last = (
@@ -167,8 +165,7 @@ def test_what_was_chosen_is_reached(run: Command, ranked: Path, tmp_path: Path) 
     assert reached
     rank, entry = reached[0]
     more = ("--direction", "0", "0", "-1", "--lift", "0.05", "--retreat", "0.05")
-    done = run(*words, "--rank", str(rank), *more)
-    assert (done.exit, done.err) == (0, "")
+    done = run(*words, "--rank", str(rank), *more).fine()
     found = np.load(out)
     assert set(found["part"]) == {"going", "coming", "closing", "lifting", "retreating"}
     assert (found["q"] == entry["solution"]["q"]).all(axis=1).any()

@@ -67,8 +67,7 @@ def test_import_and_solve(run_process: Command, tmp_path: Path, rng: np.random.G
     pytest.importorskip("pinocchio")
     arm(tmp_path)
     hand(tmp_path)
-    done = run_process("import", "arm.urdf", "hand.urdf", "--out", "mine.yaml", "--check")
-    assert (done.exit, done.err) == (0, ""), done
+    done = run_process("import", "arm.urdf", "hand.urdf", "--out", "mine.yaml", "--check").fine()
     words = done.out.split()
     for word in ("IMPORTED", "tool_flange:", "15", "GUESS", "library", "mine.yaml"):
         assert word in words, done.out
@@ -96,22 +95,19 @@ def test_import_and_solve(run_process: Command, tmp_path: Path, rng: np.random.G
 
 def test_the_arm_s_closed_form_is_said_and_its_lack_warned_of(run: Command, tmp_path: Path) -> None:
     path, out = arm(tmp_path), tmp_path / "mine.yaml"
-    done = run("import", path, hand(tmp_path), "--out", out)
-    assert (done.exit, done.err) == (0, "")
+    done = run("import", path, hand(tmp_path), "--out", out).fine()
     assert "spherical wrist" in done.out
     assert "no known closed form" not in done.out
     out.unlink()
     # The last two axes moved aside: no two of the last three meet any more.
     moved = path.read_text().replace("0.08 0 0", "0.08 0 0.06").replace("0.1 0 0", "0.1 0 0.05")
     path.write_text(moved)
-    done = run("import", path, hand(tmp_path), "--out", out)
-    assert (done.exit, done.err) == (0, "")
+    done = run("import", path, hand(tmp_path), "--out", out).fine()
     assert "no known closed form" in " ".join(done.out.split())
 
 
 def test_guessed_pads_are_on_the_skin_of_the_closing_side(run: Command, tmp_path: Path) -> None:
-    done = run("import", hand(tmp_path), "--out", tmp_path / "mine.yaml")
-    assert (done.exit, done.err) == (0, "")
+    run("import", hand(tmp_path), "--out", tmp_path / "mine.yaml").fine()
     text = (tmp_path / "mine.yaml").read_text()
     data = yaml.safe_load(text)
     assert text.count("GUESS") >= 5
@@ -150,8 +146,7 @@ def test_missing_meshes_are_named(run: Command, tmp_path: Path) -> None:
     mesh = '<collision><geometry><mesh filename="package://x/tip.stl"/></geometry></collision>'
     text = path.read_text().replace('<link name="ff_3">', f'<link name="ff_3">{mesh}')
     path.write_text(text)
-    done = run("import", path, "--out", tmp_path / "mine.yaml")
-    assert (done.exit, done.err) == (0, "")
+    done = run("import", path, "--out", tmp_path / "mine.yaml").fine()
     assert done.out.count("package://x/tip.stl") == 1
     assert "ROS_PACKAGE_PATH" in done.out
 
@@ -180,8 +175,7 @@ def test_a_humanoid_s_trunk_and_sides_are_found(
 ) -> None:
     pytest.importorskip("pinocchio")
     shipped, out = ik.load_robot("g1+dex3"), tmp_path / "mine.yaml"
-    done = run("import", humanoid(tmp_path, shipped), "--out", out, "--check")
-    assert (done.exit, done.err) == (0, "")
+    done = run("import", humanoid(tmp_path, shipped), "--out", out, "--check").fine()
     said = " ".join(done.out.split())
     for words in (
         "31 motors (3 trunk; left 7 arm, 7 hand; right 7 arm, 7 hand), 6 fingers",
@@ -205,8 +199,7 @@ def test_palms_of_a_body_are_named(run: Command, tmp_path: Path) -> None:
     robot = ik.load_robot("g1+dex3")
     path, out = humanoid(tmp_path, robot), tmp_path / "mine.yaml"
     palms = tuple(side.palm_link for side in robot.description.sides)
-    done = run("import", path, "--palm", *palms, "--out", out)
-    assert (done.exit, done.err) == (0, "")
+    run("import", path, "--palm", *palms, "--out", out).fine()
     sides = yaml.safe_load(out.read_text())["sides"]
     assert tuple(side["palm"]["link"] for side in sides.values()) == palms
     for words, says in (
@@ -276,8 +269,7 @@ def test_the_picture_of_a_body_has_all_its_hands(tmp_path: Path) -> None:
 @pytest.mark.opengl
 def test_picture(run: Command, tmp_path: Path) -> None:
     out, picture = tmp_path / "mine.yaml", tmp_path / "mine.png"
-    done = run("import", hand(tmp_path), "--out", out, "--picture", picture)
-    assert (done.exit, done.err) == (0, "")
+    run("import", hand(tmp_path), "--out", out, "--picture", picture).fine()
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "hand.urdf",
@@ -315,8 +307,7 @@ def test_a_relative_file_finds_its_meshes_and_a_propeller_is_no_thumb(
     monkeypatch.chdir(tmp_path)
     done = run(
         "import", "jaws/robot.urdf", "--palm", "tool_flange", "--out", "mine.yaml", "--check"
-    )
-    assert (done.exit, done.err) == (0, ""), done
+    ).fine()
     said = " ".join(done.out.split())
     assert "there is no such file (mesh 'package://jaws/meshes/none.stl')" in said
     assert "locked gripper: turns without end: no finger" in said
@@ -441,8 +432,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_name_is_its_file(run: Command, tmp_path: Path, package: Path) -> None:
-    done = run("import", "jaws_description", "--out", tmp_path / "mine.yaml")
-    assert (done.exit, done.err) == (0, ""), done
+    run("import", "jaws_description", "--out", tmp_path / "mine.yaml").fine()
     assert len(ik.load_robot(tmp_path / "mine.yaml").fingers) == 2
 
 

@@ -24,8 +24,7 @@ ROBOT = "kuka_lwr_barrett"
 
 
 def test_robots(run: Command, robot: ik.ArmHand) -> None:
-    done = run("robots")
-    assert (done.exit, done.err) == (0, "")
+    done = run("robots").fine()
     words = done.out.replace(",", " ").split()
     for name in (robot.name, *robot.fingers, *robot.actuators, "Kermani"):
         assert name in words
@@ -45,8 +44,7 @@ def test_robots(run: Command, robot: ik.ArmHand) -> None:
     ],
 )
 def test_lists(command: str, names: tuple[str, ...], run: Command) -> None:
-    done = run(command)
-    assert (done.exit, done.err) == (0, "")
+    done = run(command).fine()
     assert not set(names).difference(done.out.split())
     assert done.out.count("(default)") == (command == "methods")
 
@@ -65,8 +63,7 @@ def test_help(run: Command) -> None:
     found = ["", *commands(run)]
     assert {"solve", "batch", "view", "log", "log info", "log merge"} < set(found)
     for command in found:
-        done = run(*command.split(), "--help")
-        assert (done.exit, done.err) == (0, "")
+        done = run(*command.split(), "--help").fine()
         assert done.out.startswith(f"usage: casadi-ik {command}".rstrip())
         assert max(map(len, done.out.splitlines())) <= 80
         if "\ncommands:" in done.out:
@@ -116,8 +113,7 @@ def test_words_are_completed(words: str, found: set[str], tmp_path: Path) -> Non
 
 def test_completion_of_every_command(run: Command) -> None:
     for shell, start in (("bash", "_casadi_ik()"), ("zsh", "autoload"), ("fish", "complete -c")):
-        done = run("completion", shell)
-        assert (done.exit, done.err) == (0, "")
+        done = run("completion", shell).fine()
         assert done.out.startswith(start)
         for command in commands(run):
             assert command.rpartition(" ")[2] in done.out
@@ -159,8 +155,7 @@ def test_stdout_is_full() -> None:
 
 def test_poor_terminal(run_process: Command) -> None:
     environment = {**os.environ, "PYTHONIOENCODING": "ascii", "COLUMNS": "40"}
-    done = run_process("grasps", env=environment)
-    assert (done.exit, done.err) == (0, "")
+    done = run_process("grasps", env=environment).fine()
     assert done.out.isascii()
 
 

@@ -22,8 +22,7 @@ def test_solved_grasp(
     run: Command, grasp_file: GraspFile, robot: ik.ArmHand, tmp_path: Path
 ) -> None:
     out, log = tmp_path / "pinch.json", tmp_path / "pinch.mcap"
-    done = run("solve", grasp_file(), *FAST, "--out", out, "--log", log)
-    assert (done.exit, done.err) == (0, "")
+    done = run("solve", grasp_file(), *FAST, "--out", out, "--log", log).fine()
     assert done.out.startswith("SOLVED  pinch: enhanced-dls on kuka_lwr_barrett")
     assert "collision not checked" in done.out
     assert f"log      {log}" in done.out
@@ -120,8 +119,7 @@ def test_not_solved_says_why(run: Command, far_away: Path, tmp_path: Path) -> No
 
 def test_a_scene(run: Command, tmp_path: Path) -> None:
     out, scene = tmp_path / "cup.json", tmp_path / "balloon.yaml"
-    done = run("solve", "cup", "--scene", "table", "--out", out)
-    assert (done.exit, done.err) == (0, "")
+    done = run("solve", "cup", "--scene", "table", "--out", out).fine()
     assert "  clearance " in done.out
     answer = json.loads(out.read_text())
     assert answer["clearance"] >= 0
@@ -243,8 +241,7 @@ def test_units(run: Command, grasp_file: GraspFile, robot: ik.ArmHand, tmp_path:
     path, out = grasp_file(), tmp_path / "o.json"
     start = [f"{value:.17g}" for value in np.rad2deg(robot.home)]
     said = ("--tolerance-position", "2", "--tolerance-angle", "1")
-    done = run("solve", path, "--out", out, "--deg", "--mm", *said, "--q0", *start)
-    assert (done.exit, done.err) == (0, "")
+    done = run("solve", path, "--out", out, "--deg", "--mm", *said, "--q0", *start).fine()
     assert (done.out.count(" 2 mm "), done.out.count(" 1 deg ")) == (3, 3)
     in_mm = json.loads(out.read_text())
     said = ("--tolerance-position", "0.002", "--tolerance-angle", f"{math.radians(1):.17g}")
