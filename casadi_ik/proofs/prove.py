@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -25,12 +25,6 @@ from casadi_ik.proofs.premises import (
     motor_box,
 )
 from casadi_ik.proofs.proof import Proof, ProofKind
-from casadi_ik.proofs.quantities import (
-    RigidInvariant,
-    asked_values,
-    quantities_of,
-    rigid_invariants,
-)
 from casadi_ik.robots.description import RobotDescription
 
 
@@ -43,6 +37,8 @@ class ProverEffort:
         some: The same of searches with some of the fingers.
         most: The same of the last search, again with all fingers.
         alone: Boxes of each finger of a fixed hand, before any has more.
+        pair: Boxes of two fingers, looked at first: what contradicts each other by much.
+        one: Boxes of one finger, whose contact may be too far for the arm.
         subset: Fingers of more are looked at by so many, too: fewer motors to divide.
         chunk: Boxes that are looked at in one go: so many that calls cost little, few enough for
             a cache.
@@ -55,6 +51,8 @@ class ProverEffort:
     some: int = 3000
     most: int = 80_000
     alone: int = 200
+    pair: int = 100
+    one: int = 400
     subset: int = 3
     chunk: int = 4096
     together: int = 256
@@ -85,45 +83,6 @@ class _Found:
     reach: Bools
 
 
-class _Stated:
-    """What targets ask of a robot's quantities, and proofs with their numbers."""
-
-    def __init__(
-        self, robot: RobotDescription, kept: tuple[RigidInvariant, ...], targets: TargetBatch
-    ) -> None:
-        self._robot, self._kept, self._problems = robot, kept, targets
-        self._fixed = arm_span(robot) is None
-        self._asked, self._give = asked_values(robot, kept, targets)
-
-    def decided(self, known: Bools) -> list[Proof | None]:
-        """Proofs where a quantity decides by itself.
-
-        Args:
-            known: (k, f) which contacts count.
-        """
-        ends = np.array([[item.lower, item.upper] for item in self._kept]).reshape(-1, 2)
-        excess = np.maximum(ends[:, 0] - self._asked, self._asked - ends[:, 1]) - self._give
-        for column, item in enumerate(self._kept):
-            excess[~known[:, item.fingers].all(axis=1), column] = np.nan
-        found: list[Proof | None] = [None] * len(excess)
-        for row in np.flatnonzero((excess > 0).any(axis=1)).tolist():
-            item = self._kept[int(np.nanargmax(excess[row] / self._give[row]))]
-            kind = ProofKind.REACH if item.reach else ProofKind.HAND
-            found[row] = self.proof(row, kind, item.fingers, 1)
-        return found
-
-    def proof(self, row: int, kind: ProofKind, fingers: Sequence[int], boxes: int) -> Proof:
-        """A proof of one of the targets."""
-        return Proof(
-            kind=ProofKind.FINGER if self._fixed else kind,
-            fingers=tuple(self._robot.finger_names[i] for i in fingers),
-            quantities=quantities_of(self._kept, self._asked[row], self._give[row], fingers),
-            boxes=boxes,
-            tolerance=self._problems.tolerances,
-            target=self._problems.rows(slice(row, row + 1)),
-        ).sealed()
-
-
 class Prover:
     """Looks for proofs of impossibility on one robot.
 
@@ -137,7 +96,6 @@ class Prover:
         self._compiled = compiled
         self.space = HandSpace(robot)
         self._arm = arm_span(robot)
-        self._known: dict[tuple[bool, bytes], tuple[RigidInvariant, ...]] = {}
 
     def prove(
         self, targets: TargetBatch, holding: Array | None = None, most: Counts | None = None
@@ -169,8 +127,7 @@ class Prover:
             # Anywhere on a line or a plane: the point itself need not be reached.
             known &= np.isnan(targets.more[name][..., 0])
         known &= ~np.array(endless_fingers(self._robot, motor_box(self._robot, targets)))
-        stated = _Stated(self._robot, self._kept(targets), targets)
-        proofs = stated.decided(known)
+        proofs: list[Proof | None] = [None] * len(targets)
         for group, most in self._groups():
             chosen = np.zeros(known.shape[1], dtype=bool)
             chosen[group] = True
@@ -185,8 +142,14 @@ class Prover:
             for place in np.flatnonzero(result.proved).tolist():
                 row = int(rows[place])
                 kind = ProofKind.REACH if result.reach[place] else ProofKind.HAND
-                fingers = np.flatnonzero(asked[row]).tolist()
-                proofs[row] = stated.proof(row, kind, fingers, int(result.boxes[place]))
+                names = (self._robot.finger_names[i] for i in np.flatnonzero(asked[row]))
+                proofs[row] = Proof(
+                    kind=ProofKind.FINGER if self._arm is None else kind,
+                    fingers=tuple(names),
+                    boxes=int(result.boxes[place]),
+                    tolerance=targets.tolerances,
+                    target=targets.rows(slice(row, row + 1)),
+                ).sealed()
         return proofs
 
     def _groups(self) -> list[tuple[list[int], int]]:
@@ -195,20 +158,18 @@ class Prover:
         if self._arm is None:
             # One that reaches its contact must not take all the time before the one that does not.
             return [([i], most) for most in (EFFORT.alone, EFFORT.most) for i in fingers]
+        # Few fingers that contradict each other say more than all of them.
+        alone = [[[i] for i in fingers], list(map(list, combinations(fingers, 2)))]
+        few = [
+            (group, most)
+            for groups, most in zip((*alone, alone[0]), (1, EFFORT.pair, EFFORT.one), strict=True)
+            for group in groups
+            if len(group) < len(fingers)
+        ]
         if len(fingers) <= EFFORT.subset:
-            return [(fingers, EFFORT.most)]
+            return [*few, (fingers, EFFORT.most)]
         subsets = [(list(some), EFFORT.some) for some in combinations(fingers, EFFORT.subset)]
-        return [(fingers, EFFORT.first), *subsets, (fingers, EFFORT.most)]
-
-    def _kept(self, targets: TargetBatch) -> tuple[RigidInvariant, ...]:
-        """The robot's quantities; bounds are found once for limits and locked motors."""
-        fixed = b"" if targets.fixed is None else targets.fixed.tobytes()
-        key = targets.enforce_limits, fixed
-        if key not in self._known:
-            if len(self._known) >= 16:
-                self._known.clear()
-            self._known[key] = rigid_invariants(self._robot, targets)
-        return self._known[key]
+        return [*few, (fingers, EFFORT.first), *subsets, (fingers, EFFORT.most)]
 
     @cached_property
     def _test(self) -> FunctionKernel:
