@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -273,3 +274,13 @@ def test_the_time_is_that_of_a_warm_solve(run: Command, tmp_path: Path) -> None:
     first = solver.solve(ik.load_grasp("cup")).time
     assert seconds < first
     assert f"{seconds * 1e6:.3g} us" in done.out or f"{seconds * 1e3:.3g} ms" in done.out
+
+
+def test_without_a_scene_an_object_in_the_hand_is_said(run: Command, tmp_path: Path) -> None:
+    shipped = Path(__file__).parents[2] / "models" / "grasps" / "cup.yaml"
+    text = shipped.read_text(encoding="utf-8")
+    assert "0.126889040887" in text
+    moved = tmp_path / "moved.yaml"
+    moved.write_text(text.replace("0.126889040887", "0.086889040887"), encoding="utf-8")
+    assert "overlap" not in run("solve", shipped).out
+    assert re.search(r"the shapes of \w+ and cup overlap by [\d.]+ mm", run("solve", moved).out)
