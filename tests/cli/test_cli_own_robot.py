@@ -11,6 +11,7 @@ import pytest
 import trimesh
 import yaml
 from command_line import Command
+from imported_files import joint, link, urdf
 
 import casadi_ik as ik
 
@@ -18,18 +19,11 @@ PHALANX = """<collision><origin xyz="0 0 {middle}"/><geometry>
 <box size="0.02 0.016 {length}"/></geometry></collision>"""
 
 
-def link(name: str, inside: str = "") -> str:
-    return f'<link name="{name}">{inside}</link>\n'
-
-
-def joint(name: str, parent: str, child: str, xyz: str, axis: str, limits: str, **more: str) -> str:
-    ends = f'<parent link="{parent}"/><child link="{child}"/>'
+def moves(name: str, parent: str, child: str, xyz: str, axis: str, limits: str, **more: str) -> str:
+    """A joint between limits, or one that turns without end."""
     low, high = limits.split() if limits else ("", "")
-    limit = f'<limit lower="{low}" upper="{high}" velocity="0" effort="1"/>'
-    origin = f'<origin xyz="{xyz}" rpy="{more.get("rpy", "0 0 0")}"/>'
-    kind = more.get("kind", "revolute")
-    inner = f'{origin}{ends}<axis xyz="{axis}"/>{limit if kind == "revolute" else ""}'
-    return f'<joint name="{name}" type="{kind}">{inner}</joint>\n'
+    more |= {"limit": f'lower="{low}" upper="{high}" velocity="0" effort="1"'}
+    return joint(name, parent, child, xyz=xyz, axis=axis, **more)
 
 
 def hand(folder: Path, shapes: bool = True) -> Path:
@@ -38,29 +32,25 @@ def hand(folder: Path, shapes: bool = True) -> Path:
     text = link("palm")
     for name, x, side in (("ff", -0.03, -1), ("mf", 0.03, -1), ("opposed", 0.0, 1)):
         place, axis = f"{x} {0.04 * side} 0.05", f"{side} 0 0"
-        text += link(f"{name}_1") + link(f"{name}_2") + link(f"{name}_3", end)
-        text += joint(f"{name}_a", "palm", f"{name}_1", place, "0 1 0", "-0.3 0.3")
-        text += joint(f"{name}_b", f"{name}_1", f"{name}_2", "0 0 0.01", axis, "-0.1 1.4")
-        text += joint(f"{name}_c", f"{name}_2", f"{name}_3", "0 0 0.04", axis, "0 1.5")
-    path = folder / "hand.urdf"
-    path.write_text(f'<robot name="hand">{text}</robot>')
-    return path
+        text += link(f"{name}_1") + link(f"{name}_2") + link(f"{name}_3", inside=end)
+        text += moves(f"{name}_a", "palm", f"{name}_1", place, "0 1 0", "-0.3 0.3")
+        text += moves(f"{name}_b", f"{name}_1", f"{name}_2", "0 0 0.01", axis, "-0.1 1.4")
+        text += moves(f"{name}_c", f"{name}_2", f"{name}_3", "0 0 0.04", axis, "0 1.5")
+    return urdf(folder / "hand.urdf", text)
 
 
 def arm(folder: Path) -> Path:
     """Six joints, then a fixed flange; the last joint turns without end."""
-    text = link("base") + "".join(link(f"l{i}") for i in range(6)) + link("tool_flange")
+    text = link("base", *(f"l{i}" for i in range(6)), "tool_flange")
     links = ["base", *(f"l{i}" for i in range(6))]
     for i, axis in enumerate(("0 0 1", "0 1 0", "0 1 0", "1 0 0", "0 1 0", "1 0 0")):
         step = ("0 0 0.3", "0.05 0 0.1", "0 0 0.35", "0.3 0 0.05", "0.1 0 0", "0.08 0 0")[i]
         kind = "continuous" if i == 5 else "revolute"
-        text += joint(f"j{i}", links[i], links[i + 1], step, axis, "-2.5 2.5", kind=kind)
-    text += joint(
+        text += moves(f"j{i}", links[i], links[i + 1], step, axis, "-2.5 2.5", kind=kind)
+    text += moves(
         "f", "l5", "tool_flange", "0.05 0 0", "0 0 1", "0 0", kind="fixed", rpy="0 1.57 0"
     )
-    path = folder / "arm.urdf"
-    path.write_text(f'<robot name="arm">{text}</robot>')
-    return path
+    return urdf(folder / "arm.urdf", text)
 
 
 def test_import_and_solve(run_process: Command, tmp_path: Path, rng: np.random.Generator) -> None:
@@ -164,7 +154,7 @@ def humanoid(folder: Path, robot: ik.ArmHand) -> Path:
     """A body's file, to whose base a leg and a head are added."""
     text = robot.urdf().replace("</robot>", "")
     for name, kind in (("leg", "-1 -0.2"), ("head", "-0.5 0.5")):
-        text += link(name) + joint(name, robot.description.root, name, "0 0 1", "0 1 0", kind)
+        text += link(name) + moves(name, robot.description.root, name, "0 0 1", "0 1 0", kind)
     path = folder / "humanoid.urdf"
     path.write_text(text + "</robot>")
     return path
@@ -246,9 +236,9 @@ def test_refusals_leave_nothing(
     words, says = REFUSALS[case]
     monkeypatch.chdir(tmp_path)
     hand(tmp_path)
-    body = arm(tmp_path).read_text().partition('<link name="l0">')[2].removesuffix("</robot>")
-    other = f'<link name="l0">{body}'.replace('"l', '"m').replace('"j', '"k').replace('"f"', '"g"')
-    body = f'<link name="base"/><link name="l0">{body}{other.replace("tool_", "tool2_")}'
+    body = arm(tmp_path).read_text().partition('<link name="l0"/>')[2].removesuffix("</robot>\n")
+    other = f'<link name="l0"/>{body}'.replace('"l', '"m').replace('"j', '"k').replace('"f"', '"g"')
+    body = f'<link name="base"/><link name="l0"/>{body}{other.replace("tool_", "tool2_")}'
     Path("two.urdf").write_text(f'<robot name="two">{body}</robot>')
     before = sorted(tmp_path.iterdir())
     error = run("import", "--out", "mine.yaml", *words).error
@@ -283,14 +273,14 @@ def gripper(folder: Path) -> Path:
     path = arm(folder)
     text = path.read_text().replace("</robot>", "")
     body = '<collision><geometry><mesh filename="{}"/></geometry></collision>'
-    text += link("bar") + link("propeller", body.format("package://jaws/meshes/none.stl"))
-    text += joint("bar", "tool_flange", "bar", "0.04 0 0", "0 0 1", "0 0", kind="fixed")
-    text += joint("gripper", "tool_flange", "propeller", "0.02 0 0", "1 0 0", "", kind="continuous")
+    text += link("bar") + link("propeller", inside=body.format("package://jaws/meshes/none.stl"))
+    text += moves("bar", "tool_flange", "bar", "0.04 0 0", "0 0 1", "0 0", kind="fixed")
+    text += moves("gripper", "tool_flange", "propeller", "0.02 0 0", "1 0 0", "", kind="continuous")
     mimic = '<mimic joint="left" multiplier="-1"/></joint>'
     for side, mesh in (("left", "meshes/jaw.stl"), ("right", "package://jaws/meshes/jaw.stl")):
-        text += link(f"{side}_jaw", body.format(mesh))
+        text += link(f"{side}_jaw", inside=body.format(mesh))
         ends = "0.015 0.037" if side == "left" else "-0.037 -0.015"
-        jaw = joint(side, "bar", f"{side}_jaw", "0 0 0", "0 1 0", ends)
+        jaw = moves(side, "bar", f"{side}_jaw", "0 0 0", "0 1 0", ends)
         jaw = jaw.replace("revolute", "prismatic")
         text += jaw if side == "left" else jaw.replace("</joint>", mimic)
     path.write_text(text + "</robot>")
@@ -331,7 +321,7 @@ def test_a_missing_package_is_said_once(run: Command, tmp_path: Path) -> None:
     for name in ("ff_1", "mf_1", "opposed_1"):
         mesh = f'<mesh filename="package://shapes_of_it/meshes/{name}.stl"/>'
         shape = f"<collision><geometry>{mesh}</geometry></collision>"
-        text = text.replace(f'<link name="{name}">', f'<link name="{name}">{shape}')
+        text = text.replace(link(name), link(name, inside=shape))
     path.write_text(text)
     done = run("import", path, "--out", tmp_path / "mine.yaml")
     assert done.out.count("package 'shapes_of_it' is not found") == 1

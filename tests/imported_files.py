@@ -11,8 +11,9 @@ fingers:
 """
 
 
-def link(*names: str) -> str:
-    return "".join(f'<link name="{name}"/>\n' for name in names)
+def link(*names: str, inside: str = "") -> str:
+    end = f">{inside}</link>" if inside else "/>"
+    return "".join(f'<link name="{name}"{end}\n' for name in names)
 
 
 def joint(
