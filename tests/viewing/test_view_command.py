@@ -48,6 +48,21 @@ def test_a_grasp_and_a_robot(view) -> None:
     assert cup.url != robot.url
 
 
+def test_a_body_by_its_name_is_moved_part_by_part(view) -> None:
+    page = view("mobile_kuka_lwr_barrett").page
+    robot = page.robot
+    q = robot.home + 0.3 * (np.arange(len(robot.home)) == robot.actuators.index("base_yaw"))
+    page.drag_motors(q)
+    assert page.work.settle()
+    assert np.array_equal(page.answer.q, q)
+    named = [motor.label for motor in page._panel._motors]
+    assert len(named) == len(robot.actuators)
+    assert named[:2] == ["base_x [mm]", "base_y [mm]"]
+    assert "lwr_joint_1 [°]" in named  # its side is said once, above
+    # The hand is seen where the base has taken it.
+    assert np.linalg.norm(page.cameras()["Hand"].target - robot.palm(q, "arm")[:3, 3]) < 0.15
+
+
 def test_candidates_and_ranked_answers(view, robot: ik.ArmHand, tmp_path: Path) -> None:
     path = tmp_path / "candidates.yaml"
     path.write_text(CANDIDATES)

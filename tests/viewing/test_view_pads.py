@@ -67,9 +67,3 @@ def test_pads_that_are_not_stated_are_asked_for(tmp_path: Path) -> None:
     other.write_text("name: other\nhand: barrett_bh8_280\nfingers: [thumb]\n")
     with pytest.raises(errors.DescriptionError, match=r"other\.yaml: fingers: expected"):
         viewing.view_pads(other)
-
-
-def test_others_may_look_but_not_write(description: Path) -> None:
-    viewer = viewing.view_pads(description, host="0.0.0.0")
-    assert viewer.page._save.disabled
-    viewer.stop()

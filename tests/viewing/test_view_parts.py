@@ -15,7 +15,7 @@ from casadi_ik.drawing.surfaces import arrow, sharp
 from casadi_ik.files.reading import Frame, frame_matrix
 from casadi_ik.kernels.cancellation import stop_if_cancelled
 from casadi_ik.viewing import request_of
-from casadi_ik.viewing.drawn import pose_of, quaternions
+from casadi_ik.viewing.drawn import cameras, pose_of, quaternions
 from casadi_ik.viewing.newest import REST, Newest
 from casadi_ik.viewing.pad_page import LinkPad, corrected, save_pads
 from casadi_ik.viewing.panel import grasp_text
@@ -35,6 +35,18 @@ def test_quaternions_are_those_of_rotations_of_any_angle(rng: np.random.Generato
     poses = np.array([pose_of(np.zeros(3), one) for one in wxyz])
     again = np.array([pose_of(np.zeros(3), one) for one in quaternions(poses[:, :3, :3])])
     assert np.allclose(again, poses, atol=1e-12)
+
+
+def test_each_hand_of_a_body_has_a_camera_that_sees_it() -> None:
+    robot = ik.load_robot("g1+dex3")
+    found = cameras(robot, robot.home)
+    assert list(found) == ["Robot", "Left", "Right"]
+    for side, fingers in robot.hands.items():
+        camera = found[side.capitalize()]
+        tips = robot.contacts(robot.home)[0]
+        away = np.linalg.norm(tips - camera.target, axis=1) < camera.radius
+        assert [i for i, near in enumerate(away) if near] == list(fingers)
+        assert camera.radius < 0.5 * found["Robot"].radius
 
 
 def test_a_finger_may_be_left_free_but_not_all(robot: ik.ArmHand) -> None:

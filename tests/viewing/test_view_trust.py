@@ -146,6 +146,7 @@ def test_where_can_be_written_the_address_has_a_token(pads, description: Path) -
 
 def test_a_button_that_is_off_cannot_be_pressed(description: Path) -> None:
     before, viewer = description.read_text(), viewing.view_pads(description, host="0.0.0.0")
+    assert viewer.page._save.disabled
     with opened(viewer.url) as page:
         assert greeted(page)
         send(page, dragged(viewer))
