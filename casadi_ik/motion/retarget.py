@@ -43,17 +43,26 @@ KNUCKLES = (5, 17)
 RATE = 30.0
 """Frames in a second of which `Retarget.low_pass` is the share of one."""
 
-POSTURES = 4096
-"""Random ones (seed 0) that tell how far a robot's fingertips reach from its palm."""
 
-INSIDE = 0.4
-"""An origin nearer to the middle of a hand's keypoints, in lengths of its palm, is in the hand."""
+@dataclass(frozen=True)
+class SizeTuning:
+    """How sizes of hands are told.
 
-LONGEST = 5.0
-"""Of a palm that is in metres [m]."""
+    Attributes:
+        postures: Random ones (seed 0) that tell how far a robot's fingertips reach from its palm.
+        inside: An origin nearer to the middle of a hand's keypoints, in lengths of its palm, is in
+            the hand.
+        longest: Of a palm that is in metres [m].
+        largest: Of a person's palm [m]; in a picture whose size is one, hands are mostly larger.
+    """
 
-LARGEST = 0.15
-"""Of a person's palm [m]; in a picture whose size is one, hands are mostly larger."""
+    postures: int = 4096
+    inside: float = 0.4
+    longest: float = 5.0
+    largest: float = 0.15
+
+
+SIZES = SizeTuning()
 
 
 class RetargetSide(Struct, frozen=True, kw_only=True):
@@ -411,16 +420,16 @@ class _Hand:
         # In a picture x and y go from 0 to 1, a little beyond at its edges; depths count from the
         # wrist.
         inside = (np.abs(seen[:, :2] - 0.5) < 1).all() and abs(wrist[2]) < 1e-5
-        if inside and (length > LARGEST or wrist[2] != 0):
+        if inside and (length > SIZES.largest or wrist[2] != 0):
             raise InputError(
                 "keypoints: found places in a picture, from 0 to 1 (MediaPipe's image landmarks), "
                 "expected metres: take its world landmarks, or a camera with depth"
             )
-        if length > LONGEST:
+        if length > SIZES.longest:
             raise InputError(
                 f"keypoints: found a palm {length:.4g} m long, expected metres (pixels, or mm?)"
             )
-        self.in_hand = bool(np.linalg.norm(seen.mean(axis=0)) < INSIDE * length)
+        self.in_hand = bool(np.linalg.norm(seen.mean(axis=0)) < SIZES.inside * length)
 
     def _begin(self, frame: Array) -> None:
         """Where the first frame is, and how large its hand."""
@@ -437,7 +446,7 @@ class _Hand:
 
 def _reaches(robot: ArmHand, side: str | None) -> Array:
     """(f,) how far from a palm a robot's fingertips come [m]."""
-    q = robot.random(np.random.default_rng(0), POSTURES)
+    q = robot.random(np.random.default_rng(0), SIZES.postures)
     away = robot.contacts(q)[0] - robot.palm(q, side)[:, None, :3, 3]
     return np.linalg.norm(away, axis=2).max(axis=0)
 

@@ -31,7 +31,7 @@ from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.solving.alternatives.arm_search import Preference
 from casadi_ik.solving.alternatives.finder import (
     APART,
-    DISTINCT,
+    SEEKING,
     AlternativeFinder,
     checked_distance,
 )
@@ -426,7 +426,7 @@ class _Part:
         place, which = np.nonzero(kept)
         found, owner = every[place, which], rows[place]
         parts = self.finder.hand_parts(found, free_palms(self.finder.robot, some)[place])
-        fresh = Deduplicator(len(rows), parts.shape[1], DISTINCT).add(parts, place)
+        fresh = Deduplicator(len(rows), parts.shape[1], SEEKING.distinct).add(parts, place)
         return found[fresh], owner[fresh]
 
     def _answers(

@@ -16,6 +16,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 from casadi_ik.answers.solution import Solution
@@ -29,14 +30,24 @@ from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.solving.batch_parts import judged
 
-LOOK_AGAIN = 0.25
-"""Seconds from one look for compiled code to the next."""
 
-LIFETIME = 900.0
-"""Seconds after which the process in the background ends in any case."""
+@dataclass(frozen=True)
+class Waiting:
+    """How long is waited for compiled code.
 
-SECONDS_A_MOTOR = 0.6
-"""What a motor adds to the compiler's work, about (gcc 12, one core of a server of 2023)."""
+    Attributes:
+        look_again: From one look for it to the next [s].
+        lifetime: After which the process in the background ends in any case [s].
+        motor: What a motor adds to the compiler's work, about [s] (gcc 12, one core of a server of
+            2023).
+    """
+
+    look_again: float = 0.25
+    lifetime: float = 900.0
+    motor: float = 0.6
+
+
+WAITING = Waiting()
 
 CHILD = """\
 import sys
@@ -90,7 +101,7 @@ class FirstAnswers:
         """Whether the method is compiled, or is to be waited for."""
         with self._lock:
             process, now = self._process, time.monotonic()
-            if process is not None and now - self._looked < LOOK_AGAIN:
+            if process is not None and now - self._looked < WAITING.look_again:
                 return False
             self._looked = now
             try:
@@ -129,7 +140,7 @@ def started(method: HandFirstMethod) -> subprocess.Popen[bytes] | None:
             pickle.dump(method, stream)
     except OSError:
         return None
-    seconds = SECONDS_A_MOTOR * len(method.robot.actuators)
+    seconds = WAITING.motor * len(method.robot.actuators)
     tell(
         f"{method.robot.name}: compiled in the background (about {seconds:.0f} s, once per "
         "machine); until then CasADi's virtual machine answers"
@@ -148,5 +159,5 @@ def compile_in_background() -> None:
 
 
 def _end_later() -> None:
-    time.sleep(LIFETIME)
+    time.sleep(WAITING.lifetime)
     os._exit(1)

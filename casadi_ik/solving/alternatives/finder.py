@@ -38,26 +38,46 @@ from casadi_ik.solving.trials import (
 from casadi_ik.symbolic.kinematics import Pose, actuated
 from casadi_ik.symbolic.singular_values import manipulability
 
-DISTINCT = 0.05
-"""Hands and arms that are searched count as different if a motor differs by this part of its
-range."""
-
 APART = 0.25
 """Least difference of alternatives unless said otherwise, see `AlternativeFinder.find`."""
 
-TRUNKS = 64
-"""Trunks of a body that are tried with each hand."""
-
-ARMS = 64
-"""Random arms that an arm without a closed form is solved from."""
-
-BLOCKED = 1e6
-"""Taken off the score of what is not free: more than any score."""
-
 TURN = 2 * np.pi
 
-CLOSE = 1e-7
-"""Tolerance [m, rad] that hand postures are brought to first, so that equals are seen as equal."""
+
+@dataclass(frozen=True)
+class AlternativeParameters:
+    """How several solutions are found: hands, arms, the stretches of a redundancy that are allowed.
+
+    Attributes:
+        distinct: Hands and arms that are searched count as different if a motor differs by this
+            part of its range.
+        close: Tolerance [m, rad] that hand postures are brought to first, so that equals are seen
+            as equal.
+        trunks: Of a body, that are tried with each hand.
+        arms: Random ones that an arm without a closed form is solved from.
+        blocked: Taken off the score of what is not free: more than any score.
+        positions: Looked at along the bounds, where breakpoints are not known.
+        iterative_positions: Of an iterative family: each costs a search for all roots.
+        thirds: That the neighbourhood of a position is cut down by, to find a short stretch within.
+        halvings: Of a step between two positions, to find the end of a stretch.
+        samples: Looked at along a stretch for its best arm, and again around the best of them.
+        zooms: How often; each time the steps shrink to a sixteenth.
+    """
+
+    distinct: float = 0.05
+    close: float = 1e-7
+    trunks: int = 64
+    arms: int = 64
+    blocked: float = 1e6
+    positions: int = 361
+    iterative_positions: int = 37
+    thirds: int = 12
+    halvings: int = 45
+    samples: int = 33
+    zooms: int = 2
+
+
+SEEKING = AlternativeParameters()
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,16 +227,16 @@ class AlternativeFinder:
         start, first = limits.clip(q0)[None], np.zeros(1, dtype=np.intp)
         _, states, parameters = trials.hand_rows(targets, first, start, postures[None])
         loose = parameters.copy()
-        trials.set_tolerance(parameters, CLOSE)
+        trials.set_tolerance(parameters, SEEKING.close)
         q = trials.run(states, parameters)
-        exact = replace(targets, tolerance=Tolerance(10 * CLOSE, 10 * CLOSE))
+        exact = replace(targets, tolerance=Tolerance(10 * SEEKING.close, 10 * SEEKING.close))
         kept = q[trials.solved(exact, q, targets.enforce_limits)]
         if not len(kept):
             # Reachable thanks to the tolerances only, if at all.
             q = np.concatenate([q, trials.run(states, loose)])
             kept = q[trials.solved(targets, q, targets.enforce_limits)]
         parts = self.hand_parts(kept, np.repeat(free_palms(self.robot, targets), len(kept)))
-        return [kept[i] for i in distinct(parts, DISTINCT)]
+        return [kept[i] for i in distinct(parts, SEEKING.distinct)]
 
     def hand_parts(self, q: Array, free: NDArray[np.bool_]) -> Array:
         """What tells hands apart: motors as parts of their ranges, and palms that are free.
@@ -272,7 +292,7 @@ class AlternativeFinder:
             # A stretch may be shorter than the positions are apart.
             found += [_Found(arm, posture) for arm in self._searched(targets, q, seed)]
             parts = self._parts(np.stack([item.q for item in found]), self._arm)
-            return [found[i] for i in distinct(parts, DISTINCT)]
+            return [found[i] for i in distinct(parts, SEEKING.distinct)]
         return self._exact(targets, found) or [_Found(q, posture)]
 
     def _seen_by_form(self, end: Array, limits: Bounds) -> Array:
@@ -294,22 +314,22 @@ class AlternativeFinder:
     def _other_trunks(self, targets: TargetBatch, q: Array) -> list[Array]:
         """Different trunks and arms of a body, its hands as in q."""
         palms, first = palms_of(self.robot, q[None]), np.zeros(1, np.intp)
-        ends, _ = other_trunks(self.trials, targets, q[None], palms, first, 0, TRUNKS)
+        ends, _ = other_trunks(self.trials, targets, q[None], palms, first, 0, SEEKING.trunks)
         ends = np.concatenate([q[None], ends])
         kept = ends[self.trials.solved(targets, ends, targets.enforce_limits)]
         moving = [i for i in range(kept.shape[1]) if i not in self.hand]
-        return [kept[i] for i in distinct(self._parts(kept, moving), DISTINCT)]
+        return [kept[i] for i in distinct(self._parts(kept, moving), SEEKING.distinct)]
 
     def _searched(self, targets: TargetBatch, q: Array, seed: int) -> list[Array]:
         """Different arms found from random ones, the hand starting as in q."""
-        starts = self.robot.random(np.random.default_rng(seed), ARMS)
+        starts = self.robot.random(np.random.default_rng(seed), SEEKING.arms)
         starts[:, self.hand] = q[self.hand]
         starts[0] = q
-        ends = LocalRefinement(self.trials, targets).run(np.zeros(ARMS, np.intp), starts)
+        ends = LocalRefinement(self.trials, targets).run(np.zeros(SEEKING.arms, np.intp), starts)
         ends = np.concatenate([q[None], ends])
-        same = (np.abs(self._parts(ends - q, self.hand)) < DISTINCT).all(axis=1)
+        same = (np.abs(self._parts(ends - q, self.hand)) < SEEKING.distinct).all(axis=1)
         kept = ends[same & self.trials.solved(targets, ends, targets.enforce_limits)]
-        return [kept[i] for i in distinct(self._parts(kept, self._arm), DISTINCT)]
+        return [kept[i] for i in distinct(self._parts(kept, self._arm), SEEKING.distinct)]
 
     def _parts(self, q: Array, columns: list[int]) -> Array:
         """Some columns of configurations as parts of their ranges."""
@@ -338,7 +358,7 @@ class AlternativeFinder:
             return self.score(q, q0, prefer, columns)
         surplus = query.check(q).surplus
         score = self.score(q, q0, prefer, columns, surplus)
-        return np.where(surplus >= 0, score, surplus - BLOCKED)
+        return np.where(surplus >= 0, score, surplus - SEEKING.blocked)
 
     def score(
         self,
@@ -397,30 +417,6 @@ def checked_distance(apart: float) -> float:
     if not number or isinstance(apart, bool) or not 0 <= apart <= 1:
         raise InputError(f"apart: found {apart!r}, expected a number from 0 to 1")
     return float(apart)
-
-
-@dataclass(frozen=True)
-class StretchParameters:
-    """How the allowed stretches of a redundancy are found, and the best arm in one.
-
-    Attributes:
-        positions: Looked at along the bounds, where breakpoints are not known.
-        iterative_positions: Of an iterative family: each costs a search for all roots.
-        thirds: That the neighbourhood of a position is cut down by, to find a short stretch within.
-        halvings: Of a step between two positions, to find the end of a stretch.
-        samples: Looked at along a stretch for its best arm, and again around the best of them.
-        zooms: How often; each time the steps shrink to a sixteenth.
-    """
-
-    positions: int = 361
-    iterative_positions: int = 37
-    thirds: int = 12
-    halvings: int = 45
-    samples: int = 33
-    zooms: int = 2
-
-
-STRETCHES = StretchParameters()
 
 
 class ArmBranches:
@@ -498,7 +494,7 @@ class ArmBranches:
         if branch.swivel is None:
             return self.arms(palm, branch, np.zeros(1))[0], None
         first, last = branch.swivel
-        values, zooms = np.linspace(first, last, STRETCHES.samples), STRETCHES.zooms
+        values, zooms = np.linspace(first, last, SEEKING.samples), SEEKING.zooms
         if self.family.is_iterative:
             values, zooms = self._positions(palm, *bounds), 0
             values = values[(values >= first) & (values <= last)]
@@ -506,7 +502,7 @@ class ArmBranches:
             i = int(np.argmax(score(self.arms(palm, branch, values))))
             step = values[1] - values[0]
             ends = max(first, values[i] - step), min(last, values[i] + step)
-            values = np.linspace(*ends, STRETCHES.samples)
+            values = np.linspace(*ends, SEEKING.samples)
         arms = self.arms(palm, branch, values)
         i = int(np.argmax(score(arms)))
         return arms[i], float(values[i])
@@ -521,9 +517,9 @@ class ArmBranches:
             return np.unique(np.concatenate([edges, (edges[1:] + edges[:-1]) / 2]))
         if self.family.is_iterative:
             # Away from the ends: the swept joint is within its limits, the others tell apart.
-            count = STRETCHES.iterative_positions
+            count = SEEKING.iterative_positions
             return low + (high - low) * (np.arange(count) + 0.5) / count
-        return np.linspace(low, high, STRETCHES.positions)
+        return np.linspace(low, high, SEEKING.positions)
 
     def _margins(self, palm: Array, values: Array, lower: Array, upper: Array) -> Array:
         """(k, rows) of every branch; the slack where it is out of reach."""
@@ -572,7 +568,7 @@ def _peaks(grid: Array, margins: Callable[[Array], Array]) -> Array:
     at, rows = np.nonzero(top & (margin < PARAMETERS.allowed))
     step, each = grid[1] - grid[0], np.arange(len(at))
     first, last = np.maximum(grid[at] - step, grid[0]), np.minimum(grid[at] + step, grid[-1])
-    for _ in range(STRETCHES.thirds if len(at) else 0):
+    for _ in range(SEEKING.thirds if len(at) else 0):
         near, far = first + (last - first) / 3, last - (last - first) / 3
         rising = margins(near)[each, rows] < margins(far)[each, rows]
         first, last = np.where(rising, near, first), np.where(rising, last, far)
@@ -584,7 +580,7 @@ def _ends(
 ) -> Array:
     """Where branches cease to be allowed from an allowed value to one that is not."""
     each = np.arange(len(inner))
-    for _ in range(STRETCHES.halvings if len(inner) else 0):
+    for _ in range(SEEKING.halvings if len(inner) else 0):
         middle = (inner + outer) / 2
         allowed = margins(middle)[each, rows] >= PARAMETERS.allowed
         inner, outer = np.where(allowed, middle, inner), np.where(allowed, outer, middle)
