@@ -84,7 +84,7 @@ def info(said: Said) -> Answer:
         log = logs.open(name)
         about = log.info()
         parts += [_title(name), fields(_container(log, about)), _methods(log, about)]
-        parts.append(fields(_origin(about)))
+        parts.append(fields(_origin(log)))
     return Answer(Group(*parts))
 
 
@@ -447,37 +447,34 @@ def _smallest(found: logs.Table) -> str:
     )
 
 
-def _origin(about: logs.LogInfo) -> dict[str, str]:
-    """The metadata that says where a log is from, as text by name."""
-    metadata = about.metadata
+def _origin(log: logs.Log) -> dict[str, str]:
+    """The metadata that says where a log is from, as text by name; all that its shards say."""
+    told = [_told(source.metadata) for source in log.sources.sources]
+    pairs = {}
+    for name in dict.fromkeys(name for each in told for name in each):
+        texts = list(dict.fromkeys(each.get(name, "none") for each in told))
+        more = f" | {len(texts) - SHOWN} more" if len(texts) > SHOWN else ""
+        differ = len(texts) > 1 and name != "created"
+        text = f"{' | '.join(texts[:SHOWN])}{more} (by shard)" if differ else texts[0]
+        pairs[printable(name, 60)] = printable(text, 2000)
+    return pairs
+
+
+def _told(metadata: Mapping[str, Any]) -> dict[str, str]:
+    """The metadata of one shard, as text by name."""
     packages = {"casadi_ik": metadata.get("code_version"), "python": metadata.get("python")}
     packages |= metadata.get("packages", {})
-    pairs = {
+    parameters = metadata.get("parameters", {})
+    told = {
         "created": str(metadata.get("created")),
         "seed": str(metadata.get("seed")),
         "machine": _flat(metadata.get("machine", {})),
         "versions": " ".join(f"{name} {value}" for name, value in packages.items()),
+        **({} if "scene" in parameters else {"collision": "not checked"}),
     }
-    if "scene" not in metadata.get("parameters", {}):
-        pairs["collision"] = "not checked"
-    for name, value in metadata.get("parameters", {}).items():
-        pairs[name.replace("_", " ")] = _tolerance(value) if name == "tolerance" else _flat(value)
-    for key, values in about.differs.items():
-        if key == "parameters":
-            for name in dict.fromkeys(name for each in values for name in each):
-                told = _tolerance if name == "tolerance" else _flat
-                own = list(dict.fromkeys(told(each.get(name)) for each in values))
-                if len(own) > 1:
-                    pairs[name.replace("_", " ")] = _by_shard(own)
-        elif key in pairs and key != "created":
-            pairs[key] = _by_shard([_flat(value) for value in values])
-    return {printable(name, 60): printable(text, 2000) for name, text in pairs.items()}
-
-
-def _by_shard(texts: Sequence[str]) -> str:
-    """What shards differ in."""
-    more = f" | {len(texts) - SHOWN} more" if len(texts) > SHOWN else ""
-    return " | ".join(texts[:SHOWN]) + more + " (by shard)"
+    for name, value in parameters.items():
+        told[name.replace("_", " ")] = _tolerance(value) if name == "tolerance" else _flat(value)
+    return told
 
 
 def _tolerance(value: Any) -> str:
