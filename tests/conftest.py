@@ -6,7 +6,8 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,6 +22,8 @@ import casadi_ik as ik
 
 if TYPE_CHECKING:
     from pinocchio_oracle import PinocchioRobot
+
+    from casadi_ik.viewing import Viewer
 
 REFERENCE = re.compile(r"^ *(?:import|from) (?:pinocchio|coal)(?:_oracle)?\b", re.MULTILINE)
 """A test module that asks other libraries for a second opinion: the extra `reference`."""
@@ -98,6 +101,21 @@ def browser() -> Iterator[Browser]:
         pytest.skip("no Chromium (on Debian: apt-get install chromium)")
     with Browser() as started:
         yield started
+
+
+@pytest.fixture
+def view() -> Iterator[Callable[..., Viewer]]:
+    """What `casadi-ik view` with some words shows, without waiting until it is stopped."""
+    from commands import shown
+
+    with ExitStack() as stack:
+
+        def open_page(*words: str) -> Viewer:
+            viewer = shown(*words)
+            stack.callback(viewer.stop)
+            return viewer
+
+        yield open_page
 
 
 @pytest.fixture(scope="module")

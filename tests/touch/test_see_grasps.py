@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from commands import main, shown
+from commands import main
 from PIL import Image
 
 import casadi_ik as ik
@@ -45,7 +45,7 @@ def test_nothing_is_no_picture(solver):
 
 
 @pytest.mark.opengl
-def test_a_command_from_an_object_to_a_picture_and_a_page(tmp_path, capsys):
+def test_a_command_from_an_object_to_a_picture_and_a_page(tmp_path, capsys, view):
     out, picture = tmp_path / "found.npz", tmp_path / "best.png"
     words = [*ASKED, "--object-pose", *PLACE, "--out", str(out), "--picture", str(picture)]
     assert main(words) == 0
@@ -54,18 +54,14 @@ def test_a_command_from_an_object_to_a_picture_and_a_page(tmp_path, capsys):
     assert str(out) in said
     assert str(picture) in said
     assert Image.open(picture).width > 1000
-    viewer = shown(str(out), "--scene", "table")
-    try:
-        offered = viewer.page.offered
-        assert len(offered.shown) == 6
-        loads = np.load(out)["load"]
-        offered.filter(load=float(loads[2]))
-        assert len(offered.shown) == 3
-        offered.take(offered.shown[1])
-        assert viewer.page.work.settle()
-        np.testing.assert_allclose(viewer.page.answer.q, np.load(out)["q"][1], atol=1e-3)
-    finally:
-        viewer.stop()
+    page = view(str(out), "--scene", "table").page
+    assert len(page.offered.shown) == 6
+    loads = np.load(out)["load"]
+    page.offered.filter(load=float(loads[2]))
+    assert len(page.offered.shown) == 3
+    page.offered.take(page.offered.shown[1])
+    assert page.work.settle()
+    np.testing.assert_allclose(page.answer.q, np.load(out)["q"][1], atol=1e-3)
 
 
 def test_none_found_says_why_and_writes_nothing(tmp_path, capsys):

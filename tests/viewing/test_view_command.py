@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,30 +10,13 @@ import pytest
 from commands import main
 
 import casadi_ik as ik
-from casadi_ik import viewing
 from casadi_ik.answers.stored import solution_data as as_json
-from casadi_ik.cli.table import parse
-from casadi_ik.cli.view import opened
 
 CANDIDATES = """robot: kuka_lwr_barrett
 candidates:
   - contacts: {thumb: {point: [-0.83, 0.15, 0.41], normal: [0.48, -0.88, 0]}}
   - contacts: {thumb: {point: [-0.80, 0.15, 0.41], normal: [0.48, -0.88, 0]}}
 """
-
-
-@pytest.fixture
-def view() -> Iterator[object]:
-    """Opens what the command line says; ends it all."""
-    running: list[viewing.Viewer] = []
-
-    def open_page(*words: str) -> viewing.Viewer:
-        running.append(opened(parse(["view", *words])[1]))
-        return running[-1]
-
-    yield open_page
-    for one in running:
-        one.stop()
 
 
 def test_a_grasp_and_a_robot(view) -> None:
