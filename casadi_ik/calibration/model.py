@@ -115,51 +115,28 @@ def hand_parameters(
     if not fingers:
         raise InputError("fingers: none, expected at least one")
     spread = priors or Priors()
-    found: dict[str, Parameter] = {}
+    rows: list[tuple[str, str, str, float, float, str]] = []
     for finger in fingers:
         chain = robot.chain(robot.finger(finger).link)
         for joint in (j for j in chain if j.type != "fixed" and j.part == "hand"):
-            if "linkage" in groups:
-                found |= {p.name: p for p in _coupling(joint, spread)}
+            name, coupling = joint.name, joint.coupling
+            if "linkage" in groups and coupling is not None:
+                for keys, prior, unit in (
+                    (coupling.lengths, spread.length, "m"),
+                    (coupling.angles, spread.angle, "rad"),
+                ):
+                    for key in keys:
+                        value = float(getattr(coupling, key))
+                        rows.append((name, "coupling", key, value, prior, unit))
             if "axes" in groups:
-                found |= {p.name: p for p in _axis(joint, spread)}
+                at = zip("xyz", joint.placement[:3, 3].tolist(), strict=True)
+                rows += [(name, "origin", key, value, spread.origin, "m") for key, value in at]
+                rows += [(name, "axis", key, 0.0, spread.axis, "rad") for key in "12"]
         if "tips" in groups:
-            found |= {p.name: p for p in _tip(robot, finger, spread)}
-    return tuple(found.values())
-
-
-def _coupling(joint: Joint, spread: Priors) -> list[Parameter]:
-    coupling = joint.coupling
-    if coupling is None:
-        return []
-    kinds = ((coupling.lengths, spread.length, "m"), (coupling.angles, spread.angle, "rad"))
-    return [
-        Parameter(joint.name, "coupling", key, float(getattr(coupling, key)), prior, unit)
-        for keys, prior, unit in kinds
-        for key in keys
-    ]
-
-
-def _axis(joint: Joint, spread: Priors) -> list[Parameter]:
-    origin = joint.placement[:3, 3]
-    return [
-        *(
-            Parameter(joint.name, "origin", key, float(value), spread.origin, "m")
-            for key, value in zip("xyz", origin, strict=True)
-        ),
-        *(Parameter(joint.name, "axis", key, 0.0, spread.axis, "rad") for key in "12"),
-    ]
-
-
-def _tip(robot: RobotDescription, finger: str, spread: Priors) -> list[Parameter]:
-    point = robot.finger(finger).placement[:3, 3]
-    return [
-        *(
-            Parameter(finger, "tip", key, float(value), spread.tip, "m")
-            for key, value in zip("xyz", point, strict=True)
-        ),
-        *(Parameter(finger, "turn", key, 0.0, spread.tip_angle, "rad") for key in "xyz"),
-    ]
+            at = zip("xyz", robot.finger(finger).placement[:3, 3].tolist(), strict=True)
+            rows += [(finger, "tip", key, value, spread.tip, "m") for key, value in at]
+            rows += [(finger, "turn", key, 0.0, spread.tip_angle, "rad") for key in "xyz"]
+    return tuple({one.name: one for one in (Parameter(*row) for row in rows)}.values())
 
 
 @dataclass(frozen=True, eq=False)

@@ -175,7 +175,7 @@ def guess_thumb(part: Part, branches: list[Branch], pads: list[Pad]) -> tuple[in
         normals = np.array([poses[pad.link][:3, :3] @ pad.normal for pad in pads])
         # Bent fingers all face the palm: what counts is how they face each other across it.
         reaches = [
-            _point(poses, pad) - poses[branch.chain[0].child][:3, 3]
+            _apply(poses[pad.link], pad.point) - poses[branch.chain[0].child][:3, 3]
             for branch, pad in zip(branches, pads, strict=True)
         ]
         z = _unit(np.mean(reaches, axis=0), np.array([0.0, 0.0, 1.0]))
@@ -199,24 +199,21 @@ def guess_palm_frame(
     poses = _poses(part, _middle(part))
     inverse = np.linalg.inv(poses[palm])
     bases = np.array([(inverse @ poses[one.chain[0].child])[:3, 3] for one in branches])
-    tips = np.array([_point(poses, pad) for pad in pads]) @ inverse[:3, :3].T + inverse[:3, 3]
+    tips = (
+        np.array([_apply(poses[pad.link], pad.point) for pad in pads]) @ inverse[:3, :3].T
+        + inverse[:3, 3]
+    )
     others = np.delete(bases, thumb, axis=0)
     reaches = np.delete(tips - bases, thumb, axis=0) if len(others) else tips - bases
     z = _unit(reaches.mean(axis=0), np.array([0.0, 0.0, 1.0]))
     to_thumb = bases[thumb] - (others.mean(axis=0) if len(others) else 0 * bases[thumb])
     if np.linalg.norm(to_thumb - (to_thumb @ z) * z) < 5e-3:
         to_thumb = tips[thumb] - (np.delete(tips, thumb, axis=0).mean(axis=0) if len(others) else 0)
-    across: Array = np.asarray(np.cross(z, np.eye(3)[int(np.argmin(np.abs(z)))]), dtype=float)
-    y = _unit(to_thumb - (to_thumb @ z) * z, across)
+    y = _unit(_across(to_thumb, z), _any_across(z))
     frame = np.eye(4)
     frame[:3, :3] = np.column_stack([np.cross(y, z), y, z])
     frame[:3, 3] = bases.mean(axis=0)
     return frame
-
-
-def _point(poses: Mapping[str, Array], pad: Pad) -> Array:
-    pose = poses[pad.link]
-    return pose[:3, :3] @ pad.point + pose[:3, 3]
 
 
 def _unit(vector: Array, otherwise: Array) -> Array:

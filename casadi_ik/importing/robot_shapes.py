@@ -6,8 +6,9 @@ Links whose shapes touch although the meshes that they hold do not are told from
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import combinations
 
 import numpy as np
@@ -79,7 +80,14 @@ def may_touch(
         link: [c for one in found for c in capsules_of(one)] for link, found in shapes.items()
     }
     segments = {link: _segments(found, poses, link) for link, found in capsules.items()}
-    meshes = _Meshes(surfaces)
+    trees = cache(lambda link: TriangleTree(surfaces[link].points[surfaces[link].triangles]))
+
+    def meet(rows: Sequence[int], one: str, other: str) -> Iterator[bool]:
+        """Whether the meshes of two links meet in some configurations."""
+        for row in rows:
+            between = np.linalg.inv(poses[row][one]) @ poses[row][other]
+            yield trees(one).meets(trees(other), between)
+
     found: list[Touching] = []
     for one, other in combinations(shapes, 2):
         if bodies[one] == bodies[other] or frozenset((bodies[one], bodies[other])) in neighbours:
@@ -89,31 +97,41 @@ def may_touch(
             for j, (_, _, wide) in enumerate(capsules[other]):
                 apart, _ = between_segments(segments[one][:, i], segments[other][:, j])
                 least = np.minimum(least, apart - radius - wide)
-        found += _verdict((one, other), least, meshes, poses)
+        # Of too fine a mesh only points are kept.
+        known = all(len(surfaces[link].triangles) for link in (one, other))
+        found += _verdict((one, other), least, meet if known else None)
     return found
 
 
 def _verdict(
-    links: tuple[str, str], least: Array, meshes: _Meshes, poses: Sequence[Mapping[str, Array]]
+    links: tuple[str, str],
+    least: Array,
+    meet: Callable[[Sequence[int], str, str], Iterator[bool]] | None,
 ) -> list[Touching]:
-    """What is to be said of two links whose shapes are `least` (k,) [m] apart."""
+    """What is to be said of two links whose shapes are `least` (k,) [m] apart.
+
+    Args:
+        links: Their names.
+        least: In every configuration.
+        meet: In which of some configurations their meshes meet; None: they are not known.
+    """
     hit = np.flatnonzero(least < 0)
     if len(hit) < SAMPLING.enough:
         return []
     looked, always = hit[: SAMPLING.looked_at], len(hit) == SAMPLING.samples
     said = f"their shapes touch in {len(hit)} of {SAMPLING.samples} random configurations, seed 0, "
-    if not meshes.known(*links):
+    if meet is None:
         return [Touching(links, said + "their meshes were not looked at")] if always else []
-    if not any(meshes.touch(poses[row], *links) for row in looked.tolist()):
+    if not any(meet(looked.tolist(), *links)):
         return [Touching(links, said + "their meshes in none")]
     if not always:
         return []
-    meet = np.array([meshes.touch(poses[row], *links) for row in looked.tolist()])
-    said += f"their meshes in {meet.sum()} of {len(looked)}"
+    met = np.array([*meet(looked.tolist(), *links)])
+    said += f"their meshes in {met.sum()} of {len(looked)}"
     # As deep as where the meshes meet they may not be, if that tells the two apart.
     depths = -least[looked]
-    depth = math.floor(SAMPLING.depth * float(depths[meet].min()) * FIT.grid) / FIT.grid
-    if meet.mean() > SAMPLING.nested or (depths[~meet] < depth).mean() < SAMPLING.told_apart:
+    depth = math.floor(SAMPLING.depth * float(depths[met].min()) * FIT.grid) / FIT.grid
+    if met.mean() > SAMPLING.nested or (depths[~met] < depth).mean() < SAMPLING.told_apart:
         return [Touching(links, said + ", which these shapes cannot tell")]
     return [Touching(links, said + ", all deeper", depth)]
 
@@ -221,29 +239,6 @@ def _crossing(first: Array, second: Array) -> NDArray[np.bool_]:
                 t = (edge * turned).sum(axis=1) / scale
                 found |= (u >= 0) & (v >= 0) & (u + v <= 1) & (t >= 0) & (t <= 1)
     return found
-
-
-class _Meshes:
-    """Meshes of links, sorted when they are asked for."""
-
-    def __init__(self, surfaces: Mapping[str, Surface]) -> None:
-        self._surfaces = surfaces
-        self._made: dict[str, TriangleTree] = {}
-
-    def known(self, *links: str) -> bool:
-        """Whether there are triangles of all of them: of too fine a mesh only points are kept."""
-        return all(len(self._surfaces[link].triangles) for link in links)
-
-    def touch(self, pose: Mapping[str, Array], one: str, other: str) -> bool:
-        """Whether the meshes of two links meet."""
-        between = np.linalg.inv(pose[one]) @ pose[other]
-        return self._mesh(one).meets(self._mesh(other), between)
-
-    def _mesh(self, link: str) -> TriangleTree:
-        if link not in self._made:
-            surface = self._surfaces[link]
-            self._made[link] = TriangleTree(surface.points[surface.triangles])
-        return self._made[link]
 
 
 def robot_shapes(
