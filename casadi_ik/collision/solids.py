@@ -318,19 +318,27 @@ SPECK = 5e-3
 """Size of what is left out of a mesh if it is flat [m]."""
 
 
+THIN = 1e-3
+"""Thickness that a flat piece of a mesh gets [m]."""
+
+
 def hulls(shape: MeshShape, where: str) -> list[tuple[Solid, Array]]:
     """The convex hulls of the pieces of a mesh, each with its (4, 4) pose in the mesh's frame.
 
-    Specks that scanners leave, flat and smaller than `SPECK`, are no pieces.
+    Specks that scanners leave, flat and smaller than `SPECK`, are no pieces; other flat pieces of
+    several, a label that stands off, are `THIN`.
 
     Raises:
-        DescriptionError: A piece is flat.
+        DescriptionError: The only piece is flat.
     """
     found: list[tuple[Solid, Array]] = []
     for number, (points, _) in enumerate(shape.pieces):
         flat = len(points) < 4 or np.linalg.matrix_rank(points - points[0], tol=1e-9) < 3
-        if flat and len(shape.pieces) > 1 and np.ptp(points, axis=0).max() < SPECK:
-            continue
+        if flat and len(shape.pieces) > 1:
+            if np.ptp(points, axis=0).max() < SPECK:
+                continue
+            across = np.linalg.svd(points - points.mean(axis=0))[2][2]
+            points = np.concatenate([points - THIN / 2 * across, points + THIN / 2 * across])
         pose = np.eye(4)
         pose[:3, 3] = points.mean(axis=0)
         named = f"{where}: piece {number} of {len(shape.pieces)}"

@@ -63,7 +63,7 @@ class TouchParameters:
     together: int = 2000
     steps: int = 6
     free_lean: float = float(np.deg2rad(8.0))
-    slide: float = 0.05
+    slide: float = 0.25
     turn: float = 0.02
     touch: float = 1e-3
     last_lean: float = float(np.deg2rad(15.0))

@@ -287,7 +287,7 @@ def grasps_of(
             if tried:
                 generator.look()
             some = generator.candidates(attempts)
-            tried += attempts
+            tried = generator.counts["attempts"]
             before = [part.some for part in parts]
             made = _made(generator, some, before, arms, judge, place, mu, hold, jobs, start)
             if made is not None:
