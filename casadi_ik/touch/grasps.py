@@ -281,13 +281,13 @@ def grasps_of(
     generator = Generator(table, surface, fingers, chosen, np.random.default_rng(seed), hands)
     start = None if q0 is None else robot.configuration(q0)
     parts: list[_Made] = []
-    known, tried, attempts = 0, 0, chosen.first
+    known, drawn, tried, attempts = 0, 0, 0, chosen.first
     with progress(limit) as show:
         while generator.fits and known < limit and tried < chosen.most:
             if tried:
                 generator.look()
             some = generator.candidates(attempts)
-            tried = generator.counts["attempts"]
+            drawn, tried = drawn + attempts, generator.counts["attempts"]
             before = [part.some for part in parts]
             made = _made(generator, some, before, arms, judge, place, mu, hold, jobs, start)
             if made is not None:
@@ -296,7 +296,7 @@ def grasps_of(
                 known += len(made.rows)
             elif generator.alike > limit or (generator.asked >= chosen.lost and not known):
                 break  # each is like one found before, or the arm reaches none
-            wanted = 1.2 * tried * (limit - known) / known if known else tried
+            wanted = 1.2 * drawn * (limit - known) / known if known else drawn
             attempts = int(np.clip(wanted, chosen.first, chosen.attempts))
     found = _ranked(robot, generator, hands, parts, place, limit, prefer, start, mu)
     return replace(found, time=time.process_time() - begin)
