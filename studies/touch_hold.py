@@ -58,7 +58,7 @@ SQUEEZE = 18.0
 """Sum of the normal forces [N]: 6 N a finger of three."""
 
 PAD = 0.010
-"""Radius of a pad [m]."""
+"""Radius of a flat pad's ball [m]."""
 
 STIFFNESS = {"revolute": 3.0, "prismatic": 2000.0}
 """Of a joint that a motor holds [N m/rad, N/m]."""
@@ -73,15 +73,15 @@ WHOLE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
 INTRODUCTION = """
-{objects}: each on the table, turned by 40 deg, 0.5 m before the arm's base and 0.1 m aside; at
-most {limit} distinct, force-closed grasps of each, the best by load of those that the first rounds
-of the search find (friction 0.5, three fingertips, or two of a gripper). In MuJoCo the palm is
-fixed, motors are springs (3 N m/rad, 2 kN/m), pads are balls of 10 mm, only pads touch the object
-(its convex parts; friction 0.5, torsional friction of a patch of 5 mm), and it weighs 0.2 kg.
-Fingers squeeze with 18 N in sum, by `FoundGrasp.forces`. *Held*: in a second the object moves less
-than 20 mm and turns less than 30 deg, for a force of its weight in each of six directions.
-*Strong*: those whose load says that they hold it. *AUC*: the chance that a grasp that holds has a
-higher load than one that does not.
+{objects}: each on the table, turned by 40 deg, 0.5 m before the arm's base and 0.1 m aside; at most
+{limit} distinct, force-closed grasps of each, the best by load of those that the first rounds of
+the search find (friction 0.5, three fingertips, or two of a gripper). In MuJoCo the palm is fixed,
+motors are springs (3 N m/rad, 2 kN/m), pads are balls as the hand's description has them (flat ones
+of 10 mm), only pads touch the object (its convex parts; friction 0.5, torsional friction of a patch
+of 5 mm), and it weighs 0.2 kg. Fingers squeeze with 18 N in sum, by `FoundGrasp.forces`. *Held*: in
+a second the object moves less than 20 mm and turns less than 30 deg, for a force of its weight in
+each of six directions. *Strong*: those whose load says that they hold it. *AUC*: the chance that a
+grasp that holds has a higher load than one that does not.
 """
 
 NOISE = """
@@ -280,10 +280,11 @@ class Hold:
         for finger in description.fingers:
             point = finger.placement[:3, 3]
             normal = finger.placement[:3, :3] @ finger.normal
+            radius = finger.radius or PAD
             bodies[finger.link].add_geom(
                 type=mujoco.mjtGeom.mjGEOM_SPHERE,
-                size=[PAD, 0, 0],
-                pos=point - PAD * normal,
+                size=[radius, 0, 0],
+                pos=point - radius * normal,
                 mass=0.0,
                 contype=1,
                 conaffinity=2,
@@ -337,18 +338,19 @@ class Hold:
     def targets(self) -> np.ndarray:
         """Where the springs are to pull to, so that fingertips press as they should."""
         robot, q, model = self.robot, self.one.q, self.model
-        joints, goals = robot.joints(q), np.zeros(model.nu)
+        joints, goals, here = robot.joints(q), np.zeros(model.nu), robot.contact_frames(q)
+        pressed = []
+        for name, force in self.one.forces.items():
+            i, point = robot.fingers.index(name), self.one.grasp.contacts[name].point
+            pressed.append((i, np.linalg.inv(here[i]) @ np.append(point, 1.0), force))
         for motor, ratios in self.leads.items():
             index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, f"motor_{motor}")
             if index < 0:
                 continue
             step = np.zeros(len(q))
             step[motor] = 1e-5
-            slope = (robot.contacts(q + step)[0] - robot.contacts(q - step)[0]) / 2e-5
-            torque = SQUEEZE * sum(
-                float(slope[robot.fingers.index(name)] @ force)
-                for name, force in self.one.forces.items()
-            )
+            slope = (robot.contact_frames(q + step) - robot.contact_frames(q - step)) / 2e-5
+            torque = SQUEEZE * sum(float((slope[i] @ at)[:3] @ force) for i, at, force in pressed)
             lead = model.joint(int(model.actuator_trnid[index, 0])).name
             stiff = model.actuator_gainprm[index, 0]
             goals[index] = joints[lead] + torque / ratios[lead] / stiff

@@ -380,3 +380,15 @@ def test_what_is_out_of_reach_is_given_up(surface):
     assert not len(found)
     assert "none came to: arm reaches" in found.reason
     assert found.counts["attempts"] < 100_000
+
+
+def test_a_label_that_stands_off_is_a_thin_part(tmp_path):
+    label = trimesh.Trimesh(
+        [[-0.02, 0.034, -0.03], [0.02, 0.034, -0.03], [0, 0.034, 0.03]], [[0, 1, 2]]
+    )
+    body = trimesh.creation.cylinder(0.033, 0.1, sections=64)
+    trimesh.util.concatenate([body, label]).export(tmp_path / "labelled.stl")
+    found = solver_of("panda+panda_hand").grasps_of(
+        ik.load_surface(tmp_path / "labelled.stl"), PLACE, limit=3
+    )
+    assert len(found) == 3

@@ -1,0 +1,52 @@
+"""The study of grasps of surfaces runs, goes on where it was, and its own checks can fail."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+pytest.importorskip("trimesh")
+
+import touch
+
+import casadi_ik as ik
+
+ACROSS = np.array([[0.03, 0.0, 0.0], [-0.03, 0.0, 0.0]])
+"""Two opposite points of a ball of 30 mm [m]."""
+
+
+def test_the_study_writes_its_report_and_goes_on(tmp_path):
+    given = ["--robots", "panda+panda_hand", "--objects", "golf_ball", "--limit", "3"]
+    given += ["--parts", str(tmp_path / "parts"), "--out", str(tmp_path)]
+    touch.main([*given, "--minutes", "0"])
+    assert not list((tmp_path / "parts").rglob("*.json"))
+    touch.main(given)
+    found = {one["name"]: one for one in json.loads((tmp_path / "metrics.json").read_text())}
+    assert found["touch/panda+panda_hand/confirmed"]["value"] == 100
+    assert found["touch/panda+panda_hand/closed"]["value"] == 100
+    assert found["touch/panda+panda_hand/off"]["value"] < 1.0
+    done = {path: path.read_text() for path in (tmp_path / "parts").rglob("*.json")}
+    assert len(done) == 3
+    touch.main(given)
+    assert {path: path.read_text() for path in done} == done
+
+
+def test_every_pose_rests_on_the_table():
+    surface = ik.load_surface("sugar_box")
+    ups = []
+    for number in range(len(touch.POSES)):
+        pose = touch.placed(surface, number)
+        np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(pose[:3, :3]) > 0
+        assert (surface.points @ pose[:3, :3].T + pose[:3, 3])[:, 2].min() == pytest.approx(0.002)
+        ups.append(np.abs(pose[2, :3]).argmax())
+    assert sorted(ups) == [0, 1, 2]
+
+
+def test_contacts_that_do_not_oppose_each_other_do_not_close():
+    assert touch.closes(ACROSS, -ACROSS / 0.03, 0.03)
+    aside = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    assert not touch.closes(ACROSS, aside, 0.03)
+    assert not touch.closes(ACROSS[:1], -ACROSS[:1] / 0.03, 0.03)
