@@ -32,6 +32,7 @@ class TouchParameters:
         first: Pairs of hand and object that are tried at first.
         attempts: Most that are tried at once.
         most: Attempts after which no more are made.
+        seldom: Where so many are like others for each new one, no more are made.
         lost: Hands after which no more are tried if the arm has reached none of them.
         lean: Planes lean by at most this angle at first [rad]; balls may more, everywhere.
         near: A further fingertip is at most this far from the surface at first [m].
@@ -54,6 +55,7 @@ class TouchParameters:
     first: int = 500
     attempts: int = 60_000
     most: int = 1_000_000
+    seldom: int = 1000
     lost: int = 300
     lean: float = float(np.deg2rad(25.0))
     near: float = 8e-3

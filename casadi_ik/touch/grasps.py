@@ -290,12 +290,15 @@ def grasps_of(
             drawn, tried = drawn + attempts, generator.counts["attempts"]
             before = [part.some for part in parts]
             made = _made(generator, some, before, arms, judge, place, mu, hold, jobs, start)
+            new = 0 if made is None else len(made.rows)
             if made is not None:
                 parts.append(made)
-                show(min(len(made.rows), limit - known))
-                known += len(made.rows)
-            elif generator.alike > limit or (generator.asked >= chosen.lost and not known):
-                break  # each is like one found before, or the arm reaches none
+                show(min(new, limit - known))
+                known += new
+            if generator.alike > max(limit, chosen.seldom * new):
+                break  # nearly each is like one found before
+            if generator.asked >= chosen.lost and not known:
+                break  # the arm reaches none
             wanted = 1.2 * drawn * (limit - known) / known if known else drawn
             attempts = int(np.clip(wanted, chosen.first, chosen.attempts))
     found = _ranked(robot, generator, hands, parts, place, limit, prefer, start, mu)
