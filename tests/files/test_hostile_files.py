@@ -84,8 +84,7 @@ def test_normals_of_any_length(size: float) -> None:
     np.testing.assert_allclose(found, expected / np.linalg.norm(expected), rtol=1e-15)
 
 
-def test_normals_of_any_length_in_a_batch() -> None:
-    robot = ik.load_robot("kuka_lwr_barrett")
+def test_normals_of_any_length_in_a_batch(robot) -> None:
     points, normals = robot.contacts(np.tile(robot.home, (6, 1)))
     scale = np.array([1e-300, 1e-160, 1.0, 1e155, 1e200, 1e300])[:, None, None]
     batch = ik.Solver(robot).solve_batch(points, scale * normals)
@@ -95,8 +94,7 @@ def test_normals_of_any_length_in_a_batch() -> None:
 
 
 @pytest.mark.parametrize("kind", ["complex", "masked"])
-def test_numbers_that_would_lose_something(kind: str) -> None:
-    robot = ik.load_robot("kuka_lwr_barrett")
+def test_numbers_that_would_lose_something(robot, kind: str) -> None:
     points, normals = robot.contacts(robot.home[None])
     odd = points + 1j if kind == "complex" else np.ma.masked_greater(points, 0)
     solver = ik.Solver(robot)

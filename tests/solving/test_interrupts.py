@@ -59,8 +59,7 @@ def test_threads_stop(method: str, count: int, diagnose: bool, compiled: bool) -
     assert threads == "1"
 
 
-def test_a_stream_has_handed_over_what_is_finished() -> None:
-    robot = ik.load_robot("kuka_lwr_barrett")
+def test_a_stream_has_handed_over_what_is_finished(robot) -> None:
     points, normals = robot.contacts(robot.random(np.random.default_rng(0), 30))
     solver = ik.Solver(robot)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -16,8 +16,7 @@ STEPPED = [name for name in ik.METHODS if name != "ipopt"]
 
 
 @pytest.fixture(scope="module")
-def stepped_solver() -> ik.Solver:
-    robot = ik.load_robot("kuka_lwr_barrett")
+def stepped_solver(robot) -> ik.Solver:
     return ik.Solver(robot, method="enhanced-dls", finger_step="closed-form")
 
 
@@ -43,17 +42,15 @@ def same_as_the_log(solver: ik.Solver, grasp: ik.Grasp, path: Path) -> ik.Soluti
 
 
 @pytest.mark.parametrize("method", STEPPED)
-def test_steps_are_those_of_the_log(method: str, tmp_path) -> None:
-    robot = ik.load_robot("kuka_lwr_barrett")
+def test_steps_are_those_of_the_log(robot, method: str, tmp_path) -> None:
     options = {"max_iterations": 60} if method.startswith("original") else {}
     solver = ik.Solver(robot, method, finger_step="closed-form", options=options)
     same_as_the_log(solver, ik.load_grasp("sugar_box"), tmp_path / "x.mcap")
 
 
 @pytest.mark.parametrize("method", ["hand-first", "thumb-first"])
-def test_steps_go_through_all_rounds(method: str, tmp_path) -> None:
+def test_steps_go_through_all_rounds(robot, method: str, tmp_path) -> None:
     """A target out of reach takes every start there is; by hand as well as in the loop."""
-    robot = ik.load_robot("kuka_lwr_barrett")
     solver = ik.Solver(robot, method)
     points, normals = ik.load_grasp("sugar_box").arrays(robot.fingers)
     away = grasp_of(robot, points + np.array([0.0, 0.0, 3.0]), normals)

@@ -77,10 +77,9 @@ def test_every_choice_can_be_built(tmp_path):
             assert one not in made[:i], keys[i]
 
 
-def test_the_mounting_face_is_another_palm_frame(tmp_path):
+def test_the_mounting_face_is_another_palm_frame(robot, tmp_path):
     study = ablation_study(tmp_path, 1, 0, 1)
     setting = next(item for item in study.settings if "mounting face" in item.key)
-    robot = ik.load_robot("kuka_lwr_barrett")
     moved = study.solver(setting).robot
     offset = np.linalg.inv(moved.palm(robot.home)) @ robot.palm(robot.home)
     np.testing.assert_allclose(offset[:3, 3], [0, 0, 0.08], atol=1e-12)

@@ -8,11 +8,6 @@ import casadi_ik as ik
 
 
 @pytest.fixture(scope="session")
-def robot() -> ik.ArmHand:
-    return ik.load_robot("kuka_lwr_barrett")
-
-
-@pytest.fixture(scope="session")
 def grasp() -> ik.Grasp:
     return ik.load_grasp("cup")
 
