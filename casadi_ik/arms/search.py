@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import casadi as ca
@@ -393,6 +394,7 @@ class ArmTrials:
         return ca.Function("at_breakpoints", [*inputs, *unused, number], outputs)
 
 
+@cache
 def _break_count(family: ArmFamily) -> int:
     """How many breakpoints a bend has."""
     if not isinstance(family, ClosedForm):

@@ -23,7 +23,7 @@ from casadi_ik.arms.subproblems import subproblem_4
 from casadi_ik.arrays import Array
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.se3 import rotation_between, skew
-from casadi_ik.symbolic.smooth import Expr, safe_norm
+from casadi_ik.symbolic.smooth import Expr, part, safe_norm
 
 SHORTEST = 1e-12
 """Length [m] below which a vector has no direction."""
@@ -154,23 +154,34 @@ class SrsArm(ClosedForm):
         Returns:
             The elbow [rad], its slack, and the `Sphere.euler_matrix` of shoulder and wrist.
         """
-        axis, upper, fore = self.screws.axes[3], self.upper_arm, self.forearm
         line = self._line(palm)
+        along = line / ca.fmax(safe_norm(line), SHORTEST)
+        turned = palm.rotation @ ca.DM(self.screws.rotation.T)
+        elbow, slack, *matrices = self._bent(ca.sumsqr(line), along, turned, sign)
+        return elbow, slack, tuple(matrices[:3]), tuple(matrices[3:])  # type: ignore[return-value]
+
+    @cached_property
+    def _bent(self) -> ca.Function:
+        """(squared distance S-W, unit vector from S to W, rotation from zero, sign) -> `_chain`."""
+        axis, upper, fore = self.screws.axes[3], self.upper_arm, self.forearm
+        squared, sign = ca.SX.sym("squared"), ca.SX.sym("sign")
+        along, turned = ca.SX.sym("along", 3), ca.SX.sym("turned", 3, 3)
         ahead, aside = 2 * float(upper @ fore), 2 * float(upper @ np.cross(axis, fore))
-        height = ca.sumsqr(line) - float(upper @ upper + fore @ fore)
+        height = squared - float(upper @ upper + fore @ fore)
         one, other, slack = subproblem_4(ca.SX(ahead), ca.SX(aside), height)
         turn = one.or_other(sign > 0, other)
         B = turn.about(axis)
         stretched = ca.DM(upper) + B @ ca.DM(fore)
-        along = line / ca.fmax(safe_norm(line), SHORTEST)
         A_0 = rotation_between(stretched / ca.fmax(safe_norm(stretched), SHORTEST), along)
         # e(line psi) = line line' + cos (I - line line') + sin [line].
         outer = along @ along.T
-        turned = palm.rotation @ ca.DM(self.screws.rotation.T)
         parts = [part @ A_0 for part in (outer, ca.DM.eye(3) - outer, skew(along))]
-        shoulder = tuple(self.shoulder_joints.euler_matrix(A) for A in parts)
-        wrist = tuple(self.wrist_joints.euler_matrix(B.T @ (A.T @ turned)) for A in parts)
-        return self.screws.centred(3, turn.angle), slack, shoulder, wrist  # type: ignore[return-value]
+        matrices = [self.shoulder_joints.euler_matrix(A) for A in parts]
+        matrices += [self.wrist_joints.euler_matrix(B.T @ (A.T @ turned)) for A in parts]
+        elbow = self.screws.centred(3, turn.angle)
+        return part(
+            "bent_arm", [squared, along, turned, sign], [elbow, slack, *map(ca.densify, matrices)]
+        )
 
 
 def _bound_form(matrix: Expr, joint: int, bound: Expr) -> Expr:

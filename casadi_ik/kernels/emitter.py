@@ -91,7 +91,7 @@ class _Emitter:
     def _body(self, function: ca.Function) -> str:
         kind = function.class_name()
         if kind == "SXFunction":
-            return straight_lines(function, self.form)
+            return straight_lines(function, self.form, self.call)
         if kind == "Switch":
             return _switch_body(function, self)
         if kind == "Map":
@@ -102,7 +102,7 @@ class _Emitter:
             except _UnknownError:
                 pass
         try:
-            return straight_lines(function.expand(), self.form)
+            return straight_lines(function.expand(), self.form, self.call)
         except RuntimeError as error:
             raise NoCodeError(f"{function.name()!r}: {error}") from error
 

@@ -3,14 +3,18 @@
 Every operation is a line, on variables of the type `real`; comparisons are of the type `mask`. What
 only outputs behind the first need stands in a block that is left out where the caller gives no
 place for that output. An operation on the same operands as an earlier one is not written again.
+A Function that is never inlined (`symbolic.smooth.part`) is called, on arrays.
 Sines with cosines of the same angle are computed together, and up to `Form.width` sines or arcs
 that do not wait for each other in one call.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -65,7 +69,7 @@ MASK: dict[int, str] = {
 
 OF_MASKS = (ca.OP_NOT, ca.OP_AND, ca.OP_OR)
 
-TURNS, ARCS = "turns", "arcs"
+TURNS, ARCS, LINES = "turns", "arcs", "lines"
 KINDS = {
     ca.OP_SIN: TURNS,
     ca.OP_COS: TURNS,
@@ -128,7 +132,7 @@ class _Node:
         value: C text.
         mask: Whether it is of the type `mask`.
         needs: Operations it needs.
-        kind: `TURNS` or `ARCS`, "" for anything else.
+        kind: `TURNS` or `ARCS`, `LINES`: the value is whole lines, "" for anything else.
         given: What an elementary function is of: an angle, or height and width.
         outputs: A bit for each output that needs it.
         after: A bit for each elementary function it waits for, itself included.
@@ -146,16 +150,60 @@ class _Node:
     written: bool = False
 
 
-def straight_lines(function: ca.Function, form: Form) -> str:
+Caller = Callable[[ca.Function, Sequence[str]], str]
+"""The line that calls a Function with arguments."""
+
+
+PLACE = re.compile(r"(\w+)\[(\d+)\]")
+"""A number of an array."""
+
+FEW = 4
+"""Numbers that are stored one by one."""
+
+
+def _copied(stores: Sequence[str]) -> list[str]:
+    """Lines that store numbers; those that follow each other here and there are copied at once."""
+    lines: list[str] = []
+    places = [[PLACE.fullmatch(side) for side in line[:-1].split("=", 1)] for line in stores]
+    first = 0
+    for end in range(1, len(stores) + 1):
+        if end < len(stores) and all(
+            one and other and one[1] == other[1] and int(one[2]) + 1 == int(other[2])
+            for one, other in zip(places[end - 1], places[end], strict=True)
+        ):
+            continue
+        run = places[first]
+        if end - first > FEW:
+            to, source = (f"{place[1]}+{place[2]}" for place in run if place)
+            lines.append(f"memcpy({to}, {source}, {end - first}*sizeof(real));")
+        else:
+            lines += stores[first:end]
+        first = end
+    return lines
+
+
+def _view(numbers: Sequence[str]) -> str | None:
+    """The place of numbers that follow each other in an array, None if they do not."""
+    found = PLACE.fullmatch(numbers[0]) if numbers else None
+    if found is None:
+        return None
+    name, first = found[1], int(found[2])
+    together = all(each == f"{name}[{first + i}]" for i, each in enumerate(numbers))
+    return f"{name}+{first}" if together else None
+
+
+def straight_lines(function: ca.Function, form: Form, caller: Caller) -> str:
     """The body of an SX Function: inputs are `i0`, `i1`, ..., outputs `o0`, `o1`, ...
 
     Raises:
         NoCodeError: An operation has no C code.
     """
-    nodes, stores = _nodes(function, form)
+    reader = _Reader(function, form, caller)
+    nodes = reader.nodes
     for node in reversed(nodes):
         for need in node.needs:
             nodes[need].outputs |= node.outputs
+    stores = [_copied(lines) for lines in reader.stores]
     writer = _Writer(nodes, form.width)
     apart = {1 << output for output in range(1, len(stores))}
     shared = [k for k, node in enumerate(nodes) if node.outputs and node.outputs not in apart]
@@ -166,38 +214,84 @@ def straight_lines(function: ca.Function, form: Form) -> str:
     return "".join([f"  {line}\n" for line in lines])
 
 
-def _nodes(function: ca.Function, form: Form) -> tuple[list[_Node], list[list[str]]]:
-    """The operations of an SX function, and for each output the lines that store its numbers."""
-    nodes: list[_Node] = []
-    stores: list[list[str]] = [[] for _ in range(function.n_out())]
-    # Of every place of the work vector: the text of what it holds, its node or -1, its type.
-    held: dict[int, tuple[str, int, bool]] = {}
-    known: dict[str, tuple[str, int, bool]] = {}  # what operations gave, by their text
-    identity, sources, targets = (
-        function.instruction_id,
-        function.instruction_input,
-        function.instruction_output,
-    )
-    calls = 0
-    for k in range(function.n_instructions()):
-        code, to = identity(k), targets(k)
-        if code == ca.OP_CONST:
-            held[to[0]] = form.number(function.instruction_constant(k)), -1, False
-            continue
-        given = sources(k)
-        if code == ca.OP_INPUT:
-            held[to[0]] = f"i{given[0]}[{given[1]}]", -1, False
-            continue
-        values = [held[place] for place in given]
-        if code == ca.OP_OUTPUT:
-            text, node, mask = values[0]
-            stores[to[0]].append(f"o{to[0]}[{to[1]}]={f'TRUTH({text})' if mask else text};")
-            if node >= 0:
-                nodes[node].outputs |= 1 << to[0]
-            continue
-        if code == ca.OP_ASSIGN:
-            held[to[0]] = values[0]
-            continue
+_Held = tuple[str, int, bool]
+"""What a place of the work vector holds: its text, its node or -1, whether it is a `mask`."""
+
+
+@dataclass(slots=True)
+class _Call:
+    """A call of a Function: its node, the places of its arguments, the outputs that are used."""
+
+    function: ca.Function
+    node: _Node
+    arguments: list[str]
+    used: set[int]
+
+    def lines(self, caller: Caller) -> str:
+        """Room for the results, and the call; what is not used is not asked for."""
+        function, lines, arguments = self.function, [], list(self.arguments)
+        for i in range(function.n_out()):
+            if i and i not in self.used:
+                arguments.append("NULL")
+                continue
+            arguments.append(f"{self.node.name}_{i}")
+            lines.append(f"real {arguments[-1]}[{max(function.nnz_out(i), 1)}];")
+        return "\n  ".join([*lines, caller(function, arguments)])
+
+
+class _Reader:
+    """Reads the operations of an SX function.
+
+    Attributes:
+        nodes: Operations whose results have names.
+        stores: For each output the lines that store its numbers.
+    """
+
+    def __init__(self, function: ca.Function, form: Form, caller: Caller) -> None:
+        """Read all."""
+        self.nodes: list[_Node] = []
+        self.stores: list[list[str]] = [[] for _ in range(function.n_out())]
+        self._function = function
+        self._known: dict[str, _Held] = {}  # what operations gave, by their text
+        self._calls: dict[str, _Call] = {}
+        self._elementary = 0
+        held: dict[int, _Held] = {}
+        elements: Any = None
+        for k in range(function.n_instructions()):
+            code, to = function.instruction_id(k), function.instruction_output(k)
+            if code == ca.OP_CONST:
+                held[to[0]] = form.number(function.instruction_constant(k)), -1, False
+                continue
+            given = function.instruction_input(k)
+            if code == ca.OP_INPUT:
+                held[to[0]] = f"i{given[0]}[{given[1]}]", -1, False
+                continue
+            values = [held[place] for place in given]
+            if code == ca.OP_OUTPUT:
+                (text, node, mask), (output, element) = values[0], to
+                value = f"TRUTH({text})" if mask else text
+                self.stores[output].append(f"o{output}[{element}]={value};")
+                if node >= 0:
+                    self.nodes[node].outputs |= 1 << output
+            elif code == ca.OP_ASSIGN:
+                held[to[0]] = values[0]
+            elif code == ca.OP_CALL:
+                elements = elements or function.instructions_sx().nz
+                results = self._called(elements[k].which_function(), values, to)
+                held |= dict(zip(to, results, strict=True))
+            else:
+                held[to[0]] = self._operation(code, values)
+        for call in self._calls.values():
+            call.node.value = call.lines(caller)
+
+    def _add(self, value: str, needs: Iterable[int], mask: bool = False, kind: str = "") -> _Node:
+        node = _Node(f"t{len(self.nodes)}", value, mask, tuple(needs), kind)
+        for need in node.needs:
+            node.after |= self.nodes[need].after
+        self.nodes.append(node)
+        return node
+
+    def _operation(self, code: int, values: list[_Held]) -> _Held:
         texts = tuple(
             as_mask(text, mask) if wanted else f"TRUTH({text})" if mask else text
             for (text, _, mask), wanted in zip(values, takes_masks(code), strict=False)
@@ -206,21 +300,55 @@ def _nodes(function: ca.Function, form: Form) -> tuple[list[_Node], list[list[st
         try:
             value = (MASK if is_mask else REAL)[code] % texts
         except KeyError:
-            raise NoCodeError(f"operation {code} of {function.name()!r}") from None
-        if value in known:
-            held[to[0]] = known[value]
-            continue
-        needs = tuple(node for _, node, _ in values if node >= 0)
-        node = _Node(f"t{len(nodes)}", value, is_mask, needs)
-        for need in needs:
-            node.after |= nodes[need].after
-        if kind := KINDS.get(code):
-            node.kind, node.given = kind, _given(code, texts)
-            node.after |= 1 << calls
-            calls += 1
-        held[to[0]] = known[value] = node.name, len(nodes), is_mask
-        nodes.append(node)
-    return nodes, stores
+            raise NoCodeError(f"operation {code} of {self._function.name()!r}") from None
+        if value not in self._known:
+            kind = KINDS.get(code, "")
+            at, needs = len(self.nodes), (node for _, node, _ in values if node >= 0)
+            node = self._add(value, needs, is_mask, kind)
+            if kind:
+                node.given = _given(code, texts)
+                node.after |= 1 << self._elementary
+                self._elementary += 1
+            self._known[value] = node.name, at, is_mask
+        return self._known[value]
+
+    def _called(
+        self, function: ca.Function, values: list[_Held], to: Sequence[int]
+    ) -> Iterator[_Held]:
+        """The results of a call, of which those with a place in `to` are used."""
+        arguments: list[str] = []
+        needs: set[int] = set()
+        rest = iter(values)
+        for i in range(function.n_in()):
+            argument, owners = self._argument(list(islice(rest, function.nnz_in(i))))
+            arguments.append(argument)
+            needs |= owners
+        known = f"{function.__hash__()}({','.join(arguments)})"
+        if known not in self._calls:
+            self._known[known] = known, len(self.nodes), False
+            node = self._add("", sorted(needs), kind=LINES)
+            self._calls[known] = _Call(function, node, arguments, set())
+        call, at = self._calls[known], self._known[known][1]
+        places = iter(to)
+        for i in range(function.n_out()):
+            for element in range(function.nnz_out(i)):
+                if next(places) >= 0:
+                    call.used.add(i)
+                yield f"{call.node.name}_{i}[{element}]", at, False
+
+    def _argument(self, values: list[_Held]) -> tuple[str, set[int]]:
+        """The place of numbers, an array of their own where they do not stand in one."""
+        numbers = [f"TRUTH({text})" if mask else text for text, _, mask in values]
+        owners = {node for _, node, _ in values if node >= 0}
+        if (place := _view(numbers)) is not None:
+            return place, owners
+        array = ",".join(numbers or ["R(0.0)"])
+        if array not in self._known:
+            at = len(self.nodes)
+            node = self._add(f"const real t{at}[]={{{array}}};", sorted(owners), kind=LINES)
+            self._known[array] = node.name, at, False
+        name, at, _ = self._known[array]
+        return name, {at}
 
 
 def takes_masks(code: int) -> tuple[bool, bool]:
@@ -254,7 +382,7 @@ class _Writer:
     def lines(self, numbers: Sequence[int]) -> list[str]:
         """The lines of these operations, of which those before may be needed."""
         self._lines = []
-        self._calls = [number for number in numbers if self._nodes[number].kind]
+        self._calls = [number for number in numbers if self._nodes[number].kind in (TURNS, ARCS)]
         for number in numbers:
             self._write(number)
         return self._lines
@@ -270,14 +398,15 @@ class _Writer:
             at = waiting.pop()
             if node.written:
                 continue
-            if node.kind:
+            if node.kind in (TURNS, ARCS):
                 self._call(at)
             else:
                 self._put(node, node.value)
 
     def _put(self, node: _Node, value: str) -> None:
         # Not const: clang would look for a constant's value through all that it is made of.
-        self._lines.append(f"{'mask' if node.mask else 'real'} {node.name}={value};")
+        kind = "mask" if node.mask else "real"
+        self._lines.append(value if node.kind == LINES else f"{kind} {node.name}={value};")
         node.written = True
 
     def _call(self, number: int) -> None:

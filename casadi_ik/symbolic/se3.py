@@ -15,12 +15,13 @@ on the saddle.
 
 from __future__ import annotations
 
+from functools import cache
 from typing import TypeAlias
 
 import casadi as ca
 import numpy as np
 
-from casadi_ik.symbolic.smooth import Expr, even_function, safe_norm, safe_sqrt
+from casadi_ik.symbolic.smooth import Expr, even_function, part, safe_norm, safe_sqrt
 
 TINY_SQUARED = 1e-8
 """Two Taylor terms are exact to rounding below; the closed forms here never cancel above."""
@@ -373,9 +374,9 @@ def align(correlation: Expr, free: Expr | None = None) -> Expr:
     K = ca.vertcat(ca.horzcat(trace, z.T), ca.horzcat(z, B + B.T - trace * ca.DM.eye(3)))
     # Eigenvalues lie in [-sqrt(3), sqrt(3)]: shifted, the dominant one is the largest.
     M = K + 2 * ca.DM.eye(4)
+    squared = _squared()
     for _ in range(7):  # a power iteration of 128 steps
-        M = M @ M
-        M = M / (M[0, 0] + M[1, 1] + M[2, 2] + M[3, 3])
+        M = ca.triu2symm(squared(ca.triu(M)))
     column = M[:, 0]
     for j in range(1, 4):
         better = ca.sumsqr(M[:, j]) > ca.sumsqr(column)
@@ -386,3 +387,12 @@ def align(correlation: Expr, free: Expr | None = None) -> Expr:
         # they do, nearly enough, for two fingers that face each other; not for three.
         column = ca.if_else(ca.sumsqr(M) < 0.55, M @ free, column)
     return quaternion_to_matrix(column / ca.fmax(ca.norm_2(column), 1e-300))
+
+
+@cache
+def _squared() -> ca.Function:
+    """Upper triangle of a symmetric (4, 4) -> that of its square, by the trace."""
+    upper = ca.SX.sym("upper", ca.Sparsity.upper(4))
+    matrix = ca.triu2symm(upper)
+    square = matrix @ matrix
+    return part("squared", [upper], [ca.triu(square / ca.trace(square))])

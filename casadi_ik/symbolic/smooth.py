@@ -61,3 +61,34 @@ def shared(*outputs: Expr) -> list[Any]:
     """
     merged: Any = ca.cse(list(outputs))
     return merged
+
+
+def part(name: str, inputs: Sequence[Expr], outputs: Sequence[Expr]) -> ca.Function:
+    """A Function that graphs call where others are written out: code stands once for all calls.
+
+    Args:
+        name: Identifier.
+        inputs: Symbols.
+        outputs: Expressions of them; every equal piece is computed once.
+    """
+    return ca.Function(name, list(inputs), shared(*outputs), {"never_inline": True})
+
+
+def part_of(
+    name: str, inputs: Sequence[Expr], given: Sequence[Expr], outputs: Sequence[Expr]
+) -> Callable[..., Any]:
+    """A `part` that is called several times in one graph.
+
+    Args:
+        name: Identifier.
+        inputs: Symbols for what differs from call to call.
+        given: Symbols of the graph itself; what depends on them alone is computed once for all.
+        outputs: Expressions of both.
+
+    Returns:
+        The function of the inputs, for use in that graph.
+    """
+    varying: Any
+    varying, symbols, known = ca.extract_parametric(shared(*outputs), list(given))
+    called = part(name, [*inputs, *given, ca.vertcat(*symbols)], varying)
+    return lambda *values: called(*values, *given, ca.vertcat(*known))

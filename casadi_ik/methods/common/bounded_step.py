@@ -15,11 +15,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from typing import TypeAlias
 
 import casadi as ca
 
 from casadi_ik.symbolic.linear_algebra import PIVOT_FLOOR
-from casadi_ik.symbolic.smooth import Expr
+from casadi_ik.symbolic.smooth import Expr, part
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,18 @@ class System:
         places = zip(sparsity.row(), sparsity.get_col(), matrix.nonzeros(), strict=True)
         entries = {(i, j): value for i, j, value in places if i <= j}
         return cls(entries, [-slope[i] for i in range(slope.numel())], {})
+
+    @property
+    def numbers(self) -> Expr:
+        """All of it, in one column."""
+        return ca.vertcat(*self.entries.values(), *self.right, *self.inverses.values())
+
+    @classmethod
+    def of_symbols(cls, other: System) -> System:
+        """One like another, made of symbols."""
+        entries = {place: ca.SX.sym("entry") for place in other.entries}
+        inverses = {i: ca.SX.sym("inverse") for i in other.inverses}
+        return cls(entries, [ca.SX.sym("right") for _ in other.right], inverses)
 
     def copy(self) -> System:
         """The same, to go on with."""
@@ -280,27 +294,129 @@ def damped_step(
     Returns:
         The step; value + step is within the bounds, to rounding.
     """
-    gradient = ca.densify(jacobian.T @ residual)
-    normal = ca.sparsify(jacobian.T @ jacobian) + damping * ca.DM.eye(jacobian.shape[1])
+    normal, gradient = squares(jacobian, residual)
     low, high = bounded.lower - bounded.value, bounded.upper - bounded.value
-    step = in_box(normal, gradient, low, high, passes)
+    step = in_box(normal, damping, gradient, low, high, passes)
     change = jacobian @ step
     return DampedStep(step, -ca.dot(change, 2 * residual + change))
 
 
-def in_box(matrix: Expr, slope: Expr, low: Expr, high: Expr, passes: int) -> Expr:
+def squares(jacobian: Expr, residual: Expr) -> tuple[Expr, Expr]:
+    """Upper triangle (n, n) of J'J, and J'r (n, 1), of J (m, n) and r (m, 1)."""
+    return _squares(_pattern(jacobian))(jacobian, residual)
+
+
+def in_box(matrix: Expr, damping: Expr, slope: Expr, low: Expr, high: Expr, passes: int) -> Expr:
     """Minimiser of x' M x / 2 + slope' x, the last coordinates in a box that holds the origin.
 
     Args:
-        matrix: (n, n) symmetric positive definite; only its upper triangle is read.
+        matrix: (n, n) M but for the damping, symmetric; only its upper triangle is read.
+        damping: Scalar added to the diagonal, so that M is positive definite.
         slope: (n, 1).
         low: (k, 1) lower ends of the box, <= 0.
         high: (k, 1) upper ends, >= 0.
         passes: Corrections of the active set, at least one.
     """
-    first = slope.numel() - low.numel()
-    order = elimination(matrix.sparsity(), first, passes)
-    begun = order.begun(matrix, slope)
+    upper = ca.triu(matrix)
+    return _in_box(_pattern(upper), low.numel(), passes)(upper, damping, slope, low, high)
+
+
+Pattern: TypeAlias = tuple[tuple[int, int], tuple[int, ...], tuple[int, ...]]
+"""Size, rows and columns of what is structurally not zero: what functions are kept by."""
+
+
+def _pattern(matrix: Expr) -> Pattern:
+    sparsity = matrix.sparsity()
+    return matrix.shape, tuple(sparsity.row()), tuple(sparsity.get_col())
+
+
+def _sparse(name: str, pattern: Pattern) -> Expr:
+    (rows, columns), *places = pattern
+    return ca.SX.sym(name, ca.Sparsity.triplet(rows, columns, *places))
+
+
+@cache
+def _squares(pattern: Pattern) -> ca.Function:
+    """See `squares`: the sum of those of blocks, as many as possible calls of one function."""
+    jacobian = _sparse("jacobian", pattern)
+    residual = ca.SX.sym("residual", jacobian.shape[0])
+    normal, gradient = ca.SX(*(jacobian.shape[1:] * 2)), ca.SX.zeros(jacobian.shape[1])
+    blocks = _blocks(jacobian.sparsity())
+    for block in blocks:
+        rows, columns = list(block.rows), list(block.columns)
+        part_of, right = jacobian[rows, columns], residual[rows]
+        width = max(len(other.columns) for other in blocks if len(other.rows) == len(rows))
+        alike = [other for other in blocks if other.is_worth(len(rows), width)]
+        if block in alike and len(alike) > 1:
+            padded = ca.horzcat(part_of, ca.SX(len(rows), width - len(columns)))
+            normal_of, gradient_of = _block_squares(len(rows), width)(ca.densify(padded), right)
+        else:
+            normal_of, gradient_of = ca.triu(ca.sparsify(part_of.T @ part_of)), part_of.T @ right
+        chosen = ca.DM(len(columns), jacobian.shape[1])
+        for i, column in enumerate(columns):
+            chosen[i, column] = 1
+            gradient[column] += gradient_of[i]
+        normal += chosen.T @ normal_of[: len(columns), : len(columns)] @ chosen
+    return part("squares", [jacobian, residual], [normal, gradient])
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Rows of a matrix, each nonzero in some of the columns that the next is nonzero in."""
+
+    rows: tuple[int, ...]
+    columns: tuple[int, ...]
+
+    def is_worth(self, rows: int, columns: int) -> bool:
+        """Whether it may be taken for one of a size."""
+        return len(self.rows) == rows > 2 and columns <= FILL * len(self.columns)
+
+
+FILL = 1.3
+"""A block may be taken for one of so many times its columns, for one function of several blocks."""
+
+
+def _blocks(sparsity: ca.Sparsity) -> list[_Block]:
+    """The rows by what is nonzero in them."""
+    numbers: dict[int, set[int]] = {row: set() for row in range(sparsity.size1())}
+    for row, column in zip(sparsity.row(), sparsity.get_col(), strict=True):
+        numbers[row].add(column)
+    found: list[tuple[list[int], set[int]]] = []
+    for row, columns in numbers.items():
+        for i, (rows, others) in enumerate(found):
+            if others <= columns or columns <= others:
+                found[i] = [*rows, row], others | columns
+                break
+        else:
+            found.append(([row], columns))
+    return [_Block(tuple(rows), tuple(sorted(columns))) for rows, columns in found]
+
+
+@cache
+def _block_squares(rows: int, columns: int) -> ca.Function:
+    block, right = ca.SX.sym("block", rows, columns), ca.SX.sym("right", rows)
+    return part("block_squares", [block, right], [ca.triu(block.T @ block), block.T @ right])
+
+
+@cache
+def _in_box(pattern: Pattern, count: int, passes: int) -> ca.Function:
+    """See `in_box`; `count` are bounded."""
+    matrix = _sparse("matrix", pattern)
+    slope, damping = ca.SX.sym("slope", matrix.shape[0]), ca.SX.sym("damping")
+    damped = matrix + damping * ca.DM.eye(slope.numel())
+    low, high = ca.SX.sym("low", count), ca.SX.sym("high", count)
+    first = slope.numel() - count
+    order = elimination((damped + damped.T).sparsity(), first, passes)
+    begun = order.begun(damped, slope)
+    # All passes are calls of one function, of those numbers of the system that it needs.
+    known = System.of_symbols(begun)
+    held, values = ca.SX.sym("held", count), ca.SX.sym("values", count)
+    found = order.solved(known, held, values)
+    unknowns = ca.vertcat(*found.values())
+    needed = {symbol.element_hash() for symbol in ca.symvar(unknowns)}
+    places = [i for i, each in enumerate(known.numbers.nz) if each.element_hash() in needed]
+    solved = part("solved", [known.numbers[places], held, values], [unknowns])
+    numbers = begun.numbers[places]
     force = ca.vertcat(*order.resting(begun))
     at_low = ca.logic_and(low >= 0, force > 0)
     at_high = ca.logic_and(high <= 0, force < 0)
@@ -308,7 +424,8 @@ def in_box(matrix: Expr, slope: Expr, low: Expr, high: Expr, passes: int) -> Exp
     inside = low
     for number in range(passes):
         held = ca.logic_or(at_low, at_high)
-        x = order.solved(begun, held, held * ca.if_else(at_low, low, high))
+        x = solved(numbers, held, held * ca.if_else(at_low, low, high))
+        x = dict(zip(found, ca.vertsplit(x), strict=True))
         inside = ca.vertcat(*(x[i] for i in bounded))
         if number == passes - 1:
             break
@@ -316,7 +433,8 @@ def in_box(matrix: Expr, slope: Expr, low: Expr, high: Expr, passes: int) -> Exp
         at_low = ca.if_else(held, ca.logic_and(at_low, force > 0), inside < low)
         at_high = ca.if_else(held, ca.logic_and(at_high, force < 0), inside > high)
     inside = ca.fmin(ca.fmax(inside, low), high)
-    return order.completed(begun, dict(zip(bounded, ca.vertsplit(inside), strict=True)))
+    whole = order.completed(begun, dict(zip(bounded, ca.vertsplit(inside), strict=True)))
+    return part("in_box", [matrix, damping, slope, low, high], [whole])
 
 
 def clip(value: Expr, bounded: Bounded) -> Expr:

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import casadi as ca
 
 from casadi_ik.kernels.layout import Layout
-from casadi_ik.methods.common.bounded_step import Bounded, damped_step, in_box
+from casadi_ik.methods.common.bounded_step import Bounded, clip, damped_step, in_box, squares
 from casadi_ik.problem.contacts import (
     LENGTH,
     ContactRows,
@@ -26,7 +26,7 @@ from casadi_ik.problem.contacts import (
 )
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.kinematics import actuated
-from casadi_ik.symbolic.smooth import Expr, shared
+from casadi_ik.symbolic.smooth import Expr, part
 
 
 @dataclass(frozen=True)
@@ -108,6 +108,9 @@ class BalanceParameters:
 
 FIT, BALANCE = FitParameters(), BalanceParameters()
 
+TINY = 1e-100
+"""What is divided by is no smaller."""
+
 
 @dataclass(frozen=True, eq=False)
 class Tried:
@@ -129,31 +132,30 @@ class Tried:
 
 
 def lm_step(
-    before: Expr,
-    jacobian: Expr,
+    at: Callable[[Any], tuple[Expr, Expr]],
+    x: Any,
     damping: Expr,
     bounds: Bounded,
     moved: Callable[[Expr], Any],
-    residual: Callable[[Any], Expr],
-    motors: Callable[[Any], Expr],
+    motors: Callable[[Any], Expr] = lambda there: there,
 ) -> Tried:
-    """One damped least-squares step within bounds: of palm and hand, or of the arm alone.
+    """One damped least-squares step within bounds: of all motors, of palm and hand, of the arm.
 
     Args:
-        before: (m, 1) residual where it begins.
-        jacobian: (m, n).
+        at: Residual (m, 1) and Jacobian (m, n) at a place.
+        x: The place where it begins.
         damping: Scalar.
         bounds: Of the motors.
-        moved: From a step (n, 1) to where it leads.
-        residual: (m, 1) of that.
-        motors: (k, 1) of that.
+        moved: From a step (n, 1) to the place that it leads to.
+        motors: (k, 1) of a place.
     """
+    before, jacobian = at(x)
     damped = damped_step(jacobian, before, damping, bounds, FIT.passes)
     reached = moved(damped.step)
     change = ca.fabs(motors(reached) - bounds.value)
     # A tool has no motors that could move.
     size = ca.mmax(change) if change.numel() else ca.SX(0)
-    return Tried(reached, before, residual(reached), damped.promised, size)
+    return Tried(reached, before, at(reached)[0], damped.promised, size)
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,7 +264,7 @@ def whole_jacobian(robot: RobotDescription, rows: ContactRows, q: Expr, p: dict[
 
 
 class WholeContacts:
-    """Functions of q (n, 1) and of a method's parameters."""
+    """The contacts as least squares of all motors q (n, 1), and of a method's parameters."""
 
     def __init__(self, robot: RobotDescription, rows: ContactRows, parameters: Layout) -> None:
         """Remember what they are made of.
@@ -274,34 +276,34 @@ class WholeContacts:
         """
         self._robot, self._rows, self._layout = robot, rows, parameters
 
-    def tried(self, q: ca.SX) -> tuple[list[ca.SX], Tried]:
-        """Symbols of what `fitted` and `balanced` give, and these as a step from q (n, 1)."""
-        n, m = q.numel(), self._rows.size
-        sizes = {"reached": n, "before": m, "there": m, "promised": 1}
-        symbols = [ca.SX.sym(name, size) for name, size in sizes.items()]
-        reached, before, there, promised = symbols
-        return symbols, Tried(reached, before, there, promised, ca.mmax(ca.fabs(reached - q)))
+    @cached_property
+    def at(self) -> ca.Function:
+        """(q, parameters) -> residual of `ContactRows` and its Jacobian, structurally sparse."""
+        parameters = self._layout.symbols("parameters")
+        q, p = ca.SX.sym("q", len(self._robot.actuators)), self._layout.unpack(parameters)
+        residual = whole_residual(self._robot, self._rows, q, p)
+        jacobian = whole_jacobian(self._robot, self._rows, q, p)
+        return part("whole_at", [q, parameters], [ca.densify(residual), jacobian])
 
-    def fitted(self, q: Expr, damping: Expr, parameters: Expr) -> list[Expr]:
+    def fitted(self, q: Expr, damping: Expr, parameters: Expr) -> Tried:
         """One damped least-squares step within the bounds.
 
         Args:
             q: (n, 1) where it begins.
             damping: Scalar.
             parameters: Of the method.
-
-        Returns:
-            Where it leads (n, 1), residuals before and there, and by how much the linear model says
-            the cost falls.
         """
-        before, slopes = self._at(q, parameters)
-        normal, gradient = self._squares(before, slopes)
-        reached = self._box(normal, gradient, damping, q, parameters)
-        promised = self._promise(before, slopes, q, reached)
-        return [reached, before, self.residual(reached, parameters), promised]
+        bounds = self._bounds(q, parameters)
+        return lm_step(
+            lambda there: self.at(there, parameters),
+            q,
+            damping,
+            bounds,
+            lambda step: clip(q + step, bounds),
+        )
 
-    def balanced(self, q: Expr, damping: Expr, number: Expr, parameters: Expr) -> list[Expr]:
-        """One step towards the smallest largest error, see `balanced`; returns as `fitted`.
+    def balanced(self, q: Expr, damping: Expr, number: Expr, parameters: Expr) -> Tried:
+        """One step towards the smallest largest error, see `balanced`; nothing is promised of it.
 
         Args:
             q: (n, 1) where it begins.
@@ -309,90 +311,19 @@ class WholeContacts:
             number: How many powers are done.
             parameters: Of the method.
         """
-        before, slopes = self._at(q, parameters)
-        right, rows, stretched = self._reweighted(before, slopes, number, parameters)
-        normal, gradient = self._squares(right, rows)
-        normal = self._stretched(normal, stretched)
-        reached = self._box(normal, gradient, BALANCE.damping * damping, q, parameters)
-        return [reached, before, self.residual(reached, parameters), ca.MX(0)]
+        p, bounds = self._layout.unpack(parameters), self._bounds(q, parameters)
+        before, jacobian = self.at(q, parameters)
+        right, slopes = reweighted(before, jacobian, self._rows, number, p)
+        normal, gradient = squares(slopes, right)
+        low, high = bounds.lower - q, bounds.upper - q
+        step = in_box(normal, BALANCE.damping * damping, gradient, low, high, FIT.passes)
+        reached = clip(q + step, bounds)
+        size = ca.mmax(ca.fabs(reached - q))
+        return Tried(reached, before, self.at(reached, parameters)[0], ca.SX(0), size)
 
-    @cached_property
-    def residual(self) -> ca.Function:
-        """(q, parameters) -> residual of `ContactRows`."""
-        q, parameters, p = self._symbols()
-        outputs = shared(ca.densify(whole_residual(self._robot, self._rows, q, p)))
-        return ca.Function("whole_residual", [q, parameters], outputs)
-
-    @cached_property
-    def _at(self) -> ca.Function:
-        """(q, parameters) -> residual and its Jacobian, structurally sparse."""
-        q, parameters, p = self._symbols()
-        residual = whole_residual(self._robot, self._rows, q, p)
-        jacobian = whole_jacobian(self._robot, self._rows, q, p)
-        return ca.Function("whole_at", [q, parameters], shared(ca.densify(residual), jacobian))
-
-    @cached_property
-    def _squares(self) -> ca.Function:
-        """(residual, Jacobian) -> upper triangle of J'J, and J'r."""
-        residual, jacobian = self._linear()
-        outputs = shared(*_normal(jacobian, residual))
-        return ca.Function("whole_squares", [residual, jacobian], outputs)
-
-    @cached_property
-    def _reweighted(self) -> ca.Function:
-        """(residual, Jacobian, number of the power, parameters) -> see `reweighted`."""
-        residual, jacobian = self._linear()
-        _, parameters, p = self._symbols()
-        number = ca.SX.sym("number")
-        right, slopes, stretched = reweighted(residual, jacobian, self._rows, number, p)
-        slopes = ca.project(slopes, jacobian.sparsity())
-        outputs = shared(right, slopes, ca.sparsify(stretched))
-        return ca.Function("reweighted", [residual, jacobian, number, parameters], outputs)
-
-    @cached_property
-    def _stretched(self) -> ca.Function:
-        """(J'J, further rows) -> J'J with them; it gets no entry that it has not."""
-        normal = ca.SX.sym("normal", self._squares.sparsity_out(0))
-        rows = ca.SX.sym("rows", self._reweighted.sparsity_out(2))
-        more = normal + ca.triu(ca.sparsify(rows.T @ rows))
-        outputs = shared(ca.project(more, normal.sparsity()))
-        return ca.Function("stretched", [normal, rows], outputs)
-
-    @cached_property
-    def _box(self) -> ca.Function:
-        """(J'J, J'r, damping, q, parameters) -> where the step leads."""
-        normal = ca.SX.sym("normal", self._squares.sparsity_out(0))
-        q, parameters, p = self._symbols()
-        gradient, damping = ca.SX.sym("gradient", q.numel()), ca.SX.sym("damping")
-        low, high = p["lower"] - q, p["upper"] - q
-        damped = normal + damping * ca.DM.eye(q.numel())
-        step = in_box(damped, gradient, low, high, FIT.passes)
-        reached = ca.fmin(ca.fmax(q + step, p["lower"]), p["upper"])
-        inputs = [normal, gradient, damping, q, parameters]
-        return ca.Function("whole_box", inputs, shared(reached))
-
-    @cached_property
-    def _promise(self) -> ca.Function:
-        """(residual, Jacobian, q, where a step leads) -> what the linear model promises of it."""
-        residual, jacobian = self._linear()
-        n = jacobian.shape[1]
-        q, reached = ca.SX.sym("q", n), ca.SX.sym("reached", n)
-        change = jacobian @ (reached - q)
-        outputs = shared(-ca.dot(change, 2 * residual + change))
-        return ca.Function("whole_promise", [residual, jacobian, q, reached], outputs)
-
-    def _symbols(self) -> tuple[ca.SX, ca.SX, dict[str, ca.SX]]:
-        parameters = self._layout.symbols("parameters")
-        q = ca.SX.sym("q", len(self._robot.actuators))
-        return q, parameters, self._layout.unpack(parameters)
-
-    def _linear(self) -> tuple[ca.SX, ca.SX]:
-        sparsity = self._at.sparsity_out(1)
-        return ca.SX.sym("residual", self._rows.size), ca.SX.sym("jacobian", sparsity)
-
-
-def _normal(jacobian: Expr, residual: Expr) -> tuple[Expr, Expr]:
-    return ca.triu(ca.sparsify(jacobian.T @ jacobian)), ca.densify(jacobian.T @ residual)
+    def _bounds(self, q: Expr, parameters: Expr) -> Bounded:
+        p = self._layout.unpack(parameters)
+        return Bounded(q, p["lower"], p["upper"], first=0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -443,7 +374,7 @@ def _weighed(before: Expr, contacts: ContactRows, number: Expr, p: dict[str, Exp
     """Of a residual, for the power of a number."""
     scaled = _scaled(before, contacts, p)
     parts = _lengths(scaled, contacts)
-    largest = ca.fmax(ca.mmax(parts), 1e-100)
+    largest = ca.fmax(ca.mmax(parts), TINY)
     power = sum(
         (ca.if_else(number == i, value, 0.0) for i, value in enumerate(BALANCE.powers)), ca.SX(0)
     )
@@ -452,8 +383,11 @@ def _weighed(before: Expr, contacts: ContactRows, number: Expr, p: dict[str, Exp
 
 def reweighted(
     before: Expr, jacobian: Expr, contacts: ContactRows, number: Expr, p: dict[str, Expr]
-) -> tuple[Expr, Expr, Expr]:
+) -> tuple[Expr, Expr]:
     """The least squares that a step solves.
+
+    The rows of a contact count by its weight, and along its error k - 1 times as much for the power
+    k: they are stretched that way, and its residual, which lies along it, is shortened.
 
     Args:
         before: Residual (size, 1) of the contacts.
@@ -463,20 +397,34 @@ def reweighted(
         p: Parameters.
 
     Returns:
-        Residual (size, 1), Jacobian (size, n), and rows (2 f, n) that stretch it along the errors:
-        further ones, whose residual is zero.
+        Residual (size, 1) and Jacobian (size, n).
     """
-    weighed = _weighed(before, contacts, number, p)
-    weights, parts, scaled = weighed.weights, weighed.parts, weighed.scaled
-    rows = ca.sqrt(_each(weights, contacts))
-    slopes = _scaled(jacobian, contacts, p)
-    stretched = [
-        ca.sqrt(weights[i] * (weighed.power - 2))
-        / ca.fmax(parts[i], 1e-100)
-        * (scaled[own].T @ slopes[own, :])
-        for i, own in enumerate(contacts.slices)
+    weighed, n = _weighed(before, contacts, number, p), jacobian.shape[1]
+    allowed = _allowed(p)
+    residual, rows = [], []
+    for i, own in enumerate(contacts.slices):
+        part_of = jacobian[own, :]
+        columns = sorted(set(part_of.sparsity().get_col()))
+        of = _stretched(own.stop - own.start, len(columns))
+        given = (weighed.parts[i], weighed.weights[i], weighed.power, allowed[i])
+        right, slopes = of(before[own], ca.densify(part_of[:, columns]), *given)
+        residual.append(right)
+        rows.append(slopes @ ca.DM.eye(n)[columns, :])
+    return ca.vertcat(*residual), ca.vertcat(*rows)
+
+
+@cache
+def _stretched(rows: int, columns: int) -> ca.Function:
+    """Of a contact: residual, slopes, part of its tolerance, weight, power, tolerance -> both."""
+    residual, slopes = ca.SX.sym("residual", rows), ca.SX.sym("slopes", rows, columns)
+    numbers = length, weight, power, allowed = [
+        ca.SX.sym(name) for name in ("length", "weight", "power", "allowed")
     ]
-    return rows * scaled, rows * slopes, ca.vertcat(*stretched)
+    stretch, size = ca.sqrt(power - 1), ca.sqrt(weight) / allowed
+    along = residual / (allowed * ca.fmax(length, TINY))
+    right = size / stretch * residual
+    bent = size * (slopes + along @ ((stretch - 1) * (along.T @ slopes)))
+    return part("stretched", [residual, slopes, *numbers], [right, bent])
 
 
 def balanced(
@@ -528,8 +476,13 @@ def balanced(
 
 def _scaled(values: Expr, contacts: ContactRows, p: dict[str, Expr]) -> Expr:
     """Rows (size, k) of the contacts as parts of the tolerances."""
-    allowed = ca.vertcat(p["position_tolerance"] / LENGTH, chord(p["angle_tolerance"]))
-    return values / _each(ca.fmax(allowed, 1e-100), contacts)
+    return values / _each(_allowed(p), contacts)
+
+
+def _allowed(p: dict[str, Expr]) -> Expr:
+    """The tolerances (2 f, 1) in the units of residuals."""
+    both = ca.vertcat(p["position_tolerance"] / LENGTH, chord(p["angle_tolerance"]))
+    return ca.fmax(both, TINY)
 
 
 def _each(values: Expr, contacts: ContactRows) -> Expr:

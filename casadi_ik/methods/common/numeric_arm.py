@@ -8,7 +8,9 @@ solves a nominal arm beside the real one, Newton's steps lead from there to the 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -21,7 +23,7 @@ from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.even_spread import evenly
 from casadi_ik.symbolic.kinematics import Pose, actuated
 from casadi_ik.symbolic.se3 import skew
-from casadi_ik.symbolic.smooth import Expr, shared
+from casadi_ik.symbolic.smooth import Expr, part, shared
 
 TABLE = 1024
 """Configurations of the arm to start from."""
@@ -118,17 +120,25 @@ def pose_step(
     robot: RobotDescription, arm: Expr, palm: Pose, damping: Expr, p: dict[str, Expr]
 ) -> Tried:
     """One damped step of the arm (a, 1) towards a palm pose."""
-    columns = list(robot.arm_actuators)
+    columns, seen = list(robot.arm_actuators), _pose_at(robot)
     bounds = Bounded(arm, p["lower"][columns], p["upper"][columns], first=0)
+    return lm_step(
+        lambda there: seen(there, palm.rotation, palm.origin),
+        arm,
+        damping,
+        bounds,
+        lambda step: clip(arm + step, bounds),
+    )
 
-    def residual(reached: Expr) -> Expr:
-        return _error(_palm(robot, reached), palm)
 
-    def moved(step: Expr) -> Expr:
-        return clip(arm + step, bounds)
-
-    jacobian = pose_jacobian(robot, arm)
-    return lm_step(residual(arm), jacobian, damping, bounds, moved, residual, lambda there: there)
+@cache
+def _pose_at(robot: RobotDescription) -> Callable[..., Any]:
+    """(arm, rotation, origin) -> how far the palm is off, and the Jacobian of that."""
+    arm = ca.SX.sym("arm", len(robot.arm_actuators))
+    wanted = Pose(ca.SX.sym("rotation", 3, 3), ca.SX.sym("origin", 3))
+    error = _error(_palm(robot, arm), wanted)
+    inputs = [arm, wanted.rotation, wanted.origin]
+    return part("pose_at", inputs, [error, pose_jacobian(robot, arm)])
 
 
 def newton_polish(robot: RobotDescription, model_error: float) -> ca.Function:

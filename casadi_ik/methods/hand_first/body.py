@@ -182,7 +182,7 @@ class BodyStep(HandFirstStep):
         hand = list(side.robot.hand_actuators)
         q = s["q"][side.motors]
         x = PalmAndHand(s["palm_rotation"], s["palm_origin"], q[hand])
-        tried = fit_step(side.layouts, None, x, s["damping"], own, q)
+        tried = fit_step(side.layouts, None, x, s["damping"], own, q, inputs)
         # A hand that fits its contacts by half has its palm where it need not be within reach.
         judged = judge_contacts(s, own, tried, rows, BODY.fit_part)
         within = judge_contacts(s, own, tried, rows, BEFORE_THE_ARM).within

@@ -7,7 +7,7 @@ fifteen equations. The palm's coordinates are its pose; a step turns and shifts 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import casadi as ca
 
@@ -19,11 +19,10 @@ from casadi_ik.methods.hand_first.state import HandFirstLayouts
 from casadi_ik.problem.contacts import LENGTH, ContactRows, Vectors
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.se3 import compose, exp_se3, skew
-from casadi_ik.symbolic.smooth import Expr
+from casadi_ik.symbolic.smooth import Expr, part_of
 
 
-@dataclass(frozen=True, eq=False)
-class PalmAndHand:
+class PalmAndHand(NamedTuple):
     """The unknowns of the hand stage."""
 
     rotation: Expr
@@ -108,6 +107,7 @@ def fit_step(
     damping: Expr,
     p: dict[str, Expr],
     q: Expr,
+    given: Sequence[Expr],
 ) -> Tried:
     """One damped step; it turns and shifts the palm along one screw.
 
@@ -122,18 +122,17 @@ def fit_step(
         damping: Scalar.
         p: Parameters.
         q: (n, 1) with the hand's part at `x.hand`.
+        given: Symbols that the parameters are made of.
     """
-    before, jacobian = _rows(layouts, arm, x, p)
     bounds = layouts.hand_bounds(q, p, first=6)
+    there = PalmAndHand(ca.SX.sym("R", 3, 3), ca.SX.sym("t", 3), ca.SX.sym("h", x.hand.numel()))
+    seen = part_of("fit_at", there, given, _rows(layouts, arm, there, p))
 
     def moved(step: Expr) -> PalmAndHand:
         rotation, origin = compose((x.rotation, x.origin), exp_se3(step[:6]))
         return PalmAndHand(rotation, origin, clip(x.hand + step[6:], bounds))
 
-    def residual(reached: PalmAndHand) -> Expr:
-        return _rows(layouts, arm, reached, p)[0]
-
-    return lm_step(before, jacobian, damping, bounds, moved, residual, lambda there: there.hand)
+    return lm_step(lambda place: seen(*place), x, damping, bounds, moved, lambda place: place.hand)
 
 
 def _rows(

@@ -32,7 +32,7 @@ from casadi_ik.problem.trace import (
     Q,
 )
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.smooth import Expr, shared
+from casadi_ik.symbolic.smooth import Expr, part, shared
 
 STAGES = (
     *(Phase.REFINEMENT, Phase.CANDIDATE, Phase.HAND_FIT, Phase.ARM_PLACEMENT),
@@ -255,31 +255,37 @@ class HandFirstLayouts:
             accepted: Whether it was taken.
             margin: Of the arm, if the stage places it.
         """
-        f = len(self.robot.fingers)
-        positions: Expr = [NOTHING] * f
-        angles: Expr = [NOTHING] * f
+        residual, cost, size = ca.SX.nan(self.contacts.size), NOTHING, NOTHING
         if tried is not None:
-            positions, chords = self.contacts.errors(tried.before)
-            angles = 2 * ca.asin(ca.fmin(chords / 2, 1.0))
-            positions = ca.if_else(p["weights"][:, 0] > 0, positions, NOTHING)
-            angles = ca.if_else(p["weights"][:, 1] > 0, angles, NOTHING)
-        return self.record.pack(
+            residual = tried.before[: self.contacts.size]
+            cost, size = ca.sumsqr(tried.before), tried.size
+        restart = s["earlier"] + ca.fmax(s["candidate"], 0.0)
+        numbers = cost, s["damping"], size, margin, restart, accepted, float(phase)
+        return self._row(q, residual, *numbers, p["weights"], p["lower"], p["upper"])
+
+    @cached_property
+    def _row(self) -> ca.Function:
+        """What is logged, from the numbers of a stage; of a residual of NaN nothing is known."""
+        robot, n = self.robot, len(self.robot.actuators)
+        q, lower, upper = (ca.SX.sym(name, n) for name in ("q", "lower", "upper"))
+        residual = ca.SX.sym("residual", self.contacts.size)
+        weights = ca.SX.sym("weights", len(robot.fingers), 2)
+        names = ("cost", "damping", "step_size", "margin", "restart", "accepted", "phase")
+        numbers = {name: ca.SX.sym(name) for name in names}
+        positions, chords = self.contacts.errors(residual)
+        angles = 2 * ca.asin(ca.fmin(chords / 2, 1.0))
+        row = self.record.pack(
             {
                 "q": q,
-                "cost": ca.sumsqr(tried.before) if tried else NOTHING,
-                "position_error": positions,
-                "angle_error": angles,
-                "damping": s["damping"],
-                "step_size": tried.size if tried else NOTHING,
-                "margin": margin,
-                **coupling_values(self.robot, q),
-                "limit_mask": bits(ca.logic_or(q <= p["lower"], q >= p["upper"])),
-                "restart": s["earlier"] + ca.fmax(s["candidate"], 0.0),
-                "accepted": accepted,
-                "phase": float(phase),
+                **numbers,
+                "position_error": ca.if_else(weights[:, 0] > 0, positions, NOTHING),
+                "angle_error": ca.if_else(weights[:, 1] > 0, angles, NOTHING),
+                **coupling_values(robot, q),
+                "limit_mask": bits(ca.logic_or(q <= lower, q >= upper)),
                 "status": 0.0,  # filled in by the iteration
             }
         )
+        return part("row", [q, residual, *numbers.values(), weights, lower, upper], [row])
 
 
 def with_rows(q: Expr, rows: Sequence[int], values: Expr) -> Expr:

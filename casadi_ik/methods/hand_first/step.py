@@ -193,22 +193,15 @@ class HandFirstStep:
 
     def _start(self) -> ca.Function:
         """Nothing moves."""
-        inputs, s, _ = self._vectors(ca.MX)
-        residual = self.layouts.whole.residual(s["q"], inputs[1])
-        return ca.Function("start", inputs, list(self._looked()(*inputs, residual)))
-
-    def _looked(self) -> ca.Function:
         inputs, s, p = self._vectors()
         contacts = self.layouts.contacts
-        residual = ca.SX.sym("residual", contacts.size)
+        residual, _ = self.layouts.whole.at(s["q"], inputs[1])
         tolerances = p["position_tolerance"], chord(p["angle_tolerance"])
         met = within_tolerance(*contacts.errors(residual), *tolerances)
         looked = Tried(s["q"], residual, residual, ca.SX(0), ca.SX(0))
         record = self.layouts.row(s, p, s["q"], Phase.REFINEMENT, looked)
         said = {"within": met, "cost": ca.sumsqr(residual)}
-        return self._function(
-            Stage.START, [*inputs, residual], s, {"spent": ca.SX(1)}, said, record
-        )
+        return self._function(Stage.START, inputs, s, {"spent": ca.SX(1)}, said, record)
 
     def _candidate(self) -> ca.Function:
         inputs, s, p = self._vectors()
@@ -232,7 +225,7 @@ class HandFirstStep:
         inputs, s, p = self._vectors()
         columns = list(self.robot.hand_actuators)
         x = PalmAndHand(s["palm_rotation"], s["palm_origin"], s["q"][columns])
-        tried = fit_step(self.layouts, self.arm, x, s["damping"], p, s["q"])
+        tried = fit_step(self.layouts, self.arm, x, s["damping"], p, s["q"], inputs)
         judged = judge_contacts(s, p, tried, self.layouts.contacts, BEFORE_THE_ARM)
         keep, reached = judged.accepted, tried.reached
         changed = {
@@ -334,14 +327,8 @@ class HandFirstStep:
         return self._function(Stage.ARM_STEPS, inputs, s, changed, said, record)
 
     def _refinement(self) -> ca.Function:
-        inputs, s, _ = self._vectors(ca.MX)
-        step = self.layouts.whole.fitted(s["q"], s["damping"], inputs[1])
-        outputs = self._refined()(*inputs, *step)
-        return ca.Function("refinement", inputs, list(outputs))
-
-    def _refined(self) -> ca.Function:
         inputs, s, p = self._vectors()
-        symbols, tried = self.layouts.whole.tried(s["q"])
+        tried = self.layouts.whole.fitted(s["q"], s["damping"], inputs[1])
         judged = judge_contacts(s, p, tried, self.layouts.contacts)
         changed = {"q": ca.if_else(judged.accepted, tried.reached, s["q"])} | judged.fit
         said = {
@@ -350,19 +337,13 @@ class HandFirstStep:
             "near": self._left(judged.accepted, tried, p),
         }
         record = self.layouts.row(s, p, s["q"], Phase.REFINEMENT, tried, judged.accepted)
-        return self._function(Stage.REFINEMENT, [*inputs, *symbols], s, changed, said, record)
+        return self._function(Stage.REFINEMENT, inputs, s, changed, said, record)
 
     def _balance(self) -> ca.Function:
-        inputs, s, _ = self._vectors(ca.MX)
-        step = self.layouts.whole.balanced(s["q"], s["damping"], s["power"], inputs[1])
-        outputs = self._weighed()(*inputs, *step)
-        return ca.Function("balance", inputs, list(outputs))
-
-    def _weighed(self) -> ca.Function:
         inputs, s, p = self._vectors()
-        symbols, tried = self.layouts.whole.tried(s["q"])
+        tried = self.layouts.whole.balanced(s["q"], s["damping"], s["power"], inputs[1])
         found = balanced(s["q"], tried, self.layouts.contacts, s, p)
         said = {"settled": found.over, "within": found.within, "cost": found.largest}
         record = self.layouts.row(s, p, s["q"], Phase.BALANCE, tried, found.accepted)
         changed = {"q": found.q} | found.fit
-        return self._function(Stage.BALANCE, [*inputs, *symbols], s, changed, said, record)
+        return self._function(Stage.BALANCE, inputs, s, changed, said, record)

@@ -340,20 +340,10 @@ class ThumbFirstStep(ThumbFirstLayouts):
 
 def balance_stage(layouts: ThumbFirstLayouts) -> ca.Function:
     """One step of all motors; it ends with a solution or with the next start."""
-    state = ca.MX.sym("state", layouts.state.size)
-    parameters = ca.MX.sym("parameters", layouts.parameters.size)
-    s = layouts.state.unpack(state)
-    whole = WholeContacts(layouts.robot, layouts.contacts, layouts.parameters)
-    step = whole.balanced(s["q"], s["damping"], s["power"], parameters)
-    outputs = _judged(layouts, whole)(state, parameters, *step)
-    return ca.Function("balance", [state, parameters], list(outputs))
-
-
-def _judged(layouts: ThumbFirstLayouts, whole: WholeContacts) -> ca.Function:
-    """Go on from where a step leads if it gained."""
     state, parameters = layouts.state.symbols("state"), layouts.parameters.symbols("parameters")
     s, p = layouts.state.unpack(state), layouts.parameters.unpack(parameters)
-    symbols, tried = whole.tried(s["q"])
+    whole = WholeContacts(layouts.robot, layouts.contacts, layouts.parameters)
+    tried = whole.balanced(s["q"], s["damping"], s["power"], parameters)
     found = balanced(s["q"], tried, layouts.contacts, s, p)
     failed = ca.logic_and(found.over, ca.logic_not(found.within))
     after = layouts.after(
@@ -377,4 +367,4 @@ def _judged(layouts: ThumbFirstLayouts, whole: WholeContacts) -> ca.Function:
         step_size=tried.size,
         accepted=found.accepted,
     )
-    return ca.Function("balanced", [state, parameters, *symbols], shared(after, record, status))
+    return ca.Function("balance", [state, parameters], shared(after, record, status))
