@@ -310,7 +310,7 @@ class SolverSources:
         rows = max(spread.count for spread in plan.seeds.spreads[:2]) + TILE
         # Distances of all rows and of their tiles are 32 bits each.
         room = rows if self.single is None else rows + rows // TILE
-        constants = define(lookup.constants)
+        constants = define(lookup.constants | {"REGISTER_BYTES": 0})
         found = (self._part(f"{name}look_up", "lookup", lookup.key, constants, room),)
         return found + ((self._part(f"{name}seen", "map", plan.seeds.seen),) if plan.mends else ())
 
@@ -336,8 +336,8 @@ class SolverSources:
     ) -> Part:
         of_graph = isinstance(kernel, FunctionGraph)
         function: Any = row_major(kernel.function) if of_graph else kernel.function
-        if driver == "map":
-            constants = define({"N_IN": function.n_in(), "N_OUT": function.n_out()})
+        if driver in ("map", "lookup"):
+            constants += define({"N_IN": function.n_in(), "N_OUT": function.n_out()})
         if driver == "lookup":
             extra += function.numel_out(0)
         before = {"clearance": "lanes_alone"}.get(driver)

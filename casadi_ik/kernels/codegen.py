@@ -97,13 +97,6 @@ def row_major(function: Any) -> Any:
     return ca.Function(function.name(), symbols, outputs, names_in, names_out)
 
 
-LOOPS = """\
-#if defined(__GNUC__) && !defined(__clang__)
-#pragma GCC optimize ("O3")
-#endif
-"""
-"""Has gcc turn loops into vector operations, which it does not do at the level of long sources."""
-
 WIDE = """\
 #if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
 #pragma GCC target("avx2")
@@ -115,10 +108,11 @@ WIDE = """\
 @cache
 def meaning(form: Form) -> str:
     """C text that says what the emitter's code means: types, operations, elementary functions."""
-    forms = driver_text("elementary")
+    forms, loops = driver_text("elementary"), driver_text("loops")
     if form.single:
-        return "#define SINGLE\n" + driver_text("elementary_single") + driver_text("real")
-    alone = driver_text("elementary_alone") + forms
+        single = driver_text("elementary_single") + driver_text("real")
+        return f"{loops}#define SINGLE\n{single}"
+    alone = loops + driver_text("elementary_alone") + forms
     if form.lanes > 1:
         own = driver_text("lanes") + driver_text("elementary_lanes") + forms
         return alone + define({"LANES": form.lanes}) + own

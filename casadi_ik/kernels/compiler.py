@@ -25,13 +25,11 @@ from casadi_ik.kernels.cancellation import SLICE, stop_if_cancelled
 # but the driver is hidden, so that a function named like one of libc cannot be taken for it.
 FLAGS = ("-fPIC", "-shared", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden")
 
-LEVEL, LONG = ("-O2",), 60_000
-LEVEL_OF_LONG = ("-O1", "-fexpensive-optimizations", "-finline-small-functions")
-"""Optimization, and that of a source with more characters: the passes between the two take time
-that grows with the square of a function's length, a loop's whole compilation 2.5 (14 motors) to 4
-(29 motors) times as long, and win 3 % of speed. Of them "expensive" clears the upper halves of
-vector registers where code with vectors ends: a batch takes a sixth longer where none does.
-Results are the same bit for bit."""
+LEVEL = ("-O1", "-fexpensive-optimizations", "-finline-small-functions")
+"""Optimization: the passes between this and -O2 take time that grows with the square of a
+function's length, and win 3 % of speed. Of them "expensive" clears the upper halves of vector
+registers where code with vectors ends: a batch takes a sixth longer where none does. Results are
+the same bit for bit."""
 
 CANDIDATES = ("cc", "gcc", "clang")
 
@@ -72,7 +70,7 @@ class Compiler:
     @property
     def identity(self) -> str:
         """What decides the produced code, apart from the source."""
-        return "\n".join((*self.command, self.version, *LEVEL, *LEVEL_OF_LONG, *self.flags))
+        return "\n".join((*self.command, self.version, *LEVEL, *self.flags))
 
     def build(self, source: Path, library: Path) -> None:
         """Compile one C file to a shared library.
@@ -87,8 +85,7 @@ class Compiler:
             KeyboardInterrupt: Ctrl-C reached the compiler.
             CancelledError: This thread has been told to stop.
         """
-        level = LEVEL if source.stat().st_size <= LONG else LEVEL_OF_LONG
-        command = [*self.command, *level, *self.flags, "-o", str(library), str(source), "-lm"]
+        command = [*self.command, *LEVEL, *self.flags, "-o", str(library), str(source), "-lm"]
         place = {"TMPDIR": str(library.parent), "LC_ALL": "C"}
         try:
             done = _run(command, os.environ | place)

@@ -97,7 +97,7 @@ def machine_lanes() -> int:
         if asked not in ("1", "4", "8"):
             raise KernelError(f"CASADI_IK_LANES={asked[:20]!r}: expected 1, 4 or 8")
         return int(asked) if asked != "1" else 0
-    text = driver_text("registers") + driver_text("machine_lanes")
+    text = driver_text("machine_lanes")
     library = load_library("machine_lanes", lambda: text, SYMBOL_MACHINE, text)
     return 0 if library is None else int(library[SYMBOL_MACHINE]())
 
@@ -173,6 +173,7 @@ class FunctionKernel:
         input_shapes: Shape of one sample of each input.
         output_shapes: Shape of one sample of each output.
         entry: The compiled function, None if there is none.
+        library: What it is in.
     """
 
     def __init__(
@@ -180,6 +181,7 @@ class FunctionKernel:
         function: ca.Function | FunctionGraph,
         compiled: bool = True,
         in_lanes: bool = False,
+        driver: str = "",
     ) -> None:
         """Compile the function or load it from the cache.
 
@@ -188,6 +190,7 @@ class FunctionKernel:
             compiled: False keeps to the virtual machine.
             in_lanes: Whether some samples of a batch are computed side by side, where the machine
                 has such registers; the results are the same bit for bit.
+            driver: C text of another driver of the function in the same library.
 
         Raises:
             KernelError: The function has no C code, or the compiler refused it.
@@ -200,16 +203,18 @@ class FunctionKernel:
         self._names = tuple(graph.inputs)
         self._input_sizes = [rows * columns for rows, columns in graph.inputs.values()]
         self._output_sizes = [rows * columns for rows, columns in graph.outputs]
-        self.entry: Any = self._load(in_lanes) if compiled else None
+        self.library: Any = None
+        self.entry: Any = self._load(in_lanes, driver) if compiled else None
         self.compiled = self.entry is not None
         self._singles: list[SingleCall] = []
 
-    def _load(self, in_lanes: bool) -> Any:
+    def _load(self, in_lanes: bool, driver: str = "") -> Any:
         """The compiled map, None if there is none."""
         lanes = machine_lanes() if in_lanes else 0
         text = define({"N_IN": len(self._input_sizes), "N_OUT": len(self._output_sizes)})
         if not lanes:
-            return self._map(self.name, text + driver_text("map_job") + driver_text("map"), SYMBOL)
+            text += driver_text("map_job") + driver_text("map") + driver
+            return self._map(self.name, text, SYMBOL)
         text += define({"TOTAL": sum(self._input_sizes) + sum(self._output_sizes)})
         for name, sizes in (("SIZES_IN", self._input_sizes), ("SIZES_OUT", self._output_sizes)):
             text += f"#define {name} {{{', '.join(map(str, sizes))}}}\n"
@@ -222,8 +227,10 @@ class FunctionKernel:
 
     def _map(self, name: str, driver: str, symbol: str, lanes: int = 1) -> Any:
         graph = self._graph
-        library = load_function(name, lambda: graph.function, driver, symbol, graph.recipe, lanes)
-        return None if library is None else library[symbol]
+        self.library = load_function(
+            name, lambda: graph.function, driver, symbol, graph.recipe, lanes
+        )
+        return None if self.library is None else self.library[symbol]
 
     @cached_property
     def function(self) -> ca.Function:

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from casadi_ik.kernels.cancellation import SLICE, drive, stop_if_cancelled
 from casadi_ik.kernels.codegen import c_struct, define, driver_text
-from casadi_ik.kernels.function_kernel import FunctionKernel, memory
+from casadi_ik.kernels.function_kernel import FunctionKernel, machine_lanes, memory
 from casadi_ik.kernels.graphs import FunctionGraph
-from casadi_ik.kernels.libraries import load_function
 
 SYMBOL = "casadi_ik_lookup"
 
@@ -40,6 +39,7 @@ class LookupKernel:
 
     Attributes:
         key: The function that makes keys.
+        constants: What the driver expects, but for the function and the machine.
         compiled: Whether calls run in compiled code; numpy finds the same rows.
         tiles: (tiles, pairs of entries, TILE, 2) keys of the table in steps, for compiled code.
         entry: The compiled function, None if there is none.
@@ -59,7 +59,13 @@ class LookupKernel:
             KernelError: The function has no C code, or the compiler refused it.
         """
         graph = key if isinstance(key, FunctionGraph) else FunctionGraph.of(key)
-        self.key = FunctionKernel(graph, compiled)
+        self.constants = {
+            "N_KEY": graph.outputs[0][0],
+            "TILE": TILE,
+            "STEPS": STEPS,
+            "LARGEST": LARGEST,
+        }
+        self.key = FunctionKernel(graph, compiled, driver=self._driver() if compiled else "")
         (keys,) = self.key(*rows)
         self._keys = _rounded(np.nan_to_num(keys).reshape(len(keys), -1))
         # Two entries of neighbouring rows side by side, tile by tile in the order of reading: whole
@@ -67,25 +73,12 @@ class LookupKernel:
         width = self._keys.shape[1]
         padded = np.pad(self._keys, ((0, -len(keys) % TILE), (0, width % 2))).astype(np.int16)
         self.tiles = padded.reshape(-1, TILE, (width + 1) // 2, 2).transpose(0, 2, 1, 3).copy()
-        library = self._load(graph) if compiled else None
-        self.compiled = library is not None
-        self.entry: Any = None if library is None else library[SYMBOL]
+        self.compiled = self.key.compiled
+        self.entry: Any = self.key.library[SYMBOL] if self.compiled else None
 
-    def _load(self, graph: FunctionGraph) -> ctypes.CDLL | None:
-        texts = map(driver_text, ("registers", "lookup_job", "lookup"))
-        driver = define(self.constants) + "".join(texts)
-        return load_function(graph.name, lambda: graph.function, driver, SYMBOL, graph.recipe)
-
-    @property
-    def constants(self) -> dict[str, int]:
-        """What the driver expects."""
-        return {
-            "N_IN": len(self.key.input_shapes),
-            "N_KEY": self._keys.shape[1],
-            "TILE": TILE,
-            "STEPS": STEPS,
-            "LARGEST": LARGEST,
-        }
+    def _driver(self) -> str:
+        own = define(self.constants | {"REGISTER_BYTES": 8 * machine_lanes()})
+        return own + driver_text("lookup_job") + driver_text("lookup")
 
     def __call__(self, count: int, *inputs: Any) -> NDArray[np.int64]:
         """Find the nearest rows.

@@ -1,6 +1,7 @@
 /* The rows of a table whose keys are nearest to that of each sample, in order.
  *
- * Expects the macros N_IN, N_KEY, TILE, STEPS and LARGEST; the step is the function that makes a key.
+ * Expects the macros N_IN, N_KEY, TILE, STEPS, LARGEST and REGISTER_BYTES (of the machine's vectors,
+ * 0: not known); the step is the function that makes a key.
  */
 #include <math.h>
 
@@ -13,12 +14,7 @@ typedef struct {
 #define PAIRS ((N_KEY + 1) / 2)
 #define FAR INT32_MAX
 
-/* Only gcc needs to be told that loops over a tile are one instruction. */
-#if defined(__clang__)
-#define UNROLLED static inline __attribute__((always_inline, unused))
-#else
-#define UNROLLED static inline __attribute__((always_inline, unused, optimize("O3")))
-#endif
+#define UNROLLED LOOPS static inline __attribute__((always_inline, unused))
 
 static void ask(const scalar *key, asked *pairs) {
   int i;
@@ -71,59 +67,55 @@ UNROLLED void choose(const lookup_job *job, int32_t *distance, int32_t *nearest,
   }
 }
 
-typedef void look_up(const lookup_job *, const asked *, int32_t *, int32_t *, int64_t *);
-
-#if defined(__clang__)
-#define FORM static
-#else
-#define FORM static __attribute__((optimize("O3")))
-#endif
-
-#if defined(__x86_64__) && !defined(FREESTANDING)
+#if defined(__x86_64__) && REGISTER_BYTES
 #define PAIR_OF(numbers) \
   ((int32_t) ((uint32_t) (uint16_t) (numbers)[0] | (uint32_t) (uint16_t) (numbers)[1] << 16))
 
-/* With registers of so many bytes. The instruction is named: the header of all of them takes longer
- * to read than this file to compile. */
-#define DEFINE_FORM(BYTES, TARGET, REGISTER)                                                    \
-  typedef int32_t wide_##BYTES __attribute__((vector_size(BYTES)));                             \
-  typedef int16_t halves_##BYTES __attribute__((vector_size(BYTES)));                           \
-                                                                                                \
-  __attribute__((target(TARGET)))                                                               \
-  FORM void measure_##BYTES(const lookup_job *job, const asked *pairs, int32_t *distance) {     \
-    wide_##BYTES twice[PAIRS], kept[PAIRS];                                                     \
-    const int64_t parts = TILE * 4 / BYTES;                                                     \
-    int64_t part, count = (job->rows + TILE - 1) / TILE * parts;                                \
-    int i;                                                                                      \
-    for (i = 0; i < PAIRS; ++i) {                                                               \
-      twice[i] = PAIR_OF(pairs[i].twice) + (wide_##BYTES) {0};                                  \
-      kept[i] = PAIR_OF(pairs[i].kept) + (wide_##BYTES) {0};                                    \
-    }                                                                                           \
-    for (part = 0; part < count; ++part) {                                                      \
-      const char *from = (const char *) job->tiles + (part / parts * PAIRS * parts + part % parts) * BYTES; \
-      wide_##BYTES sum = {0};                                                                   \
-      for (i = 0; i < PAIRS; ++i) {                                                             \
-        wide_##BYTES a, rest, both;                                                             \
-        memcpy(&a, from + i * parts * BYTES, BYTES);                                            \
-        rest = (wide_##BYTES) ((halves_##BYTES) a - (halves_##BYTES) twice[i]) & kept[i];       \
-        __asm__("vpmaddwd %2, %1, %0" : "=" REGISTER(both) : REGISTER(a), REGISTER(rest));      \
-        sum += both;                                                                            \
-      }                                                                                         \
-      memcpy(distance + part * (BYTES / 4), &sum, BYTES);                                       \
-    }                                                                                           \
-  }                                                                                             \
-                                                                                                \
-  __attribute__((target(TARGET))) FORM void with_##BYTES(                                       \
-      const lookup_job *job, const asked *pairs, int32_t *distance, int32_t *nearest,           \
-      int64_t *found) {                                                                         \
-    measure_##BYTES(job, pairs, distance);                                                      \
-    choose(job, distance, nearest, found);                                                      \
-  }
-
-DEFINE_FORM(32, "avx2", "x")
-DEFINE_FORM(64, "avx512f,avx512bw", "v")
+/* The instruction is named: the header of all of them takes longer to read than this file to
+ * compile. */
+#if REGISTER_BYTES == 64
+#define TARGET "avx512f,avx512bw"
+#define REGISTER "v"
+#else
+#define TARGET "avx2"
+#define REGISTER "x"
 #endif
 
+typedef int32_t wide __attribute__((vector_size(REGISTER_BYTES)));
+typedef int16_t halves __attribute__((vector_size(REGISTER_BYTES)));
+
+LOOPS __attribute__((target(TARGET)))
+static void measure_wide(const lookup_job *job, const asked *pairs, int32_t *distance) {
+  wide twice[PAIRS], kept[PAIRS];
+  const int64_t parts = TILE * 4 / REGISTER_BYTES;
+  int64_t part, count = (job->rows + TILE - 1) / TILE * parts;
+  int i;
+  for (i = 0; i < PAIRS; ++i) {
+    twice[i] = PAIR_OF(pairs[i].twice) + (wide) {0};
+    kept[i] = PAIR_OF(pairs[i].kept) + (wide) {0};
+  }
+  for (part = 0; part < count; ++part) {
+    const char *from = (const char *) job->tiles
+                     + (part / parts * PAIRS * parts + part % parts) * REGISTER_BYTES;
+    wide sum = {0};
+    for (i = 0; i < PAIRS; ++i) {
+      wide a, rest, both;
+      memcpy(&a, from + i * parts * REGISTER_BYTES, REGISTER_BYTES);
+      rest = (wide) ((halves) a - (halves) twice[i]) & kept[i];
+      __asm__("vpmaddwd %2, %1, %0" : "=" REGISTER(both) : REGISTER(a), REGISTER(rest));
+      sum += both;
+    }
+    memcpy(distance + part * (REGISTER_BYTES / 4), &sum, REGISTER_BYTES);
+  }
+}
+
+LOOPS __attribute__((target(TARGET)))
+static void find(const lookup_job *job, const asked *pairs, int32_t *distance, int32_t *nearest,
+                 int64_t *found) {
+  measure_wide(job, pairs, distance);
+  choose(job, distance, nearest, found);
+}
+#else
 #if defined(FREESTANDING) && (defined(__SSE2__) || defined(__wasm_simd128__))
 #if defined(__SSE2__)
 #include <emmintrin.h>
@@ -168,36 +160,15 @@ static void measure_eight(const lookup_job *job, const asked *pairs, int32_t *di
   }
 }
 
-FORM void with_eight(
-    const lookup_job *job, const asked *pairs, int32_t *distance, int32_t *nearest, int64_t *found) {
-  measure_eight(job, pairs, distance);
-  choose(job, distance, nearest, found);
-}
-#define PLAIN with_eight
-#else
-FORM void anywhere(
-    const lookup_job *job, const asked *pairs, int32_t *distance, int32_t *nearest, int64_t *found) {
+#define measure measure_eight
+#endif
+
+LOOPS static void find(const lookup_job *job, const asked *pairs, int32_t *distance,
+                       int32_t *nearest, int64_t *found) {
   measure(job, pairs, distance);
   choose(job, distance, nearest, found);
 }
-#define PLAIN anywhere
 #endif
-
-/* Asked once: in a virtual machine the question takes longer than a lookup. Threads that ask at the
- * same time get the same answer. */
-static look_up *best_form(void) {
-#if defined(__x86_64__) && !defined(FREESTANDING)
-  static int known;
-  int bits = __atomic_load_n(&known, __ATOMIC_RELAXED);
-  if (!bits) {
-    bits = register_bits();
-    __atomic_store_n(&known, bits, __ATOMIC_RELAXED);
-  }
-  if (bits == 512) return with_64;
-  if (bits == 256) return with_32;
-#endif
-  return PLAIN;
-}
 
 DRIVER(lookup, lookup_job) {
   workspace space;
@@ -207,7 +178,6 @@ DRIVER(lookup, lookup_job) {
   int i;
   asked pairs[PAIRS];
   int32_t *distance, *nearest;
-  look_up *find = best_form();
   if (outcome != DONE) return outcome;
   distance = (int32_t *) (space.extra + N_KEY);
   nearest = distance + job->rows + TILE;

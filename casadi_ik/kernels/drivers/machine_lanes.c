@@ -1,3 +1,27 @@
+/* How wide the machine's registers are, asked of the machine itself: not every compiler brings the
+ * library behind __builtin_cpu_supports. */
+#if defined(__x86_64__)
+#include <cpuid.h>
+
+/* Bits that the system saves of a thread: it must know the registers as well. */
+static unsigned saved_registers(void) {
+  unsigned low, high;
+  __asm__ volatile("xgetbv" : "=a"(low), "=d"(high) : "c"(0));
+  return low;
+}
+
+/* 512 with all of AVX-512 F, DQ, BW, VL; 256 with AVX2; else 128. */
+static int register_bits(void) {
+  const unsigned wide = 1u << 16 | 1u << 17 | 1u << 30 | 1u << 31;
+  unsigned a, b, c, d, saved;
+  if (!__get_cpuid(1, &a, &b, &c, &d) || !(c & 1u << 27) || !(c & 1u << 28)) return 128;
+  saved = saved_registers();
+  if ((saved & 0x6) != 0x6 || !__get_cpuid_count(7, 0, &a, &b, &c, &d)) return 128;
+  if ((b & wide) == wide && (saved & 0xe6) == 0xe6) return 512;
+  return b & 1u << 5 ? 256 : 128;
+}
+#endif
+
 /* How many solves this machine can make side by side, 0: vectors are of no use. */
 #if defined(_WIN32)
 __declspec(dllexport)

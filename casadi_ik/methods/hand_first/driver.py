@@ -24,7 +24,7 @@ from casadi_ik.errors import KernelError
 from casadi_ik.grasps.grasp import LARGE, SMALL, UNIT
 from casadi_ik.kernels import REPEATED, RUNNING, FunctionKernel, LoopKernel
 from casadi_ik.kernels.cancellation import SLICE, DriverCode, check
-from casadi_ik.kernels.codegen import LOOPS, WIDE, define, define_arrays, driver_text, number
+from casadi_ik.kernels.codegen import WIDE, define, define_arrays, driver_text, number
 from casadi_ik.kernels.function_kernel import machine_lanes, memory
 from casadi_ik.kernels.graphs import recipe
 from casadi_ik.kernels.libraries import load_library
@@ -661,7 +661,7 @@ def _text(plan: SearchPlan, wide: bool) -> str:
     return "".join(
         (
             WIDE if wide else "",
-            LOOPS,
+            driver_text("loops"),
             "#include <math.h>\n#include <stdint.h>\n#include <string.h>\n",
             define(codes | {"FOREVER": FOREVER}),
             *jobs,

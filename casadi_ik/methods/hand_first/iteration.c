@@ -294,7 +294,7 @@ static int after_choice(solve s) {
 #if N_STARTS
 /* The arm begins at the next row of the table: the nearest to the palm pose that is farther than the
  * last one; of all, after the last. If what is near is wanted it begins as it is. */
-static void before_arm_steps(solve s) {
+LOOPS static void before_arm_steps(solve s) {
   double distance[N_STARTS], nearest = 1e300, again = 1e300;
   int i, k, found = 0, first = 0;
   if (X(SPENT) >= 1 || X(TURNED) > 0 || (P(NEAREST) > 0 && X(STARTS) < 1)) return;

@@ -37,16 +37,32 @@ static double apart(const double *one, const double *other) {
 }
 
 #if MENDS
+/* The row of a finger's table that is nearest to what is wanted of it, and its distance. */
+LOOPS static int nearest_row(int finger, const double *wanted, double *least) {
+  double distance[FINGER_ROWS];
+  int best = 0, i, k;
+  for (i = 0; i < FINGER_ROWS; ++i) distance[i] = 0.0;
+  for (k = 0; k < FINGER_FEATURES; ++k) {
+    const double factor = wanted[k * N_FINGERS + finger];
+    for (i = 0; i < FINGER_ROWS; ++i) distance[i] += FINGER_TIPS[finger][k][i] * factor;
+  }
+  for (i = 1; i < FINGER_ROWS; ++i) {
+    if (distance[i] < distance[best]) best = i;
+  }
+  *least = distance[best];
+  return best;
+}
+
 /* A table of whole hands is thin where there are many motors: of 16 motors thousands of postures are
  * fewer than two for each. Seen from a palm, though, the fingers know nothing of each other, and a
  * small table of every finger together stands for all combinations of its rows. So a posture is
  * mended in turns: the palm pose that suits it best, then for that pose the best row of each finger.
  * `left` is what is left of its contacts' squared errors with the best palm. */
 static int mend_one(search *job, double *hand, double *left) {
-  double wanted[FINGER_FEATURES * N_FINGERS], own[N_FINGERS], distance[FINGER_ROWS];
+  double wanted[FINGER_FEATURES * N_FINGERS], own[N_FINGERS], least;
   const double *inputs[3];
   double *outputs[3];
-  int turn, finger, i, k, code;
+  int turn, finger, k, code;
   inputs[0] = job->points;
   inputs[1] = job->normals;
   inputs[2] = hand;
@@ -58,16 +74,8 @@ static int mend_one(search *job, double *hand, double *left) {
     code = SEEN(&map);
     if (code != DONE) return code;
     for (finger = 0; turn < FINGER_TURNS && finger < N_FINGERS; ++finger) {
-      int best = 0;
-      for (i = 0; i < FINGER_ROWS; ++i) distance[i] = 0.0;
-      for (k = 0; k < FINGER_FEATURES; ++k) {
-        const double factor = wanted[k * N_FINGERS + finger];
-        for (i = 0; i < FINGER_ROWS; ++i) distance[i] += FINGER_TIPS[finger][k][i] * factor;
-      }
-      for (i = 1; i < FINGER_ROWS; ++i) {
-        if (distance[i] < distance[best]) best = i;
-      }
-      if (!(distance[best] < own[finger])) continue;
+      const int best = nearest_row(finger, wanted, &least);
+      if (!(least < own[finger])) continue;
       for (k = 0; k < FINGER_MOTORS[finger]; ++k) {
         hand[FINGER_PLACES[finger][k]] = FINGER_POSTURES[finger][best][k];
       }

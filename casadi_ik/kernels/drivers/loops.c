@@ -1,0 +1,8 @@
+/* LOOPS marks functions whose loops gcc shall turn into vector operations. */
+#ifndef LOOPS
+#if defined(__GNUC__) && !defined(__clang__)
+#define LOOPS __attribute__((optimize("O3")))
+#else
+#define LOOPS
+#endif
+#endif
