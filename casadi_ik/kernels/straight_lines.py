@@ -157,9 +157,6 @@ Caller = Callable[[ca.Function, Sequence[str]], str]
 PLACE = re.compile(r"(\w+)\[(\d+)\]")
 """A number of an array."""
 
-FEW = 4
-"""Numbers that are stored one by one."""
-
 
 def _copied(stores: Sequence[str]) -> list[str]:
     """Lines that store numbers; those that follow each other here and there are copied at once."""
@@ -173,7 +170,7 @@ def _copied(stores: Sequence[str]) -> list[str]:
         ):
             continue
         run = places[first]
-        if end - first > FEW:
+        if end - first > 4:
             to, source = (f"{place[1]}+{place[2]}" for place in run if place)
             lines.append(f"memcpy({to}, {source}, {end - first}*sizeof(real));")
         else:

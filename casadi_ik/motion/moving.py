@@ -16,7 +16,6 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.grasps import Grasp
 from casadi_ik.grasps.pose import inverse, one_pose
-from casadi_ik.methods.hand_first.method import UNBOUNDED
 from casadi_ik.motion.approach import Approach, ApproachPlan, approach
 from casadi_ik.motion.follower import Follower
 from casadi_ik.motion.inputs import FollowPlan
@@ -442,7 +441,7 @@ class MovingSolver:
         """(n,) lower and upper."""
         if targets is None:
             targets = self._anything(0.0)
-        return targets.bounds(self.robot.description, UNBOUNDED)
+        return targets.bounds(self.robot.description)
 
     def _anything(self, place: float) -> TargetBatch:
         """A target with all contacts at a place, or none if that is NaN."""

@@ -142,7 +142,7 @@ class TargetBatch:
             return found
         return self.more[name] if name in self.more else np.full_like(self.points, np.nan)
 
-    def bounds(self, robot: RobotDescription, unbounded: float) -> tuple[Array, Array]:
+    def bounds(self, robot: RobotDescription, unbounded: float = 1e3) -> tuple[Array, Array]:
         """Bounds that a method has to keep to: limits, or what the mechanisms permit.
 
         (n,), or (k, n) where targets lock different positions.

@@ -12,7 +12,7 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array, Rows
 from casadi_ik.kernels.layout import Layout
 from casadi_ik.methods.common.contact_fit import fresh_fit
-from casadi_ik.methods.hand_first.method import UNBOUNDED, HandFirstMethod
+from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.targets import TargetBatch
@@ -88,7 +88,7 @@ class Subproblems:
 
     def limits(self, targets: TargetBatch) -> Bounds:
         """The bounds that solutions have to keep, (n,) or (k, n), see `TargetBatch.bounds`."""
-        return Bounds(*targets.bounds(self.robot.description, UNBOUNDED))
+        return Bounds(*targets.bounds(self.robot.description))
 
     def search(self, targets: TargetBatch, start: Array, bounds: Bounds) -> Array:
         """The first round of hand-first for each of k targets.

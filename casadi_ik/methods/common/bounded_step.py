@@ -368,12 +368,8 @@ class _Block:
     columns: tuple[int, ...]
 
     def is_worth(self, rows: int, columns: int) -> bool:
-        """Whether it may be taken for one of a size."""
-        return len(self.rows) == rows > 2 and columns <= FILL * len(self.columns)
-
-
-FILL = 1.3
-"""A block may be taken for one of so many times its columns, for one function of several blocks."""
+        """Whether it may be taken for one of a size: that a function serves several is worth it."""
+        return len(self.rows) == rows > 2 and columns <= 1.3 * len(self.columns)
 
 
 def _blocks(sparsity: ca.Sparsity) -> list[_Block]:

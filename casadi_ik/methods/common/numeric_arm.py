@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -25,36 +26,44 @@ from casadi_ik.symbolic.kinematics import Pose, actuated
 from casadi_ik.symbolic.se3 import skew
 from casadi_ik.symbolic.smooth import Expr, part, shared
 
-TABLE = 1024
-"""Configurations of the arm to start from."""
+SIX = 6
+"""An arm with fewer free motors brings a palm where it is asked for by chance only."""
 
-STARTS = 22
-"""Of these, how many are tried for a palm pose; all rounds of a solve together try them all."""
 
-SIX, NEAR = 6, 4.0
-"""An arm with fewer free motors brings a palm where it is asked for by chance only. A start that
-ends as near as this (cost, by the sum of the squared tolerances) is good enough then: a hand on a
-wrist takes 20 evaluations of its arm instead of 250."""
+@dataclass(frozen=True)
+class NumericArmParameters:
+    """How an arm is searched step by step.
 
-GAP = 1.0
-"""A joint that can turn all around but for so much [rad] may rest at the wrong end of its range:
-what is beyond one end is nearly what is beyond the other."""
+    Attributes:
+        table: Configurations of the arm to start from.
+        starts: Of these, how many are tried for a palm pose; all rounds of a solve together try
+            them all.
+        near: A start of an arm of fewer than `SIX` free motors that ends as near as this (cost, by
+            the sum of the squared tolerances) is good enough: a hand on a wrist takes 20
+            evaluations of its arm instead of 250.
+        gap: A joint that can turn all around but for so much [rad] may rest at the wrong end of its
+            range: what is beyond one end is nearly what is beyond the other.
+        at_end: How near to a limit [rad] counts as at it.
+    """
 
-AT_END = 1e-6
-"""How near to a limit [rad] counts as at it."""
+    table: int = 1024
+    starts: int = 22
+    near: float = 4.0
+    gap: float = 1.0
+    at_end: float = 1e-6
 
-FAR = 1e30
-"""Farther than any palm."""
+
+NUMERIC_ARM = NumericArmParameters()
 
 
 @cache
 def start_table(robot: RobotDescription) -> tuple[Array, Array]:
-    """Configurations of the arm (`TABLE`, a) to start from, and their palms (`TABLE`, 12).
+    """Configurations of the arm (table, a) to start from, and their palms (table, 12).
 
     Of a palm the rotation, row by row, and the origin / `LENGTH`.
     """
     columns = list(robot.arm_actuators)
-    spread = evenly(TABLE, len(columns))
+    spread = evenly(NUMERIC_ARM.table, len(columns))
     arms = robot.lower[columns] + spread * (robot.upper - robot.lower)[columns]
     q = ca.SX.sym("q", len(columns))
     palm = _palm(robot, q)
@@ -75,7 +84,7 @@ def nearest_start(robot: RobotDescription) -> ca.Function:
     wanted = ca.vertcat(ca.vec(rotation.T), origin / LENGTH)
     distances = ca.DM((table**2).sum(axis=1)) - 2 * ca.DM(table) @ wanted
     index, distance = _next_nearest(distances + ca.sumsqr(wanted), passed)
-    arm = ca.DM(arms.T) @ (ca.DM(range(TABLE)) == index)
+    arm = ca.DM(arms.T) @ (ca.DM(range(len(arms))) == index)
     return ca.Function("nearest_start", [rotation, origin, passed], [ca.densify(arm), distance])
 
 
@@ -86,7 +95,7 @@ def _next_nearest(distances: Expr, passed: Expr) -> tuple[Expr, Expr]:
     """
     beyond = distances > passed
     over = 1 - ca.norm_inf(beyond)
-    masked = ca.if_else(ca.logic_or(beyond, ca.repmat(over, TABLE, 1)), distances, FAR)
+    masked = ca.if_else(ca.logic_or(beyond, ca.repmat(over, distances.numel(), 1)), distances, 1e30)
     nearest = ca.mmin(masked)
     return ca.find(masked <= nearest), nearest
 
@@ -105,13 +114,13 @@ def next_at_end(robot: RobotDescription, arm: Expr, turned: Expr, p: dict[str, E
     """
     columns = list(robot.arm_actuators)
     lower, upper = p["lower"][columns], p["upper"][columns]
-    found: Expr = ca.SX(0)
+    found, end = ca.SX(0), NUMERIC_ARM.at_end
     for i, column in enumerate(columns):
         if robot.actuators[column].unit != "rad":
             continue
         gap = 2 * np.pi - (upper[i] - lower[i])
-        ends = ca.logic_or(arm[i] - lower[i] <= AT_END, upper[i] - arm[i] <= AT_END)
-        due = ca.logic_and(ca.logic_and(ends, ca.fabs(gap) < GAP), turned <= i)
+        ends = ca.logic_or(arm[i] - lower[i] <= end, upper[i] - arm[i] <= end)
+        due = ca.logic_and(ca.logic_and(ends, ca.fabs(gap) < NUMERIC_ARM.gap), turned <= i)
         found = ca.if_else(ca.logic_and(due, found <= 0), i + 1, found)
     return found
 

@@ -22,17 +22,14 @@ from casadi_ik.methods.common.contact_fit import FIT, Tried, fresh_fit, judge, j
 from casadi_ik.methods.common.numeric_arm import newton_polish
 from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
 from casadi_ik.methods.hand_first.hand_fit import PalmAndHand, fit_step
-from casadi_ik.methods.hand_first.parameters import BODY
+from casadi_ik.methods.hand_first.parameters import BODY, STAGES
 from casadi_ik.methods.hand_first.state import BY_SIDE, HandFirstLayouts, Stage, with_rows
-from casadi_ik.methods.hand_first.step import BEFORE_THE_ARM, HandFirstStep
+from casadi_ik.methods.hand_first.step import HandFirstStep
 from casadi_ik.problem.contacts import LENGTH, Kinds
 from casadi_ik.problem.status import Phase
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.kinematics import ActuatedKinematics, Pose, actuated
 from casadi_ik.symbolic.smooth import Expr, shared
-
-MISSED = 1e-12
-"""Margin below zero of an arm that is within its limits, but not where it should be."""
 
 
 class SideStage(NamedTuple):
@@ -185,7 +182,7 @@ class BodyStep(HandFirstStep):
         tried = fit_step(side.layouts, None, x, s["damping"], own, q, inputs)
         # A hand that fits its contacts by half has its palm where it need not be within reach.
         judged = judge_contacts(s, own, tried, rows, BODY.fit_part)
-        within = judge_contacts(s, own, tried, rows, BEFORE_THE_ARM).within
+        within = judge_contacts(s, own, tried, rows, STAGES.before_the_arm).within
         keep, reached = judged.accepted, tried.reached
         changed = {
             "q": with_rows(s["q"], side.hand, ca.if_else(keep, reached.hand, x.hand)),
@@ -268,7 +265,7 @@ class BodyStep(HandFirstStep):
             given += [arm, score, swivel, hits]
             asked, before = side.asked(p), s["margin"][side.place]
             # A margin of zero and more says that the real arm was found.
-            score = ca.if_else(hits, ca.fmax(score, 0.0), ca.fmin(score, -MISSED))
+            score = ca.if_else(hits, ca.fmax(score, 0.0), ca.fmin(score, -BODY.missed))
             better = score > before
             margins.append(ca.fmax(score, before))
             swivels.append(ca.if_else(better, swivel, s["swivel"][side.place]))

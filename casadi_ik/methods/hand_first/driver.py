@@ -28,7 +28,7 @@ from casadi_ik.kernels.codegen import WIDE, define, define_arrays, driver_text, 
 from casadi_ik.kernels.function_kernel import machine_lanes, memory
 from casadi_ik.kernels.graphs import recipe
 from casadi_ik.kernels.libraries import load_library
-from casadi_ik.kernels.loop import SLOTS, UNBEGUN, Followed
+from casadi_ik.kernels.loop import FOREVER, SLOTS, UNBEGUN, Followed
 from casadi_ik.made import made
 from casadi_ik.methods.common.contact_fit import fresh_fit
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
@@ -47,9 +47,6 @@ from casadi_ik.symbolic.even_spread import even_steps
 
 MALFORMED = -9
 """What a search returns for a question that is none."""
-
-FOREVER = 2**62
-"""Steps and rounds of a call that has no bound."""
 
 SMALLEST = 1e-9
 """Smallest range [rad or m] a motion is measured by."""

@@ -17,8 +17,8 @@ from casadi_ik.arrays import Array
 from casadi_ik.kernels.codegen import define, define_arrays, number, row_major
 from casadi_ik.kernels.function_kernel import BufferedFunction
 from casadi_ik.methods.common.contact_fit import BALANCE, FIT, fresh_fit
-from casadi_ik.methods.common.numeric_arm import STARTS, start_table
-from casadi_ik.methods.hand_first.parameters import BODY
+from casadi_ik.methods.common.numeric_arm import NUMERIC_ARM, start_table
+from casadi_ik.methods.hand_first.parameters import BODY, STAGES
 from casadi_ik.methods.hand_first.state import BY_SIDE, PLACES, SAID, Stage
 from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.problem.status import Status
@@ -28,14 +28,8 @@ from casadi_ik.symbolic.even_spread import even_steps
 if TYPE_CHECKING:
     from casadi_ik.methods.hand_first.step import HandFirstStep
 
-OWN_HAND = 0.5
-"""Cost, with the best palm, up to which the hand as it is is fitted before other hands."""
-
 MOST_SIDES = 4
 """Of a body."""
-
-WHOLE = 0.5
-"""Cost up to which a start is refined as a whole (three contacts off by 4 cm each)."""
 
 
 def text(step: HandFirstStep) -> str:
@@ -63,7 +57,7 @@ def text(step: HandFirstStep) -> str:
         "N_HAND": len(layouts.robot.hand_actuators),
         "N_CANDIDATES": layouts.candidates,
         "N_STARTS": len(start_table(robot)[0]) if numeric else 0,
-        "MOST_STARTS": STARTS,
+        "MOST_STARTS": NUMERIC_ARM.starts,
         "HAS_ARM": bool(layouts.arm),
         "HAS_FAMILY": step.placements is not None,
         "HAS_CHOICE": step.choices is not None,
@@ -77,8 +71,8 @@ def text(step: HandFirstStep) -> str:
         "FIT_GROWTH": FIT.growth,
         "SAME_COST": BALANCE.same,
         "CLOSER": BALANCE.closer,
-        "OWN_HAND": OWN_HAND,
-        "WHOLE": WHOLE,
+        "OWN_HAND": STAGES.own_hand,
+        "WHOLE": STAGES.whole,
         "EXACT_COST": FIT.exact * FIT.exact,
         "NO_MARGIN": ARM_SEARCH.no_margin,
     }
@@ -230,7 +224,7 @@ class Iteration:
                 put(best_cost=min(said["cost"], x["best_cost"]))
                 if within:
                     return Status.SOLVED
-                if self._arm and said["cost"] > WHOLE:
+                if self._arm and said["cost"] > STAGES.whole:
                     return to_next_candidate()
                 return goes_to(Stage.REFINEMENT)
             case Stage.CANDIDATE:
@@ -241,7 +235,7 @@ class Iteration:
             case Stage.HAND_FIT:
                 last, alone = x["candidate"] + 1 >= candidates, p["alone"][()] > 0
                 first = x["candidate"] + x["earlier"] <= 0 and x["spent"] < 1
-                if candidates > 1 and nearest and first and said["cost"] > OWN_HAND:
+                if candidates > 1 and nearest and first and said["cost"] > STAGES.own_hand:
                     return to_next_candidate()
                 if not settled:
                     return goes_to(Stage.HAND_FIT)
@@ -282,7 +276,7 @@ class Iteration:
                     starts=x["starts"] + (settled and not sent),
                 )
                 few = settled and near and x["earlier"] < 1
-                if not (exact or few or y["starts"][()] >= STARTS):
+                if not (exact or few or y["starts"][()] >= NUMERIC_ARM.starts):
                     return goes_to(Stage.ARM_STEPS)
                 put(turned=0)
                 return with_arm(exact and x["fits"] > 0)

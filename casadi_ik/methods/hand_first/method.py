@@ -34,9 +34,6 @@ from casadi_ik.problem.trace import RecordedJacobian
 from casadi_ik.proofs.premises import ArmSpan, arm_span, palms_in_span
 from casadi_ik.robots.description import RobotDescription
 
-UNBOUNDED = 1e3
-"""Bounds [rad or m] where limits are ignored."""
-
 NEAREST = "q0"
 """The preference for what is near the start."""
 
@@ -185,7 +182,7 @@ class HandFirstMethod(LoopedMethod):
             self.robot,
             list(map(runs, self._sides)),
             targets,
-            np.clip(q0, *targets.bounds(self.robot, UNBOUNDED)),
+            np.clip(q0, *targets.bounds(self.robot)),
             self.step.layouts.labels,
             self.graph.record.dtype if trace else None,
         )
@@ -246,7 +243,7 @@ class HandFirstMethod(LoopedMethod):
         postures = self.postures(targets, number)
         nearest = targets.prefer == NEAREST and not number
         if nearest and self.robot.arm_actuators and postures.shape[1] > 1:
-            own = np.clip(q0, *targets.bounds(self.robot, UNBOUNDED))[:, None]
+            own = np.clip(q0, *targets.bounds(self.robot))[:, None]
             own = own[:, :, list(self.robot.hand_actuators)]
             postures = np.concatenate([own, postures[:, :-1]], axis=1)
         return self.rows(targets, q0, postures, begun=number > 0)
@@ -356,7 +353,7 @@ class HandFirstMethod(LoopedMethod):
         return kept[1]
 
     def _terms_of(self, targets: TargetBatch) -> Array:
-        bounds = targets.bounds(self.robot, UNBOUNDED)
+        bounds = targets.bounds(self.robot)
         nearest = np.array([float(targets.prefer == NEAREST)])
         every = targets.position_tolerance, targets.angle_tolerance, *bounds, nearest
         if bounds[0].ndim == 1:

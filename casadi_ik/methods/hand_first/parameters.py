@@ -126,6 +126,25 @@ class HandFirstParameters:
 
 
 @dataclass(frozen=True)
+class StageParameters:
+    """When one stage of a solve follows another.
+
+    Attributes:
+        before_the_arm: Part of the tolerances that a hand is fitted to: the arm that follows it
+            adds its rounding, which at 1e-6 has made an answer of 1.0000006e-6.
+        own_hand: Cost, with the best palm, up to which the hand as it is is fitted before others.
+        whole: Cost up to which a start is refined as a whole (three contacts off by 4 cm each).
+    """
+
+    before_the_arm: float = 0.999
+    own_hand: float = 0.5
+    whole: float = 0.5
+
+
+STAGES = StageParameters()
+
+
+@dataclass(frozen=True)
 class BodyParameters:
     """How trunks are tried for the palms of a body.
 
@@ -148,6 +167,7 @@ class BodyParameters:
         closer_every: Every so many trunks one between an even spread and the best one so far.
         trunk_unit: What counts as a unit of the trunk where what is near is wanted; of arms 1.
         box: After so many trunks half as far from the best one.
+        missed: Margin below zero of an arm that is within its limits, but not where it should be.
     """
 
     rounds: int = 16
@@ -165,6 +185,7 @@ class BodyParameters:
     closer_every: int = 4
     trunk_unit: float = 0.25
     box: float = 8.0
+    missed: float = 1e-12
 
 
 BODY = BodyParameters()

@@ -34,7 +34,7 @@ from casadi_ik.methods.common.contact_fit import (
     near_tolerance,
 )
 from casadi_ik.methods.common.numeric_arm import (
-    NEAR,
+    NUMERIC_ARM,
     SIX,
     newton_polish,
     next_at_end,
@@ -43,16 +43,13 @@ from casadi_ik.methods.common.numeric_arm import (
 from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
 from casadi_ik.methods.hand_first.hand_fit import PalmAndHand, fit_step
 from casadi_ik.methods.hand_first.iteration import Iteration, text
+from casadi_ik.methods.hand_first.parameters import STAGES
 from casadi_ik.methods.hand_first.state import SAID, HandFirstLayouts, Stage, with_rows
 from casadi_ik.problem.contacts import LENGTH, ContactRows, Kinds, chord, suffix, within_tolerance
 from casadi_ik.problem.status import Phase
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.smooth import Expr, shared
-
-BEFORE_THE_ARM = 0.999
-"""Part of the tolerances that a hand is fitted to: the arm that follows it adds its rounding, which
-at 1e-6 has made an answer of 1.0000006e-6."""
 
 
 class HandFirstStep:
@@ -226,7 +223,7 @@ class HandFirstStep:
         columns = list(self.robot.hand_actuators)
         x = PalmAndHand(s["palm_rotation"], s["palm_origin"], s["q"][columns])
         tried = fit_step(self.layouts, self.arm, x, s["damping"], p, s["q"], inputs)
-        judged = judge_contacts(s, p, tried, self.layouts.contacts, BEFORE_THE_ARM)
+        judged = judge_contacts(s, p, tried, self.layouts.contacts, STAGES.before_the_arm)
         keep, reached = judged.accepted, tried.reached
         changed = {
             "q": self._with_hand(s["q"], ca.if_else(keep, reached.hand, x.hand)),
@@ -319,7 +316,7 @@ class HandFirstStep:
         allowed = ca.mmax(position) ** 2 + ca.mmax(angle) ** 2
         said = {
             "settled": judged.settled,
-            "near": ca.logic_and(few, judged.cost < NEAR * allowed),
+            "near": ca.logic_and(few, judged.cost < NUMERIC_ARM.near * allowed),
             "cost": judged.cost,
             "at_end": next_at_end(self.robot, now, s["turned"], p),
         }

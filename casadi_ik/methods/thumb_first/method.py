@@ -20,9 +20,6 @@ from casadi_ik.problem.status import Phase
 from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.robots.description import RobotDescription
 
-UNBOUNDED = 1e3
-"""Bounds [rad or m] where limits are ignored."""
-
 NEAREST = "q0"
 """The preference for what is near the start."""
 
@@ -83,7 +80,7 @@ class ThumbFirstMethod(LoopedMethod):
     def begin(self, targets: TargetBatch, q0: Array) -> Start:
         """Start where the robot is, if its nearest is wanted, and from estimates of the palm."""
         count, step, most = len(targets), self.step, self.options.starts
-        lower, upper = targets.bounds(self.robot, UNBOUNDED)
+        lower, upper = targets.bounds(self.robot)
         hand = list(self.robot.hand_actuators)
         here = np.clip(q0, lower, upper)
         nearest = targets.prefer == NEAREST

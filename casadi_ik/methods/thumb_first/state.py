@@ -47,6 +47,14 @@ class ThumbFirstParameters:
             al. 2022), in CasADi's virtual machine; slower.
         damping: Damping [-] of the first step of a start; residuals are in 0.1 m and rad.
         step_cap: Longest change of any motor in one iteration [rad, or part of a slider's range].
+        eased: Factor of the damping after a step that lowered the cost.
+        tightened: The same after one that did not.
+        damping_floor: Smallest damping.
+        damping_ceiling: Damping at which a step leads nowhere.
+        gain: A step that leaves more than this part of the cost gained little.
+        patience: Iterations in a row with little gain after which a start is given up.
+        budget: Iterations after which it is in any case.
+        as_it_is: Summed squares up to which the robot as it is, or its hand, is worth a start.
     """
 
     starts: int = 32
@@ -55,6 +63,14 @@ class ThumbFirstParameters:
     step: str = "freeze"
     damping: float = 0.03
     step_cap: float = 0.3
+    eased: float = 1 / 3
+    tightened: float = 4.0
+    damping_floor: float = 1e-6
+    damping_ceiling: float = 100.0
+    gain: float = 0.9
+    patience: int = 12
+    budget: int = 100
+    as_it_is: float = 0.5
 
     def __post_init__(self) -> None:
         if self.step not in STEPS:

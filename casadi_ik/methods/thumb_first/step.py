@@ -51,20 +51,6 @@ from casadi_ik.problem.status import Phase, Status
 from casadi_ik.symbolic.kinematics import Pose, motor_scales
 from casadi_ik.symbolic.smooth import Expr, shared
 
-EASED, TIGHTENED = 1 / 3, 4.0
-"""Factors of the damping after a step that lowered the cost and after one that did not."""
-
-DAMPING_FLOOR, DAMPING_CEILING = 1e-6, 100.0
-"""Bounds of the damping; at the ceiling a step leads nowhere."""
-
-GAIN, PATIENCE, BUDGET = 0.9, 12, 100
-"""A start is given up after PATIENCE iterations in a row that leave more than GAIN of the cost,
-and after BUDGET iterations in any case."""
-
-
-AS_IT_IS = 0.5
-"""Summed squares up to which the robot as it is, or its hand, is worth a start."""
-
 
 @dataclass(frozen=True, eq=False)
 class ThumbFirstStep(ThumbFirstLayouts):
@@ -284,15 +270,16 @@ class ThumbFirstStep(ThumbFirstLayouts):
         )
         cost = left.cost
         solved = self._met(left, p)
-        waited = ca.if_else(cost > GAIN * before.cost, s["waited"] + 1, 0.0)
-        stuck = ca.logic_and(ca.logic_not(accepted), s["damping"] > DAMPING_CEILING)
-        over = ca.logic_or(waited >= PATIENCE, s["spent"] + 1 >= BUDGET)
+        waited = ca.if_else(cost > self.options.gain * before.cost, s["waited"] + 1, 0.0)
+        stuck = ca.logic_and(ca.logic_not(accepted), s["damping"] > self.options.damping_ceiling)
+        over = ca.logic_or(waited >= self.options.patience, s["spent"] + 1 >= self.options.budget)
         over = ca.logic_or(ca.logic_or(over, stuck), skipped)
         near = ca.logic_and(self._met(left, p, BALANCE.near), differs(cost, s["balanced"]))
         near = ca.logic_and(ca.logic_and(near, over), ca.logic_not(solved))
         failed = ca.logic_and(over, ca.logic_not(ca.logic_or(solved, near)))
         following = ca.if_else(over, float(Phase.CANDIDATE), float(Phase.HAND_ALIGNMENT))
-        eased = ca.fmax(s["damping"] * ca.if_else(accepted, EASED, TIGHTENED), DAMPING_FLOOR)
+        factor = ca.if_else(accepted, self.options.eased, self.options.tightened)
+        eased = ca.fmax(s["damping"] * factor, self.options.damping_floor)
         better = cost < s["best_cost"]
         after = self.after(
             s,
@@ -335,7 +322,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
         if not self.robot.arm_actuators:
             return ca.SX(0)
         begins = ca.logic_and(s["spent"] < 1, s["start"] <= 0)
-        return ca.logic_and(ca.logic_and(p["nearest"], begins), before.cost > AS_IT_IS)
+        return ca.logic_and(ca.logic_and(p["nearest"], begins), before.cost > self.options.as_it_is)
 
 
 def balance_stage(layouts: ThumbFirstLayouts) -> ca.Function:
