@@ -220,7 +220,7 @@ class SideSources:
 
     def source(self, names: Iterable[str]) -> str:
         """Its file, with the kernels of these names."""
-        texts = source_text("spread") + source_text("seeds")
+        texts = driver_text("loops") + source_text("spread") + source_text("seeds")
         calls = "".join(
             f"#define {name.upper()}(work) {self.prefix}_{name}_kernel(work, job->memory)\n"
             for name in names

@@ -147,7 +147,8 @@ class SearchPlan:
     def source(self) -> str:
         """The C of a search."""
         seeds = ("sides",) if self.sides else ("seeds", "valley")
-        return "".join(map(source_text, ("spread", *seeds, "hand_first")))
+        texts = map(source_text, ("spread", *seeds, "hand_first"))
+        return driver_text("loops") + "".join(texts)
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -658,7 +659,6 @@ def _text(plan: SearchPlan, wide: bool) -> str:
     return "".join(
         (
             WIDE if wide else "",
-            driver_text("loops"),
             "#include <math.h>\n#include <stdint.h>\n#include <string.h>\n",
             define(codes | {"FOREVER": FOREVER}),
             *jobs,
