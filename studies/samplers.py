@@ -109,9 +109,6 @@ SAMPLERS: dict[str, tuple[str, Sampler]] = {
 }
 """By option: title and sampler."""
 
-HARD = tuple(draw for name, (_, draw) in SAMPLERS.items() if name not in ("one-arm", "singular"))
-"""Everything that is hard for an arm-hand of seven joints and shipped grasps."""
-
 
 def suits(robot: ik.ArmHand, sampler: str) -> bool:
     """Whether a robot has what a sampler needs: shipped grasps, seven joints that can be zero."""

@@ -116,23 +116,10 @@ def pinv_times(J: Expr, e: Expr, eps: float = 1e-6) -> Expr:
     return damped_pinv_times(J, e, eps)
 
 
-def null_projector(J: Expr, eps: float = 1e-6) -> Expr:
-    """Null-space projector I - J^+ J (n, n), regularised as in `pinv_times`.
-
-    Symmetric; its eigenvalues are 1 on the null space and eps^2 / (s^2 + eps^2) elsewhere.
-
-    Args:
-        J: (m, n).
-        eps: damping [unit of a singular value of J].
-
-    Returns:
-        N (n, n).
-    """
-    return ca.densify(ca.DM.eye(J.shape[1]) - pinv_times(J, J, eps))
-
-
 def project_to_null_space(J: Expr, x: Expr, eps: float = 1e-6) -> Expr:
-    """N x with N of `null_projector`, without forming N: cheaper for a few vectors.
+    """Project x onto the null space of J: x - J^+ J x, regularised as in `pinv_times`.
+
+    The part of x at a singular value s is left with eps^2 / (s^2 + eps^2) of its length.
 
     Args:
         J: (m, n).

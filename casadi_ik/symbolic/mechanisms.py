@@ -91,32 +91,6 @@ def theta3_rate(phi: Expr, bar: Linkage) -> Expr:
     return (2 * bar.g * bar.q) * s / (bar.branch * root)
 
 
-def phi_from_theta3(theta: Expr, bar: Linkage, inverse_branch: Expr, reference: Expr = 0.0) -> Expr:
-    """Crank angle phi [rad] of a given theta3 [rad]: the inverse of eq. (9).
-
-    Q stands at r = p + h e^(i theta3) in the crank's frame, and |Q - C| = q leaves two angles,
-    mirror images that meet where rod and ground align and f = d theta3 / d phi = 0. So
-    `inverse_branch` is constant only over a range where f keeps its sign. Whether the answer
-    belongs to `bar.branch` is not checked. Out of reach, the angle of nearest approach results.
-
-    Args:
-        theta: theta3 [rad].
-        bar: the linkage; its branch plays no part.
-        inverse_branch: +-1, the sign of sin(psi); see `inverse_branch_from_pose`.
-        reference: the result is the value within pi of this angle [rad].
-    """
-    x, y = bar.p + bar.h * ca.cos(theta), bar.h * ca.sin(theta)
-    square = x * x + y * y
-    along = square + bar.g * bar.g - bar.q * bar.q
-    scale = 2 * bar.g * bar.q * MIN_SINE
-    across = ca.sqrt(ca.fmax(4 * bar.g * bar.g * square - along * along, scale * scale))
-    # angle(Q) = inverse_branch * atan2(across, along); phi = angle(Q) - angle(r).
-    c, s = along, inverse_branch * across
-    cr, sr = ca.cos(reference), ca.sin(reference)
-    cosine, sine = c * x + s * y, s * x - c * y
-    return reference + ca.atan2(sine * cr - cosine * sr, cosine * cr + sine * sr)
-
-
 def branch_from_pose(bar: Linkage, phi: float, theta: float) -> int:
     """Branch (+1 or -1) of a numeric linkage in a known pose.
 
@@ -135,11 +109,6 @@ def branch_from_pose(bar: Linkage, phi: float, theta: float) -> int:
         return abs(float(theta3(ca.DM(phi), bar._replace(branch=branch), theta)) - theta)
 
     return min((-1, 1), key=distance)
-
-
-def inverse_branch_from_pose(bar: Linkage, phi: float) -> int:
-    """Branch (+1 or -1) for `phi_from_theta3` of a numeric linkage in the pose phi [rad]."""
-    return 1 if float(psi(ca.DM(phi), bar)) >= 0 else -1
 
 
 def _rod(phi: Expr, bar: Linkage) -> tuple[tuple[Expr, Expr], Expr]:
@@ -170,12 +139,6 @@ def angle_from_slider(s: Expr, b: Expr, c: Expr) -> Expr:
     """
     low, high = _slacks(s, b, c)
     return 2 * ca.atan(ca.sqrt(low / high))
-
-
-def slider_from_angle(theta: Expr, b: Expr, c: Expr) -> Expr:
-    """Slider length s [m] of an angle theta [rad]; arms b, c [m], b != c. Inverts eq. (8)."""
-    half = ca.sin(0.5 * theta)
-    return ca.sqrt((b - c) * (b - c) + (4 * b * c) * (half * half))
 
 
 def angle_rate(s: Expr, b: Expr, c: Expr) -> Expr:

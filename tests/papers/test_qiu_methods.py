@@ -261,7 +261,7 @@ def test_most_pinches_are_solved(robot):
 
 
 def test_choices_that_matter_and_that_do_not(robot):
-    """One change each, with the effect that methods.md reports."""
+    """One change each, with its effect."""
     points, normals = pinch_targets(robot, 4)
 
     def rate(**options):

@@ -7,7 +7,6 @@ import pytest
 
 import casadi_ik as ik
 
-FINE = ik.Tolerance(1e-6, 1e-6)
 COARSE = ik.Tolerance(0.08, 0.5)
 
 

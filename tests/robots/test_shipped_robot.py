@@ -104,7 +104,7 @@ def test_palm_stands_on_frame_w_on_the_flange(robot, rng):
 
 
 def test_published_tips_of_the_open_hand(robot):
-    """Facts, section 2: tips and normals at spread 0, proximal 0."""
+    """Tips and normals at spread 0, proximal 0."""
     palm = robot.links(np.zeros(14))["bh_base"]
     points, normals = robot.contacts(np.zeros(14))
     local = (points - palm[:3, 3]) @ palm[:3, :3]

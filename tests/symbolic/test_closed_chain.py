@@ -136,7 +136,7 @@ def ranks(jacobian) -> int:
 
 
 def test_palm_has_rank_three_and_link_6_rank_four(chain, robot, rng):
-    """Facts on methods, section 2: the fourth mobility leaves the palm at rest."""
+    """The fourth mobility leaves the palm at rest."""
     parts, platform, evaluate = chain
     # Nothing borrowed, the arm leg ends at the palm as well.
     expected = 3 if platform == "palm" or len(parts.arm_leg) == 7 else 4

@@ -127,7 +127,7 @@ def test_coupling_jacobian(coupled_robot, rng):
         )
         slope = difference(lambda x: np.array(list(coupled_robot.joints(x).values())), q, 1e-7)
         np.testing.assert_allclose(coupling, slope, atol=1e-4, rtol=1e-6)
-    # Facts, section 3: a slider turns its joint by 72 to 138 rad/m.
+    # A slider turns its joint by 72 to 138 rad/m.
     assert 60 < coupling[names.index("left_1"), 1] < 150
     assert coupling[names.index("right_1"), 2] == pytest.approx(
         -coupling[names.index("left_3"), 2], rel=1e-12

@@ -96,7 +96,6 @@ def test_pseudoinverse_and_null_space(shape):
     m, n = shape
     random = seeded()
     pinv = graph(la.pinv_times, shape, (m, 1))
-    projector = graph(la.null_projector, shape)
     project = graph(la.project_to_null_space, shape, (n, 1))
     for k in range(30):
         J, x = random.standard_normal(shape), random.standard_normal(n)
@@ -106,10 +105,8 @@ def test_pseudoinverse_and_null_space(shape):
         smallest = s[s > 1e-10].min()
         tolerance = 1e-3 if k % 2 else 4e-12 / smallest**2 + 1e-12
         e = J @ x
-        N = projector(J).full()
-        assert np.allclose(N, np.eye(n) - np.linalg.pinv(J) @ J, rtol=0, atol=tolerance)
-        assert np.allclose(N, N.T, rtol=0, atol=tolerance)
-        assert np.allclose(project(J, x).full()[:, 0], N @ x, rtol=0, atol=tolerance)
+        expected = x - np.linalg.pinv(J) @ e
+        assert np.allclose(project(J, x).full()[:, 0], expected, rtol=0, atol=10 * tolerance)
         found = pinv(J, e).full()[:, 0]
         assert np.allclose(found, np.linalg.pinv(J) @ e, rtol=0, atol=10 * tolerance)
 
