@@ -68,9 +68,9 @@ def grasp(said: Said) -> Answer:
     Two opposing fingertips are matched with two opposing patches of the object, the
     other fingers look for something to touch, palm and hand are moved until all
     touch, the arm follows in closed form; what remains is judged in the scene and
-    ranked. FOUND.npz holds points and normals (k, f, 3), as for `casadi-ik batch` and
-    `choose`, q, load, closure and clearance, and the ranked answers for `casadi-ik
-    reach` and `view`. If none is found, nothing is written.
+    ranked. FOUND.npz holds points, normals and balls (k, f, 3), as for `casadi-ik
+    batch` and `choose`, q, load, closure and clearance, and the ranked answers for
+    `casadi-ik reach` and `view`. If none is found, nothing is written.
 
     exit codes: 0 at least one found, 1 none (the report says why), 2 bad input
     """
@@ -131,6 +131,8 @@ def found_data(found: FoundGrasps, fingers: tuple[str, ...]) -> bytes:
         for name, contact in one.grasp.contacts.items():
             arrays["points"][row, fingers.index(name)] = contact.point
             arrays["normals"][row, fingers.index(name)] = contact.normal
+        for name, vectors in one.grasp.more(fingers).items():
+            arrays.setdefault(name, np.full((k, f, 3), np.nan))[row] = vectors
     choices = [Choice(i, one.solution, one.score, one.grasp) for i, one in enumerate(found)]
     ranking = Ranking(tuple(choices), k, k, {}, found.prefer)
     data = ranking_data(ranking, [one.grasp.name for one in found])

@@ -3,6 +3,8 @@
 And what they squeeze with, and how they bear that the object is elsewhere.
 """
 
+import io
+
 import numpy as np
 import pytest
 import trimesh
@@ -10,6 +12,7 @@ from scipy.optimize import linprog
 
 import casadi_ik as ik
 from casadi_ik import errors
+from casadi_ik.cli.grasp import found_data
 
 PLACE = np.eye(4)
 PLACE[:3, 3] = [0.5, 0.1, 0.055]
@@ -50,6 +53,16 @@ def test_every_grasp_is_confirmed_in_the_scene(found):
         assert solver.solve(one.grasp, q0=one.q).success
         assert one.clearance >= 0
         assert list(grasps.counts.values()) == sorted(grasps.counts.values(), reverse=True)
+
+
+def test_what_is_written_is_what_was_found(found):
+    solver, grasps = found
+    held = np.load(io.BytesIO(found_data(grasps, solver.robot.fingers)))
+    asked = {name: held[name] for name in ("points", "normals", "balls") if name in held}
+    batch = solver.solve_batch(**asked, q0=held["q"])
+    assert batch.success.all()
+    np.testing.assert_allclose(batch.q, held["q"], atol=1e-9)
+    assert np.nanmax(batch.position_error) < 1e-9
 
 
 def test_fingertips_touch_the_mesh(found):
