@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import math
 import zipfile
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
-from enum import Enum
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
-from casadi_ik.answers.diagnosis import Diagnosis
 from casadi_ik.answers.solution import Ranking, Solution
 from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError, InputError
 from casadi_ik.files.limits import LIMITS, RAISED, limit
 from casadi_ik.files.npz import read_npz
+from casadi_ik.files.writing import plain
 from casadi_ik.grasps import Grasp
 from casadi_ik.grasps.load import GraspFile, grasp_data, grasp_of
 
@@ -29,7 +27,11 @@ def solution_data(solution: Solution) -> dict[str, Any]:
     names += ["time", "contacts", "diagnosis"]
     names += ["palm"] if solution.palm is not None else []
     names += ["clearance", "closest", "collision"] if solution.clearance is not None else []
-    found = _plain({name: getattr(solution, name) for name in names})
+    found = plain({name: getattr(solution, name) for name in names}, infinite=lambda _: None)
+    if solution.diagnosis is not None:
+        told = ("established", "reliefs", "freed", "lines")
+        more = {name: getattr(solution.diagnosis, name) for name in told}
+        found["diagnosis"] |= plain(more, infinite=lambda _: None)
     for contact in found["contacts"].values():
         del contact["tolerance"]
     return found
@@ -57,25 +59,6 @@ def ranking_data(ranking: Ranking, names: Sequence[str]) -> dict[str, Any]:
         )
     about = {name: getattr(ranking, name) for name in ("candidates", "answered", "prefer")}
     return about | {"failures": dict(ranking.failures), "ranked": ranked}
-
-
-def _plain(value: Any) -> Any:
-    """What JSON can hold: arrays as lists, enums by name, null for what is not finite."""
-    if isinstance(value, Enum):
-        return value.name
-    if is_dataclass(value):
-        found = {one.name: getattr(value, one.name) for one in fields(value) if one.repr}
-        if isinstance(value, Diagnosis):
-            names = ("established", "reliefs", "freed", "lines")
-            found |= {name: getattr(value, name) for name in names}
-        return _plain(found)
-    if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 RANKED_MEMBER = "ranked"

@@ -38,9 +38,8 @@ from casadi_ik.cli.outputs import check_outputs, folder_of, output, say, writing
 from casadi_ik.cli.table import Answer, Said, command
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.files.shipped import resolve
-from casadi_ik.files.writing import remove_stale
+from casadi_ik.files.writing import plain, remove_stale
 from casadi_ik.grasps.pose import moved
-from casadi_ik.logs.format import plain
 from casadi_ik.progress import progress
 
 BLOCK = 4096

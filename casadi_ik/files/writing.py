@@ -7,12 +7,16 @@ from __future__ import annotations
 
 import contextlib
 import glob
+import math
 import os
 import secrets
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import fields, is_dataclass
+from enum import Enum
 from pathlib import Path
+from typing import Any
 
 HOUR, DAY = 3600.0, 86400.0
 
@@ -86,3 +90,25 @@ def written_whole(path: Path) -> Iterator[Path]:
     finally:
         with contextlib.suppress(OSError):
             part.unlink()
+
+
+def plain(value: Any, infinite: Callable[[float], Any] = str) -> Any:
+    """A value as standard JSON holds it: arrays as lists, enums by name, records by their fields.
+
+    Args:
+        value: The value; of records what `repr` shows of them.
+        infinite: What stands for NaN and infinity.
+    """
+    if isinstance(value, Enum):
+        return value.name
+    if is_dataclass(value):
+        value = {one.name: getattr(value, one.name) for one in fields(value) if one.repr}
+    if isinstance(value, Mapping):
+        return {str(key): plain(item, infinite) for key, item in value.items()}
+    if hasattr(value, "tolist"):  # of numpy, which is not imported to say what the program can do
+        value = value.tolist()
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(item, infinite) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return infinite(value)
+    return value if value is None or isinstance(value, bool | int | float | str) else str(value)

@@ -7,7 +7,6 @@ the name and, behind "#", the shape if it has more than one axis, the unit and t
 from __future__ import annotations
 
 import json
-import math
 import os
 import platform
 import re
@@ -26,6 +25,7 @@ from mcap.records import Metadata
 from numpy.typing import NDArray
 
 from casadi_ik.errors import InputError, LogError
+from casadi_ik.files.writing import plain
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.logs.container import check_size
 
@@ -273,21 +273,6 @@ def machine() -> dict[str, Any]:
 def package_versions(names: Iterable[str]) -> dict[str, str]:
     """Versions of installed packages by name."""
     return {name: _version(name) for name in names}
-
-
-def plain(value: Any) -> Any:
-    """A value as standard JSON can hold it: arrays as lists, NaN and infinity as text."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
-    if isinstance(value, list | tuple | set | frozenset):
-        return [plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return str(value)
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    return str(value)
 
 
 def own_record(records: Sequence[Metadata]) -> Mapping[str, str]:
