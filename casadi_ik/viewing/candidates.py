@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -60,8 +59,8 @@ class CandidateList:
             candidates: The best first.
         """
         self._page, self._all = page, dict(candidates)
-        self._least = {"load": -np.inf, "clearance": -np.inf}
-        self._most, self._taken = min(AT_FIRST, len(self._all)), next(iter(self._all))
+        self._bounds = {"load": -np.inf, "clearance": -np.inf, "most": AT_FIRST}
+        self._taken = next(iter(self._all))
         server = page.server
         self._frame = server.scene.add_frame("/candidates", show_axes=False)
         place = page.asked.object_pose
@@ -88,13 +87,14 @@ class CandidateList:
     @property
     def shown(self) -> tuple[str, ...]:
         """Names of those that pass the filter, the best first."""
+        least, most = self._bounds, int(self._bounds["most"])
         found = [
             name
             for name, one in self._all.items()
-            if (one.load is None or one.load >= self._least["load"])
-            and (one.clearance is None or one.clearance >= self._least["clearance"])
+            if (one.load is None or one.load >= least["load"])
+            and (one.clearance is None or one.clearance >= least["clearance"])
         ]
-        return tuple(found[: self._most])
+        return tuple(found[:most])
 
     def place(self, pose: Array | None) -> None:
         """Move all with the object to its (4, 4) pose."""
@@ -108,19 +108,14 @@ class CandidateList:
         self._page.choose(name)
         self.filter()
 
-    def filter(
-        self, load: float | None = None, clearance: float | None = None, most: int | None = None
-    ) -> None:
+    def filter(self, **bounds: float) -> None:
         """Show others.
 
         Args:
-            load: The least [N/N]; None: as before.
-            clearance: The least [m]; None: as before.
-            most: How many at most; None: as before.
+            bounds: The least `load` [N/N] or `clearance` [m], how many at `most`; what is not
+                given is as before.
         """
-        self._least["load"] = self._least["load"] if load is None else load
-        self._least["clearance"] = self._least["clearance"] if clearance is None else clearance
-        self._most = self._most if most is None else most
+        self._bounds |= bounds
         shown = self.shown
         with self._page.server.atomic():
             for name, mesh in self._meshes.items():
@@ -141,20 +136,17 @@ class CandidateList:
             "Candidate", tuple(self._all), hint="or click its tripod on the object"
         )
         on_set(self._list, lambda name: self.take(str(name)))
-        most = gui.add_slider("Best", 1, max(len(self._all), 2), 1, self._most)
-        on_set(most, lambda value: self.filter(most=int(value)))
+        count = len(self._all)
+        most = gui.add_slider("Best", 1, max(count, 2), 1, min(AT_FIRST, count))
+        on_set(most, lambda value: self.filter(most=value))
         for key, label, scale in (("load", "Load ≥", 1.0), ("clearance", "Clearance ≥ [mm]", 1e3)):
             values = [getattr(one, key) for one in self._all.values()]
             known = [scale * value for value in values if value is not None]
             if len(known) > 1 and max(known) > min(known):
                 low, high = np.floor(100 * min(known)) / 100, np.ceil(100 * max(known)) / 100
                 slider = gui.add_slider(label, float(low), float(high), 0.01, float(low))
-                on_set(slider, partial(self._filter_by, key, scale))
+                on_set(slider, lambda value, key=key, s=scale: self.filter(**{key: value / s}))
         self._told = gui.add_html("")
-
-    def _filter_by(self, key: str, scale: float, value: float) -> None:
-        self._least[key] = value / scale
-        self.filter()
 
 
 def _tripods(robot: ArmHand, one: Candidate | FoundGrasp) -> list[Surface]:

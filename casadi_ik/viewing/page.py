@@ -196,24 +196,18 @@ class DraggedPage(Page):
     def selected(self, name: str) -> None:
         """Show what has handles."""
 
-    def state(self) -> Any:
-        """What can be gone back to."""
-        return self.asked
+    def state(self) -> tuple[PageRequest, *tuple[Any, ...]]:
+        """What can be gone back to: what is asked, which is never changed in place, and more."""
+        return (self.asked,)
 
-    def restore(self, state: Any) -> None:
+    def restore(self, state: tuple[PageRequest, *tuple[Any, ...]]) -> None:
         """Go back to a state."""
         self.changed_by_hand()
-        self.asked = state
+        self.asked = state[0]
 
     def remember(self) -> None:
         """What stands now is a step."""
         state = self.state()
-        if not same(state, self._past[-1]):
+        if state[0] is not self._past[-1][0]:
             self._past = [self._past[0], *self._past[1:], state][-KEPT:]
             self._future.clear()
-
-
-def same(one: Any, other: Any) -> bool:
-    """Whether two states are the same: their requests are, which are never changed in place."""
-    first = one[0] if isinstance(one, tuple) else one
-    return first is (other[0] if isinstance(other, tuple) else other)

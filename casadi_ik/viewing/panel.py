@@ -306,14 +306,9 @@ def save_picture(client: Any, name: str, patience: float = 20.0) -> None:
     except Exception as error:  # whatever it sends instead is read by imageio
         logger.debug("no picture: %s", error)
         return
-    client.send_file_download(f"{name}.png", png(np.asarray(image)), save_immediately=True)
-
-
-def png(image: np.ndarray) -> bytes:
-    """An image (h, w, 3) or (h, w, 4) of bytes as a PNG file."""
     written = io.BytesIO()
-    imageio.imwrite(written, image, extension=".png")
-    return written.getvalue()
+    imageio.imwrite(written, np.asarray(image), extension=".png")
+    client.send_file_download(f"{name}.png", written.getvalue(), save_immediately=True)
 
 
 def file_name(name: str, otherwise: str) -> str:
