@@ -185,7 +185,8 @@ def request_of(
         used = contact is not None or grasp is None
         contact = contact or Contact(frame[:3, 3], frame[:3, 0])
         place = contact.point if np.isfinite(contact.point).all() else frame[:3, 3]
-        normal = frame[:3, 0] if contact.normal is None else contact.normal
+        ways = (contact.normal, contact.ball, frame[:3, 0])
+        normal = next(way for way in ways if way is not None)
         control = facing(place, normal, frame[:3, :3])
         if contact.normal is None and all(getattr(contact, name) is None for name in PLACES):
             # Its normal is at hand if it is wanted after all.

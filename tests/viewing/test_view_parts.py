@@ -60,6 +60,25 @@ def test_a_finger_may_be_left_free_but_not_all(robot: ik.ArmHand) -> None:
     assert loose.normal is None
 
 
+@pytest.mark.parametrize(
+    "more", [{"normal": [0, 0, 1]}, {"line": [0, 0, 1]}, {"plane": [0, 0, 1]}, {"ball": [0, 0, 1]}]
+)
+def test_every_kind_of_contact_is_asked_as_it_is_and_turns(robot: ik.ArmHand, more) -> None:
+    (kind,), given = more, ik.Contact([0.3, 0.1, 0.5], **more)
+    asked = request_of(robot, ik.Grasp({"thumb": given}), None)
+    found = asked.grasp.contacts["thumb"]
+    for name in ("point", "normal", "line", "plane", "ball"):
+        one, other = getattr(given, name), getattr(found, name)
+        assert (one is None) == (other is None)
+        assert one is None or np.allclose(one, other, atol=1e-12)
+    turn = turned(0.0, 0.0, 0.0)
+    moved = asked.moved("thumb", turn @ asked.places["thumb"]).grasp.contacts["thumb"]
+    assert np.allclose(getattr(moved, kind), turn[:3, :3] @ [0, 0, 1], atol=1e-12)
+    if kind in ("normal", "ball"):  # they have an arrow, which is where the hand takes it
+        faced = asked.with_normal("thumb", np.array([0.6, 0.0, 0.8])).grasp.contacts["thumb"]
+        assert np.allclose(getattr(faced, kind), [0.6, 0.0, 0.8], atol=1e-12)
+
+
 def test_what_is_saved_is_read_back(robot: ik.ArmHand, tmp_path: Path) -> None:
     shipped = ik.load_grasp("cup")
     special = ik.Contact([1 / 3, 0.1, -0.2], [0, 0, 1], ik.Tolerance(1e-3, 0.02), tangent=[1, 0, 0])
