@@ -487,7 +487,8 @@ def contact_balls(
             carried[0, :, place, m] = slope * half[:, None]
             carried[1, :, place, m] = turn * half[:, None]
             far, turned = far + moved, turned + swung
-            k = list(motors).index(_motor(robot, name))
+            (driver,) = robot.driving([name])
+            k = list(motors).index(robot.actuator_names[driver])
             shares[0, :, place, k] += moved
             shares[1, :, place, k] += swung
         if in_palm:
@@ -576,11 +577,3 @@ def angle_of(a: Array, b: Array) -> Array:
     b = b / np.linalg.norm(b, axis=-1, keepdims=True)
     apart, together = np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)
     return 2 * np.arctan2(apart, together)
-
-
-def _motor(robot: RobotDescription, name: str) -> str:
-    """The actuator that a joint follows in the end."""
-    joints = {joint.name: joint for joint in robot.movable}
-    while name in joints and (coupling := joints[name].coupling) is not None:
-        name = coupling.of
-    return name
