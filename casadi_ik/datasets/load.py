@@ -24,7 +24,7 @@ from casadi_ik.datasets.postures import (
     of_fixed_axes,
     palms_of,
 )
-from casadi_ik.errors import DescriptionError, InputError, UnknownNameError
+from casadi_ik.errors import DescriptionError, InputError, UnknownNameError, os_errors
 from casadi_ik.files.limits import LIMITS, RAISED, limit
 from casadi_ik.files.npz import read_npz, refuse_giants
 from casadi_ik.grasps import Contact, Grasp, GraspObject, load_object
@@ -179,12 +179,10 @@ def read_table(path: Path) -> HandPoses:
     """
     readers: Mapping[str, Callable[[Path], Mapping[str, Array]]]
     readers = dict(zip(map(str, SUFFIXES), (_of_csv, _of_npz, _of_parquet), strict=True))
-    try:
+    with os_errors(f"{path}: cannot be read", DescriptionError):
         if path.suffix.lower() == ".csv":
             refuse_giants(str(path), path.stat().st_size, LIMITS.table_bytes)
         columns = readers[path.suffix.lower()](path)
-    except OSError as error:
-        raise DescriptionError(f"{path}: cannot be read: {error.strerror or error}") from error
     turned = QUATERNION if QUATERNION[0] in columns else ANGLES
     for name in (*PLACE, *turned):
         if name not in columns:

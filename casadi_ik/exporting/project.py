@@ -18,7 +18,7 @@ from pathlib import Path
 
 from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.errors import InputError, KernelError, MissingExtraError, UnsupportedError
+from casadi_ik.errors import InputError, KernelError, MissingExtraError, UnsupportedError, os_errors
 from casadi_ik.exporting.scene import SceneSources
 from casadi_ik.exporting.single import SinglePrecision, filled
 from casadi_ik.exporting.solver import FollowSources, SolverSources, hand_first
@@ -76,13 +76,11 @@ def check_folder(out: Path) -> None:
     Raises:
         InputError: Something else is there.
     """
-    try:
+    with os_errors(f"--out: {out}", InputError):
         if out.is_symlink() or (out.exists() and not out.is_dir()):
             raise InputError(f"--out: {out} is no folder, expected a new one, or an earlier export")
         if out.is_dir() and any(out.iterdir()) and not (out / MARK).is_file():
             raise InputError(f"--out: {out} is not empty, and no earlier export; nothing written")
-    except OSError as error:
-        raise InputError(f"--out: {out}: {error.strerror}") from error
 
 
 @dataclass(frozen=True, eq=False)

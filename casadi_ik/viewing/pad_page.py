@@ -19,7 +19,7 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.drawing.drawables import asked_marks, bodies, collision_bodies, lowest
 from casadi_ik.drawing.surfaces import facing
-from casadi_ik.errors import CasadiIKError, DescriptionError
+from casadi_ik.errors import CasadiIKError, DescriptionError, os_errors
 from casadi_ik.files.reading import Frame, frame_matrix, read_yaml
 from casadi_ik.files.writing import written_whole
 from casadi_ik.grasps.pose import inverse
@@ -229,10 +229,8 @@ def save_pads(path: Path, pads: Mapping[str, LinkPad]) -> None:
     Raises:
         DescriptionError: The description does not state its pads, or cannot be written.
     """
-    try:
+    with os_errors(f"{path}: cannot be read", DescriptionError):
         text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise DescriptionError(f"{path}: cannot be read: {error.strerror or error}") from error
     frames = read_yaml(path).get("fingers")
     if not isinstance(frames, dict):
         raise DescriptionError(f"{path}: fingers: expected the pads of the fingers, by name")
@@ -247,12 +245,10 @@ def save_pads(path: Path, pads: Mapping[str, LinkPad]) -> None:
         named = place @ inverse(frame_matrix(Frame(xyz, rpy)))
         point = (inverse(named) @ np.append(pad.point, 1.0))[:3]
         text = corrected(text, finger, point, place[:3, :3].T @ pad.normal)
-    try:
-        with written_whole(path) as part:
-            part.write_text(text, encoding="utf-8")
-            _check(part, pads)
-    except OSError as error:
-        raise DescriptionError(f"{path}: cannot be written: {error.strerror or error}") from error
+    refused = os_errors(f"{path}: cannot be written", DescriptionError)
+    with refused, written_whole(path) as part:
+        part.write_text(text, encoding="utf-8")
+        _check(part, pads)
 
 
 def corrected(text: str, finger: str, point: Array, normal: Array) -> str:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from casadi_ik import palette
 from casadi_ik.arrays import Array
-from casadi_ik.errors import InputError, PictureError
+from casadi_ik.errors import InputError, PictureError, os_errors
 from casadi_ik.files.writing import written_whole
 from casadi_ik.logs import Table
 from casadi_ik.logs.events import EVENT_COLORS, bits_of
@@ -75,12 +75,9 @@ def save_picture(picture: Figure | bytes, path: str | PathLike[str]) -> None:
     drawn = io.BytesIO()
     if isinstance(picture, Figure):
         picture.savefig(drawn, format="png", dpi=picture.dpi)
-    try:
-        with written_whole(target) as part:
-            part.write_bytes(picture if isinstance(picture, bytes) else drawn.getvalue())
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise PictureError(f"{target}: cannot write the picture: {reason}") from error
+    refused = os_errors(f"{target}: cannot write the picture", PictureError)
+    with refused, written_whole(target) as part:
+        part.write_bytes(picture if isinstance(picture, bytes) else drawn.getvalue())
 
 
 DASHES = ("-", (0, (4, 1.2)), (0, (1, 1)), (0, (6, 1.5, 1, 1.5)))

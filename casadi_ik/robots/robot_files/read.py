@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import lru_cache
 from pathlib import Path
 
-from casadi_ik.errors import DescriptionError
+from casadi_ik.errors import DescriptionError, os_errors
 from casadi_ik.robots.robot_files.confined import MACROS, confined
 from casadi_ik.robots.robot_files.mjcf_file import read_mjcf
 from casadi_ik.robots.robot_files.tree import RobotTree, parse_xml, read_robot_file
@@ -26,10 +26,8 @@ def read_tree(path: Path, xacro: bool = False) -> RobotTree:
         DescriptionError: It is missing or malformed; the message names file and joint.
         MissingExtraError: What reads this format is not installed.
     """
-    try:
+    with os_errors(f"{path}: cannot be read", DescriptionError):
         stamp = path.stat().st_mtime_ns
-    except OSError as error:
-        raise DescriptionError(f"{path}: cannot be read: {error.strerror}") from error
     return _read(path, stamp, xacro or path.suffix == ".xacro")
 
 
