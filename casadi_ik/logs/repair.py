@@ -24,6 +24,7 @@ from mcap.summary import Summary
 from casadi_ik.arrays import Counts
 from casadi_ik.errors import LogError, os_errors
 from casadi_ik.files.writing import written_whole
+from casadi_ik.kernels.layout import Layout
 from casadi_ik.logs.container import (
     COMPRESSORS,
     Contents,
@@ -205,17 +206,18 @@ class _Merge:
         """
         self.log = log
         self.summary = Summary()
-        self._ids: list[dict[int, int]] = []
+        self._topics: list[dict[int, tuple[int, str, Layout]]] = []
         self._same: list[bool] = []
         numbers: dict[str, int] = {}
         for shard in log.shards:
-            ids, same, own = dict[int, int](), True, shard.contents.summary
+            topics, same, own = dict[int, tuple[int, str, Layout]](), True, shard.contents.summary
             for method, kind in product(shard.methods, KINDS):
-                channel = own.channels[shard.topic(method, kind).channel]
+                topic = shard.topic(method, kind)
+                channel = own.channels[topic.channel]
                 number = numbers.setdefault(channel.topic, len(numbers) + 1)
                 if number >= 2**16:
                     raise LogError("more topics than a log has numbers for")
-                ids[channel.id] = number
+                topics[channel.id] = number, kind, topic.layout
                 same &= channel.id == channel.schema_id == number
                 schema = replace(own.schemas[channel.schema_id], id=number)
                 channel = replace(channel, id=number, schema_id=number)
@@ -226,7 +228,7 @@ class _Merge:
                         f"{shard.path}: method {method!r} has other fields or names than in"
                         f" {holder} ({channel.topic})"
                     )
-            self._ids.append(ids)
+            self._topics.append(topics)
             self._same.append(same)
 
     def write(self, stream: IO[bytes]) -> None:
@@ -267,9 +269,7 @@ class _Merge:
         Raises:
             LogError: It holds what is no part of a log of casadi_ik.
         """
-        shard, ids, offset = self.log.shards[i], self._ids[i], self.log.sources.offsets[i]
-        pairs = product(shard.methods, KINDS)
-        topics = {(topic := shard.topic(*pair)).channel: (pair[1], topic.layout) for pair in pairs}
+        shard, topics, offset = self.log.shards[i], self._topics[i], self.log.sources.offsets[i]
         strange = [run.channel for run in chunk.runs if run.channel not in topics]
         if strange:
             raise LogError(f"a message of channel {strange[0]}, which is no topic of casadi_ik")
@@ -281,18 +281,18 @@ class _Merge:
             later = np.uint64(offset * shard.clock.slot)
             pieces, runs, start, packed = [], [], 0, None
             for run in chunk.runs:
-                kind, layout = topics[run.channel]
+                number, kind, layout = topics[run.channel]
                 messages = chunk.messages(run, layout.dtype).copy()
                 last = int(shard.clock.locate(run.log_time)[0].max()) + offset
                 shard.clock.check(last, np.zeros(1, np.int64))
-                messages["head"]["channel"] = ids[run.channel]
+                messages["head"]["channel"] = number
                 messages["head"]["log_time"] += later
                 if kind == "solve":
                     messages["head"]["sequence"] += np.uint32(offset)
                 if "solve_id" in layout.names:
                     messages["row"]["solve_id"] += np.uint32(offset)
                 pieces.append(messages.tobytes())
-                runs.append(Run(ids[run.channel], start, run.size, run.log_time + later))
+                runs.append(Run(number, start, run.size, run.log_time + later))
                 start += len(pieces[-1])
             data = b"".join(pieces)
         return *packed_chunk(memoryview(data), runs, compression, position, packed), runs
