@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Generator, Iterable, Mapping
+from functools import cached_property
 from os import PathLike
 from typing import Any, Self
 
@@ -105,6 +106,15 @@ class Solver(MovingSolver):
         built = build_method(method, robot.description, self.options, compiled)
         self._engine = Engine(robot, built, compiled, check=check)
 
+    @cached_property
+    def _glance(self) -> Engine:
+        """For many targets of which one is enough: a round of hand postures each."""
+        if self._engine.hand_first is None:
+            return self._engine
+        method, options = self.method, {**self.options, "max_rounds": 1}
+        built = build_method(method, self.robot.description, options, self._engine.compiled)
+        return Engine(self.robot, built, self._engine.compiled, check=self._engine.check)
+
     def __reduce__(self) -> tuple[type[Solver], tuple[Any, ...]]:
         """What it was made from; a copy finds the compiled kernels on the machine it comes to."""
         return type(self), self._asked
@@ -176,6 +186,7 @@ class Solver(MovingSolver):
             start = self.robot.start(q0)
             return solve_with_object(
                 lambda some, why: self._engine.solve(some, Run(start, seed, diagnose=why)),
+                lambda some: self._glance.solve(some, Run(start, seed)),
                 targets,
                 grasp.object_pose,
                 start,

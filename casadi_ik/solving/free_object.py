@@ -16,7 +16,7 @@ from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.symbolic.even_spread import evenly
 
 LOTS = (1, 15, 240)
-"""Poses that are tried at once, as long as none is solved."""
+"""Poses that are tried at once, as long as none is solved; but the first by one round each."""
 
 
 def poses_within(free: Free, count: int) -> Array:
@@ -42,6 +42,7 @@ def placed(targets: TargetBatch, poses: Array) -> TargetBatch:
 
 def solve_with_object(
     solve: Callable[[TargetBatch, bool], BatchSolution],
+    glance: Callable[[TargetBatch], BatchSolution],
     targets: TargetBatch,
     free: Free,
     start: Array,
@@ -51,6 +52,7 @@ def solve_with_object(
 
     Args:
         solve: Solves targets; whether with a diagnosis.
+        glance: Solves them, and soon gives up what it does not.
         targets: One target, in the object's frame.
         free: Where the object may be.
         start: (n,) where the robot is.
@@ -65,7 +67,8 @@ def solve_with_object(
     middle, steps = every[0], evenly(sum(LOTS), 6) - 0.5
     for count in LOTS:
         rows = np.arange(first, first + count)
-        found = solve(placed(targets, every[rows]), False)
+        some = placed(targets, every[rows])
+        found = glance(some) if first else solve(some, False)
         solved = np.flatnonzero(found.status == Status.SOLVED)
         if len(solved):
             if targets.prefer == "q0":
@@ -75,4 +78,6 @@ def solve_with_object(
             best = int(solved[np.argmin(away)])
             return replace(found.solution(best), object_pose=every[rows[best]])
         first += count
+        if free.lower == free.upper:
+            break
     return replace(solve(placed(targets, middle[None]), True).solution(0), object_pose=middle)
