@@ -34,7 +34,6 @@ from casadi_ik.methods.common.contact_fit import fresh_fit
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.seeds import FEATURES, Seeds
 from casadi_ik.methods.hand_first.state import (
-    CARRIED,
     HandFirstLayouts,
     terms,
 )
@@ -298,7 +297,7 @@ class SearchPlan:
     @property
     def _carried(self) -> list[int]:
         """Places in the state."""
-        slices = map(self.layouts.state.slice, CARRIED)
+        slices = map(self.layouts.state.slice, self.layouts.carried)
         return [place for one in slices for place in range(one.start, one.stop)]
 
     def _arrays(self) -> dict[str, NDArray[Any]]:

@@ -138,7 +138,8 @@ static int after_all_placements(solve s) {
 }
 
 static int after_trunk(solve s) {
-  const int most = X(FIRST) > 0 ? OTHER_TRUNKS : X(EARLIER) > 0 ? LATER_TRUNKS : FIRST_TRUNKS;
+  const int later = X(EARLIER) > 0;
+  const int most = X(FIRST) > 0 ? OTHER_TRUNKS : later ? LATER_TRUNKS : FIRST_TRUNKS;
   int i;
   if (SAID(COST) < EXACT_COST) {
     begin_fit(s);
@@ -180,7 +181,7 @@ static int after_trunk(solve s) {
   to_placement(s);
   /* By turns arms are looked for all over their redundancy, or around one value of it, or they
    * begin from anywhere. */
-  if ((int) Y(TRIED) % FROM_ANYWHERE == 0) return goes_to(s, TRUNK_STAGE);
+  if ((int) Y(TRIED) % (later ? LATER_ANYWHERE : FROM_ANYWHERE) == 0) return goes_to(s, TRUNK_STAGE);
   if ((int) Y(TRIED) % 2) Y(SPENT) = AROUND;
   return RUNNING_STATUS;
 }

@@ -164,6 +164,8 @@ class BodyParameters:
         again_trials: Looks at their redundancies then.
         around: The look that begins around one value of the redundancy, of every second trunk.
         from_anywhere: Every so many trunks the arms begin from anywhere instead.
+        later_anywhere: The same of later rounds: what closed forms do not lead to at 60 trunks they
+            hardly ever lead to.
         closer_every: Every so many trunks one between an even spread and the best one so far.
         trunk_unit: What counts as a unit of the trunk where what is near is wanted; of arms 1.
         box: After so many trunks half as far from the best one.
@@ -182,6 +184,7 @@ class BodyParameters:
     again_trials: int = 4
     around: int = 5
     from_anywhere: int = 8
+    later_anywhere: int = 2
     closer_every: int = 4
     trunk_unit: float = 0.25
     box: float = 8.0

@@ -164,6 +164,11 @@ class HandFirstLayouts:
         )
 
     @property
+    def carried(self) -> tuple[str, ...]:
+        """What a round leaves to the next: of a body also how many trunks were tried."""
+        return (*CARRIED, "trunks") if self.robot.sides else CARRIED
+
+    @property
     def _of_sides(self) -> tuple[Field, ...]:
         """What a body's solves know besides."""
         sides = range(len(self.robot.sides))
