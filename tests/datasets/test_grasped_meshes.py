@@ -142,7 +142,7 @@ def test_an_object_file_with_a_mesh(tmp_path: Path) -> None:
     for file, factor, says in (
         ("no.obj", "1", r"handle\.yaml: shape\.file: no such file"),
         ("[]", "1", r"shape\.file: found none, expected at least one"),
-        ("handle.obj", "0", r"shape\.scale: found 0\.0, expected a positive"),
+        ("handle.obj", "0", r"shape\.scale: found 0, expected > 0"),
     ):
         path.write_text(text.replace("FILE", file).replace("FACTOR", factor))
         with pytest.raises(ik.errors.DescriptionError, match=says) as caught:
