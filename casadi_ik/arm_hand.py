@@ -87,6 +87,10 @@ class ArmHand(Shown):
 
         Raises:
             UnknownNameError: There is none; the message lists the sides.
+
+        Example:
+            >>> ik.load_robot("g1+dex3").side("left").actuators[:2]
+            ('waist_yaw_joint', 'waist_roll_joint')
         """
         return type(self)(self.description.side(name, carried=True))
 
