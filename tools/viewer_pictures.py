@@ -101,6 +101,7 @@ def gone_through(shown: GraspPage, page: Any) -> None:
     shown.work.settle()
     time.sleep(2.0)
     for found in (
+        "[...document.querySelectorAll('[role=tab]')].find(one => one.innerText === 'Results')",
         "[...document.querySelectorAll('.mantine-Paper-root *')]"
         ".findLast(one => one.innerText?.trim() === 'Solutions')",
         "[...document.querySelectorAll('button')].find(one => one.innerText.trim() === 'Robot')",
