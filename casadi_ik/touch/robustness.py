@@ -25,7 +25,7 @@ LEAST = 1e-4
 """Load from which contacts close [N/N]."""
 
 STEEP = float(np.deg2rad(45.0))
-"""A pad that leans more does not touch with its face [rad]."""
+"""A flat pad that leans more does not touch with its face [rad]."""
 
 
 def robustness(
@@ -80,7 +80,7 @@ def robustness(
     samples = _at(sample, there)
     inward = -surface.faces[samples]
     lean = np.arccos(np.clip((_at(faces, there) * inward).sum(axis=-1), -1, 1))
-    touches &= lean < STEEP
+    touches &= lean < STEEP + table.roll[which]
     closed = np.zeros(len(offsets), dtype=bool)
     for row_of in np.unique(touches, axis=0):
         rows = np.flatnonzero((touches == row_of).all(axis=1))
