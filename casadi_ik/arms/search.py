@@ -421,15 +421,21 @@ def _hoisted(best: ca.Function, given: list[Expr]) -> Callable[[Expr], tuple[Exp
 
 def _best_of(found: list[tuple[Expr, Expr, Expr]]) -> list[Expr]:
     """Arm, score and value with the highest score."""
-    size = found[0][0].numel()
-    tried = [(ca.SX.sym("arm", size), ca.SX.sym("score"), ca.SX.sym("value")) for _ in found]
+    chosen = _best_value(len(found), found[0][0].numel())
+    return list(chosen(*(each for one in found for each in one)))
+
+
+@cache
+def _best_value(count: int, size: int) -> ca.Function:
+    """So many arms of so many joints, each with score and value -> those of the highest score."""
+    tried = [(ca.SX.sym("arm", size), ca.SX.sym("score"), ca.SX.sym("value")) for _ in range(count)]
     best: tuple[Expr, ...] = ()
     for arm, score, value in tried:
         best = better(best, (score, arm, value))
     score, arm, value = best
-    inputs = [each for one in tried for each in one]
-    chosen = ca.Function("best_value", inputs, shared(arm, score, value))
-    return list(chosen(*(each for one in found for each in one)))
+    return ca.Function(
+        "best_value", [each for one in tried for each in one], shared(arm, score, value)
+    )
 
 
 def arms_graph(family: ArmFamily, name: str, recipe: str) -> FunctionGraph:

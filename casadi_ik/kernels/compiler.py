@@ -267,6 +267,6 @@ def announce(name: str, size: int) -> None:
         name: Of the kernel.
         size: Characters of its text.
     """
-    # 25,000 to 115,000 characters of C in a second were measured.
-    if (seconds := size / 50_000) >= 2.0:
+    # 150,000 to 280,000 characters of C in a second were measured.
+    if (seconds := size / 200_000) >= 2.0:
         tell(f"compiling {name} (about {seconds:.0f} s, once per machine)")

@@ -44,7 +44,7 @@ class Waiting:
 
     look_again: float = 0.25
     lifetime: float = 900.0
-    motor: float = 0.6
+    motor: float = 0.4
 
 
 WAITING = Waiting()

@@ -13,7 +13,10 @@ from hypothesis import strategies as st
 
 import casadi_ik as ik
 from casadi_ik.kernels import FunctionGraph, FunctionKernel, LookupKernel
+from casadi_ik.kernels.codegen import standing_alone
 from casadi_ik.kernels.lookup import LARGEST, STEPS
+from casadi_ik.kernels.straight_lines import Form
+from casadi_ik.symbolic.smooth import part
 
 from .graphs import BOTH, needs_compiler, random_expression
 
@@ -46,6 +49,30 @@ def test_matrices_are_row_major(compiled, kind):
     # Column-major input and lists are the same numbers.
     for one, other in zip(kernel(a, v.tolist(), np.asfortranarray(m)), found, strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+@needs_compiler
+@pytest.mark.parametrize("in_lanes", [False, True])
+def test_parts_are_called_with_what_is_there_or_put_together(in_lanes, rng):
+    """Neighbours in memory, results of another part, comparisons, and a result nobody asks for."""
+    x, w = ca.SX.sym("x", 3), ca.SX.sym("w", 2)
+    inner = part("inner", [x, w], [2 * ca.sin(x) + w[0], ca.sumsqr(x) * w[1]])
+    y, z = ca.SX.sym("y", 3), ca.SX.sym("z", 4)
+    once, length = inner(y + 1, z[1:3])
+    again, _ = inner(once, z[1:3])
+    swapped, _ = inner(y < 0, ca.vertcat(z[3], 0.5))
+    same, _ = inner(y + 1, z[1:3])
+    outputs = [again * length + swapped, same + once]
+    function = ca.Function("with_parts", [y, z], outputs)
+    kernel = FunctionKernel(function, in_lanes=in_lanes)
+    assert kernel.compiled
+    given = rng.normal(size=(9, 3)), rng.normal(size=(9, 4))
+    wanted = FunctionKernel(function, compiled=False)(*given)
+    for one, other in zip(kernel(*given), wanted, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-13, atol=1e-13)
+    text = standing_alone(function, Form())
+    assert text.count("CODE void f0_inner(") == 1
+    assert text.count("f0_inner(") == 4
 
 
 @BOTH

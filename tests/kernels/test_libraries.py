@@ -366,7 +366,7 @@ def test_a_long_compilation_is_announced(directory, monkeypatch, terminal, waits
             said = os.read(read, 1000).decode()
     os.close(read)
     expected = size > 1000 and (terminal or not waits)
-    about = r"compiling named \(about 20 s, once per machine\)\s*"
+    about = r"compiling named \(about 5 s, once per machine\)\s*"
     assert re.fullmatch(about if expected else "", said)
 
 
