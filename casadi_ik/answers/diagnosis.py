@@ -174,6 +174,8 @@ class Diagnosis(Shown):
         lazy: Where the remedies come from.
         palm: How far the palm is off in the nearest configuration; None where contacts were asked
             for.
+        sides: By side of a body its worst contact where it comes closest by itself, the trunk
+            moving for it alone; of sides with contacts. {} of an arm with one hand.
 
     Example:
         >>> far.status.name, far.diagnosis.reason.name, far.diagnosis.hand.fits
@@ -194,6 +196,7 @@ class Diagnosis(Shown):
     time: float
     lazy: Lazy = field(default_factory=lambda: Lazy(Remedies), repr=False)
     palm: PalmVerdict | None = None
+    sides: Mapping[str, ContactVerdict] = field(default_factory=dict[str, ContactVerdict])
 
     def __repr__(self) -> str:
         return f"<Diagnosis {self.reason.name}>"  # no search for remedies
@@ -259,7 +262,14 @@ class Diagnosis(Shown):
         return single or list(self.reliefs[:1])
 
     def _why(self) -> list[str]:
-        lines = []
+        lines = [
+            f"{name} by itself: nothing found closer than "
+            f"{_apart(worst.position_error, worst.angle_error)}"
+            for name, worst in self.sides.items()
+            if not worst.ok
+        ]
+        if len(self.sides) > 1 and not lines:
+            lines.append(f"{' and '.join(self.sides)} get there one at a time, not at once")
         if self.hand is not None and not self.hand.fits:
             off = [
                 f"{name} {_missed(verdict.position_error, verdict.angle_error)}"
@@ -288,5 +298,9 @@ def _side(value: float) -> str:
 
 
 def _missed(position: float, angle: float) -> str:
+    return f"{_apart(position, angle)} off"
+
+
+def _apart(position: float, angle: float) -> str:
     turned = "" if math.isnan(angle) else f" {_length(angle, 'rad')}"
-    return f"{_length(position, 'm')}{turned} off"
+    return f"{_length(position, 'm')}{turned}"

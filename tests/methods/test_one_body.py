@@ -151,6 +151,24 @@ def test_what_is_out_of_reach_is_told(robot):
     found = ik.Solver(robot).solve(ik.Grasp(name="far", contacts=far))
     assert found.status != ik.Status.SOLVED
     assert found.diagnosis is not None
+    assert set(found.diagnosis.sides) == set(robot.sides)
+    assert not any(worst.ok for worst in found.diagnosis.sides.values())
+
+
+def test_the_side_that_cannot_is_named():
+    robot = ik.load_robot("g1+dex3")
+    asked = grasp(robot, robot.home).contacts
+    far = {
+        finger: ik.Contact(np.add(contact.point, [0, 2.0, 0]), contact.normal)
+        for finger, contact in asked.items()
+        if finger.startswith("left")
+    }
+    found = ik.Solver(robot).solve(ik.Grasp(name="far", contacts={**asked, **far}))
+    assert found.status == ik.Status.UNREACHABLE
+    sides = found.diagnosis.sides
+    assert sides["right"].ok
+    assert sides["left"].position_error > 1.0
+    assert any(line.startswith("left by itself: ") for line in found.diagnosis.lines)
 
 
 def test_without_a_compiler_there_is_an_answer():

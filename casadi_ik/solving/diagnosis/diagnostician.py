@@ -22,7 +22,14 @@ from casadi_ik.arrays import Array, Counts
 from casadi_ik.grasps import Tolerance
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.problem.targets import TargetBatch
-from casadi_ik.problem.verdict import Verdict, deviations, judge, judge_palms
+from casadi_ik.problem.verdict import (
+    ContactVerdict,
+    Verdict,
+    contact_verdicts,
+    deviations,
+    judge,
+    judge_palms,
+)
 from casadi_ik.proofs.proof import Proof, ProofKind
 from casadi_ik.proofs.prove import EFFORT, Prover
 from casadi_ik.solving.diagnosis.closest import Closest, FloatingPalmFit, HandFits, closest
@@ -45,6 +52,7 @@ class DiagnosisEffort:
             closest, no arm is looked for that would help a hand that does not fit.
         barely: If they are missed by less than this, limits are lifted that nothing presses
             against, too.
+        alone: Random arms for every side of a body by itself, and how many of them are followed.
         clearly: A proof may take all its boxes where the tolerances would have to be so many times
             as large. What is missed by little is hardly ever proved: no box is excluded before it
             is small.
@@ -56,6 +64,7 @@ class DiagnosisEffort:
     together: int = 64
     placed: int = 2
     searches: tuple[tuple[float, int, int], ...] = ((8.0, 24, 4), (4.0, 96, 8), (1.5, 256, 32))
+    alone: tuple[int, int] = (24, 4)
     alike: int = 3
     certain: float = 1.1
     barely: float = 2.0
@@ -164,6 +173,7 @@ class Diagnostician:
         near = self._nearest(targets, np.where(solved[:, None], best.fair, best.q))
         held = self._at_limit(best.q)
         pressed = held | self._at_limit(best.fair) | (best.ratio <= DIAGNOSIS.barely)[:, None]
+        sides = self._one_at_a_time(targets, best)
         clock.lap(every)
         for i in every.tolist():
             if solved[i]:
@@ -189,7 +199,32 @@ class Diagnostician:
                 q=best.q[i],
                 time=float(clock.seconds[i]),
                 lazy=Lazy(remedies.find),
+                sides=sides[i],
             )
+
+    def _one_at_a_time(
+        self, targets: TargetBatch, best: Closest
+    ) -> list[dict[str, ContactVerdict]]:
+        """By target the worst contact of every side of a body that it asks for, the others free."""
+        found: list[dict[str, ContactVerdict]] = [{} for _ in range(len(targets))]
+        robot = self.robot
+        for name, fingers in robot.hands.items():
+            asked = ~np.isnan(targets.points[:, fingers, 0]).all(axis=1)
+            rows = np.flatnonzero(asked)
+            if name is None or not len(rows):
+                continue
+            others = [i for i in range(len(robot.fingers)) if i not in fingers]
+            alone = _free_of(targets.rows(rows), others)
+            search = self._search(alone, best.rows(rows), *DIAGNOSIS.alone)
+            position, angle, met = (
+                getattr(judge(robot, alone, search.fair), one)
+                for one in ("position_error", "angle_error", "ok")
+            )
+            verdicts = contact_verdicts(robot.fingers, alone.tolerances, position, angle, met)
+            for row, of_fingers in zip(rows.tolist(), verdicts, strict=True):
+                own = [of_fingers[robot.fingers[i]] for i in fingers]
+                found[row][name] = max(own, key=lambda one: (not one.ok, one.position_error))
+        return found
 
     def _proofs(self, targets: TargetBatch, most: Counts) -> list[Proof | None]:
         """Proofs of targets; of a body that one side cannot, wherever the trunk takes it."""
@@ -343,6 +378,18 @@ def _of_palms(robot: ArmHand, targets: TargetBatch, found: list[Diagnosis]) -> l
         short = one.reason is Reason.REACHABLE and not verdict.ok
         told.append(replace(one, palm=verdict, reason=Reason.NOT_FOUND if short else one.reason))
     return told
+
+
+def _free_of(targets: TargetBatch, fingers: list[int]) -> TargetBatch:
+    """Targets that some fingers have no part in."""
+
+    def free(array: Array) -> Array:
+        array = array.copy()
+        array[:, fingers] = np.nan
+        return array
+
+    more = {name: free(array) for name, array in targets.more.items()}
+    return replace(targets, points=free(targets.points), normals=free(targets.normals), more=more)
 
 
 def _reachable(
