@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 from casadi_ik.arms.recognise import srs_arm
 from casadi_ik.methods.common.contact_fit import whole_jacobian, whole_residual
 from casadi_ik.methods.common.numeric_arm import (
-    STARTS,
-    TABLE,
+    NUMERIC_ARM,
     nearest_start,
     pose_jacobian,
     pose_step,
@@ -369,12 +368,12 @@ def test_starts_of_the_numeric_arm_come_in_the_order_of_their_distance(robot):
     start = nearest_start(robot.description)
     palm = robot.palm(robot.home)
     passed, distances, arms = -1.0, [], []
-    for _ in range(TABLE):
+    for _ in range(NUMERIC_ARM.table):
         arm, passed = start(palm[:3, :3], palm[:3, 3], passed)
         distances.append(float(passed))
         arms.append(np.array(arm).ravel())
     assert np.all(np.diff(distances) > 0)
-    assert len(np.unique(np.round(arms, 9), axis=0)) == TABLE
+    assert len(np.unique(np.round(arms, 9), axis=0)) == NUMERIC_ARM.table
     # After the last one they begin anew.
     assert float(start(palm[:3, :3], palm[:3, 3], passed)[1]) == distances[0]
     q = np.tile(robot.home, (1, 1))
@@ -386,7 +385,7 @@ def test_starts_of_the_numeric_arm_come_in_the_order_of_their_distance(robot):
 
 def test_a_solve_tries_all_starts_of_the_numeric_arm():
     options = HandFirstParameters()
-    assert options.rounds * options.candidates * STARTS >= TABLE
+    assert options.rounds * options.candidates * NUMERIC_ARM.starts >= NUMERIC_ARM.table
 
 
 def test_a_step_of_the_numeric_arm_lowers_what_it_promises(robot, rng):
