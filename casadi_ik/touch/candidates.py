@@ -45,6 +45,8 @@ class TouchParameters:
         slide: Weight of sliding along the surface beside leaving it.
         turn: Metres that count as much as a radian of lean.
         touch: What a fingertip may be off the surface at last [m].
+        aside: How far the nearest sample may be aside of a pad at last [m]: where it is farther the
+            pad is beyond an edge.
         last_lean: What it may lean at last [rad].
         apart: Two grasps differ if a fingertip or the palm is so far elsewhere [m] ...
         turned: ... or the palm is turned by so much [rad].
@@ -68,6 +70,7 @@ class TouchParameters:
     slide: float = 0.25
     turn: float = 0.02
     touch: float = 1e-3
+    aside: float = 4e-3
     last_lean: float = float(np.deg2rad(15.0))
     apart: float = 0.010
     turned: float = float(np.deg2rad(15.0))
@@ -241,6 +244,8 @@ class Generator:
             here, _, _ = touching(table, surface, some)
             ok = np.abs(here.height) < chosen.touch
             ok &= (here.lean < chosen.last_lean + table.roll) & surface.inside[here.sample]
+            off = ((here.points - surface.points[here.sample]) ** 2).sum(axis=-1)
+            ok &= off - (here.height + table.radii) ** 2 < chosen.aside**2
             rows = np.flatnonzero((ok | ~some.used).all(axis=1))
             some = replace(some, tips=here.points).rows(rows)
         self.counted("made exact", len(some))

@@ -93,6 +93,28 @@ def test_fingertips_touch_the_mesh(found):
                 np.testing.assert_array_equal(contact.point, tip[:3, 3])
 
 
+def test_no_pad_hovers_beyond_an_edge():
+    """By distances of balls to an exact box, lying so that its long edges are at hand."""
+    solver, pose = solver_of("panda+leap"), np.eye(4)
+    pose[:3, :3] = [[0.5, 0, 0.5 * 3**0.5], [0.5 * 3**0.5, 0, -0.5], [0, 1, 0]]
+    pose[:3, 3] = [0.5, 0.1, 0.047]
+    surface = ik.load_surface("sugar_box")
+    half = np.abs(surface.points).max(axis=0)
+    found = solver.grasps_of(surface, pose, limit=60)
+    assert len(found) == 60
+    for one in found:
+        points, normals = solver.robot.contacts(one.q)
+        for name in one.grasp.contacts:
+            i, radius = (
+                solver.robot.fingers.index(name),
+                solver.robot.description.finger(name).radius,
+            )
+            local = np.linalg.inv(pose) @ np.append(points[i] - radius * normals[i], 1.0)
+            beyond = np.abs(local[:3]) - half
+            far = np.linalg.norm(np.maximum(beyond, 0)) + min(beyond.max(), 0)
+            assert far == pytest.approx(radius, abs=1.1e-3)
+
+
 def test_loads_are_those_of_linear_programs(found):
     """With the same soft fingers, on the exact cylinder: close, since normals are sampled."""
     one = found[1][0]
