@@ -80,7 +80,7 @@ class FreeSearchParameters:
     starts: int = 24
     hands: int = 8
     steps: tuple[float, ...] = (0.3, 0.2, 0.1, 0.1, 0.1, 0.1, 0.05, 0.05)
-    tries: int = 16
+    tries: int = 24
     deep: float = 0.02
     hopeful: int = 4
     least_range: float = 1e-9
