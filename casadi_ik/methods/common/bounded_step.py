@@ -407,8 +407,8 @@ def _in_box(pattern: Pattern, count: int, passes: int) -> ca.Function:
     # All passes are calls of one function, of those numbers of the system that it needs.
     known = System.of_symbols(begun)
     held, values = ca.SX.sym("held", count), ca.SX.sym("values", count)
-    found = order.solved(known, held, values)
-    unknowns = ca.vertcat(*found.values())
+    unknown = dict(sorted(order.solved(known, held, values).items()))
+    unknowns = ca.vertcat(*unknown.values())
     needed = {symbol.element_hash() for symbol in ca.symvar(unknowns)}
     places = [i for i, each in enumerate(known.numbers.nz) if each.element_hash() in needed]
     solved = part("solved", [known.numbers[places], held, values], [unknowns])
@@ -421,7 +421,7 @@ def _in_box(pattern: Pattern, count: int, passes: int) -> ca.Function:
     for number in range(passes):
         held = ca.logic_or(at_low, at_high)
         x = solved(numbers, held, held * ca.if_else(at_low, low, high))
-        x = dict(zip(found, ca.vertsplit(x), strict=True))
+        x = dict(zip(unknown, ca.vertsplit(x), strict=True))
         inside = ca.vertcat(*(x[i] for i in bounded))
         if number == passes - 1:
             break
