@@ -22,6 +22,7 @@ from casadi_ik.drawing.cameras import View, close_view, whole_view
 from casadi_ik.drawing.drawables import (
     Drawable,
     asked_marks,
+    lowest,
     nearest_pair,
     object_of,
     placed,
@@ -75,7 +76,7 @@ def shot(
             found = closest_points(robot, q, scene, pair)
             if found is not None:
                 stage.add("touching", nearest_pair(found, touching=True), 0.6)
-        stage.add_floor(0.0, body + things + around)
+        stage.add_floor(lowest(robot, scene), body + things + around)
         stage.aim(view, points_of(body + things + around), pixels, (0.03, 0.03))
         return np.clip(over(1.0, stage.shoot()), 0.0, 1.0)
 
