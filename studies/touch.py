@@ -88,8 +88,7 @@ like what was found before (grippers on boxes), the search ends before there are
 objects that are wider than the hand opens, and those that a hand can only take by a side on which
 palm or fingers would be in the object or the table. *Closed*: on round objects the normals of the
 nearest triangle and of the nearest sample differ by some degrees, which decides where a grasp is
-closed by little. *Off*: a pad may be 1 mm off; what is beyond that in results of code from before
-the search asked how far aside the nearest sample is are pads beyond an edge.
+closed by little.
 """
 
 
