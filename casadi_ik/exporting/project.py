@@ -123,9 +123,16 @@ def exported(
     Raises:
         UnsupportedError: It cannot be exported.
     """
-    as_hand = ArmHand(robot.description.as_hand) if robot.description.sides else robot
-    # Sides without a trunk are robots of their own; what knows a scene is one hand with all motors.
-    if not robot.description.trunk or single or capacity is not None:
+    sides = robot.description.sides
+    if sides and capacity is not None:
+        names = " or ".join(side.name for side in sides)
+        raise UnsupportedError(
+            f"--scene: {robot.name} has the sides {names}, expected a robot of one arm; without"
+            " --scene its solver is written, and collisions are not looked at"
+        )
+    as_hand = ArmHand(robot.description.as_hand) if sides else robot
+    # Sides without a trunk are robots of their own.
+    if not robot.description.trunk or single:
         robot = as_hand
     if single and follow:
         raise UnsupportedError("--follow: computes in double precision, expected no --single")

@@ -154,10 +154,13 @@ def test_an_object_file_with_a_mesh(tmp_path: Path) -> None:
         grasps.load_object(f"{tmp_path / 'handle.obj'}@two")
 
 
-def test_a_flat_part_is_named(tmp_path: Path) -> None:
+def test_a_flat_part_is_thin_and_a_flat_mesh_is_refused(tmp_path: Path) -> None:
     sheet = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], [[0, 1, 2], [1, 3, 2]])
-    path = _written(tmp_path / "a.stl", [*_arch(), sheet])
-    with pytest.raises(
-        ik.errors.DescriptionError, match=r"piece \d of 4: all points are in a plane"
-    ):
-        ik.Scene({"a": {"kind": "mesh", "file": str(path), "parts": True}})
+    several, alone = _written(tmp_path / "a.stl", [*_arch(), sheet]), tmp_path / "b.stl"
+    scene = ik.Scene({"a": {"kind": "mesh", "file": str(several), "parts": True}})
+    extents = [np.ptp(solid.mesh()[0], axis=0).min() for solid, _ in scene.items["a"].parts]
+    assert len(extents) == 4
+    assert min(extents) == pytest.approx(1e-3, rel=1e-3)
+    _written(alone, [sheet])
+    with pytest.raises(ik.errors.DescriptionError, match=r"all points are in a plane"):
+        ik.Scene({"a": {"kind": "mesh", "file": str(alone), "parts": True}})

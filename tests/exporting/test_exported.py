@@ -73,6 +73,13 @@ def test_stored_targets_bit_for_bit_under_sanitizers(project):
     assert foreign <= LIBM | COMPILERS
 
 
+def test_a_scene_is_for_one_arm(tmp_path, capsys):
+    words = ["export", "g1+dex3", "--scene", "8", "--out", str(tmp_path / "g1")]
+    assert main(words) == 2
+    assert "--scene: g1+dex3 has the sides left or right, expected" in capsys.readouterr().err
+    assert not any(tmp_path.iterdir())
+
+
 @needs_gcc
 def test_a_body_s_sides_and_trunk_go_with_it(tmp_path):
     """A G1's answers, without a warning; the hands of each side are found in a file of its own."""

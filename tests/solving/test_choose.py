@@ -92,9 +92,13 @@ def test_a_candidate_in_the_objects_frame_is_the_one_moved_to_it(solver, candida
     placed = [one.at(cup.object_pose) for one in candidates]
     there = solver.choose(placed)
     here = solver.choose(candidates, object_pose=cup.object_pose)
-    assert [one.candidate for one in here] == [one.candidate for one in there]
-    for one, other in zip(here, there, strict=True):
-        np.testing.assert_allclose(one.solution.q, other.solution.q, atol=1e-6)
+    # Of candidates that are equal but for rounding either may be first.
+    scores = [[one.score for one in ranked] for ranked in (here, there)]
+    np.testing.assert_allclose(*scores, atol=1e-9)
+    assert len(here) == len(there) > 3
+    others = {one.candidate: one.solution.q for one in there}
+    for one in here:
+        np.testing.assert_allclose(one.solution.q, others[one.candidate], atol=1e-6)
     # A candidate that says where its object is moves with it.
     moved = solver.choose(
         [cup, *candidates], object_pose=cup.object_pose, limit=50, apart=0, per_candidate=None

@@ -408,7 +408,7 @@ def _in_box(pattern: Pattern, count: int, passes: int) -> ca.Function:
     known = System.of_symbols(begun)
     held, values = ca.SX.sym("held", count), ca.SX.sym("values", count)
     unknown = dict(sorted(order.solved(known, held, values).items()))
-    unknowns = ca.vertcat(*unknown.values())
+    unknowns = ca.vertcat(ca.SX(0, 1), *unknown.values())
     needed = {symbol.element_hash() for symbol in ca.symvar(unknowns)}
     places = [i for i, each in enumerate(known.numbers.nz) if each.element_hash() in needed]
     solved = part("solved", [known.numbers[places], held, values], [unknowns])

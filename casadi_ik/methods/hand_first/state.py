@@ -279,12 +279,14 @@ class HandFirstLayouts:
         numbers = {name: ca.SX.sym(name) for name in names}
         positions, chords = self.contacts.errors(residual)
         angles = 2 * ca.asin(ca.fmin(chords / 2, 1.0))
+        # A least number is never NaN; the cost is where the residual is.
+        known = ca.logic_and(weights[:, 1] > 0, numbers["cost"] >= 0)
         row = self.record.pack(
             {
                 "q": q,
                 **numbers,
                 "position_error": ca.if_else(weights[:, 0] > 0, positions, NOTHING),
-                "angle_error": ca.if_else(weights[:, 1] > 0, angles, NOTHING),
+                "angle_error": ca.if_else(known, angles, NOTHING),
                 **coupling_values(robot, q),
                 "limit_mask": bits(ca.logic_or(q <= lower, q >= upper)),
                 "status": 0.0,  # filled in by the iteration
