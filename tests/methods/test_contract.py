@@ -22,7 +22,11 @@ SLOW = {("original-dls", "baxter_ar10"), ("original-sdls", "baxter_ar10")}
 CHOOSING = ("hand-first", "thumb-first")
 """Methods that take the nearest of several solutions."""
 
+BODIES = ("g1+dex3", "two_pandas+allegro", "two_ur10e+leap", "mobile_kuka_lwr_barrett")
+"""Several arm-hands, or one on a trunk: other methods refuse those with more than one palm."""
+
 CASES = [(m, r) for m in ik.METHODS for r in ROBOTS if (m, r) not in SLOW]
+CASES += [("hand-first", body) for body in BODIES]
 
 
 @dataclasses.dataclass
