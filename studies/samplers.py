@@ -171,7 +171,8 @@ def finger_sets(robot: ik.ArmHand, asked: list[str]) -> dict[str, list[int]]:
             that a robot cannot have, or has already, are left out.
     """
     every = list(range(len(robot.fingers)))
-    first = robot.fingers.index(robot.thumb) if robot.thumb else 0
+    thumb = robot.description.named_thumb
+    first = robot.fingers.index(thumb) if thumb else 0
     sets: dict[str, list[int]] = {}
     for word in asked:
         if word == "all":
