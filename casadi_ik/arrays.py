@@ -1,4 +1,4 @@
-"""Names of the arrays that pass between the parts of the package."""
+"""The arrays that pass between the parts of the package: their names, and points spread evenly."""
 
 from __future__ import annotations
 
@@ -23,3 +23,21 @@ def frozen(values: ArrayLike) -> Array:
     array = np.asarray(values, dtype=float)
     array.flags.writeable = False
     return array
+
+
+def evenly(count: int, dimensions: int, first: int = 0) -> Array:
+    """(count, dimensions) points of an additive recurrence, evenly spread over the unit cube.
+
+    From one on, counted from 0: with all before they are spread evenly as well.
+
+    Roberts' generalised golden ratio: the root of x^(d+1) = x + 1 gives the increments.
+    """
+    return (0.5 + np.arange(first + 1, first + count + 1)[:, None] * even_steps(dimensions)) % 1.0
+
+
+def even_steps(dimensions: int) -> Array:
+    """(dimensions,) from one point of an even spread to the next."""
+    ratio = 2.0
+    for _ in range(64):
+        ratio = (1 + ratio) ** (1 / (dimensions + 1))
+    return ratio ** -np.arange(1.0, dimensions + 1)

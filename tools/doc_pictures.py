@@ -18,15 +18,17 @@ from matplotlib.figure import Figure
 import casadi_ik as ik
 from casadi_ik import palette
 from casadi_ik.arrays import Array
-from casadi_ik.drawing.cameras import View, close_view, whole_view
 from casadi_ik.drawing.drawables import (
     Drawable,
+    View,
     asked_marks,
+    close_view,
     lowest,
     nearest_pair,
     object_of,
     placed,
     scene_of,
+    whole_view,
 )
 from casadi_ik.drawing.surfaces import ball
 from casadi_ik.problem.clearance import closest_points

@@ -19,8 +19,8 @@ from casadi_ik.files.shipped import resolve
 from casadi_ik.importing.capsules import FIT, fitted, worst
 from casadi_ik.importing.robot_shapes import may_touch
 from casadi_ik.importing.surfaces import Surface, together
+from casadi_ik.robots.linkage import link_poses
 from casadi_ik.robots.parts import described_part
-from casadi_ik.robots.poses import link_poses
 from casadi_ik.robots.schema import ArmFile, HandFile
 
 

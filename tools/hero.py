@@ -20,8 +20,7 @@ from PIL import ImageDraw
 import casadi_ik as ik
 from casadi_ik import palette
 from casadi_ik.arrays import Array
-from casadi_ik.drawing.cameras import close_view, whole_view
-from casadi_ik.drawing.drawables import asked_marks, object_of, placed
+from casadi_ik.drawing.drawables import asked_marks, close_view, object_of, placed, whole_view
 from casadi_ik.views.charts import save_picture
 from casadi_ik.views.pictures import animated
 from casadi_ik.views.stage import Image, Stage, over, points_of

@@ -20,7 +20,7 @@ from torch_zip import write_torch
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
-from casadi_ik.datasets.conventions import Convention, load_convention
+from casadi_ik.datasets.layouts import Convention, load_convention
 from casadi_ik.datasets.postures import HandPoses
 from casadi_ik.files.reading import roll_pitch_yaw
 from casadi_ik.grasps.pose import inverse

@@ -15,7 +15,7 @@ from casadi_ik.answers.solution import Ranking, Solution
 from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError, InputError
 from casadi_ik.files.limits import LIMITS, RAISED, limit
-from casadi_ik.files.npz import read_npz
+from casadi_ik.files.number_files import read_npz
 from casadi_ik.files.writing import plain
 from casadi_ik.grasps import Grasp
 from casadi_ik.grasps.load import GraspFile, grasp_data, grasp_of

@@ -18,9 +18,8 @@ import casadi as ca
 import numpy as np
 
 from casadi_ik.arms.family import ArmFamily, ClosedForm, Score, better
-from casadi_ik.arrays import Array
+from casadi_ik.arrays import Array, even_steps
 from casadi_ik.kernels.graphs import FunctionGraph
-from casadi_ik.symbolic.even_spread import even_steps
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.smooth import Expr, shared
 

@@ -17,7 +17,7 @@ import numpy as np
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, UnsupportedError, os_errors
 from casadi_ik.files.limits import RAISED, limit
-from casadi_ik.files.npz import UNREADABLE
+from casadi_ik.files.number_files import UNREADABLE
 from casadi_ik.problem.contacts import NAMES
 from casadi_ik.problem.targets import DIRECTIONS
 

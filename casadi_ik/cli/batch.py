@@ -21,8 +21,7 @@ import numpy as np
 from casadi_ik.answers.report import ROWS_SHOWN, Totals, files
 from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.batches.backend import check_installed
-from casadi_ik.batches.parts import BatchFolder, code_version, columns, solve_parts
+from casadi_ik.batches.parts import BatchFolder, check_installed, code_version, columns, solve_parts
 from casadi_ik.batches.targets import Source, TargetFile, polars_module, source_of
 from casadi_ik.cli import options as opt
 from casadi_ik.cli.inputs import (

@@ -16,7 +16,7 @@ from casadi_ik.cli.options import PROGRAM, Option, one_of
 from casadi_ik.cli.outputs import output, writing
 from casadi_ik.cli.table import COMMANDS, GROUPS, Answer, Said, command, load, names
 from casadi_ik.collision.scene import SceneFile
-from casadi_ik.datasets.conventions import ConventionFile
+from casadi_ik.datasets.layouts import ConventionFile
 from casadi_ik.files.json_schema import json_schema
 from casadi_ik.files.reading import convert, read_yaml
 from casadi_ik.files.shipped import BODIES, resolve, shipped_names

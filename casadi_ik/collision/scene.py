@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from casadi_ik.arrays import Array
-from casadi_ik.collision.point_files import finite_points, read_points
 from casadi_ik.collision.solids import (
     Solid,
     box,
@@ -29,7 +28,7 @@ from casadi_ik.collision.solids import (
 )
 from casadi_ik.errors import DescriptionError, InputError, UnknownNameError
 from casadi_ik.files.limits import LIMITS
-from casadi_ik.files.mesh_file import read_mesh
+from casadi_ik.files.number_files import finite_points, read_mesh, read_points
 from casadi_ik.files.reading import (
     Angles,
     Frame,

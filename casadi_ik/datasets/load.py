@@ -14,8 +14,14 @@ from numpy.typing import ArrayLike, NDArray
 from casadi_ik.arm_hand import ArmHand, load_robot
 from casadi_ik.arrays import Array
 from casadi_ik.batches.targets import TargetFile, polars_module
-from casadi_ik.datasets.conventions import Convention, convention_for, of_robot
-from casadi_ik.datasets.layouts import LAYOUTS, READERS, read_layout
+from casadi_ik.datasets.layouts import (
+    LAYOUTS,
+    READERS,
+    Convention,
+    convention_for,
+    of_robot,
+    read_layout,
+)
 from casadi_ik.datasets.postures import (
     FIT,
     HandPoses,
@@ -26,7 +32,7 @@ from casadi_ik.datasets.postures import (
 )
 from casadi_ik.errors import DescriptionError, InputError, UnknownNameError, os_errors
 from casadi_ik.files.limits import LIMITS, RAISED, limit
-from casadi_ik.files.npz import read_npz, refuse_giants
+from casadi_ik.files.number_files import read_npz, refuse_giants
 from casadi_ik.grasps import Contact, Grasp, GraspObject, load_object
 from casadi_ik.grasps.load import load_grasp_files
 from casadi_ik.grasps.objects import is_mesh

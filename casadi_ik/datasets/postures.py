@@ -14,7 +14,7 @@ from casadi_ik.arrays import Array, Bools
 from casadi_ik.errors import DescriptionError
 from casadi_ik.grasps.pose import inverse
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.robots.poses import link_poses, motion
+from casadi_ik.robots.linkage import link_poses, motion
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ import numpy as np
 
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.limits import LIMITS
-from casadi_ik.files.npz import UNREADABLE, refuse_giants
+from casadi_ik.files.number_files import UNREADABLE, refuse_giants
 
 TYPES = re.compile(r"^[<>|=]?([biufcSUO]\d{0,5}|b1|\?)$")
 """Element types that arrays may have."""

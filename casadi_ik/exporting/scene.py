@@ -11,7 +11,7 @@ import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arms.search import PARAMETERS, arms_graph
-from casadi_ik.arrays import Array
+from casadi_ik.arrays import Array, even_steps
 from casadi_ik.collision.model import CollisionModel, own_solids
 from casadi_ik.collision.scene import Scene
 from casadi_ik.collision.solids import C_NAMES, EXPORTED
@@ -26,7 +26,6 @@ from casadi_ik.problem.clearance import ROUNDING, SceneCheck
 from casadi_ik.solving.alternatives.arm_search import SearchValues
 from casadi_ik.solving.alternatives.free import PARAMETERS as FREE
 from casadi_ik.solving.alternatives.unconstrained_fingers import PARAMETERS as FINGERS
-from casadi_ik.symbolic.even_spread import even_steps
 
 MOST = 1000
 """The largest capacity: each solid costs kilobytes."""

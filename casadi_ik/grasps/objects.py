@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
-from casadi_ik.files.mesh_file import FORMATS
+from casadi_ik.files.number_files import FORMATS
 from casadi_ik.files.reading import Struct, read
 from casadi_ik.files.shipped import resolve
 from casadi_ik.files.units import Factor, Mass

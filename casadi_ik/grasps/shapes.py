@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from casadi_ik.arrays import Array, Bools
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.limits import LIMITS, RAISED, limit
-from casadi_ik.files.mesh_file import read_mesh
+from casadi_ik.files.number_files import read_mesh
 from casadi_ik.files.units import Size
 
 Mesh = tuple[Array, NDArray[np.int64]]

@@ -13,8 +13,8 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import MissingExtraError
 from casadi_ik.importing.robot_shapes import hand_links, name_in_robot
-from casadi_ik.robots.robot_files.mjcf_file import joint_name
-from casadi_ik.robots.robot_files.tree import RobotTree
+from casadi_ik.robots.read_tree import joint_name
+from casadi_ik.robots.tree import RobotTree
 
 
 def largest_difference(

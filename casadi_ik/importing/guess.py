@@ -11,10 +11,17 @@ import numpy as np
 from casadi_ik.arrays import Array
 from casadi_ik.importing.surfaces import Surface, together
 from casadi_ik.robots.description import Joint, RobotDescription
-from casadi_ik.robots.linkage import above, below, depth, moving_below, rigid
+from casadi_ik.robots.linkage import (
+    above,
+    below,
+    depth,
+    joint_positions,
+    link_poses,
+    moving_below,
+    rigid,
+)
 from casadi_ik.robots.parts import Part
-from casadi_ik.robots.poses import joint_positions, link_poses
-from casadi_ik.robots.robot_files.tree import RobotTree
+from casadi_ik.robots.tree import RobotTree
 
 WORDS = {
     "thumb": r"thumb|(?<![a-z])th(?=[jb_]|dist|prox|mid|tip|hub|base|$)",

@@ -27,14 +27,14 @@ from casadi_ik.importing.guess import (
 from casadi_ik.importing.robot_shapes import robot_shapes
 from casadi_ik.importing.surfaces import Surface, link_surfaces
 from casadi_ik.importing.write import FileLine, HandLines, Written
-from casadi_ik.robots.bodies import MOST_SIDES
 from casadi_ik.robots.file_parts import hand_from_file
+from casadi_ik.robots.joining import MOST_SIDES
 from casadi_ik.robots.linkage import below, ends, moving_below, rigid
 from casadi_ik.robots.load import load_description
 from casadi_ik.robots.parts import Part
-from casadi_ik.robots.robot_files.read import read_tree
-from casadi_ik.robots.robot_files.tree import RobotTree, TreeJoint
+from casadi_ik.robots.read_tree import read_tree
 from casadi_ik.robots.schema import HandFromFile
+from casadi_ik.robots.tree import RobotTree, TreeJoint
 
 FLANGES = (
     r"tool0$",

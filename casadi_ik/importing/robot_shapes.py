@@ -20,11 +20,10 @@ from casadi_ik.importing.capsules import FIT, Rows, fitted
 from casadi_ik.importing.surfaces import Surface, link_surfaces
 from casadi_ik.robots.collision import Touching, capsules_of
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.robots.linkage import below, rigid_bodies
+from casadi_ik.robots.linkage import below, joint_positions, link_poses, rigid_bodies
 from casadi_ik.robots.parts import PREFIX, Part
-from casadi_ik.robots.poses import joint_positions, link_poses
-from casadi_ik.robots.robot_files.tree import RobotTree
 from casadi_ik.robots.schema import ShapeEntry
+from casadi_ik.robots.tree import RobotTree
 
 
 def hand_links(robot: RobotDescription) -> frozenset[str]:

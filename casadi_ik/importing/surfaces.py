@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.limits import LIMITS
-from casadi_ik.files.mesh_file import read_mesh
+from casadi_ik.files.number_files import read_mesh
 from casadi_ik.grasps.shapes import box_mesh, capsule_mesh, circle, prism_mesh
-from casadi_ik.robots.robot_files.foreign import package_folders
-from casadi_ik.robots.robot_files.tree import (
+from casadi_ik.robots.foreign import package_folders
+from casadi_ik.robots.tree import (
     Element,
     RobotTree,
     collides,

@@ -29,9 +29,9 @@ from casadi_ik.problem.status import Status
 from casadi_ik.problem.trace import LIMIT_MASK, STATUS, STEP_SIZE, Q
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic import dual_quaternion as dq
+from casadi_ik.symbolic.linear_algebra import singular_values
 from casadi_ik.symbolic.screws import TipChain, TipMotion, finger_chain, relative_chain
 from casadi_ik.symbolic.se3 import normal_error, perpendicular
-from casadi_ik.symbolic.singular_values import singular_values
 from casadi_ik.symbolic.smooth import Expr, safe_norm, shared
 
 

@@ -38,8 +38,8 @@ from casadi_ik.problem.status import Phase
 from casadi_ik.problem.trace import CONDITION, PHASE, SIGMA, Q, RecordedJacobian
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.kinematics import ActuatedKinematics, actuated, motor_scales
+from casadi_ik.symbolic.linear_algebra import extreme_singular_values
 from casadi_ik.symbolic.se3 import perpendicular
-from casadi_ik.symbolic.singular_values import extreme_singular_values
 from casadi_ik.symbolic.smooth import Expr
 
 LARGEST_CONDITION = 1e7

@@ -17,7 +17,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import LIMIT_SLACK, TOLERANCE_SLACK
 from casadi_ik.robots.description import Joint, RobotDescription
-from casadi_ik.robots.poses import link_poses
+from casadi_ik.robots.linkage import link_poses
 
 OUTWARDS = 2 * LIMIT_SLACK
 """Limits are taken so much wider [rad or m], since the verdict allows half of it."""

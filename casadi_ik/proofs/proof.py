@@ -32,7 +32,7 @@ from casadi_ik.proofs.premises import (
     motor_ends,
 )
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.robots.poses import link_poses
+from casadi_ik.robots.linkage import link_poses
 from casadi_ik.symbolic.couplings import joint_bounds
 
 SLACK = 1e-8

@@ -13,7 +13,6 @@ from casadi_ik.arrays import Array, frozen
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.reading import Frame, frame_matrix
 from casadi_ik.robots.linkage import known
-from casadi_ik.robots.robot_files.tree import attribute, parse_xml, read_robot_file
 from casadi_ik.robots.schema import (
     BoxEntry,
     CapsuleEntry,
@@ -22,6 +21,7 @@ from casadi_ik.robots.schema import (
     ShapeEntry,
     SphereEntry,
 )
+from casadi_ik.robots.tree import attribute, parse_xml, read_robot_file
 
 
 def srdf_pairs(path: Path) -> list[tuple[tuple[str, str], str]]:

@@ -13,9 +13,8 @@ import numpy as np
 from casadi_ik.arrays import Array, frozen
 from casadi_ik.errors import UnknownNameError, UnsupportedError
 from casadi_ik.robots.collision import NO_SHAPES, Shapes
-from casadi_ik.robots.couplings import Coupling
+from casadi_ik.robots.couplings import Coupling, motor_ranges
 from casadi_ik.robots.linkage import above, links_of
-from casadi_ik.robots.motor_ranges import motor_ranges
 
 
 @dataclass(frozen=True, eq=False)

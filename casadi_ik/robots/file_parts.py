@@ -15,11 +15,9 @@ from casadi_ik.files.reading import frame_matrix
 from casadi_ik.robots.collision import NO_SHAPES, link_shapes
 from casadi_ik.robots.couplings import Coupling, Linear
 from casadi_ik.robots.description import Actuator, Joint
-from casadi_ik.robots.linkage import below, ends
+from casadi_ik.robots.linkage import below, ends, motion
 from casadi_ik.robots.parts import Part, check_couplings
-from casadi_ik.robots.poses import motion
-from casadi_ik.robots.robot_files.read import read_tree
-from casadi_ik.robots.robot_files.tree import RobotTree, TreeJoint
+from casadi_ik.robots.read_tree import read_tree
 from casadi_ik.robots.schema import (
     ArmFromFile,
     CollisionEntry,
@@ -27,6 +25,7 @@ from casadi_ik.robots.schema import (
     LinkFrame,
     PadEntry,
 )
+from casadi_ik.robots.tree import RobotTree, TreeJoint
 
 ENDLESS = 2 * math.pi
 """A joint without ends may turn this far to either side [rad]."""

@@ -13,11 +13,18 @@ from casadi_ik.arrays import Array, frozen
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.reading import Frame, checked, frame_matrix, parse_yaml, read
 from casadi_ik.files.shipped import BODIES, resolve_robot
-from casadi_ik.robots.bodies import body_from_file, body_from_parts
 from casadi_ik.robots.collision import link_shapes
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.robots.file_parts import hand_from_file
-from casadi_ik.robots.joining import a_part, fixed_joint, joined, the_fingers, with_wrist
+from casadi_ik.robots.joining import (
+    a_part,
+    body_from_file,
+    body_from_parts,
+    fixed_joint,
+    joined,
+    the_fingers,
+    with_wrist,
+)
 from casadi_ik.robots.parts import Part, described_part, told_apart, usable
 from casadi_ik.robots.schema import (
     ArmFile,

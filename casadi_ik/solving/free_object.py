@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from casadi_ik.answers.solution import BatchSolution, Solution
-from casadi_ik.arrays import Array
+from casadi_ik.arrays import Array, evenly
 from casadi_ik.files.reading import Frame, frame_matrix
 from casadi_ik.grasps.pose import Free
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.targets import TargetBatch
-from casadi_ik.symbolic.even_spread import evenly
 
 LOTS = (1, 15, 240)
 """Poses that are tried at once, as long as none is solved; but the first by one round each."""

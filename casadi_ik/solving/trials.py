@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.arrays import Array, Rows
+from casadi_ik.arrays import Array, Rows, evenly
 from casadi_ik.kernels.layout import Layout
 from casadi_ik.methods.common.contact_fit import fresh_fit
 from casadi_ik.methods.hand_first.method import HandFirstMethod
@@ -17,7 +17,6 @@ from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import deviations, judge
-from casadi_ik.symbolic.even_spread import evenly
 
 NEVER = 1e-12
 """A tolerance that nothing meets: the loop then goes on to the minimum."""

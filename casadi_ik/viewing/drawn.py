@@ -15,17 +15,20 @@ from viser.transforms import SO3
 from casadi_ik import palette
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.drawing.cameras import View, axes_of, close_view, whole_view
 from casadi_ik.drawing.drawables import (
     Drawable,
+    View,
     asked_marks,
+    axes_of,
     bodies,
+    close_view,
     collision_bodies,
     item_of,
     merged,
     object_of,
     placed,
     reached_marks,
+    whole_view,
 )
 from casadi_ik.drawing.surfaces import joined, mesh_of, sharp
 from casadi_ik.grasps.pose import rotations_of

@@ -13,8 +13,7 @@ from casadi_ik import palette
 from casadi_ik.answers.solution import Alternative
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.collision.scene import Scene
-from casadi_ik.drawing.cameras import View, close_view, whole_view
-from casadi_ik.drawing.drawables import placed, scene_of
+from casadi_ik.drawing.drawables import View, close_view, placed, scene_of, whole_view
 from casadi_ik.errors import InputError
 from casadi_ik.grasps import Grasp
 from casadi_ik.touch.grasps import FoundGrasp

@@ -22,16 +22,19 @@ from casadi_ik.answers.solution import Solution
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene
-from casadi_ik.drawing.cameras import View, close_view, palm_places, whole_view
 from casadi_ik.drawing.drawables import (
     Drawable,
+    View,
+    close_view,
     contact_marks,
     lowest,
     nearest_pair,
     object_of,
+    palm_places,
     placed,
     scene_of,
     target_place,
+    whole_view,
     with_object,
 )
 from casadi_ik.drawing.surfaces import arrow, ball

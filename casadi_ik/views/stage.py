@@ -12,8 +12,7 @@ import pyvista as pv
 from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.arrays import Array
-from casadi_ik.drawing.cameras import View, axes_of
-from casadi_ik.drawing.drawables import Drawable
+from casadi_ik.drawing.drawables import Drawable, View, axes_of
 from casadi_ik.errors import PictureError
 
 Image = NDArray[np.floating]

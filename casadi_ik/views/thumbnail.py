@@ -13,8 +13,14 @@ from matplotlib.figure import Figure
 from casadi_ik import palette
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.drawing.cameras import axes_of, close_view, palm_places, whole_view
-from casadi_ik.drawing.drawables import Drawable, placed
+from casadi_ik.drawing.drawables import (
+    Drawable,
+    axes_of,
+    close_view,
+    palm_places,
+    placed,
+    whole_view,
+)
 from casadi_ik.drawing.surfaces import coarser
 
 LIGHT = np.array([0.3, 0.5, 0.81])

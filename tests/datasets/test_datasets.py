@@ -15,10 +15,10 @@ from make_grasp_sets import ROBOTS, TABLES, Written, made
 
 import casadi_ik as ik
 from casadi_ik.answers.report import reasons
-from casadi_ik.datasets.conventions import load_convention
+from casadi_ik.datasets.layouts import load_convention
 from casadi_ik.datasets.postures import HandPoses
 from casadi_ik.grasps import load_object
-from casadi_ik.robots.poses import link_poses
+from casadi_ik.robots.linkage import link_poses
 
 PUBLISHED = json.loads((Path(__file__).parent / "published_hands.json").read_text())
 KUKA = "kuka_lwr_barrett"

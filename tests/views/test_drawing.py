@@ -10,10 +10,11 @@ import pyvista as pv
 
 import casadi_ik as ik
 from casadi_ik import palette
-from casadi_ik.drawing.cameras import axes_of, close_view
 from casadi_ik.drawing.drawables import (
     Drawable,
+    axes_of,
     bodies,
+    close_view,
     collision_bodies,
     contact_marks,
     lowest,

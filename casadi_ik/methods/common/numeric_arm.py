@@ -16,12 +16,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from casadi_ik.arrays import Array
+from casadi_ik.arrays import Array, evenly
 from casadi_ik.methods.common.bounded_step import Bounded, clip
 from casadi_ik.methods.common.contact_fit import FIT, Tried, lm_step
 from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.even_spread import evenly
 from casadi_ik.symbolic.kinematics import Pose, actuated
 from casadi_ik.symbolic.se3 import skew
 from casadi_ik.symbolic.smooth import Expr, part, shared

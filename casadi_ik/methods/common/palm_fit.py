@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
+from casadi_ik.arrays import even_steps
 from casadi_ik.problem.contacts import LENGTH, ContactRows, Rates, Vectors, tip_rates, tip_vectors
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.even_spread import even_steps
 from casadi_ik.symbolic.kinematics import actuated
 from casadi_ik.symbolic.se3 import align
 from casadi_ik.symbolic.smooth import Expr

@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.arrays import Array
+from casadi_ik.arrays import Array, evenly
 from casadi_ik.kernels import LookupKernel
 from casadi_ik.kernels.graphs import FunctionGraph, recipe
 from casadi_ik.problem.contacts import LENGTH
-from casadi_ik.symbolic.even_spread import evenly
 
 
 def contact_shape(f: int, scales: Sequence[float] | NDArray = ()) -> FunctionGraph:

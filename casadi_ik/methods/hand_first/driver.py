@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.arrays import Array
+from casadi_ik.arrays import Array, even_steps
 from casadi_ik.errors import KernelError
 from casadi_ik.grasps.grasp import LARGE, SMALL, UNIT
 from casadi_ik.kernels import REPEATED, RUNNING, FunctionKernel, LoopKernel
@@ -42,7 +42,6 @@ from casadi_ik.problem.method import Outcome, Quick
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import LIMIT_SLACK, TOLERANCE_SLACK
-from casadi_ik.symbolic.even_spread import even_steps
 
 MALFORMED = -9
 """What a search returns for a question that is none."""

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from casadi_ik.arms.search import PARAMETERS as ARM_SEARCH
-from casadi_ik.arrays import Array
+from casadi_ik.arrays import Array, even_steps
 from casadi_ik.kernels.codegen import define, define_arrays, number, row_major
 from casadi_ik.kernels.function_kernel import BufferedFunction
 from casadi_ik.methods.common.contact_fit import BALANCE, FIT, fresh_fit
@@ -23,7 +23,6 @@ from casadi_ik.methods.hand_first.state import BY_SIDE, PLACES, SAID, Stage
 from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.problem.status import Status
 from casadi_ik.robots.description import RobotDescription, Side
-from casadi_ik.symbolic.even_spread import even_steps
 
 if TYPE_CHECKING:
     from casadi_ik.methods.hand_first.step import HandFirstStep

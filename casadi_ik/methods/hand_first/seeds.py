@@ -12,14 +12,13 @@ import casadi as ca
 import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.arrays import Array
+from casadi_ik.arrays import Array, evenly
 from casadi_ik.kernels import FunctionGraph, FunctionKernel
 from casadi_ik.kernels.graphs import recipe
 from casadi_ik.methods.common.posture_table import PostureTable
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.even_spread import evenly
 from casadi_ik.symbolic.kinematics import actuated
 from casadi_ik.symbolic.se3 import align
 from casadi_ik.symbolic.smooth import Expr, shared

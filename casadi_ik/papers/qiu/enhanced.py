@@ -34,7 +34,7 @@ from casadi_ik.problem.trace import STEP_SIZE, RecordedJacobian
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.closed_chain import VIRTUAL, closed_chain, split
 from casadi_ik.symbolic.kinematics import actuated
-from casadi_ik.symbolic.singular_values import condition_number, singular_values
+from casadi_ik.symbolic.linear_algebra import condition_number, singular_values
 from casadi_ik.symbolic.smooth import Expr, safe_norm, shared
 
 NOT_MEASURED = float("nan")

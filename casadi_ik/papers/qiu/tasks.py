@@ -21,6 +21,7 @@ from casadi_ik.symbolic.linear_algebra import (
     damped_pinv_times,
     project_to_null_space,
     solve_spd,
+    svd,
     weighted_damped_pinv_times,
 )
 from casadi_ik.symbolic.se3 import (
@@ -31,7 +32,6 @@ from casadi_ik.symbolic.se3 import (
     project_to_rotation,
     rotation_between,
 )
-from casadi_ik.symbolic.singular_values import svd
 from casadi_ik.symbolic.smooth import Expr, safe_norm
 
 MILLIMETRE = 1e-3

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arms.family import ArmFamily
 from casadi_ik.arms.search import PARAMETERS, arms_graph
-from casadi_ik.arrays import Array
+from casadi_ik.arrays import Array, evenly
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.kernels.cancellation import DriverCode, check
 from casadi_ik.kernels.codegen import c_struct, driver_text
@@ -28,7 +28,6 @@ from casadi_ik.kernels.graphs import recipe
 from casadi_ik.kernels.libraries import load_library
 from casadi_ik.problem.clearance import ROUNDING, CollisionQuery
 from casadi_ik.problem.request import CLEARANCE
-from casadi_ik.symbolic.even_spread import evenly
 
 SYMBOL = "casadi_ik_arm_search"
 

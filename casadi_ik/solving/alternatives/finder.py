@@ -36,7 +36,7 @@ from casadi_ik.solving.trials import (
     palms_of,
 )
 from casadi_ik.symbolic.kinematics import Pose, actuated
-from casadi_ik.symbolic.singular_values import manipulability
+from casadi_ik.symbolic.linear_algebra import manipulability
 
 APART = 0.25
 """Least difference of alternatives unless said otherwise, see `AlternativeFinder.find`."""

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.answers.solution import BatchSolution, CollisionReport
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.arrays import Array
+from casadi_ik.arrays import Array, even_steps
 from casadi_ik.collision.distances import Table
 from casadi_ik.problem.clearance import ROUNDING, Clearances, CollisionQuery
 from casadi_ik.problem.contacts import by_kinds
@@ -45,7 +45,6 @@ from casadi_ik.solving.trials import (
     first_of_each,
     other_trunks,
 )
-from casadi_ik.symbolic.even_spread import even_steps
 
 USUAL = "limits"
 """What is preferred where nothing is said."""

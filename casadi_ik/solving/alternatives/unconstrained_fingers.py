@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.arrays import Array, Bools
+from casadi_ik.arrays import Array, Bools, even_steps
 from casadi_ik.problem.clearance import ROUNDING, CollisionQuery
 from casadi_ik.problem.targets import TargetBatch
-from casadi_ik.symbolic.even_spread import even_steps
 
 
 @dataclass(frozen=True)

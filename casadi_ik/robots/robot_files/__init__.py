@@ -1,1 +1,0 @@
-"""Other people's files (URDF, xacro, MJCF) as trees of joints, and trees as parts of a robot."""
