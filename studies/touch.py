@@ -133,12 +133,7 @@ def surface_of(name: str, seed: int) -> ik.Surface:
 def placed(surface: ik.Surface, number: int) -> np.ndarray:
     """(4, 4) of an object at one of the poses."""
     axis, yaw = POSES[number]
-    turn = np.roll(np.eye(3), -axis, axis=0)  # cyclic: z, then x, then y is up
-    low = (surface.points @ turn.T)[:, 2].min()
-    pose = standing(surface, yaw)
-    pose[:3, :3] = pose[:3, :3] @ turn
-    pose[2, 3] = 0.002 - low
-    return pose
+    return standing(surface, yaw, axis)
 
 
 def solve(cell: Cell) -> dict[str, Any]:

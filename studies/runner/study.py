@@ -148,11 +148,19 @@ def robot_of(name_or_path: str) -> ik.ArmHand:
     return ik.load_robot(name_or_path)
 
 
-def standing(surface: ik.Surface, turn: float) -> np.ndarray:
-    """(4, 4) of an object that stands on the table."""
+def standing(surface: ik.Surface, turn: float, axis: int = 0) -> np.ndarray:
+    """(4, 4) of an object that stands on the table.
+
+    Args:
+        surface: The object's.
+        turn: Its yaw on the table [rad].
+        axis: Which of its axes is up: 0 is z, 1 is y, 2 is x.
+    """
+    upright = np.roll(np.eye(3), -axis, axis=0)  # cyclic: z, then x, then y is up
     pose = np.eye(4)
     pose[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
-    pose[:3, 3] = [0.5, 0.1, 0.002 - surface.points[:, 2].min()]
+    pose[:3, :3] = pose[:3, :3] @ upright
+    pose[:3, 3] = [0.5, 0.1, 0.002 - (surface.points @ upright.T)[:, 2].min()]
     return pose
 
 

@@ -1,0 +1,181 @@
+"""Published grasps of a hand in the air: what an arm and a table leave of them.
+
+The grasps are samples of DexGraspNet (Wang et al. 2023), of its repository: files of `data/dataset`
+and, named alike, the meshes `data/meshdata/*/coacd/decomposed.obj` of it, in a folder::
+
+    git clone https://github.com/PKU-EPIC/DexGraspNet        # at bdb423c
+    python studies/public_grasps.py FOLDER
+
+FOLDER has NAME.npy and NAME.obj of each object. Every size of an object is put on the table at the
+poses of the study `touch`; what is done is kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from runner.figures import RESULTS
+from runner.parts import read_parts, run_parts
+from runner.report import (
+    Metric,
+    command,
+    markdown_table,
+    program,
+    provenance,
+    rate_metric,
+    write_metrics,
+    write_page,
+)
+from runner.study import robot_of, standing
+
+import casadi_ik as ik
+
+ROBOT = "ur5e+shadow"
+POSES = ((0, 0.0), (1, 0.7), (2, 2.1))
+"""An object's axis that is up, see `standing`, and its yaw on the table [rad]; as in `touch`."""
+
+SIZES = (0.06, 0.08, 0.1, 0.12, 0.15)
+"""What DexGraspNet scales objects by."""
+
+INTRODUCTION = """
+{total} grasps of a Shadow hand from DexGraspNet's repository, of {objects} objects in five sizes
+each, at three poses on the table: 0.5 m before a UR5e, 0.1 m aside. *Reached*: the arm takes the
+palm there; joints beyond the hand's limits are put at them. *Over the table*: and nothing of arm
+and hand touches the table or itself. *Free*: nor the object, other than with fingertips (the palm
+and other links of many published grasps press against it, which is no fault of theirs). *Found*:
+`grasps_of` for the same object, size and pose, asked for {limit} that are force-closed, reached and
+free. Times are processor times of one thread, the object's scene and the hand's table being made.
+"""
+
+PUBLISHED = """
+BODex publishes over 49 grasps a second on a GPU (RTX 3090), of hands in the air, of which over 75 %
+hold in MuJoCo, with Shadow, Allegro and LEAP (Chen et al. 2025, arXiv 2412.16490, abstract, which
+gives about 40 % for a network that learned from DexGraspNet). Its grasps are not in a repository
+that this study could read. The figures are not like for like: other objects, criteria and machines.
+"""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """An object of a size at a pose.
+
+    Attributes:
+        mesh: Path of its mesh.
+        scale: The size, as the data call it.
+        pose: Number of the pose.
+        limit: How many grasps are asked for.
+        seed: Of all random numbers.
+    """
+
+    mesh: str
+    scale: float
+    pose: int
+    limit: int
+    seed: int
+    size: int = 1
+
+    @property
+    def path(self) -> Path:
+        """Where its results are."""
+        asked = f"{self.scale:g}-{self.pose}-{self.limit}-{self.seed}.json"
+        return Path(Path(self.mesh).stem) / asked
+
+
+def solve(cell: Cell) -> dict[str, Any]:
+    """What becomes of the published ones, and what is found."""
+    mesh, robot = Path(cell.mesh), robot_of(ROBOT)
+    surface = ik.load_surface(mesh, scale=cell.scale, seed=cell.seed)
+    axis, yaw = POSES[cell.pose]
+    pose, table = standing(surface, yaw, axis), ik.Solver(robot, scene=ik.load_scene("table"))
+    data: dict[str, Any] = {"scale": cell.scale, "invalid": "clip"}
+    grasps = ik.load_candidates(mesh.with_suffix(".npy"), robot, **data)
+    around = ik.load_candidates(mesh.with_suffix(".npy"), robot, grasped=mesh, **data)
+    asked: dict[str, Any] = {"object_pose": pose, "limit": len(grasps)}
+    free = table.choose(around, **asked)
+    why = Counter[str]()
+    for cause, count in free.failures.items():
+        why["COLLISION with the object" if mesh.name in cause else cause] += count
+    table.grasps_of(surface, pose, limit=1)  # the object's scene, the hand's table
+    found = table.grasps_of(surface, pose, limit=cell.limit, seed=cell.seed)
+    return {
+        "grasps": len(grasps),
+        "reached": ik.Solver(robot).choose(grasps, **asked).answered,
+        "table": table.choose(grasps, **asked).answered,
+        "free": free.answered,
+        "why": dict(why),
+        "found": len(found),
+        "time": found.time,
+    }
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Solve and write the report."""
+    parser = argparse.ArgumentParser(description="Published grasps, with an arm and a table.")
+    parser.add_argument("data", type=Path, help="folder of NAME.npy and NAME.obj")
+    parser.add_argument("--limit", type=int, default=100, help="grasps of an object at a pose")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--parts", type=Path, default=Path("out/public_grasps"))
+    parser.add_argument("--out", type=Path, default=RESULTS / "public_grasps")
+    options = parser.parse_args(arguments)
+    cells = [
+        Cell(str(mesh), scale, pose, options.limit, options.seed)
+        for mesh in sorted(options.data.glob("*.obj"))
+        for scale in SIZES
+        for pose in range(len(POSES))
+    ]
+    run_parts(solve, cells, options.parts, jobs=options.jobs, title="objects at poses")
+    done, codes = read_parts(options.parts, cells)
+    rows, metrics = [], list[Metric]()
+    for mesh in sorted({cell.mesh for cell, _ in done}):
+        own = [one for cell, one in done if cell.mesh == mesh]
+        total = {key: sum(one[key] for one in own) for key in own[0] if key != "why"}
+        name = Path(mesh).stem.rsplit("-", 1)[0]
+        shares = [
+            f"{total[key]} ({total[key] / total['grasps']:.0%})"
+            for key in ("reached", "table", "free")
+        ]
+        found = sum(one["found"] > 0 for one in own)
+        metrics.append(rate_metric(f"public_grasps/{name}/found", found, len(own)))
+        rows.append(
+            [
+                name,
+                str(total["grasps"]),
+                *shares,
+                str(total["found"]),
+                f"{found} of {len(own)}",
+                f"{total['found'] / total['time']:.0f}",
+            ]
+        )
+    heads = [
+        "object",
+        "published, at poses",
+        "reached",
+        "over the table",
+        "free",
+        "found",
+        "sizes and poses with some",
+        "found a second",
+    ]
+    causes = sum((Counter(one["why"]) for _, one in done), Counter[str]())
+    total = sum(one["grasps"] for _, one in done) // len(POSES)
+    told = INTRODUCTION.format(total=total, objects=len(rows), limit=options.limit)
+    parts = [told, markdown_table(heads, rows), "## What is in the way"]
+    parts += [
+        markdown_table(
+            ["first pair that touches, or status", "published grasps"],
+            [[a, str(n)] for a, n in causes.most_common(12)],
+        )
+    ]
+    parts += ["## As published", PUBLISHED, "## Where this comes from"]
+    parts += [f"`{command(__file__, arguments)}`", provenance({"public grasps": codes})]
+    write_page("Published grasps with an arm and a table", parts, options.out)
+    write_metrics(metrics, options.out / "metrics.json")
+
+
+if __name__ == "__main__":
+    program(main)
