@@ -9,6 +9,7 @@ through `Solver.solve_palms` and `Solver.solve_batch`.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +17,10 @@ from numpy.typing import NDArray
 from casadi_ik.arrays import Array, Bools
 from casadi_ik.collision.distances import Table, pose_row
 from casadi_ik.grasps.pose import inverse
+from casadi_ik.kernels.cancellation import drive
 from casadi_ik.problem.clearance import CollisionQuery, SceneCheck
-from casadi_ik.touch.hand_table import HandTable, rigid
-from casadi_ik.touch.surface import Surface
+from casadi_ik.touch.hand_table import BINS, HandTable, TouchJob, rigid, touch_library
+from casadi_ik.touch.surface import Grid, Surface
 
 
 @dataclass(frozen=True)
@@ -29,17 +31,16 @@ class TouchParameters:
         facing: Two patches oppose each other if both normals are within this angle of the line
             between them [rad].
         object_pairs: Pairs of patches that are drawn at once.
-        first: Pairs of hand and object that are tried at first.
-        attempts: Most that are tried at once.
-        most: Attempts after which no more are made.
+        first: Candidates that are looked for at first.
+        round: Most that are looked for at once.
+        attempts: Pairs of hand and object that are drawn for them at most.
+        most: Pairs after which no more are drawn.
         seldom: Where so many are like others for each new one, no more are made.
         lost: Hands after which no more are tried if the arm has reached none of them.
         lean: Planes lean by at most this angle at first [rad]; balls may more, everywhere.
         near: A further fingertip is at most this far from the surface at first [m].
         clear: Fingertips that do not touch are at least this far from it [m].
-        looked: Postures of a further finger that are looked at.
-        tries: Of them that are tried against collisions.
-        together: Candidates whose further fingers are looked up at once.
+        tries: Postures of a further finger that are tried against collisions.
         steps: Of damped least squares on palm and hand.
         free_lean: Within this angle a pad leans for nothing [rad].
         slide: Weight of sliding along the surface beside leaving it.
@@ -54,18 +55,17 @@ class TouchParameters:
 
     facing: float = float(np.deg2rad(45.0))
     object_pairs: int = 20_000
-    first: int = 500
-    attempts: int = 60_000
-    most: int = 1_000_000
+    first: int = 24
+    round: int = 500
+    attempts: int = 200_000
+    most: int = 2_000_000
     seldom: int = 1000
     lost: int = 300
     lean: float = float(np.deg2rad(25.0))
     near: float = 8e-3
     clear: float = 8e-3
-    looked: int = 192
-    tries: int = 12
-    together: int = 2000
-    steps: int = 6
+    tries: int = 24
+    steps: int = 4
     free_lean: float = float(np.deg2rad(8.0))
     slide: float = 0.25
     turn: float = 0.02
@@ -126,46 +126,18 @@ WHY_NONE = {
 """What it means that nothing passes a stage."""
 
 
-class Luck:
-    """How often attempts were clear of all, by a number from 0 to 1 that they have."""
-
-    def __init__(self, bins: int = 20) -> None:
-        """Nothing is known yet."""
-        self.clear, self.tried = np.ones(bins), np.full(bins, 2.0)
-
-    def often(self, values: Array, rng: np.random.Generator) -> NDArray[np.intp]:
-        """Some of the values, the rarer the seldomer they were clear, but some of all."""
-        share = self.clear / self.tried
-        chance = np.maximum(share / share.max(), LEAST_OFTEN)
-        return np.flatnonzero(rng.random(len(values)) < chance[self._bins(values)])
-
-    def learn(self, values: Array, clear: Bools) -> None:
-        """Count which of some values were clear."""
-        bins = self._bins(values)
-        self.tried += np.bincount(bins, minlength=len(self.tried))
-        self.clear += np.bincount(bins[clear], minlength=len(self.tried))
-
-    def _bins(self, values: Array) -> NDArray[np.intp]:
-        return np.clip((values * len(self.tried)).astype(np.intp), 0, len(self.tried) - 1)
-
-
 LEAST_OFTEN = 0.03
 """The chance of what was never clear beside what was most often."""
 
 DEEP = 0.2
 """Most that counts of how far between two fingertips is from the palm [m]."""
 
+OBJECT_STEP, SCENE_STEP, CELLS = 5e-3, 25e-3, 36
+"""Edges of the cells that tell how far the object, and what stands about it, are [m], and about how
+many of them there are at most along its length."""
 
-def pairs_of_fingers(table: HandTable, cells: NDArray[np.intp], palm: Array) -> Candidates:
-    """Palms (k, 4, 4) with thumb and another finger as in pairs (k,) of the table."""
-    share, other, a, b = table.pairs[cells].T
-    used = np.zeros((len(cells), len(table.radii)), dtype=bool)
-    some = Candidates(palm, table.q[share, a].copy(), used)
-    used[:, table.thumb] = used[np.arange(len(other)), other] = True
-    for number in set(other.tolist()):
-        rows = np.flatnonzero(other == number)
-        table.put(some.hand, rows, table.q[share[rows], b[rows]], number)
-    return some
+GROWN = 40e-3
+"""How far beyond an object its distance is known [m]: more than a capsule's radius."""
 
 
 @dataclass
@@ -179,6 +151,7 @@ class Generator:
         parameters: How they are looked for.
         rng: Random numbers.
         counts: How many passed each stage.
+        tried: Pairs of hand and object that were drawn.
         asked: How many of them the arm was asked to reach.
         alike: How many of the last round were like others.
     """
@@ -190,13 +163,13 @@ class Generator:
     rng: np.random.Generator
     clear: HandCheck
     counts: dict[str, int] = field(default_factory=dict)
+    tried: int = 0
     asked: int = 0
     alike: int = 0
 
     def __post_init__(self) -> None:
-        self._pairs = np.zeros((0, 4), dtype=np.intp)
-        self.depths, self.ways = Luck(), Luck()
-        self.clear.sift()
+        self._pairs = np.zeros((0, 4), dtype=np.int64)
+        self._job, self._kept = self._made(int(self.rng.integers(2**62)))
         self.look()
 
     def look(self) -> None:
@@ -224,7 +197,7 @@ class Generator:
         turns = np.abs(turns + roll[:, None] * self.rng.uniform(-1, 1, turns.shape))
         found = table.cells(table.key(np.linalg.norm(way, axis=1), *np.cos(turns)))
         pairs = np.stack([i, j, *found], axis=1)[found[1] > 0]
-        self._pairs = np.concatenate([self._pairs, pairs])
+        self._pairs = np.ascontiguousarray(np.concatenate([self._pairs, pairs]))
 
     @property
     def fits(self) -> bool:
@@ -235,10 +208,10 @@ class Generator:
         """Count what passed a stage."""
         self.counts[stage] = self.counts.get(stage, 0) + int(number)
 
-    def candidates(self, attempts: int) -> Candidates:
-        """Palms and hands whose fingertips touch, clear of all but the arm."""
+    def candidates(self, count: int) -> Candidates:
+        """Of so many palms and hands those whose fingertips touch, clear of all but the arm."""
         table, surface, chosen = self.table, self.surface, self.parameters
-        some = self.draw(attempts)
+        some = self.draw(count)
         if len(some):
             some = snapped(table, surface, some, chosen)
             here, _, _ = touching(table, surface, some)
@@ -265,170 +238,78 @@ class Generator:
         return f"of {self.counts['attempts']:,} attempts none came to: {stage}{why}"
 
     def draw(self, count: int) -> Candidates:
-        """Candidates of some attempts: two fingertips fit, the others find something to touch."""
-        table, surface, chosen, rng = self.table, self.surface, self.parameters, self.rng
-        row = rng.integers(len(self._pairs), size=count)
-        i, j, start, number = self._pairs[row].T
-        cell = start + (rng.random(count) * number).astype(np.intp)
-        lucky = self.depths.often(table.depths[cell] / DEEP, rng)
-        i, j, cell = (column[lucky] for column in (i, j, cell))
-        share, other, a, b = table.pairs[cell].T
-        thumb = table.thumb
-        self.counted("attempts", len(cell))
-        hand_points = np.stack([table.points[share, a, thumb], table.points[share, b, other]], 1)
-        hand_normals = np.stack([table.normals[share, a, thumb], table.normals[share, b, other]], 1)
-        samples = np.stack([i, j], axis=1)
-        which = np.stack([np.full(len(cell), thumb), other], axis=1)
-        outward = surface.normals[samples]
-        middles = surface.points[samples] + table.radii[which, None] * outward
-        palm, lean = _matched(hand_points, hand_normals, middles, -outward)
-        fit = np.flatnonzero((lean < chosen.lean + table.roll[which]).all(axis=1))
-        # Where the palm's z points, up or down.
-        up = 0.5 + 0.5 * palm[fit, :3, 2] @ self.clear.pose[2, :3]
-        lucky = self.ways.often(up, rng)
-        kept, up = fit[lucky], up[lucky]
-        cell, share, a = cell[kept], share[kept], a[kept]
-        self.counted("two fingertips fit", len(kept))
-        some = pairs_of_fingers(table, cell, palm[kept])
-        ok = self.clear(some, some.used)
-        self.depths.learn(table.depths[cell] / DEEP, ok)
-        self.ways.learn(up, ok)
-        kept = np.flatnonzero(ok)
-        self.counted("they are clear", len(kept))
-        some, share = some.rows(kept), share[kept]
-        own, names = table.normals[share, a[kept], thumb], table.robot.fingers
-        pads = np.einsum("kij,kj->ki", some.palm[:, :3, :3], own)
-        placed = some.used.copy()
-        for rest, number in zip(range(len(names))[::-1], rng.permutation(len(names)), strict=True):
-            for start in range(0, len(share), chosen.together):
-                rows = np.arange(start, min(start + chosen.together, len(share)))
-                rows = rows[placed[rows].any(axis=1) & ~placed[rows, number]]
-                if len(rows):
-                    short = some.used[rows].sum(axis=1) + rest < self.fingers
-                    self._place(some, placed, share, rows, number, pads, short)
-        kept = np.flatnonzero(placed.all(axis=1) & (some.used.sum(axis=1) == self.fingers))
-        self.counted(f"{self.fingers} fingertips touch, all clear", len(kept))
-        return some.rows(kept)
+        """So many, if they are found: two fingertips fit, the others find something to touch."""
+        job, table = self._job, self.table
+        f = len(table.radii)
+        palms, shared = np.empty((count, 12)), np.empty(count, dtype=np.int64)
+        postured, used = np.empty((2, count, f), dtype=np.int64)
+        job.palms, job.shared = palms.ctypes.data, shared.ctypes.data
+        job.postured, job.used = postured.ctypes.data, used.ctypes.data
+        job.patches, job.n_patches = self._pairs.ctypes.data, len(self._pairs)
+        job.wanted, job.found, job.tried = count, 0, 0
+        drive("touch", touch_library()["casadi_ik_touch"], job)
+        found = job.found
+        hand = table.q[shared[:found], postured[:found, table.thumb]].copy()
+        for finger in range(f):
+            posture = table.q[shared[:found], postured[:found, finger]]
+            table.put(hand, np.arange(found), posture, finger)
+        self.tried += job.tried
+        self.counts |= {
+            "attempts": job.attempts,
+            "two fingertips fit": job.fit,
+            "they are clear": job.free,
+        }
+        self.counted(f"{self.fingers} fingertips touch, all clear", found)
+        palm = rigid(palms[:found, :9].reshape(-1, 3, 3), palms[:found, 9:])
+        return Candidates(palm, hand, used[:found].astype(bool))
 
-    def _place(
-        self,
-        some: Candidates,
-        placed: Bools,
-        share: NDArray[np.intp],
-        rows: NDArray[np.intp],
-        number: int,
-        thumb: Array,
-        short: Bools,
-    ) -> None:
-        """Give a finger a posture that touches, where more are wanted, else one that is clear.
-
-        It has to touch in rows that are short of fingers: those that follow are too few. A row for
-        which none is found is given up: none of its fingers counts as placed.
-        """
-        chosen = self.parameters
-        every = self.table.q.shape[1]
-        postures = self.rng.choice(every, min(chosen.looked, every), replace=False)
-        height, touch, against = self._looked_up(
-            some.palm[rows], thumb[rows], share[rows], number, postures
+    def _made(self, seed: int) -> tuple[Any, tuple[Any, ...]]:
+        """What the driver works on, but for what follows from a round; what has to live as long."""
+        table, surface, chosen, shapes = (
+            self.table,
+            self.surface,
+            self.parameters,
+            self.clear.shapes,
         )
-        wanted = some.used[rows].sum(axis=1) < self.fingers
-        # Of postures that touch rather one that pushes against the thumb.
-        chance = self.rng.random(touch.shape)
-        idle = np.where((height > chosen.clear) & ~short[:, None], chance, -1.0)
-        rank = np.where(touch & wanted[:, None], 4.0 + chance + 2.0 * against, idle)
-        left = np.arange(len(rows))
-        for _ in range(chosen.tries):
-            best = rank[left].argmax(axis=1)
-            value = rank[left, best]
-            left, best, value = left[value >= 0], best[value >= 0], value[value >= 0]
-            if not len(left):
-                break
-            here = rows[left]
-            trial = some.rows(here)
-            posture = self.table.q[share[here], postures[best]]
-            self.table.put(trial.hand, np.arange(len(here)), posture, number)
-            trial.used[:, number] = value > 1.0
-            present = placed[here].copy()
-            present[:, number] = True
-            ok = self.clear(trial, present)
-            some.hand[here[ok]], some.used[here[ok]] = trial.hand[ok], trial.used[ok]
-            placed[here[ok], number] = True
-            rank[left, best] = -1.0
-            left = left[~ok]
-        placed[rows[~placed[rows, number]]] = False
-
-    def _looked_up(
-        self,
-        palm: Array,
-        thumb: Array,
-        share: NDArray[np.intp],
-        number: int,
-        postures: NDArray[np.intp],
-    ) -> tuple[Array, Bools, Array]:
-        """Of postures of a finger at palms, (k, n) each.
-
-        Returns:
-            Heights of the tip over the surface [m], which ones touch, and minus the cosine of their
-            pads' normals with the thumb's axis: what they do against it.
-        """
-        table, surface, chosen = self.table, self.surface, self.parameters
-        points = table.points[share[:, None], postures, number]
-        normals = table.normals[share[:, None], postures, number]
-        rotation, origin = palm[:, :3, :3], palm[:, :3, 3]
-        tips = points @ rotation.swapaxes(1, 2) + origin[:, None]
-        height, sample = surface.roughly(tips)
-        height = height - table.radii[number]
-        ok = np.abs(height) < chosen.near + surface.step
-        row, posture = np.nonzero(ok)
-        chosen_samples = sample[row, posture]
-        normal = surface.normals[chosen_samples]
-        exact = ((tips[row, posture] - surface.points[chosen_samples]) * normal).sum(axis=-1)
-        exact -= table.radii[number]
-        pads = np.einsum("kij,kj->ki", rotation[row], normals[row, posture])
-        ok[row, posture] = (
-            (np.abs(exact) < chosen.near)
-            & surface.inside[chosen_samples]
-            & (-(pads * normal).sum(axis=-1) > np.cos(chosen.lean + table.roll[number]))
+        thing, around = self.clear.grids(surface.points.min(axis=0), surface.points.max(axis=0))
+        arrays: dict[str, Any] = {
+            "points": table.points,
+            "normals": table.normals,
+            "off_object": self.clear.off(True),
+            "off_scene": self.clear.off(False),
+            "radii": table.radii,
+            "cos_lean": np.cos(chosen.lean + table.roll),
+            "pairs": table.pairs.astype(np.int64),
+            "depths": table.depths / DEEP,
+            "samples": surface.points,
+            "outward": surface.normals,
+            "inside": surface.inside.astype(np.int64),
+            "near_height": surface.grid.value,
+            "near_sample": surface.grid.sample,
+            "object_value": thing.value,
+            "scene_value": around.value,
+        }
+        arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+        job = TouchJob(
+            **shapes.job,
+            **{name: array.ctypes.data for name, array in arrays.items()},
+            thumb=table.thumb,
+            near=chosen.near,
+            clear=chosen.clear,
+            least_often=LEAST_OFTEN,
+            fingers=self.fingers,
+            tries=chosen.tries,
+            most=chosen.attempts,
+            seed=seed,
         )
-        against = np.zeros(ok.shape)
-        against[row, posture] = -np.einsum("ki,ki->k", pads, thumb[row])
-        return height, ok, against
-
-
-def _matched(
-    hand: Array, hand_normals: Array, object_: Array, object_normals: Array
-) -> tuple[Array, Array]:
-    """Palms (k, 4, 4) that bring two points (k, 2, 3) onto two others, and how pads lean (k, 2)."""
-    frames = []
-    for points, normals in ((hand, hand_normals), (object_, object_normals)):
-        line = points[:, 1] - points[:, 0]
-        line /= np.linalg.norm(line, axis=1, keepdims=True)
-        # The turn about the line brings the sums of both normals' parts across it together.
-        across = normals - (normals * line[:, None]).sum(axis=-1, keepdims=True) * line[:, None]
-        frames.append((line, across))
-    (line, across), (goal, wanted) = frames
-    least = np.eye(3)[np.abs(line).argmin(axis=1)]
-    x = np.cross(line, least)
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    from_ = np.stack([x, np.cross(line, x), line], axis=-1)
-    least = np.eye(3)[np.abs(goal).argmin(axis=1)]
-    u = np.cross(goal, least)
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    v = np.cross(goal, u)
-    to = np.stack([u, v, goal], axis=-1)
-    flat = np.einsum("kji,kcj->kci", from_, across)[..., :2]
-    aim = np.einsum("kji,kcj->kci", to, wanted)[..., :2]
-    cosine = (flat * aim).sum(axis=(1, 2))
-    sine = (flat[..., 0] * aim[..., 1] - flat[..., 1] * aim[..., 0]).sum(axis=1)
-    turn = np.arctan2(sine, cosine)
-    spin = np.zeros((len(turn), 3, 3))
-    spin[:, 0, 0] = spin[:, 1, 1] = np.cos(turn)
-    spin[:, 1, 0], spin[:, 0, 1], spin[:, 2, 2] = np.sin(turn), -np.sin(turn), 1.0
-    rotation = to @ spin @ from_.swapaxes(1, 2)
-    middle = object_.mean(axis=1) - np.einsum("kij,kj->ki", rotation, hand.mean(axis=1))
-    turned = np.einsum("kij,kcj->kci", rotation, hand_normals)
-    lean = np.arccos(np.clip((turned * object_normals).sum(axis=-1), -1, 1))
-    return rigid(rotation, middle), lean
+        for name, grid in (("near", surface.grid), ("object", thing), ("scene", around)):
+            getattr(job, f"{name}_low")[:] = grid.low.tolist()
+            getattr(job, f"{name}_count")[:] = grid.counts.tolist()
+        job.up[:] = self.clear.pose[2, :3].tolist()
+        for name in ("depth", "way"):
+            getattr(job, f"{name}_clear")[:] = [1.0] * BINS
+            getattr(job, f"{name}_tried")[:] = [2.0] * BINS
+        return job, (arrays, shapes)
 
 
 @dataclass(frozen=True)
@@ -554,7 +435,7 @@ class HandCheck:
     """
 
     def __init__(
-        self, table: HandTable, check: SceneCheck, pose: Array, tables: dict[bytes, Table]
+        self, table: HandTable, check: SceneCheck, pose: Array, tables: dict[bytes, Any]
     ) -> None:
         """Take over the scene of a solver.
 
@@ -568,57 +449,77 @@ class HandCheck:
         self._every = check.table(check.scene, frozenset()).held
         at = self._every.poses(check.scene.items)
         self._items = rigid(at[:, :9].reshape(-1, 3, 3), at[:, 9:])
+        self.shapes = table.shape(check)
 
-    def sift(self) -> None:
-        """Leave out the table's pairs of fingers that hit the hand or each other; once."""
-        table = self.table
-        if not table.sifted:
-            every = np.arange(len(table.pairs))
-            some = pairs_of_fingers(table, every, np.broadcast_to(np.eye(4), (len(every), 4, 4)))
-            table.keep(self(some, some.used, alone=True))
-
-    def __call__(
-        self, some: Candidates, present: Bools | None = None, alone: bool = False
-    ) -> Bools:
-        """(k,) which are clear; of fingers that are not present nothing counts.
+    def grids(self, low: Array, high: Array) -> tuple[Grid, Grid]:
+        """Distances of the object, and of what stands about it, in the object's frame.
 
         Args:
-            some: Palms and hands.
-            present: (k, f) fingers; None: all.
-            alone: Whether there is nothing but the hand.
+            low: (3,) lower corner of the object [m].
+            high: (3,) upper corner.
         """
+        scene, size = self.check.scene, float((high - low).max())
+        if OBJECT not in self._tables:
+            parts, step = scene.items[str(scene.grasped)].parts, max(OBJECT_STEP, size / CELLS)
+            self._tables[OBJECT] = Grid.of(parts, low - GROWN, high + GROWN, step)
+        reach = sum(
+            float(np.abs(part[..., :3]).max(initial=0.0))
+            for part in (self.shapes.capsules, self.shapes.fixed)
+        )
+        others = [
+            (solid, inverse(self.pose) @ item.pose @ at)
+            for item in scene.items.values()
+            if item.name != scene.grasped
+            for solid, at in item.parts
+        ]
+        step = max(SCENE_STEP, (size + 2 * reach) / CELLS)
+        return self._tables[OBJECT], Grid.of(others, low - reach, high + reach, step)
+
+    def off(self, object_: bool) -> Array:
+        """(c,) what the middles of the hand's capsules keep off the object, or what is about it."""
+        every, shapes = self._every, self.shapes
+        first = len(every.radii) + every.own
+        grasped = np.array([name == self.check.scene.grasped for name in every.items], dtype=bool)
+        with_ = every.pairs[:, 1] >= first
+        with_[with_] = grasped[every.pairs[with_, 1] - first] == object_
+        least = np.full(len(every.radii), -np.inf)
+        np.maximum.at(least, every.pairs[with_, 0], every.offsets[with_])
+        return (least + every.radii + self.check.scene.margin)[shapes.numbers]
+
+    def __call__(self, some: Candidates) -> Bools:
+        """(k,) which are clear."""
         q = self.table.configuration(some.hand)
         world = self.table.palm @ inverse(self.pose @ some.palm)
-        if present is None:
-            present = np.ones_like(some.used)
         ok = np.zeros(len(some), dtype=bool)
-        both = np.concatenate([some.used, present], axis=1)
-        code = both @ (1 << np.arange(both.shape[1]))
+        code = some.used @ (1 << np.arange(some.used.shape[1]))
         for value in set(code.tolist()):
             rows = np.flatnonzero(code == value)
-            table = self._table(some.used[rows[0]], present[rows[0]], alone)
+            table = self._table(some.used[rows[0]])
             poses = pose_row(world[rows, None] @ self._items)
             around = CollisionQuery(self.check.kernel, table, poses, self.check.scene.margin)
             ok[rows] = around.free(q[rows])
         return ok
 
-    def _table(self, used: Bools, present: Bools, alone: bool) -> Table:
+    def arm_clear(self, q: Array) -> Bools:
+        """(k,) whether arms of configurations (k, n) are clear of all; hands aside."""
+        check = self.check
+        table = check.table(check.scene, frozenset()).swung
+        around = CollisionQuery(
+            check.kernel, table, table.poses(check.scene.items), check.scene.margin
+        )
+        return around.free(q)
+
+    def _table(self, used: Bools) -> Table:
         """The pairs that count: fingertips that are used may touch the object."""
-        key = np.concatenate([used, present, [alone]]).tobytes()
+        key = used.tobytes()
         if key not in self._tables:
-            robot, motors = self.table.robot, self.table.of_finger
-            names = list(zip(robot.fingers, used, present, strict=True))
-            pads = [self.check.bodies_of_fingers[name] for name, on, _ in names if on]
+            names = zip(self.table.robot.fingers, used, strict=True)
+            pads = [self.check.bodies_of_fingers[name] for name, on in names if on]
             touched, grasped = frozenset[str]().union(*pads), self.check.scene.grasped
-            there = {i for name, _, on in names if on for i in motors[name]}
-            absent = {i for own in motors.values() for i in own} - there
-            moved = robot.description.links_moved
-            links = moved(absent) - moved(there)
-            kept = [
-                links.isdisjoint(pair)
-                and not (pair[1] == grasped and pair[0] in touched)
-                and not (alone and pair[1] in self.check.scene.items)
-                for pair in self._every.names
-            ]
+            kept = [not (pair[1] == grasped and pair[0] in touched) for pair in self._every.names]
             self._tables[key] = self._every.only(np.array(kept, dtype=bool))
         return self._tables[key]
+
+
+OBJECT = b"object"
+"""Under which the grid of an object is kept."""

@@ -281,13 +281,13 @@ def grasps_of(
     generator = Generator(table, surface, fingers, chosen, np.random.default_rng(seed), hands)
     start = None if q0 is None else robot.configuration(q0)
     parts: list[_Made] = []
-    known, drawn, tried, attempts = 0, 0, 0, chosen.first
+    known, drawn, wanted = 0, 0, chosen.first
     with progress(limit) as show:
-        while generator.fits and known < limit and tried < chosen.most:
-            if tried:
+        while generator.fits and known < limit and generator.tried < chosen.most:
+            if generator.tried:
                 generator.look()
-            some = generator.candidates(attempts)
-            drawn, tried = drawn + attempts, generator.counts["attempts"]
+            some = generator.candidates(wanted)
+            drawn += wanted
             before = [part.some for part in parts]
             made = _made(generator, some, before, arms, judge, place, mu, hold, jobs, start)
             new = 0 if made is None else len(made.rows)
@@ -299,8 +299,8 @@ def grasps_of(
                 break  # nearly each is like one found before
             if generator.asked >= chosen.lost and not known:
                 break  # the arm reaches none
-            wanted = 1.2 * drawn * (limit - known) / known if known else drawn
-            attempts = int(np.clip(wanted, chosen.first, chosen.attempts))
+            share = 1.2 * (limit - known) / known if known else 1.0
+            wanted = int(np.clip(share * drawn, chosen.first, chosen.round))
     found = _ranked(robot, generator, hands, parts, place, limit, prefer, start, mu)
     return replace(found, time=time.process_time() - begin)
 
@@ -380,30 +380,36 @@ def _made(
     new = rows[_distinct(before, some.rows(rows), generator.parameters)]
     generator.counted("unlike each other", len(new))
     generator.alike = len(rows) - len(new)
-    found = loads(wrenches[new])
-    held = found.min(axis=1) > CLOSED
-    if hold is not None:
-        held &= found[:, FORCES].min(axis=1) * hold[1] >= hold[0] * GRAVITY
-    new, found = new[held], found[held]
-    if hold is not None:
-        generator.counted(f"hold {hold[0]:g} kg at {hold[1]:g} N", len(new))
     generator.asked += len(new)
     if not len(new):
         return None
     some, wrenches = some.rows(new), wrenches[new]
-    reached = arms.solve_palms(place @ some.palm, table.configuration(some.hand), start, jobs=jobs)
-    rows = np.flatnonzero(reached.success)
-    generator.counted("arm reaches", len(rows))
+    palms, hands = place @ some.palm, table.configuration(some.hand)
+    reached = arms.solve_palms(palms, hands, start, jobs=jobs)
+    q, met = reached.q, reached.success.copy()
+    hits = np.flatnonzero(met)
+    hits = hits[~generator.clear.arm_clear(q[hits])]
+    if len(hits):  # other arms for these hands
+        other = judge.solve_palms(palms[hits], hands[hits], start, jobs=jobs)
+        q[hits], met[hits] = other.q, other.success
+    generator.counted("arm reaches", int(reached.success.sum()))
+    rows = np.flatnonzero(met)
     if not len(rows):
         return None
-    some, q, found, wrenches = some.rows(rows), reached.q[rows], found[rows], wrenches[rows]
+    some, q, wrenches = some.rows(rows), q[rows], wrenches[rows]
     points, normals = (np.where(some.used[..., None], part, np.nan) for part in robot.contacts(q))
     batch = judge.solve_batch(points, normals, q0=q, jobs=jobs)
     rows = np.flatnonzero(batch.success)
     generator.counted("free in the scene", len(rows))
     if not len(rows):
         return None
-    return _Made(batch, rows, some.rows(rows), found[rows], wrenches[rows])
+    found = loads(wrenches[rows])
+    held = found.min(axis=1) > CLOSED
+    if hold is not None:
+        held &= found[:, FORCES].min(axis=1) * hold[1] >= hold[0] * GRAVITY
+        generator.counted(f"hold {hold[0]:g} kg at {hold[1]:g} N", int(held.sum()))
+    rows, found = rows[held], found[held]
+    return _Made(batch, rows, some.rows(rows), found, wrenches[rows])
 
 
 CLOSED = 1e-4

@@ -13,15 +13,25 @@ from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array, Bools
+from casadi_ik.collision.model import pair_table
+from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import UnsupportedError
+from casadi_ik.kernels.cancellation import SLICE, drive
+from casadi_ik.kernels.codegen import c_struct, define, driver_text
 from casadi_ik.kernels.function_kernel import FunctionKernel
 from casadi_ik.kernels.graphs import FunctionGraph, recipe
+from casadi_ik.kernels.libraries import load_library
+from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.kinematics import actuated
 from casadi_ik.symbolic.se3 import skew
 
 if TYPE_CHECKING:
     from casadi_ik.touch.candidates import Candidates
+
+
+BINS = 20
+"""By so many the driver tells apart how often what it tries is clear."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +70,7 @@ class HandTable:
         points: (s, n, f, 3) middles of pads' balls, of planes contact points, palm frame [m].
         pairs: (p, 4) of thumb and another finger: shared value, finger, posture of either.
         depths: (p,) how far between their pads is from the palm frame [m].
-        sifted: Whether pairs that hit the hand or each other are left out.
+        shapes: The capsules of these postures; None until `shape`.
         normals: (s, n, f, 3) outward pad normals in the palm frame.
     """
 
@@ -80,7 +90,8 @@ class HandTable:
         self.motors = np.array(sorted(set(users)), dtype=np.intp)
         shared = np.array([users.count(i) > 1 for i in self.motors])
         self.kernel = hand_kernel(description)
-        self.thumb, self.sifted = robot.fingers.index(robot.thumb), False
+        self.thumb = robot.fingers.index(robot.thumb)
+        self.shapes: HandShapes | None = None
         self.radii = np.array([description.finger(name).radius for name in robot.fingers])
         self.roll = np.where(self.radii > 0, chosen.roll, 0.0)
         self.palm = robot.palm(robot.home)
@@ -194,12 +205,19 @@ class HandTable:
         middles = (self.points[share, a, thumb] + self.points[share, b, other]) / 2
         self.depths = np.linalg.norm(middles, axis=1)
 
-    def keep(self, rows: Bools) -> None:
-        """Keep some of the pairs for good."""
-        self.pairs, self._keys, self.depths = (
-            column[rows] for column in (self.pairs, self._keys, self.depths)
-        )
-        self.sifted = True
+    def shape(self, check: SceneCheck) -> HandShapes:
+        """The capsules of the postures; pairs that hit the hand or each other are left out."""
+        if self.shapes is None:
+            self.shapes = shapes = HandShapes.of(self, check)
+            share, other, a, b = self.pairs.T
+            word = shapes.apart[share, self.thumb, other, a, b // 64]
+            alone = shapes.alone[share, a, self.thumb] & shapes.alone[share, b, other]
+            kept = alone & ((word >> (b % 64).astype(np.uint64)) & 1).astype(bool)
+            self.pairs, self._keys, self.depths = (
+                np.ascontiguousarray(column[kept])
+                for column in (self.pairs, self._keys, self.depths)
+            )
+        return self.shapes
 
     def key(self, length: Array, first: Array, second: Array) -> NDArray[np.int64]:
         """Cells of pairs: distance [m] and the cosines of both normals with the line."""
@@ -214,6 +232,150 @@ class HandTable:
         """First pair of cells and how many there are."""
         first = np.searchsorted(self._keys, key, "left")
         return first, np.searchsorted(self._keys, key, "right") - first
+
+
+@dataclass(frozen=True, eq=False)
+class HandShapes:
+    """The capsules of a hand in the postures of its table, palm frame: those of fingers first.
+
+    Attributes:
+        links: (c + d,) of each capsule.
+        numbers: (c + d,) which of the robot's capsules they are.
+        capsules: (s, n, c, 6) one end of the fingers' segments, and the way to the other [m].
+        fixed: (d, 6) the same of those that move with the palm alone.
+        lengths: (c + d,) of the segments [m].
+        first: (f + 1,) first capsule of each finger.
+        pads: (c,) whether a capsule may touch what its finger touches.
+        alone: (s, n, f) whether a finger is clear of itself and of the palm.
+        apart: (s, f, f, n, words) bits of the postures of another finger that are clear of one of
+            the first, and alone.
+        crossing: (x, 4) fingers and their capsules that must not meet.
+        reach: (x,) how near these may come [m].
+    """
+
+    links: tuple[str, ...]
+    numbers: NDArray[np.intp]
+    capsules: Array
+    fixed: Array
+    lengths: Array
+    first: NDArray[np.int64]
+    pads: NDArray[np.int64]
+    alone: Bools
+    apart: NDArray[np.uint64]
+    crossing: NDArray[np.int64]
+    reach: Array
+
+    @classmethod
+    def of(cls, table: HandTable, check: SceneCheck) -> HandShapes:
+        """Place the capsules and find which postures meet.
+
+        Args:
+            table: Of the hand.
+            check: Of any scene about its robot.
+        """
+        model, robot = check.model, table.robot
+        (s, n, _), f = table.q.shape, len(robot.fingers)
+        owner = [_finger_of(table, link) for link in model.links]
+        still = {link for link in model.links if link in model.moving or model.is_fixed(link)}
+        own = [[i for i, k in enumerate(owner) if k == finger] for finger in range(f)]
+        rest = [i for i, k in enumerate(owner) if k is None and model.links[i] not in still]
+        numbers = np.concatenate([*own, rest]).astype(np.intp)
+        count = len(numbers) - len(rest)
+        q = table.configuration(table.q.reshape(s * n, -1))
+        (where,) = check.kernel.placed(q)
+        segments = where.reshape(s * n, -1)[:, : 6 * len(owner)].reshape(s * n, -1, 6)[:, numbers]
+        turn, middle, half = table.palm[:3, :3], segments[..., :3], segments[..., 3:]
+        start = (middle - half - table.palm[:3, 3]) @ turn
+        placed = np.concatenate([start, 2 * half @ turn], axis=-1)
+        links = tuple(model.links[i] for i in numbers)
+        first = np.cumsum([0, *map(len, own)])
+        within = pair_table(model, Scene(), ())
+        pads = [
+            links[i] in check.bodies_of_fingers[robot.fingers[k]]
+            for k in range(f)
+            for i in range(first[k], first[k + 1])
+        ]
+        # Pairs of a finger with itself or the palm, and of two fingers.
+        fingers = np.array([-1 if k is None else k for k in owner] + [-1] * within.own)
+        pairs, known = fingers[within.pairs], np.isin(within.pairs[:, 0], numbers)
+        known &= np.isin(within.pairs[:, 1], numbers) | (within.pairs[:, 1] >= len(owner))
+        two = known & (pairs >= 0).all(axis=1) & (pairs[:, 0] != pairs[:, 1])
+        one = within.only(known & ~two)
+        distance = check.kernel.every(q, np.zeros((0, 12)), one) >= 0
+        alone = np.stack(
+            [distance[:, (fingers[one.pairs] == k).any(axis=1)].all(axis=1) for k in range(f)], 1
+        ).reshape(s, n, f)
+        place = np.zeros(len(fingers), dtype=np.int64)
+        place[numbers] = range(len(numbers))
+        a, b = within.pairs[two].T
+        words = -(-n // 64)
+        padded = np.zeros((s, f, 64 * words), dtype=bool)
+        padded[..., :n] = alone.swapaxes(1, 2)
+        bits = np.packbits(padded, axis=-1, bitorder="little").view(np.uint64)
+        made = cls(
+            links,
+            numbers,
+            np.ascontiguousarray(placed[:, :count].reshape(s, n, count, 6)),
+            np.ascontiguousarray(placed[0, count:]),
+            2 * model.halves[numbers],
+            first,
+            np.array(pads, dtype=np.int64),
+            alone,
+            np.tile(bits[:, None, :, None], (1, f, 1, n, 1)),
+            np.ascontiguousarray(np.stack([fingers[a], place[a], fingers[b], place[b]], axis=1)),
+            model.radii[a] + model.radii[b] + within.offsets[two],
+        )
+        drive("touch", touch_library()["casadi_ik_apart"], TouchJob(**made.job))
+        return made
+
+    @property
+    def job(self) -> dict[str, Any]:
+        """What the driver is told of it."""
+        s, n, c, _ = self.capsules.shape
+        arrays = ("capsules", "fixed", "lengths", "first", "pads", "apart", "crossing", "reach")
+        return {name: getattr(self, name).ctypes.data for name in arrays} | {
+            "shares": s,
+            "postures": n,
+            "words": self.apart.shape[-1],
+            "n_fingers": self.apart.shape[1],
+            "n_capsules": c,
+            "n_fixed": len(self.fixed),
+            "n_crossing": len(self.crossing),
+            "slice": SLICE,
+        }
+
+
+def _finger_of(table: HandTable, link: str) -> int | None:
+    """The finger that a link is of: whose joints lead to it, or whose motors move it."""
+    robot = table.robot.description
+    joints = {joint.name for joint in robot.chain(link)}
+    shared = [len(joints.intersection(finger.joints)) for finger in robot.fingers]
+    if max(shared):
+        return int(np.argmax(shared))
+    motors = robot.links_moved
+    moved = [name for name in robot.finger_names if link in motors(table.of_finger[name])]
+    return robot.finger_names.index(moved[0]) if moved else None
+
+
+TouchJob = c_struct("touch_job", {"3": 3, "4": 4, "BINS": BINS})
+
+
+def touch_library() -> Any:
+    """The compiled drivers `touch` and `apart`.
+
+    Raises:
+        UnsupportedError: There is no compiler.
+    """
+    parts = (
+        "typedef double scalar;\ntypedef double real;\n",
+        define({"STEP_IN": 0, "STEP_OUT": 0}),
+        *(driver_text(name) for name in ("common", "touch_job", "touch")),
+    )
+    text = "".join(parts)
+    library = load_library("touch", lambda: text, "casadi_ik_touch", text)
+    if library is None:
+        raise UnsupportedError("grasps_of: found no C compiler, expected one (docs/install.md)")
+    return library
 
 
 _TABLES: WeakKeyDictionary[ArmHand, HandTable] = WeakKeyDictionary()

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arrays import Array, Bools
+from casadi_ik.collision.solids import Kind, Solid
 from casadi_ik.errors import InputError
 from casadi_ik.grasps.objects import GraspObject, load_object
 
@@ -37,6 +39,51 @@ class SurfaceParameters:
     step: float = 3e-3
     around: float = 30e-3
     cells: int = 96
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Distances in the middles of cells.
+
+    Attributes:
+        low: (4,) lower corner, and edge of a cell [m].
+        counts: (3,) how many cells there are along each axis.
+        value: (cells,) distances [m].
+        sample: (cells,) what is there; empty where that is not known.
+    """
+
+    low: Array
+    counts: NDArray[np.int64]
+    value: Array
+    sample: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+    @classmethod
+    def of(
+        cls, solids: Iterable[tuple[Solid, Array]], low: Array, high: Array, step: float
+    ) -> Grid:
+        """The least distance of solids at poses (4, 4), infinite where there is none."""
+        low, counts, middles = cells(low, high, step)
+        value = np.full(len(middles), np.inf)
+        for solid, pose in solids:
+            seen = (middles - pose[:3, 3]) @ pose[:3, :3]
+            if solid.kind is Kind.CLOUD:
+                apart = _tree(solid.points).query(seen)[0] - solid.size[0]
+            else:
+                apart = solid.distance(seen)
+            np.minimum(value, apart, out=value)
+        return cls(low, counts, value)
+
+
+FAR = 10.0
+"""What is nowhere is so far away [m]."""
+
+
+def cells(low: Array, high: Array, step: float) -> tuple[Array, NDArray[np.int64], Array]:
+    """Lower corner and edge (4,), numbers (3,) and middles (cells, 3) of the cells of a box [m]."""
+    counts = np.ceil((high - low) / step).astype(np.int64)
+    axes = [low[i] + step * (np.arange(counts[i]) + 0.5) for i in range(3)]
+    middles = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    return np.append(low, step), counts, middles.reshape(-1, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,35 +132,15 @@ class Surface:
         return _tree(self.points)
 
     @cached_property
-    def _grid(self) -> tuple[Array, float, Array, NDArray[np.int32], NDArray[np.int32]]:
-        """Lower corner (3,), edge of a cell [m], and of cells heights, nearest samples, counts."""
-        low = self.points.min(axis=0) - self.parameters.around
-        span = np.ptp(self.points, axis=0) + 2 * self.parameters.around
-        step = max(self.parameters.step, float(span.max()) / self.parameters.cells)
-        counts = np.ceil(span / step).astype(np.int32)
-        axes = [low[i] + step * (np.arange(counts[i]) + 0.5) for i in range(3)]
-        middles = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-        height, sample = self.foot(middles.reshape(-1, 3))
-        apart = np.linalg.norm(middles.reshape(-1, 3) - self.points[sample], axis=1)
-        height = np.append(np.copysign(apart, height), self.parameters.around)
-        return low, step, height, np.append(sample, 0).astype(np.int32), counts  # the last: beyond
-
-    @property
-    def step(self) -> float:
-        """Edge of a cell of the distance grid [m]."""
-        return self._grid[1]
-
-    def roughly(self, points: Array) -> tuple[Array, NDArray[np.int32]]:
-        """Heights (...) and samples about nearest to points (..., 3), to within `step`."""
-        low, step, height, sample, counts = self._grid
-        flat, within = np.zeros(points.shape[:-1], dtype=np.int32), True
-        for axis in range(3):
-            index = ((points[..., axis] - low[axis]) / step).astype(np.int32)
-            # What is below is beyond the last cell as an unsigned number.
-            within = within & (index.view(np.uint32) < counts[axis])
-            flat = flat * counts[axis] + index
-        flat = np.where(within, flat, len(height) - 1)
-        return height[flat], sample[flat]
+    def grid(self) -> Grid:
+        """Heights about the surface, and its samples there."""
+        chosen = self.parameters
+        low, high = self.points.min(axis=0), self.points.max(axis=0)
+        step = max(chosen.step, (float((high - low).max()) + 2 * chosen.around) / chosen.cells)
+        low, counts, middles = cells(low - chosen.around, high + chosen.around, step)
+        height, sample = self.foot(middles)
+        apart = np.linalg.norm(middles - self.points[sample], axis=1)
+        return Grid(low, counts, np.copysign(apart, height), sample.astype(np.int64))
 
     def foot(self, points: Array) -> tuple[Array, NDArray[np.intp]]:
         """Nearest points of the surface: heights (...) [m], negative inside, and samples (...)."""

@@ -282,6 +282,13 @@ def test_seeds_decide_and_jobs_do_not(found, surface):
     assert not all(np.array_equal(a.q, b.q) for a, b in zip(grasps, other, strict=True))
 
 
+@pytest.mark.filterwarnings("ignore")
+def test_without_a_compiler_it_is_refused(found, surface, monkeypatch):
+    monkeypatch.setenv("CC", "none")
+    with pytest.raises(errors.UnsupportedError, match="grasps_of: found no C compiler"):
+        found[0].grasps_of(surface, PLACE, limit=12)
+
+
 def test_what_has_to_be_held_is_held(surface):
     found = solver_of("panda+panda_hand").grasps_of(surface, PLACE, limit=5, hold=(0.1, 18.0))
     assert len(found)
