@@ -196,7 +196,7 @@ def text_of(
     ]
     points, normals = robot.contacts(q)
     rows = [robot.fingers.index(finger) for finger in recipe.sides]
-    contacts = {robot.fingers[i]: (points[i], normals[i]) for i in rows}
+    contacts = {robot.fingers[i]: {"point": points[i], "normal": normals[i]} for i in rows}
     pose = robot.links(q)[ROOT] @ pinch.object_in_hand
     return grasp_text(header, ROBOT, recipe.name, scene, pose, posture, contacts)
 

@@ -35,8 +35,8 @@ def barrett_text(
         f"  {name}: {_number(value)}  # {np.rad2deg(value):.3f} deg"
         for name, value in zip(hand.hand_names, pinch.posture, strict=True)
     ]
-    contacts: dict[str, tuple[Array, Array]] = {
-        finger: (points[i], normals[i]) for i, finger in enumerate(FINGERS)
+    contacts = {
+        finger: {"point": points[i], "normal": normals[i]} for i, finger in enumerate(FINGERS)
     }
     pose = palm @ pinch.object_in_palm
     return grasp_text(header, ROBOT, recipe.name, recipe.scene, pose, posture, contacts)
@@ -63,7 +63,7 @@ def grasp_text(
     scene: str,
     pose: Array,
     posture: Iterable[str],
-    contacts: Mapping[str, tuple[Array, Array]],
+    contacts: Mapping[str, Mapping[str, Array]],
 ) -> str:
     """The file's text; twelve decimals, so that the contacts stay exact.
 
@@ -74,7 +74,7 @@ def grasp_text(
         scene: How it is held, in words.
         pose: (4, 4) the object in the base frame.
         posture: Lines, one per actuator of the hand.
-        contacts: By finger point (3,) [m] and normal (3,).
+        contacts: By finger and key what is (3,): point [m], normal, ball.
     """
     lines = [
         line
@@ -92,8 +92,8 @@ def grasp_text(
         *posture,
         "contacts:",
     ]
-    for finger, (point, normal) in contacts.items():
-        lines += [f"  {finger}:", f"    point: {_row(point)}", f"    normal: {_row(normal)}"]
+    for finger, contact in contacts.items():
+        lines += [f"  {finger}:", *(f"    {key}: {_row(value)}" for key, value in contact.items())]
     return "\n".join(lines) + "\n"
 
 
