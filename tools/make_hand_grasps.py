@@ -91,9 +91,9 @@ def make(robot: str, name: str, seed: int) -> str | None:
         pose[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
         pose[:3, 3] = place
         found = solver.grasps_of(surface, pose, limit=LIMIT, seed=seed)
-        every += [(one, pose) for one in found if one.pregrasp and one.clearance > CLEAR]
+        every += [(one, pose) for one in found if one.pregrasp and (one.clearance or 0) > CLEAR]
     for one, pose in sorted(every, key=lambda entry: -entry[0].load):
-        contacts = dict(on_surface(arm_hand, item, one, pose))
+        contacts: dict[str, dict[str, Any]] = dict(on_surface(arm_hand, item, one, pose))
         if len(contacts) < len(one.grasp.contacts):
             continue
         wanted = {finger: ik.Contact(**contact) for finger, contact in contacts.items()}
