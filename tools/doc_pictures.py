@@ -1,9 +1,9 @@
 """Pictures of the documentation that no single command makes.
 
-A scene's post passed and not; eight arm-hands in a row; a grasp that no posture meets; the way to a
-cup::
+A scene's post passed and not; eight arm-hands in a row; a grasp that no posture meets; a humanoid
+that holds a box::
 
-    python tools/doc_pictures.py --out docs --only scene pairs unreachable reach
+    python tools/doc_pictures.py --out docs --only scene pairs unreachable humanoid
 """
 
 from __future__ import annotations
@@ -177,9 +177,30 @@ def unreachable(path: Path) -> None:
     save_picture(figure, path)
 
 
+def humanoid(path: Path) -> None:
+    """A G1 that holds a box, wherever both hands reach it; contacts as in notebook 10."""
+    robot, size = ik.load_robot("g1+dex3"), np.array([0.07, 0.40, 0.04])
+    contacts: dict[str, ik.Contact] = {}
+    for side, y in (("left", 1), ("right", -1)):
+        contacts[f"{side}_thumb"] = ik.Contact([0, 0.14 * y, size[2] / 2], [0, 0, -1])
+        contacts[f"{side}_middle"] = ik.Contact([0, 0.16 * y, -size[2] / 2], [0, 0, 1])
+        contacts[f"{side}_index"] = ik.Contact([0, 0.12 * y, -size[2] / 2], [0, 0, 1])
+    about = ik.Scene({"box": {"kind": "box", "size": size.tolist()}})
+    free = ik.Free([0.28, -0.02, 0.08, 0, 0, 0], [0.42, 0.02, 0.25, 0, 0, 0])
+    solver = ik.Solver(robot, scene=about)
+    held = solver.solve(ik.Grasp(contacts, object="box", object_pose=free))
+    pose = held.object_pose
+    assert held.success and pose is not None
+    grasp = ik.Grasp(contacts, object="box", object_pose=np.eye(4)).at(pose)
+    views = [(float(np.deg2rad(angle)), float(np.deg2rad(14.0))) for angle in (38.0, -52.0)]
+    there = about.moved("box", pose)
+    images = [shot(robot, held.q, view, (460, 560), grasp, there) for view in views]
+    save_picture(panels(images, ["from the left", "from the right"], (9.2, 5.6)), path)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Draw what is asked for."""
-    every = {"scene": scene, "pairs": pairs, "unreachable": unreachable}
+    every = {"scene": scene, "pairs": pairs, "unreachable": unreachable, "humanoid": humanoid}
     parser = argparse.ArgumentParser(description="Pictures of the documentation.")
     parser.add_argument("--out", type=Path, default=Path("docs"), help="folder")
     parser.add_argument("--only", nargs="*", default=tuple(every), choices=every, help="which")
