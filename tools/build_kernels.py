@@ -126,7 +126,7 @@ def wheel(files: dict[str, bytes], target: str, out: Path) -> Path:
     about = f"{NAME}-{version}.dist-info"
     metadata = (
         f"Metadata-Version: 2.1\nName: casadi-ik-kernels\nVersion: {version}\n"
-        "Summary: Kernels of casadi-ik compiled ahead\nLicense: MIT\n"
+        "Summary: Kernels of casadi-ik compiled ahead\nLicense: BSD-3-Clause\n"
         f"Requires-Dist: casadi-ik=={version}\n"
     )
     whole = {f"{NAME}/{name}": content for name, content in files.items()} | {

@@ -14,6 +14,7 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.grasps import Contact, Grasp
+from casadi_ik.touch.hand_table import touch_library
 
 
 def uses(robot: ArmHand, everything: bool = False) -> Iterator[tuple[str, Callable[[], object]]]:
@@ -43,6 +44,7 @@ def uses(robot: ArmHand, everything: bool = False) -> Iterator[tuple[str, Callab
     yield "one target", lambda: solver.solve(grasp())
     yield "limits ignored", lambda: Solver(robot, limits="ignore").solve(grasp())
     yield "batches", lambda: solver.solve_batch(*targets())
+    yield "grasps of surfaces", touch_library
     if not everything:
         return
 
