@@ -26,10 +26,10 @@ from casadi_ik.problem.clearance import Clearances, SceneCheck
 from casadi_ik.problem.request import Request, hand_postures, one_palm, tolerances_by_finger
 from casadi_ik.problem.targets import LIMITS, TargetBatch, Tolerance
 from casadi_ik.registry import METHODS, build_method, with_finger_step
-from casadi_ik.solving.alternatives.finder import APART
 from casadi_ik.solving.choose import choose
 from casadi_ik.solving.engine import Engine, Run, SolvedBlock
 from casadi_ik.solving.fast import FastSolver
+from casadi_ik.solving.finder import APART
 from casadi_ik.solving.free_object import solve_with_object
 from casadi_ik.solving.sensitivity import Sensitivity
 from casadi_ik.touch.grasps import grasps_of

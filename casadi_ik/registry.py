@@ -10,10 +10,10 @@ from casadi_ik.errors import InputError, UnknownNameError
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.thumb_first.method import ThumbFirstMethod
-from casadi_ik.methods.thumb_first.state import ThumbFirstParameters
+from casadi_ik.methods.thumb_first.step import ThumbFirstParameters
 from casadi_ik.papers.ipopt import IpoptMethod, IpoptParameters
 from casadi_ik.papers.qiu.method import EnhancedMethod, OriginalMethod
-from casadi_ik.papers.qiu.parameters import FINGER_STEPS, OriginalParameters, QiuParameters
+from casadi_ik.papers.qiu.step import FINGER_STEPS, OriginalParameters, QiuParameters
 from casadi_ik.problem.method import Method
 from casadi_ik.robots.description import RobotDescription
 

@@ -16,8 +16,7 @@ from itertools import product
 import casadi as ca
 import numpy as np
 
-from casadi_ik.arms.screws import Screws
-from casadi_ik.arms.subproblems import Turn
+from casadi_ik.arms.screws import Screws, Turn
 from casadi_ik.arrays import Array
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.smooth import Expr, shared

@@ -25,9 +25,8 @@ import casadi as ca
 import numpy as np
 
 from casadi_ik.arms.family import SIGNS, ArmFamily, Redundancy, Score, margin
-from casadi_ik.arms.screws import Screws
+from casadi_ik.arms.screws import Screws, Turn
 from casadi_ik.arms.six_joints import SphericalArm
-from casadi_ik.arms.subproblems import Turn
 from casadi_ik.arrays import Array
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.smooth import Expr, shared

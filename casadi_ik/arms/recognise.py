@@ -9,7 +9,7 @@ This is the one place that knows the families. They are tried in this order:
 3. offset wrist: the last axis passes by where the two before it meet;
 4. locked joints: a stretch of seven or six joints is of one of these families.
 
-What is of none is searched by damped steps (`methods.common.numeric_arm`).
+What is of none is searched by damped steps (`methods.common.palm`).
 """
 
 from __future__ import annotations

@@ -16,8 +16,8 @@ import casadi as ca
 import numpy as np
 
 from casadi_ik.arms.family import Bend, ClosedForm, Redundancy, Sphere
-from casadi_ik.arms.screws import Screws
-from casadi_ik.arms.subproblems import (
+from casadi_ik.arms.screws import (
+    Screws,
     Turn,
     about_axis,
     subproblem_1,

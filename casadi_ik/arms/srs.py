@@ -18,8 +18,7 @@ import casadi as ca
 import numpy as np
 
 from casadi_ik.arms.family import Bend, ClosedForm, Redundancy, Sphere
-from casadi_ik.arms.screws import Screws
-from casadi_ik.arms.subproblems import subproblem_4
+from casadi_ik.arms.screws import Screws, subproblem_4
 from casadi_ik.arrays import Array
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.se3 import rotation_between, skew

@@ -17,9 +17,9 @@ from casadi_ik.cli.outputs import output, writing
 from casadi_ik.cli.table import COMMANDS, GROUPS, Answer, Said, command, load, names
 from casadi_ik.collision.scene import SceneFile
 from casadi_ik.datasets.layouts import ConventionFile
-from casadi_ik.files.json_schema import json_schema
 from casadi_ik.files.reading import convert, read_yaml
 from casadi_ik.files.shipped import BODIES, resolve, shipped_names
+from casadi_ik.files.units import json_schema
 from casadi_ik.grasps.load import CandidatesFile, GraspFile
 from casadi_ik.grasps.objects import ObjectFile
 from casadi_ik.motion.retarget import Retarget

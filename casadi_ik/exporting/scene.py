@@ -23,9 +23,9 @@ from casadi_ik.kernels.graphs import FunctionGraph
 from casadi_ik.kernels.robot_kernels import RobotKernels
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.problem.clearance import ROUNDING, SceneCheck
-from casadi_ik.solving.alternatives.arm_search import SearchValues
-from casadi_ik.solving.alternatives.free import PARAMETERS as FREE
-from casadi_ik.solving.alternatives.unconstrained_fingers import PARAMETERS as FINGERS
+from casadi_ik.solving.arm_search import SearchValues
+from casadi_ik.solving.free import PARAMETERS as FREE
+from casadi_ik.solving.free_hands import PARAMETERS as FINGERS
 
 MOST = 1000
 """The largest capacity: each solid costs kilobytes."""

@@ -43,8 +43,8 @@ from casadi_ik.methods.hand_first.state import terms
 from casadi_ik.motion.cycle import Cycle
 from casadi_ik.motion.follower import PALM_WEIGHT
 from casadi_ik.motion.inputs import FADING, contact_weights
+from casadi_ik.motion.motion import RUN_UP, own_velocities
 from casadi_ik.motion.moving import FOLLOWING_PULL, SETTLING
-from casadi_ik.motion.timing import RUN_UP, own_velocities
 from casadi_ik.problem.contacts import usual
 from casadi_ik.problem.request import BEYOND, touched
 from casadi_ik.problem.targets import TargetBatch, Tolerance

@@ -21,8 +21,8 @@ from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.problem.request import Request
 from casadi_ik.problem.status import Status
 from casadi_ik.registry import build_method
-from casadi_ik.solving.alternatives.free import resolve_at_once
 from casadi_ik.solving.engine import Engine
+from casadi_ik.solving.free import resolve_at_once
 
 COUNT = 1000
 """How many are stored."""

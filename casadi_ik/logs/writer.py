@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.answers.recorder import Recorder, SolveBlock
 from casadi_ik.errors import InputError, LogError
-from casadi_ik.files.in_background import InBackground
+from casadi_ik.files.writing import InBackground
 from casadi_ik.logs.container import (
     COMPRESSORS,
     MESSAGE,

@@ -15,7 +15,7 @@ from casadi_ik.grasps.pose import one_pose
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.kernels.function_kernel import Recurrence
 from casadi_ik.motion.cycle import Cycle, of_side
-from casadi_ik.motion.timing import Rates
+from casadi_ik.motion.motion import Rates
 from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.problem.contacts import LENGTH, Kinds
 from casadi_ik.problem.request import Request

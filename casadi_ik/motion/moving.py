@@ -19,8 +19,8 @@ from casadi_ik.grasps.pose import inverse, one_pose
 from casadi_ik.motion.approach import Approach, ApproachPlan, approach
 from casadi_ik.motion.follower import Follower
 from casadi_ik.motion.inputs import FollowPlan
+from casadi_ik.motion.motion import a_direction, length, rates_of, seconds, unbounded
 from casadi_ik.motion.reach import Carried, Pace, Reach, WayPlan, move, place, reach
-from casadi_ik.motion.timing import a_direction, length, rates_of, seconds, unbounded
 from casadi_ik.motion.track import PathTracker, Track, track
 from casadi_ik.problem.contacts import by_kinds
 from casadi_ik.problem.request import Request, one_palm

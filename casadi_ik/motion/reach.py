@@ -24,8 +24,7 @@ from casadi_ik.motion.approach import (
     hands_used,
 )
 from casadi_ik.motion.clear import free_way, least_clearance
-from casadi_ik.motion.motion import Motion
-from casadi_ik.motion.timing import Rates, shares, timed
+from casadi_ik.motion.motion import Motion, Rates, shares, timed
 from casadi_ik.problem.clearance import CollisionQuery, SceneCheck
 from casadi_ik.problem.targets import TargetBatch
 

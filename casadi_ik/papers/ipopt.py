@@ -29,7 +29,6 @@ from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.kernels.loop import Stepper
 from casadi_ik.methods.common.contact_fit import whole_residual
 from casadi_ik.problem.contacts import LENGTH, ContactRows, Kinds, usual
-from casadi_ik.problem.jacobian_measures import JacobianMeasures
 from casadi_ik.problem.method import Outcome
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.problem.targets import TargetBatch
@@ -42,6 +41,7 @@ from casadi_ik.problem.trace import (
     RESTART,
     STATUS,
     STEP_SIZE,
+    JacobianMeasures,
     Q,
     TraceFormat,
     packed,

@@ -28,16 +28,16 @@ from casadi_ik.problem.method import Outcome
 from casadi_ik.problem.request import CLEARANCE, Request, free_palms
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.targets import TargetBatch
-from casadi_ik.solving.alternatives.arm_search import Preference
-from casadi_ik.solving.alternatives.finder import (
+from casadi_ik.solving.arm_search import Preference
+from casadi_ik.solving.batch_parts import judged
+from casadi_ik.solving.engine import Engine
+from casadi_ik.solving.finder import (
     APART,
     SEEKING,
     AlternativeFinder,
     checked_distance,
 )
-from casadi_ik.solving.alternatives.free import free_answers
-from casadi_ik.solving.batch_parts import judged
-from casadi_ik.solving.engine import Engine
+from casadi_ik.solving.free import free_answers
 from casadi_ik.solving.trials import Deduplicator
 
 Judgement: TypeAlias = str | Callable[[ArmHand, Array], ArrayLike]

@@ -19,7 +19,7 @@ from casadi_ik.answers.solution import BatchSolution, Solution
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, RowError, UnsupportedError
-from casadi_ik.files.in_background import InBackground
+from casadi_ik.files.writing import InBackground
 from casadi_ik.grasps import Tolerance
 from casadi_ik.made import made
 from casadi_ik.methods.hand_first.method import HandFirstMethod
@@ -32,16 +32,16 @@ from casadi_ik.problem.status import Status
 from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import judge_errors, judge_one
 from casadi_ik.progress import progress, someone_looks_on
-from casadi_ik.solving.alternatives.finder import AlternativeFinder
-from casadi_ik.solving.alternatives.free import (
+from casadi_ik.solving.batch_parts import BatchParts, SolvedPart, in_order, judged
+from casadi_ik.solving.diagnostician import Diagnostician
+from casadi_ik.solving.finder import AlternativeFinder
+from casadi_ik.solving.first_answer import FirstAnswers
+from casadi_ik.solving.free import (
     RANKED,
     resolve_at_once,
     resolve_collisions,
 )
-from casadi_ik.solving.alternatives.way_out import with_way_out
-from casadi_ik.solving.batch_parts import BatchParts, SolvedPart, in_order, judged
-from casadi_ik.solving.diagnosis.diagnostician import Diagnostician
-from casadi_ik.solving.first_answer import FirstAnswers
+from casadi_ik.solving.remedies import with_way_out
 from casadi_ik.solving.sensitivity import SensitivityKernel
 
 MANIPULABILITY = "manipulability"

@@ -24,7 +24,7 @@ from casadi_ik.arms.offset_wrist import OffsetWristArm
 from casadi_ik.arms.recognise import arm_family, family_in_words, family_of, srs_arm
 from casadi_ik.arms.screws import Screws, arm_screws
 from casadi_ik.arrays import Array
-from casadi_ik.solving.alternatives.finder import ArmBranches
+from casadi_ik.solving.finder import ArmBranches
 from casadi_ik.symbolic.kinematics import Pose
 
 KINDS = {

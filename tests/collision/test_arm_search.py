@@ -9,8 +9,8 @@ import casadi_ik as ik
 from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.problem.request import PREFERENCES
 from casadi_ik.problem.targets import TargetBatch
-from casadi_ik.solving.alternatives.arm_search import ArmSearch
-from casadi_ik.solving.alternatives.unconstrained_fingers import UnconstrainedFingers
+from casadi_ik.solving.arm_search import ArmSearch
+from casadi_ik.solving.free_hands import UnconstrainedFingers
 
 
 @pytest.fixture(scope="module")

@@ -19,10 +19,9 @@ from casadi_ik.cli.main import main
 from casadi_ik.kernels.layout import STORAGE, Field, Layout
 from casadi_ik.logs.events import event_format
 from casadi_ik.logs.format import parse_layout, schema_name, schema_text
-from casadi_ik.problem.jacobian_measures import THRESHOLDS, JacobianMeasures
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.targets import TargetBatch, Tolerance
-from casadi_ik.problem.trace import RecordedJacobian, TraceFormat
+from casadi_ik.problem.trace import THRESHOLDS, JacobianMeasures, RecordedJacobian, TraceFormat
 
 __all__ = ["STORAGE", "THRESHOLDS", "Field", "JacobianMeasures", "Layout", "RecordedJacobian"]
 __all__ += ["SolveBlock", "TargetBatch", "TraceFormat", "changed", "chunks_of", "event_format"]

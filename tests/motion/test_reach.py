@@ -11,7 +11,7 @@ from dense_ways import dense
 
 import casadi_ik as ik
 from casadi_ik.motion.clear import free_way, motor_units
-from casadi_ik.motion.timing import rates_of, shares, timed
+from casadi_ik.motion.motion import rates_of, shares, timed
 
 
 @pytest.fixture(scope="module")

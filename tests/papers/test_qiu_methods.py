@@ -9,8 +9,7 @@ from trace_checks import Kept
 
 import casadi_ik as ik
 from casadi_ik import robots
-from casadi_ik.papers.qiu.finger_step import finger_step_function
-from casadi_ik.symbolic.planar_finger import planar_finger
+from casadi_ik.papers.qiu.fingers import finger_step_function, planar_finger
 
 REACHING, ALIGNMENT = ik.answers.Phase.THUMB_REACHING, ik.answers.Phase.HAND_ALIGNMENT
 SPREAD = 7

@@ -10,7 +10,7 @@ from scipy.linalg import logm
 from toy_robots import replace
 
 import casadi_ik as ik
-from casadi_ik.papers.qiu.parameters import QiuParameters
+from casadi_ik.papers.qiu.step import QiuParameters
 from casadi_ik.papers.qiu.tasks import (
     Task,
     axes_through,

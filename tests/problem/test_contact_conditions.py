@@ -13,16 +13,17 @@ from scipy.spatial.transform import Rotation
 
 from casadi_ik.arms.recognise import srs_arm
 from casadi_ik.methods.common.contact_fit import whole_jacobian, whole_residual
-from casadi_ik.methods.common.numeric_arm import (
+from casadi_ik.methods.common.palm import (
     NUMERIC_ARM,
+    best_palm,
+    hand_contacts,
     nearest_start,
     pose_jacobian,
     pose_step,
 )
-from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
-from casadi_ik.methods.hand_first.hand_fit import PalmAndHand, fit_jacobian, fit_residual, reach_row
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.state import HandFirstLayouts
+from casadi_ik.methods.hand_first.step import PalmAndHand, fit_jacobian, fit_residual, reach_row
 from casadi_ik.methods.thumb_first.closed_chain_step import contact_errors, linearised
 from casadi_ik.problem.contacts import (
     CONDITIONS,

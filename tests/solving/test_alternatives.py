@@ -175,3 +175,15 @@ def test_what_is_refused(robot, solver):
         ik.errors.UnsupportedError, match="method 'ipopt' gives one solution; several need"
     ):
         ik.Solver(robot, "ipopt").solve_all(asked)
+
+
+def test_arms_of_a_hand_with_a_wrist():
+    """The wrist makes two joints more than a closed form takes: all its branches are there."""
+    robot = ik.load_robot("ur5e+shadow")
+    solver = ik.Solver(robot)
+    for q in robot.random(np.random.default_rng(3), 3):
+        found = solver.solve_all(grasp_at(robot, q), limit=50, prefer="manipulability")
+        assert len(found) >= 6
+        for one in found:
+            assert np.abs(robot.contacts(one.q)[0] - robot.contacts(q)[0]).max() < 0.005
+            assert all(contact.ok for contact in one.contacts.values())

@@ -11,9 +11,9 @@ from toy_robots import replace
 
 import casadi_ik as ik
 from casadi_ik import robots
+from casadi_ik.papers.qiu.fingers import planar_finger
 from casadi_ik.symbolic import mechanisms
 from casadi_ik.symbolic.mechanisms import Linkage
-from casadi_ik.symbolic.planar_finger import planar_finger
 
 S, B = (1, 1), (5, 1)
 AR10 = Linkage(2.97, 3.47, 0.84, 0.72, -1)

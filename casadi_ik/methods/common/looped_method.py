@@ -16,11 +16,10 @@ from casadi_ik.errors import RowError, UnsupportedError
 from casadi_ik.kernels import LoopKernel, StepGraph
 from casadi_ik.kernels.loop import Stepper
 from casadi_ik.problem.contacts import Kinds
-from casadi_ik.problem.jacobian_measures import JacobianMeasures
 from casadi_ik.problem.method import Method, Outcome
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.problem.targets import TargetBatch
-from casadi_ik.problem.trace import RecordedJacobian, TraceFormat, trace_format
+from casadi_ik.problem.trace import JacobianMeasures, RecordedJacobian, TraceFormat, trace_format
 from casadi_ik.robots.description import RobotDescription
 
 Start = tuple[Array, Array]

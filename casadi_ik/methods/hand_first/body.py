@@ -19,12 +19,10 @@ from casadi_ik.arms.recognise import arm_family
 from casadi_ik.arms.search import PARAMETERS, ArmTrials, Farthest
 from casadi_ik.methods.common.bounded_step import Bounded, clip, damped_step
 from casadi_ik.methods.common.contact_fit import FIT, Tried, fresh_fit, judge, judge_contacts
-from casadi_ik.methods.common.numeric_arm import newton_polish
-from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
-from casadi_ik.methods.hand_first.hand_fit import PalmAndHand, fit_step
+from casadi_ik.methods.common.palm import best_palm, hand_contacts, newton_polish
 from casadi_ik.methods.hand_first.parameters import BODY, STAGES
 from casadi_ik.methods.hand_first.state import BY_SIDE, HandFirstLayouts, Stage, with_rows
-from casadi_ik.methods.hand_first.step import HandFirstStep
+from casadi_ik.methods.hand_first.step import HandFirstStep, PalmAndHand, fit_step
 from casadi_ik.problem.contacts import LENGTH, Kinds
 from casadi_ik.problem.status import Phase
 from casadi_ik.robots.description import RobotDescription

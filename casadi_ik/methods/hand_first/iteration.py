@@ -17,7 +17,7 @@ from casadi_ik.arrays import Array, even_steps
 from casadi_ik.kernels.codegen import define, define_arrays, number, row_major
 from casadi_ik.kernels.function_kernel import BufferedFunction
 from casadi_ik.methods.common.contact_fit import BALANCE, FIT, fresh_fit
-from casadi_ik.methods.common.numeric_arm import NUMERIC_ARM, start_table
+from casadi_ik.methods.common.palm import NUMERIC_ARM, start_table
 from casadi_ik.methods.hand_first.parameters import BODY, STAGES
 from casadi_ik.methods.hand_first.state import BY_SIDE, PLACES, SAID, Stage
 from casadi_ik.problem.contacts import LENGTH

@@ -15,7 +15,7 @@ from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.methods.common.bounded_step import Bounded
 from casadi_ik.methods.common.contact_fit import Tried, WholeContacts, fresh_fit
 from casadi_ik.methods.common.limits import bits, coupling_fields, coupling_values
-from casadi_ik.methods.common.numeric_arm import SIX
+from casadi_ik.methods.common.palm import SIX
 from casadi_ik.problem.contacts import ContactRows, Kinds, suffix
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.trace import (

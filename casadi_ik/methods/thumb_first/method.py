@@ -13,8 +13,7 @@ from casadi_ik.arrays import Array, Counts
 from casadi_ik.kernels import StepGraph
 from casadi_ik.methods.common.looped_method import LoopedMethod, Start
 from casadi_ik.methods.common.posture_table import PostureTable
-from casadi_ik.methods.thumb_first.state import STAGES, ThumbFirstParameters
-from casadi_ik.methods.thumb_first.step import ThumbFirstStep
+from casadi_ik.methods.thumb_first.step import STAGES, ThumbFirstParameters, ThumbFirstStep
 from casadi_ik.problem.contacts import Kinds, target_values, usual
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.targets import TargetBatch

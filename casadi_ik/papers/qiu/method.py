@@ -1,21 +1,484 @@
-"""The methods of Qiu & Kermani 2021, each one compiled loop."""
+"""The methods of Qiu & Kermani 2021, each one compiled loop.
+
+*Enhanced:* thumb reaching, then hand alignment. *Original*, of the paper's comparison: all contacts
+in one hierarchy.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Generic, TypeVar
+
+import casadi as ca
+import numpy as np
 
 from casadi_ik.arrays import Array, Counts
 from casadi_ik.kernels import StepGraph
-from casadi_ik.methods.common.limits import starts_within
+from casadi_ik.kernels.layout import Field
+from casadi_ik.methods.common.limits import kept_within, limit_mask, starts_within
 from casadi_ik.methods.common.looped_method import LoopedMethod, Start
-from casadi_ik.papers.qiu.enhanced import EnhancedStep
-from casadi_ik.papers.qiu.original import OriginalStep
-from casadi_ik.papers.qiu.parameters import OriginalParameters, QiuParameters
-from casadi_ik.problem.status import Phase
+from casadi_ik.papers.qiu.fingers import finger_step_function, planar_fingers
+from casadi_ik.papers.qiu.step import OriginalParameters, QiuParameters, QiuStep
+from casadi_ik.papers.qiu.tasks import (
+    MILLIMETRE,
+    Task,
+    TaskSolver,
+    combine,
+    contact_tasks,
+    damped,
+    palm_motion,
+    palm_orientation,
+    palm_orientation_task,
+    selective,
+    thumb_first,
+    weighted,
+    weighted_damped,
+)
+from casadi_ik.problem.contacts import contact_errors, goal_contacts, within_tolerance
+from casadi_ik.problem.status import Phase, Status
 from casadi_ik.problem.targets import TargetBatch
-from casadi_ik.problem.trace import RecordedJacobian
+from casadi_ik.problem.trace import STEP_SIZE, RecordedJacobian
 from casadi_ik.robots.description import RobotDescription
+from casadi_ik.symbolic.closed_chain import VIRTUAL, closed_chain, split
+from casadi_ik.symbolic.kinematics import actuated
+from casadi_ik.symbolic.linear_algebra import condition_number, damped_pinv_times, singular_values
+from casadi_ik.symbolic.smooth import Expr, safe_norm, shared
+
+NOT_MEASURED = float("nan")
+
+
+class EnhancedStep(QiuStep[QiuParameters]):
+    """Builds the step graph of an enhanced method for one robot.
+
+    Attributes:
+        chain: Active and passive joints of the closed chain.
+    """
+
+    family, stage = "enhanced", "phase"
+
+    def __init__(self, robot: RobotDescription, options: QiuParameters) -> None:
+        """Lay out state, parameters and record.
+
+        Raises:
+            UnsupportedError: The robot is not of the kind the method needs.
+        """
+        self.chain = split(robot, options.borrowed)
+        self.compilable = options.finger_step != "ipopt"
+        planar_fingers(robot)  # refused now rather than when the graph is built
+        state = (
+            Field("phase"),
+            Field("best", doc="smallest summed error of thumb reaching so far"),
+            Field("waited", doc="iterations since `best` fell"),
+            Field("reached", doc="iterations spent in thumb reaching"),
+        )
+        numbers = (
+            Field("reaching_damping"),
+            Field("chain_damping"),
+            Field("chain_lever", unit="mm"),
+            Field("reaching_gamma"),
+            Field("chain_gamma"),
+            Field("longest_error", unit="mm"),
+            Field("widest_error", unit="rad"),
+            Field("weights", (len(self.chain.active),)),
+            Field("reaching_patience"),
+            Field("reaching_iterations"),
+            Field("step_cap"),
+        )
+        measured = (
+            Field("palm_error", (), "f4", "rad", "palm orientation task error (phase 1)"),
+            Field("palm_motion", (2,), "f4", "mm, rad", "palm motion demanded (phase 2)"),
+            STEP_SIZE.of(robot, "largest motor change of this iteration"),
+            Field("sigma_thumb", (), "f4", "m", "smallest singular value, thumb point Jacobian"),
+            Field("sigma_palm", (), "f4", "", "smallest singular value, palm task (phase 1)"),
+            Field("sigma_closed_chain", (), "f4", "", "smallest singular value of H_p (phase 2)"),
+            Field("condition_closed_chain", (), "f4", "", "condition number of H_p (phase 2)"),
+        )
+        super().__init__(robot, options, state, numbers, measured)
+
+    @property
+    def jacobians(self) -> dict[str, RecordedJacobian]:
+        """The Jacobians in the record.
+
+        The paper names no thresholds; these are ours. A metre of the thumb's tip asks for more
+        than 20 rad of some joint, a rad of the palm for more than 2 rad, the platform for passive
+        joints that move 100 times as far as it turns. H_p has lengths in millimetres: its condition
+        number is above 400 everywhere.
+        """
+        names = self.robot.actuator_names
+        arm = tuple(names[i] for i in self.robot.arm_actuators)
+        thumb = tuple(names[i] for i in self.robot.finger_actuators(self.robot.thumb))
+        passive = tuple(names[i] for i in self.chain.passive if i != VIRTUAL)
+        return {
+            "thumb": RecordedJacobian(arm + thumb, singular=0.05),
+            "palm": RecordedJacobian(arm, singular=0.5),
+            "closed_chain": RecordedJacobian(passive, singular=0.01, condition=1e5),
+        }
+
+    def parameter_values(self, targets: TargetBatch) -> dict[str, float | list[float] | Array]:
+        """Values of all parameter fields for a batch."""
+        options = self.options
+        weights = [
+            options.virtual_weight if column == VIRTUAL else options.joint_weight
+            for column in self.chain.active
+        ]
+        return super().parameter_values(targets) | {"weights": weights}
+
+    def first_state(self, starts: Array) -> dict[str, float | Array]:
+        """Values of all state fields for starts (k, n)."""
+        most = float(np.finfo(float).max)
+        begun = {"phase": float(Phase.THUMB_REACHING), "best": most, "waited": 0.0, "reached": 0.0}
+        return super().first_state(starts) | begun
+
+    def row(
+        self, q: Expr, positions: Expr, angles: Expr, *, phase: Phase, **measured: Expr
+    ) -> ca.SX:
+        """What is logged of an iteration.
+
+        Args:
+            q: (n, 1) the configuration the row describes.
+            positions: (f, 1) its errors [m].
+            angles: (f, 1) [rad].
+            phase: The phase.
+            measured: The other fields; those that the phase does not have are left out.
+        """
+        values: dict[str, Expr] = {
+            "q": q,
+            "position_error": positions,
+            "angle_error": angles,
+            "palm_error": NOT_MEASURED,
+            "palm_motion": [NOT_MEASURED, NOT_MEASURED],
+            "sigma_palm": NOT_MEASURED,
+            "sigma_closed_chain": NOT_MEASURED,
+            "condition_closed_chain": NOT_MEASURED,
+            "limit_mask": limit_mask(self.robot, q),
+            "phase": float(phase),
+        }
+        return self.record.pack(values | measured)
+
+    def _iteration(self) -> ca.Function:
+        state = ca.MX.sym("state", self.state.size)
+        parameters = ca.MX.sym("parameters", self.parameters.size)
+        fingers = finger_step_function(self.robot, self.options.finger_step)
+        seen = self._palm_view()(state, parameters)
+        closed = fingers(state[self.state.slice("q")], *seen)
+        align = ca.Function(
+            "align", [state, parameters], list(self._align()(state, parameters, closed))
+        )
+        choose = ca.Function.if_else("phase", self._reach(), align)
+        in_reaching = state[self.state.slice("phase")] < Phase.HAND_ALIGNMENT
+        outputs = choose(in_reaching, state, parameters)
+        return ca.Function(self._name, [state, parameters], list(outputs))
+
+    def _palm_view(self) -> ca.Function:
+        """Targets of the fingers but the thumb, seen from the palm: what eq. (5) works with."""
+        state, parameters, s, p = self._inputs()
+        palm = actuated(self.robot, s["q"]).kinematics.palm
+        goals = [
+            goal for name, goal in goal_contacts(self.robot, p).items() if name != self.robot.thumb
+        ]
+        points = ca.horzcat(*(palm.inverse_apply(goal.point) for goal in goals))
+        normals = ca.horzcat(*(palm.rotation.T @ goal.normal for goal in goals))
+        return ca.Function("palm_view", [state, parameters], [points, normals])
+
+    def _reach(self) -> ca.Function:
+        """One iteration of thumb reaching (section II-B)."""
+        state, parameters, s, p = self._inputs()
+        robot, body, goals = self.robot, actuated(self.robot, s["q"]), goal_contacts(self.robot, p)
+        columns = robot.arm_actuators + robot.finger_actuators(robot.thumb)
+        palm = palm_orientation_task(
+            body, palm_orientation(robot, goals), columns, self.options.palm_error == "euler"
+        )
+        position, normal = contact_tasks(body, robot.thumb, goals[robot.thumb], columns)
+        tasks = [palm, position, normal] if self.options.palm_task else [position, normal]
+        step = self._spread(self._combined(tasks, self._reaching(p)), columns)
+        q_next = self._moved(s["q"], step, p)
+
+        positions, angles = contact_errors(body.kinematics, goals, robot.finger_names)
+        thumb = robot.finger_names.index(robot.thumb)
+        # In units of the thumb's tolerances, so that they can be summed.
+        errors = ca.vertcat(
+            positions[thumb] / p["position_tolerance"][thumb],
+            angles[thumb] / p["angle_tolerance"][thumb],
+        )
+        if self.options.palm_task:
+            errors = ca.vertcat(errors, safe_norm(palm.error) / p["angle_tolerance"][thumb])
+        within, summed = ca.mmax(errors) <= 1, ca.sum1(errors)
+        better = summed < 0.99 * s["best"]
+        waited = ca.if_else(better, 0.0, s["waited"] + 1)
+        enough = ca.logic_or(
+            waited >= p["reaching_patience"], s["reached"] + 1 >= p["reaching_iterations"]
+        )
+        finished = ca.logic_or(within, enough)
+        after = self.state.pack(
+            {
+                "q": ca.if_else(within, s["q"], q_next),
+                "phase": ca.if_else(finished, float(Phase.HAND_ALIGNMENT), s["phase"]),
+                "best": ca.if_else(better, summed, s["best"]),
+                "waited": ca.if_else(finished, 0.0, waited),
+                "reached": s["reached"] + 1,
+            }
+        )
+        status = ca.SX(float(Status.RUNNING))
+        record = self.row(
+            s["q"],
+            positions,
+            angles,
+            step_size=_largest(q_next - s["q"]),
+            status=status,
+            phase=Phase.THUMB_REACHING,
+            palm_error=safe_norm(palm.error),
+            sigma_thumb=_smallest(position.jacobian) * MILLIMETRE,
+            sigma_palm=_smallest(palm.jacobian[:, : len(robot.arm_actuators)]),
+        )
+        return ca.Function("reach", [state, parameters], shared(after, record, status))
+
+    def _align(self) -> ca.Function:
+        """One iteration of hand alignment (section II-C), after the fingers' own step."""
+        state, parameters, s, p = self._inputs()
+        closed = ca.SX.sym("closed", len(self.robot.actuators))
+        robot, body, goals = self.robot, actuated(self.robot, closed), goal_contacts(self.robot, p)
+        positions, angles = contact_errors(body.kinematics, goals, robot.finger_names)
+        solved = within_tolerance(positions, angles, p["position_tolerance"], p["angle_tolerance"])
+
+        others = {name: goal for name, goal in goals.items() if name != robot.thumb}
+        translation, rotation = palm_motion(body, others)
+        chain = closed_chain(body, self.chain, MILLIMETRE, self.options.platform)
+        moved = closed
+        if self.options.closed_chain:
+            motion = self._palm_tasks(chain.J_cc, translation, rotation, p)
+            active = self._combined(motion, self._chain_solver(p))
+            moved = self._moved(closed, chain.motor_steps(active, closed.numel()), p)
+
+        columns = robot.arm_actuators + robot.finger_actuators(robot.thumb)
+        keep = contact_tasks(actuated(robot, moved), robot.thumb, goals[robot.thumb], columns)
+        step = self._spread(self._combined(keep, self._reaching(p)), columns)
+        q_next = self._moved(moved, step, p)
+
+        status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
+        after = self.state.pack(s | {"q": ca.if_else(solved, closed, q_next)})
+        thumb_linear, _ = body.contact_jacobian(robot.thumb, columns)
+        spectrum = singular_values(chain.H_p)
+        record = self.row(
+            closed,
+            positions,
+            angles,
+            step_size=_largest(q_next - s["q"]),
+            status=status,
+            phase=Phase.HAND_ALIGNMENT,
+            palm_motion=ca.vertcat(safe_norm(translation), safe_norm(rotation)),
+            sigma_thumb=_smallest(thumb_linear),
+            sigma_closed_chain=ca.mmin(spectrum),
+            condition_closed_chain=condition_number(spectrum),
+        )
+        return ca.Function("align_rest", [state, parameters, closed], shared(after, record, status))
+
+    def _palm_tasks(
+        self, J_cc: ca.SX, translation: ca.SX, rotation: ca.SX, p: dict[str, ca.SX]
+    ) -> list[Task]:
+        """What the closed chain is to do: position, then orientation, or both as one."""
+        if self.options.chain_tasks == "successive":
+            return [
+                Task(J_cc[:3, :], translation, is_position=True),
+                Task(J_cc[3:, :], rotation, is_position=False),
+            ]
+        lever = p["chain_lever"]
+        stacked = ca.vertcat(J_cc[:3, :], lever * J_cc[3:, :])
+        return [Task(stacked, ca.vertcat(translation, lever * rotation), is_position=True)]
+
+    def _combined(self, tasks: Sequence[Task], solve: TaskSolver) -> ca.SX:
+        """One step for all tasks, the highest first, as in the paper by successive projection."""
+        return combine(tasks, [solve(task) for task in tasks], "successive")
+
+    def _reaching(self, p: dict[str, ca.SX]) -> TaskSolver:
+        """Solves the tasks of the serial chain."""
+        if self.options.steps == "dls":
+            return damped(p["reaching_damping"])
+        return selective(p["reaching_gamma"], p["longest_error"], p["widest_error"])
+
+    def _chain_solver(self, p: dict[str, ca.SX]) -> TaskSolver:
+        """Solves the tasks of the closed chain, weighted."""
+        if self.options.steps == "dls":
+            return weighted_damped(p["chain_damping"], p["weights"])
+        solver = selective(p["chain_gamma"], p["longest_error"], p["widest_error"])
+        return weighted(solver, p["weights"])
+
+    def _spread(self, step: ca.SX, columns: tuple[int, ...]) -> ca.SX:
+        """A step of some actuators as a step of all (n, 1)."""
+        full = ca.SX.zeros(len(self.robot.actuators), 1)
+        for i, column in enumerate(columns):
+            full[column] = step[i]
+        return full
+
+    def _moved(self, q: ca.SX, step: ca.SX, p: dict[str, ca.SX]) -> ca.SX:
+        """Take a step from q: capped, and kept within limits if they are enforced."""
+        q_next = q + step * ca.fmin(1.0, p["step_cap"] / ca.fmax(_largest(step), 1e-12))
+        return kept_within(self.robot, q_next, p["enforce_limits"])
+
+
+def _smallest(jacobian: ca.SX) -> ca.SX:
+    return ca.mmin(singular_values(jacobian))
+
+
+def _largest(step: ca.SX) -> ca.SX:
+    """Largest change of any motor."""
+    return ca.mmax(ca.fabs(step))
+
+
+class OriginalStep(QiuStep[OriginalParameters]):
+    """Builds the step graph of an original method for one robot.
+
+    What repeats, the solving of a task, is a function that is called: written out once per task it
+    made the C compiler slow. Only the columns of the actuators that move a task are worked on.
+    """
+
+    family = "original"
+
+    def __init__(self, robot: RobotDescription, options: OriginalParameters) -> None:
+        """Lay out state, parameters and record."""
+        numbers = (
+            Field("damping"),
+            Field("gamma"),
+            Field("longest_error", unit="mm"),
+            Field("widest_error", unit="rad"),
+        )
+        moved = STEP_SIZE.of(robot, "largest motor change of this iteration")
+        super().__init__(robot, options, (), numbers, (moved,))
+
+    def _iteration(self) -> ca.Function:
+        state = ca.MX.sym("state", self.state.size)
+        parameters = ca.MX.sym("parameters", self.parameters.size)
+        errors, *pairs = self._view()(state, parameters)
+        if self.options.projection == "stacked":
+            step = self._stacked()(parameters, *pairs)
+        else:
+            # Instruction fetch bounds an iteration: tasks of one size share one function.
+            sizes = {len(columns) for _, columns in self._kinds}
+            solve = {size: self._solve(size) for size in sorted(sizes)}
+            place = self.parameters.slice
+            longest = {True: place("longest_error"), False: place("widest_error")}
+            steps = [
+                solve[len(columns)](parameters, parameters[longest[is_position]], pair)
+                for (is_position, columns), pair in zip(self._kinds, pairs, strict=True)
+            ]
+            step = self._combined()(*pairs, *steps)
+        outputs = self._ending()(state, parameters, errors, step)
+        return ca.Function(self._name, [state, parameters], list(outputs))
+
+    @cached_property
+    def _kinds(self) -> list[tuple[bool, tuple[int, ...]]]:
+        """Of every task by priority, whether it is a position, and the actuators that move it."""
+        robot, arm = self.robot, self.robot.arm_actuators
+        movers = [(*arm, *robot.finger_actuators(name)) for name in thumb_first(robot)]
+        if self.options.order == "per-finger":
+            kinds = [(kind, columns) for columns in movers for kind in (True, False)]
+        else:
+            kinds = [(kind, columns) for kind in (True, False) for columns in movers]
+        return [(False, arm), *kinds] if self._turns_palm else kinds
+
+    @property
+    def _turns_palm(self) -> bool:
+        return self.options.palm_task and bool(self.robot.arm_actuators)
+
+    def _view(self) -> ca.Function:
+        """Errors (f, 2) of all fingers in point and normal, then all tasks by priority.
+
+        A task is its Jacobian over the actuators that move it, and its error, [J, e] (3, k + 1).
+        """
+        state, parameters, s, p = self._inputs()
+        robot, goals, body = self.robot, goal_contacts(self.robot, p), actuated(self.robot, s["q"])
+        arm = robot.arm_actuators
+        pairs = [
+            contact_tasks(body, name, goals[name], (*arm, *robot.finger_actuators(name)))
+            for name in thumb_first(robot)
+        ]
+        if self.options.order == "per-finger":
+            tasks = [task for pair in pairs for task in pair]
+        else:
+            tasks = [point for point, _ in pairs] + [normal for _, normal in pairs]
+        if self._turns_palm:
+            euler = self.options.palm_error == "euler"
+            desired = palm_orientation(robot, goals)
+            tasks.insert(0, palm_orientation_task(body, desired, arm, euler))
+        errors = ca.horzcat(*contact_errors(body.kinematics, goals, robot.finger_names))
+        seen = [ca.densify(ca.horzcat(task.jacobian, task.error)) for task in tasks]
+        return ca.Function("view", [state, parameters], shared(errors, *seen))
+
+    def _solve(self, count: int) -> ca.Function:
+        """The step of one task alone over the actuators that move it, errors not above `longest`.
+
+        SDLS needs that, DLS does not look at it.
+        """
+        _, parameters, _, p = self._inputs()
+        longest, pair = ca.SX.sym("longest"), ca.SX.sym("pair", 3, count + 1)
+        if self.options.steps == "dls":
+            solver = damped(p["damping"])
+        else:
+            solver = selective(p["gamma"], longest, longest)
+        step = solver(Task(pair[:, :-1], pair[:, -1], is_position=True))
+        return ca.Function(f"solve_{count}", [parameters, longest, pair], shared(step))
+
+    def _pairs(self) -> tuple[list[ca.SX], list[Task]]:
+        """Symbols of all [J, e], and the tasks over all actuators that they stand for."""
+        n, pairs, tasks = len(self.robot.actuators), [], []
+        for i, (is_position, columns) in enumerate(self._kinds):
+            pair = ca.SX.sym(f"pair_{i}", 3, len(columns) + 1)
+            pairs.append(pair)
+            tasks.append(Task(_spread(pair[:, :-1], columns, n), pair[:, -1], is_position))
+        return pairs, tasks
+
+    def _stacked(self) -> ca.Function:
+        """One step for all tasks as one, without priorities."""
+        _, parameters, _, p = self._inputs()
+        pairs, tasks = self._pairs()
+        J = ca.vertcat(*(task.jacobian for task in tasks))
+        e = ca.vertcat(*(task.error for task in tasks))
+        step = damped_pinv_times(ca.densify(J), e, p["damping"])
+        return ca.Function("stacked", [parameters, *pairs], shared(step))
+
+    def _combined(self) -> ca.Function:
+        """One step from those of all tasks."""
+        n, (pairs, tasks) = len(self.robot.actuators), self._pairs()
+        given, steps = [], []
+        for i, (_, columns) in enumerate(self._kinds):
+            given.append(ca.SX.sym(f"step_{i}", len(columns)))
+            steps.append(_spread(given[i].T, columns, n).T)
+        damping = self.options.damping if self.options.projectors == "damped" else None
+        step = ca.densify(combine(tasks, steps, self.options.projection, damping))
+        return ca.Function("combined", [*pairs, *given], shared(step))
+
+    def _ending(self) -> ca.Function:
+        """Take the step, or end."""
+        state, parameters, s, p = self._inputs()
+        errors = ca.SX.sym("errors", len(self.robot.fingers), 2)
+        step = ca.SX.sym("step", len(self.robot.actuators))
+        robot, q, positions, angles = self.robot, s["q"], errors[:, 0], errors[:, 1]
+        solved = within_tolerance(positions, angles, p["position_tolerance"], p["angle_tolerance"])
+        q_next = kept_within(robot, q + step, p["enforce_limits"])
+        status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
+        after = self.state.pack({"q": ca.if_else(solved, q, q_next)})
+        record = self.record.pack(
+            {
+                "q": q,
+                "position_error": positions,
+                "angle_error": angles,
+                "step_size": ca.mmax(ca.fabs(q_next - q)),
+                "limit_mask": limit_mask(robot, q),
+                "phase": float(Phase.HIERARCHY),
+                "status": status,
+            }
+        )
+        return ca.Function(
+            "ending", [state, parameters, errors, step], shared(after, record, status)
+        )
+
+
+def _spread(matrix: ca.SX, columns: tuple[int, ...], n: int) -> ca.SX:
+    """A matrix (r, k) as the given columns of one with n, the others structurally zero."""
+    wide = ca.SX(matrix.shape[0], n)
+    wide[:, list(columns)] = matrix
+    return wide
+
 
 Step = TypeVar("Step", EnhancedStep, OriginalStep)
 

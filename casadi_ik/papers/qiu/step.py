@@ -1,20 +1,188 @@
-"""What the steps of Qiu & Kermani 2021 share: layouts, and the numbers that go in."""
+"""Every number and every open choice of Qiu & Kermani 2021, and what their steps share."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from typing import Generic, TypeVar
 
 import casadi as ca
 
 from casadi_ik.arrays import Array
+from casadi_ik.errors import InputError
 from casadi_ik.kernels.graphs import StepGraph, recipe
 from casadi_ik.kernels.layout import Field, Layout
-from casadi_ik.papers.qiu.parameters import OriginalParameters, QiuParameters
+from casadi_ik.papers.qiu.tasks import PROJECTIONS as HIERARCHIES
 from casadi_ik.problem.contacts import target_fields, target_values
 from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.trace import ANGLE_ERROR, LIMIT_MASK, PHASE, POSITION_ERROR, STATUS, Q
 from casadi_ik.robots.description import RobotDescription
+
+ORDERS = ("per-finger", "points-first")
+"""Order of the tasks of the original methods: finger by finger, or all points, then all normals."""
+
+PROJECTIONS = (*HIERARCHIES, "stacked")
+"""How the tasks of the original methods share the motors: a hierarchy, or one damped least squares
+problem of all of them (DLS only: selective damping is per task here)."""
+
+PROJECTORS = ("exact", "damped")
+
+FINGER_STEPS = ("ipopt", "closed-form")
+PALM_ERRORS = ("euler", "rotation-vector")
+PLATFORMS = ("arm-leg", "palm")
+STEPS = ("dls", "sdls")
+CHAIN_TASKS = ("successive", "stacked")
+CHOICES = {
+    "chain_tasks": CHAIN_TASKS,
+    "steps": STEPS,
+    "finger_step": FINGER_STEPS,
+    "palm_error": PALM_ERRORS,
+    "platform": PLATFORMS,
+    "projection": PROJECTIONS,
+    "projectors": PROJECTORS,
+    "order": ORDERS,
+}
+MAY_BE_ZERO = ("borrowed",)
+
+
+@dataclass(frozen=True)
+class QiuParameters:
+    """Parameters of the paper's methods; the defaults are the paper's where it gives them.
+
+    Lengths inside the solver are millimetres, angles radians: the paper gives its damping
+    factors as bare numbers, and only in these units do they do what it describes (lambda = 150
+    "considerably large").
+
+    Attributes:
+        steps: How a task is solved: "dls" (Wampler 1986) or "sdls" (Buss & Kim 2005).
+        reaching_damping: lambda of thumb reaching (paper: 1), squared in the normal matrix.
+            [mm] in the position task, [rad/rad] in the orientation tasks.
+        chain_damping: lambda of the closed chain (paper: 150), squared in the normal matrix.
+            Read as 150 rather than 150^2 in the matrix (a value of 12.25 here), success falls from
+            97 % to 82 % (12 shipped grasps x 40 random arms, limits ignored).
+        reaching_gamma: SDLS: largest joint change in one step of thumb reaching (paper: pi/9)
+            [rad].
+        chain_gamma: SDLS: the same for the closed chain (paper: pi/500) [rad].
+        longest_error: SDLS: position errors are shortened to this (paper: 200) [mm].
+        widest_error: SDLS: orientation errors are shortened to this (paper: pi/6) [rad].
+        virtual_weight: Weight of the virtual joint in the closed chain (paper: 10).
+        joint_weight: Weight of the other active joints (paper: 1).
+        palm_error: "euler": differences of Euler angles as the paper writes; it names no
+            convention, taken is ZYX, each difference wrapped to (-pi, pi]. "rotation-vector":
+            rotation logarithm and geometric Jacobian, free of the Euler singularity.
+        palm_task: Whether thumb reaching has the palm's estimated orientation as its first task
+            (paper: yes).
+        closed_chain: Whether the closed chain moves the palm (paper: yes); without it only the
+            fingers close.
+        chain_tasks: "successive": the palm's position, its orientation in the null space of that
+            (paper). "stacked": both as one task, its rotations times `chain_lever`.
+        chain_lever: How much palm motion a turn of the palm counts as [mm/rad].
+        platform: Whose twist J_cc of eq. (8) is: "arm-leg" as printed (the arm's last joint is
+            left out), "palm" with it.
+        borrowed: Arm joints counted to the reversed thumb (paper: 1, the 7th).
+        finger_step: Solver of eq. (5): "ipopt" (the paper: fmincon) or "closed-form" (the same
+            answer, much faster).
+        reaching_patience: Thumb reaching ends when palm and thumb are within tolerance. The
+            paper does not say what happens when the tasks conflict and they never are: here it
+            also ends after this many iterations without a gain of 1 % in the summed errors.
+        reaching_iterations: ... and after this many iterations in any case.
+        step_cap: Longest change of any motor in one iteration [rad or m]. Not in the paper: none.
+        max_iterations: Budget of a solve, both phases together (paper: 10,000).
+    """
+
+    steps: str = "dls"
+    reaching_damping: float = 1.0
+    chain_damping: float = 150.0
+    reaching_gamma: float = math.pi / 9
+    chain_gamma: float = math.pi / 500
+    longest_error: float = 200.0
+    widest_error: float = math.pi / 6
+    virtual_weight: float = 10.0
+    joint_weight: float = 1.0
+    palm_error: str = "euler"
+    palm_task: bool = True
+    closed_chain: bool = True
+    chain_tasks: str = "successive"
+    chain_lever: float = 300.0
+    platform: str = "arm-leg"
+    borrowed: int = 1
+    finger_step: str = "ipopt"
+    reaching_patience: int = 10
+    reaching_iterations: int = 100
+    step_cap: float = 1e9
+    max_iterations: int = 10_000
+
+    def __post_init__(self) -> None:
+        _check_fields(self)
+
+
+def _check_fields(record: QiuParameters | OriginalParameters) -> None:
+    """Raise unless every field has a value it can have."""
+    for entry in fields(record):
+        value = getattr(record, entry.name)
+        if entry.name in CHOICES:
+            if value not in CHOICES[entry.name]:
+                known = ", ".join(CHOICES[entry.name])
+                raise InputError(f"{entry.name}: found {value!r}, expected one of {known}")
+        elif isinstance(entry.default, bool):
+            if not isinstance(value, bool):
+                raise InputError(f"{entry.name}: found {value!r}, expected true or false")
+        else:
+            _check_number(entry.name, value, isinstance(entry.default, int))
+
+
+def _check_number(name: str, value: object, whole: bool) -> None:
+    kind, types = ("an integer", (int,)) if whole else ("a number", (int, float))
+    zero = name in MAY_BE_ZERO
+    number = isinstance(value, types) and not isinstance(value, bool)
+    if not (number and (value > 0 or (zero and value == 0))):  # type: ignore[operator]
+        bound = ">= 0" if zero else "> 0"
+        raise InputError(f"{name}: found {value!r}, expected {kind} {bound}")
+
+
+@dataclass(frozen=True)
+class OriginalParameters:
+    """Parameters of the methods the paper compares with: one hierarchy over all motors.
+
+    The paper says only "the methods without the enhancement of the proposed approach". The
+    defaults carry the hierarchy of its thumb reaching on to the other fingers: the palm's
+    orientation, then point and normal finger by finger, the thumb first; augmented projection,
+    with the pseudoinverse in the projectors damped like a task's own. Of all readings it is among
+    the closest to the printed means; `studies/table_one.py` measures them all.
+
+    Attributes:
+        steps: How a task is solved: "dls" or "sdls".
+        palm_task: Whether the palm's estimated orientation is the first task.
+        order: Order of the contact tasks, see `ORDERS`; the thumb is the first finger.
+        projection: How a lower task is kept from disturbing the higher ones, see `hierarchy`;
+            "stacked": all tasks are one, without priorities.
+        projectors: Their pseudoinverse: "exact", or "damped" by `damping` like a task's own.
+        damping: lambda (paper: 1) [mm; rad/rad].
+        gamma: SDLS: largest joint change in one step (paper: pi/9) [rad].
+        longest_error: SDLS: position errors are shortened to this (paper: 200) [mm].
+        widest_error: SDLS: orientation errors are shortened to this (paper: pi/6) [rad].
+        palm_error: See `QiuParameters`.
+        max_iterations: Budget of a solve (paper: 10,000).
+    """
+
+    steps: str = "dls"
+    palm_task: bool = True
+    order: str = "per-finger"
+    projection: str = "augmented"
+    projectors: str = "damped"
+    damping: float = 1.0
+    gamma: float = math.pi / 9
+    longest_error: float = 200.0
+    widest_error: float = math.pi / 6
+    palm_error: str = "euler"
+    max_iterations: int = 10_000
+
+    def __post_init__(self) -> None:
+        _check_fields(self)
+        if self.projection == "stacked" and self.steps != "dls":
+            raise InputError(f"projection: found 'stacked' with {self.steps}, expected it with dls")
+
 
 Options = TypeVar("Options", QiuParameters, OriginalParameters)
 

@@ -32,8 +32,8 @@ from casadi_ik.problem.verdict import (
 )
 from casadi_ik.proofs.proof import Proof, ProofKind
 from casadi_ik.proofs.prove import EFFORT, Prover
-from casadi_ik.solving.diagnosis.closest import Closest, FloatingPalmFit, HandFits, closest
-from casadi_ik.solving.diagnosis.remedies import RemedyFinder
+from casadi_ik.solving.closest import Closest, FloatingPalmFit, HandFits, closest
+from casadi_ik.solving.remedies import RemedyFinder
 from casadi_ik.solving.trials import LocalRefinement, Rows, Subproblems
 
 

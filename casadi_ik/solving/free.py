@@ -33,11 +33,10 @@ from casadi_ik.problem.request import CLEARANCE, free_palms
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import SolvedVerdict, judge_one
-from casadi_ik.solving.alternatives.arm_search import Preference
-from casadi_ik.solving.alternatives.finder import AlternativeFinder
-from casadi_ik.solving.alternatives.sides import SideHands
-from casadi_ik.solving.alternatives.unconstrained_fingers import UnconstrainedFingers
+from casadi_ik.solving.arm_search import Preference
 from casadi_ik.solving.batch_parts import judged
+from casadi_ik.solving.finder import AlternativeFinder
+from casadi_ik.solving.free_hands import SideHands, UnconstrainedFingers
 from casadi_ik.solving.trials import (
     Deduplicator,
     LocalRefinement,

@@ -25,7 +25,7 @@ from casadi_ik.problem.clearance import CollisionQuery
 from casadi_ik.problem.request import CLEARANCE, free_palms, preference
 from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import contact_verdicts, judge
-from casadi_ik.solving.alternatives.arm_search import ArmSearch, Preference
+from casadi_ik.solving.arm_search import ArmSearch, Preference
 from casadi_ik.solving.trials import (
     Bounds,
     LocalRefinement,
@@ -271,7 +271,7 @@ class AlternativeFinder:
         if not self._arm:
             return [_Found(q, posture)]
         if self._branches is None:
-            return [_Found(arm, posture) for arm in self._searched(targets, q, seed)]
+            return [_Found(arm, posture) for arm in self._searched(targets, q, seed, q0, prefer)]
         palm = self.robot.palm(q)
         lower, upper = (self._seen_by_form(end, limits) for end in (limits.lower, limits.upper))
 
@@ -290,7 +290,7 @@ class AlternativeFinder:
             found.append(_Found(with_arm(arm[None])[0], posture, branch, swivel))
         if self._branches.family.is_iterative:
             # A stretch may be shorter than the positions are apart.
-            found += [_Found(arm, posture) for arm in self._searched(targets, q, seed)]
+            found += [_Found(arm, posture) for arm in self._searched(targets, q, seed, q0, prefer)]
             parts = self._parts(np.stack([item.q for item in found]), self._arm)
             return [found[i] for i in distinct(parts, SEEKING.distinct)]
         return self._exact(targets, found) or [_Found(q, posture)]
@@ -320,12 +320,19 @@ class AlternativeFinder:
         moving = [i for i in range(kept.shape[1]) if i not in self.hand]
         return [kept[i] for i in distinct(self._parts(kept, moving), SEEKING.distinct)]
 
-    def _searched(self, targets: TargetBatch, q: Array, seed: int) -> list[Array]:
-        """Different arms found from random ones, the hand starting as in q."""
+    def _searched(
+        self, targets: TargetBatch, q: Array, seed: int, q0: Array, prefer: str
+    ) -> list[Array]:
+        """Different arms: the preferred of every branch, and those found from random ones."""
         starts = self.robot.random(np.random.default_rng(seed), SEEKING.arms)
         starts[:, self.hand] = q[self.hand]
-        starts[0] = q
-        ends = LocalRefinement(self.trials, targets).run(np.zeros(SEEKING.arms, np.intp), starts)
+        if self.arm_search is not None:
+            limits, no_cap = self.trials.limits(targets).first, np.full(1, np.inf)
+            bounds, order = (limits.lower, limits.upper), {CLEARANCE: "limits"}.get(prefer, prefer)
+            found = self.arm_search.choose(q[None], q0[None], bounds, order, None, no_cap, True)
+            starts = np.concatenate([found.q, starts])
+        starts = np.concatenate([q[None], starts])
+        ends = LocalRefinement(self.trials, targets).run(np.zeros(len(starts), np.intp), starts)
         ends = np.concatenate([q[None], ends])
         same = (np.abs(self._parts(ends - q, self.hand)) < SEEKING.distinct).all(axis=1)
         kept = ends[same & self.trials.solved(targets, ends, targets.enforce_limits)]

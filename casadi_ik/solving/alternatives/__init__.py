@@ -1,1 +1,0 @@
-"""Several solutions of a grasp, and moving grasps."""

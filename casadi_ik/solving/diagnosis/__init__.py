@@ -1,1 +1,0 @@
-"""Why a grasp cannot be solved."""
