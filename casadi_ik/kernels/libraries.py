@@ -128,8 +128,7 @@ def load_library(
         if compiler is None:
             warn_no_compiler()
             return None
-        versions = ca.CasadiMeta.version(), version("numpy")
-        note = f"{short}-{_key(compiler, *versions, recipe)}.key"
+        note = f"{short}-{_key(compiler, *_versions(), recipe)}.key"
         folders = places()
         for directory in folders if recipe else ():
             if (library := _recognised(directory, short, note, symbol)) is not None:
@@ -150,6 +149,12 @@ def load_library(
         for directory in folders if recipe else ():
             _note(directory / note, key)
         return library
+
+
+@cache
+def _versions() -> tuple[str, str]:
+    """Of what makes graphs; reading them takes a millisecond."""
+    return ca.CasadiMeta.version(), version("numpy")
 
 
 def _key(compiler: Compiler, *parts: str) -> str:

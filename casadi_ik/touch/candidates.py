@@ -33,8 +33,8 @@ class TouchParameters:
         object_pairs: Pairs of patches that are drawn at once.
         first: Candidates that are looked for at first.
         round: Most that are looked for at once.
-        attempts: Pairs of hand and object that are drawn for them at most.
-        most: Pairs after which no more are drawn.
+        attempts: Pairs of hand and object that are tried for them at most.
+        most: Pairs after which no more are tried.
         seldom: Where so many are like others for each new one, no more are made.
         lost: Hands after which no more are tried if the arm has reached none of them.
         lean: Planes lean by at most this angle at first [rad]; balls may more, everywhere.
@@ -56,9 +56,9 @@ class TouchParameters:
     facing: float = float(np.deg2rad(45.0))
     object_pairs: int = 20_000
     first: int = 24
-    round: int = 500
-    attempts: int = 200_000
-    most: int = 2_000_000
+    round: int = 2000
+    attempts: int = 100_000
+    most: int = 1_000_000
     seldom: int = 1000
     lost: int = 300
     lean: float = float(np.deg2rad(25.0))
@@ -136,9 +136,6 @@ OBJECT_STEP, SCENE_STEP, CELLS = 5e-3, 25e-3, 36
 """Edges of the cells that tell how far the object, and what stands about it, are [m], and about how
 many of them there are at most along its length."""
 
-GROWN = 40e-3
-"""How far beyond an object its distance is known [m]: more than a capsule's radius."""
-
 
 @dataclass
 class Generator:
@@ -151,7 +148,6 @@ class Generator:
         parameters: How they are looked for.
         rng: Random numbers.
         counts: How many passed each stage.
-        tried: Pairs of hand and object that were drawn.
         asked: How many of them the arm was asked to reach.
         alike: How many of the last round were like others.
     """
@@ -163,7 +159,6 @@ class Generator:
     rng: np.random.Generator
     clear: HandCheck
     counts: dict[str, int] = field(default_factory=dict)
-    tried: int = 0
     asked: int = 0
     alike: int = 0
 
@@ -246,14 +241,13 @@ class Generator:
         job.palms, job.shared = palms.ctypes.data, shared.ctypes.data
         job.postured, job.used = postured.ctypes.data, used.ctypes.data
         job.patches, job.n_patches = self._pairs.ctypes.data, len(self._pairs)
-        job.wanted, job.found, job.tried = count, 0, 0
+        job.wanted, job.found, job.most = count, 0, job.attempts + self.parameters.attempts
         drive("touch", touch_library()["casadi_ik_touch"], job)
         found = job.found
         hand = table.q[shared[:found], postured[:found, table.thumb]].copy()
         for finger in range(f):
             posture = table.q[shared[:found], postured[:found, finger]]
             table.put(hand, np.arange(found), posture, finger)
-        self.tried += job.tried
         self.counts |= {
             "attempts": job.attempts,
             "two fingertips fit": job.fit,
@@ -299,7 +293,6 @@ class Generator:
             least_often=LEAST_OFTEN,
             fingers=self.fingers,
             tries=chosen.tries,
-            most=chosen.attempts,
             seed=seed,
         )
         for name, grid in (("near", surface.grid), ("object", thing), ("scene", around)):
@@ -371,7 +364,7 @@ def snapped(
         axis = np.cross(here.normals, -normal)
         axis *= (excess / np.maximum(np.linalg.norm(axis, axis=-1), 1e-9))[..., None]
         rows = [
-            np.einsum("kfi,kfij->kfj", normal, to_points)[:, :, None],
+            normal[:, :, None] @ to_points,
             chosen.slide * to_points,
             chosen.turn * to_turns,
         ]
@@ -398,13 +391,17 @@ def _bounded_step(matrix: Array, right: Array, hand: Array, lower: Array, upper:
     k, m = hand.shape
     free, damping = np.ones((k, 6 + m), dtype=bool), _damping(m)
     step: Array = np.zeros((k, 6 + m))
+    left = np.arange(k)
     for _ in range(2):
-        kept = matrix * free[:, None]
-        square = kept.swapaxes(1, 2) @ kept
-        square[:, range(6 + m), range(6 + m)] += np.where(free, damping, 1.0)
-        step[:] = np.linalg.solve(square, kept.swapaxes(1, 2) @ right[..., None])[..., 0]
-        after = hand + step[:, 6:]
-        free[:, 6:] &= (after >= lower) & (after <= upper)
+        kept = matrix[left] * free[left, None]
+        turned = kept.swapaxes(1, 2)
+        square = turned @ kept
+        square[:, range(6 + m), range(6 + m)] += np.where(free[left], damping, 1.0)
+        step[left] = np.linalg.solve(square, turned @ right[left, :, None])[..., 0]
+        after = hand[left] + step[left, 6:]
+        within = (after >= lower) & (after <= upper)
+        free[left, 6:] &= within
+        left = left[~within.all(axis=1)]
     return step
 
 
@@ -461,7 +458,8 @@ class HandCheck:
         scene, size = self.check.scene, float((high - low).max())
         if OBJECT not in self._tables:
             parts, step = scene.items[str(scene.grasped)].parts, max(OBJECT_STEP, size / CELLS)
-            self._tables[OBJECT] = Grid.of(parts, low - GROWN, high + GROWN, step)
+            grown = max(float(self.off(True).max(initial=0.0)), 0.0) + 2 * step
+            self._tables[OBJECT] = Grid.of(parts, low - grown, high + grown, step)
         reach = sum(
             float(np.abs(part[..., :3]).max(initial=0.0))
             for part in (self.shapes.capsules, self.shapes.fixed)

@@ -281,13 +281,13 @@ def grasps_of(
     generator = Generator(table, surface, fingers, chosen, np.random.default_rng(seed), hands)
     start = None if q0 is None else robot.configuration(q0)
     parts: list[_Made] = []
-    known, drawn, wanted = 0, 0, chosen.first
+    known, drawn, tried, wanted = 0, 0, 0, chosen.first
     with progress(limit) as show:
-        while generator.fits and known < limit and generator.tried < chosen.most:
-            if generator.tried:
+        while generator.fits and known < limit and tried < chosen.most:
+            if tried:
                 generator.look()
             some = generator.candidates(wanted)
-            drawn += wanted
+            drawn, tried = drawn + wanted, generator.counts["attempts"]
             before = [part.some for part in parts]
             made = _made(generator, some, before, arms, judge, place, mu, hold, jobs, start)
             new = 0 if made is None else len(made.rows)
@@ -300,7 +300,7 @@ def grasps_of(
             if generator.asked >= chosen.lost and not known:
                 break  # the arm reaches none
             share = 1.2 * (limit - known) / known if known else 1.0
-            wanted = int(np.clip(share * drawn, chosen.first, chosen.round))
+            wanted = int(np.clip(share * drawn, chosen.first, min(10 * drawn, chosen.round)))
     found = _ranked(robot, generator, hands, parts, place, limit, prefer, start, mu)
     return replace(found, time=time.process_time() - begin)
 

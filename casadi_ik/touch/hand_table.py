@@ -301,9 +301,9 @@ class HandShapes:
         known &= np.isin(within.pairs[:, 1], numbers) | (within.pairs[:, 1] >= len(owner))
         two = known & (pairs >= 0).all(axis=1) & (pairs[:, 0] != pairs[:, 1])
         one = within.only(known & ~two)
-        distance = check.kernel.every(q, np.zeros((0, 12)), one) >= 0
+        clear = check.kernel.every(q, np.zeros((0, 12)), one) >= 0
         alone = np.stack(
-            [distance[:, (fingers[one.pairs] == k).any(axis=1)].all(axis=1) for k in range(f)], 1
+            [clear[:, (fingers[one.pairs] == k).any(axis=1)].all(axis=1) for k in range(f)], 1
         ).reshape(s, n, f)
         place = np.zeros(len(fingers), dtype=np.int64)
         place[numbers] = range(len(numbers))
@@ -406,7 +406,8 @@ def hand_kernel(robot: RobotDescription) -> FunctionKernel:
         return ca.Function(name, [q], outputs, ["q"], ["points", "normals", "linear", "angular"])
 
     shapes = ((f, 3), (f, 3), (3 * f, m), (3 * f, m))
-    return FunctionKernel(FunctionGraph(name, build, {"q": (n, 1)}, shapes, recipe(name, robot)))
+    graph = FunctionGraph(name, build, {"q": (n, 1)}, shapes, recipe(name, robot))
+    return FunctionKernel(graph, in_lanes=True)
 
 
 def _sobol(dimensions: int, count: int, seed: int) -> Array:

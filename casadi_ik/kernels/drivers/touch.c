@@ -64,26 +64,29 @@ static int64_t cell_of(const scalar *low, const int64_t *count, const scalar *p)
   return cell;
 }
 
-/* Value at a point between the middles of cells; beyond them all what is `beyond`. */
-static scalar between_cells(const scalar *low, const int64_t *count, const scalar *value,
-                            const scalar *p, scalar beyond) {
+/* What is free about a point beyond a distance to what a grid tells of. Of points beyond the middles
+ * of its outer cells it is their distance from these: what is farther away is not known. */
+static scalar free_about(const scalar *low, const int64_t *count, const scalar *value,
+                         const scalar *p, scalar distance) {
   int64_t cell[3];
-  scalar part[3], lower, upper;
+  scalar part[3], lower, upper, beyond = -1;
   const scalar *v;
   int k;
   for (k = 0; k < 3; ++k) {
-    const scalar at = (p[k] - low[k]) / low[3] - 0.5;
-    if (!(at >= 0 && at < (scalar) (count[k] - 1))) return beyond;
+    const scalar at = (p[k] - low[k]) / low[3] - 0.5, over = at - (scalar) (count[k] - 1);
+    beyond = -at > beyond ? -at : beyond;
+    beyond = over > beyond ? over : beyond;
     cell[k] = (int64_t) at;
     part[k] = at - (scalar) cell[k];
   }
+  if (beyond >= 0) return beyond * low[3];
   const int64_t row = count[Z], plane = count[Y] * row;
   v = value + cell[X] * plane + cell[Y] * row + cell[Z];
 #define ALONG(i) (v[i] + part[Z] * (v[(i) + 1] - v[i]))
   lower = ALONG(0) + part[Y] * (ALONG(row) - ALONG(0));
   upper = ALONG(plane) + part[Y] * (ALONG(plane + row) - ALONG(plane));
 #undef ALONG
-  return lower + part[X] * (upper - lower);
+  return lower + part[X] * (upper - lower) - distance;
 }
 
 /* Whether a segment keeps a distance to what a grid tells of: walked by what is free about it. */
@@ -95,7 +98,7 @@ static int keeps(const scalar *low, const int64_t *count, const scalar *value, c
     const scalar part = length > 0 ? t / length : 0;
     const scalar p[3] = {start[X] + part * way[X], start[Y] + part * way[Y],
                          start[Z] + part * way[Z]};
-    const scalar free = between_cells(low, count, value, p, INFINITY) - distance;
+    const scalar free = free_about(low, count, value, p, distance);
     if (free < 0) return 0;
     if (t >= length || t + free > length) return 1;
     t += free > LEAST_STEP ? free : LEAST_STEP;
@@ -324,8 +327,8 @@ static int attempt(touch_job *job) {
 
 DRIVER(touch, touch_job) {
   const scalar limit = monotonic() + job->slice;
-  while (job->found < job->wanted && job->tried < job->most) {
-    if (++job->tried % 1024 == 0 && monotonic() > limit) return SLICE_OVER;
+  while (job->found < job->wanted && job->attempts < job->most) {
+    if (++job->drawn % 1024 == 0 && monotonic() > limit) return SLICE_OVER;
     job->found += attempt(job);
   }
   return DONE;

@@ -38,7 +38,7 @@ typedef struct {
   /* How often what was tried was clear. */
   scalar depth_clear[BINS], depth_tried[BINS], way_clear[BINS], way_tried[BINS];
   /* What was found. */
-  int64_t wanted, found, attempts, fit, free, tried;
+  int64_t wanted, found, drawn, attempts, fit, free;
   scalar *palms;               /* (wanted, 12) rotation row by row, origin */
   int64_t *shared, *postured;  /* (wanted), (wanted, fingers) */
   int64_t *used;               /* (wanted, fingers) */
