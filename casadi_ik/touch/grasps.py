@@ -389,7 +389,8 @@ def _made(
     q, met = reached.q, reached.success.copy()
     hits = np.flatnonzero(met)
     hits = hits[~generator.clear.arm_clear(q[hits])]
-    if len(hits):  # other arms for these hands
+    met[hits] = False
+    if len(hits) > met.sum():  # other arms for these hands; else other hands come cheaper
         other = judge.solve_palms(palms[hits], hands[hits], start, jobs=jobs)
         q[hits], met[hits] = other.q, other.success
     generator.counted("arm reaches", int(reached.success.sum()))
