@@ -67,11 +67,14 @@ def of_grasps(robot: ik.ArmHand, name: str) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = []
     for file in shipped_grasps(name):
         grasp = ik.load_grasp(file)
-        points, normals = grasp.arrays(robot.fingers)
-        if grasp.object is None or grasp.object_pose is None or grasp.more(robot.fingers):
+        if grasp.object is None or grasp.object_pose is None:
             continue
-        for i, k in itertools.combinations(range(len(points)), 2):
-            if np.linalg.norm(points[i] - points[k]) < CLOSE:
+        # Where pads are and face then, which of balls is not where they touch.
+        q = ik.Solver(robot, scene=with_object(ik.Scene(), grasp)).solve(grasp).q
+        points, normals = robot.contacts(q)
+        for k, finger in enumerate(robot.fingers):
+            near = np.linalg.norm(points[:k] - points[k], axis=1) < CLOSE
+            if finger not in grasp.contacts or near.any():
                 points[k] = normals[k] = np.nan
         parts = of_object(load_object(grasp.object).shape)
         if len(parts) >= CAPACITY or any(solid.kind not in EXPORTED for solid, _ in parts):
