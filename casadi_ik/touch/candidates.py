@@ -37,6 +37,11 @@ class TouchParameters:
         most: Pairs after which no more are tried.
         seldom: Where so many are like others for each new one, no more are made.
         lost: Hands after which no more are tried if the arm has reached none of them.
+        least_often: The chance of what was never clear beside what was most often.
+        deep: Most that counts of how far between two fingertips is from the palm [m].
+        object_step: Edge of the cells that tell how far the object is [m], at least ...
+        scene_step: ... and how far what stands about it is.
+        cells: About how many cells there are at most along either.
         lean: Planes lean by at most this angle at first [rad]; balls may more, everywhere.
         near: A further fingertip is at most this far from the surface at first [m].
         clear: Fingertips that do not touch are at least this far from it [m].
@@ -61,6 +66,11 @@ class TouchParameters:
     most: int = 1_000_000
     seldom: int = 1000
     lost: int = 300
+    least_often: float = 0.03
+    deep: float = 0.2
+    object_step: float = 5e-3
+    scene_step: float = 25e-3
+    cells: int = 36
     lean: float = float(np.deg2rad(25.0))
     near: float = 8e-3
     clear: float = 8e-3
@@ -124,17 +134,6 @@ WHY_NONE = {
     "free in the scene": "arm or hand would hit something of the scene, or the object",
 }
 """What it means that nothing passes a stage."""
-
-
-LEAST_OFTEN = 0.03
-"""The chance of what was never clear beside what was most often."""
-
-DEEP = 0.2
-"""Most that counts of how far between two fingertips is from the palm [m]."""
-
-OBJECT_STEP, SCENE_STEP, CELLS = 5e-3, 25e-3, 36
-"""Edges of the cells that tell how far the object, and what stands about it, are [m], and about how
-many of them there are at most along its length."""
 
 
 @dataclass
@@ -265,7 +264,8 @@ class Generator:
             self.parameters,
             self.clear.shapes,
         )
-        thing, around = self.clear.grids(surface.points.min(axis=0), surface.points.max(axis=0))
+        low, high = surface.points.min(axis=0), surface.points.max(axis=0)
+        thing, around = self.clear.grids(low, high, chosen)
         arrays: dict[str, Any] = {
             "points": table.points,
             "normals": table.normals,
@@ -274,7 +274,7 @@ class Generator:
             "radii": table.radii,
             "cos_lean": np.cos(chosen.lean + table.roll),
             "pairs": table.pairs.astype(np.int64),
-            "depths": table.depths / DEEP,
+            "depths": table.depths / chosen.deep,
             "samples": surface.points,
             "outward": surface.normals,
             "inside": surface.inside.astype(np.int64),
@@ -290,7 +290,7 @@ class Generator:
             thumb=table.thumb,
             near=chosen.near,
             clear=chosen.clear,
-            least_often=LEAST_OFTEN,
+            least_often=chosen.least_often,
             fingers=self.fingers,
             tries=chosen.tries,
             seed=seed,
@@ -448,16 +448,18 @@ class HandCheck:
         self._items = rigid(at[:, :9].reshape(-1, 3, 3), at[:, 9:])
         self.shapes = table.shape(check)
 
-    def grids(self, low: Array, high: Array) -> tuple[Grid, Grid]:
+    def grids(self, low: Array, high: Array, chosen: TouchParameters) -> tuple[Grid, Grid]:
         """Distances of the object, and of what stands about it, in the object's frame.
 
         Args:
             low: (3,) lower corner of the object [m].
             high: (3,) upper corner.
+            chosen: How finely.
         """
         scene, size = self.check.scene, float((high - low).max())
         if OBJECT not in self._tables:
-            parts, step = scene.items[str(scene.grasped)].parts, max(OBJECT_STEP, size / CELLS)
+            parts = scene.items[str(scene.grasped)].parts
+            step = max(chosen.object_step, size / chosen.cells)
             grown = max(float(self.off(True).max(initial=0.0)), 0.0) + 2 * step
             self._tables[OBJECT] = Grid.of(parts, low - grown, high + grown, step)
         reach = sum(
@@ -470,7 +472,7 @@ class HandCheck:
             if item.name != scene.grasped
             for solid, at in item.parts
         ]
-        step = max(SCENE_STEP, (size + 2 * reach) / CELLS)
+        step = max(chosen.scene_step, (size + 2 * reach) / chosen.cells)
         return self._tables[OBJECT], Grid.of(others, low - reach, high + reach, step)
 
     def off(self, object_: bool) -> Array:

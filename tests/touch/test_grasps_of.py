@@ -65,6 +65,25 @@ def test_what_is_written_is_what_was_found(found):
     assert np.nanmax(batch.position_error) < 1e-9
 
 
+def test_things_beside_the_object_are_kept_clear_of(surface):
+    """A wall, a post and a cloud of points close by, told apart by their exact distances."""
+    cloud = np.stack(np.meshgrid([0.47, 0.5, 0.53], [0.02], [0.03, 0.06, 0.09]), -1).reshape(-1, 3)
+    scene = ik.Scene(
+        {
+            "wall": {"kind": "box", "size": [0.02, 0.4, 0.3], "xyz": [0.59, 0.1, 0.15]},
+            "post": {"kind": "cylinder", "radius": 0.01, "length": 0.2, "xyz": [0.44, 0.16, 0.1]},
+            "floor": {"kind": "half-space"},
+            "points": {"kind": "point-cloud", "points": cloud, "radius": 0.01},
+        }
+    )
+    solver = ik.Solver(ik.load_robot("panda+allegro_right"), scene=scene)
+    found = solver.grasps_of(surface, PLACE, limit=10)
+    assert len(found) == 10
+    for one in found:
+        assert solver.solve(one.grasp, q0=one.q).success
+        assert one.clearance >= 0
+
+
 def test_fingertips_touch_the_mesh(found):
     """By distances of the pads, balls or points, to the exact cylinder."""
     solver, grasps = found
