@@ -17,9 +17,16 @@ from numpy.typing import NDArray
 from casadi_ik.arrays import Array, Bools
 from casadi_ik.collision.distances import Table, pose_row
 from casadi_ik.grasps.pose import inverse
-from casadi_ik.kernels.cancellation import drive
+from casadi_ik.kernels.cancellation import SLICE, drive
 from casadi_ik.problem.clearance import CollisionQuery, SceneCheck
-from casadi_ik.touch.hand_table import BINS, HandTable, TouchJob, rigid, touch_library
+from casadi_ik.touch.hand_table import (
+    BINS,
+    HandTable,
+    SnapJob,
+    TouchJob,
+    rigid,
+    touch_library,
+)
 from casadi_ik.touch.surface import Grid, Surface
 
 
@@ -208,7 +215,7 @@ class Generator:
         some = self.draw(count)
         if len(some):
             some = snapped(table, surface, some, chosen)
-            here, _, _ = touching(table, surface, some)
+            here = touching(table, surface, some)
             ok = np.abs(here.height) < chosen.touch
             ok &= (here.lean < chosen.last_lean + table.roll) & surface.inside[here.sample]
             off = ((here.points - surface.points[here.sample]) ** 2).sum(axis=-1)
@@ -324,104 +331,52 @@ class Touching:
     lean: Array
 
 
-def touching(table: HandTable, surface: Surface, some: Candidates) -> tuple[Touching, Array, Array]:
-    """Where fingertips are, and their Jacobians (k, f, 3, m) in the object's frame."""
-    points, normals, linear, angular = table.at(some.hand)
+def touching(table: HandTable, surface: Surface, some: Candidates) -> Touching:
+    """Where fingertips are, in the object's frame."""
+    points, normals, _, _ = table.at(some.hand)
     rotation, origin = some.palm[:, None, :3, :3], some.palm[:, None, :3, 3]
     turn = np.broadcast_to(rotation, (*points.shape, 3))
     points = np.einsum("kfij,kfj->kfi", turn, points) + origin
     normals = np.einsum("kfij,kfj->kfi", turn, normals)
     height, sample = surface.foot(points)
     lean = np.arccos(np.clip(-(normals * surface.normals[sample]).sum(axis=-1), -1, 1))
-    here = Touching(points, normals, height - table.radii, sample, lean)
-    return here, turn @ linear, turn @ angular
+    return Touching(points, normals, height - table.radii, sample, lean)
 
 
 def snapped(
     table: HandTable, surface: Surface, some: Candidates, chosen: TouchParameters
 ) -> Candidates:
-    """Palms and hands moved until every fingertip touches: damped least squares, limits kept.
-
-    Rows of a fingertip: its height over the surface, sliding along it (nearly free), and the part
-    of its lean that is beyond what a pad does for nothing.
-    """
-    k, m = some.hand.shape
-    lower, upper = table.robot.lower[table.motors], table.robot.upper[table.motors]
-    for _ in range(chosen.steps):
-        here, linear, angular = touching(table, surface, some)
-        about = some.palm[:, None, :3, 3]
-        normal = surface.normals[here.sample]
-        f = normal.shape[1]
-        # Of a twist of the palm (v, w): a point moves by v + w x r, a normal by w x n.
-        arms = here.points - about
-        to_points = np.concatenate(
-            [np.broadcast_to(np.eye(3), (k, f, 3, 3)), -_cross(arms), linear], -1
-        )
-        to_turns = np.concatenate(
-            [np.zeros((k, f, 3, 3)), np.broadcast_to(np.eye(3), (k, f, 3, 3)), angular], -1
-        )
-        excess = np.maximum(here.lean - chosen.free_lean - table.roll, 0.0)
-        axis = np.cross(here.normals, -normal)
-        axis *= (excess / np.maximum(np.linalg.norm(axis, axis=-1), 1e-9))[..., None]
-        rows = [
-            normal[:, :, None] @ to_points,
-            chosen.slide * to_points,
-            chosen.turn * to_turns,
-        ]
-        goal = [
-            -here.height[..., None],
-            np.zeros_like(normal),
-            chosen.turn * axis,
-        ]
-        weight = some.used[..., None, None]
-        matrix = (np.concatenate(rows, axis=2) * weight).reshape(k, -1, 6 + m)
-        right = (np.concatenate(goal, axis=2) * weight[..., 0]).reshape(k, -1)
-        step = _bounded_step(matrix, right, some.hand, lower, upper)
-        hand = np.clip(some.hand + np.clip(step[:, 6:], -0.3, 0.3), lower, upper)
-        twist = step[:, :6]
-        turn = _rotation(np.clip(twist[:, 3:], -0.5, 0.5))
-        shift = np.clip(twist[:, :3], -0.02, 0.02)
-        palm = rigid(turn @ some.palm[:, :3, :3], some.palm[:, :3, 3] + shift)
-        some = Candidates(palm, hand, some.used)
-    return some
-
-
-def _bounded_step(matrix: Array, right: Array, hand: Array, lower: Array, upper: Array) -> Array:
-    """Damped least-squares steps (k, 6 + m); motors that would leave their range stay."""
-    k, m = hand.shape
-    free, damping = np.ones((k, 6 + m), dtype=bool), _damping(m)
-    step: Array = np.zeros((k, 6 + m))
-    left = np.arange(k)
-    for _ in range(2):
-        kept = matrix[left] * free[left, None]
-        turned = kept.swapaxes(1, 2)
-        square = turned @ kept
-        square[:, range(6 + m), range(6 + m)] += np.where(free[left], damping, 1.0)
-        step[left] = np.linalg.solve(square, turned @ right[left, :, None])[..., 0]
-        after = hand[left] + step[left, 6:]
-        within = (after >= lower) & (after <= upper)
-        free[left, 6:] &= within
-        left = left[~within.all(axis=1)]
-    return step
-
-
-def _damping(m: int) -> Array:
-    """(6 + m,) of metres, radians of the palm and motors."""
-    return np.concatenate([np.full(3, 1e-4), np.full(3, 1e-6), np.full(m, 1e-6)])
-
-
-def _cross(vectors: Array) -> Array:
-    """(..., 3, 3) matrices of the cross product."""
-    zero = np.zeros(vectors.shape[:-1])
-    x, y, z = np.moveaxis(vectors, -1, 0)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*zero.shape, 3, 3)
-
-
-def _rotation(vectors: Array) -> Array:
-    """(k, 3, 3) of rotation vectors."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_rotvec(vectors).as_matrix()
+    """Palms and hands moved until every fingertip touches: damped least squares, limits kept."""
+    here = touching(table, surface, some)
+    palms, q = pose_row(some.palm), table.configuration(some.hand)
+    robot, motors = table.robot, table.motors
+    arrays: dict[str, Any] = {
+        "palms": palms,
+        "q": q,
+        "used": some.used.astype(np.int64),
+        "motors": motors.astype(np.int64),
+        "lower": robot.lower[motors],
+        "upper": robot.upper[motors],
+        "radii": table.radii,
+        "free_lean": chosen.free_lean + table.roll,
+        "samples": surface.points,
+        "normals": surface.normals,
+        "faces": surface.faces,
+        "neighbours": surface.neighbours,
+        "start": here.sample.astype(np.int64),
+    }
+    arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    job = SnapJob(
+        **{name: array.ctypes.data for name, array in arrays.items()},
+        slide=chosen.slide,
+        turn=chosen.turn,
+        steps=chosen.steps,
+        count=len(q),
+        slice=SLICE,
+    )
+    drive("snap", table.kernel.library["casadi_ik_snap"], job)
+    palm = rigid(arrays["palms"][:, :9].reshape(-1, 3, 3), arrays["palms"][:, 9:])
+    return Candidates(palm, arrays["q"][:, motors], some.used)
 
 
 class HandCheck:

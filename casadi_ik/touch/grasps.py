@@ -369,7 +369,7 @@ def _made(
     generator.alike = 0
     if not len(some):
         return None
-    here, _, _ = touching(table, surface, some)
+    here = touching(table, surface, some)
     order = np.argsort(~some.used, axis=1, kind="stable")[:, : generator.fingers]
     sample = np.take_along_axis(here.sample, order, axis=1)
     center, length = surface.middle, surface.size / 2

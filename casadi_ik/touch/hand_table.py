@@ -25,6 +25,7 @@ from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.kinematics import actuated
 from casadi_ik.symbolic.se3 import skew
+from casadi_ik.touch.surface import NEIGHBOURS
 
 if TYPE_CHECKING:
     from casadi_ik.touch.candidates import Candidates
@@ -358,6 +359,7 @@ def _finger_of(table: HandTable, link: str) -> int | None:
 
 
 TouchJob = c_struct("touch_job", {"3": 3, "4": 4, "BINS": BINS})
+SnapJob = c_struct("snap_job", driver="snap")
 
 
 def touch_library() -> Any:
@@ -407,7 +409,8 @@ def hand_kernel(robot: RobotDescription) -> FunctionKernel:
 
     shapes = ((f, 3), (f, 3), (3 * f, m), (3 * f, m))
     graph = FunctionGraph(name, build, {"q": (n, 1)}, shapes, recipe(name, robot))
-    return FunctionKernel(graph, in_lanes=True)
+    sizes = {"N_Q": n, "N_F": f, "N_M": m, "NEIGHBOURS": NEIGHBOURS}
+    return FunctionKernel(graph, driver=define(sizes) + driver_text("snap"))
 
 
 def _sobol(dimensions: int, count: int, seed: int) -> Array:

@@ -74,6 +74,9 @@ class Grid:
         return cls(low, counts, value)
 
 
+NEIGHBOURS = 12
+"""Samples about each: by them the nearest of a point is found from one that is near."""
+
 FAR = 10.0
 """What is nowhere is so far away [m]."""
 
@@ -141,6 +144,11 @@ class Surface:
         height, sample = self.foot(middles)
         apart = np.linalg.norm(middles - self.points[sample], axis=1)
         return Grid(low, counts, np.copysign(apart, height), sample.astype(np.int64))
+
+    @cached_property
+    def neighbours(self) -> NDArray[np.int64]:
+        """(m, NEIGHBOURS) the samples that are nearest to each."""
+        return self.tree.query(self.points, NEIGHBOURS)[1].astype(np.int64)
 
     def foot(self, points: Array) -> tuple[Array, NDArray[np.intp]]:
         """Nearest points of the surface: heights (...) [m], negative inside, and samples (...)."""
