@@ -10,6 +10,7 @@ import time
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -70,6 +71,10 @@ def solved(
     """
     if not parts:
         return
+    script = getattr(sys.modules["__main__"], "__file__", "")
+    if jobs > 1 and dask is None and solve.__module__ == "__main__" and script:
+        # What the script keeps by `functools.cache` other processes can only import.
+        solve = getattr(import_module(Path(script).stem), solve.__name__)
     with backend(jobs, dask), _progress() as progress:
         task = progress.add_task(title, total=sum(part.size for part in parts))
         parallel: Any = joblib.Parallel(return_as="generator_unordered")
