@@ -117,15 +117,38 @@ class Candidates:
         tips = self.tips[rows] if len(self.tips) else self.tips
         return Candidates(self.palm[rows], self.hand[rows], self.used[rows], tips)
 
-    def alike(self, one: int, others: NDArray[np.intp], chosen: TouchParameters) -> Bools:
-        """Which of others have palm and fingertips about where one has them."""
-        turn = np.einsum("kij,ij->k", self.palm[others, :3, :3], self.palm[one, :3, :3])
-        turned = np.arccos(np.clip((turn - 1) / 2, -1, 1)) < chosen.turned
-        near = np.linalg.norm(self.palm[others, :3, 3] - self.palm[one, :3, 3], axis=1)
-        off = np.linalg.norm(self.tips[others] - self.tips[one], axis=-1)
-        off = np.where(self.used[one], off, 0.0).max(axis=1)
-        same = (self.used[others] == self.used[one]).all(axis=1)
-        return turned & same & (np.maximum(near, off) < chosen.apart)
+    def alike(self, others: Candidates, chosen: TouchParameters) -> Bools:
+        """(k, n) which have palm and fingertips about where others have them."""
+        turns, theirs = (one.palm[:, :3, :3].reshape(-1, 9) for one in (self, others))
+        same = turns @ theirs.T > 1 + 2 * np.cos(chosen.turned)
+        same &= (self.used[:, None] == others.used).all(axis=2)
+        same &= _apart(self.palm[:, :3, 3], others.palm[:, :3, 3]) < chosen.apart
+        for finger in range(self.used.shape[1]):
+            off = _apart(self.tips[:, finger], others.tips[:, finger]) < chosen.apart
+            same &= off | ~self.used[:, finger, None]
+        return same
+
+    def unlike(self, others: Candidates, chosen: TouchParameters) -> NDArray[np.intp]:
+        """Rows that are unlike all of others."""
+        return np.flatnonzero(~self.alike(others, chosen).any(axis=1))
+
+    def distinct(self, chosen: TouchParameters, together: int = 256) -> NDArray[np.intp]:
+        """In their order the first of those that are alike."""
+        left, found = np.arange(len(self)), np.zeros(0, dtype=np.intp)
+        while len(left):
+            rows, left = left[:together], left[together:]
+            same = self.rows(rows).alike(self.rows(rows), chosen)
+            first = np.ones(len(rows), dtype=bool)
+            for i in range(len(rows)):
+                first[i + 1 :] &= ~(first[i] & same[i, i + 1 :])
+            found = np.append(found, rows[first])
+            left = left[self.rows(left).unlike(self.rows(rows[first]), chosen)]
+        return found
+
+
+def _apart(points: Array, others: Array) -> Array:
+    """(k, n) distances of points (k, 3) and (n, 3)."""
+    return np.sqrt(((points[:, None] - others) ** 2).sum(axis=2))
 
 
 WHY_NONE = {

@@ -366,7 +366,11 @@ def _made(
 ) -> _Made | None:
     """Those that are unlike those before, hold, are reached by the arm and free in the scene."""
     robot, table, surface = arms.robot, generator.table, generator.surface
-    generator.alike = 0
+    clear, chosen = len(some), generator.parameters
+    for part in before:
+        some = some.rows(some.unlike(part, chosen))
+    generator.alike = clear - len(some)
+    generator.counted("unlike those before", len(some))
     if not len(some):
         return None
     here = touching(table, surface, some)
@@ -377,9 +381,9 @@ def _made(
     firm = closed(wrenches)
     rows = np.argsort(-firm, kind="stable")[: np.count_nonzero(firm > CLOSED)]
     generator.counted("force-closed", len(rows))
-    new = rows[_distinct(before, some.rows(rows), generator.parameters)]
+    new = rows[some.rows(rows).distinct(chosen)]
     generator.counted("unlike each other", len(new))
-    generator.alike = len(rows) - len(new)
+    generator.alike += len(rows) - len(new)
     generator.asked += len(new)
     if not len(new):
         return None
@@ -415,25 +419,6 @@ def _made(
 
 CLOSED = 1e-4
 """Load from which a grasp counts as force-closed [N/N]."""
-
-
-def _distinct(
-    before: Sequence[Candidates], some: Candidates, chosen: TouchParameters
-) -> NDArray[np.intp]:
-    """Of some in their order the first of those that are alike, and unlike all before."""
-    parts = [*before, some]
-    every = Candidates(
-        *(
-            np.concatenate([getattr(part, name) for part in parts])
-            for name in ("palm", "hand", "used", "tips")
-        )
-    )
-    left, kept = np.arange(len(every)), []
-    while len(left):
-        kept.append(left[0])
-        left = left[1:][~every.alike(left[0], left[1:], chosen)]
-    first = len(every) - len(some)
-    return np.array([row - first for row in kept if row >= first], dtype=np.intp)
 
 
 def _ranked(
