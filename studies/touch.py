@@ -80,13 +80,14 @@ GOALS = {"first": 50.0, "hundred": 0.3, "rate": 300.0, "found": 95.0, "confirmed
 """What is wanted of every robot: at most, where lower is better, at least, where higher is."""
 
 MISSED = """
-*Rate and first*: of most hands one pair of fingertips in ten is clear of the object, the table and
-the palm, and of these one in ten lets a third finger touch; each round asks the collision kernel
-some forty times for few rows, whose calls cost more than their distances. LEAP's capsules stand out
-by 14 to 19 mm, so that its fingers seldom fit beside each other. Where nearly all that is found is
-like what was found before (grippers on boxes), the search ends before there are a hundred. *None*:
-objects that are wider than the hand opens, and those that a hand can only take by a side on which
-palm or fingers would be in the object or the table. *Closed*: on round objects the normals of the
+*Rate*: what is left is mostly linear programs in numpy: what a grasp holds in each of twelve
+directions and how it is squeezed best; after that moving hands until they touch, and the arm.
+LEAP's capsules stand out by 14 to 19 mm, so that its fingers seldom fit beside each other, and half
+of what touches is not closed. Flat things, and small round ones, leave room for few third fingers.
+Where nearly all that is found is like what was found before (grippers on boxes), the search ends
+before there are a hundred. *None*: objects that are wider than the hand opens, or so small that
+three fingers are in each other's way, and those that a hand can only take by a side on which palm
+or fingers would be in the object or the table. *Closed*: on round objects the normals of the
 nearest triangle and of the nearest sample differ by some degrees, which decides where a grasp is
 closed by little.
 """

@@ -66,7 +66,7 @@ class TouchParameters:
     """
 
     facing: float = float(np.deg2rad(45.0))
-    object_pairs: int = 20_000
+    object_pairs: int = 40_000
     first: int = 24
     round: int = 2000
     attempts: int = 100_000
