@@ -42,7 +42,7 @@ class TouchParameters:
         round: Most that are looked for at once.
         attempts: Pairs of hand and object that are tried for them at most.
         most: Pairs after which no more are tried.
-        seldom: Where so many are like others for each new one, no more are made.
+        seldom: Where so many are like others before a new one comes, no more are made.
         lost: Hands after which no more are tried if the arm has reached none of them.
         least_often: The chance of what was never clear beside what was most often.
         deep: Most that counts of how far between two fingertips is from the palm [m].
@@ -71,7 +71,7 @@ class TouchParameters:
     round: int = 2000
     attempts: int = 100_000
     most: int = 1_000_000
-    seldom: int = 1000
+    seldom: int = 3000
     lost: int = 300
     least_often: float = 0.03
     deep: float = 0.2

@@ -281,7 +281,7 @@ def grasps_of(
     generator = Generator(table, surface, fingers, chosen, np.random.default_rng(seed), hands)
     start = None if q0 is None else robot.configuration(q0)
     parts: list[_Made] = []
-    known, drawn, tried, wanted = 0, 0, 0, chosen.first
+    known, drawn, tried, alike, wanted = 0, 0, 0, 0, chosen.first
     with progress(limit) as show:
         while generator.fits and known < limit and tried < chosen.most:
             if tried:
@@ -295,7 +295,8 @@ def grasps_of(
                 parts.append(made)
                 show(min(new, limit - known))
                 known += new
-            if generator.alike > max(limit, chosen.seldom * new):
+            alike = generator.alike if new else alike + generator.alike
+            if alike > max(limit, chosen.seldom * max(new, 1)):
                 break  # nearly each is like one found before
             if generator.asked >= chosen.lost and not known:
                 break  # the arm reaches none
