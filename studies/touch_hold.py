@@ -50,7 +50,9 @@ ROBOTS = (
     "panda+leap",
     "ur5e+shadow",
     "kuka_lwr_barrett",
+    "panda+unitree_dex3",
     "panda+panda_hand",
+    "panda+robotiq_2f85",
 )
 
 MASS, GRAVITY, FRICTION, PATCH = 0.2, 9.80665, 0.5, 0.005

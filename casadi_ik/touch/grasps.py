@@ -31,7 +31,14 @@ from casadi_ik.touch.candidates import (
 )
 from casadi_ik.touch.hand_table import HandTable
 from casadi_ik.touch.robustness import offsets, robustness
-from casadi_ik.touch.strength import FORCES, closed, generators, loads, squeezes
+from casadi_ik.touch.strength import (
+    FORCES,
+    GIVE,
+    closed,
+    generators,
+    loads_and_squeezes,
+    stiffnesses,
+)
 from casadi_ik.touch.surface import Surface
 
 GRAVITY = 9.80665
@@ -65,7 +72,8 @@ class FoundGrasp:
             it squeezes (`squeeze`), as palms and postures.
         solution: How it is made, judged in the scene.
         load: Weight that the worst of six directions holds per newton of squeeze (the sum of the
-            normal forces) with friction [N/N].
+            normal forces) with friction, the less the more the object gives way: half where it
+            moves 20 mm, or turns 30 deg, as pads roll and motors yield like springs [N/N].
         closure: The same over forces and torques (about the middle of the object, divided by half
             its size); above 0 the grasp is force-closed.
         score: What it was ranked by, higher is better.
@@ -217,7 +225,8 @@ class _Made:
     rows: NDArray[np.intp]
     some: Candidates
     loads: Array
-    wrenches: Array
+    closures: Array
+    forces: Array
 
 
 def grasps_of(
@@ -409,13 +418,48 @@ def _made(
     generator.counted("free in the scene", len(rows))
     if not len(rows):
         return None
-    found = loads(wrenches[rows])
-    held = found.min(axis=1) > CLOSED
+    some = some.rows(rows)
+    found, forces = loads_and_squeezes(wrenches[rows])
+    pull, squeeze = USUAL if hold is None else hold
+    stiff = _stiffnesses(generator, some, squeeze * forces, mu)
+    # What the object gives way by is a part of what it may.
+    given = pull * GRAVITY / GIVE.far
+    load = found[:, FORCES].min(axis=1) * stiff / (stiff + given)
+    closure = found.min(axis=1)
+    held = closure > CLOSED
     if hold is not None:
-        held &= found[:, FORCES].min(axis=1) * hold[1] >= hold[0] * GRAVITY
-        generator.counted(f"hold {hold[0]:g} kg at {hold[1]:g} N", int(held.sum()))
-    rows, found = rows[held], found[held]
-    return _Made(batch, rows, some.rows(rows), found, wrenches[rows])
+        held &= load * squeeze >= pull * GRAVITY
+        generator.counted(f"hold {pull:g} kg at {squeeze:g} N", int(held.sum()))
+    return _Made(batch, rows[held], some.rows(held), load[held], closure[held], forces[held])
+
+
+USUAL = (0.2, 18.0)
+"""Mass [kg] and squeeze [N] for which stiffness counts where none are said."""
+
+
+def _stiffnesses(generator: Generator, some: Candidates, forces: Array, mu: float) -> Array:
+    """(k,) of candidates whose fingertips press with forces (k, c, 3), object frame [N/m]."""
+    table, surface, robot = generator.table, generator.surface, generator.table.robot
+    _, _, linear, angular = table.at(some.hand)
+    own, (row, finger) = some.used, np.nonzero(some.used)
+    shape = (len(some), -1)
+    sample = touching(table, surface, some).sample[own]
+    normals, radii = -surface.faces[sample], table.radii[finger]
+    turned = np.einsum("kij,kjm->kim", some.palm[row, :3, :3], angular[own])
+    jacobians = np.einsum("kij,kjm->kim", some.palm[row, :3, :3], linear[own])
+    jacobians += np.cross(turned, (radii[:, None] * normals)[..., None], axis=1)
+    units = [robot.description.actuators[i].unit for i in table.motors]
+    springs = np.array([GIVE.springs[unit == "m"] for unit in units])
+    stiff = stiffnesses(
+        (surface.points[sample] - surface.middle).reshape(*shape, 3),
+        normals.reshape(*shape, 3),
+        forces,
+        radii.reshape(shape),
+        jacobians.reshape(*shape, 3, len(springs)),
+        springs,
+        mu,
+    )
+    return np.maximum(stiff, 0.0)
 
 
 CLOSED = 1e-4
@@ -439,8 +483,8 @@ def _ranked(
     if not where:
         return FoundGrasps((), generator.counts, name, 0.0, generator.why_none(), *about)
     q = np.concatenate([part.batch.q[part.rows] for part in parts])
-    found = np.concatenate([part.loads for part in parts])
-    load, closure = found[:, FORCES].min(axis=1), found.min(axis=1)
+    load = np.concatenate([part.loads for part in parts])
+    closure = np.concatenate([part.closures for part in parts])
     clearance = np.concatenate([np.asarray(part.batch.clearance)[part.rows] for part in parts])
     span = robot.upper - robot.lower
     scores = {
@@ -463,8 +507,8 @@ def _ranked(
     )
     # Of the fingertips that touch, in the order of the fingers.
     forces = np.zeros((*some.used.shape, 3))
-    wrenches = np.stack([part.wrenches[i] for part, i in chosen])
-    forces[some.used] = (squeezes(wrenches) @ place[:3, :3].T).reshape(-1, 3)
+    squeezes = np.stack([part.forces[i] for part, i in chosen])
+    forces[some.used] = (squeezes @ place[:3, :3].T).reshape(-1, 3)
     solutions = [part.batch.solution(int(part.rows[i])) for part, i in chosen]
     grasps = _grasps(robot, generator, hands, some, q[kept], place, forces)
     entries = []

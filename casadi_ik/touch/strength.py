@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from casadi_ik.arrays import Array
@@ -72,24 +74,101 @@ def closed(wrenches: Array) -> Array:
     return np.maximum(_solved(wrenches, wrenches.mean(axis=2)[:, None])[:, 0, -2], 0.0)
 
 
-def squeezes(wrenches: Array) -> Array:
-    """Forces at rest from which a grasp is best pulled or pushed any way.
+def loads_and_squeezes(wrenches: Array) -> tuple[Array, Array]:
+    """The loads of `DIRECTIONS`, and forces at rest from which a grasp is best pulled any way.
 
-    The mean of what holds as much against each of six forces with least squeeze: as these cancel,
-    the object is at rest.
+    These are the mean of what holds as much against each of six forces with least squeeze: as
+    those cancel, the object is at rest.
 
     Args:
         wrenches: (k, 6, c * (EDGES + 2)) from `generators`.
 
     Returns:
-        (k, c, 3) forces on the object; their normal parts sum to 1 N.
+        (k, 12) loads [N per N], and (k, c, 3) forces on the object; their normal parts sum to 1 N.
     """
     k, _, g = wrenches.shape
-    solved = _solved(wrenches, DIRECTIONS[FORCES])
+    every = _solved(wrenches, DIRECTIONS)
+    solved = every[:, FORCES]
     shares = (solved[..., :g] / np.maximum(solved[..., g : g + 1], 1e-12)).sum(axis=1)
     shares /= shares.sum(axis=1, keepdims=True)
     forces = wrenches[:, :3] * shares[:, None]
-    return forces.reshape(k, 3, g // (EDGES + 2), EDGES + 2).sum(axis=-1).swapaxes(1, 2)
+    forces = forces.reshape(k, 3, g // (EDGES + 2), EDGES + 2).sum(axis=-1).swapaxes(1, 2)
+    return np.maximum(every[..., g], 0.0), forces
+
+
+@dataclass(frozen=True)
+class GiveParameters:
+    """How a grasp gives way when the object is pulled; those of the study `touch_hold`.
+
+    Attributes:
+        springs: Of motors that turn and that slide [N m/rad, N/m].
+        far: What the object may move [m] ...
+        turned: ... and turn [rad].
+        spin: Turn after which a pad's friction about its normal is used up [rad].
+        flat: Radius of the ball that a plane counts as [m].
+        contact: Compliance of a contact itself [m/N].
+    """
+
+    springs: tuple[float, float] = (3.0, 2000.0)
+    far: float = 0.020
+    turned: float = float(np.deg2rad(30.0))
+    spin: float = float(np.deg2rad(3.0))
+    flat: float = 0.010
+    contact: float = 2e-5
+
+
+GIVE = GiveParameters()
+
+
+def stiffnesses(
+    arms: Array,
+    normals: Array,
+    forces: Array,
+    radii: Array,
+    jacobians: Array,
+    springs: Array,
+    mu: float,
+    patch: float = 0.005,
+    give: GiveParameters = GIVE,
+) -> Array:
+    """Least stiffness of grasps (k,) [N/m] against moving, and turning about their middle.
+
+    Motors are springs, and pads are balls that roll on the object without sliding: as it turns, the
+    contact moves on, and the squeeze turns it further or back (Cutkosky and Kao 1989, with faces
+    flat and fingertips that do not turn). Below 0 the object rolls out of the hand.
+
+    Args:
+        arms: (k, c, 3) contacts from the middle of the object [m].
+        normals: (k, c, 3) unit, into the object.
+        forces: (k, c, 3) on the object at rest [N].
+        radii: (k, c) of pads [m]; 0 of planes.
+        jacobians: (k, c, 3, m) of contacts over motors.
+        springs: (m,) of motors [N m/rad or N/m].
+        mu: Friction coefficient.
+        patch: Radius of a contact patch [m].
+        give: What motors and contacts give.
+    """
+    k, c, _, m = jacobians.shape
+    length = give.far / give.turned  # of a turn that counts as a metre
+    compliant = (jacobians / springs).reshape(k, 3 * c, m)
+    compliant = compliant @ jacobians.reshape(k, 3 * c, m).swapaxes(1, 2)
+    compliant += give.contact * np.eye(3 * c)
+    eye = np.broadcast_to(np.eye(3), (k, c, 3, 3))
+    moved = np.concatenate([eye, -cross_matrices(arms) / length], axis=-1).reshape(k, 3 * c, 6)
+    stiff = moved.swapaxes(1, 2) @ np.linalg.solve(compliant, moved)
+    pressed = np.maximum((forces * normals).sum(axis=-1), 0.0)
+    spin = 2 / 3 * mu * patch / give.spin * pressed
+    turning = np.einsum("kc,kci,kcj->kij", spin, normals, normals)
+    # The contact moves by (turn) x (arm + radius normal), and the force with it.
+    behind = arms + np.where(radii > 0, radii, give.flat)[..., None] * normals
+    turning -= (cross_matrices(forces) @ cross_matrices(behind)).sum(axis=1)
+    stiff[:, 3:, 3:] += turning / length**2
+    return np.linalg.eigvalsh((stiff + stiff.swapaxes(1, 2)) / 2)[:, 0]
+
+
+def cross_matrices(vectors: Array) -> Array:
+    """(..., 3, 3) matrices of the cross product."""
+    return np.cross(vectors[..., None, :], np.eye(3)).swapaxes(-1, -2)
 
 
 def _solved(wrenches: Array, directions: Array, steps: int = 25) -> Array:
