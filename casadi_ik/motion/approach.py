@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -142,6 +143,9 @@ def hands_used(robot: ArmHand, problem: TargetBatch) -> Array:
 
 LEAN = float(np.tan(np.deg2rad(35.0)))
 """How far ways lean that are tried when none before could be gone."""
+
+NARROWER = np.array([1.0, 0.5, 0.25])
+"""Of the opening that was asked for: where the hand, or a table, leaves no room for the whole."""
 
 PRESSED = 1e-3
 """What a pad may be in the object while the open hand comes: as far off as a contact may be [m]."""
@@ -291,9 +295,12 @@ def approaches(asked: ApproachPlan, solutions: Sequence[Array]) -> Iterator[Trie
     closer = Closer(asked.plan)
     holding, open_handed = _surroundings(asked)
     for number, q in enumerate(solutions, start=1):
+        barred = -1.0
         last, reason, coming = None, "", open_handed
-        for way in asked.ways(q):
-            last = closer.find(asked.problem, q, asked.opening, asked.distance, way)
+        for opening, way in product(asked.opening * NARROWER, asked.ways(q)):
+            if barred == opening:
+                continue
+            last = closer.find(asked.problem, q, opening, asked.distance, way)
             why, coming = _blocked(asked, last, holding, open_handed)
             reason = reason or why
             if not why:
@@ -301,7 +308,7 @@ def approaches(asked: ApproachPlan, solutions: Sequence[Array]) -> Iterator[Trie
                 break
             last = None
             if why.startswith(CLOSES):
-                break
+                barred = opening  # whichever way the hand comes
         yield Tried(closer, number, q, last, reason, open_handed, holding, coming)
 
 

@@ -377,7 +377,7 @@ def _made(
     """Those that are unlike those before, hold, are reached by the arm and free in the scene."""
     robot, table, surface = arms.robot, generator.table, generator.surface
     clear, chosen = len(some), generator.parameters
-    for part in before:
+    for part in before if clear else ():
         some = some.rows(some.unlike(part, chosen))
     generator.alike = clear - len(some)
     generator.counted("unlike those before", len(some))
