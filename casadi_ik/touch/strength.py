@@ -163,7 +163,8 @@ def stiffnesses(
     behind = arms + np.where(radii > 0, radii, give.flat)[..., None] * normals
     turning -= (cross_matrices(forces) @ cross_matrices(behind)).sum(axis=1)
     stiff[:, 3:, 3:] += turning / length**2
-    return np.linalg.eigvalsh((stiff + stiff.swapaxes(1, 2)) / 2)[:, 0]
+    least: Array = np.linalg.eigvalsh((stiff + stiff.swapaxes(1, 2)) / 2)[:, 0].astype(float)
+    return least
 
 
 def cross_matrices(vectors: Array) -> Array:
