@@ -186,11 +186,12 @@ def humanoid(path: Path) -> None:
         contacts[f"{side}_middle"] = ik.Contact([0, 0.16 * y, -size[2] / 2], [0, 0, 1])
         contacts[f"{side}_index"] = ik.Contact([0, 0.12 * y, -size[2] / 2], [0, 0, 1])
     about = ik.Scene({"box": {"kind": "box", "size": size.tolist()}})
-    free = ik.Free([0.28, -0.02, 0.08, 0, 0, 0], [0.42, 0.02, 0.25, 0, 0, 0])
+    free = ik.Free((0.28, -0.02, 0.08, 0, 0, 0), (0.42, 0.02, 0.25, 0, 0, 0))
     solver = ik.Solver(robot, scene=about)
     held = solver.solve(ik.Grasp(contacts, object="box", object_pose=free))
     pose = held.object_pose
-    assert held.success and pose is not None
+    assert held.success
+    assert pose is not None
     grasp = ik.Grasp(contacts, object="box", object_pose=np.eye(4)).at(pose)
     views = [(float(np.deg2rad(angle)), float(np.deg2rad(14.0))) for angle in (38.0, -52.0)]
     there = about.moved("box", pose)

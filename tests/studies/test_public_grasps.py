@@ -8,8 +8,8 @@ import pytest
 
 trimesh = pytest.importorskip("trimesh")
 
-import public_grasps
-from make_grasp_sets import made
+import public_grasps  # noqa: E402
+from make_grasp_sets import made  # noqa: E402
 
 
 def test_what_an_arm_and_a_table_leave_of_published_grasps(tmp_path, monkeypatch):
