@@ -121,10 +121,17 @@ def reached(robot: ik.ArmHand) -> dict[str, Any]:
 
 def about(robot: ik.ArmHand, name: str) -> dict[str, Any]:
     """What the page has to know of a robot beside its solver."""
+    description = robot.description
+    arms = description.arm_actuators
+    if description.sides:
+        arms = (
+            *description.trunk_actuators,
+            *(i for arm, _ in description.side_actuators for i in arm),
+        )
     return {
         "name": robot.name,
         "title": ROBOTS.get(name, name),
-        "armMotors": list(robot.description.arm_actuators),
+        "armMotors": list(arms),
         "looks": looks_of(robot.description),
         "prismatic": [motor.unit == "m" for motor in robot.description.actuators],
         "grasps": of_grasps(robot, name),

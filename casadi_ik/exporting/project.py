@@ -20,6 +20,7 @@ from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import InputError, KernelError, MissingExtraError, UnsupportedError, os_errors
 from casadi_ik.exporting.scene import SceneSources
+from casadi_ik.exporting.scene_of_body import BodySceneSources
 from casadi_ik.exporting.single import SinglePrecision, filled
 from casadi_ik.exporting.solver import FollowSources, SolverSources, hand_first
 from casadi_ik.exporting.targets import (
@@ -27,6 +28,8 @@ from casadi_ik.exporting.targets import (
     IN_TEST_C,
     IN_TEST_MJS,
     IN_TEST_SINGLE,
+    OF_BODY_C,
+    OF_BODY_MJS,
     Example,
     SceneTargets,
     example,
@@ -124,15 +127,13 @@ def exported(
         UnsupportedError: It cannot be exported.
     """
     sides = robot.description.sides
-    if sides and capacity is not None:
-        names = " or ".join(side.name for side in sides)
+    if sides and single and capacity is not None:
         raise UnsupportedError(
-            f"--scene: {robot.name} has the sides {names}, expected a robot of one arm; without"
-            " --scene its solver is written, and collisions are not looked at"
+            f"--single: {robot.name} has several sides, expected no --scene: their collisions are "
+            "looked at in double precision only"
         )
     as_hand = ArmHand(robot.description.as_hand) if sides else robot
-    # Sides without a trunk are robots of their own.
-    if not robot.description.trunk or single:
+    if single:
         robot = as_hand
     if single and follow:
         raise UnsupportedError("--follow: computes in double precision, expected no --single")
@@ -145,7 +146,8 @@ def exported(
     allowing = SinglePrecision(robot) if single else None
     scene = None
     if capacity is not None:
-        scene = SceneSources.of(robot, method, prefix, capacity, allowing)
+        kind = BodySceneSources if robot.description.sides else SceneSources
+        scene = kind.of(robot, method, prefix, capacity, allowing)
     tolerance = next(iter(solver.tolerances.values()))
     sources = SolverSources(robot, method, prefix, tolerance, scene, allowing)
     shown = example(robot)
@@ -183,7 +185,11 @@ def _tested(project: Exported, pieces: Mapping[str, str]) -> dict[str, str]:
     if project.scene is None:
         return project.marks
     prefix = project.marks["PREFIX"]
-    return project.marks | {name: piece.replace("@P", prefix) for name, piece in pieces.items()}
+    named = {
+        name: piece.replace("@P", prefix).replace("@G", prefix.upper())
+        for name, piece in pieces.items()
+    }
+    return project.marks | named
 
 
 def c_project(
@@ -214,7 +220,8 @@ def c_project(
         "Makefile": "Makefile",
         "README.md": "README.md",
     }
-    marks = _tested(project, IN_TEST_SINGLE if single else IN_TEST_C)
+    of_body = OF_BODY_C if robot.description.sides else {}
+    marks = _tested(project, IN_TEST_SINGLE if single else IN_TEST_C | of_body)
     return {
         **project.sources,
         f"include/{prefix}.hpp": filled("solver.hpp", marks),
@@ -279,7 +286,8 @@ def wasm_project(
     if importlib.util.find_spec("ziglang") is None:
         raise MissingExtraError("--target wasm needs ziglang: pip install 'casadi-ik[compiler]'")
     project = exported(robot, prefix, capacity, follow=follow)
-    marks = _tested(project, IN_TEST_MJS) | {
+    of_body = OF_BODY_MJS if robot.description.sides else {}
+    marks = _tested(project, IN_TEST_MJS | of_body) | {
         "LOWER_JSON": json.dumps(robot.lower.tolist()),
         "UPPER_JSON": json.dumps(robot.upper.tolist()),
         "HOME_JSON": json.dumps(robot.home.tolist()),

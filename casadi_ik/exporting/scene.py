@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arms.family import ArmFamily
 from casadi_ik.arms.search import PARAMETERS, arms_graph
 from casadi_ik.arrays import Array, even_steps
 from casadi_ik.collision.model import CollisionModel, own_solids
@@ -29,6 +30,50 @@ from casadi_ik.solving.free_hands import PARAMETERS as FINGERS
 
 MOST = 1000
 """The largest capacity: each solid costs kilobytes."""
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedArm:
+    """An arm in closed form, as C looks at it.
+
+    Attributes:
+        family: Its family.
+        columns: Positions in q of its motors.
+        lower: (a,) its limits.
+        upper: (a,).
+        values: Values of the redundancy at which it is looked at.
+    """
+
+    family: ArmFamily
+    columns: tuple[int, ...]
+    lower: Array
+    upper: Array
+    values: SearchValues
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Macros that its arrays are made of."""
+        grid, between = self.values.levels
+        return {
+            "N_ARM": len(self.lower),
+            "N_REDUNDANCY": self.family.size,
+            "N_ROWS": self.family.rows,
+            "N_PLACES": len(grid),
+            "N_MORE_PLACES": len(between),
+            "N_CLOSER": len(self.values.closer),
+        }
+
+    @property
+    def arrays(self) -> dict[str, Array]:
+        """Its arrays; none is empty."""
+        (grid, between), closer = self.values.levels, self.values.closer
+        return {
+            "PLACES": grid.ravel(),
+            "MORE_PLACES": between.ravel() if between.size else np.zeros(1),
+            "CLOSER": closer if len(closer) else np.zeros(1),
+            "ARM_LOW": self.lower,
+            "ARM_RANGE": self.upper - self.lower,
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,15 +120,20 @@ class SceneSources:
         return self.check.model
 
     @cached_property
-    def values(self) -> SearchValues | None:
-        """Values of the redundancy at which arms are looked at; None for an arm of no family."""
-        family = self.method.step.arm
-        return None if family is None else SearchValues.of(family, *self._arm_limits)
+    def closed_arms(self) -> list[ClosedArm]:
+        """The arm, or those of a body's sides; none where one has no closed form."""
+        found = []
+        for family, columns in self._families:
+            if family is None:
+                return []
+            limits = self.robot.lower[list(columns)], self.robot.upper[list(columns)]
+            found.append(ClosedArm(family, columns, *limits, SearchValues.of(family, *limits)))
+        return found
 
     @property
-    def _arm_limits(self) -> tuple[Array, Array]:
-        columns = list(self.robot.description.arm_actuators)
-        return self.robot.lower[columns], self.robot.upper[columns]
+    def _families(self) -> list[tuple[ArmFamily | None, tuple[int, ...]]]:
+        """Of every arm its family and the positions in q of its motors."""
+        return [(self.method.step.arm, self.robot.description.arm_actuators)]
 
     @property
     def near(self) -> tuple[FunctionKernel, str, int]:
@@ -94,15 +144,12 @@ class SceneSources:
         return self.check.kernel.placed, constants, room
 
     @property
-    def arms(self) -> FunctionGraph | None:
-        """All arms of a palm; None where they have no closed form."""
-        arm = self.method.step.arm
-        return None if arm is None else arms_graph(arm, "all_arms", "")
-
-    @property
-    def palm(self) -> FunctionKernel:
-        """Where the palm is."""
-        return RobotKernels(self.robot.description).palm
+    def maps(self) -> dict[str, FunctionKernel | FunctionGraph]:
+        """What is asked of arms in closed form, by name: where the palm is, and its arms."""
+        if not self.closed_arms:
+            return {}
+        palm, (arm,) = RobotKernels(self.robot.description).palm, self.closed_arms
+        return {"palm": palm, "arms": arms_graph(arm.family, "all_arms", "")}
 
     @property
     def _own(self) -> int:
@@ -115,16 +162,15 @@ class SceneSources:
     @property
     def room(self) -> int:
         """Eights of bytes that the search among arms works with, `room` of drivers/arm_search.c."""
-        values, family = self.values, self.method.step.arm
-        if values is None or family is None:
-            return 1
-        n, arm = len(self.robot.actuators), len(family.screws)
-        most = max(*map(len, values.levels), len(values.closer)) * family.rows + 1
-        free = family.size
-        whole = 6 * most + 2
-        numbers = 2 * most * (arm + 2) + most * (12 + free) + (most + 1) * n + 1
-        size = 8 if self.single is None else 4
-        return whole + (size * numbers + 2 * most + 7) // 8
+        n, sizes = len(self.robot.actuators), [1]
+        for arm in self.closed_arms:
+            values, rows, free = arm.values, arm.family.rows, arm.family.size
+            most = max(*map(len, values.levels), len(values.closer)) * rows + 1
+            whole = 6 * most + 2
+            numbers = 2 * most * (len(arm.lower) + 2) + most * (12 + free) + (most + 1) * n + 1
+            size = 8 if self.single is None else 4
+            sizes.append(whole + (size * numbers + 2 * most + 7) // 8)
+        return max(sizes)
 
     @property
     def rounding(self) -> float:
@@ -170,7 +216,7 @@ class SceneSources:
             "N_CANDIDATES": str(candidates),
             "TRIED": str(self._rounds * candidates),
             "N_LOOKED": str(self._rounds * candidates + 1),
-            "LOOK_CONSTANTS": self._look_constants(),
+            "LOOK_CONSTANTS": self.look_constants(),
             "MOST_PAIRS": str(max(self._most_pairs, 1)),
             "KINDS_C": "\n".join(
                 f"  {self.prefix.upper()}_{kind.name} = {int(kind)}, /* {row.size} */"
@@ -184,6 +230,7 @@ class SceneSources:
             "LINK_NAMES": ", ".join(json.dumps(link, ensure_ascii=False) for link in self.links),
             "SHAPES_JSON": json.dumps(self.shapes()),
         }
+        marks |= self.kind
         real = marks["REAL"]
         room = "double" if self.single is None else "int64_t"
         wasm, js, types = (
@@ -200,7 +247,7 @@ class SceneSources:
             "SCENE_ROOM": f"  {room} room[{self.room}];\n",
             "SCENE_LOOK": filled("scene_look.c", marks),
             "SCENE_INIT": f"  {self.prefix}_scene_init(solver);\n",
-            "SCENE_BEGIN": "  solver->scene.looking = solver->scene.again = 0;\n",
+            "SCENE_BEGIN": self.begun,
             "SCENE_WASM": wasm,
             "SCENE_JS": js,
             "SCENE_DTS": types,
@@ -227,7 +274,8 @@ class SceneSources:
             "PREFIX": self.prefix,
             "GUARD": self.prefix.upper(),
             "SCENE_CONSTANTS": self._constants(),
-            "ARM_SEARCH": "" if self.values is None else driver_text("arm_search"),
+            "ARM_SEARCH": driver_text("arm_search") if self.closed_arms else "",
+            **self.kind,
         }
         return filled("scene.c", marks)
 
@@ -240,9 +288,7 @@ class SceneSources:
             f"{self.prefix}_memory *memory);\n"
             f"void {self.prefix}_scene_init({self.prefix}_solver *solver);\n"
             f"int {self.prefix}_hand_is_free({self.prefix}_solver *solver, const scalar *lower, "
-            "const scalar *upper, scalar *q);\n"
-            f"int {self.prefix}_arm_is_free({self.prefix}_solver *solver, const scalar *lower, "
-            "const scalar *upper, int near, scalar *q);\n"
+            "const scalar *upper, scalar *q);\n" + self.own_jobs
         )
 
     def shapes(self) -> dict[str, Any]:
@@ -264,9 +310,39 @@ class SceneSources:
         """Rounds of other hands that are looked at."""
         return min(FREE.rounds, self.method.options.rounds)
 
-    def _look_constants(self) -> str:
+    begun = "  solver->scene.looking = solver->scene.again = 0;\n"
+    """What happens to the scene where a target is taken up."""
+
+    @property
+    def kind(self) -> dict[str, str]:
+        """What stands for the marks that say how many arms there are."""
+        return {
+            "ONE_ARM": "",
+            "CAPSULE_PART": "(MOVING[i] ? OF_ARM : idle && idle[LINK[i]])",
+            "PAIR_PART": "(PAIR_MOVING[k] ? OF_ARM : idle && (idle[first] || idle[other]))",
+        }
+
+    @property
+    def own_jobs(self) -> str:
+        """What finds arms that are free."""
+        return (
+            f"int {self.prefix}_arm_is_free({self.prefix}_solver *solver, const scalar *lower, "
+            "const scalar *upper, int near, scalar *q);\n"
+        )
+
+    def decided_by(self, *links: str) -> int:
+        """Whether the arm decides where links are to each other, or one to the base."""
+        return int(not self.model.moving.isdisjoint(links))
+
+    def arm_constants(self) -> tuple[dict[str, int], str, dict[str, Array]]:
+        """What is known of arms in closed form: whole numbers, text, arrays."""
+        (arm,) = self.closed_arms
+        columns = ", ".join(map(str, arm.columns))
+        return arm.sizes, f"#define ARM_COLUMNS {{{columns}}}\n", arm.arrays
+
+    def look_constants(self) -> str:
         """What the search for hands that are free knows."""
-        closed = int(self.values is not None)
+        closed = int(bool(self.closed_arms))
         ranges = np.maximum(self.robot.upper - self.robot.lower, FREE.least_range)
         return (
             define({"LOOK_ROUNDS": self._rounds, "HAS_CLOSED_ARM": closed})
@@ -306,14 +382,13 @@ class SceneSources:
         own, shapes = own_solids(robot.description), robot.description.shapes.solids
         touching = self.check.bodies_of_fingers
         pairs, capsules = model.pairs, model.capsules
-        moving = np.array([one.link in model.moving for one in capsules], dtype=int)
-        crossing = [int(not model.moving.isdisjoint(model.names(i, j))) for i, j in pairs.tolist()]
+        crossing = [self.decided_by(*model.names(i, j)) for i, j in pairs.tolist()]
         arrays: dict[str, np.ndarray] = {
             "RADII": model.radii,
             "HALVES": model.halves,
             "LINK": np.array([links[one.link] for one in capsules]),
             "FIXED": np.array([int(model.is_fixed(one.link)) for one in capsules]),
-            "MOVING": moving,
+            "MOVING": np.array([self.decided_by(one.link) for one in capsules]),
             "TOUCHES": np.array(
                 [[int(one.link in touching[f]) for one in capsules] for f in robot.fingers]
             ),
@@ -331,31 +406,13 @@ class SceneSources:
             "N_OWN": len(own),
             "N_KINDS": len(EXPORTED),
             "N_PAIRS": len(pairs),
-            "HAS_CLOSED_ARM": int(self.values is not None),
+            "HAS_CLOSED_ARM": int(bool(self.closed_arms)),
         }
         text = f"#define ROUNDING {number(self.rounding)}\n"
-        values, family = self.values, self.method.step.arm
-        if values is not None and family is not None:
-            grid, between = values.levels
-            low, high = self._arm_limits
-            whole |= {
-                "N_ARM": len(low),
-                "N_REDUNDANCY": family.size,
-                "N_ROWS": family.rows,
-                "N_PLACES": len(grid),
-                "N_MORE_PLACES": len(between),
-                "N_CLOSER": len(values.closer),
-            }
+        if self.closed_arms:
             text += f"#define ALLOWED {number(self.allowed)}\n"
-            columns = ", ".join(map(str, self.robot.description.arm_actuators))
-            text += f"#define ARM_COLUMNS {{{columns}}}\n"
-            arrays |= {
-                "PLACES": grid.ravel(),
-                "MORE_PLACES": between.ravel() if between.size else np.zeros(1),
-                "CLOSER": values.closer if len(values.closer) else np.zeros(1),
-                "ARM_LOW": low,
-                "ARM_RANGE": high - low,
-            }
+            sizes, columns, tables = self.arm_constants()
+            whole, text, arrays = whole | sizes, text + columns, arrays | tables
         return define(whole) + text + define_arrays(arrays) + self._idle_constants()
 
 

@@ -216,15 +216,18 @@ def in_single(single: SinglePrecision) -> dict[str, str]:
 
 
 MARK = re.compile(r"@([A-Z_]+)(\??)@")
+SECTION = re.compile(r"^@([A-Z_]+)\{@\n(.*?)^@\}@\n", re.MULTILINE | re.DOTALL)
 
 
 def filled(name: str, substitutes: Mapping[str, str]) -> str:
     """The text of `templates/<name>` with every mark replaced.
 
-    A mark with a question mark stands for nothing where an export has no such thing.
+    A mark with a question mark stands for nothing where an export has no such thing; lines between
+    `@NAME{@` and `@}@` are there for exports that have a NAME.
 
     Raises:
         KeyError: Another mark stands for nothing.
     """
     text = (resources.files("casadi_ik.exporting") / "templates" / name).read_text(encoding="utf-8")
+    text = SECTION.sub(lambda m: m[2] if m[1] in substitutes else "", text)
     return MARK.sub(lambda m: substitutes.get(m[1], "") if m[2] else substitutes[m[1]], text)

@@ -322,9 +322,7 @@ class SolverSources:
         near = self._part("near", "clearance", placed, constants, room)
         place = filled("place.c", {"PREFIX": self.prefix})
         parts = (replace(near, text=near.text + place),)
-        if scene.arms is not None:
-            parts += (self._part("palm", "map", scene.palm), self._part("arms", "map", scene.arms))
-        return parts
+        return parts + tuple(self._part(name, "map", each) for name, each in scene.maps.items())
 
     def _part(
         self,

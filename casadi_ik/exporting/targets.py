@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -17,6 +18,8 @@ from casadi_ik.collision.solids import stated
 from casadi_ik.errors import DescriptionError
 from casadi_ik.grasps.load import load_grasp, shipped_grasps
 from casadi_ik.kernels.codegen import digits, numbers
+from casadi_ik.methods.hand_first.method import HandFirstMethod
+from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.problem.request import Request
 from casadi_ik.problem.status import Status
@@ -73,18 +76,47 @@ def stored(solver: Solver, scene: SceneTargets | None = None) -> list[dict[str, 
     q0 = np.clip(q + 0.1, robot.lower, robot.upper)
     found: list[dict[str, Any]] = [{} for _ in range(COUNT)]
     for rows, starts in ((~near, None), (near, q0[near])):
-        batch = solver.solve_batch(points[rows], normals[rows], q0=starts)
+        answers = _answers(solver, points[rows], normals[rows], starts)
         for i, row in enumerate(np.flatnonzero(rows).tolist()):
+            q, *numbers = next(answers)
             found[row] = {
                 "q0": None if starts is None else starts[i].tolist(),
                 "points": points[row].ravel().tolist(),
                 "normals": normals[row].ravel().tolist(),
-                "q": batch.q[i].tolist(),
-                "status": int(batch.status[i]),
-                "iterations": int(batch.iterations[i]),
-                "restarts": int(batch.restarts[i]),
+                "q": q.tolist(),
+                **dict(zip(WHOLE, map(int, numbers), strict=True)),
             }
     return found if scene is None else [scene.answered(target) for target in found]
+
+
+def _answers(
+    solver: Solver, points: Array, normals: Array, starts: Array | None
+) -> Iterator[tuple[Array, int, int, int]]:
+    """The answers to k targets, each with the numbers that `WHOLE` names.
+
+    A batch solves the sides of a body without a trunk one by one; an export, like `fast`, solves it
+    as any body.
+    """
+    robot = solver.robot.description
+    if not robot.sides or robot.trunk:
+        batch = solver.solve_batch(points, normals, q0=starts)
+        yield from zip(batch.q, batch.status, batch.iterations, batch.restarts, strict=True)
+        return
+    method, request = (
+        HandFirstMethod(robot, HandFirstParameters()),
+        Request(solver.robot, solver.tolerances, True),
+    )
+    search = method.alone(enforce_limits=True)
+    assert search is not None
+    for row in range(len(points)):
+        q0 = None if starts is None else starts[row]
+        prefer = "limits" if q0 is None else "q0"
+        target = request.of_arrays(
+            points[row : row + 1], normals[row : row + 1], None, prefer=prefer
+        )
+        search.ask(target, 0, request.start(q0), method.terms(target))
+        answer = search.answer(search(method.rounds) or 0)
+        yield answer.q, answer.status, answer.iterations, answer.restarts
 
 
 def targets_header(solver: Solver, scene: SceneTargets | None = None, single: bool = False) -> str:
@@ -186,6 +218,8 @@ class SceneTargets:
         """A stored target with the answer to it in the scene: another arm or hand at the most."""
         if target["status"] != Status.SOLVED:
             return target | {"clearance": None}
+        if self.solver.robot.description.sides:
+            return target | self._touching(target)
         points, normals = (np.reshape(target[key], (1, -1, 3)) for key in ("points", "normals"))
         found = self._free(points, normals, np.array(target["q"]), target["q0"])
         if found is None and target["q0"] is not None:
@@ -194,6 +228,16 @@ class SceneTargets:
         if found is None:
             return target | {"status": int(Status.COLLISION), "clearance": None}
         return target | {"q": found[0].tolist(), "clearance": found[1]}
+
+    def _touching(self, target: dict[str, Any]) -> dict[str, Any]:
+        """Of a body only whether its answer touches something is known, not what else is found."""
+        points, normals = (np.reshape(target[key], (1, -1, 3)) for key in ("points", "normals"))
+        request = Request(self.solver.robot, self.solver.tolerances, True)
+        query = self._check.collision_query(request.of_arrays(points, normals, None))
+        clear = query.check(np.array(target["q"])[None])
+        if not clear.free[0]:
+            return {"status": int(Status.COLLISION), "clearance": None}
+        return {"clearance": float(clear.distance[0])}
 
     def _free(
         self, points: Array, normals: Array, q: Array, q0: list[float] | None
@@ -276,3 +320,21 @@ IN_TEST_MJS = {
     ),
 }
 """What the tests of an export have in addition."""
+
+OF_BODY_C = {
+    "SCENE_TEST_FREED": (
+        "  if (stored->status == @G_COLLISION && solver->status == @G_SOLVED) {\n"
+        "    return solver->clearance >= MARGIN - 1e-9\n"
+        "        && solver->iterations == stored->iterations;\n"
+        "  }\n"
+    ),
+}
+OF_BODY_MJS = {
+    "SCENE_TEST_FREED": (
+        "  if (target.status === Status.COLLISION && answer.status === Status.SOLVED) {\n"
+        "    const near = answer.clearance < about.margin - 1e-9;\n"
+        "    return near || answer.iterations !== target.iterations;\n"
+        "  }\n"
+    ),
+}
+"""Of a body's answer that touches something only that much is stored: another may be found."""

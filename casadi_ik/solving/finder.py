@@ -25,6 +25,7 @@ from casadi_ik.problem.clearance import CollisionQuery
 from casadi_ik.problem.request import CLEARANCE, free_palms, preference
 from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import contact_verdicts, judge
+from casadi_ik.robots.description import RobotDescription
 from casadi_ik.solving.arm_search import ArmSearch, Preference
 from casadi_ik.solving.trials import (
     Bounds,
@@ -136,14 +137,6 @@ class AlternativeFinder:
             return self.manipulability
 
         return ArmSearch(self.robot, family, scores, measure, self._compiled, side)
-
-    @cached_property
-    def side_links(self) -> list[tuple[frozenset[str], frozenset[str]]]:
-        """Of every side of a body the links that it moves: its arm's, and those with the palm."""
-        body = self.robot.description
-        moved = [body.links_moved(arm) for arm, _ in body.side_actuators]
-        hands = [body.links_moved(arm[-1:]) for arm, _ in body.side_actuators]
-        return [(links - hand, hand) for links, hand in zip(moved, hands, strict=True)]
 
     @cached_property
     def manipulability(self) -> FunctionKernel:
@@ -412,6 +405,13 @@ class AlternativeFinder:
             manipulability=float(self._measured(q)[0]),
             distance=float(-self.score(q, q0, "q0")[0]),
         )
+
+
+def side_links(body: RobotDescription) -> list[tuple[frozenset[str], frozenset[str]]]:
+    """Of every side of a body the links that it moves: its arm's, and those with the palm."""
+    moved = [body.links_moved(arm) for arm, _ in body.side_actuators]
+    hands = [body.links_moved(arm[-1:]) for arm, _ in body.side_actuators]
+    return [(links - hand, hand) for links, hand in zip(moved, hands, strict=True)]
 
 
 def checked_distance(apart: float) -> float:

@@ -35,7 +35,7 @@ from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import SolvedVerdict, judge_one
 from casadi_ik.solving.arm_search import Preference
 from casadi_ik.solving.batch_parts import judged
-from casadi_ik.solving.finder import AlternativeFinder
+from casadi_ik.solving.finder import AlternativeFinder, side_links
 from casadi_ik.solving.free_hands import SideHands, UnconstrainedFingers
 from casadi_ik.solving.trials import (
     Deduplicator,
@@ -207,7 +207,7 @@ class FreeSearch:
         self._fresh = np.ones(count, dtype=bool)
         self._sides: SideHands | None = None
         if robot.description.sides:
-            own = finder.side_links, targets, query
+            own = side_links(robot.description), targets, query
             self._sides = SideHands(self.trials, *own, PARAMETERS.alike)
 
     @cached_property

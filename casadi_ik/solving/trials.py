@@ -24,6 +24,16 @@ NEVER = 1e-12
 LAST = 1e6
 """Trunks tried: none follows the one that a row begins from."""
 
+CARRYING = {
+    "first": LAST,
+    "farthest": LAST,
+    "fits": 1.0,
+    "fitted": 1.0,
+    "tried": LAST,
+    "again": 1.0,
+}
+"""What a row says that is to end where trunk and arms carry the palms, or nowhere."""
+
 AT_ENDS = 2.0
 """Of every second trunk the even spread is stretched by this about its middle, up to the ends."""
 
@@ -278,12 +288,7 @@ def carried(
         "best_q": q,
         "phase": phase,
         "side": len(robot.sides),
-        "first": LAST,
-        "farthest": LAST,
-        "fits": 1.0,
-        "fitted": 1.0,
-        "tried": LAST,
-        "again": 1.0,
+        **CARRYING,
     }
     for place in range(len(robot.sides)):
         wanted[f"palm_rotation_{place}"] = palms[:, place, :3, :3].reshape(-1, 9)

@@ -73,11 +73,78 @@ def test_stored_targets_bit_for_bit_under_sanitizers(project):
     assert foreign <= LIBM | COMPILERS
 
 
-def test_a_scene_is_for_one_arm(tmp_path, capsys):
-    words = ["export", "g1+dex3", "--scene", "8", "--out", str(tmp_path / "g1")]
+def test_collisions_of_a_body_are_looked_at_in_double_precision(tmp_path, capsys):
+    words = ["export", "g1+dex3", "--scene", "8", "--single", "--out", str(tmp_path / "g1")]
     assert main(words) == 2
-    assert "--scene: g1+dex3 has the sides left or right, expected" in capsys.readouterr().err
+    assert "--single: g1+dex3 has several sides, expected no --scene" in capsys.readouterr().err
     assert not any(tmp_path.iterdir())
+
+
+IN_A_SCENE = """
+#include <stdio.h>
+#include "arm.h"
+static arm_solver solver;
+int main(void) { /* pose of a box; rows of numbers: whether there is a q0, points, normals, q0 */
+  const double size[] = {0.3, 0.3, 0.2};
+  double pose[12], row[1 + 6 * ARM_FINGERS + ARM_MOTORS];
+  arm_init(&solver);
+  if (fread(pose, sizeof pose, 1, stdin) != 1) return 2;
+  arm_set_solid(&solver, 0, ARM_BOX, size, pose, 0);
+  while (fread(row, sizeof row, 1, stdin) == 1) {
+    const double *points = row + 1, *normals = points + 3 * ARM_FINGERS;
+    int i;
+    printf("%d", arm_solve(&solver, points, normals, *row ? normals + 3 * ARM_FINGERS : 0));
+    printf(" %a", solver.clearance);
+    for (i = 0; i < ARM_MOTORS; ++i) printf(" %a", solver.q[i]);
+    puts("");
+  }
+  return 0;
+}
+"""
+
+
+@needs_gcc
+@pytest.mark.parametrize("name", ["two_ur10e+barrett_bh8_280", "mobile_kuka_lwr_barrett"])
+def test_a_body_keeps_clear_of_a_scene_and_of_itself(tmp_path, name):
+    """Of targets that a posture meets which touches nothing; every third has an idle finger."""
+    robot = ik.load_robot(name)
+    write_folder(tmp_path, c_project(robot, "arm", 2))
+    (tmp_path / "scene.c").write_text(IN_A_SCENE)
+    sources = [str(path.relative_to(tmp_path)) for path in sorted(tmp_path.glob("src/*.c"))]
+    compiled(tmp_path, "-O1", "-c", *sources)
+    objects = [Path(name).with_suffix(".o").name for name in sources]
+    for program, text in (("stored", "test/test.c"), ("answers", "scene.c")):
+        compiled(tmp_path, text, *objects, "-o", program, "-lm")
+    assert "wrong: 0" in said(tmp_path / "stored")
+
+    place = [0.5, 0.2, 0.6]
+    scene = ik.Scene({"box": {"kind": "box", "size": [0.3, 0.3, 0.2], "xyz": place}})
+    solver, drawn = ik.Solver(robot, scene=scene), robot.random(np.random.default_rng(2), 3000)
+    any_grasp = ik.Grasp({robot.fingers[0]: ik.Contact([0.5, 0.0, 0.5])})
+
+    def clear(q):
+        found = solver.check(q, any_grasp)
+        assert found is not None
+        return found
+
+    q = drawn[clear(drawn).free][:60]
+    (points, normals), count = robot.contacts(q), len(q)
+    points[::3, 0] = normals[::3, 0] = np.nan
+    near = np.arange(count) % 4 == 1
+    rows = np.hstack([near[:, None], *(a.reshape(count, -1) for a in (points, normals, q + 0.01))])
+    asked = np.array([*np.eye(3).ravel(), *place]).tobytes() + rows.tobytes()
+    lines = [line.split() for line in said(tmp_path / "answers", input=asked).splitlines()]
+    found = np.array([[float.fromhex(word) for word in words[1:]] for words in lines])
+    assert {words[0] for words in lines} == {str(int(ik.Status.SOLVED))}
+    answers, clearance = found[:, 1:], clear(found[:, 1:])
+    assert clearance.free.all()
+    assert np.allclose(clearance.distance, found[:, 0], atol=1e-9)
+    away = np.linalg.norm(robot.contacts(answers)[0] - points, axis=2)
+    assert np.nanmax(away) < 5.001e-3
+    assert np.isnan(away).sum() == len(points[::3])
+    # Or nothing was looked for.
+    first = ik.Solver(robot).solve_batch(points, normals).q
+    assert (~clear(first).free).sum() > 10
 
 
 @needs_gcc
@@ -223,7 +290,7 @@ int main(void) { /* how many solids, each: kind, size, pose; points, normals */
 
 @needs_gcc
 def test_other_hands_are_looked_at_as_in_python(tmp_path):
-    """Of Panda and Shadow no grasp of the page is free with the first hand: idle fingers are in."""
+    """Grasps of the page, the object in the hand: C and Python look alike for what is free."""
     page = runpy.run_path(str(Path(__file__).parents[2] / "page" / "build.py"))
     robot, out = ik.load_robot("panda+shadow"), tmp_path / "solver"
     words = ["export", "panda+shadow", "--prefix", "arm", "--scene", "8", "--out", str(out)]
@@ -242,7 +309,11 @@ def test_other_hands_are_looked_at_as_in_python(tmp_path):
     solver = ik.Solver(robot, scene=ik.Scene({}))
     for one, line in zip(grasps, lines, strict=True):
         status, *words = line.split()
-        answer = solver.solve(ik.load_grasp(one["name"]), diagnose=False)
+        grasp = ik.load_grasp(one["name"])
+        asked_for = zip(robot.fingers, one["points"], one["normals"], strict=True)
+        contacts = {name: ik.Contact(*pair) for name, *pair in asked_for if pair[0] is not None}
+        same = ik.Grasp(contacts, object=grasp.object, object_pose=grasp.object_pose)
+        answer = solver.solve(same, diagnose=False)
         assert int(status) == answer.status == ik.Status.SOLVED, one["name"]
         np.testing.assert_array_equal([float.fromhex(word) for word in words], answer.q)
 

@@ -13,6 +13,20 @@ enum { DONE = 0, SLICE_OVER = 1, NO_MEMORY = -1 };
 
 @SCENE_CONSTANTS@
 @ARM_SEARCH@
+@BODY{@
+enum { N_SIDES = @SIDES@ };
+
+#if HAS_CLOSED_ARM
+typedef struct {
+  KERNEL(arms, map_job);
+  int64_t n_arm, n_redundancy, n_rows, n_places[LEVELS];
+  const scalar *places[LEVELS], *low, *range;
+  const int64_t *columns;
+} arm_of_side;
+
+#endif
+@ARMS_OF_SIDES@
+@}@
 void @PREFIX@_scene_init(@PREFIX@_solver *solver) {
   int i, k;
   for (i = 0; i < N_OWN; ++i) {
@@ -56,10 +70,30 @@ static void add_pair(@PREFIX@_solver *solver, int i, int j, scalar offset) {
   solver->scene.offsets[k] = offset;
 }
 
+@ONE_ARM{@
 /* Of which pairs the distance is decided by what: hand and palm, without or with the fingers that
  * touch nothing, or the arm, too. */
 enum { OF_HAND, OF_IDLE, OF_ARM };
+@}@
+@BODY{@
+/* Of which pairs the distance is decided by what: a hand and its palm, without or with the fingers
+ * that touch nothing, by side; then the trunk or several palms; then an arm, with those before it. */
+enum {
+  OF_HAND,
+  OF_IDLE = N_SIDES,
+  OF_TRUNK = 2 * N_SIDES,
+  OF_ARM,
+  N_PARTS_OF_PAIRS = OF_ARM + N_SIDES
+};
+@}@
 
+@BODY{@
+/* The part of a pair, if an idle finger is in it. */
+static int part_of(int part, int idle) {
+  return part < OF_IDLE && idle ? OF_IDLE + part : part;
+}
+
+@}@
 static int link_of(int body) {
   if (body < N_CAPSULES) return LINK[body];
   body -= N_CAPSULES;
@@ -87,7 +121,7 @@ static void add_pairs(@PREFIX@_solver *solver, const int *idle, int part) {
     if (solver->scene.solids[N_OWN + k].kind == @GUARD@_NOTHING) continue;
     for (i = 0; i < N_CAPSULES; ++i) {
       int may = 0;
-      if (FIXED[i] || (MOVING[i] ? OF_ARM : idle && idle[LINK[i]]) != part) continue;
+      if (FIXED[i] || @CAPSULE_PART@ != part) continue;
       /* A finger may touch what it grasps with the link of its pad. */
       for (f = 0; f < @GUARD@_FINGERS; ++f) {
         may |= TOUCHES[f][i] && solver->points[3 * f] == solver->points[3 * f];
@@ -97,7 +131,7 @@ static void add_pairs(@PREFIX@_solver *solver, const int *idle, int part) {
   }
   for (k = 0; k < N_PAIRS; ++k) {
     const int first = link_of(PAIRS[k][0]), other = link_of(PAIRS[k][1]);
-    if ((PAIR_MOVING[k] ? OF_ARM : idle && (idle[first] || idle[other])) == part) {
+    if (@PAIR_PART@ == part) {
       add_pair(solver, PAIRS[k][0], PAIRS[k][1], OFFSETS[k]);
     }
   }
@@ -106,12 +140,25 @@ static void add_pairs(@PREFIX@_solver *solver, const int *idle, int part) {
 static clearance_job about(@PREFIX@_solver *solver, const int *idle) {
   clearance_job job = {0};
   int i;
+@ONE_ARM{@
   solver->scene.n_pairs = 0;
   add_pairs(solver, idle, OF_HAND);
   solver->scene.n_busy = solver->scene.n_pairs;
   add_pairs(solver, idle, OF_IDLE);
   solver->scene.n_held = solver->scene.n_pairs;
   add_pairs(solver, idle, OF_ARM);
+@}@
+@BODY{@
+  if (!solver->scene.listed) {
+    solver->scene.n_pairs = 0;
+    for (i = 0; i < N_PARTS_OF_PAIRS; ++i) {
+      add_pairs(solver, idle, i);
+      solver->scene.ends[i] = solver->scene.n_pairs;
+    }
+    solver->scene.n_busy = solver->scene.ends[OF_IDLE - 1];
+    solver->scene.n_held = solver->scene.ends[OF_TRUNK - 1];
+  }
+@}@
   job.poses = solver->scene.poses;
   job.n_solids = @GUARD@_SCENE;
   job.solids = solver->scene.solids;
@@ -150,6 +197,7 @@ scalar @PREFIX@_clearance(@PREFIX@_solver *solver, const scalar *q) {
   return solver->clearance = room + solver->scene.margin;
 }
 
+@ONE_ARM{@
 #if HAS_CLOSED_ARM
 /* The preferred arm that touches nothing, for the hand of an answer; 0 if there is none. */
 static int choose_arm(@PREFIX@_solver *solver, const scalar *lower, const scalar *upper, int near,
@@ -216,6 +264,87 @@ static int choose_arm(@PREFIX@_solver *solver, const scalar *lower, const scalar
   return 1;
 }
 #endif
+@}@
+@BODY{@
+/* Only the pairs from one part to another. */
+static clearance_job of_parts(@PREFIX@_solver *solver, int first, int last) {
+  clearance_job job = about(solver, 0);
+  const int64_t begin = first ? solver->scene.ends[first - 1] : 0;
+  job.pairs += 2 * begin;
+  job.offsets += begin;
+  job.n_pairs = solver->scene.ends[last] - begin;
+  return job;
+}
+
+static int part_is_free(@PREFIX@_solver *solver, int first, int last, const scalar *q) {
+  clearance_job job = of_parts(solver, first, last);
+  int64_t closest;
+  job.most = solver->scene.margin;
+  job.enough = solver->scene.margin - ROUNDING;
+  return room_at(solver, &job, q, &closest) >= -ROUNDING;
+}
+
+#if HAS_CLOSED_ARM
+/* Arms that touch nothing for the palms of a side and of those behind it; 0 if there are none. Of
+ * every arm but the last the preferred one of each branch is taken up. */
+static int choose_arms(@PREFIX@_solver *solver, const scalar *lower, const scalar *upper, int near,
+                       int side, const scalar *palms, scalar *q) {
+  const arm_of_side *own = ARMS + side;
+  const int last = side + 1 == N_SIDES;
+  clearance_job clear = of_parts(solver, OF_ARM + side, OF_ARM + side);
+  arm_search_job job = {0};
+  scalar low[MOST_ARM], high[MOST_ARM], arms[(MOST_ROWS + 1) * MOST_ARM], score[MOST_ROWS + 1];
+  int64_t tried = 0;
+  int i, k;
+  for (i = 0; i < own->n_arm; ++i) {
+    low[i] = lower[own->columns[i]];
+    high[i] = upper[own->columns[i]];
+  }
+  job.arms = own->arms;
+  job.check = @PREFIX@_near_kernel;
+  job.clear = &clear;
+  job.lanes = 1;
+  job.order = near ? NEAR_START : FAR_FROM_LIMITS;
+  job.n_q = @GUARD@_MOTORS;
+  job.n_arm = own->n_arm;
+  job.n_redundancy = own->n_redundancy;
+  job.n_rows = own->n_rows;
+  job.n_groups = last ? 1 : own->n_rows + 1;
+  for (i = 0; i < LEVELS; ++i) {
+    job.n_places[i] = own->n_places[i];
+    job.places[i] = own->places[i];
+  }
+  job.columns = own->columns;
+  job.lower = low;
+  job.upper = high;
+  job.low = own->low;
+  job.range = own->range;
+  job.q = q;
+  job.palms = palms + 16 * side;
+  job.starts = solver->here;
+  job.poses = solver->scene.poses;
+  job.margin = solver->scene.margin;
+  job.rounding = ROUNDING;
+  job.allowed = ALLOWED;
+  job.count = 1;
+  job.chosen = arms;
+  job.score = score;
+  job.tried = &tried;
+  job.memory = &solver->memory;
+  if (casadi_ik_arm_search(&job) != DONE) return 0;
+  for (k = 0; k < job.n_groups; ++k) {
+    scalar next[@GUARD@_MOTORS];
+    if (!(score[k] > -INFINITY)) continue;
+    memcpy(next, q, sizeof next);
+    for (i = 0; i < own->n_arm; ++i) next[own->columns[i]] = arms[k * own->n_arm + i];
+    if (!last && !choose_arms(solver, lower, upper, near, side + 1, palms, next)) continue;
+    memcpy(q, next, sizeof next);
+    return 1;
+  }
+  return 0;
+}
+#endif
+@}@
 
 /* Puts idle fingers where they have most room, if the hand touches something by them alone; the room
  * that hand and palm have [m]. */
@@ -268,6 +397,7 @@ int @PREFIX@_hand_is_free(@PREFIX@_solver *solver, const scalar *lower, const sc
   return put_aside(solver, lower, upper, q) >= -ROUNDING;
 }
 
+@ONE_ARM{@
 int @PREFIX@_arm_is_free(@PREFIX@_solver *solver, const scalar *lower, const scalar *upper, int near,
                          scalar *q) {
 #if HAS_CLOSED_ARM
@@ -277,3 +407,29 @@ int @PREFIX@_arm_is_free(@PREFIX@_solver *solver, const scalar *lower, const sca
   return @PREFIX@_clearance(solver, q) - solver->scene.margin >= -ROUNDING;
 #endif
 }
+@}@
+@BODY{@
+void @PREFIX@_list_pairs(@PREFIX@_solver *solver, const scalar *lower, const scalar *upper) {
+  int motors[N_HAND], links[@GUARD@_LINKS];
+  find_idle(solver, lower, upper, motors, links);
+  solver->scene.listed = 0;
+  (void) about(solver, links);
+  solver->scene.listed = 1;
+}
+
+int @PREFIX@_side_is_free(@PREFIX@_solver *solver, int side, const scalar *q) {
+  return part_is_free(solver, OF_HAND + side, OF_HAND + side, q)
+      && part_is_free(solver, OF_IDLE + side, OF_IDLE + side, q);
+}
+
+int @PREFIX@_arms_are_free(@PREFIX@_solver *solver, const scalar *lower, const scalar *upper, int near,
+                           const scalar *palms, scalar *q) {
+#if HAS_CLOSED_ARM
+  return part_is_free(solver, OF_HAND, OF_TRUNK, q)
+      && choose_arms(solver, lower, upper, near, 0, palms, q);
+#else
+  (void) lower, (void) upper, (void) near, (void) palms;
+  return 0;
+#endif
+}
+@}@

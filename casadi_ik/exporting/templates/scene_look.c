@@ -20,6 +20,9 @@ static int answered(@PREFIX@_solver *solver, const scalar *q) {
 static void end_look(@PREFIX@_solver *solver, int found) {
   @PREFIX@_scene *look = &solver->scene;
   look->looking = 0;
+@BODY{@
+  look->listed = 0;
+@}@
   if (!found && solver->terms[TERMS_NEAREST] > 0 && !look->again) {
     solver->terms[TERMS_NEAREST] = 0;
     memcpy(solver->here, HOME, sizeof solver->here);
@@ -37,6 +40,7 @@ static void end_look(@PREFIX@_solver *solver, int found) {
   solver->restarts = look->restarts;
 }
 
+@ONE_ARM{@
 /* Another arm for a hand that is free, and whether that is an answer. */
 static int swung_free(@PREFIX@_solver *solver, const scalar *hand) {
   scalar q[N_MOTORS];
@@ -134,6 +138,7 @@ static void look_about(@PREFIX@_solver *solver) {
   solver->status = RUNNING;
 }
 
+@}@
 /* Begins the fit of the next hand of the round. */
 static int begin_hand(search *job) {
   @PREFIX@_scene *look = &job->scene;
@@ -167,11 +172,15 @@ static int begin_hand(search *job) {
   code = BEGIN(&map);
   job->state[STATE_PHASE] = CANDIDATE_PHASE;
   job->state[STATE_CANDIDATE] = N_CANDIDATES - 1;
+@BODY{@
+  job->state[STATE_FIRST] = N_CANDIDATES - 1;
+@}@
   job->slot = -1;
   job->loop_status = RUNNING;
   return code;
 }
 
+@ONE_ARM{@
 /* Goes on with the search: at most so many iterations of one fit, or the arms of one hand. */
 static int look_on(@PREFIX@_solver *solver, int64_t most) {
   @PREFIX@_scene *look = &solver->scene;
@@ -207,6 +216,207 @@ static int look_on(@PREFIX@_solver *solver, int64_t most) {
   return DONE;
 }
 
+@}@
+@BODY{@
+/* Where the palms are, twelve numbers a side, and as the trunk's end sees them, sixteen. */
+static int find_palms(search *job, const scalar *q, scalar *palms, scalar *seen) {
+  const scalar *inputs[1];
+  scalar *outputs[2];
+  map_job map = mapping(1, inputs, ALONE, outputs, ALONE);
+  inputs[0] = q;
+  outputs[0] = palms;
+  outputs[1] = seen;
+  return PALM(&map);
+}
+
+/* Whether a hand of a side and its palm are like none before. */
+static int is_new(const @PREFIX@_scene *look, int side, int first, const scalar *q,
+                  const scalar *palm) {
+  int64_t n;
+  int i;
+  for (n = 0; n < look->n_hands[side]; ++n) {
+    const scalar *hand = look->hands[side][n], *before = look->palms[side][n];
+    int alike = 1;
+    for (i = first; i < first + SIDE_HANDS[side]; ++i) {
+      alike &= fabs(q[HAND[i]] - hand[HAND[i]]) < LOOK_ALIKE * LOOK_RANGES[HAND[i]];
+    }
+    for (i = 0; i < 12; ++i) {
+      alike &= (i < 9 ? PALM_TURN : PALM_SHIFT) * fabs(palm[i] - before[i]) < LOOK_ALIKE;
+    }
+    if (alike) return 0;
+  }
+  return 1;
+}
+
+/* Takes an answer in, its idle fingers put elsewhere where they touch something: hands that touch
+ * nothing by themselves are kept by side. Whether it is free as a whole. */
+static int take_answer(search *job, scalar *q) {
+  @PREFIX@_scene *look = &job->scene;
+  scalar palms[12 * N_SIDES], seen[16 * N_SIDES], room;
+  int side, first = 0;
+  (void) @PREFIX@_hand_is_free(job, job->terms + TERMS_LOWER, job->terms + TERMS_UPPER, q);
+  room = least_room(job, q);
+  if (room > look->room) {
+    look->room = room;
+    memcpy(look->q, q, sizeof look->q);
+  }
+  if (room >= -LOOK_ROUNDING) return answered(job, q);
+  if (find_palms(job, q, palms, seen) != DONE) return 0;
+  for (side = 0; side < N_SIDES; first += SIDE_HANDS[side++]) {
+    const int64_t n = look->n_hands[side];
+    const scalar *palm = palms + 12 * side;
+    if (!@PREFIX@_side_is_free(job, side, q) || !is_new(look, side, first, q, palm)) continue;
+    memcpy(look->hands[side][n], q, sizeof look->hands[side][n]);
+    memcpy(look->palms[side][n], palm, sizeof look->palms[side][n]);
+    ++look->n_hands[side];
+    look->fresh = 1;
+  }
+  return 0;
+}
+
+/* What the loop is at: the fit of another hand, another trunk, or arms that were found at one. */
+enum { AT_NOTHING, AT_HAND, AT_TRUNK, AT_ARMS };
+
+/* An answer that touches something is exchanged for one that does not (`look_on`): with other trunks
+ * and arms for the same hands, then with other hands. */
+static void look_about(@PREFIX@_solver *solver) {
+  @PREFIX@_scene *look = &solver->scene;
+  scalar q[N_MOTORS];
+  if (!look->again) {
+    look->iterations = solver->iterations;
+    look->restarts = solver->restarts;
+    look->room = -INFINITY;
+  }
+  memcpy(q, solver->q, sizeof q);
+  if (least_room(solver, q) >= -LOOK_ROUNDING) {
+    end_look(solver, 1);
+    return;
+  }
+  @PREFIX@_list_pairs(solver, solver->terms + TERMS_LOWER, solver->terms + TERMS_UPPER);
+  look->looking = 1;
+  look->round = look->lot = look->tried = look->under_way = 0;
+  look->fit = N_CANDIDATES;
+  look->fresh = 1;
+  memset(look->n_hands, 0, sizeof look->n_hands);
+  if (take_answer(solver, q)) end_look(solver, 1);
+  else solver->status = RUNNING;
+}
+
+/* Trunk and arms, from a configuration on, are to carry palms; its hands stay. */
+static int begin_carry(search *job, const scalar *q, const scalar *palms, int phase) {
+  const scalar *inputs[5];
+  scalar *outputs[2];
+  map_job map = mapping(1, inputs, ALONE, outputs, ALONE);
+  int code, i;
+  for (i = 0; i < N_CANDIDATES * N_HAND; ++i) job->near[i] = q[HAND[i % N_HAND]];
+  inputs[0] = job->points;
+  inputs[1] = job->normals;
+  inputs[2] = q;
+  inputs[3] = job->terms;
+  inputs[4] = job->near;
+  outputs[0] = job->state;
+  outputs[1] = job->parameters;
+  code = BEGIN(&map);
+  memcpy(job->state + STATE_Q, q, N_MOTORS * sizeof(scalar));
+  memcpy(job->state + STATE_BEST_Q, q, N_MOTORS * sizeof(scalar));
+  memcpy(job->state + STATE_PALMS, palms, 12 * N_SIDES * sizeof(scalar));
+  for (i = 0; i < N_CARRY; ++i) job->state[CARRY_PLACES[i]] = CARRY_VALUES[i];
+  job->state[STATE_PHASE] = phase;
+  job->slot = -1;
+  job->loop_status = RUNNING;
+  return code;
+}
+
+/* The next trunk of the lot, evenly spread as all arms are, every second one up to the limits; ways
+ * to combine hands of the sides share them. */
+static int begin_trunk(search *job) {
+  @PREFIX@_scene *look = &job->scene;
+  scalar q[N_MOTORS], palms[12 * N_SIDES];
+  int64_t ways = 1, before = 0, number;
+  int i, k, side, first = 0;
+  for (side = 0; side < N_SIDES; ++side) {
+    if (look->n_hands[side] > ways) ways = look->n_hands[side];
+  }
+  for (i = 0; i < look->lot; ++i) before += LOTS[i][0];
+  if (ways > LOTS[look->lot][1]) ways = LOTS[look->lot][1];
+  number = before + look->tried / ways;
+  for (side = 0; side < N_SIDES; first += SIDE_HANDS[side++]) {
+    const int64_t n = look->tried % ways % look->n_hands[side];
+    if (!side) memcpy(q, look->hands[side][n], sizeof q);
+    for (k = first; k < first + SIDE_HANDS[side]; ++k) q[HAND[k]] = look->hands[side][n][HAND[k]];
+    memcpy(palms + 12 * side, look->palms[side][n], sizeof look->palms[side][n]);
+  }
+  for (i = 0; i < N_CARRYING; ++i) {
+    const int column = CARRYING[i];
+    const scalar low = job->terms[TERMS_LOWER + column], high = job->terms[TERMS_UPPER + column];
+    scalar part = even(number + 1, CARRYING_STEPS[i]);
+    if (number % 2) part = clipped((part - 0.5) * TRUNK_AT_ENDS + 0.5, 0.0, 1.0);
+    q[column] = low + part * (high - low);
+  }
+  return begin_carry(job, q, palms, number % 4 != 3 ? ARM_PLACEMENT_PHASE : TRUNK_PHASE);
+}
+
+/* Begins what comes next; 0: the search is over. */
+static int look_next(search *job, int *code) {
+  @PREFIX@_scene *look = &job->scene;
+  int side, known = 1;
+  for (side = 0; side < N_SIDES; ++side) known &= look->n_hands[side] > 0;
+  while (look->fit == N_CANDIDATES) {
+    if (look->lot == N_LOTS) return 0;
+    if (known && look->tried < LOTS[look->lot][0]) {
+      look->under_way = AT_TRUNK;
+      *code = begin_trunk(job);
+      return 1;
+    }
+    ++look->lot;
+    look->tried = 0;
+    /* Where a round has brought no other hand, the next will not either. */
+    if (look->round < LOOK_ROUNDS && look->fresh) look->fit = 0;
+  }
+  look->under_way = AT_HAND;
+  *code = begin_hand(job);
+  return 1;
+}
+
+/* Goes on with the search: at most so many iterations of one fit, or of one trunk. */
+static int look_on(@PREFIX@_solver *solver, int64_t most) {
+  @PREFIX@_scene *look = &solver->scene;
+  scalar q[N_MOTORS], palms[12 * N_SIDES], seen[16 * N_SIDES];
+  int code = DONE, met, at, found = 0;
+  if (most <= 0) return DONE;
+  if (look->under_way == AT_NOTHING && !look_next(solver, &code)) {
+    end_look(solver, 0);
+    return DONE;
+  }
+  if (code == DONE) code = iterate(solver, most, NULL);
+  if (code != DONE) return code == SLICE_OVER ? DONE : code;
+  at = (int) look->under_way;
+  look->under_way = AT_NOTHING;
+  memcpy(q, solver->state + STATE_Q, sizeof q);
+  met = answered(solver, q);
+  if (at == AT_HAND) {
+    look->round += ++look->fit == N_CANDIDATES;
+    found = met && take_answer(solver, q);
+  } else {
+    look->tried += at == AT_TRUNK;
+    found = met && least_room(solver, q) >= -LOOK_ROUNDING;
+  }
+  solver->status = RUNNING;
+  if (found) {
+    end_look(solver, 1);
+  } else if (at == AT_TRUNK && met) {
+    code = find_palms(solver, q, palms, seen);
+    if (code == DONE
+        && @PREFIX@_arms_are_free(solver, solver->terms + TERMS_LOWER, solver->terms + TERMS_UPPER,
+                                  solver->terms[TERMS_NEAREST] > 0, seen, q)) {
+      look->under_way = AT_ARMS;
+      code = begin_carry(solver, q, palms, TRUNK_PHASE);
+    }
+  }
+  return code;
+}
+
+@}@
 /* Goes on with what is under way. */
 static int run_on(@PREFIX@_solver *solver, int64_t most) {
   int code;

@@ -25,8 +25,21 @@ typedef struct {
   @REAL@ offsets[@MOST_PAIRS@];
   int64_t n_busy, n_held, n_pairs;
   /* The search for a hand that is free, where the answer touches something. */
+@ONE_ARM{@
   int64_t looking, again, round, fit, n_met, next, iterations, restarts, fresh, n_known, n_swung;
+@}@
+@BODY{@
+  int64_t ends[@PARTS_OF_PAIRS@], listed;
+  int64_t looking, again, round, fit, lot, tried, under_way, fresh, iterations, restarts;
+@}@
   @REAL@ q[@GUARD@_MOTORS], room; /* the answer of largest clearance */
+@BODY{@
+  /* Hands of each side that touch nothing by themselves, and where their palms are. */
+  int64_t n_hands[@SIDES@];
+  @REAL@ hands[@SIDES@][@N_LOOKED@][@GUARD@_MOTORS], palms[@SIDES@][@N_LOOKED@][12];
+@}@
+@ONE_ARM{@
   @REAL@ met[@N_CANDIDATES@ * @GUARD@_MOTORS], rated[@N_CANDIDATES@];
   @REAL@ known[@N_LOOKED@ * @N_HAND@], swung[@N_LOOKED@ * @N_HAND@];
+@}@
 } @PREFIX@_scene;

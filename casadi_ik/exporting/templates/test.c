@@ -10,7 +10,7 @@
 static @PREFIX@_solver one, other;
 
 static int is_as_stored(const @PREFIX@_solver *solver, const target *stored) {
-  return solver->status == stored->status && solver->iterations == stored->iterations
+@SCENE_TEST_FREED?@  return solver->status == stored->status && solver->iterations == stored->iterations
       && solver->restarts == stored->restarts
 @SCENE_TEST_SAME?@      && (@SCENE_TEST_OR?@!memcmp(solver->q, stored->q, sizeof stored->q));
 }

@@ -17,6 +17,7 @@ import casadi as ca
 from casadi_ik.arms.family import ArmFamily
 from casadi_ik.arms.recognise import arm_family
 from casadi_ik.arms.search import PARAMETERS, ArmTrials, Farthest
+from casadi_ik.kernels.graphs import FunctionGraph
 from casadi_ik.methods.common.bounded_step import Bounded, clip, damped_step
 from casadi_ik.methods.common.contact_fit import FIT, Tried, fresh_fit, judge, judge_contacts
 from casadi_ik.methods.common.palm import best_palm, hand_contacts, newton_polish
@@ -244,6 +245,26 @@ class BodyStep(HandFirstStep):
             rotation, origin = self._palm(s, side)
             found += [base.rotation.T @ rotation, base.inverse_apply(origin)]
         return ca.Function("seen", inputs, shared(*map(ca.densify, found)))
+
+    def palms(self) -> FunctionGraph:
+        """Where the palms are.
+
+        Returns:
+            q (n, 1) -> rotation, row by row, and origin of every palm, (12 s, 1); the same as the
+            trunk's end sees them, as the rows of (4, 4) poses, (16 s, 1).
+        """
+        q = ca.SX.sym("q", len(self.robot.actuators))
+        body = actuated(self.robot, q)
+        base = body.kinematics.links[self.robot.trunk_link]
+        found: list[Expr] = []
+        seen: list[Expr] = []
+        for side in self.sides:
+            pose = side.palm(body)
+            found += [ca.vec(pose.rotation.T), pose.origin]
+            placed = ca.horzcat(base.rotation.T @ pose.rotation, base.inverse_apply(pose.origin))
+            seen += [ca.vec(placed.T), ca.SX([0.0, 0.0, 0.0, 1.0])]
+        outputs = shared(*(ca.densify(ca.vertcat(*some)) for some in (found, seen)))
+        return FunctionGraph.of(ca.Function("palms", [q], outputs))
 
     def _palm(self, s: dict[str, Expr], side: BodySide) -> tuple[Expr, Expr]:
         return s[f"palm_rotation_{side.place}"], s[f"palm_origin_{side.place}"]
