@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import casadi_ik as ik
-from casadi_ik.exporting.ahead import uses
+from casadi_ik.exporting.project import uses
 from casadi_ik.kernels import libraries
 from casadi_ik.kernels.compiler import FLAGS, ZIG, Compiler
 from casadi_ik.kernels.function_kernel import machine_lanes

@@ -1,7 +1,6 @@
 """Calibration: the hand's own dimensions from measured fingertip poses."""
 
-from casadi_ik.calibration.describe import write_description
-from casadi_ik.calibration.estimate import LOSSES, Calibration, calibrate
+from casadi_ik.calibration.estimate import LOSSES, Calibration, calibrate, write_description
 from casadi_ik.calibration.measurements import (
     Measurements,
     read_measurements,

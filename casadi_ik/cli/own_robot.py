@@ -22,19 +22,18 @@ from casadi_ik.cli.options import Option
 from casadi_ik.cli.outputs import check_outputs, output, say
 from casadi_ik.cli.table import Answer, Said, command
 from casadi_ik.errors import InputError, MissingExtraError, UnsupportedError
-from casadi_ik.exporting.ahead import uses
 from casadi_ik.exporting.project import (
     c_project,
     check_folder,
     check_method,
     checked_prefix,
+    uses,
     wasm_project,
     write_folder,
 )
 from casadi_ik.importing import imported
 from casadi_ik.importing.capsules import worst
-from casadi_ik.importing.check import largest_difference
-from casadi_ik.importing.imported import Imported
+from casadi_ik.importing.imported import Imported, largest_difference
 from casadi_ik.kernels import cache_directory
 from casadi_ik.kernels.compiler import find_compiler
 

@@ -1,4 +1,4 @@
-"""What is written of a robot: a C project, a WebAssembly module.
+"""What is written of a robot: a C project, a WebAssembly module; and kernels compiled ahead.
 
 A folder is built beside its place, and put there when it is whole.
 """
@@ -12,15 +12,18 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+
+import numpy as np
 
 from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import InputError, KernelError, MissingExtraError, UnsupportedError, os_errors
-from casadi_ik.exporting.scene import SceneSources
-from casadi_ik.exporting.scene_of_body import BodySceneSources
+from casadi_ik.exporting.scene import BodySceneSources, SceneSources
 from casadi_ik.exporting.single import SinglePrecision, filled
 from casadi_ik.exporting.solver import FollowSources, SolverSources, hand_first
 from casadi_ik.exporting.targets import (
@@ -37,6 +40,8 @@ from casadi_ik.exporting.targets import (
     targets_header,
     written,
 )
+from casadi_ik.grasps import Contact, Grasp
+from casadi_ik.touch.hand_table import touch_library
 
 MARK = ".casadi_ik_export"
 """A file by which a folder is known as an export."""
@@ -339,3 +344,51 @@ def _module(project: Exported) -> bytes:
             complaint = "; ".join(done.stderr.splitlines()[:3]) or "no complaint"
             raise KernelError(f"zig made no WebAssembly module: {complaint[:500]}")
         return made.read_bytes()
+
+
+def uses(robot: ArmHand, everything: bool = False) -> Iterator[tuple[str, Callable[[], object]]]:
+    """Ways to use a robot that compile something, in words and as what does it.
+
+    Args:
+        robot: The robot.
+        everything: Whether scenes, choices, motions and diagnoses are among them.
+    """
+    solver = Solver(robot)
+    q = robot.random(np.random.default_rng(0), 64)  # enough for solves side by side
+
+    def targets() -> tuple[np.ndarray, np.ndarray]:
+        return robot.contacts(q)
+
+    @cache
+    def grasp() -> Grasp:
+        points, normals = robot.contacts(q[0])
+        pairs = zip(robot.fingers, points, normals, strict=True)
+        return Grasp({name: Contact(*pair) for name, *pair in pairs})
+
+    def logged() -> object:
+        with tempfile.TemporaryDirectory() as place:
+            return solver.solve_batch(*targets(), log=Path(place) / "log.mcap")
+
+    yield "forward kinematics", targets
+    yield "one target", lambda: solver.solve(grasp())
+    yield "limits ignored", lambda: Solver(robot, limits="ignore").solve(grasp())
+    yield "batches", lambda: solver.solve_batch(*targets())
+    yield "grasps of surfaces", touch_library
+    if not everything:
+        return
+
+    def beyond() -> object:
+        points, normals = targets()
+        return solver.solve_batch(points[:1] + 100.0, normals[:1], diagnose=True)
+
+    yield "real-time loops", solver.fast
+    yield "logs", logged
+    yield "diagnoses", beyond
+    yield "followers", lambda: solver.follow(q[0], period=0.001)(grasp())
+    try:
+        about = Solver(robot, scene=Scene())
+    except UnsupportedError:
+        return
+    yield "scenes", lambda: about.solve_batch(*targets())
+    yield "choices", lambda: about.choose([grasp()] * 2, limit=1)
+    yield "ways to a grasp", lambda: about.reach(grasp(), q0=q[1])

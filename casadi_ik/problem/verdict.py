@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.grasps import Tolerance
-from casadi_ik.made import made
 from casadi_ik.problem.targets import TargetBatch
 
 LIMIT_SLACK = 1e-9
@@ -265,3 +264,20 @@ def _turn(one: Array, other: Array) -> Array:
     axis = [turned[..., i, j] - turned[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))]
     cosine = turned[..., 0, 0] + turned[..., 1, 1] + turned[..., 2, 2] - 1
     return np.arctan2(np.linalg.norm(np.stack(axis, axis=-1), axis=-1), cosine)
+
+
+T = TypeVar("T")
+
+
+def made(kind: type[T], **fields: Any) -> T:
+    """An object of a frozen dataclass as its `__init__` makes it, from fields that are sound.
+
+    That sets every field by a call, which for the 17 of a solution takes as long as a hand's fit.
+
+    Args:
+        kind: A dataclass without `__post_init__` and slots.
+        fields: By name; those with a plain default may be left out.
+    """
+    found = object.__new__(kind)
+    vars(found).update(fields)
+    return found

@@ -21,7 +21,6 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, RowError, UnsupportedError
 from casadi_ik.files.writing import InBackground
 from casadi_ik.grasps import Tolerance
-from casadi_ik.made import made
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.problem.clearance import CollisionQuery, SceneCheck
@@ -30,7 +29,7 @@ from casadi_ik.problem.method import Method, Outcome, Quick
 from casadi_ik.problem.request import CLEARANCE, NO_PREFERENCE, preference
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.targets import TargetBatch
-from casadi_ik.problem.verdict import judge_errors, judge_one
+from casadi_ik.problem.verdict import judge_errors, judge_one, made
 from casadi_ik.progress import progress, someone_looks_on
 from casadi_ik.solving.batch_parts import BatchParts, SolvedPart, in_order, judged
 from casadi_ik.solving.diagnostician import Diagnostician

@@ -36,8 +36,7 @@ from casadi_ik.viewing.drawn import (
     light_lamp,
     usable,
 )
-from casadi_ik.viewing.newest import LOOKS, PAUSE, REST
-from casadi_ik.viewing.page import DraggedPage, in_turn
+from casadi_ik.viewing.page import LOOKS, PAUSE, REST, DraggedPage, in_turn
 from casadi_ik.viewing.panel import (
     Q_FORMATS,
     bars,

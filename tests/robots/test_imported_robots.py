@@ -9,7 +9,7 @@ from imported_files import FINGERS, arm, describe, hand, joint, link, urdf
 from toy_robots import grasp_at
 
 import casadi_ik as ik
-from casadi_ik.importing.check import largest_difference
+from casadi_ik.importing.imported import largest_difference
 from casadi_ik.importing.robot_shapes import TriangleTree, robot_shapes
 from casadi_ik.robots.read_tree import read_tree
 

@@ -14,7 +14,7 @@ from processes import python
 from toy_robots import grasp_of
 
 import casadi_ik as ik
-from casadi_ik.exporting.ahead import uses
+from casadi_ik.exporting.project import uses
 from casadi_ik.kernels import libraries
 from casadi_ik.kernels.compiler import Compiler, find_compiler
 

@@ -16,8 +16,8 @@ from casadi_ik.files.reading import Frame, frame_matrix
 from casadi_ik.kernels.cancellation import stop_if_cancelled
 from casadi_ik.viewing import request_of
 from casadi_ik.viewing.drawn import cameras, pose_of, quaternions
-from casadi_ik.viewing.newest import REST, Newest
 from casadi_ik.viewing.pad_page import LinkPad, corrected, save_pads
+from casadi_ik.viewing.page import REST, Newest
 from casadi_ik.viewing.panel import grasp_text
 
 

@@ -29,7 +29,6 @@ from casadi_ik.kernels.function_kernel import machine_lanes, memory
 from casadi_ik.kernels.graphs import recipe
 from casadi_ik.kernels.libraries import load_library
 from casadi_ik.kernels.loop import FOREVER, SLOTS, UNBEGUN, Followed
-from casadi_ik.made import made
 from casadi_ik.methods.common.contact_fit import fresh_fit
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.seeds import FEATURES, Seeds
@@ -41,7 +40,7 @@ from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.problem.method import Outcome, Quick
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.problem.targets import TargetBatch
-from casadi_ik.problem.verdict import LIMIT_SLACK, TOLERANCE_SLACK
+from casadi_ik.problem.verdict import LIMIT_SLACK, TOLERANCE_SLACK, made
 
 MALFORMED = -9
 """What a search returns for a question that is none."""
