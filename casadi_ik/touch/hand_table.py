@@ -17,8 +17,8 @@ from casadi_ik.collision.model import pair_table
 from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.kernels.cancellation import SLICE, drive
-from casadi_ik.kernels.codegen import c_struct, define, driver_text
-from casadi_ik.kernels.function_kernel import FunctionKernel
+from casadi_ik.kernels.codegen import WIDE, c_struct, define, driver_text
+from casadi_ik.kernels.function_kernel import FunctionKernel, machine_lanes
 from casadi_ik.kernels.graphs import FunctionGraph, recipe
 from casadi_ik.kernels.libraries import load_library
 from casadi_ik.problem.clearance import SceneCheck
@@ -363,12 +363,13 @@ SnapJob = c_struct("snap_job", driver="snap")
 
 
 def touch_library() -> Any:
-    """The compiled drivers `touch` and `apart`.
+    """The compiled drivers `touch`, `apart` and `loads`.
 
     Raises:
         UnsupportedError: There is no compiler.
     """
     parts = (
+        WIDE if machine_lanes() else "",
         "typedef double scalar;\ntypedef double real;\n",
         define({"STEP_IN": 0, "STEP_OUT": 0}),
         *(driver_text(name) for name in ("common", "touch_job", "touch")),

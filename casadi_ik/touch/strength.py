@@ -7,6 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from casadi_ik.arrays import Array
+from casadi_ik.kernels.cancellation import SLICE, drive
+from casadi_ik.kernels.codegen import c_struct
+from casadi_ik.touch.hand_table import touch_library
 
 EDGES = 8
 """Edges of the pyramid within a friction cone."""
@@ -16,6 +19,9 @@ DIRECTIONS = np.concatenate([np.eye(6), -np.eye(6)])
 
 FORCES = [0, 1, 2, 6, 7, 8]
 """Those of them that are forces."""
+
+STEPS, ENOUGH = 50, 1e-9
+"""Most iterations of a linear program, and the mean of x z that is followed by the last."""
 
 
 def generators(
@@ -51,18 +57,17 @@ def generators(
     return np.concatenate([force, torque], axis=-1).reshape(k, c * (EDGES + 2), 6).swapaxes(1, 2)
 
 
-def loads(wrenches: Array, directions: Array = DIRECTIONS, steps: int = 25) -> Array:
+def loads(wrenches: Array, directions: Array = DIRECTIONS) -> Array:
     """Largest s with -s d = W x, x >= 0, sum x <= 1: what a squeeze of 1 N holds against d.
 
     Args:
         wrenches: (k, 6, g) of the cones' edges.
         directions: (d, 6).
-        steps: Of the interior-point method.
 
     Returns:
         (k, d) loads [N per N]; 0 where nothing is held.
     """
-    return np.maximum(_solved(wrenches, directions, steps)[..., -2], 0.0)
+    return np.maximum(_solved(wrenches, directions)[..., -2], 0.0)
 
 
 def closed(wrenches: Array) -> Array:
@@ -172,65 +177,37 @@ def cross_matrices(vectors: Array) -> Array:
     return np.cross(vectors[..., None, :], np.eye(3)).swapaxes(-1, -2)
 
 
-def _solved(wrenches: Array, directions: Array, steps: int = 25) -> Array:
-    """(k, d, g + 2) x, s and slack of the linear programs of `loads`.
+LoadJob = c_struct("load_job", driver="touch")
 
-    Directions are the same for all, (d, 6), or their own, (k, d, 6). All programs are solved side
-    by side by Mehrotra's predictor and corrector.
+COLUMN = 14 * 4
+"""Numbers of a column that four programs work on (drivers/touch.c)."""
+
+
+def _solved(wrenches: Array, directions: Array) -> Array:
+    """(k, d, g + 2) x, s and slack of the linear programs of `loads`, by compiled code.
+
+    Directions are the same for all, (d, 6), or their own, (k, d, 6).
+
+    Raises:
+        UnsupportedError: There is no compiler.
     """
     k, _, g = wrenches.shape
     d = directions.shape[-2]
-    # min -s: columns x (g), s, slack; rows: W x + s d = 0, sum x + slack = 1.
-    count = k * d
-    matrix = np.zeros((count, 7, g + 2))
-    matrix[:, :6, :g] = np.repeat(wrenches, d, axis=0)
-    matrix[:, :6, g] = np.broadcast_to(directions, (k, d, 6)).reshape(-1, 6)
-    matrix[:, 6, :g] = matrix[:, 6, g + 1] = 1.0
-    right = np.zeros(7)
-    right[6] = 1.0
-    cost = np.zeros(g + 2)
-    cost[g] = -1.0
-    x = np.full((count, g + 2), 1.0 / (g + 2))
-    z, y = np.ones_like(x), np.zeros((count, 7))
-    solved, left = np.zeros_like(x), np.arange(count)
-    for _ in range(steps):
-        primal = right - np.einsum("kij,kj->ki", matrix, x)
-        dual = cost - np.einsum("kij,ki->kj", matrix, y) - z
-        gap = (x * z).mean(axis=1)
-        scaled = x / z
-        normal = (matrix * scaled[:, None]) @ matrix.swapaxes(1, 2)
-        # Contacts on a line leave rows that depend on each other.
-        normal[:, range(7), range(7)] += 1e-12 * (1.0 + np.trace(normal, axis1=1, axis2=2))[:, None]
-
-        def step(target: Array) -> tuple[Array, Array, Array]:
-            """Newton's step towards x z = target."""
-            rest = dual - target / x + z  # noqa: B023
-            side = primal + np.einsum("kij,kj->ki", matrix, scaled * rest)  # noqa: B023
-            dy = np.linalg.solve(normal, side[..., None])[..., 0]  # noqa: B023
-            dx = scaled * (np.einsum("kij,ki->kj", matrix, dy) - rest)  # noqa: B023
-            return dx, dy, (target - z * dx) / x - z  # noqa: B023
-
-        dx, _, dz = step(np.zeros_like(x))
-        ahead = _longest(x, dx), _longest(z, dz)
-        after = ((x + ahead[0][:, None] * dx) * (z + ahead[1][:, None] * dz)).mean(axis=1)
-        center = (after / np.maximum(gap, 1e-300)) ** 3
-        dx, dy, dz = step((center * gap)[:, None] - dx * dz)
-        a, b = 0.99 * _longest(x, dx), 0.99 * _longest(z, dz)
-        x = np.maximum(x + a[:, None] * dx, 1e-14)
-        y, z = y + b[:, None] * dy, np.maximum(z + b[:, None] * dz, 1e-14)
-        done = gap < 1e-9
-        if done.any():
-            solved[left[done]] = x[done]
-            left = left[~done]
-            matrix, x, y, z = (part[~done] for part in (matrix, x, y, z))
-            if not len(left):
-                break
-    solved[left] = x
-    return solved.reshape(k, d, g + 2)
-
-
-def _longest(value: Array, way: Array) -> Array:
-    """How far to go so that all stays positive, at most 1, (k,)."""
-    with np.errstate(over="ignore"):
-        ratio = np.where(way < 0, -value / np.minimum(way, -1e-300), np.inf)
-    return np.minimum(1.0, ratio.min(axis=1))
+    solved = np.empty((k, d, g + 2))
+    arrays = {
+        "wrenches": np.ascontiguousarray(wrenches),
+        "directions": np.ascontiguousarray(np.broadcast_to(directions, (k, d, 6))),
+        "solved": solved,
+        "work": np.empty((g + 2) * COLUMN),
+    }
+    job = LoadJob(
+        **{name: array.ctypes.data for name, array in arrays.items()},
+        enough=ENOUGH,
+        edges=g,
+        each=d,
+        steps=STEPS,
+        count=k * d,
+        slice=SLICE,
+    )
+    drive("loads", touch_library()["casadi_ik_loads"], job)
+    return solved

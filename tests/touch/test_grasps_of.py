@@ -13,7 +13,7 @@ from scipy.optimize import linprog
 import casadi_ik as ik
 from casadi_ik import errors
 from casadi_ik.cli.grasp import found_data
-from casadi_ik.touch.strength import GIVE, stiffnesses
+from casadi_ik.touch.strength import DIRECTIONS, GIVE, generators, loads, stiffnesses
 
 PLACE = np.eye(4)
 PLACE[:3, 3] = [0.5, 0.1, 0.055]
@@ -162,6 +162,43 @@ def test_loads_are_those_of_linear_programs(found):
         held.append(-linprog(cost, most, [1.0], whole, np.zeros(6)).fun)
     # As the object gives way, some of it is lost.
     assert 0.25 * min(held) < one.load < 1.25 * min(held) + 0.02
+
+
+LINE = np.array([[[-0.03, 0, 0], [0.03, 0, 0], [0.01, 0, 0]]])
+
+
+@pytest.mark.parametrize(
+    ("points", "normals", "off"),
+    [
+        pytest.param(None, None, 1e-9, id="anywhere"),
+        pytest.param(None, "middle", 1e-9, id="towards their middle"),
+        pytest.param(LINE, -LINE, 1e-9, id="on a line"),
+        pytest.param(LINE, -LINE, 1e-6, id="nearly on a line"),
+        pytest.param(np.full((1, 3, 3), 0.02), np.ones((1, 3, 3)), 1e-9, id="all the same"),
+        pytest.param(LINE[:, [0, 1, 0]], -LINE[:, [0, 1, 0]], 1e-9, id="one of them twice"),
+    ],
+)
+def test_loads_of_any_contacts_are_those_of_linear_programs(points, normals, off, rng):
+    """What nothing holds is 0; HiGHS is not surer than `off` where contacts nearly depend."""
+    for count in (2, 3, 5) if points is None else (3,):
+        at = 0.03 * rng.normal(size=(6, count, 3)) if points is None else points
+        if off > 1e-9:
+            at = at + 1e-6 * rng.normal(size=at.shape)
+        facing = rng.normal(size=at.shape) if normals is None else normals
+        facing = -at + 0.01 * rng.normal(size=at.shape) if isinstance(facing, str) else facing
+        facing = facing / np.linalg.norm(facing, axis=-1, keepdims=True)
+        wrenches = generators(at, facing, 0.5, np.zeros(3), 0.05)
+        found = loads(wrenches)
+        for own, row in zip(wrenches, found, strict=True):
+            cost, most = np.append(np.zeros(own.shape[1]), -1.0), np.ones((1, own.shape[1] + 1))
+            most[0, -1] = 0.0
+            for direction, load in zip(DIRECTIONS, row, strict=True):
+                whole = np.column_stack([own, direction])
+                solved = linprog(cost, most, [1.0], whole, np.zeros(6), options=EXACTLY)
+                assert abs(-solved.fun - load) < 2 * off
+
+
+EXACTLY = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
 
 
 @pytest.mark.parametrize("radius", [0.0, 0.012])

@@ -378,3 +378,196 @@ DRIVER(apart, touch_job) {
   }
   return DONE;
 }
+
+/* Loads: linear programs max s, W x + s d = 0, sum x + slack = 1, all at least 0, by the predictor and
+ * corrector of S. Mehrotra (1992), SIDE of them side by side. They end in the middle of what is
+ * optimal: where several edges of a cone would do, these share. */
+enum { ROWS = 7, SIDE = 4 };
+
+/* A number of each, and for which of them something holds. */
+typedef scalar few __attribute__((vector_size(SIDE * sizeof(scalar)), aligned(16)));
+typedef int64_t few_of __attribute__((vector_size(SIDE * sizeof(scalar)), aligned(16)));
+
+#define SMALLEST 1e-14 /* of variables and dual slacks */
+
+/* A share more of the normal matrix's diagonal, for rows that depend on each other, as of contacts on a
+ * line; each step is solved so often, for what that leaves. */
+#define MORE 1e-14
+#define PASSES 2
+
+/* A column of the matrix, its variable and dual slack with their inverses, and the step of both. */
+typedef struct {
+  few at[ROWS], x, z, over_x, over_z, dual, dx, dz;
+} column;
+
+typedef struct {
+  const scalar *wrenches;      /* (count / each, 6, edges) W */
+  const scalar *directions;    /* (count, 6) d */
+  scalar *solved;              /* (count, edges + 2) x, s and slack */
+  scalar *work;                /* (edges + 2) columns */
+  scalar enough;               /* a mean of x z that is followed by the last step */
+  int64_t edges, each, steps, count, next;
+  scalar slice;
+} load_job;
+
+static few most_of(few a, few b) {
+  const few_of first = a > b;
+  return (few) ((first & (few_of) a) | (~first & (few_of) b));
+}
+
+/* Divides by the matrix of a factor, in place. */
+static void divided(few factor[ROWS][ROWS], few *y) {
+  int i, k;
+  for (i = 0; i < ROWS; ++i) {
+    for (k = 0; k < i; ++k) y[i] -= factor[i][k] * y[k];
+    y[i] *= factor[i][i];
+  }
+  for (i = ROWS - 1; i >= 0; --i) {
+    for (k = i + 1; k < ROWS; ++k) y[i] -= factor[k][i] * y[k];
+    y[i] *= factor[i][i];
+  }
+}
+
+static few along(const column *c, const few *y) {
+  few sum = c->at[0] * y[0];
+  int i;
+  for (i = 1; i < ROWS; ++i) sum += c->at[i] * y[i];
+  return sum;
+}
+
+/* Newton's step to where x z is `goal` less dx dz of the step before. */
+static void newton(column *all, int64_t n, few factor[ROWS][ROWS], const few *off, few goal, few *y) {
+  few rest[ROWS];
+  int64_t j;
+  int i, pass;
+  for (j = 0; j < n; ++j) {
+    column *c = all + j;
+    c->dz = goal - c->dx * c->dz;
+    c->dx = c->dual + c->z - c->dz * c->over_x;
+  }
+  memset(y, 0, ROWS * sizeof(few));
+  for (pass = 0; pass < PASSES; ++pass) {
+    for (i = 0; i < ROWS; ++i) rest[i] = off[i];
+    for (j = 0; j < n; ++j) {
+      const column *c = all + j;
+      const few part = c->x * c->over_z * (c->dx - along(c, y));
+      for (i = 0; i < ROWS; ++i) rest[i] += c->at[i] * part;
+    }
+    divided(factor, rest);
+    for (i = 0; i < ROWS; ++i) y[i] += rest[i];
+  }
+  for (j = 0; j < n; ++j) {
+    column *c = all + j;
+    c->dx = c->x * c->over_z * (along(c, y) - c->dx);
+    c->dz = (c->dz - c->z * c->dx) * c->over_x - c->z;
+  }
+}
+
+/* How far to go, at most once, so that all x and all z stay positive. */
+static void longest(const column *all, int64_t n, few *x, few *z) {
+  int64_t j;
+  *x = *z = (few) {0} + 1;
+  for (j = 0; j < n; ++j) {
+    *x = most_of(*x, -all[j].dx * all[j].over_x);
+    *z = most_of(*z, -all[j].dz * all[j].over_z);
+  }
+  *x = 1 / *x;
+  *z = 1 / *z;
+}
+
+/* Factor of A diag(x / z) A', whose diagonal is inverted. */
+static void factorised(const column *all, int64_t n, few a[ROWS][ROWS]) {
+  int64_t j;
+  int i, k, l;
+  memset(a, 0, ROWS * ROWS * sizeof(few));
+  for (j = 0; j < n; ++j) {
+    const few ratio = all[j].x * all[j].over_z;
+    for (i = 0; i < ROWS; ++i) {
+      const few part = ratio * all[j].at[i];
+      for (k = 0; k <= i; ++k) a[i][k] += part * all[j].at[k];
+    }
+  }
+  for (k = 0; k < ROWS; ++k) {
+    const few more = MORE * a[k][k] + 1e-300;
+    a[k][k] += more;
+    for (l = 0; l < k; ++l) a[k][k] -= a[k][l] * a[k][l];
+    a[k][k] = most_of(a[k][k], more);
+    for (i = 0; i < SIDE; ++i) a[k][k][i] = 1 / sqrt(a[k][k][i]);
+    for (i = k + 1; i < ROWS; ++i) {
+      for (l = 0; l < k; ++l) a[i][k] -= a[i][l] * a[k][l];
+      a[i][k] *= a[k][k];
+    }
+  }
+}
+
+/* One iteration; returns the mean of x z before. */
+static few load_step(column *all, int64_t n, few *y) {
+  const few nothing = {0};
+  few factor[ROWS][ROWS], off[ROWS], dy[ROWS], gap = nothing, after = nothing, x, z;
+  int64_t j;
+  int i;
+  memset(off, 0, sizeof off);
+  off[ROWS - 1] += 1;
+  for (j = 0; j < n; ++j) {
+    column *c = all + j;
+    c->over_x = 1 / c->x;
+    c->over_z = 1 / c->z;
+    c->dx = c->dz = nothing;
+    c->dual = -c->z - (j == n - 2);
+    for (i = 0; i < ROWS; ++i) {
+      off[i] -= c->at[i] * c->x;
+      c->dual -= c->at[i] * y[i];
+    }
+    gap += c->x * c->z;
+  }
+  factorised(all, n, factor);
+  newton(all, n, factor, off, nothing, dy);
+  longest(all, n, &x, &z);
+  for (j = 0; j < n; ++j) after += (all[j].x + x * all[j].dx) * (all[j].z + z * all[j].dz);
+  gap /= (scalar) n;
+  after /= gap * (scalar) n;
+  newton(all, n, factor, off, after * after * after * gap, dy);
+  longest(all, n, &x, &z);
+  for (j = 0; j < n; ++j) {
+    all[j].x = most_of(all[j].x + 0.99 * x * all[j].dx, nothing + SMALLEST);
+    all[j].z = most_of(all[j].z + 0.99 * z * all[j].dz, nothing + SMALLEST);
+  }
+  for (i = 0; i < ROWS; ++i) y[i] += 0.99 * z * dy[i];
+  return gap;
+}
+
+DRIVER(loads, load_job) {
+  const scalar limit = monotonic() + job->slice;
+  const int64_t n = job->edges + 2;
+  column *all = (column *) job->work;
+  for (; job->next < job->count; job->next += SIDE) {
+    const int64_t here = job->count - job->next < SIDE ? job->count - job->next : SIDE;
+    int64_t step, j, l, left = here;
+    int done[SIDE] = {0}, i;
+    few y[ROWS];
+    if (monotonic() > limit) return SLICE_OVER;
+    memset(y, 0, sizeof y);
+    memset(all, 0, (size_t) n * sizeof(column));
+    for (l = 0; l < SIDE; ++l) { /* where there are less, the last several times */
+      const int64_t number = job->next + (l < here ? l : here - 1);
+      const scalar *wrench = job->wrenches + number / job->each * 6 * job->edges;
+      for (j = 0; j < n; ++j) {
+        for (i = 0; i < 6 && j < job->edges; ++i) all[j].at[i][l] = wrench[i * job->edges + j];
+        all[j].at[6][l] = j != job->edges;
+        all[j].x[l] = 1 / (scalar) n;
+        all[j].z[l] = 1;
+      }
+      for (i = 0; i < 6; ++i) all[job->edges].at[i][l] = job->directions[6 * number + i];
+    }
+    for (step = 1; step <= job->steps && left; ++step) {
+      const few gap = load_step(all, n, y);
+      for (l = 0; l < here; ++l) {
+        if (done[l] || (gap[l] >= job->enough && step < job->steps)) continue;
+        for (j = 0; j < n; ++j) job->solved[n * (job->next + l) + j] = all[j].x[l];
+        done[l] = 1;
+        --left;
+      }
+    }
+  }
+  return DONE;
+}
