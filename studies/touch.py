@@ -143,10 +143,10 @@ def solve(cell: Cell) -> dict[str, Any]:
     pose = placed(surface, cell.pose)
     asked = {"pose": pose, "mu": MU, "seed": cell.seed}
     try:
-        solver.grasps_of(surface, limit=1, **asked)  # the object's scene, the hand's table
+        solver.grasps_of(surface, limit=1, among=1, **asked)  # the object's scene, the hand's table
     except ik.errors.DescriptionError as error:
         return {"count": 0, "reason": f"refused: {error}"}
-    first = solver.grasps_of(surface, limit=1, **asked)
+    first = solver.grasps_of(surface, limit=1, among=1, **asked)
     found = solver.grasps_of(surface, limit=cell.limit, **asked)
     if not len(found):
         return {"count": 0, "reason": found.reason, "time": found.time}

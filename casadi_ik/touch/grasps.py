@@ -241,6 +241,7 @@ def grasps_of(
     seed: int = 0,
     prefer: Judgement = "load",
     q0: ArrayLike | None = None,
+    among: int = 200,
 ) -> FoundGrasps:
     """Find grasps of an object that the arm and the hand can make, free of collision.
 
@@ -262,6 +263,8 @@ def grasps_of(
         prefer: What comes first: "load", "clearance", "limits", "q0", or a function of the
             robot and configurations (m, n) that gives scores (m,), higher is better.
         q0: (n,) where the robot is [rad or m]; None is `robot.home`.
+        among: Of so many distinct grasps, if there are, the best are given: with a small `limit`
+            this decides how good they are, and how long it takes.
 
     Returns:
         The grasps, best first, with how many candidates passed each stage.
@@ -283,7 +286,8 @@ def grasps_of(
     begin, chosen = time.process_time(), TouchParameters()
     robot = solver.robot
     place = np.eye(4) if pose is None else one_pose(pose)
-    _check(fingers, mu, hold, limit, prefer)
+    _check(fingers, mu, hold, limit, among, prefer)
+    goal = max(limit, among)
     fingers = min(fingers, len(robot.fingers))
     table = HandTable.of(robot)
     arms, judge, hands = _solvers(solver, table, surface, place, chosen)
@@ -291,8 +295,8 @@ def grasps_of(
     start = None if q0 is None else robot.configuration(q0)
     parts: list[_Made] = []
     known, drawn, tried, alike, wanted = 0, 0, 0, 0, chosen.first
-    with progress(limit) as show:
-        while generator.fits and known < limit and tried < chosen.most:
+    with progress(goal) as show:
+        while generator.fits and known < goal and tried < chosen.most:
             if tried:
                 generator.look()
             some = generator.candidates(wanted)
@@ -302,14 +306,14 @@ def grasps_of(
             new = 0 if made is None else len(made.rows)
             if made is not None:
                 parts.append(made)
-                show(min(new, limit - known))
+                show(min(new, goal - known))
                 known += new
             alike = generator.alike if new else alike + generator.alike
-            if alike > max(limit, chosen.seldom * max(new, 1)):
+            if alike > max(goal, chosen.seldom * max(new, 1)):
                 break  # nearly each is like one found before
             if generator.asked >= chosen.lost and not known:
                 break  # the arm reaches none
-            share = 1.2 * (limit - known) / known if known else 1.0
+            share = 1.2 * (goal - known) / known if known else 1.0
             wanted = int(np.clip(share * drawn, chosen.first, min(10 * drawn, chosen.round)))
     found = _ranked(robot, generator, hands, parts, place, limit, prefer, start, mu)
     return replace(found, time=time.process_time() - begin)
@@ -343,6 +347,7 @@ def _check(
     mu: float,
     hold: tuple[float, float] | None,
     limit: int,
+    among: int,
     prefer: Judgement,
 ) -> None:
     """Refuse what cannot be asked for."""
@@ -351,8 +356,9 @@ def _check(
     if not 0 < mu < np.inf:
         raise InputError(f"mu: found {mu!r}, expected a friction coefficient > 0")
     _check_hold(hold)
-    if not isinstance(limit, int) or limit < 1:
-        raise InputError(f"limit: found {limit!r}, expected an integer >= 1")
+    for name, number in {"limit": limit, "among": among}.items():
+        if not isinstance(number, int) or number < 1:
+            raise InputError(f"{name}: found {number!r}, expected an integer >= 1")
     if not callable(prefer) and prefer not in RANKINGS:
         raise InputError(f"prefer: found {prefer!r}, expected {', '.join(RANKINGS)} or a function")
 

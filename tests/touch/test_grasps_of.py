@@ -33,7 +33,7 @@ def surface(tmp_path_factory):
 @pytest.fixture(scope="module", params=["panda+panda_hand", "panda+allegro_right"])
 def found(request, surface):
     solver = solver_of(request.param)
-    return solver, solver.grasps_of(surface, PLACE, limit=12, seed=1)
+    return solver, solver.grasps_of(surface, PLACE, limit=12, among=12, seed=1)
 
 
 def test_samples_lie_on_the_surface_and_face_outwards(surface):
@@ -78,7 +78,7 @@ def test_things_beside_the_object_are_kept_clear_of(surface):
         }
     )
     solver = ik.Solver(ik.load_robot("panda+allegro_right"), scene=scene)
-    found = solver.grasps_of(surface, PLACE, limit=10)
+    found = solver.grasps_of(surface, PLACE, limit=10, among=10)
     assert len(found) == 10
     for one in found:
         assert solver.solve(one.grasp, q0=one.q).success
@@ -120,7 +120,7 @@ def test_no_pad_hovers_beyond_an_edge():
     pose[:3, 3] = [0.5, 0.1, 0.047]
     surface = ik.load_surface("sugar_box")
     half = np.abs(surface.points).max(axis=0)
-    found = solver.grasps_of(surface, pose, limit=60)
+    found = solver.grasps_of(surface, pose, limit=60, among=60)
     assert len(found) == 60
     for one in found:
         points, normals = solver.robot.contacts(one.q)
@@ -353,9 +353,9 @@ def test_bad_noise_is_refused(found):
 
 def test_seeds_decide_and_jobs_do_not(found, surface):
     solver, grasps = found
-    again = solver.grasps_of(surface, PLACE, limit=12, seed=1, jobs=2)
+    again = solver.grasps_of(surface, PLACE, limit=12, among=12, seed=1, jobs=2)
     assert all(np.array_equal(a.q, b.q) for a, b in zip(grasps, again, strict=True))
-    other = solver.grasps_of(surface, PLACE, limit=12, seed=2)
+    other = solver.grasps_of(surface, PLACE, limit=12, among=12, seed=2)
     assert not all(np.array_equal(a.q, b.q) for a, b in zip(grasps, other, strict=True))
 
 
@@ -363,18 +363,28 @@ def test_seeds_decide_and_jobs_do_not(found, surface):
 def test_without_a_compiler_it_is_refused(found, surface, monkeypatch):
     monkeypatch.setenv("CC", "none")
     with pytest.raises(errors.UnsupportedError, match="grasps_of: found no C compiler"):
-        found[0].grasps_of(surface, PLACE, limit=12)
+        found[0].grasps_of(surface, PLACE, limit=12, among=12)
 
 
 def test_what_has_to_be_held_is_held(surface):
-    found = solver_of("panda+panda_hand").grasps_of(surface, PLACE, limit=5, hold=(0.1, 18.0))
+    found = solver_of("panda+panda_hand").grasps_of(
+        surface, PLACE, limit=5, among=5, hold=(0.1, 18.0)
+    )
     assert len(found)
     assert all(one.load * 18.0 >= 0.1 * 9.8 for one in found)
 
 
+def test_the_best_of_many_are_given(found, surface):
+    solver, few = found
+    many = solver.grasps_of(surface, PLACE, limit=40, seed=1, among=1)
+    best = solver.grasps_of(surface, PLACE, limit=12, seed=1, among=40)
+    assert [one.load for one in best] == [one.load for one in many[:12]]
+    assert np.mean([one.load for one in best]) > np.mean([one.load for one in few])
+
+
 def test_a_function_may_rank(surface):
     found = solver_of("panda+panda_hand").grasps_of(
-        surface, PLACE, limit=5, prefer=lambda robot, q: robot.palm(q)[:, 2, 3]
+        surface, PLACE, limit=5, among=20, prefer=lambda robot, q: robot.palm(q)[:, 2, 3]
     )
     assert [one.score for one in found] == sorted((one.score for one in found), reverse=True)
 
@@ -402,6 +412,7 @@ def test_the_search_ends_when_nothing_new_is_found(tmp_path):
         ({"mu": 0.0}, "mu: found 0.0, expected a friction coefficient > 0"),
         ({"hold": (0.2, -1.0)}, "hold: found"),
         ({"limit": 0}, "limit: found 0"),
+        ({"among": 0}, "among: found 0"),
         ({"prefer": "best"}, "prefer: found 'best'"),
         ({"pose": np.zeros((4, 4))}, "pose: its first three columns"),
     ],
@@ -423,7 +434,7 @@ def test_a_mesh_that_is_inside_out_is_turned_and_said(tmp_path, surface):
     assert ((turned.faces * turned.points).sum(axis=1) > 0).all()
     assert turned.notes == ("the mesh was inside out: its triangles are turned",)
     assert not surface.notes
-    found = solver_of("panda+panda_hand").grasps_of(turned, PLACE, limit=3)
+    found = solver_of("panda+panda_hand").grasps_of(turned, PLACE, limit=3, among=3)
     assert len(found) == 3
     assert "inside out" in str(found)
 
@@ -433,7 +444,7 @@ def test_an_open_mesh_serves_and_is_said(tmp_path):
     mesh.update_faces(mesh.triangles_center[:, 2] < 0.049)
     opened = ik.load_surface(written(tmp_path, mesh))
     assert opened.notes == ("the mesh is open: 128 edges have one triangle only",)
-    assert len(solver_of("panda+panda_hand").grasps_of(opened, PLACE, limit=3)) == 3
+    assert len(solver_of("panda+panda_hand").grasps_of(opened, PLACE, limit=3, among=3)) == 3
 
 
 def test_triangles_that_face_opposite_ways_are_refused(tmp_path):
@@ -487,7 +498,7 @@ def test_specks_that_a_scanner_leaves_are_no_parts(tmp_path):
     speck = trimesh.Trimesh([[0, 0, 0.06], [1e-3, 0, 0.06], [0, 1e-3, 0.06]], [[0, 1, 2]])
     trimesh.util.concatenate([body, speck]).export(tmp_path / "scan.stl")
     found = solver_of("panda+panda_hand").grasps_of(
-        ik.load_surface(tmp_path / "scan.stl"), PLACE, limit=3
+        ik.load_surface(tmp_path / "scan.stl"), PLACE, limit=3, among=3
     )
     assert len(found) == 3
 
@@ -508,6 +519,6 @@ def test_a_label_that_stands_off_is_a_thin_part(tmp_path):
     body = trimesh.creation.cylinder(0.033, 0.1, sections=64)
     trimesh.util.concatenate([body, label]).export(tmp_path / "labelled.stl")
     found = solver_of("panda+panda_hand").grasps_of(
-        ik.load_surface(tmp_path / "labelled.stl"), PLACE, limit=3
+        ik.load_surface(tmp_path / "labelled.stl"), PLACE, limit=3, among=3
     )
     assert len(found) == 3
