@@ -37,6 +37,8 @@ ROBOTS = {
     "panda+allegro_right": "Panda · Allegro",
     "baxter_ar10": "Baxter · AR10",
     "panda+shadow": "Panda · Shadow",
+    "two_ur10e+barrett_bh8_280": "Two UR10e · Barretts",
+    "g1+dex3": "G1 · two Dex3",
 }
 """What can be chosen, and what it is called there."""
 

@@ -17,7 +17,10 @@ const UP = new THREE.Vector3(0, 1, 0);
 const ALONG = new THREE.Vector3(0, 0, 1);
 const PAD = [0.0056, 0.003]; // radius and thickness [m]
 
-export const COLORS = ["#f0a400", "#2f7fd6", "#16a39a", "#b04fc9", "#e0528a"];
+// Of fingers: as many as two hands have.
+export const COLORS = [
+  "#f0a400", "#2f7fd6", "#16a39a", "#b04fc9", "#e0528a", "#8fae1b", "#7a5a3c", "#5b4fcf", "#d8492a", "#6f8796",
+];
 
 const solid = (color) => new THREE.MeshStandardMaterial({ color, roughness: 0.7, metalness: 0 });
 

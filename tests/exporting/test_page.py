@@ -17,16 +17,16 @@ from browser import Browser, Page
 
 import casadi_ik as ik
 from casadi_ik.exporting import project
-from casadi_ik.exporting.project import wasm_project, write_folder
+from casadi_ik.exporting.project import checked_prefix, wasm_project, write_folder
 from casadi_ik.kernels.clearance_kernel import ClearanceKernel
 
 BUILD = Path(__file__).parents[2] / "page" / "build.py"
-ROBOT = "kuka_lwr_barrett"
+ROBOT, BODY = "kuka_lwr_barrett", "two_ur10e+barrett_bh8_280"
 ANSWERED = "globalThis.casadiIk?.now.answer && casadiIk.now.shown === casadiIk.now.answer.q"
 
 
 def build(out: Path, kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The page of one robot, and its exported module.
+    """The page of two robots, and their exported modules.
 
     Compiled without optimisation, in a third of the time: that both give the same bits is what the
     test of the module without a scene finds.
@@ -37,7 +37,7 @@ def build(out: Path, kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plainly = tuple("-O0" if word == "-O2" else word for word in project.COMMAND)
     # Without optimisation zig guards the stack by a function that a browser does not have.
     monkeypatch.setattr(project, "COMMAND", (*plainly, "-fno-stack-protector"))
-    words = ["build", "--robots", ROBOT, "--out", str(out), "--keep", str(kept)]
+    words = ["build", "--robots", ROBOT, BODY, "--out", str(out), "--keep", str(kept)]
     monkeypatch.setattr(sys, "argv", words)
     try:
         runpy.run_path(str(BUILD), run_name="__main__")
@@ -256,6 +256,30 @@ def used_on_a_phone(page: Page) -> None:
     assert page.complaints == []
 
 
+def two_hands_hold(page: Page) -> None:
+    """A robot of two arms is chosen: its six fingers differ, one hand moves and the other stays."""
+    robot = ik.load_robot(BODY)
+    page.evaluate(f"document.querySelector('[data-robot=\"{BODY}\"]').click()")
+    page.wait(f"casadiIk.now.robot?.name === '{BODY}' && {ANSWERED}")
+    settled(page)
+    assert page.evaluate("casadiIk.now.solving.robot.fingers") == list(robot.fingers)
+    dots = "[...document.querySelectorAll('#fingers i')].map((dot) => dot.style.background)"
+    assert len(set(page.evaluate(dots))) == len(robot.fingers) == 6
+    side = "document.querySelector('aside')"
+    assert page.evaluate(f"{side}.scrollWidth <= {side}.clientWidth")
+    before = asked(page)
+    x, y = page.evaluate("casadiIk.pixel('point 3')")
+    page.drag((x, y), (x + 3, y - 3), steps=2)
+    settled(page)
+    after = asked(page)
+    assert np.linalg.norm(after[3] - before[3]) > 1e-3
+    assert np.array_equal(after[:3], before[:3])
+    assert now(page, "answer.status") == ik.Status.SOLVED
+    points, _ = robot.contacts(np.array(page.evaluate("[...casadiIk.now.answer.q]")))
+    assert np.linalg.norm(points - after, axis=1).max() <= 5.001e-3
+    assert page.complaints == []
+
+
 def as_in_python(module: Path) -> None:
     """The exported module gives the stored answers bit for bit, in a scene too."""
     done = subprocess.run(["node", "test.mjs"], cwd=module, capture_output=True, text=True)
@@ -274,9 +298,11 @@ def test_page(
     out, kept = tmp_path / "page", tmp_path / "module"
     build(out, kept, monkeypatch)
     as_in_python(kept / ROBOT)
+    as_in_python(kept / checked_prefix(None, BODY))
     browser: Browser = request.getfixturevalue("browser")
     url = (out / "index.html").as_uri()
     used_by_mouse(opened(browser, url, 900, 600), robot, browser, url)
+    two_hands_hold(opened(browser, url, 900, 600))
     used_on_a_phone(opened(browser, url, 360, 740, phone=True))
 
 
