@@ -33,6 +33,7 @@ class Joint:
         velocity: Velocity limit [rad/s or m/s], inf if unknown.
         coupling: What the joint follows; None if it is an actuator itself.
         part: "arm", "mount" or "hand".
+        effort: Largest torque or force [N m or N], inf if unknown.
     """
 
     name: str
@@ -46,6 +47,7 @@ class Joint:
     velocity: float
     coupling: Coupling | None
     part: str
+    effort: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,7 @@ class Actuator:
         upper: Upper limit, likewise.
         velocity: Velocity limit [unit/s], inf if unknown.
         part: "arm" or "hand".
+        effort: Largest torque or force, at its own position [N m or N], inf if unknown.
     """
 
     name: str
@@ -67,6 +70,7 @@ class Actuator:
     upper: float
     velocity: float
     part: str
+    effort: float = np.inf
 
 
 @dataclass(frozen=True, eq=False)

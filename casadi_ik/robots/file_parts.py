@@ -175,6 +175,7 @@ class _Chosen:
                 joint.upper,
                 joint.velocity,
                 joint.part,
+                joint.effort,
             )
             for joint in joints
             if joint.type != "fixed" and joint.coupling is None
@@ -207,6 +208,7 @@ class _Chosen:
             joint.velocity,
             coupling,
             part,
+            joint.effort,
         )
 
     def _refuse_circle(self, name: str) -> None:
@@ -303,5 +305,6 @@ class _Chosen:
             return
         low, high = self._limits(name)
         slides = leader is not None and leader.type == "prismatic"
-        velocity = math.inf if leader is None else leader.velocity
-        self._extra[name] = Actuator(name, "m" if slides else "rad", low, high, velocity, "hand")
+        velocity, effort = (math.inf,) * 2 if leader is None else (leader.velocity, leader.effort)
+        unit = "m" if slides else "rad"
+        self._extra[name] = Actuator(name, unit, low, high, velocity, "hand", effort)

@@ -386,6 +386,7 @@ def _joint(entry: JointEntry, part: str) -> Joint:
         velocity=entry.velocity or math.inf,
         coupling=entry.coupling,
         part=part,
+        effort=entry.effort or math.inf,
     )
 
 
@@ -416,9 +417,10 @@ def _actuators(
                 f"{where}: limits: lower {low:.6g} is not below upper {high:.6g}"
             )
         velocity = entry.velocity or (joint.velocity if joint else math.inf)
+        effort = entry.effort or (joint.effort if joint else math.inf)
         if entry.source or joint is None:
             known_source(entry.source, sources, f"{where}: source")
         unit = ("m" if joint.type == "prismatic" else "rad") if joint else entry.unit
-        actuators.append(Actuator(name, unit, low, high, velocity, part))
+        actuators.append(Actuator(name, unit, low, high, velocity, part, effort))
     check_couplings(by_name, actuators, path)
     return actuators

@@ -187,11 +187,28 @@ def _of_body(
         still = np.allclose(after, np.eye(4), rtol=0, atol=0)
         carried = child if still else f"{child}:anchor"
         coupling = couplings.get(name)
-        found.append(TreeJoint(name, parent, carried, kind, pose, axis, limits, math.inf, coupling))
+        effort = _effort(mujoco, model, joint)
+        found.append(
+            TreeJoint(name, parent, carried, kind, pose, axis, limits, math.inf, coupling, effort)
+        )
         if not still:
             found.append(fixed(f"{name}_anchor", carried, child, after))
         parent, placement = child, np.eye(4)
     return found
+
+
+def _effort(mujoco: Any, model: Any, joint: int) -> float:
+    """The largest torque or force of the actuators on a joint, inf where the file limits none."""
+    most = math.inf
+    if model.jnt_actfrclimited[joint]:
+        most = float(np.abs(model.jnt_actfrcrange[joint]).max())
+    driven = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (
+        model.actuator_trnid[:, 0] == joint
+    )
+    if driven.any() and model.actuator_forcelimited[driven].all():
+        ranges = np.abs(model.actuator_forcerange[driven]).max(axis=1)
+        most = min(most, float((ranges * np.abs(model.actuator_gear[driven, 0])).sum()))
+    return most or math.inf
 
 
 def _equalities(mujoco: Any, model: Any, path: Path) -> dict[str, Coupling]:
@@ -319,7 +336,8 @@ def _check(joint: Element, links: list[str], where: str) -> None:
         raise DescriptionError(f"{where}: axis: is zero, expected a direction")
     limit = joint.find("limit")
     ends = _ends(limit, where)
-    number(limit, "velocity", f"{where}: limit", math.inf)
+    for rate in ("velocity", "effort"):
+        number(limit, rate, f"{where}: limit", math.inf)
     low, high = (end or 0.0 for end in ends)
     if low > high:
         raise DescriptionError(f"{where}: limit: lower {low:.6g} is above upper {high:.6g}")
@@ -359,7 +377,10 @@ def _joint(element: Element, name: str, where: str) -> TreeJoint:
     if kind in ("revolute", "continuous", "prismatic"):
         axis = np.array(_direction(element.find("axis")))
         axis /= np.linalg.norm(axis)
-    velocity = number(limit, "velocity", f"{where}: limit", math.inf) or math.inf
+    velocity, effort = (
+        abs(number(limit, rate, f"{where}: limit", math.inf) or math.inf)
+        for rate in ("velocity", "effort")
+    )
     placement = pose_of(element)
     assert placement is not None  # its vectors are checked
     return TreeJoint(
@@ -370,8 +391,9 @@ def _joint(element: Element, name: str, where: str) -> TreeJoint:
         placement,
         axis,
         _limits(limit, where) if kind in ("revolute", "prismatic") else None,
-        abs(velocity),
+        velocity,
         _mimic(element, where),
+        effort,
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from casadi_ik.files.reading import Angles, Frame, Point, Struct, Vector
-from casadi_ik.files.units import AnyValue, JointRate, JointValue, Length, Size
+from casadi_ik.files.units import AnyValue, Factor, JointRate, JointValue, Length, Size
 from casadi_ik.robots.couplings import Coupling
 
 
@@ -121,6 +121,7 @@ class JointEntry(Struct, frozen=True):
         type: revolute, prismatic or fixed.
         origin: The child's frame in the parent's while the joint reads zero.
         velocity: Its limit [rad/s or m/s]; left out: not known.
+        effort: Its largest torque or force [N m or N]; left out: not known.
         coupling: What it follows; left out: it has a motor of its own.
     """
 
@@ -133,6 +134,7 @@ class JointEntry(Struct, frozen=True):
     type: str = "revolute"
     origin: Frame = Frame()
     velocity: JointRate | None = None
+    effort: Factor | None = None
     coupling: Coupling | None = None
 
 
@@ -142,12 +144,14 @@ class ActuatorEntry(Struct, frozen=True):
     Attributes:
         limits: Lower and upper end [rad or m]; left out: the joint's of the same name.
         velocity: Its limit [rad/s or m/s]; left out: the joint's.
+        effort: Its largest torque or force [N m or N]; left out: the joint's.
         unit: rad or m, where no joint has its name.
         source: Tags of `sources` that its numbers are from.
     """
 
     limits: tuple[JointValue, JointValue] | None = None
     velocity: JointRate | None = None
+    effort: Factor | None = None
     unit: str = "rad"
     source: str = ""
 

@@ -310,6 +310,7 @@ class TreeJoint:
         limits: Lower and upper [rad or m]; None if the file states none.
         velocity: Velocity limit [rad/s or m/s], inf if the file states none (or zero).
         coupling: What it follows; None if nothing.
+        effort: Largest torque or force [N m or N], inf if the file states none (or zero).
     """
 
     name: str
@@ -321,6 +322,7 @@ class TreeJoint:
     limits: tuple[float, float] | None
     velocity: float
     coupling: Coupling | None
+    effort: float = math.inf
 
 
 @dataclass(frozen=True, eq=False)

@@ -56,7 +56,7 @@ def to_urdf(robot: RobotDescription) -> str:
             "limit",
             lower=repr(joint.lower),
             upper=repr(joint.upper),
-            effort="0",
+            effort=repr(joint.effort if math.isfinite(joint.effort) else 0.0),
             velocity=repr(velocity),
         )
         if joint.name in mimics:

@@ -159,7 +159,7 @@ WHY_NONE = {
     "made exact": "fingertips do not come to rest on the surface inside a face",
     "still clear": "palm or fingers would be in the object",
     "force-closed": "contacts do not oppose each other within friction",
-    "hold ": "it is too heavy for that squeeze and friction",
+    "hold ": "it is too heavy for that squeeze, friction and the motors' torques",
     "arm reaches": "the object is out of the arm's reach, or only from sides that hold nothing",
     "free in the scene": "arm or hand would hit something of the scene, or the object",
 }

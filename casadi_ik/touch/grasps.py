@@ -37,6 +37,7 @@ from casadi_ik.touch.strength import (
     closed,
     generators,
     loads_and_squeezes,
+    most_squeezes,
     stiffnesses,
 )
 from casadi_ik.touch.surface import Surface
@@ -80,6 +81,8 @@ class FoundGrasp:
         forces: (3,) by finger, with which to squeeze, of the fingertip on the object, base frame:
             the object stays at rest, and is best held against any pull. Their normal parts sum to
             1 N.
+        most_squeeze: Largest sum of normal forces for which the torques of the motors suffice [N];
+            inf where the robot's description tells none (`effort` of a joint).
     """
 
     grasp: Grasp
@@ -88,6 +91,7 @@ class FoundGrasp:
     closure: float
     score: float
     forces: Mapping[str, Array]
+    most_squeeze: float = np.inf
 
     @property
     def q(self) -> Array:
@@ -227,6 +231,7 @@ class _Made:
     loads: Array
     closures: Array
     forces: Array
+    most: Array
 
 
 def grasps_of(
@@ -256,7 +261,8 @@ def grasps_of(
         fingers: How many fingertips touch, the thumb among them; of a hand with fewer, all.
         mu: Friction coefficient between fingertips and object.
         hold: Mass [kg], and the squeeze [N] with which it has to be held in each of six
-            directions; None: it is enough that the grasp is force-closed.
+            directions, or with what the motors' torques suffice for, if that is less; None: it is
+            enough that the grasp is force-closed.
         limit: How many distinct grasps at most.
         jobs: Threads; the answer does not depend on them.
         seed: Of all random numbers.
@@ -427,24 +433,35 @@ def _made(
     some = some.rows(rows)
     found, forces = loads_and_squeezes(wrenches[rows])
     pull, squeeze = USUAL if hold is None else hold
-    stiff = _stiffnesses(generator, some, squeeze * forces, mu)
+    stiff, most = _stiffnesses(generator, some, forces, squeeze, mu)
     # What the object gives way by is a part of what it may.
     given = pull * GRAVITY / GIVE.far
     load = found[:, FORCES].min(axis=1) * stiff / (stiff + given)
     closure = found.min(axis=1)
     held = closure > CLOSED
     if hold is not None:
-        held &= load * squeeze >= pull * GRAVITY
+        held &= load * np.minimum(squeeze, most) >= pull * GRAVITY
         generator.counted(f"hold {pull:g} kg at {squeeze:g} N", int(held.sum()))
-    return _Made(batch, rows[held], some.rows(held), load[held], closure[held], forces[held])
+    kept = load[held], closure[held], forces[held], most[held]
+    return _Made(batch, rows[held], some.rows(held), *kept)
 
 
 USUAL = (0.2, 18.0)
 """Mass [kg] and squeeze [N] for which stiffness counts where none are said."""
 
 
-def _stiffnesses(generator: Generator, some: Candidates, forces: Array, mu: float) -> Array:
-    """(k,) of candidates whose fingertips press with forces (k, c, 3), object frame [N/m]."""
+def _stiffnesses(
+    generator: Generator, some: Candidates, forces: Array, squeeze: float, mu: float
+) -> tuple[Array, Array]:
+    """Stiffness of candidates (k,) [N/m], and the largest squeeze of their motors [N].
+
+    Args:
+        generator: Of the candidates.
+        some: They.
+        forces: (k, c, 3) of fingertips for a squeeze of 1 N, object frame.
+        squeeze: With which they press, as far as their motors can [N].
+        mu: Friction coefficient.
+    """
     table, surface, robot = generator.table, generator.surface, generator.table.robot
     _, _, linear, angular = table.at(some.hand)
     own, (row, finger) = some.used, np.nonzero(some.used)
@@ -454,18 +471,20 @@ def _stiffnesses(generator: Generator, some: Candidates, forces: Array, mu: floa
     turned = np.einsum("kij,kjm->kim", some.palm[row, :3, :3], angular[own])
     jacobians = np.einsum("kij,kjm->kim", some.palm[row, :3, :3], linear[own])
     jacobians += np.cross(turned, (radii[:, None] * normals)[..., None], axis=1)
-    units = [robot.description.actuators[i].unit for i in table.motors]
-    springs = np.array([GIVE.springs[unit == "m"] for unit in units])
+    motors = [robot.description.actuators[i] for i in table.motors]
+    springs = np.array([GIVE.springs[motor.unit == "m"] for motor in motors])
+    jacobians = jacobians.reshape(*shape, 3, len(springs))
+    most = most_squeezes(forces, jacobians, np.array([motor.effort for motor in motors]))
     stiff = stiffnesses(
         (surface.points[sample] - surface.middle).reshape(*shape, 3),
         normals.reshape(*shape, 3),
-        forces,
+        np.minimum(squeeze, most)[:, None, None] * forces,
         radii.reshape(shape),
-        jacobians.reshape(*shape, 3, len(springs)),
+        jacobians,
         springs,
         mu,
     )
-    return np.maximum(stiff, 0.0)
+    return np.maximum(stiff, 0.0), most
 
 
 CLOSED = 1e-4
@@ -491,6 +510,7 @@ def _ranked(
     q = np.concatenate([part.batch.q[part.rows] for part in parts])
     load = np.concatenate([part.loads for part in parts])
     closure = np.concatenate([part.closures for part in parts])
+    most = np.concatenate([part.most for part in parts])
     clearance = np.concatenate([np.asarray(part.batch.clearance)[part.rows] for part in parts])
     span = robot.upper - robot.lower
     scores = {
@@ -521,7 +541,8 @@ def _ranked(
     for i, (row, solution, grasp) in enumerate(zip(kept, solutions, grasps, strict=True)):
         by_finger = {name: forces[i, robot.fingers.index(name)] for name in grasp.contacts}
         values = float(load[row]), float(closure[row]), float(score[row])
-        entries.append(FoundGrasp(grasp, solution, *values, MappingProxyType(by_finger)))
+        forced = MappingProxyType(by_finger)
+        entries.append(FoundGrasp(grasp, solution, *values, forced, float(most[row])))
     return FoundGrasps(tuple(entries), generator.counts, name, 0.0, "", *about)
 
 

@@ -172,6 +172,19 @@ def stiffnesses(
     return least
 
 
+def most_squeezes(forces: Array, jacobians: Array, efforts: Array) -> Array:
+    """(k,) how many times the forces (k, c, 3) motors of limited efforts (m,) can exert.
+
+    Args:
+        forces: (k, c, 3) of fingertips [N].
+        jacobians: (k, c, 3, m) of contacts over motors.
+        efforts: (m,) largest torques and forces of motors [N m or N]; inf where not known.
+    """
+    torques = np.abs(np.einsum("kcim,kci->km", jacobians, forces))
+    most: Array = (efforts / np.maximum(torques, 1e-12)).min(axis=1)
+    return most
+
+
 def cross_matrices(vectors: Array) -> Array:
     """(..., 3, 3) matrices of the cross product."""
     return np.cross(vectors[..., None, :], np.eye(3)).swapaxes(-1, -2)

@@ -50,6 +50,7 @@ def test_arm_and_hand_move_as_pinocchio_says(tmp_path, rng):
     np.testing.assert_allclose(robot.contacts(q)[0][0], tip[:3], atol=1e-15)
     assert robot.description.named_thumb is None
     np.testing.assert_allclose(robot.description.actuators[0].velocity, 2.0)
+    assert robot.description.actuators[0].effort == 1.0
 
 
 def test_clashing_joints_of_the_hand_get_a_prefix(tmp_path, rng):
@@ -124,6 +125,7 @@ def test_one_file_with_its_palm(tmp_path, rng):
     np.testing.assert_allclose(robot.upper[1], 2 * np.pi)
     assert robot.description.actuators[3].lower == 0.0
     assert robot.description.actuators[3].velocity == np.inf
+    assert robot.description.actuators[3].effort == np.inf
 
 
 MIMIC = '<mimic joint="left_spread" multiplier="-2" offset="0.3"/>'
@@ -264,7 +266,7 @@ MJCF = """<mujoco>
   <worldbody>
     <body name="forearm" pos="0 0 0.1" quat="0.9 0.1 0.3 0.2">
       <body name="palm" pos="0 0.01 0.2">
-        <joint name="wrist_a" axis="0 1 0" range="-0.5 0.4"/>
+        <joint name="wrist_a" axis="0 1 0" range="-0.5 0.4" actuatorfrcrange="-3 2"/>
         <joint name="wrist_b" axis="1 0 0" pos="0 0.01 0.02" range="-0.7 0.6"/>
         <geom type="box" size="0.03 0.03 0.01"/>
         <body name="left_1" pos="0 0.03 0.05" euler="0.1 0.2 0.3">
@@ -294,7 +296,10 @@ MJCF = """<mujoco>
   <tendon>
     <fixed name="pull"><joint joint="right_a" coef="1"/><joint joint="right_b" coef="1"/></fixed>
   </tendon>
-  <actuator><position name="motor" tendon="pull"/></actuator>
+  <actuator>
+    <position name="motor" tendon="pull"/>
+    <position name="bend" joint="left_a" gear="2" forcerange="-0.4 0.4"/>
+  </actuator>
 </mujoco>
 """
 
@@ -310,6 +315,7 @@ def test_mjcf_moves_as_mujoco_says(mjcf, rng):
     robot = ik.load_robot(mjcf)
     assert robot.actuators == ("wrist_a", "wrist_b", "left_a", "right_c", "pull")
     assert robot.description.arm_actuators == (0, 1)
+    assert [one.effort for one in robot.description.actuators[:3]] == [3.0, np.inf, 0.8]
     q = robot.random(rng, 20)
     assert largest_difference(robot, read_tree(mjcf.parent / "hand.xml"), q) < 1e-12
     assert (robot.beyond_limits(q) <= 1e-9).all()

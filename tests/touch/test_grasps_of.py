@@ -374,6 +374,26 @@ def test_what_has_to_be_held_is_held(surface):
     assert all(one.load * 18.0 >= 0.1 * 9.8 for one in found)
 
 
+def test_torques_of_motors_limit_the_squeeze(surface):
+    """The one that is used most has all that it can, by differences of its fingertips' places."""
+    solver = solver_of("panda+leap")
+    robot = solver.robot
+    asked = {"limit": 5, "among": 5, "hold": (0.15, 1000.0)}
+    for one in solver.grasps_of(surface, PLACE, **asked):
+        here, torques = robot.contact_frames(one.q), np.zeros(len(one.q))
+        for name, force in one.forces.items():
+            i = robot.fingers.index(name)
+            on_link = np.linalg.inv(here[i]) @ [*one.grasp.contacts[name].point, 1.0]
+            for motor, step in enumerate(1e-6 * np.eye(len(one.q))):
+                ends = [(robot.contact_frames(q)[i] @ on_link)[:3] for q in (one.q + step, one.q)]
+                torques[motor] += (ends[0] - ends[1]) @ force / 1e-6
+        hand = torques[list(robot.description.hand_actuators)]
+        assert np.abs(hand).max() * one.most_squeeze == pytest.approx(0.95, rel=1e-3)
+        assert one.load * one.most_squeeze >= 0.15 * 9.8
+    unknown = solver_of("panda+panda_hand").grasps_of(surface, PLACE, limit=1, among=1)
+    assert unknown[0].most_squeeze == np.inf
+
+
 def test_the_best_of_many_are_given(found, surface):
     solver, few = found
     many = solver.grasps_of(surface, PLACE, limit=40, seed=1, among=1)
