@@ -208,7 +208,9 @@ class Engine:
     def about(self, check: SceneCheck) -> Engine:
         """The engine with another scene; all that was worked out for the robot stays."""
         other = copy(self)
-        vars(other).update(check=check, _others={})
+        with self._lock:
+            others = {kinds: one.about(check) for kinds, one in self._others.items()}
+        vars(other).update(check=check, _others=others, _lock=Lock())
         return other
 
     def collision_query(self, targets: TargetBatch) -> CollisionQuery | None:
