@@ -473,7 +473,12 @@ def _frozen_palms(palm: Any) -> Array | Mapping[str, Array]:
 
 
 def _unit(value: Any, name: str) -> Array:
-    vector, zero = unit_vectors(_vector(value, name))
+    vector = _vector(value, name)
+    x, y, z = vector.tolist()
+    length = math.sqrt(x * x + y * y + z * z)
+    if SMALL < length < LARGE:  # `unit_vectors`, whose arrays take long for a single one
+        return vector if abs(length - 1) < UNIT else frozen(vector / length)
+    vector, zero = unit_vectors(vector)
     if zero:
         raise InputError(f"{name}: found [0.0, 0.0, 0.0], expected a direction, not zero")
     return frozen(vector)
@@ -486,6 +491,6 @@ def _vector(value: Any, name: str) -> Array:
         raise InputError(f"{name}: found {value!r}, expected three numbers") from error
     if array.shape != (3,):
         raise InputError(f"{name}: found shape {array.shape}, expected (3,)")
-    if not np.all(np.isfinite(array)):
+    if not all(map(math.isfinite, array.tolist())):
         raise InputError(f"{name}: found {array.tolist()}, expected finite numbers")
     return frozen(array)

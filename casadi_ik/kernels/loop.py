@@ -172,6 +172,9 @@ WORTH = 64
 """Solves from which on a compiler is waited for, if no library that makes them side by side is at
 hand. One by one they take a millisecond or two, and the compiler the better part of a minute."""
 
+LOOKED = 1000
+"""Solves of small batches after which one looks again for a library that was not at hand."""
+
 SPARE = 1.25
 """How much more room a trace begins with than the last one needed."""
 
@@ -318,6 +321,7 @@ class LoopKernel:
         self.compiled = library is not None
         self.entry: Any = None if library is None else library[SYMBOL]
         self._rows_each = 0.0
+        self._few = 0
 
     def _load(self, lanes: int = 1) -> ctypes.CDLL | None:
         """The library of the loop that makes so many solves side by side."""
@@ -337,7 +341,10 @@ class LoopKernel:
         """The loop that makes some solves of so many at a time; None: one after the other."""
         if count < FEWEST:
             return None
-        return self._at_hand if count < WORTH else self._side_by_side
+        if count >= WORTH or "_side_by_side" in vars(self):
+            return self._side_by_side
+        self._few -= count
+        return None if self._few > 0 else self._at_hand
 
     @property
     def _at_hand(self) -> Any:
@@ -346,6 +353,7 @@ class LoopKernel:
             with cached_only():
                 return self._side_by_side
         except NotCachedError:
+            self._few = LOOKED  # looking takes a millisecond
             return None
 
     @cached_property

@@ -192,6 +192,7 @@ class Generator:
     alike: int = 0
 
     def __post_init__(self) -> None:
+        self._entry = touch_library()["casadi_ik_touch"]
         self._pairs = np.zeros((0, 4), dtype=np.int64)
         self._job, self._kept = self._made(int(self.rng.integers(2**62)))
         self.look()
@@ -271,7 +272,7 @@ class Generator:
         job.postured, job.used = postured.ctypes.data, used.ctypes.data
         job.patches, job.n_patches = self._pairs.ctypes.data, len(self._pairs)
         job.wanted, job.found, job.most = count, 0, job.attempts + self.parameters.attempts
-        drive("touch", touch_library()["casadi_ik_touch"], job)
+        drive("touch", self._entry, job)
         found = job.found
         hand = table.q[shared[:found], postured[:found, table.thumb]].copy()
         for finger in range(f):

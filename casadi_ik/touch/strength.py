@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
 import numpy as np
 
@@ -222,5 +224,10 @@ def _solved(wrenches: Array, directions: Array) -> Array:
         count=k * d,
         slice=SLICE,
     )
-    drive("loads", touch_library()["casadi_ik_loads"], job)
+    drive("loads", _entry(), job)
     return solved
+
+
+@cache
+def _entry() -> Any:
+    return touch_library()["casadi_ik_loads"]

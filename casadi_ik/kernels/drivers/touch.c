@@ -9,6 +9,10 @@
 
 enum { X, Y, Z, MOST_FINGERS = 8, MOST_WORDS = 32 };
 
+/* Products of two sines below which two pads face along their line, and tell no turn about it. */
+#define ACROSS 0.02
+#define TURN 6.283185307179586
+
 /* What a capsule advances by at least where it is near something [m]. */
 #define LEAST_STEP 2e-3
 
@@ -153,10 +157,9 @@ static void axes_about(const scalar *line, scalar *x, scalar *y) {
 }
 
 /* The palm that brings two points with normals onto two others; the turn about their line is that
- * which brings the parts of both normals across it together. */
-static void match(const scalar *a, const scalar *b, const scalar *na, const scalar *nb,
-                  const scalar *p, const scalar *q, const scalar *np, const scalar *nq,
-                  scalar *palm) {
+ * which brings the parts of both normals across it together, or any where pads face along it. */
+static void match(touch_job *job, const scalar *a, const scalar *b, const scalar *na, const scalar *nb,
+                  const scalar *p, const scalar *q, const scalar *np, const scalar *nq, scalar *palm) {
   scalar from[3][3], to[3][3], cosine, sine, over, mean[3], goal[3];
   int i, k;
   for (k = 0; k < 3; ++k) from[2][k] = b[k] - a[k];
@@ -170,9 +173,14 @@ static void match(const scalar *a, const scalar *b, const scalar *na, const scal
   sine = dot(from[0], na) * dot(to[1], np) - dot(from[1], na) * dot(to[0], np)
        + dot(from[0], nb) * dot(to[1], nq) - dot(from[1], nb) * dot(to[0], nq);
   over = sqrt(cosine * cosine + sine * sine);
-  if (!(over > 0)) cosine = over = 1;
-  cosine /= over;
-  sine /= over;
+  if (over > ACROSS) {
+    cosine /= over;
+    sine /= over;
+  } else {
+    const scalar turn = TURN * chance(job);
+    cosine = cos(turn);
+    sine = sin(turn);
+  }
   for (k = 0; k < 3; ++k) {
     const scalar x = cosine * to[0][k] + sine * to[1][k], y = cosine * to[1][k] - sine * to[0][k];
     for (i = 0; i < 3; ++i) palm[3 * k + i] = x * from[0][i] + y * from[1][i] + to[2][k] * from[2][i];
@@ -299,7 +307,7 @@ static int attempt(touch_job *job) {
     point[side] = pad(job, job->points, share, which[side], at[side]);
     normal[side] = pad(job, job->normals, share, which[side], at[side]);
   }
-  match(point[0], point[1], normal[0], normal[1], middle[0], middle[1], inward[0], inward[1], palm);
+  match(job, point[0], point[1], normal[0], normal[1], middle[0], middle[1], inward[0], inward[1], palm);
   turned(palm, normal[1], faces);
   turned(palm, normal[0], thumb);
   if (dot(thumb, inward[0]) <= job->cos_lean[one]) return 0;
