@@ -147,7 +147,7 @@ def solve(cell: Cell) -> dict[str, Any]:
     except ik.errors.DescriptionError as error:
         return {"count": 0, "reason": f"refused: {error}"}
     first = solver.grasps_of(surface, limit=1, among=1, **asked)
-    found = solver.grasps_of(surface, limit=cell.limit, **asked)
+    found = solver.grasps_of(surface, limit=cell.limit, among=cell.limit, **asked)
     if not len(found):
         return {"count": 0, "reason": found.reason, "time": found.time}
     confirmed = [bool(solver.solve(one.grasp, q0=one.q).success) for one in found]
