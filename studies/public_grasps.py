@@ -99,8 +99,9 @@ def solve(cell: Cell) -> dict[str, Any]:
     why = Counter[str]()
     for cause, count in free.failures.items():
         why["COLLISION with the object" if mesh.name in cause else cause] += count
-    table.grasps_of(surface, pose, limit=1)  # the object's scene, the hand's table
-    found = table.grasps_of(surface, pose, limit=cell.limit, seed=cell.seed)
+    sought: dict[str, Any] = {"limit": cell.limit, "among": cell.limit, "seed": cell.seed}
+    table.grasps_of(surface, pose, limit=1, among=1)  # the object's scene, the hand's table
+    found = table.grasps_of(surface, pose, **sought)
     return {
         "grasps": len(grasps),
         "reached": ik.Solver(robot).choose(grasps, **asked).answered,
