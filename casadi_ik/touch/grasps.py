@@ -31,19 +31,8 @@ from casadi_ik.touch.candidates import (
 )
 from casadi_ik.touch.hand_table import HandTable
 from casadi_ik.touch.robustness import offsets, robustness
-from casadi_ik.touch.strength import (
-    FORCES,
-    GIVE,
-    closed,
-    generators,
-    loads_and_squeezes,
-    most_squeezes,
-    stiffnesses,
-)
+from casadi_ik.touch.strength import CLOSED, Strengths, closed, generators, strengths
 from casadi_ik.touch.surface import Surface
-
-GRAVITY = 9.80665
-"""Standard acceleration of free fall [m/s^2]."""
 
 OPENINGS = (0.025, 0.015, 0.008)
 """How far fingertips are from the object before they close, the first that is clear [m]."""
@@ -195,8 +184,7 @@ class FoundGrasps(Sequence[FoundGrasp]):
             )
         _check_hold(hold)
         off = offsets(position, angle, samples, seed, self.surface.middle)
-        least = None if hold is None else hold[0] * GRAVITY / hold[1]
-        shares = [robustness(self.robot, self.surface, one, self.mu, off, least) for one in self]
+        shares = [robustness(self.robot, self.surface, one, self.mu, off, hold) for one in self]
         return np.array(shares)
 
     @property
@@ -431,37 +419,22 @@ def _made(
     if not len(rows):
         return None
     some = some.rows(rows)
-    found, forces = loads_and_squeezes(wrenches[rows])
-    pull, squeeze = USUAL if hold is None else hold
-    stiff, most = _stiffnesses(generator, some, forces, squeeze, mu)
-    # What the object gives way by is a part of what it may.
-    given = pull * GRAVITY / GIVE.far
-    load = found[:, FORCES].min(axis=1) * stiff / (stiff + given)
-    closure = found.min(axis=1)
-    held = closure > CLOSED
+    found = _strengths(generator, some, wrenches[rows], mu, hold)
+    held = found.hold(hold)
     if hold is not None:
-        held &= load * np.minimum(squeeze, most) >= pull * GRAVITY
-        generator.counted(f"hold {pull:g} kg at {squeeze:g} N", int(held.sum()))
-    kept = load[held], closure[held], forces[held], most[held]
-    return _Made(batch, rows[held], some.rows(held), *kept)
+        generator.counted(f"hold {hold[0]:g} kg at {hold[1]:g} N", int(held.sum()))
+    parts = found.load, found.closure, found.forces, found.most
+    return _Made(batch, rows[held], some.rows(held), *(part[held] for part in parts))
 
 
-USUAL = (0.2, 18.0)
-"""Mass [kg] and squeeze [N] for which stiffness counts where none are said."""
-
-
-def _stiffnesses(
-    generator: Generator, some: Candidates, forces: Array, squeeze: float, mu: float
-) -> tuple[Array, Array]:
-    """Stiffness of candidates (k,) [N/m], and the largest squeeze of their motors [N].
-
-    Args:
-        generator: Of the candidates.
-        some: They.
-        forces: (k, c, 3) of fingertips for a squeeze of 1 N, object frame.
-        squeeze: With which they press, as far as their motors can [N].
-        mu: Friction coefficient.
-    """
+def _strengths(
+    generator: Generator,
+    some: Candidates,
+    wrenches: Array,
+    mu: float,
+    hold: tuple[float, float] | None,
+) -> Strengths:
+    """How well candidates hold the object."""
     table, surface, robot = generator.table, generator.surface, generator.table.robot
     _, _, linear, angular = table.at(some.hand)
     own, (row, finger) = some.used, np.nonzero(some.used)
@@ -471,24 +444,16 @@ def _stiffnesses(
     turned = np.einsum("kij,kjm->kim", some.palm[row, :3, :3], angular[own])
     jacobians = np.einsum("kij,kjm->kim", some.palm[row, :3, :3], linear[own])
     jacobians += np.cross(turned, (radii[:, None] * normals)[..., None], axis=1)
-    motors = [robot.description.actuators[i] for i in table.motors]
-    springs = np.array([GIVE.springs[motor.unit == "m"] for motor in motors])
-    jacobians = jacobians.reshape(*shape, 3, len(springs))
-    most = most_squeezes(forces, jacobians, np.array([motor.effort for motor in motors]))
-    stiff = stiffnesses(
+    return strengths(
+        wrenches,
         (surface.points[sample] - surface.middle).reshape(*shape, 3),
         normals.reshape(*shape, 3),
-        np.minimum(squeeze, most)[:, None, None] * forces,
         radii.reshape(shape),
-        jacobians,
-        springs,
+        jacobians.reshape(*shape, 3, len(table.motors)),
+        [robot.description.actuators[i] for i in table.motors],
         mu,
+        hold,
     )
-    return np.maximum(stiff, 0.0), most
-
-
-CLOSED = 1e-4
-"""Load from which a grasp counts as force-closed [N/N]."""
 
 
 def _ranked(

@@ -12,7 +12,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.grasps.pose import inverse
 from casadi_ik.touch.candidates import Candidates
 from casadi_ik.touch.hand_table import HandTable
-from casadi_ik.touch.strength import FORCES, generators, loads
+from casadi_ik.touch.strength import generators, strengths
 from casadi_ik.touch.surface import Surface
 
 if TYPE_CHECKING:
@@ -20,9 +20,6 @@ if TYPE_CHECKING:
 
 OPEN, FAR, PLACES = 0.020, 0.020, 33
 """Fingertips come from so far before contacts, go on so far beyond [m]; places between."""
-
-LEAST = 1e-4
-"""Load from which contacts close [N/N]."""
 
 STEEP = float(np.deg2rad(45.0))
 """A flat pad that leans more does not touch with its face [rad]."""
@@ -34,7 +31,7 @@ def robustness(
     one: FoundGrasp,
     mu: float,
     offsets: Array,
-    least: float | None = None,
+    hold: tuple[float, float] | None = None,
 ) -> float:
     """The share of places of the object at which the hand still closes on it.
 
@@ -48,8 +45,8 @@ def robustness(
         one: The grasp.
         mu: Friction coefficient.
         offsets: (k, 4, 4) where the object is really, in the frame in which it was thought to be.
-        least: Load that the contacts must have [N/N]; None: it is enough that they are
-            force-closed.
+        hold: Mass [kg], and the squeeze [N] with which it has to be held; None: it is enough that
+            the contacts are force-closed.
     """
     table, pose = HandTable.of(robot), one.grasp.known_pose
     assert pose is not None
@@ -60,8 +57,11 @@ def robustness(
     way = np.concatenate(
         [table.opened(same, float(back)).hand for back in np.linspace(OPEN, -FAR, PLACES)]
     )
-    points, normals, _, _ = table.at(way)
+    points, normals, linear, angular = table.at(way)
     which = np.flatnonzero(used[0])
+    # (s, c, 3, m) in the frame in which the object was thought to be.
+    linear, angular = (palm[:3, :3] @ part[:, which] for part in (linear, angular))
+    motors = [robot.description.actuators[i] for i in table.motors]
     # (s, c, 3) where the object was thought to be, then (k, s, c, 3) where it is.
     points = points[:, which] @ palm[:3, :3].T + palm[:3, 3]
     normals = normals[:, which] @ palm[:3, :3].T
@@ -86,14 +86,26 @@ def robustness(
         rows = np.flatnonzero((touches == row_of).all(axis=1))
         if row_of.sum() < 2:
             continue
-        chosen = samples[rows][:, row_of]
-        wrenches = generators(
-            surface.points[chosen], -surface.faces[chosen], mu, surface.middle, surface.size / 2
+        chosen, at, own = samples[rows][:, row_of], there[rows][:, row_of], np.flatnonzero(row_of)
+        points, normals = surface.points[chosen], -surface.faces[chosen]
+        radii = np.broadcast_to(table.radii[which[own]], chosen.shape)
+        turns = seen[rows, None, :3, :3]
+        jacobians = turns @ linear[at, own]
+        jacobians += np.cross(
+            turns @ angular[at, own], (radii[..., None] * normals)[..., None], axis=2
         )
-        found = loads(wrenches)
-        closed[rows] = found.min(axis=1) > LEAST
-        if least is not None:
-            closed[rows] &= found[:, FORCES].min(axis=1) >= least
+        length = surface.size / 2
+        found = strengths(
+            generators(points, normals, mu, surface.middle, length),
+            points - surface.middle,
+            normals,
+            radii,
+            jacobians,
+            motors,
+            mu,
+            hold,
+        )
+        closed[rows] = found.hold(hold)
     return float(closed.mean())
 
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 import numpy as np
 
-from casadi_ik.arrays import Array
+from casadi_ik.arrays import Array, Bools
 from casadi_ik.kernels.cancellation import SLICE, drive
 from casadi_ik.kernels.codegen import c_struct
+from casadi_ik.robots.description import Actuator
 from casadi_ik.touch.hand_table import touch_library
 
 EDGES = 8
@@ -21,6 +23,15 @@ DIRECTIONS = np.concatenate([np.eye(6), -np.eye(6)])
 
 FORCES = [0, 1, 2, 6, 7, 8]
 """Those of them that are forces."""
+
+GRAVITY = 9.80665
+"""Standard acceleration of free fall [m/s^2]."""
+
+USUAL = (0.2, 18.0)
+"""Mass [kg] and squeeze [N] for which stiffness counts where none are said."""
+
+CLOSED = 1e-4
+"""Load from which a grasp counts as force-closed [N/N]."""
 
 STEPS, ENOUGH = 50, 1e-9
 """Most iterations of a linear program, and the mean of x z that is followed by the last."""
@@ -127,6 +138,66 @@ class GiveParameters:
 GIVE = GiveParameters()
 
 
+@dataclass(frozen=True, eq=False)
+class Strengths:
+    """How well grasps hold: k of them, of c contacts.
+
+    Attributes:
+        load: (k,) what the worst of six directions holds by friction, less by how far the object
+            gives way [N/N].
+        closure: (k,) what the worst of `DIRECTIONS` holds.
+        forces: (k, c, 3) on the object at rest; their normal parts sum to 1 N.
+        most: (k,) largest squeeze for which motors' efforts suffice [N].
+    """
+
+    load: Array
+    closure: Array
+    forces: Array
+    most: Array
+
+    def hold(self, hold: tuple[float, float] | None) -> Bools:
+        """(k,) which are force-closed, and hold a mass [kg] with a squeeze [N] if that is said."""
+        held: Bools = self.closure > CLOSED
+        if hold is None:
+            return held
+        return held & (self.load * np.minimum(hold[1], self.most) >= hold[0] * GRAVITY)
+
+
+def strengths(
+    wrenches: Array,
+    arms: Array,
+    normals: Array,
+    radii: Array,
+    jacobians: Array,
+    motors: Sequence[Actuator],
+    mu: float,
+    hold: tuple[float, float] | None,
+) -> Strengths:
+    """How well grasps hold a mass [kg] with a squeeze [N] (None: `USUAL`).
+
+    Args:
+        wrenches: (k, 6, c * (EDGES + 2)) from `generators`.
+        arms: (k, c, 3) contacts from the middle of the object [m].
+        normals: (k, c, 3) unit, into the object.
+        radii: (k, c) of pads [m]; 0 of planes.
+        jacobians: (k, c, 3, m) of contacts over motors.
+        motors: The m motors.
+        mu: Friction coefficient.
+        hold: Mass [kg] and squeeze [N] for which the object's giving way counts.
+    """
+    mass, squeeze = USUAL if hold is None else hold
+    found, forces = loads_and_squeezes(wrenches)
+    torques = np.abs(np.einsum("kcim,kci->km", jacobians, forces))
+    efforts = np.array([motor.effort for motor in motors])
+    most = (efforts / np.maximum(torques, 1e-12)).min(axis=1)
+    springs = np.array([GIVE.springs[motor.unit == "m"] for motor in motors])
+    pressed = np.minimum(squeeze, most)[:, None, None] * forces
+    stiff = np.maximum(stiffnesses(arms, normals, pressed, radii, jacobians, springs, mu), 0.0)
+    # What the object gives way by is a part of what it may.
+    load = found[:, FORCES].min(axis=1) * stiff / (stiff + mass * GRAVITY / GIVE.far)
+    return Strengths(load, found.min(axis=1), forces, most)
+
+
 def stiffnesses(
     arms: Array,
     normals: Array,
@@ -172,19 +243,6 @@ def stiffnesses(
     stiff[:, 3:, 3:] += turning / length**2
     least: Array = np.linalg.eigvalsh((stiff + stiff.swapaxes(1, 2)) / 2)[:, 0].astype(float)
     return least
-
-
-def most_squeezes(forces: Array, jacobians: Array, efforts: Array) -> Array:
-    """(k,) how many times the forces (k, c, 3) motors of limited efforts (m,) can exert.
-
-    Args:
-        forces: (k, c, 3) of fingertips [N].
-        jacobians: (k, c, 3, m) of contacts over motors.
-        efforts: (m,) largest torques and forces of motors [N m or N]; inf where not known.
-    """
-    torques = np.abs(np.einsum("kcim,kci->km", jacobians, forces))
-    most: Array = (efforts / np.maximum(torques, 1e-12)).min(axis=1)
-    return most
 
 
 def cross_matrices(vectors: Array) -> Array:
