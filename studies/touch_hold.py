@@ -18,7 +18,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -75,23 +75,24 @@ WHOLE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
 INTRODUCTION = """
-{objects}: each on the table, turned by 40 deg, 0.5 m before the arm's base and 0.1 m aside; at most
-{limit} distinct, force-closed grasps of each, the best by load of those that the first rounds of
-the search find (friction 0.5, three fingertips, or two of a gripper). In MuJoCo the palm is fixed,
-motors are springs (3 N m/rad, 2 kN/m), pads are balls as the hand's description has them (flat ones
-of 10 mm), only pads touch the object (its convex parts; friction 0.5, torsional friction of a patch
-of 5 mm), and it weighs 0.2 kg. Fingers squeeze with 18 N in sum, by `FoundGrasp.forces`. *Held*: in
-a second the object moves less than 20 mm and turns less than 30 deg, for a force of its weight in
-each of six directions. *Strong*: those whose load says that they hold it. *AUC*: the chance that a
-grasp that holds has a higher load than one that does not.
+{names}: each on the table, turned by 40 deg, 0.5 m before the arm's base and 0.1 m aside; at most
+{limit} distinct, force-closed grasps of each (friction 0.5, three fingertips, or two of a gripper),
+of which the {best} best by load are tried, and every {every}th whatever its load. In MuJoCo the
+palm is fixed, motors are springs (3 N m/rad, 2 kN/m), pads are balls as the hand's description has
+them (flat ones of 10 mm), only pads touch the object (its convex parts; friction 0.5, torsional
+friction of a patch of 5 mm), and it weighs 0.2 kg. Fingers squeeze with 18 N in sum, by
+`FoundGrasp.forces`. *Held*: in a second the object moves less than 20 mm and turns less than 30
+deg, for a force of its weight in each of six directions. *Best third*: by load, of the {best} best
+of all objects. *AUC*: the chance that a grasp that holds has a higher load than one that does not,
+among every {every}th. *Strong*: those of these whose load says that they hold it.
 """
 
 NOISE = """
-The object is 5 mm and 3 deg elsewhere than the hand believes ({samples} times per grasp, in random
-directions); the hand closes from its open posture. *Robustness* is `FoundGrasps.robustness`: the
-share at which the contacts that fingers come to hold 0.2 kg by their load. *Held*: the share that
-holds it against gravity in MuJoCo. *AUC*: the chance that of two grasps the one that holds more
-often has the higher robustness, or load.
+The object is 5 mm and 3 deg elsewhere than the hand believes, once for each displacement and each
+of the best grasps ({samples} in random directions); the hand closes from its open posture.
+*Robustness* is `FoundGrasps.robustness`: the share at which the contacts that fingers come to hold
+0.2 kg by their load. *Held*: the share that holds it against gravity in MuJoCo. *AUC*: the chance
+that of two grasps the one that holds more often has the higher robustness, or load.
 """
 
 
@@ -100,7 +101,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description="Do grasps of surfaces hold?")
     parser.add_argument("--robots", nargs="+", default=ROBOTS)
     parser.add_argument("--objects", nargs="+", default=ik.shipped_names("objects"))
-    parser.add_argument("--limit", type=int, default=20, help="grasps of an object")
+    parser.add_argument("--limit", type=int, default=200, help="grasps that are found of an object")
+    parser.add_argument("--best", type=int, default=12, help="of which so many best are tried ...")
+    parser.add_argument("--every", type=int, default=4, help="... and every so many-th")
     parser.add_argument("--samples", type=int, default=4, help="displacements of a grasp")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=RESULTS / "touch_hold")
@@ -111,23 +114,21 @@ def main(arguments: list[str] | None = None) -> None:
     for robot in options.robots:
         solver = ik.Solver(robot_of(robot), scene=ik.load_scene("table"))
         tries = [
-            one
-            for surface in track(surfaces, robot)
-            for one in tried(solver, surface, options.limit, options.samples, options.seed)
+            one for surface in track(surfaces, robot) for one in tried(solver, surface, options)
         ]
         rows.append(row_of(robot, tries, metrics))
         noisy.append(noise_of(robot, tries, metrics))
         for surface in surfaces:
-            held = [one.held for one in tries if one.object == name_of(surface)]
+            held = [one.held for one in tries if one.best and one.object == name_of(surface)]
             objects.append([robot, name_of(surface), str(len(held)), str(sum(held))])
-    heads = ["robot", "grasps", "held", "AUC of load", "AUC of closure", "best third held"]
+    heads = ["robot", "best", "held", "best third held", "any", "held", "AUC of load"]
     parts = [
-        INTRODUCTION.format(objects=names, limit=options.limit),
-        markdown_table([*heads, "strong", "of them held"], rows),
+        INTRODUCTION.format(names=names, **vars(options)),
+        markdown_table([*heads, "AUC of closure", "strong", "of them held"], rows),
         "## Noise",
         NOISE.format(samples=options.samples),
         markdown_table(["robot", "robustness", "held", "AUC of robustness", "AUC of load"], noisy),
-        "## By object",
+        "## The best by object",
         markdown_table(["robot", "object", "grasps", "held"], objects),
         f"## Where this comes from\n\n`{command(__file__, arguments)}`",
         provenance({}),
@@ -150,57 +151,80 @@ class Tried:
         load: Its load [N/N].
         closure: Its closure.
         held: Whether it was held six ways.
-        robustness: Of the geometry.
-        noisy: Share of displacements at which it was held.
+        best: Whether it is one of the best ...
+        any: ... and whether it was taken whatever its load.
+        robustness: Of the geometry; NaN if it is none of the best.
+        noisy: Share of displacements at which it was held; likewise.
     """
 
     object: str
     load: float
     closure: float
     held: bool
+    best: bool
+    any: bool
     robustness: float
     noisy: float
 
 
-def tried(
-    solver: ik.Solver, surface: ik.Surface, limit: int, samples: int, seed: int
-) -> Iterator[Tried]:
+def tried(solver: ik.Solver, surface: ik.Surface, options: argparse.Namespace) -> Iterator[Tried]:
     """Grasps of an object, as they went."""
-    found = solver.grasps_of(surface, standing(surface, 0.7), limit=limit, seed=seed)
-    shares = found.robustness(hold=(MASS, SQUEEZE), seed=seed)
-    away = offsets(5e-3, np.deg2rad(3.0), samples, seed + 1, surface.middle)
+    limit, seed = options.limit, options.seed
+    found = solver.grasps_of(surface, standing(surface, 0.7), limit=limit, among=limit, seed=seed)
+    some = replace(found, entries=found[: options.best])
+    shares = some.robustness(hold=(MASS, SQUEEZE), seed=seed)
+    away = offsets(5e-3, np.deg2rad(3.0), options.samples, seed + 1, surface.middle)
     six = np.concatenate([np.eye(3), -np.eye(3)])
-    for one, share in zip(found, shares, strict=True):
+    for place, one in enumerate(found):
+        best, any_ = place < options.best, place % options.every == 0
+        if not (best or any_):
+            continue
         hold = Hold(solver.robot, one, surface)
-        noisy = [bool(hold.held(hold.settled(off), -np.eye(3)[2:]).all()) for off in away]
         held = bool(hold.held(hold.settled(), six).all())
-        mean = float(np.mean(noisy)) if noisy else float("nan")
-        yield Tried(name_of(surface), one.load, one.closure, held, float(share), mean)
+        share = mean = math.nan
+        if best:
+            noisy = [bool(hold.held(hold.settled(off), -np.eye(3)[2:]).all()) for off in away]
+            share, mean = float(shares[place]), float(np.mean(noisy)) if noisy else math.nan
+        yield Tried(name_of(surface), one.load, one.closure, held, best, any_, share, mean)
 
 
 def row_of(robot: str, tries: Sequence[Tried], metrics: list[Metric]) -> list[str]:
     """What came of one robot."""
-    held = np.array([one.held for one in tries], dtype=bool)
-    loads = np.array([one.load for one in tries])
-    best = np.argsort(-loads, kind="stable")[: len(tries) // 3]
-    strong = loads >= MASS * GRAVITY / SQUEEZE
     name = f"touch_hold/{robot}"
+    best = sorted((one for one in tries if one.best), key=lambda one: -one.load)
+    every = [one for one in tries if one.any]
+    held = np.array([one.held for one in every], dtype=bool)
+    loads, closures = np.array([[one.load, one.closure] for one in every]).reshape(-1, 2).T
+    groups = {
+        "held": best,
+        "best_third": best[: len(best) // 3],
+        "held_of_any": every,
+        "strong": [one for one in every if one.load >= MASS * GRAVITY / SQUEEZE],
+    }
     rates = [
-        rate_metric(f"{name}/held", int(held.sum()), len(held)),
-        rate_metric(f"{name}/best_third", int(held[best].sum()), len(best)),
-        rate_metric(f"{name}/strong", int(held[strong].sum()), int(strong.sum())),
+        rate_metric(f"{name}/{key}", sum(one.held for one in group), len(group))
+        for key, group in groups.items()
     ]
-    areas = auc(loads, held), auc(np.array([one.closure for one in tries]), held)
-    area = Metric(f"{name}/auc", areas[0], "", "higher", math.nan, math.nan, len(tries))
-    metrics += [*rates, area]
-    cells = [f"{int(held[rows].sum())} of {len(held[rows])}" for rows in (best, strong)]
-    shares = [f"{value:.3f}" for value in areas]
-    held_of = f"{int(held.sum())} ({rates[0].value:.0f} %)"
-    return [robot, str(len(held)), held_of, *shares, cells[0], str(int(strong.sum())), cells[1]]
+    areas = auc(loads, held), auc(closures, held)
+    metrics += [
+        *rates,
+        Metric(f"{name}/auc", areas[0], "", "higher", math.nan, math.nan, len(every)),
+    ]
+    shares = [f"{rate.value:.0f} %" for rate in rates]
+    third, strong = (
+        f"{sum(one.held for one in groups[key])} of {len(groups[key])}"
+        for key in ("best_third", "strong")
+    )
+    return [
+        *(robot, str(len(best)), shares[0], third, str(len(every)), shares[2]),
+        *(f"{area:.3f}" for area in areas),
+        *(str(len(groups["strong"])), strong),
+    ]
 
 
 def noise_of(robot: str, tries: Sequence[Tried], metrics: list[Metric]) -> list[str]:
-    """What noise does to one robot's grasps."""
+    """What noise does to one robot's best grasps."""
+    tries = [one for one in tries if one.best]
     share = np.array([one.robustness for one in tries])
     held = np.array([one.noisy for one in tries])
     loads = np.array([one.load for one in tries])

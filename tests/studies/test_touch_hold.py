@@ -20,7 +20,9 @@ RESULTS = Path(touch_hold.__file__).parent / "results"
 
 def test_the_study_writes_its_report(tmp_path):
     given = ["--robots", "panda+panda_hand", "--objects", "tennis_ball", "sugar_box"]
-    touch_hold.main([*given, "--limit", "3", "--samples", "1", "--out", str(tmp_path)])
+    touch_hold.main(
+        [*given, "--limit", "6", "--best", "3", "--samples", "1", "--out", str(tmp_path)]
+    )
     text = (tmp_path / "report.md").read_text()
     assert "| panda+panda_hand | tennis_ball | 3 | 3 |" in text
     found = {one["name"]: one for one in json.loads((tmp_path / "metrics.json").read_text())}
