@@ -92,12 +92,12 @@ class Table:
     @cached_property
     def of_robot(self) -> Table:
         """The pairs of the robot with itself."""
-        return self.only(self._within)
+        return self.only(self.within)
 
     @cached_property
     def of_scene(self) -> Table:
         """The pairs of the robot with what stands about it."""
-        return self.only(~self._within)
+        return self.only(~self.within)
 
     def parted(self, links: frozenset[str]) -> tuple[Table, Table]:
         """The pairs that one of some links is in, and all others; worked out once."""
@@ -111,7 +111,8 @@ class Table:
         return np.array([not self.moving.isdisjoint(pair) for pair in self.names], dtype=bool)
 
     @property
-    def _within(self) -> NDArray[np.bool_]:
+    def within(self) -> NDArray[np.bool_]:
+        """(p,) which pairs are of the robot with itself."""
         return self.pairs[:, 1] < len(self.radii) + self.own
 
     def only(self, rows: NDArray[np.bool_]) -> Table:

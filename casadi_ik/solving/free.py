@@ -67,11 +67,12 @@ class FreeSearchParameters:
         steps: About what is nearest to being free, one after the other [of motors' ranges].
         tries: Of such a step, in random directions; the best is taken.
         deep: What is farther inside something [m] is not got out of by such steps.
-        left: As much for each of the steps, of an arm in closed form: for all, and for the hand by
-            itself. A target all of whose hands are farther inside than at first is given up after
-            a round of them. Source: among 9,000 targets of `studies/bench.py` steps free 280, among
-            4,459 of `studies/collision.py` 84; with these depths a fifth and a tenth fewer, in 0.4
-            times as many tries as with 20 and 6 mm throughout.
+        left: As much for each of the steps, of an arm in closed form: for all, and for the hand
+            inside itself, unless a hand is nearer to the scene. A target all of whose hands are
+            farther inside themselves than at first is given up after a round of them. Source: among
+            9,000 targets of `studies/bench.py` steps free 280, among 4,459 of
+            `studies/collision.py` 84; with these depths a fifth and a tenth fewer, in 0.4 times as
+            many tries as with 20 and 6 mm throughout.
         hopeful: Hands with most room that are looked at for why there is no answer.
         least_range: What stands for the range of a motor that has none [rad or m].
     """
@@ -190,7 +191,8 @@ class FreeSearch:
     Attributes:
         best: (k, n) the preferred of what is free so far.
         free: (k,) whether there is any.
-        room: (k,) most that a hand has by itself [m].
+        room: (k,) most that one of the hands has among its own links [m]; infinite if something
+            of the scene is nearer.
     """
 
     def __init__(
@@ -251,7 +253,7 @@ class FreeSearch:
 
     @property
     def _hopeful(self) -> NDArray[np.bool_]:
-        """(k,) of which targets a hand touches nothing by itself, or hardly."""
+        """(k,) of which targets a hand touches none of its own links, or hardly."""
         return self.room > -PARAMETERS.left[0][1]
 
     def take(self, q: Array, owner: NDArray[np.intp]) -> Array:
@@ -286,8 +288,12 @@ class FreeSearch:
             np.add.at(self.tried, owner, 1)
             self._fresh[owner] = True
             return
-        surplus = self.query.rows(owner).held.check(q).surplus
-        np.maximum.at(self.room, owner, surplus)
+        held = self.query.rows(owner).held
+        clear = held.check(q)
+        surplus = clear.surplus
+        # What stands about another hand may avoid.
+        itself = np.append(held.table.within, False)[clear.pairs]
+        np.maximum.at(self.room, owner, np.where(itself, surplus, np.inf))
         parts = self.finder.hand_parts(q, self._palms[owner])
         fresh = self._known.add(parts, owner)
         self._fresh[owner[fresh]] = True
@@ -413,8 +419,9 @@ class FreeSearch:
             most = PARAMETERS.deep if self.arm_search is None else deep
             rows = np.flatnonzero(~self.free & (self.surplus > -most))
             if len(rows) and self.arm_search is not None:
-                alone = self.query.rows(rows).held.check(self.nearest[rows]).surplus
-                rows = rows[alone > -of_hand]
+                itself = self.query.among(self.query.table.of_robot).held.rows(rows)
+                alone = itself.check(self.nearest[rows]).surplus
+                rows = rows[(alone > -of_hand) | np.isinf(self.room[rows])]
             if not len(rows):
                 return
             self.take(*self._steps_about(self.nearest[rows], rows, slice(None), number))
