@@ -11,11 +11,13 @@ what `real`, `mask` and `real_sin` stand for is said by the C text before it (`d
 - A Switch calls one of several Functions. Of vectors it calls each that any lane takes, and every
   lane keeps the results of its own.
 
-Other Functions are expanded into SX.
+Other Functions are expanded into SX. Functions that differ by constants alone, as those of a left
+and a right arm do, are one in C, with a table of constants each.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -44,8 +46,8 @@ def emit(functions: Sequence[ca.Function], form: Form) -> tuple[str, list[Name]]
 
     Returns:
         The text, and the names of the functions in C: `static void name(const real *i0, ...,
-        real *o0, ...)`, of lanes with `int wanted` behind, a bit for each lane that counts. The
-        nonzeros of an output are written where it is not NULL; the first never is.
+        real *o0, ...)`, some of them macros, of lanes with `int wanted` behind, a bit for each lane
+        that counts. The nonzeros of an output are written where it is not NULL; the first never is.
 
     Raises:
         KernelError: One holds what has no C code (a Python callback, an Ipopt call).
@@ -57,7 +59,20 @@ def emit(functions: Sequence[ca.Function], form: Form) -> tuple[str, list[Name]]
             names.append(emitter.name(function))
         except NoCodeError as error:
             raise KernelError(f"kernel {function.name()!r}: no C code for {error}") from error
-    return "".join(emitter.texts), names
+    return emitter.text(), names
+
+
+VARIES = re.compile(r"\bR\((-?[0-9][^()]*)\)|\b(f[0-9]+_\w+)\(")
+"""What functions that are alike differ in: constants, and which of some alike they call."""
+
+
+class _Written(NamedTuple):
+    """A function in C: its name, its parameters, its body, the kind of functions that it is of."""
+
+    name: Name
+    given: str
+    body: str
+    kind: int
 
 
 class _Emitter:
@@ -65,8 +80,9 @@ class _Emitter:
 
     def __init__(self, form: Form) -> None:
         self.form = form
-        self.texts: list[str] = []
         self._names: dict[int, tuple[Name, ca.Function]] = {}
+        self._written: dict[Name, _Written] = {}
+        self._kinds: dict[str, int] = {}
 
     def name(self, function: ca.Function) -> Name:
         """The name of a function in C, which is written if it is not yet."""
@@ -80,8 +96,58 @@ class _Emitter:
             given = [f"const real *{each}" for each in inputs] + [f"real *{o}" for o in outputs]
             head = ", ".join(given + (["int wanted"] if self.form.lanes > 1 else []))
             unused = ", ".join(f"(void) {each}" for each in inputs + outputs)
-            self.texts.append(f"CODE void {name}({head}) {{\n  {unused};\n{body}}}\n")
+            self._write(name, head, f"  {unused};\n{body}")
         return self._names[key][0]
+
+    def _write(self, name: Name, given: str, body: str) -> None:
+        """Keep a function that calls none but those that are kept."""
+
+        def kind(found: re.Match[str]) -> str:
+            return f"<{self._written[found[2]].kind if found[2] else ''}>"
+
+        form = given + VARIES.sub(kind, body)
+        number = self._kinds.setdefault(form, len(self._kinds))
+        self._written[name] = _Written(name, given, body, number)
+
+    def text(self) -> str:
+        """All of them, those that are alike as one with constants by name."""
+        kinds: list[list[_Written]] = [[] for _ in self._kinds]
+        for function in self._written.values():
+            kinds[function.kind].append(function)
+        tables: dict[Name, list[str]] = {}
+        return "".join(self._of_kind(number, kind, tables) for number, kind in enumerate(kinds))
+
+    def _of_kind(self, number: int, kind: list[_Written], tables: dict[Name, list[str]]) -> str:
+        """Functions that are alike; `tables` gets the constants in which each differs."""
+        first, *others = kind
+        own = [list[str]() for _ in kind]
+        places: list[int | None] = []
+        for varying in zip(*(VARIES.findall(each.body) for each in kind), strict=True):
+            parts = [tables[name] if name else [constant] for constant, name in varying]
+            differs = any(part != parts[0] for part in parts)
+            places.append(len(own[0]) if differs else None)
+            for table, part in zip(own, parts, strict=True):
+                table += part if differs else []
+        tables |= {each.name: table for each, table in zip(kind, own, strict=True)}
+        if not own[0]:
+            same = "".join(f"#define {other.name} {first.name}\n" for other in others)
+            return f"CODE void {first.name}({first.given}) {{\n{first.body}}}\n{same}"
+        at = iter(places)
+
+        def placed(found: re.Match[str]) -> str:
+            place = next(at)
+            if place is None:
+                return found[0]
+            if not found[2]:
+                return f"R(constants[{place}])"
+            return f"alike{self._written[found[2]].kind}(constants+{place}, "
+
+        body = VARIES.sub(placed, first.body)
+        text = f"CODE void alike{number}(const scalar *constants, {first.given}) {{\n{body}}}\n"
+        for each, table in zip(kind, own, strict=True):
+            text += f"static const scalar of_{each.name}[]={{{','.join(table)}}};\n"
+            text += f"#define {each.name}(...) alike{number}(of_{each.name}, __VA_ARGS__)\n"
+        return text
 
     def call(self, function: ca.Function, arguments: Sequence[str], wanted: str = "wanted") -> str:
         """A call of a function."""

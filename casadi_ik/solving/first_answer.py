@@ -155,7 +155,7 @@ def compile_in_background() -> None:
     with contextlib.suppress(OSError, AttributeError):
         os.nice(5)
     method.prepare()
-    _ = method.kernel.lanes
+    method.prepare(batches=True)
 
 
 def _end_later() -> None:

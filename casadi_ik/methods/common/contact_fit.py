@@ -282,7 +282,10 @@ class WholeContacts:
         parameters = self._layout.symbols("parameters")
         q, p = ca.SX.sym("q", len(self._robot.actuators)), self._layout.unpack(parameters)
         residual = whole_residual(self._robot, self._rows, q, p)
-        jacobian = whole_jacobian(self._robot, self._rows, q, p)
+        # Rows of a contact are alike, so that a fit and its balance are solved by the same code.
+        slopes = whole_jacobian(self._robot, self._rows, q, p)
+        both = (_in_columns(slopes[own, :]) for own in self._rows.slices)
+        jacobian = ca.vertcat(*(dense @ columns for dense, columns in both))
         return part("whole_at", [q, parameters], [ca.densify(residual), jacobian])
 
     def fitted(self, q: Expr, damping: Expr, parameters: Expr) -> Tried:
@@ -399,18 +402,22 @@ def reweighted(
     Returns:
         Residual (size, 1) and Jacobian (size, n).
     """
-    weighed, n = _weighed(before, contacts, number, p), jacobian.shape[1]
+    weighed = _weighed(before, contacts, number, p)
     allowed = _allowed(p)
     residual, rows = [], []
     for i, own in enumerate(contacts.slices):
-        part_of = jacobian[own, :]
-        columns = sorted(set(part_of.sparsity().get_col()))
-        of = _stretched(own.stop - own.start, len(columns))
+        dense, columns = _in_columns(jacobian[own, :])
         given = (weighed.parts[i], weighed.weights[i], weighed.power, allowed[i])
-        right, slopes = of(before[own], ca.densify(part_of[:, columns]), *given)
+        right, slopes = _stretched(*dense.shape)(before[own], dense, *given)
         residual.append(right)
-        rows.append(slopes @ ca.DM.eye(n)[columns, :])
+        rows.append(slopes @ columns)
     return ca.vertcat(*residual), ca.vertcat(*rows)
+
+
+def _in_columns(rows: Expr) -> tuple[Expr, ca.DM]:
+    """Two factors of rows (m, n): what is structurally not zero in one of them, and its columns."""
+    columns = sorted(set(rows.sparsity().get_col()))
+    return ca.densify(rows[:, columns]), ca.DM.eye(rows.shape[1])[columns, :]
 
 
 @cache

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 
@@ -18,6 +18,7 @@ from casadi_ik.arms.family import ArmFamily
 from casadi_ik.arms.recognise import arm_family
 from casadi_ik.arms.search import PARAMETERS, ArmTrials, Farthest
 from casadi_ik.kernels.graphs import FunctionGraph
+from casadi_ik.kernels.layout import Layout
 from casadi_ik.methods.common.bounded_step import Bounded, clip, damped_step
 from casadi_ik.methods.common.contact_fit import FIT, Tried, fresh_fit, judge, judge_contacts
 from casadi_ik.methods.common.palm import best_palm, hand_contacts, newton_polish
@@ -28,7 +29,7 @@ from casadi_ik.problem.contacts import LENGTH, Kinds
 from casadi_ik.problem.status import Phase
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.kinematics import ActuatedKinematics, Pose, actuated
-from casadi_ik.symbolic.smooth import Expr, shared
+from casadi_ik.symbolic.smooth import Expr, part, part_of, shared
 
 
 class SideStage(NamedTuple):
@@ -74,14 +75,41 @@ class BodySide:
         """The side as a robot by itself."""
         return self.layouts.robot
 
+    @cached_property
+    def _own(self) -> Layout:
+        """Of its parameters."""
+        fields = self.layouts.parameters.fields
+        return Layout(tuple(field for field in fields if field.name != "postures"))
+
+    # What follows are functions of what is the side's alone: of a left and a right side they are
+    # alike, so that their code stands once (kernels/emitter.py).
+
+    def best_palm(self, hand: Expr, own: dict[str, Expr], number: Expr) -> tuple[Expr, Expr]:
+        """Rotation and origin of the palm that suits a hand best, see `palm_fit.best_palm`."""
+        given, turn = self._own.symbols("own"), ca.SX.sym("turn")
+        at = ca.SX.sym("hand", hand.numel())
+        contacts = hand_contacts(self.robot, at, self.robot.hand_actuators)
+        found = best_palm(contacts, self.layouts.contacts, self._own.unpack(given), turn)
+        return part("best_palm", [at, given, turn], found)(hand, self._own.pack(own), number)
+
+    def fitted(self, x: PalmAndHand, damping: Expr, own: dict[str, Expr], q: Expr) -> Tried:
+        """One damped step of palm and hand, see `fit_step`."""
+        given, around = self._own.symbols("own"), ca.SX.sym("damping")
+        there = PalmAndHand(ca.SX.sym("R", 3, 3), ca.SX.sym("t", 3), ca.SX.sym("h", x.hand.numel()))
+        at = ca.SX.sym("q", q.numel())
+        step = fit_step(self.layouts, None, there, around, self._own.unpack(given), at, [given])
+        rest = step.before, step.there, step.promised, step.size
+        whole = part("fitted", [*there, around, given, at], [*step.reached, *rest])
+        *reached, before, left, promised, size = whole(*x, damping, self._own.pack(own), q)
+        return Tried(PalmAndHand(*reached), before, left, promised, size)
+
     def parameters(self, p: dict[str, Expr]) -> dict[str, Expr]:
         """The part of a body's parameters that is the side's."""
         contacts = {field.name for field in self.layouts.contacts.fields}
         by_finger = contacts | {"position_tolerance", "angle_tolerance"}
         found = {
             name: p[name][self.fingers, :] if name in by_finger else p[name]
-            for name in self.layouts.parameters.names
-            if name != "postures"
+            for name in self._own.names
         }
         return found | {name: p[name][self.motors] for name in ("lower", "upper", "start")}
 
@@ -156,10 +184,9 @@ class BodyStep(HandFirstStep):
     def _side_candidate(self, stage: Stage | SideStage, side: BodySide) -> ca.Function:
         inputs, s, p = self._vectors()
         hands = ca.SX.sym("hand", len(self.layouts.robot.hand_actuators))
-        hand, own = hands[side.hands], side.parameters(p)
-        contacts = hand_contacts(side.robot, hand, side.robot.hand_actuators)
+        hand = hands[side.hands]
         number = ca.fmax(s["candidate"] + s["earlier"], 0.0) + s["turn"]
-        rotation, origin = best_palm(contacts, side.layouts.contacts, own, number)
+        rotation, origin = side.best_palm(hand, side.parameters(p), number)
         before = s["q"] if side.place else p["start"]
         q = with_rows(before, side.hand, hand)
         changed = {
@@ -178,7 +205,7 @@ class BodyStep(HandFirstStep):
         hand = list(side.robot.hand_actuators)
         q = s["q"][side.motors]
         x = PalmAndHand(s["palm_rotation"], s["palm_origin"], q[hand])
-        tried = fit_step(side.layouts, None, x, s["damping"], own, q, inputs)
+        tried = side.fitted(x, s["damping"], own, q)
         # A hand that fits its contacts by half has its palm where it need not be within reach.
         judged = judge_contacts(s, own, tried, rows, BODY.fit_part)
         within = judge_contacts(s, own, tried, rows, STAGES.before_the_arm).within
@@ -306,10 +333,15 @@ class BodyStep(HandFirstStep):
         said = {"within": near, "near": near}
         return self._function(Stage.ARM_PLACEMENT, [*inputs, *given], s, changed, said, record)
 
+    @property
+    def _carrying(self) -> list[int]:
+        """Positions in q of what carries the palms: trunk, then arms."""
+        return [*self.robot.trunk_actuators, *self.layouts.arm]
+
     def _trunk(self) -> ca.Function:
         """One damped step of trunk and arms that keeps the palms."""
         inputs, s, p = self._vectors()
-        rows = [*self.robot.trunk_actuators, *self.layouts.arm]
+        rows, off = self._carrying, self._off(s, p, inputs)
         # Where what is near is wanted the trunk moves last.
         unit = ca.if_else(p["nearest"], BODY.trunk_unit, 1.0)
         units = ca.vertcat(
@@ -317,11 +349,11 @@ class BodyStep(HandFirstStep):
         )
         value, lower, upper = (x[rows] / units for x in (s["q"], p["lower"], p["upper"]))
         bounds = Bounded(value, lower, upper, first=0)
-        before, slopes, turned = self._off(s, p, s["q"], rows)
+        before, slopes, turned = off(s["q"])
         slopes = slopes @ ca.diag(units)
         damped = damped_step(slopes, turned, s["damping"], bounds, FIT.passes)
         q = with_rows(s["q"], rows, units * clip(value + damped.step, bounds))
-        there = self._off(s, p, q, [])[0]
+        there = off(q)[0]
         size = ca.mmax(ca.fabs(q - s["q"]))
         tried = Tried(q, before, there, damped.promised, size)
         judged = judge(s, tried, ca.SX(0), ca.SX(0), BODY.patience, BODY.budget)
@@ -332,15 +364,21 @@ class BodyStep(HandFirstStep):
         return self._function(Stage.TRUNK, inputs, s, changed, said, record)
 
     def _off(
-        self, s: dict[str, Expr], p: dict[str, Expr], q: Expr, rows: list[int]
-    ) -> tuple[Expr, Expr, Expr]:
-        """How far the palms are off.
+        self, s: dict[str, Expr], p: dict[str, Expr], given: list[Expr]
+    ) -> Callable[[Expr], Any]:
+        """How far the palms are off, a function of q.
+
+        Args:
+            s: State.
+            p: Parameters.
+            given: The symbols that both are made of.
 
         Returns:
-            Differences of origins by `LENGTH` and of rotations, twelve a side; six rows a side with
-            the same normal equations, as Jacobian over `rows` and as residual: three columns of a
-            rotation turn like one vector.
+            What gives differences of origins by `LENGTH` and of rotations, twelve a side; six rows
+            a side with the same normal equations, as Jacobian over trunk and arms and as residual:
+            three columns of a rotation turn like one vector.
         """
+        q = ca.SX.sym("q", s["q"].numel())
         body = actuated(self.robot, q)
         apart: list[Expr] = []
         slopes: list[Expr] = []
@@ -350,14 +388,13 @@ class BodyStep(HandFirstStep):
             rotation, origin = self._palm(s, side)
             shift = asked * (palm.origin - origin) / LENGTH
             apart += [shift, asked * ca.vec(palm.rotation - rotation)]
-            if not rows:
-                continue
-            linear, angular = body.twist(side.robot.palm_link, palm.origin, rows)
+            rates = body.twist(side.robot.palm_link, palm.origin, self._carrying)
+            linear, angular = map(ca.sparsify, rates)
             crossed = sum(
                 (ca.cross(palm.rotation[:, i], rotation[:, i]) for i in range(3)), ca.SX.zeros(3, 1)
             )
             half = 2**0.5
             slopes += [asked * linear / LENGTH, asked * half * angular]
             turned += [shift, -asked * crossed / half]
-        none = ca.SX.zeros(0, len(rows))
-        return ca.vertcat(*apart), ca.vertcat(none, *slopes), ca.vertcat(ca.SX.zeros(0, 1), *turned)
+        found = (ca.vertcat(*each) for each in (apart, slopes, turned))
+        return part_of("palms_off", [q], given, list(found))

@@ -100,10 +100,7 @@ class SearchPlan:
         budget: Iterations of a round.
         seeds: The hand postures that rounds begin from.
         enforce_limits: Whether limits are part of being solved.
-        begin: Makes first state and parameters of a round.
-        solve: The loop.
-        contacts: Contact points and normals of configurations.
-        judge: Errors and excess over limits of a configuration.
+        made: What gives the kernels below, which are compiled when first asked for.
         sides: Of a body, what its sides' hands are found by.
     """
 
@@ -112,11 +109,28 @@ class SearchPlan:
     budget: int
     seeds: Seeds
     enforce_limits: bool
-    begin: FunctionKernel
-    solve: LoopKernel
-    contacts: FunctionKernel
-    judge: FunctionKernel
+    made: Mapping[str, Callable[[], Any]]
     sides: tuple[SearchPlan, ...] = ()
+
+    @property
+    def begin(self) -> FunctionKernel:
+        """Makes first state and parameters of a round."""
+        return self.made["begin"]()
+
+    @property
+    def solve(self) -> LoopKernel:
+        """The loop."""
+        return self.made["solve"]()
+
+    @property
+    def contacts(self) -> FunctionKernel:
+        """Contact points and normals of configurations."""
+        return self.made["contacts"]()
+
+    @property
+    def judge(self) -> FunctionKernel:
+        """Errors and excess over limits of a configuration."""
+        return self.made["judge"]()
 
     @property
     def rounds(self) -> int:

@@ -173,8 +173,19 @@ class HandFirstMethod(LoopedMethod):
 
     @cached_property
     def is_compiled(self) -> bool:
-        """Whether all that a search calls is compiled: made ahead some may be missing."""
+        """Whether all that solves call is compiled: made ahead some may be missing."""
+        if self._is_apart:
+            return all(side.is_compiled for side in self._sides)
+        return self._is_searchable
+
+    @cached_property
+    def _is_searchable(self) -> bool:
         return self.kernel.compiled and can_search(self.plan(enforce_limits=True))
+
+    @property
+    def _is_apart(self) -> bool:
+        """Whether the robot is a body whose sides know nothing of each other."""
+        return bool(self.robot.sides) and not self.robot.trunk
 
     def in_virtual_machine(self) -> HandFirstMethod:
         """The same, never compiled; a body is one hand with all motors there."""
@@ -184,8 +195,18 @@ class HandFirstMethod(LoopedMethod):
         """What it was made from."""
         return HandFirstMethod, (self.robot, self.options, self._compiled, self._kinds)
 
-    def prepare(self) -> None:
-        """Build and compile what one target takes, and fill the table of the first round."""
+    def prepare(self, batches: bool = False) -> None:
+        """Build and compile what one target takes, and fill the table of the first round.
+
+        Args:
+            batches: Whether to compile what many targets take, too.
+        """
+        if batches and not self._is_apart:
+            _ = self.kernel.lanes
+        if self._is_apart:
+            for side in self._sides:
+                side.prepare(batches)
+            return
         _ = self.first
         if not self.robot.sides:
             _ = self.seeds.table
@@ -207,10 +228,12 @@ class HandFirstMethod(LoopedMethod):
             budget=self.max_iterations,
             seeds=self.seeds,
             enforce_limits=enforce_limits,
-            begin=self.first,
-            solve=self.kernel,
-            contacts=kernels.contacts,
-            judge=kernels.deviations,
+            made={
+                "begin": lambda: self.first,
+                "solve": lambda: self.kernel,
+                "contacts": lambda: kernels.contacts,
+                "judge": lambda: kernels.deviations,
+            },
             sides=tuple(side.plan(enforce_limits) for side in self._sides),
         )
 
@@ -244,7 +267,7 @@ class HandFirstMethod(LoopedMethod):
         if not self.is_compiled:
             method = self.in_virtual_machine() if self.robot.sides else self
             return method._run_from_tables(targets, q0, trace, rounds)
-        if self.robot.sides and not self.robot.trunk:
+        if self._is_apart:
             return self._side_by_side(targets, q0, seed, trace, rounds)
         most = np.full(len(targets), self._rounds_for(targets))
         if rounds is not None:
@@ -274,7 +297,7 @@ class HandFirstMethod(LoopedMethod):
 
     def quick(self, targets: TargetBatch, q0: Array) -> Quick | None:
         """What `run` would find for one target from q0 (n,), sooner; None: ask `run`."""
-        if not self.is_compiled or (self.robot.sides and not self.robot.trunk):
+        if not self.is_compiled or self._is_apart:
             return None
         with self._searches.lent(targets.enforce_limits) as search:
             search.ask(targets, 0, q0, self.terms(targets))
@@ -284,7 +307,7 @@ class HandFirstMethod(LoopedMethod):
     def alone(self, enforce_limits: bool) -> Searches | None:
         """Memory for one search after the other; None without a compiler."""
         self.prepare()
-        return Searches(self.plan(enforce_limits), 1) if self.is_compiled else None
+        return Searches(self.plan(enforce_limits), 1) if self._is_searchable else None
 
     def stepper(self, targets: TargetBatch, q0: Array) -> Stepper:
         """One target, one iteration at a time; see `Method.stepper`."""
