@@ -49,6 +49,8 @@ BLOCK = 20_000
 """Targets solved in one call."""
 ALONE = 300
 """Targets solved one by one; poses of the path that is followed."""
+CYCLES = 2000
+"""Of hands that are led through each other, at 1 kHz."""
 
 INTRODUCTION = """
 A target is what all fingertips of a configuration touch, so it can be reached: *random* ones are
@@ -133,6 +135,33 @@ def followed(robot: ArmHand) -> list[str]:
     return [robot.name, f"{median:.1f}", f"{most:.1f}", f"{1e3 * np.median(off):.2f}"]
 
 
+def crossed(robot: ArmHand) -> list[str] | None:
+    """Hands led to each other's place and back, through each other, followed in a scene."""
+    sides = robot.description.sides
+    if len(sides) != 2 or not robot.description.shapes.capsules:
+        return None
+    solver, (points, normals) = ik.Solver(robot, scene=ik.Scene()), robot.contacts(robot.home)
+    rows = [[robot.fingers.index(finger) for finger in side.fingers] for side in sides]
+    way = points[rows[1]].mean(axis=0) - points[rows[0]].mean(axis=0)
+    for _ in range(2):  # once to have all compiled and warm
+        follower, q, spent, blocked = solver.follow(robot.home), [robot.home], [], 0
+        for share in np.sin(np.linspace(0, np.pi, CYCLES)) ** 2:
+            goal = points.copy()
+            goal[rows[0]] += share * way
+            goal[rows[1]] -= share * way
+            begun = time.process_time()
+            q.append(follower(goal, normals))
+            spent.append(1e6 * (time.process_time() - begun))
+            blocked += follower.state.status is ik.motion.FollowStatus.BLOCKED
+    every = zip(robot.fingers, points, normals, strict=True)
+    grasp = ik.Grasp(name="home", contacts={f: ik.Contact(p, n) for f, p, n in every})
+    room = solver.check(np.array(q), grasp)
+    assert room is not None
+    median, most = np.median(spent), np.quantile(spent, 0.99)
+    least = f"{1e3 * room.surplus.min():.3f}"
+    return [robot.name, f"{median:.1f}", f"{most:.1f}", f"{blocked} of {CYCLES}", least]
+
+
 def free(robot: ArmHand, count: int, seed: int) -> list[str] | None:
     """Targets made by configurations that touch nothing: answers that touch nothing either."""
     if not robot.description.shapes.capsules:
@@ -169,30 +198,43 @@ def main(arguments: list[str] | None = None) -> None:
     """Solve and write the report."""
     parser = argparse.ArgumentParser(description="Several arms on a trunk, solved as one.")
     parser.add_argument("--robots", nargs="+", default=ROBOTS)
-    parser.add_argument("--count", type=int, default=100_000, help="targets of every kind")
+    parser.add_argument("--count", type=int, default=100_000, help="targets of every kind; 0: none")
     parser.add_argument("--free", type=int, default=500, help="targets without collision; 0: none")
     parser.add_argument("--peers", type=int, default=100, help="targets for other ways; 0: none")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=RESULTS / "one_body")
     options = parser.parse_args(arguments)
     table, metrics, paths, rooms, others, wrists = [], list[Metric](), [], [], [], []
+    crossings = list[list[str]]()
     for name in options.robots:
         robot = ik.load_robot(name)
-        rows, some = batches(robot, options.count, options.seed)
-        own = alone(robot, options.seed)
-        metrics += [*some, median_metric(f"one_body/{name}/alone", [own], "us")]
-        label = f"{name} ({len(robot.actuators)} motors)"
-        table += [[label, *row, f"{own:.0f}"] for row in rows]
+        if options.count:
+            rows, some = batches(robot, options.count, options.seed)
+            own = alone(robot, options.seed)
+            metrics += [*some, median_metric(f"one_body/{name}/alone", [own], "us")]
+            label = f"{name} ({len(robot.actuators)} motors)"
+            table += [[label, *row, f"{own:.0f}"] for row in rows]
         paths.append(followed(robot))
+        crossing = crossed(robot)
+        crossings += [] if crossing is None else [crossing]
         room = free(robot, options.free, options.seed) if options.free else None
         rooms += [] if room is None else [room]
         if options.peers and name == options.robots[0]:
             others = by_contacts(robot, drawn(robot, options.peers, False, options.seed))
             wrists = by_wrists(robot, 2 * options.peers, options.seed)
     heads = ["robot", "targets", "tolerance", "missed", "a target [us]", "one alone [us]"]
-    parts = [INTRODUCTION, markdown_table(heads, table), "## Followed at 1 kHz"]
+    parts = [INTRODUCTION, markdown_table(heads, table)] if table else []
+    parts.append("## Followed at 1 kHz")
     heads = ["robot", "a cycle, median [us]", "99th percent [us]", "error, median [mm]"]
     parts.append(markdown_table(heads, paths))
+    if crossings:
+        parts.append(
+            "## Hands led through each other\n\nBoth are led to the other's place and back, in "
+            f"{CYCLES} cycles of 1 ms, by a follower that knows the robot's shapes. *Blocked*: "
+            "cycles in which it holds back."
+        )
+        heads = ["robot", "a cycle, median [us]", "99th percent [us]", "blocked"]
+        parts.append(markdown_table([*heads, "least clearance [mm]"], crossings))
     if rooms:
         parts.append(
             "## Touching nothing\n\nTargets of configurations that do not touch themselves. "

@@ -59,7 +59,7 @@ def emit(functions: Sequence[ca.Function], form: Form) -> tuple[str, list[Name]]
             names.append(emitter.name(function))
         except NoCodeError as error:
             raise KernelError(f"kernel {function.name()!r}: no C code for {error}") from error
-    return emitter.text(), names
+    return emitter.text(names), names
 
 
 VARIES = re.compile(r"\bR\((-?[0-9][^()]*)\)|\b(f[0-9]+_\w+)\(")
@@ -109,16 +109,26 @@ class _Emitter:
         number = self._kinds.setdefault(form, len(self._kinds))
         self._written[name] = _Written(name, given, body, number)
 
-    def text(self) -> str:
-        """All of them, those that are alike as one with constants by name."""
+    def text(self, asked: Sequence[Name]) -> str:
+        """All of them, those that are alike as one with constants by name if they are called so."""
         kinds: list[list[_Written]] = [[] for _ in self._kinds]
         for function in self._written.values():
             kinds[function.kind].append(function)
         tables: dict[Name, list[str]] = {}
-        return "".join(self._of_kind(number, kind, tables) for number, kind in enumerate(kinds))
+        codes = [self._of_kind(number, kind, tables) for number, kind in enumerate(kinds)]
+        called = {*asked, *(name for code in codes for _, name in VARIES.findall(code))}
+        texts = []
+        for number, (code, kind) in enumerate(zip(codes, kinds, strict=True)):
+            texts.append(code)
+            for name in (each.name for each in kind if tables[each.name] and each.name in called):
+                texts += [
+                    f"static const scalar of_{name}[]={{{','.join(tables[name])}}};\n",
+                    f"#define {name}(...) alike{number}(of_{name}, __VA_ARGS__)\n",
+                ]
+        return "".join(texts)
 
     def _of_kind(self, number: int, kind: list[_Written], tables: dict[Name, list[str]]) -> str:
-        """Functions that are alike; `tables` gets the constants in which each differs."""
+        """Code of functions that are alike; `tables` gets the constants in which each differs."""
         first, *others = kind
         own = [list[str]() for _ in kind]
         places: list[int | None] = []
@@ -143,11 +153,7 @@ class _Emitter:
             return f"alike{self._written[found[2]].kind}(constants+{place}, "
 
         body = VARIES.sub(placed, first.body)
-        text = f"CODE void alike{number}(const scalar *constants, {first.given}) {{\n{body}}}\n"
-        for each, table in zip(kind, own, strict=True):
-            text += f"static const scalar of_{each.name}[]={{{','.join(table)}}};\n"
-            text += f"#define {each.name}(...) alike{number}(of_{each.name}, __VA_ARGS__)\n"
-        return text
+        return f"CODE void alike{number}(const scalar *constants, {first.given}) {{\n{body}}}\n"
 
     def call(self, function: ca.Function, arguments: Sequence[str], wanted: str = "wanted") -> str:
         """A call of a function."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import ctypes
 import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -23,6 +23,8 @@ from casadi_ik.kernels.graphs import FunctionGraph
 from casadi_ik.kernels.libraries import load_function, load_library
 
 logger = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
 
 _BYTE: Any = ctypes.c_char
 
@@ -263,6 +265,17 @@ class FunctionKernel:
         run(arrays, steps, outputs, 1 if count is None else count)
         return outputs
 
+    def standing(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> Callable[[], None]:
+        """One call to be made again and again, on arrays of the inputs' and outputs' shapes."""
+        if self.compiled:
+            return SingleCall(self.name, self.entry, inputs, outputs)
+
+        def call() -> None:
+            for output, found in zip(outputs, self(*inputs), strict=True):
+                output[...] = found
+
+        return call
+
     def _single(self) -> SingleCall:
         """One call with memory of its own, to be made again and again."""
         inputs, outputs = (
@@ -374,9 +387,6 @@ def _shape(size: tuple[int, int]) -> tuple[int, ...]:
     if columns != 1:
         return (rows, columns)
     return () if rows == 1 else (rows,)
-
-
-Array = NDArray[np.float64]
 
 
 class Recurrence:

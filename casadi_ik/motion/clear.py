@@ -10,22 +10,30 @@ free is taken as free.
 as the contacts leave it free: small clearances are rows of its least squares. And a step is made
 only if the robot can come to rest after it without being too near to anything; else the motors
 brake. Since the step before was made under the same condition, braking is safe: by induction the
-robot never comes nearer than the margin to what stands still.
+robot never comes nearer than the margin to what stands still. Some places on the way to rest are
+looked at, with `RESOLUTION` and what distances bend by for what is between them; of pairs those
+alone that may be near by how far their shapes have moved since all were looked at (`Watch`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array, Bools
+from casadi_ik.kernels import FunctionKernel
+from casadi_ik.kernels.clearance_kernel import Watch
+from casadi_ik.kernels.graphs import FunctionGraph, recipe
 from casadi_ik.motion.inputs import FollowerInputs, FollowPlan
 from casadi_ik.problem.clearance import ROUNDING, Clearances, CollisionQuery
 from casadi_ik.problem.targets import TargetBatch
+from casadi_ik.symbolic.smooth import shared
 
 
 def stopping_way(moved: Array, change: Array) -> Array:
@@ -39,23 +47,39 @@ def stopping_way(moved: Array, change: Array) -> Array:
     return np.sign(moved) * (np.abs(moved) * after - change * after * (after + 1) / 2)
 
 
-def stopping_path(q: Array, moved: Array, change: Array, count: int) -> Array:
-    """Where motors are on the way to rest.
+def stopping(n: int, places: int) -> FunctionGraph:
+    """Where motors are that make part of a step, and then come to rest.
 
     Args:
-        q: (n,) where they are.
-        moved: (n,) their last steps.
-        change: (n,) by how much a step may differ from the last.
-        count: How many places, evenly spaced in time.
+        n: How many motors.
+        places: Where they are, and others on the way to rest, evenly spaced in time.
 
     Returns:
-        (count, n), q itself the first and the place of rest the last.
+        ``(q, last, wanted, change, share) -> (step, path, sound)``, (n,) where they are, their last
+        step, the one wanted now, and by how much a step may differ from the last; the share of the
+        wanted step, between it and braking. The step made; (places, n), where they are the first,
+        where the step leads the next and the place of rest the last; finite if all numbers are.
     """
-    speed = np.abs(moved)
-    after = np.floor(speed / change)
-    number = np.ceil(np.linspace(0.0, after.max(), count))[:, None]
-    steps = np.minimum(number, after)
-    return q + np.sign(moved) * (speed * steps - change * steps * (steps + 1) / 2)
+    name = f"stopping_{n}_{places}"
+
+    def build() -> ca.Function:
+        q, last, wanted, change = (ca.SX.sym(f"{x}", n) for x in ("q", "last", "wanted", "change"))
+        share = ca.SX.sym("share")
+        braked = ca.sign(last) * ca.fmax(ca.fabs(last) - change, 0.0)
+        step = braked + share * (wanted - braked)
+        speed, sign = ca.fabs(step), ca.sign(step)
+        after = ca.floor(speed / change)
+        most, path = ca.mmax(after), [q.T]
+        for k in range(places - 1):
+            steps = ca.fmin(ca.ceil(most * k / (places - 2)), after)
+            gone = sign * (speed * steps - change * steps * (steps + 1) / 2)
+            path.append((q + step + gone).T)
+        given = [q, last, wanted, change, share]
+        outputs = shared(step, ca.vertcat(*path), ca.sum2(path[-1]))
+        return ca.Function(name, given, outputs, ["q", "last", "wanted", "change", "share"], [])
+
+    inputs = dict.fromkeys(("q", "last", "wanted", "change"), (n, 1)) | {"share": (1, 1)}
+    return FunctionGraph(name, build, inputs, ((n, 1), (places, n), (1, 1)), recipe(name))
 
 
 RESOLUTION = 1e-4
@@ -371,31 +395,58 @@ class Guard:
     Attributes:
         near: Clearance beyond the margin from which on the goal keeps away [m].
         nudge: Part of a motor's unit by which slopes of clearances are measured [rad or m].
-        places: Places on the way to rest that are looked at.
+        places: Places on the way to rest that are looked at, as many as vector registers hold.
         shares: Parts of the wanted step, between it and braking, that are tried in turn.
     """
 
     near = 0.01
     nudge = 1e-4
-    places = 9
+    places = 8
     shares = (1.0, 0.5)
 
     def __init__(self, plan: FollowPlan) -> None:
         """Take the scene, every finger in contact."""
         assert plan.check is not None
         self._check, self._plan = plan.check, plan
-        fingers = len(plan.robot.fingers)
+        fingers, n = len(plan.robot.fingers), len(plan.robot.actuators)
+        self._n, self._change = n, plan.rates.steps(plan.period)[1]
+        self._rest = np.zeros((self.places, n))
+        self._asked = np.zeros(n), np.zeros(n), np.zeros(n), self._change, np.zeros(())
+        self._step, self._sound = np.zeros(n), np.zeros(())
+        self._stop = FunctionKernel(stopping(n, self.places), plan.compiled).standing(
+            self._asked, (self._step, self._rest, self._sound)
+        )
+        self._nudges = np.concatenate([np.zeros((1, n)), self.nudge * np.eye(n)])
         anywhere = np.zeros((1, fingers, 3))
         self._query = self._at(plan.request.of_arrays(anywhere, anywhere + 1.0, None))
-        self._n = len(plan.robot.actuators)
-        self._change = plan.rates.steps(plan.period)[1]
+        self._lay_out()
 
     def surround(self, problem: TargetBatch) -> None:
         """Mind one target: which fingers touch, and where the object is."""
-        self._query = self._at(problem)
+        query, before = self._at(problem), self._query
+        self._query = query
+        if query.table is not before.table:
+            self._lay_out()
+        elif not np.array_equal(query.poses, before.poses):
+            for watch in (self._path, self._goal, self._slopes):
+                watch.surround(query.poses)
 
     def _at(self, problem: TargetBatch) -> CollisionQuery:
         return self._check.collision_query(problem).rows(np.zeros(1, dtype=np.intp))
+
+    def _lay_out(self) -> None:
+        """Memory for the distances that are looked at."""
+        query, n = self._query, self._n
+        kernel, poses, table, margin = query.kernel, query.poses, query.table, query.margin
+        self._enough, self._near = margin + RESOLUTION - ROUNDING, margin + self.near
+        goal, nudged = np.zeros((1, n)), np.zeros((n + 1, n))
+        self._path = Watch(kernel, self._rest, poses, table, self._near, way=True)
+        self._goal = Watch(kernel, goal, poses, table, self._near, few=OBSTACLES)
+        # Of a few pairs, others each time.
+        self._few = replace(
+            table, pairs=np.zeros((OBSTACLES, 2), dtype=np.int32), offsets=np.zeros(OBSTACLES)
+        )
+        self._slopes = Watch(kernel, nudged, poses, self._few)
 
     def clearance(self, q: Array) -> Clearances:
         """Of a configuration (n,)."""
@@ -408,48 +459,53 @@ class Guard:
             The state, and whether the motors had to brake.
         """
         n, run = self._n, asked.run
-        before = run.state.copy()
+        before = run.state
         self._keep_away(asked, before[2 * n : 3 * n])
         after = run.step()
-        q, moved = before[:n], after[n : 2 * n].copy()
-        braked = np.sign(before[n : 2 * n]) * np.maximum(
-            np.abs(before[n : 2 * n]) - self._change, 0.0
-        )
-        for share in self.shares:
-            step = braked + share * (moved - braked)
-            if self._can_rest(q + step, step):
+        q, last, wanted, _, share = self._asked
+        q[...], last[...], wanted[...] = before[:n], before[n : 2 * n], after[n : 2 * n]
+        for part in self.shares:
+            share[...] = part
+            self._stop()
+            self._path()
+            # What is no number is nowhere.
+            if min(self._path.least[1:].tolist()) >= self._enough and math.isfinite(self._sound):
                 break
         else:
-            share, step = 0.0, braked
-            if not moved.any() or self._gets_free(q, moved):
-                share, step = 1.0, moved
-        if share < 1.0:
-            after[:n], after[n : 2 * n] = q + step, step
+            part = 0.0
+            if self._gets_free(q, wanted):
+                return after, False
+            share[...] = part
+            self._stop()
+        if part < 1.0:
+            after[:n], after[n : 2 * n] = q + self._step, self._step
             # A goal that runs ahead where nobody can follow would be reached through the obstacle.
-            after[2 * n : 3 * n] = q + step + stopping_way(step, self._change)
+            after[2 * n : 3 * n] = self._rest[-1]
             after[3 * n] = 0.0
-        return after, share < 1.0
-
-    def _can_rest(self, q: Array, moved: Array) -> bool:
-        path = stopping_path(q, moved, self._change, self.places)
-        return bool(self._query.free(path).all())
+        return after, part < 1.0
 
     def _gets_free(self, q: Array, moved: Array) -> bool:
-        """Whether a robot that is too near already gets away."""
+        """Whether a robot that is too near already stays or gets away."""
+        if self._path.least[0] >= self._enough:
+            return False
+        if not moved.any():
+            return True
         surplus = self._query.check(np.stack([q, q + moved])).surplus
-        return bool(surplus[0] < 0 and surplus[1] > surplus[0])
+        return bool(surplus[1] > surplus[0])
 
     def _keep_away(self, asked: FollowerInputs, goal: Array) -> None:
-        query = self._query
         rooms, slopes = asked.views["rooms"], asked.views["slopes"]
-        rooms[...] = 0.0
-        most = query.margin + self.near
-        least, _ = query.kernel.least(goal[None], query.poses, query.table, most)
-        if least[0] >= most:
+        self._goal.q[...] = goal
+        self._goal()
+        # Without room to gain a row counts nothing, whatever its slopes.
+        nearest = self._goal.nearest
+        np.subtract(self._near, self._goal.near, out=rooms)
+        if nearest[0] < 0:
             return
-        nudged = goal + np.concatenate([np.zeros((1, self._n)), self.nudge * np.eye(self._n)])
-        every = query.kernel.every(nudged, query.poses, query.table)
-        nearest = np.argsort(every[0])[: len(rooms)]
-        count = len(nearest)
-        rooms[:count] = np.maximum(most - every[0, nearest], 0.0)
-        slopes[:count] = ((every[1:, nearest] - every[0, nearest]) / self.nudge).T
+        table = self._query.table
+        self._few.pairs[...], self._few.offsets[...] = table.pairs[nearest], table.offsets[nearest]
+        np.add(goal, self._nudges, out=self._slopes.q)
+        self._slopes()
+        every = self._slopes.every
+        np.subtract(every[1:].T, every[0, :, None], out=slopes)
+        slopes /= self.nudge

@@ -65,6 +65,31 @@ def test_leaping_targets_never_make_it_touch_anything(robot, solver, seed):
     assert clearances(solver, np.array(q)).free.all()
 
 
+def test_hands_that_are_led_through_each_other_do_not_get_there():
+    """They stop before each other, and follow again on the way back."""
+    body = ik.load_robot("g1+dex3")
+    points, normals = body.contacts(body.home)
+    rows = [
+        [body.fingers.index(finger) for finger in side.fingers] for side in body.description.sides
+    ]
+    way = points[rows[1]].mean(axis=0) - points[rows[0]].mean(axis=0)
+    solver = ik.Solver(body, scene=ik.Scene())
+    plain, careful = ik.Solver(body).follow(body.home, PERIOD), solver.follow(body.home, PERIOD)
+    ways: dict[bool, list] = {True: [body.home], False: [body.home]}
+    statuses = []
+    for share in np.append(np.sin(np.linspace(0, np.pi, 500)) ** 2, np.zeros(100)):
+        goal = points.copy()
+        goal[rows[0]] += share * way
+        goal[rows[1]] -= share * way
+        ways[False].append(plain(goal, normals))
+        ways[True].append(careful(goal, normals))
+        statuses.append(careful.state.status)
+    assert clearances(solver, np.array(ways[False])).distance.min() < -0.01
+    assert clearances(solver, np.array(ways[True])).free.all()
+    assert ik.motion.FollowStatus.BLOCKED in statuses
+    assert statuses[-1] is ik.motion.FollowStatus.FOLLOWING
+
+
 def clearances_around(solver):
     grasp = ik.Grasp(dict.fromkeys(solver.robot.fingers[:1], ik.Contact([0, 0, 0], [0, 0, 1])))
     around = solver._engine.collision_query(solver._request.of_grasps([grasp], None))
