@@ -45,7 +45,7 @@ PLACES = ([0.45, -0.2, 0.35], [0.5, 0.15, 0.35])
 """Where objects are held [m], in the Panda's base frame: x forward, y left, z up."""
 
 YAWS = (0.0, 2.1, 4.2)
-LIMIT = 30
+LIMIT = 200
 """How many grasps are looked for at a place and yaw [rad]."""
 
 CLEAR = 0.0015
@@ -187,6 +187,8 @@ def text_of(
         f"Load with a friction coefficient of 0.5: {load:.3f} N per newton of squeeze.",
     ]
     hand = set(description.hand_actuators)
+    # Twelve decimals are written, and these are within limits.
+    q = np.clip(q, np.ceil(1e12 * robot.lower) / 1e12, np.floor(1e12 * robot.upper) / 1e12)
     posture = [
         f"  {one.name}: {value:.12f}  # "
         + (f"{np.rad2deg(value):.3f} deg" if one.unit == "rad" else f"{1e3 * value:.3f} mm")
