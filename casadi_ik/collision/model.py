@@ -224,6 +224,7 @@ def pair_table(
                 + ", ".join([*scene.items, *model.robot.links])
             )
     own, count = own_solids(model.robot), len(model.capsules)
+    fingers = _finger_links(model.robot) if scene.enveloping else frozenset[str]()
     parts = [(item, *part) for item in scene.items.values() for part in item.parts]
     rows: list[tuple[tuple[int, int], float, float, tuple[str, str]]] = []
 
@@ -239,7 +240,9 @@ def pair_table(
             fixed = model.is_fixed(link) and not (carried and grasped)
             if not fixed and not (grasped and link in touched_by):
                 usual = scene.margin if item.margin is None else item.margin
-                add((i, k), (link, item.name), usual, 0.0)
+                deep = grasped and link in fingers
+                usual, overlap = (0.0, -scene.enveloping) if deep else (usual, 0.0)
+                add((i, k), (link, item.name), usual, overlap)
     for (i, j), overlap in zip(model.pairs.tolist(), model.offsets.tolist(), strict=True):
         add((i, j), model.names(i, j), scene.margin, overlap)
     return Table(
@@ -255,6 +258,12 @@ def pair_table(
         margins=np.array([margin for _, _, margin, _ in rows]),
         moving=model.moving,
     )
+
+
+def _finger_links(robot: RobotDescription) -> frozenset[str]:
+    """Links that joints of fingers move."""
+    joints = {name for finger in robot.fingers for name in finger.joints}
+    return frozenset(k for k in robot.links if any(one.name in joints for one in robot.chain(k)))
 
 
 def check_base(model: CollisionModel, scene: Scene, where: Array, names: Collection[str]) -> None:

@@ -317,6 +317,8 @@ class SceneFile(Struct, frozen=True):
         margin: Distance to keep, also between links [m].
         grasped: Name of the solid that is grasped: links with a contact may touch it.
         margins: Distances of two, before the solid's and the scene's.
+        enveloping: Fingers may touch what is grasped with all their links, whose shapes may be so
+            deep in it [m]; 0: with fingertips alone.
         touching: Pairs that may touch.
         name: What it is called; left out: as its file.
         description: One sentence.
@@ -326,6 +328,7 @@ class SceneFile(Struct, frozen=True):
     margin: Distance = 0.0
     grasped: str | None = None
     margins: list[MarginEntry] = msgspec.field(default_factory=list)
+    enveloping: Distance = 0.0
     touching: list[TouchingEntry] = msgspec.field(default_factory=list)
     name: str = ""
     description: str = ""
@@ -359,6 +362,7 @@ class Scene:
         grasped: Name of the item that is grasped: links with a contact may touch it.
         margins: By pair of links or items the distance to keep instead of the scene's or item's
             [m].
+        enveloping: How deep shapes of all links of fingers may be in what is grasped [m].
         touching: Links that may touch an item or each other, and why.
         name: What it is called.
 
@@ -376,6 +380,7 @@ class Scene:
         grasped: str | None = None,
         touching: Sequence[Mapping[str, Any]] = (),
         margins: Sequence[Mapping[str, Any]] = (),
+        enveloping: float = 0.0,
         name: str = "scene",
     ) -> None:
         """Make a scene; without solids the robot is checked against itself.
@@ -387,6 +392,8 @@ class Scene:
             grasped: Name of the solid that is grasped.
             touching: ``{"links": [LINK, SOLID], "reason": TEXT}`` each.
             margins: ``{"links": [LINK, SOLID], "margin": 0.01}`` each, of links or solids [m].
+            enveloping: Fingers may touch what is grasped with all their links, whose shapes may be
+                so deep in it [m]; 0: with fingertips alone.
             name: What to call it.
 
         Raises:
@@ -409,6 +416,7 @@ class Scene:
             "grasped": grasped,
             "touching": [_plain(one) for one in touching],
             "margins": [_plain(one) for one in margins],
+            "enveloping": enveloping,
         }
         where = Path(name)
         entry, _ = checked(data, SceneFile, where)
@@ -433,7 +441,7 @@ class Scene:
             parts = tuple(solid.solids(where, path.parent))
             entry_there = _located(solid, path.parent)
             self.items[name] = Item(name, parts, solid.matrix(where), solid.margin, entry_there)
-        self.grasped = entry.grasped
+        self.grasped, self.enveloping = entry.grasped, entry.enveloping
         if entry.grasped is not None and entry.grasped not in self.items:
             known = ", ".join(self.items) or "none"
             raise DescriptionError(
@@ -500,6 +508,8 @@ class Scene:
         lines = [f"name: {json.dumps(self.name)}", f"margin: {self.margin:.9g}"]
         if self.grasped is not None:
             lines.append(f"grasped: {json.dumps(self.grasped)}")
+        if self.enveloping:
+            lines.append(f"enveloping: {self.enveloping:.9g}")
         for key, rows in (("touching", self.touching), ("margins", self.margins.items())):
             lines += [f"{key}:"] if rows else []
             for row in rows:

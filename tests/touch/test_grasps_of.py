@@ -82,6 +82,7 @@ def test_things_beside_the_object_are_kept_clear_of(surface):
     assert len(found) == 10
     for one in found:
         assert solver.solve(one.grasp, q0=one.q).success
+        assert one.clearance is not None
         assert one.clearance >= 0
 
 
@@ -554,3 +555,35 @@ def test_a_label_that_stands_off_is_a_thin_part(tmp_path):
         ik.load_surface(tmp_path / "labelled.stl"), PLACE, limit=3, among=3
     )
     assert len(found) == 3
+
+
+def test_fingers_lean_on_what_they_envelop(surface, tmp_path):
+    """Their links alone, and no deeper than the scene says; plain scenes refuse these hands."""
+    robot, deep = ik.load_robot("panda+leap"), 0.006
+    text = f"enveloping: {deep}\n{ik.load_scene('table').text()}"
+    (tmp_path / "leaning.yaml").write_text(text)
+    leaning = ik.load_scene(tmp_path / "leaning.yaml")
+    assert "enveloping: 0.006" in leaning.text()
+    plain = solver_of("panda+leap")
+    solver = ik.Solver(robot, scene=leaning)
+    grasps = solver.grasps_of(surface, PLACE, limit=40, among=40)
+    assert len(grasps) == 40
+    depths = []
+    for one in grasps:
+        assert one.clearance is not None
+        assert one.clearance >= 0
+        assert solver.solve(one.grasp, q0=one.q).success
+        clear = plain.check(one.q, one.grasp)
+        assert clear is not None
+        nearest = clear.pair(0)
+        if not clear.free[0]:
+            assert nearest is not None
+            link, solid = nearest
+            assert solid == surface.name
+            fingers = robot.description.fingers
+            chain = {joint.name for joint in robot.description.chain(link)}
+            assert any(chain.intersection(finger.joints) for finger in fingers)
+            depths.append(-clear.distance[0])
+    assert len(depths) > 5
+    assert max(depths) <= deep
+    assert max(depths) > 0.5 * deep
