@@ -30,6 +30,7 @@ from runner.report import (
 
 import casadi_ik as ik
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
 
 ROBOTS = (
     "g1+dex3",
@@ -143,6 +144,9 @@ def crossed(robot: ArmHand) -> list[str] | None:
     solver, (points, normals) = ik.Solver(robot, scene=ik.Scene()), robot.contacts(robot.home)
     rows = [[robot.fingers.index(finger) for finger in side.fingers] for side in sides]
     way = points[rows[1]].mean(axis=0) - points[rows[0]].mean(axis=0)
+    q: list[Array] = []
+    spent: list[float] = []
+    blocked = 0
     for _ in range(2):  # once to have all compiled and warm
         follower, q, spent, blocked = solver.follow(robot.home), [robot.home], [], 0
         for share in np.sin(np.linspace(0, np.pi, CYCLES)) ** 2:

@@ -30,8 +30,15 @@ from casadi_ik.touch.candidates import (
     touching,
 )
 from casadi_ik.touch.hand_table import HandTable
-from casadi_ik.touch.robustness import offsets, robustness
-from casadi_ik.touch.strength import CLOSED, Strengths, closed, generators, strengths
+from casadi_ik.touch.strength import (
+    CLOSED,
+    Strengths,
+    closed,
+    generators,
+    offsets,
+    robustness,
+    strengths,
+)
 from casadi_ik.touch.surface import Surface
 
 OPENINGS = (0.025, 0.015, 0.008)
