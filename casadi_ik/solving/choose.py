@@ -153,7 +153,8 @@ def choose(
         fixed: As for `solve`.
         apart: How different answers are, of one candidate or several: of any two at least one
             actuator differs by this part of its range, 0 to 1. 0: all that are not the same.
-        per_candidate: How many answers of one candidate at most; None: any number.
+        per_candidate: How many answers of one candidate at most; None: any number, and once there
+            are `limit` of them no candidate is looked at further.
 
     Returns:
         The answers, best first, and why candidates have none.
@@ -183,7 +184,9 @@ def choose(
     # Neither what is preferred nor where the robot is decides which candidates have an answer.
     parts = list(search.look(every, Look.QUICK))
     answers = Answers.joined(parts, len(grasps))
-    if answers.answered.sum() < min(limit, len(grasps)):
+    enough = answers.answered.sum() >= min(limit, len(grasps))
+    # Where several answers of one candidate will do, they may be enough.
+    if not enough and not (most is None and len(search.best(answers, apart, most)) >= limit):
         parts += search.look(~answers.answered, Look.THOROUGH)
         answers = Answers.joined(parts, len(grasps))
     if q0 is not None:
