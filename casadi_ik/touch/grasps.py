@@ -320,7 +320,7 @@ def grasps_of(
     return replace(found, time=time.process_time() - begin)
 
 
-_SOLVERS: WeakKeyDictionary[Any, dict[tuple[str, TouchParameters], tuple[Any, Any, Any]]] = (
+_SOLVERS: WeakKeyDictionary[Any, dict[tuple[str, int, TouchParameters], tuple[Any, Any, Any]]] = (
     WeakKeyDictionary()
 )
 
@@ -329,7 +329,9 @@ def _solvers(
     solver: Any, table: HandTable, surface: Surface, place: Array, chosen: TouchParameters
 ) -> tuple[Any, Any, HandCheck]:
     """What solves palms, what judges grasps and hands with the object in the scene; made once."""
-    made, key = _SOLVERS.setdefault(solver, {}), (surface.name, chosen)
+    # A file may be another mesh by now.
+    key = surface.name, hash(surface.points.tobytes()), chosen
+    made = _SOLVERS.setdefault(solver, {})
     if key not in made:
         kinds = {"tolerance": Tolerance(chosen.touch, chosen.turned / 15)}
         kinds |= {"options": {"max_rounds": 1}}

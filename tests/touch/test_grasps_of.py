@@ -587,3 +587,14 @@ def test_fingers_lean_on_what_they_envelop(surface, tmp_path):
     assert len(depths) > 5
     assert max(depths) <= deep
     assert max(depths) > 0.5 * deep
+
+
+def test_a_file_that_is_another_mesh_by_now(tmp_path):
+    solver, path = solver_of("panda+panda_hand"), tmp_path / "part.stl"
+    for part in (trimesh.creation.icosphere(3, 0.03), trimesh.creation.box((0.05, 0.09, 0.11))):
+        part.export(path)
+        found = solver.grasps_of(ik.load_surface(path), PLACE, limit=5, among=5)
+        assert len(found) == 5
+        fresh = solver_of("panda+panda_hand")
+        for one in found:
+            assert fresh.solve(one.grasp, q0=one.q).success
