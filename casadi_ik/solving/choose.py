@@ -10,7 +10,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from enum import Enum, auto
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -38,7 +37,7 @@ from casadi_ik.solving.finder import (
     checked_distance,
 )
 from casadi_ik.solving.free import free_answers
-from casadi_ik.solving.trials import Deduplicator
+from casadi_ik.solving.trials import Deduplicator, first_of_each
 
 Judgement: TypeAlias = str | Callable[[ArmHand, Array], ArrayLike]
 """One of `PREFERENCES`, or what gives configurations (m, n) of a robot their scores (m,)."""
@@ -61,20 +60,6 @@ class ChooseParameters:
 
 
 PARAMETERS = ChooseParameters()
-
-
-class Look(Enum):
-    """Which hands of a candidate are looked at.
-
-    Attributes:
-        QUICK: Those that one round leads to.
-        THOROUGH: All that a single grasp would get, after `ChooseParameters.rounds` of rounds.
-        OWN: The one that a solve comes to.
-    """
-
-    QUICK = auto()
-    THOROUGH = auto()
-    OWN = auto()
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,19 +165,15 @@ def choose(
     wanted: Preference = _own(prefer, engine.robot) if callable(prefer) else word
     asked = list(_asked(request, grasps, pose, fixed))
     search = _Search(engine, asked, start, wanted, limit, seed)
-    every = np.ones(len(grasps), dtype=bool)
-    # Neither what is preferred nor where the robot is decides which candidates have an answer.
-    parts = list(search.look(every, Look.QUICK))
+    parts = list(search.look(np.ones(len(grasps), dtype=bool), thorough=False))
     answers = Answers.joined(parts, len(grasps))
-    enough = answers.answered.sum() >= min(limit, len(grasps))
-    # Where several answers of one candidate will do, they may be enough.
-    if not enough and not (most is None and len(search.best(answers, apart, most)) >= limit):
-        parts += search.look(~answers.answered, Look.THOROUGH)
-        answers = Answers.joined(parts, len(grasps))
-    if q0 is not None:
-        parts += search.look(answers.answered, Look.OWN)
-        answers = Answers.joined(parts, len(grasps))
     found = search.best(answers, apart, most)
+    # Where several answers of one candidate will do, they may be enough.
+    enough = limit if most is None and len(found) >= limit else answers.answered.sum()
+    if enough < min(limit, len(grasps)):
+        parts += search.look(~answers.answered, thorough=True)
+        answers = Answers.joined(parts, len(grasps))
+        found = search.best(answers, apart, most)
     seconds = (time.perf_counter() - begin) / len(grasps)
     entries = []
     for row, solution in found:
@@ -302,22 +283,28 @@ class _Search:
     limit: int
     seed: int
 
-    def look(self, candidates: Bools, look: Look) -> Iterator[tuple[NDArray[np.intp], Answers]]:
-        """Answers to some candidates (k,), part by part, with the numbers of these."""
-        near = look is Look.OWN
+    def look(self, candidates: Bools, thorough: bool) -> Iterator[tuple[NDArray[np.intp], Answers]]:
+        """Answers to some candidates (k,), part by part, with the numbers of these.
+
+        Neither what is preferred nor where the robot is decides which candidates have one.
+
+        Args:
+            candidates: (k,) which.
+            thorough: Whether to look at all hands that a single grasp would get, after
+                `ChooseParameters.rounds` of rounds, instead of those that one round leads to.
+        """
         for numbers, targets in self.asked:
             left = numbers[candidates[numbers]]
             if not len(left):
                 continue
             some = targets.rows(np.searchsorted(numbers, left))
-            some = replace(some, picked=left, prefer="q0" if near else "limits")
+            some = replace(some, picked=left, prefer="limits")
             engine, query = self.engine.kinds_of(some), self.engine.collision_query(some)
-            begin = self.start if near else self.engine.robot.home
             for first in range(0, len(left), PARAMETERS.together):
                 rows = np.arange(first, min(first + PARAMETERS.together, len(left)))
                 nearby = None if query is None else query.rows(rows)
-                part = _Part(self, engine.finder, some.rows(rows), nearby, begin)
-                yield left[rows], part.run(look)
+                part = _Part(self, engine.finder, some.rows(rows), nearby)
+                yield left[rows], part.run(thorough)
 
     def best(self, answers: Answers, apart: float, most: int | None) -> list[tuple[int, Solution]]:
         """Rows of the best that differ from each other, at most so many of a candidate."""
@@ -325,29 +312,21 @@ class _Search:
         # Of equals that whose arm is farther from its limits, then the first candidate.
         left = np.lexsort((answers.owner, -answers.margin, -answers.score))
         parts = answers.q / (robot.upper - robot.lower)
-        places = np.full(len(answers.reasons), limit if most is None else most)
-        found: list[tuple[int, Solution]] = []
-
-        def others(rows: NDArray[np.intp], row: int, places: NDArray[np.intp]) -> NDArray[np.intp]:
-            off = np.abs(parts[rows] - parts[row]).max(axis=1)
-            vacant = places[answers.owner[rows]] > 0
-            return rows[(off >= apart) & (off > 0) & vacant]
-
-        while len(left) and len(found) < limit:
-            chosen, rest, free = list[int](), left, places.copy()
-            while len(rest) and len(found) + len(chosen) < limit:
+        solutions: dict[int, Solution] = {}
+        while True:
+            chosen, rest = list[int](), left
+            places = np.full(len(answers.reasons), limit if most is None else most)
+            while len(rest) and len(chosen) < limit:
                 row = int(rest[0])
                 chosen.append(row)
-                free[answers.owner[row]] -= 1
-                rest = others(rest, row, free)
-            solutions = self._judged(answers, np.array(chosen))
-            left = left[~np.isin(left, chosen)]
-            for row in chosen:
-                if solutions[row].success:
-                    found.append((row, solutions[row]))
-                    places[answers.owner[row]] -= 1
-                    left = others(left, row, places)
-        return found
+                places[answers.owner[row]] -= 1
+                off = np.abs(parts[rest] - parts[row]).max(axis=1)
+                rest = rest[(off >= apart) & (off > 0) & (places[answers.owner[rest]] > 0)]
+            solutions |= self._judged(answers, np.setdiff1d(chosen, [*solutions]).astype(np.intp))
+            failed = [row for row in chosen if not solutions[row].success]
+            if not failed:
+                return [(row, solutions[row]) for row in chosen]
+            left = left[~np.isin(left, failed)]
 
     def _judged(self, answers: Answers, rows: NDArray[np.intp]) -> dict[int, Solution]:
         """Answers with the verdict on them, which has the last word."""
@@ -367,10 +346,7 @@ class _Search:
 
 
 class _Part:
-    """Some candidates that are alike.
-
-    Hands are looked for from `begin`, (n,).
-    """
+    """Some candidates that are alike."""
 
     def __init__(
         self,
@@ -378,36 +354,45 @@ class _Part:
         finder: AlternativeFinder,
         targets: TargetBatch,
         query: CollisionQuery | None,
-        begin: Array,
     ) -> None:
         self.search, self.finder, self.targets, self.query = search, finder, targets, query
         self.prefer, self.trials = search.prefer, finder.trials
-        self.begin, self.starts = (np.tile(q, (len(targets), 1)) for q in (begin, search.start))
+        ends = finder.robot.home, search.start
+        self.home, self.starts = (np.tile(q, (len(targets), 1)) for q in ends)
         self.limits = self.trials.limits(targets)
-        fixed = np.full(len(begin), np.nan) if targets.fixed is None else targets.fixed
+        fixed = np.full(len(search.start), np.nan) if targets.fixed is None else targets.fixed
         # What is given has no part in what is better.
         self.columns = np.flatnonzero(np.isnan(np.atleast_2d(fixed)).any(axis=0)).tolist()
 
-    def run(self, look: Look) -> Answers:
+    def run(self, thorough: bool) -> Answers:
         """Their answers."""
         method = self.trials.method
-        rounds = PARAMETERS.rounds if look is Look.THOROUGH else 1
-        outcome = method.run(self.targets, self.begin, self.search.seed, False, rounds)
+        rounds = PARAMETERS.rounds if thorough else 1
+        outcome = method.run(self.targets, self.home, self.search.seed, False, rounds)
         good = self.trials.solved(self.targets, outcome.q, self.targets.enforce_limits)
-        rows = np.flatnonzero(good)
-        hands = outcome.q[rows], rows
-        q, owner, pairs = self._answers(*(hands if look is Look.OWN else self._hands(*hands)))
-        if look is Look.THOROUGH and self.query is not None:
-            left = rows[~np.isin(rows, owner)]
-            more, whose = self._further(outcome.q, left, self.query)
-            q, owner = np.concatenate([q, more]), np.concatenate([owner, whose])
         reasons = np.array([Status(int(code)).name for code in outcome.status], dtype=object)
         # A method that is content with what the verdict refuses has come to a standstill.
         reasons[~good & (outcome.status == Status.SOLVED)] = Status.STALLED.name
-        for row, pair in pairs.items():
+        rows = np.flatnonzero(good)
+        q, pairs = outcome.q[rows], dict[int, tuple[str, str]]()
+        if thorough and self.query is not None:
+            q, rows, pairs = self._freed(q, rows, self.query)
+        q, owner, more = self._answers(*self._hands(q, rows))
+        for row, pair in (pairs | more).items():
             reasons[row] = f"{Status.COLLISION.name}: {pair[0]} and {pair[1]}"
-        reasons[slice(None) if look is Look.OWN else owner] = ""  # those had an answer before
+        reasons[owner] = ""
         return Answers(q, owner, self._score(q, owner), self.finder.arm_margins(q), reasons)
+
+    def _freed(
+        self, q: Array, rows: NDArray[np.intp], query: CollisionQuery
+    ) -> tuple[Array, NDArray[np.intp], dict[int, tuple[str, str]]]:
+        """What a single grasp would get: free answers; and what is in the way of the others."""
+        some, nearby, home = self.targets.rows(rows), query.rows(rows), self.home[rows]
+        seed = self.search.seed
+        found = free_answers(self.finder, some, nearby, q, home, seed, reasons=False)
+        reports = zip(rows.tolist(), found.reports, strict=True)
+        pairs = {row: report.pair for row, report in reports if report is not None}
+        return found.q[found.free], rows[found.free], pairs
 
     def _hands(self, q: Array, rows: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
         """Different hands that meet the contacts of candidates, with an arm for each.
@@ -420,7 +405,7 @@ class _Part:
             return q, rows  # a hand that is given has no other posture
         some = self.targets.rows(rows)
         postures = self.trials.method.postures(some, 0)
-        starts = self.limits.clip(self.begin)
+        starts = self.limits.clip(self.home)
         owner, *begun = self.trials.hand_rows(self.targets, rows, starts, postures)
         ends, asked = self.trials.run(*begun), self.targets.rows(owner)
         ends[~self.trials.solved(asked, ends, asked.enforce_limits)] = np.nan
@@ -452,7 +437,7 @@ class _Part:
             return found, whose, {}
         left = np.flatnonzero(~np.isin(owner, whose))
         # The last word has the hand with most room.
-        left = left[np.argsort(surplus[left], kind="stable")]
+        left = first_of_each(owner, left[np.lexsort((-surplus[left], owner[left]))], 1)
         clear = query.rows(owner[left]).check(q[left])
         named = ((row, clear.pair(i)) for i, row in enumerate(owner[left].tolist()))
         return found, whose, {row: pair for row, pair in named if pair is not None}
@@ -483,14 +468,6 @@ class _Part:
         assert self.query is not None
         free = self.query.rows(owner[found.owner]).free(found.q)
         return found.q[free], found.owner[free]
-
-    def _further(
-        self, q: Array, rows: NDArray[np.intp], query: CollisionQuery
-    ) -> tuple[Array, NDArray[np.intp]]:
-        """What a single grasp would get."""
-        some, nearby, begin = self.targets.rows(rows), query.rows(rows), self.begin[rows]
-        found = free_answers(self.finder, some, nearby, q[rows], begin, self.search.seed)
-        return found.q[found.free], rows[found.free]
 
     def _score(self, q: Array, owner: NDArray[np.intp]) -> Array:
         if not len(q):
