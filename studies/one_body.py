@@ -59,6 +59,10 @@ ALONE = 300
 """Targets solved one by one; poses of the path that is followed."""
 CYCLES = 2000
 """Of hands that are led through each other, at 1 kHz."""
+SEARCH = 20_000
+"""Answers that a random search looks at for one that touches nothing."""
+SEARCHED = 1000
+"""Of them, in one call."""
 
 INTRODUCTION = """
 A target is what all fingertips of a configuration touch, so it can be reached: *random* ones are
@@ -192,45 +196,113 @@ def crossed(_cell: Cell, robot: ArmHand) -> dict[str, Any]:
             q.append(follower(goal, normals))
             spent.append(1e6 * (time.process_time() - begun))
             blocked += follower.state.status is ik.motion.FollowStatus.BLOCKED
-    every = zip(robot.fingers, points, normals, strict=True)
-    grasp = ik.Grasp(name="home", contacts={f: ik.Contact(p, n) for f, p, n in every})
-    room = solver.check(np.array(q), grasp)
-    assert room is not None
     median, most = np.median(spent), np.quantile(spent, 0.99)
-    least = f"{1e3 * room.surplus.min():.3f}"
+    least = f"{1e3 * room_of(solver, np.array(q)).min():.3f}"
     return row(robot.name, f"{median:.1f}", f"{most:.1f}", f"{blocked} of {CYCLES}", least)
+
+
+def grasp(robot: ArmHand, points: Array, normals: Array) -> ik.Grasp:
+    """Contacts (f, 3) of all fingers."""
+    every = zip(robot.fingers, points, normals, strict=True)
+    return ik.Grasp(name="target", contacts={f: ik.Contact(p, n) for f, p, n in every})
+
+
+def room_of(solver: ik.Solver, q: Array) -> Array:
+    """(k,) how far configurations are from touching anything [m]; < 0: they do."""
+    room = solver.check(q, grasp(solver.robot, *solver.robot.contacts(solver.robot.home)))
+    assert room is not None
+    return room.surplus
+
+
+def untouched(solver: ik.Solver, count: int, seed: int) -> Array:
+    """(count, n) random configurations that touch nothing; none where they are too rare."""
+    kept = np.zeros((0, len(solver.robot.lower)))
+    for number in range(1000):
+        some = drawn(solver.robot, 1000, False, seed + number)
+        kept = np.concatenate([kept, some[room_of(solver, some) > 0]])
+        if len(kept) >= count:
+            return kept[:count]
+    return kept[:0]
 
 
 def free(cell: Cell, robot: ArmHand) -> dict[str, Any]:
     """Targets made by configurations that touch nothing: answers that touch nothing either."""
     if not robot.description.shapes.capsules:
         return {"rows": []}
-    solver, plain = ik.Solver(robot, scene=ik.Scene()), ik.Solver(robot)
-
-    def grasp(q: np.ndarray) -> ik.Grasp:
-        points, normals = robot.contacts(q)
-        pairs = zip(robot.fingers, points, normals, strict=True)
-        return ik.Grasp(name="free", contacts={f: ik.Contact(p, n) for f, p, n in pairs})
-
-    about, kept, number, count = grasp(robot.home), list[np.ndarray](), 0, cell.count
-    while len(kept) < count:
-        some = drawn(robot, 1000, False, cell.seed + number)
-        room = solver.check(some, about)
-        assert room is not None
-        kept += list(some[room.distance > 0])
-        number += 1
-        if number > 1000:
-            return {"rows": []}
-    points, normals = robot.contacts(np.array(kept[:count]))
-    first = solver.check(plain.solve_batch(points, normals).q, about)
-    assert first is not None
+    solver, plain, count = ik.Solver(robot, scene=ik.Scene()), ik.Solver(robot), cell.count
+    kept = untouched(solver, count, cell.seed)
+    if not len(kept):
+        return {"rows": []}
+    points, normals = robot.contacts(kept)
+    hits = int((room_of(solver, plain.solve_batch(points, normals).q) <= 0).sum())
     solver.solve_batch(points, normals)  # all that is needed is compiled now
     begun = time.process_time()
     found = solver.solve_batch(points, normals)
     each = 1e3 * (time.process_time() - begun) / count
     solved = int((found.status == ik.Status.SOLVED).sum())
-    hits = int((first.distance <= 0).sum())
     return row(robot.name, f"{hits} of {count}", f"{solved} of {count}", f"{each:.2f}")
+
+
+def around(
+    points: Array, normals: Array, count: int, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """(count, f, 3) contacts and normals, evenly spread over what the tolerance allows."""
+    tolerance = ik.Tolerance()
+    shift, turn = rng.standard_normal((2, count, *points.shape))
+    shift /= np.linalg.norm(shift, axis=2, keepdims=True)
+    turn -= (turn * normals).sum(axis=2, keepdims=True) * normals
+    turn /= np.linalg.norm(turn, axis=2, keepdims=True)
+    part = rng.random((2, count, len(points), 1))
+    angle = tolerance.angle * np.sqrt(part[1])
+    moved = points + tolerance.position * np.cbrt(part[0]) * shift
+    return moved, np.cos(angle) * normals + np.sin(angle) * turn
+
+
+def random_search(
+    solver: ik.Solver, plain: ik.Solver, points: Array, normals: Array, seed: int
+) -> bool:
+    """Whether one of `SEARCH` answers to a target from random postures touches nothing.
+
+    By turns the target itself is solved, which finds other trunks and arms, and targets within its
+    tolerances, which finds other hands.
+    """
+    robot, rng, tolerance = solver.robot, np.random.default_rng(seed), ik.Tolerance()
+    for block in range(0, SEARCH, SEARCHED):
+        asked = np.tile(points, (SEARCHED, 1, 1)), np.tile(normals, (SEARCHED, 1, 1))
+        if block % (2 * SEARCHED):
+            asked = around(points, normals, SEARCHED, rng)
+        found = plain.solve_batch(*asked, q0=robot.random(rng, SEARCHED), prefer="q0")
+        at, facing = robot.contacts(found.q)
+        off = np.linalg.norm(at - points, axis=2).max(axis=1)
+        turned = np.arccos(np.clip((facing * normals).sum(axis=2), -1, 1)).max(axis=1)
+        met = found.success & (off <= tolerance.position) & (turned <= tolerance.angle)
+        if (room_of(solver, found.q[met]) >= 0).any():
+            return True
+    return False
+
+
+def searched(cell: Cell, robot: ArmHand) -> dict[str, Any]:
+    """Targets of which nobody knows whether they have a free answer, beside a random search."""
+    if not robot.description.shapes.capsules:
+        return {"rows": []}
+    solver, plain = ik.Solver(robot, scene=ik.Scene()), ik.Solver(robot)
+    hands = list(robot.description.hand_actuators)
+    q = drawn(robot, cell.count, False, cell.seed + 10**6)
+    with_free = q.copy()
+    apart = untouched(solver, cell.count, cell.seed + 2 * 10**6)
+    with_free[: len(apart), hands] = apart[:, hands]
+    rows = []
+    for kind, some in {"any": q, "free": with_free[: len(apart)]}.items():
+        points, normals = robot.contacts(some)
+        left = np.flatnonzero(~solver.solve_batch(points, normals).success)
+        missed = [
+            int(i) for i in left if random_search(solver, plain, points[i], normals[i], int(i))
+        ]
+        ours, alone = len(some) - len(left), len(missed)
+        share = f"{100 * ours / max(ours + alone, 1):.2f} %"
+        numbers = str(ours), str(alone), str(len(left) - alone), share
+        rows.append([robot.name, kind, *numbers])
+    return {"rows": rows}
 
 
 def contacts(cell: Cell, robot: ArmHand) -> dict[str, Any]:
@@ -284,6 +356,15 @@ TABLES = {
         "*First*: answers of a solver without a scene that do.",
         ("robot", "first answers that touch", "free answers", "a target [ms]"),
     ),
+    "searched": Table(
+        searched,
+        f"Beside a search: where no free answer is found, {SEARCH:,} answers from random postures "
+        "are looked at, half of them to the target and half to targets within its tolerances. "
+        "Trunk and arms that make the targets are random, touching or not; *hands* are random too "
+        "(any), or those of configurations that touch nothing (free). *Share* is of the targets "
+        "for which either finds one.",
+        ("robot", "hands", "free answers", "the search alone", "neither", "share"),
+    ),
     "contacts": Table(
         contacts, "## Other ways\n\n" + OTHERS, ("robot", "way", "solved", "a target [us]")
     ),
@@ -313,7 +394,9 @@ def cells(options: argparse.Namespace) -> list[Cell]:
             ]
         every += [one(what="alone", count=ALONE)] if options.count else []
         every += [one(what="followed", count=1), one(what="crossed", count=1)]
-        every += [one(what="free", count=options.free)] if options.free else []
+        for what in ("free", "searched"):
+            count = getattr(options, what)
+            every += [one(what=what, count=count)] if count else []
         if options.peers and robot == options.robots[0]:
             every.append(one(what="contacts", count=options.peers))
             every.append(one(what="wrists", count=2 * options.peers))
@@ -349,6 +432,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--robots", nargs="+", default=ROBOTS)
     parser.add_argument("--count", type=int, default=100_000, help="targets of every kind; 0: none")
     parser.add_argument("--free", type=int, default=500, help="targets without collision; 0: none")
+    parser.add_argument(
+        "--searched", type=int, default=200, help="targets beside a random search; 0: none"
+    )
     parser.add_argument("--peers", type=int, default=100, help="targets for other ways; 0: none")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=1, help="processes")
