@@ -341,7 +341,7 @@ targets for every line, so differences are more certain than the intervals look.
 
 
 def write_report(studies: Sequence[Study], results: Path, folder: Path, command: str) -> None:
-    """Write `report.md`, `report.html`, figures and `metrics.json`.
+    """Write `report.md`, figures and `metrics.json`.
 
     Args:
         studies: The table, its part by the original methods, the ablation and the readings.

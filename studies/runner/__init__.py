@@ -11,7 +11,7 @@ from casadi_ik.errors import MissingExtraError
 # What is timed is compiled.
 os.environ.setdefault("CASADI_IK_COMPILE", "wait")
 
-for _name in ("joblib", "markdown_it", "matplotlib", "polars"):
+for _name in ("joblib", "matplotlib", "polars"):
     if find_spec(_name) is None:
         raise MissingExtraError(
             f"studies need {_name}, which is not installed: pip install 'casadi-ik[studies]'"

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from markdown_it import MarkdownIt
 from numpy.typing import ArrayLike
 
 from casadi_ik.errors import CasadiIKError
@@ -106,15 +105,6 @@ def write_metrics(metrics: Iterable[Metric], path: Path) -> None:
     path.write_text(f"[\n {lines}\n]\n", encoding="utf-8")
 
 
-STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem }
-table { border-collapse: collapse; font-size: 0.9rem }
-th, td { padding: 0.15rem 0.6rem; border-bottom: 1px solid #ddd }
-img { max-width: 100% }
-code { font-size: 0.9em }
-"""
-
-
 def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table; the first column to the left, the others to the right."""
     lines = [heads, ["---", *["---:"] * (len(heads) - 1)], *rows]
@@ -122,7 +112,7 @@ def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def write_page(title: str, parts: Sequence[str], folder: Path) -> None:
-    """Write `report.md` and `report.html`.
+    """Write `report.md`.
 
     Args:
         title: Title of the page.
@@ -132,10 +122,6 @@ def write_page(title: str, parts: Sequence[str], folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     text = "\n\n".join((f"# {title}", *(part.strip() for part in parts))) + "\n"
     (folder / "report.md").write_text(text, encoding="utf-8")
-    body = MarkdownIt("commonmark").enable("table").render(text)
-    head = f'<meta charset="utf-8"><title>{title}</title><style>{STYLE}</style>'
-    page = f'<!doctype html>\n<html lang="en"><head>{head}</head><body>\n{body}</body></html>\n'
-    (folder / "report.html").write_text(page, encoding="utf-8")
 
 
 def publish(
