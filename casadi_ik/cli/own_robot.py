@@ -102,7 +102,6 @@ def import_robot(said: Said) -> Answer:
         tip=said.tip,
         palm=said.palm or (),
         mount=said.mount,
-        shapes=draw is not None,
         xacro=said.xacro,
     )
     with output(said.out) as part:

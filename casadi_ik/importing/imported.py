@@ -28,7 +28,7 @@ from casadi_ik.importing.guess import (
     palms,
 )
 from casadi_ik.importing.robot_shapes import hand_links, name_in_robot, robot_shapes
-from casadi_ik.importing.surfaces import Surface, link_surfaces
+from casadi_ik.importing.surfaces import link_surfaces
 from casadi_ik.importing.write import FileLine, HandLines, Written
 from casadi_ik.robots.file_parts import hand_from_file
 from casadi_ik.robots.joining import MOST_SIDES
@@ -202,13 +202,11 @@ class Imported:
     Attributes:
         written: The description.
         branches: The fingers as they were found, the thumb first, hand by hand.
-        surfaces: Shapes of the hand's links, by the file's names.
         files: The arm's and the hand's file.
     """
 
     written: Written
     branches: tuple[Branch, ...]
-    surfaces: dict[str, Surface]
     files: tuple[RobotTree | None, RobotTree]
 
     def at_home(self, path: Path) -> Imported:
@@ -254,7 +252,6 @@ def import_robot(
     tip: str | None = None,
     palm: Sequence[str] = (),
     mount: Sequence[float] | None = None,
-    shapes: bool = False,
     xacro: bool = False,
 ) -> Imported:
     """Choose and guess everything that a description needs but home.
@@ -267,7 +264,6 @@ def import_robot(
         tip: Link of the arm that carries the hand; None: guessed.
         palm: Links that the fingers of a hand hang on, one of each; none: guessed.
         mount: (6,) pose of the hand's base on the tip [m, rad]; None: on it.
-        shapes: Whether the shapes of all links are wanted, for a picture.
         xacro: Whether macros are expanded in files that are not called ``.xacro``.
 
     Raises:
@@ -296,7 +292,7 @@ def import_robot(
         still |= beside
     locked |= still
     told = xacro and hand.suffix != ".xacro"
-    hands, branches, surfaces, notes = [], [], {}, []
+    hands, branches, notes = [], [], []
     for side, (link, how) in found.items():
         own = {one.name for one in kept_joints(tree, link)}
         entry = HandFromFile(
@@ -307,11 +303,10 @@ def import_robot(
             xacro=told,
         )
         part = hand_from_file(entry, {}, key, out)
-        one = _found_hand(tree, part, side, link, how, shapes)
-        hands.append(one[0])
-        branches += one[1]
-        surfaces |= one[2]
-        notes += one[3]
+        lines, fingers, missing = _found_hand(tree, part, side, link, how)
+        hands.append(lines)
+        branches += fingers
+        notes += missing
     arm_tree = None if arm is None else read_tree(arm, xacro)
     arm_line = None if arm_tree is None else _arm_line(arm_tree, out, tip, xacro)
     if arm is None and (tip is not None or mount is not None):
@@ -332,21 +327,17 @@ def import_robot(
         hands=hands,
         notes=notes,
     )
-    return Imported(written, tuple(branches), surfaces, (arm_tree, tree))
+    return Imported(written, tuple(branches), (arm_tree, tree))
 
 
 def _found_hand(
-    tree: RobotTree, part: Part, side: str, palm: str, how: str, shapes: bool
-) -> tuple[HandLines, list[Branch], dict[str, Surface], list[str]]:
-    """A hand's fingers with their pads, the thumb first, its shapes, and what cannot be read."""
+    tree: RobotTree, part: Part, side: str, palm: str, how: str
+) -> tuple[HandLines, list[Branch], list[str]]:
+    """A hand's fingers with their pads, the thumb first, and what cannot be read."""
     branches = find_fingers(part, palm)
     if not branches:
         raise DescriptionError(f"{tree.path}: no joint moves below the palm {palm!r}; try --palm")
-    wanted = (
-        {palm, *(joint.child for joint in below(tree, palm))}
-        if shapes
-        else {one for branch in branches for one in _ends_of(part, branch)}
-    )
+    wanted = {one for branch in branches for one in _ends_of(part, branch)}
     surfaces, notes = link_surfaces(tree, wanted)
     pads = guess_pads(part, palm, branches, surfaces)
     thumb, thumb_how = guess_thumb(part, branches, pads)
@@ -359,7 +350,7 @@ def _found_hand(
         *(side, frame, palm, how, {names[i]: pads[i] for i in order}),
         (names[thumb], thumb_how),
     )
-    return lines, [replace(branches[i], name=names[i]) for i in order], surfaces, notes
+    return lines, [replace(branches[i], name=names[i]) for i in order], notes
 
 
 def _ends_of(part: Part, branch: Branch) -> list[str]:
