@@ -9,10 +9,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 from trimesh import Trimesh
+from trimesh.creation import revolve, torus
 from trimesh.graph import smooth_shade
 
 from casadi_ik.arrays import Array
-from casadi_ik.grasps.shapes import capsule_mesh, circle, tube_mesh
+from casadi_ik.grasps.shapes import capsule_mesh
 from casadi_ik.importing.surfaces import Surface, together
 
 AROUND = 32
@@ -104,13 +105,15 @@ def ring(center: Array, axis: Array, radius: float, width: float) -> Shape:
     return Shape("ring", (radius, width), upright(center, axis))
 
 
+def _made(mesh: Trimesh) -> Surface:
+    return Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+
 def _turned(profile: ArrayLike) -> Surface:
     """A closed body about z of a profile (m, 2): radius and height, from below to above [m]."""
-    radii, heights = np.asarray(profile, dtype=float).T
-    rings = circle(AROUND)[None] * radii[:, None, None]
-    rings[..., 2] = heights[:, None]
-    ends = np.array([[0.0, 0.0, heights[0]], [0.0, 0.0, heights[-1]]])
-    return Surface(*tube_mesh(rings, *ends))
+    rows = np.asarray(profile, dtype=float)
+    axis = rows[[0, -1]] * [0.0, 1.0]
+    return _made(revolve(np.vstack([axis[0], rows, axis[1]]), sections=AROUND))
 
 
 def _drum(radius: float, length: float) -> Surface:
@@ -127,23 +130,11 @@ def _arrow(length: float, width: float) -> Surface:
     return _turned(profile)
 
 
-def _ring(radius: float, width: float) -> Surface:
-    around, across = circle(2 * AROUND), circle(12)
-    out = radius + width / 2 * across[:, 0]
-    points = around[:, None] * out[None, :, None]
-    points[..., 2] = width / 2 * across[:, 1]
-    i, j = np.meshgrid(np.arange(2 * AROUND), np.arange(12), indexing="ij")
-    a, b = 12 * i + j, 12 * ((i + 1) % (2 * AROUND)) + j
-    c, d = 12 * i + (j + 1) % 12, 12 * ((i + 1) % (2 * AROUND)) + (j + 1) % 12
-    triangles = np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)]).reshape(-1, 3)
-    return Surface(points.reshape(-1, 3), triangles)
-
-
 KINDS: dict[str, Callable[..., Surface]] = {
     "capsule": lambda radius, length: Surface(*capsule_mesh(radius, length / 2, AROUND)),
     "drum": _drum,
     "arrow": _arrow,
-    "ring": _ring,
+    "ring": lambda radius, width: _made(torus(radius, width / 2, 2 * AROUND, 12)),
 }
 """Of shapes by their numbers: capsule (radius, length without the caps), drum (radius, length),
 arrow (length, width of its shaft), ring (radius, width)."""
@@ -163,8 +154,7 @@ def sharp(body: Surface, degrees: float = 35.0) -> Surface:
         body: The surface.
         degrees: Faces that meet at a larger angle meet at an edge.
     """
-    found = smooth_shade(Trimesh(body.points, body.triangles), angle=np.deg2rad(degrees))
-    return Surface(np.asarray(found.vertices), np.asarray(found.faces))
+    return _made(smooth_shade(Trimesh(body.points, body.triangles), angle=np.deg2rad(degrees)))
 
 
 def coarser(body: Surface, most: int = 3000) -> Surface:

@@ -520,30 +520,12 @@ def _to_triangles(points: Array, corners: Array) -> tuple[Array, Array]:
     squares = (points**2).sum(axis=1)[:, None] + (middles**2).sum(axis=1)
     to_middle = np.sqrt(np.maximum(squares - 2 * points @ middles.T, 0.0))
     away, face = np.empty((len(points), 3)), np.empty((len(points), 3))
+    from trimesh.triangles import closest_point
+
     for i, point in enumerate(points):
         near = np.flatnonzero(to_middle[i] - radii <= to_middle[i].min() + MESHES.rounded)
-        off = point - _nearest_points(point, corners[near])
+        off = point - closest_point(corners[near], np.tile(point, (len(near), 1)))
         best = int(np.argmin(np.einsum("ti,ti->t", off, off)))
         away[i] = off[best]
         face[i] = _normals(corners[near[best : best + 1]])[0]
     return away, face
-
-
-def _nearest_points(point: Array, corners: Array) -> Array:
-    """(t, 3) nearest to a point on triangles (t, 3, 3): in the plane, or on one of the edges."""
-    a = corners[:, 0]
-    normal = _normals(corners)
-    foot = point - np.sum((point - a) * normal, axis=1, keepdims=True) * normal
-    found, least = foot.copy(), np.full(len(corners), np.inf)
-    within = np.linalg.norm(normal, axis=1) > 0
-    for i in range(3):
-        start, along = corners[:, i], corners[:, (i + 1) % 3] - corners[:, i]
-        within &= np.sum(np.cross(along, foot - start) * normal, axis=1) >= 0
-        length = np.maximum(np.sum(along * along, axis=1), 1e-300)
-        share = np.clip(np.sum((point - start) * along, axis=1) / length, 0.0, 1.0)
-        on_edge = start + share[:, None] * along
-        far = np.sum((point - on_edge) ** 2, axis=1)
-        nearer = far < least
-        found = np.where(nearer[:, None], on_edge, found)
-        least = np.where(nearer, far, least)
-    return np.where(within[:, None], foot, found)

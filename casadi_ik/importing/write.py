@@ -147,8 +147,8 @@ class HandLines:
     def palm_text(self) -> str:
         """The palm's frame, in one line."""
         return (
-            f"{{link: {scalar(self.link)}, xyz: {_vector(self.palm[:3, 3])}, "
-            f"rpy: {_vector(roll_pitch_yaw(self.palm[:3, :3]))}}}"
+            f"{{link: {scalar(self.link)}, xyz: {vector(self.palm[:3, 3])}, "
+            f"rpy: {vector(roll_pitch_yaw(self.palm[:3, :3]))}}}"
         )
 
     def finger_lines(self) -> list[str]:
@@ -158,8 +158,8 @@ class HandLines:
         for name, pad in self.fingers.items():
             lines.append(f"  # GUESS: {one_line(pad.how)}")
             lines.append(
-                f"  {scalar(name)}: {{link: {scalar(pad.link)}, xyz: {_vector(pad.point)}, "
-                f"normal: {_vector(pad.normal)}}}"
+                f"  {scalar(name)}: {{link: {scalar(pad.link)}, xyz: {vector(pad.point)}, "
+                f"normal: {vector(pad.normal)}}}"
             )
         return lines
 
@@ -218,7 +218,7 @@ class Written:
         palm = [] if others else [first.palm_text(), about]
         lines += _file_lines(self.key, self.hand, "palm", palm)
         if self.mount is not None:
-            x = _vector(np.array(self.mount[:3])), _vector(np.array(self.mount[3:]))
+            x = vector(np.array(self.mount[:3])), vector(np.array(self.mount[3:]))
             lines.append(f"mount: {{xyz: {x[0]}, rpy: {x[1]}}}  # {self.mount_how}")
         if others:
             lines += ["sides:  # the trunk ends where the chains to the palms part", f"  {about}"]
@@ -264,10 +264,7 @@ def _guess(how: str) -> str:
     return how if how.startswith("--") else f"GUESS: {how}"
 
 
-def _vector(values: Array) -> str:
-    return "[" + ", ".join(_number(float(value)) for value in values) + "]"
-
-
-def _number(value: float) -> str:
-    text = f"{value:.6f}".rstrip("0").rstrip(".")
-    return "0" if text in ("-0", "") else text
+def vector(values: Array, digits: int = 6) -> str:
+    """Numbers as YAML has them, with so many digits behind the point at most."""
+    texts = (f"{float(value):.{digits}f}".rstrip("0").rstrip(".") for value in values)
+    return "[" + ", ".join("0" if text in ("-0", "") else text for text in texts) + "]"

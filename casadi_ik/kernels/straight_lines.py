@@ -20,7 +20,6 @@ import casadi as ca
 import numpy as np
 
 Name = str
-Code = tuple[int, ...]
 
 FLOAT = np.finfo(np.float32)
 

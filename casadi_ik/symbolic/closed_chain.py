@@ -95,16 +95,14 @@ class ClosedChain:
     Attributes:
         split: Legs and active coordinates.
         constraint: (6, k) matrix [J_r, -J_arm] of eq. (6) over `split.columns`.
-        H_a: (6, mobility) columns of the active coordinates, eq. (7).
         H_p: (6, 6) columns of the passive coordinates, eq. (7).
-        H: (6, mobility) passive over active coordinates, -H_p^-1 H_a.
+        H: (6, mobility) passive over active coordinates, -H_p^-1 H_a of eq. (7).
         J_cc: (6, mobility) twist of the platform per active coordinate, eq. (8): the arm leg's
             columns times the rows of H (or unit rows) that belong to the arm leg.
     """
 
     split: ChainSplit
     constraint: ca.SX
-    H_a: ca.SX
     H_p: ca.SX
     H: ca.SX
     J_cc: ca.SX
@@ -164,7 +162,7 @@ def closed_chain(
         rows.append(-row if index in chain.reversed_leg else row)
         twists.append(columns[index])
     J_cc = ca.densify(ca.horzcat(*twists) @ ca.vertcat(*rows))
-    return ClosedChain(chain, constraint, H_a, H_p, H, J_cc)
+    return ClosedChain(chain, constraint, H_p, H, J_cc)
 
 
 def _column(robot_kinematics: ActuatedKinematics, index: int, length: float) -> ca.SX:

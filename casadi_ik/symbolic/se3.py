@@ -215,31 +215,6 @@ def inverse(transform: Transform) -> Transform:
     return R.T, -ca.mtimes(R.T, p)
 
 
-def act(transform: Transform, points: Expr) -> Expr:
-    """Coordinates of points in the outer frame.
-
-    Args:
-        transform: (R, p).
-        points: (3, k) [m] in the moved frame, one per column.
-
-    Returns:
-        (3, k) [m].
-    """
-    R, p = transform
-    return ca.mtimes(R, points) + ca.repmat(p, 1, points.shape[1])
-
-
-def to_matrix(transform: Transform) -> Expr:
-    """Homogeneous matrix (4, 4) of a transform."""
-    R, p = transform
-    return ca.densify(ca.vertcat(ca.horzcat(R, p), ca.DM([[0.0, 0.0, 0.0, 1.0]])))
-
-
-def from_matrix(T: Expr) -> Transform:
-    """Transform of a homogeneous matrix (4, 4)."""
-    return T[:3, :3], T[:3, 3]
-
-
 def exp_se3(twist: Expr) -> Transform:
     """Transform reached by following a constant twist for unit time.
 

@@ -77,9 +77,6 @@ class Grid:
 NEIGHBOURS = 12
 """Samples about each: by them the nearest of a point is found from one that is near."""
 
-FAR = 10.0
-"""What is nowhere is so far away [m]."""
-
 
 def cells(low: Array, high: Array, step: float) -> tuple[Array, NDArray[np.int64], Array]:
     """Lower corner and edge (4,), numbers (3,) and middles (cells, 3) of the cells of a box [m]."""

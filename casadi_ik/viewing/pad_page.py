@@ -24,6 +24,7 @@ from casadi_ik.files.reading import Frame, frame_matrix, read_yaml
 from casadi_ik.files.writing import written_whole
 from casadi_ik.grasps.pose import inverse
 from casadi_ik.importing.surfaces import Surface, together
+from casadi_ik.importing.write import vector
 from casadi_ik.robots.load import load_description
 from casadi_ik.viewing.access import Server
 from casadi_ik.viewing.drawn import DrawnRobot, Handles, cameras, light_lamp
@@ -264,7 +265,7 @@ def corrected(text: str, finger: str, point: Array, normal: Array) -> str:
         DescriptionError: The text has no such pad.
     """
     key, entry = _finger(text, finger)
-    values = {"xyz": _vector(point), "normal": _vector(normal)}
+    values = {"xyz": vector(point, 7), "normal": vector(normal, 7)}
     edits: list[tuple[int, int, str]] = []
     there = {name.value: value for name, value in entry.value}
     for name, value in values.items():
@@ -321,15 +322,6 @@ def _check(part: Path, pads: Mapping[str, LinkPad]) -> None:
         point = found.placement[:3, 3]
         if np.abs(np.concatenate([point - pad.point, normal - pad.normal])).max() > 1e-6:
             raise DescriptionError(f"fingers.{finger}: could not be corrected in the text")
-
-
-def _vector(values: Array) -> str:
-    return "[" + ", ".join(_number(float(value)) for value in values) + "]"
-
-
-def _number(value: float) -> str:
-    text = f"{value:.7f}".rstrip("0").rstrip(".")
-    return "0" if text in ("-0", "") else text
 
 
 # The skin.
