@@ -56,8 +56,8 @@ def test_steps_go_through_all_rounds(robot, method: str, tmp_path) -> None:
     away = grasp_of(robot, points + np.array([0.0, 0.0, 3.0]), normals)
     solution = same_as_the_log(solver, away, tmp_path / "x.mcap")
     assert solution.status is ik.Status.STALLED
-    # Six rounds of eight hands from tables, three along valleys and two from anywhere.
-    expected = 8 * (6 + 3 + 2) if method == "hand-first" else 32
+    # Six rounds of eight hands from tables and five from anywhere.
+    expected = 8 * (6 + 5) if method == "hand-first" else 32
     assert solution.restarts == expected - 1
 
 

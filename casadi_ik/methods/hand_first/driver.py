@@ -52,7 +52,6 @@ KERNELS = {
     "look_up": "lookup_job",
     "begin": "map_job",
     "solve": "loop_job",
-    "contacts": "map_job",
     "seen": "map_job",
     "judge": "map_job",
 }
@@ -124,7 +123,7 @@ class SearchPlan:
 
     @property
     def contacts(self) -> FunctionKernel:
-        """Contact points and normals of configurations."""
+        """Contact points and normals of configurations, for what is exported."""
         return self.made["contacts"]()
 
     @property
@@ -146,7 +145,7 @@ class SearchPlan:
     def kernels(self) -> dict[str, Any]:
         """Those that are called, by the names of `KERNELS`."""
         found = {"begin": self.begin, "solve": self.solve, "judge": self.judge}
-        return found if self.sides else found | {"contacts": self.contacts} | self.of_hands
+        return found if self.sides else found | self.of_hands
 
     @property
     def of_hands(self) -> dict[str, Any]:
@@ -157,8 +156,8 @@ class SearchPlan:
     @property
     def source(self) -> str:
         """The C of a search."""
-        seeds = ("sides",) if self.sides else ("seeds", "valley")
-        texts = map(source_text, ("spread", *seeds, "hand_first"))
+        names = "spread", "sides" if self.sides else "seeds", "hand_first"
+        texts = map(source_text, names)
         return driver_text("loops") + "".join(texts)
 
     @property
@@ -218,13 +217,6 @@ class SearchPlan:
             "closest": (double, pool, ""),
             "found": (whole, pool, ""),
             "taken": (whole, pool, ""),
-            "moved": (double, (h + 1) * n, ""),
-            "moved_points": (double, (h + 1) * 3 * f, ""),
-            "moved_normals": (double, (h + 1) * 3 * f, ""),
-            "rigid": (double, 36 * f, ""),
-            "slopes": (double, 6 * f * h, ""),
-            "held": (double, h, ""),
-            "motion": (double, h, ""),
         }
 
     def members(self) -> str:
@@ -324,9 +316,7 @@ class SearchPlan:
             "FRESH_VALUES": np.array([float(value) for value in fresh.values()]),
             "LOWER": robot.lower,
             "UPPER": robot.upper,
-            "SIZE": seeds.size,
             "ORDER_RANGES": np.maximum((robot.upper - robot.lower)[hand], SMALLEST),
-            "STRIDES": np.concatenate([seeds.strides(i) for i in range(self.rounds)]),
             "HAND_STEPS": even_steps(len(hand)),
             "ALL_STEPS": even_steps(len(robot.actuators)),
             "ANYWHERE_LOWER": lower,

@@ -1,9 +1,9 @@
 /* Hand first: the search for one target, from the question to the verdict.
  *
  * A search makes rounds until a target is solved or none is left that may help. A round takes up to
- * N_CANDIDATES hand postures (seeds.c, valley.c, of a body sides.c), one after the other. Of each
- * it takes the palm pose that suits it best (candidate), fits palm and hand to the contacts as if
- * the hand could fly (hand fit), has the arm carry the palm there in closed form (arm placement, or
+ * N_CANDIDATES hand postures (seeds.c, of a body sides.c), one after the other. Of each it takes
+ * the palm pose that suits it best (candidate), fits palm and hand to the contacts as if the hand
+ * could fly (hand fit), has the arm carry the palm there in closed form (arm placement, or
  * arm choice if what is near q0 is wanted), moves all motors where the arm cannot follow exactly
  * (refinement), and brings the largest error down where contacts contradict each other (balance).
  * An iteration is one step of the stage that the solve is in, and the choice of the next stage:
@@ -15,11 +15,6 @@
  *
  * BEGIN, SOLVE and JUDGE call compiled kernels, as in seeds.c; the constants come from driver.py.
  */
-
-#if N_SIDES
-#undef VALLEY_ROUNDS           /* valleys are those of one hand */
-#define VALLEY_ROUNDS 0
-#endif
 
 /* Hand postures from anywhere, and all motors of the first of them: for what no table holds. */
 static void from_anywhere(search *job, int64_t number, double *first) {
@@ -44,20 +39,12 @@ static int begin_round(search *job) {
   const double *inputs[5 + N_MORE];
   double *outputs[2], first[N_MOTORS];
   map_job map = mapping(1, inputs, ALONE, outputs, ALONE);
-  int code = DONE, goes_on, i, k;
+  int code = DONE, i, k;
   memcpy(job->last, job->state, sizeof job->last);
-  /* The floor of some valleys falls so little that a refinement gives up: ten of them have reached
-   * the end. By turns, since what has come to a valley's lowest place has to leave it. */
-  goes_on = !N_SIDES && later >= VALLEY_ROUNDS && (later - VALLEY_ROUNDS) % 2 == 0
-            && job->last[STATE_BEST_COST] < FLAT_COST;
-  if (later < 0 || !number) code = from_table(job, number);
-#if !N_SIDES
-  else if (later < VALLEY_ROUNDS) code = along_valley(job, later);
-  else if (goes_on) code = along_valley(job, VALLEY_ROUNDS + (later - VALLEY_ROUNDS) / 2);
-#endif
-  else from_anywhere(job, later - VALLEY_ROUNDS, first);
+  if (later < 0) code = from_table(job, number);
+  else from_anywhere(job, later, first);
 #if MENDS
-  if (later >= VALLEY_ROUNDS && !goes_on) code = from_spread(job, number);
+  if (later >= 0) code = from_spread(job, number);
 #endif
   if (code != DONE) return code;
   inputs[0] = job->points;
@@ -78,8 +65,10 @@ static int begin_round(search *job) {
   }
   job->state[STATE_PHASE] = CANDIDATE_PHASE;
   job->state[STATE_CANDIDATE] = 0.0;
-  if (later >= VALLEY_ROUNDS) {
-    /* The first begins as a whole: what stands in the way may be arm and hand together. */
+  if (later >= 0) {
+    /* The first begins as a whole: what stands in the way may be arm and hand together. By turns it
+     * is the best so far, where that nearly fits: a refinement gives up in a flat valley. */
+    const int goes_on = later % 2 && job->last[STATE_BEST_COST] < FLAT_COST;
     if (goes_on) memcpy(first, job->last + STATE_BEST_Q, sizeof first);
     for (k = 0; k < N_MOTORS; ++k) {
       job->state[STATE_Q + k] = clipped(first[k], job->parameters[PARAMETERS_LOWER + k],

@@ -7,19 +7,16 @@ from dataclasses import dataclass, fields
 from casadi_ik.errors import InputError
 from casadi_ik.robots.description import RobotDescription
 
-STRIDES = (0.05, 0.1, 0.2, 0.4, 0.03, 0.15, 0.3, 0.8, 0.5, 0.6, 0.7, 0.25, 1.0, 1.2, 1.5, 2.0)
-
 
 @dataclass(frozen=True)
 class HandFirstParameters:
     """Parameters of the method.
 
     A round begins from up to `candidates` hand postures. In order there are `rounds` from tables,
-    `valley_rounds` along the direction in which the contacts move least, `global_rounds` from
-    anywhere that every target gets, and `rugged_rounds` more for targets that end elsewhere each
-    time. Many motors are more than `many_motors` of the hand: such a hand has so many places where
-    fits end that few of them tell little. Where held motors leave a hand or arm less than its
-    motions, no table holds its postures, and the numbers for many motors count.
+    `global_rounds` from anywhere that every target gets, and `rugged_rounds` more for targets that
+    end elsewhere each time. Many motors are more than `many_motors` of the hand: such a hand has so
+    many places where fits end that few of them tell little. Where held motors leave a hand or arm
+    less than its motions, no table holds its postures, and the numbers for many motors count.
 
     Attributes:
         table: Hand postures the targets' shapes are compared with.
@@ -49,9 +46,6 @@ class HandFirstParameters:
             rounds and 8 after 64; with 96 in all rounds 140 and 16. By turns with these there are
             rounds of postures that are not mended.
         late_round: See above.
-        valley_rounds: Rounds along the directions in which the contacts move least.
-        strides: How far along a valley, to either side, a hand begins anew [rad of the motor that
-            moves most], round by round.
         global_rounds: See above.
         rugged_rounds: Of a hand with few motors, and with many. Of 640,000 targets at limits of
             LEAP hands on eight arms 200 are left after 32 rounds of all kinds, 55 after 64, 14
@@ -61,7 +55,8 @@ class HandFirstParameters:
             was given up one round too early; sixteen cost a tenth more time where contacts
             contradict each other. A hand with many motors comes back to a minimum that just misses
             from many sides: one target did 166 times ten rounds before it was solved.
-        flat_cost: Cost (0.01 mm, 0.1 mrad) above which this is a minimum, no long flat valley.
+        flat_cost: Cost (0.01 mm, 0.1 mrad) above which this is a minimum, no long flat valley: what
+            has come so near goes on from where it is in every second round from anywhere.
         far_cost: Cost (14 mm, 8 deg; 0.3 m) from which on a target that still misses is taken to be
             out of reach; of a hand with few motors, and with many.
         far_cost_shrinks: After the k-th rugged round at most this / (k + 1): the longer a target
@@ -85,9 +80,7 @@ class HandFirstParameters:
     fresh_pool: int = 64
     late_pool: int = 24
     late_round: int = 12
-    valley_rounds: int = 3
-    strides: tuple[float, ...] = STRIDES
-    global_rounds: int = 2
+    global_rounds: int = 5
     rugged_rounds: tuple[int, int] = (40, 250)
     same_minimum: tuple[int, int] = (16, 600)
     flat_cost: float = 1e-8
@@ -116,7 +109,7 @@ class HandFirstParameters:
     @property
     def first_rugged(self) -> int:
         """Rounds before those from anywhere that not every target gets."""
-        return self.rounds + self.valley_rounds + self.global_rounds
+        return self.rounds + self.global_rounds
 
     def all_rounds(self, robot: RobotDescription) -> int:
         """Rounds of all kinds at most."""

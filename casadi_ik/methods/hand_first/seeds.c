@@ -3,7 +3,7 @@
  * The first round compares the target with a table of postures. The next ones compare it with a
  * table many times as large, half of it at limits, and take only postures that differ from each
  * other: the neighbours of one that failed fail as well. Of hands with many motors every finger
- * takes the posture that suits it best by itself. What all of them miss is left to valley.c.
+ * takes the posture that suits it best by itself.
  *
  * The kernels are called by the macros LOOK_UP and SEEN (if MENDS), which take a pointer to a job of
  * the drivers; the constants come from driver.py.

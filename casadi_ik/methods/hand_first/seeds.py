@@ -140,22 +140,9 @@ class Seeds:
         fresh = max(options.fresh_pool, options.late_pool) if self.mends else 0
         return max(options.pool * wanted, fresh)
 
-    def strides(self, which: int) -> Array:
-        """(candidates,) how far the hands of a round begin along their valley."""
-        both_sides = [sign * size for size in self._options.strides for sign in (1, -1)]
-        first = (which + 1) // 2 * self._options.candidates
-        return np.resize(np.roll(both_sides, -first), self._options.candidates)
-
     def anywhere_bounds(self, enforce_limits: bool) -> tuple[Array, Array]:
         """(n,) between which configurations from anywhere are."""
         return (self._robot.lower, self._robot.upper) if enforce_limits else self._everywhere
-
-    @property
-    def size(self) -> Array:
-        """(hand,) a radian of every motor, or half the range of a slider [m]."""
-        units = [self._robot.description.actuators[column].unit for column in self._hand]
-        ranges = (self._robot.upper - self._robot.lower)[self._hand]
-        return np.where([unit == "rad" for unit in units], 1.0, ranges / 2)
 
     @property
     def _everywhere(self) -> tuple[Array, Array]:
