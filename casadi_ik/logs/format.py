@@ -205,7 +205,7 @@ CHECKSUM = "crc32"
 SHARDS = "shards"
 """Key of where the solves of a merged log come from."""
 
-PACKAGES = ("casadi", "numpy", "mcap", "msgspec", "pyyaml")
+PACKAGES = ("casadi", "numpy", "mcap", "proxsuite", "msgspec", "pyyaml")
 
 Number = Annotated[str, msgspec.Meta(pattern=r"^[0-9]{1,19}\Z")]
 Text = Annotated[str, msgspec.Meta(max_length=10_000)]

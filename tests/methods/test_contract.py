@@ -362,6 +362,7 @@ def test_bad_solvers(robot, arguments, error, says):
     [
         ("hand-first", {"candidates": 0}, "candidates: found 0, expected a whole number >= 1"),
         ("hand-first", {"table": 4}, "table: found 4, expected at least"),
+        ("thumb-first", {"step": "newton"}, "step: found 'newton', expected one of freeze, proxqp"),
         ("thumb-first", {"starts": 0}, "starts: found 0, expected a whole number >= 1"),
         ("thumb-first", {"table": 8}, "table: found 8, expected at least starts = 32"),
         ("thumb-first", {"step_cap": 0.0}, "step_cap: found 0.0, expected a number > 0"),

@@ -126,6 +126,16 @@ def test_without_an_arm_the_palm_is_fixed(coupled_robot, rng):
     assert not batch.phases["arm-placement"].any()
 
 
+def test_proxqp_solves_as_well(robot, once, rng):
+    """The quadratic program takes the same way: nothing is lost by fixing joints one by one."""
+    targets = robot.contacts(shipped_hands(robot, rng, 60))
+    program = thumb_first(robot, starts=1, step="proxqp")
+    one, other = once.solve_batch(*targets), program.solve_batch(*targets)
+    np.testing.assert_array_equal(one.success, other.success)
+    assert other.limits_ok.all()
+    assert np.mean(one.iterations == other.iterations) > 0.8
+
+
 @pytest.mark.parametrize("joints", [1, 3, 4])
 def test_thumbs_of_any_number_of_joints(tmp_path, rng, joints):
     robot = thumb_of(tmp_path, joints)

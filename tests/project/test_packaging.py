@@ -13,7 +13,7 @@ import casadi_ik as ik
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-ON_DEMAND = "pinocchio coal matplotlib pyvista polars mujoco scipy trimesh collada rich"
+ON_DEMAND = "pinocchio coal matplotlib pyvista polars mujoco scipy proxsuite trimesh collada rich"
 """What the public names do not import."""
 
 

@@ -12,9 +12,13 @@ H_p that could be singular.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
 import casadi as ca
+import numpy as np
 
 from casadi_ik.problem.contacts import LENGTH, PLACE, ContactRows, resting, tip_rates, tip_vectors
 from casadi_ik.robots.description import RobotDescription
@@ -62,6 +66,61 @@ def merit(robot: RobotDescription, rows: ContactRows, q: Expr, p: dict[str, Expr
     )
 
 
+ITERATIONS = 30
+"""Of its outer loop: contradictions in a narrow box converge slowly, and the step is only tried."""
+
+ACCURACY = 1e-9
+"""Residuals at which a program counts as solved."""
+
+
+class ProxqpNode(ca.Callback):
+    """``(H, g, A, b, lower, upper) -> x``, the minimiser of x'Hx/2 + g'x with Ax = b in a box."""
+
+    def __init__(self, n: int, m: int) -> None:
+        """Make the node for n unknowns and m equations."""
+        ca.Callback.__init__(self)
+        self._shapes = [(n, n), (n, 1), (m, n), (m, 1), (n, 1), (n, 1)]
+        self.construct(f"proxqp_{n}_{m}", {})
+
+    def get_n_in(self) -> int:
+        """Number of inputs."""
+        return len(self._shapes)
+
+    def get_n_out(self) -> int:
+        """Number of outputs."""
+        return 1
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        """Shape of an input, dense."""
+        return ca.Sparsity.dense(*self._shapes[i])
+
+    def get_sparsity_out(self, i: int) -> ca.Sparsity:
+        """Shape of the output, dense."""
+        del i
+        return ca.Sparsity.dense(*self._shapes[1])
+
+    def eval(self, arg: Any) -> list[Any]:
+        """Solve one program; with contradicting equations the nearest that can be solved."""
+        from proxsuite import proxqp as backend
+
+        H, g, A, b, lower, upper = (np.array(x) for x in arg)
+        program = backend.dense.QP(len(g), len(b), 0, True)
+        program.settings.eps_abs = ACCURACY
+        program.settings.primal_infeasibility_solving = True
+        program.settings.max_iter = ITERATIONS
+        nothing = None
+        vectors = (lower.ravel(), upper.ravel())
+        program.init(H, g.ravel(), A, b.ravel(), nothing, nothing, nothing, *vectors)
+        program.solve()
+        return [ca.DM(program.results.x.tolist())]
+
+
+@cache
+def proxqp(n: int, m: int) -> ProxqpNode:
+    """The node for n unknowns and m equations; kept, since a graph does not keep it alive."""
+    return ProxqpNode(n, m)
+
+
 THUMB_DAMPING = 0.01
 """Least damping [-] of the thumb's rows, 1 mm per rad: J_t^# stays finite where J_t is singular."""
 
@@ -106,6 +165,10 @@ class Room:
     lower: Expr
     upper: Expr
     damping: Expr
+
+
+StepSolver = Callable[[Linear, Room], tuple[Expr, Expr]]
+"""Gives the step (n, 1) and which motors it holds at their limits (n, 1)."""
 
 
 def contact_errors(
@@ -185,9 +248,6 @@ def free_step(linear: Linear, damping: Expr) -> Expr:
 def freezing(linear: Linear, room: Room) -> tuple[Expr, Expr]:
     """Within the limits: what violates them most is fixed there, and the step is solved again.
 
-    It takes the same way as the quadratic program, which may let go of a motor again, and can be
-    compiled.
-
     Args:
         linear: Of MX symbols, since further passes are only made where they are needed.
         room: Likewise.
@@ -236,3 +296,23 @@ def _solved_and_fixed(sparsities: list[ca.Sparsity]) -> ca.Function:
     ]
     inputs = [thumb, thumb_error, others, others_error, lower, upper, damping, held, values]
     return ca.Function("solved_and_fixed", inputs, shared(*map(ca.densify, outputs)))
+
+
+def quadratic_program(linear: Linear, room: Room) -> tuple[Expr, Expr]:
+    """The same problem as a quadratic program within the limits, by ProxQP.
+
+    The thumb's rows are equations; where the limits leave no solution, ProxQP takes the nearest
+    that there is, so that the thumb still comes first. Returns as `freezing`.
+    """
+    m, n = linear.thumb.shape
+    demanded = linear.thumb @ thumb_step(linear, room.damping)
+    hessian = linear.others.T @ linear.others + room.damping**2 * ca.DM.eye(n)
+    gradient = -linear.others.T @ linear.others_error
+    program = (hessian, gradient, linear.thumb, demanded, room.lower, room.upper)
+    found = proxqp(n, m)(*map(ca.densify, program))
+    step = ca.fmin(ca.fmax(found, room.lower), room.upper)
+    return step, ca.logic_or(step <= room.lower, step >= room.upper)
+
+
+STEP_SOLVERS: dict[str, StepSolver] = {"freeze": freezing, "proxqp": quadratic_program}
+"""By the name of `ThumbFirstParameters.step`."""

@@ -27,7 +27,7 @@ class ThumbFirstMethod(LoopedMethod):
     """`thumb-first`: the arm starts at the estimated palm, then the closed chain does the rest.
 
     Attributes:
-        step: Its step for this robot.
+        step: Its step for this robot; in the virtual machine if it is ProxQP's.
         preferences: What it can prefer.
     """
 

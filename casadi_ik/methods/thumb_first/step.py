@@ -40,10 +40,10 @@ from casadi_ik.methods.common.contact_fit import (
 from casadi_ik.methods.common.limits import bits
 from casadi_ik.methods.common.palm import best_palm, hand_contacts, nearest_start, pose_step
 from casadi_ik.methods.thumb_first.closed_chain_step import (
+    STEP_SOLVERS,
     Linear,
     Merit,
     Room,
-    freezing,
     linearised,
     merit,
 )
@@ -67,6 +67,9 @@ from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.kinematics import Pose, motor_scales
 from casadi_ik.symbolic.smooth import Expr, shared
 
+STEPS = ("freeze", "proxqp")
+"""How a step keeps to the limits."""
+
 
 @dataclass(frozen=True)
 class ThumbFirstParameters:
@@ -76,6 +79,9 @@ class ThumbFirstParameters:
         starts: Palm estimates a solve may begin from, each from another hand posture.
         table: Hand postures that the target's shape is compared with to find them.
         pull: How much a posture's distance from the start's hand counts along with the shape.
+        step: "freeze": the joint that violates its limits most is fixed there and the step is
+            solved again. "proxqp": the same problem as a quadratic program (ProxQP, Bambade et
+            al. 2022), in CasADi's virtual machine; slower.
         damping: Damping [-] of the first step of a start; residuals are in 0.1 m and rad.
         step_cap: Longest change of any motor in one iteration [rad, or part of a slider's range].
         eased: Factor of the damping after a step that lowered the cost.
@@ -91,6 +97,7 @@ class ThumbFirstParameters:
     starts: int = 32
     table: int = 8192
     pull: float = 6.0
+    step: str = "freeze"
     damping: float = 0.03
     step_cap: float = 0.3
     eased: float = 1 / 3
@@ -103,6 +110,9 @@ class ThumbFirstParameters:
     as_it_is: float = 0.5
 
     def __post_init__(self) -> None:
+        if self.step not in STEPS:
+            known = ", ".join(STEPS)
+            raise InputError(f"step: found {self.step!r}, expected one of {known}")
         for entry in fields(self):
             value = getattr(self, entry.name)
             if entry.type == "int" and not (type(value) is int and value >= 1):
@@ -268,13 +278,14 @@ class ThumbFirstStep(ThumbFirstLayouts):
     arm: ArmFamily | None
 
     def graph(self) -> StepGraph:
-        """The whole iteration."""
+        """The whole iteration; compilable unless the step is ProxQP's."""
         return StepGraph(
             self._name,
             self._iteration,
             self.state,
             self.parameters,
             self.record,
+            self.options.step != "proxqp",
             stage="phase",
             recipe=recipe(self._name, self.robot, self.options, self.kinds),
         )
@@ -434,7 +445,8 @@ class ThumbFirstStep(ThumbFirstLayouts):
     def _alignment(self) -> ca.Function:
         state, parameters, _, _ = self._vectors(ca.MX)
         *problem, lower, upper, damping = self._problem()(state, parameters)
-        step, held = freezing(Linear(*problem), Room(lower, upper, damping))
+        solve = STEP_SOLVERS[self.options.step]
+        step, held = solve(Linear(*problem), Room(lower, upper, damping))
         outputs = self._take()(state, parameters, step, held)
         return ca.Function("alignment", [state, parameters], list(outputs))
 
