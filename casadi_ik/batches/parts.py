@@ -11,7 +11,6 @@ import io
 import json
 import logging
 import pickle
-import sys
 import tempfile
 import zipfile
 import zlib
@@ -19,7 +18,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -147,37 +146,18 @@ def _check(client: Client, address: str, packages: tuple[str, ...]) -> None:
             f"--dask {address}: found no worker within {PATIENCE} s, expected at least one: "
             f"`dask worker {address}`"
         ) from error
-    import cloudpickle
-
-    mine, here = installed(packages), sys.modules[__name__]
-    # The question has to travel whole: this package may be another there, or none.
-    cloudpickle.register_pickle_by_value(here)
-    try:
-        found = client.run(installed, packages)
-        scheduler = client.run_on_scheduler(installed, packages)
-    finally:
-        cloudpickle.unregister_pickle_by_value(here)
-    assert isinstance(found, dict)
-    for place, theirs in {**found, "the scheduler": scheduler}.items():
-        if theirs != mine:
-            raise InputError(
-                f"--dask {address}: {place} has {_listed(theirs)}, expected {_listed(mine)} as here"
-            )
+    found: Any = client.get_versions(packages=list(packages))
+    mine = _installed(found["client"], packages)
+    for place, state in {**found["workers"], "the scheduler": found["scheduler"]}.items():
+        if (theirs := _installed(state, packages)) != mine:
+            raise InputError(f"--dask {address}: {place} has {theirs}, expected {mine} as here")
 
 
-def installed(packages: tuple[str, ...]) -> dict[str, str]:
-    """Python and versions of packages; "none" of what is not there."""
-    found = {"python": f"{sys.version_info[0]}.{sys.version_info[1]}"}
-    for name in packages:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "none"
-    return found
-
-
-def _listed(packages: dict[str, str]) -> str:
-    return ", ".join(f"{name} {text}" for name, text in packages.items())
+def _installed(state: Mapping[str, Any], packages: tuple[str, ...]) -> str:
+    """Python and packages with their versions as Dask tells them; "none" of what is not there."""
+    found = state["packages"]
+    python = ".".join(found["python"].split(".")[:2])
+    return ", ".join([f"python {python}", *(f"{one} {found[one] or 'none'}" for one in packages)])
 
 
 MANIFEST = "batch.json"

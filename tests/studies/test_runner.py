@@ -18,6 +18,7 @@ import polars as pl
 import pytest
 import small_study
 from dask_processes import scheduler_process, worker_process
+from distributed.versions import get_versions
 from processes import python
 from runner.report import interval_text, mean_metric, median_metric, rate_metric
 from runner.study import STUDY_FILE, claim, missing, read_results, run
@@ -102,11 +103,10 @@ def test_a_worker_with_another_version_is_named(monkeypatch):
     class Client:
         def wait_for_workers(self, n_workers: int, timeout: float) -> None: ...
 
-        def run(self, function, packages):
-            return {"tcp://worker:1": function(packages) | {"casadi-ik": "0.0.1"}}
-
-        def run_on_scheduler(self, function, packages):
-            return function(packages)
+        def get_versions(self, packages):
+            here = get_versions(packages)
+            worker = {"packages": here["packages"] | {"casadi-ik": "0.0.1"}}
+            return {"client": here, "scheduler": here, "workers": {"tcp://worker:1": worker}}
 
     with pytest.raises(
         ik.errors.InputError, match=r"tcp://worker:1 has .*casadi-ik 0\.0\.1.*expected"
