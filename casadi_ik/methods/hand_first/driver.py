@@ -179,8 +179,8 @@ class SearchPlan:
         }
 
     @property
-    def fields(self) -> dict[str, tuple[str, int, str]]:
-        """Type, length and meaning of what a search has in memory, all of eight bytes each."""
+    def fields(self) -> dict[str, tuple[str, int | None, str]]:
+        """Type, length (None: a number) and meaning of what a search has in memory, 8 bytes."""
         f, n, h, _, state, parameters, candidates, pool, mended, more, _ = self.sizes.values()
         double, whole = "double", "int64_t"
         return {
@@ -189,22 +189,22 @@ class SearchPlan:
             "more": (double, 3 * f * more + 1, "contacts' other vectors, without a verdict here"),
             "here": (double, n, "where the robot is"),
             "terms": (double, self.sizes["N_TERMS"], "tolerances, bounds, 1 = nearest wanted"),
-            "most": (whole, 0, "rounds of a search; 0: its first alone, no search without"),
+            "most": (whole, None, "rounds of a search; 0: its first alone, no search without"),
             "q": (double, n, "the answer"),
             "position_error": (double, f, "[m]"),
             "angle_error": (double, f, "[rad]"),
-            "beyond": (double, 0, "by how much the worst motor or joint is beyond its limits"),
-            "iterations": (whole, 0, ""),
-            "restarts": (whole, 0, ""),
-            "status": (whole, 0, ""),
-            "judged": (whole, 0, "on its way: whether there is a verdict"),
-            "round": (whole, 0, ""),
-            "again": (whole, 0, "1 = near `here` there was none: the search without preference"),
-            "may_begin": (whole, 0, "rounds of this call"),
-            "slot": (whole, 0, "of the loop, -1 = not under way"),
-            "begun": (whole, 0, "iterations before the round"),
-            "loop_status": (whole, 0, ""),
-            "paused": (whole, 0, ""),
+            "beyond": (double, None, "by how much the worst motor or joint is beyond its limits"),
+            "iterations": (whole, None, ""),
+            "restarts": (whole, None, ""),
+            "status": (whole, None, ""),
+            "judged": (whole, None, "on its way: whether there is a verdict"),
+            "round": (whole, None, ""),
+            "again": (whole, None, "1 = near `here` there was none: the search without preference"),
+            "may_begin": (whole, None, "rounds of this call"),
+            "slot": (whole, None, "of the loop, -1 = not under way"),
+            "begun": (whole, None, "iterations before the round"),
+            "loop_status": (whole, None, ""),
+            "paused": (whole, None, ""),
             "state": (double, state, ""),
             "parameters": (double, parameters, ""),
             "last": (double, state, "the state in which the round before ended"),
@@ -223,7 +223,7 @@ class SearchPlan:
         """The `fields` as members of a struct of C."""
         lines = []
         for name, (kind, length, doc) in self.fields.items():
-            size = f"[{length}]" if length or (kind == "double" and name != "beyond") else ""
+            size = "" if length is None else f"[{length}]"
             lines.append(f"  {kind} {name}{size};{f'  /* {doc} */' if doc else ''}\n")
         return "".join(lines)
 
@@ -638,15 +638,11 @@ def _form(plan: SearchPlan) -> list[Any]:
     """The memory of a search, as a record of numpy."""
     kinds = {"double": np.float64, "int64_t": np.int64}
     form: list[Any] = [
-        (name, kinds[kind], (length,) if _is_array(name, kind, length) else ())
+        (name, kinds[kind], () if length is None else (length,))
         for name, (kind, length, _) in plan.fields.items()
     ]
     sides = [(name, np.int64, (len(plan.sides),)) for name in ("sides", "hands") if plan.sides]
     return [*form, ("tiles", np.int64, (3,)), *sides, *((name, np.int64) for name in KERNELS)]
-
-
-def _is_array(name: str, kind: str, length: int) -> bool:
-    return bool(length) or (kind == "double" and name != "beyond")
 
 
 def _text(plan: SearchPlan, wide: bool) -> str:
