@@ -7,7 +7,7 @@ what the linear model promised (Nielsen 1999: Damping parameter in Marquardt's m
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Any
 
@@ -170,7 +170,12 @@ class Judged:
 
 
 def judge_contacts(
-    s: dict[str, Expr], p: dict[str, Expr], tried: Tried, rows: ContactRows, part: float = 1.0
+    s: dict[str, Expr],
+    p: dict[str, Expr],
+    tried: Tried,
+    rows: ContactRows,
+    part: float = 1.0,
+    fine: Expr = 1.0,
 ) -> Judged:
     """Judge a step by the contacts, its residuals those of `rows`; see `judge`.
 
@@ -180,12 +185,17 @@ def judge_contacts(
         tried: The step.
         rows: The contacts.
         part: Of the tolerances; what is within that is within them.
+        fine: What part of them, if less, is good enough to stop at, should the cost fall slowly.
     """
     residual = ca.if_else(gains(tried), tried.there, tried.before)
     positions, chords = rows.errors(residual)
-    tolerances = part * p["position_tolerance"], part * chord(p["angle_tolerance"])
-    exact = within_tolerance(positions / FIT.fine, chords / FIT.fine, *tolerances)
-    return judge(s, tried, within_tolerance(positions, chords, *tolerances), exact)
+    tolerances = p["position_tolerance"], chord(p["angle_tolerance"])
+
+    def within(part: Expr) -> Expr:
+        return within_tolerance(positions, chords, *(part * allowed for allowed in tolerances))
+
+    fine = ca.fmin(part, fine)
+    return replace(judge(s, tried, within(fine), within(FIT.fine * fine)), within=within(part))
 
 
 def gains(tried: Tried) -> Expr:

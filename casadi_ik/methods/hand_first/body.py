@@ -206,19 +206,17 @@ class BodyStep(HandFirstStep):
         q = s["q"][side.motors]
         x = PalmAndHand(s["palm_rotation"], s["palm_origin"], q[hand])
         tried = side.fitted(x, s["damping"], own, q)
-        # A hand that fits its contacts by half has its palm where it need not be within reach.
-        judged = judge_contacts(s, own, tried, rows, BODY.fit_part)
-        within = judge_contacts(s, own, tried, rows, STAGES.before_the_arm).within
+        judged = judge_contacts(s, own, tried, rows, STAGES.before_the_arm, STAGES.fit_part)
         keep, reached = judged.accepted, tried.reached
         changed = {
             "q": with_rows(s["q"], side.hand, ca.if_else(keep, reached.hand, x.hand)),
             "palm_rotation": ca.if_else(keep, reached.rotation, x.rotation),
             "palm_origin": ca.if_else(keep, reached.origin, x.origin),
-            "fits": within,
+            "fits": judged.within,
         } | judged.fit
         said = {
             "settled": judged.settled,
-            "within": within,
+            "within": judged.within,
             "near": self._left(keep, tried, own, rows),
             "cost": ca.sumsqr(tried.before),
         }

@@ -367,7 +367,8 @@ class HandFirstStep:
         columns = list(self.robot.hand_actuators)
         x = PalmAndHand(s["palm_rotation"], s["palm_origin"], s["q"][columns])
         tried = fit_step(self.layouts, self.arm, x, s["damping"], p, s["q"], inputs)
-        judged = judge_contacts(s, p, tried, self.layouts.contacts, STAGES.before_the_arm)
+        fine = ca.if_else(s["earlier"] > 0, STAGES.fit_part, STAGES.before_the_arm)
+        judged = judge_contacts(s, p, tried, self.layouts.contacts, STAGES.before_the_arm, fine)
         keep, reached = judged.accepted, tried.reached
         changed = {
             "q": self._with_hand(s["q"], ca.if_else(keep, reached.hand, x.hand)),
