@@ -220,7 +220,7 @@ class SideSources:
 
     def source(self, names: Iterable[str]) -> str:
         """Its file, with the kernels of these names."""
-        texts = driver_text("loops") + source_text("spread") + source_text("seeds")
+        texts = driver_text("loops") + "".join(map(source_text, ("spread", "seeds", "hands")))
         calls = "".join(
             f"#define {name.upper()}(work) {self.prefix}_{name}_kernel(work, job->memory)\n"
             for name in names
@@ -399,7 +399,7 @@ class SolverSources:
             "PARTS": parts,
             "CALLS": calls,
             "SIZES": define(sizes),
-            "CONSTANTS": self.plan.constants(self.plan.source, *changed),
+            "CONSTANTS": self.plan.constants(self.plan.source + "".join(about.values()), *changed),
             "SEARCH": self.plan.source,
             "TERMS": define_arrays({"TERMS": self._terms(), "HOME": robot.home}),
             "LIMITS": define_arrays(

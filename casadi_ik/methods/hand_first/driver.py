@@ -652,6 +652,7 @@ def _text(plan: SearchPlan, wide: bool) -> str:
     calls = "".join(f"#define {name.upper()}(work) (job->{name})(work)\n" for name in KERNELS)
     count = len(plan.sides)
     sides = f"  int64_t sides[{count}], hands[{count}];\n" if count else ""
+    source = plan.source + ("" if plan.sides else source_text("hands"))
     codes = {code.name: int(code) for code in DriverCode} | {"MALFORMED": MALFORMED}
     return "".join(
         (
@@ -663,10 +664,10 @@ def _text(plan: SearchPlan, wide: bool) -> str:
             f"  const int16_t *tiles[3];\n{sides}{pointers}}} search;\n",
             f"{calls}#define TILES(table) (job->tiles[table])\n",
             define(plan.sizes),
-            plan.constants(plan.source),
+            plan.constants(source),
             EXPORT,
             OF_SIDES if plan.sides else f"#define FIND_HANDS {HANDS}\n",
-            plan.source,
+            source,
             source_text("calls"),
         )
     )
