@@ -334,7 +334,7 @@ def smallest(owner: Rows, values: Array, most: int) -> Rows:
 def best_of_each(owner: NDArray[np.intp], value: Array, than: Array) -> NDArray[np.intp]:
     """The row of the largest value (m,) of each owner (m,), where it exceeds what that has (k,)."""
     order = np.lexsort((value, owner))
-    last = order[np.append(owner[order][1:] != owner[order][:-1], True)]
+    last = order[np.diff(owner[order], append=-1) != 0]
     return last[value[last] > than[owner[last]]]
 
 

@@ -132,6 +132,18 @@ def test_what_touches_nothing_is_found(name):
     assert (solver.check(first, about).distance < 0).mean() > 0.1
 
 
+def test_hands_that_touch_themselves_are_moved_within_tolerances():
+    """Of contacts of random postures, most of which touch something, many can be met freely."""
+    robot = ik.load_robot("g1+dex3")
+    solver, about = ik.Solver(robot, scene=ik.Scene()), grasp(robot, robot.home)
+    q = robot.random(np.random.default_rng(0), 40)
+    points, normals = robot.contacts(q)
+    found = solver.solve_batch(points, normals)
+    assert found.success.sum() >= 8
+    assert (solver.check(found.q, about).distance >= 0)[found.success].all()
+    assert misses(robot, found.q, points)[found.success].max() <= 5e-3 * 1.001
+
+
 def test_motors_are_held(robot):
     q = targets(robot, 1, seed=3)[0][0]
     names = [*robot.description.trunk, robot.description.sides[0].hand[0]]
