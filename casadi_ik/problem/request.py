@@ -209,8 +209,8 @@ def _leave_free(points: Array, facing: Array) -> NDArray[np.bool_]:
     for i, axis in enumerate(np.eye(3)):
         moved[:, i, :f] = axis * placed
         moved[:, 3 + i] = turned @ TURNS[i]
-    values = np.linalg.svd(moved.reshape(len(points), 6, -1), compute_uv=False)
-    return np.asarray(values[:, -1] < DETERMINED)
+    rows = moved.reshape(len(points), 6, -1)
+    return np.asarray(np.linalg.eigvalsh(rows @ np.swapaxes(rows, 1, 2))[:, 0] < DETERMINED**2)
 
 
 def held_too(postures: Array, fixed: Array | None, actuators: Sequence[str]) -> Array:
