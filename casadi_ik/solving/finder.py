@@ -276,11 +276,13 @@ class AlternativeFinder:
         def valued(arms: Array) -> Array:
             return self._valued(with_arm(arms), q0, prefer, query, True)
 
-        found = []
-        for branch in self._branches.find(palm, lower, upper):
-            stop_if_cancelled()
-            arm, swivel = self._branches.best(palm, branch, (lower, upper), valued)
-            found.append(_Found(with_arm(arm[None])[0], posture, branch, swivel))
+        branches = self._branches.find(palm, lower, upper)
+        found = [
+            _Found(with_arm(arm[None])[0], posture, branch, swivel)
+            for branch, (arm, swivel) in zip(
+                branches, self._branches.best(palm, branches, (lower, upper), valued), strict=True
+            )
+        ]
         if self._branches.family.is_iterative:
             # A stretch may be shorter than the positions are apart.
             found += [_Found(arm, posture) for arm in self._searched(targets, q, seed, q0, prefer)]
@@ -319,7 +321,7 @@ class AlternativeFinder:
         """Different arms: the preferred of every branch, and those found from random ones."""
         starts = self.robot.random(np.random.default_rng(seed), SEEKING.arms)
         starts[:, self.hand] = q[self.hand]
-        if self.arm_search is not None:
+        if self._branches is None and self.arm_search is not None:
             limits, no_cap = self.trials.limits(targets).first, np.full(1, np.inf)
             bounds, order = (limits.lower, limits.upper), {CLEARANCE: "limits"}.get(prefer, prefer)
             found = self.arm_search.choose(q[None], q0[None], bounds, order, None, no_cap, True)
@@ -479,27 +481,43 @@ class ArmBranches:
 
     def arms(self, palm: Array, branch: ArmBranch, values: Array) -> Array:
         """Configurations (k, n) [rad] of a branch at values (k,) of the redundancy."""
-        signs = tuple(getattr(branch, part) for part in self.family.parts)
         arms, _ = self._at(palm[:3, :3], palm[:3, 3], values)
-        return arms[:, SIGNS.index(signs) * self.family.roots + branch.root]
+        return arms[:, self._row(branch)]
+
+    def _row(self, branch: ArmBranch) -> int:
+        signs = tuple(getattr(branch, part) for part in self.family.parts)
+        return SIGNS.index(signs) * self.family.roots + branch.root
 
     def best(
+        self,
+        palm: Array,
+        branches: list[ArmBranch],
+        bounds: tuple[Array, Array],
+        score: Callable[[Array], Array],
+    ) -> list[tuple[Array, float | None]]:
+        """Of every branch the arm with the highest score, and its redundancy.
+
+        Args:
+            palm: (4, 4).
+            branches: With their stretches.
+            bounds: (n,) and (n,), those that they were found with.
+            score: Of configurations (k, n) -> (k,).
+        """
+        if self.family.redundancy:
+            return [self._best(palm, branch, bounds, score) for branch in branches]
+        arms, _ = self._at(palm[:3, :3], palm[:3, 3], np.zeros(1))
+        return [(arms[0, self._row(branch)], None) for branch in branches]
+
+    def _best(
         self,
         palm: Array,
         branch: ArmBranch,
         bounds: tuple[Array, Array],
         score: Callable[[Array], Array],
     ) -> tuple[Array, float | None]:
-        """The arm of a branch with the highest score, and its redundancy.
-
-        Args:
-            palm: (4, 4).
-            branch: With its stretch.
-            bounds: (n,) and (n,), those that it was found with.
-            score: Of configurations (k, n) -> (k,).
-        """
-        if branch.swivel is None:
-            return self.arms(palm, branch, np.zeros(1))[0], None
+        """See `best`; of a branch with a stretch."""
+        stop_if_cancelled()
+        assert branch.swivel is not None
         first, last = branch.swivel
         values, zooms = np.linspace(first, last, SEEKING.samples), SEEKING.zooms
         if self.family.is_iterative:
