@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import math
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -36,108 +35,113 @@ BLOCK = 1024
 ClearanceJob = c_struct("clearance_job", {"RECENT": RECENT})
 
 
-@dataclass(frozen=True)
-class Watching:
-    """How distances are kept from call to call.
+OBSTACLES = 4
+"""Clearances that a goal minds at once."""
+
+SPARE = 0.1
+"""How far [m] motors may move things, at most, until a guard looks at all pairs again."""
+
+Surroundings = c_struct("surroundings", driver="guard_job")
+GuardJob = c_struct("guard_job")
+
+
+class Guarding:
+    """What keeps a follower clear, on memory of its own; not to be shared by threads.
 
     Attributes:
-        worn: So far [m] shapes may be from where all pairs were looked at until they are again.
-        horizon: Distances [m] up to which pairs are told apart then.
-    """
-
-    worn: float = 0.02
-    horizon: float = 0.3
-
-
-WATCHING = Watching()
-
-
-class Watch:
-    """Distances of configurations near those of the call before; not to be shared by threads.
-
-    What two shapes are apart changes by no more than they move. So of pairs that were far apart
-    where all were looked at last nothing has to be worked out until shapes are far from there.
-
-    Attributes:
-        q: (k, n) configurations; write into it. Where the first is, all pairs are looked at.
-        least: (k,) the smallest distance of each [m] after a call, `most` where none is below it.
-        nearest: (few,) numbers of the pairs nearest to each other where the first configuration is,
-            the nearest first; -1 where no other is below `most`.
-        near: (few,) their distances [m], at most `most`.
-        every: (k, p) distances of all pairs [m] where no `most` is given.
+        poses: (m, 12) of the scene's solids; see `surround`.
+        goal: (n,) configuration that keeps away; write into it.
+        rooms: (OBSTACLES,) what the nearest pairs lack there [m]; 0: nothing.
+        slopes: (OBSTACLES, n) how these distances grow [m per rad or m].
+        q: (n,) where the motors are; write into it, as into the next two.
+        last: (n,) their last step.
+        wanted: (n,) their next.
+        part: (n,) the shares of it that are free; 0: the motor brakes.
+        step: (n,) the step after which they can come to rest free.
+        rest: (n,) where that is.
     """
 
     def __init__(
         self,
         kernel: ClearanceKernel,
-        q: Array,
         poses: Array,
         table: Table,
-        most: float = math.inf,
-        enough: float = -math.inf,
-        few: int = 0,
-        way: bool = False,
+        levers: Array,
+        hand: Array,
+        change: Array,
+        shares: tuple[float, ...],
+        **given: float,
     ) -> None:
         """Lay the memory out.
 
         Args:
-            kernel: Of the robot.
-            q: (k, n) aligned doubles, which are kept.
+            kernel: Of the robot, compiled.
             poses: (m, 12) of the scene's solids.
             table: The pairs.
-            most: As for `ClearanceKernel.least`.
-            enough: As for `ClearanceKernel.least`.
-            few: So many nearest pairs are told.
-            way: Whether all configurations but the first are places on a way, evenly spaced in
-                time: their distances are less by what these bend by on the way.
+            levers: (p, n) see `collision.levers`.
+            hand: (n,) 1 for motors beyond a palm.
+            change: (n,) how much a step may differ from the last.
+            shares: As in the driver.
+            given: Likewise.
         """
-        self.q, self.least = q, np.full(len(q), most)
-        self.every = np.empty((len(q), len(table.pairs) if math.isinf(most) else 0))
-        self.nearest, self.near = np.full(few, -1, dtype=np.int64), np.full(few, most)
+        count, n = levers.shape
         # Of its own: what stands about the robot may move.
-        poses = np.array(poses)
-        self._kernel, self._given = kernel, (poses, table, most, enough)
-        self._where = np.full(kernel.size, math.nan)
-        if kernel.entry is None or not len(table.pairs):
-            return
-        self._job, self._kept = kernel.job(q, poses, table, most, enough)
-        self._closest = np.empty(len(q), dtype=np.int64)
-        self._known = np.empty(len(table.pairs))
-        job = self._job
-        job.least, job.closest = memory(self.least), memory(self._closest)
-        job.way, job.few, job.nearest, job.near = way, few, memory(self.nearest), memory(self.near)
-        if math.isinf(most):
-            job.every = memory(self.every)
-        else:
-            job.known, job.reference = memory(self._known), memory(self._where)
-            job.worn, job.horizon = WATCHING.worn, most + WATCHING.horizon
-        self._reference = ctypes.byref(job)
+        self.poses = np.array(poses)
+        names = "goal", "q", "last", "wanted", "part", "step", "rest"
+        numbers = {name: np.zeros(n) for name in names}
+        self.goal, self.q, self.last, self.wanted, self.part, self.step, self.rest = (
+            numbers.values()
+        )
+        self.rooms, self.slopes = np.zeros(OBSTACLES), np.zeros((OBSTACLES, n))
+        about, kept = kernel.job(self.q, self.poses, table, math.inf, -math.inf)
+        self._at, distances = np.full((2, n), math.nan), np.empty((2, 2, count))
+        listed = np.empty((2, 2, count), dtype=np.int64)
+        arrays = numbers | {
+            "levers": doubles(levers),
+            "hand": doubles(hand),
+            "widest": levers.max(axis=0, initial=0.0),
+            "change": doubles(change),
+            "shares": doubles(shares),
+            "rooms": self.rooms,
+            "slopes": self.slopes,
+        }
+        here = [
+            Surroundings(
+                at=memory(at),
+                near=memory(near),
+                known=memory(known),
+                close=memory(close),
+                limits=memory(limits),
+            )
+            for at, (near, close), (known, limits) in zip(self._at, listed, distances, strict=True)
+        ]
+        self._job = GuardJob(
+            about=ctypes.addressof(about),
+            by_goal=ctypes.addressof(here[0]),
+            by_way=ctypes.addressof(here[1]),
+            n_shares=len(shares),
+            spare=SPARE,
+            **{name: memory(array) for name, array in arrays.items()},
+            **given,
+        )
+        self._kept = about, kept, here, listed, distances, arrays
+        self._name, self._reference = kernel.name, ctypes.byref(self._job)
+        self._keep_away, self._stop_in_time = kernel.guards
 
     def surround(self, poses: Array) -> None:
         """Take the scene's solids to be elsewhere, (m, 12)."""
-        self._given[0][...] = poses
-        self._where[:] = math.nan
+        self.poses[...] = poses
+        self._at[...] = math.nan
 
-    def __call__(self) -> None:
-        """Work the distances out."""
-        poses, table, most, enough = self._given
-        if not len(table.pairs):
-            return
-        if self._kernel.entry is None:
-            self.least[:], _ = self._kernel.least(self.q, poses, table, most, enough)
-            if self.every.size:
-                self.every[:] = self._kernel.every(self.q, poses, table)
-            if len(self.nearest):
-                (every,) = self._kernel.every(self.q[:1], poses, table)
-                order = np.argsort(every, kind="stable")[: len(self.nearest)]
-                found = every[order] < most
-                self.nearest[:], self.near[:] = -1, most
-                self.nearest[: len(order)][found] = order[found]
-                self.near[: len(order)][found] = every[order[found]]
-            return
-        self._job.next = 0
-        while code := self._kernel.entry(self._reference):
-            check(self._kernel.name, code)
+    def keep_away(self) -> None:
+        """Work out what the goal has to keep away from."""
+        if code := self._keep_away(self._reference):
+            check(self._name, code)
+
+    def stop_in_time(self) -> None:
+        """Find the step."""
+        if code := self._stop_in_time(self._reference):
+            check(self._name, code)
 
 
 class ClearanceKernel:
@@ -147,6 +151,7 @@ class ClearanceKernel:
         name: What it is called.
         size: Numbers that say where the shapes are.
         entry: The compiled driver; None: numpy works distances out.
+        guards: Those of `Guarding`, compiled with it.
     """
 
     def __init__(self, robot: RobotDescription, compiled: bool = True) -> None:
@@ -168,6 +173,7 @@ class ClearanceKernel:
         self.name, self.size, self._n = name, size, n
         self._robot = robot
         self._compiled = compiled
+        self.guards: tuple[Any, ...] = ()
         self.entry: Any = self._load() if compiled else None
 
     def _load(self) -> Any:
@@ -176,17 +182,20 @@ class ClearanceKernel:
             return None
         shapes = self._robot.shapes
         constants = {"N_Q": self._n, "N_CAPSULES": len(shapes.capsules)}
-        constants |= {"N_OWN": len(shapes.solids), **C_NAMES}
-        texts = driver_text("clearance_job") + driver_text("clearance")
+        constants |= {"N_OWN": len(shapes.solids), "OBSTACLES": OBSTACLES, **C_NAMES}
+        names = "clearance_job", "clearance", "guard_job", "guard"
         library = load_function(
             f"{self.name}_lanes{lanes}",
             lambda: self._graph.function,
-            define(constants) + texts,
+            define(constants) + "".join(map(driver_text, names)),
             SYMBOL,
             self._graph.recipe,
             lanes,
         )
-        return None if library is None else library[SYMBOL]
+        if library is None:
+            return None
+        self.guards = library["casadi_ik_keep_away"], library["casadi_ik_stop_in_time"]
+        return library[SYMBOL]
 
     @cached_property
     def placed(self) -> FunctionKernel:

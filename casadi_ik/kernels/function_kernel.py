@@ -8,7 +8,7 @@ from __future__ import annotations
 import ctypes
 import logging
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -264,17 +264,6 @@ class FunctionKernel:
         run = self._run_compiled if self.compiled else self._run_vm
         run(arrays, steps, outputs, 1 if count is None else count)
         return outputs
-
-    def standing(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> Callable[[], None]:
-        """One call to be made again and again, on arrays of the inputs' and outputs' shapes."""
-        if self.compiled:
-            return SingleCall(self.name, self.entry, inputs, outputs)
-
-        def call() -> None:
-            for output, found in zip(outputs, self(*inputs), strict=True):
-                output[...] = found
-
-        return call
 
     def _single(self) -> SingleCall:
         """One call with memory of its own, to be made again and again."""

@@ -8,32 +8,29 @@ free is taken as free.
 
 *From cycle to cycle* (`Guard`) two things keep a follower clear. The goal keeps away softly, as far
 as the contacts leave it free: small clearances are rows of its least squares. And a step is made
-only if the robot can come to rest after it without being too near to anything; else the motors
-brake. Since the step before was made under the same condition, braking is safe: by induction the
-robot never comes nearer than the margin to what stands still. Some places on the way to rest are
-looked at, with `RESOLUTION` and what distances bend by for what is between them; of pairs those
-alone that may be near by how far their shapes have moved since all were looked at (`Watch`).
+only if the robot can come to rest after it without being too near to anything in any cycle; else
+motors brake. Since the step before was made under the same condition, braking is safe: by induction
+the robot never comes nearer than the margin to what stands still. Cycles are left out between which
+a pair has no time to come near, and pairs that were far apart when all were looked at: by steps of
+motors times levers (`collision.levers`). A pair that motors of one hand alone can part holds these
+back, any other all motors.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array, Bools
-from casadi_ik.kernels import FunctionKernel
-from casadi_ik.kernels.clearance_kernel import Watch
-from casadi_ik.kernels.graphs import FunctionGraph, recipe
+from casadi_ik.collision.levers import levers
+from casadi_ik.kernels.clearance_kernel import OBSTACLES, Guarding
 from casadi_ik.motion.inputs import FollowerInputs, FollowPlan
 from casadi_ik.problem.clearance import ROUNDING, Clearances, CollisionQuery
 from casadi_ik.problem.targets import TargetBatch
-from casadi_ik.symbolic.smooth import shared
 
 
 def stopping_way(moved: Array, change: Array) -> Array:
@@ -47,39 +44,21 @@ def stopping_way(moved: Array, change: Array) -> Array:
     return np.sign(moved) * (np.abs(moved) * after - change * after * (after + 1) / 2)
 
 
-def stopping(n: int, places: int) -> FunctionGraph:
-    """Where motors are that make part of a step, and then come to rest.
+def stopping_path(q: Array, step: Array, change: Array) -> Array:
+    """Where motors are in every cycle that make a step, and then come to rest as fast as they may.
 
     Args:
-        n: How many motors.
-        places: Where they are, and others on the way to rest, evenly spaced in time.
+        q: (n,) where they are.
+        step: (n,).
+        change: (n,) by how much a step may differ from the last.
 
     Returns:
-        ``(q, last, wanted, change, share) -> (step, path, sound)``, (n,) where they are, their last
-        step, the one wanted now, and by how much a step may differ from the last; the share of the
-        wanted step, between it and braking. The step made; (places, n), where they are the first,
-        where the step leads the next and the place of rest the last; finite if all numbers are.
+        (k, n), after the step the first and the place of rest the last.
     """
-    name = f"stopping_{n}_{places}"
-
-    def build() -> ca.Function:
-        q, last, wanted, change = (ca.SX.sym(f"{x}", n) for x in ("q", "last", "wanted", "change"))
-        share = ca.SX.sym("share")
-        braked = ca.sign(last) * ca.fmax(ca.fabs(last) - change, 0.0)
-        step = braked + share * (wanted - braked)
-        speed, sign = ca.fabs(step), ca.sign(step)
-        after = ca.floor(speed / change)
-        most, path = ca.mmax(after), [q.T]
-        for k in range(places - 1):
-            steps = ca.fmin(ca.ceil(most * k / (places - 2)), after)
-            gone = sign * (speed * steps - change * steps * (steps + 1) / 2)
-            path.append((q + step + gone).T)
-        given = [q, last, wanted, change, share]
-        outputs = shared(step, ca.vertcat(*path), ca.sum2(path[-1]))
-        return ca.Function(name, given, outputs, ["q", "last", "wanted", "change", "share"], [])
-
-    inputs = dict.fromkeys(("q", "last", "wanted", "change"), (n, 1)) | {"share": (1, 1)}
-    return FunctionGraph(name, build, inputs, ((n, 1), (places, n), (1, 1)), recipe(name))
+    speed = np.abs(step)
+    after = np.floor(speed / change)
+    steps = np.minimum(np.arange(after.max() + 1)[:, None], after)
+    return q + step + np.sign(step) * (speed * steps - change * steps * (steps + 1) / 2)
 
 
 RESOLUTION = 1e-4
@@ -385,38 +364,28 @@ def _numbers(state: Any, n: int) -> Array:
     return np.array([state[i] for i in range(n)])
 
 
-OBSTACLES = 4
-"""Clearances that the goal minds at once."""
-
-
 class Guard:
     """The scene about a follower.
 
     Attributes:
         near: Clearance beyond the margin from which on the goal keeps away [m].
         nudge: Part of a motor's unit by which slopes of clearances are measured [rad or m].
-        places: Places on the way to rest that are looked at, as many as vector registers hold.
+        exact: What distances of solids are worked out to, and a little more [m].
         shares: Parts of the wanted step, between it and braking, that are tried in turn.
     """
 
     near = 0.01
     nudge = 1e-4
-    places = 8
+    exact = 1e-6
     shares = (1.0, 0.5)
 
     def __init__(self, plan: FollowPlan) -> None:
         """Take the scene, every finger in contact."""
         assert plan.check is not None
-        self._check, self._plan = plan.check, plan
+        self._check, self._robot = plan.check, plan.robot.description
         fingers, n = len(plan.robot.fingers), len(plan.robot.actuators)
         self._n, self._change = n, plan.rates.steps(plan.period)[1]
-        self._rest = np.zeros((self.places, n))
-        self._asked = np.zeros(n), np.zeros(n), np.zeros(n), self._change, np.zeros(())
-        self._step, self._sound = np.zeros(n), np.zeros(())
-        self._stop = FunctionKernel(stopping(n, self.places), plan.compiled).standing(
-            self._asked, (self._step, self._rest, self._sound)
-        )
-        self._nudges = np.concatenate([np.zeros((1, n)), self.nudge * np.eye(n)])
+        self._hand = np.isin(np.arange(n), self._robot.hand_actuators).astype(float)
         anywhere = np.zeros((1, fingers, 3))
         self._query = self._at(plan.request.of_arrays(anywhere, anywhere + 1.0, None))
         self._lay_out()
@@ -427,26 +396,31 @@ class Guard:
         self._query = query
         if query.table is not before.table:
             self._lay_out()
-        elif not np.array_equal(query.poses, before.poses):
-            for watch in (self._path, self._goal, self._slopes):
-                watch.surround(query.poses)
+        elif self._compiled is not None and not np.array_equal(query.poses, before.poses):
+            self._compiled.surround(query.poses)
 
     def _at(self, problem: TargetBatch) -> CollisionQuery:
         return self._check.collision_query(problem).rows(np.zeros(1, dtype=np.intp))
 
     def _lay_out(self) -> None:
         """Memory for the distances that are looked at."""
-        query, n = self._query, self._n
-        kernel, poses, table, margin = query.kernel, query.poses, query.table, query.margin
-        self._enough, self._near = margin + RESOLUTION - ROUNDING, margin + self.near
-        goal, nudged = np.zeros((1, n)), np.zeros((n + 1, n))
-        self._path = Watch(kernel, self._rest, poses, table, self._near, way=True)
-        self._goal = Watch(kernel, goal, poses, table, self._near, few=OBSTACLES)
-        # Of a few pairs, others each time.
-        self._few = replace(
-            table, pairs=np.zeros((OBSTACLES, 2), dtype=np.int32), offsets=np.zeros(OBSTACLES)
-        )
-        self._slopes = Watch(kernel, nudged, poses, self._few)
+        query = self._query
+        self._enough, self._minded = query.margin + self.exact, query.margin + self.near
+        self._levers = levers(self._robot, query.table)
+        self._compiled = None
+        if query.kernel.entry is not None:
+            self._compiled = Guarding(
+                query.kernel,
+                query.poses,
+                query.table,
+                self._levers,
+                self._hand,
+                self._change,
+                self.shares,
+                enough=self._enough,
+                minded=self._minded,
+                nudge=self.nudge,
+            )
 
     def clearance(self, q: Array) -> Clearances:
         """Of a configuration (n,)."""
@@ -460,52 +434,60 @@ class Guard:
         """
         n, run = self._n, asked.run
         before = run.state
-        self._keep_away(asked, before[2 * n : 3 * n])
-        after = run.step()
-        q, last, wanted, _, share = self._asked
-        q[...], last[...], wanted[...] = before[:n], before[n : 2 * n], after[n : 2 * n]
-        for part in self.shares:
-            share[...] = part
-            self._stop()
-            self._path()
-            # What is no number is nowhere.
-            if min(self._path.least[1:].tolist()) >= self._enough and math.isfinite(self._sound):
-                break
-        else:
-            part = 0.0
-            if self._gets_free(q, wanted):
-                return after, False
-            share[...] = part
-            self._stop()
-        if part < 1.0:
-            after[:n], after[n : 2 * n] = q + self._step, self._step
-            # A goal that runs ahead where nobody can follow would be reached through the obstacle.
-            after[2 * n : 3 * n] = self._rest[-1]
-            after[3 * n] = 0.0
-        return after, part < 1.0
-
-    def _gets_free(self, q: Array, moved: Array) -> bool:
-        """Whether a robot that is too near already stays or gets away."""
-        if self._path.least[0] >= self._enough:
-            return False
-        if not moved.any():
-            return True
-        surplus = self._query.check(np.stack([q, q + moved])).surplus
-        return bool(surplus[1] > surplus[0])
-
-    def _keep_away(self, asked: FollowerInputs, goal: Array) -> None:
         rooms, slopes = asked.views["rooms"], asked.views["slopes"]
-        self._goal.q[...] = goal
-        self._goal()
-        # Without room to gain a row counts nothing, whatever its slopes.
-        nearest = self._goal.nearest
-        np.subtract(self._near, self._goal.near, out=rooms)
-        if nearest[0] < 0:
-            return
-        table = self._query.table
-        self._few.pairs[...], self._few.offsets[...] = table.pairs[nearest], table.offsets[nearest]
-        np.add(goal, self._nudges, out=self._slopes.q)
-        self._slopes()
-        every = self._slopes.every
-        np.subtract(every[1:].T, every[0, :, None], out=slopes)
-        slopes /= self.nudge
+        rooms[...], slopes[...] = self._obstacles(before[2 * n : 3 * n])
+        after = run.step()
+        q, wanted = before[:n], after[n : 2 * n]
+        part, step, rest = self._free_step(q, before[n : 2 * n], wanted)
+        held = part < 1.0
+        if not held.any():
+            return after, False
+        after[:n], after[n : 2 * n] = q + step, step
+        # A goal that runs ahead where nobody can follow would be reached through the obstacle.
+        np.copyto(after[2 * n : 3 * n], rest, where=held)
+        after[3 * n] = 0.0
+        return after, True
+
+    def _free_step(self, q: Array, last: Array, wanted: Array) -> tuple[Array, Array, Array]:
+        """What of a wanted step is free, and can end free.
+
+        Motors that move a pair nearer than is free, or than it is if that is less, make less of
+        theirs, and brake at last: where all motors of a pair brake was free in the cycle before.
+
+        Returns:
+            (n,) the part that each motor makes of it; the step; where it ends.
+        """
+        if (guarding := self._compiled) is not None:
+            guarding.q[...], guarding.last[...], guarding.wanted[...] = q, last, wanted
+            guarding.stop_in_time()
+            return guarding.part, guarding.step, guarding.rest
+        braked = np.sign(last) * np.maximum(np.abs(last) - self._change, 0.0)
+        shares, tried = np.array([*self.shares, 0.0]), np.zeros(self._n, dtype=int)
+        while True:
+            step = braked + shares[tried] * (wanted - braked)
+            path = stopping_path(q, step, self._change)
+            here, *every = self._query.kernel.every(
+                np.concatenate([q[None], path]), self._query.poses, self._query.table
+            )
+            touching = ~(every >= np.minimum(here, self._enough)).all(axis=0)
+            held = self._levers[touching] > 0
+            less = held.any(axis=0) | held[:, self._hand == 0].any()
+            less &= tried < len(self.shares)
+            if not less.any():
+                return shares[tried], step, path[-1]
+            tried += less
+
+    def _obstacles(self, goal: Array) -> tuple[Array, Array]:
+        """What the nearest pairs at a goal lack (o,) [m], and how that shrinks (o, n)."""
+        if (guarding := self._compiled) is not None:
+            guarding.goal[...] = goal
+            guarding.keep_away()
+            return guarding.rooms, guarding.slopes
+        rooms, slopes = np.zeros(OBSTACLES), np.zeros((OBSTACLES, self._n))
+        nudged = goal + np.concatenate([np.zeros((1, self._n)), self.nudge * np.eye(self._n)])
+        every = self._query.kernel.every(nudged, self._query.poses, self._query.table)
+        nearest = np.argsort(every[0], kind="stable")[:OBSTACLES]
+        count = len(nearest)
+        rooms[:count] = np.maximum(self._minded - every[0, nearest], 0.0)
+        slopes[:count] = ((every[1:, nearest] - every[0, nearest]) / self.nudge).T
+        return rooms, slopes

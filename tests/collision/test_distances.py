@@ -8,6 +8,7 @@ from capsule_arm import SCENE, write_robot
 from coal_oracle import described, distance, in_scene
 
 import casadi_ik as ik
+from casadi_ik.collision.levers import levers
 from casadi_ik.problem.clearance import CollisionQuery, SceneCheck
 
 MICROMETRE = 1e-6
@@ -88,6 +89,28 @@ def test_the_virtual_machine_gives_the_same(robot, rng):
     least, which = compiled.kernel.least(q, compiled.poses, compiled.table)
     np.testing.assert_array_equal(least, every[0].min(axis=1))
     np.testing.assert_array_equal(which, every[0].argmin(axis=1))
+
+
+@pytest.mark.parametrize("name", ["three", "ar10"])
+def test_shapes_come_no_nearer_than_by_steps_times_levers(robot, rng, name):
+    """Joints that turn, slide, and follow sliders over linkages."""
+    robot, scene = (
+        (robot, ik.Scene(SCENE)) if name == "three" else (ik.load_robot(name), ik.Scene())
+    )
+    around = surroundings(robot, scene, compiled=False)
+    longest = levers(robot.description, around.table)
+    for size in (1e-3, 0.1):
+        q = robot.random(rng, 60)
+        other = np.clip(
+            q + size * (robot.upper - robot.lower) * rng.normal(size=q.shape),
+            robot.lower,
+            robot.upper,
+        )
+        before, after = (around.kernel.every(x, around.poses, around.table) for x in (q, other))
+        bound = np.abs(other - q) @ longest.T
+        assert (np.abs(after - before) <= bound + MICROMETRE).all()
+        moved = bound > 1e-5
+        assert (np.abs(after - before)[moved] / bound[moved]).max() > 0.5, "far too cautious"
 
 
 def test_nan_is_not_free(robot):

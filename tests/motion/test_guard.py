@@ -54,6 +54,20 @@ def test_targets_in_a_table_are_not_followed_there(robot, solver):
     assert (np.abs(changes) <= follower.acceleration * PERIOD**2 * (1 + 1e-9)).all()
 
 
+def test_without_a_compiler_it_stops_at_the_same_places(robot, solver):
+    points, normals = robot.contacts(robot.home)
+    plain = ik.Solver(robot, scene=ik.load_scene("table"), compiled=False)
+    ways, statuses = [], set()
+    for one in (solver, plain):
+        follower, q = one.follow(robot.home, 5 * PERIOD), []
+        for depth in np.linspace(0, 0.6, 30):
+            q.append(follower(points - np.array([0.0, 0.0, depth]), normals))
+            statuses.add(follower.state.status)
+        ways.append(q)
+    np.testing.assert_allclose(*ways, atol=1e-6)
+    assert ik.motion.FollowStatus.BLOCKED in statuses
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_leaping_targets_never_make_it_touch_anything(robot, solver, seed):
     rng = np.random.default_rng(seed)
@@ -65,29 +79,48 @@ def test_leaping_targets_never_make_it_touch_anything(robot, solver, seed):
     assert clearances(solver, np.array(q)).free.all()
 
 
-def test_hands_that_are_led_through_each_other_do_not_get_there():
-    """They stop before each other, and follow again on the way back."""
-    body = ik.load_robot("g1+dex3")
+def led_through_each_other(body, shares):
+    """Contacts of both hands on the way to the other's place, so far each."""
     points, normals = body.contacts(body.home)
     rows = [
         [body.fingers.index(finger) for finger in side.fingers] for side in body.description.sides
     ]
     way = points[rows[1]].mean(axis=0) - points[rows[0]].mean(axis=0)
+    for share in shares:
+        goal = points.copy()
+        goal[rows[0]] += share * way
+        goal[rows[1]] -= share * way
+        yield goal, normals
+
+
+def test_hands_that_are_led_through_each_other_do_not_get_there():
+    """They stop before each other, and follow again on the way back."""
+    body = ik.load_robot("g1+dex3")
     solver = ik.Solver(body, scene=ik.Scene())
     plain, careful = ik.Solver(body).follow(body.home, PERIOD), solver.follow(body.home, PERIOD)
     ways: dict[bool, list] = {True: [body.home], False: [body.home]}
     statuses = []
-    for share in np.append(np.sin(np.linspace(0, np.pi, 500)) ** 2, np.zeros(100)):
-        goal = points.copy()
-        goal[rows[0]] += share * way
-        goal[rows[1]] -= share * way
-        ways[False].append(plain(goal, normals))
-        ways[True].append(careful(goal, normals))
+    shares = np.append(np.sin(np.linspace(0, np.pi, 500)) ** 2, np.zeros(100))
+    for target in led_through_each_other(body, shares):
+        ways[False].append(plain(*target))
+        ways[True].append(careful(*target))
         statuses.append(careful.state.status)
     assert clearances(solver, np.array(ways[False])).distance.min() < -0.01
     assert clearances(solver, np.array(ways[True])).free.all()
     assert ik.motion.FollowStatus.BLOCKED in statuses
     assert statuses[-1] is ik.motion.FollowStatus.FOLLOWING
+
+
+def test_thumbs_that_pass_each_other_on_the_way_to_rest_are_apart_in_every_cycle():
+    """They are at the ends of that way, and at places on it, 25 cycles from one to the next."""
+    body = ik.load_robot("g1+inspire")
+    solver = ik.Solver(body, scene=ik.Scene())
+    follower, shares = solver.follow(body.home), np.sin(np.linspace(0, np.pi, 2000))[:450] ** 2
+    q = [follower(*target) for target in led_through_each_other(body, shares)]
+    found = clearances(solver, np.array(q))
+    assert found.free.all()
+    assert found.distance.min() < 2e-3, "they never came near"
+    assert follower.state.status is ik.motion.FollowStatus.BLOCKED
 
 
 def clearances_around(solver):

@@ -281,107 +281,45 @@ LANES_INLINE int apart(const clearance_job *job, int64_t pair, const lanes *plac
   return 1;
 }
 
-/* How far points of each shape of the robot are from where they were at `reference`, at most in any
- * lane. Gives whether one is farther than `worn` in the first lane. */
-static LANES_TARGET int moves(const clearance_job *job, const lanes *placed, scalar *moved) {
-  const scalar *was = job->reference;
-  int shape, k, lane, worn = 0;
-  for (shape = 0; shape < N_CAPSULES + N_OWN; ++shape) {
-    lanes far;
-    if (shape < N_CAPSULES) {
-      const vector c = {placed[0] - was[0], placed[1] - was[1], placed[2] - was[2]};
-      const vector h = {placed[3] - was[3], placed[4] - was[4], placed[5] - was[5]};
-      /* Of both ends, the farther. */
-      far = lanes_sqrt(dot(c, c) + dot(h, h) + (scalar) 2 * lanes_fabs(dot(c, h)));
-      placed += 6;
-      was += 6;
-    } else {
-      const vector c = {placed[9] - was[9], placed[10] - was[10], placed[11] - was[11]};
-      lanes turned = SPREAD(0.0);
-      for (k = 0; k < 9; ++k) turned += (placed[k] - was[k]) * (placed[k] - was[k]);
-      far = lanes_sqrt(dot(c, c)) + lanes_sqrt(turned) * job->solids[shape - N_CAPSULES].reach;
-      placed += 12;
-      was += 12;
-    }
-    /* What is no number has moved. */
-    worn |= !(lanes_at(far, 0) <= job->worn);
-    moved[shape] = 0;
-    for (lane = 0; lane < LANES; ++lane) {
-      if (!(lanes_at(far, lane) <= moved[shape])) moved[shape] = lanes_at(far, lane);
-    }
-  }
-  return worn;
-}
-
-/* Looks at all pairs where the first lane is. */
-static LANES_TARGET void look(const clearance_job *job, const lanes *placed, lanes *lines) {
-  int64_t k;
-  for (k = 0; k < 6 * N_CAPSULES + 12 * N_OWN; ++k) job->reference[k] = lanes_at(placed[k], 0);
-  for (k = 0; k < job->n_pairs; ++k) {
-    lanes distance;
-    const int near = apart(job, k, placed, SPREAD(job->horizon), lines, &distance);
-    const scalar found = near ? lanes_at(distance, 0) : job->horizon;
-    job->known[k] = found < job->horizon ? found : job->horizon;
-  }
-}
-
-/* Distances at places on a way, less what they bend by between them: a pair that comes nearer and
- * then parts is nearest there. The lanes from `first` on are the places. */
-static LANES_TARGET lanes on_the_way(lanes distance, int first) {
-  scalar at[LANES], bend = 0;
-  int lane;
-  for (lane = 0; lane < LANES; ++lane) at[lane] = lanes_at(distance, lane);
-  for (lane = first + 1; lane + 1 < LANES; ++lane) {
-    const scalar here = at[lane - 1] + at[lane + 1] - 2 * at[lane];
-    if (here > bend) bend = here;
-  }
-  for (lane = first; lane < LANES; ++lane) ((scalar *) &distance)[lane] -= bend / 8;
-  return distance;
-}
-
-/* Puts a pair among the nearest, if it is one. */
-static void told(const clearance_job *job, int64_t pair, scalar distance) {
-  int64_t k = job->few;
-  for (; k > 0 && distance < job->near[k - 1]; --k) {
-    if (k == job->few) continue;
-    job->near[k] = job->near[k - 1];
-    job->nearest[k] = job->nearest[k - 1];
-  }
-  if (k == job->few) return;
-  job->near[k] = distance;
-  job->nearest[k] = pair;
-}
-
-LANES_TARGET DRIVER(clearance, clearance_job) {
+/* What distances of LANES configurations are worked out on. */
+typedef struct {
   workspace space;
-  lanes *q, *placed, *poses, *lines;
-  scalar *moved;
-  const size_t shapes = N_CAPSULES + N_OWN + (size_t) job->n_solids;
-  const size_t places = 6 * N_CAPSULES + 12 * (shapes - N_CAPSULES);
-  const int exact = job->every || job->few || job->way;
-  int64_t ticks = 0, most = 0, k;
-  scalar limit;
-  int lane, outcome;
+  lanes *q, *placed;           /* N_Q; the numbers of the step, then the poses of the scene */
+  lanes *lines;                /* of a convex solid's planes */
+} placing;
+
+static LANES_TARGET int lay_out(placing *here, const clearance_job *job) {
+  const int64_t own = 6 * N_CAPSULES + 12 * N_OWN, places = own + 12 * job->n_solids;
+  int64_t most = 0, k;
+  int outcome;
   for (k = 0; k < N_OWN + job->n_solids; ++k) {
     if (job->solids[k].kind == CONVEX && job->solids[k].planes > most) {
       most = job->solids[k].planes;
     }
   }
-  outcome = set_up(&space, N_Q + places + 2 * (size_t) most + shapes);
+  outcome = set_up(&here->space, (size_t) (N_Q + places + 2 * most));
   if (outcome != DONE) return outcome;
-  q = space.extra;
-  placed = q + N_Q;
-  poses = placed + 6 * N_CAPSULES + 12 * N_OWN;
-  lines = placed + places;
-  moved = (scalar *) (lines + 2 * most);
+  here->q = here->space.extra;
+  here->placed = here->q + N_Q;
+  here->lines = here->placed + places;
+  for (k = 0; k < 12 * job->n_solids; ++k) here->placed[own + k] = SPREAD(job->poses[k]);
+  return DONE;
+}
+
+static LANES_TARGET void place(placing *here) {
+  here->space.arg[0] = here->q;
+  here->space.res[0] = here->placed;
+  STEP(here->space.arg, here->space.res, (1 << LANES) - 1);
+}
+
+LANES_TARGET DRIVER(clearance, clearance_job) {
+  placing here;
+  int64_t ticks = 0, k;
+  scalar *poses, limit;
+  int lane, outcome = lay_out(&here, job);
+  if (outcome != DONE) return outcome;
+  poses = (scalar *) (here.placed + 6 * N_CAPSULES + 12 * N_OWN);
   limit = monotonic() + job->slice;
-  for (k = 0; k < 12 * job->n_solids; ++k) poses[k] = SPREAD(job->poses[k]);
-  /* What stands about the robot has not moved. */
-  for (k = 0; k < (int64_t) shapes; ++k) moved[k] = 0;
-  for (k = job->next ? job->few : 0; k < job->few; ++k) {
-    job->near[k] = job->most;
-    job->nearest[k] = -1;
-  }
   for (; job->next < job->count; job->next += LANES) {
     lanes least = SPREAD(job->most), who = SPREAD(-1.0);
     if (++ticks % CLOCK_INTERVAL == 0 && monotonic() > limit) {
@@ -390,40 +328,25 @@ LANES_TARGET DRIVER(clearance, clearance_job) {
     }
     for (lane = 0; lane < LANES; ++lane) {
       const int64_t row = job->next + lane < job->count ? job->next + lane : job->count - 1;
-      for (k = 0; k < N_Q; ++k) ((scalar *) q)[k * LANES + lane] = job->q[row * N_Q + k];
+      for (k = 0; k < N_Q; ++k) ((scalar *) here.q)[k * LANES + lane] = job->q[row * N_Q + k];
       if (!job->pose_step) continue;
       for (k = 0; k < 12 * job->n_solids; ++k) {
-        ((scalar *) poses)[k * LANES + lane] = job->poses[row * job->pose_step + k];
+        poses[k * LANES + lane] = job->poses[row * job->pose_step + k];
       }
     }
-    space.arg[0] = q;
-    space.res[0] = placed;
-    STEP(space.arg, space.res, (1 << LANES) - 1);
-    if (job->known && moves(job, placed, moved) && !job->next) {
-      look(job, placed, lines);
-      moves(job, placed, moved);
-    }
+    place(&here);
     /* What was in the way last may be in the way again. */
     for (k = -RECENT; k < job->n_pairs; ++k) {
       const int64_t pair = k < 0 ? job->recent[RECENT + k] : k;
+      const lanes enough = job->every ? SPREAD(INFINITY) : least;
       lanes distance;
       lane_mask nearer;
-      int near;
-      if (pair < 0) continue;
-      near = !job->known || !(job->known[pair] - moved[job->pairs[2 * pair]]
-                                  - moved[job->pairs[2 * pair + 1]] >= job->most);
-      near = near && apart(job, pair, placed, exact ? SPREAD(job->most) : least, lines, &distance);
-      if (near && job->way && !lanes_all(distance >= SPREAD(job->most))) {
-        distance = on_the_way(distance, job->next ? 0 : 1);
-      }
+      if (pair < 0 || !apart(job, pair, here.placed, enough, here.lines, &distance)) continue;
       if (job->every) {
         for (lane = 0; lane < LANES && job->next + lane < job->count; ++lane) {
-          job->every[(job->next + lane) * job->n_pairs + pair] =
-              near ? lanes_at(distance, lane) : INFINITY;
+          job->every[(job->next + lane) * job->n_pairs + pair] = lanes_at(distance, lane);
         }
       }
-      if (!near) continue;
-      if (!job->next && job->few) told(job, pair, lanes_at(distance, 0));
       nearer = distance < least;
       least = lanes_select(nearer, distance, least);
       who = lanes_select(nearer, SPREAD((scalar) pair), who);
@@ -437,6 +360,6 @@ LANES_TARGET DRIVER(clearance, clearance_job) {
       job->closest[job->next + lane] = (int64_t) lanes_at(who, lane);
     }
   }
-  give_back(&space);
+  give_back(&here.space);
   return outcome;
 }

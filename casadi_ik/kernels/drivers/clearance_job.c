@@ -25,16 +25,9 @@ typedef struct {
   int64_t recent[RECENT];      /* pairs that are looked at first, those that were enough; -1: none */
   scalar most;                 /* distances above this are not told apart */
   scalar enough;               /* nor those below this */
-  scalar *known;               /* each pair's distance where shapes were at `reference`, or less */
-  scalar *reference;           /* the numbers of the step; known NULL: nothing is known */
-  scalar worn, horizon;        /* how far shapes may be from there; up to where distances count */
   scalar *least;
   int64_t *closest;            /* pair of the least; -1: none below `most` */
   scalar *every;               /* count rows of n_pairs, or NULL */
-  int64_t way;                 /* all but the first are places on a way, evenly spaced in time */
-  int64_t few;                 /* so many nearest pairs of the first configuration are told */
-  int64_t *nearest;            /* their numbers, the nearest first; -1: not below `most` */
-  scalar *near;                /* their distances, at most `most` */
   int64_t count, next;
   scalar slice;
 } clearance_job;

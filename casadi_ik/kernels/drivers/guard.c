@@ -1,0 +1,242 @@
+/* What keeps a follower clear, behind clearance.c: see `motion.clear`.
+ *
+ * Of a pair nothing is worked out while what it was apart, less what motors can have moved it since,
+ * is more than enough: steps of motors times levers.
+ */
+
+/* How far motors are from where all pairs were looked at, at most on a way that turns nowhere. */
+static LANES_TARGET scalar strayed(const guard_job *job, const surroundings *here,
+                                   const scalar *from, const scalar *to, scalar *far) {
+  scalar most = 0;
+  int k;
+  for (k = 0; k < N_Q; ++k) {
+    const scalar a = fabs(from[k] - here->at[k]), b = fabs(to[k] - here->at[k]);
+    far[k] = b > a ? b : a;
+    most += job->widest[k] * far[k];
+  }
+  return most;
+}
+
+/* Places all lanes at once. */
+static LANES_TARGET void place_at(placing *space, const scalar *q) {
+  int k;
+  for (k = 0; k < N_Q; ++k) space->q[k] = SPREAD(q[k]);
+  place(space);
+}
+
+/* How far apart the balls about the shapes of a pair are in the first lane. */
+LANES_INLINE scalar balls_apart(const clearance_job *about, int64_t pair, const lanes *placed) {
+  const int i = about->pairs[2 * pair], j = about->pairs[2 * pair + 1], solid = j - N_CAPSULES;
+  const lanes *one = placed + 6 * i;
+  const lanes *other = placed + (solid < 0 ? 6 * j : 6 * N_CAPSULES + 12 * solid + 9);
+  const scalar reach = solid < 0 ? about->radii[j] + about->halves[j] : about->solids[solid].reach;
+  const scalar x = lanes_at(one[0], 0) - lanes_at(other[0], 0);
+  const scalar y = lanes_at(one[1], 0) - lanes_at(other[1], 0);
+  const scalar z = lanes_at(one[2], 0) - lanes_at(other[2], 0);
+  return sqrt(x * x + y * y + z * z) - about->radii[i] - about->halves[i] - about->offsets[pair]
+         - reach;
+}
+
+/* Looks at all pairs where a way begins: at those exactly that are nearer than `sure`. */
+static LANES_TARGET void look(const guard_job *job, placing *space, surroundings *here,
+                              const scalar *from, scalar sure) {
+  const clearance_job *about = job->about;
+  int64_t pair;
+  place_at(space, from);
+  here->n_near = here->spent = 0;
+  for (pair = 0; pair < about->n_pairs; ++pair) {
+    scalar known = balls_apart(about, pair, space->placed);
+    lanes distance;
+    if (known >= here->horizon) continue;
+    if (!(known >= sure)) {
+      known = sure;
+      if (apart(about, pair, space->placed, SPREAD(sure), space->lines, &distance)) {
+        known = lanes_at(distance, 0);
+      }
+    }
+    here->known[here->n_near] = known;
+    here->near[here->n_near++] = pair;
+  }
+}
+
+/* Lists the pairs that may come nearer than a distance on a way that turns nowhere. */
+static LANES_TARGET void come_close(const guard_job *job, placing *space, surroundings *here,
+                                    const scalar *from, const scalar *to, scalar wanted) {
+  scalar far[N_Q], most = strayed(job, here, from, to, far);
+  int64_t i;
+  int k;
+  /* When more pairs have come into question than there are, a look costs no more. */
+  if (!(wanted + most <= here->horizon) || here->spent > job->about->n_pairs) {
+    memcpy(here->at, from, N_Q * sizeof(scalar));
+    most = strayed(job, here, from, to, far);
+    here->horizon = wanted + most + job->spare;
+    look(job, space, here, from, wanted + most);
+  }
+  here->n_close = 0;
+  for (i = 0; i < here->n_near; ++i) {
+    const scalar *lever = job->levers + here->near[i] * N_Q;
+    scalar left = here->known[i] - wanted;
+    if (left >= most) continue;
+    ++here->spent;
+    for (k = 0; k < N_Q; ++k) left -= lever[k] * far[k];
+    if (!(left >= 0)) here->close[here->n_close++] = here->near[i];
+  }
+}
+
+/* Puts a pair among the nearest, if it is one. */
+static void told(scalar *near, int64_t *nearest, int64_t pair, scalar distance) {
+  int64_t k = OBSTACLES;
+  for (; k > 0 && distance < near[k - 1]; --k) {
+    if (k == OBSTACLES) continue;
+    near[k] = near[k - 1];
+    nearest[k] = nearest[k - 1];
+  }
+  if (k == OBSTACLES) return;
+  near[k] = distance;
+  nearest[k] = pair;
+}
+
+/* What the pairs nearest to each other at the goal lack, and how motors change their distances. */
+LANES_TARGET DRIVER(keep_away, guard_job) {
+  const clearance_job *about = job->about;
+  surroundings *here = job->by_goal;
+  placing space;
+  scalar near[OBSTACLES];
+  int64_t nearest[OBSTACLES], few = OBSTACLES, i, k;
+  int motor = 0, lane, outcome = lay_out(&space, about);
+  if (outcome != DONE) return outcome;
+  come_close(job, &space, here, job->goal, job->goal, job->minded);
+  for (i = 0; i < few; ++i) near[i] = job->minded;
+  if (here->n_close) place_at(&space, job->goal);
+  for (i = 0; i < here->n_close; ++i) {
+    lanes distance;
+    if (apart(about, here->close[i], space.placed, SPREAD(job->minded), space.lines, &distance)) {
+      told(near, nearest, here->close[i], lanes_at(distance, 0));
+    }
+  }
+  for (i = 0; i < few; ++i) job->rooms[i] = job->minded - near[i];
+  for (i = 0; i < few && near[i] < job->minded; ++i) {
+    memset(job->slopes + i * N_Q, 0, N_Q * sizeof(scalar));
+  }
+  few = i;
+  while (few && motor < N_Q) {
+    int nudged[LANES], count = 0;
+    for (; motor < N_Q && count < LANES; ++motor) {
+      for (i = 0; i < few && job->levers[nearest[i] * N_Q + motor] == 0; ++i) continue;
+      if (i < few) nudged[count++] = motor;
+    }
+    if (!count) break;
+    for (k = 0; k < N_Q; ++k) space.q[k] = SPREAD(job->goal[k]);
+    for (lane = 0; lane < count; ++lane) ((scalar *) (space.q + nudged[lane]))[lane] += job->nudge;
+    place(&space);
+    for (i = 0; i < few; ++i) {
+      lanes distance;
+      apart(about, nearest[i], space.placed, SPREAD(INFINITY), space.lines, &distance);
+      for (lane = 0; lane < count; ++lane) {
+        job->slopes[i * N_Q + nudged[lane]] = (lanes_at(distance, lane) - near[i]) / job->nudge;
+      }
+    }
+  }
+  give_back(&space.space);
+  return outcome;
+}
+
+/* Where a motor is after so many cycles: the first makes the step, in all others it brakes. */
+LANES_INLINE lanes after(const guard_job *job, int motor, lanes cycles) {
+  const scalar step = fabs(job->step[motor]), change = job->change[motor];
+  const lanes braked = smaller(cycles - 1, SPREAD(floor(step / change)));
+  const lanes way = step * (braked + 1) - change * braked * (braked + 1) / 2;
+  return job->q[motor] + (job->step[motor] < 0 ? -way : way);
+}
+
+/* Marks motors that move pairs nearer than is free, or nearer than they are if that is less, in any
+ * cycle from one to another. Those cycles alone are left out between which a pair has no time for it:
+ *
+ *     its least distance >= (distance before + distance after - motion between) / 2
+ */
+static LANES_TARGET void find_touching(const guard_job *job, placing *space, int64_t from,
+                                       int64_t to, int *touching) {
+  const surroundings *here = job->by_way;
+  int64_t cycle[LANES], i;
+  int unsure[LANES] = {0}, lane, k;
+  lanes now, next, moved[N_Q];
+  for (lane = 0; lane < LANES; ++lane) {
+    cycle[lane] = from + (to - from) * lane / (LANES - 1);
+    ((scalar *) &now)[lane] = (scalar) cycle[lane];
+    ((scalar *) &next)[lane] = (scalar) (from + (to - from) * (lane + 1) / (LANES - 1));
+  }
+  for (k = 0; k < N_Q; ++k) {
+    space->q[k] = after(job, k, now);
+    moved[k] = lanes_fabs(after(job, k, next) - space->q[k]);
+  }
+  place(space);
+  for (i = 0; i < here->n_close; ++i) {
+    const scalar *lever = job->levers + here->close[i] * N_Q;
+    lanes distance, motion = SPREAD(0.0);
+    scalar most = 0;
+    int touches = 0, arms = 0;
+    for (k = 0; k < N_Q; ++k) motion += lever[k] * moved[k];
+    for (lane = 0; lane < LANES; ++lane) {
+      if (!(lanes_at(motion, lane) <= most)) most = lanes_at(motion, lane);
+    }
+    if (from == 0) here->limits[i] = job->enough;
+    if (!apart(job->about, here->close[i], space->placed, SPREAD(job->enough + most / 2),
+               space->lines, &distance)) {
+      continue;
+    }
+    if (from == 0 && lanes_at(distance, 0) < job->enough) here->limits[i] = lanes_at(distance, 0);
+    for (lane = 0; lane < LANES; ++lane) {
+      touches |= !(lanes_at(distance, lane) >= here->limits[i]);
+      if (lane < LANES - 1 && cycle[lane + 1] - cycle[lane] > 1) {
+        const scalar both = lanes_at(distance, lane) + lanes_at(distance, lane + 1);
+        unsure[lane] |= !(both - lanes_at(motion, lane) >= 2 * here->limits[i]);
+      }
+    }
+    for (k = 0; touches && k < N_Q; ++k) {
+      arms |= lever[k] > 0 && !(job->hand[k] > 0);
+      touching[k] |= lever[k] > 0;
+    }
+    for (k = 0; arms && k < N_Q; ++k) touching[k] = 1;
+  }
+  for (lane = 0; lane < LANES - 1; ++lane) {
+    if (unsure[lane]) find_touching(job, space, cycle[lane], cycle[lane + 1], touching);
+  }
+}
+
+/* Makes of a step so much that the robot stays free and can come to rest free: motors that move a
+ * pair too near make less of theirs, and brake at last. What all motors of a pair that brake lead to
+ * was free in the cycle before. */
+LANES_TARGET DRIVER(stop_in_time, guard_job) {
+  placing space;
+  int tried[N_Q] = {0}, touching[N_Q], k, less, outcome = lay_out(&space, job->about);
+  if (outcome != DONE) return outcome;
+  do {
+    scalar cycles = 0, sum = 0;
+    for (k = 0; k < N_Q; ++k) {
+      const scalar left = fabs(job->last[k]) - job->change[k];
+      const scalar braked = left > 0 ? (job->last[k] < 0 ? -left : left) : 0;
+      job->part[k] = tried[k] < job->n_shares ? job->shares[tried[k]] : 0;
+      job->step[k] = braked;
+      if (job->part[k] > 0) job->step[k] += job->part[k] * (job->wanted[k] - braked);
+      cycles = fmax(cycles, floor(fabs(job->step[k]) / job->change[k]) + 1);
+    }
+    for (k = 0; k < N_Q; ++k) {
+      sum += job->rest[k] = lanes_at(after(job, k, SPREAD(cycles)), 0);
+      touching[k] = 0;
+    }
+    if (isfinite(sum)) {
+      come_close(job, &space, job->by_way, job->q, job->rest, job->enough);
+      find_touching(job, &space, 0, (int64_t) cycles, touching);
+    } else {
+      /* What is no number is nowhere. */
+      for (k = 0; k < N_Q; ++k) touching[k] = 1;
+    }
+    for (less = k = 0; k < N_Q; ++k) {
+      if (!touching[k] || tried[k] == job->n_shares) continue;
+      ++tried[k];
+      less = 1;
+    }
+  } while (less);
+  give_back(&space.space);
+  return outcome;
+}
