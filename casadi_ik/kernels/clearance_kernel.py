@@ -97,7 +97,7 @@ class Guarding:
         self._at, distances = np.full((2, n), math.nan), np.empty((2, 2, count))
         listed = np.empty((2, 2, count), dtype=np.int64)
         arrays = numbers | {
-            "levers": doubles(levers),
+            "levers": np.pad(levers, ((0, 0), (0, -n % 8))),
             "hand": doubles(hand),
             "widest": levers.max(axis=0, initial=0.0),
             "change": doubles(change),

@@ -371,13 +371,13 @@ class Guard:
         near: Clearance beyond the margin from which on the goal keeps away [m].
         nudge: Part of a motor's unit by which slopes of clearances are measured [rad or m].
         exact: What distances of solids are worked out to, and a little more [m].
-        shares: Parts of the wanted step, between it and braking, that are tried in turn.
+        shares: Parts of the wanted step, beside braking, that are tried in turn.
     """
 
     near = 0.01
     nudge = 1e-4
     exact = 1e-6
-    shares = (1.0, 0.5)
+    shares = (1.0,)
 
     def __init__(self, plan: FollowPlan) -> None:
         """Take the scene, every finger in contact."""

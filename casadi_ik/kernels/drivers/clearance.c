@@ -288,36 +288,32 @@ typedef struct {
   lanes *lines;                /* of a convex solid's planes */
 } placing;
 
-static LANES_TARGET int lay_out(placing *here, const clearance_job *job) {
-  const int64_t own = 6 * N_CAPSULES + 12 * N_OWN, places = own + 12 * job->n_solids;
+/* How many numbers these are. */
+static size_t room(const clearance_job *job) {
   int64_t most = 0, k;
-  int outcome;
   for (k = 0; k < N_OWN + job->n_solids; ++k) {
     if (job->solids[k].kind == CONVEX && job->solids[k].planes > most) {
       most = job->solids[k].planes;
     }
   }
-  outcome = set_up(&here->space, (size_t) (N_Q + places + 2 * most));
-  if (outcome != DONE) return outcome;
-  here->q = here->space.extra;
-  here->placed = here->q + N_Q;
-  here->lines = here->placed + places;
-  for (k = 0; k < 12 * job->n_solids; ++k) here->placed[own + k] = SPREAD(job->poses[k]);
-  return DONE;
+  return (size_t) (N_Q + 6 * N_CAPSULES + 12 * (N_OWN + job->n_solids) + 2 * most);
 }
 
-static LANES_TARGET void place(placing *here) {
-  here->space.arg[0] = here->q;
-  here->space.res[0] = here->placed;
-  STEP(here->space.arg, here->space.res, (1 << LANES) - 1);
+static LANES_TARGET void lay_out(placing *here, const clearance_job *job) {
+  int64_t k;
+  here->q = here->space.extra;
+  here->placed = here->q + N_Q;
+  here->lines = here->placed + 6 * N_CAPSULES + 12 * N_OWN;
+  for (k = 0; k < 12 * job->n_solids; ++k) *here->lines++ = SPREAD(job->poses[k]);
 }
 
 LANES_TARGET DRIVER(clearance, clearance_job) {
   placing here;
   int64_t ticks = 0, k;
   scalar *poses, limit;
-  int lane, outcome = lay_out(&here, job);
+  int lane, outcome = set_up(&here.space, room(job));
   if (outcome != DONE) return outcome;
+  lay_out(&here, job);
   poses = (scalar *) (here.placed + 6 * N_CAPSULES + 12 * N_OWN);
   limit = monotonic() + job->slice;
   for (; job->next < job->count; job->next += LANES) {
@@ -334,7 +330,9 @@ LANES_TARGET DRIVER(clearance, clearance_job) {
         poses[k * LANES + lane] = job->poses[row * job->pose_step + k];
       }
     }
-    place(&here);
+    here.space.arg[0] = here.q;
+    here.space.res[0] = here.placed;
+    STEP(here.space.arg, here.space.res, (1 << LANES) - 1);
     /* What was in the way last may be in the way again. */
     for (k = -RECENT; k < job->n_pairs; ++k) {
       const int64_t pair = k < 0 ? job->recent[RECENT + k] : k;

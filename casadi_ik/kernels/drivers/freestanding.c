@@ -19,5 +19,5 @@ typedef struct {
   real *extra;
 } workspace;
 
-#define set_up(space, size) ((space)->extra = memory->w, DONE)
+#define set_up(space, size) ((void) (size), (space)->extra = memory->w, DONE)
 #define give_back(space) ((void) (space))

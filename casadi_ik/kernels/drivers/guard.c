@@ -4,17 +4,26 @@
  * is more than enough: steps of motors times levers.
  */
 
-/* How far motors are from where all pairs were looked at, at most on a way that turns nowhere. */
-static LANES_TARGET scalar strayed(const guard_job *job, const surroundings *here,
-                                   const scalar *from, const scalar *to, scalar *far) {
+/* Numbers of a row of levers, the last of them zeros: as many as fill vectors. */
+enum { ROW = (N_Q + 7) / 8 * 8 };
+
+/* How far motors are from a place, at most on a way that turns nowhere, and what that moves. */
+static LANES_TARGET scalar strayed(const guard_job *job, const scalar *at, const scalar *from,
+                                   const scalar *to, scalar *far) {
   scalar most = 0;
   int k;
   for (k = 0; k < N_Q; ++k) {
-    const scalar a = fabs(from[k] - here->at[k]), b = fabs(to[k] - here->at[k]);
+    const scalar a = fabs(from[k] - at[k]), b = fabs(to[k] - at[k]);
     far[k] = b > a ? b : a;
     most += job->widest[k] * far[k];
   }
   return most;
+}
+
+static LANES_TARGET void place(placing *space) {
+  space->space.arg[0] = space->q;
+  space->space.res[0] = space->placed;
+  STEP(space->space.arg, space->space.res, (1 << LANES) - 1);
 }
 
 /* Places all lanes at once. */
@@ -24,17 +33,13 @@ static LANES_TARGET void place_at(placing *space, const scalar *q) {
   place(space);
 }
 
-/* How far apart the balls about the shapes of a pair are in the first lane. */
-LANES_INLINE scalar balls_apart(const clearance_job *about, int64_t pair, const lanes *placed) {
+/* Lower bound of a pair's distance: how far the balls about its shapes are apart. */
+LANES_INLINE lanes balls_apart(const clearance_job *about, int64_t pair, const lanes *placed) {
   const int i = about->pairs[2 * pair], j = about->pairs[2 * pair + 1], solid = j - N_CAPSULES;
-  const lanes *one = placed + 6 * i;
   const lanes *other = placed + (solid < 0 ? 6 * j : 6 * N_CAPSULES + 12 * solid + 9);
   const scalar reach = solid < 0 ? about->radii[j] + about->halves[j] : about->solids[solid].reach;
-  const scalar x = lanes_at(one[0], 0) - lanes_at(other[0], 0);
-  const scalar y = lanes_at(one[1], 0) - lanes_at(other[1], 0);
-  const scalar z = lanes_at(one[2], 0) - lanes_at(other[2], 0);
-  return sqrt(x * x + y * y + z * z) - about->radii[i] - about->halves[i] - about->offsets[pair]
-         - reach;
+  const vector r = minus(load(placed + 6 * i), load(other));
+  return lanes_sqrt(dot(r, r)) - (about->radii[i] + about->halves[i] + about->offsets[pair] + reach);
 }
 
 /* Looks at all pairs where a way begins: at those exactly that are nearer than `sure`. */
@@ -45,7 +50,7 @@ static LANES_TARGET void look(const guard_job *job, placing *space, surroundings
   place_at(space, from);
   here->n_near = here->spent = 0;
   for (pair = 0; pair < about->n_pairs; ++pair) {
-    scalar known = balls_apart(about, pair, space->placed);
+    scalar known = lanes_at(balls_apart(about, pair, space->placed), 0);
     lanes distance;
     if (known >= here->horizon) continue;
     if (!(known >= sure)) {
@@ -62,24 +67,35 @@ static LANES_TARGET void look(const guard_job *job, placing *space, surroundings
 /* Lists the pairs that may come nearer than a distance on a way that turns nowhere. */
 static LANES_TARGET void come_close(const guard_job *job, placing *space, surroundings *here,
                                     const scalar *from, const scalar *to, scalar wanted) {
-  scalar far[N_Q], most = strayed(job, here, from, to, far);
+  scalar far[ROW] = {0};
+  const scalar least = strayed(job, from, from, to, far);
+  scalar most = strayed(job, here->at, from, to, far);
   int64_t i;
   int k;
-  /* When more pairs have come into question than there are, a look costs no more. */
-  if (!(wanted + most <= here->horizon) || here->spent > job->about->n_pairs) {
+  /* A look costs no more than pairs that come into question because motors have gone on. */
+  if (!(wanted + most <= here->horizon)
+      || (here->spent > job->about->n_pairs && 2 * least < most)) {
     memcpy(here->at, from, N_Q * sizeof(scalar));
-    most = strayed(job, here, from, to, far);
+    most = strayed(job, here->at, from, to, far);
     here->horizon = wanted + most + job->spare;
     look(job, space, here, from, wanted + most);
   }
   here->n_close = 0;
   for (i = 0; i < here->n_near; ++i) {
-    const scalar *lever = job->levers + here->near[i] * N_Q;
+    const scalar *lever = job->levers + here->near[i] * ROW;
     scalar left = here->known[i] - wanted;
+    lanes sum = SPREAD(0.0), row, way;
     if (left >= most) continue;
     ++here->spent;
-    for (k = 0; k < N_Q; ++k) left -= lever[k] * far[k];
-    if (!(left >= 0)) here->close[here->n_close++] = here->near[i];
+    for (k = 0; k < ROW; k += LANES) {
+      memcpy(&row, lever + k, sizeof(lanes));
+      memcpy(&way, far + k, sizeof(lanes));
+      sum += row * way;
+    }
+    for (k = 0; k < LANES; ++k) left -= lanes_at(sum, k);
+    if (left >= 0) continue;
+    here->limits[here->n_close] = wanted;
+    here->close[here->n_close++] = here->near[i];
   }
 }
 
@@ -103,8 +119,9 @@ LANES_TARGET DRIVER(keep_away, guard_job) {
   placing space;
   scalar near[OBSTACLES];
   int64_t nearest[OBSTACLES], few = OBSTACLES, i, k;
-  int motor = 0, lane, outcome = lay_out(&space, about);
+  int motor = 0, lane, outcome = set_up(&space.space, room(about));
   if (outcome != DONE) return outcome;
+  lay_out(&space, about);
   come_close(job, &space, here, job->goal, job->goal, job->minded);
   for (i = 0; i < few; ++i) near[i] = job->minded;
   if (here->n_close) place_at(&space, job->goal);
@@ -122,7 +139,7 @@ LANES_TARGET DRIVER(keep_away, guard_job) {
   while (few && motor < N_Q) {
     int nudged[LANES], count = 0;
     for (; motor < N_Q && count < LANES; ++motor) {
-      for (i = 0; i < few && job->levers[nearest[i] * N_Q + motor] == 0; ++i) continue;
+      for (i = 0; i < few && job->levers[nearest[i] * ROW + motor] == 0; ++i) continue;
       if (i < few) nudged[count++] = motor;
     }
     if (!count) break;
@@ -154,12 +171,13 @@ LANES_INLINE lanes after(const guard_job *job, int motor, lanes cycles) {
  *
  *     its least distance >= (distance before + distance after - motion between) / 2
  */
-static LANES_TARGET void find_touching(const guard_job *job, placing *space, int64_t from,
-                                       int64_t to, int *touching) {
+static LANES_TARGET int find_touching(const guard_job *job, placing *space, int64_t from,
+                                       int64_t to, int64_t n_pairs, int *touching) {
   const surroundings *here = job->by_way;
-  int64_t cycle[LANES], i;
-  int unsure[LANES] = {0}, lane, k;
-  lanes now, next, moved[N_Q];
+  int64_t cycle[LANES], n_unsure = 0, i;
+  int unsure[LANES] = {0}, found = 0, lane, k;
+  lanes now, next, moved[N_Q], longest = SPREAD(0.0);
+  scalar way = 0;
   for (lane = 0; lane < LANES; ++lane) {
     cycle[lane] = from + (to - from) * lane / (LANES - 1);
     ((scalar *) &now)[lane] = (scalar) cycle[lane];
@@ -168,39 +186,58 @@ static LANES_TARGET void find_touching(const guard_job *job, placing *space, int
   for (k = 0; k < N_Q; ++k) {
     space->q[k] = after(job, k, now);
     moved[k] = lanes_fabs(after(job, k, next) - space->q[k]);
+    longest += job->widest[k] * moved[k];
+  }
+  for (lane = 0; lane < LANES; ++lane) {
+    if (!(lanes_at(longest, lane) <= way)) way = lanes_at(longest, lane);
   }
   place(space);
-  for (i = 0; i < here->n_close; ++i) {
-    const scalar *lever = job->levers + here->close[i] * N_Q;
+  for (i = 0; i < n_pairs; ++i) {
+    const int64_t pair = here->close[i];
+    const scalar *lever = job->levers + pair * ROW;
     lanes distance, motion = SPREAD(0.0);
-    scalar most = 0;
-    int touches = 0, arms = 0;
+    scalar most = 0, limit = here->limits[i];
+    int touches = 0, arms = 0, again = 0;
+    if (lanes_all(balls_apart(job->about, pair, space->placed) >= SPREAD(job->enough + way / 2))) {
+      continue;
+    }
     for (k = 0; k < N_Q; ++k) motion += lever[k] * moved[k];
     for (lane = 0; lane < LANES; ++lane) {
       if (!(lanes_at(motion, lane) <= most)) most = lanes_at(motion, lane);
     }
-    if (from == 0) here->limits[i] = job->enough;
-    if (!apart(job->about, here->close[i], space->placed, SPREAD(job->enough + most / 2),
-               space->lines, &distance)) {
+    if (!apart(job->about, pair, space->placed, SPREAD(job->enough + most / 2), space->lines,
+               &distance)) {
       continue;
     }
-    if (from == 0 && lanes_at(distance, 0) < job->enough) here->limits[i] = lanes_at(distance, 0);
+    if (from == 0 && lanes_at(distance, 0) < limit) limit = lanes_at(distance, 0);
     for (lane = 0; lane < LANES; ++lane) {
-      touches |= !(lanes_at(distance, lane) >= here->limits[i]);
+      touches |= !(lanes_at(distance, lane) >= limit);
       if (lane < LANES - 1 && cycle[lane + 1] - cycle[lane] > 1) {
         const scalar both = lanes_at(distance, lane) + lanes_at(distance, lane + 1);
-        unsure[lane] |= !(both - lanes_at(motion, lane) >= 2 * here->limits[i]);
+        const int missed = !(both - lanes_at(motion, lane) >= 2 * limit);
+        unsure[lane] |= missed;
+        again |= missed;
       }
     }
+    if (again) {
+      /* The pairs that have to be looked at again come first. */
+      here->close[i] = here->close[n_unsure];
+      here->limits[i] = here->limits[n_unsure];
+      here->close[n_unsure] = pair;
+      here->limits[n_unsure++] = limit;
+    }
+    found |= touches;
     for (k = 0; touches && k < N_Q; ++k) {
       arms |= lever[k] > 0 && !(job->hand[k] > 0);
       touching[k] |= lever[k] > 0;
     }
     for (k = 0; arms && k < N_Q; ++k) touching[k] = 1;
   }
-  for (lane = 0; lane < LANES - 1; ++lane) {
-    if (unsure[lane]) find_touching(job, space, cycle[lane], cycle[lane + 1], touching);
+  for (lane = 0; !found && lane < LANES - 1; ++lane) {
+    if (!unsure[lane]) continue;
+    found = find_touching(job, space, cycle[lane], cycle[lane + 1], n_unsure, touching);
   }
+  return found;
 }
 
 /* Makes of a step so much that the robot stays free and can come to rest free: motors that move a
@@ -208,25 +245,29 @@ static LANES_TARGET void find_touching(const guard_job *job, placing *space, int
  * was free in the cycle before. */
 LANES_TARGET DRIVER(stop_in_time, guard_job) {
   placing space;
-  int tried[N_Q] = {0}, touching[N_Q], k, less, outcome = lay_out(&space, job->about);
+  int tried[N_Q] = {0}, touching[N_Q], k, less, outcome = set_up(&space.space, room(job->about));
   if (outcome != DONE) return outcome;
+  lay_out(&space, job->about);
   do {
     scalar cycles = 0, sum = 0;
+    int going = 0;
     for (k = 0; k < N_Q; ++k) {
       const scalar left = fabs(job->last[k]) - job->change[k];
       const scalar braked = left > 0 ? (job->last[k] < 0 ? -left : left) : 0;
       job->part[k] = tried[k] < job->n_shares ? job->shares[tried[k]] : 0;
       job->step[k] = braked;
       if (job->part[k] > 0) job->step[k] += job->part[k] * (job->wanted[k] - braked);
+      going |= tried[k] < job->n_shares;
       cycles = fmax(cycles, floor(fabs(job->step[k]) / job->change[k]) + 1);
     }
     for (k = 0; k < N_Q; ++k) {
       sum += job->rest[k] = lanes_at(after(job, k, SPREAD(cycles)), 0);
       touching[k] = 0;
     }
+    if (!going) break;
     if (isfinite(sum)) {
       come_close(job, &space, job->by_way, job->q, job->rest, job->enough);
-      find_touching(job, &space, 0, (int64_t) cycles, touching);
+      find_touching(job, &space, 0, (int64_t) cycles, job->by_way->n_close, touching);
     } else {
       /* What is no number is nowhere. */
       for (k = 0; k < N_Q; ++k) touching[k] = 1;
