@@ -50,10 +50,6 @@ precision: the cost at which a fit, or an arm that is searched for, is exact. Si
 never come to it, and an arm would be searched for from every start, in thirteen times as many
 iterations."""
 
-NUDGE = EPSILON**0.5
-"""Difference [rad or m] from which slopes are taken: its own rounding and that of what it causes
-weigh the same."""
-
 SMALL, LARGE = 1e-15, 1e15
 """Between these the squares of a length are neither rounded to zero nor infinite."""
 
@@ -134,7 +130,6 @@ class SinglePrecision:
     def reals(self) -> dict[str, float]:
         """Numbers of the search that follow the precision."""
         return {
-            "NUDGE": NUDGE,
             "LIMIT_SLACK": 0.0,
             "TOLERANCE_SLACK": 0.0,
             "SMALL_LENGTH": SMALL,
