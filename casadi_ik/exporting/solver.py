@@ -230,7 +230,7 @@ class SideSources:
             f'#include "{self.solver}_parts.h"\n\n'
             "enum { DONE = 0, SLICE_OVER = 1 };\n\n"
             f"typedef struct {self.prefix} search;\n\n"
-            f"{tiles(self.prefix)}{calls}#define FIND_HANDS int {self.prefix}_hands\n"
+            f"{tiles(self.prefix, self.plan)}{calls}#define FIND_HANDS int {self.prefix}_hands\n"
             f"{define(self.plan.sizes)}{self.plan.constants(texts)}{texts}"
         )
 
@@ -246,9 +246,10 @@ static int hands_of(search *job, int side, const scalar *points, const scalar *n
 """
 
 
-def tiles(prefix: str) -> str:
-    """Where the search finds its tables."""
-    return f"#define TILES(table) ((table) ? {prefix}_table_1 : {prefix}_table_0)\n"
+def tiles(prefix: str, plan: SearchPlan) -> str:
+    """Where the search finds its tables; there is only one where fingers mend postures."""
+    first, later = (f"{prefix}_table_{i}" for i in (0, 0 if plan.mends else 1))
+    return f"#define TILES(table) ((table) ? {later} : {first})\n"
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,7 +308,8 @@ class SolverSources:
     def _hand_parts(self, name: str, plan: SearchPlan) -> tuple[Part, ...]:
         """Those that find hands."""
         lookup = plan.seeds.table.lookup
-        rows = max(spread.count for spread in plan.seeds.spreads[:2]) + TILE
+        tables = zip(plan.seeds.tables(enforce_limits=True), plan.seeds.spreads, strict=False)
+        rows = max(spread.count for _, spread in tables) + TILE
         # Distances of all rows and of their tiles are 32 bits each.
         room = rows if self.single is None else rows + rows // TILE
         constants = define(lookup.constants | {"REGISTER_BYTES": 0})
@@ -412,7 +414,7 @@ class SolverSources:
     def _seeds(self) -> str:
         """How the search comes by tables, or by the hands of its sides."""
         if not self.sides:
-            return tiles(self.prefix)
+            return tiles(self.prefix, self.plan)
         return HANDS_OF.replace("@CASES@", "".join(side.called for side in self.sides))
 
     @property

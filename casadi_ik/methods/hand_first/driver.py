@@ -210,13 +210,9 @@ class SearchPlan:
             "last": (double, state, "the state in which the round before ended"),
             "mark": (double, state, ""),
             "postures": (double, candidates * h, "of the round"),
-            "near": (double, pool * h, "room for seeds.c"),
-            "mended": (double, mended * h, ""),
+            "near": (double, mended * h, "room for seeds.c"),
             "left": (double, mended, ""),
-            "places": (double, pool * h, ""),
-            "closest": (double, pool, ""),
             "found": (whole, pool, ""),
-            "taken": (whole, pool, ""),
         }
 
     def members(self) -> str:
@@ -285,10 +281,8 @@ class SearchPlan:
         return found
 
     def _real_numbers(self) -> dict[str, float]:
-        options, hand = self.options, len(self.layouts.robot.hand_actuators)
         return {
             "LENGTH": LENGTH,
-            "ALIKE": options.similar * options.similar * hand,
             "UNIT": UNIT,
             "SMALL_LENGTH": SMALL,
             "LARGE_LENGTH": LARGE,

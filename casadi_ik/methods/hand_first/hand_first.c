@@ -94,7 +94,7 @@ static int may_help(const search *job) {
   if (rugged >= 0) {
     return returns < most && cost < near && cost < FAR_COST_SHRINKS / (double) (rugged + 1);
   }
-  return returns < most || cost < FLAT_COST || job->round < VARIED_ROUNDS || job->round >= ROUNDS;
+  return returns < most || cost < FLAT_COST || job->round < SURE_ROUNDS || job->round >= ROUNDS;
 }
 
 /* The next round that may help; 0 if there is none. A preference orders answers: where none was

@@ -31,15 +31,11 @@ class HandFirstParameters:
             motors 16 instead of 4 need a second posture, and all of them an eighth less time.
         many_motors: See above.
         at_limits: Part of the range that the wide table moves to the limits.
-        similar: Postures nearer to each other than this [root mean square, of the motors' ranges]
-            are alike.
-        pool: From so many times as many postures as are wanted those that differ are taken. Twice
-            as many cost more time than the fits they save.
-        varied_rounds: Rounds from tables in any case: the second takes hands that differ.
+        sure_rounds: Rounds from tables in any case.
         finger_rows: Postures of a finger that is chosen by itself; with four times as many no more
             fits succeed.
         finger_turns: How often palm and fingers are chosen in turns; a third time mends little.
-        fresh_pool: Postures mended finger by finger for a round after the second: not those that
+        fresh_pool: Postures mended finger by finger for a round after the first: not those that
             look like the target, but as many others in every round.
         late_pool: The same after `late_round`: what the best of many is not near in one round it is
             not in the next. Of 64,000 targets of a LEAP hand near limits 100 are left after 16
@@ -72,9 +68,7 @@ class HandFirstParameters:
     few_motors_table: float = 3 / 8
     many_motors: int = 9
     at_limits: float = 0.5
-    similar: float = 0.25
-    pool: int = 3
-    varied_rounds: int = 2
+    sure_rounds: int = 2
     finger_rows: int = 128
     finger_turns: int = 2
     fresh_pool: int = 64
@@ -96,11 +90,13 @@ class HandFirstParameters:
                 continue
             if isinstance(value, bool) or not (isinstance(value, int) and value >= 1):
                 raise InputError(f"{field.name}: found {value!r}, expected a whole number >= 1")
-        if self.candidates * self.rounds > self.table:
-            raise InputError(
-                f"table: found {self.table}, expected at least candidates x rounds = "
-                f"{self.candidates * self.rounds}"
-            )
+        least = self.candidates * self.rounds
+        for name in ("table", "wide_table"):
+            if getattr(self, name) < least:
+                raise InputError(
+                    f"{name}: found {getattr(self, name)}, expected at least candidates x rounds = "
+                    f"{least}"
+                )
 
     def is_many(self, robot: RobotDescription) -> bool:
         """Whether a robot's hand has many motors."""

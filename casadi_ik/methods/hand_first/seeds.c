@@ -1,9 +1,8 @@
 /* Where the rounds of hand-first begin: hand postures, each round's of another kind.
  *
  * The first round compares the target with a table of postures. The next ones compare it with a
- * table many times as large, half of it at limits, and take only postures that differ from each
- * other: the neighbours of one that failed fail as well. Of hands with many motors every finger
- * takes the posture that suits it best by itself.
+ * table many times as large, half of it at limits. Of hands with many motors they begin from any
+ * postures, of which every finger takes the one that suits it best by itself.
  *
  * The kernels are called by the macros LOOK_UP and SEEN (if MENDS), which take a pointer to a job of
  * the drivers; the constants come from driver.py.
@@ -84,55 +83,24 @@ static int mend_one(search *job, double *hand, double *left) {
   return DONE;
 }
 
-/* The pool's postures mended; those of which least is left come first. */
-static int mend(search *job, int64_t pool) {
+/* Postures from those of `near`: of the mended ones those of which least is left. */
+static int mend(search *job, int64_t count) {
   int64_t i, place;
-  memcpy(job->mended, job->near, (size_t) pool * N_HAND * sizeof(double));
-  for (i = 0; i < pool; ++i) {
-    const int code = mend_one(job, job->mended + i * N_HAND, job->left + i);
+  for (i = 0; i < count; ++i) {
+    const int code = mend_one(job, job->near + i * N_HAND, job->left + i);
     if (code != DONE) return code;
     for (place = i; place > 0 && job->left[i] < job->left[job->found[place - 1]]; --place) {
       job->found[place] = job->found[place - 1];
     }
     job->found[place] = i;
   }
-  for (i = 0; i < pool; ++i) {
-    memcpy(job->near + i * N_HAND, job->mended + job->found[i] * N_HAND, N_HAND * sizeof(double));
+  for (i = 0; i < N_CANDIDATES; ++i) {
+    const double *best = job->near + job->found[i % count] * N_HAND;
+    memcpy(job->postures + i * N_HAND, best, N_HAND * sizeof(double));
   }
   return DONE;
 }
 #endif
-
-/* Of the pool of postures those that differ, best first, without the first of them. */
-static void vary(search *job, int table, int64_t pool, int64_t count, int64_t first, double *into) {
-  int64_t i, k, place, pick;
-  for (i = 0; i < pool; ++i) {
-    for (k = 0; k < N_HAND; ++k) {
-      const double range = TABLE_RANGE[table][k];
-      job->places[i * N_HAND + k] = job->near[i * N_HAND + k] / (range > 0 ? range : 1.0);
-    }
-    job->closest[i] = 1e300;
-    job->taken[i] = 0;
-  }
-  for (place = 0; place < count; ++place) {
-    int64_t least = 4;
-    pick = 0;
-    for (i = 0; i < pool; ++i) {
-      const int64_t rank = 2 * job->taken[i] + (job->closest[i] < ALIKE);
-      if (rank < least) {
-        least = rank;
-        pick = i;
-      }
-    }
-    job->taken[pick] = 1;
-    for (i = 0; i < pool; ++i) {
-      const double off = apart(job->places + i * N_HAND, job->places + pick * N_HAND);
-      if (off < job->closest[i]) job->closest[i] = off;
-    }
-    if (place < first) continue;
-    memcpy(into + (place - first) * N_HAND, job->near + pick * N_HAND, N_HAND * sizeof(double));
-  }
-}
 
 #if MENDS
 /* Mended postures that do not look like the target in particular, other ones in every round; late
@@ -141,7 +109,7 @@ static int from_spread(search *job, int64_t number) {
   const int plain = number >= LATE_ROUND && number % 2;
   const int64_t count = plain ? N_CANDIDATES : number < LATE_ROUND ? FRESH_POOL : LATE_POOL;
   int64_t i;
-  int code, k;
+  int k;
   for (i = 0; i < count; ++i) {
     for (k = 0; k < N_HAND; ++k) job->near[i * N_HAND + k] = posture(1, number * FRESH_POOL + i, k);
   }
@@ -149,9 +117,7 @@ static int from_spread(search *job, int64_t number) {
     memcpy(job->postures, job->near, sizeof job->postures);
     return DONE;
   }
-  code = mend(job, count);
-  if (code == DONE) vary(job, 1, count, N_CANDIDATES, 0, job->postures);
-  return code;
+  return mend(job, count);
 }
 #endif
 
@@ -183,34 +149,24 @@ static void order(search *job, int own) {
   memcpy(job->postures, sorted, sizeof sorted);
 }
 
-/* Postures whose contacts look like the target. */
+/* Postures whose contacts look like the target, in later rounds the next best of another table. */
 static int from_table(search *job, int64_t number) {
   const int table = !number ? 0 : !ENFORCE_LIMITS && number % 2 ? 2 : 1;
-  const int64_t wanted = number ? number * N_CANDIDATES : N_CANDIDATES;
-  const int64_t most = TABLE_ROWS[table];
-  int64_t pool = number ? POOL * wanted : wanted;
+  const int64_t before = number ? (number - 1) * N_CANDIDATES : 0;
   int code, i, k;
 #if MENDS
-  if (number >= VARIED_ROUNDS) {
+  if (number) {
     code = from_spread(job, number);
     if (code == DONE && job->terms[TERMS_NEAREST] > 0) order(job, 0);
     return code;
   }
 #endif
-  if (pool > most) pool = most;
-  code = look_up(job, table, pool);
+  code = look_up(job, table, before + N_CANDIDATES);
   if (code != DONE) return code;
-  for (i = 0; i < pool; ++i) {
-    for (k = 0; k < N_HAND; ++k) job->near[i * N_HAND + k] = posture(table, job->found[i], k);
-  }
-  if (number) {
-#if MENDS
-    code = mend(job, pool);
-    if (code != DONE) return code;
-#endif
-    vary(job, table, pool, wanted, wanted - N_CANDIDATES, job->postures);
-  } else {
-    memcpy(job->postures, job->near, sizeof job->postures);
+  for (i = 0; i < N_CANDIDATES; ++i) {
+    for (k = 0; k < N_HAND; ++k) {
+      job->postures[i * N_HAND + k] = posture(table, job->found[before + i], k);
+    }
   }
   if (job->terms[TERMS_NEAREST] > 0) order(job, !number);
   return DONE;

@@ -96,8 +96,9 @@ class Seeds:
         """Those that are asked, in the order of `spreads`; of a body its sides know theirs."""
         if self._robot.description.sides:
             return ()
-        own = (self.table, self._wide_table)
-        return own if enforce_limits else (*own, self._free_table)
+        if not enforce_limits:
+            return self.table, self._wide_table, self._free_table
+        return (self.table,) if self.mends else (self.table, self._wide_table)
 
     def _table(self, which: int) -> PostureTable:
         spread = self.spreads[which]
@@ -136,9 +137,8 @@ class Seeds:
     def pool(self) -> int:
         """Postures of which a round's are taken, at most."""
         options = self._options
-        wanted = options.candidates * max(options.rounds - 1, 1)
         fresh = max(options.fresh_pool, options.late_pool) if self.mends else 0
-        return max(options.pool * wanted, fresh)
+        return max(options.candidates * max(options.rounds - 1, 1), fresh)
 
     def anywhere_bounds(self, enforce_limits: bool) -> tuple[Array, Array]:
         """(n,) between which configurations from anywhere are."""
