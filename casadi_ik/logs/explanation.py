@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.logs.events import Happening, errors_text, listed, number, plain_name, plural
+from casadi_ik.logs.format import LogClock
 from casadi_ik.logs.reader import Log
 from casadi_ik.logs.solve import OneSolve, Stretch, targets_beside
 from casadi_ik.problem.contacts import NAMES
@@ -86,6 +87,8 @@ def explain(solve: OneSolve) -> Explanation:
         headline += f" and {plural(solve.restarts, 'restart')}"
     if len(solve.rows) == 0:
         kept = "the log kept no iterations of this solve"
+        if solve.iterations > LogClock().room:
+            kept += f": it has room for {LogClock().room:,}"
         return Explanation(headline, verdict=(kept, *_verdict(solve)))
     return Explanation(
         headline,

@@ -67,23 +67,21 @@ class LogClock:
         """Log time of a solve's first iteration [ns]."""
         return self.t0 + solve_id * self.slot
 
-    def check(self, first: int, counts: NDArray[np.int64]) -> None:
-        """Check that there is time for solves from `first` on, of so many iterations (k,).
+    @property
+    def room(self) -> int:
+        """Iterations of a solve that there is time for."""
+        return self.slot // ITERATION
+
+    def check(self, first: int, count: int) -> None:
+        """Check that there is time for so many solves from `first` on.
 
         Raises:
-            LogError: There are more iterations than the slot has room for, or a solve's number is
-                negative or beyond what 64-bit nanoseconds can tell.
+            LogError: A solve's number is negative or beyond what 64-bit nanoseconds can tell.
         """
-        last = first + len(counts) - 1
+        last = first + count - 1
         if not (first >= 0 and last < 2**32 and self.start(last + 1) < 2**63):
             wrong = first if first < 0 else last
             raise LogError(f"solve {wrong}: the log has no time for a solve of this number")
-        room = self.slot // ITERATION
-        if counts.size and counts.max() > room:
-            raise LogError(
-                f"solve {first + int(counts.argmax())}: {counts.max()} iterations, the log has room"
-                f" for {room} per solve"
-            )
 
     def times(self, solve_id: NDArray[np.int64], iteration: NDArray[np.int64]) -> np.ndarray:
         """Log times of iterations, uint64 [ns]; both arguments of the same shape."""

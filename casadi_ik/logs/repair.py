@@ -284,7 +284,7 @@ class _Merge:
                 number, kind, layout = topics[run.channel]
                 messages = chunk.messages(run, layout.dtype).copy()
                 last = int(shard.clock.locate(run.log_time)[0].max()) + offset
-                shard.clock.check(last, np.zeros(1, np.int64))
+                shard.clock.check(last, 1)
                 messages["head"]["channel"] = number
                 messages["head"]["log_time"] += later
                 if kind == "solve":

@@ -69,6 +69,7 @@ CHUNK_SIZE = 2**21
 class Keep:
     """Which solves keep every iteration and event; of the others the totals are kept.
 
+    Of a solve of more iterations than a log has room for (`LogClock.room`) only the totals are.
     Stands in the log's metadata, so that no reader takes the sample for the whole.
 
     Attributes:
@@ -214,7 +215,8 @@ class McapRecorder:
         tally = np.bincount(cell, minlength=len(block) * kinds).reshape(-1, kinds)
         solves = solve_rows(block, tally, method.solve)
         singular = tally[:, list(SINGULAR)].sum(axis=1) > 0
-        solves["kept"] = self.keep(block.first, block.batch.success, singular)
+        wanted = self.keep(block.first, block.batch.success, singular)
+        solves["kept"] = wanted & (counts <= self.clock.room)
         messages = block_messages(block, events, solves, method.channels, self.clock)
         self._chunks.check(messages, f"{self.path}: method {block.method!r}", block.first)
         # Numbers that follow each other are remembered as one range.
@@ -273,7 +275,7 @@ class McapRecorder:
             if not same or known.fingers != block.fingers:
                 raise LogError(f"{where}: layout or labels differ from the method's earlier solves")
         try:
-            self.clock.check(block.first, block.batch.iterations)
+            self.clock.check(block.first, len(block))
         except LogError as error:
             raise LogError(f"{where}: {error}") from None
 
@@ -401,7 +403,7 @@ def block_messages(
             channels["solve"],
             solves,
             block.first + solve,
-            clock.times(block.first + solve, np.maximum(counts - 1, 0)),
+            clock.times(block.first + solve, np.clip(counts - 1, 0, clock.room - 1)),
             block.started + seconds.astype(np.int64),
             1 + solve,
         ),

@@ -219,7 +219,6 @@ def test_blocks_that_contradict_leave_the_log_usable(tmp_path: Path) -> None:
         "lower_snake_case": make_block(
             1, method="new", form=TraceFormat(Layout.record(Field("J")))
         ),
-        "room for 60000": make_block(60_001, first=4),
         "no time for a solve": make_block(1, first=2**32),
         "solve -1": changed(make_block(1), first=-1),
     }
@@ -298,9 +297,19 @@ def test_log_times_are_arithmetic() -> None:
     np.testing.assert_array_equal(times, [15_001_000, 19_001_000, 20_001_000])
     for found, expected in zip(clock.locate(times), (solve, iteration), strict=True):
         np.testing.assert_array_equal(found, expected)
-    clock.check(3, np.array([5, 5]))
-    with pytest.raises(errors.LogError, match="solve 4: 6 iterations, the log has room for 5"):
-        clock.check(3, np.array([5, 6]))
+    assert clock.room == 5
+
+
+def test_a_solve_of_more_iterations_than_there_is_time_for_has_its_totals(tmp_path: Path) -> None:
+    path = tmp_path / "long.mcap"
+    clock = logs.LogClock(T0, slot=5_000_000)
+    with logs.McapRecorder(path, robot_name="made_up", clock=clock) as recorder:
+        recorder.record(make_block(5, 6, 4))
+    log = logs.open(path)
+    solves = log.solves().array()
+    assert (solves["kept"].tolist(), solves["iterations"].tolist()) == ([1, 0, 1], [5, 6, 4])
+    assert log.iterations().solve_id.tolist() == [0] * 5 + [2] * 4
+    assert log.solves(solve=[1]).solve_id.tolist() == [1]
 
 
 LIMIT = 3 * 2**21
