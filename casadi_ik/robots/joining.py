@@ -339,6 +339,13 @@ def body_from_parts(
         DescriptionError: With file, key, what was found and what was expected.
     """
     _check_sides(body.name, body.sides, where)
+    placed = [name for name, entry in body.sides.items() if entry.at is not None]
+    for name in body.sides:
+        if placed and name not in placed:
+            raise DescriptionError(
+                f"{where}: sides.{name}.at: found none, expected one as in sides.{placed[0]}; "
+                "at: {} is the trunk's end"
+            )
     arms = {
         name: _mirrored(a_part(entry.arm, f"sides.{name}.arm", where), entry, "arm", name, where)
         for name, entry in body.sides.items()

@@ -167,6 +167,18 @@ def test_what_is_wrong_is_said_in_a_line(in_a_file: Path, old: str, new: str, sa
     refused(in_a_file, said)
 
 
+def test_arms_stand_at_places_that_are_all_given(tmp_path: Path):
+    path, given = tmp_path / "pair.yaml", "{arm: panda, hand: allegro_left%s}"
+    sides = ", at: {xyz: [0, 0.3, 0]}", ""
+    text = "name: pair\ntrunk: lift\nsides:\n  left: " + given + "\n  right: " + given + "\n"
+    path.write_text(text % sides)
+    refused(path, "sides.right.at: found none, expected one as in sides.left")
+    path.write_text(text % (sides[0], ", at: {}"))
+    robot = ik.load_robot(path)
+    apart = robot.palm(robot.home, "left") - robot.palm(robot.home, "right")
+    np.testing.assert_allclose(apart[:3, 3], [0, 0.3, 0], atol=1e-12)
+
+
 def refused(path: Path, said: str):
     """One line that names the file is said of it."""
     with pytest.raises(ik.errors.DescriptionError) as caught:
