@@ -318,7 +318,7 @@ FIRST = {
     "single": "solver.solve(grasp)",
     "fast": "solver.fast()(points, normals)",
     "batch": "solver.solve_batch(*(np.tile(a, (8, 1, 1)) for a in (points, normals)))",
-    "scene": "solver = ik.Solver(robot, scene=ik.load_scene('table')); "
+    "scene": "solver = ik.Solver(robot, scene=ik.Scene({'table': TABLE})); "
     "solver.choose([grasp], q0=robot.home)",
 }
 """What is asked first: as a program."""
@@ -334,6 +334,9 @@ solver = ik.Solver(robot, {method!r})
 points, normals = robot.contacts(robot.home)
 contacts = zip(robot.fingers, points, normals)
 grasp = ik.Grasp({{name: ik.Contact(p, n) for name, p, n in contacts}})
+# An arm stands on it; a body's pelvis and what hangs from it have room above.
+below = 1.5 if robot.description.sides else 0.0
+TABLE = {{"kind": "box", "size": [2, 2, 0.04], "xyz": [0, 0, -0.02 - below]}}
 {ask}
 print(imported - begin, time.perf_counter() - imported)
 """
