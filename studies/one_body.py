@@ -59,6 +59,8 @@ ALONE = 300
 """Targets solved one by one; poses of the path that is followed."""
 CYCLES = 2000
 """Of hands that are led through each other, at 1 kHz."""
+BEYOND = (1e-3, 5e-3, 20e-3, 50e-3)
+"""How far out of reach targets are [m]."""
 SEARCH = 20_000
 """Answers that a random search looks at for one that touches nothing."""
 SEARCHED = 1000
@@ -243,6 +245,37 @@ def free(cell: Cell, robot: ArmHand) -> dict[str, Any]:
     return row(robot.name, f"{hits} of {count}", f"{solved} of {count}", f"{each:.2f}")
 
 
+def beyond(cell: Cell, robot: ArmHand) -> dict[str, Any]:
+    """Targets moved away from the base until they are just out of reach."""
+    solver, sides = ik.Solver(robot), robot.description.sides
+    points, normals = robot.contacts(drawn(robot, cell.count, False, cell.seed))
+    way = np.zeros_like(points)
+    for place, side in enumerate(sides):
+        own = [robot.fingers.index(finger) for finger in side.fingers]
+        middle = points[:, own].mean(axis=1)
+        moved = np.isin(np.arange(cell.count) % (len(sides) + 1), (place, len(sides)))
+        way[:, own] = (moved[:, None] * middle / np.linalg.norm(middle, axis=1)[:, None])[:, None]
+    reached, step = np.zeros(cell.count), np.full(cell.count, 0.1)
+    for _ in range(18):
+        there = points + (reached + step)[:, None, None] * way
+        met = solver.solve_batch(there, normals).success
+        reached[met] += step[met]
+        step = np.where(met, step, step / 2)
+    rows = []
+    for far in BEYOND:
+        there, fast, spent = points + (reached + far)[:, None, None] * way, solver.fast(), []
+        for goal, facing in zip(there, normals, strict=True):
+            begun = time.process_time()
+            fast(goal, facing)
+            spent.append(1e3 * (time.process_time() - begun))
+        met = solver.solve_batch(there, normals).success.sum()
+        why = solver.solve_batch(there, normals, diagnose=True).status
+        times = [f"{time:.0f}" for time in (np.mean(spent), np.quantile(spent, 0.99), max(spent))]
+        proved = str((why == ik.Status.UNREACHABLE).sum())
+        rows.append([robot.name, f"{1e3 * far:.0f}", str(cell.count), *times, str(met), proved])
+    return {"rows": rows}
+
+
 def around(
     points: Array, normals: Array, count: int, rng: np.random.Generator
 ) -> tuple[Array, Array]:
@@ -350,6 +383,17 @@ TABLES = {
             *("blocked", "least clearance [mm]"),
         ),
     ),
+    "beyond": Table(
+        beyond,
+        "## Just out of reach\n\nContacts of random configurations, those of one side or of all "
+        "moved away from the base until no answer is found, and so much farther. One by one; "
+        "*solved* are those that a batch finds an answer for after all, *proved* are verdicts "
+        "UNREACHABLE of a diagnosis.",
+        (
+            *("robot", "beyond [mm]", "targets", "a target, mean [ms]", "99th percent [ms]"),
+            *("longest [ms]", "solved", "proved"),
+        ),
+    ),
     "free": Table(
         free,
         "## Touching nothing\n\nTargets of configurations that do not touch themselves. "
@@ -394,7 +438,7 @@ def cells(options: argparse.Namespace) -> list[Cell]:
             ]
         every += [one(what="alone", count=ALONE)] if options.count else []
         every += [one(what="followed", count=1), one(what="crossed", count=1)]
-        for what in ("free", "searched"):
+        for what in ("beyond", "free", "searched"):
             count = getattr(options, what)
             every += [one(what=what, count=count)] if count else []
         if options.peers and robot == options.robots[0]:
@@ -431,6 +475,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description="Several arms on a trunk, solved as one.")
     parser.add_argument("--robots", nargs="+", default=ROBOTS)
     parser.add_argument("--count", type=int, default=100_000, help="targets of every kind; 0: none")
+    parser.add_argument("--beyond", type=int, default=60, help="targets out of reach; 0: none")
     parser.add_argument("--free", type=int, default=500, help="targets without collision; 0: none")
     parser.add_argument(
         "--searched", type=int, default=200, help="targets beside a random search; 0: none"

@@ -245,7 +245,7 @@ class SearchPlan:
 
     def _whole_numbers(self) -> dict[str, int]:
         layouts, robot = self.layouts, self.layouts.robot
-        places = {f"STATE_{name.upper()}": layouts.state.slice(name).start for name in STATE}
+        places = {f"STATE_{name.upper()}": layouts.state.slice(name).start for name in self._state}
         for label, layout in (("PARAMETERS", layouts.parameters), ("TERMS", terms(robot))):
             for name in ("lower", "upper", "nearest"):
                 places[f"{label}_{name.upper()}"] = layout.slice(name).start
@@ -268,6 +268,10 @@ class SearchPlan:
             **{k: v for k, v in self._options.items() if isinstance(v, int)},
             **places,
         }
+
+    @property
+    def _state(self) -> tuple[str, ...]:
+        return (*STATE, "hopeless") if self.sides else STATE
 
     @property
     def _options(self) -> dict[str, Any]:

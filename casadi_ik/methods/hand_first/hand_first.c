@@ -100,6 +100,9 @@ static int may_help(const search *job) {
 /* The next round that may help; 0 if there is none. A preference orders answers: where none was
  * found near `here`, all rounds follow without it. */
 static int choose_round(search *job) {
+#if N_SIDES
+  if (job->state[STATE_HOPELESS] > 0) return 0;
+#endif
   do ++job->round;
   while (job->round < job->most && !may_help(job));
   if (job->round < job->most) return 1;

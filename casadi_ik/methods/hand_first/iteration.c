@@ -137,10 +137,19 @@ static int after_all_placements(solve s) {
   return X(FITS) > 0 ? SOLVED_STATUS : RUNNING_STATUS;
 }
 
+/* The farther off the nearest palms of hands that fit are, the fewer trunks are worth a try. */
+static int is_hopeless(solve s) {
+  const double most = P(LOOSE) > 0 ? FAR_LOOSE : FAR_TRUNKS;
+  if (!(X(FITS) > 0)) return 0;
+  Y(LOOKED) = X(LOOKED) + 1;
+  if (!(X(LOOKED) > 0) || SAID(COST) < X(FAR)) Y(FAR) = SAID(COST);
+  Y(HOPELESS) = Y(LOOKED) >= LEAST_TRUNKS && Y(LOOKED) * Y(FAR) > most;
+  return Y(HOPELESS) > 0;
+}
+
 static int after_trunk(solve s) {
   const int later = X(EARLIER) > 0;
-  const int most = X(FIRST) > 0 ? OTHER_TRUNKS : later ? LATER_TRUNKS : FIRST_TRUNKS;
-  int i;
+  int i, most = X(FIRST) > 0 ? OTHER_TRUNKS : later ? LATER_TRUNKS : FIRST_TRUNKS;
   if (SAID(COST) < EXACT_COST) {
     begin_fit(s);
     goes_to(s, REFINEMENT_STAGE);
@@ -156,12 +165,17 @@ static int after_trunk(solve s) {
   Y(TRIED) = X(TRIED) + 1;
   if (!(X(TRIED) > 0) || SAID(COST) < X(PALMS_LEAST)) {
     Y(PALMS_LEAST) = SAID(COST);
-    for (i = 0; i < N_TRUNK; ++i) ENTRY(Y(BEST_TRUNK), i) = ENTRY(Y(Q), TRUNK_MOTORS[i]);
+    for (i = 0; i < N_MOTORS; ++i) ENTRY(Y(PALMS_BEST), i) = ENTRY(Y(Q), i);
+  }
+  if (is_hopeless(s)) {
+    Y(FARTHEST) = N_CANDIDATES - 1;
+    most = 0;
   }
   if (Y(TRIED) >= most) {
+    /* What is beyond the reach of arms may be within tolerances. */
+    for (i = 0; i < N_MOTORS; ++i) ENTRY(Y(Q), i) = ENTRY(Y(PALMS_BEST), i);
     begin_fit(s);
-    if (X(FARTHEST) + 1 >= N_CANDIDATES) return goes_to(s, REFINEMENT_STAGE);
-    return to_next_candidate(s);
+    return goes_to(s, REFINEMENT_STAGE);
   }
   Y(TRUNKS) = X(TRUNKS) + 1;
   for (i = 0; i < N_TRUNK; ++i) {
@@ -170,7 +184,7 @@ static int after_trunk(solve s) {
     ENTRY(Y(Q), k) = anywhere;
     if ((int) Y(TRIED) % CLOSER_EVERY == CLOSER_EVERY - 1) {
       /* Near the best trunk so far, the nearer the more were tried. */
-      const double best = ENTRY(Y(BEST_TRUNK), i);
+      const double best = ENTRY(Y(PALMS_BEST), k);
       ENTRY(Y(Q), k) = best + (anywhere - best) * BOX / (BOX + Y(TRIED));
     }
   }

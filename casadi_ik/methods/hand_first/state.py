@@ -16,7 +16,7 @@ from casadi_ik.methods.common.bounded_step import Bounded
 from casadi_ik.methods.common.contact_fit import Tried, WholeContacts, fresh_fit
 from casadi_ik.methods.common.limits import bits, coupling_fields, coupling_values
 from casadi_ik.methods.common.palm import SIX
-from casadi_ik.problem.contacts import ContactRows, Kinds, suffix
+from casadi_ik.problem.contacts import ContactRows, Kinds, suffix, usual
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.trace import (
     ACCEPTED,
@@ -86,6 +86,8 @@ CARRIED = (
 were balanced in vain, and what was found."""
 
 NOTHING = float("nan")
+
+LOOSE = "1 if the contacts of a side are fewer conditions than palm and hand have motions"
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,13 +167,13 @@ class HandFirstLayouts:
 
     @property
     def carried(self) -> tuple[str, ...]:
-        """What a round leaves to the next: of a body also how many trunks were tried."""
-        return (*CARRIED, "trunks") if self.robot.sides else CARRIED
+        """What a round leaves to the next: of a body also what came of its trunks."""
+        return (*CARRIED, "trunks", "looked", "far") if self.robot.sides else CARRIED
 
     @property
     def _of_sides(self) -> tuple[Field, ...]:
         """What a body's solves know besides."""
-        sides = range(len(self.robot.sides))
+        n, sides = len(self.robot.actuators), range(len(self.robot.sides))
         palms = [
             (Field(f"palm_rotation_{i}", (3, 3)), Field(f"palm_origin_{i}", (3,), unit="m"))
             for i in sides
@@ -183,10 +185,13 @@ class HandFirstLayouts:
             Field("fitted", (len(sides),), doc="1 if palm and hand meet the contacts, by side"),
             *(field for palm in palms for field in palm),
             Field("palms_least", doc="smallest cost of trunk steps for these palms"),
-            Field("best_trunk", (len(self.robot.trunk),), doc="the trunk it belongs to"),
+            Field("palms_best", (n,), doc="the configuration it belongs to"),
             Field("again", doc="1 once arms were placed anew at the trunk found"),
             Field("tried", doc="trunks tried for these palms"),
             Field("trunks", doc="trunks tried for all palms"),
+            Field("looked", doc="those of them that were tried for palms of hands that fit"),
+            Field("far", doc="smallest cost of trunk steps for such palms"),
+            Field("hopeless", doc="1 if that is too far for so many trunks"),
         )
 
     @cached_property
@@ -205,6 +210,7 @@ class HandFirstLayouts:
                 Field("alone", doc="1 if a solve ends with the hand's fit, and the arm stays out"),
                 Field("start", (n,), doc="where the robot is, within bounds"),
                 Field("nearest", doc="1 if the solution nearest to the start is wanted"),
+                *((Field("loose", doc=LOOSE),) if self.robot.sides else ()),
                 Field("postures", (self.candidates, hand), doc="hand postures to try"),
             )
         )
@@ -370,6 +376,7 @@ def _build(name: str, layouts: HandFirstLayouts) -> ca.Function:
             "reach": 1.0,
             "alone": 0.0,
             "start": start,
+            **({"loose": _is_loose(layouts, known)} if robot.sides else {}),
             "postures": ca.horzcat(*tried).T,
             **t,
         }
@@ -405,6 +412,17 @@ def _is_held(layouts: HandFirstLayouts, t: dict[str, Expr]) -> Expr:
     )
     less = ca.logic_or(free_hand < len(hand), free_arm < SIX)
     return ca.logic_and(less, free_hand > 0)
+
+
+def _is_loose(layouts: HandFirstLayouts, known: Expr) -> Expr:
+    """1 if contacts of which `known` (f, 2) are given leave palms of a body a freedom."""
+    robot, place = layouts.robot, layouts.robot.finger_names.index
+    loose = ca.SX(float(layouts.kinds != usual(len(robot.fingers))))
+    for side, (_, hand) in zip(robot.sides, robot.side_actuators, strict=True):
+        conditions = ca.sum1(known[list(map(place, side.fingers)), :] @ ca.SX([3, 2]))
+        fewer = ca.logic_and(conditions > 0, conditions < SIX + len(hand))
+        loose = ca.logic_or(loose, fewer)
+    return loose
 
 
 def _is_number(x: Expr) -> Expr:
