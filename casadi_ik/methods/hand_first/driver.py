@@ -173,7 +173,7 @@ class SearchPlan:
             "N_PARAMETERS": layouts.parameters.size,
             "N_CANDIDATES": self.options.candidates,
             "N_POOL": self.seeds.pool,
-            "N_MENDED": self.seeds.pool if self.mends else 1,
+            "N_MENDED": self.seeds.pool if self.mends else self.options.candidates,
             "N_MORE": len(layouts.contacts.data) - 2,
             "N_SIDES": len(self.sides),
         }
@@ -210,7 +210,7 @@ class SearchPlan:
             "last": (double, state, "the state in which the round before ended"),
             "mark": (double, state, ""),
             "postures": (double, candidates * h, "of the round"),
-            "near": (double, mended * h, "room for seeds.c"),
+            "near": (double, mended * h, "room for seeds.c, and for a scene's hands"),
             "left": (double, mended, ""),
             "found": (whole, pool, ""),
         }
