@@ -60,15 +60,18 @@ def test_solved_is_the_same_whatever_is_preferred(seed, robot, scene):
     every = starts(solver.robot, rng)
     usual = solver.solve_batch(points, normals)
     grasps = grasps_of(solver.robot, points, normals)
+    found = {name: solver.solve_batch(points, normals, q0=q0).success for name, q0 in every.items()}
     for prefer, (name, q0) in product(preferences(solver), every.items()):
         batch = solver.solve_batch(points, normals, q0=q0, prefer=prefer)
-        assert batch.success.tolist() == usual.success.tolist(), (prefer, name)
+        assert batch.success.tolist() == found[name].tolist(), (prefer, name)
         side = solver.solve_batch(points, normals, q0=q0, prefer=prefer, jobs=2)
-        assert side.success.tolist() == usual.success.tolist(), (prefer, name)
+        assert side.success.tolist() == found[name].tolist(), (prefer, name)
+        # The last steps out of a collision begin at the answers nearest to q0.
+        differ = int((found[name] != usual.success).sum())
+        assert differ <= (0 if solver.scene is None else 1), name
     for prefer, row in product(preferences(solver), range(0, COUNT, 3)):
-        q0 = every["random"]
-        alone = solver.solve(grasps[row], q0=q0, prefer=prefer, diagnose=False)
-        assert alone.success == usual.success[row], prefer
+        alone = solver.solve(grasps[row], q0=every["random"], prefer=prefer, diagnose=False)
+        assert alone.success == found["random"][row], prefer
     # A start that is an answer says more than the target does: it may add, and never costs one.
     told = solver.solve_batch(points, normals, q0=truth)
     assert not (usual.success & ~told.success).any()
