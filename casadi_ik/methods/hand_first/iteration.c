@@ -137,13 +137,13 @@ static int after_all_placements(solve s) {
   return X(FITS) > 0 ? SOLVED_STATUS : RUNNING_STATUS;
 }
 
-/* The farther off the nearest palms of hands that fit are, the fewer trunks are worth a try. */
+/* The farther off the nearest palms of hands that fit are, the fewer trunks are worth a try; where
+ * contacts leave palms a freedom, others may be near. */
 static int is_hopeless(solve s) {
-  const double most = P(LOOSE) > 0 ? FAR_LOOSE : FAR_TRUNKS;
-  if (!(X(FITS) > 0)) return 0;
+  if (!(X(FITS) > 0) || P(LOOSE) > 0) return 0;
   Y(LOOKED) = X(LOOKED) + 1;
   if (!(X(LOOKED) > 0) || SAID(COST) < X(FAR)) Y(FAR) = SAID(COST);
-  Y(HOPELESS) = Y(LOOKED) >= LEAST_TRUNKS && Y(LOOKED) * Y(FAR) > most;
+  Y(HOPELESS) = Y(LOOKED) >= LEAST_TRUNKS && Y(LOOKED) * Y(FAR) > FAR_TRUNKS;
   return Y(HOPELESS) > 0;
 }
 
