@@ -78,7 +78,7 @@ class Guarding:
             kernel: Of the robot, compiled.
             poses: (m, 12) of the scene's solids.
             table: The pairs.
-            levers: (p, n) see `collision.levers`.
+            levers: (p, n) see `collision.distances.levers`.
             hand: (n,) 1 for motors beyond a palm.
             change: (n,) how much a step may differ from the last.
             shares: As in the driver.

@@ -12,8 +12,8 @@ only if the robot can come to rest after it without being too near to anything i
 motors brake. Since the step before was made under the same condition, braking is safe: by induction
 the robot never comes nearer than the margin to what stands still. Cycles are left out between which
 a pair has no time to come near, and pairs that were far apart when all were looked at: by steps of
-motors times levers (`collision.levers`). A pair that motors of one hand alone can part holds these
-back, any other all motors.
+motors times levers (`collision.distances.levers`). A pair that motors of one hand alone can part
+holds these back, any other all motors.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array, Bools
-from casadi_ik.collision.levers import levers
+from casadi_ik.collision.distances import levers
 from casadi_ik.kernels.clearance_kernel import OBSTACLES, Guarding
 from casadi_ik.motion.inputs import FollowerInputs, FollowPlan
 from casadi_ik.problem.clearance import ROUNDING, Clearances, CollisionQuery
