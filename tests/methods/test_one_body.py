@@ -154,7 +154,7 @@ def test_motors_are_held(robot):
         assert found.q[robot.description.actuator_index(name)] == pytest.approx(value, abs=1e-12)
 
 
-@pytest.mark.parametrize("name", ["g1+dex3", "two_pandas+allegro"])
+@pytest.mark.parametrize("name", ["g1+dex3", "h1_2+inspire"])
 def test_what_is_just_out_of_reach_is_given_up_soon(name):
     robot = ik.load_robot(name)
     side = [robot.fingers.index(finger) for finger in robot.description.sides[0].fingers]
