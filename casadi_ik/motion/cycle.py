@@ -265,7 +265,7 @@ class Cycle:
         first, low, high, *others = begin(state, parameters)
         goal, which = first, list[ca.MX]()
         if self.obstacles:
-            # Slopes of clearances are full rows: a step without them takes half the time.
+            # A step without them takes a fifth less time.
             step = ca.Function.if_else("choose", self._step(minded=True), step)
             which = [ca.mmax(parameters[self.parameters.slice("rooms")]) > 0]
         for _ in range(TUNING.steps):
@@ -368,21 +368,20 @@ class Cycle:
         """
         n, scales = here.numel(), motor_scales(self.robot)
         residual, jacobian = self._residual(here, p), self._jacobian(here, p)
-        missed = ca.dot(residual, residual)
-        residual = residual - left
+        missed, full = ca.dot(residual, residual), None
         if minded:
             rooms = ca.fmax(p["rooms"], 0.0)
             felt = TUNING.avoidance / LENGTH * ca.if_else(rooms > 0, 1.0, 0.0)
-            residual = ca.vertcat(residual, TUNING.avoidance / LENGTH * rooms)
-            jacobian = ca.vertcat(jacobian, -p["slopes"] * ca.repmat(felt, 1, n))
+            slopes = -p["slopes"] * ca.repmat(felt, 1, n)
+            full = slopes @ ca.diag(scales), TUNING.avoidance / LENGTH * rooms
+        residual = residual - left
         pull = ca.sqrt(p["pull"])
         residual = ca.vertcat(residual, pull * (here - anchor) / scales)
         jacobian = ca.vertcat(jacobian @ ca.diag(scales), pull * ca.SX.eye(n))
         at, (low, high) = here / scales, bounds
         box = Bounded(at, low / scales, high / scales, first=0)
-        found = damped_step(
-            ca.sparsify(jacobian), residual, TUNING.residual_damping * missed, box, TUNING.passes
-        )
+        damping = TUNING.residual_damping * missed
+        found = damped_step(ca.sparsify(jacobian), residual, damping, box, TUNING.passes, full)
         return here + found.step * scales
 
     def _residual(self, q: Expr, p: dict[str, Expr]) -> Expr:

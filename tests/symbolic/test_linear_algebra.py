@@ -318,21 +318,27 @@ def test_a_singular_problem_is_finite(step):
 FINGERS, JOINTS, PALM = 5, 4, 6
 
 
-def test_a_sparse_problem_has_the_solution_of_the_dense_one(rng):
+@pytest.mark.parametrize("full", [0, 3])
+def test_a_sparse_problem_has_the_solution_of_the_dense_one(rng, full):
+    """Rows that concern all coordinates aside, fingers share no more than their palm."""
     count = PALM + FINGERS * JOINTS
     J = fingers()
     r, damping = ca.SX.sym("r", J.shape[0]), ca.SX.sym("damping")
     value, lower, upper = (ca.SX.sym(name, count - PALM) for name in ("value", "lower", "upper"))
-    found = damped_step(J, r, damping, Bounded(value, lower, upper, PALM), 6)
-    inputs = [ca.vertcat(*J.nonzeros()), r, damping, value, lower, upper]
-    step = ca.Function("step", inputs, [found.step])
+    rows, rest = ca.SX.sym("rows", full, count), ca.SX.sym("rest", full)
+    bounded = Bounded(value, lower, upper, PALM)
+    found = damped_step(J, r, damping, bounded, 6, (rows, rest) if full else None)
+    inputs = [ca.vertcat(*J.nonzeros()), r, rows, rest, damping, value, lower, upper]
+    step = ca.Function("step", inputs, [found.step, found.promised])
     same, held = 0, 0
     for _ in range(10):
-        numbers = rng.normal(size=J.nnz())
-        dense = np.array(ca.DM(J.sparsity(), numbers))
+        numbers, concern_all = rng.normal(size=J.nnz()), rng.normal(size=(full, count))
+        dense = np.vstack([ca.DM(J.sparsity(), numbers).full(), concern_all])
         low, high = -rng.uniform(0, 0.3, count - PALM), rng.uniform(0, 0.3, count - PALM)
-        at, right = rng.uniform(low, high), rng.normal(size=J.shape[0])
-        s = np.array(step(numbers, right, 1e-2, at, low, high)).ravel()
+        at, right = rng.uniform(low, high), rng.normal(size=len(dense))
+        split = np.split(right, [J.shape[0]])
+        s, promised = step(numbers, split[0], concern_all, split[1], 1e-2, at, low, high)
+        s = np.array(s).ravel()
         matrix = np.vstack([dense, 0.1 * np.eye(count)])
         free = np.full(PALM, np.inf)
         ends = np.r_[-free, low - at] - 1e-13, np.r_[free, high - at] + 1e-13
@@ -341,6 +347,7 @@ def test_a_sparse_problem_has_the_solution_of_the_dense_one(rng):
         )
         same += np.allclose(s, expected.x, atol=1e-6)
         held += np.sum(np.isclose(at + s[PALM:], low) | np.isclose(at + s[PALM:], high))
+        assert float(promised) == pytest.approx(right @ right - np.sum((right + dense @ s) ** 2))
     assert same >= 8
     assert held > 10
 

@@ -31,10 +31,12 @@ class Pivot:
     Attributes:
         place: Number of the unknown.
         others: Numbers of the unknowns it is coupled with by then, those eliminated before aside.
+        sign: Of its diagonal entry, which no elimination changes (Vanderbei 1995).
     """
 
     place: int
     others: tuple[int, ...]
+    sign: float = 1.0
 
     @property
     def operations(self) -> int:
@@ -90,7 +92,7 @@ class System:
             value: Where it is held, 0 if it is not.
         """
         i, entries = pivot.place, self.entries
-        inverse = 1 / ca.fmax(entries[i, i], PIVOT_FLOOR)
+        inverse = pivot.sign / ca.fmax(pivot.sign * entries[i, i], PIVOT_FLOOR)
         own = self.right[i]
         if free is None:
             own = inverse * own
@@ -198,20 +200,21 @@ class Elimination:
         return ca.vertcat(*(known[i] for i in range(len(begun.right))))
 
 
-def elimination(sparsity: ca.Sparsity, free: int, times: int) -> Elimination:
+def elimination(sparsity: ca.Sparsity, free: int, times: int, duals: int = 0) -> Elimination:
     """The order that takes fewest operations.
 
     Args:
         sparsity: Of the matrix.
         free: Unknowns before this number are never held.
         times: How often it is solved with other unknowns held.
+        duals: Unknowns before this number have a negative diagonal.
     """
-    after = _pivots(_couplings(sparsity, free), range(free))
+    after = _pivots(_couplings(sparsity, free), range(free), duals)
     ways = []
     for first in (range(free), range(0)):
         couplings = _couplings(sparsity, sparsity.size1())
-        once = _pivots(couplings, first)
-        each = _pivots(couplings, [i for i in couplings if i not in first])
+        once = _pivots(couplings, first, duals)
+        each = _pivots(couplings, [i for i in couplings if i not in first], duals)
         cost = _operations(once or after) + times * _operations(each)
         ways.append((cost, Elimination(free, once, each, after)))
     return min(ways, key=lambda way: way[0])[1]
@@ -231,7 +234,9 @@ def _couplings(sparsity: ca.Sparsity, count: int) -> dict[int, set[int]]:
     return found
 
 
-def _pivots(couplings: dict[int, set[int]], places: Sequence[int]) -> tuple[Pivot, ...]:
+def _pivots(
+    couplings: dict[int, set[int]], places: Sequence[int], duals: int
+) -> tuple[Pivot, ...]:
     """Some unknowns, always the least coupled one next (minimum degree); they are taken out."""
     found, left = [], set(places)
     while left:
@@ -241,7 +246,7 @@ def _pivots(couplings: dict[int, set[int]], places: Sequence[int]) -> tuple[Pivo
         for i in others:
             couplings[i] |= others
             couplings[i] -= {place, i}
-        found.append(Pivot(place, tuple(sorted(others))))
+        found.append(Pivot(place, tuple(sorted(others)), -1.0 if place < duals else 1.0))
     return tuple(found)
 
 
@@ -280,7 +285,12 @@ class DampedStep:
 
 
 def damped_step(
-    jacobian: Expr, residual: Expr, damping: Expr, bounded: Bounded, passes: int
+    jacobian: Expr,
+    residual: Expr,
+    damping: Expr,
+    bounded: Bounded,
+    passes: int,
+    full: tuple[Expr, Expr] | None = None,
 ) -> DampedStep:
     """Levenberg-Marquardt step within the bounds.
 
@@ -290,15 +300,22 @@ def damped_step(
         damping: Scalar added to the diagonal of J'J.
         bounded: The bounded coordinates, the last ones.
         passes: Corrections of the active set, at least one.
+        full: Rows (k, n) that concern all coordinates, and their residual (k, 1). As multipliers
+            of their own they leave J'J as sparse as it is.
 
     Returns:
         The step; value + step is within the bounds, to rounding.
     """
     normal, gradient = squares(jacobian, residual)
     low, high = bounded.lower - bounded.value, bounded.upper - bounded.value
-    step = in_box(normal, damping, gradient, low, high, passes)
+    step = in_box(normal, damping, gradient, low, high, passes, full)
+    promised = _promise(jacobian, residual, step)
+    return DampedStep(step, promised if full is None else promised + _promise(*full, step))
+
+
+def _promise(jacobian: Expr, residual: Expr, step: Expr) -> Expr:
     change = jacobian @ step
-    return DampedStep(step, -ca.dot(change, 2 * residual + change))
+    return -ca.dot(change, 2 * residual + change)
 
 
 def squares(jacobian: Expr, residual: Expr) -> tuple[Expr, Expr]:
@@ -306,7 +323,15 @@ def squares(jacobian: Expr, residual: Expr) -> tuple[Expr, Expr]:
     return _squares(_pattern(jacobian))(jacobian, residual)
 
 
-def in_box(matrix: Expr, damping: Expr, slope: Expr, low: Expr, high: Expr, passes: int) -> Expr:
+def in_box(
+    matrix: Expr,
+    damping: Expr,
+    slope: Expr,
+    low: Expr,
+    high: Expr,
+    passes: int,
+    full: tuple[Expr, Expr] | None = None,
+) -> Expr:
     """Minimiser of x' M x / 2 + slope' x, the last coordinates in a box that holds the origin.
 
     Args:
@@ -316,9 +341,17 @@ def in_box(matrix: Expr, damping: Expr, slope: Expr, low: Expr, high: Expr, pass
         low: (k, 1) lower ends of the box, <= 0.
         high: (k, 1) upper ends, >= 0.
         passes: Corrections of the active set, at least one.
+        full: A (m, n) and b (m, 1) of |A x + b|^2 / 2, which is added. Its residual y is unknown
+            as well, ``M x + A' y = -slope, A x - y = -b``.
     """
-    upper = ca.triu(matrix)
-    return _in_box(_pattern(upper), low.numel(), passes)(upper, damping, slope, low, high)
+    upper, duals = ca.triu(matrix), 0
+    if full is not None:
+        duals = full[1].numel()
+        below = ca.horzcat(ca.SX(matrix.shape[0], duals), upper)
+        upper = ca.vertcat(ca.horzcat(-ca.SX.eye(duals), full[0]), below)
+        slope = ca.vertcat(full[1], slope)
+    found = _in_box(_pattern(upper), low.numel(), passes, duals)(upper, damping, slope, low, high)
+    return found[duals:]
 
 
 Pattern: TypeAlias = tuple[tuple[int, int], tuple[int, ...], tuple[int, ...]]
@@ -395,14 +428,15 @@ def _block_squares(rows: int, columns: int) -> ca.Function:
 
 
 @cache
-def _in_box(pattern: Pattern, count: int, passes: int) -> ca.Function:
-    """See `in_box`; `count` are bounded."""
+def _in_box(pattern: Pattern, count: int, passes: int, duals: int) -> ca.Function:
+    """See `in_box`; `count` are bounded, the first unknowns are multipliers."""
     matrix = _sparse("matrix", pattern)
     slope, damping = ca.SX.sym("slope", matrix.shape[0]), ca.SX.sym("damping")
-    damped = matrix + damping * ca.DM.eye(slope.numel())
+    primal = ca.DM([float(i >= duals) for i in range(slope.numel())])
+    damped = matrix + damping * ca.sparsify(ca.diag(primal))
     low, high = ca.SX.sym("low", count), ca.SX.sym("high", count)
     first = slope.numel() - count
-    order = elimination((damped + damped.T).sparsity(), first, passes)
+    order = elimination((damped + damped.T).sparsity(), first, passes, duals)
     begun = order.begun(damped, slope)
     # All passes are calls of one function, of those numbers of the system that it needs.
     known = System.of_symbols(begun)
