@@ -234,9 +234,7 @@ def _couplings(sparsity: ca.Sparsity, count: int) -> dict[int, set[int]]:
     return found
 
 
-def _pivots(
-    couplings: dict[int, set[int]], places: Sequence[int], duals: int
-) -> tuple[Pivot, ...]:
+def _pivots(couplings: dict[int, set[int]], places: Sequence[int], duals: int) -> tuple[Pivot, ...]:
     """Some unknowns, always the least coupled one next (minimum degree); they are taken out."""
     found, left = [], set(places)
     while left:
