@@ -138,9 +138,9 @@ static int after_all_placements(solve s) {
 }
 
 /* The farther off the nearest palms of hands that fit are, the fewer trunks are worth a try; where
- * contacts leave palms a freedom, others may be near. */
+ * contacts leave palms a freedom, others may be near, and one arm may need a trunk of its own. */
 static int is_hopeless(solve s) {
-  if (!(X(FITS) > 0) || P(LOOSE) > 0) return 0;
+  if (N_SIDES < 2 || !(X(FITS) > 0) || P(LOOSE) > 0) return 0;
   Y(LOOKED) = X(LOOKED) + 1;
   if (!(X(LOOKED) > 0) || SAID(COST) < X(FAR)) Y(FAR) = SAID(COST);
   Y(HOPELESS) = Y(LOOKED) >= LEAST_TRUNKS && Y(LOOKED) * Y(FAR) > FAR_TRUNKS;
