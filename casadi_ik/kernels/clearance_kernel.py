@@ -68,6 +68,7 @@ class Guarding:
         table: Table,
         levers: Array,
         hand: Array,
+        side: Array,
         change: Array,
         shares: tuple[float, ...],
         **given: float,
@@ -80,6 +81,7 @@ class Guarding:
             table: The pairs.
             levers: (p, n) see `collision.distances.levers`.
             hand: (n,) 1 for motors beyond a palm.
+            side: (n,) number of a motor's side; -1 for motors that move all palms.
             change: (n,) how much a step may differ from the last.
             shares: As in the driver.
             given: Likewise.
@@ -99,6 +101,7 @@ class Guarding:
         arrays = numbers | {
             "levers": np.pad(levers, ((0, 0), (0, -n % 8))),
             "hand": doubles(hand),
+            "side": doubles(side),
             "widest": levers.max(axis=0, initial=0.0),
             "change": doubles(change),
             "shares": doubles(shares),

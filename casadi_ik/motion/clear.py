@@ -13,7 +13,7 @@ motors brake. Since the step before was made under the same condition, braking i
 the robot never comes nearer than the margin to what stands still. Cycles are left out between which
 a pair has no time to come near, and pairs that were far apart when all were looked at: by steps of
 motors times levers (`collision.distances.levers`). A pair that motors of one hand alone can part
-holds these back, any other all motors.
+holds these back, one that an arm moves all of its side, and one that a trunk moves all motors.
 """
 
 from __future__ import annotations
@@ -386,6 +386,10 @@ class Guard:
         fingers, n = len(plan.robot.fingers), len(plan.robot.actuators)
         self._n, self._change = n, plan.rates.steps(plan.period)[1]
         self._hand = np.isin(np.arange(n), self._robot.hand_actuators).astype(float)
+        self._side = np.zeros(n)
+        self._side[list(self._robot.trunk_actuators)] = -1
+        for number, motors in enumerate(self._robot.side_actuators):
+            self._side[list(sum(motors, ()))] = number
         anywhere = np.zeros((1, fingers, 3))
         self._query = self._at(plan.request.of_arrays(anywhere, anywhere + 1.0, None))
         self._lay_out()
@@ -415,6 +419,7 @@ class Guard:
                 query.table,
                 self._levers,
                 self._hand,
+                self._side,
                 self._change,
                 self.shares,
                 enough=self._enough,
@@ -470,12 +475,17 @@ class Guard:
                 np.concatenate([q[None], path]), self._query.poses, self._query.table
             )
             touching = ~(every >= np.minimum(here, self._enough)).all(axis=0)
-            held = self._levers[touching] > 0
-            less = held.any(axis=0) | held[:, self._hand == 0].any()
+            less = self._held(self._levers[touching] > 0)
             less &= tried < len(self.shares)
             if not less.any():
                 return shares[tried], step, path[-1]
             tried += less
+
+    def _held(self, moving: Bools) -> Bools:
+        """(n,) motors that pairs hold back which the motors (p, n) move, as in guard.c."""
+        arms = (moving & (self._hand == 0)).any(axis=0)
+        sides = np.isin(self._side, self._side[arms]) | (self._side[arms] < 0).any()
+        return moving.any(axis=0) | sides
 
     def _obstacles(self, goal: Array) -> tuple[Array, Array]:
         """What the nearest pairs at a goal lack (o,) [m], and how that shrinks (o, n)."""

@@ -140,10 +140,15 @@ class AlternativeFinder:
 
     @cached_property
     def manipulability(self) -> FunctionKernel:
-        """Of the arm, for a configuration."""
-        q = ca.SX.sym("q", len(self.robot.actuators))
-        linear, angular = actuated(self.robot.description, q).palm_jacobian(self._arm)
-        measure = manipulability(ca.vertcat(linear, angular))
+        """Of the arm, for a configuration; of a body the least of its arms."""
+        robot, q = self.robot.description, ca.SX.sym("q", len(self.robot.actuators))
+        body, found = actuated(robot, q), list[ca.SX]()
+        for side in robot.sides or (robot,):
+            palm = body.kinematics.links[side.palm_link].at(side.palm_placement)
+            arm = list(map(robot.actuator_index, side.arm)) if robot.sides else self._arm
+            jacobian = ca.vertcat(*body.twist(side.palm_link, palm.origin, arm))
+            found.append(manipulability(jacobian))
+        measure = ca.mmin(ca.vertcat(*found))
         return FunctionKernel(ca.Function("arm_manipulability", [q], [measure]), self._compiled)
 
     def find(
@@ -391,7 +396,8 @@ class AlternativeFinder:
         return self._measured(q)
 
     def _measured(self, q: Array) -> Array:
-        return self.manipulability(q)[0] if self._arm else np.zeros(len(q))
+        held = self._arm or self.robot.description.sides
+        return self.manipulability(q)[0] if held else np.zeros(len(q))
 
     def _described(self, targets: TargetBatch, found: _Found, q0: Array) -> Alternative:
         q = found.q[None]

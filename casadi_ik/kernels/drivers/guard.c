@@ -166,6 +166,19 @@ LANES_INLINE lanes after(const guard_job *job, int motor, lanes cycles) {
   return job->q[motor] + (job->step[motor] < 0 ? -way : way);
 }
 
+/* Marks motors that a pair holds back: those of a hand that can part it by itself, else whole sides;
+ * a trunk's motor all. */
+static void hold_back(const guard_job *job, const scalar *lever, int *held) {
+  int k, i;
+  for (k = 0; k < N_Q; ++k) {
+    if (!(lever[k] > 0)) continue;
+    held[k] = 1;
+    for (i = 0; !(job->hand[k] > 0) && i < N_Q; ++i) {
+      held[i] |= job->side[k] < 0 || job->side[i] == job->side[k];
+    }
+  }
+}
+
 /* Marks motors that move pairs nearer than is free, or nearer than they are if that is less, in any
  * cycle from one to another. Those cycles alone are left out between which a pair has no time for it:
  *
@@ -197,7 +210,7 @@ static LANES_TARGET int find_touching(const guard_job *job, placing *space, int6
     const scalar *lever = job->levers + pair * ROW;
     lanes distance, motion = SPREAD(0.0);
     scalar most = 0, limit = here->limits[i];
-    int touches = 0, arms = 0, again = 0;
+    int touches = 0, again = 0;
     if (lanes_all(balls_apart(job->about, pair, space->placed) >= SPREAD(job->enough + way / 2))) {
       continue;
     }
@@ -227,11 +240,7 @@ static LANES_TARGET int find_touching(const guard_job *job, placing *space, int6
       here->limits[n_unsure++] = limit;
     }
     found |= touches;
-    for (k = 0; touches && k < N_Q; ++k) {
-      arms |= lever[k] > 0 && !(job->hand[k] > 0);
-      touching[k] |= lever[k] > 0;
-    }
-    for (k = 0; arms && k < N_Q; ++k) touching[k] = 1;
+    if (touches) hold_back(job, lever, touching);
   }
   for (lane = 0; !found && lane < LANES - 1; ++lane) {
     if (!unsure[lane]) continue;

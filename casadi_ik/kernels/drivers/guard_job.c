@@ -15,6 +15,7 @@ typedef struct {
   clearance_job *about;        /* pairs and solids */
   const scalar *levers;        /* n_pairs rows of ROW: `collision.distances.levers` */
   const scalar *hand;          /* N_Q: 1 of motors beyond a palm */
+  const scalar *side;          /* N_Q: number of the side; -1: all palms are moved by it */
   const scalar *widest;        /* N_Q: the longest of all pairs */
   scalar spare;                /* how far motors may move things until all pairs are looked at */
   surroundings *by_goal, *by_way;

@@ -137,13 +137,14 @@ static int after_all_placements(solve s) {
   return X(FITS) > 0 ? SOLVED_STATUS : RUNNING_STATUS;
 }
 
-/* The farther off the nearest palms of hands that fit are, the fewer trunks are worth a try; where
- * contacts leave palms a freedom, others may be near, and one arm may need a trunk of its own. */
+/* The farther off the nearest palms of hands that fit are, the fewer trunks are worth a try; more
+ * where contacts leave palms a freedom, since others may be near, and all for one arm. */
 static int is_hopeless(solve s) {
-  if (N_SIDES < 2 || !(X(FITS) > 0) || P(LOOSE) > 0) return 0;
+  const double most = P(LOOSE) > 0 ? LOOSE_TRUNKS : FAR_TRUNKS;
+  if (N_SIDES < 2 || !(X(FITS) > 0)) return 0;
   Y(LOOKED) = X(LOOKED) + 1;
   if (!(X(LOOKED) > 0) || SAID(COST) < X(FAR)) Y(FAR) = SAID(COST);
-  Y(HOPELESS) = Y(LOOKED) >= LEAST_TRUNKS && Y(LOOKED) * Y(FAR) > FAR_TRUNKS;
+  Y(HOPELESS) = Y(LOOKED) >= LEAST_TRUNKS && Y(LOOKED) * Y(FAR) > most;
   return Y(HOPELESS) > 0;
 }
 
