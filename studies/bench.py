@@ -146,9 +146,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--report", type=Path, help="folder of the report")
     options = parser.parse_args(arguments)
     cases = [
-        case
+        (part, *words)
         for part in options.part
-        for case in CASES[part](list(options.robots), options.count, str(options.page.resolve()))
+        for words in CASES[part](list(options.robots), options.count, str(options.page.resolve()))
     ]
     console, rows = Console(), list[list[str]]()
     heads = ["part", "robot", "of", "quantity", "here"]

@@ -502,34 +502,23 @@ def _samplers(robot: str) -> list[str]:
 
 def _batches(robots: list[str], count: int, _: str) -> list[Case]:
     return [
-        ("batch", robot, sampler, tolerance, count)
+        (robot, sampler, tolerance, count)
         for robot in robots
         for sampler in _samplers(robot)
         for tolerance in TOLERANCES
     ]
 
 
-def _first_uses(robots: list[str], *_: Any) -> list[Case]:
-    asks: list[Case] = [
-        ("first-use", robot, ask, "hand-first") for robot in robots for ask in FIRST
-    ]
-    return asks
-
-
 def _methods(*_: Any) -> list[Case]:
     steps = {name: ("closed-form", "ipopt") for name in ik.METHODS if name.startswith("enhanced")}
     others = [name for name in ik.METHODS if name not in ("hand-first", "ipopt")]
-    return [
-        ("methods", "kuka_lwr_barrett", name, step)
-        for name in others
-        for step in steps.get(name, ("",))
-    ]
+    return [("kuka_lwr_barrett", name, step) for name in others for step in steps.get(name, ("",))]
 
 
 def _peers(robots: list[str], count: int, _: str) -> list[Case]:
     names = importlib.import_module("peers").installed()
     return [
-        ("peers", robot, sampler, tolerance, name, min(count, 60))
+        (robot, sampler, tolerance, name, min(count, 60))
         for robot in robots
         for sampler in _samplers(robot)[:2]
         for tolerance in TOLERANCES
@@ -539,42 +528,45 @@ def _peers(robots: list[str], count: int, _: str) -> list[Case]:
 
 CASES: dict[str, Callable[[list[str], int, str], list[Case]]] = {
     "batch": _batches,
-    "fast": lambda robots, *_: [("fast", robot, FAST) for robot in robots],
-    "single": lambda robots, *_: [("single", robot, SINGLE) for robot in robots],
-    "scene": lambda robots, count, _: [("scene", name, min(count, 200)) for name in robots],
+    "fast": lambda robots, *_: [(robot, FAST) for robot in robots],
+    "single": lambda robots, *_: [(robot, SINGLE) for robot in robots],
+    "scene": lambda robots, count, _: [(robot, min(count, 200)) for robot in robots],
     "choose": lambda robots, *_: [
-        ("choose", robot, given, around)
+        (robot, given, around)
         for robot in robots
         for given in ("palms", "contacts")
         for around in ("free", "scene")
     ],
-    "follow": lambda robots, *_: [("follow", robot) for robot in robots],
+    "follow": lambda robots, *_: [(robot,) for robot in robots],
     "diagnosis": lambda robots, *_: [
-        ("diagnosis", robot, kind, 60) for robot in robots for kind in ("far", "moved", "turned")
+        (robot, kind, 60) for robot in robots for kind in ("far", "moved", "turned")
     ],
     "methods": _methods,
-    "threads": lambda robots, count, _: [("threads", robot, 4 * count) for robot in robots],
-    "memory": lambda robots, count, _: [("memory", robot, 50 * count) for robot in robots[:1]],
-    "many": lambda robots, count, _: [("many", robot, count) for robot in robots],
-    "first-use": _first_uses,
+    "threads": lambda robots, count, _: [(robot, 4 * count) for robot in robots],
+    "memory": lambda robots, count, _: [(robot, 50 * count) for robot in robots[:1]],
+    "many": lambda robots, count, _: [(robot, count) for robot in robots],
+    "first-use": lambda robots, *_: [
+        (robot, ask, "hand-first") for robot in robots for ask in FIRST
+    ],
     "export": lambda robots, *_: [
-        ("export", robot, *words)
+        (robot, *words)
         for robot in robots
         for words in (("c",), ("c", "--single"), ("c", "--scene", "8"), ("wasm",))
     ],
     "logs": lambda _, count, __: [
-        ("logs", "kuka_lwr_barrett", method, compression, count)
+        ("kuka_lwr_barrett", method, compression, count)
         for method in ("hand-first", "enhanced-dls")
         for compression in ("zstd", "lz4", "none")
     ],
     "peers": _peers,
     "view": lambda _, __, page: [
-        ("view", where, painted, flow)
+        (where, painted, flow)
         for where in ("server", *([page] if Path(page).is_file() else []))
         for painted, flow in ((True, False), (False, False), (False, True))
     ],
 }
-"""The cases of every part, from robots, targets of a batch, and the page without a server."""
+"""The cases of every part, behind its name, from robots, targets of a batch, and the page without
+a server."""
 
 
 @cache

@@ -149,7 +149,7 @@ class PinContacts:
         self.frames = [model.getFrameId(f"{name}_contact") for name in robot.fingers]
         place = self.joints.order([n for n in model.names if n != "universe"])
         self.rows = np.array([model.joints[int(i) + 1].idx_q for i in place])
-        self.axes = normal_axes(robot, self.at(model.createData(), robot.home)[2])
+        self.axes = normal_axes(robot, self.at(model.createData(), robot.home)[1])
 
     def theta(self, q: Array) -> Array:
         """Joints in pinocchio's order."""
@@ -157,23 +157,18 @@ class PinContacts:
         theta[self.rows] = self.joints.C @ q
         return theta
 
-    def at(self, data: Any, q: Array) -> tuple[Any, Array, Array]:
+    def at(self, data: Any, q: Array) -> tuple[Array, Array]:
         """Points and rotations of the contact frames; `data` then holds the Jacobians."""
         self.pin.computeJointJacobians(self.model, data, self.theta(q))
         self.pin.updateFramePlacements(self.model, data)
         placed = [data.oMf[frame] for frame in self.frames]
-        return (
-            data,
-            np.array([m.translation for m in placed]),
-            np.array([m.rotation for m in placed]),
-        )
+        return np.array([m.translation for m in placed]), np.array([m.rotation for m in placed])
 
     def rows_of(self, data: Any, normals: Array) -> Array:
-        """(6 f, joints) derivative of points / LENGTH and normals, in pinocchio's order."""
+        """See `derivative`; joints in pinocchio's order."""
         world = self.pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         parts = [self.pin.getFrameJacobian(self.model, data, i, world) for i in self.frames]
-        turned = [-cross(n) @ J[3:] for n, J in zip(normals, parts, strict=True)]
-        return np.concatenate([J[:3] / LENGTH for J in parts] + turned)
+        return derivative(parts, normals)
 
 
 class Scipy:
@@ -199,7 +194,7 @@ class Scipy:
 
     def contacts(self, q: Array) -> tuple[Array, Array]:
         """See `Peer`."""
-        _, points, rotations = self._pin.at(self._data, q)
+        points, rotations = self._pin.at(self._data, q)
         return points, np.einsum("fij,fj->fi", rotations, self._pin.axes)
 
     def step(self, q: Array) -> Array:
@@ -236,9 +231,22 @@ def residual(points: Array, normals: Array, wanted: Array, facing: Array) -> Arr
     return np.concatenate([((points - wanted) / LENGTH).ravel(), (normals - facing).ravel()])
 
 
+def derivative(jacobians: list[Array], normals: Array) -> Array:
+    """(6 f, joints) derivative of `residual`, from the Jacobian (6, joints) of every contact."""
+    turned = [-cross(n) @ J[3:] for n, J in zip(normals, jacobians, strict=True)]
+    return np.concatenate([J[:3] / LENGTH for J in jacobians] + turned)
+
+
 def cross(v: Array) -> Array:
     """(3, 3) the matrix of the cross product with v."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def by_daqp(problem: Any, lower: Array, upper: Array, motors: NDArray[np.intp]) -> Array:
+    """The change of the motors that DAQP finds, their limits as bounds; zero if it finds none."""
+    problem.lb, problem.ub = lower, upper
+    change = import_module("qpsolvers").solve_problem(problem, solver="daqp").x
+    return np.zeros(len(motors)) if change is None else change[motors]
 
 
 LEAST = 1e-9
@@ -251,11 +259,11 @@ class Pink:
     def __init__(self, robot: ik.ArmHand, damping: float) -> None:
         """Set it up; `damping` is the task's Levenberg-Marquardt damping."""
         self._pink: Any = import_module("pink")
-        self._qp: Any = import_module("qpsolvers")
         tasks: Any = import_module("pink.tasks")
         self._pin = contacts = PinContacts(robot)
         model = contacts.model
         names = contacts.joints.names
+        self._motors = contacts.rows[contacts.joints.leader]
         start = contacts.theta(robot.home)
         self._configuration = self._pink.Configuration(model, model.createData(), start)
         self._lower, self._upper = model.lowerPositionLimit, model.upperPositionLimit
@@ -299,12 +307,7 @@ class Pink:
             self._configuration, self._tasks, 1.0, 1e-8, limits=[], constraints=self._coupled
         )
         theta = self._configuration.q
-        problem.lb, problem.ub = self._lower - theta, self._upper - theta
-        change = self._qp.solve_problem(problem, solver="daqp").x
-        return np.zeros(len(self._pin.joints.leader)) if change is None else self._ours(change)
-
-    def _ours(self, change: Array) -> Array:
-        return change[self._pin.rows][self._pin.joints.leader]
+        return by_daqp(problem, self._lower - theta, self._upper - theta, self._motors)
 
 
 class Mink:
@@ -315,7 +318,6 @@ class Mink:
         mink: Any = import_module("mink")
         mujoco: Any = import_module("mujoco")
         self._mink, self._mujoco = mink, mujoco
-        self._qp: Any = import_module("qpsolvers")
         joints = self._joints = Joints(robot)
         self._model = model = self._spec(robot).compile()
         order = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, n) for n in joints.names]
@@ -390,11 +392,8 @@ class Mink:
             constraints=self._coupled,
         )
         theta = self._configuration.q
-        problem.lb, problem.ub = self._limits[0] - theta, self._limits[1] - theta
-        change = self._qp.solve_problem(problem, solver="daqp").x
-        if change is None:
-            return np.zeros(len(self._joints.leader))
-        return change[self._rows][self._joints.leader]
+        motors = self._rows[self._joints.leader]
+        return by_daqp(problem, self._limits[0] - theta, self._limits[1] - theta, motors)
 
     def _derivative(self, data: Any) -> Array:
         parts = []
@@ -402,8 +401,7 @@ class Mink:
             J = np.zeros((6, self._model.nv))
             self._mujoco.mj_jacBody(self._model, data, J[:3], J[3:], body)
             parts.append(J)
-        turned = [-cross(n) @ J[3:] for n, J in zip(self._now[1], parts, strict=True)]
-        return np.concatenate([J[:3] / LENGTH for J in parts] + turned)
+        return derivative(parts, self._now[1])
 
 
 class Placo:

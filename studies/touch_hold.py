@@ -205,7 +205,7 @@ def row_of(robot: str, tries: Sequence[Tried], metrics: list[Metric]) -> list[st
         rate_metric(f"{name}/{key}", sum(one.held for one in group), len(group))
         for key, group in groups.items()
     ]
-    areas = auc(loads, held), auc(closures, held)
+    areas = concordance(loads, held), concordance(closures, held)
     metrics += [
         *rates,
         Metric(f"{name}/auc", areas[0], "", "higher", math.nan, math.nan, len(every)),
@@ -234,11 +234,6 @@ def noise_of(robot: str, tries: Sequence[Tried], metrics: list[Metric]) -> list[
         metrics.append(Metric(name, value, "%", "higher", math.nan, math.nan, len(tries)))
     areas = [f"{concordance(score, held):.3f}" for score in (share, loads)]
     return [robot, *(f"{mean:.0f} %" for mean in means), *areas]
-
-
-def auc(scores: np.ndarray, held: np.ndarray) -> float:
-    """Chance that one that holds scores higher than one that does not."""
-    return concordance(scores, held.astype(float))
 
 
 def concordance(scores: np.ndarray, values: np.ndarray) -> float:

@@ -53,7 +53,7 @@ def test_peers_see_the_robot_that_we_solve(name):
     contacts = peers.PinContacts(robot)
     q = robot.random(np.random.default_rng(0), 5)
     for one, points, normals in zip(q, *robot.contacts(q), strict=True):
-        _, found, rotations = contacts.at(contacts.model.createData(), one)
+        found, rotations = contacts.at(contacts.model.createData(), one)
         np.testing.assert_allclose(found, points, atol=1e-12)
         turned = np.einsum("fij,fj->fi", rotations, contacts.axes)
         np.testing.assert_allclose(turned, normals, atol=1e-12)

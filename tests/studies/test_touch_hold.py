@@ -42,9 +42,9 @@ def test_what_is_squeezed_too_little_falls(monkeypatch):
 
 def test_the_area_under_the_curve():
     held = np.array([True, False, True, False])
-    assert touch_hold.auc(np.array([4.0, 1.0, 3.0, 2.0]), held) == 1.0
-    assert touch_hold.auc(np.array([1.0, 4.0, 2.0, 3.0]), held) == 0.0
-    assert touch_hold.auc(np.ones(4), held) == 0.5
+    assert touch_hold.concordance(np.array([4.0, 1.0, 3.0, 2.0]), held) == 1.0
+    assert touch_hold.concordance(np.array([1.0, 4.0, 2.0, 3.0]), held) == 0.0
+    assert touch_hold.concordance(np.ones(4), held) == 0.5
 
 
 @pytest.mark.parametrize(("folder", "least"), [("touch_hold", 0.88), ("touch_hold_ycb", 0.88)])
