@@ -326,11 +326,15 @@ def event_format(form: TraceFormat) -> TraceFormat:
     labels = {
         "kind": tuple(kind.name for kind in EventKind),
         "jacobian": ("none", *jacobian_names(form)),
-        "joint_mask": form.labels.get(Q.name) or form.labels.get(LIMIT_MASK.name, ()),
+        "joint_mask": _actuators(form),
         "joint_unit": form.labels.get("q_unit", ()),
         "phase": form.labels.get(PHASE.name, ()),
     }
     return TraceFormat(event_layout(mask_words(form)), labels)
+
+
+def _actuators(form: TraceFormat) -> tuple[str, ...]:
+    return form.labels.get(Q.name) or form.labels.get(LIMIT_MASK.name, ())
 
 
 # How they are found.
@@ -607,8 +611,7 @@ def _singular(traces: Traces) -> Iterator[Found]:
     It may enter again once it was better than its threshold by the factor `EventRules.release`,
     or was not computed (NaN) in between.
     """
-    names, release = traces.form.labels.get(Q.name) or (), traces.rules.release
-    names = names or traces.form.labels.get(LIMIT_MASK.name, ())
+    names, release = _actuators(traces.form), traces.rules.release
     for number, jacobian in enumerate(traces.jacobians, start=1):
         joints = traces.words(np.array([[name in jacobian.joints for name in names]], dtype=bool))
         if SIGMA in jacobian.columns and jacobian.singular > 0:

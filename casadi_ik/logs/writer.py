@@ -180,12 +180,9 @@ class McapRecorder:
         keeping = asdict(self.keep)
         entries = log_metadata(robot_name, seed, given, keeping, compression, self.clock)
         now, summary = time.time_ns(), Summary()
-        data = None if urdf is None else urdf.encode()
-        attached = (
-            [Attachment(now, now, "robot.urdf", "application/xml", data)]
-            if data is not None
-            else []
-        )
+        attached = list[Attachment]()
+        if urdf is not None:
+            attached.append(Attachment(now, now, "robot.urdf", "application/xml", urdf.encode()))
         library = f"casadi_ik {entries['code_version']}"
         try:
             start = beginning(summary, library, Metadata(METADATA_NAME, entries), attached)

@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import accumulate, pairwise
 from math import sqrt
 from typing import NamedTuple, TypeAlias
 
@@ -332,9 +333,8 @@ class ContactRows:
     def fields(self) -> tuple[Field, ...]:
         """Parameter fields that state the targets."""
         f = len(self.kinds)
-        units = {"point": "m"}
         vectors = (
-            Field(f"{name}s", (f, 3), unit=units.get(name, ""), doc=DOCS[name])
+            Field(f"{name}s", (f, 3), unit="m" if name == "point" else "", doc=DOCS[name])
             for name in self.data
         )
         weights = Field("weights", (f, 2), doc="1 where point, normal count, 0 where free")
@@ -348,13 +348,9 @@ class ContactRows:
     @cached_property
     def slices(self) -> tuple[slice, ...]:
         """Rows of the places of all fingers, then of their facings, (2 f,)."""
-        found, first = [], 0
-        for aspect in range(2):
-            for kind in self.kinds:
-                after = first + kind.conditions[aspect].rows
-                found.append(slice(first, after))
-                first = after
-        return tuple(found)
+        sizes = [kind.conditions[aspect].rows for aspect in range(2) for kind in self.kinds]
+        ends = accumulate(sizes, initial=0)
+        return tuple(slice(*each) for each in pairwise(ends))
 
     def goals(self, p: dict[str, Expr]) -> list[Vectors]:
         """The targets by finger, base frame.

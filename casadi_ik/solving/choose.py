@@ -37,7 +37,7 @@ from casadi_ik.solving.finder import (
     checked_distance,
 )
 from casadi_ik.solving.free import free_answers
-from casadi_ik.solving.trials import Deduplicator, first_of_each
+from casadi_ik.solving.trials import Deduplicator, largest_of_each
 
 Judgement: TypeAlias = str | Callable[[ArmHand, Array], ArrayLike]
 """One of `PREFERENCES`, or what gives configurations (m, n) of a robot their scores (m,)."""
@@ -437,7 +437,7 @@ class _Part:
             return found, whose, {}
         left = np.flatnonzero(~np.isin(owner, whose))
         # The last word has the hand with most room.
-        left = first_of_each(owner, left[np.lexsort((-surplus[left], owner[left]))], 1)
+        left = left[largest_of_each(owner[left], surplus[left], 1)]
         clear = query.rows(owner[left]).check(q[left])
         named = ((row, clear.pair(i)) for i, row in enumerate(owner[left].tolist()))
         return found, whose, {row: pair for row, pair in named if pair is not None}

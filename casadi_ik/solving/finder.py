@@ -298,8 +298,8 @@ class AlternativeFinder:
     def _seen_by_form(self, end: Array, limits: Bounds) -> Array:
         """(a,) bounds of the arm, those of held joints in the turn in which a form gives them."""
         middle = (self.robot.lower + self.robot.upper) / 2
-        turns = np.floor((end - middle + np.pi) / (2 * np.pi))
-        moved = np.where(limits.lower < limits.upper, end, end - 2 * np.pi * turns)
+        turns = np.floor((end - middle + np.pi) / TURN)
+        moved = np.where(limits.lower < limits.upper, end, end - TURN * turns)
         return moved[self._arm]
 
     def _exact(self, targets: TargetBatch, found: list[_Found]) -> list[_Found]:
@@ -483,7 +483,8 @@ class ArmBranches:
             ends = np.concatenate([starts, stops])
             starts, stops = np.split(_ends(ends, positions[outer], np.tile(rows, 2), margins), 2)
         stretches = zip(rows.tolist(), starts.tolist(), stops.tolist(), strict=True)
-        return [self._branch(row, ends) for row, *ends in self._joined(list(stretches))]
+        joined = self._joined(list(stretches))
+        return [self._branch(row, (first, last)) for row, first, last in joined]
 
     def arms(self, palm: Array, branch: ArmBranch, values: Array) -> Array:
         """Configurations (k, n) [rad] of a branch at values (k,) of the redundancy."""
@@ -571,11 +572,10 @@ class ArmBranches:
             joined += own
         return joined
 
-    def _branch(self, row: int, stretch: tuple[float, float] | list[float] | None) -> ArmBranch:
+    def _branch(self, row: int, stretch: tuple[float, float] | None) -> ArmBranch:
         number, root = divmod(row, self.family.roots)
         signs = dict(zip(self.family.parts, SIGNS[number], strict=True))
-        ends = None if stretch is None else (stretch[0], stretch[1])
-        return ArmBranch(**signs, swivel=ends, root=root)
+        return ArmBranch(**signs, swivel=stretch, root=root)
 
 
 def _breakpoints(family: ArmFamily) -> ca.Function | None:

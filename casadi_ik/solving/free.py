@@ -43,7 +43,7 @@ from casadi_ik.solving.trials import (
     LocalRefinement,
     best_of_each,
     carried,
-    first_of_each,
+    largest_of_each,
     other_trunks,
     palms_of,
 )
@@ -293,7 +293,7 @@ class FreeSearch:
             every, of, room = self._near
             every, of = np.concatenate([every, q]), np.concatenate([of, owner])
             room = np.concatenate([room, surplus])
-            some = first_of_each(of, np.lexsort((-room, of)), PARAMETERS.near)
+            some = largest_of_each(of, room, PARAMETERS.near)
             self._near = every[some], of[some], room[some]
         kept = np.flatnonzero(surplus >= -ROUNDING)
         if len(kept):
@@ -431,10 +431,10 @@ class FreeSearch:
 
     def _find_nearest(self, rows: NDArray[np.intp]) -> None:
         """The answers with most room, of the hands with most."""
-        q, owner, surplus = self._hands_of(rows)
         if self.arm_search is None:
             return
-        kept = first_of_each(owner, np.lexsort((-surplus, owner)), 1)
+        q, owner, surplus = self._hands_of(rows)
+        kept = largest_of_each(owner, surplus, 1)
         found, mine, _ = self._arms(q[kept], owner[kept], surplus[kept], self.query, CLEARANCE)
         self.take(np.concatenate([found, q[kept]]), np.concatenate([mine, owner[kept]]))
 
@@ -566,11 +566,7 @@ class FreeSearch:
             possible[owner[query.rows(owner).free(q)]] = True
             return possible
         kept = np.flatnonzero(query.rows(owner).held.free(q))
-        kept = kept[
-            first_of_each(
-                owner[kept], np.lexsort((-surplus[kept], owner[kept])), PARAMETERS.hopeful
-            )
-        ]
+        kept = kept[largest_of_each(owner[kept], surplus[kept], PARAMETERS.hopeful)]
         any_room = np.full(len(kept), np.inf)
         _, mine, _ = self._arms(q[kept], owner[kept], any_room, query, "limits")
         possible[mine] = True

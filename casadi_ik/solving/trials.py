@@ -338,6 +338,11 @@ def best_of_each(owner: NDArray[np.intp], value: Array, than: Array) -> NDArray[
     return last[value[last] > than[owner[last]]]
 
 
+def largest_of_each(owner: NDArray[np.intp], value: Array, count: int) -> NDArray[np.intp]:
+    """The rows of so many of the largest values (m,) of each owner (m,), owner by owner."""
+    return first_of_each(owner, np.lexsort((-value, owner)), count)
+
+
 def first_of_each(owner: NDArray[np.intp], order: NDArray[np.intp], count: int) -> NDArray[np.intp]:
     """So many rows of each owner, the first in an order that goes owner by owner."""
     sorted_owner = owner[order]

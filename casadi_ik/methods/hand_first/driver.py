@@ -32,10 +32,7 @@ from casadi_ik.kernels.loop import FOREVER, SLOTS, UNBEGUN, Followed
 from casadi_ik.methods.common.contact_fit import fresh_fit
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.seeds import FEATURES, Seeds
-from casadi_ik.methods.hand_first.state import (
-    HandFirstLayouts,
-    terms,
-)
+from casadi_ik.methods.hand_first.state import HandFirstLayouts, terms
 from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.problem.method import Outcome, Quick
 from casadi_ik.problem.status import Phase, Status
@@ -167,7 +164,7 @@ class SearchPlan:
         return {
             "N_FINGERS": len(robot.fingers),
             "N_MOTORS": len(robot.actuators),
-            "N_HAND": len(layouts.robot.hand_actuators),
+            "N_HAND": len(robot.hand_actuators),
             "N_TERMS": terms(robot).size,
             "N_STATE": layouts.state.size,
             "N_PARAMETERS": layouts.parameters.size,
@@ -304,7 +301,7 @@ class SearchPlan:
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         robot, seeds = self.layouts.robot, self.seeds
-        hand, spreads = list(self.layouts.robot.hand_actuators), seeds.spreads
+        hand, spreads = list(robot.hand_actuators), seeds.spreads
         lower, upper = seeds.anywhere_bounds(self.enforce_limits)
         fresh, state = fresh_fit(), self.layouts.state
         return {
@@ -397,7 +394,7 @@ class Searches:
         self._find_postures: Any = library["casadi_ik_postures"]
         self._follow = ctypes.cast(library["casadi_ik_follow"], ctypes.c_void_p).value
         self._memory = searches = np.zeros(count, dtype=_form(plan))
-        self._kept = self._called(plan, searches, plan.kernels)
+        self._kept = _called(plan, searches, plan.kernels)
         for i, side in enumerate(plan.sides):
             self._kept += self._hands_of(side, i)
         f = len(robot.fingers)
@@ -409,27 +406,16 @@ class Searches:
         self.state, self.parameters = one["state"], one["parameters"]
         self.postures = one["postures"].reshape(plan.options.candidates, -1)
         self._one = one
-        self._labels = plan.layouts.labels
         self._counts = self.state[plan.layouts.state.slice("counts")]
-        self._address = ctypes.c_void_p(memory(searches.view(np.uint8)))
+        self._base = memory(searches.view(np.uint8))
+        self._address = ctypes.c_void_p(self._base)
         # An entry of a record costs as much as a tenth of a solve: these are read in every one.
-        base, offsets = memory(searches.view(np.uint8)), searches.dtype.fields or {}
+        offsets = searches.dtype.fields or {}
         self._most, self._iterations, self._restarts, self._status, self._paused = (
-            ctypes.c_int64.from_address(base + offsets[name][1])
+            ctypes.c_int64.from_address(self._base + offsets[name][1])
             for name in ("most", "iterations", "restarts", "status", "paused")
         )
-        self._beyond = ctypes.c_double.from_address(base + offsets["beyond"][1])
-
-    def _called(
-        self, plan: SearchPlan, searches: NDArray[Any], kernels: dict[str, Any]
-    ) -> tuple[Any, ...]:
-        """Write down what searches call; returns what has to be kept meanwhile."""
-        tables = plan.seeds.tables(plan.enforce_limits)
-        for i, table in enumerate(tables):
-            searches["tiles"][:, i] = memory(table.lookup.tiles)
-        for name, kernel in kernels.items():
-            searches[name] = ctypes.cast(kernel.entry, ctypes.c_void_p).value
-        return kernels, tables, searches
+        self._beyond = ctypes.c_double.from_address(self._base + offsets["beyond"][1])
 
     def _hands_of(self, plan: SearchPlan, place: int) -> tuple[Any, ...]:
         """Memory of a side's searches for hands, one for each search of the body."""
@@ -437,7 +423,7 @@ class Searches:
         if library is None:
             raise KernelError(f"{name}: no compiler, and no kernel made ahead")
         own = np.zeros(len(self._memory), dtype=_form(plan))
-        kept = self._called(plan, own, plan.of_hands)
+        kept = _called(plan, own, plan.of_hands)
         step = own.dtype.itemsize
         first = memory(own.view(np.uint8))
         self._memory["sides"][:, place] = first + step * np.arange(len(own))
@@ -557,15 +543,12 @@ class Searches:
             np.empty(count, dtype=np.int64),
         ]
         step = 0 if given.ndim == 1 else given.shape[1]
-        job = (ctypes.c_int64 * 11)(
-            self._address.value or 0, *map(memory, asked), step, *map(memory, answers)
-        )
+        job = (ctypes.c_int64 * 11)(self._base, *map(memory, asked), step, *map(memory, answers))
         fields: Any = self._memory.dtype.fields
-        base = self._address.value or 0
         result = plan.solve.run_followed(
             Followed(
-                states=base + fields["state"][1],
-                parameters=base + fields["parameters"][1],
+                states=self._base + fields["state"][1],
+                parameters=self._base + fields["parameters"][1],
                 step=self._memory.dtype.itemsize // 8,
                 slots=len(self._memory),
                 follow=self._follow or 0,
@@ -585,6 +568,16 @@ class Searches:
             phases=dict(zip(self.plan.layouts.labels, counts.astype(np.int64).T, strict=True)),
             rows=result.rows,
         )
+
+
+def _called(plan: SearchPlan, searches: NDArray[Any], kernels: dict[str, Any]) -> tuple[Any, ...]:
+    """Write down what searches call; returns what has to be kept meanwhile."""
+    tables = plan.seeds.tables(plan.enforce_limits)
+    for i, table in enumerate(tables):
+        searches["tiles"][:, i] = memory(table.lookup.tiles)
+    for name, kernel in kernels.items():
+        searches[name] = ctypes.cast(kernel.entry, ctypes.c_void_p).value
+    return kernels, tables, searches
 
 
 class SearchPool:

@@ -446,9 +446,9 @@ class HandFirstMethod(LoopedMethod):
             states[:, layout.slice("candidate")] = 0.0
         return states, parameters
 
-    def run_rows(self, states: Array, parameters: Array, trace: bool = False) -> LoopResult:
+    def run_rows(self, states: Array, parameters: Array) -> LoopResult:
         """Run the compiled loop on rows as made by `rows`."""
-        return self.kernel.run(states, parameters, self.max_iterations, trace)
+        return self.kernel.run(states, parameters, self.max_iterations)
 
     def terms(self, targets: TargetBatch) -> Array:
         """What `beginning` calls terms; kept, since making them costs as much as a solve."""
