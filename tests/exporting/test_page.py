@@ -281,7 +281,7 @@ def two_hands_hold(page: Page) -> None:
 
 
 def as_in_python(module: Path) -> None:
-    """The exported module gives the stored answers bit for bit, in a scene too."""
+    """The exported module gives the stored answers bit for bit, in its scene if it has one."""
     done = subprocess.run(["node", "test.mjs"], cwd=module, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     said = json.loads(done.stdout)
@@ -332,10 +332,7 @@ def test_a_hand_without_a_scene(tmp_path):
     robot = ik.load_robot("ar10")
     module = tmp_path / "module"
     write_folder(module, wasm_project(robot, "arm"))
-    done = subprocess.run(["node", "test.mjs"], cwd=module, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
-    said = json.loads(done.stdout)
-    assert (said["targets"], said["wrong"], said["refused"]) == (1000, 0, True)
+    as_in_python(module)
 
     (module / "use.mjs").write_text(WRAPPER)
     done = subprocess.run(["node", "use.mjs"], cwd=module, capture_output=True, text=True)

@@ -175,10 +175,11 @@ def own_errors(kind, data, frames):
 @every_kind
 def test_errors_are_distances_and_angles(robot, kind, rng):
     """Of the residual, of the rotation vectors, and as they are measured: all three agree."""
+    place, facing = kind.conditions
     for q, other in robot.random(rng, 10).reshape(5, 2, 14):
         data, rows = data_at(robot, other, rng), ContactRows((kind,) * 3)
-        p = parameters(data, np.ones((3, 2)))
-        distance, angle = own_errors(kind, data, robot.contact_frames(q))
+        p, frames = parameters(data, np.ones((3, 2))), robot.contact_frames(q)
+        distance, angle = own_errors(kind, data, frames)
         residual = ca.DM(number(whole_residual(robot.description, rows, ca.SX(q), p)))
         positions, chords = rows.errors(residual)
         np.testing.assert_allclose(number(positions).ravel(), distance, atol=1e-9)
@@ -187,15 +188,6 @@ def test_errors_are_distances_and_angles(robot, kind, rng):
         for i in range(3):
             assert np.linalg.norm(number(places[i])) * LENGTH == pytest.approx(distance[i])
             assert np.linalg.norm(number(facings[i])) == pytest.approx(angle[i])
-
-
-@every_kind
-def test_what_a_condition_measures(robot, kind, rng):
-    """The third way to the same numbers, on vectors alone."""
-    for q, other in robot.random(rng, 10).reshape(5, 2, 14):
-        data, frames = data_at(robot, other, rng), robot.contact_frames(q)
-        distance, angle = own_errors(kind, data, frames)
-        place, facing = kind.conditions
         for i, frame in enumerate(frames):
             tip = {"point": frame[:3, 3], "normal": frame[:3, 0], "tangent": frame[:3, 1]}
             tip["pad"] = RADIUS * frame[:3, 0]

@@ -23,11 +23,15 @@ def solver_of(robot):
     return ik.Solver(ik.load_robot(robot), scene=ik.load_scene("table"))
 
 
+def surface_of(folder, mesh):
+    mesh.export(folder / "mesh.stl")
+    return ik.load_surface(folder / "mesh.stl")
+
+
 @pytest.fixture(scope="module")
 def surface(tmp_path_factory):
-    path = tmp_path_factory.mktemp("touch") / "can.stl"
-    trimesh.creation.cylinder(0.033, 0.1, sections=128).export(path)
-    return ik.load_surface(path)
+    can = trimesh.creation.cylinder(0.033, 0.1, sections=128)
+    return surface_of(tmp_path_factory.mktemp("touch"), can)
 
 
 @pytest.fixture(scope="module", params=["panda+panda_hand", "panda+allegro_right"])
@@ -423,17 +427,15 @@ def test_a_function_may_rank(surface):
 
 
 def test_what_is_too_large_says_so(tmp_path):
-    trimesh.creation.box((0.5, 0.5, 0.5)).export(tmp_path / "box.stl")
-    solver = ik.Solver(ik.load_robot("panda+panda_hand"))
-    found = solver.grasps_of(ik.load_surface(tmp_path / "box.stl"), PLACE)
+    box = surface_of(tmp_path, trimesh.creation.box((0.5, 0.5, 0.5)))
+    found = ik.Solver(ik.load_robot("panda+panda_hand")).grasps_of(box, PLACE)
     assert not len(found)
     assert "no two patches" in found.reason
 
 
 def test_the_search_ends_when_nothing_new_is_found(tmp_path):
-    trimesh.creation.box((0.012, 0.012, 0.012)).export(tmp_path / "cube.stl")
-    solver = ik.Solver(ik.load_robot("panda+panda_hand"))
-    found = solver.grasps_of(ik.load_surface(tmp_path / "cube.stl"), PLACE)
+    cube = surface_of(tmp_path, trimesh.creation.box((0.012, 0.012, 0.012)))
+    found = ik.Solver(ik.load_robot("panda+panda_hand")).grasps_of(cube, PLACE)
     assert 0 < len(found) < 200
     assert found.counts["attempts"] < 500_000  # of a million
 
@@ -455,15 +457,10 @@ def test_bad_questions_are_refused(surface, asked, expected):
         solver_of("panda+panda_hand").grasps_of(surface, **{"pose": PLACE, **asked})
 
 
-def written(tmp_path, mesh):
-    mesh.export(tmp_path / "mesh.stl")
-    return tmp_path / "mesh.stl"
-
-
 def test_a_mesh_that_is_inside_out_is_turned_and_said(tmp_path, surface):
     mesh = trimesh.creation.cylinder(0.033, 0.1, sections=128)
     mesh.invert()
-    turned = ik.load_surface(written(tmp_path, mesh))
+    turned = surface_of(tmp_path, mesh)
     assert ((turned.faces * turned.points).sum(axis=1) > 0).all()
     assert turned.notes == ("the mesh was inside out: its triangles are turned",)
     assert not surface.notes
@@ -475,7 +472,7 @@ def test_a_mesh_that_is_inside_out_is_turned_and_said(tmp_path, surface):
 def test_an_open_mesh_serves_and_is_said(tmp_path):
     mesh = trimesh.creation.cylinder(0.033, 0.1, sections=128)
     mesh.update_faces(mesh.triangles_center[:, 2] < 0.049)
-    opened = ik.load_surface(written(tmp_path, mesh))
+    opened = surface_of(tmp_path, mesh)
     assert opened.notes == ("the mesh is open: 128 edges have one triangle only",)
     assert len(solver_of("panda+panda_hand").grasps_of(opened, PLACE, limit=3, among=3)) == 3
 
@@ -486,15 +483,15 @@ def test_triangles_that_face_opposite_ways_are_refused(tmp_path):
     faces[::2] = faces[::2, ::-1]
     mixed = trimesh.Trimesh(mesh.vertices, faces, process=False)
     with pytest.raises(errors.InputError, match=r"face opposite ways at .* expected outward"):
-        ik.load_surface(written(tmp_path, mixed))
+        surface_of(tmp_path, mixed)
 
 
 def test_sheets_and_specks_are_no_bodies(tmp_path):
     sheet = trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0.1]], [[0, 1, 2]])
     with pytest.raises(errors.InputError, match="found a flat sheet"):
-        ik.load_surface(written(tmp_path, sheet))
+        surface_of(tmp_path, sheet)
     with pytest.raises(errors.InputError, match="found a size of 1e-06 m, expected metres"):
-        ik.load_surface(written(tmp_path, trimesh.creation.box((1e-6, 1e-6, 1e-6))))
+        surface_of(tmp_path, trimesh.creation.box((1e-6, 1e-6, 1e-6)))
 
 
 @pytest.mark.parametrize(
@@ -514,24 +511,31 @@ def test_what_is_no_mesh_is_refused(tmp_path, text, expected):
 def test_many_triangles_are_sampled(tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=7, radius=0.035)
     assert len(ball.faces) > 300_000
-    surface = ik.load_surface(written(tmp_path, ball))
+    surface = surface_of(tmp_path, ball)
     assert surface.inside.all()
     assert np.abs(np.linalg.norm(surface.points, axis=1) - 0.035).max() < 1e-5
 
 
 def test_millimetres_are_told(tmp_path):
-    trimesh.creation.cylinder(33, 100).export(tmp_path / "can.stl")
     with pytest.raises(errors.InputError, match=r"scale=0\.001 is for millimetres"):
-        ik.load_surface(tmp_path / "can.stl")
-    assert ik.load_surface(tmp_path / "can.stl", scale=0.001).size == pytest.approx(0.137, abs=2e-3)
+        surface_of(tmp_path, trimesh.creation.cylinder(33, 100))
+    found = ik.load_surface(tmp_path / "mesh.stl", scale=0.001)
+    assert found.size == pytest.approx(0.137, abs=2e-3)
 
 
-def test_specks_that_a_scanner_leaves_are_no_parts(tmp_path):
+@pytest.mark.parametrize(
+    "corners",
+    [
+        pytest.param([[0, 0, 0.06], [1e-3, 0, 0.06], [0, 1e-3, 0.06]], id="speck of a scanner"),
+        pytest.param([[-0.02, 0.034, -0.03], [0.02, 0.034, -0.03], [0, 0.034, 0.03]], id="label"),
+    ],
+)
+def test_what_stands_off_costs_no_grasps(tmp_path, corners):
+    """A speck is no part, a label a thin one."""
     body = trimesh.creation.cylinder(0.033, 0.1, sections=64)
-    speck = trimesh.Trimesh([[0, 0, 0.06], [1e-3, 0, 0.06], [0, 1e-3, 0.06]], [[0, 1, 2]])
-    trimesh.util.concatenate([body, speck]).export(tmp_path / "scan.stl")
+    both = trimesh.util.concatenate([body, trimesh.Trimesh(corners, [[0, 1, 2]])])
     found = solver_of("panda+panda_hand").grasps_of(
-        ik.load_surface(tmp_path / "scan.stl"), PLACE, limit=3, among=3
+        surface_of(tmp_path, both), PLACE, limit=3, among=3
     )
     assert len(found) == 3
 
@@ -543,18 +547,6 @@ def test_what_is_out_of_reach_is_given_up(surface):
     assert not len(found)
     assert "none came to: arm reaches" in found.reason
     assert found.counts["attempts"] < 100_000
-
-
-def test_a_label_that_stands_off_is_a_thin_part(tmp_path):
-    label = trimesh.Trimesh(
-        [[-0.02, 0.034, -0.03], [0.02, 0.034, -0.03], [0, 0.034, 0.03]], [[0, 1, 2]]
-    )
-    body = trimesh.creation.cylinder(0.033, 0.1, sections=64)
-    trimesh.util.concatenate([body, label]).export(tmp_path / "labelled.stl")
-    found = solver_of("panda+panda_hand").grasps_of(
-        ik.load_surface(tmp_path / "labelled.stl"), PLACE, limit=3, among=3
-    )
-    assert len(found) == 3
 
 
 def test_fingers_lean_on_what_they_envelop(surface, tmp_path):

@@ -61,3 +61,11 @@ def description(tmp_path: Path) -> Path:
     path = tmp_path / "my_hand.yaml"
     path.write_text(YAML)
     return path
+
+
+@pytest.fixture
+def pads(description: Path) -> Iterator[viewing.Viewer]:
+    """The page of these pads."""
+    viewer = viewing.view_pads(description)
+    yield viewer
+    viewer.stop()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,15 +11,8 @@ import casadi_ik as ik
 from casadi_ik import errors, viewing
 
 
-@pytest.fixture
-def viewer(description: Path) -> Iterator[viewing.Viewer]:
-    viewer = viewing.view_pads(description)
-    yield viewer
-    viewer.stop()
-
-
-def test_dragged_pads_are_saved_and_read_back(viewer: viewing.Viewer, description: Path) -> None:
-    page = viewer.page
+def test_dragged_pads_are_saved_and_read_back(pads: viewing.Viewer, description: Path) -> None:
+    page = pads.page
     before = ik.load_robot(description)
     points, normals = before.contacts(before.home)
     pose = page.asked.held["first"].control.copy()
@@ -44,8 +36,8 @@ def test_dragged_pads_are_saved_and_read_back(viewer: viewing.Viewer, descriptio
     assert page.changed == []
 
 
-def test_a_pad_goes_onto_the_skin(viewer: viewing.Viewer) -> None:
-    page = viewer.page
+def test_a_pad_goes_onto_the_skin(pads: viewing.Viewer) -> None:
+    page = pads.page
     page.onto_skin("first")
     assert page.work.settle()
     assert page.said == ""

@@ -7,7 +7,6 @@ import subprocess
 import sys
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -71,13 +70,6 @@ def asked(url: str, **headers: str) -> tuple[int, bytes]:
             return answer.status, answer.read()
     except urllib.error.HTTPError as error:
         return error.code, error.read()
-
-
-@pytest.fixture
-def pads(description: Path) -> Iterator[viewing.Viewer]:
-    viewer = viewing.view_pads(description)
-    yield viewer
-    viewer.stop()
 
 
 def dragged(viewer: viewing.Viewer) -> dict[str, Any]:
