@@ -279,7 +279,7 @@ class AlternativeFinder:
             return limits.clip(whole)
 
         def valued(arms: Array) -> Array:
-            return self._valued(with_arm(arms), q0, prefer, query, True)
+            return self._valued(with_arm(arms), q0, prefer, query, self._arm)
 
         branches = self._branches.find(palm, lower, upper)
         found = [
@@ -357,15 +357,14 @@ class AlternativeFinder:
         q0: Array,
         prefer: str,
         query: CollisionQuery | None,
-        arm_only: bool = False,
+        columns: list[int] | None = None,
     ) -> Array:
-        """(k,) `score`, of margins over the arm only if asked; what is not free comes last."""
-        columns = self._arm if arm_only else None
-        if query is None:
-            return self.score(q, q0, prefer, columns)
-        surplus = query.check(q).surplus
+        """(k,) `score`; what is not free comes last."""
+        surplus = None if query is None else query.check(q).surplus
         score = self.score(q, q0, prefer, columns, surplus)
-        return np.where(surplus >= 0, score, surplus - SEEKING.blocked)
+        return (
+            score if surplus is None else np.where(surplus >= 0, score, surplus - SEEKING.blocked)
+        )
 
     def score(
         self,
