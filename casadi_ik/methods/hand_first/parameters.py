@@ -155,10 +155,11 @@ class BodyParameters:
         far_trunks: Trunks times the least cost they came to (1: 10 cm or 1 rad) from which on a
             target is out of reach. Of 200,000 targets of an H1-2 at 1e-6 near limits those that
             are solved last have 59, 42 and 37, all but eight less than 15; at 5 mm 150 lost one of
-            200,000, 400 none. One arm's on a trunk never is: so 20 of 1,000,000 of an LWR on a
-            mobile base near limits were lost at 5 mm, some even at 5,000.
+            200,000, 400 none.
         loose_trunks: The same where contacts leave palms a freedom. Without, two Pandas with
             Allegros look for a second for what is 2 m away.
+        one_arm_trunks: The same of one arm on a trunk. Of 1,000,000 targets of an LWR on a mobile
+            base near limits 20 were lost with 400 at 5 mm, some even with 5,000.
         at_limits: Part of a motor's range that every second trunk moves to its limits.
         patience: Steps of trunk and arms with little gain before they are given up; with 3 instead
             of 8 three times as many of these targets are missed.
@@ -182,6 +183,7 @@ class BodyParameters:
     least_trunks: int = 120
     far_trunks: float = 400.0
     loose_trunks: float = 4000.0
+    one_arm_trunks: float = 40000.0
     at_limits: float = 0.5
     patience: int = 8
     budget: int = 25
