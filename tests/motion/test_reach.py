@@ -53,10 +53,13 @@ def check_motion(robot, grasp, found, q0):
     return part
 
 
-def test_straight_there_then_straight_on_then_closing(robot, grasp):
-    found = ik.Solver(robot).reach(grasp, distance=0.1, opening=0.025)
+@pytest.mark.parametrize("scene", [None, ik.Scene()], ids=["no scene", "nothing in it"])
+def test_straight_there_then_straight_on_then_closing(robot, grasp, scene):
+    grasp, solver = ik.Grasp(grasp.contacts), ik.Solver(robot, scene=scene)
+    found = solver.reach(grasp, distance=0.1, opening=0.025)
     part = check_motion(robot, grasp, found, robot.home)
-    assert found.clearance is None
+    assert (found.clearance is None) == (scene is None)
+    assert solver.approach(grasp).success
     motion = found.motion
     coming = robot.palm(motion.q[part == "coming"])
     way = coming[:, :3, 3] - coming[-1, :3, 3]
