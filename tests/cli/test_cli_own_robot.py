@@ -200,7 +200,12 @@ def test_palms_of_a_body_are_named(run: Command, tmp_path: Path) -> None:
     ):
         refused = run("import", path, "--palm", *words, "--out", tmp_path / "other.yaml")
         assert says in refused.error
-    assert not (tmp_path / "other.yaml").exists()
+    name = '<joint name="right_elbow_joint" type="revolute">'
+    path.write_text(path.read_text().replace(name, f'{name}<mimic joint="left_elbow_joint"/>'))
+    other = tmp_path / "other.yaml"
+    error = run("import", path, "--palm", *palms, "--out", other).error
+    assert error.startswith(f"{other}: sides.right: joint 'right_elbow_joint' follows motor ")
+    assert not list(tmp_path.glob("*other*"))
 
 
 def test_joints_without_limits_get_assumed_ones(run: Command, tmp_path: Path) -> None:
