@@ -81,7 +81,7 @@ class MovingSolver:
         """
         start = self._request.start(q0)
         rates = rates_of(self.robot, velocity, acceleration)
-        comfortable = start if posture is None else self._request.start(posture)
+        comfortable = start if posture is None else self._request.start(posture, "posture")
         return Follower(
             FollowPlan(
                 self._request,

@@ -165,13 +165,14 @@ def test_trunk_and_sides_are_found_in_a_file(in_a_file: Path):
         ("{palm: left", "{thumb: toe, palm: left", "sides.left.thumb: side 'left' has no finger"),
         ("sides:", "trunk: nowhere\nsides:", "trunk: unknown link 'nowhere'; known: base"),
         ("sides:", "trunk: base\nsides:", "joint 'waist' beyond it moves every palm; expected"),
+        ("two.urdf", "tow.urdf", "robot.file: {folder}/tow.urdf: no such file"),
         ("two.urdf", "two.urdf, palm: torso", "robot.palm: found one, expected it under each of"),
         ("sides:", "colour: red\nsides:", "colour"),
     ],
 )
 def test_what_is_wrong_is_said_in_a_line(in_a_file: Path, old: str, new: str, said: str):
     in_a_file.write_text(FILE.replace(old, new, 1))
-    refused(in_a_file, said)
+    refused(in_a_file, said.replace("{folder}", str(in_a_file.parent)))
 
 
 def test_arms_stand_at_places_that_are_all_given(tmp_path: Path):
