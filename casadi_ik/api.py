@@ -23,7 +23,7 @@ from casadi_ik.logs import Compression, Keep
 from casadi_ik.logs.writer import recorder_of
 from casadi_ik.motion.moving import MovingSolver
 from casadi_ik.problem.clearance import Clearances, SceneCheck
-from casadi_ik.problem.request import Request, hand_postures, one_palm, tolerances_by_finger
+from casadi_ik.problem.request import Request, hand_postures, tolerances_by_finger
 from casadi_ik.problem.targets import LIMITS, TargetBatch, Tolerance
 from casadi_ik.registry import METHODS, build_method, with_finger_step
 from casadi_ik.solving.choose import choose
@@ -418,7 +418,7 @@ class Solver(MovingSolver):
         Raises:
             InputError: No rigid poses, or postures that are not all there or beyond limits.
             UnknownNameError: No such actuator.
-            UnsupportedError: The method is not hand-first, or the robot has several palms.
+            UnsupportedError: The method is not hand-first, or the robot is a body.
 
         Example:
             >>> q = robot.random(np.random.default_rng(4), 50)
@@ -427,7 +427,7 @@ class Solver(MovingSolver):
             >>> bool(batch.success.all()), bool(batch.palm_position_error.max() < 1e-3)
             (True, True)
         """
-        one_palm(self._request.robot, "solve_palms")
+        self.robot.description.one_hand("solve_palms")
         poses = checked_pose(palms, "palms")
         if poses.ndim != 3:
             raise InputError(f"palms: found shape {poses.shape}, expected (k, 4, 4)")

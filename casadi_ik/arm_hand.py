@@ -317,23 +317,23 @@ class ArmHand(Shown):
 
         Args:
             q: (n,) or (k, n) actuator positions.
-            side: Of a body, whose palm.
+            side: Of a body, whose palm; None: the only one.
 
         Raises:
-            InputError: See `configuration`; or a body without a side.
+            InputError: See `configuration`; or a body of several sides and none said.
             UnknownNameError: No such side.
 
         Example:
             >>> robot.palm(robot.home).shape
             (4, 4)
         """
-        sides = self.description.sides
+        if side is None and len(self.sides) == 1:
+            (side,) = self.sides
         if side is not None:
             asked = self.description.side_named(side)
             return self.links(q)[asked.palm_link] @ asked.palm_placement
-        if sides:
-            names = ", ".join(one.name for one in sides)
-            raise InputError(f"side: found None, expected one of {names}")
+        if self.sides:
+            raise InputError(f"side: found None, expected one of {', '.join(self.sides)}")
         (pose,) = self._kernels.palm(_for_kernels(self.configuration(q)))
         return pose
 

@@ -82,6 +82,9 @@ def follow(said: Said) -> Answer:
     if not name:
         raise InputError("--robot: missing, expected it here or as robot in --retarget")
     robot = the_robot(name)
+    with located("--retarget" if said.retarget is None else said.retarget):
+        config = config or usual_retarget(robot)
+        Retargeter(config, robot)  # is of the robot's sides and fingers
     sides = [side.name for side in robot.description.sides]
     frames = read_frames(path, len(robot.fingers), sides)
     inputs = [path] + ([Path(said.retarget)] if said.retarget else [])
@@ -90,8 +93,7 @@ def follow(said: Said) -> Answer:
     solver = the_solver(said, robot)
     start = np.asarray(the_start(said, robot) or _start(solver, frames))
     follower = solver.follow(start, said.period)
-    with located("--retarget" if said.retarget is None else said.retarget):
-        retargeter = Retargeter(config or usual_retarget(robot), robot, start)
+    retargeter = Retargeter(config, robot, start)
     began = time.perf_counter()
     with located(str(path)):
         motion = follow_frames(robot, follower, frames, retargeter)

@@ -33,7 +33,7 @@ from casadi_ik.exporting.project import (
 )
 from casadi_ik.importing import imported
 from casadi_ik.importing.capsules import worst
-from casadi_ik.importing.imported import Imported, largest_difference
+from casadi_ik.importing.imported import Imported, largest_difference, no_palm
 from casadi_ik.kernels import cache_directory
 from casadi_ik.kernels.compiler import find_compiler
 
@@ -195,9 +195,11 @@ def _import_report(
     for reason in dict.fromkeys(lines.hand.why.values()):
         still = ", ".join(name for name, why in lines.hand.why.items() if why == reason)
         pairs["locked" if "locked" not in pairs else "locked too"] = f"{still}: {reason}"
-    for name, value in differences.items():
-        verdict = "as its own library has it" if value <= SAME else "NOT as its own library has it"
-        pairs[f"check {name}"] = f"{verdict}: poses differ by at most {value:.1e}"
+    pairs["check"] = "\n".join(
+        f"{name}: {'' if value <= SAME else 'NOT '}as its own library has it: poses differ by at "
+        f"most {value:.1e}"
+        for name, value in differences.items()
+    )
     if lines.shapes:
         shapes = sum(map(len, lines.shapes.values()))
         pairs["shapes"] = (
@@ -212,7 +214,9 @@ def _import_report(
         normal = " ".join(f"{round(value, 2) + 0.0:.2f}" for value in pad.normal.tolist())
         called = f"{side}_{name}" if side else name
         rows.add_row(called, pad.link, str(len(branch.chain)), point, normal)
-    notes = list(lines.notes)
+    asked = [hand.link for hand in lines.hands if hand.how == "--palm"]
+    notes = [f"--palm: {why}" for link in asked if (why := no_palm(found.files[1], link))]
+    notes += lines.notes
     if any(map(is_searched, arms)):
         notes.append(
             "the arm has no known closed form: it is searched, and a solve takes several times "

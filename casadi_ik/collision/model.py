@@ -293,8 +293,9 @@ def check_base(model: CollisionModel, scene: Scene, where: Array, names: Collect
                 for solid, place in item.parts
             ]
             if max(depths) > 0:
+                deep = f"stands {1e3 * max(depths):.1f} mm inside"
+                how = deep if max(depths) >= 0.05e-3 else "touches"
                 raise DescriptionError(
-                    f"{scene.name}: solids.{name}: stands {1e3 * max(depths):.1f} mm inside "
-                    f"{link!r}, which cannot move; expected it beside the robot's base "
-                    "(or the two under 'touching')"
+                    f"{scene.name}: solids.{name}: {how} {link!r}, which cannot move; "
+                    "expected it beside the robot's base (or the two under 'touching')"
                 )

@@ -101,9 +101,17 @@ def resolve_robot(
         return resolve(text, BODIES)
     if not path_like and plus and arm in shipped_names(BODIES):
         return resolve(arm, BODIES), resolve(hand, "hands")
+    arms, bodies = shipped_names("arms"), f"bodies: {', '.join(shipped_names(BODIES))}"
+    if not path_like and plus and arm not in arms:
+        listed = f"arms: {', '.join(arms)}; {bodies}"
+        body = did_you_mean(text, shipped_names(BODIES), listed)
+        raise UnknownNameError(
+            f"no shipped arm or body is called {arm!r}; {did_you_mean(arm, arms, body)} (or give "
+            "the path of a YAML file)"
+        )
     if not path_like and plus:
         return resolve(arm, "arms"), resolve(hand, "hands")
-    if not path_like and text in shipped_names("arms"):
+    if not path_like and text in arms:
         return resolve(text, "arms"), None
     if not path_like and text in shipped_names("hands") and text not in shipped_names("arm_hands"):
         return None, resolve(text, "hands")
@@ -111,7 +119,7 @@ def resolve_robot(
         return resolve(name_or_path, "arm_hands", beside)
     except UnknownNameError:
         known = [name for kind in KINDS for name in shipped_names(kind)]
-        listed = f"shipped: {', '.join(shipped_names('arm_hands'))}"
+        listed = f"shipped: {', '.join(shipped_names('arm_hands'))}; {bodies}"
         raise UnknownNameError(
             f"no shipped arm-hand is called {text!r}; {did_you_mean(text, known, listed)} (or give "
             "the path of a YAML file, or ARM+HAND of the catalogue, see casadi-ik robots)"

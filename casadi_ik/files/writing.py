@@ -22,6 +22,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from casadi_ik.errors import CasadiIKError
+
 HOUR, DAY = 3600.0, 86400.0
 
 
@@ -82,6 +84,8 @@ def part_of(target: Path) -> Path:
 def written_whole(path: Path) -> Iterator[Path]:
     """Gives a path to write to, and puts what was written in its place once it is complete.
 
+    An error of the package about what is written meanwhile names the path that was asked for.
+
     Raises:
         OSError: It cannot be written; nothing is left behind, and what stood there stays.
     """
@@ -91,6 +95,9 @@ def written_whole(path: Path) -> Iterator[Path]:
     try:
         yield part
         part.replace(target)
+    except CasadiIKError as error:
+        error.args = tuple(str(one).replace(str(part), str(path)) for one in error.args)
+        raise
     finally:
         with contextlib.suppress(OSError):
             part.unlink()

@@ -287,8 +287,8 @@ class Grasp:
         posture: A hand posture by actuator that realises the contacts, where one is known; with a
             palm the posture to take, a number for every motor that moves a finger [rad or m].
         palm: (4, 4) pose of the robot's palm frame in the base frame: then the hand is as the
-            posture has it, and only the arm is looked for. Of a body the poses by side: hands of
-            sides that are left out stay. None: the contacts say all.
+            posture has it, and only the arm is looked for. Of a body with several sides the poses
+            by side: hands of those that are left out stay. None: the contacts say all.
         pregrasp: The same hand before it closes, if it is known: a palm and a posture.
         squeeze: The same hand as it squeezes, if it is known: a palm and a posture.
 

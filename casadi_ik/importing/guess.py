@@ -88,9 +88,18 @@ def palms(tree: RobotTree) -> list[str]:
 
 def holds_arms(tree: RobotTree, palm: str) -> bool:
     """Whether what hangs on a link is rather arms than fingers."""
-    return any(
-        depth(tree, joint.child) + 1 >= GUESS.arm_joints for joint in moving_below(tree, palm)
-    )
+    return bool(ends_of_arms(tree, palm))
+
+
+def ends_of_arms(tree: RobotTree, palm: str) -> list[str]:
+    """Of chains below a link that are as long as arms, the links that carry their last joints."""
+    return [
+        joint.parent
+        for first in moving_below(tree, palm)
+        if depth(tree, first.child) + 1 >= GUESS.arm_joints
+        for joint in (first, *below(tree, first.child))
+        if joint.type != "fixed" and not moving_below(tree, joint.child)
+    ]
 
 
 def find_fingers(part: Part, palm: str) -> list[Branch]:

@@ -19,6 +19,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError, InputError, MissingExtraError
 from casadi_ik.importing.guess import (
     Branch,
+    ends_of_arms,
     find_fingers,
     guess_home,
     guess_pads,
@@ -90,12 +91,21 @@ def the_palm(tree: RobotTree, palm: str | None) -> tuple[str, str]:
     found = palms(tree)
     if not found:
         return tree.root, "there is a single chain of joints: the base"
-    if holds_arms(tree, found[0]):
-        raise InputError(
-            f"--palm: missing; from {found[0]!r} of {tree.path.name} go chains as long as arms: "
-            f"write the link that the fingers hang on, such as {', '.join(found[1:8] or found)}"
-        )
+    if why := no_palm(tree, found[0]):
+        raise InputError(f"--palm: missing; {why}")
     return found[0], "the first link from which several chains of joints go out"
+
+
+def no_palm(tree: RobotTree, link: str) -> str:
+    """What is said of a link on which rather arms than fingers hang; "" of any other."""
+    if link not in palms(tree) or not holds_arms(tree, link):
+        return ""
+    hands = [one for one in palms(tree) if not holds_arms(tree, one)]
+    such = list(dict.fromkeys(hands or ends_of_arms(tree, link)))
+    return (
+        f"from {link!r} of {tree.path.name} go chains as long as arms: write the link that the "
+        f"fingers hang on, such as {', '.join(such[:7])}"
+    )
 
 
 def the_palms(tree: RobotTree, asked: Sequence[str]) -> dict[str, tuple[str, str]]:
@@ -121,7 +131,9 @@ def the_palms(tree: RobotTree, asked: Sequence[str]) -> dict[str, tuple[str, str
         return {"": the_palm(tree, asked[0] if asked else None)}
     for link in asked:
         the_palm(tree, link)
-        if any(joint.child in asked for joint in below(tree, link)) or asked.count(link) > 1:
+        if asked.count(link) > 1:
+            raise InputError(f"--palm: {link!r} is given twice, expected one of each hand")
+        if any(joint.child in asked for joint in below(tree, link)):
             raise InputError(f"--palm: {link!r} carries another palm, expected hands side by side")
     names = [_side_name(link) for link, _ in several]
     if "" in names or len(set(names)) < len(names):

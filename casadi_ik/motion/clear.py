@@ -178,10 +178,9 @@ def between(query: CollisionQuery, q: Array, least: bool = False) -> Between:
     """
     count, n = max(len(q) - 1, 0), q.shape[1]
     poses = query.poses
-    if poses.ndim == 2 or len(poses) != len(q):
-        poses = np.broadcast_to(
-            poses.reshape(-1, *poses.shape[-2:])[:1], (len(q), *poses.shape[-2:])
-        )
+    if poses.ndim == 3 and len(poses) != len(q):
+        poses = poses[0]
+    poses = np.broadcast_to(poses, (len(q), *poses.shape[-2:]))
     looking = _Looking(query)
     free, found = np.ones(count, dtype=bool), np.full((count, 3), np.inf)
     found[:, 2] = -1

@@ -23,7 +23,7 @@ from casadi_ik.motion.motion import a_direction, length, rates_of, seconds, unbo
 from casadi_ik.motion.reach import Carried, Pace, Reach, WayPlan, move, place, reach
 from casadi_ik.motion.track import PathTracker, Track, track
 from casadi_ik.problem.contacts import by_kinds
-from casadi_ik.problem.request import Request, one_palm
+from casadi_ik.problem.request import Request
 from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import LIMIT_SLACK, judge
 from casadi_ik.solving.engine import Engine, Run
@@ -81,7 +81,7 @@ class MovingSolver:
         """
         start = self._request.start(q0)
         rates = rates_of(self.robot, velocity, acceleration)
-        comfortable = start if posture is None else self._request.start(posture)
+        comfortable = start if posture is None else self._request.start(posture, "posture")
         return Follower(
             FollowPlan(
                 self._request,
@@ -261,7 +261,8 @@ class MovingSolver:
         Raises:
             InputError: Bad numbers, or a grasp that does not say where its object is.
             MissingExtraError: toppra is not installed (extra `motion`).
-            UnsupportedError: The method is not hand-first, or no arm moves the palm.
+            UnsupportedError: The method is not hand-first, no arm moves the palm, or the robot is a
+                body.
 
         Example:
             >>> best = solver.choose([grasp])[0]
@@ -275,7 +276,7 @@ class MovingSolver:
         start, chosen, target = self._request.start(q0), held.grasp, one_pose(pose)
         if chosen.known_pose is None:
             raise InputError("held: found a grasp without a known object_pose, expected one")
-        one_palm(self.robot, "place")
+        self.robot.description.one_hand("place")
         if not self.robot.description.arm_actuators:
             raise UnsupportedError(f"place: {self.robot.name!r} has no arm that moves its palm")
         moved = target @ inverse(chosen.known_pose)

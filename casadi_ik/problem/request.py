@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.errors import InputError, UnknownNameError, UnsupportedError
+from casadi_ik.errors import InputError, UnknownNameError
 from casadi_ik.grasps import Contact, Grasp, Tolerance
 from casadi_ik.grasps.pose import Free, checked_pose
 from casadi_ik.problem.contacts import LENGTH, more_arrays
@@ -56,19 +56,6 @@ at least."""
 
 BEYOND = 1e-6
 """A posture may be so far beyond a limit [rad or m]; it is then at the limit."""
-
-
-def one_palm(robot: ArmHand, what: str) -> None:
-    """Whether a robot has one palm, as `what` needs it.
-
-    Raises:
-        UnsupportedError: It has several.
-    """
-    if robot.description.sides:
-        raise UnsupportedError(
-            f"{what}: {robot.name!r} has several palms ({', '.join(robot.sides)}), expected a "
-            f"robot with one, as robot.side({robot.sides[0]!r}) is"
-        )
 
 
 def hand_posture(robot: ArmHand, posture: Mapping[str, float], name: str = "posture") -> Array:
@@ -314,6 +301,12 @@ class Request:
                 raise InputError(f"grasp: found {type(grasp).__name__}, expected a Grasp")
         if not free and any(isinstance(grasp.object_pose, Free) for grasp in grasps):
             raise InputError("object_pose: found a Free pose, which only Solver.solve looks for")
+        if len(self.robot.sides) == 1:
+            (side,) = self.robot.sides
+            grasps = [
+                grasp if grasp.one_palm is None else replace(grasp, palm={side: grasp.one_palm})
+                for grasp in grasps
+            ]
         if any(isinstance(grasp.palm, Mapping) for grasp in grasps):
             grasps, held = self._with_palms_met(grasps)
             targets = self.of_grasps(grasps, None, prefer, free)

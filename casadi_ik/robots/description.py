@@ -167,14 +167,31 @@ class RobotDescription:
         """Name of the finger placed first.
 
         Raises:
-            UnsupportedError: The description names none.
+            UnsupportedError: The description names none, or it is a body, which has one by side.
         """
+        self.one_hand("thumb")
         if self.named_thumb is None:
             raise UnsupportedError(
                 f"robot {self.name!r} names no thumb, which is needed here; write 'thumb: FINGER' "
                 f"in its description, one of {', '.join(self.finger_names)}"
             )
         return self.named_thumb
+
+    def one_hand(self, what: str) -> None:
+        """See to it that this is no body, for what can do one arm with one hand alone.
+
+        Args:
+            what: What needs it, for the message.
+
+        Raises:
+            UnsupportedError: It is one.
+        """
+        if self.sides:
+            sides = ", ".join(side.name for side in self.sides)
+            raise UnsupportedError(
+                f"{what} is for one arm with one hand, found {self.name!r}, a body ({sides}); take "
+                f"robot.side({self.sides[0].name!r})"
+            )
 
     def __getstate__(self) -> dict[str, Any]:
         """Its fields alone: what was worked out of them so far is no part of what it is."""

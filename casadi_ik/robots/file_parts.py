@@ -104,9 +104,10 @@ def palm_frame(palm: str | LinkFrame) -> LinkFrame:
 
 def _opened(entry: Entry, key: str, beside: Path) -> tuple[RobotTree, str, str]:
     """The file, the description with the key, and the link that the part begins with."""
-    path = Path(entry.file).expanduser()
-    tree = read_tree(path if path.is_absolute() else beside.parent / path, entry.xacro)
-    where = f"{beside}: {key}"
+    path, where = beside.parent / Path(entry.file).expanduser(), f"{beside}: {key}"
+    if not path.exists():
+        raise DescriptionError(f"{where}.file: {path}: no such file")
+    tree = read_tree(path, entry.xacro)
     return tree, where, tree.known_link(entry.root or tree.root, f"{where}.root: {tree.path.name}")
 
 

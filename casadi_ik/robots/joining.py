@@ -547,27 +547,42 @@ def _motors_of(
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """The motors of a side's arm and hand: between the trunk's end and the palm, and below it."""
     to_palm = _moving(robot, palm)
-    carried = {one.name for one in below(robot, palm) if one.type != "fixed"}
-    beyond = carried.union(*(one.joints for one in fingers)) - {*to_palm}
     arm = _motors(robot, {*to_palm} - {*_moving(robot, end)})
-    return arm, tuple(name for name in _motors(robot, beyond) if name not in arm)
+    beyond = _motors(robot, _carried(robot, palm, fingers) - {*to_palm})
+    return arm, tuple(name for name in beyond if name not in arm)
+
+
+def _carried(robot: RobotDescription, palm: str, fingers: Iterable[Finger]) -> set[str]:
+    """The joints below a palm, and those of fingers."""
+    below_it = {one.name for one in below(robot, palm) if one.type != "fixed"}
+    return below_it.union(*(one.joints for one in fingers))
 
 
 def _check_motors(robot: RobotDescription, where: Path) -> None:
     """Every motor is of the trunk or of one side."""
-    owners = dict.fromkeys(robot.trunk, "the trunk")
+    trunk = {*_moving(robot, robot.trunk_link)}
+    places = {"trunk": ("the trunk", robot.trunk, trunk)}
     for side in robot.sides:
-        for motor in (*side.arm, *side.hand):
-            if motor in owners:
-                place = {robot.actuator_index(motor)}
-                moved = [one for one in robot.joint_names if robot.driving([one]) == place]
-                raise DescriptionError(
-                    f"{where}: sides.{side.name}: joint {moved[-1]!r} follows motor {motor!r}, "
-                    f"which is of {owners[motor]}; expected a motor of its own"
-                )
-            owners[motor] = f"side {side.name!r}"
+        carried = _carried(robot, side.palm_link, map(robot.finger, side.fingers))
+        own = {*_moving(robot, side.palm_link)} | carried
+        places[f"sides.{side.name}"] = f"side {side.name!r}", side.arm + side.hand, own - trunk
+    still = []
     for motor in robot.actuator_names:
-        if motor not in owners:
+        keys = [key for key, (_, motors, _) in places.items() if motor in motors]
+        if len(keys) > 1:
+            # Its own joint is called like the motor.
+            keys.sort(key=lambda key: motor not in places[key][2])
+            place = {robot.actuator_index(motor)}
+            others = [one for one in robot.joint_names if one in places[keys[1]][2]]
+            moved = [one for one in others if robot.driving([one]) == place]
             raise DescriptionError(
-                f"{where}: motor {motor!r} moves no side; write locked: {{{motor}: 0}} under robot"
+                f"{where}: {keys[1]}: joint {moved[-1]!r} follows motor {motor!r}, "
+                f"which is of {places[keys[0]][0]}; expected a motor of its own"
             )
+        if not keys:
+            still.append(f"{motor}: 0")
+    if still:
+        raise DescriptionError(
+            f"{where}: robot: found motors that move no side; write them under locked: "
+            f"{{{', '.join(still)}}}"
+        )

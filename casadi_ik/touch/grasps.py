@@ -20,7 +20,6 @@ from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import InputError
 from casadi_ik.grasps import Contact, Grasp, Tolerance
 from casadi_ik.grasps.pose import inverse, one_pose
-from casadi_ik.problem.request import one_palm
 from casadi_ik.progress import progress
 from casadi_ik.touch.candidates import (
     Candidates,
@@ -272,8 +271,8 @@ def grasps_of(
 
     Raises:
         InputError: Bad numbers, or no rigid pose.
-        UnsupportedError: The hand has one finger, robot or hand have no shapes, the robot has
-            several palms, or the method cannot solve palms.
+        UnsupportedError: The hand has one finger, robot or hand have no shapes, the robot is a
+            body, or the method cannot solve palms.
 
     Example:
         >>> pose = np.eye(4)
@@ -283,7 +282,7 @@ def grasps_of(
         >>> len(found), bool(found[0].load >= found[4].load)
         (5, True)
     """
-    one_palm(solver.robot, "grasps_of")
+    solver.robot.description.one_hand("grasps_of")
     begin, chosen = time.process_time(), TouchParameters()
     robot = solver.robot
     place = np.eye(4) if pose is None else one_pose(pose)

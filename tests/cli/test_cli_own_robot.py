@@ -193,14 +193,19 @@ def test_palms_of_a_body_are_named(run: Command, tmp_path: Path) -> None:
     sides = yaml.safe_load(out.read_text())["sides"]
     assert tuple(side["palm"]["link"] for side in sides.values()) == palms
     for words, says in (
-        ((palms[0], palms[0]), f"--palm: {palms[0]!r} carries another palm"),
+        ((palms[0], palms[0]), f"--palm: {palms[0]!r} is given twice"),
         (("torso_link", palms[0]), "--palm: 'torso_link' carries another palm"),
         ((*palms, "hip"), "--palm: humanoid.urdf has no link 'hip'"),
         ((palms * 3), "--palm: found 6 links, expected 4 at most"),
     ):
         refused = run("import", path, "--palm", *words, "--out", tmp_path / "other.yaml")
         assert says in refused.error
-    assert not (tmp_path / "other.yaml").exists()
+    name = '<joint name="right_elbow_joint" type="revolute">'
+    path.write_text(path.read_text().replace(name, f'{name}<mimic joint="left_elbow_joint"/>'))
+    other = tmp_path / "other.yaml"
+    error = run("import", path, "--palm", *palms, "--out", other).error
+    assert error.startswith(f"{other}: sides.right: joint 'right_elbow_joint' follows motor ")
+    assert not list(tmp_path.glob("*other*"))
 
 
 def test_joints_without_limits_get_assumed_ones(run: Command, tmp_path: Path) -> None:
@@ -214,6 +219,14 @@ def test_joints_without_limits_get_assumed_ones(run: Command, tmp_path: Path) ->
     assert "assumed, since hand.urdf states none" in " ".join(done.out.split())
 
 
+def test_a_palm_with_arms_for_fingers_is_doubted(run: Command, tmp_path: Path) -> None:
+    path = arm(tmp_path)
+    leg = link("leg") + moves("hip", "base", "leg", "0.1 0 0", "0 1 0", "-1 1")
+    path.write_text(path.read_text().replace("</robot>", f"{leg}</robot>"))
+    done = run("import", path, "--palm", "base", "--out", tmp_path / "mine.yaml").fine()
+    assert "--palm: from 'base' of arm.urdf go chains as long as arms: write" in done.out
+
+
 REFUSALS = {
     "no file": (("nothing.urdf",), "nothing.urdf: cannot be read: No such file"),
     "no such palm": (("hand.urdf", "--palm", "hip"), "--palm: hand.urdf has no link 'hip'"),
@@ -222,7 +235,7 @@ REFUSALS = {
     "mount without arm": (("hand.urdf", "--mount", *"123456"), "--mount: there is no arm"),
     "an arm for a hand": (("arm.urdf", "hand.urdf", "--palm", "mf_3"), "no joint moves below"),
     "one file twice": (("arm.urdf", "arm.urdf"), "arm.urdf: arm and hand are the same file"),
-    "two arms": (("two.urdf",), "--palm: missing; from 'base' of two.urdf go chains as long"),
+    "two arms": (("two.urdf",), "as arms: write the link that the fingers hang on, such as l4, m4"),
     "arm that branches": (("two.urdf", "hand.urdf"), "--tip: missing; two.urdf branches at 'base'"),
     "description": (("hand.yaml",), "is a description already, expected --picture and no --out"),
     "output is the input": (("hand.urdf", "--out", "hand.urdf"), "expected a name ending in .yaml"),

@@ -37,6 +37,7 @@ BYTES = {
     "broken.yaml": b"robot: [1,\n  a: b",
     "binary.yaml": bytes(range(256)),
     "code.yaml": b"!!python/object/apply:os.system ['echo hi']",
+    "sides.yaml": b"sides: {left: {fingers: {thumb: 4}}}",
     "text.npz": b"hello",
     "text.mcap": b"hello",
     "torn.npz": b"PK",
@@ -152,6 +153,7 @@ follow back.npz {ROBOT} --out m.npz => times: expected 2 growing numbers
 follow extra.npz {ROBOT} --out m.npz => extra: unknown, expected
 follow targets.npz {ROBOT} --period 0 --out m.npz => --period: found '0'
 follow targets.npz {ROBOT} --retarget no.yaml --out m.npz => no.yaml: cannot be read
+follow targets.npz {ROBOT} --retarget sides.yaml --out m.npz => sides.yaml: sides.left: no such side
 follow targets.npz --out m.npz => --robot: missing, expected it here or as robot in --retarget
 follow torn.npz {ROBOT} --out m.npz => torn.npz: not an npz file
 follow targets.npz {ROBOT} --out m.parquet => expected a name ending in .mcap, .npz, .csv

@@ -85,5 +85,8 @@ def test_nothing_may_stand_in_the_base(tmp_path):
     inside = {"post": {"kind": "box", "size": [0.1, 0.1, 0.1], "xyz": [0, 0, 0.1]}}
     with pytest.raises(DescriptionError, match=r"solids.post: stands .* mm inside 'base'"):
         ik.Solver(robot, scene=ik.Scene(inside))
+    inside["post"]["xyz"][0] = 0.05 - 1e-5
+    with pytest.raises(DescriptionError, match=r"solids.post: touches 'base', which cannot move"):
+        ik.Solver(robot, scene=ik.Scene(inside))
     with pytest.raises(DescriptionError, match=r"touching.*unknown 'moon'"):
         ik.Solver(robot, scene=ik.Scene(SCENE, touching=[{"links": ["moon", "l1"], "reason": "x"}]))

@@ -223,3 +223,5 @@ def test_what_is_refused(robot, solver):
         solver.follow(velocity=[1.0, 2.0])
     with pytest.raises(ik.errors.InputError, match="q0: found shape"):
         solver.follow(np.zeros(3))
+    with pytest.raises(ik.errors.InputError, match="posture: found"):
+        solver.follow(posture={"lwr_joint_1": 0.2})

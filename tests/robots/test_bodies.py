@@ -92,6 +92,9 @@ URDF = """
     <axis xyz="0 0 1"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint>
   <joint name="neck" type="revolute"><parent link="torso"/><child link="head"/>
     <axis xyz="0 0 1"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint>
+  <link name="end"/>
+  <joint name="tail" type="revolute"><parent link="base"/><child link="end"/>
+    <axis xyz="0 0 1"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint>
   {sides}
 </robot>
 """
@@ -109,7 +112,7 @@ SIDE = """
 """
 FILE = """
 name: two
-robot: {file: two.urdf, locked: {neck: 0}}
+robot: {file: two.urdf, locked: {neck: 0, tail: 0}}
 sides:
   left: {palm: left_palm, fingers: {tip: {link: left_tip, normal: [0, 0, 1]}}}
   right: {palm: right_palm, fingers: {tip: {link: right_tip, normal: [0, 0, 1]}}}
@@ -140,7 +143,11 @@ def test_trunk_and_sides_are_found_in_a_file(in_a_file: Path):
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("locked: {neck: 0}", "locked: {}", "motor 'neck' moves no side; write locked: {neck: 0}"),
+        (
+            ", locked: {neck: 0, tail: 0}",
+            "",
+            "move no side; write them under locked: {neck: 0, tail: 0}",
+        ),
         ("sides:", "trunk: left_arm\nsides:", "does not carry the palm of 'right'"),
         ("link: left_tip", "link: right_tip", "fingers.tip.link: 'right_tip' does not hang on"),
         (
@@ -158,13 +165,14 @@ def test_trunk_and_sides_are_found_in_a_file(in_a_file: Path):
         ("{palm: left", "{thumb: toe, palm: left", "sides.left.thumb: side 'left' has no finger"),
         ("sides:", "trunk: nowhere\nsides:", "trunk: unknown link 'nowhere'; known: base"),
         ("sides:", "trunk: base\nsides:", "joint 'waist' beyond it moves every palm; expected"),
+        ("two.urdf", "tow.urdf", "robot.file: {folder}/tow.urdf: no such file"),
         ("two.urdf", "two.urdf, palm: torso", "robot.palm: found one, expected it under each of"),
         ("sides:", "colour: red\nsides:", "colour"),
     ],
 )
 def test_what_is_wrong_is_said_in_a_line(in_a_file: Path, old: str, new: str, said: str):
     in_a_file.write_text(FILE.replace(old, new, 1))
-    refused(in_a_file, said)
+    refused(in_a_file, said.replace("{folder}", str(in_a_file.parent)))
 
 
 def test_arms_stand_at_places_that_are_all_given(tmp_path: Path):
@@ -191,19 +199,17 @@ def refused(path: Path, said: str):
 @pytest.mark.parametrize(
     ("follower", "leader", "said"),
     [
-        ("finger", "left_finger", "joint 'right_finger' follows motor 'left_finger', which is of "),
-        (
-            "shoulder",
-            "waist",
-            "joint 'right_shoulder' follows motor 'waist', which is of the trunk",
-        ),
+        ("right_finger", "left_finger", "sides.right: {} which is of side 'left'"),
+        ("left_wrist", "right_finger", "sides.left: {} which is of side 'right'"),
+        ("right_shoulder", "waist", "sides.right: {} which is of the trunk"),
+        ("waist", "left_wrist", "trunk: {} which is of side 'left'"),
     ],
 )
 def test_a_motor_of_two_sides_is_refused(in_a_file: Path, follower: str, leader: str, said: str):
     file = in_a_file.with_suffix(".urdf")
-    joint = f'<joint name="right_{follower}" type="revolute">'
+    joint = f'<joint name="{follower}" type="revolute">'
     file.write_text(file.read_text().replace(joint, f'{joint}<mimic joint="{leader}"/>'))
-    refused(in_a_file, f"sides.right: {said}")
+    refused(in_a_file, said.format(f"joint {follower!r} follows motor {leader!r},"))
 
 
 @pytest.mark.parametrize(

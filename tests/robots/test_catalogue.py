@@ -8,6 +8,7 @@ a macro); the files themselves are no part of this project.
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -80,15 +81,25 @@ def test_hands_stand_where_published_files_have_them(hand):
             np.testing.assert_allclose(found[link][i, :3], pose, atol=known["tolerance"])
 
 
-def test_unknown_arms_and_hands_are_named():
-    with pytest.raises(
-        ik.errors.UnknownNameError, match=r"no shipped arm is called 'pander'; did you mean 'panda'"
-    ):
-        ik.load_robot("pander+allegro_right")
-    with pytest.raises(
-        ik.errors.UnknownNameError, match=r"no shipped hand is called 'allegra'; did you mean"
-    ):
-        ik.load_robot("panda+allegra")
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("pander+allegro_right", "arm or body is called 'pander'; did you mean 'panda'?"),
+        ("panda+allegra", "hand is called 'allegra'; did you mean 'allegro_"),
+        ("g1+dex4", "arm or body is called 'g1'; did you mean 'g1+dex3'?"),
+        ("h1+inspire", "arm or body is called 'h1'; did you mean 'h1_2+inspire'?"),
+        ("foo+leap", "arm or body is called 'foo'; arms: "),
+        ("foo+leap", "; bodies: baxter+ar10, "),
+        ("foo", "arm-hand is called 'foo'; shipped: "),
+        ("foo", "; bodies: baxter+ar10, "),
+    ],
+)
+def test_unknown_robots_are_named(name, said):
+    with pytest.raises(ik.errors.UnknownNameError, match=f"^no shipped .*{re.escape(said)}"):
+        ik.load_robot(name)
+
+
+def test_a_path_with_a_plus_is_a_path():
     with pytest.raises(ik.errors.DescriptionError, match="no such file"):
         ik.load_robot("a+b/robot.yaml")
 

@@ -82,7 +82,7 @@ def refusal(path: Path) -> str:
 
 DESCRIPTIONS = r"""
 hand: {file: nothing.urdf}
-    nothing.urdf: cannot be read: No such
+    nothing.urdf: no such file
 hand: {file: hand.urdf, palm: nowhere}
     hand.palm: hand.urdf: unknown link 'nowhere'; known: base_link, left_1
 hand: {file: hand.urdf} / left_tip: thumb_tip

@@ -46,6 +46,7 @@ class ThumbFirstMethod(LoopedMethod):
     ) -> None:
         """Recognise the arm and lay out the step; point and normal if no kinds are given."""
         super().__init__(robot, options, compiled)
+        robot.one_hand(self.name)
         self.options: ThumbFirstParameters = options
         self._kinds = kinds or usual(len(robot.fingers))
         self.step = ThumbFirstStep(robot, options, self._kinds, arm_family(robot))
