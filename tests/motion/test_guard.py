@@ -111,6 +111,18 @@ def test_hands_that_are_led_through_each_other_do_not_get_there():
     assert statuses[-1] is ik.motion.FollowStatus.FOLLOWING
 
 
+def test_an_arm_in_the_way_holds_back_its_own_side():
+    """Hands leap to where a turned waist has them; the right shoulder would touch the torso."""
+    body = ik.load_robot("g1+dex3")
+    q = body.home.copy()
+    q[body.actuators.index("waist_yaw_joint")] = 0.4
+    q[body.actuators.index("left_elbow_joint")] = 0.3
+    follower = ik.Solver(body, scene=ik.Scene()).follow(body.home, 0.01)
+    for _ in range(600):
+        follower(*body.contacts(q))
+    assert follower.state.status is ik.motion.FollowStatus.FOLLOWING
+
+
 def test_thumbs_that_pass_each_other_on_the_way_to_rest_are_apart_in_every_cycle():
     """They are at the ends of that way, and at places on it, 25 cycles from one to the next."""
     body = ik.load_robot("g1+inspire")
