@@ -299,7 +299,8 @@ class Retargeter:
                 raise InputError(f"keypoints: found shape {frame.shape}, expected one frame")
             if hand.sees(frame):
                 frames[side] = hand.smoothed(frame, elapsed)
-        if self._turn is None and len(frames) == len(self._hands):
+        known = self.config.rpy is not None or len(frames) == len(self._hands)
+        if self._turn is None and known:
             self._turn = self._aligned(frames)
         if self._turn is None or not frames:
             return Wanted(points, None)

@@ -349,7 +349,9 @@ class Request:
             raise InputError("grasps: found palms and contacts, expected the same in all")
         if self.robot.description.sides:
             names = ", ".join(side.name for side in self.robot.description.sides)
-            raise InputError(f"palm: found one pose, expected one by side: {names}")
+            raise InputError(
+                f"palm: found one pose, expected one by side (palms in a file): {names}"
+            )
         postures = postures_of(self.robot, [grasp.posture for grasp in grasps])
         targets = self.of_palms(np.stack(palms), postures, fixed, prefer)
         named, poses = grasps[0].object, _object_poses(grasps)

@@ -288,7 +288,8 @@ def test_palms_that_cannot_be_are_refused():
     with pytest.raises(ik.errors.InputError, match=r"palm\.middle: no such side.*left, right"):
         solver.solve(ik.Grasp(palm={"middle": np.eye(4)}, posture=one.posture))
     with pytest.raises(
-        ik.errors.InputError, match=r"found one pose, expected one by side: left, right"
+        ik.errors.InputError,
+        match=r"one pose, expected one by side \(palms in a file\): left, right",
     ):
         solver.solve(ik.Grasp(palm=np.eye(4), posture=one.posture))
     with pytest.raises(
