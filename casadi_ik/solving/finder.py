@@ -143,10 +143,10 @@ class AlternativeFinder:
         """Of the arm, for a configuration; of a body the least of its arms."""
         robot, q = self.robot.description, ca.SX.sym("q", len(self.robot.actuators))
         body, found = actuated(robot, q), list[ca.SX]()
-        for side in robot.sides or (robot,):
-            palm = body.kinematics.links[side.palm_link].at(side.palm_placement)
-            arm = list(map(robot.actuator_index, side.arm)) if robot.sides else self._arm
-            jacobian = ca.vertcat(*body.twist(side.palm_link, palm.origin, arm))
+        arms = [arm for arm, _ in robot.side_actuators] or [self._arm]
+        for carrier, arm in zip(robot.sides or [robot], arms, strict=True):
+            palm = body.kinematics.links[carrier.palm_link].at(carrier.palm_placement)
+            jacobian = ca.vertcat(*body.twist(carrier.palm_link, palm.origin, arm))
             found.append(manipulability(jacobian))
         measure = ca.mmin(ca.vertcat(*found))
         return FunctionKernel(ca.Function("arm_manipulability", [q], [measure]), self._compiled)
