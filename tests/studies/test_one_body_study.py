@@ -13,7 +13,7 @@ import casadi_ik as ik
 def test_the_study_writes_its_report_and_goes_on(tmp_path, monkeypatch):
     monkeypatch.setattr(one_body, "PART", 40)
     given = ["--robots", "mobile_kuka_lwr_barrett", "--count", "60", "--free", "5", "--peers", "0"]
-    given += ["--searched", "5"]
+    given += ["--searched", "5", "--beyond", "2"]
     given += ["--parts", str(tmp_path / "parts"), "--out", str(tmp_path)]
     one_body.main([*given, "--minutes", "0"])
     assert "0 are done so far" in (tmp_path / "report.md").read_text()

@@ -138,10 +138,11 @@ static int after_all_placements(solve s) {
 }
 
 /* The farther off the nearest palms of hands that fit are, the fewer trunks are worth a try; more
- * where contacts leave palms a freedom, since others may be near, and for one arm. */
+ * where contacts leave palms a freedom, since others may be near, and for one arm. Without a trunk
+ * it is arms from anywhere that are tried, which tell nothing. */
 static int is_hopeless(solve s) {
   const double most = N_SIDES < 2 ? ONE_ARM_TRUNKS : P(LOOSE) > 0 ? LOOSE_TRUNKS : FAR_TRUNKS;
-  if (!(X(FITS) > 0)) return 0;
+  if (!N_TRUNK || !(X(FITS) > 0)) return 0;
   Y(LOOKED) = X(LOOKED) + 1;
   if (!(X(LOOKED) > 0) || SAID(COST) < X(FAR)) Y(FAR) = SAID(COST);
   Y(HOPELESS) = Y(LOOKED) >= LEAST_TRUNKS && Y(LOOKED) * Y(FAR) > most;
