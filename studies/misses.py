@@ -94,11 +94,12 @@ iterations (half of them also towards badly conditioned ones).
 """
 
 CAUSES = """
-*Solved now:* by the code that wrote this page. *Given the hand:* with the hand's motors fixed where
-they were when the target was made; what that solves was missed because no posture came near enough,
-the others because no arm was found that holds the hand where it fits. *From nearby:* from a start
-within 0.1 of every motor's range. *At limits:* mean over the missed of the part of arm and hand
-motors within a thousandth of their range. *Off:* the largest error of a contact in the best answer.
+Missed targets are asked again with all fingers. *Solved now:* by the code that wrote this page.
+*Given the hand:* with the hand's motors fixed where they were when the target was made; what that
+solves was missed because no posture came near enough, the others because no arm was found that
+holds the hand where it fits. *From nearby:* from a start within 0.1 of every motor's range. *At
+limits:* mean over the missed of the part of arm and hand motors within a thousandth of their range.
+*Off:* the largest error of a contact in the best answer.
 """
 
 
@@ -135,9 +136,9 @@ class Part:
     @property
     def path(self) -> Path:
         """Where its counts are."""
-        kind = (
-            f"{self.sampler} {self.noise[0]:g} {self.noise[1]:g}" if self.looked else self.sampler
-        )
+        kind = self.sampler
+        if any(self.noise):
+            kind += f" {self.noise[0]:g} {self.noise[1]:g}, {self.looked} looked at"
         name = f"{self.number:05d}-{self.size}-{self.seed}.json"
         return Path(self.robot) / f"{kind}, {self.fingers}" / self.tolerance / name
 
