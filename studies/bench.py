@@ -9,8 +9,8 @@
     python studies/bench.py --part view --page out/page/index.html         # needs Chromium
 
 Every package measured has a process of its own that runs the same code (`bench_parts.py`, public
-names only); the two take turns, and of all turns the least counts. Machines differ and are noisy:
-quote ratios.
+names only) with the same targets; the two take turns, and of all turns the least counts. Machines
+differ and are noisy: quote ratios.
 """
 
 from __future__ import annotations
@@ -20,11 +20,12 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from bench_parts import ABROAD, CASES, Case
+from bench_parts import ABROAD, CASES, SHARED, Case
 from rich.console import Console
 from runner.parts import code_version
 from runner.report import command, markdown_table, program, publish
@@ -48,10 +49,10 @@ over least time there; *by turns:* the median of the ratios of single turns.
 class Worker:
     """A process that measures one package."""
 
-    def __init__(self, package: Path) -> None:
-        """Start it; a package is a folder that holds `casadi_ik`."""
+    def __init__(self, package: Path, targets: str) -> None:
+        """Start it; a package is a folder that holds `casadi_ik`, another one is for targets."""
         self.package = package
-        environment = os.environ | {"PYTHONPATH": str(package)}
+        environment = os.environ | {"PYTHONPATH": str(package), SHARED: targets}
         self._process = subprocess.Popen(
             [sys.executable, str(Path(__file__).with_name("bench_parts.py"))],
             stdin=subprocess.PIPE,
@@ -83,11 +84,11 @@ class Worker:
 
 
 @contextmanager
-def worker(package: Path) -> Iterator[Worker]:
+def worker(package: Path, targets: str) -> Iterator[Worker]:
     """A worker while it is needed."""
     if not (package / "casadi_ik").is_dir():
         raise InputError(f"--against: found no folder casadi_ik in {package}, expected a checkout")
-    started = Worker(package.resolve())
+    started = Worker(package.resolve(), targets)
     try:
         yield started
     finally:
@@ -154,8 +155,9 @@ def main(arguments: list[str] | None = None) -> None:
     heads = ["part", "robot", "of", "quantity", "here"]
     heads += ["other", "ratio", "by turns"] if options.against else []
     with ExitStack() as stack:
-        here = stack.enter_context(worker(Path(__file__).resolve().parents[1]))
-        other = stack.enter_context(worker(options.against)) if options.against else None
+        targets = stack.enter_context(tempfile.TemporaryDirectory(prefix="casadi_ik-bench-"))
+        here = stack.enter_context(worker(Path(__file__).resolve().parents[1], targets))
+        other = stack.enter_context(worker(options.against, targets)) if options.against else None
         for case, mine, theirs in measured(cases, here, other, options.turns):
             for row in rows_of(case, mine, theirs):
                 rows.append(row)

@@ -28,6 +28,9 @@ import casadi_ik as ik
 PROBES = Path(__file__).parent / "probes"
 """Programs beside those that are measured; `stack.c` marks the stack of a solve."""
 
+SHARED = "CASADI_IK_BENCH_TARGETS"
+"""Variable of the environment: the folder of targets that all processes of a run share."""
+
 Found = dict[str, float]
 Case = tuple[Any, ...]
 Targets = tuple[Any, Any]
@@ -54,8 +57,15 @@ CYCLES, PERIOD = 500, 1e-3
 
 
 def drawn(robot: ik.ArmHand, sampler: str, count: int) -> Targets:
-    """Contacts of a sampler, the same in every process."""
-    return robot.contacts(SAMPLERS[sampler][1](robot, np.random.default_rng(0), count))
+    """Contacts of a sampler, the same in every process: as the first one that asks draws them."""
+    path = Path(os.environ.get(SHARED, ".")) / f"{robot.name}-{sampler}-{count}.npy"
+    if SHARED in os.environ and path.exists():
+        points, normals = np.load(path)
+        return points, normals
+    targets = robot.contacts(SAMPLERS[sampler][1](robot, np.random.default_rng(0), count))
+    if SHARED in os.environ:
+        np.save(path, np.stack(targets))
+    return targets
 
 
 @contextlib.contextmanager

@@ -35,13 +35,12 @@ class HandFirstParameters:
         finger_rows: Postures of a finger that is chosen by itself; with four times as many no more
             fits succeed.
         finger_turns: How often palm and fingers are chosen in turns; a third time mends little.
-        fresh_pool: Postures mended finger by finger for a round after the first: not those that
-            look like the target, but as many others in every round.
-        late_pool: The same after `late_round`: what the best of many is not near in one round it is
-            not in the next. Of 64,000 targets of a LEAP hand near limits 100 are left after 16
-            rounds and 8 after 64; with 96 in all rounds 140 and 16. By turns with these there are
-            rounds of postures that are not mended.
-        late_round: See above.
+        pool: Postures mended finger by finger for a round after the first: not those that look like
+            the target, but as many others in every round. With 64 a batch of an Allegro, LEAP or
+            Shadow hand takes up to a third longer.
+        late_round: From this round on every second one begins from postures that are not mended. Of
+            64,000 targets of a LEAP hand near limits 140 are left after 16 rounds and 16 after 64
+            where all are, 100 and 8 by turns.
         global_rounds: See above.
         rugged_rounds: Of a hand with few motors, and with many. Of 640,000 targets at limits of
             LEAP hands on eight arms 200 are left after 32 rounds of all kinds, 55 after 64, 14
@@ -71,8 +70,7 @@ class HandFirstParameters:
     sure_rounds: int = 2
     finger_rows: int = 128
     finger_turns: int = 2
-    fresh_pool: int = 64
-    late_pool: int = 24
+    pool: int = 24
     late_round: int = 12
     global_rounds: int = 5
     rugged_rounds: tuple[int, int] = (40, 250)

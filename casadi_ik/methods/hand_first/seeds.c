@@ -107,11 +107,11 @@ static int mend(search *job, int64_t count) {
  * ones by turns as they are. */
 static int from_spread(search *job, int64_t number) {
   const int plain = number >= LATE_ROUND && number % 2;
-  const int64_t count = plain ? N_CANDIDATES : number < LATE_ROUND ? FRESH_POOL : LATE_POOL;
+  const int64_t count = plain ? N_CANDIDATES : POOL;
   int64_t i;
   int k;
   for (i = 0; i < count; ++i) {
-    for (k = 0; k < N_HAND; ++k) job->near[i * N_HAND + k] = posture(1, number * FRESH_POOL + i, k);
+    for (k = 0; k < N_HAND; ++k) job->near[i * N_HAND + k] = posture(1, number * POOL + i, k);
   }
   if (plain) {
     memcpy(job->postures, job->near, sizeof job->postures);

@@ -137,8 +137,9 @@ class Seeds:
     def pool(self) -> int:
         """Postures of which a round's are taken, at most."""
         options = self._options
-        fresh = max(options.fresh_pool, options.late_pool) if self.mends else 0
-        return max(options.candidates * max(options.rounds - 1, 1), fresh)
+        if self.mends:
+            return max(options.candidates, options.pool)
+        return options.candidates * max(options.rounds - 1, 1)
 
     def anywhere_bounds(self, enforce_limits: bool) -> tuple[Array, Array]:
         """(n,) between which configurations from anywhere are."""
