@@ -207,6 +207,8 @@ class SearchPlan:
             "last": (double, state, "the state in which the round before ended"),
             "mark": (double, state, ""),
             "postures": (double, candidates * h, "of the round"),
+            "bests": (double, 2 * h, "the best hand, and the one that was it before"),
+            "n_bests": (whole, None, ""),
             "near": (double, mended * h, "room for seeds.c, and for a scene's hands"),
             "left": (double, mended, ""),
             "found": (whole, pool, ""),

@@ -33,6 +33,34 @@ static void from_anywhere(search *job, int64_t number, double *first) {
   }
 }
 
+#if !N_SIDES
+/* By turns, where the best so far nearly fits, hands on the line through it and the one that was it
+ * before: contacts move little along it, and of its hands the arm may hold another. */
+static void from_line(search *job, int64_t number) {
+  double *best = job->bests, *before = job->bests + N_HAND, longest = 0;
+  int i, k, other = 0;
+  if (!(job->last[STATE_BEST_COST] < NEARLY_FITS)) return;
+  for (k = 0; k < N_HAND; ++k) other |= job->last[STATE_BEST_Q + HAND[k]] != best[k];
+  if (other) {
+    memcpy(before, best, N_HAND * sizeof(double));
+    for (k = 0; k < N_HAND; ++k) best[k] = job->last[STATE_BEST_Q + HAND[k]];
+    ++job->n_bests;
+  }
+  for (k = 0; k < N_HAND; ++k) {
+    const double part = fabs(best[k] - before[k]) / ORDER_RANGES[k];
+    if (part > longest) longest = part;
+  }
+  if (job->n_bests < 2 || number % 2 || !(longest > 0)) return;
+  for (i = 0; i < N_CANDIDATES; ++i) {
+    const double way = 2 * even(number * N_CANDIDATES + i + 1, ALL_STEPS[0]) - 1;
+    for (k = 0; k < N_HAND; ++k) {
+      const double step = ALONG_LINE * way / longest * (best[k] - before[k]);
+      job->postures[i * N_HAND + k] = best[k] + step;
+    }
+  }
+}
+#endif
+
 /* First state and parameters of the round, from its postures; what was found before stays. */
 static int begin_round(search *job) {
   const int64_t number = job->round, later = number - ROUNDS;
@@ -47,6 +75,9 @@ static int begin_round(search *job) {
   if (later >= 0) code = from_spread(job, number);
 #endif
   if (code != DONE) return code;
+#if !N_SIDES
+  if (number) from_line(job, number);
+#endif
   inputs[0] = job->points;
   inputs[1] = job->normals;
   for (i = 0; i < N_MORE; ++i) inputs[2 + i] = job->more + 3 * N_FINGERS * i;
@@ -68,7 +99,7 @@ static int begin_round(search *job) {
   if (later >= 0) {
     /* The first begins as a whole: what stands in the way may be arm and hand together. By turns it
      * is the best so far, where that nearly fits: a refinement gives up in a flat valley. */
-    const int goes_on = later % 2 && job->last[STATE_BEST_COST] < FLAT_COST;
+    const int goes_on = later % 2 && job->last[STATE_BEST_COST] < NEARLY_FITS;
     if (goes_on) memcpy(first, job->last + STATE_BEST_Q, sizeof first);
     for (k = 0; k < N_MOTORS; ++k) {
       job->state[STATE_Q + k] = clipped(first[k], job->parameters[PARAMETERS_LOWER + k],
@@ -147,7 +178,7 @@ static int follow(void *method, int64_t slot, int64_t solve, int32_t *status) {
   (void) slot, (void) solve;
   if (*status != SOLVED_STATUS) {
     if (!job->may_begin) return SLICE_OVER;
-    if (goes_on) job->round = job->again = 0;
+    if (goes_on) job->round = job->again = job->n_bests = 0;
     else goes_on = choose_round(job);
   }
   if (goes_on) {
