@@ -139,6 +139,13 @@ class SearchPlan:
         return self.enforce_limits and self.seeds.mends
 
     @property
+    def pool(self) -> int:
+        """Postures of which a round's are taken, at most."""
+        options = self.options
+        mended = max(options.pool, options.candidates)
+        return mended if self.mends else options.candidates * max(options.rounds - 1, 1)
+
+    @property
     def kernels(self) -> dict[str, Any]:
         """Those that are called, by the names of `KERNELS`."""
         found = {"begin": self.begin, "solve": self.solve, "judge": self.judge}
@@ -169,8 +176,8 @@ class SearchPlan:
             "N_STATE": layouts.state.size,
             "N_PARAMETERS": layouts.parameters.size,
             "N_CANDIDATES": self.options.candidates,
-            "N_POOL": self.seeds.pool,
-            "N_MENDED": self.seeds.pool if self.mends else self.options.candidates,
+            "N_POOL": self.pool,
+            "N_MENDED": self.pool if self.mends else self.options.candidates,
             "N_MORE": len(layouts.contacts.data) - 2,
             "N_SIDES": len(self.sides),
         }

@@ -133,14 +133,6 @@ class Seeds:
         tips, count = _tips(robot), len(robot.finger_names)
         return [_rows(robot, tips, finger, self._options) for finger in range(count)]
 
-    @property
-    def pool(self) -> int:
-        """Postures of which a round's are taken, at most."""
-        options = self._options
-        if self.mends:
-            return max(options.candidates, options.pool)
-        return options.candidates * max(options.rounds - 1, 1)
-
     def anywhere_bounds(self, enforce_limits: bool) -> tuple[Array, Array]:
         """(n,) between which configurations from anywhere are."""
         return (self._robot.lower, self._robot.upper) if enforce_limits else self._everywhere
