@@ -172,18 +172,20 @@ def free_answers(
         reasons: Whether to find out if those without one would have one without the scene, or if
             the robot could pass through itself.
     """
-    found = _searched(finder, targets, query, q, starts, seed, every, reasons)
     home = np.tile(finder.robot.home, (len(q), 1))
     biased = targets.prefer != USUAL or not np.array_equal(starts, home)
+    found = _searched(finder, targets, query, q, starts, seed, every, reasons, steps=not biased)
     left = np.flatnonzero(~found.free)
     if not biased or not len(left):
         return found
-    # A preference orders answers; whether there is one it does not decide.
+    # A preference orders answers; whether there is one it does not decide. So steps out of a
+    # collision, which lead to any answer, are left to the search without one.
     some, trials = replace(targets.rows(left), prefer=USUAL), finder.trials
     ends = trials.method.run(some, home[left], seed, False).q
     met = trials.solved(some, ends, some.enforce_limits)
     left, some, ends = left[met], some.rows(np.flatnonzero(met)), ends[met]
-    again = _searched(finder, some, query.rows(left), ends, home[left], seed, False, False)
+    asked = query.rows(left), ends, home[left]
+    again = _searched(finder, some, *asked, seed, every=False, reasons=False, steps=True)
     taken = left[again.free]
     found.q[taken], found.free[taken], found.reports[taken] = again.q[again.free], True, None
     return found
@@ -198,8 +200,9 @@ def _searched(
     seed: int,
     every: bool,
     reasons: bool,
+    steps: bool,
 ) -> FreeAnswers:
-    """One search, see `free_answers`."""
+    """One search, see `free_answers`; with steps out of a collision if asked."""
     if not len(q):
         return FreeAnswers(q, np.zeros(0, dtype=bool), np.zeros(0, dtype=object))
     parts = []
@@ -209,7 +212,7 @@ def _searched(
         search = FreeSearch(finder, *some, seed)
         if every:
             search.take(q[rows], np.arange(len(rows)))
-        search.run(q[rows], every)
+        search.run(q[rows], every, steps)
         found = search.found(reasons)
         parts.append((found.q, found.free, found.reports))
     return FreeAnswers(*(np.concatenate(each) for each in zip(*parts, strict=True)))
@@ -265,7 +268,7 @@ class FreeSearch:
     def _descent(self) -> LocalRefinement:
         return LocalRefinement(self.trials, self.targets)
 
-    def run(self, q: Array, every: bool = False) -> None:
+    def run(self, q: Array, every: bool, steps: bool) -> None:
         """Look until all are free; or first, if asked, at the hands of a round whether or not."""
         self.try_hands(q, np.arange(len(q)))
         hands, sides = self.other_hands(every), self._sides
@@ -284,7 +287,8 @@ class FreeSearch:
         blocked = np.flatnonzero(~self.free)
         if len(blocked):
             self._find_nearest(blocked)
-            self._escape()
+            if steps:
+                self._escape()
 
     def take(self, q: Array, owner: NDArray[np.intp]) -> Array:
         """Keep the preferred free ones of configurations (m, n), and the nearest; their room."""

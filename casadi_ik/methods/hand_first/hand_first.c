@@ -47,7 +47,7 @@ static void from_line(search *job, int64_t number) {
     ++job->n_bests;
   }
   for (k = 0; k < N_HAND; ++k) {
-    const double part = fabs(best[k] - before[k]) / ORDER_RANGES[k];
+    const double part = fabs(best[k] - before[k]) / ANYWHERE_RANGE[HAND[k]];
     if (part > longest) longest = part;
   }
   if (job->n_bests < 2 || number % 2 || !(longest > 0)) return;
