@@ -69,8 +69,8 @@ class FreeSearchParameters:
         steps: About what is nearest to being free, one after the other [of motors' ranges].
         tries: Of such a step, in random directions; the best is taken. Of a robot with one hand and
             of a body. Source: of 330 targets of a KUKA LWR with a Barrett hand of
-            `studies/collision.py` 241 are free with 12, in 0.94 times the time of commit 508e6b5
-            (which frees 233), 246 with 24 in 1.26 times.
+            `studies/collision.py` 241 are free with 12, in 0.94 to 1.07 times the time of commit
+            508e6b5 (which frees 233), 246 with 24 in 1.26 to 1.34 times.
         aside: Steps of the motors of a body's hands. Source: of two Pandas with Allegro hands those
             of `steps` leave more to `within`: 1.9 to 2.5 ms a target instead of 1.5 to 1.6.
         within: Steps of the contacts of a body's hands [of their tolerances], where those of motors
