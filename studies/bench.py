@@ -28,7 +28,7 @@ from pathlib import Path
 from bench_parts import ABROAD, CASES, SHARED, Case
 from rich.console import Console
 from runner.parts import code_version
-from runner.report import command, markdown_table, program, publish
+from runner.report import command, commit, markdown_table, program, publish
 
 from casadi_ik.errors import InputError
 
@@ -41,8 +41,8 @@ says otherwise. Counts are of the answers that were timed. Load of the machine a
 """
 
 AGAINST = """
-*other* is the package in `{path}`, measured by turns by the same code. *ratio:* least time here
-over least time there; *by turns:* the median of the ratios of single turns.
+*other* is the package at commit `{other}`, measured by turns by the same code. *ratio:* least time
+here over least time there; *by turns:* the median of the ratios of single turns.
 """
 
 
@@ -165,9 +165,12 @@ def main(arguments: list[str] | None = None) -> None:
     if options.report:
         load = ", ".join(f"{value:.1f}" for value in os.getloadavg())
         parts = [INTRODUCTION.format(turns=options.turns, load=load)]
-        parts += [AGAINST.format(path=options.against)] if options.against else []
+        parts += [AGAINST.format(other=commit(options.against))] if options.against else []
         parts += [markdown_table(heads, rows)]
+        # Folders of this machine say nothing to a reader.
         run_by = command(__file__, arguments)
+        for folder, name in ((options.against, "CHECKOUT"), (options.report, "REPORT")):
+            run_by = run_by.replace(str(folder), name)
         publish("Timings", parts, options.report, run_by, {"bench": code_version()})
 
 

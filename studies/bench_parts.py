@@ -11,6 +11,7 @@ import importlib
 import inspect
 import json
 import os
+import pickle
 import subprocess
 import sys
 import tempfile
@@ -56,16 +57,24 @@ CYCLES, PERIOD = 500, 1e-3
 """Of following, and their length [s]."""
 
 
+def shared(name: str, make: Callable[[], Any]) -> Any:
+    """What is made once for all processes of a run: by the first that asks."""
+    folder = os.environ.get(SHARED)
+    if folder is None:
+        return make()
+    path = Path(folder) / f"{name}.pickle"
+    if not path.exists():
+        path.write_bytes(pickle.dumps(make()))
+    return pickle.loads(path.read_bytes())
+
+
 def drawn(robot: ik.ArmHand, sampler: str, count: int) -> Targets:
-    """Contacts of a sampler, the same in every process: as the first one that asks draws them."""
-    path = Path(os.environ.get(SHARED, ".")) / f"{robot.name}-{sampler}-{count}.npy"
-    if SHARED in os.environ and path.exists():
-        points, normals = np.load(path)
-        return points, normals
-    targets = robot.contacts(SAMPLERS[sampler][1](robot, np.random.default_rng(0), count))
-    if SHARED in os.environ:
-        np.save(path, np.stack(targets))
-    return targets
+    """Contacts of a sampler, the same in every process."""
+
+    def draw() -> Targets:
+        return robot.contacts(SAMPLERS[sampler][1](robot, np.random.default_rng(0), count))
+
+    return shared(f"{robot.name}-{sampler}-{count}", draw)
 
 
 @contextlib.contextmanager
@@ -153,6 +162,35 @@ def scene(robot: str, count: int) -> Callable[[], Found]:
         return found | counts
 
     measure()
+    return measure
+
+
+def clutter(robot: str, place: int) -> Callable[[], Found]:
+    """Every third grasp at a place of the collision study, at each clutter, in batches of 256."""
+    arm_hand = ik.load_robot(robot)
+
+    def placed() -> list[Any]:
+        search = importlib.import_module("collision_study.search")
+        pieces = [search.Piece(robot, clutter, place, 3, 0) for clutter in (0, 3, 8)]
+        return [case for piece in pieces for case in list(search.targets_at(piece))[::3]]
+
+    cases = []
+    for solids, name, points, normals, poses in shared(f"{robot}-clutter-{place}", placed):
+        every = np.arange(256) % len(points)
+        asked = {"points": points[every], "normals": normals[every], "object_pose": poses[every]}
+        solver = ik.Solver(arm_hand, scene=ik.Scene(solids, grasped=name))
+        solver.solve_batch(**asked)
+        cases.append((solver, asked, len(points)))
+
+    def measure() -> Found:
+        seconds, solved, count = 0.0, 0, 0
+        for solver, asked, own in cases:
+            begun = time.thread_time()
+            batch = solver.solve_batch(**asked)
+            seconds += (time.thread_time() - begun) * own / len(batch.q)
+            solved, count = solved + int(batch.success[:own].sum()), count + own
+        return {"us": 1e6 * seconds / count, "solved": float(solved), "targets": float(count)}
+
     return measure
 
 
@@ -487,6 +525,7 @@ MEASUREMENTS: dict[str, Callable[..., Callable[[], Found]]] = {
     "fast": fast,
     "single": single,
     "scene": scene,
+    "clutter": clutter,
     "choose": choose,
     "follow": follow,
     "diagnosis": diagnosis,
@@ -541,6 +580,7 @@ CASES: dict[str, Callable[[list[str], int, str], list[Case]]] = {
     "fast": lambda robots, *_: [(robot, FAST) for robot in robots],
     "single": lambda robots, *_: [(robot, SINGLE) for robot in robots],
     "scene": lambda robots, count, _: [(robot, min(count, 200)) for robot in robots],
+    "clutter": lambda robots, *_: [(robot, place) for robot in robots for place in range(4)],
     "choose": lambda robots, *_: [
         (robot, given, around)
         for robot in robots

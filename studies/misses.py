@@ -518,7 +518,8 @@ def heat_map(rows: list[Row], path: Path) -> None:
     bar.ax.minorticks_off()
     bar.set_label(f"time of a target over that of {REFERENCE}")
     name = (
-        f"Random targets, {tolerance_name(finest)}; red: how many targets of all kinds were missed"
+        f"Random targets, {tolerance_name(finest)}; red: targets of all kinds missed; "
+        "white: not asked"
     )
     title(axes, name, "hand", "arm")
     drawn.tight_layout()

@@ -73,8 +73,27 @@ def solve_piece(piece: Piece) -> dict[str, Any]:
     return {"targets": rows}
 
 
+def targets_at(piece: Piece) -> Iterator[tuple[dict[str, Any], str, Array, Array, Array]]:
+    """Of each grasp of a piece, those turns that contacts alone solve.
+
+    Yields:
+        Solids of the scene, the name of the one that is grasped, and its (k, f, 3) points,
+        (k, f, 3) normals and (k, 4, 4) poses.
+    """
+    for solids, grasps in _solvable(piece):
+        arrays = [grasp.arrays(ik.load_robot(piece.robot).fingers) for grasp in grasps]
+        points, normals = (np.stack(both) for both in zip(*arrays, strict=True))
+        poses = np.stack([grasp.known_pose for grasp in grasps if grasp.known_pose is not None])
+        yield solids, grasps[0].object, points, normals, poses
+
+
 def grasps_at(piece: Piece) -> Iterator[tuple[ik.Scene, list[ik.Grasp]]]:
     """The scene of every grasp of a piece, and the grasp's targets that contacts alone solve."""
+    for solids, grasps in _solvable(piece):
+        yield ik.Scene(solids, grasped=grasps[0].object), grasps
+
+
+def _solvable(piece: Piece) -> Iterator[tuple[dict[str, Any], list[ik.Grasp]]]:
     robot = ik.load_robot(piece.robot)
     blind = ik.Solver(robot)
     for solids, held, grasps in _placed(piece, robot):
@@ -83,8 +102,9 @@ def grasps_at(piece: Piece) -> Iterator[tuple[ik.Scene, list[ik.Grasp]]]:
         kept = np.flatnonzero(blind.solve_batch(points, normals).success)
         pose, name = grasps[0].known_pose, grasps[0].object
         assert pose is not None
-        scene = ik.Scene({**solids, name: held | {"xyz": pose[:3, 3].tolist()}}, grasped=name)
-        yield scene, [grasps[i] for i in kept]
+        if len(kept):
+            place = {"xyz": pose[:3, 3].tolist()}
+            yield {**solids, name: held | place}, [grasps[i] for i in kept]
 
 
 def _placed(

@@ -165,12 +165,14 @@ def provenance(code: Mapping[str, str | None]) -> str:
     return (
         f"Machine: {on['processor']}, {on['cores']} cores, {on['system']}; "
         f"{compiler.version if compiler else 'no C compiler'}. Packages: {versions}. Sources "
-        f"(version and digest): {sources}; report written at commit `{_commit()}`."
+        f"(version and digest): {sources}; report written at commit "
+        f"`{commit(Path(__file__).parent)}`."
     )
 
 
-def _commit() -> str:
-    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short=12", "HEAD"]
+def commit(folder: Path) -> str:
+    """The commit that is checked out in a folder."""
+    command = ["git", "-C", str(folder), "rev-parse", "--short=12", "HEAD"]
     try:
         done = subprocess.run(command, capture_output=True, text=True)
     except OSError:

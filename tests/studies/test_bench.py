@@ -18,6 +18,7 @@ CASES = (
     ("batch", "kuka_lwr_barrett", "limits", "5mm", 16),
     ("fast", "kuka_lwr_barrett", 16),
     ("single", "kuka_lwr_barrett", 4),
+    ("clutter", "kuka_lwr_barrett", 2),
     ("follow", "kuka_lwr_barrett"),
     ("diagnosis", "kuka_lwr_barrett", "far", 4),
     ("methods", "kuka_lwr_barrett", "thumb-first", ""),
@@ -43,7 +44,8 @@ def test_two_checkouts_by_turns(tmp_path):
     rows = re.findall(r"^\| batch \| ar10 \| \w+ \S+ 16 \| us \| (.*) \|$", text, re.MULTILINE)
     assert len(rows) == 4
     assert all(float(cell) > 0 for row in rows for cell in row.split(" | "))
-    assert "--against" in text
+    assert "--against CHECKOUT" in text
+    assert str(ROOT) not in text
 
 
 @pytest.mark.parametrize("name", ["xarm7+ability", "kinova_gen3+inspire_rh56", "ur5e+shadow"])

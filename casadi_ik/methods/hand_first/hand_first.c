@@ -33,13 +33,13 @@ static void from_anywhere(search *job, int64_t number, double *first) {
   }
 }
 
-#if !N_SIDES
 /* By turns, where the best so far nearly fits, hands on the line through it and the one that was it
- * before: contacts move little along it, and of its hands the arm may hold another. */
-static void from_line(search *job, int64_t number) {
+ * before: contacts move little along it, and of its hands the arm may hold another. Whether it made
+ * the round's; not of a body, whose sides find hands by themselves. */
+static int from_line(search *job, int64_t number) {
   double *best = job->bests, *before = job->bests + N_HAND, longest = 0;
   int i, k, other = 0;
-  if (!(job->last[STATE_BEST_COST] < NEARLY_FITS)) return;
+  if (N_SIDES || !number || !(job->last[STATE_BEST_COST] < NEARLY_FITS)) return 0;
   for (k = 0; k < N_HAND; ++k) other |= job->last[STATE_BEST_Q + HAND[k]] != best[k];
   if (other) {
     memcpy(before, best, N_HAND * sizeof(double));
@@ -50,7 +50,7 @@ static void from_line(search *job, int64_t number) {
     const double part = fabs(best[k] - before[k]) / ANYWHERE_RANGE[HAND[k]];
     if (part > longest) longest = part;
   }
-  if (job->n_bests < 2 || number % 2 || !(longest > 0)) return;
+  if (job->n_bests < 2 || number % 2 || !(longest > 0)) return 0;
   for (i = 0; i < N_CANDIDATES; ++i) {
     const double way = 2 * even(number * N_CANDIDATES + i + 1, ALL_STEPS[0]) - 1;
     for (k = 0; k < N_HAND; ++k) {
@@ -58,8 +58,8 @@ static void from_line(search *job, int64_t number) {
       job->postures[i * N_HAND + k] = best[k] + step;
     }
   }
+  return 1;
 }
-#endif
 
 /* First state and parameters of the round, from its postures; what was found before stays. */
 static int begin_round(search *job) {
@@ -69,15 +69,13 @@ static int begin_round(search *job) {
   map_job map = mapping(1, inputs, ALONE, outputs, ALONE);
   int code = DONE, i, k;
   memcpy(job->last, job->state, sizeof job->last);
-  if (later < 0) code = from_table(job, number);
-  else from_anywhere(job, later, first);
+  if (later >= 0) from_anywhere(job, later, first);
+  if (from_line(job, number)) code = DONE;
+  else if (later < 0) code = from_table(job, number);
 #if MENDS
-  if (later >= 0) code = from_spread(job, number);
+  else code = from_spread(job, number);
 #endif
   if (code != DONE) return code;
-#if !N_SIDES
-  if (number) from_line(job, number);
-#endif
   inputs[0] = job->points;
   inputs[1] = job->normals;
   for (i = 0; i < N_MORE; ++i) inputs[2 + i] = job->more + 3 * N_FINGERS * i;
