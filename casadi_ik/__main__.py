@@ -2,7 +2,7 @@
 
 import sys
 
-from casadi_ik.cli.main import main
+from casadi_ik.app.cli.main import main
 
 if __name__ == "__main__":
     sys.exit(main())

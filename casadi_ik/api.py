@@ -11,28 +11,32 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from casadi_ik.answers.recorder import Recorder
-from casadi_ik.answers.solution import Alternative, BatchSolution, Solution
-from casadi_ik.arm_hand import ArmHand
+from casadi_ik.collision.clearance import Clearances, SceneCheck
 from casadi_ik.collision.scene import Scene, grasped_in
+from casadi_ik.compile.loop import Stepper
 from casadi_ik.errors import InputError
-from casadi_ik.grasps import Grasp
-from casadi_ik.grasps.pose import Free, checked_pose, one_pose
-from casadi_ik.kernels.loop import Stepper
+from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.logs import Compression, Keep
 from casadi_ik.logs.writer import recorder_of
+from casadi_ik.model.grasp import Grasp
+from casadi_ik.model.pose import Free, checked_pose, one_pose
+from casadi_ik.model.targets import LIMITS, TargetBatch, Tolerance
 from casadi_ik.motion.moving import MovingSolver
-from casadi_ik.problem.clearance import Clearances, SceneCheck
-from casadi_ik.problem.request import Request, hand_postures, tolerances_by_finger
-from casadi_ik.problem.targets import LIMITS, TargetBatch, Tolerance
-from casadi_ik.registry import METHODS, build_method, with_finger_step
-from casadi_ik.solving.choose import choose
-from casadi_ik.solving.engine import Engine, Run, SolvedBlock
-from casadi_ik.solving.fast import FastSolver
-from casadi_ik.solving.finder import APART
-from casadi_ik.solving.free_object import solve_with_object
-from casadi_ik.solving.sensitivity import Sensitivity
-from casadi_ik.touch.grasps import grasps_of
+from casadi_ik.papers.qiu.step import FINGER_STEPS
+from casadi_ik.planning.choose import choose
+from casadi_ik.planning.object_pose import solve_with_object
+from casadi_ik.planning.touch.grasps import grasps_of
+from casadi_ik.solve.alternatives import APART
+from casadi_ik.solve.engine import Engine, Run, SolvedBlock
+from casadi_ik.solve.fast import FastSolver
+from casadi_ik.solve.recorder import Recorder
+from casadi_ik.solve.registry import build_method, method_names, with_finger_step
+from casadi_ik.solve.request import Request, hand_postures, tolerances_by_finger
+from casadi_ik.solve.sensitivity import Sensitivity
+from casadi_ik.solve.solution import Alternative, BatchSolution, Solution
+
+METHODS = method_names()
+"""Names of the methods that come with the package, the default first."""
 
 
 class Solver(MovingSolver):
@@ -94,6 +98,10 @@ class Solver(MovingSolver):
             raise InputError(f"limits: found {limits!r}, expected one of {', '.join(LIMITS)}")
         if scene is not None and not isinstance(scene, Scene):
             raise InputError(f"scene: found {scene!r}, expected a Scene, or None")
+        if finger_step is not None and finger_step not in FINGER_STEPS:
+            raise InputError(
+                f"finger_step: found {finger_step!r}, expected one of {', '.join(FINGER_STEPS)}"
+            )
         self._asked = (robot, method, tolerance, limits, finger_step, options, compiled, scene)
         self.robot = robot
         self.method = method

@@ -23,12 +23,12 @@ from typing import Any
 import numpy as np
 
 import casadi_ik as ik
-from casadi_ik import palette
+from casadi_ik.app.drawing import palette
+from casadi_ik.app.drawing.drawables import close_view, looks_of, whole_view, with_object
 from casadi_ik.collision.solids import EXPORTED, of_object, stated
-from casadi_ik.drawing.drawables import close_view, looks_of, whole_view, with_object
-from casadi_ik.exporting.project import checked_prefix, wasm_project, write_folder
-from casadi_ik.grasps.load import shipped_grasps
-from casadi_ik.grasps.objects import load_object
+from casadi_ik.export.project import checked_prefix, wasm_project, write_folder
+from casadi_ik.model.load_grasp import shipped_grasps
+from casadi_ik.model.objects import load_object
 
 HERE = Path(__file__).parent
 

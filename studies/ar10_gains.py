@@ -21,8 +21,8 @@ from runner.figures import COLORS, figure, title
 from runner.report import command, markdown_table, program
 
 import casadi_ik as ik
-from casadi_ik.arrays import Array
-from casadi_ik.symbolic import dual_quaternion as dq
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics import dual_quaternion as dq
 
 STEPS = 80
 """Of a run that is drawn."""

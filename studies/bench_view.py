@@ -168,7 +168,7 @@ def _on_view(
     _: str, browser: Any, steps: int, painted: bool, rest: float
 ) -> tuple[list[dict[str, float]], Found]:
     """A drag on the page of `casadi-ik view`; what of it are the server's and the solver's."""
-    viewing = importlib.import_module("casadi_ik.viewing")
+    viewing = importlib.import_module("casadi_ik.app.viewer")
     robot, grasp = ik.load_robot("kuka_lwr_barrett"), ik.load_grasp("cup")
     viewer = viewing.view_grasp(robot, grasp, scene=ik.load_scene("table"))
     shown, served, solves, begun = viewer.page, [], [], [0.0]

@@ -20,8 +20,9 @@ from runner.figures import OURS, PAPER, THIRD, figure, title
 from runner.report import command, markdown_table, program
 
 import casadi_ik as ik
-from casadi_ik.arrays import Array
-from casadi_ik.calibration import (
+from casadi_ik.errors import InputError
+from casadi_ik.files.arrays import Array
+from casadi_ik.papers.chandra.calibration import (
     LOSSES,
     Calibration,
     HandModel,
@@ -31,7 +32,6 @@ from casadi_ik.calibration import (
     simulate,
     true_values,
 )
-from casadi_ik.errors import InputError
 
 OUTLIERS = 0.1, 0.25
 """Parts of the poses that are outliers, beside none, if not asked otherwise."""

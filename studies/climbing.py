@@ -21,8 +21,8 @@ from runner.parts import code_version, keep
 from samplers import contact_slopes, corners
 
 import casadi_ik as ik
-from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
+from casadi_ik.files.arrays import Array
 
 CLIMBERS = 512
 PATIENCE = 25

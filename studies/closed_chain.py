@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 import casadi_ik as ik
-from casadi_ik.arms.recognise import srs_arm
-from casadi_ik.arms.search import PARAMETERS, ArmTrials, Farthest
-from casadi_ik.arrays import Array
-from casadi_ik.kernels import FunctionKernel
-from casadi_ik.symbolic.closed_chain import closed_chain, split
-from casadi_ik.symbolic.kinematics import Pose, actuated
+from casadi_ik.compile import FunctionKernel
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.arms.recognise import srs_arm
+from casadi_ik.kinematics.arms.search import PARAMETERS, ArmTrials, Farthest
+from casadi_ik.kinematics.closed_chain import closed_chain, split
+from casadi_ik.kinematics.forward import Pose, actuated
 
 LENGTH = 0.1
 """Unit of the constraint's linear rows [m]: about the size of a hand."""

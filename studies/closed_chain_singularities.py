@@ -16,8 +16,8 @@ from runner.figures import OURS, PAPER, field, figure, options, title, write
 from runner.report import command, program
 
 import casadi_ik as ik
-from casadi_ik.arrays import Array
-from casadi_ik.symbolic.closed_chain import VIRTUAL, mobility, pivoted, split
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.closed_chain import VIRTUAL, mobility, pivoted, split
 
 
 def conditions(

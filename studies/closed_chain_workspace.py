@@ -16,7 +16,7 @@ from runner.figures import OURS, PAPER, field, figure, options, title, write
 from runner.report import command, program
 
 import casadi_ik as ik
-from casadi_ik.arrays import Array
+from casadi_ik.files.arrays import Array
 
 
 def random_palms(

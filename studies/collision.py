@@ -45,7 +45,7 @@ from runner.report import (
 from samplers import grasps_of
 
 import casadi_ik as ik
-from casadi_ik.problem.clearance import CollisionQuery, SceneCheck
+from casadi_ik.collision.clearance import CollisionQuery, SceneCheck
 
 ROBOTS = ("kuka_lwr_barrett", "panda+allegro_right", "ur5e+shadow")
 CLUTTER = (0, 3, 8)

@@ -27,7 +27,7 @@ from runner.parts import code_version
 from runner.report import command, markdown_table, program, publish
 
 import casadi_ik as ik
-from casadi_ik.arrays import Array
+from casadi_ik.files.arrays import Array
 
 Kept = dict[str, Any]
 """Arrays by name of the targets / what they are."""
@@ -129,7 +129,7 @@ def _seconds(call: Callable[[], object]) -> float:
     return time.thread_time() - begin
 
 
-def _kept(name: str, points: Array, whys: tuple[ik.answers.Diagnosis | None, ...]) -> Kept:
+def _kept(name: str, points: Array, whys: tuple[ik.solve.Diagnosis | None, ...]) -> Kept:
     nearest = [
         np.nan if why is None else max(near.position_error for near in why.nearest.values())
         for why in whys

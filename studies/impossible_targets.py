@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 import casadi_ik as ik
-from casadi_ik.arrays import Array
+from casadi_ik.files.arrays import Array
 
 Targets = tuple[Array, Array]
 

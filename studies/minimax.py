@@ -20,9 +20,9 @@ import casadi as ca
 import numpy as np
 
 import casadi_ik as ik
-from casadi_ik.arrays import Array
-from casadi_ik.symbolic.couplings import joint_positions
-from casadi_ik.symbolic.kinematics import actuated
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.couplings import joint_positions
+from casadi_ik.kinematics.forward import actuated
 
 ITERATIONS = 300
 """Of Ipopt, from one start."""

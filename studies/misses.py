@@ -47,8 +47,8 @@ from runner.report import (
 from samplers import SAMPLERS, finger_sets, noisy, random_hands, suits
 
 import casadi_ik as ik
-from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
+from casadi_ik.files.arrays import Array
 
 MADE = {path.stem: path for path in (Path(__file__).parent / "robots").glob("*.yaml")}
 """Robots that no parameter of a method was chosen for, and their arms."""

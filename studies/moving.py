@@ -31,7 +31,7 @@ from runner.report import (
 from samplers import grasps_of, palm_slopes, smooth_path
 
 import casadi_ik as ik
-from casadi_ik.arrays import Array
+from casadi_ik.files.arrays import Array
 
 ROBOTS = ("kuka_lwr_barrett", "panda+allegro_right", "ur5e+shadow")
 PERIOD = 1e-3

@@ -18,7 +18,7 @@ from rich.console import Console
 from runner.report import command, markdown_table, publish
 
 import casadi_ik as ik
-from casadi_ik.arrays import Array
+from casadi_ik.files.arrays import Array
 
 STEP = 0.25e-3
 """Largest motion of a contact from one target of a path to the next [m], about."""

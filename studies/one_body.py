@@ -34,8 +34,8 @@ from runner.report import (
 )
 
 import casadi_ik as ik
-from casadi_ik.arm_hand import ArmHand
-from casadi_ik.arrays import Array
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.arm_hand import ArmHand
 
 ROBOTS = (
     "g1+dex3",

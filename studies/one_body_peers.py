@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from peers import SETTINGS, run_peer
 
 import casadi_ik as ik
-from casadi_ik.arm_hand import ArmHand
-from casadi_ik.symbolic.kinematics import actuated
+from casadi_ik.kinematics.arm_hand import ArmHand
+from casadi_ik.kinematics.forward import actuated
 
 Array = NDArray[np.float64]
 LEG = 90

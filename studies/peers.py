@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import casadi_ik as ik
-from casadi_ik.arrays import Array
+from casadi_ik.files.arrays import Array
 from casadi_ik.files.reading import roll_pitch_yaw
 
 Targets = tuple[Array, Array]

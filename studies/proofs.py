@@ -39,9 +39,9 @@ from runner.report import (
 from samplers import corners, near_limits, random_hands, singular_arms
 
 import casadi_ik as ik
-from casadi_ik.arrays import Array
-from casadi_ik.problem.targets import TargetBatch
-from casadi_ik.proofs.prove import Prover
+from casadi_ik.files.arrays import Array
+from casadi_ik.model.targets import TargetBatch
+from casadi_ik.solve.proofs.prove import Prover
 
 ROBOTS = (*SHIPPED_AND_MADE, "ur5e+shadow")
 

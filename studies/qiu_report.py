@@ -25,9 +25,9 @@ from runner.report import (
 from runner.study import Setting, Study, code_of, read_results, robot_of
 
 import casadi_ik as ik
-from casadi_ik.arrays import Array
+from casadi_ik.app.drawing.palette import method_colors
 from casadi_ik.errors import InputError
-from casadi_ik.palette import method_colors
+from casadi_ik.files.arrays import Array
 
 BUDGET = 10_000
 """Iterations of a solve (section III of the paper)."""

@@ -16,7 +16,7 @@ from samplers import grasp_arms
 import casadi_ik as ik
 from casadi_ik.errors import InputError
 from casadi_ik.files.shipped import models_folder
-from casadi_ik.registry import option_names
+from casadi_ik.solve.registry import option_names
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 
 import casadi_ik as ik
-from casadi_ik.arrays import Array
+from casadi_ik.files.arrays import Array
 
 Sampler = Callable[[ik.ArmHand, np.random.Generator, int], Array]
 

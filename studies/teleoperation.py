@@ -30,7 +30,7 @@ from runner.report import command, markdown_table, publish
 from samplers import smooth_path
 
 import casadi_ik as ik
-from casadi_ik.arrays import Array
+from casadi_ik.files.arrays import Array
 
 ROBOTS = ("panda+allegro_right", "kuka_lwr_barrett", "ur5e+shadow")
 PERIOD = 0.01

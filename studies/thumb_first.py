@@ -19,7 +19,7 @@ from runner.report import command, program
 from samplers import random_arm_targets
 
 import casadi_ik as ik
-from casadi_ik.arrays import Array
+from casadi_ik.files.arrays import Array
 
 Targets = tuple[Array, Array]
 

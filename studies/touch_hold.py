@@ -40,8 +40,8 @@ from runner.study import robot_of, standing
 
 import casadi_ik as ik
 from casadi_ik.collision.solids import object_solids
-from casadi_ik.touch.grasps import FoundGrasp
-from casadi_ik.touch.strength import offsets
+from casadi_ik.planning.touch.grasps import FoundGrasp
+from casadi_ik.planning.touch.strength import offsets
 
 mujoco: Any = import_module("mujoco")
 

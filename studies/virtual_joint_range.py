@@ -16,8 +16,8 @@ from runner.figures import OURS, field, figure, options, title, write
 from runner.report import command, program
 
 import casadi_ik as ik
-from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
+from casadi_ik.files.arrays import Array
 
 
 def usable(robot: ik.ArmHand, held: HeldThumb, q: Array, steps: int) -> NDArray[np.bool_]:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from casadi_ik import viewing
-from casadi_ik.cli.lists import schema_of
-from casadi_ik.cli.main import main
-from casadi_ik.cli.table import COMMANDS, GROUPS, load, parse
+from casadi_ik.app import viewer as viewing
+from casadi_ik.app.cli.lists import schema_of
+from casadi_ik.app.cli.main import main
+from casadi_ik.app.cli.table import COMMANDS, GROUPS, load, parse
 
 __all__ = ["COMMANDS", "GROUPS", "load", "main", "schema_of", "shown"]
 
 
 def shown(*words: str) -> viewing.Viewer:
     """What `casadi-ik view` shows, without waiting until it is stopped."""
-    from casadi_ik.cli.view import opened
+    from casadi_ik.app.cli.view import opened
 
     return opened(parse(["view", *words])[1])

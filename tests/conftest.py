@@ -23,7 +23,7 @@ import casadi_ik as ik
 if TYPE_CHECKING:
     from pinocchio_oracle import PinocchioRobot
 
-    from casadi_ik.viewing import Viewer
+    from casadi_ik.app.viewer import Viewer
 
 REFERENCE = re.compile(r"^ *(?:import|from) (?:pinocchio|coal)(?:_oracle)?\b", re.MULTILINE)
 """A test module that asks other libraries for a second opinion: the extra `reference`."""
@@ -148,5 +148,5 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def _has_opengl() -> bool:
     """Tried in a process of its own, since VTK may end it."""
-    program = "from casadi_ik.views.stage import Stage; Stage().close()"
+    program = "from casadi_ik.app.pictures.scene3d import Stage; Stage().close()"
     return subprocess.run([sys.executable, "-c", program], capture_output=True).returncode == 0

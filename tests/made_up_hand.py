@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 import casadi_ik as ik
-from casadi_ik.arrays import Array
+from casadi_ik.files.arrays import Array
 
 BONES = (0.045, 0.027, 0.022)
 """Of a finger behind its knuckle [m]."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 import casadi_ik as ik
-from casadi_ik.robots import FourBar, LeadScrew
+from casadi_ik.model.couplings import FourBar, LeadScrew
 
 
 def joint_positions(robot: ik.ArmHand, q: np.ndarray) -> dict[str, np.ndarray]:

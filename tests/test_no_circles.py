@@ -1,4 +1,4 @@
-"""No module of the package needs, over whatever way, one that needs it."""
+"""No module of the package imports, directly or not, a module that imports it."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ def module_name(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def needs(path: Path, modules: set[str]) -> set[str]:
-    """Modules of the package that one imports anywhere, inside its functions too."""
+def imported_modules(path: Path, modules: set[str]) -> set[str]:
+    """Return the modules of the package that a file imports.
+
+    Imports inside functions and below `TYPE_CHECKING` count.
+    """
 
     def imports(node: ast.AST) -> set[str]:
-        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
-            return set()
         found: set[str] = set()
         if isinstance(node, ast.Import):
             found = {alias.name for alias in node.names}
@@ -33,10 +34,22 @@ def needs(path: Path, modules: set[str]) -> set[str]:
     return imports(ast.parse(path.read_text(encoding="utf-8"))) & modules - {module_name(path)}
 
 
+ALLOWED = {
+    "casadi_ik.app.viewer.candidates": "casadi_ik.app.viewer.grasp_page",
+    "casadi_ik.app.viewer.viser_scene": "casadi_ik.app.viewer.page",
+    "casadi_ik.planning.touch.hand_table": "casadi_ik.planning.touch.candidates",
+    "casadi_ik.planning.touch.strength": "casadi_ik.planning.touch.grasps",
+    "casadi_ik.solve.hand_first.iteration": "casadi_ik.solve.hand_first.step",
+}
+"""Imports of a type only, which are still to be removed."""
+
+
 def test_no_circles():
     paths = {module_name(path): path for path in ROOT.rglob("*.py")}
-    graph = {name: needs(path, set(paths)) for name, path in paths.items()}
-    assert "casadi_ik.cli.inputs" in graph["casadi_ik.cli.batch"]
+    graph = {name: imported_modules(path, set(paths)) for name, path in paths.items()}
+    for name, imported in ALLOWED.items():
+        graph[name].remove(imported)
+    assert "casadi_ik.app.cli.inputs" in graph["casadi_ik.app.cli.batch"]
     try:
         TopologicalSorter(graph).prepare()
     except CycleError as error:

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import casadi_ik as ik
-from casadi_ik.answers.recorder import SolveBlock
-from casadi_ik.kernels.layout import Layout  # noqa: F401 (for test_trace_contract)
-from casadi_ik.problem.status import Phase, Status
-from casadi_ik.problem.trace import (  # noqa: F401
+from casadi_ik.compile.layout import Layout  # noqa: F401 (for test_trace_contract)
+from casadi_ik.solve.recorder import SolveBlock
+from casadi_ik.solve.status import Phase, Status
+from casadi_ik.solve.trace import (
     ACCEPTED,
     ACTIVE_MASK,
     ANGLE_ERROR,
@@ -26,12 +26,9 @@ from casadi_ik.problem.trace import (  # noqa: F401
     PHASE,
     POSITION_ERROR,
     RESTART,
-    STANDARD,
     STATUS,
     STEP_SIZE,
     Q,
-    StandardField,
-    trace_format,
 )
 
 LENGTH = 0.1

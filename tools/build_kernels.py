@@ -24,11 +24,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import casadi_ik as ik
-from casadi_ik.exporting.project import uses
-from casadi_ik.kernels import libraries
-from casadi_ik.kernels.compiler import FLAGS, ZIG, Compiler
-from casadi_ik.kernels.function_kernel import machine_lanes
-from casadi_ik.kernels.graphs import package_sources
+from casadi_ik.compile import libraries
+from casadi_ik.compile.compiler import FLAGS, ZIG, Compiler
+from casadi_ik.compile.function_kernel import machine_lanes
+from casadi_ik.compile.graphs import package_sources
+from casadi_ik.export.project import uses
 
 ROBOTS = {
     "kuka_lwr_barrett": "the package's own examples; Qiu & Kermani 2021",

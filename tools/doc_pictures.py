@@ -16,9 +16,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import casadi_ik as ik
-from casadi_ik import palette
-from casadi_ik.arrays import Array
-from casadi_ik.drawing.drawables import (
+from casadi_ik.app.drawing import palette
+from casadi_ik.app.drawing.drawables import (
     Drawable,
     View,
     asked_marks,
@@ -30,10 +29,11 @@ from casadi_ik.drawing.drawables import (
     scene_of,
     whole_view,
 )
-from casadi_ik.drawing.surfaces import ball
-from casadi_ik.problem.clearance import closest_points
-from casadi_ik.views.charts import new_figure, save_picture
-from casadi_ik.views.stage import Image, Stage, over, points_of
+from casadi_ik.app.drawing.surfaces import ball
+from casadi_ik.app.pictures.charts import new_figure, save_picture
+from casadi_ik.app.pictures.scene3d import Image, Stage, over, points_of
+from casadi_ik.collision.clearance import closest_points
+from casadi_ik.files.arrays import Array
 
 PAIRS = (
     ("kuka_lwr_barrett", "LWR 4+ · Barrett"),

@@ -16,12 +16,12 @@ from shape_fitting.writing import write
 
 from casadi_ik.files.reading import read
 from casadi_ik.files.shipped import resolve
-from casadi_ik.importing.capsules import FIT, fitted, worst
-from casadi_ik.importing.robot_shapes import may_touch
-from casadi_ik.importing.surfaces import Surface, together
-from casadi_ik.robots.linkage import link_poses
-from casadi_ik.robots.parts import described_part
-from casadi_ik.robots.schema import ArmFile, HandFile
+from casadi_ik.integrations.importing.capsules import FIT, fitted, worst
+from casadi_ik.integrations.importing.robot_shapes import may_touch
+from casadi_ik.integrations.importing.surfaces import Surface, together
+from casadi_ik.model.linkage import link_poses
+from casadi_ik.model.parts import described_part
+from casadi_ik.model.schema import ArmFile, HandFile
 
 
 def main() -> None:

@@ -18,12 +18,12 @@ from PIL import Image as Pillow
 from PIL import ImageDraw
 
 import casadi_ik as ik
-from casadi_ik import palette
-from casadi_ik.arrays import Array
-from casadi_ik.drawing.drawables import asked_marks, close_view, object_of, placed, whole_view
-from casadi_ik.views.charts import save_picture
-from casadi_ik.views.pictures import animated
-from casadi_ik.views.stage import Image, Stage, over, points_of
+from casadi_ik.app.drawing import palette
+from casadi_ik.app.drawing.drawables import asked_marks, close_view, object_of, placed, whole_view
+from casadi_ik.app.pictures.charts import save_picture
+from casadi_ik.app.pictures.pictures import animated
+from casadi_ik.app.pictures.scene3d import Image, Stage, over, points_of
+from casadi_ik.files.arrays import Array
 
 ROBOT, GRASP = "kuka_lwr_barrett", "cup"
 

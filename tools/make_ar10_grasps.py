@@ -27,10 +27,10 @@ from grasp_synthesis.holding import Scene, hold
 from grasp_synthesis.writing import grasp_text, made_by, placed_at
 
 import casadi_ik as ik
-from casadi_ik.arrays import Array
+from casadi_ik.collision.clearance import SceneCheck
+from casadi_ik.files.arrays import Array
 from casadi_ik.files.shipped import models_folder
-from casadi_ik.grasps import GraspObject, load_object
-from casadi_ik.problem.clearance import SceneCheck
+from casadi_ik.model.objects import GraspObject, load_object
 
 ROBOT, ROOT = "baxter_ar10", "hand_base"
 ALL, TWO = {"thumb": 1, "index": -1, "middle": -1}, {"thumb": 1, "index": -1}

@@ -19,11 +19,11 @@ import numpy as np
 from torch_zip import write_torch
 
 import casadi_ik as ik
-from casadi_ik.arrays import Array
-from casadi_ik.datasets.layouts import Convention, load_convention
-from casadi_ik.datasets.postures import HandPoses
+from casadi_ik.files.arrays import Array
 from casadi_ik.files.reading import roll_pitch_yaw
-from casadi_ik.grasps.pose import inverse
+from casadi_ik.integrations.datasets.layouts import Convention, load_convention
+from casadi_ik.integrations.datasets.postures import HandPoses
+from casadi_ik.model.pose import inverse
 
 ROBOTS = {
     "allegro": "panda+allegro_right",

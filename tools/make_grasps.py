@@ -29,7 +29,7 @@ from grasp_synthesis.writing import barrett_text
 
 import casadi_ik as ik
 from casadi_ik.files.shipped import models_folder
-from casadi_ik.grasps import GraspObject, load_object
+from casadi_ik.model.objects import GraspObject, load_object
 
 PLACES = 20  # places tried per pinch
 MIN_CONDITIONING = 0.10  # smallest singular value of the palm's Jacobian (metres, radians)

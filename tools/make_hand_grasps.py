@@ -23,9 +23,10 @@ import numpy as np
 from grasp_synthesis.writing import grasp_text, made_by, placed_at
 
 import casadi_ik as ik
-from casadi_ik.arrays import Array
+from casadi_ik.files.arrays import Array
 from casadi_ik.files.shipped import models_folder
-from casadi_ik.grasps import Box, Cylinder, EllipticCylinder, GraspObject, load_object
+from casadi_ik.model.objects import GraspObject, load_object
+from casadi_ik.model.shapes import Box, Cylinder, EllipticCylinder
 
 HANDS = {
     "allegro": ("allegro_right", ("tomato_soup_can", "mug", "cup")),

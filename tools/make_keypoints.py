@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 import casadi_ik as ik
-from casadi_ik.arrays import Array
+from casadi_ik.files.arrays import Array
 from casadi_ik.files.reading import Frame, frame_matrix
 from casadi_ik.motion.retarget import OPENXR, RATE
 

@@ -20,14 +20,14 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 from shape_fitting.links import in_our_links
 
-from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
+from casadi_ik.files.arrays import Array
 from casadi_ik.files.reading import read
 from casadi_ik.files.shipped import resolve
-from casadi_ik.importing.surfaces import Surface, together
-from casadi_ik.robots.collision import LinkCapsule, LinkSolid
-from casadi_ik.robots.parts import Part, described_part
-from casadi_ik.robots.schema import ArmFile, HandFile
+from casadi_ik.integrations.importing.surfaces import Surface, together
+from casadi_ik.model.link_shapes import LinkCapsule, LinkSolid
+from casadi_ik.model.parts import Part, described_part
+from casadi_ik.model.schema import ArmFile, HandFile
 
 SHARE = "example_robot_data/cmeel.prefix/share/example-robot-data/robots"
 SUITE = "robosuite/robosuite/models/assets"

@@ -13,7 +13,7 @@ from zipfile import ZipFile
 
 import numpy as np
 
-from casadi_ik.arrays import Array
+from casadi_ik.files.arrays import Array
 
 Content = dict[str, "Content"] | list["Content"] | tuple["Content", ...] | str | int | Array
 """What can be in a file: tensors are arrays, kept as four bytes a number."""

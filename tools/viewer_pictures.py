@@ -24,11 +24,11 @@ from typing import Any
 import numpy as np
 from PIL import Image as Pillow
 
-from casadi_ik.cli.main import main as command
-from casadi_ik.cli.table import parse
-from casadi_ik.cli.view import opened
+from casadi_ik.app.cli.main import main as command
+from casadi_ik.app.cli.table import parse
+from casadi_ik.app.cli.view import opened
+from casadi_ik.app.viewer.grasp_page import GraspPage
 from casadi_ik.files.shipped import resolve
-from casadi_ik.viewing.grasp_page import GraspPage
 
 ROBOT = "kuka_lwr_barrett"
 WINDOW = (1200, 760)

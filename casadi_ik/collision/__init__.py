@@ -1,1 +1,1 @@
-"""Shapes, scenes and distances: what may be hit, and how far it is."""
+"""Collision shapes, scenes, distances and clearance."""

@@ -1,6 +1,6 @@
 """Pairs of shapes as arrays, and their distances in numpy.
 
-The compiled driver (``kernels/drivers/clearance.c``) gives the same distances; numpy serves where
+The compiled driver (``compile/runtime/clearance.c``) gives the same distances; numpy serves where
 there is no compiler, and where few distances are wanted: gaps between things, nearest points.
 """
 
@@ -14,11 +14,12 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Item
 from casadi_ik.collision.solids import Kind, Solid, along_rays, spread
-from casadi_ik.robots.description import Joint, RobotDescription
-from casadi_ik.robots.linkage import joint_positions
+from casadi_ik.files.arrays import Array
+from casadi_ik.model.description import RobotDescription
+from casadi_ik.model.joints import Joint
+from casadi_ik.model.linkage import joint_positions
 
 
 @dataclass(frozen=True, eq=False)

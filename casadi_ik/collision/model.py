@@ -11,15 +11,15 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.arrays import Array
 from casadi_ik.collision.distances import Table, from_solid, pose_row
 from casadi_ik.collision.scene import Scene
 from casadi_ik.collision.solids import Solid, box, cylinder
 from casadi_ik.errors import DescriptionError, UnsupportedError
-from casadi_ik.robots.collision import LinkCapsule, Shapes, Touching
-from casadi_ik.robots.description import RobotDescription
-from casadi_ik.robots.linkage import rigid_bodies
-from casadi_ik.symbolic.kinematics import Pose, actuated
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.forward import Pose, actuated
+from casadi_ik.model.description import RobotDescription
+from casadi_ik.model.link_shapes import LinkCapsule, Shapes, Touching
+from casadi_ik.model.linkage import rigid_bodies
 
 
 @dataclass(frozen=True, eq=False)

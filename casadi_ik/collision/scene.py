@@ -13,7 +13,6 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from casadi_ik.arrays import Array
 from casadi_ik.collision.solids import (
     Solid,
     box,
@@ -27,6 +26,7 @@ from casadi_ik.collision.solids import (
     thinned,
 )
 from casadi_ik.errors import DescriptionError, InputError, UnknownNameError
+from casadi_ik.files.arrays import Array
 from casadi_ik.files.limits import LIMITS
 from casadi_ik.files.number_files import finite_points, read_mesh, read_points
 from casadi_ik.files.reading import (
@@ -40,10 +40,10 @@ from casadi_ik.files.reading import (
 )
 from casadi_ik.files.shipped import resolve
 from casadi_ik.files.units import Distance, Factor, Length, Pure, Size
-from casadi_ik.grasps.pose import checked_pose, one_pose, rotations_of
-from casadi_ik.grasps.shapes import load_mesh_shape
-from casadi_ik.robots.collision import Touching
-from casadi_ik.robots.schema import TouchingEntry
+from casadi_ik.model.link_shapes import Touching
+from casadi_ik.model.pose import checked_pose, one_pose, rotations_of
+from casadi_ik.model.schema import TouchingEntry
+from casadi_ik.model.shapes import load_mesh_shape
 
 Part = tuple[Solid, Array]
 """A solid and its (4, 4) pose in the frame of what it is part of."""

@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
-from casadi_ik.grasps.objects import load_object
-from casadi_ik.grasps.shapes import (
+from casadi_ik.files.arrays import Array
+from casadi_ik.model.objects import load_object
+from casadi_ik.model.shapes import (
     BentCapsule,
     Box,
     Cylinder,
@@ -36,7 +36,7 @@ from casadi_ik.grasps.shapes import (
 )
 
 GROUP = 32
-"""Points of a cloud that share a bounding ball, as in ``drivers/clearance.c``."""
+"""Points of a cloud that share a bounding ball, as in ``runtime/clearance.c``."""
 
 
 class Kind(IntEnum):
@@ -86,7 +86,7 @@ class Solid:
 
 @dataclass(frozen=True)
 class Row:
-    """What the package knows of a kind besides its distance in ``drivers/clearance.c``.
+    """What the package knows of a kind besides its distance in ``runtime/clearance.c``.
 
     Attributes:
         distance: Signed distance of points (..., 3) from a solid. Exact or less; convex, except

@@ -1,1 +1,1 @@
-"""Description files: YAML with units, and where the shipped ones are."""
+"""Reading and writing of files, and limits on what is read."""

@@ -19,8 +19,8 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
+from casadi_ik.files.arrays import Array
 from casadi_ik.files.limits import LIMITS, RAISED, limit
 from casadi_ik.files.reading import read_bytes
 

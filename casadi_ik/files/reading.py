@@ -15,8 +15,8 @@ import numpy as np
 import yaml
 from yaml.composer import ComposerError
 
-from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
+from casadi_ik.files.arrays import Array
 from casadi_ik.files.limits import LIMITS
 from casadi_ik.files.units import (
     QUANTITY,

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from mcap.writer import Writer
 
-from casadi_ik.arm_hand import ArmHand
-from casadi_ik.arrays import Array
 from casadi_ik.errors import LogError
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.logs.container import CDR_HEADER, MESSAGE, read_chunk, read_contents, reading
 
 Stamp = tuple[int, int]

@@ -52,8 +52,8 @@ from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC as MAGIC
 from numpy.typing import NDArray
 
+from casadi_ik.compile.layout import opaque
 from casadi_ik.errors import LogError, os_errors
-from casadi_ik.kernels.layout import opaque
 
 Kind = TypeVar("Kind", bound=McapRecord)
 

@@ -18,7 +18,7 @@ standard field            events
 ``CLEARANCE``             COLLISION_ENTERED, COLLISION_LEFT (of a log with a scene)
 ========================  ==============================================================
 
-The standard fields are those of `casadi_ik.problem.trace`. One that a layout does not have gives
+The standard fields are those of `casadi_ik.solve.trace`. One that a layout does not have gives
 no events. A finder is a function in `FINDERS`.
 """
 
@@ -34,10 +34,10 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from casadi_ik.arrays import Bools, Rows
+from casadi_ik.compile.layout import Field, Layout
 from casadi_ik.errors import InputError
-from casadi_ik.kernels.layout import Field, Layout
-from casadi_ik.problem.trace import (
+from casadi_ik.files.arrays import Bools, Rows
+from casadi_ik.solve.trace import (
     ACTIVE_MASK,
     ANGLE_ERROR,
     CLEARANCE,

@@ -13,14 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.contacts import NAMES
 from casadi_ik.logs.events import Happening, errors_text, listed, number, plain_name, plural
 from casadi_ik.logs.format import LogClock
 from casadi_ik.logs.reader import Log
 from casadi_ik.logs.solve import OneSolve, Stretch, targets_beside
-from casadi_ik.problem.contacts import NAMES
-from casadi_ik.problem.trace import CLEARANCE
+from casadi_ik.solve.trace import CLEARANCE
 
 STRETCHES_SHOWN = 6
 """More stretches than this are told phase by phase."""

@@ -24,9 +24,9 @@ import numpy as np
 from mcap.records import Metadata
 from numpy.typing import NDArray
 
+from casadi_ik.compile.layout import Field, Layout
 from casadi_ik.errors import InputError, LogError
 from casadi_ik.files.writing import plain
-from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.logs.container import check_size
 
 KINDS = ("iteration", "solve", "event")

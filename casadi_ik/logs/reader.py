@@ -11,8 +11,8 @@ from typing import Any, TypedDict, Unpack
 
 import numpy as np
 
-from casadi_ik.arrays import Counts
 from casadi_ik.errors import LogError, UnknownNameError, printable
+from casadi_ik.files.arrays import Counts
 from casadi_ik.logs.events import EventKind
 from casadi_ik.logs.format import KINDS
 from casadi_ik.logs.shards import Paths, Shard, Sources, open_shards

@@ -21,10 +21,10 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import Attachment, ChunkIndex, Metadata
 from mcap.summary import Summary
 
-from casadi_ik.arrays import Counts
+from casadi_ik.compile.layout import Layout
 from casadi_ik.errors import LogError, os_errors
+from casadi_ik.files.arrays import Counts
 from casadi_ik.files.writing import written_whole
-from casadi_ik.kernels.layout import Layout
 from casadi_ik.logs.container import (
     COMPRESSORS,
     Contents,

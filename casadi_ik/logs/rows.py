@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.answers.recorder import SolveBlock
-from casadi_ik.kernels.layout import Field, Layout, opaque
+from casadi_ik.compile.layout import Field, Layout, opaque
+from casadi_ik.kinematics.contacts import NAMES
 from casadi_ik.logs.events import EventKind, as_matrix, jacobian_names, measured_jacobians, words_of
-from casadi_ik.problem.contacts import NAMES
-from casadi_ik.problem.request import NO_PREFERENCE, PREFERENCES
-from casadi_ik.problem.status import Status
-from casadi_ik.problem.trace import CLEARANCE, TraceFormat
+from casadi_ik.solve.recorder import SolveBlock
+from casadi_ik.solve.request import NO_PREFERENCE, PREFERENCES
+from casadi_ik.solve.status import Status
+from casadi_ik.solve.trace import CLEARANCE, TraceFormat
 
 STATUSES = (*Status.labels(), Status.INVALID.name)
 """Names of the codes of a solve's status: those of `Status`, the last for its -1."""

@@ -23,9 +23,9 @@ from mcap.records import Attachment, Channel, ChunkIndex, Schema
 from numpy.lib.recfunctions import repack_fields
 from numpy.typing import NDArray
 
-from casadi_ik.arrays import Counts
+from casadi_ik.compile.layout import Field, Layout, opaque
 from casadi_ik.errors import LogError, UnknownNameError, os_errors, printable
-from casadi_ik.kernels.layout import Field, Layout, opaque
+from casadi_ik.files.arrays import Counts
 from casadi_ik.logs.container import (
     NothingWrittenError,
     read_chunk,
@@ -46,7 +46,7 @@ from casadi_ik.logs.format import (
 )
 from casadi_ik.logs.rows import solve_layout
 from casadi_ik.logs.tables import Labels, MethodRows
-from casadi_ik.problem.trace import CONDITION, SIGMA, STANDARD, Elements
+from casadi_ik.solve.trace import CONDITION, SIGMA, STANDARD, Elements
 
 logger = logging.getLogger(__name__)
 

@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.arm_hand import ArmHand
-from casadi_ik.arrays import Array
+from casadi_ik.compile.layout import Field, Layout
 from casadi_ik.errors import LogError, UnknownNameError
-from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.arm_hand import ArmHand
+from casadi_ik.kinematics.contacts import NAMES
 from casadi_ik.logs.events import Happening, bits_of, errors_text, measured_jacobians
 from casadi_ik.logs.reader import Log
 from casadi_ik.logs.tables import MethodRows, Table, element_name, happenings, label_of
-from casadi_ik.problem.contacts import NAMES
-from casadi_ik.problem.request import NO_PREFERENCE
-from casadi_ik.problem.targets import Tolerance
-from casadi_ik.problem.trace import SIGMA, TraceFormat
+from casadi_ik.model.targets import Tolerance
+from casadi_ik.solve.request import NO_PREFERENCE
+from casadi_ik.solve.trace import SIGMA, TraceFormat
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.compile.layout import opaque
 from casadi_ik.errors import LogError, MissingExtraError, UnknownNameError, os_errors
-from casadi_ik.kernels.layout import opaque
 from casadi_ik.logs.events import MOVES, SINGULAR, EventKind, Happening, as_matrix, bits_of
 
 if TYPE_CHECKING:

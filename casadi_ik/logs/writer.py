@@ -26,7 +26,6 @@ from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
 from mcap.summary import Summary
 from numpy.typing import NDArray
 
-from casadi_ik.answers.recorder import Recorder, SolveBlock
 from casadi_ik.errors import InputError, LogError
 from casadi_ik.files.writing import InBackground
 from casadi_ik.logs.container import (
@@ -51,7 +50,8 @@ from casadi_ik.logs.format import (
     topic,
 )
 from casadi_ik.logs.rows import measured_format, measured_rows, solve_format, solve_rows
-from casadi_ik.problem.trace import CLEARANCE, TraceFormat
+from casadi_ik.solve.recorder import Recorder, SolveBlock
+from casadi_ik.solve.trace import CLEARANCE, TraceFormat
 
 try:
     import fcntl

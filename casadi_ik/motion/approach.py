@@ -10,16 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from casadi_ik.arm_hand import ArmHand
-from casadi_ik.arrays import Array
+from casadi_ik.collision.clearance import CollisionQuery
 from casadi_ik.collision.distances import gaps
 from casadi_ik.collision.scene import Scene
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.arm_hand import ArmHand
+from casadi_ik.kinematics.contacts import usual
+from casadi_ik.model.targets import TargetBatch
 from casadi_ik.motion.clear import least_clearance
 from casadi_ik.motion.cycle import of_side
 from casadi_ik.motion.inputs import ANY, FollowerInputs, FollowPlan
-from casadi_ik.problem.clearance import CollisionQuery
-from casadi_ik.problem.contacts import usual
-from casadi_ik.problem.targets import TargetBatch
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,13 +24,13 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.arm_hand import ArmHand
-from casadi_ik.arrays import Array, Bools
+from casadi_ik.collision.clearance import ROUNDING, Clearances, CollisionQuery
+from casadi_ik.collision.clearance_kernel import OBSTACLES, Guarding
 from casadi_ik.collision.distances import levers
-from casadi_ik.kernels.clearance_kernel import OBSTACLES, Guarding
+from casadi_ik.files.arrays import Array, Bools
+from casadi_ik.kinematics.arm_hand import ArmHand
+from casadi_ik.model.targets import TargetBatch
 from casadi_ik.motion.inputs import FollowerInputs, FollowPlan
-from casadi_ik.problem.clearance import ROUNDING, Clearances, CollisionQuery
-from casadi_ik.problem.targets import TargetBatch
 
 
 def stopping_way(moved: Array, change: Array) -> Array:

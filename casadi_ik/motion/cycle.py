@@ -36,12 +36,12 @@ from functools import cached_property
 
 import casadi as ca
 
-from casadi_ik.arrays import Array
-from casadi_ik.kernels.graphs import FunctionGraph, recipe
-from casadi_ik.kernels.layout import Field, Layout
-from casadi_ik.methods.common.bounded_step import Bounded, damped_step
-from casadi_ik.methods.common.contact_fit import whole_jacobian, whole_residual
-from casadi_ik.problem.contacts import (
+from casadi_ik.compile.graphs import FunctionGraph, recipe
+from casadi_ik.compile.layout import Field, Layout
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.box_qp import Bounded, damped_step
+from casadi_ik.kinematics.contact_fit import whole_jacobian, whole_residual
+from casadi_ik.kinematics.contacts import (
     LENGTH,
     ContactRows,
     Kinds,
@@ -49,10 +49,10 @@ from casadi_ik.problem.contacts import (
     tip_vectors,
     within_tolerance,
 )
-from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.kinematics import actuated, motor_scales
-from casadi_ik.symbolic.se3 import skew
-from casadi_ik.symbolic.smooth import Expr, shared
+from casadi_ik.kinematics.forward import actuated, motor_scales
+from casadi_ik.kinematics.se3 import skew
+from casadi_ik.kinematics.smooth import Expr, shared
+from casadi_ik.model.description import RobotDescription
 
 
 @dataclass(frozen=True)

@@ -9,15 +9,14 @@ from enum import Enum
 import numpy as np
 from numpy.typing import ArrayLike
 
-from casadi_ik.answers.solution import Pair
-from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
-from casadi_ik.grasps import Grasp
-from casadi_ik.grasps.grasp import real_array
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.contacts import Kinds, by_kinds, usual
+from casadi_ik.model.grasp import Grasp, real_array
 from casadi_ik.motion.clear import OBSTACLES, Guard, stopping_way
 from casadi_ik.motion.inputs import FollowerInputs, FollowPlan
-from casadi_ik.problem.contacts import Kinds, by_kinds, usual
-from casadi_ik.problem.verdict import TOLERANCE_SLACK
+from casadi_ik.solve.solution import Pair
+from casadi_ik.solve.verdict import TOLERANCE_SLACK
 
 Poses = Mapping[str | None, Array]
 """Of palms (4, 4), by side; None: of the only one."""

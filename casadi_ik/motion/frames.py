@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from casadi_ik.arm_hand import ArmHand
-from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
+from casadi_ik.files.arrays import Array
 from casadi_ik.files.limits import LIMITS, RAISED, limit
 from casadi_ik.files.number_files import read_npz
+from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.motion.cycle import of_side
 from casadi_ik.motion.follower import Follower, FollowStatus
 from casadi_ik.motion.motion import Motion

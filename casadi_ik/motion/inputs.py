@@ -9,18 +9,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from casadi_ik.arm_hand import ArmHand
-from casadi_ik.arrays import Array, Bools
-from casadi_ik.grasps.pose import one_pose
-from casadi_ik.kernels import FunctionKernel
-from casadi_ik.kernels.function_kernel import Recurrence
+from casadi_ik.collision.clearance import SceneCheck
+from casadi_ik.compile import FunctionKernel
+from casadi_ik.compile.function_kernel import Recurrence
+from casadi_ik.files.arrays import Array, Bools
+from casadi_ik.kinematics.arm_hand import ArmHand
+from casadi_ik.kinematics.contacts import LENGTH, Kinds
+from casadi_ik.model.pose import one_pose
+from casadi_ik.model.targets import TargetBatch, Tolerance
 from casadi_ik.motion.cycle import Cycle, of_side
 from casadi_ik.motion.motion import Rates
-from casadi_ik.problem.clearance import SceneCheck
-from casadi_ik.problem.contacts import LENGTH, Kinds
-from casadi_ik.problem.request import Request
-from casadi_ik.problem.targets import TargetBatch, Tolerance
-from casadi_ik.problem.verdict import deviations
+from casadi_ik.solve.request import Request
+from casadi_ik.solve.verdict import deviations
 
 FADING = 0.05
 """Seconds in which an error of the contacts fades."""

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from mcap.writer import Writer
 
-from casadi_ik.arm_hand import ArmHand
-from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, MissingExtraError
+from casadi_ik.files.arrays import Array
 from casadi_ik.files.writing import written_whole
+from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.logs.cdr import JOINT_TRAJECTORY, cdr_message, ros_channel, write_postures
 
 CROSSING = 1.0

@@ -10,23 +10,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from casadi_ik.answers.solution import Chosen
-from casadi_ik.arm_hand import ArmHand
-from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, UnsupportedError
-from casadi_ik.grasps import Grasp
-from casadi_ik.grasps.pose import inverse, one_pose
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.arm_hand import ArmHand
+from casadi_ik.kinematics.contacts import by_kinds
+from casadi_ik.model.grasp import Grasp
+from casadi_ik.model.pose import inverse, one_pose
+from casadi_ik.model.targets import TargetBatch
 from casadi_ik.motion.approach import Approach, ApproachPlan, approach
 from casadi_ik.motion.follower import Follower
 from casadi_ik.motion.inputs import FollowPlan
 from casadi_ik.motion.motion import a_direction, length, rates_of, seconds, unbounded
 from casadi_ik.motion.reach import Carried, Pace, Reach, WayPlan, move, place, reach
 from casadi_ik.motion.track import PathTracker, Track, track
-from casadi_ik.problem.contacts import by_kinds
-from casadi_ik.problem.request import Request
-from casadi_ik.problem.targets import TargetBatch
-from casadi_ik.problem.verdict import LIMIT_SLACK, judge
-from casadi_ik.solving.engine import Engine, Run
+from casadi_ik.solve.engine import Engine, Run
+from casadi_ik.solve.request import Request
+from casadi_ik.solve.solution import Chosen
+from casadi_ik.solve.verdict import LIMIT_SLACK, judge
 
 SETTLING = 0.1
 """Seconds in which motions that contacts leave free come to their posture."""

@@ -12,10 +12,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from casadi_ik.arm_hand import ArmHand
-from casadi_ik.arrays import Array
+from casadi_ik.collision.clearance import CollisionQuery, SceneCheck
 from casadi_ik.collision.distances import gaps
-from casadi_ik.grasps.pose import inverse
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.arm_hand import ArmHand
+from casadi_ik.model.pose import inverse
+from casadi_ik.model.targets import TargetBatch
 from casadi_ik.motion.approach import (
     ApproachPlan,
     ReachStatus,
@@ -25,8 +27,6 @@ from casadi_ik.motion.approach import (
 )
 from casadi_ik.motion.clear import free_way, least_clearance
 from casadi_ik.motion.motion import Motion, Rates, shares, timed
-from casadi_ik.problem.clearance import CollisionQuery, SceneCheck
-from casadi_ik.problem.targets import TargetBatch
 
 
 class Carried:

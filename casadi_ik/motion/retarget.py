@@ -17,11 +17,11 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from casadi_ik.arm_hand import ArmHand
-from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError, InputError
+from casadi_ik.files.arrays import Array
 from casadi_ik.files.reading import Angles, Frame, Point, Struct, frame_matrix, read
-from casadi_ik.grasps.grasp import real_array
+from casadi_ik.kinematics.arm_hand import ArmHand
+from casadi_ik.model.grasp import real_array
 
 KEYPOINTS = 21
 """Of a hand."""

@@ -9,14 +9,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.arrays import Array, Bools
+from casadi_ik.collision.clearance import CollisionQuery
+from casadi_ik.files.arrays import Array, Bools
+from casadi_ik.kinematics.contacts import Kinds
+from casadi_ik.model.targets import TargetBatch
 from casadi_ik.motion.clear import OBSTACLES, Guard, between
 from casadi_ik.motion.inputs import FollowerInputs, FollowPlan, contact_rows, tolerance_rows
-from casadi_ik.problem.clearance import CollisionQuery
-from casadi_ik.problem.contacts import Kinds
-from casadi_ik.problem.targets import TargetBatch
-from casadi_ik.problem.verdict import judge
-from casadi_ik.solving.engine import Engine
+from casadi_ik.solve.engine import Engine
+from casadi_ik.solve.verdict import judge
 
 
 def contacts_between(targets: TargetBatch, i: int, count: int) -> TargetBatch:

@@ -17,22 +17,24 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.arrays import Array
-from casadi_ik.errors import InputError, UnsupportedError
-from casadi_ik.kernels.cancellation import (
+from casadi_ik.compile.cancellation import (
     ForkSafeLock,
     interrupt_afterwards,
     is_cancelled,
     stop_if_cancelled,
 )
-from casadi_ik.kernels.layout import Field, Layout
-from casadi_ik.kernels.loop import Stepper
-from casadi_ik.methods.common.contact_fit import whole_residual
-from casadi_ik.problem.contacts import LENGTH, ContactRows, Kinds, usual
-from casadi_ik.problem.method import Outcome
-from casadi_ik.problem.status import Phase, Status
-from casadi_ik.problem.targets import TargetBatch
-from casadi_ik.problem.trace import (
+from casadi_ik.compile.layout import Field, Layout
+from casadi_ik.compile.loop import Stepper
+from casadi_ik.errors import InputError, UnsupportedError
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.contact_fit import whole_residual
+from casadi_ik.kinematics.contacts import LENGTH, ContactRows, Kinds, usual
+from casadi_ik.kinematics.couplings import joint_positions
+from casadi_ik.model.description import RobotDescription
+from casadi_ik.model.targets import TargetBatch
+from casadi_ik.solve.method import Outcome
+from casadi_ik.solve.status import Phase, Status
+from casadi_ik.solve.trace import (
     ANGLE_ERROR,
     COST,
     LIMIT_MASK,
@@ -47,8 +49,6 @@ from casadi_ik.problem.trace import (
     packed,
     trace_format,
 )
-from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.couplings import joint_positions
 
 
 @dataclass(frozen=True)

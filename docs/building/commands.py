@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 
-from casadi_ik.cli.options import PROGRAM, Option
-from casadi_ik.cli.table import COMMANDS, GROUPS, load, usage
+from casadi_ik.app.cli.options import PROGRAM, Option
+from casadi_ik.app.cli.table import COMMANDS, GROUPS, load, usage
 
 
 def command_line() -> str:

@@ -6,7 +6,7 @@ import json
 import re
 from typing import Any
 
-from casadi_ik.cli.lists import FILES, schema_of
+from casadi_ik.app.cli.lists import FILES, schema_of
 
 OF = {
     "schema": "robot",

@@ -1,6 +1,6 @@
 """The role `src`: what computes an equation, by name, linked to its text on the site.
 
-{src}`symbolic.se3.log_so3` fails the build if the package has no such thing.
+{src}`kinematics.se3.log_so3` fails the build if the package has no such thing.
 """
 
 from __future__ import annotations

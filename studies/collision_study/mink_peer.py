@@ -15,9 +15,9 @@ import numpy as np
 from peers import Mink, starts_of
 
 import casadi_ik as ik
-from casadi_ik.arrays import Array
+from casadi_ik.collision.clearance import CollisionQuery, SceneCheck
 from casadi_ik.collision.solids import Kind
-from casadi_ik.problem.clearance import CollisionQuery, SceneCheck
+from casadi_ik.files.arrays import Array
 from collision_study.oracles import with_shapes
 from collision_study.search import Piece, grasps_at, surroundings
 

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import casadi_ik as ik
-from casadi_ik.arrays import Array
+from casadi_ik.collision.clearance import CollisionQuery
 from casadi_ik.collision.solids import Kind
-from casadi_ik.problem.clearance import CollisionQuery
+from casadi_ik.files.arrays import Array
 
 coal: Any = import_module("coal")
 mujoco: Any = import_module("mujoco")

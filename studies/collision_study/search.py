@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 import casadi_ik as ik
-from casadi_ik.arrays import Array
-from casadi_ik.problem.clearance import CollisionQuery, SceneCheck
-from casadi_ik.problem.request import Request, tolerances_by_finger
+from casadi_ik.collision.clearance import CollisionQuery, SceneCheck
+from casadi_ik.files.arrays import Array
+from casadi_ik.solve.request import Request, tolerances_by_finger
 from collision_study.oracles import CoalOracle
 
 TABLE = {"kind": "box", "size": [3, 3, 0.04], "xyz": [0, 0, -0.02]}

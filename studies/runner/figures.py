@@ -10,9 +10,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 
-from casadi_ik.arrays import Array
-from casadi_ik.palette import FAINT, INK
-from casadi_ik.views.charts import new_figure
+from casadi_ik.app.drawing.palette import FAINT, INK
+from casadi_ik.app.pictures.charts import new_figure
+from casadi_ik.files.arrays import Array
 
 RESULTS = Path(__file__).parents[1] / "results"
 

@@ -20,8 +20,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColum
 from rich.progress import TimeRemainingColumn as TimeRemaining
 from rich.text import Text
 
-from casadi_ik.batches import parts as places
-from casadi_ik.batches.parts import code_version
+from casadi_ik.integrations import batches as places
+from casadi_ik.integrations.batches import code_version
 
 PART = ".part"
 """Ending of a file that is not complete."""
@@ -136,7 +136,7 @@ def _progress() -> Progress:
 
 @contextmanager
 def backend(jobs: int, dask: str | None) -> Iterator[None]:
-    """Where joblib's calls go meanwhile, see `casadi_ik.batches.parts`.
+    """Where joblib's calls go meanwhile, see `casadi_ik.integrations.batches`.
 
     A cluster needs the installed package with its extra `studies` and nothing else: the study's own
     modules are sent to it, and what its workers solve comes back as bytes.

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from casadi_ik.compile.compiler import find_compiler
 from casadi_ik.errors import CasadiIKError
-from casadi_ik.kernels.compiler import find_compiler
 from casadi_ik.logs.format import machine, package_versions
 
 Z95 = 1.959963984540054

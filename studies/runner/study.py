@@ -18,8 +18,8 @@ import numpy as np
 import polars as pl
 
 import casadi_ik as ik
-from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
+from casadi_ik.files.arrays import Array
 from casadi_ik.logs import Keep
 from runner.parts import PART, code_version, keep, solved
 

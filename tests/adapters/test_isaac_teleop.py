@@ -16,7 +16,7 @@ from isaacteleop.retargeting_engine.interface import (
 )
 from isaacteleop.retargeting_engine.tensor_types import HandInput, HandInputIndex
 
-from casadi_ik.adapters.isaac_teleop import ArmHandRetargeter
+from casadi_ik.integrations.isaac_teleop import ArmHandRetargeter
 
 YAML = """robot: panda+allegro_right
 fingers: {thumb: 4, index: 8, middle: 12, ring: 16}

@@ -19,7 +19,7 @@ from lerobot.robots.so_follower.robot_kinematic_processor import (
 )
 from lerobot.utils.rotation import Rotation
 
-from casadi_ik.adapters.lerobot import ArmKinematics, ContactsToJoints
+from casadi_ik.integrations.lerobot import ArmKinematics, ContactsToJoints
 
 
 @pytest.fixture(scope="module")

@@ -16,13 +16,13 @@ import casadi_ik as ik
 
 zenoh = pytest.importorskip("zenoh")
 
-from casadi_ik.adapters.ros2 import decode_contacts, encode_contacts  # noqa: E402
+from casadi_ik.integrations.ros2 import decode_contacts, encode_contacts  # noqa: E402
 
 ROBOT = "panda+allegro_right"
 
 NODE = """
 import sys, zenoh, casadi_ik as ik
-from casadi_ik.adapters.ros2 import ContactNode
+from casadi_ik.integrations.ros2 import ContactNode
 config = zenoh.Config()
 config.insert_json5("listen/endpoints", '["tcp/127.0.0.1:%s"]' % sys.argv[1])
 config.insert_json5("scouting/multicast/enabled", "false")

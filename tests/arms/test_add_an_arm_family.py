@@ -12,7 +12,7 @@ SCRIPT = """
 import sys
 import numpy as np
 import casadi_ik as ik
-from casadi_ik.arms.recognise import (family_in_words)
+from casadi_ik.kinematics.arms.recognise import (family_in_words)
 
 robot = ik.load_robot(sys.argv[1])
 assert family_in_words(robot.description) == "nearly gimbal", family_in_words(robot.description)
@@ -34,10 +34,10 @@ def test_a_family_is_added_in_two_files(tmp_path):
     (tmp_path / "robot").mkdir()
     package = package_copy(tmp_path)
     family, row = blocks("add_an_arm_family.md")
-    (package / "arms" / "gimbal.py").write_text(family)
-    registry = package / "arms" / "recognise.py"
+    (package / "kinematics" / "arms" / "gimbal.py").write_text(family)
+    registry = package / "kinematics" / "arms" / "recognise.py"
     (old,) = re.findall(r"^FAMILIES: .*$", registry.read_text(), re.MULTILINE)
     replace(registry, old, row.rstrip())
-    imported = "from casadi_ik.arms.locked_joints"
-    replace(registry, imported, f"from casadi_ik.arms.gimbal import Gimbal\n{imported}")
+    imported = "from casadi_ik.kinematics.arms.locked_joints"
+    replace(registry, imported, f"from casadi_ik.kinematics.arms.gimbal import Gimbal\n{imported}")
     run_with(package, SCRIPT, part_of_the_arm(tmp_path / "robot", slice(4, None)))

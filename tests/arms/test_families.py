@@ -19,13 +19,13 @@ from scipy.optimize import brentq, least_squares
 from scipy.spatial.transform import Rotation
 
 import casadi_ik as ik
-from casadi_ik.arms.family import SIGNS, ArmFamily
-from casadi_ik.arms.offset_wrist import OffsetWristArm
-from casadi_ik.arms.recognise import arm_family, family_in_words, family_of, srs_arm
-from casadi_ik.arms.screws import Screws, arm_screws
-from casadi_ik.arrays import Array
-from casadi_ik.solving.finder import ArmBranches
-from casadi_ik.symbolic.kinematics import Pose
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.arms.family import SIGNS, ArmFamily
+from casadi_ik.kinematics.arms.offset_wrist import OffsetWristArm
+from casadi_ik.kinematics.arms.recognise import arm_family, family_in_words, family_of, srs_arm
+from casadi_ik.kinematics.arms.screws import Screws, arm_screws
+from casadi_ik.kinematics.forward import Pose
+from casadi_ik.solve.alternatives import ArmBranches
 
 KINDS = {
     "kuka_lwr4": "spherical shoulder and wrist",
@@ -462,7 +462,7 @@ def test_the_stretches_are_all_that_is_allowed_and_no_more(name):
         margins = arm.branches._margins(palm, scan, *arm.bounds)
         for kind in BENDS:
             of_kind = [b.swivel for b in found if (b.shoulder, b.elbow, b.wrist) == kind]
-            arms = arm.branches.arms(palm, ik.answers.ArmBranch(*kind, arm.range), scan)
+            arms = arm.branches.arms(palm, ik.solve.ArmBranch(*kind, arm.range), scan)
             row = np.abs(arm.branches._at(palm[:3, :3], palm[:3, 3], scan)[0] - arms[:, None])
             (row,) = np.flatnonzero(row.max(axis=(0, 2)) == 0)
             inside = np.any([arm.contains(b, scan) for b in of_kind] or [scan > 1e9], axis=0)

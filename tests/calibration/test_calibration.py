@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.calibration import (
+from casadi_ik.kinematics import dual_quaternion as dq
+from casadi_ik.papers.chandra.calibration import (
     LOSSES,
     Calibration,
     HandModel,
@@ -21,7 +22,6 @@ from casadi_ik.calibration import (
     write_description,
     write_measurements,
 )
-from casadi_ik.symbolic import dual_quaternion as dq
 
 EXACT = (1e-9, 1e-9)
 

@@ -13,7 +13,7 @@ from command_line import POSTURE, Command, Run, solvable
 from processes import python
 
 import casadi_ik as ik
-from casadi_ik.cli.main import main
+from casadi_ik.app.cli.main import main
 
 
 @pytest.fixture

@@ -261,7 +261,7 @@ def test_refusals_leave_nothing(
 
 @pytest.mark.opengl
 def test_the_picture_of_a_body_has_all_its_hands(tmp_path: Path) -> None:
-    from casadi_ik import views
+    from casadi_ik.app import pictures as views
 
     figure = views.draw_pads(ik.load_robot("baxter+barrett_bh8_280"), tmp_path / "pads.png")
     said = {text.get_text() for text in figure.texts}

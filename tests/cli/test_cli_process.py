@@ -276,7 +276,7 @@ def test_a_killed_batch(run: Command, tmp_path: Path) -> None:
 
 
 def test_bugs_are_not_hidden(run: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("casadi_ik.cli.lists.method_summary", lambda _: 1 / 0)
+    monkeypatch.setattr("casadi_ik.app.cli.lists.method_summary", lambda _: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         run("methods")
 
@@ -288,7 +288,7 @@ def test_warnings_are_one_line(run: Command, monkeypatch: pytest.MonkeyPatch) ->
             warnings.warn("no C compiler:\n slower", UserWarning, stacklevel=1)
         return name
 
-    monkeypatch.setattr("casadi_ik.cli.lists.method_summary", warn)
+    monkeypatch.setattr("casadi_ik.app.cli.lists.method_summary", warn)
     done = run("methods")
     assert done.exit == 0
     assert set(done.err.splitlines()) == {"casadi-ik: warning: no C compiler: slower"}

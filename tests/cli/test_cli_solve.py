@@ -157,7 +157,7 @@ def test_what_a_picture_lacks_is_found_first(
     path = grasp_file(object={"name": "nothing"})
     error = run("solve", path, *FAST, *picture).error
     assert error.startswith(f"{path}: object.name: ")
-    for name in [name for name in sys.modules if name.startswith("casadi_ik.views")]:
+    for name in [name for name in sys.modules if name.startswith("casadi_ik.app.pictures")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert "casadi-ik[plots]" in run("solve", grasp_file(), *FAST, *picture).error
@@ -194,7 +194,7 @@ def test_joints_beyond_their_limits_are_named(
     coupled_robot: ik.ArmHand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Those that follow an actuator by a coupling, too; each once."""
-    monkeypatch.setitem(sys.modules, "casadi_ik.views.thumbnail", None)
+    monkeypatch.setitem(sys.modules, "casadi_ik.app.pictures.thumbnail", None)
     description = coupled_robot.description
     for q in coupled_robot.random(np.random.default_rng(0), 20):
         theta = np.array(list(coupled_robot.joints(q).values()))

@@ -8,9 +8,9 @@ import coal
 import numpy as np
 from capsule_arm import SCENE
 
-from casadi_ik.arm_hand import ArmHand
-from casadi_ik.arrays import Array
+from casadi_ik.files.arrays import Array
 from casadi_ik.files.reading import Frame, frame_matrix
+from casadi_ik.kinematics.arm_hand import ArmHand
 
 
 def described(robot: ArmHand) -> list[tuple[str, Any, Array]]:

@@ -42,7 +42,7 @@ def test_a_kind_is_added_in_three_files(tmp_path: Path) -> None:
     replace(solids, "    CLOUD = 5\n", f"    CLOUD = 5\n{name}")
     replace(solids, '}\n"""The kinds:', f'{row}}}\n"""The kinds:')
     replace(solids, "def half_space()", f"{make}\n\ndef half_space()")
-    driver = package / "kernels" / "drivers" / "clearance.c"
+    driver = package / "compile" / "runtime" / "clearance.c"
     before = "static LANES_TARGET along from_solid("
     replace(driver, before, f"{distance}\n{before}")
     first = "  if (one->kind == BOX)"

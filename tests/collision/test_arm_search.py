@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.problem.clearance import SceneCheck
-from casadi_ik.problem.request import PREFERENCES
-from casadi_ik.problem.targets import TargetBatch
-from casadi_ik.solving.arm_search import ArmSearch
-from casadi_ik.solving.free_hands import UnconstrainedFingers
+from casadi_ik.collision.clearance import SceneCheck
+from casadi_ik.model.targets import TargetBatch
+from casadi_ik.solve.arm_search import ArmSearch
+from casadi_ik.solve.free_hands import UnconstrainedFingers
+from casadi_ik.solve.request import PREFERENCES
 
 
 @pytest.fixture(scope="module")

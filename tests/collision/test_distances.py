@@ -8,8 +8,8 @@ from capsule_arm import SCENE, write_robot
 from coal_oracle import described, distance, in_scene
 
 import casadi_ik as ik
+from casadi_ik.collision.clearance import CollisionQuery, SceneCheck
 from casadi_ik.collision.distances import levers
-from casadi_ik.problem.clearance import CollisionQuery, SceneCheck
 
 MICROMETRE = 1e-6
 

@@ -12,14 +12,14 @@ import yaml
 from capsule_arm import ARM, write_robot
 
 import casadi_ik as ik
-from casadi_ik import robots
+from casadi_ik import model as robots
+from casadi_ik.collision.clearance import SceneCheck
 from casadi_ik.collision.model import collision_model
 from casadi_ik.files.reading import Frame, checked, frame_matrix
-from casadi_ik.importing import capsules, imported
-from casadi_ik.importing.write import collision_lines
-from casadi_ik.problem.clearance import SceneCheck
-from casadi_ik.robots.collision import Touching, capsules_of
-from casadi_ik.robots.schema import BoxEntry, CapsuleEntry, CollisionEntry, CylinderEntry
+from casadi_ik.integrations.importing import capsules, imported
+from casadi_ik.integrations.importing.write import collision_lines
+from casadi_ik.model.link_shapes import Touching, capsules_of
+from casadi_ik.model.schema import BoxEntry, CapsuleEntry, CollisionEntry, CylinderEntry
 
 PLACE = '<origin xyz="0 0 0.02" rpy="0.3 0.2 0.1"/>'
 SIMPLE = {

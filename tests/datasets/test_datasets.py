@@ -14,11 +14,11 @@ from commands import main
 from make_grasp_sets import ROBOTS, TABLES, Written, made
 
 import casadi_ik as ik
-from casadi_ik.answers.report import reasons
-from casadi_ik.datasets.layouts import load_convention
-from casadi_ik.datasets.postures import HandPoses
-from casadi_ik.grasps import load_object
-from casadi_ik.robots.linkage import link_poses
+from casadi_ik.app.report import reasons
+from casadi_ik.integrations.datasets.layouts import load_convention
+from casadi_ik.integrations.datasets.postures import HandPoses
+from casadi_ik.model.linkage import link_poses
+from casadi_ik.model.objects import load_object
 
 PUBLISHED = json.loads((Path(__file__).parent / "published_hands.json").read_text())
 KUKA = "kuka_lwr_barrett"

@@ -11,7 +11,7 @@ import trimesh
 from make_grasp_sets import made
 
 import casadi_ik as ik
-from casadi_ik import grasps
+from casadi_ik import model as grasps
 
 ROBOT = "panda+allegro_right"
 

@@ -12,7 +12,7 @@ import pytest
 from torch_zip import write_torch
 
 import casadi_ik as ik
-from casadi_ik.datasets.unpickling import read_torch
+from casadi_ik.integrations.datasets.unpickling import read_torch
 
 
 def test_a_file_that_torch_wrote() -> None:

@@ -33,8 +33,8 @@ def test_an_addition_takes_the_files_that_are_named() -> None:
             assert (ROOT / "casadi_ik" / file).is_file(), f"{what}: {file}"
 
 
-def test_every_folder_has_a_layer() -> None:
-    layers = " ".join(row[0] for row in rows("Layers"))
+def test_every_folder_is_in_the_table_of_rooms() -> None:
+    rooms = " ".join(row[0] for row in rows("Rooms"))
     for path in (ROOT / "casadi_ik").iterdir():
         if path.is_dir() and (path / "__init__.py").is_file():
-            assert f"`{path.name}`" in layers, path.name
+            assert f"`{path.name}`" in rooms, path.name

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik import public, registry
+from casadi_ik.solve import registry
 
+SUBMODULES = tuple(name for name in ik.__all__ if inspect.ismodule(getattr(ik, name)))
 WITHOUT = {
     "METHODS",  # a tuple of names
-    *public.SUBMODULES,  # their names have their own
+    *SUBMODULES,  # their names have their own
     "logs.Compression",  # three words
     "logs.detect_events",  # takes what a recorder is given while a batch runs
 }
@@ -37,7 +38,7 @@ PLAIN = {
 def public_names() -> list[str]:
     inside = (
         f"{module}.{name}"
-        for module in public.SUBMODULES
+        for module in SUBMODULES
         if module != "errors"
         for name in getattr(ik, module).__all__
     )

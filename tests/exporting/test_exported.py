@@ -16,11 +16,11 @@ from commands import main
 from processes import said
 
 import casadi_ik as ik
-from casadi_ik.exporting.project import MARK, c_project, checked_prefix, write_folder
-from casadi_ik.exporting.single import ROUNDING, SinglePrecision, in_single_precision
-from casadi_ik.exporting.solver import plain
-from casadi_ik.exporting.targets import SceneTargets, stored
-from casadi_ik.kernels.codegen import driver_text
+from casadi_ik.compile.codegen import driver_text
+from casadi_ik.export.project import MARK, c_project, checked_prefix, write_folder
+from casadi_ik.export.single import ROUNDING, SinglePrecision, in_single_precision
+from casadi_ik.export.solver import plain
+from casadi_ik.export.targets import SceneTargets, stored
 
 STRICT = ("-std=c11", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-ffp-contract=off")
 SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")

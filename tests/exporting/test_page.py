@@ -16,9 +16,9 @@ from bench_view import NO_PAINTING
 from browser import Browser, Page
 
 import casadi_ik as ik
-from casadi_ik.exporting import project
-from casadi_ik.exporting.project import checked_prefix, wasm_project, write_folder
-from casadi_ik.kernels.clearance_kernel import ClearanceKernel
+from casadi_ik.collision.clearance_kernel import ClearanceKernel
+from casadi_ik.export import project
+from casadi_ik.export.project import checked_prefix, wasm_project, write_folder
 
 BUILD = Path(__file__).parents[2] / "page" / "build.py"
 ROBOT, BODY = "kuka_lwr_barrett", "two_ur10e+barrett_bh8_280"

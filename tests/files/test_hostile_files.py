@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import casadi_ik as ik
-from casadi_ik import grasps
-from casadi_ik.batches.targets import TargetFile
-from casadi_ik.cli.outputs import OutputError, check_outputs
+from casadi_ik import model as grasps
+from casadi_ik.app.cli.outputs import OutputError, check_outputs
+from casadi_ik.solve.target_files import TargetFile
 
 CONTACT = "contacts: {thumb: {point: [0, 0, 0]}}\n"
 

@@ -15,9 +15,9 @@ import yaml
 from commands import main
 
 import casadi_ik as ik
-from casadi_ik.cli.lists import FILES, schema_of
+from casadi_ik.app.cli.lists import FILES, schema_of
 from casadi_ik.files.reading import checked
-from casadi_ik.robots.load import file_type
+from casadi_ik.model.load_robot import file_type
 
 ROOT = Path(__file__).parents[2]
 MODELS = ROOT / "models"

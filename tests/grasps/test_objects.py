@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik import grasps
+from casadi_ik import model as grasps
 
 NAMES = [name for name in ik.shipped_names("objects") if name != "golf_ball"]
 """Those that grasps are shipped for: a golf ball is too small for most hands."""

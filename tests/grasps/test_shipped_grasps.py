@@ -12,7 +12,7 @@ import pytest
 from processes import python
 
 import casadi_ik as ik
-from casadi_ik import grasps
+from casadi_ik import model as grasps
 
 NAMES = ik.shipped_names("grasps")
 TOOLS = Path(__file__).resolve().parents[2] / "tools"

@@ -6,8 +6,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from casadi_ik.kernels import RUNNING, Field, Layout, StepGraph
-from casadi_ik.kernels.compiler import find_compiler
+from casadi_ik.compile import RUNNING, Field, Layout, StepGraph
+from casadi_ik.compile.compiler import find_compiler
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="needs a C compiler")
 BOTH = pytest.mark.parametrize("compiled", [pytest.param(True, marks=needs_compiler), False])

@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import casadi_ik as ik
-from casadi_ik.kernels import FunctionGraph, FunctionKernel, LookupKernel
-from casadi_ik.kernels.codegen import standing_alone
-from casadi_ik.kernels.lookup import LARGEST, STEPS
-from casadi_ik.kernels.straight_lines import Form
-from casadi_ik.symbolic.smooth import part
+from casadi_ik.compile import FunctionGraph, FunctionKernel, LookupKernel
+from casadi_ik.compile.codegen import standing_alone
+from casadi_ik.compile.lookup import LARGEST, STEPS
+from casadi_ik.compile.straight_lines import Form
+from casadi_ik.kinematics.smooth import part
 
 from .graphs import BOTH, needs_compiler, random_expression
 
@@ -103,7 +103,7 @@ def test_pauses_change_nothing(monkeypatch):
     x = ca.SX.sym("x")
     kernel = FunctionKernel(ca.Function("twice", [x], [2 * x]))
     points = np.arange(1000.0)
-    monkeypatch.setattr("casadi_ik.kernels.function_kernel.SLICE", 0.0)
+    monkeypatch.setattr("casadi_ik.compile.function_kernel.SLICE", 0.0)
     np.testing.assert_array_equal(kernel(points)[0], 2 * points)
 
 

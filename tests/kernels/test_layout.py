@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import casadi_ik as ik
-from casadi_ik.kernels import Field, Layout, LoopKernel, StepGraph
-from casadi_ik.kernels.layout import STORAGE, store_rows
+from casadi_ik.compile import Field, Layout, LoopKernel, StepGraph
+from casadi_ik.compile.layout import STORAGE, store_rows
 
 from .graphs import BOTH
 

@@ -28,7 +28,7 @@ import pytest
 from build_kernels import wheel
 
 import casadi_ik as ik
-from casadi_ik.kernels import (
+from casadi_ik.compile import (
     CacheWarning,
     FunctionKernel,
     LoopKernel,
@@ -38,8 +38,8 @@ from casadi_ik.kernels import (
     compiler,
     libraries,
 )
-from casadi_ik.kernels.cancellation import cached_only, virtual_machine
-from casadi_ik.kernels.graphs import FunctionGraph, package_sources, recipe
+from casadi_ik.compile.cancellation import cached_only, virtual_machine
+from casadi_ik.compile.graphs import FunctionGraph, package_sources, recipe
 
 from .graphs import counting_step, needs_compiler
 
@@ -183,7 +183,7 @@ def test_processes_that_need_the_same_build_it_once(directory):
     text = """
         import sys
         import casadi as ca
-        from casadi_ik.kernels import FunctionKernel, compiler
+        from casadi_ik.compile import FunctionKernel, compiler
         build = compiler.Compiler.build
         def counted(*arguments):
             print("built")
@@ -566,7 +566,7 @@ def test_a_working_folder_that_is_gone(tmp_path):
     text = f"""
         import os
         import casadi as ca
-        from casadi_ik.kernels import FunctionKernel
+        from casadi_ik.compile import FunctionKernel
         os.chdir({str(tmp_path)!r})
         os.rmdir(os.getcwd())
         x = ca.SX.sym("x")
@@ -652,7 +652,7 @@ def test_a_compilation_that_is_killed(directory):
     """What it leaves is no library and holds nobody up: the next one builds."""
     text = """
         import casadi as ca
-        from casadi_ik.kernels import FunctionKernel, compiler
+        from casadi_ik.compile import FunctionKernel, compiler
         def build(self, source, library):
             library.write_bytes(b"half")
             print("go", flush=True)

@@ -12,7 +12,7 @@ import pytest
 from processes import python
 
 import casadi_ik as ik
-from casadi_ik.kernels import (
+from casadi_ik.compile import (
     FAILED,
     NON_FINITE,
     REPEATED,
@@ -23,8 +23,8 @@ from casadi_ik.kernels import (
     LoopResult,
     StepGraph,
 )
-from casadi_ik.kernels.function_kernel import machine_lanes
-from casadi_ik.kernels.loop import FEWEST, FIRST_ROWS, ROOM_BYTES, SLOTS, WORTH
+from casadi_ik.compile.function_kernel import machine_lanes
+from casadi_ik.compile.loop import FEWEST, FIRST_ROWS, ROOM_BYTES, SLOTS, WORTH
 
 from .graphs import (
     BOTH,
@@ -276,7 +276,7 @@ def test_pauses_change_nothing(monkeypatch):
     kernel = LoopKernel(random_step())
     states, parameters = starts(5)
     whole = kernel.run(states, parameters, 300, trace=True)
-    monkeypatch.setattr("casadi_ik.kernels.loop.SLICE", 0.0)
+    monkeypatch.setattr("casadi_ik.compile.loop.SLICE", 0.0)
     assert_same(kernel.run(states, parameters, 300, trace=True), whole)
 
 
@@ -285,7 +285,7 @@ def test_keyboard_interrupt_reaches_a_compiled_loop():
     script = """
         import os, signal, threading
         import casadi as ca
-        from casadi_ik.kernels import Field, Layout, LoopKernel, StepGraph
+        from casadi_ik.compile import Field, Layout, LoopKernel, StepGraph
         x, p = ca.SX.sym("x"), ca.SX.sym("p")
         one = Layout((Field("x"),))
         function = ca.Function("endless", [x, p], [x + p, x, 0])
@@ -313,7 +313,7 @@ def lanes(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> in
     """Both widths, where the machine has them."""
     if machine_lanes() < request.param:
         pytest.skip(f"this machine has {machine_lanes()} lanes")
-    monkeypatch.setattr("casadi_ik.kernels.loop.machine_lanes", lambda: request.param)
+    monkeypatch.setattr("casadi_ik.compile.loop.machine_lanes", lambda: request.param)
     return request.param
 
 
@@ -413,7 +413,7 @@ def test_every_end_beside_every_other(count):
 
 @LANES
 def test_lanes_pauses_change_nothing(monkeypatch):
-    monkeypatch.setattr("casadi_ik.kernels.loop.SLICE", 0.0)
+    monkeypatch.setattr("casadi_ik.compile.loop.SLICE", 0.0)
     rng = np.random.default_rng(3)
     count = COUNTS[-1]
     states = np.column_stack([rng.normal(size=count), np.zeros(count)])

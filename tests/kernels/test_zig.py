@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from processes import python
 
-from casadi_ik.kernels import LoopKernel
-from casadi_ik.kernels.compiler import find_compiler
+from casadi_ik.compile import LoopKernel
+from casadi_ik.compile.compiler import find_compiler
 
 from .graphs import branching_step, needs_compiler, random_step
 
@@ -30,8 +30,8 @@ order of numbers, vectors, locks. What C says in any case is said once."""
 ITERATES = """
 import sys
 import numpy as np
-from casadi_ik.kernels import LoopKernel
-from casadi_ik.kernels.compiler import find_compiler
+from casadi_ik.compile import LoopKernel
+from casadi_ik.compile.compiler import find_compiler
 from tests.kernels.graphs import branching_step, random_step
 print("ziglang" in find_compiler().command, file=sys.stderr)
 rng = np.random.default_rng(0)

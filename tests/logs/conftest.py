@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from made_up_solves import T0
 
-from casadi_ik.answers.recorder import SolveBlock
 from casadi_ik.logs import LogClock, McapRecorder
+from casadi_ik.solve.recorder import SolveBlock
 
 
 @pytest.fixture

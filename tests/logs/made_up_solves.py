@@ -13,15 +13,15 @@ from mcap.reader import make_reader
 from mcap.records import ChunkIndex
 from mcap.writer import Writer
 
-from casadi_ik.answers.recorder import SolveBlock
-from casadi_ik.answers.solution import BatchSolution
-from casadi_ik.cli.main import main
-from casadi_ik.kernels.layout import STORAGE, Field, Layout
+from casadi_ik.app.cli.main import main
+from casadi_ik.compile.layout import STORAGE, Field, Layout
 from casadi_ik.logs.events import event_format
 from casadi_ik.logs.format import parse_layout, schema_name, schema_text
-from casadi_ik.problem.status import Status
-from casadi_ik.problem.targets import TargetBatch, Tolerance
-from casadi_ik.problem.trace import THRESHOLDS, JacobianMeasures, RecordedJacobian, TraceFormat
+from casadi_ik.model.targets import TargetBatch, Tolerance
+from casadi_ik.solve.recorder import SolveBlock
+from casadi_ik.solve.solution import BatchSolution
+from casadi_ik.solve.status import Status
+from casadi_ik.solve.trace import THRESHOLDS, JacobianMeasures, RecordedJacobian, TraceFormat
 
 __all__ = ["STORAGE", "THRESHOLDS", "Field", "JacobianMeasures", "Layout", "RecordedJacobian"]
 __all__ += ["SolveBlock", "TargetBatch", "TraceFormat", "changed", "chunks_of", "event_format"]

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.compile.layout import Field, Layout
 from casadi_ik.logs import Asked
 from casadi_ik.logs.events import Happening, told
 from casadi_ik.logs.solve import OneSolve
-from casadi_ik.problem.targets import Tolerance
+from casadi_ik.model.targets import Tolerance
 
 __all__ = ["Field", "Happening", "Layout", "OneSolve", "told"]
 

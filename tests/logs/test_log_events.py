@@ -402,7 +402,7 @@ def test_near_a_toggle_is_an_event_that_names_the_motors(ar10, tmp_path, monkeyp
     q = ar10.random(np.random.default_rng(1), 1)[0]
     _, events = logged(ar10, tmp_path / "clear.mcap", q)
     assert events == []
-    monkeypatch.setattr("casadi_ik.methods.common.limits.NEAR_TOGGLE", 1.0)
+    monkeypatch.setattr("casadi_ik.solve.limits.NEAR_TOGGLE", 1.0)
     rows, events = logged(ar10, tmp_path / "near.mcap", q)
     assert (rows["sigma_coupling"] < 1.0).all()
     assert events
@@ -470,7 +470,7 @@ def test_each_row_with_a_configuration_has_the_values_it_should(robot, log):
         hands = [spread(robot, q, name, columns) for name, columns in fingers.items()]
         assert row["sigma_hand"] == pytest.approx(min(s[-1] for s in hands), rel=1e-3, abs=1e-5)
         assert row["condition_hand"] == pytest.approx(max(s[0] / s[-1] for s in hands), rel=1e-2)
-        if unplaced and row["phase"] in (ik.answers.Phase.CANDIDATE, ik.answers.Phase.HAND_FIT):
+        if unplaced and row["phase"] in (ik.solve.Phase.CANDIDATE, ik.solve.Phase.HAND_FIT):
             assert np.isnan(row["sigma_arm"])
             assert np.isnan(row["condition_arm"])
             continue

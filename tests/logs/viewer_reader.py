@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory as Protobuf
 from mcap_ros2.decoder import DecoderFactory as Ros2
 
-from casadi_ik.logs.viewers import layout_of, shipped_layout, write_view
+from casadi_ik.app.log_viewers import layout_of, shipped_layout, write_view
 
 __all__ = ["Decoded", "decode", "layout_of", "shipped_layout", "write_view"]
 

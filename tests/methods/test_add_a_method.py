@@ -10,7 +10,8 @@ from package_copy import blocks
 from toy_robots import grasp_of, near_home
 
 import casadi_ik as ik
-from casadi_ik import errors, registry
+from casadi_ik import errors
+from casadi_ik.solve import registry
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from pinocchio_oracle import PinocchioRobot, assert_verdicts
 from toy_robots import grasp_of, near_home
 
 import casadi_ik as ik
-from casadi_ik import registry
+from casadi_ik.solve import registry
 
 PAPER = ("enhanced-dls", "enhanced-sdls", "original-dls", "original-sdls")
 ROBOTS = ik.shipped_names("arm_hands")

@@ -8,10 +8,10 @@ from toy_robots import replace
 from trace_checks import Kept
 
 import casadi_ik as ik
-from casadi_ik import robots
+from casadi_ik import model as robots
 from casadi_ik.papers.qiu.fingers import finger_step_function, planar_finger
 
-REACHING, ALIGNMENT = ik.answers.Phase.THUMB_REACHING, ik.answers.Phase.HAND_ALIGNMENT
+REACHING, ALIGNMENT = ik.solve.Phase.THUMB_REACHING, ik.solve.Phase.HAND_ALIGNMENT
 SPREAD = 7
 FLEXIONS = {"finger_2": (10, 11), "finger_3": (12, 13)}
 

@@ -10,6 +10,8 @@ from scipy.linalg import logm
 from toy_robots import replace
 
 import casadi_ik as ik
+from casadi_ik.kinematics.contacts import Target
+from casadi_ik.kinematics.forward import actuated
 from casadi_ik.papers.qiu.step import QiuParameters
 from casadi_ik.papers.qiu.tasks import (
     Task,
@@ -22,8 +24,6 @@ from casadi_ik.papers.qiu.tasks import (
     palm_orientation,
     palm_orientation_task,
 )
-from casadi_ik.problem.contacts import Target
-from casadi_ik.symbolic.kinematics import actuated
 
 
 def estimate(robot: ik.ArmHand, points: np.ndarray) -> np.ndarray:

@@ -11,21 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from casadi_ik.arms.recognise import srs_arm
-from casadi_ik.methods.common.contact_fit import whole_jacobian, whole_residual
-from casadi_ik.methods.common.palm import (
-    NUMERIC_ARM,
-    best_palm,
-    hand_contacts,
-    nearest_start,
-    pose_jacobian,
-    pose_step,
-)
-from casadi_ik.methods.hand_first.parameters import HandFirstParameters
-from casadi_ik.methods.hand_first.state import HandFirstLayouts
-from casadi_ik.methods.hand_first.step import PalmAndHand, fit_jacobian, fit_residual, reach_row
-from casadi_ik.methods.thumb_first.closed_chain_step import contact_errors, linearised
-from casadi_ik.problem.contacts import (
+from casadi_ik.kinematics.arms.recognise import srs_arm
+from casadi_ik.kinematics.contact_fit import whole_jacobian, whole_residual
+from casadi_ik.kinematics.contacts import (
     CONDITIONS,
     FACING,
     LENGTH,
@@ -38,8 +26,20 @@ from casadi_ik.problem.contacts import (
     usual,
     within_tolerance,
 )
-from casadi_ik.symbolic.kinematics import Pose
-from casadi_ik.symbolic.se3 import compose, exp_se3
+from casadi_ik.kinematics.forward import Pose
+from casadi_ik.kinematics.palm import (
+    NUMERIC_ARM,
+    best_palm,
+    hand_contacts,
+    nearest_start,
+    pose_jacobian,
+    pose_step,
+)
+from casadi_ik.kinematics.se3 import compose, exp_se3
+from casadi_ik.solve.hand_first.parameters import HandFirstParameters
+from casadi_ik.solve.hand_first.state import HandFirstLayouts
+from casadi_ik.solve.hand_first.step import PalmAndHand, fit_jacobian, fit_residual, reach_row
+from casadi_ik.solve.thumb_first.closed_chain_step import contact_errors, linearised
 
 ARM = 7
 RADIUS = 9.5e-3

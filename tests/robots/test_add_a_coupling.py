@@ -11,16 +11,16 @@ from package_copy import blocks, package_copy, run_with
 from toy_robots import replace, write_coupled_robot
 
 import casadi_ik as ik
-from casadi_ik.robots.couplings import CouplingKind
-from casadi_ik.symbolic.couplings import coupling_rate, follow, has_toggle
+from casadi_ik.kinematics.couplings import coupling_rate, follow, has_toggle
+from casadi_ik.model.couplings import CouplingKind
 
 SCRIPT = """
 import sys
 import casadi as ca
 import numpy as np
 import casadi_ik as ik
-from casadi_ik.calibration.model import (hand_parameters)
-from casadi_ik.symbolic.couplings import (coupling_rate, follow, joint_positions)
+from casadi_ik.papers.chandra.calibration.model import (hand_parameters)
+from casadi_ik.kinematics.couplings import (coupling_rate, follow, joint_positions)
 
 robot = ik.load_robot(sys.argv[1])
 rng = np.random.default_rng(3)
@@ -76,8 +76,8 @@ def test_a_kind_is_added_in_two_files(tmp_path):
     package = package_copy(tmp_path)
     data, row = blocks("add_a_coupling.md")
     union = "Coupling = Linear | LeadScrew | FourBar"
-    replace(package / "robots" / "couplings.py", union, f"{data}\n\n{union} | Quadratic")
-    graphs = package / "symbolic" / "couplings.py"
+    replace(package / "model" / "couplings.py", union, f"{data}\n\n{union} | Quadratic")
+    graphs = package / "kinematics" / "couplings.py"
     replace(graphs, "Linear, Polynomial\n", "Linear, Polynomial, Quadratic\n")
     replace(graphs, '}\n"""The kinds of couplings."""', f'{row}}}\n"""The kinds of couplings."""')
     run_with(package, SCRIPT, path)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik import robots
+from casadi_ik import model as robots
 
 FINGERS = ("index", "middle", "ring", "little")
 SLIDERS = (

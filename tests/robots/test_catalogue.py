@@ -19,7 +19,7 @@ from commands import main
 from toy_robots import grasp_at
 
 import casadi_ik as ik
-from casadi_ik import robots
+from casadi_ik import model as robots
 
 MODELS = Path(__file__).parents[2] / "models"
 ARMS, HANDS = ik.shipped_names("arms"), ik.shipped_names("hands")

@@ -9,9 +9,9 @@ from imported_files import FINGERS, arm, describe, hand, joint, link, urdf
 from toy_robots import grasp_at
 
 import casadi_ik as ik
-from casadi_ik.importing.imported import largest_difference
-from casadi_ik.importing.robot_shapes import TriangleTree, robot_shapes
-from casadi_ik.robots.read_tree import read_tree
+from casadi_ik.integrations.importing.imported import largest_difference
+from casadi_ik.integrations.importing.robot_shapes import TriangleTree, robot_shapes
+from casadi_ik.model.urdf_mjcf import read_tree
 
 MOUNT = "mount: {xyz: [0.01, 0.02, 0.03], rpy: [0.1, 0.2, 0.3]}"
 

@@ -11,8 +11,8 @@ import yaml
 from toy_robots import COUPLED_HAND, copy_shipped_robot, write_coupled_robot
 
 import casadi_ik as ik
-from casadi_ik.robots.couplings import FourBar, LeadScrew, Linear
-from casadi_ik.symbolic.couplings import follow
+from casadi_ik.kinematics.couplings import follow
+from casadi_ik.model.couplings import FourBar, LeadScrew, Linear
 
 MODELS = Path(__file__).parents[2] / "models"
 

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 import casadi_ik as ik
-from casadi_ik import robots
+from casadi_ik import model as robots
 
 MODELS = Path(__file__).parents[2] / "models"
 

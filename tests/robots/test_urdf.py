@@ -11,7 +11,7 @@ import pytest
 from pinocchio_oracle import PinocchioRobot
 
 import casadi_ik as ik
-from casadi_ik import robots
+from casadi_ik import model as robots
 
 
 @pytest.fixture(params=["every coupling", *ik.shipped_names("arm_hands")])

@@ -31,7 +31,7 @@ def cup(robot: ik.ArmHand) -> tuple[Array, Array]:
     return ik.load_grasp("cup").arrays(robot.fingers)
 
 
-def diagnosed(solver: ik.Solver, points: Array, normals: Array) -> ik.answers.Diagnosis:
+def diagnosed(solver: ik.Solver, points: Array, normals: Array) -> ik.solve.Diagnosis:
     """The diagnosis of a target that is not solved; called unreachable only with a proof."""
     batch = solver.solve_batch(points[None], normals[None], diagnose=True)
     (diagnosis,) = batch.diagnoses
@@ -41,7 +41,7 @@ def diagnosed(solver: ik.Solver, points: Array, normals: Array) -> ik.answers.Di
     return diagnosis
 
 
-def proved(solver: ik.Solver, points: Array, normals: Array) -> ik.answers.Diagnosis:
+def proved(solver: ik.Solver, points: Array, normals: Array) -> ik.solve.Diagnosis:
     """The diagnosis of a target that is to be called unreachable."""
     diagnosis = diagnosed(solver, points, normals)
     assert diagnosis.established
@@ -75,7 +75,7 @@ def test_contacts_too_far_apart(solver: ik.Solver, cup: tuple[Array, Array]) -> 
     points, normals = cup
     spread = points + 0.25 * np.array([[0, 1, 0], [1, -1, 0], [-1, -1, 0]])
     diagnosis = proved(solver, spread, normals)
-    assert diagnosis.reason is ik.answers.Reason.HAND
+    assert diagnosis.reason is ik.solve.Reason.HAND
     assert diagnosis.hand is not None
     assert not diagnosis.hand.fits
     assert max(c.position_error for c in diagnosis.hand.contacts.values()) > 0.05
@@ -88,7 +88,7 @@ def test_too_far(
     solver: ik.Solver, cup: tuple[Array, Array], shift: Array, distance: float
 ) -> None:
     diagnosis = proved(solver, cup[0] + np.array(shift), cup[1])
-    assert diagnosis.reason is ik.answers.Reason.REACH
+    assert diagnosis.reason is ik.solve.Reason.REACH
     assert diagnosis.reach is not None
     assert diagnosis.reach.farthest == pytest.approx(0.79)
     assert diagnosis.reach.excess == pytest.approx(distance - 0.79, abs=0.8)
@@ -102,7 +102,7 @@ def test_object_in_the_shoulder(
     """The elbow would have to bend farther than it can; lifting its limit proves it."""
     points = cup[0] - cup[0].mean(axis=0) + [0, 0, 0.31]
     diagnosis = proved(solver, points, cup[1])
-    assert diagnosis.reason is ik.answers.Reason.REACH
+    assert diagnosis.reason is ik.solve.Reason.REACH
     assert diagnosis.reach is not None
     assert diagnosis.reach.nearest == pytest.approx(0.395, abs=1e-3)
     assert diagnosis.reach.excess < -0.1
@@ -117,7 +117,7 @@ def test_normal_that_faces_away(
     points, normals = cup
     normals = normals * np.array([[-1], [1], [1]])
     diagnosis = diagnosed(solver, points, normals)
-    assert diagnosis.reason is ik.answers.Reason.HAND
+    assert diagnosis.reason is ik.solve.Reason.HAND
     assert {(item.part, item.finger) for item in diagnosis.freed} >= {
         ("normal", "thumb"),
         ("finger", "thumb"),
@@ -167,7 +167,7 @@ def test_one_limit_blocks(solver: ik.Solver, robot: ik.ArmHand) -> None:
             assert diagnosis is not None
             best = best_of_restarts(robot, points, normals, q)
             assert np.linalg.norm(residual(best, robot, points, normals)) > 1e-2
-            assert diagnosis.reason is not ik.answers.Reason.REACHABLE
+            assert diagnosis.reason is not ik.solve.Reason.REACHABLE
             (relief,) = (item for item in diagnosis.reliefs if item.lifted == name)
             assert list(relief.beyond) == [name]
             assert 0 < abs(relief.beyond[name]) <= np.deg2rad(5.3)
@@ -231,7 +231,7 @@ def test_other_methods_ask_hand_first(robot: ik.ArmHand, cup: tuple[Array, Array
     assert not solution.success
     assert solution.status is not ik.Status.UNREACHABLE
     assert solution.diagnosis is not None
-    assert solution.diagnosis.reason is ik.answers.Reason.REACHABLE
+    assert solution.diagnosis.reason is ik.solve.Reason.REACHABLE
     assert "hand-first solves it" in solution.diagnosis.lines[1]
     far = paper.solve_batch(cup[0][None] + 3.0, cup[1][None], diagnose=True)
     assert far.status_names.tolist() == ["UNREACHABLE"]
@@ -356,7 +356,7 @@ def test_free_finger(robot: ik.ArmHand, cup: tuple[Array, Array], finger: int) -
     (why,) = far.diagnoses
     assert far.status_names.tolist() == ["UNREACHABLE"]
     assert why is not None
-    assert why.reason is ik.answers.Reason.REACH
+    assert why.reason is ik.solve.Reason.REACH
     assert np.isnan(why.nearest[robot.fingers[finger]].position_error)
     assert robot.fingers[finger] not in {item.finger for item in why.freed}
 
@@ -376,7 +376,7 @@ def test_fixed_actuators(robot: ik.ArmHand, cup: tuple[Array, Array]) -> None:
     (why,) = closed.diagnoses
     assert set(closed.status_names) <= {"UNREACHABLE", "NOT_FOUND"}
     assert why is not None
-    assert why.reason is ik.answers.Reason.HAND
+    assert why.reason is ik.solve.Reason.HAND
     assert why.q[robot.actuators.index("bh_spread")] == pytest.approx(2.5)
     for relief in why.reliefs:
         assert "bh_spread" not in relief.beyond
@@ -393,7 +393,7 @@ def test_arm_without_a_closed_form(bent: ik.ArmHand) -> None:
     wide = points + 0.25 * np.array([[0, 1, 0], [1, -1, 0], [-1, -1, 0]])
     (why,) = batch_of(solver, wide[None], normals[None]).diagnoses
     assert why is not None
-    assert why.reason is ik.answers.Reason.HAND
+    assert why.reason is ik.solve.Reason.HAND
     assert why.established
 
     # What such an arm can span is not known: too far is seen, but not called by its name.
@@ -402,7 +402,7 @@ def test_arm_without_a_closed_form(bent: ik.ArmHand) -> None:
     assert not far.success[0]
     assert why is not None
     assert why.reach is None
-    assert why.reason is not ik.answers.Reason.HAND
+    assert why.reason is not ik.solve.Reason.HAND
     assert why.enough.position > 1.0
 
 
@@ -419,6 +419,6 @@ def test_a_bad_start_never_makes_it_unreachable(robot: ik.ArmHand) -> None:
     assert not batch.success.any()
     found = [diagnosis for diagnosis in batch.diagnoses if diagnosis is not None]
     assert len(found) == len(q)
-    assert {diagnosis.reason for diagnosis in found} == {ik.answers.Reason.REACHABLE}
+    assert {diagnosis.reason for diagnosis in found} == {ik.solve.Reason.REACHABLE}
     reached, _ = robot.contacts(np.stack([diagnosis.q for diagnosis in found]))
     assert np.linalg.norm(reached - points, axis=2).max() < 5.01e-3

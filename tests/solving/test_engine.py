@@ -11,10 +11,10 @@ from toy_robots import grasp_at, replace
 from trace_checks import Kept
 
 import casadi_ik as ik
-from casadi_ik.problem.method import Outcome
-from casadi_ik.problem.targets import TargetBatch
-from casadi_ik.problem.verdict import judge
-from casadi_ik.solving.engine import Engine, Run
+from casadi_ik.model.targets import TargetBatch
+from casadi_ik.solve.engine import Engine, Run
+from casadi_ik.solve.method import Outcome
+from casadi_ik.solve.verdict import judge
 
 
 class Answering:

@@ -14,9 +14,9 @@ from processes import python
 from toy_robots import grasp_of
 
 import casadi_ik as ik
-from casadi_ik.exporting.project import uses
-from casadi_ik.kernels import libraries
-from casadi_ik.kernels.compiler import Compiler, find_compiler
+from casadi_ik.compile import libraries
+from casadi_ik.compile.compiler import Compiler, find_compiler
+from casadi_ik.export.project import uses
 
 pytestmark = pytest.mark.skipif(
     find_compiler() is None or os.name != "posix", reason="needs a C compiler, and POSIX's signals"

@@ -12,8 +12,8 @@ import pytest
 from processes import python
 
 import casadi_ik as ik
-from casadi_ik.kernels.cancellation import CancelledError, stop_if_cancelled
-from casadi_ik.solving.batch_parts import in_order
+from casadi_ik.compile.cancellation import CancelledError, stop_if_cancelled
+from casadi_ik.solve.batches import in_order
 
 pytestmark = pytest.mark.usefixtures("usual_flags")
 

@@ -16,15 +16,15 @@ from toy_robots import grasp_of, moved, write_coupled_robot
 from toy_robots import replace as put
 
 import casadi_ik as ik
-from casadi_ik.arrays import Array
-from casadi_ik.problem.targets import TargetBatch
-from casadi_ik.proofs.box_tests import Seen, pair_rows
-from casadi_ik.proofs.boxes import box_contacts
-from casadi_ik.proofs.premises import arm_cones
-from casadi_ik.proofs.proof import Proof, ProofKind
-from casadi_ik.proofs.prove import EFFORT, Prover
-from casadi_ik.robots.couplings import Polynomial
-from casadi_ik.symbolic.couplings import ROWS, Interval
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.couplings import ROWS, Interval
+from casadi_ik.model.couplings import Polynomial
+from casadi_ik.model.targets import TargetBatch
+from casadi_ik.solve.proofs.box_tests import Seen, pair_rows
+from casadi_ik.solve.proofs.boxes import box_contacts
+from casadi_ik.solve.proofs.premises import arm_cones
+from casadi_ik.solve.proofs.proof import Proof, ProofKind
+from casadi_ik.solve.proofs.prove import EFFORT, Prover
 
 pytestmark = pytest.mark.usefixtures("usual_flags")
 
@@ -325,7 +325,7 @@ def test_what_is_not_proved_is_not_unreachable(
     assert diagnosis is not None
     assert (diagnosis.proof, diagnosis.established) == (None, False)
     assert diagnosis.searches > 2
-    assert diagnosis.lines[0] == f"likely: {ik.answers.Reason.REACH}"
+    assert diagnosis.lines[0] == f"likely: {ik.solve.Reason.REACH}"
     assert any(line.startswith("not proved; no solution from") for line in diagnosis.lines)
 
 

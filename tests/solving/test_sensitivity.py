@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik import differentiable, errors
+from casadi_ik import errors
+from casadi_ik.integrations import differentiable
 
 STEP = 1e-5
 

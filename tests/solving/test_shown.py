@@ -13,7 +13,7 @@ from toy_robots import grasp_of
 import casadi_ik as ik
 
 TERMINAL = os.environ | {"TERM": "xterm", "COLUMNS": "80"}
-WITH_PICTURE = (ik.ArmHand, ik.Solution, ik.answers.Choice)
+WITH_PICTURE = (ik.ArmHand, ik.Solution, ik.solve.Choice)
 
 
 def answers(name):
@@ -61,7 +61,7 @@ def test_what_is_said(robot):
 
 def test_tables_need_no_drawing(robot, monkeypatch):
     solution = ik.Solver(robot).solve(ik.load_grasp("cup"))
-    monkeypatch.setitem(sys.modules, "casadi_ik.views.thumbnail", None)
+    monkeypatch.setitem(sys.modules, "casadi_ik.app.pictures.thumbnail", None)
     page = solution._repr_html_()
     assert "<img" not in page
     assert "<th" in page

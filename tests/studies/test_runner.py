@@ -24,7 +24,7 @@ from runner.report import interval_text, mean_metric, median_metric, rate_metric
 from runner.study import STUDY_FILE, claim, missing, read_results, run
 
 import casadi_ik as ik
-from casadi_ik import batches
+from casadi_ik import integrations as batches
 
 STUDY = small_study.STUDY
 FOLDERS = os.pathsep.join((str(Path(small_study.__file__).parent), *sys.path))

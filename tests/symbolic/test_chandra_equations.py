@@ -13,10 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import casadi_ik as ik
-from casadi_ik.symbolic import couplings, mechanisms, screws, se3
-from casadi_ik.symbolic import dual_quaternion as dq
-from casadi_ik.symbolic.kinematics import actuated
-from casadi_ik.symbolic.screws import (
+from casadi_ik.kinematics import couplings, mechanisms, screws, se3
+from casadi_ik.kinematics import dual_quaternion as dq
+from casadi_ik.kinematics.forward import actuated
+from casadi_ik.kinematics.screws import (
     TipChain,
     finger_chain,
     relative_chain,

@@ -8,7 +8,10 @@ import pytest
 from robot_variants import thumb_of
 
 import casadi_ik as ik
-from casadi_ik.methods.thumb_first.closed_chain_step import (
+from casadi_ik.kinematics.closed_chain import VIRTUAL, closed_chain, mobility, pivoted, split
+from casadi_ik.kinematics.contacts import LENGTH, ContactRows, usual
+from casadi_ik.kinematics.forward import actuated, motor_scales
+from casadi_ik.solve.thumb_first.closed_chain_step import (
     THUMB_DAMPING,
     Linear,
     Room,
@@ -16,9 +19,6 @@ from casadi_ik.methods.thumb_first.closed_chain_step import (
     linearised,
     quadratic_program,
 )
-from casadi_ik.problem.contacts import LENGTH, ContactRows, usual
-from casadi_ik.symbolic.closed_chain import VIRTUAL, closed_chain, mobility, pivoted, split
-from casadi_ik.symbolic.kinematics import actuated, motor_scales
 
 SPREAD, THUMB_1, THUMB_2 = 7, 8, 9
 

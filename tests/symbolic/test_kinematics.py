@@ -7,9 +7,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from casadi_ik.symbolic.couplings import joint_positions
-from casadi_ik.symbolic.kinematics import actuated, forward
-from casadi_ik.symbolic.se3 import euler_zyx
+from casadi_ik.kinematics.couplings import joint_positions
+from casadi_ik.kinematics.forward import actuated, forward
+from casadi_ik.kinematics.se3 import euler_zyx
 
 
 @pytest.fixture(params=["shipped", "coupled"])

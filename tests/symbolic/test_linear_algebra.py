@@ -8,9 +8,9 @@ import pytest
 from algebra_samples import central_difference, gradient, graph
 from scipy.optimize import lsq_linear
 
-from casadi_ik.methods.common.bounded_step import Bounded, damped_step
-from casadi_ik.symbolic import linear_algebra as la
-from casadi_ik.symbolic.linear_algebra import extreme_singular_values
+from casadi_ik.kinematics import linear_algebra as la
+from casadi_ik.kinematics.box_qp import Bounded, damped_step
+from casadi_ik.kinematics.linear_algebra import extreme_singular_values
 
 solve_spd = graph(la.solve_spd, (6, 6), (6, 4))
 solve = graph(la.solve, (6, 6), (6, 4))

@@ -10,10 +10,10 @@ from algebra_samples import central_difference, gradient, graph
 from toy_robots import replace
 
 import casadi_ik as ik
-from casadi_ik import robots
+from casadi_ik import model as robots
+from casadi_ik.kinematics import mechanisms
+from casadi_ik.kinematics.mechanisms import Linkage
 from casadi_ik.papers.qiu.fingers import planar_finger
-from casadi_ik.symbolic import mechanisms
-from casadi_ik.symbolic.mechanisms import Linkage
 
 S, B = (1, 1), (5, 1)
 AR10 = Linkage(2.97, 3.47, 0.84, 0.72, -1)

@@ -25,9 +25,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from casadi_ik.symbolic import dual_quaternion as dq
-from casadi_ik.symbolic import se3
-from casadi_ik.symbolic.se3 import align
+from casadi_ik.kinematics import dual_quaternion as dq
+from casadi_ik.kinematics import se3
+from casadi_ik.kinematics.se3 import align
 
 V, M, W = (3, 1), (3, 3), (6, 1)
 exp = graph(se3.exp_se3, W)

@@ -12,8 +12,8 @@ from scipy.optimize import linprog
 
 import casadi_ik as ik
 from casadi_ik import errors
-from casadi_ik.cli.grasp import found_data
-from casadi_ik.touch.strength import DIRECTIONS, GIVE, generators, loads, stiffnesses
+from casadi_ik.app.cli.grasp import found_data
+from casadi_ik.planning.touch.strength import DIRECTIONS, GIVE, generators, loads, stiffnesses
 
 PLACE = np.eye(4)
 PLACE[:3, 3] = [0.5, 0.1, 0.055]

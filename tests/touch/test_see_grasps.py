@@ -8,7 +8,8 @@ from commands import main
 from PIL import Image
 
 import casadi_ik as ik
-from casadi_ik import viewing, views
+from casadi_ik.app import pictures as views
+from casadi_ik.app import viewer as viewing
 
 ROBOT, PLACE = "panda+panda_hand", ("0.5", "0.1", "0.051", "0", "0", "0")
 ASKED = ("grasp", "tomato_soup_can", "--robot", ROBOT, "--scene", "table", "--limit", "6")

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import casadi_ik as ik
-from casadi_ik import viewing
+from casadi_ik.app import viewer as viewing
 
 URDF = """<robot name="hand"><link name="palm"/>
 {links}</robot>"""

@@ -14,7 +14,7 @@ from bench_view import NO_PAINTING
 from browser import CHROMIUM, Browser, Page
 
 import casadi_ik as ik
-from casadi_ik import viewing
+from casadi_ik.app import viewer as viewing
 
 pose_of = viewing.drawn.pose_of
 
@@ -155,7 +155,7 @@ def test_object_and_contact_are_dragged_by_mouse_and_reached(
 def test_two_browsers_see_one_drag_and_save_it(
     cup: viewing.Viewer, browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("casadi_ik.viewing.panel.PICTURE", (200, 320))
+    monkeypatch.setattr("casadi_ik.app.viewer.panel.PICTURE", (200, 320))
     other, _ = opened(browser, cup)
     page, _ = opened(browser, cup, painted=True)
     shown = cup.page

@@ -10,7 +10,7 @@ import pytest
 from commands import main
 
 import casadi_ik as ik
-from casadi_ik.answers.stored import solution_data as as_json
+from casadi_ik.solve.solution_files import solution_data as as_json
 
 CANDIDATES = """robot: kuka_lwr_barrett
 candidates:
@@ -172,7 +172,7 @@ def test_without_viser_the_extra_is_named(
 ) -> None:
     import sys
 
-    for name in [name for name in sys.modules if name.startswith("casadi_ik.viewing")]:
+    for name in [name for name in sys.modules if name.startswith("casadi_ik.app.viewer")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(ik.CasadiIKError, match=r"pip install 'casadi-ik\[view\]'"):

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik import errors, viewing
+from casadi_ik import errors
+from casadi_ik.app import viewer as viewing
 
 
 def test_dragged_pads_are_saved_and_read_back(pads: viewing.Viewer, description: Path) -> None:

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik import errors, viewing
+from casadi_ik import errors
+from casadi_ik.app import viewer as viewing
 
 
 def shifted(pose: np.ndarray, *by: float) -> np.ndarray:

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.drawing.drawables import bodies, item_of
-from casadi_ik.drawing.surfaces import arrow, sharp
+from casadi_ik.app.drawing.drawables import bodies, item_of
+from casadi_ik.app.drawing.surfaces import arrow, sharp
+from casadi_ik.app.viewer import request_of
+from casadi_ik.app.viewer.pad_page import LinkPad, corrected, save_pads
+from casadi_ik.app.viewer.page import REST, Newest
+from casadi_ik.app.viewer.panel import grasp_text
+from casadi_ik.app.viewer.viser_scene import cameras, pose_of, quaternions
+from casadi_ik.compile.cancellation import stop_if_cancelled
 from casadi_ik.files.reading import Frame, frame_matrix
-from casadi_ik.kernels.cancellation import stop_if_cancelled
-from casadi_ik.viewing import request_of
-from casadi_ik.viewing.drawn import cameras, pose_of, quaternions
-from casadi_ik.viewing.pad_page import LinkPad, corrected, save_pads
-from casadi_ik.viewing.page import REST, Newest
-from casadi_ik.viewing.panel import grasp_text
 
 
 def turned(x: float, y: float, z: float, *angles: float) -> np.ndarray:

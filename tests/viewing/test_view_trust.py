@@ -21,7 +21,7 @@ from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 from websockets.typing import Origin, Subprotocol
 
-from casadi_ik import viewing
+from casadi_ik.app import viewer as viewing
 
 VERSION = f"viser-v{viser.__version__}"
 CAMERA = {

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik import errors, logs, views
+from casadi_ik import errors, logs
+from casadi_ik.app import pictures as views
 
 
 def words(figure) -> str:

@@ -9,8 +9,8 @@ import pytest
 import pyvista as pv
 
 import casadi_ik as ik
-from casadi_ik import palette
-from casadi_ik.drawing.drawables import (
+from casadi_ik.app.drawing import palette
+from casadi_ik.app.drawing.drawables import (
     Drawable,
     axes_of,
     bodies,
@@ -21,9 +21,9 @@ from casadi_ik.drawing.drawables import (
     placed,
     target_place,
 )
-from casadi_ik.drawing.surfaces import ball, drum, ring, rod
-from casadi_ik.views import draw_solution, show
-from casadi_ik.views.stage import Stage
+from casadi_ik.app.drawing.surfaces import ball, drum, ring, rod
+from casadi_ik.app.pictures import draw_solution, show
+from casadi_ik.app.pictures.scene3d import Stage
 
 pytestmark = pytest.mark.opengl
 

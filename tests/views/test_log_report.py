@@ -10,7 +10,8 @@ import pytest
 from processes import python
 
 import casadi_ik as ik
-from casadi_ik import logs, views
+from casadi_ik import logs
+from casadi_ik.app import pictures as views
 
 
 class Page(HTMLParser):

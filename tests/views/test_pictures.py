@@ -13,7 +13,9 @@ from matplotlib.image import imread
 from processes import python
 
 import casadi_ik as ik
-from casadi_ik import errors, palette, views
+from casadi_ik import errors
+from casadi_ik.app import pictures as views
+from casadi_ik.app.drawing import palette
 
 pytestmark = pytest.mark.opengl
 
@@ -95,9 +97,9 @@ def test_a_missed_grasp_is_red(robot, grasp) -> None:
 def test_free_fingers_and_normals_are_left_out(robot, solution, grasp) -> None:
     point = grasp.contacts["thumb"].point
     part = ik.Grasp({"thumb": ik.Contact(point)}, name="a point", object="no such thing")
-    free = ik.answers.ContactVerdict(np.nan, np.nan, True, ik.Tolerance())
+    free = ik.solve.ContactVerdict(np.nan, np.nan, True, ik.Tolerance())
     verdicts = dict.fromkeys(robot.fingers, free)
-    verdicts["thumb"] = ik.answers.ContactVerdict(1e-3, np.nan, True, ik.Tolerance())
+    verdicts["thumb"] = ik.solve.ContactVerdict(1e-3, np.nan, True, ik.Tolerance())
     answer = dataclasses.replace(solution, contacts=verdicts)
     text = words(views.draw_solution(robot, answer, part, dpi=40))
     assert "1.00 mm" in text
@@ -111,7 +113,7 @@ def test_a_target_far_away_does_not_shrink_the_close_up(robot, solution, grasp) 
         for name, contact in grasp.contacts.items()
     }
     missed = {
-        name: ik.answers.ContactVerdict(5.0, 0.0, False, ik.Tolerance()) for name in robot.fingers
+        name: ik.solve.ContactVerdict(5.0, 0.0, False, ik.Tolerance()) for name in robot.fingers
     }
     far = views.draw_solution(
         robot,
@@ -146,7 +148,7 @@ def test_pictures_are_written_whole_at_their_size(robot, solution, grasp, log, t
 def test_headless_pictures_say_nothing_and_leave_pyplot_alone() -> None:
     code = (
         "import sys, casadi_ik as ik\n"
-        "from casadi_ik.views import draw_solution\n"
+        "from casadi_ik.app.pictures import draw_solution\n"
         "robot, grasp = ik.load_robot('kuka_lwr_barrett'), ik.load_grasp('cup')\n"
         "solver = ik.Solver(robot, 'enhanced-dls', finger_step='closed-form')\n"
         "draw_solution(robot, solver.solve(grasp), grasp, dpi=40)\n"
@@ -162,7 +164,7 @@ def test_without_the_extra_the_error_says_what_to_install(missing: str) -> None:
     code = (
         f"import sys; sys.modules['{missing}'] = None\n"
         "import casadi_ik\n"
-        "try: import casadi_ik.views\n"
+        "try: import casadi_ik.app.pictures\n"
         "except casadi_ik.CasadiIKError as error: print(type(error).__name__, error)"
     )
     done = python("-c", code, check=True)

@@ -11,8 +11,8 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
-from casadi_ik.arrays import Array
-from casadi_ik.grasps import GraspObject
+from casadi_ik.files.arrays import Array
+from casadi_ik.model.objects import GraspObject
 
 PHALANX_RADIUS = 0.009  # [m]
 PALM_SURFACE = 0.080  # [m] z in frame W (robots.md, section 2)

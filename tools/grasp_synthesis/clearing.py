@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 import casadi_ik as ik
-from casadi_ik.arrays import Array
-from casadi_ik.problem.clearance import CollisionQuery, SceneCheck
-from casadi_ik.problem.request import Request, tolerances_by_finger
+from casadi_ik.collision.clearance import CollisionQuery, SceneCheck
+from casadi_ik.files.arrays import Array
+from casadi_ik.solve.request import Request, tolerances_by_finger
 from grasp_synthesis.fingertip_pinch import TipPinch
 
 MARGIN = 0.5e-3  # [m] that everything is apart at least

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from casadi_ik.arrays import Array
+from casadi_ik.files.arrays import Array
 
 
 def friction_needed(points: Array, normals: Array) -> float:

@@ -19,11 +19,12 @@ from itertools import combinations
 import casadi as ca
 import numpy as np
 
-from casadi_ik.arrays import Array
-from casadi_ik.grasps import GraspObject, Sphere
-from casadi_ik.robots import RobotDescription
-from casadi_ik.symbolic.kinematics import actuated
-from casadi_ik.symbolic.se3 import exp_so3
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.forward import actuated
+from casadi_ik.kinematics.se3 import exp_so3
+from casadi_ik.model.description import RobotDescription
+from casadi_ik.model.objects import GraspObject
+from casadi_ik.model.shapes import Sphere
 from grasp_synthesis.patches import Patch, primitive
 from grasp_synthesis.programme import Programme
 

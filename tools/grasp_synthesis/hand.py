@@ -7,9 +7,10 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from casadi_ik.arrays import Array
-from casadi_ik.robots import RobotDescription, load_description
-from casadi_ik.symbolic.kinematics import Kinematics, Pose, forward
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.forward import Kinematics, Pose, forward
+from casadi_ik.model.description import RobotDescription
+from casadi_ik.model.load_robot import load_description
 
 ROBOT = "kuka_lwr_barrett"
 FRAME_W = "bh_base"  # on the mounting face; the palm surface is 80 mm above it

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from casadi_ik.arrays import Array
-from casadi_ik.robots import RobotDescription
-from casadi_ik.symbolic.kinematics import actuated
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.forward import actuated
+from casadi_ik.model.description import RobotDescription
 from grasp_synthesis.fingertip_pinch import TipPinch
 from grasp_synthesis.programme import OPTIONS
 

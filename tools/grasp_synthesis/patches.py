@@ -12,17 +12,17 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from casadi_ik.arrays import Array
-from casadi_ik.grasps import (
+from casadi_ik.files.arrays import Array
+from casadi_ik.model.objects import GraspObject
+from casadi_ik.model.shapes import (
     BentCapsule,
     Box,
     Cylinder,
     EllipticCylinder,
-    GraspObject,
+    MeshShape,
     Shape,
     Sphere,
 )
-from casadi_ik.grasps.shapes import MeshShape
 
 
 def primitive(item: GraspObject) -> Shape:

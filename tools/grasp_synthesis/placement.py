@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from casadi_ik.arrays import Array
-from casadi_ik.grasps import GraspObject
+from casadi_ik.files.arrays import Array
+from casadi_ik.model.objects import GraspObject
 from grasp_synthesis.hand import FRAME_W, ArmHand
 from grasp_synthesis.posture import Pinch
 from grasp_synthesis.programme import OPTIONS

@@ -17,9 +17,10 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from casadi_ik.arrays import Array
-from casadi_ik.grasps import BentCapsule, Cylinder, GraspObject, Sphere
-from casadi_ik.symbolic.kinematics import Pose
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.forward import Pose
+from casadi_ik.model.objects import GraspObject
+from casadi_ik.model.shapes import BentCapsule, Cylinder, Sphere
 from grasp_synthesis.hand import ArmHand, full_posture
 from grasp_synthesis.patches import Patch, primitive
 from grasp_synthesis.programme import Programme

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from casadi_ik.arrays import Array
+from casadi_ik.files.arrays import Array
 
 OPTIONS = {
     "print_time": False,

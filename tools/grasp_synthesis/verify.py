@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from casadi_ik.grasps import load_grasp, load_object
+from casadi_ik.model.load_grasp import load_grasp
+from casadi_ik.model.objects import load_object
 from grasp_synthesis.clearance import clearance
 from grasp_synthesis.closure import friction_needed
 from grasp_synthesis.hand import FINGERS, ArmHand

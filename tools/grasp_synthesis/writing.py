@@ -1,4 +1,4 @@
-"""A grasp as a file in the format of `casadi_ik.grasps.load_grasp`."""
+"""A grasp as a file in the format of `casadi_ik.model.load_grasp`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from casadi_ik.arrays import Array
+from casadi_ik.files.arrays import Array
 from grasp_synthesis.clearance import Clearance
 from grasp_synthesis.hand import FINGERS, ROBOT, ArmHand
 from grasp_synthesis.placement import Placement

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from casadi_ik.arrays import Array
-from casadi_ik.importing.surfaces import Surface, link_surfaces
-from casadi_ik.robots.linkage import below, link_poses
-from casadi_ik.robots.parts import Part
-from casadi_ik.robots.read_tree import read_tree
-from casadi_ik.robots.tree import RobotTree, TreeJoint
+from casadi_ik.files.arrays import Array
+from casadi_ik.integrations.importing.surfaces import Surface, link_surfaces
+from casadi_ik.model.linkage import below, link_poses
+from casadi_ik.model.parts import Part
+from casadi_ik.model.urdf_mjcf import read_tree
+from casadi_ik.model.xml_tree import RobotTree, TreeJoint
 
 ALIKE = 2e-4
 """Axes that differ by less [m, or as unit vectors] are one."""

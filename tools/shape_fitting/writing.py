@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from casadi_ik.importing.write import collision_lines
-from casadi_ik.robots.collision import Touching
-from casadi_ik.robots.schema import ShapeEntry
+from casadi_ik.integrations.importing.write import collision_lines
+from casadi_ik.model.link_shapes import Touching
+from casadi_ik.model.schema import ShapeEntry
 
 
 def write(

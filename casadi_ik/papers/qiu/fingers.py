@@ -29,12 +29,13 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from casadi_ik.arrays import Array
 from casadi_ik.errors import UnsupportedError
-from casadi_ik.problem.contacts import Target
-from casadi_ik.robots.description import Joint, RobotDescription
-from casadi_ik.symbolic.kinematics import forward, number
-from casadi_ik.symbolic.smooth import Expr
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.contacts import Target
+from casadi_ik.kinematics.forward import forward, number
+from casadi_ik.kinematics.smooth import Expr
+from casadi_ik.model.description import RobotDescription
+from casadi_ik.model.joints import Joint
 
 ALIGNED = 1e-9
 

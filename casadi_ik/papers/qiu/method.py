@@ -13,11 +13,16 @@ from typing import Generic, TypeVar
 import casadi as ca
 import numpy as np
 
-from casadi_ik.arrays import Array, Counts
-from casadi_ik.kernels import StepGraph
-from casadi_ik.kernels.layout import Field
-from casadi_ik.methods.common.limits import kept_within, limit_mask, starts_within
-from casadi_ik.methods.common.looped_method import LoopedMethod, Start
+from casadi_ik.compile import StepGraph
+from casadi_ik.compile.layout import Field
+from casadi_ik.files.arrays import Array, Counts
+from casadi_ik.kinematics.closed_chain import VIRTUAL, closed_chain, split
+from casadi_ik.kinematics.contacts import contact_errors, goal_contacts, within_tolerance
+from casadi_ik.kinematics.forward import actuated
+from casadi_ik.kinematics.linear_algebra import condition_number, damped_pinv_times, singular_values
+from casadi_ik.kinematics.smooth import Expr, safe_norm, shared
+from casadi_ik.model.description import RobotDescription
+from casadi_ik.model.targets import TargetBatch
 from casadi_ik.papers.qiu.fingers import finger_step_function, planar_fingers
 from casadi_ik.papers.qiu.step import OriginalParameters, QiuParameters, QiuStep
 from casadi_ik.papers.qiu.tasks import (
@@ -35,15 +40,10 @@ from casadi_ik.papers.qiu.tasks import (
     weighted,
     weighted_damped,
 )
-from casadi_ik.problem.contacts import contact_errors, goal_contacts, within_tolerance
-from casadi_ik.problem.status import Phase, Status
-from casadi_ik.problem.targets import TargetBatch
-from casadi_ik.problem.trace import STEP_SIZE, RecordedJacobian
-from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.closed_chain import VIRTUAL, closed_chain, split
-from casadi_ik.symbolic.kinematics import actuated
-from casadi_ik.symbolic.linear_algebra import condition_number, damped_pinv_times, singular_values
-from casadi_ik.symbolic.smooth import Expr, safe_norm, shared
+from casadi_ik.solve.limits import kept_within, limit_mask, starts_within
+from casadi_ik.solve.looped_method import LoopedMethod, Start
+from casadi_ik.solve.status import Phase, Status
+from casadi_ik.solve.trace import STEP_SIZE, RecordedJacobian
 
 NOT_MEASURED = float("nan")
 

@@ -9,15 +9,15 @@ from typing import Generic, TypeVar
 
 import casadi as ca
 
-from casadi_ik.arrays import Array
+from casadi_ik.compile.graphs import StepGraph, recipe
+from casadi_ik.compile.layout import Field, Layout
 from casadi_ik.errors import InputError
-from casadi_ik.kernels.graphs import StepGraph, recipe
-from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.contacts import target_fields, target_values
+from casadi_ik.model.description import RobotDescription
+from casadi_ik.model.targets import TargetBatch
 from casadi_ik.papers.qiu.tasks import PROJECTIONS as HIERARCHIES
-from casadi_ik.problem.contacts import target_fields, target_values
-from casadi_ik.problem.targets import TargetBatch
-from casadi_ik.problem.trace import ANGLE_ERROR, LIMIT_MASK, PHASE, POSITION_ERROR, STATUS, Q
-from casadi_ik.robots.description import RobotDescription
+from casadi_ik.solve.trace import ANGLE_ERROR, LIMIT_MASK, PHASE, POSITION_ERROR, STATUS, Q
 
 ORDERS = ("per-finger", "points-first")
 """Order of the tasks of the original methods: finger by finger, or all points, then all normals."""

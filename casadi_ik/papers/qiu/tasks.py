@@ -12,19 +12,18 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from casadi_ik.arrays import Array
 from casadi_ik.errors import UnsupportedError
-from casadi_ik.problem.contacts import USUAL, Target, tip_vectors
-from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.kinematics import ActuatedKinematics, forward, number
-from casadi_ik.symbolic.linear_algebra import (
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.contacts import USUAL, Target, tip_vectors
+from casadi_ik.kinematics.forward import ActuatedKinematics, forward, number
+from casadi_ik.kinematics.linear_algebra import (
     damped_pinv_times,
     project_to_null_space,
     solve_spd,
     svd,
     weighted_damped_pinv_times,
 )
-from casadi_ik.symbolic.se3 import (
+from casadi_ik.kinematics.se3 import (
     euler_zyx,
     log_se3,
     log_so3,
@@ -32,7 +31,8 @@ from casadi_ik.symbolic.se3 import (
     project_to_rotation,
     rotation_between,
 )
-from casadi_ik.symbolic.smooth import Expr, safe_norm
+from casadi_ik.kinematics.smooth import Expr, safe_norm
+from casadi_ik.model.description import RobotDescription
 
 MILLIMETRE = 1e-3
 """The paper's solvers work in millimetres and radians: their damping factors say so."""

@@ -1,1 +1,0 @@
-"""Arm-hand kinematics inside other people's systems: a module each, which imports that system."""

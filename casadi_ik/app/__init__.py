@@ -1,0 +1,1 @@
+"""Command line, browser viewer, pictures and reports."""

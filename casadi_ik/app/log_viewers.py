@@ -1,0 +1,319 @@
+"""One solve as a file that Foxglove and Lichtblick play: robot, frames, contacts, phases, events.
+
+======================  ==========================  ================================================
+topic                   schema                      message
+======================  ==========================  ================================================
+``/robot_description``  std_msgs/msg/String         the robot as URDF, once
+``/tf``                 foxglove.FrameTransforms    every link under its parent, each iteration
+``/joint_states``       sensor_msgs/msg/JointState  joints after the couplings, each iteration
+``/ik/targets``         foxglove.SceneUpdate        the contacts asked for, once
+``/ik/contacts``        foxglove.SceneUpdate        where the fingertips are, each iteration
+``/ik/iteration``       as in the log               all that the log holds of each iteration
+``/ik/messages``        foxglove.Log                how it began, phases, events, how it ended
+======================  ==========================  ================================================
+
+An iteration takes 10 ms, and the first is at the time when the solve began.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.writer import Writer
+from scipy.spatial.transform import Rotation
+
+from casadi_ik.app.drawing import palette
+from casadi_ik.errors import LogError, MissingExtraError, os_errors
+from casadi_ik.files.arrays import Array
+from casadi_ik.files.shipped import models_folder
+from casadi_ik.files.writing import written_whole
+from casadi_ik.kinematics.arm_hand import ArmHand
+from casadi_ik.logs.cdr import ros_channel, write_postures
+from casadi_ik.logs.container import CDR_HEADER
+from casadi_ik.logs.events import SERIOUS, told
+from casadi_ik.logs.format import schema_name, schema_text
+from casadi_ik.logs.solve import OneSolve
+
+try:
+    from foxglove import Schema
+    from foxglove import messages as fox
+except ImportError as error:
+    raise MissingExtraError(
+        "viewer files need foxglove-sdk, which is not installed: pip install 'casadi-ik[viewer]'"
+    ) from error
+
+ITERATION = 10_000_000
+"""Time between two iterations in the viewer [ns]."""
+
+FREE = "#999999"
+"""Of the contact of a free finger."""
+
+ARROW = 0.05
+"""Length of a contact's normal [m]."""
+
+
+def write_view(path: str | os.PathLike[str], solve: OneSolve, robot: ArmHand) -> None:
+    """Write a viewer file.
+
+    Args:
+        path: The MCAP file; it is there when it is complete.
+        solve: The solve.
+        robot: The robot that it was solved for.
+
+    Raises:
+        LogError: The log has no iterations of the solve, or the file cannot be written.
+    """
+    if len(solve.rows) == 0:
+        raise LogError(
+            f"solve {solve.solve_id + 1} of {solve.method}: the log kept no iterations of it"
+        )
+    refused = os_errors(f"{path}: cannot write the viewer file", LogError)
+    with refused, written_whole(Path(path)) as part, part.open("xb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2", library="casadi_ik")
+        _View(writer, solve, robot).write()
+        writer.finish()
+
+
+class _View:
+    """The topics of one solve."""
+
+    def __init__(self, writer: Writer, solve: OneSolve, robot: ArmHand) -> None:
+        self.writer = writer
+        self.solve = solve
+        self.robot = robot
+        self.root = robot.description.root
+        self.q = solve.rows["q"].astype(float)
+        self.times = solve.started + ITERATION * np.arange(len(solve.rows))
+
+    def write(self) -> None:
+        """All topics, each in its order; a reader sorts by time."""
+        write_postures(self.writer, self.robot, self.q, self.times.tolist())
+        self._targets()
+        self._transforms()
+        self._contacts()
+        self._iterations()
+        self._messages()
+
+    def _protobuf(self, topic: str, found: Schema) -> int:
+        number = self.writer.register_schema(found.name, found.encoding, found.data)
+        return self.writer.register_channel(topic, "protobuf", number)
+
+    def _add(self, channel: int, i: int, data: bytes) -> None:
+        time = int(self.times[i])
+        self.writer.add_message(channel, time, data, time, sequence=i)
+
+    def _transforms(self) -> None:
+        description, links = self.robot.description, self.robot.links(self.q)
+        poses = [
+            (joint.parent, joint.child, np.linalg.inv(links[joint.parent]) @ links[joint.child])
+            for joint in description.joints
+        ]
+        poses += [
+            (finger.link, f"{finger.name}_contact", np.tile(finger.placement, (len(self.q), 1, 1)))
+            for finger in description.fingers
+        ]
+        frames = [
+            (parent, child, pose[:, :3, 3], Rotation.from_matrix(pose[:, :3, :3]).as_quat())
+            for parent, child, pose in poses
+        ]
+        channel = self._protobuf("/tf", fox.FrameTransforms.get_schema())
+        for i, time in enumerate(self.times.tolist()):
+            stamp = stamp_of(time)
+            transforms = [
+                fox.FrameTransform(
+                    timestamp=stamp,
+                    parent_frame_id=parent,
+                    child_frame_id=child,
+                    translation=vector_of(positions[i]),
+                    rotation=quaternion_of(rotations[i]),
+                )
+                for parent, child, positions, rotations in frames
+            ]
+            self._add(channel, i, fox.FrameTransforms(transforms=transforms).encode())
+
+    def _targets(self) -> None:
+        solve = self.solve
+        turned = along(solve.target_normals)
+        contacts = [
+            (f"{finger} target", solve.target_points[j], turned[j], palette.TARGET)
+            for j, finger in enumerate(solve.fingers)
+            if not np.isnan(solve.target_points[j]).any()
+        ]
+        channel = self._protobuf("/ik/targets", fox.SceneUpdate.get_schema())
+        self._add(channel, 0, self._scene(0, contacts, thickness=0.008))
+
+    def _contacts(self) -> None:
+        solve = self.solve
+        points, normals = self.robot.contacts(self.q)
+        turned = along(normals.reshape(-1, 3)).reshape(*normals.shape[:2], 4)
+        missed = (solve.rows["position_error"] > solve.position_tolerance) | (
+            solve.rows["angle_error"] > solve.angle_tolerance
+        )
+        channel = self._protobuf("/ik/contacts", fox.SceneUpdate.get_schema())
+        free = [bool(np.isnan(point).any()) for point in solve.target_points]
+        for i in range(len(self.q)):
+            colors = [
+                FREE if free[j] else palette.MISSED if missed[i, j] else palette.MET
+                for j in range(len(free))
+            ]
+            contacts = list(zip(solve.fingers, points[i], turned[i], colors, strict=True))
+            self._add(channel, i, self._scene(i, contacts, thickness=0.004))
+
+    def _scene(
+        self, i: int, contacts: list[tuple[str, Array, Array, str]], thickness: float
+    ) -> bytes:
+        """Contacts as points with arrows along their normals: name, point, rotation, colour."""
+        stamp = stamp_of(int(self.times[i]))
+        entities = [
+            fox.SceneEntity(
+                timestamp=stamp,
+                frame_id=self.root,
+                id=name,
+                spheres=[sphere(point, 2.5 * thickness, color)],
+                arrows=[] if np.isnan(turned).any() else [arrow(point, turned, thickness, color)],
+            )
+            for name, point, turned, color in contacts
+        ]
+        return fox.SceneUpdate(entities=entities).encode()
+
+    def _iterations(self) -> None:
+        solve = self.solve
+        name = schema_name("iteration", solve.method, solve.layout, len(solve.fingers))
+        text = schema_text(solve.layout, solve.labels)
+        channel = ros_channel(self.writer, "/ik/iteration", (name, text))
+        for i, row in enumerate(solve.rows):
+            self._add(channel, i, CDR_HEADER + row.tobytes())
+
+    def _messages(self) -> None:
+        solve, last = self.solve, len(self.q) - 1
+        lines = [
+            (0, fox.LogLevel.Info, f"{solve.method} on {solve.robot}, solve {solve.solve_id + 1}")
+        ]
+        lines += [(each.first, fox.LogLevel.Info, each.phase) for each in solve.stretches]
+        lines += [
+            (
+                event.iteration,
+                fox.LogLevel.Warning if event.kind in SERIOUS else fox.LogLevel.Info,
+                told(event),
+            )
+            for event in solve.events
+            if event.kind != "PHASE_CHANGE"
+        ]
+        level = fox.LogLevel.Info if solve.success else fox.LogLevel.Error
+        lines.append((last, level, f"{solve.status} after {solve.iterations} iterations"))
+        for i, finger in enumerate(solve.fingers):
+            level = fox.LogLevel.Info if solve.ok[i] else fox.LogLevel.Error
+            lines.append((last, level, f"{finger} off by {solve.errors_of(i)}"))
+        channel = self._protobuf("/ik/messages", fox.Log.get_schema())
+        for i, level, text in sorted(lines, key=lambda line: line[0]):
+            stamp = stamp_of(int(self.times[i]))
+            log = fox.Log(timestamp=stamp, level=level, message=text, name=f"iteration {i + 1}")
+            self._add(channel, i, log.encode())
+
+
+def shipped_layout() -> Path:
+    """The layout file that comes with the package."""
+    return models_folder() / "viewer" / "layout.json"
+
+
+def layout_of(solve: OneSolve, robot: ArmHand) -> dict[str, Any]:
+    """The shipped layout, its plots and its frame filled in for a solve.
+
+    Args:
+        solve: The solve; its fields are what is plotted.
+        robot: The robot that it was solved for.
+    """
+    layout = json.loads(shipped_layout().read_text(encoding="utf-8"))
+    panels = layout["configById"]
+    panels["3D!robot"]["followTf"] = robot.description.root
+    for name in ("position_error", "angle_error"):
+        panels[f"Plot!{name}"]["paths"] = _paths(_lines(solve, name))
+    sigmas = [name for name in solve.layout.names if name.startswith("sigma_")]
+    panels["Plot!sigma"]["paths"] = _paths(line for name in sigmas for line in _lines(solve, name))
+    panels["Plot!joints"]["paths"] = _paths(
+        (f"/joint_states.position[{i}]", joint)
+        for i, joint in enumerate(robot.description.joint_names)
+    )
+    return layout
+
+
+def _lines(solve: OneSolve, name: str) -> list[tuple[str, str]]:
+    """A line per element of a field of the log."""
+    fields = {item.name: item for item in solve.layout}
+    if name not in fields:
+        return []
+    if not fields[name].shape:
+        return [(f"/ik/iteration.{name}", name.removeprefix("sigma_"))]
+    return [
+        (f"/ik/iteration.{name}[{i}]", solve.name_of(name, i)) for i in range(fields[name].size)
+    ]
+
+
+def _paths(lines: Iterable[tuple[str, str]]) -> list[dict[str, Any]]:
+    return [
+        {
+            "value": value,
+            "label": label,
+            "enabled": True,
+            "timestampMethod": "receiveTime",
+            "color": palette.LINES[i % len(palette.LINES)],
+        }
+        for i, (value, label) in enumerate(lines)
+    ]
+
+
+def stamp_of(time: int) -> fox.Timestamp:
+    """A time [ns since the Unix epoch]."""
+    return fox.Timestamp(*divmod(time, 1_000_000_000))
+
+
+def vector_of(values: Array) -> fox.Vector3:
+    """A vector (3,)."""
+    x, y, z = values.tolist()
+    return fox.Vector3(x=x, y=y, z=z)
+
+
+def quaternion_of(values: Array) -> fox.Quaternion:
+    """A quaternion (4,), scalar last."""
+    x, y, z, w = values.tolist()
+    return fox.Quaternion(x=x, y=y, z=z, w=w)
+
+
+def along(normals: Array) -> Array:
+    """Quaternions (k, 4), scalar last, that turn x axes to unit vectors (k, 3); NaN of NaN."""
+    x, y, z = normals.T
+    turned = np.stack([0 * x, -z, y, 1 + x], axis=1)
+    turned[~turned.any(axis=1)] = 0, 0, 1, 0
+    return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True), np.float64)
+
+
+def color_of(color: str) -> fox.Color:
+    """An opaque colour."""
+    red, green, blue = (part / 255 for part in palette.rgb(color))
+    return fox.Color(r=red, g=green, b=blue, a=1.0)
+
+
+def sphere(point: Array, size: float, color: str) -> fox.SpherePrimitive:
+    """A sphere at a point, its diameter [m]."""
+    pose = fox.Pose(position=vector_of(point), orientation=fox.Quaternion(w=1.0))
+    return fox.SpherePrimitive(
+        pose=pose, size=fox.Vector3(x=size, y=size, z=size), color=color_of(color)
+    )
+
+
+def arrow(point: Array, turned: Array, thickness: float, color: str) -> fox.ArrowPrimitive:
+    """An arrow from a point; in its own frame it points along x."""
+    return fox.ArrowPrimitive(
+        pose=fox.Pose(position=vector_of(point), orientation=quaternion_of(turned)),
+        shaft_length=0.7 * ARROW,
+        shaft_diameter=thickness,
+        head_length=0.3 * ARROW,
+        head_diameter=2.2 * thickness,
+        color=color_of(color),
+    )

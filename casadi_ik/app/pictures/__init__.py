@@ -1,0 +1,33 @@
+"""Pictures of grasps and of convergence; needs the extra `plots`: matplotlib and PyVista."""
+
+import warnings
+
+from casadi_ik.errors import MissingExtraError
+
+try:
+    import matplotlib as _  # noqa: F401
+
+    with warnings.catch_warnings():
+        # What it downloads with has progress bars, which complain in notebooks without widgets.
+        warnings.filterwarnings("ignore", "IProgress not found")
+        import pyvista as _pyvista  # noqa: F401
+except ImportError as error:
+    raise MissingExtraError(
+        f"pictures need {error.name}, which is not installed: pip install 'casadi-ik[plots]'"
+    ) from error
+
+from casadi_ik.app.pictures.charts import draw_convergence
+from casadi_ik.app.pictures.grasps import draw_alternatives, draw_grasps
+from casadi_ik.app.pictures.pictures import draw_motion, draw_pads, draw_solution, show
+from casadi_ik.app.pictures.study_report import study_page
+
+__all__ = [
+    "draw_alternatives",
+    "draw_convergence",
+    "draw_grasps",
+    "draw_motion",
+    "draw_pads",
+    "draw_solution",
+    "show",
+    "study_page",
+]

@@ -1,0 +1,270 @@
+"""The machine's C compiler."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import importlib.util
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+from casadi_ik.compile.cancellation import SLICE, stop_if_cancelled
+from casadi_ik.errors import KernelError
+
+# No contraction: with fused multiply-adds the iterates would differ from the VM's. Errno of sqrt
+# and friends is never read, and without it they are single instructions of the same value. All
+# but the driver is hidden, so that a function named like one of libc cannot be taken for it.
+FLAGS = ("-fPIC", "-shared", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden")
+
+LEVEL = ("-O2",)
+"""Optimization: -O1 compiles in three quarters of the time, and `fast` then takes 6 to 8 % more.
+Results are the same bit for bit."""
+
+CANDIDATES = ("cc", "gcc", "clang")
+
+ZIG = ("-m", "ziglang", "cc", "-mcpu=baseline", "-fno-sanitize=all")
+"""The compiler of the Python package ziglang: for any machine of the kind, as gcc compiles."""
+
+SHOWN_ERROR_LINES, SHOWN_CHARACTERS = 3, 200
+"""How much of a compiler's complaint is shown."""
+
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT) if hasattr(errno, "EDQUOT") else (errno.ENOSPC,)
+
+SMALL = 2**20
+"""A disk with less room [bytes] counts as full if a compiler failed on it."""
+
+
+class NoCompilerWarning(RuntimeWarning):
+    """There is no C compiler: kernels run in CasADi's virtual machine, 20 to 60 times slower."""
+
+
+class UnloadableError(KernelError):
+    """What a compiler made cannot be loaded."""
+
+
+@dataclass(frozen=True)
+class Compiler:
+    """A C compiler that answered.
+
+    Attributes:
+        command: Absolute path, then arguments of `CC` if it had any.
+        version: The first line of its `--version`.
+        flags: Flags of every compilation.
+    """
+
+    command: tuple[str, ...]
+    version: str
+    flags: tuple[str, ...] = FLAGS
+
+    @property
+    def identity(self) -> str:
+        """What decides the produced code, apart from the source."""
+        return "\n".join((*self.command, self.version, *LEVEL, *self.flags))
+
+    def build(self, source: Path, library: Path) -> None:
+        """Compile one C file to a shared library.
+
+        Args:
+            source: The file.
+            library: Where the library shall stand; the compiler's own files are put beside it.
+
+        Raises:
+            KernelError: The compiler refused; the message has the first lines of its complaint.
+            OSError: The disk is full.
+            KeyboardInterrupt: Ctrl-C reached the compiler.
+            CancelledError: This thread has been told to stop.
+        """
+        command = [*self.command, *LEVEL, *self.flags, "-o", str(library), str(source), "-lm"]
+        place = {"TMPDIR": str(library.parent), "LC_ALL": "C"}
+        try:
+            done = _run(command, os.environ | place)
+        except OSError as error:
+            raise KernelError(f"compiler {self.command[0]} cannot be run: {error}") from error
+        if done.returncode == 0 and library.is_file():
+            return
+        if done.returncode == -signal.SIGINT:
+            raise KeyboardInterrupt
+        if _full(library.parent, done.stderr):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(library.parent))
+        lines = done.stderr.splitlines()
+        errors = [line for line in lines if "error" in line.lower()] or lines or ["no complaint"]
+        complaint = "; ".join(line[:SHOWN_CHARACTERS] for line in errors[:SHOWN_ERROR_LINES])
+        ended = f"failed with {_ending(done.returncode)}" if done.returncode else "made no library"
+        raise KernelError(
+            f"compiler {self} {ended} "
+            f"(CC=... names another compiler, CC=none does without): {complaint}"
+        )
+
+    def __str__(self) -> str:
+        return shlex.join(self.command)[:SHOWN_CHARACTERS]
+
+
+def _run(
+    command: Sequence[str], environment: Mapping[str, str]
+) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end, or until this thread has been told to stop."""
+    process = subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        errors="replace",
+        env=environment,
+    )
+    with process:
+        try:
+            while True:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    out, complaint = process.communicate(timeout=SLICE)
+                    break
+                stop_if_cancelled()
+        except BaseException:
+            process.kill()
+            raise
+    return subprocess.CompletedProcess(command, process.returncode, out, complaint)
+
+
+def _ending(code: int) -> str:
+    """How a process ended, in words."""
+    try:
+        return signal.Signals(-code).name if code < 0 else f"exit code {code}"
+    except ValueError:
+        return f"exit code {code}"
+
+
+def _full(directory: Path, complaint: str) -> bool:
+    """Whether it was for want of room that a compiler failed."""
+    if any(os.strerror(code) in complaint for code in NO_ROOM):
+        return True
+    return shutil.disk_usage(directory).free < SMALL
+
+
+def find_compiler() -> Compiler | None:
+    """The compiler of the environment, or None.
+
+    The environment variable `CC` (command and arguments) counts alone if it is set; otherwise the
+    first of cc, gcc, clang on the path, then the Python package ziglang (extra `compiler`). A `CC`
+    that does not exist (`CC=none`) is a way to ask for the virtual machine. `CASADI_IK_CFLAGS` is
+    appended to the flags.
+    """
+    return _find(
+        os.environ.get("CC", ""),
+        os.environ.get("PATH", ""),
+        os.environ.get("CASADI_IK_CFLAGS", ""),
+    )
+
+
+@lru_cache(maxsize=16)
+def _find(cc: str, path: str, flags: str) -> Compiler | None:
+    """`find_compiler` for one environment, remembered because it starts processes."""
+    try:
+        further = shlex.split(flags)
+    except ValueError as error:
+        raise KernelError(f"CASADI_IK_CFLAGS={flags[:SHOWN_CHARACTERS]!r}: {error}") from error
+    try:
+        wanted = [shlex.split(cc)] if cc.strip() else [[name] for name in CANDIDATES] + _zig()
+    except ValueError:  # a quotation without an end
+        return None
+    for words in wanted:
+        program = shutil.which(words[0], path=path)
+        if program is None:
+            continue
+        version = _version((program, *words[1:]))
+        if version is not None:
+            return Compiler((program, *words[1:]), version, flags=(*FLAGS, *further))
+    return None
+
+
+def _zig() -> list[list[str]]:
+    """Its command, where it is installed."""
+    known = importlib.util.find_spec("ziglang") is not None and bool(sys.executable)
+    return [[sys.executable, *ZIG]] if known else []
+
+
+def _version(command: tuple[str, ...]) -> str | None:
+    """The first line of `--version`, None if the program does not run (macOS has such a stub)."""
+    try:
+        done = subprocess.run(
+            [*command, "--version"], capture_output=True, text=True, errors="replace", timeout=30
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    if done.returncode != 0:
+        return None
+    return done.stdout.partition("\n")[0]
+
+
+_warned = False
+
+
+def warn_no_compiler(problem: str = "") -> None:
+    """Say once per process that kernels run in the virtual machine.
+
+    Args:
+        problem: Why; "": there is no compiler.
+    """
+    global _warned
+    if _warned:
+        return
+    _warned = True
+    found = problem or (
+        f"CC={os.environ['CC'][:SHOWN_CHARACTERS]!r} does not run"
+        if os.environ.get("CC", "").strip()
+        else (
+            f"none of {', '.join(CANDIDATES)} is on the path; "
+            "pip install 'casadi-ik[compiler]' brings one"
+        )
+    )
+    warnings.warn(
+        f"no C compiler ({found}): casadi_ik runs in CasADi's virtual machine, with the same "
+        "results but about 20 times slower, batches 60 times",
+        NoCompilerWarning,
+        stacklevel=2,
+    )
+
+
+POLICY = "CASADI_IK_COMPILE"
+BACKGROUND, WAIT = "background", "wait"
+
+
+def waits() -> bool:
+    """Whether the first answer of a robot waits for the compiler.
+
+    Raises:
+        KernelError: The environment variable says neither.
+    """
+    policy = os.environ.get(POLICY) or BACKGROUND
+    if policy not in (BACKGROUND, WAIT):
+        raise KernelError(
+            f"{POLICY}={policy[:SHOWN_CHARACTERS]!r}: expected {BACKGROUND} or {WAIT}"
+        )
+    return policy == WAIT
+
+
+def tell(text: str) -> None:
+    """Say on stderr what is compiled: anywhere, or if waiting was asked for on a terminal only."""
+    stream = sys.stderr
+    if stream is not None and (not waits() or stream.isatty()):
+        stream.write(f"{text}\n")
+        stream.flush()
+
+
+def announce(name: str, size: int) -> None:
+    """Say what is compiled and about how long that takes, if it is long.
+
+    Args:
+        name: Of the kernel.
+        size: Characters of its text.
+    """
+    # 150,000 to 280,000 characters of C in a second were measured.
+    if (seconds := size / 200_000) >= 2.0:
+        tell(f"compiling {name} (about {seconds:.0f} s, once per machine)")

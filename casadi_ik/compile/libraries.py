@@ -1,0 +1,343 @@
+"""Compiled libraries: of this process, made ahead, of the machine's cache, or built here.
+
+A library's file name in the cache holds two hashes: of everything it was built from (the key) and
+of its own bytes. The second lets a torn file be known before it is loaded (loading one can kill the
+process), and being in the name it needs no second file that could disagree. Files appear by
+`os.replace` only: one who is killed in the middle leaves nothing that looks like a library. Of
+several processes that need the same, one builds it and the others wait.
+
+The wheel `casadi-ik-kernels` (tools/build_kernels.py) brings libraries of shipped robots that were
+compiled ahead. They are told by what their text follows from, so they serve without a compiler.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import hashlib
+import importlib.util
+import os
+import platform
+import re
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from functools import cache
+from importlib.metadata import version
+from itertools import chain
+from pathlib import Path
+
+import casadi as ca
+
+from casadi_ik.compile.cache import own_file, places, reason, temporary, warn_once, workshop
+from casadi_ik.compile.cancellation import (
+    ForkSafeLock,
+    interrupt_afterwards,
+    is_cached_only,
+    is_virtual,
+    stop_if_cancelled,
+)
+from casadi_ik.compile.codegen import Stages, library_source, row_major
+from casadi_ik.compile.compiler import (
+    Compiler,
+    UnloadableError,
+    announce,
+    find_compiler,
+    warn_no_compiler,
+)
+from casadi_ik.compile.graphs import package_sources
+from casadi_ik.files.writing import remove_stale
+
+AHEAD = "casadi_ik_kernels"
+"""The package of libraries made ahead."""
+
+PATIENCE = 120.0
+"""Seconds that are waited for another process that builds the same library."""
+
+KEY = re.compile("[0-9a-f]{32}")
+
+on_text: list[Callable[[str, str], None]] = []
+"""Who wants the text of every library, told apart by the name of its file ahead
+(tools/build_kernels.py)."""
+
+_lock = ForkSafeLock()
+_loaded: dict[str, ctypes.CDLL] = {}
+
+
+class NotCachedError(Exception):
+    """A library would have to be built where none may be."""
+
+
+def load_function(
+    name: str,
+    build: Callable[[], ca.Function | Stages],
+    driver: str,
+    symbol: str,
+    recipe: str = "",
+    lanes: int = 1,
+    wide: bool = False,
+) -> ctypes.CDLL | None:
+    """The compiled library of a function and a driver; see `load_library`.
+
+    Args:
+        name: Of the library's file.
+        build: Gives the function.
+        driver: C text of the driver, with its constants.
+        symbol: The function the driver exports.
+        recipe: What the function follows from (`graphs.recipe`), "" if that is not known.
+        lanes: As for `library_source`, like those below.
+        wide: Likewise.
+    """
+
+    def text() -> str:
+        return library_source(row_major(build()), driver, lanes, wide)
+
+    form = f"{recipe} {lanes} {wide} {driver}" if recipe else ""
+    return load_library(name, text, symbol, form)
+
+
+def load_library(
+    name: str, text: Callable[[], str], symbol: str, recipe: str = ""
+) -> ctypes.CDLL | None:
+    """A compiled library: from this process, made ahead, from disk, or built.
+
+    Args:
+        name: Of the library's file.
+        text: Gives its C text.
+        symbol: A function it exports.
+        recipe: What the text follows from, "" if that is not known. Where a library of that recipe
+            is found, the text is not made.
+
+    Returns:
+        The library, or None where there is no compiler, or no room for what it makes (a warning
+        says so once).
+
+    Raises:
+        KernelError: There is no C code, or the compiler refused it or made no library.
+        NotCachedError: It is not there yet, and nothing may be built (`cached_only`).
+    """
+    if is_virtual():
+        return None
+    # The key tells apart what is called alike that far.
+    short = name[:100]
+    ahead = f"{short}-{_hash(recipe)}" if recipe else ""
+    with _lock:
+        if ahead and (library := _made_ahead(ahead, symbol)) is not None:
+            return library
+        compiler = find_compiler()
+        if compiler is None:
+            warn_no_compiler()
+            return None
+        note = f"{short}-{_key(compiler, *_versions(), recipe)}.key"
+        folders = places()
+        for directory in folders if recipe else ():
+            if (library := _recognised(directory, short, note, symbol)) is not None:
+                return library
+        if is_cached_only():
+            raise NotCachedError(name)
+        with interrupt_afterwards():
+            source = text()
+        for listener in on_text:
+            listener(ahead, source)
+        key = _key(compiler, source)
+        library = _loaded.get(key) or _kept_or_built(
+            folders, f"{short}-{key}", source, compiler, symbol
+        )
+        if library is None:
+            return None
+        _loaded[key] = library
+        for directory in folders if recipe else ():
+            _note(directory / note, key)
+        return library
+
+
+@cache
+def _versions() -> tuple[str, str]:
+    """Of what makes graphs; reading them takes a millisecond."""
+    return ca.CasadiMeta.version(), version("numpy")
+
+
+def _key(compiler: Compiler, *parts: str) -> str:
+    """Hash of everything a library is built from, 32 hexadecimal digits."""
+    return _hash(platform.system(), platform.machine(), compiler.identity, *parts)
+
+
+def _hash(*parts: str) -> str:
+    digest = hashlib.sha256()
+    for part in parts:
+        # The length keeps the parts apart.
+        digest.update(f"{len(part)}:".encode())
+        digest.update(part.encode())
+    return digest.hexdigest()[:32]
+
+
+@cache
+def ahead_folder() -> Path | None:
+    """Where libraries made ahead for these sources are, None if there are none."""
+    found = importlib.util.find_spec(AHEAD)
+    if found is None or not found.submodule_search_locations:
+        return None
+    folder = Path(found.submodule_search_locations[0])
+    try:
+        made_for = (folder / "made_for").read_text(encoding="ascii").strip()
+    except OSError:
+        made_for = ""
+    if made_for == package_sources():
+        return folder
+    warnings.warn(
+        f"casadi-ik-kernels was made for another version than casadi-ik {version('casadi-ik')}: "
+        "its kernels are not used",
+        RuntimeWarning,
+        stacklevel=2,
+    )
+    return None
+
+
+def _made_ahead(name: str, symbol: str) -> ctypes.CDLL | None:
+    """A library made ahead, or None."""
+    if name in _loaded:
+        return _loaded[name]
+    folder = ahead_folder()
+    path = None if folder is None else folder / f"{name}.so"
+    if path is None or not path.is_file():
+        return None
+    try:
+        library = ctypes.CDLL(str(path))
+    except OSError:
+        return None
+    if not hasattr(library, symbol):
+        return None
+    _loaded[name] = library
+    return library
+
+
+def _recognised(directory: Path, name: str, note: str, symbol: str) -> ctypes.CDLL | None:
+    """The library that a recipe led to before, or None."""
+    path = directory / note
+    try:
+        key = path.read_text(encoding="ascii") if own_file(path) else ""
+    except (OSError, ValueError):
+        return None
+    if not KEY.fullmatch(key):
+        return None
+    library = _loaded.get(key) or _find(directory, f"{name}-{key}", symbol)
+    if library is not None:
+        _loaded[key] = library
+    return library
+
+
+def _note(path: Path, key: str) -> None:
+    """Remember what a recipe led to; that it cannot be written costs time only."""
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        part.write_text(key, encoding="ascii")
+        part.chmod(0o600)
+        part.replace(path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+
+
+def _find(directory: Path, stem: str, symbol: str) -> ctypes.CDLL | None:
+    """A whole, loadable library of that key that has the symbol, or None; torn ones are removed."""
+    for path in directory.glob(f"{stem}-*.so"):
+        try:
+            if not own_file(path):
+                continue
+            if path.name != f"{stem}-{_content_hash(path)}.so":
+                path.unlink(missing_ok=True)
+                continue
+            library = ctypes.CDLL(str(path))
+        except OSError:
+            continue
+        if hasattr(library, symbol):
+            return library
+    return None
+
+
+def _content_hash(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+
+
+def _kept_or_built(
+    folders: list[Path], stem: str, source: str, compiler: Compiler, symbol: str
+) -> ctypes.CDLL | None:
+    """From disk, or compiled into the first place that has room; None if none has."""
+    problems: dict[Path, OSError | UnloadableError] = {}
+    library = None
+
+    def found() -> ctypes.CDLL | None:
+        return next(filter(None, (_find(folder, stem, symbol) for folder in folders)), None)
+
+    if (library := found()) is not None:
+        return library
+    announce(stem.rpartition("-")[0], len(source))
+    for place in chain(folders, temporary(folders)):
+        try:
+            remove_stale(place, "build-*", 1)
+            remove_stale(place, ".*.part", -2)
+            remove_stale(place, ".*.lock")
+            with _sole_builder(place / f".{stem}.lock"):
+                library = found() or _compiled(place, stem, source, compiler, symbol)
+            break
+        except (OSError, UnloadableError) as error:
+            problems[place] = error
+    for place, error in problems.items():
+        if library is None and isinstance(error, UnloadableError):
+            raise error
+        warn_once(str(place), f"cannot be used: {reason(error)}")
+    if library is None:
+        warn_no_compiler("there is no room for what it makes")
+    return library
+
+
+@contextlib.contextmanager
+def _sole_builder(path: Path) -> Iterator[None]:
+    """Wait while another process is in this block with the same file; not on Windows.
+
+    A process that is killed holds nothing. Waiting too long does no harm either: both build.
+    """
+    try:
+        import fcntl
+    except ImportError:
+        yield
+        return
+    until = time.monotonic() + PATIENCE
+    with path.open("w") as file:
+        while time.monotonic() < until:
+            with contextlib.suppress(BlockingIOError):
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            stop_if_cancelled()
+            time.sleep(0.05)
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
+
+
+def _compiled(
+    directory: Path, stem: str, source: str, compiler: Compiler, symbol: str
+) -> ctypes.CDLL:
+    """Compile into a directory.
+
+    Raises:
+        OSError: It cannot be written, or is full.
+        KernelError: The compiler refused, or made something else than the library.
+    """
+    with workshop(directory) as place:
+        text, file = place / "kernel.c", place / "kernel.so"
+        text.write_text(source, encoding="utf-8")
+        compiler.build(text, file)
+        # Loaded before it is shown to others, who might tidy the directory up.
+        try:
+            library = ctypes.CDLL(str(file))
+            library[symbol]
+        except (OSError, AttributeError) as error:
+            raise UnloadableError(
+                f"compiler {compiler} ended well, but what it made cannot be loaded "
+                f"(CC=... names another compiler, CC=none does without): {error}"
+            ) from error
+        file.chmod(0o700)
+        file.replace(directory / f"{stem}-{_content_hash(file)}.so")
+    return library

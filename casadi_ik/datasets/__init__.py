@@ -1,6 +1,0 @@
-"""Other people's grasps: data sets and tables, read as candidates."""
-
-from casadi_ik.datasets.layouts import LAYOUTS
-from casadi_ik.datasets.load import Candidates, load_candidates
-
-__all__ = ["LAYOUTS", "Candidates", "load_candidates"]

@@ -1,0 +1,1 @@
+"""Export of a solver as standalone C or WebAssembly source code."""

@@ -1,0 +1,394 @@
+"""What is written of a robot: a C project, a WebAssembly module; and kernels compiled ahead.
+
+A folder is built beside its place, and put there when it is whole.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from casadi_ik.api import Solver
+from casadi_ik.collision.scene import Scene
+from casadi_ik.errors import InputError, KernelError, MissingExtraError, UnsupportedError, os_errors
+from casadi_ik.export.scene import BodySceneSources, SceneSources
+from casadi_ik.export.single import SinglePrecision, filled
+from casadi_ik.export.solver import FollowSources, SolverSources, hand_first
+from casadi_ik.export.targets import (
+    COUNT,
+    IN_TEST_C,
+    IN_TEST_MJS,
+    IN_TEST_SINGLE,
+    OF_BODY_C,
+    OF_BODY_MJS,
+    Example,
+    SceneTargets,
+    example,
+    stored,
+    targets_header,
+    written,
+)
+from casadi_ik.kinematics.arm_hand import ArmHand
+from casadi_ik.model.grasp import Contact, Grasp
+from casadi_ik.planning.touch.hand_table import touch_library
+
+MARK = ".casadi_ik_export"
+"""A file by which a folder is known as an export."""
+
+EXPORTED = ("hand-first",)
+"""The methods that can be exported."""
+
+IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+
+
+def checked_prefix(prefix: str | None, robot: str) -> str:
+    """What names begin with; of the robot's name if it is not said.
+
+    Raises:
+        InputError: No name of C.
+    """
+    if prefix is None:
+        made = re.sub(r"\W+", "_", robot, flags=re.ASCII).strip("_").lower()
+        return made if IDENTIFIER.fullmatch(made) else f"robot_{made}"
+    if not IDENTIFIER.fullmatch(prefix):
+        raise InputError(f"--prefix: found {prefix!r}, expected letters, digits and underscores")
+    return prefix
+
+
+def check_method(method: str) -> None:
+    """Whether it can be exported.
+
+    Raises:
+        UnsupportedError: It cannot.
+    """
+    if method not in EXPORTED:
+        raise UnsupportedError(
+            f"--method: {method!r} cannot be exported, expected one of {', '.join(EXPORTED)}"
+        )
+
+
+def check_folder(out: Path) -> None:
+    """Whether a folder may be written: it is not there, empty, or an export.
+
+    Raises:
+        InputError: Something else is there.
+    """
+    with os_errors(f"--out: {out}", InputError):
+        if out.is_symlink() or (out.exists() and not out.is_dir()):
+            raise InputError(f"--out: {out} is no folder, expected a new one, or an earlier export")
+        if out.is_dir() and any(out.iterdir()) and not (out / MARK).is_file():
+            raise InputError(f"--out: {out} is not empty, and no earlier export; nothing written")
+
+
+@dataclass(frozen=True, eq=False)
+class Exported:
+    """A robot's solver on its way out.
+
+    Attributes:
+        solver: Its answers are those of the export.
+        example: What the example solves.
+        marks: What stands for the marks of the templates.
+        sources: Headers and C files by path.
+        scene: What its targets are solved in; None: the export knows no scene.
+        judge: Files of the kinematics that judge answers in single precision.
+    """
+
+    solver: Solver
+    example: Example
+    marks: dict[str, str]
+    sources: dict[str, str]
+    scene: SceneTargets | None
+    judge: dict[str, str]
+
+
+def exported(
+    robot: ArmHand,
+    prefix: str,
+    capacity: int | None = None,
+    single: bool = False,
+    follow: bool = False,
+) -> Exported:
+    """The solver of a robot as source code.
+
+    Args:
+        robot: The robot.
+        prefix: What every name begins with.
+        capacity: How many solids may stand about; None: collisions are not looked at.
+        single: Whether it is in single precision.
+        follow: Whether a follower goes with it, in double precision.
+
+    Raises:
+        UnsupportedError: It cannot be exported.
+    """
+    sides = robot.description.sides
+    if sides and single and capacity is not None:
+        raise UnsupportedError(
+            f"--single: {robot.name} has several sides, expected no --scene: their collisions are "
+            "looked at in double precision only"
+        )
+    as_hand = ArmHand(robot.description.as_hand) if sides else robot
+    if single:
+        robot = as_hand
+    if single and follow:
+        raise UnsupportedError("--follow: computes in double precision, expected no --single")
+    method, solver = hand_first(robot), Solver(robot)
+    if not method.kernel.compiled:
+        raise UnsupportedError(
+            "export: its test needs answers from compiled code, and there is no C compiler here; "
+            "pip install 'casadi-ik[compiler]' brings one"
+        )
+    allowing = SinglePrecision(robot) if single else None
+    scene = None
+    if capacity is not None:
+        kind = BodySceneSources if robot.description.sides else SceneSources
+        scene = kind.of(robot, method, prefix, capacity, allowing)
+    tolerance = next(iter(solver.tolerances.values()))
+    sources = SolverSources(robot, method, prefix, tolerance, scene, allowing)
+    shown = example(robot)
+    marks = sources.substitutes | {
+        "EXAMPLE_WHAT": shown.what,
+        "EXAMPLE_POINTS": written(shown.points),
+        "EXAMPLE_NORMALS": written(shown.normals),
+        "TARGETS": str(COUNT),
+        "ROUNDS_COUNT": str(sources.plan.rounds),
+    }
+    more: dict[str, str] = {}
+    if follow:
+        more, about_it = FollowSources(as_hand, prefix, tolerance).files()
+        marks |= about_it
+    files = (
+        more
+        | sources.side_files
+        | {
+            f"include/{prefix}.h": filled("solver.h", marks),
+            f"src/{prefix}_parts.h": filled("parts.h", marks),
+            f"src/{prefix}_solver.c": filled("solver.c", marks),
+            f"src/{prefix}_tables.c": sources.tables(),
+            **{f"src/{prefix}_{part.name}.c": part.text for part in sources.parts},
+        }
+    )
+    if scene is not None:
+        files[f"src/{prefix}_scene.c"] = scene.source()
+    about = None if capacity is None else SceneTargets(solver, capacity)
+    judge = sources.judge() if single else {}
+    return Exported(solver, shown, marks, sources.final(files), about, judge)
+
+
+def _tested(project: Exported, pieces: Mapping[str, str]) -> dict[str, str]:
+    """The marks of a project, and those that its test has in addition where there is a scene."""
+    if project.scene is None:
+        return project.marks
+    prefix = project.marks["PREFIX"]
+    named = {
+        name: piece.replace("@P", prefix).replace("@G", prefix.upper())
+        for name, piece in pieces.items()
+    }
+    return project.marks | named
+
+
+def c_project(
+    robot: ArmHand,
+    prefix: str,
+    capacity: int | None = None,
+    single: bool = False,
+    follow: bool = False,
+) -> dict[str, str | bytes]:
+    """The files of a project in C, by path.
+
+    Args:
+        robot: The robot.
+        prefix: What every name begins with.
+        capacity: How many solids may stand about; None: collisions are not looked at.
+        single: Whether it is in single precision.
+        follow: Whether a follower goes with it.
+
+    Raises:
+        UnsupportedError: The robot's solver cannot be exported.
+    """
+    project = exported(robot, prefix, capacity, single, follow)
+    files = {
+        "example/main.c": "main.c",
+        "test/test.c": "test_single.c" if single else "test.c",
+        "bench/bench.c": "bench.c",
+        "CMakeLists.txt": "CMakeLists.txt",
+        "Makefile": "Makefile",
+        "README.md": "README.md",
+    }
+    of_body = OF_BODY_C if robot.description.sides else {}
+    marks = _tested(project, IN_TEST_SINGLE if single else IN_TEST_C | of_body)
+    return {
+        **project.sources,
+        f"include/{prefix}.hpp": filled("solver.hpp", marks),
+        **{path: filled(name, marks) for path, name in files.items()},
+        **project.judge,
+        "test/targets.h": targets_header(project.solver, project.scene, single),
+    }
+
+
+def write_folder(out: Path, files: Mapping[str, str | bytes]) -> None:
+    """Write a folder as a whole; an earlier export is replaced.
+
+    Raises:
+        InputError: It cannot be written; nothing is left of it.
+    """
+    check_folder(out)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        made = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
+        try:
+            for name, content in files.items():
+                path = made / name
+                path.parent.mkdir(parents=True, exist_ok=True)
+                data = content.encode() if isinstance(content, str) else content
+                path.write_bytes(data)
+            (made / MARK).write_text("casadi-ik export wrote this folder and may replace it.\n")
+            made.chmod(0o755)
+            old = made.with_name(made.name + ".old")
+            if out.exists():
+                out.rename(old)
+            try:
+                made.rename(out)
+            except OSError:
+                if old.exists():
+                    old.rename(out)
+                raise
+            shutil.rmtree(old, ignore_errors=True)
+        except BaseException:
+            shutil.rmtree(made, ignore_errors=True)
+            raise
+    except OSError as error:
+        raise InputError(f"--out: {out}: cannot be written: {error.strerror}") from error
+
+
+# No contraction: with fused multiply-adds the answers would be others in the last places.
+COMMAND = (
+    *("-m", "ziglang", "cc", "-target", "wasm32-wasi", "-mexec-model=reactor", "-std=c11"),
+    *("-O2", "-msimd128", "-ffp-contract=off", "-fno-math-errno", "-fno-sanitize=all", "-s"),
+)
+
+
+def wasm_project(
+    robot: ArmHand, prefix: str, capacity: int | None = None, follow: bool = False
+) -> dict[str, str | bytes]:
+    """The files of a module with its wrapper, by path.
+
+    Raises:
+        MissingExtraError: ziglang is not installed.
+        UnsupportedError: The robot's solver cannot be exported.
+        KernelError: The compiler refused.
+    """
+    if importlib.util.find_spec("ziglang") is None:
+        raise MissingExtraError("--target wasm needs ziglang: pip install 'casadi-ik[compiler]'")
+    project = exported(robot, prefix, capacity, follow=follow)
+    of_body = OF_BODY_MJS if robot.description.sides else {}
+    marks = _tested(project, IN_TEST_MJS | of_body) | {
+        "LOWER_JSON": json.dumps(robot.lower.tolist()),
+        "UPPER_JSON": json.dumps(robot.upper.tolist()),
+        "HOME_JSON": json.dumps(robot.home.tolist()),
+        "EXAMPLE_POINTS_JSON": _numbers(project.example.points.ravel().tolist()),
+        "EXAMPLE_NORMALS_JSON": _numbers(project.example.normals.ravel().tolist()),
+    }
+    files = {
+        f"{prefix}.js": "solver.js",
+        f"{prefix}.d.ts": "solver.d.ts",
+        "example.html": "example.html",
+        "test.mjs": "test.mjs",
+        "README.md": "README_wasm.md",
+    }
+    package = {"name": prefix, "type": "module", "main": f"{prefix}.js"}
+    about = {} if project.scene is None else {"scene.json": project.scene.json()}
+    return {
+        **about,
+        **{path: filled(name, marks) for path, name in files.items()},
+        "package.json": json.dumps(package) + "\n",
+        "targets.json": json.dumps(stored(project.solver, project.scene)) + "\n",
+        f"{prefix}.wasm": _module(project),
+    }
+
+
+def _numbers(values: list[float]) -> str:
+    """A JavaScript array, NaN included."""
+    return "[" + ", ".join("NaN" if value != value else repr(value) for value in values) + "]"
+
+
+def _module(project: Exported) -> bytes:
+    """The sources, compiled.
+
+    Raises:
+        KernelError: The compiler refused.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        for name, text in project.sources.items():
+            path = place / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8")
+        (place / "src" / "wasm.c").write_text(filled("wasm.c", project.marks), encoding="utf-8")
+        made = place / "solver.wasm"
+        texts = sorted(str(path) for path in (place / "src").glob("*.c"))
+        include = [f"-I{place / 'include'}", f"-I{place / 'src'}"]
+        command = [sys.executable, *COMMAND, *include, *texts, "-lm", "-o", str(made)]
+        done = subprocess.run(command, capture_output=True, text=True, errors="replace")
+        if done.returncode or not made.is_file():
+            complaint = "; ".join(done.stderr.splitlines()[:3]) or "no complaint"
+            raise KernelError(f"zig made no WebAssembly module: {complaint[:500]}")
+        return made.read_bytes()
+
+
+def uses(robot: ArmHand, everything: bool = False) -> Iterator[tuple[str, Callable[[], object]]]:
+    """Ways to use a robot that compile something, in words and as what does it.
+
+    Args:
+        robot: The robot.
+        everything: Whether scenes, choices, motions and diagnoses are among them.
+    """
+    solver = Solver(robot)
+    q = robot.random(np.random.default_rng(0), 64)  # enough for solves side by side
+
+    def targets() -> tuple[np.ndarray, np.ndarray]:
+        return robot.contacts(q)
+
+    @cache
+    def grasp() -> Grasp:
+        points, normals = robot.contacts(q[0])
+        pairs = zip(robot.fingers, points, normals, strict=True)
+        return Grasp({name: Contact(*pair) for name, *pair in pairs})
+
+    def logged() -> object:
+        with tempfile.TemporaryDirectory() as place:
+            return solver.solve_batch(*targets(), log=Path(place) / "log.mcap")
+
+    yield "forward kinematics", targets
+    yield "one target", lambda: solver.solve(grasp())
+    yield "limits ignored", lambda: Solver(robot, limits="ignore").solve(grasp())
+    yield "batches", lambda: solver.solve_batch(*targets())
+    yield "grasps of surfaces", touch_library
+    if not everything:
+        return
+
+    def beyond() -> object:
+        points, normals = targets()
+        return solver.solve_batch(points[:1] + 100.0, normals[:1], diagnose=True)
+
+    yield "real-time loops", solver.fast
+    yield "logs", logged
+    yield "diagnoses", beyond
+    yield "followers", lambda: solver.follow(q[0], period=0.001)(grasp())
+    try:
+        about = Solver(robot, scene=Scene())
+    except UnsupportedError:
+        return
+    yield "scenes", lambda: about.solve_batch(*targets())
+    yield "choices", lambda: about.choose([grasp()] * 2, limit=1)
+    yield "ways to a grasp", lambda: about.reach(grasp(), q0=q[1])

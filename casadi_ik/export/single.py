@@ -1,0 +1,228 @@
+"""Templates, and what they say in double and in single precision."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from importlib import resources
+
+import numpy as np
+
+from casadi_ik.compile.codegen import number
+from casadi_ik.errors import UnsupportedError
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.arm_hand import ArmHand
+from casadi_ik.kinematics.contact_fit import FIT
+from casadi_ik.model.targets import Tolerance
+
+TOKEN = re.compile(
+    r"""
+    (?P<kept> /\*.*?\*/ | //[^\n]* | "(?:\\.|[^"\\])*" | '(?:\\.|[^'\\])*'
+            | ^[ ]*\#[ ]*include[^\n]* | 0[xX][0-9a-fA-F]+\w* )
+    | (?P<number> (?: \d+\.\d* | \.\d+ ) (?:[eE][-+]?\d+)? (?!\w) | \d+[eE][-+]?\d+ (?!\w) )
+    | \d[\w.]*
+    | (?P<word> [A-Za-z_]\w* )
+    """,
+    re.VERBOSE | re.MULTILINE | re.DOTALL,
+)
+
+_TURNS = ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh")
+_OTHERS = ("exp", "log", "log10", "pow", "sqrt", "hypot", "fabs", "floor", "ceil", "fmod", "fmax")
+LIBM = frozenset((*_TURNS, *_OTHERS, "fmin", "rint", "round", "copysign", "frexp", "ldexp"))
+"""Functions of the C library whose forms for single precision have an f behind their name."""
+
+FLOAT = np.finfo(np.float32)
+EPSILON = float(FLOAT.eps)
+
+ROUNDING = 8 * EPSILON
+"""What rounding makes of kinematics at most, as an angle [rad] and as a part of how far the robot
+reaches: three times what 20,000 random solves of kuka_lwr_barrett and panda+allegro_right found."""
+
+ARM_ROUNDING = 16 * ROUNDING
+"""What rounding makes of the joints of an arm that is found again from where its palm is [rad]:
+one that stands at a limit is beyond it by as much, and put back."""
+
+FOLLOWING = ((FIT.exact * FIT.exact, ARM_ROUNDING * ARM_ROUNDING),)
+"""Numbers in the graphs that say what is zero but for rounding, and what they are in single
+precision: the cost at which a fit, or an arm that is searched for, is exact. Single precision would
+never come to it, and an arm would be searched for from every start, in thirteen times as many
+iterations."""
+
+SMALL, LARGE = 1e-15, 1e15
+"""Between these the squares of a length are neither rounded to zero nor infinite."""
+
+SAMPLES = 1024
+"""Random configurations that say how far a robot reaches."""
+
+
+def in_single_precision(text: str) -> str:
+    """The same C code with single precision wherever it has double.
+
+    Types, numbers and calls of the C library are exchanged, so that no operation is left in double
+    precision. Numbers too large or too small for it become the largest and the smallest there are,
+    not infinite and nought: such bounds say "any" and "more than nothing", and a divisor kept above
+    nought that is nought after all makes fits go astray.
+    """
+    return TOKEN.sub(_exchanged, text)
+
+
+def _exchanged(match: re.Match[str]) -> str:
+    number, word = match["number"], match["word"]
+    if number is not None:
+        return _number(number)
+    if word == "double":
+        return "float"
+    return f"{word}f" if word in LIBM else match[0]
+
+
+def _number(text: str) -> str:
+    """A number as C writes it in single precision."""
+    value = float(text)
+    if value > float(FLOAT.max):
+        text = repr(float(FLOAT.max))
+    elif 0 < value < float(FLOAT.tiny):
+        text = repr(float(FLOAT.tiny))
+    return f"{text}f"
+
+
+@dataclass(frozen=True, eq=False)
+class SinglePrecision:
+    """What a solver in single precision allows for, so that double precision confirms its answers.
+
+    Attributes:
+        robot: The robot.
+    """
+
+    robot: ArmHand
+
+    @cached_property
+    def reach(self) -> float:
+        """How far contacts come from the origin of the base frame [m]."""
+        points, _ = self.robot.contacts(self.robot.random(np.random.default_rng(0), SAMPLES))
+        return float(np.linalg.norm(points, axis=-1).max())
+
+    @property
+    def tolerance(self) -> Tolerance:
+        """What rounding may make of an error: answers keep to tolerances less this."""
+        return Tolerance(ROUNDING * self.reach, ROUNDING)
+
+    @cached_property
+    def bounds(self) -> tuple[Array, Array]:
+        """The robot's limits (n,), moved inwards by rounding; exact in single precision.
+
+        Raises:
+            UnsupportedError: There is nothing between them then.
+        """
+        lower, upper = self.robot.lower, self.robot.upper
+        low = (lower + ROUNDING * np.maximum(1.0, np.abs(lower))).astype(np.float32)
+        high = (upper - ROUNDING * np.maximum(1.0, np.abs(upper))).astype(np.float32)
+        for name, one, other in zip(self.robot.actuators, low, high, strict=True):
+            if one >= other:
+                raise UnsupportedError(
+                    f"--single: motor {name!r}: between its limits there is too little room "
+                    "for single precision"
+                )
+        return low.astype(float), high.astype(float)
+
+    @property
+    def reals(self) -> dict[str, float]:
+        """Numbers of the search that follow the precision."""
+        return {
+            "LIMIT_SLACK": 0.0,
+            "TOLERANCE_SLACK": 0.0,
+            "SMALL_LENGTH": SMALL,
+            "LARGE_LENGTH": LARGE,
+        }
+
+    @property
+    def arrays(self) -> dict[str, Array]:
+        """Arrays of the search that follow the precision."""
+        lower, upper = self.bounds
+        return {"LOWER": lower, "UPPER": upper}
+
+
+IN_DOUBLE = {
+    "REAL": "double",
+    "MATHS": "#include <math.h>",
+    "AND_SUM": ", sum = 0;",
+    "ANSWERS": (
+        "The answers are bit for bit those of the Python package (method hand-first) on a machine "
+        "of the same\narithmetic, whatever the optimisation, as long as multiply-adds are not "
+        "fused (`-ffp-contract=off`).\n"
+    ),
+    "COMPARED": "answers compared bit for bit",
+}
+"""What stands for the marks in double precision."""
+
+ANSWERS = """\
+In single precision, for controllers without a unit for doubles: nothing is computed in double
+precision. What is called solved is so in double precision, too; see [below](#single-precision).
+"""
+
+ABOUT = """
+## Single precision
+
+All numbers are `float`; `-Wdouble-promotion` tells that nothing else is computed with. The method
+is the one of the double-precision export, its bounds against division by nothing those of this
+precision; the iterates are others, and so may an answer be where a target has several.
+
+Rounding moves this robot's fingertips by less than {position:.1e} m and {angle:.1e} rad. Answers
+keep to tolerances less that, and to limits moved inwards by {angle:.1e} rad: what is called solved
+is solved for double precision as well. So tolerances from {least:.1g} m and {least_angle:.1g} rad
+on make sense; smaller ones than rounding are never met.
+
+How often it solves: of 10,000 random targets within reach at 5 mm and 3 deg all that double
+precision solves, of each of the robots kuka_lwr_barrett and panda+allegro_right. For this robot
+`make test` tells: of a thousand that double precision solves one may be missed, and every answer is
+judged by kinematics in double precision (`test/judge.c`).
+"""
+
+
+def in_single(single: SinglePrecision) -> dict[str, str]:
+    """What stands for the marks in single precision."""
+    less = single.tolerance
+    about = ABOUT.format(
+        position=less.position,
+        angle=less.angle,
+        least=100 * less.position,
+        least_angle=100 * less.angle,
+    )
+    return {
+        "REAL": "float",
+        "MATHS": "#define SINGLE\n#include <tgmath.h>",
+        "AS_DOUBLE": "(double) ",
+        "TO_REAL": "(float) ",
+        "AND_SUM": ";\n  double sum = 0;",
+        "LESS_POSITION": f" - {number(less.position)}",
+        "LESS_ANGLE": f" - {number(less.angle)}",
+        "STRICTER": " -Wdouble-promotion",
+        "JUDGE": " test/judge.c",
+        "PRECISION": ", single precision",
+        "PRECISION_NOTE": (
+            " *\n * In single precision. Answers keep to tolerances less what rounding makes of\n"
+            f" * them: {less.position:.1e} m and {less.angle:.1e} rad.\n"
+        ),
+        "ANSWERS": ANSWERS,
+        "COMPARED": "answers judged in double precision",
+        "ABOUT_PRECISION": about,
+    }
+
+
+MARK = re.compile(r"@([A-Z_]+)(\??)@")
+SECTION = re.compile(r"^@([A-Z_]+)\{@\n(.*?)^@\}@\n", re.MULTILINE | re.DOTALL)
+
+
+def filled(name: str, substitutes: Mapping[str, str]) -> str:
+    """The text of `templates/<name>` with every mark replaced.
+
+    A mark with a question mark stands for nothing where an export has no such thing; lines between
+    `@NAME{@` and `@}@` are there for exports that have a NAME.
+
+    Raises:
+        KeyError: Another mark stands for nothing.
+    """
+    text = (resources.files("casadi_ik.export") / "templates" / name).read_text(encoding="utf-8")
+    text = SECTION.sub(lambda m: m[2] if m[1] in substitutes else "", text)
+    return MARK.sub(lambda m: substitutes.get(m[1], "") if m[2] else substitutes[m[1]], text)

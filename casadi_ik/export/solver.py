@@ -1,0 +1,487 @@
+"""The sources of a solver and of a follower: templates filled, each kernel in a file of its own."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.compile import FunctionKernel, LoopKernel
+from casadi_ik.compile.codegen import (
+    define,
+    define_arrays,
+    driver_text,
+    number,
+    row_major,
+    standing_alone,
+)
+from casadi_ik.compile.emitter import Form
+from casadi_ik.compile.graphs import FunctionGraph
+from casadi_ik.compile.layout import Layout
+from casadi_ik.compile.lookup import TILE
+from casadi_ik.export.scene import WITHOUT_SCENE, SceneSources
+from casadi_ik.export.single import (
+    FOLLOWING,
+    IN_DOUBLE,
+    SinglePrecision,
+    filled,
+    in_single,
+    in_single_precision,
+)
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.arm_hand import ArmHand
+from casadi_ik.kinematics.contacts import usual
+from casadi_ik.model.targets import TargetBatch, Tolerance
+from casadi_ik.motion.cycle import Cycle
+from casadi_ik.motion.follower import PALM_WEIGHT
+from casadi_ik.motion.inputs import FADING, contact_weights
+from casadi_ik.motion.motion import RUN_UP, own_velocities
+from casadi_ik.motion.moving import FOLLOWING_PULL, SETTLING
+from casadi_ik.solve.hand_first.driver import SearchPlan, source_text
+from casadi_ik.solve.hand_first.method import HandFirstMethod
+from casadi_ik.solve.hand_first.parameters import HandFirstParameters
+from casadi_ik.solve.hand_first.state import terms
+from casadi_ik.solve.request import BEYOND, touched
+from casadi_ik.solve.verdict import LIMIT_SLACK, TOLERANCE_SLACK
+
+
+def palm_marks(robot: ArmHand, prefix: str, real: str) -> dict[str, str]:
+    """What stands for the marks of palms; nothing for a body, without an arm, or a free palm."""
+    if not robot.description.arm_actuators or robot.description.sides:
+        return {}
+    motors = robot.description.finger_motors
+    own = np.where(np.isin(robot.actuators, motors), robot.home, np.nan)
+    home = robot.palm(robot.home)
+    if touched(robot, home[None], own[None])[2]:  # contacts leave it free
+        return {}
+    pose = np.concatenate([home[:3, :3].ravel(), home[:3, 3]])
+    constants = f"#define POSTURE_ROUNDING {number(BEYOND)}\n" + define_arrays(
+        {"HOME_PALM": pose, "OF_HAND": np.isin(robot.actuators, motors).astype(int)}
+    )
+    marks = {"PREFIX": prefix, "GUARD": prefix.upper()}
+    return {
+        "PALM_CALLS": filled("palm.h", marks | {"REAL": real}),
+        "PALM": "\n" + constants + filled("palm.c", marks),
+        "PALM_WASM": filled("palm_wasm.c", marks),
+        "PALM_JS": filled("palm.js", marks),
+        "PALM_DTS": filled("palm.d.ts", marks),
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class FollowSources:
+    """What a follower adds to the sources of a solver.
+
+    Attributes:
+        robot: The robot.
+        prefix: What every name begins with.
+        tolerance: When a contact counts as reached.
+    """
+
+    robot: ArmHand
+    prefix: str
+    tolerance: Tolerance
+
+    def files(self) -> tuple[dict[str, str], dict[str, str]]:
+        """The C file by path, and what stands for the marks of the other templates."""
+        cycle = Cycle(self.robot.description, usual(len(self.robot.fingers)))
+        marks = {
+            "PREFIX": self.prefix,
+            "GUARD": self.prefix.upper(),
+            "CYCLE": standing_alone(row_major(cycle.graph.function), Form()),
+            "FOLLOW_CONSTANTS": self._constants(cycle),
+            "FOLLOW_STATE": str(cycle.state.size),
+            "FOLLOW_ASKED": str(cycle.parameters.size),
+            "FOLLOW_RECORD": str(cycle.record.size),
+        }
+        about = {
+            "FOLLOW_CALLS": filled("follow.h", marks),
+            "FOLLOW_WASM": filled("follow_wasm.c", marks),
+            "FOLLOW_JS": filled("follow.js", marks),
+            "FOLLOW_DTS": filled("follow.d.ts", marks),
+            "FOLLOW_STATUS_JS": (
+                "export const FollowStatus = Object.freeze({\n"
+                "  HOLDING: 0,\n  FOLLOWING: 1,\n  LATE: 2,\n  MISSED: 3,\n});\n"
+            ),
+            "FOLLOW_STATUS_DTS": (
+                "export const FollowStatus: {\n"
+                "  /** The frame was none: the motors come to rest and wait. */\n"
+                "  readonly HOLDING: 0;\n"
+                "  /** Every contact is within tolerance. */\n  readonly FOLLOWING: 1;\n"
+                "  /** Velocities and accelerations permit no more. */\n  readonly LATE: 2;\n"
+                "  /** No posture on this branch meets the contacts. */\n  readonly MISSED: 3;\n"
+                "};\n"
+            ),
+        }
+        return {f"src/{self.prefix}_follow.c": filled("follow.c", marks)}, about
+
+    def _constants(self, cycle: Cycle) -> str:
+        robot, f = self.robot, len(self.robot.fingers)
+        places = {
+            "N_FINGERS": f,
+            "N_MOTORS": len(robot.actuators),
+            "MOVES_PALM": int(bool(cycle.palms)),
+        }
+        places |= _places("STATE", cycle.state) | _places("ASKED", cycle.parameters)
+        numbers = {
+            "TOLERANCE_SLACK": TOLERANCE_SLACK,
+            "SETTLING": SETTLING,
+            "FADING": FADING,
+            "PULL": FOLLOWING_PULL,
+            "RUN_UP": RUN_UP,
+            "PALM_WEIGHT": PALM_WEIGHT,
+        }
+        arrays = {
+            "LOWER": robot.lower,
+            "UPPER": robot.upper,
+            "HOME": robot.home,
+            "VELOCITY": own_velocities(robot),
+            "WEIGHTS": contact_weights((self.tolerance,) * f),
+            "POSITION_TOLERANCES": np.full(f, self.tolerance.position),
+            "ANGLE_TOLERANCES": np.full(f, self.tolerance.angle),
+        }
+        return (
+            define(places | _places("RECORD", cycle.record))
+            + "".join(f"#define {name} {number(value)}\n" for name, value in numbers.items())
+            + define_arrays(arrays)
+        )
+
+
+def _places(label: str, layout: Layout) -> dict[str, int]:
+    return {f"{label}_{one.name.upper()}": layout.slice(one.name).start for one in layout}
+
+
+@dataclass(frozen=True)
+class Part:
+    """A kernel.
+
+    Attributes:
+        name: Of its file and function.
+        job: What it works on.
+        text: Its file.
+        work: Numbers that it works with.
+    """
+
+    name: str
+    job: str
+    text: str
+    work: int
+
+
+@dataclass(frozen=True, eq=False)
+class SideSources:
+    """What finds the hands of a side of an exported body.
+
+    Attributes:
+        plan: The search of the side by itself.
+        solver: What names of the body's solver begin with.
+        place: Of the side.
+    """
+
+    plan: SearchPlan
+    solver: str
+    place: int
+
+    @property
+    def prefix(self) -> str:
+        """What its own names begin with."""
+        return f"{self.solver}_side_{self.place}"
+
+    @property
+    def member(self) -> str:
+        """Its memory in the struct of the solver."""
+        own = f"{self.plan.members()}  {self.solver}_memory *memory;\n"
+        return f"  struct {self.prefix} {{\n{own}  }} side_{self.place};\n"
+
+    @property
+    def declared(self) -> str:
+        """Its function."""
+        return (
+            f"int {self.prefix}_hands(struct {self.prefix} *job, const scalar *points, "
+            "const scalar *normals,\n    const scalar *here, int64_t nearest, int64_t round, "
+            "scalar *postures);\n"
+        )
+
+    @property
+    def called(self) -> str:
+        """A case of what has hands found."""
+        return (
+            f"    case {self.place}:\n"
+            f"      job->side_{self.place}.memory = &job->memory;\n"
+            f"      return {self.prefix}_hands(&job->side_{self.place}, points, normals, here, "
+            "nearest, round,\n                                postures);\n"
+        )
+
+    def source(self, names: Iterable[str]) -> str:
+        """Its file, with the kernels of these names."""
+        texts = driver_text("loops") + "".join(map(source_text, ("spread", "seeds", "hands")))
+        calls = "".join(
+            f"#define {name.upper()}(work) {self.prefix}_{name}_kernel(work, job->memory)\n"
+            for name in names
+        )
+        return (
+            f"/* The hands of {plain(self.plan.layouts.robot.name)}. */\n"
+            f'#include "{self.solver}_parts.h"\n\n'
+            "enum { DONE = 0, SLICE_OVER = 1 };\n\n"
+            f"typedef struct {self.prefix} search;\n\n"
+            f"{tiles(self.prefix, self.plan)}{calls}#define FIND_HANDS int {self.prefix}_hands\n"
+            f"{define(self.plan.sizes)}{self.plan.constants(texts)}{texts}"
+        )
+
+
+HANDS_OF = """\
+static int hands_of(search *job, int side, const scalar *points, const scalar *normals,
+                    const scalar *here, int64_t nearest, int64_t round, scalar *postures) {
+  switch (side) {
+@CASES@    default: return SLICE_OVER;
+  }
+}
+#define HANDS(side, ...) hands_of(job, side, __VA_ARGS__)
+"""
+
+
+def tiles(prefix: str, plan: SearchPlan) -> str:
+    """Where the search finds its tables; there is only one where fingers mend postures."""
+    first, later = (f"{prefix}_table_{i}" for i in (0, 0 if plan.mends else 1))
+    return f"#define TILES(table) ((table) ? {later} : {first})\n"
+
+
+@dataclass(frozen=True, eq=False)
+class SolverSources:
+    """The sources of a solver.
+
+    Attributes:
+        robot: The robot.
+        method: Hand-first for it.
+        prefix: What every name in it begins with.
+        tolerance: When a contact counts as reached, unless set otherwise.
+        scene: What it knows of collisions; None: nothing.
+        single: What it allows for in single precision; None: it is in double.
+    """
+
+    robot: ArmHand
+    method: HandFirstMethod
+    prefix: str
+    tolerance: Tolerance
+    scene: SceneSources | None = None
+    single: SinglePrecision | None = None
+
+    @cached_property
+    def plan(self) -> SearchPlan:
+        """The search for one target."""
+        return self.method.plan(enforce_limits=True)
+
+    @cached_property
+    def sides(self) -> tuple[SideSources, ...]:
+        """Those of a body."""
+        return tuple(SideSources(one, self.prefix, i) for i, one in enumerate(self.plan.sides))
+
+    @property
+    def _searches(self) -> dict[str, SearchPlan]:
+        """What looks hands up, by what its names begin with behind the solver's."""
+        found = {f"side_{side.place}_": side.plan for side in self.sides}
+        return found or {"": self.plan}
+
+    @cached_property
+    def parts(self) -> tuple[Part, ...]:
+        """The kernels."""
+        plan, n_state = self.plan, self.plan.layouts.state.size
+        # The record of an iteration is never asked for.
+        loop = define(plan.solve.constants | {"N_RECORD": 0, "ROW_BYTES": 0})
+        loop += "#define store_row(record, row) ((void) (record), (void) (row))\n"
+        parts = (
+            self._part("begin", "map", plan.begin),
+            self._part("solve", "loop", plan.solve, loop, 2 * n_state),
+            self._part("contacts", "map", plan.contacts),
+            self._part("judge", "map", plan.judge),
+        )
+        for name, search in self._searches.items():
+            parts += self._hand_parts(name, search)
+        return parts + self._scene_parts()
+
+    def _hand_parts(self, name: str, plan: SearchPlan) -> tuple[Part, ...]:
+        """Those that find hands."""
+        lookup = plan.seeds.table.lookup
+        tables = zip(plan.seeds.tables(enforce_limits=True), plan.seeds.spreads, strict=False)
+        rows = max(spread.count for _, spread in tables) + TILE
+        # Distances of all rows and of their tiles are 32 bits each.
+        room = rows if self.single is None else rows + rows // TILE
+        constants = define(lookup.constants | {"REGISTER_BYTES": 0})
+        found = (self._part(f"{name}look_up", "lookup", lookup.key, constants, room),)
+        return found + ((self._part(f"{name}seen", "map", plan.seeds.seen),) if plan.mends else ())
+
+    def _scene_parts(self) -> tuple[Part, ...]:
+        scene = self.scene
+        if scene is None:
+            return ()
+        placed, constants, room = scene.near
+        near = self._part("near", "clearance", placed, constants, room)
+        place = filled("place.c", {"PREFIX": self.prefix})
+        parts = (replace(near, text=near.text + place),)
+        return parts + tuple(self._part(name, "map", each) for name, each in scene.maps.items())
+
+    def _part(
+        self,
+        name: str,
+        driver: str,
+        kernel: FunctionKernel | LoopKernel | FunctionGraph,
+        constants: str = "",
+        extra: int = 0,
+    ) -> Part:
+        of_graph = isinstance(kernel, FunctionGraph)
+        function: Any = row_major(kernel.function) if of_graph else kernel.function
+        if driver in ("map", "lookup"):
+            constants += define({"N_IN": function.n_in(), "N_OUT": function.n_out()})
+        if driver == "lookup":
+            extra += function.numel_out(0)
+        before = {"clearance": "lanes_alone"}.get(driver)
+        text = driver_text(before) if before else ""
+        text += driver_text(driver)
+        body = "".join(
+            (
+                f'#include "{self.prefix}_parts.h"\n\n',
+                standing_alone(function, self.form),
+                f"#define NAMED {self.prefix}_{name}_kernel\n",
+                f"#define MEMORY {self.prefix}_memory\n",
+                driver_text("freestanding"),
+                constants,
+                text,
+            )
+        )
+        return Part(name, f"{driver}_job", body, extra)
+
+    @property
+    def form(self) -> Form:
+        """What the code of graphs is for."""
+        return Form() if self.single is None else Form(single=True, replaced=FOLLOWING)
+
+    @property
+    def substitutes(self) -> dict[str, str]:
+        """What stands for the marks of the templates."""
+        robot, sizes = self.robot, self.plan.sizes
+        jobs = "".join(driver_text(f"{name}_job") for name in ("loop", "map", "lookup"))
+        jobs += self.scene.jobs() if self.scene else ""
+        parts = "".join(
+            f"int {self.prefix}_{p.name}_kernel({p.job} *job, {self.prefix}_memory *memory);\n"
+            for p in self.parts
+        ) + "".join(side.declared for side in self.sides)
+        calls = "".join(
+            f"#define {p.name.upper()}(work) {self.prefix}_{p.name}_kernel(work, &job->memory)\n"
+            for p in self.parts
+        )
+        about = dict(WITHOUT_SCENE) if self.scene is None else self.scene.substitutes()
+        about |= IN_DOUBLE if self.single is None else in_single(self.single)
+        about |= palm_marks(robot, self.prefix, about["REAL"])
+        lower, upper = self._bounds
+        single = self.single
+        changed = (None, None) if single is None else (single.reals, single.arrays)
+        return about | {
+            "PREFIX": self.prefix,
+            "GUARD": self.prefix.upper(),
+            "ROBOT": plain(robot.name),
+            "FINGERS": str(len(robot.fingers)),
+            "MOTORS": str(len(robot.actuators)),
+            "FINGER_LIST": ", ".join(map(plain, robot.fingers)),
+            "MOTOR_LIST": ", ".join(map(plain, robot.actuators)),
+            "FINGER_NAMES": _strings(robot.fingers),
+            "MOTOR_NAMES": _strings(robot.actuators),
+            "W": str(max(1, *(part.work for part in self.parts))),
+            "STRUCT": (self.plan.members() + "".join(side.member for side in self.sides)).rstrip(),
+            "SEEDS": self._seeds(),
+            "TABLES": "".join(
+                f"extern const int16_t {name}[];\n" for name in self._tables
+            ).rstrip(),
+            "JOBS": jobs,
+            "PARTS": parts,
+            "CALLS": calls,
+            "SIZES": define(sizes),
+            "CONSTANTS": self.plan.constants(self.plan.source + "".join(about.values()), *changed),
+            "SEARCH": self.plan.source,
+            "TERMS": define_arrays({"TERMS": self._terms(), "HOME": robot.home}),
+            "LIMITS": define_arrays(
+                {f"{self.prefix}_lower": lower, f"{self.prefix}_upper": upper}, "const"
+            ),
+            "POSITION_TOLERANCE": repr(self.tolerance.position),
+            "ANGLE_TOLERANCE": repr(self.tolerance.angle),
+        }
+
+    def _seeds(self) -> str:
+        """How the search comes by tables, or by the hands of its sides."""
+        if not self.sides:
+            return tiles(self.prefix, self.plan)
+        return HANDS_OF.replace("@CASES@", "".join(side.called for side in self.sides))
+
+    @property
+    def side_files(self) -> dict[str, str]:
+        """Their texts by path."""
+        return {f"src/{side.prefix}.c": side.source(side.plan.of_hands) for side in self.sides}
+
+    @cached_property
+    def _tables(self) -> dict[str, NDArray[np.int16]]:
+        """The lookup tables' keys by the names of their arrays."""
+        return {
+            f"{self.prefix}_{name}table_{i}": np.ascontiguousarray(table.lookup.tiles).reshape(-1)
+            for name, plan in self._searches.items()
+            for i, table in enumerate(plan.seeds.tables(enforce_limits=True))
+        }
+
+    def tables(self) -> str:
+        """The file of the lookup tables' keys."""
+        head = (
+            f'/* Shapes of hand postures, to be compared with targets. */\n#include "{self.prefix}'
+        )
+        return head + '_parts.h"\n\n' + define_arrays(self._tables, "const")
+
+    @property
+    def _bounds(self) -> tuple[Array, Array]:
+        return (self.robot.lower, self.robot.upper) if self.single is None else self.single.bounds
+
+    def _terms(self) -> Array:
+        f = len(self.robot.fingers)
+        none, allowed = np.zeros((1, f, 3)), self.tolerance
+        layout = terms(self.robot.description)
+        if self.single is not None:
+            less = self.single.tolerance
+            allowed = Tolerance(allowed.position - less.position, allowed.angle - less.angle)
+        found = self.method.terms(TargetBatch(none, none, allowed, True)).copy()
+        found[layout.slice("lower")], found[layout.slice("upper")] = self._bounds
+        return found
+
+    def judge(self) -> dict[str, str]:
+        """Files of the kinematics in double precision that answers are judged by."""
+        marks = {
+            "KINEMATICS": standing_alone(self.plan.judge.function, Form()),
+            "POSITION_TOLERANCE": repr(self.tolerance.position),
+            "ANGLE_TOLERANCE": repr(self.tolerance.angle),
+            "LIMIT_SLACK": repr(LIMIT_SLACK),
+        }
+        return {f"test/{name}": filled(name, marks) for name in ("judge.c", "judge.h")}
+
+    def final(self, files: dict[str, str]) -> dict[str, str]:
+        """Files in C, in the precision that is wanted."""
+        if self.single is None:
+            return files
+        return {path: in_single_precision(text) for path, text in files.items()}
+
+
+def hand_first(robot: ArmHand) -> HandFirstMethod:
+    """The method whose solver is exported, compiled."""
+    method = HandFirstMethod(robot.description, HandFirstParameters())
+    method.prepare()
+    return method
+
+
+def plain(name: str) -> str:
+    """A name as it may stand in a comment of any language: names may come from any file."""
+    return re.sub(r"[^\w .+-]", "_", name)
+
+
+def _strings(names: tuple[str, ...]) -> str:
+    """String literals, of C and JavaScript alike."""
+    return ", ".join(json.dumps(name, ensure_ascii=False) for name in names)

@@ -1,0 +1,340 @@
+"""Targets with the answers of this package: what an exported solver is tested and shown by."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from casadi_ik.api import Solver
+from casadi_ik.collision.clearance import SceneCheck
+from casadi_ik.collision.scene import Scene
+from casadi_ik.collision.solids import stated
+from casadi_ik.compile.codegen import digits, numbers
+from casadi_ik.errors import DescriptionError
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.arm_hand import ArmHand
+from casadi_ik.model.load_grasp import load_grasp, shipped_grasps
+from casadi_ik.solve.collision_free import resolve_at_once
+from casadi_ik.solve.engine import Engine
+from casadi_ik.solve.hand_first.method import HandFirstMethod
+from casadi_ik.solve.hand_first.parameters import HandFirstParameters
+from casadi_ik.solve.registry import build_method
+from casadi_ik.solve.request import Request
+from casadi_ik.solve.status import Status
+
+COUNT = 1000
+"""How many are stored."""
+
+BEYOND = 10
+"""Of these, how many are moved out of reach: they go through all rounds."""
+
+SEED = 17
+
+WHOLE = ("status", "iterations", "restarts")
+
+
+@dataclass(frozen=True, eq=False)
+class Example:
+    """One target.
+
+    Attributes:
+        what: What it is, in words.
+        points: (f, 3) [m].
+        normals: (f, 3), NaN where free.
+    """
+
+    what: str
+    points: Array
+    normals: Array
+
+
+def example(robot: ArmHand) -> Example:
+    """The robot's first shipped grasp, or where its fingertips are when it is at home."""
+    names = shipped_grasps(robot.name)
+    if names:
+        grasp = load_grasp(names[0])
+        points, normals = grasp.arrays(robot.fingers)
+        if not np.isnan(points).any() and not grasp.more(robot.fingers):
+            return Example(f"Solves the shipped grasp {names[0]}.", points, normals)
+    return Example("Solves what the fingertips touch at home.", *robot.contacts(robot.home))
+
+
+def stored(solver: Solver, scene: SceneTargets | None = None) -> list[dict[str, Any]]:
+    """`COUNT` targets and the answers to them; q0 None: at home, and far from limits is wanted."""
+    robot = solver.robot
+    rng = np.random.default_rng(SEED)
+    q = robot.random(rng, COUNT)
+    ends = np.where(rng.random(q.shape) < 0.5, robot.lower, robot.upper)
+    points, normals = robot.contacts(np.where(rng.random(q.shape) < 0.2, ends, q))
+    points[:BEYOND] += rng.normal(0, 0.1, points[:BEYOND].shape)
+    near = np.arange(COUNT) % 4 == 1
+    q0 = np.clip(q + 0.1, robot.lower, robot.upper)
+    found: list[dict[str, Any]] = [{} for _ in range(COUNT)]
+    for rows, starts in ((~near, None), (near, q0[near])):
+        answers = _answers(solver, points[rows], normals[rows], starts)
+        for i, row in enumerate(np.flatnonzero(rows).tolist()):
+            q, *numbers = next(answers)
+            found[row] = {
+                "q0": None if starts is None else starts[i].tolist(),
+                "points": points[row].ravel().tolist(),
+                "normals": normals[row].ravel().tolist(),
+                "q": q.tolist(),
+                **dict(zip(WHOLE, map(int, numbers), strict=True)),
+            }
+    return found if scene is None else [scene.answered(target) for target in found]
+
+
+def _answers(
+    solver: Solver, points: Array, normals: Array, starts: Array | None
+) -> Iterator[tuple[Array, int, int, int]]:
+    """The answers to k targets, each with the numbers that `WHOLE` names.
+
+    A batch solves the sides of a body without a trunk one by one; an export, like `fast`, solves it
+    as any body.
+    """
+    robot = solver.robot.description
+    if not robot.sides or robot.trunk:
+        batch = solver.solve_batch(points, normals, q0=starts)
+        yield from zip(batch.q, batch.status, batch.iterations, batch.restarts, strict=True)
+        return
+    method, request = (
+        HandFirstMethod(robot, HandFirstParameters()),
+        Request(solver.robot, solver.tolerances, True),
+    )
+    search = method.alone(enforce_limits=True)
+    assert search is not None
+    for row in range(len(points)):
+        q0 = None if starts is None else starts[row]
+        prefer = "limits" if q0 is None else "q0"
+        target = request.of_arrays(
+            points[row : row + 1], normals[row : row + 1], None, prefer=prefer
+        )
+        search.ask(target, 0, request.start(q0), method.terms(target))
+        answer = search.answer(search(method.rounds) or 0)
+        yield answer.q, answer.status, answer.iterations, answer.restarts
+
+
+def targets_header(solver: Solver, scene: SceneTargets | None = None, single: bool = False) -> str:
+    """A C header with the `stored` targets and the scene.
+
+    Args:
+        solver: Of the robot.
+        scene: What the targets are solved in.
+        single: For a solver in single precision: how targets end stands there without answers.
+    """
+    f, n = len(solver.robot.fingers), len(solver.robot.actuators)
+    whole, answer = (WHOLE[:1], "") if single else (WHOLE, f", q[{n}]")
+    clearance = scene is not None and not single
+    rows = []
+    for target in stored(solver, scene):
+        q0 = target["q0"] or solver.robot.home.tolist()
+        row = [str(int(target["q0"] is not None)), *(str(target[name]) for name in whole)]
+        row += map(numbers, (target["points"], target["normals"], q0))
+        row += [numbers(target["q"])] if answer else []
+        if clearance:
+            row.append("NAN" if target["clearance"] is None else digits(target["clearance"]))
+        rows.append("{" + ", ".join(row) + "},\n")
+    what = "how they end in double precision" if single else "what the Python package answers"
+    return (
+        f"/* Targets, and {what}. */\n"
+        f"enum {{ TARGETS = {COUNT} }};\n\n"
+        f"typedef struct {{\n  int near, {', '.join(whole)};\n"
+        f"  double points[{3 * f}], normals[{3 * f}], q0[{n}]{answer};\n"
+        f"{'  double clearance;' + chr(10) if clearance else ''}}} target;\n\n"
+        "static const target targets[TARGETS] = {\n" + "".join(rows) + "};\n"
+    ) + ("" if scene is None else "\n" + scene.header("float" if single else "double"))
+
+
+def written(array: Array) -> str:
+    """An array as C text, NaN included."""
+    values = (digits(v) if np.isfinite(v) else "NAN" for v in array.ravel().tolist())
+    return "{" + ", ".join(values) + "}"
+
+
+DRAWN = 64
+"""Random configurations, at whose fingertips solids are put."""
+
+SIZE = 0.15
+"""Of a solid, as a part of how far the robot reaches."""
+
+MARGIN = 1e-3
+"""To be kept [m]."""
+
+GRASPED = 1
+"""Number of the solid that is grasped."""
+
+
+class SceneTargets:
+    """Targets in a scene of a few solids, and the answers to them.
+
+    Attributes:
+        solver: Without a scene.
+        scene: As many solids as fit in, four at most.
+    """
+
+    def __init__(self, solver: Solver, capacity: int) -> None:
+        self.solver, robot = solver, solver.robot
+        q = robot.random(np.random.default_rng(5), DRAWN)
+        tips = robot.contacts(q)[0][:, 0]
+        far = np.linalg.norm(tips, axis=1)
+        places = tips[np.argsort(-far)][[0, 12, 24]]
+        size = SIZE * float(far.max())
+        wall = [0.9 * float(tips[:, 0].max()), 0.0, 0.0]
+        shapes: list[dict[str, Any]] = [
+            {"kind": "box", "size": [size, 0.7 * size, 0.5 * size], "rpy": [0.3, 0.2, 0.1]},
+            {"kind": "capsule", "radius": 0.4 * size, "length": 0.5 * size, "rpy": [1.0, 0.0, 0.5]},
+            {"kind": "cylinder", "radius": 0.4 * size, "length": size, "rpy": [0.0, 0.5, 0.0]},
+            {"kind": "half-space", "rpy": [0.0, -np.pi / 2, 0.0], "xyz": wall},
+        ]
+        solids: dict[str, dict[str, Any]] = {}
+        self._check = SceneCheck(robot, Scene({}, MARGIN))
+        for shape, place in zip(shapes, places.tolist(), strict=False):
+            shape["xyz"] = place
+        self.scene = Scene({}, MARGIN)
+        for shape in shapes[:capacity]:
+            solids = solids | {f"solid {len(solids)}": shape}
+            grasped = f"solid {GRASPED}" if GRASPED in range(len(solids)) else None
+            scene = Scene(solids, MARGIN, grasped)
+            try:
+                self._check = SceneCheck(robot, scene)
+            except DescriptionError:
+                # About a hand alone there is less room: what stands in its base is left out.
+                solids.popitem()
+            else:
+                self.scene = scene
+
+    @cached_property
+    def _engine(self) -> Engine:
+        robot = self.solver.robot
+        method = build_method("hand-first", robot.description, {})
+        return Engine(robot, method, check=self._check)
+
+    def answered(self, target: dict[str, Any]) -> dict[str, Any]:
+        """A stored target with the answer to it in the scene: another arm or hand at the most."""
+        if target["status"] != Status.SOLVED:
+            return target | {"clearance": None}
+        if self.solver.robot.description.sides:
+            return target | self._touching(target)
+        points, normals = (np.reshape(target[key], (1, -1, 3)) for key in ("points", "normals"))
+        found = self._free(points, normals, np.array(target["q"]), target["q0"])
+        if found is None and target["q0"] is not None:
+            usual = self.solver.solve_batch(points, normals)
+            found = self._free(points, normals, usual.q[0], None) if usual.success[0] else None
+        if found is None:
+            return target | {"status": int(Status.COLLISION), "clearance": None}
+        return target | {"q": found[0].tolist(), "clearance": found[1]}
+
+    def _touching(self, target: dict[str, Any]) -> dict[str, Any]:
+        """Of a body only whether its answer touches something is known, not what else is found."""
+        points, normals = (np.reshape(target[key], (1, -1, 3)) for key in ("points", "normals"))
+        request = Request(self.solver.robot, self.solver.tolerances, True)
+        query = self._check.collision_query(request.of_arrays(points, normals, None))
+        clear = query.check(np.array(target["q"])[None])
+        if not clear.free[0]:
+            return {"status": int(Status.COLLISION), "clearance": None}
+        return {"clearance": float(clear.distance[0])}
+
+    def _free(
+        self, points: Array, normals: Array, q: Array, q0: list[float] | None
+    ) -> tuple[Array, float] | None:
+        """An answer that touches nothing, beside a given one, and its clearance [m]."""
+        engine, request = self._engine, Request(self.solver.robot, self.solver.tolerances, True)
+        prefer = "limits" if q0 is None else "q0"
+        targets = request.of_arrays(points, normals, None, prefer=prefer)
+        query = engine.collision_query(targets)
+        assert query is not None
+        clear = query.check(q[None])
+        if not clear.free[0]:
+            found = resolve_at_once(
+                engine.finder, targets, query, q, request.start(q0), others=True
+            )
+            if found is None:
+                return None
+            q, _, clear = found
+        return q, float(clear.distance[0])
+
+    def solids(self) -> list[dict[str, Any]]:
+        """The scene as an export takes it."""
+        found = []
+        for name, item in self.scene.items.items():
+            (solid, place) = item.parts[0]
+            found.append(stated(solid, item.pose @ place) | {"grasped": name == self.scene.grasped})
+        return found
+
+    def header(self, real: str = "double") -> str:
+        """The scene as a C header has it, of such numbers."""
+        rows = ",\n".join(
+            f"{{{one['kind']}, {int(one['grasped'])}, {numbers(one['size'])}, "
+            f"{numbers(one['pose'])}}}"
+            for one in self.solids()
+        )
+        return (
+            "typedef struct {\n  int kind, grasped;\n"
+            f"  {real} size[3], pose[12];\n}} standing;\n\n"
+            f"enum {{ STANDING = {len(self.scene.items)} }};\n"
+            f"#define MARGIN ({real}) {digits(self.scene.margin)}\n"
+            f"static const standing scene[STANDING] = {{\n{rows}}};\n\n"
+        )
+
+    def json(self) -> str:
+        """The scene as JavaScript has it."""
+        return json.dumps({"margin": self.scene.margin, "solids": self.solids()}) + "\n"
+
+
+IN_TEST_C = {
+    "SCENE_TEST_SAME": (
+        "      && (!(stored->clearance == stored->clearance)\n"
+        "          || solver->clearance == stored->clearance)\n"
+    ),
+    # What comes nearest to an answer is not compared.
+    "SCENE_TEST_OR": f"stored->status == {int(Status.COLLISION)} || ",
+    "SCENE_TEST_SET": (
+        "  @P_set_margin(&one, MARGIN);\n  @P_set_margin(&other, MARGIN);\n"
+        "  for (i = 0; i < STANDING; ++i) {\n"
+        "    const standing *put = scene + i;\n"
+        "    @P_set_solid(&one, i, put->kind, put->size, put->pose, put->grasped);\n"
+        "    @P_set_solid(&other, i, put->kind, put->size, put->pose, put->grasped);\n"
+        "  }\n"
+    ),
+}
+IN_TEST_SINGLE = IN_TEST_C | {
+    "SCENE_TEST_SAME": "  met &= solver->clearance >= MARGIN;\n",
+}
+IN_TEST_MJS = {
+    "SCENE_TEST_SAME": (
+        "    (target.clearance !== null && target.clearance !== answer.clearance) ||\n"
+    ),
+    "SCENE_TEST_OR": "target.status !== Status.COLLISION && ",
+    "SCENE_TEST_SET": (
+        'const place = new URL("./scene.json", import.meta.url);\n'
+        'const about = JSON.parse(await readFile(place, "utf8"));\n'
+        "for (const one of [solver, other]) {\n"
+        "  one.setMargin(about.margin);\n"
+        "  about.solids.forEach((s, i) => one.setSolid(i, s.kind, s.size, s.pose, s.grasped));\n"
+        "}\n"
+    ),
+}
+"""What the tests of an export have in addition."""
+
+OF_BODY_C = {
+    "SCENE_TEST_FREED": (
+        "  if (stored->status == @G_COLLISION && solver->status == @G_SOLVED) {\n"
+        "    return solver->clearance >= MARGIN - 1e-9\n"
+        "        && solver->iterations == stored->iterations;\n"
+        "  }\n"
+    ),
+}
+OF_BODY_MJS = {
+    "SCENE_TEST_FREED": (
+        "  if (target.status === Status.COLLISION && answer.status === Status.SOLVED) {\n"
+        "    const near = answer.clearance < about.margin - 1e-9;\n"
+        "    return near || answer.iterations !== target.iterations;\n"
+        "  }\n"
+    ),
+}
+"""Of a body's answer that touches something only that much is stored: another may be found."""

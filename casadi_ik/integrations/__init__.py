@@ -1,0 +1,1 @@
+"""Adapters to other systems: frameworks, robot files, data sets, clusters."""

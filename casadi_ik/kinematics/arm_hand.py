@@ -1,0 +1,449 @@
+"""The robot as a user holds it: its description and its compiled forward kinematics."""
+
+from __future__ import annotations
+
+import warnings
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from casadi_ik.errors import InputError
+from casadi_ik.files.arrays import Array
+from casadi_ik.files.lazy_import import Shown, on_demand
+from casadi_ik.kinematics.robot_kernels import RobotKernels
+from casadi_ik.model.description import RobotDescription
+from casadi_ik.model.grasp import real_array
+from casadi_ik.model.load_robot import load_description
+from casadi_ik.model.write_urdf import to_urdf
+
+
+class ArmHand(Shown):
+    """A robot: an arm with a hand, an arm alone, or a hand on a fixed base.
+
+    Attributes:
+        description: The frozen data behind it.
+
+    Example:
+        >>> robot.name, robot.fingers, robot.thumb
+        ('kuka_lwr_barrett', ('thumb', 'finger_2', 'finger_3'), 'thumb')
+        >>> len(robot.actuators), robot.actuators[7]
+        (14, 'bh_spread')
+        >>> bool(np.all((robot.lower <= robot.home) & (robot.home <= robot.upper)))
+        True
+    """
+
+    def __init__(self, description: RobotDescription) -> None:
+        """Wrap a description; kernels are compiled when first used and cached on the machine."""
+        self.description = description
+
+    def __reduce__(self) -> tuple[type[ArmHand], tuple[RobotDescription]]:
+        """Its data; a copy finds the compiled kernels on the machine it comes to."""
+        return type(self), (self.description,)
+
+    def __repr__(self) -> str:
+        return f"<ArmHand {self.name}: {len(self.actuators)} actuators, fingers {self.fingers}>"
+
+    @property
+    def name(self) -> str:
+        """Name of the robot."""
+        return self.description.name
+
+    @property
+    def fingers(self) -> tuple[str, ...]:
+        """Names of the fingers, in the order of `contacts`."""
+        return self.description.finger_names
+
+    @property
+    def thumb(self) -> str:
+        """The finger that is placed first."""
+        return self.description.thumb
+
+    @property
+    def actuators(self) -> tuple[str, ...]:
+        """Names of the actuators, in the order of q."""
+        return self.description.actuator_names
+
+    @property
+    def sides(self) -> tuple[str, ...]:
+        """Names of the sides of a body; () of an arm with one hand.
+
+        Example:
+            >>> robot.sides
+            ()
+        """
+        return tuple(side.name for side in self.description.sides)
+
+    @property
+    def trunk(self) -> tuple[str, ...]:
+        """Names of the actuators that move every palm of a body."""
+        return self.description.trunk
+
+    def side(self, name: str) -> ArmHand:
+        """An arm-hand of a body by itself, the trunk as the first joints of its arm.
+
+        Its base is the body's, its motors, links and fingers keep their names. All other sides are
+        left out: collisions with them are not checked.
+
+        Raises:
+            UnknownNameError: There is none; the message lists the sides.
+
+        Example:
+            >>> ik.load_robot("g1+dex3").side("left").actuators[:2]
+            ('waist_yaw_joint', 'waist_roll_joint')
+        """
+        return type(self)(self.description.side(name, carried=True))
+
+    @property
+    def lower(self) -> Array:
+        """(n,) lower limits of the actuators [rad or m], those of their joints included."""
+        return self.description.lower
+
+    @property
+    def upper(self) -> Array:
+        """(n,) upper limits of the actuators [rad or m], those of their joints included."""
+        return self.description.upper
+
+    @property
+    def home(self) -> Array:
+        """(n,) home position [rad or m]."""
+        return self.description.home
+
+    def configuration(self, q: ArrayLike | None, name: str = "q") -> Array:
+        """A configuration as an array, checked; None gives `home`.
+
+        Args:
+            q: (n,) or (k, n) actuator positions [rad or m].
+            name: What to call it in an error.
+
+        Raises:
+            InputError: Wrong shape or a number that is not finite.
+        """
+        if q is None:
+            return self.home.copy()
+        try:
+            array = real_array(q)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{name}: found {q!r}, expected numbers: {error}") from error
+        n = len(self.actuators)
+        if array.ndim not in (1, 2) or array.shape[-1] != n:
+            raise InputError(f"{name}: found shape {array.shape}, expected ({n},) or (k, {n})")
+        if not np.all(np.isfinite(array)):
+            raise InputError(f"{name}: holds NaN or infinity, expected finite numbers")
+        return array
+
+    def start(self, q0: ArrayLike | None, name: str = "q0") -> Array:
+        """A configuration to start from, checked; None gives `home`.
+
+        A warning says if a motor that turns would be more than a turn beyond its limits, as it is
+        where q0 is in degrees.
+
+        Raises:
+            InputError: As for `configuration`.
+
+        Example:
+            >>> bool((robot.start(None) == robot.home).all())
+            True
+        """
+        start = self.configuration(q0, name)
+        if q0 is None:
+            return start
+        middle, far = self._far
+        beyond = np.abs(start - middle) > far
+        if beyond.any():
+            *_, i = np.argwhere(beyond)[0].tolist()
+            value, ends = start[beyond][0], f"{self.lower[i]:.3g} to {self.upper[i]:.3g}"
+            text = f"{name}: {self.actuators[i]} is {value:g} rad, far beyond its limits {ends} rad"
+            # From here, whoever asked: Python says the same once.
+            warnings.warn(f"{text}; degrees are np.deg2rad(...)", stacklevel=1)
+        return start
+
+    @cached_property
+    def _far(self) -> tuple[Array, Array]:
+        """(n,) middles of all motors, and how far from it is a turn beyond the limits."""
+        units = [actuator.unit for actuator in self.description.actuators]
+        turn = np.where([unit == "rad" for unit in units], 2 * np.pi, np.inf)
+        return (self.lower + self.upper) / 2, (self.upper - self.lower) / 2 + turn
+
+    def joints(self, q: ArrayLike) -> dict[str, Any]:
+        """Positions of all movable joints after the couplings.
+
+        Args:
+            q: (n,) or (k, n) actuator positions.
+
+        Returns:
+            By joint name a float, or (k,) for a batch [rad or m].
+
+        Raises:
+            InputError: See `configuration`.
+
+        Example:
+            >>> joints = robot.joints(robot.home)  # one motor spreads two fingers
+            >>> len(robot.actuators), len(joints)
+            (14, 15)
+            >>> print(round(np.rad2deg(joints["lwr_joint_2"]), 6))
+            30.0
+        """
+        configuration, names = self.configuration(q), self.description.joint_names
+        (theta,) = self._kernels.joints(_for_kernels(configuration))
+        # Of a robot of one joint kernels give a single number.
+        return _by_name(names, theta.reshape(*configuration.shape[:-1], len(names)))
+
+    def toggle_margins(self, q: ArrayLike) -> dict[str, Any]:
+        """How far every lead screw and four-bar is from its singular (toggle) position.
+
+        Args:
+            q: (n,) or (k, n) actuator positions.
+
+        Returns:
+            By joint the squared sine of its transmission angle, a float or (k,) for a batch: 1 at
+            best, 0 at the toggle, negative where the mechanism cannot be assembled. Empty if the
+            robot has no such couplings.
+
+        Raises:
+            InputError: See `configuration`.
+        """
+        configuration = self.configuration(q)
+        names, kernel = self._kernels.toggle_margins
+        if not names:
+            return {}
+        (margins,) = kernel(configuration)
+        return _by_name(names, margins.reshape(*configuration.shape[:-1], len(names)))
+
+    def contacts(self, q: ArrayLike) -> tuple[Array, Array]:
+        """Where the fingertips are and which way they face.
+
+        Args:
+            q: (n,) or (k, n) actuator positions.
+
+        Returns:
+            points (f, 3) [m] and outward pad normals (f, 3), unit, in the base frame; with a
+            leading k for a batch.
+
+        Raises:
+            InputError: See `configuration`.
+
+        Example:
+            >>> points, normals = robot.contacts(robot.home)
+            >>> points.shape, bool(np.allclose(np.linalg.norm(normals, axis=1), 1))
+            ((3, 3), True)
+        """
+        points, normals = self._kernels.contacts(_for_kernels(self.configuration(q)))
+        return points, normals
+
+    def contact_frames(self, q: ArrayLike) -> Array:
+        """Contact frames of all fingers, in the base frame.
+
+        The origin is the contact point. The first axis is the outward pad normal, the second the
+        pad's tangent: the one the description names (``tangent``), else the x axis of its contact
+        frame made orthogonal to the normal. The third is normal x tangent.
+
+        Args:
+            q: (n,) or (k, n) actuator positions.
+
+        Returns:
+            (f, 4, 4), or (k, f, 4, 4) for a batch.
+
+        Raises:
+            InputError: See `configuration`.
+
+        Example:
+            >>> frames = robot.contact_frames(robot.home)
+            >>> bool(np.allclose(frames[:, :3, 0], robot.contacts(robot.home)[1]))
+            True
+        """
+        return self.frames_at(self.configuration(q))
+
+    def frames_at(self, q: Array) -> Array:
+        """`contact_frames` of configurations that need not be finite; NaN gives NaN."""
+        (frames,) = self._kernels.contact_frames(_for_kernels(q))
+        return frames.reshape(*frames.shape[:-2], len(self.fingers), 4, 4)
+
+    def errors(self, q: ArrayLike, points: ArrayLike, normals: ArrayLike) -> tuple[Array, Array]:
+        """How far the fingertips are from contacts.
+
+        Args:
+            q: (n,) or (k, n) actuator positions.
+            points: (f, 3) or (k, f, 3) [m], base frame; NaN where free.
+            normals: (f, 3) or (k, f, 3), unit; NaN where free.
+
+        Returns:
+            Distances [m] and angles [rad], (f,) or (k, f); NaN where free.
+
+        Raises:
+            InputError: See `configuration`.
+
+        Example:
+            >>> points, normals = robot.contacts(robot.home)
+            >>> position, angle = robot.errors(robot.home, points + [0, 0, 0.01], normals)
+            >>> print(np.round(1e3 * position, 6))
+            [10. 10. 10.]
+        """
+        position, angle, _ = self.deviations(
+            self.configuration(q), np.asarray(points), np.asarray(normals)
+        )
+        return position, angle
+
+    def deviations(self, q: Array, points: Array, normals: Array) -> tuple[Array, Array, Array]:
+        """`errors` and `beyond_limits` at once, of configurations that need not be finite.
+
+        Args:
+            q: (n,) or (k, n) actuator positions; NaN gives NaN.
+            points: (f, 3) or (k, f, 3) [m], base frame; NaN where free.
+            normals: (f, 3) or (k, f, 3), unit; NaN where free.
+
+        Returns:
+            Distances [m] (f,) or (k, f), angles [rad] the same, and () or (k,) by how much the
+            worst actuator or joint is beyond its limits [rad or m].
+        """
+        position, angle, beyond = self._kernels.deviations(_for_kernels(q), points, normals)
+        # A kernel's single number has no dimension of its own, even that of a single finger.
+        by_finger = (*beyond.shape, len(self.fingers))
+        return position.reshape(by_finger), angle.reshape(by_finger), beyond
+
+    def beyond_limits(self, q: ArrayLike) -> Array:
+        """By how much the worst actuator or joint is beyond its limits [rad or m], () or (k,).
+
+        Negative within limits.
+
+        Raises:
+            InputError: See `configuration`.
+        """
+        (beyond,) = self._kernels.beyond(_for_kernels(self.configuration(q)))
+        return beyond
+
+    def palm(self, q: ArrayLike, side: str | None = None) -> Array:
+        """(4, 4) or (k, 4, 4) pose of the palm frame in the base frame.
+
+        Args:
+            q: (n,) or (k, n) actuator positions.
+            side: Of a body, whose palm; None: the only one.
+
+        Raises:
+            InputError: See `configuration`; or a body of several sides and none said.
+            UnknownNameError: No such side.
+
+        Example:
+            >>> robot.palm(robot.home).shape
+            (4, 4)
+        """
+        if side is None and len(self.sides) == 1:
+            (side,) = self.sides
+        if side is not None:
+            asked = self.description.side_named(side)
+            return self.links(q)[asked.palm_link] @ asked.palm_placement
+        if self.sides:
+            raise InputError(f"side: found None, expected one of {', '.join(self.sides)}")
+        (pose,) = self._kernels.palm(_for_kernels(self.configuration(q)))
+        return pose
+
+    @cached_property
+    def hands(self) -> dict[str | None, tuple[int, ...]]:
+        """Fingers, as positions in `fingers`, by side; None is the only hand of an arm.
+
+        Example:
+            >>> robot.hands
+            {None: (0, 1, 2)}
+        """
+        place = {name: i for i, name in enumerate(self.fingers)}
+        sides = self.description.sides
+        if not sides:
+            return {None: tuple(place.values())}
+        return {side.name: tuple(place[name] for name in side.fingers) for side in sides}
+
+    def links(self, q: ArrayLike) -> dict[str, Array]:
+        """Pose of every link frame in the base frame, by link name.
+
+        Args:
+            q: (n,) or (k, n) actuator positions.
+
+        Returns:
+            By link name (4, 4), or (k, 4, 4) for a batch.
+
+        Raises:
+            InputError: See `configuration`.
+
+        Example:
+            >>> robot.links(robot.home)["lwr_flange"].shape
+            (4, 4)
+        """
+        (poses,) = self._kernels.links(_for_kernels(self.configuration(q)))
+        names = self.description.links
+        stacked = poses.reshape(*poses.shape[:-2], len(names), 4, 4)
+        return {name: stacked[..., i, :, :] for i, name in enumerate(names)}
+
+    def random(self, rng: np.random.Generator, count: int) -> Array:
+        """(count, n) configurations uniform within the limits.
+
+        Example:
+            >>> robot.random(np.random.default_rng(0), 100).shape
+            (100, 14)
+        """
+        return rng.uniform(self.lower, self.upper, (count, len(self.actuators)))
+
+    def urdf(self) -> str:
+        """The robot as URDF text, see `casadi_ik.model.to_urdf`.
+
+        Example:
+            >>> robot.urdf().count("<joint ") >= 15
+            True
+        """
+        return self._urdf
+
+    def view(self, q: ArrayLike | None = None, **options: Any) -> Any:
+        """Show the robot in the browser, and in a notebook; needs the extra `view`.
+
+        Args:
+            q: (n,) where it is [rad or m]; None is `home`.
+            options: As `casadi_ik.app.viewer.view_grasp` has them: grasp, scene, host, port.
+
+        Returns:
+            The running `casadi_ik.app.viewer.Viewer`.
+
+        Raises:
+            MissingExtraError: viser is not installed.
+            InputError: See `configuration`.
+        """
+        return on_demand("casadi_ik.app.viewer").view_grasp(
+            self, q=self.configuration(q), **options
+        )
+
+    @cached_property
+    def _urdf(self) -> str:
+        return to_urdf(self.description)
+
+    @cached_property
+    def _kernels(self) -> RobotKernels:
+        return RobotKernels(self.description)
+
+
+def _for_kernels(q: Array) -> Array:
+    """(n,) or (k, n); of a robot of one motor () or (k,), as its kernels have a single number."""
+    return q[..., 0] if q.shape[-1] == 1 else q
+
+
+def load_robot(name_or_path: str | Path) -> ArmHand:
+    """Load a robot.
+
+    Args:
+        name_or_path: A shipped name (`casadi-ik robots` lists them), a shipped arm with a shipped
+            hand ("panda+allegro_right"), or the path of your own YAML.
+
+    Raises:
+        UnknownNameError: No shipped robot has that name.
+        DescriptionError: The file is missing or malformed; the message names file and key.
+
+    Example:
+        >>> ik.load_robot("panda+allegro_right")
+        <ArmHand panda+allegro_right: 23 actuators, fingers ('thumb', 'index', 'middle', 'ring')>
+    """
+    return ArmHand(load_description(name_or_path))
+
+
+def _by_name(names: tuple[str, ...], values: Array) -> dict[str, Any]:
+    """Values (m,) or (k, m) by name: floats, or (k,) for a batch."""
+    if values.ndim == 1:
+        return {name: float(value) for name, value in zip(names, values, strict=True)}
+    return dict(zip(names, values.T, strict=True))

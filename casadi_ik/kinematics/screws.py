@@ -1,0 +1,322 @@
+"""Kinematics by unit dual quaternions: the product of exponentials of Chandra et al. 2019.
+
+Section II-A, eqs. (1) to (7). Every joint is a screw about a line that is fixed in the base frame
+at the reference pose, all joints at zero; the pose of the end is
+
+    x_e = delta_1 delta_2 ... delta_n x_e0,   delta_j = exp(theta_j / 2  s_j0).
+
+The numbers are those of `casadi_ik.kinematics.forward`, which multiplies frames instead.
+
+How a fingertip moves with its joints and sliders: eqs. (10), (12), (15). A tip is seen from the
+robot's base, or from another fingertip. Either way its pose is a product of screws from a reference
+pose, eq. (3). Seen from another tip, the chain runs from that tip back to the palm and out again,
+and the joints of the way back move with reversed sign, eq. (16).
+
+Joints that follow others have no column of their own: their screws are added to that of the joint
+that drives them, times the coupling's rate. So there is a column per driving joint (eqs. (12) and
+(15), in joint space), and from the same graph one per actuator (in slider space).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from casadi_ik.errors import InputError
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics import dual_quaternion as dq
+from casadi_ik.kinematics.couplings import coupling_rate, joint_positions
+from casadi_ik.kinematics.forward import Pose, forward, number
+from casadi_ik.kinematics.smooth import Expr
+from casadi_ik.model.description import RobotDescription
+from casadi_ik.model.joints import Joint
+
+
+@dataclass(frozen=True, eq=False)
+class Screw:
+    """A joint's axis at the reference pose, in the base frame.
+
+    Attributes:
+        direction: (3,) unit direction l.
+        moment: (3,) moment m = p x l [m], p any point of the axis.
+        revolute: Whether it turns about the axis, else it slides along it.
+    """
+
+    direction: Array
+    moment: Array
+    revolute: bool
+
+    def displacement(self, theta: Expr) -> Expr:
+        """Unit dual quaternion (8, 1) of moving by theta [rad or m]: delta_j of eq. (3)."""
+        angle, distance = (theta, 0.0) if self.revolute else (0.0, theta)
+        return dq.exp_screw(angle, distance, ca.DM(self.direction), ca.DM(self.moment))
+
+
+@dataclass(frozen=True, eq=False)
+class ScrewChain:
+    """The joints from the base to one frame.
+
+    Attributes:
+        joints: Names of the movable joints, from the base on.
+        screws: Their screws at the reference pose.
+        reference: (8,) unit dual quaternion x_e0 of the frame at the reference pose.
+    """
+
+    joints: tuple[str, ...]
+    screws: tuple[Screw, ...]
+    reference: Array
+
+    def at(self, theta: Expr) -> Screws:
+        """The chain with its joints at theta (len(joints), 1) [rad or m]."""
+        return Screws(self, theta)
+
+
+@dataclass(frozen=True, eq=False)
+class Screws:
+    """A chain at a configuration.
+
+    Attributes:
+        chain: The chain.
+        theta: (len(chain.joints), 1) joint positions [rad or m].
+    """
+
+    chain: ScrewChain
+    theta: Expr
+
+    @cached_property
+    def displacements(self) -> list[Expr]:
+        """The products delta_1 ... delta_j for j = 0 (nothing moved), 1, ..., n: eq. (7)."""
+        products = [dq.identity()]
+        for i, screw in enumerate(self.chain.screws):
+            products.append(dq.multiply(products[-1], screw.displacement(self.theta[i])))
+        return products
+
+    @property
+    def pose(self) -> Expr:
+        """Unit dual quaternion (8, 1) of the frame in the base frame: eq. (3)."""
+        return dq.multiply(self.displacements[-1], ca.DM(self.chain.reference))
+
+    @property
+    def axes(self) -> list[tuple[Expr, Expr]]:
+        """Direction (3, 1) and moment (3, 1) [m] of every joint's axis now: eq. (6)."""
+        return [
+            dq.act_on_line(moved, ca.DM(screw.direction), ca.DM(screw.moment))
+            for moved, screw in zip(self.displacements, self.chain.screws, strict=False)
+        ]
+
+    @property
+    def jacobian(self) -> Expr:
+        """Screw Jacobian (6, n): eq. (5), written as twists [v; w] per joint unit.
+
+        v is the velocity of the point of the end's body that is instantly at the base's origin,
+        as in eq. (4); a point p of the body moves with v + w x p.
+        """
+        columns = [
+            ca.vertcat(moment, direction) if screw.revolute else ca.vertcat(direction, 0, 0, 0)
+            for screw, (direction, moment) in zip(self.chain.screws, self.axes, strict=True)
+        ]
+        return ca.densify(ca.horzcat(ca.DM.zeros(6, 0), *columns))
+
+
+def screw_chain_to_contact(robot: RobotDescription, finger: str) -> ScrewChain:
+    """The chain to a finger's contact frame.
+
+    Raises:
+        UnknownNameError: There is no such finger.
+    """
+    entry = robot.finger(finger)
+    return _chain(robot, entry.link, entry.placement)
+
+
+def _chain(robot: RobotDescription, link: str, placement: Array) -> ScrewChain:
+    reference = forward(robot, ca.SX.zeros(len(robot.movable), 1))
+    joints = [joint for joint in robot.chain(link) if joint.type != "fixed"]
+    end = reference.links[link].at(placement)
+    return ScrewChain(
+        joints=tuple(joint.name for joint in joints),
+        screws=tuple(
+            _screw(joint, reference.links[joint.child], reference.axes[joint.name])
+            for joint in joints
+        ),
+        reference=number(dq.from_pose(end.rotation, end.origin)),
+    )
+
+
+def _screw(joint: Joint, frame: Pose, axis: ca.SX) -> Screw:
+    direction = number(axis)
+    moment = np.cross(number(frame.origin), direction)
+    return Screw(direction, moment, joint.type == "revolute")
+
+
+@dataclass(frozen=True, eq=False)
+class TipChain:
+    """The joints between a frame and a fingertip.
+
+    Attributes:
+        robot: The description.
+        chain: Screws in that frame, from it to the tip, and the tip's reference pose.
+        signs: +1 or -1 per joint of the chain: eq. (16), -1 on the way back to the palm.
+    """
+
+    robot: RobotDescription
+    chain: ScrewChain
+    signs: tuple[int, ...]
+
+    def at(self, q: Expr) -> TipMotion:
+        """The chain with the actuators at q (n, 1) [rad or m]."""
+        return TipMotion(self, q)
+
+    @cached_property
+    def drivers(self) -> tuple[str, ...]:
+        """The joints that follow no other joint, in the order in which they are met."""
+        return tuple(dict.fromkeys(self.driver(name) for name in self.chain.joints))
+
+    @cached_property
+    def actuators(self) -> tuple[int, ...]:
+        """Positions in q of the actuators that move the tip, in order."""
+        return tuple(
+            sorted({self.robot.actuator_index(self.source(name)) for name in self.drivers})
+        )
+
+    def driver(self, name: str) -> str:
+        """The joint at the beginning of what a joint follows; itself if it follows no joint."""
+        joint = self.joint(name)
+        while joint.coupling is not None and joint.coupling.of in self.robot.joint_names:
+            joint = self.joint(joint.coupling.of)
+        return joint.name
+
+    def source(self, driver: str) -> str:
+        """The actuator that moves a driving joint."""
+        coupling = self.joint(driver).coupling
+        return driver if coupling is None else coupling.of
+
+    def joint(self, name: str) -> Joint:
+        """The movable joint of that name."""
+        return self.robot.movable[self.robot.joint_names.index(name)]
+
+
+@dataclass(frozen=True, eq=False)
+class TipMotion:
+    """A tip at a configuration; twists are [v; w] in the frame it is seen from.
+
+    Attributes:
+        tip: The chain.
+        q: (n, 1) actuator positions [rad or m].
+    """
+
+    tip: TipChain
+    q: Expr
+
+    @cached_property
+    def joints(self) -> dict[str, Expr]:
+        """Position of every movable joint of the robot [rad or m]."""
+        robot = self.tip.robot
+        theta = joint_positions(robot, self.q)
+        return {name: theta[i] for i, name in enumerate(robot.joint_names)}
+
+    @cached_property
+    def screws(self) -> Screws:
+        """The chain's screws at this configuration: eqs. (3), (5) to (7)."""
+        pairs = zip(self.tip.signs, self.tip.chain.joints, strict=True)
+        return self.tip.chain.at(ca.vertcat(*(sign * self.joints[name] for sign, name in pairs)))
+
+    @property
+    def pose(self) -> Expr:
+        """Unit dual quaternion (8, 1) of the tip: eq. (3)."""
+        return self.screws.pose
+
+    @cached_property
+    def joint_jacobian(self) -> Expr:
+        """Twist (6, d) per unit rate of the driving joints: eq. (12), seen from a tip eq. (15).
+
+        Column i belongs to `tip.drivers[i]`. Of the index finger of the AR10 it is
+        [s_1, s_2 + f s_3]; from its tip to the thumb's [s_i2 + f s_i3, s_i1, s_t1, s_t2]. The
+        paper's display of (15) leaves s_i1 out, which its (16) asks for. A driving joint of the
+        way back counts as reversed, so its rate is the negative of the joint's own: see
+        `displacement`.
+        """
+        tip, columns = self.tip, dict.fromkeys(self.tip.drivers, ca.DM.zeros(6, 1))
+        for i, name in enumerate(tip.chain.joints):
+            driver = tip.driver(name)
+            scale = tip.signs[i] * self._sign(driver) * self._rate(name)
+            columns[driver] = columns[driver] + scale * self.screws.jacobian[:, i]
+        return ca.densify(ca.horzcat(*columns.values()))
+
+    def displacement(self, rates: Expr) -> Expr:
+        """Joint displacements (d, 1) that `joint_jacobian` multiplies: eq. (16).
+
+        Args:
+            rates: (d, 1) of the driving joints themselves [rad or m].
+        """
+        return ca.vertcat(*(self._sign(name) for name in self.tip.drivers)) * rates
+
+    @cached_property
+    def jacobian(self) -> Expr:
+        """Twist (6, k) per unit rate of `tip.actuators`: in slider space for the AR10."""
+        tip = self.tip
+        drive = ca.SX.zeros(len(tip.drivers), len(tip.actuators))
+        for row, driver in enumerate(tip.drivers):
+            index = tip.robot.actuator_index(tip.source(driver))
+            rate = coupling_rate(tip.joint(driver), self.q[index])
+            drive[row, tip.actuators.index(index)] = self._sign(driver) * rate
+        return ca.densify(self.joint_jacobian @ drive)
+
+    def _rate(self, name: str) -> Expr:
+        """How fast a joint moves per unit of its driving joint, down its couplings."""
+        joint, rate = self.tip.joint(name), ca.DM(1)
+        while joint.coupling is not None and joint.coupling.of in self.joints:
+            rate = rate * coupling_rate(joint, self.joints[joint.coupling.of])
+            joint = self.tip.joint(joint.coupling.of)
+        return rate
+
+    def _sign(self, driver: str) -> int:
+        """Sense in which a driving joint counts; a joint beside the chain counts as it is."""
+        joints = self.tip.chain.joints
+        return self.tip.signs[joints.index(driver)] if driver in joints else 1
+
+
+def finger_chain(robot: RobotDescription, finger: str) -> TipChain:
+    """A finger's contact frame seen from the base: the chain of eq. (12).
+
+    Raises:
+        UnknownNameError: There is no such finger.
+    """
+    chain = screw_chain_to_contact(robot, finger)
+    return TipChain(robot, chain, (1,) * len(chain.joints))
+
+
+def relative_chain(robot: RobotDescription, reference: str, finger: str) -> TipChain:
+    """A finger's contact frame seen from another finger's: the chain of eqs. (15) and (16).
+
+    Joints that carry both (an arm, above all) move neither against the other and are left out.
+
+    Args:
+        robot: The description.
+        reference: The finger whose contact frame everything is expressed in.
+        finger: The other one.
+
+    Raises:
+        UnknownNameError: There is no such finger.
+        InputError: Both are the same.
+    """
+    if reference == finger:
+        raise InputError(f"relative chain: found {finger!r} twice, expected two fingers")
+    back, out = (screw_chain_to_contact(robot, name) for name in (reference, finger))
+    shared = sum(a == b for a, b in zip(back.joints, out.joints, strict=False))
+    base_in_reference = dq.conjugate(ca.DM(back.reference))
+
+    def seen(screw: Screw) -> Screw:
+        moved = dq.act_on_line(base_in_reference, ca.DM(screw.direction), ca.DM(screw.moment))
+        return Screw(number(moved[0]), number(moved[1]), screw.revolute)
+
+    screws = (*reversed(back.screws[shared:]), *out.screws[shared:])
+    chain = ScrewChain(
+        joints=(*reversed(back.joints[shared:]), *out.joints[shared:]),
+        screws=tuple(seen(screw) for screw in screws),
+        reference=number(dq.multiply(base_in_reference, ca.DM(out.reference))),
+    )
+    signs = (-1,) * len(back.joints[shared:]) + (1,) * len(out.joints[shared:])
+    return TipChain(robot, chain, signs)

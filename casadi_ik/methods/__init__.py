@@ -1,1 +1,0 @@
-"""A method is a folder."""

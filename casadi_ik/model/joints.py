@@ -1,0 +1,66 @@
+"""Joints and motors of a robot as frozen data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from casadi_ik.files.arrays import Array
+from casadi_ik.model.couplings import Coupling
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """A joint of the tree.
+
+    Attributes:
+        name: Unique name.
+        parent: Link it hangs on.
+        child: Link it carries; the child's frame is the joint's frame.
+        type: "revolute" [rad], "prismatic" [m] or "fixed".
+        placement: (4, 4) pose of the joint frame in the parent link at zero.
+        axis: (3,) unit axis in the joint frame.
+        lower: Lower limit [rad or m].
+        upper: Upper limit [rad or m].
+        velocity: Velocity limit [rad/s or m/s], inf if unknown.
+        coupling: What the joint follows; None if it is an actuator itself.
+        part: "arm", "mount" or "hand".
+        effort: Largest torque or force [N m or N], inf if unknown.
+    """
+
+    name: str
+    parent: str
+    child: str
+    type: str
+    placement: Array
+    axis: Array
+    lower: float
+    upper: float
+    velocity: float
+    coupling: Coupling | None
+    part: str
+    effort: float = np.inf
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """A motor: what the solver sets.
+
+    Attributes:
+        name: Unique name.
+        unit: "rad" or "m".
+        lower: Lower limit of its own; `RobotDescription.lower` minds its joints' limits as well.
+        upper: Upper limit, likewise.
+        velocity: Velocity limit [unit/s], inf if unknown.
+        part: "arm" or "hand".
+        effort: Largest torque or force, at its own position [N m or N], inf if unknown.
+    """
+
+    name: str
+    unit: str
+    lower: float
+    upper: float
+    velocity: float
+    part: str
+    effort: float = np.inf

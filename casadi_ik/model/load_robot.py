@@ -1,0 +1,166 @@
+"""Arms and hands, described or imported, become one `RobotDescription`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from casadi_ik.errors import DescriptionError
+from casadi_ik.files.arrays import Array, frozen
+from casadi_ik.files.reading import Frame, checked, frame_matrix, parse_yaml, read
+from casadi_ik.files.shipped import BODIES, resolve_robot
+from casadi_ik.model.description import RobotDescription
+from casadi_ik.model.imported_parts import hand_from_file
+from casadi_ik.model.joining import (
+    a_part,
+    body_from_file,
+    body_from_parts,
+    fixed_joint,
+    joined,
+    the_fingers,
+    with_wrist,
+)
+from casadi_ik.model.link_shapes import link_shapes
+from casadi_ik.model.parts import Part, described_part, told_apart, usable
+from casadi_ik.model.schema import (
+    ArmFile,
+    ArmHandFile,
+    BodyFile,
+    HandFile,
+    ImportedBody,
+    ImportedFile,
+    PadEntry,
+)
+
+
+def load_description(name_or_path: str | Path) -> RobotDescription:
+    """Load an arm-hand description.
+
+    Args:
+        name_or_path: A shipped name (`shipped_names("arm_hands")`), a shipped arm and a shipped
+            hand joined by a plus sign ("panda+allegro_right"), one of the two alone ("panda",
+            whose one fingertip ``flange`` is its tip, facing along z; "allegro_right", which
+            stands on a fixed base), a shipped body (`shipped_names("bodies")`, "g1+dex3") with a
+            hand after a plus sign if it has none ("two_ur10e+leap"), or the path of a YAML file,
+            whose ``arm`` and ``hand`` may be shipped names or paths relative to it, or may stand in
+            somebody's URDF or MJCF.
+
+    Raises:
+        UnknownNameError: No shipped description has that name.
+        DescriptionError: A file is missing or malformed; the message names file and key.
+        MissingExtraError: What reads a file's format is not installed.
+    """
+    found = resolve_robot(name_or_path)
+    if not isinstance(found, tuple):
+        return _robot(found)
+    first, hand = found
+    if first is None or first.parent.name != BODIES:
+        return _pair(first, hand)
+    body, units = read(first, BodyFile)
+    if hand is None:
+        return body_from_parts(body, first, units)
+    named = msgspec.structs.replace(body, name=f"{body.name}+{hand.stem}")
+    return body_from_parts(named, first, units, hand.stem)
+
+
+FLANGE = Part(
+    *("flange", "flange: ", "flange"),
+    *([], [], {}, "flange", np.eye(4), {}),
+    pads={"flange": PadEntry(link="flange", normal=(0.0, 0.0, 1.0))},
+)
+"""What an arm has that stands alone: its tip, which touches what is before it."""
+
+
+def _pair(arm_path: Path | None, hand_path: Path | None) -> RobotDescription:
+    """A shipped arm with a shipped hand, as their files say that they are put together."""
+    arm, hand = None, FLANGE
+    if arm_path is not None:
+        arm = described_part(read(arm_path, ArmFile)[0], arm_path)
+    if hand_path is not None:
+        hand = described_part(read(hand_path, HandFile)[0], hand_path)
+    name = "+".join(path.stem for path in (arm_path, hand_path) if path is not None)
+    return _arm_hand(name, arm, hand.mount, hand, list(hand.pads), hand.thumb, {}, {}, {}, name)
+
+
+def file_type(raw: Any) -> type[ArmHandFile | ImportedFile | BodyFile | ImportedBody]:
+    """Which kind of robot a description is of, by its keys."""
+    keys = raw if isinstance(raw, dict) else {}
+    if "sides" in keys:
+        return ImportedBody if "robot" in keys else BodyFile
+    hand = keys.get("hand")
+    in_a_file = "robot" in keys or (isinstance(hand, dict) and "file" in hand)
+    return ImportedFile if in_a_file else ArmHandFile
+
+
+def _robot(path: Path) -> RobotDescription:
+    raw = parse_yaml(path)
+    top, units = checked(raw, file_type(raw), path)
+    if isinstance(top, BodyFile):
+        robot = body_from_parts(top, path, units)
+    elif isinstance(top, ImportedBody):
+        robot = body_from_file(top, path, units)
+    else:
+        robot = _on_arm(top, units, path)
+    # What a description says of a link goes before what its file says.
+    said = () if top.collision is None else top.collision.links
+    more = link_shapes(top.collision, robot.links, path)
+    return replace(robot, shapes=robot.shapes.without(said) + more, path=path)
+
+
+def _on_arm(top: ArmHandFile | ImportedFile, units: dict[str, str], path: Path) -> RobotDescription:
+    usable(top.name, f"{path}: name")
+    arm = None if top.arm is None else a_part(top.arm, "arm", path)
+    if isinstance(top, ArmHandFile):
+        hand = a_part(top.hand, "hand", path)
+    else:
+        entry, key = top.hand or top.robot, "hand" if top.hand else "robot"
+        if entry is None or (top.hand and top.robot):
+            raise DescriptionError(f"{path}: expected either 'hand' or 'robot'")
+        if arm is not None and top.robot is not None:
+            raise DescriptionError(f"{path}: arm: found beside 'robot', which has its own")
+        hand = hand_from_file(entry, top.fingers, key, path)
+    if arm is None and top.mount != Frame():
+        arm = Part("base", f"{path}: ", "base", [], [], {}, "base", np.eye(4), {})
+    return _arm_hand(
+        *(top.name, arm, frame_matrix(top.mount), hand, list(top.fingers), top.thumb),
+        *(top.home, units, top.sources, str(path)),
+    )
+
+
+def _arm_hand(
+    name: str,
+    arm: Part | None,
+    mount: Array,
+    hand: Part,
+    fingers: list[str],
+    thumb: str | None,
+    home: dict[str, float],
+    units: dict[str, str],
+    sources: dict[str, str],
+    where: str,
+) -> RobotDescription:
+    """The robot of an arm (if there is one) and a hand on it."""
+    if arm is not None:
+        hand = told_apart(hand, arm)
+    hand = with_wrist(hand)
+    joints, root, parts = list(hand.joints), hand.root, [(hand.name, hand)]
+    if arm is not None:
+        fixed = fixed_joint("mount", arm.tip_link, hand.root, arm.tip @ mount)
+        joints, root = [*arm.joints, fixed, *joints], arm.root
+        parts.insert(0, (arm.name, arm))
+    home = home or {motor: at for _, part in parts for motor, at in part.home.items()}
+    palms = {hand.tip_link}
+    robot, flat = joined(name, root, joints, parts, palms, home, units, sources, where)
+    if thumb is None and hand.thumb in fingers:
+        thumb = hand.thumb
+    return replace(
+        robot,
+        fingers=the_fingers(fingers, thumb, hand, flat, f"{where}: "),
+        named_thumb=thumb,
+        palm_link=hand.tip_link,
+        palm_placement=frozen(hand.tip),
+    )

@@ -1,0 +1,420 @@
+"""An arm or a hand as a part of a robot: checked, and read from our own files joint by joint."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from casadi_ik.errors import DescriptionError
+from casadi_ik.files.arrays import Array, frozen
+from casadi_ik.files.limits import LIMITS
+from casadi_ik.files.reading import frame_matrix
+from casadi_ik.model.couplings import Linear
+from casadi_ik.model.joints import Actuator, Joint
+from casadi_ik.model.link_shapes import NO_SHAPES, Shapes, link_shapes
+from casadi_ik.model.linkage import known, links_of, parents_first
+from casadi_ik.model.schema import ActuatorEntry, ArmFile, HandFile, JointEntry, PadEntry
+
+
+def check_couplings(joints: dict[str, Joint], actuators: list[Actuator], path: Path) -> None:
+    """Whether every coupling ends at an actuator, and every actuator moves something.
+
+    Args:
+        joints: The movable joints by name.
+        actuators: The actuators.
+        path: The file they stand in.
+
+    Raises:
+        DescriptionError: See above; or a coupling follows something of another unit, or a slider
+            leaves its triangle.
+    """
+    units = {joint.name: "m" if joint.type == "prismatic" else "rad" for joint in joints.values()}
+    units |= {actuator.name: actuator.unit for actuator in actuators}
+    followed = {joint.coupling.of for joint in joints.values() if joint.coupling is not None}
+    for actuator in actuators:
+        if actuator.name not in joints and actuator.name not in followed:
+            raise DescriptionError(
+                f"{path}: actuators.{actuator.name}: moves nothing; expected the name of a joint, "
+                "or a coupling that follows it"
+            )
+    for joint in joints.values():
+        _check_coupling(joint, joints, {actuator.name for actuator in actuators}, path)
+        if (coupling := joint.coupling) is None:
+            continue
+        if coupling.source_unit and units[coupling.of] != coupling.source_unit:
+            raise DescriptionError(
+                f"{path}: joint {joint.name!r}: coupling.of: {coupling.of!r} is in "
+                f"{units[coupling.of]}, expected something in {coupling.source_unit}"
+            )
+        motor = next((one for one in actuators if one.name == coupling.of), None)
+        if motor is not None:
+            where = f"{path}: joint {joint.name!r}: coupling"
+            coupling.check_stroke(motor.name, motor.lower, motor.upper, where)
+
+
+def _check_coupling(
+    joint: Joint, by_name: dict[str, Joint], actuators: set[str], path: Path
+) -> None:
+    """Follow a joint's couplings down to an actuator."""
+    where = f"{path}: joint {joint.name!r}"
+    followed, current = [joint.name], joint
+    while current.coupling is not None:
+        source = current.coupling.of
+        if source in followed:
+            cycle = " -> ".join([*followed, source])
+            raise DescriptionError(f"{where}: coupling.of: is a cycle {cycle}")
+        if source in actuators:
+            return
+        if source not in by_name:
+            raise DescriptionError(
+                f"{where}: coupling.of: unknown joint or actuator {source!r}; known: "
+                + ", ".join([*by_name, *sorted(actuators - set(by_name))])
+            )
+        followed.append(source)
+        current = by_name[source]
+    if current.name not in actuators:
+        raise DescriptionError(
+            f"{where}: coupling: missing, and there is no {current.name!r} under 'actuators'"
+        )
+
+
+def unique(names: Iterable[str], where: str) -> None:
+    """Refuse a name that appears twice."""
+    seen: set[str] = set()
+    for name in names:
+        usable(name, where)
+        if name in seen:
+            raise DescriptionError(f"{where}: {name!r} appears twice")
+        seen.add(name)
+
+
+def usable(name: str, where: str) -> None:
+    """Refuse a name that is empty, or too long to be read in a table or a file's name."""
+    if not 0 < len(name) <= LIMITS.name_text:
+        raise DescriptionError(
+            f"{where}: found a name of {len(name)} characters, expected 1 to {LIMITS.name_text}"
+        )
+
+
+def known_source(tags: str, sources: dict[str, str], where: str) -> None:
+    """Refuse source tags (separated by blanks or commas) that are empty or not explained."""
+    for tag in tags.replace(",", " ").split():
+        if tag not in sources:
+            raise DescriptionError(f"{where}: unknown tag {tag!r}; sources: {', '.join(sources)}")
+    if not tags.strip():
+        raise DescriptionError(f"{where}: is empty; every number needs its source")
+
+
+PREFIX = "hand_"
+"""Put before a name of the hand that the arm has as well."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """An arm or a hand.
+
+    Attributes:
+        name: What it is called.
+        where: What stands before its keys in messages: its file, "arm.yaml: ".
+        root: Its base link.
+        joints: Its joints, parents before children.
+        actuators: Its motors.
+        sources: Where its numbers come from, by tag.
+        tip_link: Link that carries what comes next: an arm's tip, a hand's palm.
+        tip: (4, 4) pose of the tip or palm frame in that link.
+        home: Positions of some motors.
+        shapes: Of its links, for collisions.
+        pads: A hand's contact frames, by finger.
+        thumb: The finger placed first, if it says so itself.
+        mount: (4, 4) pose of a hand's root on an arm's tip, if the robot says nothing.
+    """
+
+    name: str
+    where: str
+    root: str
+    joints: list[Joint]
+    actuators: list[Actuator]
+    sources: dict[str, str]
+    tip_link: str
+    tip: Array
+    home: dict[str, float]
+    shapes: Shapes = NO_SHAPES
+    pads: Mapping[str, PadEntry] = field(default_factory=dict)
+    thumb: str | None = None
+    mount: Array = field(default_factory=lambda: np.eye(4))
+
+    @property
+    def links(self) -> tuple[str, ...]:
+        """All links, the root first."""
+        return links_of(self)
+
+    @property
+    def movers(self) -> set[str]:
+        """Names of all joints and motors."""
+        return {one.name for one in (*self.joints, *self.actuators)}
+
+
+def told_apart(hand: Part, arm: Part) -> Part:
+    """The hand, with `PREFIX` before every name of a link, joint or motor that the arm has too."""
+    movers = arm.movers | {"mount"}
+    return _renamed(
+        hand,
+        lambda name: _free(name, arm.links, hand.links),
+        lambda name: _free(name, movers, hand.movers),
+    )
+
+
+def of_side(part: Part, side: str, shared: str | None = None) -> Part:
+    """The part, with the side's name before all names that do not begin with it.
+
+    Args:
+        part: An arm or a hand.
+        side: "left" makes "left_" of it.
+        shared: A link that keeps its name.
+    """
+
+    def own(name: str) -> str:
+        return name if name == shared or name.startswith(f"{side}_") else f"{side}_{name}"
+
+    named = _renamed(part, own, own)
+    thumb = None if part.thumb is None else own(part.thumb)
+    return replace(named, pads={own(name): pad for name, pad in named.pads.items()}, thumb=thumb)
+
+
+def mirrored(part: Part) -> Part:
+    """The part's mirror image, left for right: y is turned round in its root's frame.
+
+    Every frame of it is mirrored in its own y. A joint turns about the mirrored axis; where the
+    opposite one is nearer to what it was, it turns about that and runs the other way round, if it
+    is not coupled otherwise than linearly.
+    """
+    bent = [one for one in part.joints if one.coupling and not isinstance(one.coupling, Linear)]
+    stays = {one.name for one in bent} | {one.coupling.of for one in bent if one.coupling}
+    turned: set[str] = set()
+    joints = []
+    for joint in part.joints:
+        axis = joint.axis * ACROSS
+        if joint.type == "revolute":
+            axis = -axis
+        if joint.type != "fixed" and axis @ joint.axis < 0 and joint.name not in stays:
+            axis = -axis
+            turned.add(joint.name)
+        joints.append(replace(joint, axis=frozen(axis), placement=_mirrored(joint.placement)))
+    # A motor that is no joint runs with those that follow it.
+    followed = {j.coupling.of for j in joints if j.coupling is not None and j.name in turned}
+    turned |= followed - {joint.name for joint in joints}
+    return replace(
+        part,
+        joints=[_run_back(joint, turned) for joint in joints],
+        actuators=[
+            replace(one, lower=-one.upper, upper=-one.lower) if one.name in turned else one
+            for one in part.actuators
+        ],
+        tip=_mirrored(part.tip),
+        mount=_mirrored(part.mount),
+        home={name: -at if name in turned else at for name, at in part.home.items()},
+        shapes=part.shapes.mirrored(),
+        pads={name: _mirrored_pad(pad) for name, pad in part.pads.items()},
+    )
+
+
+ACROSS = np.array([1.0, -1.0, 1.0])
+"""What a vector is multiplied by in the mirror."""
+
+
+def _mirrored(pose: Array) -> Array:
+    mirror = np.diag([*ACROSS, 1.0])
+    return frozen(mirror @ pose @ mirror)
+
+
+def _mirrored_pad(pad: PadEntry) -> PadEntry:
+    def across(vector: tuple[float, ...]) -> tuple[float, ...]:
+        return vector[0], -vector[1], vector[2]
+
+    return msgspec.structs.replace(
+        pad,
+        xyz=across(pad.xyz),
+        rpy=(-pad.rpy[0], pad.rpy[1], -pad.rpy[2]),
+        normal=across(pad.normal),
+        tangent=None if pad.tangent is None else across(pad.tangent),
+    )
+
+
+def _run_back(joint: Joint, turned: set[str]) -> Joint:
+    """A joint of a mirror image whose positions, or those that it follows, change their sign."""
+    coupling, back = joint.coupling, joint.name in turned
+    if isinstance(coupling, Linear) and (back or coupling.of in turned):
+        sign = -1.0 if back else 1.0
+        ratio = coupling.ratio * sign * (-1.0 if coupling.of in turned else 1.0)
+        coupling = msgspec.structs.replace(coupling, ratio=ratio, offset=sign * coupling.offset)
+    lower, upper = (-joint.upper, -joint.lower) if back else (joint.lower, joint.upper)
+    return replace(joint, coupling=coupling, lower=lower, upper=upper)
+
+
+def _renamed(part: Part, link: Callable[[str], str], mover: Callable[[str], str]) -> Part:
+    """The part with other names of links, and of joints and motors."""
+    joints = [
+        replace(
+            joint,
+            name=mover(joint.name),
+            parent=link(joint.parent),
+            child=link(joint.child),
+            coupling=joint.coupling
+            and msgspec.structs.replace(joint.coupling, of=mover(joint.coupling.of)),
+        )
+        for joint in part.joints
+    ]
+    return replace(
+        part,
+        root=link(part.root),
+        joints=joints,
+        actuators=[replace(one, name=mover(one.name)) for one in part.actuators],
+        shapes=part.shapes.renamed({name: link(name) for name in part.links}),
+        tip_link=link(part.tip_link),
+        home={mover(name): value for name, value in part.home.items()},
+        pads={
+            name: msgspec.structs.replace(pad, link=link(pad.link))
+            for name, pad in part.pads.items()
+        },
+    )
+
+
+def _free(name: str, taken: Collection[str], own: Collection[str]) -> str:
+    if name not in taken:
+        return name
+    while name in taken or name in own:
+        name = PREFIX + name
+    return name
+
+
+JOINT_TYPES = ("revolute", "prismatic", "fixed")
+
+
+def described_part(file: ArmFile | HandFile, path: Path) -> Part:
+    """An arm or a hand of a file of ours, checked.
+
+    Args:
+        file: What it says.
+        path: The file.
+
+    Raises:
+        DescriptionError: With file, key, what was found and what was expected.
+    """
+    hand = isinstance(file, HandFile)
+    kind, key, end = ("hand", "palm", file.palm) if hand else ("arm", "tip", file.tip)
+    joints = _joints(file.joints, file.root, file.sources, kind, path)
+    motors = _actuators(file.actuators if hand else None, joints, file.sources, kind, path)
+    links = (file.root, *(joint.child for joint in joints))
+    known(end.link, links, "link", f"{path}: {key}.link")
+    known_source(end.source, file.sources, f"{path}: {key}.source")
+    for name, finger in file.fingers.items() if hand else ():
+        known_source(finger.source, file.sources, f"{path}: fingers.{name}.source")
+    if file.collision is not None and file.collision.links:
+        known_source(file.collision.source, file.sources, f"{path}: collision.source")
+    part = Part(
+        file.name,
+        f"{path}: ",
+        file.root,
+        joints,
+        motors,
+        file.sources,
+        end.link,
+        frame_matrix(end),
+        file.home,
+        link_shapes(file.collision, links, path),
+    )
+    if not hand:
+        return part
+    return replace(part, pads=file.fingers, thumb=file.thumb, mount=frame_matrix(file.mount))
+
+
+def _joints(
+    entries: list[JointEntry], root: str, sources: dict[str, str], part: str, path: Path
+) -> list[Joint]:
+    """Checked joints, parents before children."""
+    names = [entry.name for entry in entries]
+    unique(names, f"{path}: joints")
+    unique([root, *(entry.child for entry in entries)], f"{path}: joints: child links")
+    for entry in entries:
+        where = f"{path}: joint {entry.name!r}"
+        if entry.type not in JOINT_TYPES:
+            raise DescriptionError(
+                f"{where}: type: found {entry.type!r}, expected one of {', '.join(JOINT_TYPES)}"
+            )
+        low, high = entry.limits
+        if not low <= high:
+            raise DescriptionError(f"{where}: limits: lower {low:.6g} is above upper {high:.6g}")
+        if not np.linalg.norm(entry.axis) > 1e-9:
+            raise DescriptionError(f"{where}: axis: is zero, expected a direction")
+        known_source(entry.source, sources, f"{where}: source")
+        if entry.coupling is not None:
+            entry.coupling.check(f"{where}: coupling")
+    ordered = parents_first(entries, root)
+    stray = next((entry for entry in entries if entry not in ordered), None)
+    if stray is not None:
+        links = {entry.child for entry in entries}
+        problem = "is part of a frame cycle" if stray.parent in links else "is no link"
+        raise DescriptionError(
+            f"{path}: joint {stray.name!r}: parent: {stray.parent!r} {problem}; "
+            f"expected a chain of joints down to the root {root!r}"
+        )
+    return [_joint(entry, part) for entry in ordered]
+
+
+def _joint(entry: JointEntry, part: str) -> Joint:
+    axis = np.asarray(entry.axis, dtype=float)
+    return Joint(
+        name=entry.name,
+        parent=entry.parent,
+        child=entry.child,
+        type=entry.type,
+        placement=frozen(frame_matrix(entry.origin)),
+        axis=frozen(axis / np.linalg.norm(axis)),
+        lower=entry.limits[0],
+        upper=entry.limits[1],
+        velocity=entry.velocity or math.inf,
+        coupling=entry.coupling,
+        part=part,
+        effort=entry.effort or math.inf,
+    )
+
+
+def _actuators(
+    entries: dict[str, ActuatorEntry] | None,
+    joints: list[Joint],
+    sources: dict[str, str],
+    part: str,
+    path: Path,
+) -> list[Actuator]:
+    """The part's actuators, after checking that every coupling ends at one of them."""
+    by_name = {joint.name: joint for joint in joints if joint.type != "fixed"}
+    if entries is None:
+        entries = {name: ActuatorEntry() for name, j in by_name.items() if j.coupling is None}
+    actuators = []
+    for name, entry in entries.items():
+        where = f"{path}: actuators.{name}"
+        joint = by_name.get(name)
+        if joint is not None and joint.coupling is not None:
+            raise DescriptionError(f"{where}: joint {name!r} follows {joint.coupling.of!r} already")
+        if entry.limits is None and joint is None:
+            raise DescriptionError(f"{where}: limits: missing (no joint has this name)")
+        if entry.unit not in ("rad", "m"):
+            raise DescriptionError(f"{where}: unit: found {entry.unit!r}, expected 'rad' or 'm'")
+        low, high = entry.limits or ((joint.lower, joint.upper) if joint else (0.0, 0.0))
+        if not low < high:
+            raise DescriptionError(
+                f"{where}: limits: lower {low:.6g} is not below upper {high:.6g}"
+            )
+        velocity = entry.velocity or (joint.velocity if joint else math.inf)
+        effort = entry.effort or (joint.effort if joint else math.inf)
+        if entry.source or joint is None:
+            known_source(entry.source, sources, f"{where}: source")
+        unit = ("m" if joint.type == "prismatic" else "rad") if joint else entry.unit
+        actuators.append(Actuator(name, unit, low, high, velocity, part, effort))
+    check_couplings(by_name, actuators, path)
+    return actuators

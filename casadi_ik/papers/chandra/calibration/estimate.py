@@ -1,0 +1,476 @@
+"""The estimate, maximum a posteriori and robust to outliers, and the description made of it.
+
+Gauss-Newton on whitened misfits and priors, reweighted for a robust loss (iteratively reweighted
+least squares), the parameters within bounds. The noise is estimated from the data, so the standard
+deviations given are only where that begins. Everything is computed in units of the priors: a
+singular value s of the whitened Jacobian says how much more (s > 1) or less (s < 1) the data know
+about a direction than the prior does.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+
+from casadi_ik.errors import InputError, UnknownNameError
+from casadi_ik.files.arrays import Array
+from casadi_ik.files.reading import Frame, frame_matrix, read_yaml
+from casadi_ik.files.shipped import resolve
+from casadi_ik.kinematics.couplings import joint_positions
+from casadi_ik.kinematics.se3 import exp_so3, matrix_to_rpy
+from casadi_ik.model.load_robot import load_description
+from casadi_ik.papers.chandra.calibration.measurements import Measurements
+from casadi_ik.papers.chandra.calibration.model import HandModel, Parameter, tilted
+
+CAUCHY, HUBER = 2.385, 1.345
+"""Tuning constants for 95 % efficiency on one normal component (Holland & Welsch 1977)."""
+
+
+@dataclass(frozen=True)
+class Loss:
+    """A loss.
+
+    Attributes:
+        cost: What a component of a measurement costs.
+        weight: Weight of a measurement in the normal equations, cost' / rho.
+        slope: Its share in the mean curvature, weight + rho weight' / m over m components, from
+            weight, rho and m.
+    """
+
+    cost: Callable[[Array], Array]
+    weight: Callable[[Array], Array]
+    slope: Callable[[Array, Array, Array], Array]
+
+
+LOSSES = {
+    "cauchy": Loss(
+        cost=lambda rho: 0.5 * CAUCHY**2 * np.log1p((rho / CAUCHY) ** 2),
+        weight=lambda rho: 1 / (1 + (rho / CAUCHY) ** 2),
+        slope=lambda weight, rho, m: weight - 2 * (weight * rho / CAUCHY) ** 2 / m,
+    ),
+    "huber": Loss(
+        cost=lambda rho: np.where(rho <= HUBER, 0.5 * rho**2, HUBER * (rho - 0.5 * HUBER)),
+        weight=lambda rho: HUBER / np.maximum(rho, HUBER),
+        slope=lambda weight, rho, m: np.where(rho <= HUBER, 1.0, weight * (1 - 1 / m)),
+    ),
+    "squares": Loss(lambda rho: 0.5 * rho**2, np.ones_like, lambda weight, *_: weight),
+}
+"""The losses by name."""
+
+
+NORMAL_95 = 1.959964
+"""95 % of a normal variable lie within so many standard deviations."""
+
+
+@dataclass(frozen=True)
+class EstimateSettings:
+    """How the estimate is found.
+
+    Attributes:
+        unknown: Singular value, relative to the largest, below which the data say nothing at all.
+        fewest: Measured numbers beyond those that the parameters can explain, so that noise can be
+            seen.
+        max_iterations: Steps at most.
+        smallest_step: Step at which the iteration ends, in prior standard deviations.
+    """
+
+    unknown: float = 1e-6
+    fewest: int = 12
+    max_iterations: int = 60
+    smallest_step: float = 1e-7
+
+
+SETTINGS = EstimateSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """What the data say about the parameters; m measurements, k parameters.
+
+    Attributes:
+        parameters: The parameters.
+        values: (k,) estimates.
+        covariance: (k, k) of the estimates.
+        singular_values: (k,) of the whitened Jacobian in units of the priors, descending.
+        directions: (k, k) their directions in units of the priors, one per row.
+        weights: (m,) weight of each measurement, 1 where it is taken in full.
+        noise: Standard deviations of a measured coordinate [m] and angle [rad]; NaN if no
+            orientation was measured.
+        noise_estimated: Whether the noise is from the data; with too few it is what was assumed.
+        before: (m, 2) misfit of the description: distance [m] and angle [rad, NaN].
+        after: (m, 2) the same of the estimate.
+        iterations: Gauss-Newton steps.
+        converged: Whether the last step was small enough.
+    """
+
+    parameters: tuple[Parameter, ...]
+    values: Array
+    covariance: Array
+    singular_values: Array
+    directions: Array
+    weights: Array
+    noise: tuple[float, float]
+    noise_estimated: bool
+    before: Array
+    after: Array
+    iterations: int
+    converged: bool
+
+    @property
+    def deviation(self) -> Array:
+        """(k,) standard deviations of the estimates."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def interval(self) -> Array:
+        """(k,) half widths of the 95 % intervals."""
+        return NORMAL_95 * self.deviation
+
+    @property
+    def learned(self) -> Array:
+        """(k,) part of the prior's variance that the data took away: 0 nothing, 1 all."""
+        prior = np.array([parameter.prior for parameter in self.parameters])
+        return np.clip(1 - (self.deviation / prior) ** 2, 0.0, 1.0)
+
+    @property
+    def outliers(self) -> NDArray[np.intp]:
+        """Rows that count less than a quarter."""
+        return np.flatnonzero(self.weights < 0.25)
+
+    def unidentified(self, below: float = 1.0) -> list[tuple[float, dict[str, float]]]:
+        """Directions about which the data say less than the priors.
+
+        Args:
+            below: Singular value up to which a direction counts.
+
+        Returns:
+            Singular value and the larger components by parameter, the worst first.
+        """
+        found = []
+        for value, direction in zip(self.singular_values, self.directions, strict=True):
+            if value < below:
+                large = np.flatnonzero(np.abs(direction) > 0.3 * np.abs(direction).max())
+                order = large[np.argsort(-np.abs(direction[large]))]
+                names = {self.parameters[i].name: float(direction[i]) for i in order}
+                found.append((float(value), names))
+        return found[::-1]
+
+    @property
+    def unknown_directions(self) -> int:
+        """How many directions the data say nothing at all about."""
+        return int(np.sum(self.singular_values < SETTINGS.unknown * self.singular_values[0]))
+
+
+CHI_SQUARE_MEDIAN = 2.366
+"""Median of the chi-square distribution of 3 degrees of freedom."""
+
+
+def calibrate(
+    model: HandModel,
+    measurements: Measurements,
+    *,
+    loss: str = "cauchy",
+    sigma_position: float = 0.5e-3,
+    sigma_angle: float = math.radians(1.0),
+) -> Calibration:
+    """Estimate the parameters of a model.
+
+    Args:
+        model: The description with its free numbers.
+        measurements: Measured poses.
+        loss: "cauchy" (the default), "huber", or "squares" (not robust).
+        sigma_position: Noise of a measured coordinate [m] to begin with; with too few data to
+            estimate it, it is taken as it is.
+        sigma_angle: The same of a measured angle [rad].
+
+    Raises:
+        UnknownNameError: No such loss.
+        InputError: A noise that is not positive.
+    """
+    if loss not in LOSSES:
+        raise UnknownNameError(f"loss: found {loss!r}, expected one of {', '.join(LOSSES)}")
+    for name, value in (("sigma_position", sigma_position), ("sigma_angle", sigma_angle)):
+        if not (math.isfinite(value) and value > 0):
+            raise InputError(f"{name}: found {value!r}, expected a number > 0")
+    fit = _Fit(model, measurements, LOSSES[loss])
+    noise = np.array([sigma_position, sigma_angle])
+    x = np.zeros(len(model.parameters))
+    before, _ = fit.misfit(x)
+    estimated = fit.enough()
+    converged, steps = False, 0
+    while not converged and steps < SETTINGS.max_iterations:
+        step = fit.step(x, noise)
+        x, last = x + step, noise
+        noise = fit.noise(x, last) if estimated else last
+        converged = bool(np.abs(step).max() < SETTINGS.smallest_step)
+        converged = converged and bool(np.allclose(noise, last, rtol=1e-4))
+        steps += 1
+    return fit.result(x, noise, estimated, before, steps, converged)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """The least-squares problem; x are the parameters' deviations in units of the priors."""
+
+    model: HandModel
+    measurements: Measurements
+    loss: Loss
+
+    def misfit(self, x: Array) -> tuple[Array, Array]:
+        """Errors (m, 6) [m, rad], 0 where not measured, and their Jacobian (m, 6, k) over x."""
+        seen, model = self.measurements, self.model
+        values = model.nominal + model.prior * x
+        errors = np.zeros((len(seen), 6))
+        jacobians = np.zeros((len(seen), 6, len(x)))
+        for finger in seen.measured_fingers:
+            rows = seen.rows(finger)
+            found = model.misfit(finger, seen.q[rows], values, seen.poses[rows])
+            errors[rows], jacobians[rows] = found[0], found[1] * model.prior
+        errors[~seen.turned, 3:] = 0.0
+        jacobians[~seen.turned, 3:] = 0.0
+        return errors, jacobians
+
+    def step(self, x: Array, noise: Array) -> Array:
+        """A Gauss-Newton step within the bounds, halved until the cost does not rise."""
+        errors, jacobians = self.misfit(x)
+        white, rho, _ = self.whitened(errors, noise)
+        roots = np.sqrt(self.loss.weight(rho))
+        # Stacked, not squared: with good data some directions are known a billion times better.
+        rows = np.vstack([_stacked(jacobians, noise, roots), np.eye(len(x))])
+        right = -np.concatenate([(roots[:, None] * white).ravel(), x])
+        lower, upper = self._bounds()
+        step = lsq_linear(rows, right, (lower - x, upper - x), method="bvls").x
+        start = self._cost(x, noise)
+        for _ in range(12):
+            if self._cost(x + step, noise) <= start * (1 + 1e-12):
+                break
+            step = 0.5 * step
+        return step
+
+    def whitened(self, errors: Array, noise: Array) -> tuple[Array, Array, Array]:
+        """Errors over the noise (m, 6), their root mean squares (m,) and numbers (m,)."""
+        white = errors / _each(noise)
+        numbers = np.where(self.measurements.turned, 6.0, 3.0)
+        return white, np.sqrt((white**2).sum(axis=1) / numbers), numbers
+
+    def enough(self) -> bool:
+        """Whether there are rows enough beyond what the parameters can explain."""
+        _, jacobians = self.misfit(np.zeros(len(self.model.parameters)))
+        rows = jacobians.reshape(-1, jacobians.shape[2])
+        return (
+            self._rows() - int(np.linalg.matrix_rank(rows, rtol=SETTINGS.unknown))
+            >= SETTINGS.fewest
+        )
+
+    def noise(self, x: Array, noise: Array) -> Array:
+        """Standard deviations from the medians of the misfits, which outliers hardly move."""
+        errors, jacobians = self.misfit(x)
+        _, rho, _ = self.whitened(errors, noise)
+        known, _ = self._known(jacobians, noise, self.loss.weight(rho))
+        free = 1 - _used(known) / self._rows()
+        turned = self.measurements.turned
+        position = np.median((errors[:, :3] ** 2).sum(axis=1))
+        estimate = [math.sqrt(position / CHI_SQUARE_MEDIAN / free), float(noise[1])]
+        if turned.any():
+            angle = np.median((errors[turned, 3:] ** 2).sum(axis=1))
+            estimate[1] = math.sqrt(angle / CHI_SQUARE_MEDIAN / free)
+        # Exact data have no noise; what is left of them is rounding.
+        return np.maximum(np.array(estimate), 1e-8)
+
+    def _rows(self) -> int:
+        """How many numbers were measured."""
+        return int(np.where(self.measurements.turned, 6, 3).sum())
+
+    def _known(self, jacobians: Array, noise: Array, weights: Array) -> tuple[Array, Array]:
+        """Singular values (k,) and directions (k, k) of the whitened, weighted Jacobian."""
+        rows = _stacked(jacobians, noise, np.sqrt(weights))
+        few = len(rows) < rows.shape[1]  # else the directions are complete without the rest of U
+        _, known, directions = np.linalg.svd(rows, full_matrices=few)
+        return np.concatenate([known, np.zeros(len(directions) - len(known))]), directions
+
+    def result(
+        self, x: Array, noise: Array, estimated: bool, before: Array, steps: int, converged: bool
+    ) -> Calibration:
+        """The estimate with all that is said about it; `estimated`: the noise is from the data."""
+        errors, jacobians = self.misfit(x)
+        _, rho, numbers = self.whitened(errors, noise)
+        weights = self.loss.weight(rho)
+        eye = np.eye(len(x))
+
+        def information(share: Array) -> Array:
+            rows = _stacked(jacobians, noise, np.sqrt(share))
+            return rows.T @ rows
+
+        # Sandwich of an M-estimator with a prior: curvature outside, variance of the score inside.
+        curved = _stacked(jacobians, noise, np.sqrt(self.loss.slope(weights, rho, numbers)))
+        _, sizes, turns = np.linalg.svd(np.vstack([curved, eye]), full_matrices=False)
+        outer = (turns.T / sizes**2) @ turns
+        known, directions = self._known(jacobians, noise, weights)
+        # Where there are too few data to see the scatter, the noise that was assumed stands for it.
+        scatter = (weights * rho) ** 2 / (1 - _used(known) / self._rows())
+        share = scatter if estimated else self.loss.slope(weights, rho, numbers)
+        inner = information(share) + eye
+        prior = self.model.prior
+        covariance = np.outer(prior, prior) * (outer @ inner @ outer)
+        turned = self.measurements.turned
+        return Calibration(
+            parameters=self.model.parameters,
+            values=self.model.nominal + prior * x,
+            covariance=0.5 * (covariance + covariance.T),
+            singular_values=known,
+            directions=directions,
+            weights=weights,
+            noise=(float(noise[0]), float(noise[1]) if turned.any() else math.nan),
+            noise_estimated=estimated,
+            before=_sizes(before, turned),
+            after=_sizes(errors, turned),
+            iterations=steps,
+            converged=converged,
+        )
+
+    def _cost(self, x: Array, noise: Array) -> float:
+        errors, _ = self.misfit(x)
+        _, rho, numbers = self.whitened(errors, noise)
+        return float((numbers * self.loss.cost(rho)).sum() + 0.5 * x @ x)
+
+    def _bounds(self) -> tuple[Array, Array]:
+        bounds = np.array([parameter.bounds for parameter in self.model.parameters])
+        scaled = (bounds - self.model.nominal[:, None]) / self.model.prior[:, None]
+        return scaled[:, 0], scaled[:, 1]
+
+
+def _stacked(jacobians: Array, noise: Array, roots: Array) -> Array:
+    """Whitened Jacobians (m, 6, k) as rows (6 m, k), each measurement times its root weight."""
+    scaled = jacobians * (roots[:, None] / _each(noise))[:, :, None]
+    return scaled.reshape(-1, jacobians.shape[2])
+
+
+def _used(known: Array) -> float:
+    """How many of the measured numbers the estimate follows, by its singular values."""
+    return float((known**2 / (known**2 + 1)).sum())
+
+
+def _each(noise: Array) -> Array:
+    return np.repeat(noise, 3)
+
+
+def _sizes(errors: Array, turned: NDArray[np.bool_]) -> Array:
+    angles = np.where(turned, np.linalg.norm(errors[:, 3:], axis=1), np.nan)
+    return np.column_stack([np.linalg.norm(errors[:, :3], axis=1), angles])
+
+
+TAG = "calibration"
+"""Source of the numbers that were estimated."""
+
+GRID = 201
+"""Positions per stroke at which a coupled joint's range is looked for."""
+
+MARGIN = 1e-3
+"""By which a widened joint limit lies beyond what the strokes allow [rad]."""
+
+
+def write_description(
+    calibration: Calibration, robot: str | Path, path: Path, origin: str = ""
+) -> None:
+    """Write the robot with its estimated numbers; the hand stands in the same file.
+
+    A joint limit that the calibrated couplings pass within their actuator's stroke is widened to
+    it, since such limits follow from the stroke.
+
+    Args:
+        calibration: The estimate.
+        robot: The robot it was made for, a shipped name or a path.
+        path: The file to write.
+        origin: Where the data are from, for the list of sources.
+
+    Raises:
+        InputError: The robot's joints are not described in our own files.
+        OSError: The file cannot be written.
+    """
+    top_path = resolve(robot, "arm_hands")
+    top = read_yaml(top_path)
+    if any(isinstance(part, dict) and "file" in part for part in top.values()):
+        raise InputError(
+            f"{top_path}: a calibrated robot is written joint by joint, but this one's joints are "
+            "in files of others"
+        )
+    if isinstance(top["hand"], str):
+        top["hand"] = read_yaml(resolve(top["hand"], "hands", beside=top_path))
+    if top.get("arm") is not None and Path(top["arm"]).suffix:
+        top["arm"] = str(resolve(top["arm"], "arms", beside=top_path).resolve())
+    hand = top["hand"]
+    hand["sources"][TAG] = (
+        f"Estimated from {len(calibration.weights)} measured fingertip poses{origin and ' in '}"
+        f"{origin}."
+    )
+    values = zip(calibration.parameters, calibration.values.tolist(), strict=True)
+    by_owner: dict[tuple[str, str], dict[str, float]] = {}
+    for parameter, value in values:
+        by_owner.setdefault((parameter.owner, parameter.part), {})[parameter.key] = value
+    joints = {joint["name"]: joint for joint in hand["joints"]}
+    for (owner, part), numbers in by_owner.items():
+        entry = joints[owner] if part in ("coupling", "origin", "axis") else hand["fingers"][owner]
+        _PARTS[part](entry, numbers)
+        if TAG not in entry["source"].split():
+            entry["source"] += f" {TAG}"
+    _write(top, path)
+    _widen(joints, {owner for (owner, part) in by_owner if part == "coupling"}, path)
+    _write(top, path)
+
+
+def _coupling(entry: dict[str, Any], numbers: dict[str, float]) -> None:
+    entry["coupling"] |= numbers
+
+
+def _origin(entry: dict[str, Any], numbers: dict[str, float]) -> None:
+    entry["origin"] = entry.get("origin", {}) | {"xyz": [numbers[key] for key in "xyz"]}
+
+
+def _axis(entry: dict[str, Any], numbers: dict[str, float]) -> None:
+    axis = np.asarray(entry["axis"], dtype=float)
+    turned = tilted(axis / np.linalg.norm(axis), ca.DM([numbers["1"], numbers["2"]]))
+    entry["axis"] = np.array(turned).ravel().tolist()
+
+
+def _tip(entry: dict[str, Any], numbers: dict[str, float]) -> None:
+    entry["xyz"] = [numbers[key] for key in "xyz"]
+
+
+def _turn(entry: dict[str, Any], numbers: dict[str, float]) -> None:
+    before = frame_matrix(Frame(rpy=tuple(entry.get("rpy", (0.0, 0.0, 0.0)))))[:3, :3]
+    after = ca.DM(before) @ exp_so3(ca.DM([numbers[key] for key in "xyz"]))
+    entry["rpy"] = np.array(matrix_to_rpy(after)).ravel().tolist()
+
+
+_PARTS = {"coupling": _coupling, "origin": _origin, "axis": _axis, "tip": _tip, "turn": _turn}
+
+
+def _widen(joints: dict[str, dict[str, Any]], names: set[str], path: Path) -> None:
+    """Let the limits of some coupled joints include what their actuators' strokes allow."""
+    robot = load_description(path)
+    q = ca.SX.sym("q", len(robot.actuators))
+    positions = ca.Function("joints", [q], [joint_positions(robot, q)])
+    # A triangle or a four-bar hangs on one actuator, so all strokes can be gone through at once.
+    strokes = np.linspace(*robot.strokes, GRID)
+    ranges = np.array(positions(strokes.T))
+    for joint, values in zip(robot.movable, ranges, strict=True):
+        if joint.name in names and joint.coupling is not None and joint.coupling.slope is None:
+            low, high = float(values.min()), float(values.max())
+            joints[joint.name]["limits"] = [
+                joint.lower if low >= joint.lower else low - MARGIN,
+                joint.upper if high <= joint.upper else high + MARGIN,
+            ]
+
+
+def _write(data: dict[str, Any], path: Path) -> None:
+    text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)
+    path.write_text(text, encoding="utf-8")

@@ -1,0 +1,235 @@
+"""Measured fingertip poses: from a CSV file, from arrays, or simulated with noise and outliers."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.compile import FunctionKernel
+from casadi_ik.errors import InputError
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics import dual_quaternion as dq
+from casadi_ik.kinematics.screws import finger_chain
+from casadi_ik.model.description import RobotDescription
+from casadi_ik.papers.chandra.calibration.model import HandModel
+
+POINT = ("x", "y", "z")
+TURN = ("qw", "qx", "qy", "qz")
+
+STROKE_SLACK = 1e-3
+"""Part of its range by which a reading may lie beyond an actuator's limits."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """Fingertips seen at known actuator positions.
+
+    Attributes:
+        fingers: (m,) name of the finger of each row.
+        q: (m, n) actuator positions [rad or m]; home where an actuator does not move the finger.
+        poses: (m, 8) unit dual quaternions of the contact frames in the base frame.
+        turned: (m,) whether the orientation was measured too.
+    """
+
+    fingers: tuple[str, ...]
+    q: Array
+    poses: Array
+    turned: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.fingers)
+
+    @property
+    def measured_fingers(self) -> tuple[str, ...]:
+        """The fingers that were measured, each once."""
+        return tuple(dict.fromkeys(self.fingers))
+
+    def rows(self, finger: str) -> NDArray[np.intp]:
+        """Which rows are of a finger."""
+        return np.flatnonzero([name == finger for name in self.fingers])
+
+
+def read_measurements(path: Path, robot: RobotDescription) -> Measurements:
+    """Read a CSV file.
+
+    The header names the columns: ``finger``, the actuators that move the measured fingers [rad or
+    m], ``x, y, z`` [m] of the contact point and, if the orientation was measured, the contact
+    frame's unit quaternion ``qw, qx, qy, qz``; all in the robot's base frame. The quaternion may be
+    left empty in a row.
+
+    Args:
+        path: The file.
+        robot: The robot it is about.
+
+    Raises:
+        InputError: It cannot be read, or holds what cannot be; the message names line and column.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            lines = [(i, row) for i, row in enumerate(csv.reader(stream, strict=True), 1) if row]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        reason = error.strerror if isinstance(error, OSError) else f"not CSV text: {error}"
+        raise InputError(f"{path}: cannot be read: {reason}") from error
+    if len(lines) < 2:
+        raise InputError(f"{path}: holds no measurements, expected a header and rows")
+    header = [name.strip() for name in lines[0][1]]
+    _check_header(header, robot, path)
+    moving = {name: finger_chain(robot, name).actuators for name in robot.finger_names}
+    rows = [_row(line, header, cells, robot, moving, path) for line, cells in lines[1:]]
+    return Measurements(
+        tuple(row[0] for row in rows),
+        np.array([row[1] for row in rows]),
+        np.array([row[2] for row in rows]),
+        np.array([row[3] for row in rows]),
+    )
+
+
+def write_measurements(measurements: Measurements, robot: RobotDescription, path: Path) -> None:
+    """Write a CSV file that `read_measurements` reads.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    with path.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(["finger", *robot.actuator_names, *POINT, *TURN])
+        rows = zip(
+            measurements.fingers,
+            measurements.q,
+            measurements.poses,
+            measurements.turned,
+            strict=True,
+        )
+        for finger, q, pose, turned in rows:
+            point = np.array(dq.translation(ca.DM(pose))).ravel()
+            turn = pose[:4].tolist() if turned else [""] * 4
+            writer.writerow([finger, *q.tolist(), *point.tolist(), *turn])
+
+
+def _check_header(header: Sequence[str], robot: RobotDescription, path: Path) -> None:
+    known = ("finger", *POINT, *TURN, *robot.actuator_names)
+    where = f"{path}:1"
+    for name in header:
+        if name not in known:
+            raise InputError(f"{where}: unknown column {name!r}; known: {', '.join(known)}")
+        if header.count(name) > 1:
+            raise InputError(f"{where}: column {name!r} appears twice")
+    for name in ("finger", *POINT):
+        if name not in header:
+            raise InputError(f"{where}: column {name!r} is missing")
+    turn = [name for name in TURN if name in header]
+    if turn and len(turn) < 4:
+        raise InputError(f"{where}: found {', '.join(turn)}, expected all or none of qw,qx,qy,qz")
+
+
+def _row(
+    line: int,
+    header: Sequence[str],
+    cells: Sequence[str],
+    robot: RobotDescription,
+    moving: Mapping[str, tuple[int, ...]],
+    path: Path,
+) -> tuple[str, Array, Array, bool]:
+    if len(cells) != len(header):
+        raise InputError(f"{path}:{line}: found {len(cells)} columns, the header has {len(header)}")
+    row = {name: cell.strip() for name, cell in zip(header, cells, strict=True)}
+    finger = row["finger"]
+    if finger not in robot.finger_names:
+        raise InputError(
+            f"{path}:{line}: finger: found {finger!r}, expected one of "
+            + ", ".join(robot.finger_names)
+        )
+
+    def number(column: str) -> float:
+        try:
+            value = float(row[column])
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise InputError(
+                f"{path}:{line}: {column}: found {row[column]!r}, expected a finite number"
+            )
+        return value
+
+    q = robot.home.copy()
+    for index in moving[finger]:
+        actuator = robot.actuators[index]
+        if actuator.name not in row:
+            raise InputError(f"{path}:1: column {actuator.name!r} is missing; it moves {finger!r}")
+        value, slack = number(actuator.name), STROKE_SLACK * (actuator.upper - actuator.lower)
+        if not actuator.lower - slack <= value <= actuator.upper + slack:
+            raise InputError(
+                f"{path}:{line}: {actuator.name}: found {value:g}, expected within "
+                f"[{actuator.lower:g}, {actuator.upper:g}] {actuator.unit}"
+            )
+        q[index] = value
+    point = np.array([number(column) for column in POINT])
+    turned = any(row.get(column) for column in TURN)
+    turn = np.array([number(column) for column in TURN]) if turned else np.array([1.0, 0, 0, 0])
+    length = float(np.linalg.norm(turn))
+    if abs(length - 1) > 1e-2:
+        raise InputError(f"{path}:{line}: qw..qz: found length {length:.4g}, expected 1")
+    pose = dq.from_quaternion(ca.DM(turn / length), ca.DM(point))
+    return finger, q, np.array(pose).ravel(), turned
+
+
+def true_values(model: HandModel, rng: np.random.Generator) -> Array:
+    """(k,) parameters of a hand that the description's priors could mean.
+
+    Args:
+        model: The model; deviations are normal with its priors, cut at 2.5 of them.
+        rng: Source of the deviations.
+    """
+    deviations = np.clip(rng.standard_normal(len(model.prior)), -2.5, 2.5)
+    return model.nominal + model.prior * deviations
+
+
+def simulate(
+    model: HandModel,
+    values: Array,
+    finger: str,
+    count: int,
+    rng: np.random.Generator,
+    *,
+    noise: tuple[float, float] = (2e-4, np.deg2rad(0.5)),
+    outliers: float = 0.0,
+    factor: float = 20.0,
+) -> Measurements:
+    """Poses of a fingertip at random actuator positions, with noise.
+
+    Args:
+        model: The model.
+        values: (k,) its true parameters.
+        finger: The finger that is measured.
+        count: How many poses.
+        rng: Source of positions and noise.
+        noise: Standard deviations of a coordinate [m] and of an angle [rad].
+        outliers: Part of the poses whose noise is `factor` times as large.
+        factor: See `outliers`.
+    """
+    robot = model.robot
+    columns = list(finger_chain(robot, finger).actuators)
+    q = np.tile(robot.home, (count, 1))
+    q[:, columns] = rng.uniform(robot.lower[columns], robot.upper[columns], (count, len(columns)))
+    scale = np.where(rng.random(count) < outliers, factor, 1.0)[:, None]
+    shifts = noise[0] * scale * rng.standard_normal((count, 3))
+    turns = noise[1] * scale * rng.standard_normal((count, 3))
+    (seen,) = _displaced()(model.poses(finger, q, values), turns, shifts)
+    return Measurements((finger,) * count, q, seen, np.ones(count, dtype=bool))
+
+
+@cache
+def _displaced() -> FunctionKernel:
+    """A pose turned about its own point and shifted, both in the base frame."""
+    pose, turn, shift = ca.SX.sym("pose", 8), ca.SX.sym("turn", 3), ca.SX.sym("shift", 3)
+    turned = dq.quaternion_multiply(dq.exp(turn, ca.DM.zeros(3, 1))[:4], pose[:4])
+    moved = dq.from_quaternion(turned, dq.translation(pose) + shift)
+    return FunctionKernel(ca.Function("displaced_pose", [pose, turn, shift], [moved]))

@@ -1,0 +1,271 @@
+"""A hand whose dimensions are symbols: numbers with priors, and fingertip poses over them.
+
+The same graphs as everywhere: eq. (8) for the triangles, eq. (9) for the four-bars, eq. (3) for the
+chain (Chandra et al. 2019), with the description's numbers as inputs. A four-bar keeps the branch
+of its known pose.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from casadi_ik.compile import FunctionKernel
+from casadi_ik.errors import InputError
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics import dual_quaternion as dq
+from casadi_ik.kinematics.couplings import follow
+from casadi_ik.kinematics.se3 import exp_so3, perpendicular
+from casadi_ik.kinematics.smooth import Expr, shared
+from casadi_ik.model.description import RobotDescription
+from casadi_ik.model.joints import Joint
+
+GROUPS = ("linkage", "axes", "tips")
+"""Numbers of the couplings; origins and directions of the joint axes; contact frames."""
+
+BOUND = 3.0
+"""Estimates stay within so many prior standard deviations of the description."""
+
+
+@dataclass(frozen=True)
+class Priors:
+    """How far the description may be off: standard deviations.
+
+    Attributes:
+        length: Sides of triangles and four-bars [m].
+        angle: Reference angles of the couplings [rad].
+        origin: Every coordinate of a point of a joint axis [m].
+        axis: Tilts of a joint axis [rad].
+        tip: Every coordinate of a contact point [m].
+        tip_angle: Turns of a contact frame [rad].
+    """
+
+    length: float = 0.5e-3
+    angle: float = math.radians(2.0)
+    origin: float = 1e-3
+    axis: float = math.radians(1.0)
+    tip: float = 1e-3
+    tip_angle: float = math.radians(2.0)
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not (math.isfinite(value) and value > 0):
+                raise InputError(f"priors.{name}: found {value!r}, expected a number > 0")
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number that is estimated.
+
+    Attributes:
+        owner: The joint or finger it belongs to.
+        part: "coupling", "origin", "axis", "tip" or "turn".
+        key: Which number: a field of the coupling, "x", "y", "z", or the tilt "1", "2".
+        nominal: What the description says; 0 for tilts and turns.
+        prior: Standard deviation.
+        unit: "m" or "rad".
+    """
+
+    owner: str
+    part: str
+    key: str
+    nominal: float
+    prior: float
+    unit: str
+
+    @property
+    def name(self) -> str:
+        """What it is called."""
+        if self.part == "coupling":
+            return f"{self.owner}.{self.key}"
+        return f"{self.owner}.{self.part}.{self.key}"
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Least and largest value."""
+        return self.nominal - BOUND * self.prior, self.nominal + BOUND * self.prior
+
+
+def hand_parameters(
+    robot: RobotDescription,
+    fingers: Sequence[str],
+    groups: Sequence[str] = GROUPS,
+    priors: Priors | None = None,
+) -> tuple[Parameter, ...]:
+    """The numbers of some fingers, from the palm to the tips, each once.
+
+    Args:
+        robot: The description.
+        fingers: Fingers that were measured.
+        groups: Which kinds of numbers.
+        priors: How far they may be off.
+
+    Raises:
+        UnknownNameError: There is no such finger.
+        InputError: No fingers, or an unknown group.
+    """
+    unknown = [group for group in groups if group not in GROUPS]
+    if unknown or not groups:
+        wrong = repr(unknown[0]) if unknown else "nothing"
+        raise InputError(f"groups: found {wrong}, expected some of {', '.join(GROUPS)}")
+    if not fingers:
+        raise InputError("fingers: none, expected at least one")
+    spread = priors or Priors()
+    rows: list[tuple[str, str, str, float, float, str]] = []
+    for finger in fingers:
+        chain = robot.chain(robot.finger(finger).link)
+        for joint in (j for j in chain if j.type != "fixed" and j.part == "hand"):
+            name, coupling = joint.name, joint.coupling
+            if "linkage" in groups and coupling is not None:
+                for keys, prior, unit in (
+                    (coupling.lengths, spread.length, "m"),
+                    (coupling.angles, spread.angle, "rad"),
+                ):
+                    for key in keys:
+                        value = float(getattr(coupling, key))
+                        rows.append((name, "coupling", key, value, prior, unit))
+            if "axes" in groups:
+                at = zip("xyz", joint.placement[:3, 3].tolist(), strict=True)
+                rows += [(name, "origin", key, value, spread.origin, "m") for key, value in at]
+                rows += [(name, "axis", key, 0.0, spread.axis, "rad") for key in "12"]
+        if "tips" in groups:
+            at = zip("xyz", robot.finger(finger).placement[:3, 3].tolist(), strict=True)
+            rows += [(finger, "tip", key, value, spread.tip, "m") for key, value in at]
+            rows += [(finger, "turn", key, 0.0, spread.tip_angle, "rad") for key in "xyz"]
+    return tuple({one.name: one for one in (Parameter(*row) for row in rows)}.values())
+
+
+@dataclass(frozen=True, eq=False)
+class HandModel:
+    """A description with some of its numbers free.
+
+    Attributes:
+        robot: The description.
+        parameters: The free numbers, in the order of every (k,) vector of values.
+        compiled: Whether to compile the graphs.
+    """
+
+    robot: RobotDescription
+    parameters: tuple[Parameter, ...]
+    compiled: bool = True
+
+    @cached_property
+    def nominal(self) -> Array:
+        """(k,) what the description says."""
+        return np.array([parameter.nominal for parameter in self.parameters])
+
+    @cached_property
+    def prior(self) -> Array:
+        """(k,) standard deviations of the priors."""
+        return np.array([parameter.prior for parameter in self.parameters])
+
+    def poses(self, finger: str, q: Array, values: Array) -> Array:
+        """Fingertip poses.
+
+        Args:
+            finger: The finger.
+            q: (m, n) actuator positions [rad or m].
+            values: (k,) of the parameters.
+
+        Returns:
+            (m, 8) unit dual quaternions in the base frame.
+        """
+        (poses,) = self._kernel(finger, "pose")(q, values)
+        return poses
+
+    def misfit(self, finger: str, q: Array, values: Array, measured: Array) -> tuple[Array, Array]:
+        """What the model misses of measured poses, and how the parameters move it.
+
+        Args:
+            finger: The finger.
+            q: (m, n) actuator positions.
+            values: (k,) of the parameters.
+            measured: (m, 8) unit dual quaternions in the base frame.
+
+        Returns:
+            error (m, 6), point of the model minus the measured one [m] and rotation vector from
+            measured to model [rad], and its Jacobian (m, 6, k).
+        """
+        error, jacobian = self._kernel(finger, "misfit")(q, values, measured)
+        return error, jacobian.reshape(len(error), 6, len(values))
+
+    def _kernel(self, finger: str, kind: str) -> FunctionKernel:
+        key = (finger, kind)
+        if key not in self._kernels:
+            q = ca.SX.sym("q", len(self.robot.actuators))
+            p = ca.SX.sym("p", len(self.parameters))
+            pose = self._pose(finger, q, p)
+            name = ca.Function.fix_name(f"calibrate_{kind}_{self.robot.name}_{finger}")
+            if kind == "pose":
+                function = ca.Function(name, [q, p], shared(ca.densify(pose)))
+            else:
+                seen = ca.SX.sym("measured", 8)
+                turn, _ = dq.log(dq.error(pose, seen))
+                error = ca.vertcat(dq.translation(pose) - dq.translation(seen), turn)
+                outputs = shared(error, ca.densify(ca.jacobian(error, p)))
+                function = ca.Function(name, [q, p, seen], outputs)
+            self._kernels[key] = FunctionKernel(function, self.compiled)
+        return self._kernels[key]
+
+    @cached_property
+    def _kernels(self) -> dict[tuple[str, str], FunctionKernel]:
+        return {}
+
+    def _pose(self, finger: str, q: ca.SX, p: ca.SX) -> Expr:
+        """The product of the joints' screws, each joint's frame placed in its parent's."""
+        symbols = {parameter.name: p[i] for i, parameter in enumerate(self.parameters)}
+        positions = {name: q[i] for i, name in enumerate(self.robot.actuator_names)}
+        joints = {joint.name: joint for joint in self.robot.movable}
+
+        def position(name: str) -> Expr:
+            if name not in positions:
+                joint = joints[name]
+                source = position(joint.coupling.of)  # type: ignore[union-attr]
+                positions[name] = follow(joint, source, _Numbers(joint, symbols))
+            return positions[name]
+
+        entry = self.robot.finger(finger)
+        pose: Expr = dq.identity()
+        for joint in self.robot.chain(entry.link):
+            origin = _vector(symbols, joint.name, "origin", joint.placement[:3, 3])
+            pose = dq.multiply(pose, dq.from_pose(ca.DM(joint.placement[:3, :3]), origin))
+            if joint.type == "fixed":
+                continue
+            axis = tilted(joint.axis, _vector(symbols, joint.name, "axis", np.zeros(2)))
+            value = position(joint.name)
+            angle, distance = (value, 0.0) if joint.type == "revolute" else (0.0, value)
+            moved = dq.exp_screw(angle, distance, axis, ca.DM.zeros(3, 1))
+            pose = dq.multiply(pose, moved)
+        point = _vector(symbols, finger, "tip", entry.placement[:3, 3])
+        placed = dq.from_pose(ca.DM(entry.placement[:3, :3]), point)
+        turn = _vector(symbols, finger, "turn", np.zeros(3))
+        return dq.multiply(dq.multiply(pose, placed), dq.exp(turn, ca.DM.zeros(3, 1)))
+
+
+def tilted(axis: Array, tilts: Expr) -> Expr:
+    """A unit axis (3,) turned by the rotation vector of two tilts (2, 1) [rad] across it."""
+    first = perpendicular(ca.DM(axis.tolist()))
+    across = ca.horzcat(first, ca.cross(ca.DM(axis.tolist()), first))
+    return exp_so3(across @ tilts) @ ca.DM(axis.tolist())
+
+
+class _Numbers:
+    """The numbers of a joint's coupling, symbols where they are free."""
+
+    def __init__(self, joint: Joint, symbols: dict[str, Expr]) -> None:
+        self._joint, self._symbols = joint, symbols
+
+    def __getattr__(self, key: str) -> Expr:
+        return self._symbols.get(f"{self._joint.name}.{key}", getattr(self._joint.coupling, key))
+
+
+def _vector(symbols: dict[str, Expr], owner: str, part: str, nominal: Array) -> Expr:
+    """A vector whose entries are symbols where they are free."""
+    keys: Sequence[str] = "12" if part == "axis" else "xyz"
+    pairs = zip(keys, nominal, strict=True)
+    return ca.vertcat(*(symbols.get(f"{owner}.{part}.{key}", float(value)) for key, value in pairs))

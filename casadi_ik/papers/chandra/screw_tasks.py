@@ -1,0 +1,354 @@
+"""What a fingertip is to do, as rows that go to zero: a whole pose, or only what matters.
+
+Chandra et al. 2019 control the whole pose, six rows for the two to four coordinates of a hand, and
+name task-specific Jacobians as future work. Here every objective reads the same tip motion, seen
+from the base or from another fingertip, and takes from it the rows that the task asks for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from casadi_ik.compile import Field, Layout, StepGraph
+from casadi_ik.errors import InputError, UnknownNameError
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics import dual_quaternion as dq
+from casadi_ik.kinematics.box_qp import Bounded, damped_step
+from casadi_ik.kinematics.linear_algebra import singular_values
+from casadi_ik.kinematics.screws import TipChain, TipMotion, finger_chain, relative_chain
+from casadi_ik.kinematics.se3 import normal_error, perpendicular
+from casadi_ik.kinematics.smooth import Expr, safe_norm, shared
+from casadi_ik.model.description import RobotDescription
+from casadi_ik.solve.limits import coupling_fields, coupling_values, kept_within, limit_mask
+from casadi_ik.solve.status import Status
+from casadi_ik.solve.trace import LIMIT_MASK, STATUS, STEP_SIZE, Q
+
+
+@dataclass(frozen=True)
+class ScrewTask:
+    """Desired motion of a fingertip.
+
+    Attributes:
+        kind: "pose", "position", "planar-pose" (position in a plane and angle about its normal),
+            "distance" (of the two tips) or "contact" (point and outward pad normal).
+        finger: The finger that is controlled.
+        relative_to: The finger whose contact frame the target is given in, and which moves as
+            well; None is the robot's base.
+        axis: Normal of the plane of "planar-pose", in the frame of the target; None is the axis of
+            the finger's last joint, with all joints at zero.
+
+    Example:
+        >>> ik.papers.ScrewTask("distance", "thumb", relative_to="finger_2").kind
+        'distance'
+    """
+
+    kind: str
+    finger: str
+    relative_to: str | None = None
+    axis: tuple[float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.kind not in OBJECTIVES:
+            raise UnknownNameError(
+                f"task: unknown kind {self.kind!r}; expected one of {', '.join(OBJECTIVES)}"
+            )
+        if self.kind == "distance" and self.relative_to is None:
+            raise InputError("task 'distance': relative_to: missing, expected the other finger")
+        if self.axis is not None and not np.linalg.norm(self.axis) > 0:
+            raise InputError(f"task {self.kind!r}: axis: found {self.axis}, expected a direction")
+
+    def chain(self, robot: RobotDescription) -> TipChain:
+        """The screws between the frame of the target and the tip.
+
+        Raises:
+            UnknownNameError: There is no such finger.
+            InputError: The finger is to be controlled relative to itself.
+        """
+        if self.relative_to is None:
+            return finger_chain(robot, self.finger)
+        return relative_chain(robot, self.relative_to, self.finger)
+
+    @property
+    def target_fields(self) -> tuple[Field, ...]:
+        """What a target consists of."""
+        return OBJECTIVES[self.kind].target
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """An objective at a configuration.
+
+    Attributes:
+        error: (m, 1) what is left, desired minus current [m, rad].
+        jacobian: (m, k) over the tip's actuators.
+        linear: How many of the rows, the first ones, are lengths [m]; the rest are angles [rad].
+    """
+
+    error: Expr
+    jacobian: Expr
+    linear: int
+
+
+@dataclass(frozen=True, eq=False)
+class Tip:
+    """What the objectives read of a tip.
+
+    Attributes:
+        motion: The tip's screws.
+        normal: (3,) outward pad normal in the contact frame.
+        axis: (3,) unit normal of the plane, in the frame of the target.
+    """
+
+    motion: TipMotion
+    normal: ca.DM
+    axis: ca.DM
+
+    @property
+    def point(self) -> Expr:
+        """(3, 1) contact point [m]."""
+        return dq.translation(self.motion.pose)
+
+    @property
+    def angular(self) -> Expr:
+        """(3, k) angular velocity per unit rate."""
+        return self.motion.jacobian[3:, :]
+
+    @property
+    def linear(self) -> Expr:
+        """(3, k) velocity of the contact point per unit rate: v + w x p of the screws."""
+        columns = ca.horzsplit(self.motion.jacobian)
+        return ca.horzcat(*(twist[:3] + ca.cross(twist[3:], self.point) for twist in columns))
+
+    @property
+    def normal_now(self) -> Expr:
+        """(3, 1) pad normal in the frame of the target."""
+        return dq.rotate(self.motion.pose, self.normal)
+
+
+def rows(task: ScrewTask, robot: RobotDescription, q: Expr, target: dict[str, Expr]) -> Rows:
+    """A task's rows at q (n, 1) for a target given as the task's target fields."""
+    return OBJECTIVES[task.kind].rows(tip(task, robot, q), target)
+
+
+def values(task: ScrewTask, robot: RobotDescription, q: Expr) -> dict[str, Expr]:
+    """The target that q (n, 1) fulfils, as the task's target fields."""
+    seen = tip(task, robot, q)
+    every = {
+        "pose": seen.motion.pose,
+        "point": seen.point,
+        "normal": seen.normal_now,
+        "distance": safe_norm(seen.point),
+    }
+    return {field.name: every[field.name] for field in task.target_fields}
+
+
+def tip(task: ScrewTask, robot: RobotDescription, q: Expr) -> Tip:
+    """What the objectives read of the task's fingertip, the actuators at q (n, 1)."""
+    chain = task.chain(robot)
+    axis = chain.chain.screws[-1].direction if task.axis is None else np.asarray(task.axis, float)
+    normal = robot.finger(task.finger).normal
+    return Tip(chain.at(q), ca.DM(normal.tolist()), ca.DM((axis / np.linalg.norm(axis)).tolist()))
+
+
+def _pose(tip: Tip, target: dict[str, Expr]) -> Rows:
+    """All six, the paper's: -log of the error, the twist that eq. (14) asks for."""
+    w, v = dq.control_twist(dq.error(tip.motion.pose, target["pose"]), 1.0)
+    return Rows(ca.vertcat(v, w), tip.motion.jacobian, 3)
+
+
+def _position(tip: Tip, target: dict[str, Expr]) -> Rows:
+    return Rows(target["point"] - tip.point, tip.linear, 3)
+
+
+def _planar_pose(tip: Tip, target: dict[str, Expr]) -> Rows:
+    """Two coordinates in the plane, and the turn about its normal.
+
+    The turn's row is exact where the tip turns about that normal alone, as a finger with parallel
+    axes does; elsewhere it is an approximation that still vanishes at the target.
+    """
+    first = perpendicular(tip.axis)
+    plane = ca.horzcat(first, ca.cross(tip.axis, first)).T
+    w, _ = dq.control_twist(dq.error(tip.motion.pose, target["pose"]), 1.0)
+    return Rows(
+        ca.vertcat(plane @ (dq.translation(target["pose"]) - tip.point), ca.dot(tip.axis, w)),
+        ca.vertcat(plane @ tip.linear, tip.axis.T @ tip.angular),
+        2,
+    )
+
+
+def _distance(tip: Tip, target: dict[str, Expr]) -> Rows:
+    length = safe_norm(tip.point)
+    return Rows(target["distance"] - length, (tip.point / length).T @ tip.linear, 1)
+
+
+def _contact(tip: Tip, target: dict[str, Expr]) -> Rows:
+    """Point and normal; turning about the normal is free."""
+    normal = tip.normal_now
+    turning = tip.angular - normal @ (normal.T @ tip.angular)
+    return Rows(
+        ca.vertcat(target["point"] - tip.point, normal_error(normal, target["normal"])),
+        ca.vertcat(tip.linear, turning),
+        3,
+    )
+
+
+@dataclass(frozen=True)
+class Objective:
+    """How a kind of task is written.
+
+    Attributes:
+        target: Fields of its target.
+        rows: Its rows, from a tip and the target's values.
+    """
+
+    target: tuple[Field, ...]
+    rows: Callable[[Tip, dict[str, Expr]], Rows]
+
+
+POSE = Field("pose", (8,), doc="desired pose of the tip, unit dual quaternion")
+POINT = Field("point", (3,), unit="m", doc="desired contact point")
+NORMAL = Field("normal", (3,), doc="desired outward pad normal, unit")
+DISTANCE = Field("distance", unit="m", doc="desired distance of the two contact points")
+
+OBJECTIVES = {
+    "pose": Objective((POSE,), _pose),
+    "position": Objective((POINT,), _position),
+    "planar-pose": Objective((POSE,), _planar_pose),
+    "distance": Objective((DISTANCE,), _distance),
+    "contact": Objective((POINT, NORMAL), _contact),
+}
+"""The kinds of tasks."""
+
+
+PASSES = 6
+"""Corrections of the active set; a hand has few sliders."""
+
+
+@dataclass(frozen=True, eq=False)
+class ScrewControlStep:
+    """The step of one task on one robot.
+
+    Attributes:
+        robot: The description.
+        task: What the tip is to do.
+    """
+
+    robot: RobotDescription
+    task: ScrewTask
+
+    @cached_property
+    def state(self) -> Layout:
+        """What a step hands to the next."""
+        return Layout((Field("q", (len(self.robot.actuators),)),))
+
+    @cached_property
+    def parameters(self) -> Layout:
+        """Target and numbers of the law."""
+        n = len(self.robot.actuators)
+        return Layout(
+            (
+                *self.task.target_fields,
+                Field("gain", doc="part of the error that a step is to remove"),
+                Field("damping", doc="unit of a singular value of J over half ranges"),
+                Field("centring", doc="part of the way to mid-range that z is"),
+                Field("length", unit="m", doc="length that counts as much as a radian"),
+                Field("largest_step", (n,), unit="rad or m"),
+                Field("resolution", (n,), unit="rad or m", doc="0: none"),
+                Field("tolerance", doc="error norm below which the loop ends"),
+            )
+        )
+
+    @cached_property
+    def record(self) -> Layout:
+        """What is logged of a step; everything but `step_size` is from before it."""
+        return Layout.record(
+            Q.of(self.robot),
+            Field("point", (3,), "f8", "m", "contact point in the frame of the target"),
+            Field("error", (self._graph_rows,), "f8", "m, rad", "rows of the task"),
+            Field("error_norm", (), "f8", "", "norm of the rows; of a pose Chandra eq. (17)"),
+            STEP_SIZE.of(self.robot, "largest actuator change of this step"),
+            Field("sigma_task", (), "f4", "", "smallest singular value of the scaled Jacobian"),
+            *coupling_fields(self.robot),
+            LIMIT_MASK.of(self.robot),
+            STATUS.of(self.robot),
+        )
+
+    @cached_property
+    def _graph_rows(self) -> int:
+        q, target = self._symbols()
+        return rows(self.task, self.robot, q, target).error.numel()
+
+    def _symbols(self) -> tuple[ca.SX, dict[str, ca.SX]]:
+        layout = Layout(self.task.target_fields)
+        return ca.SX.sym("q", len(self.robot.actuators)), layout.unpack(layout.symbols("target"))
+
+    @cached_property
+    def target_function(self) -> ca.Function:
+        """The target that q fulfils: (q) -> fields of the task's target, in order."""
+        q, _ = self._symbols()
+        fulfilled = values(self.task, self.robot, q)
+        name = ca.Function.fix_name(f"screw_target_{self.robot.name}")
+        return ca.Function(name, [q], [ca.densify(value) for value in fulfilled.values()])
+
+    def graph(self) -> StepGraph:
+        """The whole step."""
+        state, parameters = self.state.symbols("state"), self.parameters.symbols("parameters")
+        q, p = self.state.unpack(state)["q"], self.parameters.unpack(parameters)
+        seen = tip(self.task, self.robot, q)
+        moving = list(seen.motion.tip.actuators)
+        objective = rows(self.task, self.robot, q, p)
+
+        lower, upper = self.robot.lower[moving], self.robot.upper[moving]
+        half, middle = ca.DM(0.5 * (upper - lower)), ca.DM(0.5 * (lower + upper))
+        count = objective.error.numel()
+        linear = objective.linear
+        weights = ca.vertcat(*[1 / p["length"]] * linear, *[1.0] * (count - linear))
+        jacobian = objective.jacobian * (weights @ half.T)
+        reach = p["largest_step"][moving]
+        low = ca.fmax(ca.DM(lower) - q[moving], -reach) / half
+        high = ca.fmin(ca.DM(upper) - q[moving], reach) / half
+        # z itself has to lie in the box: the problem is posed in s - z, which starts at 0.
+        z = ca.fmin(ca.fmax(p["centring"] * (middle - q[moving]) / half, low), high)
+        demand = p["gain"] * weights * objective.error
+        box = Bounded(z, low, high, first=0)
+        step = z + damped_step(jacobian, jacobian @ z - demand, p["damping"] ** 2, box, PASSES).step
+
+        moved = ca.SX(q)
+        moved[moving] = q[moving] + half * step
+        grid = p["resolution"]
+        spacing = ca.if_else(grid > 0, grid, 1.0)
+        start = ca.DM(self.robot.lower.tolist())
+        rounded = start + spacing * ca.floor((moved - start) / spacing + 0.5)
+        q_next = kept_within(self.robot, ca.if_else(grid > 0, rounded, moved), 1.0)
+
+        error_norm = safe_norm(objective.error)
+        reached = error_norm <= p["tolerance"]
+        status = ca.if_else(reached, float(Status.SOLVED), float(Status.RUNNING))
+        after = self.state.pack({"q": ca.if_else(reached, q, q_next)})
+        record = self.record.pack(
+            {
+                "q": q,
+                "point": seen.point,
+                "error": objective.error,
+                "error_norm": error_norm,
+                "step_size": ca.mmax(ca.fabs(q_next - q)),
+                "sigma_task": ca.mmin(singular_values(jacobian)),
+                **coupling_values(self.robot, q),
+                "limit_mask": limit_mask(self.robot, q),
+                "status": status,
+            }
+        )
+        kind = self.task.kind.replace("-", "_")
+        name = ca.Function.fix_name(f"screw_control_{kind}_{self.robot.name}")
+        function = ca.Function(name, [state, parameters], shared(after, record, status))
+        return StepGraph(name, function, self.state, self.parameters, self.record)
+
+    def parameter_vector(self, target: dict[str, Any], numbers: dict[str, Any]) -> Array:
+        """Parameters (np,) of a target and the law's numbers."""
+        return self.parameters.pack({**target, **numbers})

@@ -1,0 +1,1 @@
+"""Choice among grasps, and grasps of object surfaces."""

@@ -1,0 +1,589 @@
+"""Grasps of a surface that an arm-hand can make, ranked: see `Solver.grasps_of`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, overload
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from casadi_ik.collision.scene import Scene
+from casadi_ik.errors import InputError
+from casadi_ik.files.arrays import Array
+from casadi_ik.files.progress import progress
+from casadi_ik.kinematics.arm_hand import ArmHand
+from casadi_ik.model.grasp import Contact, Grasp, Tolerance
+from casadi_ik.model.pose import inverse, one_pose
+from casadi_ik.planning.touch.candidates import (
+    Candidates,
+    Generator,
+    HandCheck,
+    TouchParameters,
+    touching,
+)
+from casadi_ik.planning.touch.hand_table import HandTable
+from casadi_ik.planning.touch.strength import (
+    CLOSED,
+    Strengths,
+    closed,
+    generators,
+    offsets,
+    robustness,
+    strengths,
+)
+from casadi_ik.planning.touch.surface import Surface
+from casadi_ik.solve.solution import BatchSolution, Solution
+
+OPENINGS = (0.025, 0.015, 0.008)
+"""How far fingertips are from the object before they close, the first that is clear [m]."""
+
+INWARD = 5e-3
+"""How far fingertips would go into the object to squeeze it, in the mean [m]."""
+
+RETREAT = 0.06
+"""How far the palm is back before it comes to the grasp [m]."""
+
+ROUGHLY = float(np.deg2rad(3.0))
+"""How far an object may be turned that was seen by a camera [rad]."""
+
+Judgement = str | Callable[[ArmHand, Array], ArrayLike]
+"""What grasps are ranked by: a name of `RANKINGS`, or scores (m,) of configurations (m, n)."""
+
+RANKINGS = ("load", "clearance", "limits", "q0")
+
+
+@dataclass(frozen=True, eq=False)
+class FoundGrasp:
+    """A grasp that the arm-hand can make.
+
+    Attributes:
+        grasp: Contacts in the base frame: where fingertips are and their pads face; with the
+            object's name and pose, the hand's posture, and the same hand before (`pregrasp`) and as
+            it squeezes (`squeeze`), as palms and postures.
+        solution: How it is made, judged in the scene.
+        load: Weight that the worst of six directions holds per newton of squeeze (the sum of the
+            normal forces) with friction, the less the more the object gives way: half where it
+            moves 20 mm, or turns 30 deg, as pads roll and motors yield like springs [N/N].
+        closure: The same over forces and torques (about the middle of the object, divided by half
+            its size); above 0 the grasp is force-closed.
+        score: What it was ranked by, higher is better.
+        forces: (3,) by finger, with which to squeeze, of the fingertip on the object, base frame:
+            the object stays at rest, and is best held against any pull. Their normal parts sum to
+            1 N.
+        most_squeeze: Largest sum of normal forces for which the torques of the motors suffice [N];
+            inf where the robot's description tells none (`effort` of a joint).
+    """
+
+    grasp: Grasp
+    solution: Solution
+    load: float
+    closure: float
+    score: float
+    forces: Mapping[str, Array]
+    most_squeeze: float = np.inf
+
+    @property
+    def q(self) -> Array:
+        """(n,) the posture: what `Solver.reach` goes to."""
+        return self.solution.q
+
+    @property
+    def clearance(self) -> float | None:
+        """Smallest distance of a pair that must not touch [m]."""
+        return self.solution.clearance
+
+    @property
+    def pregrasp(self) -> Grasp | None:
+        """Palm and posture before it; None: no opening of the hand was clear."""
+        return self.grasp.pregrasp
+
+
+@dataclass(frozen=True, eq=False)
+class FoundGrasps(Sequence[FoundGrasp]):
+    """Distinct grasps of an object, best first.
+
+    Attributes:
+        entries: The grasps; itself a sequence of them.
+        counts: How many candidates passed each stage, in order.
+        prefer: What they are ranked by.
+        time: Processor time [s].
+        reason: Why there is none; "" if there are some.
+        robot: The robot.
+        surface: The object's.
+        mu: Friction coefficient.
+    """
+
+    entries: tuple[FoundGrasp, ...]
+    counts: Mapping[str, int]
+    prefer: str
+    time: float
+    reason: str
+    robot: ArmHand
+    surface: Surface
+    mu: float
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+    def __iter__(self) -> Iterator[FoundGrasp]:
+        return iter(self.entries)
+
+    @overload
+    def __getitem__(self, place: int) -> FoundGrasp: ...
+
+    @overload
+    def __getitem__(self, place: slice) -> tuple[FoundGrasp, ...]: ...
+
+    def __getitem__(self, place: int | slice) -> FoundGrasp | tuple[FoundGrasp, ...]:
+        return self.entries[place]
+
+    @property
+    def grasps(self) -> tuple[Grasp, ...]:
+        """The grasps, for `Solver.choose`."""
+        return tuple(one.grasp for one in self.entries)
+
+    def robustness(
+        self,
+        position: float = 5e-3,
+        angle: float = ROUGHLY,
+        hold: tuple[float, float] | None = None,
+        samples: int = 64,
+        seed: int = 0,
+    ) -> Array:
+        """How the grasps bear that the object is not quite where it was thought to be.
+
+        The share of displacements at which the fingers, each moving until it touches, still close
+        on the object.
+
+        Args:
+            position: How far the object is off, in random directions [m].
+            angle: How far it is turned, about random axes [rad].
+            hold: Mass [kg], and the squeeze [N] with which it has to be held then, as for
+                `Solver.grasps_of`; None: it is enough that the hand closes.
+            samples: Displacements of each grasp.
+            seed: Of their directions.
+
+        Returns:
+            (k,) shares, one for each grasp.
+
+        Raises:
+            InputError: A negative or infinite number, no sample, or a bad `hold`.
+
+        Example:
+            >>> pose = np.eye(4)
+            >>> pose[:3, 3] = [0.55, 0.1, 0.2]
+            >>> gripper = ik.Solver(ik.load_robot("panda+panda_hand"))
+            >>> found = gripper.grasps_of(ik.load_surface("tomato_soup_can"), pose, limit=3)
+            >>> found.robustness(position=0.0, angle=0.0, samples=1)
+            array([1., 1., 1.])
+        """
+        if not (0 <= position < np.inf and 0 <= angle < np.inf and samples >= 1):
+            raise InputError(
+                f"robustness: found {position!r} m, {angle!r} rad and {samples!r} samples, "
+                "expected numbers >= 0 and at least one sample"
+            )
+        _check_hold(hold)
+        off = offsets(position, angle, samples, seed, self.surface.middle)
+        shares = [robustness(self.robot, self.surface, one, self.mu, off, hold) for one in self]
+        return np.array(shares)
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """The same in short lines."""
+        lines = [f"{len(self)} distinct grasps in {self.time:.2f} s of processor time"]
+        lines += [f"  {number:>9,} {stage}" for stage, number in self.counts.items()]
+        lines += [f"{self.surface.name}: {note}" for note in self.surface.notes]
+        if self.reason:
+            return (*lines, f"none: {self.reason}")
+        lines.append(f"best by {self.prefer}:")
+        for place, one in enumerate(self.entries[:10], 1):
+            room = "" if one.clearance is None else f", clearance {1e3 * one.clearance:.1f} mm"
+            score = "" if self.prefer == "load" else f"{self.prefer} {one.score:.4g}, "
+            lines.append(f"  {place:>2}. {score}load {one.load:.3f} N/N{room}")
+        return tuple(lines)
+
+    def __str__(self) -> str:
+        return "\n".join(self.lines)
+
+    def __repr__(self) -> str:
+        return f"<FoundGrasps: {len(self)} by {self.prefer}>"
+
+
+@dataclass(frozen=True, eq=False)
+class _Made:
+    """Grasps of a round that pass all: k of them."""
+
+    batch: BatchSolution
+    rows: NDArray[np.intp]
+    some: Candidates
+    loads: Array
+    closures: Array
+    forces: Array
+    most: Array
+
+
+def grasps_of(
+    solver: Any,
+    surface: Surface,
+    pose: ArrayLike | None = None,
+    fingers: int = 3,
+    mu: float = 0.5,
+    hold: tuple[float, float] | None = None,
+    limit: int = 200,
+    jobs: int = 1,
+    seed: int = 0,
+    prefer: Judgement = "load",
+    q0: ArrayLike | None = None,
+    among: int = 200,
+) -> FoundGrasps:
+    """Find grasps of an object that the arm and the hand can make, free of collision.
+
+    Two opposing fingertips are matched with two opposing patches of the surface, the others
+    look for something to touch, palm and hand are moved until all touch within 1 mm and 15 deg
+    (pads that are balls 40), the arm follows, and what remains is judged in the scene and ranked.
+
+    Args:
+        solver: A `Solver`.
+        surface: From `load_surface`.
+        pose: (4, 4) of the object in the base frame; None: the identity.
+        fingers: How many fingertips touch, the thumb among them; of a hand with fewer, all.
+        mu: Friction coefficient between fingertips and object.
+        hold: Mass [kg], and the squeeze [N] with which it has to be held in each of six
+            directions, or with what the motors' torques suffice for, if that is less; None: it is
+            enough that the grasp is force-closed.
+        limit: How many distinct grasps at most.
+        jobs: Threads; the answer does not depend on them.
+        seed: Of all random numbers.
+        prefer: What comes first: "load", "clearance", "limits", "q0", or a function of the
+            robot and configurations (m, n) that gives scores (m,), higher is better.
+        q0: (n,) where the robot is [rad or m]; None is `robot.home`.
+        among: Of so many distinct grasps, if there are, the best are given: with a small `limit`
+            this decides how good they are, and how long it takes.
+
+    Returns:
+        The grasps, best first, with how many candidates passed each stage.
+
+    Raises:
+        InputError: Bad numbers, or no rigid pose.
+        UnsupportedError: The hand has one finger, robot or hand have no shapes, the robot is a
+            body, or the method cannot solve palms.
+
+    Example:
+        >>> pose = np.eye(4)
+        >>> pose[:3, 3] = [0.55, 0.1, 0.2]
+        >>> gripper = ik.Solver(ik.load_robot("panda+panda_hand"))
+        >>> found = gripper.grasps_of(ik.load_surface("tomato_soup_can"), pose, limit=5)
+        >>> len(found), bool(found[0].load >= found[4].load)
+        (5, True)
+    """
+    solver.robot.description.one_hand("grasps_of")
+    begin, chosen = time.process_time(), TouchParameters()
+    robot = solver.robot
+    place = np.eye(4) if pose is None else one_pose(pose)
+    _check(fingers, mu, hold, limit, among, prefer)
+    goal = max(limit, among)
+    fingers = min(fingers, len(robot.fingers))
+    table = HandTable.of(robot)
+    arms, judge, hands = _solvers(solver, table, surface, place, chosen)
+    generator = Generator(table, surface, fingers, chosen, np.random.default_rng(seed), hands)
+    start = None if q0 is None else robot.configuration(q0)
+    parts: list[_Made] = []
+    known, drawn, tried, alike, wanted = 0, 0, 0, 0, chosen.first
+    with progress(goal) as show:
+        while generator.fits and known < goal and tried < chosen.most:
+            if tried:
+                generator.look()
+            some = generator.candidates(wanted)
+            drawn, tried = drawn + wanted, generator.counts["attempts"]
+            before = [part.some for part in parts]
+            made = _made(generator, some, before, arms, judge, place, mu, hold, jobs, start)
+            new = 0 if made is None else len(made.rows)
+            if made is not None:
+                parts.append(made)
+                show(min(new, goal - known))
+                known += new
+            alike = generator.alike if new else alike + generator.alike
+            if alike > max(goal, chosen.seldom * max(new, 1)):
+                break  # nearly each is like one found before
+            if generator.asked >= chosen.lost and not known:
+                break  # the arm reaches none
+            share = 1.2 * (goal - known) / known if known else 1.0
+            wanted = int(np.clip(share * drawn, chosen.first, min(10 * drawn, chosen.round)))
+    found = _ranked(robot, generator, hands, parts, place, limit, prefer, start, mu)
+    return replace(found, time=time.process_time() - begin)
+
+
+_SOLVERS: WeakKeyDictionary[Any, dict[tuple[str, int, TouchParameters], tuple[Any, Any, Any]]] = (
+    WeakKeyDictionary()
+)
+
+
+def _solvers(
+    solver: Any, table: HandTable, surface: Surface, place: Array, chosen: TouchParameters
+) -> tuple[Any, Any, HandCheck]:
+    """What solves palms, what judges grasps and hands with the object in the scene; made once."""
+    # A file may be another mesh by now.
+    key = surface.name, hash(surface.points.tobytes()), chosen
+    made = _SOLVERS.setdefault(solver, {})
+    if key not in made:
+        kinds = {"tolerance": Tolerance(chosen.touch, chosen.turned / 15)}
+        kinds |= {"options": {"max_rounds": 1}}
+        scene = (solver.scene or Scene()).holding(surface.name, place)
+        one = type(solver)
+        made[key] = one(solver.robot, **kinds), one(solver.robot, scene=scene, **kinds), {}
+    arms, judge, tables = made[key]
+    # What is worked out for the object at one place serves at the next.
+    judge = judge.moved(surface.name, place)
+    made[key] = arms, judge, tables
+    return arms, judge, HandCheck(table, judge.scene_check, place, tables)
+
+
+def _check(
+    fingers: int,
+    mu: float,
+    hold: tuple[float, float] | None,
+    limit: int,
+    among: int,
+    prefer: Judgement,
+) -> None:
+    """Refuse what cannot be asked for."""
+    if not isinstance(fingers, int) or fingers < 2:
+        raise InputError(f"fingers: found {fingers!r}, expected an integer >= 2")
+    if not 0 < mu < np.inf:
+        raise InputError(f"mu: found {mu!r}, expected a friction coefficient > 0")
+    _check_hold(hold)
+    for name, number in {"limit": limit, "among": among}.items():
+        if not isinstance(number, int) or number < 1:
+            raise InputError(f"{name}: found {number!r}, expected an integer >= 1")
+    if not callable(prefer) and prefer not in RANKINGS:
+        raise InputError(f"prefer: found {prefer!r}, expected {', '.join(RANKINGS)} or a function")
+
+
+def _check_hold(hold: tuple[float, float] | None) -> None:
+    if hold is not None and not (len(hold) == 2 and min(hold) > 0):
+        raise InputError(f"hold: found {hold!r}, expected a mass [kg] and a squeeze [N], both > 0")
+
+
+def _made(
+    generator: Generator,
+    some: Candidates,
+    before: Sequence[Candidates],
+    arms: Any,
+    judge: Any,
+    place: Array,
+    mu: float,
+    hold: tuple[float, float] | None,
+    jobs: int,
+    start: Array | None,
+) -> _Made | None:
+    """Those that are unlike those before, hold, are reached by the arm and free in the scene."""
+    robot, table, surface = arms.robot, generator.table, generator.surface
+    clear, chosen = len(some), generator.parameters
+    for part in before if clear else ():
+        some = some.rows(some.unlike(part, chosen))
+    generator.alike = clear - len(some)
+    generator.counted("unlike those before", len(some))
+    if not len(some):
+        return None
+    here = touching(table, surface, some)
+    order = np.argsort(~some.used, axis=1, kind="stable")[:, : generator.fingers]
+    sample = np.take_along_axis(here.sample, order, axis=1)
+    center, length = surface.middle, surface.size / 2
+    wrenches = generators(surface.points[sample], -surface.faces[sample], mu, center, length)
+    firm = closed(wrenches)
+    rows = np.argsort(-firm, kind="stable")[: np.count_nonzero(firm > CLOSED)]
+    generator.counted("force-closed", len(rows))
+    new = rows[some.rows(rows).distinct(chosen)]
+    generator.counted("unlike each other", len(new))
+    generator.alike += len(rows) - len(new)
+    generator.asked += len(new)
+    if not len(new):
+        return None
+    some, wrenches = some.rows(new), wrenches[new]
+    palms, hands = place @ some.palm, table.configuration(some.hand)
+    reached = arms.solve_palms(palms, hands, start, jobs=jobs)
+    q, met = reached.q, reached.success.copy()
+    hits = np.flatnonzero(met)
+    hits = hits[~generator.clear.arm_clear(q[hits])]
+    met[hits] = False
+    if len(hits) > met.sum():  # other arms for these hands; else other hands come cheaper
+        other = judge.solve_palms(palms[hits], hands[hits], start, jobs=jobs)
+        q[hits], met[hits] = other.q, other.success
+    generator.counted("arm reaches", int(reached.success.sum()))
+    rows = np.flatnonzero(met)
+    if not len(rows):
+        return None
+    some, q, wrenches = some.rows(rows), q[rows], wrenches[rows]
+    points, normals = (np.where(some.used[..., None], part, np.nan) for part in robot.contacts(q))
+    batch = judge.solve_batch(points, normals, q0=q, jobs=jobs)
+    rows = np.flatnonzero(batch.success)
+    generator.counted("free in the scene", len(rows))
+    if not len(rows):
+        return None
+    some = some.rows(rows)
+    found = _strengths(generator, some, wrenches[rows], mu, hold)
+    held = found.hold(hold)
+    if hold is not None:
+        generator.counted(f"hold {hold[0]:g} kg at {hold[1]:g} N", int(held.sum()))
+    parts = found.load, found.closure, found.forces, found.most
+    return _Made(batch, rows[held], some.rows(held), *(part[held] for part in parts))
+
+
+def _strengths(
+    generator: Generator,
+    some: Candidates,
+    wrenches: Array,
+    mu: float,
+    hold: tuple[float, float] | None,
+) -> Strengths:
+    """How well candidates hold the object."""
+    table, surface, robot = generator.table, generator.surface, generator.table.robot
+    _, _, linear, angular = table.at(some.hand)
+    own, (row, finger) = some.used, np.nonzero(some.used)
+    shape = (len(some), -1)
+    sample = touching(table, surface, some).sample[own]
+    normals, radii = -surface.faces[sample], table.radii[finger]
+    turned = np.einsum("kij,kjm->kim", some.palm[row, :3, :3], angular[own])
+    jacobians = np.einsum("kij,kjm->kim", some.palm[row, :3, :3], linear[own])
+    jacobians += np.cross(turned, (radii[:, None] * normals)[..., None], axis=1)
+    return strengths(
+        wrenches,
+        (surface.points[sample] - surface.middle).reshape(*shape, 3),
+        normals.reshape(*shape, 3),
+        radii.reshape(shape),
+        jacobians.reshape(*shape, 3, len(table.motors)),
+        [robot.description.actuators[i] for i in table.motors],
+        mu,
+        hold,
+    )
+
+
+def _ranked(
+    robot: ArmHand,
+    generator: Generator,
+    hands: HandCheck,
+    parts: list[_Made],
+    place: Array,
+    limit: int,
+    prefer: Judgement,
+    start: Array | None,
+    mu: float,
+) -> FoundGrasps:
+    """The distinct ones, best first."""
+    where = [(part, i) for part in parts for i in range(len(part.rows))]
+    name, about = prefer if isinstance(prefer, str) else "own", (robot, generator.surface, mu)
+    if not where:
+        return FoundGrasps((), generator.counts, name, 0.0, generator.why_none(), *about)
+    q = np.concatenate([part.batch.q[part.rows] for part in parts])
+    load = np.concatenate([part.loads for part in parts])
+    closure = np.concatenate([part.closures for part in parts])
+    most = np.concatenate([part.most for part in parts])
+    clearance = np.concatenate([np.asarray(part.batch.clearance)[part.rows] for part in parts])
+    span = robot.upper - robot.lower
+    scores = {
+        "load": lambda: load,
+        "clearance": lambda: clearance,
+        "limits": lambda: (np.minimum(q - robot.lower, robot.upper - q) / span).min(axis=1),
+        "q0": lambda: -np.abs((q - (robot.home if start is None else start)) / span).max(axis=1),
+    }
+    score = (
+        scores[prefer]() if isinstance(prefer, str) else np.asarray(prefer(robot, q), dtype=float)
+    )
+    if score.shape != (len(q),):
+        raise InputError(f"prefer: gave shape {score.shape}, expected ({len(q)},)")
+    kept = np.argsort(-score, kind="stable")[:limit]
+    chosen = [where[row] for row in kept]
+    some = Candidates(
+        place @ np.stack([part.some.palm[i] for part, i in chosen]),
+        np.take(q[kept], generator.table.motors, axis=1),
+        np.stack([part.some.used[i] for part, i in chosen]),
+    )
+    # Of the fingertips that touch, in the order of the fingers.
+    forces = np.zeros((*some.used.shape, 3))
+    squeezes = np.stack([part.forces[i] for part, i in chosen])
+    forces[some.used] = (squeezes @ place[:3, :3].T).reshape(-1, 3)
+    solutions = [part.batch.solution(int(part.rows[i])) for part, i in chosen]
+    grasps = _grasps(robot, generator, hands, some, q[kept], place, forces)
+    entries = []
+    for i, (row, solution, grasp) in enumerate(zip(kept, solutions, grasps, strict=True)):
+        by_finger = {name: forces[i, robot.fingers.index(name)] for name in grasp.contacts}
+        values = float(load[row]), float(closure[row]), float(score[row])
+        forced = MappingProxyType(by_finger)
+        entries.append(FoundGrasp(grasp, solution, *values, forced, float(most[row])))
+    return FoundGrasps(tuple(entries), generator.counts, name, 0.0, "", *about)
+
+
+def _grasps(
+    robot: ArmHand,
+    generator: Generator,
+    hands: HandCheck,
+    some: Candidates,
+    q: Array,
+    place: Array,
+    forces: Array,
+) -> list[Grasp]:
+    """The grasps of postures q (k, n), with the hand before each and as it squeezes.
+
+    Args:
+        robot: The robot.
+        generator: Of the candidates.
+        hands: Tells which hands are clear.
+        some: The hands as they touch, palms in the base frame.
+        q: (k, n) the postures.
+        place: (4, 4) of the object.
+        forces: (k, f, 3) on the object, base frame.
+    """
+    table, surface = generator.table, generator.surface
+    points, normals = robot.contacts(q)
+    radii = table.radii[:, None]
+    middles = points - radii * normals
+    _, sample = surface.foot((middles - place[:3, 3]) @ place[:3, :3])
+    into = -surface.faces[sample] @ place[:3, :3].T
+    touched = np.where(radii > 0, middles + radii * into, points)
+    palms = robot.palm(q)
+    seen_forces, seen_pads = (
+        np.einsum("kfi,kij->kfj", one, palms[:, :3, :3]) for one in (forces, touched - middles)
+    )
+    squeezed = table.squeezed(some, seen_pads, seen_forces, INWARD)
+    opened, known = some.hand.copy(), np.zeros(len(some), dtype=bool)
+    seen = replace(some, palm=inverse(place) @ palms)
+    for opening in OPENINGS:
+        left = np.flatnonzero(~known)
+        if len(left):
+            tried = table.opened(seen.rows(left), opening)
+            clear = hands(tried)
+            opened[left[clear]], known[left[clear]] = tried.hand[clear], True
+    motors = [robot.actuators[i] for i in table.motors]
+    stem = Path(surface.object.name).stem
+    found = []
+    for i in range(len(some)):
+        contacts = {}
+        for j in np.flatnonzero(some.used[i]):
+            ball = into[i, j] if table.radii[j] else None
+            contacts[robot.fingers[j]] = Contact(touched[i, j], normals[i, j], ball=ball)
+        back = palms[i].copy()
+        away = back[:3, 3] - np.mean([one.point for one in contacts.values()], axis=0)
+        back[:3, 3] += RETREAT * away / max(float(np.linalg.norm(away)), 1e-9)
+        hand, before, after = (
+            dict(zip(motors, one[i].tolist(), strict=True)) for one in (some.hand, opened, squeezed)
+        )
+        pregrasp = Grasp(robot=robot.name, palm=back, posture=before) if known[i] else None
+        found.append(
+            Grasp(
+                contacts,
+                robot=robot.name,
+                name=f"{stem} {'+'.join(contacts)}",
+                object=surface.name,
+                object_pose=place,
+                posture=hand,
+                pregrasp=pregrasp,
+                squeeze=Grasp(robot=robot.name, palm=palms[i], posture=after),
+            )
+        )
+    return found

@@ -1,0 +1,428 @@
+"""What a hand's fingertips can do by themselves: postures, opposing pairs, Jacobians."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.collision.clearance import SceneCheck
+from casadi_ik.collision.model import pair_table
+from casadi_ik.collision.scene import Scene
+from casadi_ik.compile.cancellation import SLICE, drive
+from casadi_ik.compile.codegen import WIDE, c_struct, define, driver_text
+from casadi_ik.compile.function_kernel import FunctionKernel, machine_lanes
+from casadi_ik.compile.graphs import FunctionGraph, recipe
+from casadi_ik.compile.libraries import load_library
+from casadi_ik.errors import UnsupportedError
+from casadi_ik.files.arrays import Array, Bools
+from casadi_ik.kinematics.arm_hand import ArmHand
+from casadi_ik.kinematics.forward import actuated
+from casadi_ik.kinematics.se3 import skew
+from casadi_ik.model.description import RobotDescription
+from casadi_ik.planning.touch.surface import NEIGHBOURS
+
+if TYPE_CHECKING:
+    from casadi_ik.planning.touch.candidates import Candidates
+
+
+BINS = 20
+"""By so many the driver tells apart how often what it tries is clear."""
+
+
+@dataclass(frozen=True)
+class HandTableParameters:
+    """How finely a hand is looked at.
+
+    Attributes:
+        postures: Of each finger, for each value of the motors that it shares with others.
+        shared: Values of the motors that fingers share.
+        facing: Two fingertips oppose each other if both normals are within this angle of the line
+            between them [rad]; of balls so much farther as they may lean more.
+        roll: By so much more than a plane a pad leans that is a ball [rad].
+        cell: Edge of a cell of distances [m].
+        turn: Edge of a cell of angles [rad].
+        pairs: Most pairs that are kept.
+    """
+
+    postures: int = 512
+    shared: int = 12
+    facing: float = float(np.deg2rad(48.0))
+    roll: float = float(np.deg2rad(25.0))
+    cell: float = 4e-3
+    turn: float = float(np.deg2rad(12.0))
+    pairs: int = 200_000
+
+
+class HandTable:
+    """Postures of a hand's fingers and the pairs among them that oppose each other.
+
+    Attributes:
+        robot: The robot.
+        motors: Positions in q of the motors that move fingers.
+        q: (s, n, m) positions of these motors, for s values of the shared ones.
+        radii: (f,) of the pads' balls [m], 0 of planes.
+        roll: (f,) by how much more than a plane they may lean [rad].
+        points: (s, n, f, 3) middles of pads' balls, of planes contact points, palm frame [m].
+        pairs: (p, 4) of thumb and another finger: shared value, finger, posture of either.
+        depths: (p,) how far between their pads is from the palm frame [m].
+        shapes: The capsules of these postures; None until `shape`.
+        normals: (s, n, f, 3) outward pad normals in the palm frame.
+    """
+
+    def __init__(
+        self, robot: ArmHand, seed: int = 0, parameters: HandTableParameters | None = None
+    ) -> None:
+        """Draw the postures (Sobol' points) and sort the pairs by distance and angles."""
+        self.parameters = chosen = parameters or HandTableParameters()
+        description = robot.description
+        if len(robot.fingers) < 2:
+            raise UnsupportedError(
+                f"robot {robot.name!r} has one finger, expected two or more that oppose each other"
+            )
+        self.robot = robot
+        self.of_finger = {name: description.finger_actuators(name) for name in robot.fingers}
+        users = [i for own in self.of_finger.values() for i in own]
+        self.motors = np.array(sorted(set(users)), dtype=np.intp)
+        shared = np.array([users.count(i) > 1 for i in self.motors])
+        self.kernel = hand_kernel(description)
+        self.thumb = robot.fingers.index(robot.thumb)
+        self.shapes: HandShapes | None = None
+        self.radii = np.array([description.finger(name).radius for name in robot.fingers])
+        self.roll = np.where(self.radii > 0, chosen.roll, 0.0)
+        self.palm = robot.palm(robot.home)
+        # Where fingers share all motors (a gripper) a posture is a value of these.
+        count = 1 if shared.all() else chosen.postures
+        values = chosen.postures if shared.all() else chosen.shared if shared.any() else 1
+        lower, upper = robot.lower[self.motors], robot.upper[self.motors]
+        self.q = np.tile(lower + _sobol(len(lower), count, seed) * (upper - lower), (values, 1, 1))
+        if shared.any():
+            common = _sobol(int(shared.sum()), values, seed + 1)
+            self.q[:, :, shared] = (lower[shared] + common * (upper - lower)[shared])[:, None]
+        points, normals, _, _ = self.at(self.q.reshape(-1, len(self.motors)))
+        shape = (values, count, len(robot.fingers), 3)
+        self.points, self.normals = points.reshape(shape), normals.reshape(shape)
+        self._sort_pairs()
+
+    @classmethod
+    def of(cls, robot: ArmHand) -> HandTable:
+        """The table of a robot, made once per process."""
+        if robot not in _TABLES:
+            _TABLES[robot] = cls(robot)
+        return _TABLES[robot]
+
+    def put(self, hand: Array, rows: NDArray[np.intp], posture: Array, finger: int) -> None:
+        """Take a finger's own motors from a posture."""
+        own = self.of_finger[self.robot.fingers[finger]]
+        columns = np.flatnonzero(np.isin(self.motors, own))
+        hand[np.ix_(rows, columns)] = posture[:, columns]
+
+    def opened(self, some: Candidates, opening: float) -> Candidates:
+        """The same palms with fingertips moved back from what they touch [m]; negative: into it."""
+        hand = some.hand
+        lower, upper = self.robot.lower[self.motors], self.robot.upper[self.motors]
+        for _ in range(4):
+            _, normals, linear, _ = self.at(hand)
+            rows = (linear * some.used[..., None, None]).reshape(len(hand), -1, len(self.motors))
+            goal = (-0.25 * opening * normals * some.used[..., None]).reshape(len(hand), -1)
+            square = rows.swapaxes(1, 2) @ rows + 1e-5 * np.eye(len(self.motors))
+            step = np.linalg.solve(square, rows.swapaxes(1, 2) @ goal[..., None])[..., 0]
+            hand = np.clip(hand + step, lower, upper)
+        return replace(some, hand=hand)
+
+    def squeezed(self, some: Candidates, touched: Array, forces: Array, inward: float) -> Array:
+        """(k, m) hands whose motors go on in proportion to the torques of forces.
+
+        So do motors that are held by equal springs: sent there, they exert these forces.
+
+        Args:
+            some: The hands as they touch.
+            touched: (k, f, 3) where their pads do, from the middles [m], palm frame.
+            forces: (k, f, 3) of fingertips on the object, palm frame; 0 of those that do not touch.
+            inward: How far fingertips would go, in the mean [m].
+        """
+        _, _, linear, angular = self.at(some.hand)
+        linear = linear + np.cross(angular, touched[..., None], axis=2)
+        torque = np.einsum("kfim,kfi->km", linear, forces)
+        along = np.einsum("kfim,km,kfi->k", linear, torque, forces)
+        along /= np.linalg.norm(forces, axis=2).sum(axis=1)
+        step = inward / np.maximum(along, 1e-9)[:, None] * torque
+        lower, upper = self.robot.lower[self.motors], self.robot.upper[self.motors]
+        return np.clip(some.hand + step, lower, upper)
+
+    def configuration(self, hands: Array) -> Array:
+        """(k, n) configurations with hands (k, m), the arm at home."""
+        q = np.tile(self.robot.home, (len(hands), 1))
+        q[:, self.motors] = hands
+        return q
+
+    def at(self, hands: Array) -> tuple[Array, Array, Array, Array]:
+        """Pads of hands (k, m) in the palm frame.
+
+        Returns:
+            Middles of balls, of planes contact points (k, f, 3) [m], outward normals (k, f, 3), and
+            Jacobians (k, f, 3, m) of these points and of rotations over the fingers' motors.
+        """
+        f, m = len(self.robot.fingers), len(self.motors)
+        flat = self.kernel(self.configuration(hands))
+        points, normals = (part.reshape(-1, f, 3) for part in flat[:2])
+        linear, angular = (part.reshape(-1, f, 3, m) for part in flat[2:])
+        return points, normals, linear, angular
+
+    def _sort_pairs(self) -> None:
+        """Pairs of a posture of the thumb and one of another finger that oppose each other."""
+        robot, chosen = self.robot, self.parameters
+        thumb = self.thumb
+        found, keys = [], []
+        least = np.cos(chosen.facing + self.roll)
+        for share in range(len(self.q)):
+            a, n = self.points[share, :, thumb], self.normals[share, :, thumb]
+            for other in range(len(robot.fingers)):
+                if other == thumb:
+                    continue
+                b, o = self.points[share, :, other], self.normals[share, :, other]
+                way = b[None] - a[:, None]
+                length = np.linalg.norm(way, axis=-1)
+                way /= np.maximum(length, 1e-9)[..., None]
+                first = np.einsum("ijk,ik->ij", way, n)
+                second = -np.einsum("ijk,jk->ij", way, o)
+                i, j = np.nonzero((first > least[thumb]) & (second > least[other]))
+                found.append(
+                    np.stack([np.full(len(i), share), np.full(len(i), other), i, j], axis=1)
+                )
+                keys.append(self.key(length[i, j], first[i, j], second[i, j]))
+        pairs, key = np.concatenate(found), np.concatenate(keys)
+        if len(pairs) > chosen.pairs:
+            kept = np.random.default_rng(0).choice(len(pairs), chosen.pairs, replace=False)
+            pairs, key = pairs[kept], key[kept]
+        order = np.argsort(key, kind="stable")
+        self.pairs, self._keys = pairs[order], key[order]
+        share, other, a, b = self.pairs.T
+        middles = (self.points[share, a, thumb] + self.points[share, b, other]) / 2
+        self.depths = np.linalg.norm(middles, axis=1)
+
+    def shape(self, check: SceneCheck) -> HandShapes:
+        """The capsules of the postures; pairs that hit the hand or each other are left out."""
+        if self.shapes is None:
+            self.shapes = shapes = HandShapes.of(self, check)
+            share, other, a, b = self.pairs.T
+            word = shapes.apart[share, self.thumb, other, a, b // 64]
+            alone = shapes.alone[share, a, self.thumb] & shapes.alone[share, b, other]
+            kept = alone & ((word >> (b % 64).astype(np.uint64)) & 1).astype(bool)
+            self.pairs, self._keys, self.depths = (
+                np.ascontiguousarray(column[kept])
+                for column in (self.pairs, self._keys, self.depths)
+            )
+        return self.shapes
+
+    def key(self, length: Array, first: Array, second: Array) -> NDArray[np.int64]:
+        """Cells of pairs: distance [m] and the cosines of both normals with the line."""
+        chosen = self.parameters
+        turns = [
+            np.minimum(np.arccos(np.clip(c, -1, 1)) / chosen.turn, 99).astype(np.int64)
+            for c in (first, second)
+        ]
+        return ((length / chosen.cell).astype(np.int64) * 100 + turns[0]) * 100 + turns[1]
+
+    def cells(self, key: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """First pair of cells and how many there are."""
+        first = np.searchsorted(self._keys, key, "left")
+        return first, np.searchsorted(self._keys, key, "right") - first
+
+
+@dataclass(frozen=True, eq=False)
+class HandShapes:
+    """The capsules of a hand in the postures of its table, palm frame: those of fingers first.
+
+    Attributes:
+        links: (c + d,) of each capsule.
+        numbers: (c + d,) which of the robot's capsules they are.
+        capsules: (s, n, c, 6) one end of the fingers' segments, and the way to the other [m].
+        fixed: (d, 6) the same of those that move with the palm alone.
+        lengths: (c + d,) of the segments [m].
+        first: (f + 1,) first capsule of each finger.
+        pads: (c,) whether a capsule may touch what its finger touches.
+        alone: (s, n, f) whether a finger is clear of itself and of the palm.
+        apart: (s, f, f, n, words) bits of the postures of another finger that are clear of one of
+            the first, and alone.
+        crossing: (x, 4) fingers and their capsules that must not meet.
+        reach: (x,) how near these may come [m].
+    """
+
+    links: tuple[str, ...]
+    numbers: NDArray[np.intp]
+    capsules: Array
+    fixed: Array
+    lengths: Array
+    first: NDArray[np.int64]
+    pads: NDArray[np.int64]
+    alone: Bools
+    apart: NDArray[np.uint64]
+    crossing: NDArray[np.int64]
+    reach: Array
+
+    @classmethod
+    def of(cls, table: HandTable, check: SceneCheck) -> HandShapes:
+        """Place the capsules and find which postures meet.
+
+        Args:
+            table: Of the hand.
+            check: Of any scene about its robot.
+        """
+        model, robot = check.model, table.robot
+        (s, n, _), f = table.q.shape, len(robot.fingers)
+        owner = [_finger_of(table, link) for link in model.links]
+        still = {link for link in model.links if link in model.moving or model.is_fixed(link)}
+        own = [[i for i, k in enumerate(owner) if k == finger] for finger in range(f)]
+        rest = [i for i, k in enumerate(owner) if k is None and model.links[i] not in still]
+        numbers = np.concatenate([*own, rest]).astype(np.intp)
+        count = len(numbers) - len(rest)
+        q = table.configuration(table.q.reshape(s * n, -1))
+        (where,) = check.kernel.placed(q)
+        segments = where.reshape(s * n, -1)[:, : 6 * len(owner)].reshape(s * n, -1, 6)[:, numbers]
+        turn, middle, half = table.palm[:3, :3], segments[..., :3], segments[..., 3:]
+        start = (middle - half - table.palm[:3, 3]) @ turn
+        placed = np.concatenate([start, 2 * half @ turn], axis=-1)
+        links = tuple(model.links[i] for i in numbers)
+        first = np.cumsum([0, *map(len, own)])
+        within = pair_table(model, Scene(), ())
+        pads = [
+            links[i] in check.bodies_of_fingers[robot.fingers[k]]
+            for k in range(f)
+            for i in range(first[k], first[k + 1])
+        ]
+        # Pairs of a finger with itself or the palm, and of two fingers.
+        fingers = np.array([-1 if k is None else k for k in owner] + [-1] * within.own)
+        pairs, known = fingers[within.pairs], np.isin(within.pairs[:, 0], numbers)
+        known &= np.isin(within.pairs[:, 1], numbers) | (within.pairs[:, 1] >= len(owner))
+        two = known & (pairs >= 0).all(axis=1) & (pairs[:, 0] != pairs[:, 1])
+        one = within.only(known & ~two)
+        clear = check.kernel.every(q, np.zeros((0, 12)), one) >= 0
+        alone = np.stack(
+            [clear[:, (fingers[one.pairs] == k).any(axis=1)].all(axis=1) for k in range(f)], 1
+        ).reshape(s, n, f)
+        place = np.zeros(len(fingers), dtype=np.int64)
+        place[numbers] = range(len(numbers))
+        a, b = within.pairs[two].T
+        words = -(-n // 64)
+        padded = np.zeros((s, f, 64 * words), dtype=bool)
+        padded[..., :n] = alone.swapaxes(1, 2)
+        bits = np.packbits(padded, axis=-1, bitorder="little").view(np.uint64)
+        made = cls(
+            links,
+            numbers,
+            np.ascontiguousarray(placed[:, :count].reshape(s, n, count, 6)),
+            np.ascontiguousarray(placed[0, count:]),
+            2 * model.halves[numbers],
+            first,
+            np.array(pads, dtype=np.int64),
+            alone,
+            np.tile(bits[:, None, :, None], (1, f, 1, n, 1)),
+            np.ascontiguousarray(np.stack([fingers[a], place[a], fingers[b], place[b]], axis=1)),
+            model.radii[a] + model.radii[b] + within.offsets[two],
+        )
+        drive("touch", touch_library()["casadi_ik_apart"], TouchJob(**made.job))
+        return made
+
+    @property
+    def job(self) -> dict[str, Any]:
+        """What the driver is told of it."""
+        s, n, c, _ = self.capsules.shape
+        arrays = ("capsules", "fixed", "lengths", "first", "pads", "apart", "crossing", "reach")
+        return {name: getattr(self, name).ctypes.data for name in arrays} | {
+            "shares": s,
+            "postures": n,
+            "words": self.apart.shape[-1],
+            "n_fingers": self.apart.shape[1],
+            "n_capsules": c,
+            "n_fixed": len(self.fixed),
+            "n_crossing": len(self.crossing),
+            "slice": SLICE,
+        }
+
+
+def _finger_of(table: HandTable, link: str) -> int | None:
+    """The finger that a link is of: whose joints lead to it, or whose motors move it."""
+    robot = table.robot.description
+    joints = {joint.name for joint in robot.chain(link)}
+    shared = [len(joints.intersection(finger.joints)) for finger in robot.fingers]
+    if max(shared):
+        return int(np.argmax(shared))
+    motors = robot.links_moved
+    moved = [name for name in robot.finger_names if link in motors(table.of_finger[name])]
+    return robot.finger_names.index(moved[0]) if moved else None
+
+
+TouchJob = c_struct("touch_job", {"3": 3, "4": 4, "BINS": BINS})
+SnapJob = c_struct("snap_job", driver="snap")
+
+
+def touch_library() -> Any:
+    """The compiled drivers `touch`, `apart` and `loads`.
+
+    Raises:
+        UnsupportedError: There is no compiler.
+    """
+    parts = (
+        WIDE if machine_lanes() else "",
+        "typedef double scalar;\ntypedef double real;\n",
+        define({"STEP_IN": 0, "STEP_OUT": 0}),
+        *(driver_text(name) for name in ("common", "touch_job", "touch")),
+    )
+    text = "".join(parts)
+    library = load_library("touch", lambda: text, "casadi_ik_touch", text)
+    if library is None:
+        raise UnsupportedError("grasps_of: found no C compiler, expected one (docs/install.md)")
+    return library
+
+
+_TABLES: WeakKeyDictionary[ArmHand, HandTable] = WeakKeyDictionary()
+
+
+def hand_kernel(robot: RobotDescription) -> FunctionKernel:
+    """Pads and their Jacobians over the fingers' motors, in the palm frame, of q."""
+    motors = sorted({i for name in robot.finger_names for i in robot.finger_actuators(name)})
+    f, m, n = len(robot.finger_names), len(motors), len(robot.actuators)
+    name = ca.Function.fix_name(f"{robot.name}_hand_contacts")
+
+    def build() -> ca.Function:
+        q = ca.SX.sym("q", n)
+        moving = actuated(robot, q)
+        palm = moving.kinematics.palm
+        parts: list[list[ca.SX]] = [[], [], [], []]
+        for finger in robot.finger_names:
+            point, normal = moving.kinematics.contact(finger)
+            linear, angular = moving.contact_jacobian(finger, motors)
+            # The middle of a ball is so far behind the point.
+            behind = robot.finger(finger).radius * normal
+            linear = linear + skew(behind) @ angular
+            parts[0].append(palm.inverse_apply(point - behind).T)
+            parts[1].append((palm.rotation.T @ normal).T)
+            parts[2].append(palm.rotation.T @ linear)
+            parts[3].append(palm.rotation.T @ angular)
+        outputs = [ca.densify(ca.vertcat(*part)) for part in parts]
+        return ca.Function(name, [q], outputs, ["q"], ["points", "normals", "linear", "angular"])
+
+    shapes = ((f, 3), (f, 3), (3 * f, m), (3 * f, m))
+    graph = FunctionGraph(name, build, {"q": (n, 1)}, shapes, recipe(name, robot))
+    sizes = {"N_Q": n, "N_F": f, "N_M": m, "NEIGHBOURS": NEIGHBOURS}
+    return FunctionKernel(graph, driver=define(sizes) + driver_text("snap"))
+
+
+def _sobol(dimensions: int, count: int, seed: int) -> Array:
+    """(count, dimensions) points of [0, 1]."""
+    power = int(np.ceil(np.log2(max(count, 2))))
+    qmc: Any = import_module("scipy.stats").qmc
+    return qmc.Sobol(dimensions, rng=seed).random_base2(power)[:count]
+
+
+def rigid(rotation: Array, origin: Array) -> Array:
+    """(k, 4, 4) poses."""
+    pose = np.zeros((*origin.shape[:-1], 4, 4))
+    pose[..., :3, :3], pose[..., :3, 3], pose[..., 3, 3] = rotation, origin, 1.0
+    return pose

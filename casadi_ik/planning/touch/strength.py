@@ -1,0 +1,419 @@
+"""How well contacts hold an object, many grasps at once; also where it is not quite there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.compile.cancellation import SLICE, drive
+from casadi_ik.compile.codegen import c_struct
+from casadi_ik.files.arrays import Array, Bools
+from casadi_ik.kinematics.arm_hand import ArmHand
+from casadi_ik.model.joints import Actuator
+from casadi_ik.model.pose import inverse
+from casadi_ik.planning.touch.candidates import Candidates
+from casadi_ik.planning.touch.hand_table import HandTable, touch_library
+from casadi_ik.planning.touch.surface import Surface
+
+if TYPE_CHECKING:
+    from casadi_ik.planning.touch.grasps import FoundGrasp
+
+EDGES = 8
+"""Edges of the pyramid within a friction cone."""
+
+DIRECTIONS = np.concatenate([np.eye(6), -np.eye(6)])
+"""(12, 6) wrenches: forces along and torques about the axes, both ways."""
+
+FORCES = [0, 1, 2, 6, 7, 8]
+"""Those of them that are forces."""
+
+GRAVITY = 9.80665
+"""Standard acceleration of free fall [m/s^2]."""
+
+USUAL = (0.2, 18.0)
+"""Mass [kg] and squeeze [N] for which stiffness counts where none are said."""
+
+CLOSED = 1e-4
+"""Load from which a grasp counts as force-closed [N/N]."""
+
+STEPS, ENOUGH = 50, 1e-9
+"""Most iterations of a linear program, and the mean of x z that is followed by the last."""
+
+
+def generators(
+    points: Array, normals: Array, mu: float, center: Array, length: float, patch: float = 0.005
+) -> Array:
+    """Wrenches of soft fingers with a normal force of 1: the edges of their friction cones.
+
+    Args:
+        points: (k, c, 3) contacts [m].
+        normals: (k, c, 3) unit, into the object.
+        mu: Friction coefficient.
+        center: (3,) about which torques are [m].
+        length: By which torques are divided [m].
+        patch: Radius of a pad's contact patch [m]: it holds 2/3 mu patch about its normal
+            (Coulomb friction under even pressure).
+
+    Returns:
+        (k, 6, c * (EDGES + 2)).
+    """
+    k, c = points.shape[:2]
+    first = np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=-1)])
+    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    second = np.cross(normals, first)
+    angle = 2 * np.pi * np.arange(EDGES) / EDGES
+    along = first[..., None, :] * np.cos(angle)[:, None]
+    along = along + second[..., None, :] * np.sin(angle)[:, None]
+    normal = normals[..., None, :]
+    force = np.concatenate([normal + mu * along, normal, normal], axis=-2)
+    torque = np.cross((points - center)[..., None, :], force) / length
+    spin = 2 / 3 * mu * patch / length * normals
+    torque[..., -2, :] += spin
+    torque[..., -1, :] -= spin
+    return np.concatenate([force, torque], axis=-1).reshape(k, c * (EDGES + 2), 6).swapaxes(1, 2)
+
+
+def loads(wrenches: Array, directions: Array = DIRECTIONS) -> Array:
+    """Largest s with -s d = W x, x >= 0, sum x <= 1: what a squeeze of 1 N holds against d.
+
+    Args:
+        wrenches: (k, 6, g) of the cones' edges.
+        directions: (d, 6).
+
+    Returns:
+        (k, d) loads [N per N]; 0 where nothing is held.
+    """
+    return np.maximum(_solved(wrenches, directions)[..., -2], 0.0)
+
+
+def closed(wrenches: Array) -> Array:
+    """(k,) loads against the mean of the wrenches (k, 6, g): above 0 if a grasp is force-closed.
+
+    Only then all of them can be above 0 and in balance. One program tells it, not twelve as by
+    `loads`.
+    """
+    return np.maximum(_solved(wrenches, wrenches.mean(axis=2)[:, None])[:, 0, -2], 0.0)
+
+
+def loads_and_squeezes(wrenches: Array) -> tuple[Array, Array]:
+    """The loads of `DIRECTIONS`, and forces at rest from which a grasp is best pulled any way.
+
+    These are the mean of what holds as much against each of six forces with least squeeze: as
+    those cancel, the object is at rest.
+
+    Args:
+        wrenches: (k, 6, c * (EDGES + 2)) from `generators`.
+
+    Returns:
+        (k, 12) loads [N per N], and (k, c, 3) forces on the object; their normal parts sum to 1 N.
+    """
+    k, _, g = wrenches.shape
+    every = _solved(wrenches, DIRECTIONS)
+    solved = every[:, FORCES]
+    shares = (solved[..., :g] / np.maximum(solved[..., g : g + 1], 1e-12)).sum(axis=1)
+    shares /= shares.sum(axis=1, keepdims=True)
+    forces = wrenches[:, :3] * shares[:, None]
+    forces = forces.reshape(k, 3, g // (EDGES + 2), EDGES + 2).sum(axis=-1).swapaxes(1, 2)
+    return np.maximum(every[..., g], 0.0), forces
+
+
+@dataclass(frozen=True)
+class GiveParameters:
+    """How a grasp gives way when the object is pulled; those of the study `touch_hold`.
+
+    Attributes:
+        springs: Of motors that turn and that slide [N m/rad, N/m].
+        far: What the object may move [m] ...
+        turned: ... and turn [rad].
+        spin: Turn after which a pad's friction about its normal is used up [rad].
+        flat: Radius of the ball that a plane counts as [m].
+        contact: Compliance of a contact itself [m/N].
+    """
+
+    springs: tuple[float, float] = (3.0, 2000.0)
+    far: float = 0.020
+    turned: float = float(np.deg2rad(30.0))
+    spin: float = float(np.deg2rad(3.0))
+    flat: float = 0.010
+    contact: float = 2e-5
+
+
+GIVE = GiveParameters()
+
+
+@dataclass(frozen=True, eq=False)
+class Strengths:
+    """How well grasps hold: k of them, of c contacts.
+
+    Attributes:
+        load: (k,) what the worst of six directions holds by friction, less by how far the object
+            gives way [N/N].
+        closure: (k,) what the worst of `DIRECTIONS` holds.
+        forces: (k, c, 3) on the object at rest; their normal parts sum to 1 N.
+        most: (k,) largest squeeze for which motors' efforts suffice [N].
+    """
+
+    load: Array
+    closure: Array
+    forces: Array
+    most: Array
+
+    def hold(self, hold: tuple[float, float] | None) -> Bools:
+        """(k,) which are force-closed, and hold a mass [kg] with a squeeze [N] if that is said."""
+        held: Bools = self.closure > CLOSED
+        if hold is None:
+            return held
+        return held & (self.load * np.minimum(hold[1], self.most) >= hold[0] * GRAVITY)
+
+
+def strengths(
+    wrenches: Array,
+    arms: Array,
+    normals: Array,
+    radii: Array,
+    jacobians: Array,
+    motors: Sequence[Actuator],
+    mu: float,
+    hold: tuple[float, float] | None,
+) -> Strengths:
+    """How well grasps hold a mass [kg] with a squeeze [N] (None: `USUAL`).
+
+    Args:
+        wrenches: (k, 6, c * (EDGES + 2)) from `generators`.
+        arms: (k, c, 3) contacts from the middle of the object [m].
+        normals: (k, c, 3) unit, into the object.
+        radii: (k, c) of pads [m]; 0 of planes.
+        jacobians: (k, c, 3, m) of contacts over motors.
+        motors: The m motors.
+        mu: Friction coefficient.
+        hold: Mass [kg] and squeeze [N] for which the object's giving way counts.
+    """
+    mass, squeeze = USUAL if hold is None else hold
+    found, forces = loads_and_squeezes(wrenches)
+    torques = np.abs(np.einsum("kcim,kci->km", jacobians, forces))
+    efforts = np.array([motor.effort for motor in motors])
+    most = (efforts / np.maximum(torques, 1e-12)).min(axis=1)
+    springs = np.array([GIVE.springs[motor.unit == "m"] for motor in motors])
+    pressed = np.minimum(squeeze, most)[:, None, None] * forces
+    stiff = np.maximum(stiffnesses(arms, normals, pressed, radii, jacobians, springs, mu), 0.0)
+    # What the object gives way by is a part of what it may.
+    load = found[:, FORCES].min(axis=1) * stiff / (stiff + mass * GRAVITY / GIVE.far)
+    return Strengths(load, found.min(axis=1), forces, most)
+
+
+def stiffnesses(
+    arms: Array,
+    normals: Array,
+    forces: Array,
+    radii: Array,
+    jacobians: Array,
+    springs: Array,
+    mu: float,
+    patch: float = 0.005,
+    give: GiveParameters = GIVE,
+) -> Array:
+    """Least stiffness of grasps (k,) [N/m] against moving, and turning about their middle.
+
+    Motors are springs, and pads are balls that roll on the object without sliding: as it turns, the
+    contact moves on, and the squeeze turns it further or back (Cutkosky and Kao 1989, with faces
+    flat and fingertips that do not turn). Below 0 the object rolls out of the hand.
+
+    Args:
+        arms: (k, c, 3) contacts from the middle of the object [m].
+        normals: (k, c, 3) unit, into the object.
+        forces: (k, c, 3) on the object at rest [N].
+        radii: (k, c) of pads [m]; 0 of planes.
+        jacobians: (k, c, 3, m) of contacts over motors.
+        springs: (m,) of motors [N m/rad or N/m].
+        mu: Friction coefficient.
+        patch: Radius of a contact patch [m].
+        give: What motors and contacts give.
+    """
+    k, c, _, m = jacobians.shape
+    length = give.far / give.turned  # of a turn that counts as a metre
+    compliant = (jacobians / springs).reshape(k, 3 * c, m)
+    compliant = compliant @ jacobians.reshape(k, 3 * c, m).swapaxes(1, 2)
+    compliant += give.contact * np.eye(3 * c)
+    eye = np.broadcast_to(np.eye(3), (k, c, 3, 3))
+    moved = np.concatenate([eye, -cross_matrices(arms) / length], axis=-1).reshape(k, 3 * c, 6)
+    stiff = moved.swapaxes(1, 2) @ np.linalg.solve(compliant, moved)
+    pressed = np.maximum((forces * normals).sum(axis=-1), 0.0)
+    spin = 2 / 3 * mu * patch / give.spin * pressed
+    turning = np.einsum("kc,kci,kcj->kij", spin, normals, normals)
+    # The contact moves by (turn) x (arm + radius normal), and the force with it.
+    behind = arms + np.where(radii > 0, radii, give.flat)[..., None] * normals
+    turning -= (cross_matrices(forces) @ cross_matrices(behind)).sum(axis=1)
+    stiff[:, 3:, 3:] += turning / length**2
+    least: Array = np.linalg.eigvalsh((stiff + stiff.swapaxes(1, 2)) / 2)[:, 0].astype(float)
+    return least
+
+
+def cross_matrices(vectors: Array) -> Array:
+    """(..., 3, 3) matrices of the cross product."""
+    return np.cross(vectors[..., None, :], np.eye(3)).swapaxes(-1, -2)
+
+
+LoadJob = c_struct("load_job", driver="touch")
+
+COLUMN = 14 * 4
+"""Numbers of a column that four programs work on (runtime/touch.c)."""
+
+
+def _solved(wrenches: Array, directions: Array) -> Array:
+    """(k, d, g + 2) x, s and slack of the linear programs of `loads`, by compiled code.
+
+    Directions are the same for all, (d, 6), or their own, (k, d, 6).
+
+    Raises:
+        UnsupportedError: There is no compiler.
+    """
+    k, _, g = wrenches.shape
+    d = directions.shape[-2]
+    solved = np.empty((k, d, g + 2))
+    arrays = {
+        "wrenches": np.ascontiguousarray(wrenches),
+        "directions": np.ascontiguousarray(np.broadcast_to(directions, (k, d, 6))),
+        "solved": solved,
+        "work": np.empty((g + 2) * COLUMN),
+    }
+    job = LoadJob(
+        **{name: array.ctypes.data for name, array in arrays.items()},
+        enough=ENOUGH,
+        edges=g,
+        each=d,
+        steps=STEPS,
+        count=k * d,
+        slice=SLICE,
+    )
+    drive("loads", _entry(), job)
+    return solved
+
+
+@cache
+def _entry() -> Any:
+    return touch_library()["casadi_ik_loads"]
+
+
+OPEN, FAR, PLACES = 0.020, 0.020, 33
+"""Fingertips come from so far before contacts, go on so far beyond [m]; places between."""
+
+STEEP = float(np.deg2rad(45.0))
+"""A flat pad that leans more does not touch with its face [rad]."""
+
+
+def robustness(
+    robot: ArmHand,
+    surface: Surface,
+    one: FoundGrasp,
+    mu: float,
+    offsets: Array,
+    hold: tuple[float, float] | None = None,
+) -> float:
+    """The share of places of the object at which the hand still closes on it.
+
+    The palm is where it was to be, and the fingers of the grasp close from 20 mm before their
+    contacts, each until it touches or is 20 mm beyond. It is closed if the contacts that there are
+    then hold any small force and torque. Fingers that share a motor are looked at one by one.
+
+    Args:
+        robot: The robot.
+        surface: The object's.
+        one: The grasp.
+        mu: Friction coefficient.
+        offsets: (k, 4, 4) where the object is really, in the frame in which it was thought to be.
+        hold: Mass [kg], and the squeeze [N] with which it has to be held; None: it is enough that
+            the contacts are force-closed.
+    """
+    table, pose = HandTable.of(robot), one.grasp.known_pose
+    assert pose is not None
+    palm = inverse(pose) @ robot.palm(one.q)
+    hand = one.q[table.motors][None]
+    used = np.array([[name in one.grasp.contacts for name in robot.fingers]])
+    same = Candidates(palm[None], hand, used)
+    way = np.concatenate(
+        [table.opened(same, float(back)).hand for back in np.linspace(OPEN, -FAR, PLACES)]
+    )
+    points, normals, linear, angular = table.at(way)
+    which = np.flatnonzero(used[0])
+    # (s, c, 3, m) in the frame in which the object was thought to be.
+    linear, angular = (palm[:3, :3] @ part[:, which] for part in (linear, angular))
+    motors = [robot.description.actuators[i] for i in table.motors]
+    # (s, c, 3) where the object was thought to be, then (k, s, c, 3) where it is.
+    points = points[:, which] @ palm[:3, :3].T + palm[:3, 3]
+    normals = normals[:, which] @ palm[:3, :3].T
+    seen = np.linalg.inv(offsets)
+    tips = np.einsum("kij,scj->ksci", seen[:, :3, :3], points) + seen[:, None, None, :3, 3]
+    faces = np.einsum("kij,scj->ksci", seen[:, :3, :3], normals)
+    height, sample = surface.foot(tips)
+    height = height - table.radii[which]
+    within = height <= 0
+    first = within.argmax(axis=1)  # (k, c)
+    touches = within.any(axis=1) & (first > 0)
+    # The place before it touches or the one after: that which is nearer to the surface.
+    before = np.maximum(first - 1, 0)
+    nearer = np.abs(_at(height, before)) < np.abs(_at(height, first))
+    there = np.where(nearer, before, first)
+    samples = _at(sample, there)
+    inward = -surface.faces[samples]
+    lean = np.arccos(np.clip((_at(faces, there) * inward).sum(axis=-1), -1, 1))
+    touches &= lean < STEEP + table.roll[which]
+    closed = np.zeros(len(offsets), dtype=bool)
+    for row_of in np.unique(touches, axis=0):
+        rows = np.flatnonzero((touches == row_of).all(axis=1))
+        if row_of.sum() < 2:
+            continue
+        chosen, at, own = samples[rows][:, row_of], there[rows][:, row_of], np.flatnonzero(row_of)
+        points, normals = surface.points[chosen], -surface.faces[chosen]
+        radii = np.broadcast_to(table.radii[which[own]], chosen.shape)
+        turns = seen[rows, None, :3, :3]
+        jacobians = turns @ linear[at, own]
+        jacobians += np.cross(
+            turns @ angular[at, own], (radii[..., None] * normals)[..., None], axis=2
+        )
+        length = surface.size / 2
+        found = strengths(
+            generators(points, normals, mu, surface.middle, length),
+            points - surface.middle,
+            normals,
+            radii,
+            jacobians,
+            motors,
+            mu,
+            hold,
+        )
+        closed[rows] = found.hold(hold)
+    return float(closed.mean())
+
+
+def _at(values: NDArray[Any], places: NDArray[np.intp]) -> NDArray[Any]:
+    """(k, c, ...) values (k, s, c, ...) at places (k, c)."""
+    k, c = places.shape
+    return values[np.arange(k)[:, None], places, np.arange(c)]
+
+
+def offsets(position: float, angle: float, samples: int, seed: int, middle: Array) -> Array:
+    """(k, 4, 4) displacements by a distance [m] and an angle [rad] in random directions.
+
+    Args:
+        position: How far the object is off [m].
+        angle: How far it is turned, about its middle [rad].
+        samples: How many, k.
+        seed: Of the directions.
+        middle: (3,) of the object [m].
+    """
+    rng = np.random.default_rng(seed)
+    ways, axes = rng.normal(size=(2, samples, 3))
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    x, y, z = (axes / np.linalg.norm(axes, axis=1, keepdims=True)).T
+    skew = np.zeros((samples, 3, 3))
+    skew[:, 0, 1], skew[:, 0, 2], skew[:, 1, 2] = -z, y, -x
+    skew -= skew.swapaxes(1, 2)
+    found = np.tile(np.eye(4), (samples, 1, 1))
+    found[:, :3, :3] += np.sin(angle) * skew + (1 - np.cos(angle)) * skew @ skew
+    found[:, :3, 3] = position * ways + middle - found[:, :3, :3] @ middle
+    return found

@@ -1,0 +1,288 @@
+"""Surfaces of objects as oriented samples: where a fingertip may touch, and how far points are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.collision.solids import Kind, Solid
+from casadi_ik.errors import InputError
+from casadi_ik.files.arrays import Array, Bools
+from casadi_ik.model.objects import GraspObject, load_object
+
+
+@dataclass(frozen=True)
+class SurfaceParameters:
+    """How finely a surface is looked at (lengths of Drost et al. 2010, scaled to fingertips).
+
+    Attributes:
+        samples: Points on the surface.
+        smoothing: Normals are means over this radius [m], about that of a fingertip's pad.
+        patch: A point is inside a face if all samples of this radius about it [m] ...
+        bend: ... have normals within this angle of its own [rad].
+        step: Edge of a cell of the distance grid [m].
+        around: How far beyond the object the grid reaches [m].
+        cells: Most cells along an edge of the grid; large objects get larger cells.
+    """
+
+    samples: int = 6000
+    smoothing: float = 4e-3
+    patch: float = 5e-3
+    bend: float = float(np.deg2rad(25.0))
+    step: float = 3e-3
+    around: float = 30e-3
+    cells: int = 96
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Distances in the middles of cells.
+
+    Attributes:
+        low: (4,) lower corner, and edge of a cell [m].
+        counts: (3,) how many cells there are along each axis.
+        value: (cells,) distances [m].
+        sample: (cells,) what is there; empty where that is not known.
+    """
+
+    low: Array
+    counts: NDArray[np.int64]
+    value: Array
+    sample: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+    @classmethod
+    def of(
+        cls, solids: Iterable[tuple[Solid, Array]], low: Array, high: Array, step: float
+    ) -> Grid:
+        """The least distance of solids at poses (4, 4), infinite where there is none."""
+        low, counts, middles = cells(low, high, step)
+        value = np.full(len(middles), np.inf)
+        for solid, pose in solids:
+            seen = (middles - pose[:3, 3]) @ pose[:3, :3]
+            if solid.kind is Kind.CLOUD:
+                apart = _tree(solid.points).query(seen)[0] - solid.size[0]
+            else:
+                apart = solid.distance(seen)
+            np.minimum(value, apart, out=value)
+        return cls(low, counts, value)
+
+
+NEIGHBOURS = 12
+"""Samples about each: by them the nearest of a point is found from one that is near."""
+
+
+def cells(low: Array, high: Array, step: float) -> tuple[Array, NDArray[np.int64], Array]:
+    """Lower corner and edge (4,), numbers (3,) and middles (cells, 3) of the cells of a box [m]."""
+    counts = np.ceil((high - low) / step).astype(np.int64)
+    axes = [low[i] + step * (np.arange(counts[i]) + 0.5) for i in range(3)]
+    middles = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    return np.append(low, step), counts, middles.reshape(-1, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """An object's surface.
+
+    Attributes:
+        name: As `load_object` takes it, with its scale.
+        object: The object.
+        points: (m, 3) samples [m], object frame.
+        normals: (m, 3) unit outward normals, smoothed.
+        faces: (m, 3) unit outward normals of the triangles themselves.
+        inside: (m,) whether a fingertip's pad fits: no edge of the surface is near.
+        parameters: How it was sampled.
+        notes: What is odd about the mesh, and what was made of it; empty for a closed one.
+
+    Example:
+        >>> surface = ik.load_surface("tomato_soup_can")
+        >>> height, _ = surface.foot(np.array([0.0, 0.0, 1.0]))
+        >>> bool(height > 0.9)
+        True
+    """
+
+    name: str
+    object: GraspObject
+    points: Array
+    normals: Array
+    faces: Array
+    inside: Bools
+    parameters: SurfaceParameters
+    notes: tuple[str, ...] = ()
+
+    @cached_property
+    def size(self) -> float:
+        """Diagonal of the box around it [m]."""
+        return float(np.linalg.norm(np.ptp(self.points, axis=0)))
+
+    @cached_property
+    def middle(self) -> Array:
+        """(3,) mean of the samples [m]: about where the centre of mass is."""
+        return self.points.mean(axis=0)
+
+    @cached_property
+    def tree(self):
+        """Nearest samples of points."""
+        return _tree(self.points)
+
+    @cached_property
+    def grid(self) -> Grid:
+        """Heights about the surface, and its samples there."""
+        chosen = self.parameters
+        low, high = self.points.min(axis=0), self.points.max(axis=0)
+        step = max(chosen.step, (float((high - low).max()) + 2 * chosen.around) / chosen.cells)
+        low, counts, middles = cells(low - chosen.around, high + chosen.around, step)
+        height, sample = self.foot(middles)
+        apart = np.linalg.norm(middles - self.points[sample], axis=1)
+        return Grid(low, counts, np.copysign(apart, height), sample.astype(np.int64))
+
+    @cached_property
+    def neighbours(self) -> NDArray[np.int64]:
+        """(m, NEIGHBOURS) the samples that are nearest to each."""
+        return self.tree.query(self.points, NEIGHBOURS)[1].astype(np.int64)
+
+    def foot(self, points: Array) -> tuple[Array, NDArray[np.intp]]:
+        """Nearest points of the surface: heights (...) [m], negative inside, and samples (...)."""
+        _, sample = self.tree.query(points)
+        height = ((points - self.points[sample]) * self.faces[sample]).sum(axis=-1)
+        return height, sample
+
+
+def _tree(points: Array) -> Any:
+    return import_module("scipy.spatial").cKDTree(points)
+
+
+def load_surface(
+    name_or_path: str | Path,
+    scale: float = 1.0,
+    seed: int = 0,
+    parameters: SurfaceParameters | None = None,
+) -> Surface:
+    """Sample the surface of an object.
+
+    Args:
+        name_or_path: A shipped object, the path of an object's file, or of a mesh in metres (STL,
+            OBJ, PLY, ...).
+        scale: Of a mesh: its unit in metres (0.001 for millimetres).
+        seed: Of the samples.
+        parameters: How finely; None: `SurfaceParameters()`.
+
+    Raises:
+        UnknownNameError: No shipped object has that name.
+        DescriptionError: The file is missing or malformed.
+        InputError: A scale for an object that is no mesh, or a surface that is no body's: without
+            area, flat, too large or small for a hand, or with triangles that face opposite ways.
+
+    Example:
+        >>> surface = ik.load_surface("tomato_soup_can")
+        >>> surface.points.shape
+        (6000, 3)
+    """
+    chosen = parameters or SurfaceParameters()
+    name = str(name_or_path) if scale == 1.0 else f"{name_or_path}@{scale:g}"
+    thing = load_object(name)
+    vertices, triangles = thing.mesh(resolution=96)
+    vertices, triangles, notes = _body(name, vertices, triangles)
+    corners = vertices[triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    doubled = np.linalg.norm(normals, axis=1)
+    rng = np.random.default_rng(seed)
+    face = rng.choice(len(triangles), chosen.samples, p=doubled / doubled.sum())
+    u, v = np.sqrt(rng.random(chosen.samples)), rng.random(chosen.samples)
+    weights = np.stack([1 - u, u * (1 - v), u * v], axis=1)
+    points = (corners[face] * weights[..., None]).sum(axis=1)
+    own = normals[face] / doubled[face, None]
+    return replace(_smoothed(name, thing, points, own, chosen), notes=notes)
+
+
+SIZES = (5e-3, 2.0)
+"""Least and largest edge of the box around an object that a hand may grasp [m]."""
+
+FLAT = 1e-4
+"""What is thinner has no two sides for a hand [m]."""
+
+DISAGREE = 0.05
+"""Share of edges whose two triangles may face opposite ways: scans have some."""
+
+
+def _body(
+    name: str, vertices: Array, triangles: NDArray[np.int64]
+) -> tuple[Array, NDArray[np.int64], tuple[str, ...]]:
+    """A mesh whose triangles face outwards, and what was odd about it.
+
+    Raises:
+        InputError: It is no body's, see `load_surface`.
+    """
+    corners = vertices[triangles]
+    crossed = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    if not np.linalg.norm(crossed, axis=1).sum() > 0:
+        raise InputError(f"{name}: found a surface without area, expected a mesh of a body")
+    largest = np.ptp(vertices, axis=0).max()
+    if not SIZES[0] <= largest <= SIZES[1]:
+        raise InputError(
+            f"{name}: found a size of {largest:.3g} m, expected metres, from {SIZES[0]:g} to "
+            f"{SIZES[1]:g} m; scale=0.001 is for millimetres"
+        )
+    middle = vertices.mean(axis=0)
+    _, axes = np.linalg.eigh(np.cov((vertices - middle).T))
+    thin = np.ptp(vertices @ axes[:, 0])
+    if thin < FLAT:
+        raise InputError(
+            f"{name}: found a flat sheet ({1e3 * thin:.2g} mm), expected a mesh of a body"
+        )
+    notes: list[str] = []
+    _, same = np.unique(np.round(vertices, 7), axis=0, return_inverse=True)
+    merged = same.reshape(-1)[triangles]
+    edges = merged[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    edges = edges[edges[:, 0] != edges[:, 1]]
+    forward = edges[:, 0] < edges[:, 1]
+    key = np.sort(edges, axis=1) @ np.array([len(vertices), 1])
+    _, edge, users = np.unique(key, return_inverse=True, return_counts=True)
+    ways = np.bincount(edge, weights=forward)
+    wrong = int(((users == 2) & (ways != 1)).sum())
+    if wrong > DISAGREE * len(users):
+        raise InputError(
+            f"{name}: found triangles that face opposite ways at {wrong:,} of {len(users):,} "
+            "edges, expected outward normals; trimesh.repair.fix_normals mends such a mesh"
+        )
+    border = int((users == 1).sum())
+    if border:
+        notes.append(f"the mesh is open: {border:,} edges have one triangle only")
+    volume = ((corners[:, 0] - middle) * crossed).sum() / 6
+    if volume < 0:
+        notes.append("the mesh was inside out: its triangles are turned")
+        triangles = triangles[:, ::-1]
+    return vertices, triangles, tuple(notes)
+
+
+def _smoothed(
+    name: str, thing: GraspObject, points: Array, faces: Array, chosen: SurfaceParameters
+) -> Surface:
+    """The surface of samples whose normals are averaged over their neighbours."""
+    tree = _tree(points)
+
+    def links(radius: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        pairs = tree.query_pairs(radius, output_type="ndarray")
+        every = np.arange(len(points))
+        return (
+            np.concatenate([pairs[:, 0], pairs[:, 1], every]),
+            np.concatenate([pairs[:, 1], pairs[:, 0], every]),
+        )
+
+    # Sides of a thin wall that face away from each other are no neighbours.
+    one, other = links(chosen.smoothing)
+    alike = (faces[one] * faces[other]).sum(axis=1) > 0
+    normals = np.zeros_like(points)
+    np.add.at(normals, one[alike], faces[other[alike]])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    one, other = links(chosen.patch)
+    bent = (normals[one] * faces[other]).sum(axis=1) < np.cos(chosen.bend)
+    inside = np.ones(len(points), dtype=bool)
+    inside[one[bent]] = False
+    return Surface(name, thing, points, normals, faces, inside, chosen)

@@ -1,0 +1,673 @@
+"""The driver of hand-first: C that is made for a robot, and its calls for one target and for many.
+
+What is done when stands in hand_first.c and seeds.c, and in the loop that calls them. Here they get
+their memory, their constants and the kernels that they call.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import re
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from functools import cache
+from importlib import resources
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.compile import REPEATED, RUNNING, FunctionKernel, LoopKernel
+from casadi_ik.compile.cancellation import SLICE, DriverCode, check
+from casadi_ik.compile.codegen import WIDE, define, define_arrays, driver_text, number
+from casadi_ik.compile.function_kernel import machine_lanes, memory
+from casadi_ik.compile.graphs import recipe
+from casadi_ik.compile.libraries import load_library
+from casadi_ik.compile.loop import FOREVER, SLOTS, UNBEGUN, Followed
+from casadi_ik.errors import KernelError
+from casadi_ik.files.arrays import Array, even_steps
+from casadi_ik.kinematics.contact_fit import fresh_fit
+from casadi_ik.kinematics.contacts import LENGTH
+from casadi_ik.model.grasp import LARGE, SMALL, UNIT
+from casadi_ik.model.targets import TargetBatch
+from casadi_ik.solve.hand_first.parameters import HandFirstParameters
+from casadi_ik.solve.hand_first.seeds import FEATURES, Seeds
+from casadi_ik.solve.hand_first.state import HandFirstLayouts, terms
+from casadi_ik.solve.method import Outcome, Quick
+from casadi_ik.solve.status import Phase, Status
+from casadi_ik.solve.verdict import LIMIT_SLACK, TOLERANCE_SLACK, made
+
+MALFORMED = -9
+"""What a search returns for a question that is none."""
+
+SMALLEST = 1e-9
+"""Smallest range [rad or m] a motion is measured by."""
+
+KERNELS = {
+    "look_up": "lookup_job",
+    "begin": "map_job",
+    "solve": "loop_job",
+    "seen": "map_job",
+    "judge": "map_job",
+}
+"""The compiled functions it calls, and what they work on."""
+
+EXPORT = """
+#if defined(_WIN32)
+#define EXPORT __declspec(dllexport)
+#else
+#define EXPORT __attribute__((visibility("default")))
+#endif
+"""
+
+HANDS = "EXPORT int casadi_ik_hands"
+"""What a body calls of its sides' libraries."""
+
+OF_SIDES = """
+typedef int (*find_hands)(void *, const double *, const double *, const double *, int64_t, int64_t,
+                          double *);
+#define HANDS(side, ...) ((find_hands) job->hands[side])((void *) job->sides[side], __VA_ARGS__)
+"""
+"""How a body does it."""
+
+STATE = (
+    *("q", "phase", "candidate", "earlier", "held", "returns"),
+    *("best_cost", "best_q", "counts"),
+)
+"""What the C reads and writes of a state."""
+
+
+@cache
+def source_text(name: str) -> str:
+    """The text of one of the files beside this one, as "hand_first"."""
+    source = resources.files("casadi_ik.solve.hand_first") / f"{name}.c"
+    return source.read_text(encoding="utf-8")
+
+
+@dataclass(frozen=True, eq=False)
+class SearchPlan:
+    """What the C is made of for a robot and a way of taking limits.
+
+    Attributes:
+        layouts: Of the step.
+        options: Of the method.
+        budget: Iterations of a round.
+        seeds: The hand postures that rounds begin from.
+        enforce_limits: Whether limits are part of being solved.
+        made: What gives the kernels below, which are compiled when first asked for.
+        sides: Of a body, what its sides' hands are found by.
+    """
+
+    layouts: HandFirstLayouts
+    options: HandFirstParameters
+    budget: int
+    seeds: Seeds
+    enforce_limits: bool
+    made: Mapping[str, Callable[[], Any]]
+    sides: tuple[SearchPlan, ...] = ()
+
+    @property
+    def begin(self) -> FunctionKernel:
+        """Makes first state and parameters of a round."""
+        return self.made["begin"]()
+
+    @property
+    def solve(self) -> LoopKernel:
+        """The loop."""
+        return self.made["solve"]()
+
+    @property
+    def contacts(self) -> FunctionKernel:
+        """Contact points and normals of configurations, for what is exported."""
+        return self.made["contacts"]()
+
+    @property
+    def judge(self) -> FunctionKernel:
+        """Errors and excess over limits of a configuration."""
+        return self.made["judge"]()
+
+    @property
+    def rounds(self) -> int:
+        """How many there are at most."""
+        return self.options.all_rounds(self.layouts.robot)
+
+    @property
+    def mends(self) -> bool:
+        """Whether every finger by itself mends the postures that rounds begin from."""
+        return self.enforce_limits and self.seeds.mends
+
+    @property
+    def pool(self) -> int:
+        """Postures of which a round's are taken, at most."""
+        options = self.options
+        mended = max(options.pool, options.candidates)
+        return mended if self.mends else options.candidates * max(options.rounds - 1, 1)
+
+    @property
+    def kernels(self) -> dict[str, Any]:
+        """Those that are called, by the names of `KERNELS`."""
+        found = {"begin": self.begin, "solve": self.solve, "judge": self.judge}
+        return found if self.sides else found | self.of_hands
+
+    @property
+    def of_hands(self) -> dict[str, Any]:
+        """Those that find hands."""
+        found = {"look_up": self.seeds.table.lookup}
+        return found | ({"seen": self.seeds.seen} if self.mends else {})
+
+    @property
+    def source(self) -> str:
+        """The C of a search."""
+        names = "spread", "sides" if self.sides else "seeds", "hand_first"
+        texts = map(source_text, names)
+        return driver_text("loops") + "".join(texts)
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """The macros that dimensions of arrays are made of."""
+        robot, layouts = self.layouts.robot, self.layouts
+        return {
+            "N_FINGERS": len(robot.fingers),
+            "N_MOTORS": len(robot.actuators),
+            "N_HAND": len(robot.hand_actuators),
+            "N_TERMS": terms(robot).size,
+            "N_STATE": layouts.state.size,
+            "N_PARAMETERS": layouts.parameters.size,
+            "N_CANDIDATES": self.options.candidates,
+            "N_POOL": self.pool,
+            "N_MENDED": self.pool if self.mends else self.options.candidates,
+            "N_MORE": len(layouts.contacts.data) - 2,
+            "N_SIDES": len(self.sides),
+        }
+
+    @property
+    def fields(self) -> dict[str, tuple[str, int | None, str]]:
+        """Type, length (None: a number) and meaning of what a search has in memory, 8 bytes."""
+        f, n, h, _, state, parameters, candidates, pool, mended, more, _ = self.sizes.values()
+        double, whole = "double", "int64_t"
+        return {
+            "points": (double, 3 * f, "the question: base frame, NaN = free"),
+            "normals": (double, 3 * f, ""),
+            "more": (double, 3 * f * more + 1, "contacts' other vectors, without a verdict here"),
+            "here": (double, n, "where the robot is"),
+            "terms": (double, self.sizes["N_TERMS"], "tolerances, bounds, 1 = nearest wanted"),
+            "most": (whole, None, "rounds of a search; 0: its first alone, no search without"),
+            "q": (double, n, "the answer"),
+            "position_error": (double, f, "[m]"),
+            "angle_error": (double, f, "[rad]"),
+            "beyond": (double, None, "by how much the worst motor or joint is beyond its limits"),
+            "iterations": (whole, None, ""),
+            "restarts": (whole, None, ""),
+            "status": (whole, None, ""),
+            "judged": (whole, None, "on its way: whether there is a verdict"),
+            "round": (whole, None, ""),
+            "again": (whole, None, "1 = near `here` there was none: the search without preference"),
+            "may_begin": (whole, None, "rounds of this call"),
+            "slot": (whole, None, "of the loop, -1 = not under way"),
+            "begun": (whole, None, "iterations before the round"),
+            "loop_status": (whole, None, ""),
+            "paused": (whole, None, ""),
+            "state": (double, state, ""),
+            "parameters": (double, parameters, ""),
+            "last": (double, state, "the state in which the round before ended"),
+            "mark": (double, state, ""),
+            "postures": (double, candidates * h, "of the round"),
+            "bests": (double, 2 * h, "the best hand, and the one that was it before"),
+            "n_bests": (whole, None, ""),
+            "near": (double, mended * h, "room for seeds.c, and for a scene's hands"),
+            "left": (double, mended, ""),
+            "found": (whole, pool, ""),
+        }
+
+    def members(self) -> str:
+        """The `fields` as members of a struct of C."""
+        lines = []
+        for name, (kind, length, doc) in self.fields.items():
+            size = "" if length is None else f"[{length}]"
+            lines.append(f"  {kind} {name}{size};{f'  /* {doc} */' if doc else ''}\n")
+        return "".join(lines)
+
+    def constants(
+        self,
+        source: str,
+        reals: Mapping[str, float] | None = None,
+        arrays: Mapping[str, NDArray[Any]] | None = None,
+    ) -> str:
+        """All of them but the `sizes`, as C text.
+
+        Args:
+            source: Text in C; arrays are those that it names.
+            reals: Those of the constants that are others than in Python.
+            arrays: Likewise.
+        """
+        numbers = self._real_numbers() | dict(reals or {})
+        lines = (f"#define {name} {number(value)}\n" for name, value in numbers.items())
+        named = set(re.findall(r"\w+", source))
+        tables = self._arrays() | dict(arrays or {})
+        tables = {name: array for name, array in tables.items() if name in named}
+        return define(self._whole_numbers()) + "".join(lines) + define_arrays(tables)
+
+    def _whole_numbers(self) -> dict[str, int]:
+        layouts, robot = self.layouts, self.layouts.robot
+        places = {f"STATE_{name.upper()}": layouts.state.slice(name).start for name in self._state}
+        for label, layout in (("PARAMETERS", layouts.parameters), ("TERMS", terms(robot))):
+            for name in ("lower", "upper", "nearest"):
+                places[f"{label}_{name.upper()}"] = layout.slice(name).start
+        return {
+            "RUNNING": RUNNING,
+            "REPEATED": REPEATED,
+            "UNBEGUN": UNBEGUN,
+            "BUDGET": self.budget,
+            "ALL_ROUNDS": self.rounds,
+            "FIRST_RUGGED": self.options.first_rugged,
+            "MENDS": int(self.mends),
+            "FINGER_FEATURES": FEATURES,
+            "ENFORCE_LIMITS": int(self.enforce_limits),
+            "HAS_ARM": int(bool(layouts.arm)),
+            "N_CARRIED": len(self._carried),
+            "N_FRESH": len(fresh_fit()),
+            "N_COUNTS": len(self.layouts.stages),
+            **{f"{status.name}_STATUS": int(status) for status in Status},
+            **{f"{phase.name}_PHASE": int(phase) for phase in Phase},
+            **{k: v for k, v in self._options.items() if isinstance(v, int)},
+            **places,
+        }
+
+    @property
+    def _state(self) -> tuple[str, ...]:
+        return (*STATE, "hopeless") if self.sides else STATE
+
+    @property
+    def _options(self) -> dict[str, Any]:
+        """Those that are numbers; of the two for few and many motors the robot's and the other."""
+        many, found = self.options.is_many(self.layouts.robot), dict[str, Any]()
+        for name, value in asdict(self.options).items():
+            if isinstance(value, int | float):
+                found[name.upper()] = value
+            elif name in ("same_minimum", "far_cost"):
+                found |= {name.upper(): value[many], f"{name.upper()}_MANY": value[1]}
+        return found
+
+    def _real_numbers(self) -> dict[str, float]:
+        return {
+            "LENGTH": LENGTH,
+            "UNIT": UNIT,
+            "SMALL_LENGTH": SMALL,
+            "LARGE_LENGTH": LARGE,
+            "TOLERANCE_SLACK": TOLERANCE_SLACK,
+            "LIMIT_SLACK": LIMIT_SLACK,
+            "SLICE": SLICE,
+            **{k: v for k, v in self._options.items() if isinstance(v, float)},
+        }
+
+    @property
+    def _carried(self) -> list[int]:
+        """Places in the state."""
+        slices = map(self.layouts.state.slice, self.layouts.carried)
+        return [place for one in slices for place in range(one.start, one.stop)]
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        robot, seeds = self.layouts.robot, self.seeds
+        hand, spreads = list(robot.hand_actuators), seeds.spreads
+        lower, upper = seeds.anywhere_bounds(self.enforce_limits)
+        fresh, state = fresh_fit(), self.layouts.state
+        return {
+            "HAND": np.array(hand, dtype=np.int64),
+            "CARRIED": np.array(self._carried),
+            "FRESH_PLACES": np.array([state.slice(name).start for name in fresh]),
+            "FRESH_VALUES": np.array([float(value) for value in fresh.values()]),
+            "LOWER": robot.lower,
+            "UPPER": robot.upper,
+            "ORDER_RANGES": np.maximum((robot.upper - robot.lower)[hand], SMALLEST),
+            "HAND_STEPS": even_steps(len(hand)),
+            "ALL_STEPS": even_steps(len(robot.actuators)),
+            "ANYWHERE_LOWER": lower,
+            "ANYWHERE_RANGE": upper - lower,
+            **(self._finger_tables() if self.mends else {}),
+            "TABLE_LOWER": np.array([spread.lower[hand] for spread in spreads]),
+            "TABLE_RANGE": np.array([(spread.upper - spread.lower)[hand] for spread in spreads]),
+            "TABLE_SQUEEZE": np.array([1 - spread.at_limits for spread in spreads]),
+            "TABLE_ROWS": np.array([spread.count for spread in spreads]),
+            **(self._side_tables() if self.sides else {}),
+        }
+
+    def _side_tables(self) -> dict[str, NDArray[Any]]:
+        """How a body's fingers, hands and motors are shared out; filled up with zeros."""
+        robot = self.layouts.robot
+        motors = [sorted((*arm, *hand)) for arm, hand in robot.side_actuators]
+        places = np.zeros((len(motors), max(map(len, motors))), dtype=np.int64)
+        for i, own in enumerate(motors):
+            places[i, : len(own)] = own
+        return {
+            "SIDE_FINGERS": np.array([len(side.fingers) for side in robot.sides]),
+            "SIDE_HANDS": np.array([len(hand) for _, hand in robot.side_actuators]),
+            "SIDE_MOTORS": np.array([len(own) for own in motors]),
+            "SIDE_PLACES": places,
+        }
+
+    def _finger_tables(self) -> dict[str, NDArray[Any]]:
+        """Those by which postures are mended, filled up with zeros."""
+        tables = self.seeds.fingers
+        most = max(len(table.places) for table in tables)
+        places = np.zeros((len(tables), most), dtype=np.int64)
+        postures = np.zeros((len(tables), len(tables[0].postures), most))
+        for i, table in enumerate(tables):
+            places[i, : len(table.places)] = table.places
+            postures[i, :, : len(table.places)] = table.postures
+        return {
+            "FINGER_MOTORS": np.array([len(table.places) for table in tables]),
+            "FINGER_PLACES": places,
+            "FINGER_POSTURES": postures,
+            "FINGER_TIPS": np.array([table.features for table in tables]),
+        }
+
+
+class Searches:
+    """Memory for some searches at a time, and the calls that make them; not shared by threads.
+
+    The arrays of the first are there to be written into and read.
+
+    Attributes:
+        points: (f, 3) [m], NaN where free; write into it.
+        normals: (f, 3); write into it.
+        more: (f, 3) each, the contacts' other vectors; write into them.
+        here: (n,) where the robot is; write into it.
+        terms: What `beginning` calls so; write into it.
+        q: (n,) the answer; a call overwrites it, as all below.
+        position_error: (f,) [m], where there are points and normals only.
+        angle_error: (f,) [rad], likewise.
+        state: (ns,) of the loop.
+        parameters: (np,) of the loop.
+        postures: (candidates, hand) of a round.
+    """
+
+    def __init__(self, plan: SearchPlan, count: int) -> None:
+        """Compile what is not compiled yet.
+
+        Args:
+            plan: What it is made of; its kernels are compiled.
+            count: How many searches may be under way.
+
+        Raises:
+            KernelError: The compiler refused.
+        """
+        robot = plan.layouts.robot
+        self.plan = plan
+        self._name, library = _library(plan)
+        if library is None:
+            raise KernelError(f"{self._name}: no compiler, and no kernel made ahead")
+        self._search: Any = library["casadi_ik_search"]
+        self._decide: Any = library["casadi_ik_decide"]
+        self._find_postures: Any = library["casadi_ik_postures"]
+        self._follow = ctypes.cast(library["casadi_ik_follow"], ctypes.c_void_p).value
+        self._memory = searches = np.zeros(count, dtype=_form(plan))
+        self._kept = _called(plan, searches, plan.kernels)
+        for i, side in enumerate(plan.sides):
+            self._kept += self._hands_of(side, i)
+        f = len(robot.fingers)
+        one = searches[0]
+        self.points, self.normals = one["points"].reshape(f, 3), one["normals"].reshape(f, 3)
+        self.more = list(one["more"][:-1].reshape(-1, f, 3))
+        self.here, self.terms, self.q = one["here"], one["terms"], one["q"]
+        self.position_error, self.angle_error = one["position_error"], one["angle_error"]
+        self.state, self.parameters = one["state"], one["parameters"]
+        self.postures = one["postures"].reshape(plan.options.candidates, -1)
+        self._one = one
+        self._counts = self.state[plan.layouts.state.slice("counts")]
+        self._base = memory(searches.view(np.uint8))
+        self._address = ctypes.c_void_p(self._base)
+        # An entry of a record costs as much as a tenth of a solve: these are read in every one.
+        offsets = searches.dtype.fields or {}
+        self._most, self._iterations, self._restarts, self._status, self._paused = (
+            ctypes.c_int64.from_address(self._base + offsets[name][1])
+            for name in ("most", "iterations", "restarts", "status", "paused")
+        )
+        self._beyond = ctypes.c_double.from_address(self._base + offsets["beyond"][1])
+
+    def _hands_of(self, plan: SearchPlan, place: int) -> tuple[Any, ...]:
+        """Memory of a side's searches for hands, one for each search of the body."""
+        name, library = _library(plan)
+        if library is None:
+            raise KernelError(f"{name}: no compiler, and no kernel made ahead")
+        own = np.zeros(len(self._memory), dtype=_form(plan))
+        kept = _called(plan, own, plan.of_hands)
+        step = own.dtype.itemsize
+        first = memory(own.view(np.uint8))
+        self._memory["sides"][:, place] = first + step * np.arange(len(own))
+        found: Any = library["casadi_ik_hands"]
+        self._memory["hands"][:, place] = ctypes.cast(found, ctypes.c_void_p).value
+        return kept
+
+    def ask(self, targets: TargetBatch, row: int, here: Array, given: Array) -> None:
+        """Put one of k targets in.
+
+        Args:
+            targets: k targets.
+            row: Which of them.
+            here: (n,) where the robot is.
+            given: Its terms.
+        """
+        self.points[...], self.normals[...] = targets.points[row], targets.normals[row]
+        self.here[...], self.terms[...] = here, given
+        for vectors, name in zip(self.more, self.plan.layouts.contacts.data[2:], strict=True):
+            vectors[...] = targets.vectors(f"{name}s")[row]
+
+    def __call__(self, rounds: int) -> int | None:
+        """Search for the target that stands in the arrays.
+
+        Args:
+            rounds: At most.
+
+        Returns:
+            Code of `Status`, after the verdict where there is one; None: the target is malformed.
+
+        Raises:
+            KernelError: No work memory.
+        """
+        self._most.value = rounds
+        code = self._search(self._address)
+        if code == DriverCode.DONE:
+            return self._status.value
+        if code == MALFORMED:
+            return None
+        try:
+            while code != DriverCode.DONE:
+                check(self._name, code)
+                code = self._search(self._address)
+        finally:
+            self._paused.value = 0
+        return self._status.value
+
+    def answer(self, status: int) -> Quick:
+        """The last answer, copied.
+
+        Args:
+            status: What the call returned.
+        """
+        errors = None
+        if not self.more:
+            errors = self.position_error.tolist(), self.angle_error.tolist(), self._beyond.value
+        return made(
+            Quick,
+            q=self.q.copy(),
+            status=status,
+            iterations=self._iterations.value,
+            restarts=self._restarts.value,
+            phases=dict(
+                zip(self.plan.layouts.labels, map(int, self._counts.tolist()), strict=True)
+            ),
+            errors=errors,
+        )
+
+    def decide(self, status: int, rounds: int) -> bool:
+        """Whether a round follows; it then begins with `state` and `parameters`.
+
+        Args:
+            status: How the loop ended in `state`, or `UNBEGUN`.
+            rounds: At most.
+        """
+        self._one["loop_status"], self._one["most"] = status, rounds
+        code = self._decide(self._address)
+        if code != DriverCode.GOES_ON:
+            check(self._name, code)
+        return code == DriverCode.GOES_ON
+
+    def hands(self, number: int) -> Array:
+        """Postures (candidates, hand) of a round that look like the target in the arrays."""
+        self._one["round"], self.terms[-1] = number, 0.0  # in no particular order
+        check(self._name, self._find_postures(self._address))
+        return self.postures.copy()
+
+    def batch(
+        self,
+        targets: TargetBatch,
+        q0: Array,
+        given: Array,
+        rounds: NDArray[np.int64],
+        trace: bool,
+    ) -> Outcome:
+        """Search for k targets, some of them at a time.
+
+        Args:
+            targets: The targets.
+            q0: (k, n) where the robot is.
+            given: Their terms, (t,) or (k, t).
+            rounds: (k,) at most.
+            trace: Whether to keep every iteration.
+        """
+        plan, count = self.plan, len(targets)
+        data = plan.layouts.contacts.data
+        more = [targets.vectors(f"{name}s") for name in data[2:]]
+        asked = [
+            *map(np.ascontiguousarray, (targets.points, targets.normals)),
+            np.stack(more, axis=1) if more else np.zeros(1),
+            *map(np.ascontiguousarray, (q0, given)),
+            rounds,
+        ]
+        answers = [
+            np.empty_like(q0, order="C"),
+            np.empty((count, len(plan.layouts.stages))),
+            np.empty(count, dtype=np.int64),
+        ]
+        step = 0 if given.ndim == 1 else given.shape[1]
+        job = (ctypes.c_int64 * 11)(self._base, *map(memory, asked), step, *map(memory, answers))
+        fields: Any = self._memory.dtype.fields
+        result = plan.solve.run_followed(
+            Followed(
+                states=self._base + fields["state"][1],
+                parameters=self._base + fields["parameters"][1],
+                step=self._memory.dtype.itemsize // 8,
+                slots=len(self._memory),
+                follow=self._follow or 0,
+                method=ctypes.addressof(job),
+            ),
+            count,
+            plan.budget,
+            trace,
+        )
+        q, counts, restarts = answers
+        return Outcome(
+            q=q,
+            status=result.status.astype(np.int64),
+            iterations=result.iterations,
+            restarts=restarts,
+            time=result.time,
+            phases=dict(zip(self.plan.layouts.labels, counts.astype(np.int64).T, strict=True)),
+            rows=result.rows,
+        )
+
+
+def _called(plan: SearchPlan, searches: NDArray[Any], kernels: dict[str, Any]) -> tuple[Any, ...]:
+    """Write down what searches call; returns what has to be kept meanwhile."""
+    tables = plan.seeds.tables(plan.enforce_limits)
+    for i, table in enumerate(tables):
+        searches["tiles"][:, i] = memory(table.lookup.tiles)
+    for name, kernel in kernels.items():
+        searches[name] = ctypes.cast(kernel.entry, ctypes.c_void_p).value
+    return kernels, tables, searches
+
+
+class SearchPool:
+    """Memory of searches, made once for as many threads as are at work at a time."""
+
+    def __init__(self, plan: Callable[[bool], SearchPlan]) -> None:
+        """Nothing is compiled before it is asked for.
+
+        Args:
+            plan: For limits that are enforced or not.
+        """
+        self._plan = plan
+        self._free: dict[tuple[bool, int], list[Searches]] = {}
+
+    @contextmanager
+    def lent(self, enforce_limits: bool, count: int = 1) -> Iterator[Searches]:
+        """Memory for one search, or for `SLOTS` if there are more targets than one."""
+        size = SLOTS if count > 1 else 1
+        free = self._free.setdefault((enforce_limits, size), [])
+        try:
+            searches = free.pop()
+        except IndexError:
+            searches = Searches(self._plan(enforce_limits), size)
+        yield searches
+        free.append(searches)
+
+
+def can_search(plan: SearchPlan) -> bool:
+    """Whether there is compiled code of a search and of all that it calls."""
+    called = (
+        *plan.kernels.values(),
+        *(one for side in plan.sides for one in side.of_hands.values()),
+    )
+    libraries = (_library(one)[1] for one in (plan, *plan.sides))
+    return all(kernel.entry for kernel in called) and None not in libraries
+
+
+def _library(plan: SearchPlan) -> tuple[str, ctypes.CDLL | None]:
+    """Name and compiled code of a search."""
+    robot = plan.layouts.robot
+    name = ca.Function.fix_name(f"hand_first_search_{robot.name}")
+    given = robot, plan.options, plan.layouts.kinds, plan.budget, plan.enforce_limits
+    wide = machine_lanes() > 0
+    known = recipe(*given, wide)
+    return name, load_library(name, lambda: _text(plan, wide), "casadi_ik_search", known)
+
+
+def _form(plan: SearchPlan) -> list[Any]:
+    """The memory of a search, as a record of numpy."""
+    kinds = {"double": np.float64, "int64_t": np.int64}
+    form: list[Any] = [
+        (name, kinds[kind], () if length is None else (length,))
+        for name, (kind, length, _) in plan.fields.items()
+    ]
+    sides = [(name, np.int64, (len(plan.sides),)) for name in ("sides", "hands") if plan.sides]
+    return [*form, ("tiles", np.int64, (3,)), *sides, *((name, np.int64) for name in KERNELS)]
+
+
+def _text(plan: SearchPlan, wide: bool) -> str:
+    """The C text of the library."""
+    jobs = (driver_text(name) for name in ("loop_job", "map_job", "lookup_job"))
+    pointers = "".join(f"  int (*{name})({job} *);\n" for name, job in KERNELS.items())
+    calls = "".join(f"#define {name.upper()}(work) (job->{name})(work)\n" for name in KERNELS)
+    count = len(plan.sides)
+    sides = f"  int64_t sides[{count}], hands[{count}];\n" if count else ""
+    source = plan.source + ("" if plan.sides else source_text("hands"))
+    codes = {code.name: int(code) for code in DriverCode} | {"MALFORMED": MALFORMED}
+    return "".join(
+        (
+            WIDE if wide else "",
+            "#include <math.h>\n#include <stdint.h>\n#include <string.h>\n",
+            define(codes | {"FOREVER": FOREVER}),
+            *jobs,
+            f"typedef struct {{\n{plan.members()}",
+            f"  const int16_t *tiles[3];\n{sides}{pointers}}} search;\n",
+            f"{calls}#define TILES(table) (job->tiles[table])\n",
+            define(plan.sizes),
+            plan.constants(source),
+            EXPORT,
+            OF_SIDES if plan.sides else f"#define FIND_HANDS {HANDS}\n",
+            source,
+            source_text("calls"),
+        )
+    )

@@ -1,0 +1,78 @@
+"""Joint limits inside a step, kept or ignored; what records hold of limits and couplings."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+from casadi_ik.compile.layout import Field
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.couplings import has_toggle, toggle_margins
+from casadi_ik.kinematics.smooth import Expr
+from casadi_ik.model.description import RobotDescription
+from casadi_ik.model.targets import TargetBatch
+from casadi_ik.solve.trace import WORD, RecordedJacobian
+
+
+def kept_within(robot: RobotDescription, q: Expr, enforce: Expr) -> Expr:
+    """Move q (n, 1) into the limits where `enforce` is 1; leave it as it is where it is 0."""
+    lower, upper = ca.DM(robot.lower.tolist()), ca.DM(robot.upper.tolist())
+    return ca.if_else(enforce > 0, ca.fmin(ca.fmax(q, lower), upper), q)
+
+
+def starts_within(robot: RobotDescription, targets: TargetBatch, q0: Array) -> Array:
+    """Starts (k, n), moved into the limits where the targets enforce them."""
+    return np.clip(q0, robot.lower, robot.upper) if targets.enforce_limits else q0
+
+
+def limit_mask(robot: RobotDescription, q: Expr) -> Expr:
+    """Bit i is set where actuator i stands at or beyond a limit."""
+    lower, upper = ca.DM(robot.lower.tolist()), ca.DM(robot.upper.tolist())
+    return bits(ca.logic_or(q <= lower, q >= upper))
+
+
+def bits(flags: Expr) -> Expr:
+    """Bit i is set where flag i (n, 1) is; a word (1, 1) for every `WORD` of them."""
+    n = flags.numel()
+    words = [flags[first : min(first + WORD, n)] for first in range(0, n, WORD)]
+    return ca.vertcat(
+        *(ca.dot(word, ca.DM([2.0**i for i in range(word.numel())])) for word in words)
+    )
+
+
+NEAR_TOGGLE = 0.03
+"""Squared sine of a transmission angle (10 deg) below which a mechanism counts as near toggle."""
+
+
+def coupling_fields(robot: RobotDescription) -> tuple[Field, ...]:
+    """The field of the record; none for a robot whose couplings have no toggle position."""
+    if not _motors(robot):
+        return ()
+    doc = "smallest squared sine of the transmission angles, 0 at a toggle"
+    return (Field("sigma_coupling", (), "f4", "", doc),)
+
+
+def coupling_values(robot: RobotDescription, q: ca.SX) -> dict[str, Expr]:
+    """The value of the field at q (n, 1)."""
+    if not _motors(robot):
+        return {}
+    return {"sigma_coupling": ca.mmin(ca.vertcat(*toggle_margins(robot, q).values()))}
+
+
+def coupling_jacobian(robot: RobotDescription) -> dict[str, RecordedJacobian]:
+    """When the coupling Jacobian counts as near singular, for the events of a log."""
+    motors = _motors(robot)
+    return {"coupling": RecordedJacobian(motors, singular=NEAR_TOGGLE)} if motors else {}
+
+
+def _motors(robot: RobotDescription) -> tuple[str, ...]:
+    """The actuators behind mechanisms that have a toggle position."""
+    sources = {joint.name: joint.coupling.of for joint in robot.movable if joint.coupling}
+    found: dict[str, None] = {}
+    for joint in robot.movable:
+        if has_toggle(joint):
+            name = joint.name
+            while name in sources and name not in robot.actuator_names:
+                name = sources[name]
+            found[name] = None
+    return tuple(found)

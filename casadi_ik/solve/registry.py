@@ -1,0 +1,195 @@
+"""The methods by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any
+
+from casadi_ik.errors import InputError, UnknownNameError
+from casadi_ik.model.description import RobotDescription
+from casadi_ik.solve.hand_first.method import HandFirstMethod
+from casadi_ik.solve.hand_first.parameters import HandFirstParameters
+from casadi_ik.solve.method import Method
+from casadi_ik.solve.thumb_first.method import ThumbFirstMethod
+from casadi_ik.solve.thumb_first.step import ThumbFirstParameters
+
+Build = Callable[[RobotDescription, Any, bool], Method]
+"""Makes a method from robot, parameter record and whether to compile; often a class."""
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """How a method is built.
+
+    Attributes:
+        summary: What it does, in one line.
+        record: Its parameter record, a dataclass.
+        build: Makes it.
+        fixed: Fields of the record that make the method what its name says.
+    """
+
+    summary: str
+    record: type[Any]
+    build: Build
+    fixed: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """Fields of the record that can be chosen."""
+        return tuple(entry.name for entry in fields(self.record) if entry.name not in self.fixed)
+
+
+_ENTRIES: dict[str, _Entry] = {
+    "hand-first": _Entry(
+        "palm and hand are fitted to the contacts, the arm follows in closed form (ours)",
+        HandFirstParameters,
+        HandFirstMethod,
+    ),
+    "thumb-first": _Entry(
+        "the arm starts at the estimated palm, then moves along the arm-thumb closed chain (ours)",
+        ThumbFirstParameters,
+        ThumbFirstMethod,
+    ),
+}
+"""Methods by name. `casadi_ik.papers` adds its methods, `register_method` those of users."""
+
+_SHIPPED = set(_ENTRIES)
+"""Names that come with the package and cannot be replaced."""
+
+
+def add_shipped_method(
+    name: str,
+    summary: str,
+    parameters: type[Any],
+    build: Build,
+    fixed: Mapping[str, Any] | None = None,
+) -> None:
+    """Add a method that comes with the package; the arguments are those of `register_method`."""
+    _ENTRIES[name] = _Entry(summary, parameters, build, dict(fixed or {}))
+    _SHIPPED.add(name)
+
+
+def register_method(
+    name: str,
+    summary: str,
+    parameters: type[Any],
+    build: Build,
+    fixed: Mapping[str, Any] | None = None,
+    replace: bool = False,
+) -> None:
+    """Register a method for `Solver` under a name, in this process.
+
+    Args:
+        name: What it is called; also `Method.name` of what `build` makes.
+        summary: What it does, in one line.
+        parameters: Its parameter record, a dataclass whose fields have defaults; `Solver(options=)`
+            sets them.
+        build: Makes it from robot, parameter record and whether to compile; a subclass of
+            `LoopedMethod` does.
+        fixed: Fields of the record that cannot be chosen.
+        replace: Whether it may take the place of a method registered before.
+
+    Raises:
+        InputError: The name is taken, or an argument is not what it has to be.
+
+    Example:
+        >>> from dataclasses import dataclass
+        >>> @dataclass(frozen=True)
+        ... class Parameters:
+        ...     damping: float = 0.1
+        >>> def build(robot, parameters, compiled):
+        ...     raise NotImplementedError("make a `LoopedMethod`: docs/add_a_method.md")
+        >>> ik.register_method("mine", "what it does", Parameters, build)
+    """
+    if not (isinstance(name, str) and name):
+        raise InputError(f"name: found {name!r}, expected the name of a method")
+    if name in _SHIPPED or (name in _ENTRIES and not replace):
+        raise InputError(f"name: there is a method {name!r} already, expected another name")
+    if not (isinstance(parameters, type) and is_dataclass(parameters)):
+        raise InputError(f"parameters: found {parameters!r}, expected a dataclass")
+    if not callable(build):
+        raise InputError(f"build: found {build!r}, expected what makes a method")
+    _ENTRIES[name] = _Entry(summary, parameters, build, dict(fixed or {}))
+
+
+def method_names() -> tuple[str, ...]:
+    """Return the names of all methods: those of the package, then those registered by users."""
+    return tuple(_ENTRIES)
+
+
+def method_summary(name: str) -> str:
+    """What a method does, in one line.
+
+    Raises:
+        UnknownNameError: No such method.
+    """
+    return _entry(name).summary
+
+
+def option_names(name: str) -> tuple[str, ...]:
+    """Names of the parameters that `Solver`'s options can set.
+
+    Raises:
+        UnknownNameError: No such method.
+    """
+    return _entry(name).options
+
+
+def with_finger_step(
+    method: str, options: Mapping[str, Any], finger_step: str | None
+) -> dict[str, Any]:
+    """Return the options with the finger step, if it is given and the method has one.
+
+    Raises:
+        UnknownNameError: No such method.
+        InputError: The finger step is among the options as well.
+    """
+    if finger_step is None:
+        return dict(options)
+    if "finger_step" in options:
+        raise InputError("finger_step: found twice, expected it as argument or among the options")
+    has_one = "finger_step" in option_names(method)
+    return {**options, "finger_step": finger_step} if has_one else dict(options)
+
+
+def build_method(
+    name: str, robot: RobotDescription, options: dict[str, Any], compiled: bool = True
+) -> Method:
+    """Build a method for a robot.
+
+    Args:
+        name: One of `method_names`.
+        robot: The description.
+        options: Fields of the method's parameter record that differ from their defaults.
+        compiled: False keeps to CasADi's virtual machine.
+
+    Raises:
+        UnknownNameError: No such method, or no such option.
+        InputError: An option has a value it cannot have.
+        UnsupportedError: The robot is not of the kind the method needs.
+    """
+    entry = _entry(name)
+    for option in options:
+        if option not in entry.options:
+            raise UnknownNameError(
+                f"option {option!r} does not exist for method {name!r}; options: "
+                + ", ".join(entry.options)
+            )
+    try:
+        record = entry.record(**options, **entry.fixed)
+    except TypeError as error:
+        raise InputError(f"options: {error}") from error
+    method = entry.build(robot, record, compiled)
+    if method.name != name:
+        raise InputError(f"method {name!r} calls itself {method.name!r}, expected one name")
+    return method
+
+
+def _entry(name: str) -> _Entry:
+    try:
+        return _ENTRIES[name]
+    except (KeyError, TypeError):
+        raise UnknownNameError(
+            f"method {name!r} does not exist; methods: {', '.join(_ENTRIES)}"
+        ) from None

@@ -1,0 +1,109 @@
+"""How answers move with their targets: derivatives by the implicit function theorem.
+
+With the contacts' residual r(q, t) an answer q of a target t follows the target by keeping what is
+left, r(q + dq, t + dt) = r(q, t), in the sense of least squares where not all rows can be kept:
+
+    dq = -(dr/dq)^+ dr/dt dt
+
+over the motors that are free to move. A motor at a limit stays there. Of motions that contacts
+leave free none is made: the pseudo-inverse takes the smallest (motors as `motor_scales` counts).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from casadi_ik.compile import FunctionGraph, FunctionKernel
+from casadi_ik.compile.graphs import recipe
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.contact_fit import whole_residual
+from casadi_ik.kinematics.contacts import ContactRows, Kinds, suffix
+from casadi_ik.kinematics.forward import motor_scales
+from casadi_ik.kinematics.linear_algebra import solve_spd
+from casadi_ik.model.description import RobotDescription
+from casadi_ik.model.targets import TargetBatch
+
+AT_LIMIT = 1e-9
+"""A motor that is nearer to a limit [rad or m] is at it."""
+
+DAMPING, PASSES = 1e-7, 5
+"""Added to the squares of the singular values; further passes take its effect away again, to 1e-5
+of a value of 1e-3. What is below 3e-4 counts as a motion that contacts leave free. With less, the
+rounding of these motions is seen in the others: 3e-7 with 1e-8."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivity:
+    """Derivatives of configurations, or of a number that depends on them, by contacts.
+
+    Attributes:
+        points: (..., f, 3) by coordinates of contact points [1/m]; 0 where free.
+        normals: (..., f, 3) by those of normals, which count as scaled to length 1; likewise.
+    """
+
+    points: Array
+    normals: Array
+
+
+class SensitivityKernel:
+    """Derivatives of a robot's answers, for contacts of some kinds."""
+
+    def __init__(self, robot: RobotDescription, kinds: Kinds, compiled: bool = True) -> None:
+        """Lay the inputs out; the function is compiled when first needed."""
+        self._robot, self._contacts = robot, ContactRows(kinds)
+        n, f = len(robot.actuators), len(kinds)
+        self._inputs = {"q": (n, 1), "free": (n, 1), "gradient": (n, 1)}
+        self._inputs |= {field.name: (f, field.size // f) for field in self._contacts.fields}
+        size = sum(rows * columns for rows, columns in self._inputs.values())
+        self._name = name = ca.Function.fix_name(f"{robot.name}_sensitivity{suffix(kinds)}")
+        self._shapes, known = {"given": (size, 1)}, recipe(name, robot, kinds)
+        self._outputs, self._recipe, self._compiled = ((6 * f, 1),), known, compiled
+
+    @cached_property
+    def _kernel(self) -> FunctionKernel:
+        graph = FunctionGraph(self._name, self._graph, self._shapes, self._outputs, self._recipe)
+        return FunctionKernel(graph, self._compiled, in_lanes=True)
+
+    def __call__(self, targets: TargetBatch, q: Array, gradients: Array) -> Sensitivity:
+        """Derivatives of ``gradients @ q`` for answers q (k, n) to k targets, gradients (k, n)."""
+        low, high = targets.bounds(self._robot, np.inf)
+        values: dict[str, Any] = {"q": q, "gradient": gradients}
+        values["free"] = (q - low >= AT_LIMIT) & (high - q >= AT_LIMIT)
+        known = [~np.isnan(array[..., 0]) for array in (targets.points, targets.normals)]
+        values["weights"] = np.stack(known, axis=2)
+        for name in self._inputs.keys() - values.keys():
+            values[name] = np.nan_to_num(targets.vectors(name))
+        given = [values[name].reshape(len(q), -1) for name in self._inputs]
+        (found,) = self._kernel(np.concatenate(given, axis=1, dtype=float))
+        points, normals = np.split(found.reshape(len(q), -1, 3), 2, axis=1)
+        return Sensitivity(points, normals)
+
+    def _graph(self) -> ca.Function:
+        """All inputs below each other, row by row -> derivatives by points, then by normals."""
+        given, first, robot = dict[str, ca.SX](), 0, self._robot
+        ((_, shape),) = self._shapes.items()
+        column = ca.SX.sym("given", *shape)
+        for name, (rows, columns) in self._inputs.items():
+            own = column[first : first + rows * columns]
+            given[name], first = ca.reshape(own, columns, rows).T, first + rows * columns
+        residual = whole_residual(robot, self._contacts, given["q"], given)
+        scales = given["free"] * motor_scales(robot)
+        rates = ca.jacobian(residual, given["q"]) @ ca.diag(scales)
+        square = ca.densify(rates.T @ rates + DAMPING * ca.DM.eye(len(robot.actuators)))
+        step = solve_spd(square, scales * given["gradient"])
+        total = step
+        for _ in range(PASSES - 1):
+            step = DAMPING * solve_spd(square, step)
+            total = total + step
+        by_points, by_normals = (
+            -ca.jtimes(residual, given[name], rates @ total, True) for name in ("points", "normals")
+        )
+        along = ca.sum2(by_normals * given["normals"])
+        by_normals = by_normals - ca.repmat(along, 1, 3) * given["normals"]
+        found = ca.vertcat(ca.vec(by_points.T), ca.vec(by_normals.T))
+        return ca.Function(self._name, [column], [ca.densify(ca.cse(found))])

@@ -1,1 +1,0 @@
-"""Batches, streams and single steps of any method."""

@@ -1,1 +1,0 @@
-"""How the robot moves: pure CasADi graphs, nothing solved."""
