@@ -1,4 +1,4 @@
-"""Old import paths of documented modules, which work until version 0.3 with a DeprecationWarning."""
+"""Old import paths of documented modules: they work until version 0.3, with a DeprecationWarning."""
 
 from __future__ import annotations
 
@@ -44,7 +44,10 @@ class RenamedModuleFinder:
     """Import hook that finds a module under its old path."""
 
     def find_spec(
-        self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
+        self,
+        name: str,
+        path: Sequence[str] | None = None,  # noqa: ARG002 - the interface of meta path finders
+        target: ModuleType | None = None,  # noqa: ARG002
     ) -> ModuleSpec | None:
         """Return the spec of a renamed module; None for every other name."""
         package, _, old = name.partition(".")
@@ -65,7 +68,7 @@ class _RenamedModuleLoader:
     def __init__(self, new: str) -> None:
         self.new = new
 
-    def create_module(self, spec: ModuleSpec) -> ModuleType:
+    def create_module(self, spec: ModuleSpec) -> ModuleType:  # noqa: ARG002
         """Import the module under its new path and put it under the old one."""
         module = importlib.import_module(self.new)
         self._spec = module.__spec__
@@ -75,7 +78,7 @@ class _RenamedModuleLoader:
         """Restore the spec of the new path; the module has been executed there."""
         module.__spec__ = self._spec
 
-    def get_code(self, name: str) -> CodeType | None:
+    def get_code(self, name: str) -> CodeType | None:  # noqa: ARG002
         """Return the code of the module, for `python -m` with the old path."""
         spec = importlib.util.find_spec(self.new)
         loader = spec.loader if spec else None

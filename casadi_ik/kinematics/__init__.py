@@ -1,1 +1,1 @@
-"""Kinematics as CasADi graphs: forward kinematics, couplings, contact conditions, arms in closed form."""
+"""Kinematics as CasADi graphs: joints, couplings, contact conditions, arms in closed form."""

@@ -1,6 +1,6 @@
 """Whether no hand within a box of postures can meet a target: one test, as a graph.
 
-Every contact of such a hand lies in a ball (`solve.proofs.boxes`), every contact asked for within its
+Every contact of such a hand lies in a ball (`proofs.boxes`), every contact asked for within its
 tolerances. Hence inequalities between what is kept by all motions of the palm, and between that
 and what the arm can do. All are necessary: what is refuted is impossible, what is not may be, too.
 

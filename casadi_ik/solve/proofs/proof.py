@@ -1,6 +1,6 @@
 """A proof that a target is impossible: what was proved, of what, and its check by other means.
 
-The check shares with the search for proofs what a proof starts from (`solve.proofs.premises`) and none of
+The check shares with the search for proofs what a proof starts from (`proofs.premises`) and none of
 its bounds: it proves the target impossible again, in numpy, by simpler bounds and finer boxes.
 """
 
