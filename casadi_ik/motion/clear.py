@@ -495,8 +495,9 @@ class Guard:
         rooms, slopes = np.zeros(OBSTACLES), np.zeros((OBSTACLES, self._n))
         nudged = goal + np.concatenate([np.zeros((1, self._n)), self.nudge * np.eye(self._n)])
         every = self._query.kernel.every(nudged, self._query.poses, self._query.table)
-        nearest = np.argsort(every[0], kind="stable")[:OBSTACLES]
-        count = len(nearest)
-        rooms[:count] = np.maximum(self._minded - every[0, nearest], 0.0)
+        order = np.argsort(every[0], kind="stable")
+        nearest, omitted = order[:OBSTACLES], order[OBSTACLES : OBSTACLES + 1]
+        count, minded = len(nearest), every[0, omitted].min(initial=self._minded)
+        rooms[:count] = np.maximum(minded - every[0, nearest], 0.0)
         slopes[:count] = ((every[1:, nearest] - every[0, nearest]) / self.nudge).T
         return rooms, slopes

@@ -17,6 +17,10 @@ When contacts cannot be met so (they leap, or are too fast, or out of reach), go
 the goal goes on within the limits of position and velocity, and the motors run after it as fast as
 they may and without going past it (`track_goal`), until they are there.
 
+Lacking clearances shrink as a critically damped spring does, with the time constant of the free
+motions: a step removes the part ``1 - keep`` of what is lacking where the cycle begins. A clearance
+that had to be restored within one cycle would make an undamped oscillator of it and the momentum.
+
 How fast motors are. Lengths are steps: a velocity is counted as the way of one cycle, an
 acceleration as what a step may differ from the one before. A motor whose steps shrink by ``change``
 each stops after
@@ -71,6 +75,8 @@ class CycleTuning:
         spare: Part of the acceleration that motors count on to come to rest at their goal: the
             rest is for what the goal itself does meanwhile.
         locked_on: So near to its goal a motor is there [rad or m].
+        least_change: Steps of the goal below this part of the largest change of a step, or below
+            `locked_on`, are omitted: the motors come to rest exactly.
     """
 
     steps: int = 2
@@ -80,6 +86,7 @@ class CycleTuning:
     avoidance: float = 0.1
     spare: float = 0.7
     locked_on: float = 1e-9
+    least_change: float = 1e-5
 
 
 TUNING = CycleTuning()
@@ -268,8 +275,9 @@ class Cycle:
             # A step without them takes a fifth less time.
             step = ca.Function.if_else("choose", self._step(minded=True), step)
             which = [ca.mmax(parameters[self.parameters.slice("rooms")]) > 0]
+        origin = state[self.state.slice("goal")]
         for _ in range(TUNING.steps):
-            goal = step(*which, goal, low, high, *others, parameters)
+            goal = step(*which, origin, goal, low, high, *others, parameters)
         after, record = end(state, first, goal, low, high, parameters)
         return ca.Function(
             name, [state, parameters], [after, record], ["state", "parameters"], ["after", "record"]
@@ -305,16 +313,21 @@ class Cycle:
         return ca.Function("begin", [state, parameters], outputs)
 
     def _step(self, minded: bool) -> ca.Function:
-        """``(goal, low, high, anchor, left, parameters) -> goal'``; whether it minds clearances."""
-        goal, low, high, anchor = self._symbols("goal", "low", "high", "anchor")
+        """Return a step ``(origin, goal, low, high, anchor, left, parameters) -> goal'``.
+
+        Args:
+            minded: Whether it increases lacking clearances.
+        """
+        names = "origin", "goal", "low", "high", "anchor"
+        origin, goal, low, high, anchor = self._symbols(*names)
         left = ca.SX.sym("left", self.state.size - 3 * goal.numel() - 1)
         parameters = self.parameters.symbols("parameters")
         p = self._unpacked(parameters)
-        after = self._goal(goal, (low, high), anchor, left, p, minded)
+        end = self._goal(goal, (low, high), anchor, left, p, origin if minded else None)
         return ca.Function(
             "minding" if minded else "step",
-            [goal, low, high, anchor, left, parameters],
-            shared(ca.densify(after)),
+            [origin, goal, low, high, anchor, left, parameters],
+            shared(ca.densify(end)),
         )
 
     def _end(self) -> ca.Function:
@@ -324,6 +337,10 @@ class Cycle:
         locked_on = s["locked_on"] > 0.5
         first, wanted, low, high = self._symbols("first", "wanted", "low", "high")
         goal = share_within(first, wanted, low, high)
+        # Without this, rounding errors would move the motors indefinitely.
+        threshold = ca.fmin(TUNING.least_change * p["change"], TUNING.locked_on)
+        excess = ca.mmax(ca.fabs(goal - s["goal"]) - threshold)
+        goal = ca.if_else(excess <= 0, s["goal"], goal)
         position, angle = self._errors(goal, p)
         met = within_tolerance(position, angle, p["position_tolerance"], p["angle_tolerance"])
         drawn = ca.if_else(met, goal - s["goal"], 0.0)
@@ -354,26 +371,29 @@ class Cycle:
         anchor: Expr,
         left: Expr,
         p: dict[str, Expr],
-        minded: bool,
+        origin: Expr | None,
     ) -> Expr:
-        """The solution (n, 1) of the least squares; a little of it may be beyond the bounds.
+        """Return the solution (n, 1) of the least squares; it may exceed the bounds slightly.
 
         Args:
-            here: (n, 1) where it begins, within the bounds.
-            bounds: (n, 1) each.
-            anchor: (n, 1).
-            left: Residual that may be left.
-            p: Parameters.
-            minded: Whether it keeps away from what is near.
+            here: (n, 1) start of the step, within the bounds.
+            bounds: Lower and upper bounds, (n, 1) each.
+            anchor: (n, 1) goal that the free motions lead to.
+            left: Residual that may remain after the cycle.
+            p: Parameters by name.
+            origin: (n, 1) goal at which the clearances were measured; None ignores them.
         """
         n, scales = here.numel(), motor_scales(self.robot)
         residual, jacobian = self._residual(here, p), self._jacobian(here, p)
         missed, full = ca.dot(residual, residual), None
-        if minded:
+        if origin is not None:
             rooms = ca.fmax(p["rooms"], 0.0)
             felt = TUNING.avoidance / LENGTH * ca.if_else(rooms > 0, 1.0, 0.0)
             slopes = -p["slopes"] * ca.repmat(felt, 1, n)
-            full = slopes @ ca.diag(scales), TUNING.avoidance / LENGTH * rooms
+            full = (
+                slopes @ ca.diag(scales),
+                TUNING.avoidance / LENGTH * (1 - p["keep"]) * rooms + slopes @ (here - origin),
+            )
         residual = residual - left
         pull = ca.sqrt(p["pull"])
         residual = ca.vertcat(residual, pull * (here - anchor) / scales)

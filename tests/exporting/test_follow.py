@@ -134,14 +134,18 @@ def test_follows_as_in_python_and_within_limits(robot, project):
 
 @needs_gcc
 def test_what_moves_within_reach_is_followed_closely(robot, project):
+    """The motors stand still in the last second of four in which the target does."""
     program = built(project, "closely", FOLLOWED, "arm_follow", "-O1")
-    turn = np.linspace(0, 2 * np.pi, 500)[:, None, None]
+    second = round(1 / PERIOD)
+    turn = np.append(np.linspace(0, 4, 500), np.full(4 * second, 4.0))[:, None, None]
     points, normals = robot.contacts(robot.home)
     points = points + 0.04 * np.concatenate([np.sin(turn), 1 - np.cos(turn), 0 * turn], axis=2)
     none = np.zeros((len(points), 13))
     facing = np.broadcast_to(normals.ravel(), (len(points), normals.size))
-    status, q = asked(program, robot.home, np.hstack([points.reshape(500, -1), facing, none]))
+    rows = np.hstack([points.reshape(len(points), -1), facing, none])
+    status, q = asked(program, robot.home, rows)
     assert set(status) == {1}
+    np.testing.assert_array_equal(q[-second:], q[-1:].repeat(second, axis=0))
     assert np.linalg.norm(robot.contacts(q)[0] - points, axis=2).max() < 2e-3
 
 

@@ -111,6 +111,21 @@ def test_hands_that_are_led_through_each_other_do_not_get_there():
     assert statuses[-1] is ik.motion.FollowStatus.FOLLOWING
 
 
+@pytest.mark.parametrize("period", [0.001, 0.01])
+def test_motors_come_to_rest_where_pairs_lack_clearance(period):
+    """Nearly all pairs of links within a hand are nearer than the clearance that is kept."""
+    body = ik.load_robot("g1+dex3")
+    solver = ik.Solver(body, scene=ik.Scene())
+    rng, second = np.random.default_rng(11), round(1 / period)
+    starts = body.home + 0.5 * (body.random(rng, 100) - body.home)
+    for start in starts[clearances(solver, starts).free][:3]:
+        follower, target = solver.follow(start, period), body.contacts(start)
+        q = np.array([follower(*target) for _ in range(4 * second)])
+        assert follower.state.status is ik.motion.FollowStatus.FOLLOWING
+        assert np.abs(q[-1] - start).max() > 1e-4
+        np.testing.assert_array_equal(q[-second:], q[-1:].repeat(second, axis=0))
+
+
 def test_an_arm_in_the_way_holds_back_its_own_side():
     """Hands leap to where a turned waist has them; the right shoulder would touch the torso."""
     body = ik.load_robot("g1+dex3")

@@ -99,40 +99,42 @@ static LANES_TARGET void come_close(const guard_job *job, placing *space, surrou
   }
 }
 
-/* Puts a pair among the nearest, if it is one. */
-static void told(scalar *near, int64_t *nearest, int64_t pair, scalar distance) {
-  int64_t k = OBSTACLES;
+/* Inserts a pair into the list of the nearest pairs, which is sorted by distance. */
+static void insert_nearest(scalar *near, int64_t *nearest, int64_t pair, scalar distance) {
+  int64_t k = OBSTACLES + 1;
   for (; k > 0 && distance < near[k - 1]; --k) {
-    if (k == OBSTACLES) continue;
+    if (k > OBSTACLES) continue;
     near[k] = near[k - 1];
     nearest[k] = nearest[k - 1];
   }
-  if (k == OBSTACLES) return;
+  if (k > OBSTACLES) return;
   near[k] = distance;
   nearest[k] = pair;
 }
 
-/* What the pairs nearest to each other at the goal lack, and how motors change their distances. */
+/* Computes the lacking clearances of the nearest pairs at the goal and their gradients. Clearance is
+ * lacking up to the distance of the nearest pair beyond the list: a pair that enters the list or
+ * leaves it lacks nothing there, so the lacking clearances are continuous functions of the goal. */
 LANES_TARGET DRIVER(keep_away, guard_job) {
   const clearance_job *about = job->about;
   surroundings *here = job->by_goal;
   placing space;
-  scalar near[OBSTACLES];
-  int64_t nearest[OBSTACLES], few = OBSTACLES, i, k;
+  scalar near[OBSTACLES + 1];
+  int64_t nearest[OBSTACLES + 1], few = OBSTACLES, i, k;
   int motor = 0, lane, outcome = set_up(&space.space, room(about));
   if (outcome != DONE) return outcome;
   lay_out(&space, about);
   come_close(job, &space, here, job->goal, job->goal, job->minded);
-  for (i = 0; i < few; ++i) near[i] = job->minded;
+  for (i = 0; i <= few; ++i) near[i] = job->minded;
   if (here->n_close) place_at(&space, job->goal);
   for (i = 0; i < here->n_close; ++i) {
     lanes distance;
     if (apart(about, here->close[i], space.placed, SPREAD(job->minded), space.lines, &distance)) {
-      told(near, nearest, here->close[i], lanes_at(distance, 0));
+      insert_nearest(near, nearest, here->close[i], lanes_at(distance, 0));
     }
   }
-  for (i = 0; i < few; ++i) job->rooms[i] = job->minded - near[i];
-  for (i = 0; i < few && near[i] < job->minded; ++i) {
+  for (i = 0; i < few; ++i) job->rooms[i] = near[few] - near[i];
+  for (i = 0; i < few && job->rooms[i] > 0; ++i) {
     memset(job->slopes + i * N_Q, 0, N_Q * sizeof(scalar));
   }
   few = i;
