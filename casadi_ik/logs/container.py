@@ -61,6 +61,12 @@ _DAMAGE = (McapError, struct.error, ValueError, MemoryError, OverflowError)
 """Exceptions of the library over bytes that are not as they were written."""
 
 
+NOT_IN_CHUNKS = (
+    "the messages are not in chunks; expected chunks, which tools for MCAP files write unless"
+    " chunking is off (as in rosbag2's preset fastwrite)"
+)
+
+
 class NothingWrittenError(LogError):
     """A log whose writer ended before anything was whole: nothing can be lost with it."""
 
@@ -78,6 +84,7 @@ class Contents:
             is still being written. Then every complete chunk is here, each verified.
         end: Offset behind its last complete record.
         owed: Messages of the last chunk if their indexes are not whole.
+        index_offsets: Offsets of the indexes that are there for these messages, by channel.
     """
 
     path: Path
@@ -87,6 +94,7 @@ class Contents:
     complete: bool = True
     end: int = len(MAGIC)
     owed: Sequence[Run] = ()
+    index_offsets: dict[int, int] = field(default_factory=dict)
 
     @property
     def chunks(self) -> list[ChunkIndex]:
@@ -124,7 +132,10 @@ def read_contents(path: Path) -> Contents:
         size, closed = check_magic(stream)
         if not closed:
             return replace(scan(stream, path), complete=False)
-        contents = Contents(path, size, read_summary(stream), end=size)
+        summary = read_summary(stream)
+        if summary is None:
+            return scan(stream, path)
+        contents = Contents(path, size, summary, end=size)
         for index in contents.summary.metadata_indexes:
             contents.records.append(record_at(Metadata, stream, index.offset, index.length))
     return contents
@@ -196,18 +207,28 @@ def check_magic(stream: IO[bytes]) -> tuple[int, bool]:
     return size, size > len(MAGIC) and stream.read() == MAGIC
 
 
-def read_summary(stream: IO[bytes]) -> Summary:
-    """The summary of a file that ends with its magic bytes, its checksum verified.
+def read_summary(stream: IO[bytes]) -> Summary | None:
+    """Read the summary of a file that ends with its magic bytes, and verify its checksum.
+
+    The MCAP format makes the summary and each of its parts optional, and other tools leave parts
+    out. The indexes of metadata and attachments are completed from the file, which reads no more
+    than the head of every record.
+
+    Returns:
+        The summary; None if the file has none, or one without schemas, channels, chunk indexes or
+        counts, so that the data have to be read instead.
 
     Raises:
-        LogError: It is damaged, or there is none.
+        LogError: The summary is damaged.
     """
     end = stream.seek(-len(MAGIC), os.SEEK_END)
     with _damage("its end"):
         stream.seek(end - 20)
         start, _, checksum = struct.unpack("<QQI", stream.read(20))
+    if start == 0:
+        return None
     if not len(MAGIC) < start < end:
-        raise LogError("the file has no summary")
+        raise LogError("the log is damaged: its summary begins outside of the file")
     check_size("the summary", end - start)
     stream.seek(start)
     # The checksum covers the summary and the footer up to itself.
@@ -217,8 +238,36 @@ def read_summary(stream: IO[bytes]) -> Summary:
     with _damage("its summary"):
         summary = SeekingReader(stream, record_size_limit=RECORD_LIMIT).get_summary()
     if summary is None or summary.statistics is None:
-        raise LogError("the file has no summary")
+        return None
+    counts, chunks = summary.statistics, len(summary.chunk_indexes)
+    definitions = len(summary.schemas), len(summary.channels)
+    if (*definitions, chunks) != (counts.schema_count, counts.channel_count, counts.chunk_count):
+        return None
+    indexed = len(summary.metadata_indexes), len(summary.attachment_indexes)
+    if not indexed[0] or indexed != (counts.metadata_count, counts.attachment_count):
+        _index_metadata(stream, summary)
     return summary
+
+
+def _index_metadata(stream: IO[bytes], summary: Summary) -> None:
+    """Find all metadata and attachments of a file by the heads of its records.
+
+    Raises:
+        LogError: A record reaches beyond the end of the file.
+    """
+    summary.metadata_indexes, summary.attachment_indexes = [], []
+    size, start, opcode = stream.seek(0, os.SEEK_END), len(MAGIC), 0
+    while opcode != Opcode.DATA_END:
+        stream.seek(start)
+        with _damage(f"the record at byte {start}"):
+            opcode, length = RECORD.unpack(stream.read(RECORD.size))
+        length += RECORD.size
+        if start + length > size:
+            raise LogError(f"the log is damaged: the record at byte {start} is cut off")
+        if opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
+            kind = Metadata if opcode == Opcode.METADATA else Attachment
+            _note(summary, record_at(kind, stream, start, length), start, length)
+        start += length
 
 
 def counts_of(summary: Summary) -> dict[int, int]:
@@ -311,6 +360,8 @@ def scan(stream: IO[bytes], path: Path) -> Contents:
     with contextlib.suppress(*_DAMAGE):
         for record in reader.records:
             length = stream.tell() - start
+            if isinstance(record, Message) and not torn:
+                raise LogError(NOT_IN_CHUNKS)
             try:
                 if torn:
                     damaged |= isinstance(record, Chunk) and bool(unpack(record, "a chunk"))
@@ -346,7 +397,8 @@ def _take(
     summary, end = contents.summary, start + length
     record_at(type(record), stream, start, length)
     if isinstance(record, MessageIndex):
-        return  # not the one that its chunk would have here
+        _take_message_index(contents, record, start, end)
+        return
     owed: Sequence[Run] = ()
     if isinstance(record, Chunk):
         chunk = unpack(record, f"the chunk at byte {start}")
@@ -364,12 +416,28 @@ def _take(
         _note(summary, record, start, length)
         if isinstance(record, Metadata):
             contents.records.append(record)
-    elif isinstance(record, Message):
-        raise LogError("the messages are not in chunks, which casadi_ik does not read")
     elif isinstance(record, Schema | Channel):
         _declare(summary, record)
-    contents.end, contents.owed = end, owed
+    contents.end, contents.owed, contents.index_offsets = end, owed, {}
     stream.seek(end)
+
+
+def _take_message_index(contents: Contents, record: MessageIndex, start: int, end: int) -> None:
+    """Account for the index of a channel that another tool has written behind the last chunk.
+
+    Other tools order channels and entries differently. What does not index the chunk's messages is
+    passed over, and a log that is finished gets another index instead.
+    """
+    runs = [run for run in contents.owed if run.channel == record.channel_id]
+    entries = np.frombuffer(b"".join(run.entries for run in runs), "<u8").reshape(-1, 2)
+    if not runs or sorted(record.records) != sorted(map(tuple, entries.tolist())):
+        return
+    contents.index_offsets[record.channel_id] = start
+    if {run.channel for run in contents.owed} <= contents.index_offsets.keys():
+        index = contents.chunks[-1]
+        index.message_index_offsets = contents.index_offsets
+        index.message_index_length = end - contents.end
+        contents.end, contents.owed = end, ()
 
 
 def _declare(summary: Summary, record: Schema | Channel) -> None:

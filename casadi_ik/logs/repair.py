@@ -56,7 +56,7 @@ class Finished:
         changed: False if it was whole already.
         chunks: Complete chunks in it.
         messages: Messages in it.
-        cut: Bytes of the torn tail that were cut away.
+        cut: Bytes of a torn tail that were cut away; 0 if only the summary was missing.
     """
 
     path: Path
@@ -91,7 +91,11 @@ def finish_log(path: str | os.PathLike[str]) -> Finished:
 
 
 def _close(contents: Contents) -> int:
-    """Cut what is torn and write the end; gives the bytes that were cut."""
+    """Cut what is torn and write the end of the file.
+
+    Returns:
+        The bytes that were torn; none if the data had an end and only a summary was missing.
+    """
     tail = b""
     if contents.owed:
         tail = index_messages(contents.chunks[-1], contents.owed, contents.end)
@@ -106,15 +110,18 @@ def _close(contents: Contents) -> int:
         stream.write(tail)
         stream.flush()
         os.fsync(stream.fileno())
-    return contents.size - contents.end
+    return 0 if contents.complete else contents.size - contents.end
 
 
 def _ends_well(stream: IO[bytes], contents: Contents) -> bool:
     """Whether the file ends with a summary that says what it holds."""
     with suppress(LogError):
-        known, found = read_summary(stream).chunk_indexes, contents.chunks
-        places = [(chunk.chunk_start_offset, chunk.chunk_length) for chunk in known]
-        return places == [(chunk.chunk_start_offset, chunk.chunk_length) for chunk in found]
+        summary = read_summary(stream)
+        if summary is None:
+            return False
+        indexed, scanned = summary.chunk_indexes, contents.chunks
+        places = [(chunk.chunk_start_offset, chunk.chunk_length) for chunk in indexed]
+        return places == [(chunk.chunk_start_offset, chunk.chunk_length) for chunk in scanned]
     return False
 
 

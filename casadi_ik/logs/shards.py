@@ -27,6 +27,7 @@ from casadi_ik.compile.layout import Field, Layout, opaque
 from casadi_ik.errors import LogError, UnknownNameError, os_errors, printable
 from casadi_ik.files.arrays import Counts
 from casadi_ik.logs.container import (
+    NOT_IN_CHUNKS,
     NothingWrittenError,
     read_chunk,
     read_contents,
@@ -101,7 +102,7 @@ class Shard:
             self.robot: str = self.metadata["robot"]
             self.clock = clock_of(self.metadata)
             if not contents.chunks and any(contents.counts.values()):
-                raise LogError("the messages are not in chunks, which casadi_ik does not read")
+                raise LogError(NOT_IN_CHUNKS)
             self._topics = self._described()
             self.methods: tuple[str, ...] = tuple(dict.fromkeys(name for name, _ in self._topics))
         self._solves: dict[str, MethodRows] = {}

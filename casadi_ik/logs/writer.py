@@ -616,11 +616,20 @@ class LogFile:
 
 
 def locked(descriptor: int, path: Path) -> bool:
-    """Lock an open file; false if somebody else writes it, or if it is no longer at its path."""
+    """Lock an open file, where the file system has locks.
+
+    Returns:
+        False if another process writes the file, or if it is no longer at its path.
+    """
     if fcntl is None:
         return True
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError):
+        return False
+    except OSError:
+        pass  # ENOLCK, ENOTSUP or ENOSYS: network file systems often have no locks
+    try:
         return os.path.samestat(os.fstat(descriptor), path.stat())
     except OSError:
         return False

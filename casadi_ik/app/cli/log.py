@@ -266,9 +266,9 @@ def finish(said: Said) -> Answer:
                 raise
             about = {"done": f"left as it is: {EMPTY}"}
         else:
-            cut = f"finished, {_size(done.cut)} of a torn tail cut"
+            cut = f"{_size(done.cut)} of a torn tail cut" if done.cut else "a summary was written"
             about = {
-                "done": cut if done.changed else "whole already",
+                "done": f"finished, {cut}" if done.changed else "whole already",
                 "holds": f"{counted(done.chunks, 'chunk')}, {counted(done.messages, 'message')}",
             }
         parts += [_title(str(path)), fields(about)]

@@ -1,0 +1,155 @@
+"""Logs that other tools for MCAP files have rewritten, and files of theirs that are not logs."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from made_up_solves import main, make_block, rewritten
+from mcap.data_stream import RecordBuilder
+from mcap.reader import make_reader
+from mcap.records import Chunk, MessageIndex, Metadata
+from mcap.stream_reader import StreamReader
+from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType, Writer
+
+from casadi_ik import errors, logs
+
+Write = Callable[..., Path]
+
+
+@pytest.fixture
+def log(write: Write) -> Path:
+    return write(make_block(30, 20), make_block(10, 5, method="hand-first"), urdf="<robot/>")
+
+
+def rows_of(path: Path) -> list[bytes]:
+    opened = logs.open(path)
+    tables = opened.solves(), opened.iterations(), opened.events()
+    return [part.rows.tobytes() for table in tables for part in table.parts]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"index_types": IndexType.ALL & ~IndexType.METADATA},
+        {"index_types": IndexType.NONE},
+        {"index_types": IndexType.CHUNK | IndexType.MESSAGE},
+        {"use_statistics": False},
+        {"repeat_channels": False, "repeat_schemas": False},
+        {"use_statistics": False, "use_summary_offsets": False, "index_types": IndexType.NONE},
+        {"enable_crcs": False, "compression": CompressionType.LZ4},
+    ],
+)
+def test_the_summary_and_its_parts_are_optional(log: Path, options: dict[str, Any]) -> None:
+    """A rewritten log holds the same rows, whatever the tool's writer leaves out."""
+    copy = rewritten(log, **options)
+    assert rows_of(copy) == rows_of(log)
+    assert logs.open(copy).metadata["robot"] == "made_up"
+    finished = logs.finish_log(copy)
+    assert finished.cut == 0
+    assert rows_of(copy) == rows_of(log)
+    assert not logs.finish_log(copy).changed
+
+
+def without_summary(path: Path) -> Path:
+    """Copy a log up to the end of its data, with an empty footer and no summary."""
+    end = path.read_bytes().rindex(bytes([0x0F]) + (4).to_bytes(8, "little") + bytes(4))
+    builder = RecordBuilder()
+    builder.write(path.read_bytes()[:end])
+    builder.write(bytes([0x0F]) + (4).to_bytes(8, "little") + bytes(4))
+    builder.write(bytes([0x02]) + (20).to_bytes(8, "little") + bytes(20))
+    builder.write(MCAP0_MAGIC)
+    copy = path.with_name("no_summary.mcap")
+    copy.write_bytes(builder.end())
+    return copy
+
+
+def test_a_log_without_summary_is_complete(log: Path) -> None:
+    copy = without_summary(log)
+    assert rows_of(copy) == rows_of(log)
+    assert logs.open(copy).info().unfinished == ()
+    finished = logs.finish_log(copy)
+    assert (finished.changed, finished.cut) == (True, 0)
+    with copy.open("rb") as stream:
+        assert make_reader(stream, validate_crcs=True).get_summary() is not None
+    assert rows_of(copy) == rows_of(log)
+
+
+def test_message_indexes_in_another_order_are_kept(log: Path) -> None:
+    """A torn log whose chunks are followed by indexes of another order loses none of them."""
+    builder, indexes = RecordBuilder(), list[MessageIndex]()
+    builder.write(MCAP0_MAGIC)
+    with log.open("rb") as stream:
+        for record in StreamReader(stream, emit_chunks=True).records:
+            if isinstance(record, MessageIndex):
+                indexes.insert(0, MessageIndex(record.channel_id, record.records[::-1]))
+                continue
+            for index in indexes:
+                index.write(builder)
+            indexes.clear()
+            if not isinstance(record, Chunk | Metadata) and builder.count > 10_000:
+                break
+            record.write(builder)
+    data = builder.end()
+    torn = log.with_name("torn.mcap")
+    torn.write_bytes(data + b"\x06\xff\xff")
+    expected = rows_of(log)
+    assert rows_of(torn) == expected
+    finished = logs.finish_log(torn)
+    assert (finished.changed, finished.cut) == (True, 3)
+    assert rows_of(torn) == expected
+    with torn.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        counted = logs.open(torn).info().counts["hand-first"]["iteration"]
+        assert len(list(reader.iter_messages("/ik/hand-first/iteration"))) == counted
+
+
+@pytest.mark.parametrize("closed", [True, False])
+@pytest.mark.parametrize("own", [True, False])
+def test_messages_outside_chunks_are_refused(
+    log: Path, closed: bool, own: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As in a bag that rosbag2 records with its preset fastwrite, or in a log without chunks."""
+    if own:
+        path = rewritten(log, use_chunking=False)
+    else:
+        path = log.with_name("bag.mcap")
+        with path.open("wb") as stream:
+            writer = Writer(stream, use_chunking=False)
+            writer.start("ros2", "a recorder")
+            schema = writer.register_schema("std_msgs/msg/Float64", "ros2msg", b"float64 data\n")
+            channel = writer.register_channel("/x", "cdr", schema)
+            for i in range(20):
+                writer.add_message(channel, i, bytes(12), i)
+            writer.finish()
+    if not closed:
+        path.write_bytes(path.read_bytes()[:-30])
+    before = path.read_bytes()
+    for ask in (logs.open, logs.finish_log):
+        with pytest.raises(errors.LogError) as caught:
+            ask(path)
+        assert str(caught.value).startswith(f"{path}: ")
+    for words in (("info",), ("solves",), ("finish",)):
+        assert main(["log", *words, str(path)]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("code", [errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS])
+def test_a_file_system_without_locks(
+    write: Write, monkeypatch: pytest.MonkeyPatch, code: int
+) -> None:
+    fcntl = pytest.importorskip("fcntl")
+
+    def refuse(*_: object) -> None:
+        raise OSError(code, "not here")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    path = write(make_block(30, 20))
+    assert len(logs.open(path).solves()) == 2
+    path.write_bytes(path.read_bytes()[:-30])
+    assert logs.finish_log(path).changed
