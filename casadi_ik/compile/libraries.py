@@ -293,9 +293,10 @@ def _kept_or_built(
 
 @contextlib.contextmanager
 def _sole_builder(path: Path) -> Iterator[None]:
-    """Wait while another process is in this block with the same file; not on Windows.
+    """Wait while another process is in this block with the same file.
 
-    A process that is killed holds nothing. Waiting too long does no harm either: both build.
+    Windows and some file systems have no such locks; there two processes may build the same
+    library, which is harmless. A process that is killed releases its lock.
     """
     try:
         import fcntl
@@ -305,9 +306,13 @@ def _sole_builder(path: Path) -> Iterator[None]:
     until = time.monotonic() + PATIENCE
     with path.open("w") as file:
         while time.monotonic() < until:
-            with contextlib.suppress(BlockingIOError):
+            try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break
+            except BlockingIOError:
+                pass
+            except OSError:
+                break  # a file system without locks: both may build
             stop_if_cancelled()
             time.sleep(0.05)
         try:
