@@ -19,6 +19,7 @@ from pathlib import Path
 
 from casadi_ik.compile.cancellation import SLICE, stop_if_cancelled
 from casadi_ik.errors import KernelError
+from casadi_ik.files.progress import is_terminal
 
 # No contraction: with fused multiply-adds the iterates would differ from the VM's. Errno of sqrt
 # and friends is never read, and without it they are single instructions of the same value. All
@@ -251,11 +252,10 @@ def waits() -> bool:
 
 
 def tell(text: str) -> None:
-    """Say on stderr what is compiled: anywhere, or if waiting was asked for on a terminal only."""
+    """Write a line on what is compiled to stderr; if the caller waits for it, to terminals only."""
     stream = sys.stderr
-    if stream is not None and (not waits() or stream.isatty()):
-        stream.write(f"{text}\n")
-        stream.flush()
+    if stream is not None and (not waits() or is_terminal(stream)):
+        print(text, file=stream, flush=hasattr(stream, "flush"))
 
 
 def announce(name: str, size: int) -> None:

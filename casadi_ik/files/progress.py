@@ -72,12 +72,20 @@ def _bar(count: int) -> Callable[[int | None, float], None] | None:
     """What draws a bar, and takes it away for None; None: there is nothing to draw on."""
     if _in_notebook():
         return _notebook(count)
-    return _terminal(count) if someone_looks_on() else None
+    return _terminal(count) if is_interactive() else None
 
 
-def someone_looks_on() -> bool:
-    """Whether there is a notebook or a terminal to show something on."""
-    return _in_notebook() or (sys.stderr is not None and sys.stderr.isatty())
+def is_interactive() -> bool:
+    """Return whether there is a notebook or a terminal to show progress on."""
+    return _in_notebook() or is_terminal(sys.stderr)
+
+
+def is_terminal(stream: Any) -> bool:
+    """Return whether a stream is a terminal.
+
+    A program may have put any object with a `write` method in place of `sys.stderr`, or None.
+    """
+    return hasattr(stream, "isatty") and not getattr(stream, "closed", False) and stream.isatty()
 
 
 def _in_notebook() -> bool:

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from casadi_ik.collision.clearance import CollisionQuery, SceneCheck
 from casadi_ik.errors import InputError, RowError, UnsupportedError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.progress import progress, someone_looks_on
+from casadi_ik.files.progress import is_interactive, progress
 from casadi_ik.files.writing import InBackground
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import Kinds, by_kinds, usual
@@ -395,7 +395,7 @@ class Engine:
     ) -> Iterator[SolvedPart]:
         """Parts of the batch in order, solved, judged and diagnosed side by side."""
         trace = run.recorder is not None
-        parts = BatchParts(len(targets), run.jobs, trace, run.shown and someone_looks_on())
+        parts = BatchParts(len(targets), run.jobs, trace, run.shown and is_interactive())
 
         def solve(rows: slice) -> SolvedPart:
             started, asked, q0 = time.time_ns(), targets.rows(rows), starts[rows]

@@ -1,0 +1,45 @@
+"""Progress where `sys.stderr` is not a terminal's stream."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+
+import casadi_ik as ik
+from casadi_ik.kernels.compiler import tell
+
+
+class LogStream:
+    """A program's own stream, which has nothing but `write`."""
+
+    def __init__(self) -> None:
+        self.text = ""
+
+    def write(self, text: str) -> None:
+        self.text += text
+
+
+class ClosedTerminal(LogStream):
+    """A stream that was closed; asking it anything is an error."""
+
+    closed = True
+
+    def isatty(self) -> bool:
+        raise ValueError("I/O operation on closed file")
+
+
+@pytest.mark.parametrize("stream", [None, LogStream(), ClosedTerminal()])
+@pytest.mark.parametrize("policy", ["wait", "background"])
+def test_a_stream_without_isatty(
+    solver: ik.Solver, monkeypatch: pytest.MonkeyPatch, stream: Any, policy: str
+) -> None:
+    points, normals = solver.robot.contacts(solver.robot.random(np.random.default_rng(0), 5))
+    monkeypatch.setattr(sys, "stderr", stream)
+    assert len(solver.solve_batch(points, normals).success) == 5
+    monkeypatch.setenv("CASADI_IK_COMPILE", policy)
+    tell("compiling")
+    if isinstance(stream, LogStream) and policy == "background":
+        assert stream.text.endswith("compiling\n")
