@@ -3,10 +3,10 @@
 import warnings
 
 from casadi_ik.errors import MissingExtraError
+from casadi_ik.views.backend import import_matplotlib
 
 try:
-    import matplotlib as _  # noqa: F401
-
+    import_matplotlib()
     with warnings.catch_warnings():
         # What it downloads with has progress bars, which complain in notebooks without widgets.
         warnings.filterwarnings("ignore", "IProgress not found")
