@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, overload
 from weakref import WeakKeyDictionary
 
@@ -514,8 +513,7 @@ def _ranked(
     for i, (row, solution, grasp) in enumerate(zip(kept, solutions, grasps, strict=True)):
         by_finger = {name: forces[i, robot.fingers.index(name)] for name in grasp.contacts}
         values = float(load[row]), float(closure[row]), float(score[row])
-        forced = MappingProxyType(by_finger)
-        entries.append(FoundGrasp(grasp, solution, *values, forced, float(most[row])))
+        entries.append(FoundGrasp(grasp, solution, *values, by_finger, float(most[row])))
     return FoundGrasps(tuple(entries), generator.counts, name, 0.0, "", *about)
 
 
