@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.kernels.compiler import tell
+from casadi_ik.compile.compiler import tell
 
 
 class LogStream:

@@ -2,8 +2,8 @@
 
 import warnings
 
+from casadi_ik.app.pictures.backend import import_matplotlib
 from casadi_ik.errors import MissingExtraError
-from casadi_ik.views.backend import import_matplotlib
 
 try:
     import_matplotlib()
