@@ -27,7 +27,7 @@ from casadi_ik.kinematics.contacts import (
     tip_rates,
     tip_vectors,
 )
-from casadi_ik.kinematics.forward import Pose, actuated
+from casadi_ik.kinematics.forward import Pose, actuated, sparse
 from casadi_ik.kinematics.se3 import align, skew
 from casadi_ik.kinematics.smooth import Expr, part, shared
 from casadi_ik.model.description import RobotDescription
@@ -74,10 +74,25 @@ def hand_contacts(robot: RobotDescription, hand: Expr, columns: tuple[int, ...])
     return HandContacts(tips, rates)
 
 
+def base_rotation(robot: RobotDescription) -> Array:
+    """Return the rotation (3, 3) that the fixed joints before the first motor make.
+
+    A choice relative to it does not depend on how the robot is mounted.
+    """
+    rotation = np.eye(3)
+    for joint in robot.chain(robot.movable[0].child) if robot.movable else ():
+        rotation = rotation @ joint.placement[:3, :3]
+    return rotation
+
+
 def best_palm(
-    contacts: HandContacts, rows: ContactRows, p: dict[str, Expr], number: Expr | None = None
+    contacts: HandContacts,
+    rows: ContactRows,
+    p: dict[str, Expr],
+    number: Expr | None = None,
+    base: Array | None = None,
 ) -> tuple[Expr, Expr]:
-    """The palm pose that brings a given posture closest to the contacts.
+    """Return the palm pose that brings a given posture closest to the contacts.
 
     A line or a plane is taken for the point it goes through.
 
@@ -87,6 +102,7 @@ def best_palm(
         p: Parameters with the target.
         number: Where contacts leave the palm's rotation free (two fingers that face each other, one
             finger), another one for every number from 0, evenly spread; None: always the same.
+        base: (3, 3) rotation that these turns are relative to; None: the base frame.
 
     Returns:
         rotation (3, 3) and origin (3, 1) [m], base frame.
@@ -107,7 +123,8 @@ def best_palm(
         for axis in ("normal", "tangent"):
             if axis in goal:
                 B = B + weights[i, 1] * goal[axis] @ tip[axis].T
-    rotation = align(B, None if number is None else even_turn(number))
+    R_base = sparse(np.eye(3) if base is None else base)
+    rotation = R_base @ align(R_base.T @ B, None if number is None else even_turn(number))
     return rotation, target_centre - rotation @ hand_centre
 
 

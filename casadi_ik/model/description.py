@@ -88,7 +88,7 @@ class RobotDescription:
         path: The file that it was read from; None: its parts are shipped.
         sides: Of a body, its arm-hands; none of an arm-hand or a hand.
         trunk: Of a body, the motors that move every palm: a waist, a lift, a mobile base.
-        trunk_link: Of a body, the link that the sides stand on.
+        trunk_link: Of a body, the link that the sides stand on; the root if it has no trunk motors.
     """
 
     name: str

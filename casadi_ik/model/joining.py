@@ -514,8 +514,22 @@ def _links_to(link: str, whole: Part) -> list[str]:
 def _with_sides(
     robot: RobotDescription, flat: FlatJoints, sides: Sequence[_OneSide], end: str, where: Path
 ) -> RobotDescription:
-    """The body, once it is known which motors and fingers are whose."""
+    """Return the body with the motors and fingers of its sides.
+
+    Args:
+        robot: The robot without sides.
+        flat: Its joints.
+        sides: Its sides.
+        end: Link that the sides stand on.
+        where: The description's file, for messages.
+
+    Raises:
+        DescriptionError: With file, key, what was found and what was expected.
+    """
     end = flat.places[end][0]
+    trunk = _motors(robot, _moving(robot, end))
+    # Sides without a moving trunk are solved independently, in the frame of the contacts: the root.
+    end = end if trunk else robot.root
     fingers: list[Finger] = []
     found: list[Side] = []
     for side in sides:
@@ -528,7 +542,6 @@ def _with_sides(
         arm, hand = side.motors or _motors_of(robot, palm, own, end)
         found.append(Side(side.name, palm, placement, side.thumb, names, arm, hand))
         fingers += own
-    trunk = _motors(robot, _moving(robot, end))
     robot = replace(robot, fingers=tuple(fingers), sides=tuple(found), trunk=trunk, trunk_link=end)
     _check_motors(robot, where)
     return robot

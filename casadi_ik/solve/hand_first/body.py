@@ -16,6 +16,7 @@ import casadi as ca
 
 from casadi_ik.compile.graphs import FunctionGraph
 from casadi_ik.compile.layout import Layout
+from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arms.family import ArmFamily
 from casadi_ik.kinematics.arms.recognise import arm_family
 from casadi_ik.kinematics.arms.search import PARAMETERS, ArmTrials, Farthest
@@ -23,7 +24,7 @@ from casadi_ik.kinematics.box_qp import Bounded, clip, damped_step
 from casadi_ik.kinematics.contact_fit import FIT, Tried, fresh_fit, judge, judge_contacts
 from casadi_ik.kinematics.contacts import LENGTH, Kinds
 from casadi_ik.kinematics.forward import ActuatedKinematics, Pose, actuated
-from casadi_ik.kinematics.palm import best_palm, hand_contacts, newton_polish
+from casadi_ik.kinematics.palm import base_rotation, best_palm, hand_contacts, newton_polish
 from casadi_ik.kinematics.smooth import Expr, part, part_of, shared
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.solve.hand_first.parameters import BODY, STAGES
@@ -58,6 +59,7 @@ class BodySide:
         fingers: Numbers of its fingers.
         arms: Where its arm is among the motors of all arms.
         hands: Where its hand is among the motors of all hands.
+        base: (3, 3) rotation of the body's base, see `palm.base_rotation`.
     """
 
     place: int
@@ -69,6 +71,7 @@ class BodySide:
     fingers: list[int]
     arms: slice
     hands: slice
+    base: Array
 
     @property
     def robot(self) -> RobotDescription:
@@ -85,11 +88,11 @@ class BodySide:
     # alike, so that their code stands once (compile/emitter.py).
 
     def best_palm(self, hand: Expr, own: dict[str, Expr], number: Expr) -> tuple[Expr, Expr]:
-        """Rotation and origin of the palm that suits a hand best, see `palm_fit.best_palm`."""
+        """Return rotation and origin of the palm that suits a hand best, see `palm.best_palm`."""
         given, turn = self._own.symbols("own"), ca.SX.sym("turn")
         at = ca.SX.sym("hand", hand.numel())
         contacts = hand_contacts(self.robot, at, self.robot.hand_actuators)
-        found = best_palm(contacts, self.layouts.contacts, self._own.unpack(given), turn)
+        found = best_palm(contacts, self.layouts.contacts, self._own.unpack(given), turn, self.base)
         return part("best_palm", [at, given, turn], found)(hand, self._own.pack(own), number)
 
     def fitted(self, x: PalmAndHand, damping: Expr, own: dict[str, Expr], q: Expr) -> Tried:
@@ -133,6 +136,7 @@ def body_sides(robot: RobotDescription, candidates: int, kinds: Kinds) -> list[B
     """
     found: list[BodySide] = []
     arms = hands = 0
+    base = base_rotation(robot)
     for place, (side, (arm, hand)) in enumerate(
         zip(robot.sides, robot.side_actuators, strict=True)
     ):
@@ -145,6 +149,7 @@ def body_sides(robot: RobotDescription, candidates: int, kinds: Kinds) -> list[B
                 *(sorted((*arm, *hand)), arm, hand, fingers),
                 slice(arms, arms + len(arm)),
                 slice(hands, hands + len(hand)),
+                base,
             )
         )
         arms, hands = arms + len(arm), hands + len(hand)

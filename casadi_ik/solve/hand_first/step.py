@@ -53,6 +53,7 @@ from casadi_ik.kinematics.palm import (
     NUMERIC_ARM,
     SIX,
     HandContacts,
+    base_rotation,
     best_palm,
     hand_contacts,
     newton_polish,
@@ -349,7 +350,9 @@ class HandFirstStep:
         hand = ca.SX.sym("hand", len(self.robot.hand_actuators))
         contacts = hand_contacts(self.robot, hand, self.robot.hand_actuators)
         number = ca.fmax(s["candidate"] + s["earlier"], 0.0) + s["turn"]
-        rotation, origin = best_palm(contacts, self.layouts.contacts, p, number)
+        rotation, origin = best_palm(
+            contacts, self.layouts.contacts, p, number, base_rotation(self.robot)
+        )
         q = self._with_hand(p["start"], hand)
         changed = {
             "q": q,

@@ -39,7 +39,13 @@ from casadi_ik.kinematics.contact_fit import (
 )
 from casadi_ik.kinematics.contacts import ContactRows, Kinds, suffix, within_tolerance
 from casadi_ik.kinematics.forward import Pose, motor_scales
-from casadi_ik.kinematics.palm import best_palm, hand_contacts, nearest_start, pose_step
+from casadi_ik.kinematics.palm import (
+    base_rotation,
+    best_palm,
+    hand_contacts,
+    nearest_start,
+    pose_step,
+)
 from casadi_ik.kinematics.smooth import Expr, shared
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.solve.limits import bits
@@ -372,7 +378,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
             ca.SX.zeros(len(self.robot.hand_actuators), 1),
         )
         contacts = hand_contacts(self.robot, hand, self.robot.hand_actuators)
-        rotation, origin = best_palm(contacts, self.contacts, p)
+        rotation, origin = best_palm(contacts, self.contacts, p, base=base_rotation(self.robot))
         return ca.Function("guess", [state, parameters], shared(hand, rotation, origin))
 
     def _begin(self) -> ca.Function:
