@@ -15,11 +15,12 @@ from casadi_ik.collision.clearance import Clearances, SceneCheck
 from casadi_ik.collision.scene import Scene, grasped_in
 from casadi_ik.compile.loop import Stepper
 from casadi_ik.errors import InputError
+from casadi_ik.files.input_checks.poses import checked_pose, one_pose
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.logs import Compression, Keep
 from casadi_ik.logs.writer import recorder_of
 from casadi_ik.model.grasp import Grasp
-from casadi_ik.model.pose import Free, checked_pose, one_pose
+from casadi_ik.model.pose import Free
 from casadi_ik.model.targets import LIMITS, TargetBatch, Tolerance
 from casadi_ik.motion.moving import MovingSolver
 from casadi_ik.papers.qiu.step import FINGER_STEPS

@@ -112,6 +112,22 @@ class RowError(InputError):
         self.row = row
 
 
+class InvalidPoseError(InputError, DescriptionError):
+    """A pose, rotation or quaternion is not rigid, by more than rounding.
+
+    Arguments and files raise the same class: those who catch `InputError` or `DescriptionError`
+    catch it, too.
+    """
+
+
+class InputWarning(UserWarning):
+    """An input is accepted, but probably not meant: its units or the order of its keypoints.
+
+    The message names the value, the limit and the likely mistake (millimetres given as metres,
+    degrees given as radians). Silence it with ``warnings.simplefilter("ignore", InputWarning)``.
+    """
+
+
 class UnsupportedError(CasadiIKError):
     """The method cannot be used with this robot; the message says which property is missing."""
 

@@ -141,7 +141,7 @@ def _rows(frames: Array, joints: Array) -> Array:
 def _bodex(path: Path, frames: Array, convention: Convention, joints: Array) -> None:
     del convention
     rows = _rows(frames, joints).astype(np.float32)
-    stages = np.stack([0.5 * rows, rows, 2.0 * rows], axis=1)
+    stages = np.stack([_scaled(rows, 0.5), rows, _scaled(rows, 2.0)], axis=1)
     held = {"robot_pose": stages[None], "obj_pose": OBJECT[None], "obj_scale": np.array([0.06])}
     np.save(path, np.array(held, dtype=object))
 
@@ -149,7 +149,8 @@ def _bodex(path: Path, frames: Array, convention: Convention, joints: Array) -> 
 def _dexgraspbench(path: Path, frames: Array, convention: Convention, joints: Array) -> None:
     del convention
     rows = _rows(frames, joints).astype(np.float32)
-    stages = {"pregrasp_qpos": 0.5 * rows, "grasp_qpos": rows, "squeeze_qpos": 2.0 * rows}
+    stages = {"pregrasp_qpos": _scaled(rows, 0.5), "grasp_qpos": rows}
+    stages |= {"squeeze_qpos": _scaled(rows, 2.0)}
     held = stages | {"obj_pose": OBJECT, "obj_scale": np.float64(0.06), "obj_path": "assets"}
     np.save(path, np.array(held, dtype=object))
 
@@ -186,6 +187,11 @@ def _table(path: Path, palms: Array, names: tuple[str, ...], joints: Array) -> N
         writer = csv.writer(file)
         writer.writerow(columns)
         writer.writerows(np.stack(list(columns.values()), axis=1).tolist())
+
+
+def _scaled(rows: Array, factor: float) -> Array:
+    """Return rows x y z, w x y z, joints with the joints scaled."""
+    return np.hstack([rows[:, :7], factor * rows[:, 7:]])
 
 
 def _quaternions(rotations: Array) -> Array:

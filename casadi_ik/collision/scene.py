@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,6 +26,12 @@ from casadi_ik.collision.solids import (
 )
 from casadi_ik.errors import DescriptionError, InputError, UnknownNameError
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.input_checks.poses import (
+    checked_pose,
+    checked_quaternion,
+    one_pose,
+    rotations_of,
+)
 from casadi_ik.files.limits import LIMITS
 from casadi_ik.files.number_files import finite_points, read_mesh, read_points
 from casadi_ik.files.reading import (
@@ -41,7 +46,6 @@ from casadi_ik.files.reading import (
 from casadi_ik.files.shipped import resolve
 from casadi_ik.files.units import Distance, Factor, Length, Pure, Size
 from casadi_ik.model.link_shapes import Touching
-from casadi_ik.model.pose import checked_pose, one_pose, rotations_of
 from casadi_ik.model.schema import TouchingEntry
 from casadi_ik.model.shapes import load_mesh_shape
 
@@ -103,18 +107,13 @@ class Entry(
         if len(turns) > 1:
             raise DescriptionError(f"{where}: found {' and '.join(turns)}, expected one of them")
         if self.pose is not None:
-            try:
-                return one_pose(self.pose, f"{where}.pose")
-            except InputError as error:
-                raise DescriptionError(str(error)) from error
+            return one_pose(self.pose, f"{where}.pose")
         pose = frame_matrix(Frame(self.xyz or (0.0, 0.0, 0.0), self.rpy or (0.0, 0.0, 0.0)))
         for key, shift in (("quaternion_wxyz", 0), ("quaternion_xyzw", 1)):
             given = getattr(self, key)
             if given is not None:
-                length = math.hypot(*given)
-                if abs(length - 1) > 0.01:  # it is rounded where it is written down
-                    raise DescriptionError(f"{where}.{key}: found length {length:g}, expected 1")
-                pose[:3, :3] = rotations_of(np.roll(given, shift)[None])[0]
+                unit = checked_quaternion(given, f"{where}.{key}")
+                pose[:3, :3] = rotations_of(np.roll(unit, shift)[None])[0]
         return pose
 
 

@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array, Bools, frozen
-from casadi_ik.model.pose import Free, inverse, one_pose
+from casadi_ik.files.input_checks.poses import MAX_SKEW, one_pose
+from casadi_ik.model.pose import Free, inverse
 
 
 @dataclass(frozen=True)
@@ -104,9 +105,6 @@ MORE: Mapping[str, str] = {
 PLACES = ("line", "plane", "ball")
 """Those that say where the point is touched: a contact has one at most."""
 
-ACROSS = 1e-6
-"""Largest cosine between a tangent and its normal that counts as rounding."""
-
 
 def fault(vectors: Mapping[str, Array]) -> str | None:
     """What is wrong with the vectors of one contact: the first line of it, or None.
@@ -125,7 +123,7 @@ def fault(vectors: Mapping[str, Array]) -> str | None:
     if "normal" not in vectors:
         return "tangent: found one without a normal, expected both"
     cosine = float(vectors["tangent"] @ vectors["normal"])
-    if not abs(cosine) <= ACROSS:
+    if not abs(cosine) <= MAX_SKEW:
         degrees = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
         return (
             f"tangent: found {np.round(vectors['tangent'], 6).tolist()} at {degrees:.4g} deg to "
@@ -150,7 +148,7 @@ def faulty(vectors: Mapping[str, Array]) -> Bools:
         bad |= np.sum(places, axis=0) > 1
     if "tangent" in given:
         cosine = np.einsum("...i,...i->...", vectors["tangent"], vectors["normal"])
-        bad |= given["tangent"] & ~(np.abs(cosine) <= ACROSS)
+        bad |= given["tangent"] & ~(np.abs(cosine) <= MAX_SKEW)
     return bad
 
 

@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.errors import InputError, RowError, UnknownNameError
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.input_checks.poses import checked_pose
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.grasp import Tolerance, real_array, unit_vectors
-from casadi_ik.model.pose import checked_pose
 
 LIMITS = ("enforce", "ignore")
 """How joint limits are taken: as part of being solved, or not at all (the paper's reading)."""

@@ -13,9 +13,9 @@ from casadi_ik.collision.clearance import SceneCheck
 from casadi_ik.compile import FunctionKernel
 from casadi_ik.compile.function_kernel import Recurrence
 from casadi_ik.files.arrays import Array, Bools
+from casadi_ik.files.input_checks.poses import one_pose
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import LENGTH, Kinds
-from casadi_ik.model.pose import one_pose
 from casadi_ik.model.targets import TargetBatch, Tolerance
 from casadi_ik.motion.cycle import Cycle, of_side
 from casadi_ik.motion.motion import Rates

@@ -12,10 +12,11 @@ from numpy.typing import ArrayLike
 
 from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.input_checks.poses import one_pose
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import by_kinds
 from casadi_ik.model.grasp import Grasp
-from casadi_ik.model.pose import inverse, one_pose
+from casadi_ik.model.pose import inverse
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.motion.approach import Approach, ApproachPlan, approach
 from casadi_ik.motion.follower import Follower

@@ -18,10 +18,11 @@ from numpy.typing import ArrayLike, NDArray
 from casadi_ik.collision.clearance import ROUNDING, CollisionQuery
 from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array, Bools
+from casadi_ik.files.input_checks.poses import one_pose
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import by_kinds
 from casadi_ik.model.grasp import Grasp
-from casadi_ik.model.pose import inverse, moved, one_pose
+from casadi_ik.model.pose import inverse, moved
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.alternatives import APART, SEEKING, AlternativeFinder, checked_distance
 from casadi_ik.solve.arm_search import Preference

@@ -15,10 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.errors import InputError, UnknownNameError
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.input_checks.poses import checked_pose
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import LENGTH, more_arrays
 from casadi_ik.model.grasp import Contact, Grasp, Tolerance
-from casadi_ik.model.pose import Free, checked_pose
+from casadi_ik.model.pose import Free
 from casadi_ik.model.targets import DIRECTIONS, TargetBatch, fixed_array, target_arrays
 
 CLEARANCE = "clearance"

@@ -76,7 +76,7 @@ def test_moving_leaves_the_first_scene_alone():
     assert pickle.loads(pickle.dumps(moved)).margin == 0.01
     with pytest.raises(UnknownNameError, match="no solid 'b'; its solids: a"):
         scene.moved("b", pose)
-    with pytest.raises(InputError, match="are no rotation"):
+    with pytest.raises(InputError, match="is not a rotation"):
         scene.moved("a", np.ones((4, 4)))
 
 

@@ -141,7 +141,10 @@ def test_many_palms() -> None:
     ("given", "says"),
     [
         ({"palm": np.eye(4)}, "posture: missing"),
-        ({"palm": np.diag([2.0, 1, 1, 1]), "posture": {"a": 1.0}}, "palm: its first three columns"),
+        (
+            {"palm": np.diag([2.0, 1, 1, 1]), "posture": {"a": 1.0}},
+            "palm: the matrix is not a rotation",
+        ),
         (
             {
                 "palm": np.eye(4),
@@ -226,8 +229,8 @@ def _getagrip(**changes: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("content", "says"),
     [
-        (_getagrip(rot=2 * np.tile(np.eye(3), (2, 1, 1))), "row 0: rotation: .* no rotation"),
-        (_getagrip(rot=np.tile(np.diag([1.0, 1, -1]), (2, 1, 1))), "no rotation"),
+        (_getagrip(rot=2 * np.tile(np.eye(3), (2, 1, 1))), "row 0: rotation: .* not a rotation"),
+        (_getagrip(rot=np.tile(np.diag([1.0, 1, -1]), (2, 1, 1))), "not a rotation"),
         (_getagrip(trans=np.zeros((3, 3))), "rotation: found shape"),
         (_getagrip(joint_angles=np.zeros((2, 12))), "joints: found 12, expected 16"),
         (_getagrip(trans="none"), "trans: expected an array of numbers"),

@@ -217,7 +217,7 @@ def test_bad_questions_are_one_clear_line(solver, robot, candidates, cup):
     for words, text in (
         ({"grasps": []}, "grasps: found none, expected at least one"),
         ({"object_pose": unknown}, "object_pose: holds NaN or infinity, expected finite numbers"),
-        ({"object_pose": skewed}, "object_pose: its first three columns are no rotation"),
+        ({"object_pose": skewed}, "object_pose: the matrix is not a rotation"),
         ({"object_pose": np.zeros((3, 4))}, r"object_pose: found shape \(3, 4\)"),
         ({"prefer": "best"}, "prefer: found 'best', expected one of limits"),
         ({"prefer": "clearance"}, "which needs a solver with a scene"),

@@ -449,7 +449,7 @@ def test_the_search_ends_when_nothing_new_is_found(tmp_path):
         ({"limit": 0}, "limit: found 0"),
         ({"among": 0}, "among: found 0"),
         ({"prefer": "best"}, "prefer: found 'best'"),
-        ({"pose": np.zeros((4, 4))}, "pose: its first three columns"),
+        ({"pose": np.zeros((4, 4))}, "pose: the matrix is not a rotation"),
     ],
 )
 def test_bad_questions_are_refused(surface, asked, expected):

@@ -33,8 +33,8 @@ from casadi_ik.app.viewer.access import Server
 from casadi_ik.app.viewer.request import OBJECT, Held, PageRequest
 from casadi_ik.collision.clearance import Closest
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.input_checks.poses import rotations_of
 from casadi_ik.kinematics.arm_hand import ArmHand
-from casadi_ik.model.pose import rotations_of
 from casadi_ik.solve.verdict import ContactVerdict
 
 if TYPE_CHECKING:

@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from casadi_ik.errors import DescriptionError, UnsupportedError
+from casadi_ik.errors import DescriptionError, InvalidPoseError, UnsupportedError
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.input_checks.poses import rotations_of
 from casadi_ik.files.limits import LIMITS
 from casadi_ik.files.number_files import refuse_giants
 from casadi_ik.files.reading import Frame, Point, Struct, frame_matrix, read
@@ -22,7 +23,7 @@ from casadi_ik.integrations.datasets.postures import HandPoses, of_fixed_axes, o
 from casadi_ik.integrations.datasets.unpickling import Packed, read_npy, read_torch
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.linkage import motion
-from casadi_ik.model.pose import inverse, rotations_of
+from casadi_ik.model.pose import inverse
 
 
 class HandFrame(Frame, frozen=True, kw_only=True):
@@ -409,7 +410,7 @@ def _object_pose(where: str, found: Mapping[str, Any]) -> Array:
         f"{where}: obj_pose", row[None, :3], rotations_of(row[None, 3:]), np.zeros((1, 0))
     )
     if held.faults:
-        raise DescriptionError(f"{where}: obj_pose: {held.faults[0]}")
+        raise InvalidPoseError(f"{where}: obj_pose: {held.faults[0]}")
     return held.poses[0]
 
 

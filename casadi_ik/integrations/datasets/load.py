@@ -11,8 +11,15 @@ from typing import Any, Literal, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from casadi_ik.errors import DescriptionError, InputError, UnknownNameError, os_errors
+from casadi_ik.errors import (
+    DescriptionError,
+    InputError,
+    InvalidPoseError,
+    UnknownNameError,
+    os_errors,
+)
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.input_checks.poses import rotations_of
 from casadi_ik.files.limits import LIMITS, RAISED, limit
 from casadi_ik.files.number_files import read_npz, refuse_giants
 from casadi_ik.integrations.datasets.layouts import (
@@ -36,7 +43,6 @@ from casadi_ik.kinematics.contacts import NAMES
 from casadi_ik.model.grasp import Contact, Grasp
 from casadi_ik.model.load_grasp import load_grasp_files
 from casadi_ik.model.objects import GraspObject, is_mesh, load_object
-from casadi_ik.model.pose import rotations_of
 from casadi_ik.model.targets import DIRECTIONS
 from casadi_ik.solve.target_files import TargetFile, polars_module
 
@@ -162,7 +168,8 @@ def kept_rows(
         clips = invalid == "error" and set(beyond) - set(faults)
         more = ", 'clip' puts joints at their limits" if clips else ""
         wayout = f"; invalid='drop' leaves such rows out{more} (--invalid)"
-        raise DescriptionError(
+        kind = InvalidPoseError if bad[first].startswith("rotation") else DescriptionError
+        raise kind(
             f"{where}: row {first}: {bad[first]}; {len(bad)} of {len(rows)} rows are invalid"
             f"{'' if invalid == 'drop' else wayout}"
         )

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.arrays import Array, Bools
+from casadi_ik.files.input_checks.poses import nearest_rotations, rotation_problem
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.linkage import link_poses, motion
@@ -23,7 +24,6 @@ class PostureFit:
 
     Attributes:
         far: A hand farther from its object than this [m] is one in millimetres.
-        skew: How far a rotation may be from one: data sets keep four bytes a number.
         beyond: A joint may be so far beyond its limits [rad or m]; it is then at the limit.
         apart: How far a joint may be from where its coupling puts it [rad or m].
         steps: Of the search for the nearest posture, at most.
@@ -34,7 +34,6 @@ class PostureFit:
     """
 
     far: float = 5.0
-    skew: float = 2e-3
     beyond: float = 0.02
     apart: float = 0.02
     steps: int = 40
@@ -182,7 +181,8 @@ class HandPoses:
 
         for name in ("position", "rotation", "joints"):
             finite = np.isfinite(getattr(self, name)).reshape(len(self.position), -1).all(axis=1)
-            text = f"{name}: holds NaN or infinity, expected finite numbers"
+            more = " (and quaternions of length 1)" if name == "rotation" else ""
+            text = f"{name}: holds NaN or infinity, expected finite numbers{more}"
             note(np.asarray(~finite), lambda _, text=text: text)
         away = np.linalg.norm(self.position, axis=1)
         note(
@@ -200,13 +200,8 @@ class HandPoses:
         )
         whole = np.array([row not in found for row in self.rows])
         rotation = np.where(whole[:, None, None], self.rotation, np.eye(3))
-        left, _, right = np.linalg.svd(rotation)
-        exact = left @ right
-        off = np.abs(exact - rotation).reshape(len(exact), -1).max(axis=1)
-        note(
-            (off > FIT.skew) | (np.linalg.det(exact) < 0),
-            lambda _: "rotation: its columns are no rotation, expected a rigid pose",
-        )
+        exact, invalid = nearest_rotations(rotation)
+        note(invalid, lambda i: f"rotation: {rotation_problem(rotation[i])}")
         whole = np.array([row not in found for row in self.rows])
         object.__setattr__(self, "rotation", np.where(whole[:, None, None], exact, np.eye(3)))
         for name in ("position", "joints"):

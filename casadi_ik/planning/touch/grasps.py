@@ -15,10 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.input_checks.poses import one_pose
 from casadi_ik.files.progress import progress
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.grasp import Contact, Grasp, Tolerance
-from casadi_ik.model.pose import inverse, one_pose
+from casadi_ik.model.pose import inverse
 from casadi_ik.planning.touch.candidates import (
     Candidates,
     Generator,

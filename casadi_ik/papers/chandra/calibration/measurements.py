@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from casadi_ik.compile import FunctionKernel
 from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.input_checks.poses import checked_quaternion
 from casadi_ik.kinematics import dual_quaternion as dq
 from casadi_ik.kinematics.screws import finger_chain
 from casadi_ik.model.description import RobotDescription
@@ -174,10 +175,8 @@ def _row(
     point = np.array([number(column) for column in POINT])
     turned = any(row.get(column) for column in TURN)
     turn = np.array([number(column) for column in TURN]) if turned else np.array([1.0, 0, 0, 0])
-    length = float(np.linalg.norm(turn))
-    if abs(length - 1) > 1e-2:
-        raise InputError(f"{path}:{line}: qw..qz: found length {length:.4g}, expected 1")
-    pose = dq.from_quaternion(ca.DM(turn / length), ca.DM(point))
+    unit = checked_quaternion(turn, f"{path}:{line}: qw..qz")
+    pose = dq.from_quaternion(ca.DM(unit), ca.DM(point))
     return finger, q, np.array(pose).ravel(), turned
 
 
