@@ -41,7 +41,7 @@ from casadi_ik.export.targets import (
 )
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.grasp import Contact, Grasp
-from casadi_ik.planning.touch.hand_table import touch_library
+from casadi_ik.planning.touch.library import touch_library
 
 MARK = ".casadi_ik_export"
 """A file by which a folder is known as an export."""

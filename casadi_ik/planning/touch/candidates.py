@@ -8,7 +8,7 @@ through `Solver.solve_palms` and `Solver.solve_batch`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -25,8 +25,8 @@ from casadi_ik.planning.touch.hand_table import (
     SnapJob,
     TouchJob,
     rigid,
-    touch_library,
 )
+from casadi_ik.planning.touch.library import touch_library
 from casadi_ik.planning.touch.surface import Grid, Surface
 
 
@@ -58,8 +58,8 @@ class TouchParameters:
         slide: Weight of sliding along the surface beside leaving it.
         turn: Metres that count as much as a radian of lean.
         touch: What a fingertip may be off the surface at last [m].
-        aside: How far the nearest sample may be aside of a pad at last [m]: where it is farther the
-            pad is beyond an edge.
+        max_spread: Largest angle between the triangles that meet at a contact and their mean, and
+            between this and the direction in which the pad meets them [rad]; beyond, it is an edge.
         last_lean: What it may lean at last [rad].
         apart: Two grasps differ if a fingertip or the palm is so far elsewhere [m] ...
         turned: ... or the palm is turned by so much [rad].
@@ -87,7 +87,7 @@ class TouchParameters:
     slide: float = 0.25
     turn: float = 0.02
     touch: float = 1e-3
-    aside: float = 4e-3
+    max_spread: float = float(np.deg2rad(20.0))
     last_lean: float = float(np.deg2rad(15.0))
     apart: float = 0.010
     turned: float = float(np.deg2rad(15.0))
@@ -102,12 +102,14 @@ class Candidates:
         hand: (k, m) positions of the fingers' motors [rad or m].
         used: (k, f) which fingers touch.
         tips: (k, f, 3) fingertips [m]; empty where they were not looked up.
+        contacts: Contacts with the surface; None where they were not looked up.
     """
 
     palm: Array
     hand: Array
     used: Bools
     tips: Array = field(default_factory=lambda: np.zeros(0))
+    contacts: Touching | None = None
 
     def __len__(self) -> int:
         return len(self.hand)
@@ -115,7 +117,8 @@ class Candidates:
     def rows(self, rows: NDArray) -> Candidates:
         """Some of them."""
         tips = self.tips[rows] if len(self.tips) else self.tips
-        return Candidates(self.palm[rows], self.hand[rows], self.used[rows], tips)
+        contacts = None if self.contacts is None else self.contacts.rows(rows)
+        return Candidates(self.palm[rows], self.hand[rows], self.used[rows], tips, contacts)
 
     def alike(self, others: Candidates, chosen: TouchParameters) -> Bools:
         """(k, n) which have palm and fingertips about where others have them."""
@@ -161,6 +164,7 @@ WHY_NONE = {
     "force-closed": "contacts do not oppose each other within friction",
     "hold ": "it is too heavy for that squeeze, friction and the motors' torques",
     "arm reaches": "the object is out of the arm's reach, or only from sides that hold nothing",
+    "contacts as claimed": "contacts are off, lean, or are not closed once the arm is solved",
     "free in the scene": "arm or hand would hit something of the scene, or the object",
 }
 """What it means that nothing passes a stage."""
@@ -239,13 +243,14 @@ class Generator:
         some = self.draw(count)
         if len(some):
             some = snapped(table, surface, some, chosen)
-            here = touching(table, surface, some)
-            ok = np.abs(here.height) < chosen.touch
-            ok &= (here.lean < chosen.last_lean + table.roll) & surface.inside[here.sample]
-            off = ((here.points - surface.points[here.sample]) ** 2).sum(axis=-1)
-            ok &= off - (here.height + table.radii) ** 2 < chosen.aside**2
+            tips = pads_of(table, some).points
+            contacts = touching(table, surface, some)
+            # Whether an edge of the surface is near is known for samples.
+            feet = np.where(some.used[..., None], contacts.foot, tips)
+            fits = surface.inside[surface.foot(feet)[1]]
+            ok = contacts.accepted(chosen, table.roll) & fits
             rows = np.flatnonzero((ok | ~some.used).all(axis=1))
-            some = replace(some, tips=here.points).rows(rows)
+            some = replace(some, tips=tips, contacts=contacts).rows(rows)
         self.counted("made exact", len(some))
         some = some.rows(np.flatnonzero(self.clear(some)))
         self.counted("still clear", len(some))
@@ -337,41 +342,98 @@ class Generator:
 
 
 @dataclass(frozen=True)
-class Touching:
-    """Where fingertips are on a surface.
+class Pads:
+    """Fingertip pads in the object's frame.
 
     Attributes:
-        points: (k, f, 3) middles of pads' balls, of planes contact points [m], object frame.
-        normals: (k, f, 3) pad normals.
-        height: (k, f) distance of pads from the surface [m].
-        sample: (k, f) nearest samples.
-        lean: (k, f) between pad normals and the surface's [rad].
+        points: (k, f, 3) centres of balls, contact points of planes [m].
+        normals: (k, f, 3) outward pad normals.
     """
 
     points: Array
     normals: Array
-    height: Array
-    sample: NDArray[np.intp]
-    lean: Array
 
 
-def touching(table: HandTable, surface: Surface, some: Candidates) -> Touching:
-    """Where fingertips are, in the object's frame."""
-    points, normals, _, _ = table.at(some.hand)
-    rotation, origin = some.palm[:, None, :3, :3], some.palm[:, None, :3, 3]
+def pads_of(table: HandTable, hands: Candidates) -> Pads:
+    """Return the fingertip pads of hands in the object's frame."""
+    points, normals, _, _ = table.at(hands.hand)
+    rotation, origin = hands.palm[:, None, :3, :3], hands.palm[:, None, :3, 3]
     turn = np.broadcast_to(rotation, (*points.shape, 3))
     points = np.einsum("kfij,kfj->kfi", turn, points) + origin
-    normals = np.einsum("kfij,kfj->kfi", turn, normals)
-    height, sample = surface.foot(points)
-    lean = np.arccos(np.clip(-(normals * surface.normals[sample]).sum(axis=-1), -1, 1))
-    return Touching(points, normals, height - table.radii, sample, lean)
+    return Pads(points, np.einsum("kfij,kfj->kfi", turn, normals))
+
+
+@dataclass(frozen=True)
+class Touching:
+    """Contacts of fingertips with the triangles of a surface, object frame.
+
+    Attributes:
+        foot: (k, f, 3) nearest points of the surface [m].
+        inward: (k, f, 3) unit normals into the object; means where several triangles meet.
+        spread: (k, f) largest angle between such a mean and the normals of its triangles [rad].
+        toward: (k, f, 3) unit directions in which pads that are balls meet the surface.
+        height: (k, f) distances of pads from the surface [m], negative inside.
+        lean: (k, f) largest angle between a pad normal and the inward normals [rad].
+    """
+
+    foot: Array
+    inward: Array
+    spread: Array
+    toward: Array
+    height: Array
+    lean: Array
+
+    def rows(self, rows: NDArray) -> Touching:
+        """Return the contacts of some of the hands."""
+        return Touching(*(getattr(self, part.name)[rows] for part in fields(self)))
+
+    def accepted(self, parameters: TouchParameters, roll: Array) -> Bools:
+        """Return which pads (k, f) touch the surface as grasps promise.
+
+        Args:
+            parameters: The limits of distance and lean.
+            roll: (f,) additional lean that pads may have [rad].
+        """
+        aside = np.arccos(np.clip((self.toward * self.inward).sum(axis=-1), -1, 1))
+        touches: Bools = np.abs(self.height) < parameters.touch
+        touches &= self.lean < parameters.last_lean + roll
+        return touches & (np.maximum(self.spread, aside) < parameters.max_spread)
+
+
+def touching(table: HandTable, surface: Surface, hands: Candidates) -> Touching:
+    """Return the exact contacts of fingertips with the triangles of a surface.
+
+    Of fingers that do not touch all numbers are NaN.
+    """
+    pads = pads_of(table, hands)
+    row, finger = np.nonzero(hands.used)
+    points, normals, radii = (
+        pads.points[row, finger],
+        pads.normals[row, finger],
+        table.radii[finger],
+    )
+    nearest = surface.nearest(points)
+    away = points - nearest.point
+    side = (away * nearest.normal).sum(axis=1)
+    distance = np.copysign(np.linalg.norm(away, axis=1), side)
+    far = (radii > 0) & (np.abs(distance) > 1e-6)
+    toward = np.where(far[:, None], -away / np.where(far, distance, 1.0)[:, None], -nearest.normal)
+    lean = np.arccos(np.clip(-(normals * nearest.normal).sum(axis=1), -1, 1)) + nearest.spread
+
+    def spread_out(values: Array) -> Array:
+        whole = np.full((*hands.used.shape, *values.shape[1:]), np.nan)
+        whole[row, finger] = values
+        return whole
+
+    parts = nearest.point, -nearest.normal, nearest.spread, toward, distance - radii, lean
+    return Touching(*(spread_out(part) for part in parts))
 
 
 def snapped(
     table: HandTable, surface: Surface, some: Candidates, chosen: TouchParameters
 ) -> Candidates:
     """Palms and hands moved until every fingertip touches: damped least squares, limits kept."""
-    here = touching(table, surface, some)
+    _, start = surface.foot(pads_of(table, some).points)
     palms, q = pose_row(some.palm), table.configuration(some.hand)
     robot, motors = table.robot, table.motors
     arrays: dict[str, Any] = {
@@ -387,7 +449,7 @@ def snapped(
         "normals": surface.normals,
         "faces": surface.faces,
         "neighbours": surface.neighbours,
-        "start": here.sample.astype(np.int64),
+        "start": start.astype(np.int64),
     }
     arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     job = SnapJob(

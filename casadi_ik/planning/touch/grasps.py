@@ -25,6 +25,7 @@ from casadi_ik.planning.touch.candidates import (
     Generator,
     HandCheck,
     TouchParameters,
+    pads_of,
     touching,
 )
 from casadi_ik.planning.touch.hand_table import HandTable
@@ -33,6 +34,7 @@ from casadi_ik.planning.touch.strength import (
     Strengths,
     closed,
     generators,
+    narrowed,
     offsets,
     robustness,
     strengths,
@@ -51,6 +53,13 @@ RETREAT = 0.06
 
 ROUGHLY = float(np.deg2rad(3.0))
 """How far an object may be turned that was seen by a camera [rad]."""
+
+SURE = float(np.cos(np.pi / 8))
+"""Force closure is judged with friction reduced by this factor.
+
+The friction cones so reduced lie within every pyramid of eight or more edges inscribed in the full
+cones: another linear program with such pyramids agrees.
+"""
 
 Judgement = str | Callable[[ArmHand, Array], ArrayLike]
 """What grasps are ranked by: a name of `RANKINGS`, or scores (m,) of configurations (m, n)."""
@@ -383,7 +392,7 @@ def _made(
     start: Array | None,
 ) -> _Made | None:
     """Those that are unlike those before, hold, are reached by the arm and free in the scene."""
-    robot, table, surface = arms.robot, generator.table, generator.surface
+    robot, table = arms.robot, generator.table
     clear, chosen = len(some), generator.parameters
     for part in before if clear else ():
         some = some.rows(some.unlike(part, chosen))
@@ -391,12 +400,7 @@ def _made(
     generator.counted("unlike those before", len(some))
     if not len(some):
         return None
-    here = touching(table, surface, some)
-    order = np.argsort(~some.used, axis=1, kind="stable")[:, : generator.fingers]
-    sample = np.take_along_axis(here.sample, order, axis=1)
-    center, length = surface.middle, surface.size / 2
-    wrenches = generators(surface.points[sample], -surface.faces[sample], mu, center, length)
-    firm = closed(wrenches)
+    firm = closed(_wrenches(generator, some, SURE * mu))
     rows = np.argsort(-firm, kind="stable")[: np.count_nonzero(firm > CLOSED)]
     generator.counted("force-closed", len(rows))
     new = rows[some.rows(rows).distinct(chosen)]
@@ -405,7 +409,7 @@ def _made(
     generator.asked += len(new)
     if not len(new):
         return None
-    some, wrenches = some.rows(new), wrenches[new]
+    some = some.rows(new)
     palms, hands = place @ some.palm, table.configuration(some.hand)
     reached = arms.solve_palms(palms, hands, start, jobs=jobs)
     q, met = reached.q, reached.success.copy()
@@ -419,45 +423,91 @@ def _made(
     rows = np.flatnonzero(met)
     if not len(rows):
         return None
-    some, q, wrenches = some.rows(rows), q[rows], wrenches[rows]
+    some, q = some.rows(rows), q[rows]
     points, normals = (np.where(some.used[..., None], part, np.nan) for part in robot.contacts(q))
     batch = judge.solve_batch(points, normals, q0=q, jobs=jobs)
     rows = np.flatnonzero(batch.success)
     generator.counted("free in the scene", len(rows))
     if not len(rows):
         return None
-    some = some.rows(rows)
-    found = _strengths(generator, some, wrenches[rows], mu, hold)
-    held = found.hold(hold)
+    final = _as_solved(generator, some.rows(rows), batch.q[rows], place)
+    kept = _confirmed(generator, final, mu)
+    generator.counted("contacts as claimed", len(kept))
+    final, rows = final.rows(kept), rows[kept]
+    if not len(rows):
+        return None
+    strength = _strengths(generator, final, mu, hold)
+    held = strength.hold(hold)
     if hold is not None:
         generator.counted(f"hold {hold[0]:g} kg at {hold[1]:g} N", int(held.sum()))
-    parts = found.load, found.closure, found.forces, found.most
-    return _Made(batch, rows[held], some.rows(held), *(part[held] for part in parts))
+    parts = strength.load, strength.closure, strength.forces, strength.most
+    return _Made(batch, rows[held], final.rows(held), *(part[held] for part in parts))
+
+
+def _as_solved(generator: Generator, hands: Candidates, q: Array, place: Array) -> Candidates:
+    """Return hands as configurations q (k, n) place them, with their contacts.
+
+    Args:
+        generator: Generator of the candidates.
+        hands: The hands before the arm was solved; they say which fingers touch.
+        q: (k, n) solved configurations.
+        place: (4, 4) pose of the object in the base frame.
+    """
+    table = generator.table
+    palm = inverse(place) @ table.robot.palm(q)
+    solved = replace(hands, palm=palm, hand=np.take(q, table.motors, axis=1), contacts=None)
+    return replace(
+        solved,
+        tips=pads_of(table, solved).points,
+        contacts=touching(table, generator.surface, solved),
+    )
+
+
+def _confirmed(generator: Generator, hands: Candidates, mu: float) -> NDArray[np.intp]:
+    """Return which hands meet every claim of a grasp: distance, lean, and force closure."""
+    assert hands.contacts is not None
+    ok = hands.contacts.accepted(generator.parameters, generator.table.roll)
+    rows = np.flatnonzero((ok | ~hands.used).all(axis=1))
+    firm = closed(_wrenches(generator, hands.rows(rows), SURE * mu))
+    return rows[firm > CLOSED]
+
+
+def _of_touching(hands: Candidates, values: Array) -> Array:
+    """Return the values (k, f, ...) of the fingers that touch, (k, c, ...)."""
+    return values[hands.used].reshape(len(hands), -1, *values.shape[2:])
+
+
+def _wrenches(generator: Generator, hands: Candidates, mu: float) -> Array:
+    """Return the wrenches (k, 6, g) of the cones' edges at the contacts of hands."""
+    assert hands.contacts is not None
+    surface, contacts = generator.surface, hands.contacts
+    foot, inward, spread = (
+        _of_touching(hands, part) for part in (contacts.foot, contacts.inward, contacts.spread)
+    )
+    return generators(foot, inward, narrowed(mu, spread), surface.middle, surface.size / 2)
 
 
 def _strengths(
-    generator: Generator,
-    some: Candidates,
-    wrenches: Array,
-    mu: float,
-    hold: tuple[float, float] | None,
+    generator: Generator, hands: Candidates, mu: float, hold: tuple[float, float] | None
 ) -> Strengths:
-    """How well candidates hold the object."""
+    """Return how well hands hold the object."""
+    assert hands.contacts is not None
     table, surface, robot = generator.table, generator.surface, generator.table.robot
-    _, _, linear, angular = table.at(some.hand)
-    own, (row, finger) = some.used, np.nonzero(some.used)
-    shape = (len(some), -1)
-    sample = touching(table, surface, some).sample[own]
-    normals, radii = -surface.faces[sample], table.radii[finger]
-    turned = np.einsum("kij,kjm->kim", some.palm[row, :3, :3], angular[own])
-    jacobians = np.einsum("kij,kjm->kim", some.palm[row, :3, :3], linear[own])
-    jacobians += np.cross(turned, (radii[:, None] * normals)[..., None], axis=1)
+    _, _, linear, angular = table.at(hands.hand)
+    foot, inward, toward = (
+        _of_touching(hands, part)
+        for part in (hands.contacts.foot, hands.contacts.inward, hands.contacts.toward)
+    )
+    radii = table.radii[np.nonzero(hands.used)[1]].reshape(len(hands), -1)
+    rotation = hands.palm[:, None, :3, :3]
+    turned, jacobians = (rotation @ _of_touching(hands, part) for part in (angular, linear))
+    jacobians = jacobians + np.cross(turned, (radii[..., None] * toward)[..., None], axis=2)
     return strengths(
-        wrenches,
-        (surface.points[sample] - surface.middle).reshape(*shape, 3),
-        normals.reshape(*shape, 3),
-        radii.reshape(shape),
-        jacobians.reshape(*shape, 3, len(table.motors)),
+        _wrenches(generator, hands, mu),
+        foot - surface.middle,
+        inward,
+        radii,
+        jacobians,
         [robot.description.actuators[i] for i in table.motors],
         mu,
         hold,
@@ -499,11 +549,9 @@ def _ranked(
         raise InputError(f"prefer: gave shape {score.shape}, expected ({len(q)},)")
     kept = np.argsort(-score, kind="stable")[:limit]
     chosen = [where[row] for row in kept]
-    some = Candidates(
-        place @ np.stack([part.some.palm[i] for part, i in chosen]),
-        np.take(q[kept], generator.table.motors, axis=1),
-        np.stack([part.some.used[i] for part, i in chosen]),
-    )
+    used = np.stack([part.some.used[i] for part, i in chosen])
+    hands_kept = Candidates(np.zeros((len(kept), 4, 4)), np.zeros((len(kept), 0)), used)
+    some = _as_solved(generator, hands_kept, q[kept], place)
     # Of the fingertips that touch, in the order of the fingers.
     forces = np.zeros((*some.used.shape, 3))
     squeezes = np.stack([part.forces[i] for part, i in chosen])
@@ -533,25 +581,24 @@ def _grasps(
         robot: The robot.
         generator: Of the candidates.
         hands: Tells which hands are clear.
-        some: The hands as they touch, palms in the base frame.
+        some: The hands as they touch.
         q: (k, n) the postures.
         place: (4, 4) of the object.
         forces: (k, f, 3) on the object, base frame.
     """
     table, surface = generator.table, generator.surface
+    assert some.contacts is not None
     points, normals = robot.contacts(q)
-    radii = table.radii[:, None]
-    middles = points - radii * normals
-    _, sample = surface.foot((middles - place[:3, 3]) @ place[:3, :3])
-    into = -surface.faces[sample] @ place[:3, :3].T
-    touched = np.where(radii > 0, middles + radii * into, points)
+    middles = points - table.radii[:, None] * normals
+    toward = np.nan_to_num(some.contacts.toward) @ place[:3, :3].T
+    touched = np.where(table.radii[:, None] > 0, middles + table.radii[:, None] * toward, points)
     palms = robot.palm(q)
     seen_forces, seen_pads = (
         np.einsum("kfi,kij->kfj", one, palms[:, :3, :3]) for one in (forces, touched - middles)
     )
     squeezed = table.squeezed(some, seen_pads, seen_forces, INWARD)
     opened, known = some.hand.copy(), np.zeros(len(some), dtype=bool)
-    seen = replace(some, palm=inverse(place) @ palms)
+    seen = some
     for opening in OPENINGS:
         left = np.flatnonzero(~known)
         if len(left):
@@ -564,7 +611,7 @@ def _grasps(
     for i in range(len(some)):
         contacts = {}
         for j in np.flatnonzero(some.used[i]):
-            ball = into[i, j] if table.radii[j] else None
+            ball = toward[i, j] if table.radii[j] else None
             contacts[robot.fingers[j]] = Contact(touched[i, j], normals[i, j], ball=ball)
         back = palms[i].copy()
         away = back[:3, 3] - np.mean([one.point for one in contacts.values()], axis=0)

@@ -15,16 +15,16 @@ from casadi_ik.collision.clearance import SceneCheck
 from casadi_ik.collision.model import pair_table
 from casadi_ik.collision.scene import Scene
 from casadi_ik.compile.cancellation import SLICE, drive
-from casadi_ik.compile.codegen import WIDE, c_struct, define, driver_text
-from casadi_ik.compile.function_kernel import FunctionKernel, machine_lanes
+from casadi_ik.compile.codegen import c_struct, define, driver_text
+from casadi_ik.compile.function_kernel import FunctionKernel
 from casadi_ik.compile.graphs import FunctionGraph, recipe
-from casadi_ik.compile.libraries import load_library
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.forward import actuated
 from casadi_ik.kinematics.se3 import skew
 from casadi_ik.model.description import RobotDescription
+from casadi_ik.planning.touch.library import touch_library
 from casadi_ik.planning.touch.surface import NEIGHBOURS
 
 if TYPE_CHECKING:
@@ -360,25 +360,6 @@ def _finger_of(table: HandTable, link: str) -> int | None:
 
 TouchJob = c_struct("touch_job", {"3": 3, "4": 4, "BINS": BINS})
 SnapJob = c_struct("snap_job", driver="snap")
-
-
-def touch_library() -> Any:
-    """The compiled drivers `touch`, `apart` and `loads`.
-
-    Raises:
-        UnsupportedError: There is no compiler.
-    """
-    parts = (
-        WIDE if machine_lanes() else "",
-        "typedef double scalar;\ntypedef double real;\n",
-        define({"STEP_IN": 0, "STEP_OUT": 0}),
-        *(driver_text(name) for name in ("common", "touch_job", "touch")),
-    )
-    text = "".join(parts)
-    library = load_library("touch", lambda: text, "casadi_ik_touch", text)
-    if library is None:
-        raise UnsupportedError("grasps_of: found no C compiler, expected one (docs/install.md)")
-    return library
 
 
 _TABLES: WeakKeyDictionary[ArmHand, HandTable] = WeakKeyDictionary()

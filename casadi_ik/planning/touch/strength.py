@@ -17,7 +17,8 @@ from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.joints import Actuator
 from casadi_ik.model.pose import inverse
 from casadi_ik.planning.touch.candidates import Candidates
-from casadi_ik.planning.touch.hand_table import HandTable, touch_library
+from casadi_ik.planning.touch.hand_table import HandTable
+from casadi_ik.planning.touch.library import touch_library
 from casadi_ik.planning.touch.surface import Surface
 
 if TYPE_CHECKING:
@@ -46,14 +47,19 @@ STEPS, ENOUGH = 50, 1e-9
 
 
 def generators(
-    points: Array, normals: Array, mu: float, center: Array, length: float, patch: float = 0.005
+    points: Array,
+    normals: Array,
+    mu: float | Array,
+    center: Array,
+    length: float,
+    patch: float = 0.005,
 ) -> Array:
     """Wrenches of soft fingers with a normal force of 1: the edges of their friction cones.
 
     Args:
         points: (k, c, 3) contacts [m].
         normals: (k, c, 3) unit, into the object.
-        mu: Friction coefficient.
+        mu: Friction coefficient, or (k, c) of each contact.
         center: (3,) about which torques are [m].
         length: By which torques are divided [m].
         patch: Radius of a pad's contact patch [m]: it holds 2/3 mu patch about its normal
@@ -70,12 +76,24 @@ def generators(
     along = first[..., None, :] * np.cos(angle)[:, None]
     along = along + second[..., None, :] * np.sin(angle)[:, None]
     normal = normals[..., None, :]
-    force = np.concatenate([normal + mu * along, normal, normal], axis=-2)
+    friction = np.broadcast_to(mu, (k, c))[..., None, None]
+    force = np.concatenate([normal + friction * along, normal, normal], axis=-2)
     torque = np.cross((points - center)[..., None, :], force) / length
-    spin = 2 / 3 * mu * patch / length * normals
+    spin = 2 / 3 * friction[..., 0] * patch / length * normals
     torque[..., -2, :] += spin
     torque[..., -1, :] -= spin
     return np.concatenate([force, torque], axis=-1).reshape(k, c * (EDGES + 2), 6).swapaxes(1, 2)
+
+
+def narrowed(mu: float, spread: Array) -> Array:
+    """Return friction coefficients of cones that lie within those about all normals of a contact.
+
+    Args:
+        mu: Friction coefficient.
+        spread: (...) largest angle between the axis of the cone and these normals [rad].
+    """
+    coefficients: Array = np.tan(np.maximum(np.arctan(mu) - spread, 1e-3))
+    return coefficients
 
 
 def loads(wrenches: Array, directions: Array = DIRECTIONS) -> Array:
@@ -349,8 +367,7 @@ def robustness(
     seen = np.linalg.inv(offsets)
     tips = np.einsum("kij,scj->ksci", seen[:, :3, :3], points) + seen[:, None, None, :3, 3]
     faces = np.einsum("kij,scj->ksci", seen[:, :3, :3], normals)
-    height, sample = surface.foot(tips)
-    height = height - table.radii[which]
+    height = surface.foot(tips)[0] - table.radii[which]
     within = height <= 0
     first = within.argmax(axis=1)  # (k, c)
     touches = within.any(axis=1) & (first > 0)
@@ -358,8 +375,8 @@ def robustness(
     before = np.maximum(first - 1, 0)
     nearer = np.abs(_at(height, before)) < np.abs(_at(height, first))
     there = np.where(nearer, before, first)
-    samples = _at(sample, there)
-    inward = -surface.faces[samples]
+    contacts = surface.nearest(_at(tips, there))
+    inward = -contacts.normal
     lean = np.arccos(np.clip((_at(faces, there) * inward).sum(axis=-1), -1, 1))
     touches &= lean < STEEP + table.roll[which]
     closed = np.zeros(len(offsets), dtype=bool)
@@ -367,17 +384,18 @@ def robustness(
         rows = np.flatnonzero((touches == row_of).all(axis=1))
         if row_of.sum() < 2:
             continue
-        chosen, at, own = samples[rows][:, row_of], there[rows][:, row_of], np.flatnonzero(row_of)
-        points, normals = surface.points[chosen], -surface.faces[chosen]
-        radii = np.broadcast_to(table.radii[which[own]], chosen.shape)
+        at, fingers = there[rows][:, row_of], np.flatnonzero(row_of)
+        points, normals = (part[rows][:, row_of] for part in (contacts.point, inward))
+        friction = narrowed(mu, contacts.spread[rows][:, row_of])
+        radii = np.broadcast_to(table.radii[which[fingers]], at.shape)
         turns = seen[rows, None, :3, :3]
-        jacobians = turns @ linear[at, own]
+        jacobians = turns @ linear[at, fingers]
         jacobians += np.cross(
-            turns @ angular[at, own], (radii[..., None] * normals)[..., None], axis=2
+            turns @ angular[at, fingers], (radii[..., None] * normals)[..., None], axis=2
         )
         length = surface.size / 2
         found = strengths(
-            generators(points, normals, mu, surface.middle, length),
+            generators(points, normals, friction, surface.middle, length),
             points - surface.middle,
             normals,
             radii,

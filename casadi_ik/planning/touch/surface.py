@@ -16,6 +16,7 @@ from casadi_ik.collision.solids import Kind, Solid
 from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.model.objects import GraspObject, load_object
+from casadi_ik.planning.touch.nearest import NearestPoints, TriangleTree
 
 
 @dataclass(frozen=True)
@@ -97,6 +98,7 @@ class Surface:
         normals: (m, 3) unit outward normals, smoothed.
         faces: (m, 3) unit outward normals of the triangles themselves.
         inside: (m,) whether a fingertip's pad fits: no edge of the surface is near.
+        corners: (t, 3, 3) corners of the triangles [m], outward by the right-hand rule.
         parameters: How it was sampled.
         notes: What is odd about the mesh, and what was made of it; empty for a closed one.
 
@@ -113,6 +115,7 @@ class Surface:
     normals: Array
     faces: Array
     inside: Bools
+    corners: Array
     parameters: SurfaceParameters
     notes: tuple[str, ...] = ()
 
@@ -130,6 +133,19 @@ class Surface:
     def tree(self):
         """Nearest samples of points."""
         return _tree(self.points)
+
+    @cached_property
+    def triangle_tree(self) -> TriangleTree:
+        """Tree of the triangles, for exact nearest points."""
+        return TriangleTree(self.corners)
+
+    def nearest(self, points: Array) -> NearestPoints:
+        """Return the exact nearest points to points (..., 3), with the normals there.
+
+        Raises:
+            UnsupportedError: There is no C compiler.
+        """
+        return self.triangle_tree.nearest(points)
 
     @cached_property
     def grid(self) -> Grid:
@@ -197,8 +213,8 @@ def load_surface(
     u, v = np.sqrt(rng.random(chosen.samples)), rng.random(chosen.samples)
     weights = np.stack([1 - u, u * (1 - v), u * v], axis=1)
     points = (corners[face] * weights[..., None]).sum(axis=1)
-    own = normals[face] / doubled[face, None]
-    return replace(_smoothed(name, thing, points, own, chosen), notes=notes)
+    faces = normals[face] / doubled[face, None]
+    return replace(_smoothed(name, thing, points, faces, corners[doubled > 0], chosen), notes=notes)
 
 
 SIZES = (5e-3, 2.0)
@@ -262,7 +278,12 @@ def _body(
 
 
 def _smoothed(
-    name: str, thing: GraspObject, points: Array, faces: Array, chosen: SurfaceParameters
+    name: str,
+    thing: GraspObject,
+    points: Array,
+    faces: Array,
+    corners: Array,
+    chosen: SurfaceParameters,
 ) -> Surface:
     """The surface of samples whose normals are averaged over their neighbours."""
     tree = _tree(points)
@@ -285,4 +306,4 @@ def _smoothed(
     bent = (normals[one] * faces[other]).sum(axis=1) < np.cos(chosen.bend)
     inside = np.ones(len(points), dtype=bool)
     inside[one[bent]] = False
-    return Surface(name, thing, points, normals, faces, inside, chosen)
+    return Surface(name, thing, points, normals, faces, inside, corners, chosen)
