@@ -9,8 +9,10 @@ from enum import Enum
 import numpy as np
 from numpy.typing import ArrayLike
 
-from casadi_ik.errors import InputError
+from casadi_ik.errors import InputError, InvalidPoseError
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.input_checks.keypoints import lost_contacts
+from casadi_ik.files.input_checks.poses import one_pose
 from casadi_ik.kinematics.contacts import Kinds, by_kinds, usual
 from casadi_ik.model.grasp import Grasp, real_array
 from casadi_ik.motion.clear import OBSTACLES, Guard, stopping_way
@@ -85,6 +87,9 @@ class FollowState:
 
 
 NO_FRAME = "no frame yet"
+
+IDENTITY = np.eye(4)
+"""A palm's pose that trackers send for a lost hand: no palm is in the base with its axes."""
 
 PALM_WEIGHT = 0.1
 """How much a palm's place and its axes count unless said, a contact counting 1."""
@@ -217,17 +222,23 @@ class Follower:
             (n,) where the motors are to be at the end of the cycle [rad or m].
 
         Raises:
-            InputError: Wrong shapes or no numbers, a grasp the robot cannot take, a palm's pose
-                that is no rigid motion. Points and normals that are bad numbers are no error.
+            InputError: Wrong shapes or no numbers, or a grasp the robot cannot take. Points,
+                normals and poses of a tracker that has lost the hand are not an error: the motors
+                come to rest, and `FollowState.reason` says why.
         """
         self._cycles += 1
-        self._reason = ""
+        poses, self._reason = self._poses(palm)
         if isinstance(target, Grasp):
             self._ask_grasp(target, normals)
-            return self._step(self._poses(palm), palm_weight)[: self._n].copy()
-        poses = self._poses(palm)
+            after = self._hold() if self._reason else self._step(poses, palm_weight)
+            return after[: self._n].copy()
         points = self._vectors("points", target)
         facing = None if normals is None else self._vectors("normals", normals)
+        # All coordinates of a lost hand are alike: seldom the case, and cheap to see.
+        if points[0, 0] == points[-1, 0]:
+            self._reason = self._reason or lost_contacts(points)
+        if self._reason:
+            return self._hold()[: self._n].copy()
         if self._asked.cycle.kinds != self._usual:
             self._take_up(self._usual)
         self._tolerances = self._own
@@ -268,9 +279,13 @@ class Follower:
                 return after
             asked.run.back()
             self._reason = "a number is out of range"
-        asked.ask_nothing()
-        self._go_to_rest(asked)
-        return self._step({}, palm_weight)
+        return self._hold()
+
+    def _hold(self) -> Array:
+        """Return the state after a step in which the motors come to rest."""
+        self._asked.ask_nothing()
+        self._go_to_rest(self._asked)
+        return self._step({}, (PALM_WEIGHT, PALM_WEIGHT))
 
     def _ask_grasp(self, grasp: Grasp, normals: ArrayLike | None) -> None:
         if normals is not None:
@@ -307,10 +322,10 @@ class Follower:
         """Whether there is an arm, so that the palm may be asked for."""
         return bool(self._asked.cycle.palms)
 
-    def _poses(self, palm: ArrayLike | Mapping[str, ArrayLike] | None) -> Poses:
-        """By side; of an arm with a hand by None."""
+    def _poses(self, palm: ArrayLike | Mapping[str, ArrayLike] | None) -> tuple[Poses, str]:
+        """Return the poses by side (of an arm with a hand by None), and what is wrong with them."""
         if palm is None:
-            return {}
+            return {}, ""
         known = self._asked.cycle.palms
         if not known:
             raise InputError("palm: found a pose for a hand that stands still, expected None")
@@ -321,7 +336,16 @@ class Follower:
                 expected = f"poses by side: {names}" if names else "one pose"
                 found = "one pose" if side is None else f"side {side!r}"
                 raise InputError(f"palm: found {found}, expected {expected}")
-        return {side: np.asarray(pose, dtype=float) for side, pose in poses.items()}
+        exact = dict[str | None, Array]()
+        for side, pose in poses.items():
+            name = "palm" if side is None else f"palm.{side}"
+            try:
+                exact[side] = one_pose(pose, name)
+            except InvalidPoseError as error:
+                return {}, str(error)
+            if (exact[side] == IDENTITY).all():
+                return {}, f"{name}: the identity, which trackers send for a lost hand"
+        return exact, ""
 
     @property
     def state(self) -> FollowState:

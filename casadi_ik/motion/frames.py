@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.input_checks.keypoints import KEYPOINTS, lost_contacts
 from casadi_ik.files.limits import LIMITS, RAISED, limit
 from casadi_ik.files.number_files import read_npz
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.motion.cycle import of_side
 from casadi_ik.motion.follower import Follower, FollowStatus
 from casadi_ik.motion.motion import Motion
-from casadi_ik.motion.retarget import KEYPOINTS, RATE, Retargeter, as_keypoints
+from casadi_ik.motion.retarget import RATE, Retargeter, as_keypoints
 
 AT_ONCE = 1024
 """Cycles whose targets are in memory."""
@@ -33,6 +34,7 @@ class Frames:
             contacts are given.
         points: (k, f, 3) contact points [m], base frame; nothing where keypoints are given.
         normals: (k, f, 3) outward pad normals; NaN where free.
+        lost: Why frames were rejected as those of a tracker that has lost the hand, one for each.
     """
 
     path: Path
@@ -40,6 +42,17 @@ class Frames:
     keypoints: dict[str | None, Array]
     points: Array
     normals: Array
+    lost: tuple[str, ...] = ()
+
+    def screened(self, retargeter: Retargeter) -> Frames:
+        """Return the frames with NaN in those of a tracker that has lost the hand."""
+        if self.keypoints:
+            keypoints, reasons = retargeter.screened(self.keypoints, self.times)
+            return replace(self, keypoints=keypoints, lost=tuple(reasons))
+        reasons = [lost_contacts(frame) for frame in self.points]
+        points = self.points.copy()
+        points[[i for i, reason in enumerate(reasons) if reason]] = np.nan
+        return replace(self, points=points, lost=tuple(filter(None, reasons)))
 
     def at(self, times: Array, values: Array) -> Array:
         """Values of frames between the frames, linearly; NaN beside a frame that has NaN."""

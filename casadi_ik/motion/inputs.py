@@ -13,7 +13,6 @@ from casadi_ik.collision.clearance import SceneCheck
 from casadi_ik.compile import FunctionKernel
 from casadi_ik.compile.function_kernel import Recurrence
 from casadi_ik.files.arrays import Array, Bools
-from casadi_ik.files.input_checks.poses import one_pose
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import LENGTH, Kinds
 from casadi_ik.model.targets import TargetBatch, Tolerance
@@ -183,8 +182,7 @@ class FollowerInputs:
     def ask_palms(self, poses: Mapping[str | None, Array], weight: tuple[float, float]) -> None:
         """Ask for poses of palms (4, 4) by side, as far as contacts leave them free."""
         for side, pose in poses.items():
-            checked = one_pose(pose, "palm" if side is None else f"palm.{side}")
-            asked = {"point": checked[:3, 3], "axes": checked[:3, :3], "weight": weight}
+            asked = {"point": pose[:3, 3], "axes": pose[:3, :3], "weight": weight}
             self._fill(**{of_side(f"palm_{name}", side): value for name, value in asked.items()})
 
     def free_palms(self) -> None:

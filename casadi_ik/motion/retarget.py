@@ -19,12 +19,10 @@ from numpy.typing import ArrayLike
 
 from casadi_ik.errors import DescriptionError, InputError
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.input_checks.keypoints import KEYPOINTS, KNUCKLES, FrameFilter
 from casadi_ik.files.reading import Angles, Frame, Point, Struct, frame_matrix, read
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.grasp import real_array
-
-KEYPOINTS = 21
-"""Of a hand."""
 
 OPENXR = (1, *range(2, 6), *range(7, 11), *range(12, 16), *range(17, 21), *range(22, 26))
 """Joints of OpenXR that are the keypoints: all but palm and metacarpals of four fingers."""
@@ -35,10 +33,6 @@ LAYOUTS = {
     25: tuple(joint - 1 for joint in OPENXR),
 }
 """Where the keypoints are among so many joints."""
-
-KNUCKLES = (5, 17)
-"""Of index and little finger: with the wrist they tell how a hand is turned."""
-
 
 RATE = 30.0
 """Frames in a second of which `Retarget.low_pass` is the share of one."""
@@ -202,10 +196,12 @@ class Wanted:
         points: (f, 3) fingertips [m], base frame; NaN where free or where the frame is none.
         palm: (4, 4) the wrist; of a body by side those whose frame is one; None where the frame is
             none.
+        reason: Why a frame was rejected, with its side if there are two; "": none was.
     """
 
     points: Array
     palm: Array | dict[str, Array] | None
+    reason: str = ""
 
 
 def as_keypoints(joints: ArrayLike, name: str = "keypoints") -> Array:
@@ -286,31 +282,56 @@ class Retargeter:
 
         Raises:
             InputError: Another shape, no numbers, places in a picture instead of metres, a side
-                that the configuration has not, or a bad time. NaN is no error: then nothing is
-                wanted.
+                that the configuration has not, or a bad time. A frame of a tracker that has lost
+                the hand (NaN, zeros, -1, a jump, a bone that is too long) is not an error: then
+                nothing is wanted, and `Wanted.reason` says why.
         """
         if not 0 < elapsed < np.inf:
             raise InputError(f"elapsed: found {elapsed}, expected seconds above 0")
         points, frames = np.full((len(self._robot.fingers), 3), np.nan), dict[str | None, Array]()
+        reasons = list[str]()
         for side, joints in self._by_side(keypoints).items():
             hand = self._hands[side]
             frame = as_keypoints(joints, "keypoints" if side is None else f"keypoints.{side}")
             if frame.ndim != 2:
                 raise InputError(f"keypoints: found shape {frame.shape}, expected one frame")
-            if hand.sees(frame):
+            if hand.accepts(frame, elapsed):
                 frames[side] = hand.smoothed(frame, elapsed)
+            else:
+                reasons.append(
+                    hand.filter.reason if side is None else f"{side}: {hand.filter.reason}"
+                )
+        reason = "; ".join(reasons)
         known = self.config.rpy is not None or len(frames) == len(self._hands)
         if self._turn is None and known:
             self._turn = self._aligned(frames)
         if self._turn is None or not frames:
-            return Wanted(points, None)
+            return Wanted(points, None, reason)
         palms = dict[str | None, Array]()
         for side, frame in frames.items():
             hand = self._hands[side]
             points[hand.rows], palms[side] = hand.wanted(frame, self._turn)
         if None in palms:
-            return Wanted(points, palms[None])
-        return Wanted(points, {str(side): palm for side, palm in palms.items()})
+            return Wanted(points, palms[None], reason)
+        return Wanted(points, {str(side): palm for side, palm in palms.items()}, reason)
+
+    def screened(
+        self, recorded: Mapping[str | None, Array], times: Array
+    ) -> tuple[dict[str | None, Array], list[str]]:
+        """Return recorded frames with NaN in those of a lost hand, and the reasons.
+
+        Args:
+            recorded: (k, 21, 3) by side [m].
+            times: (k,) [s].
+        """
+        kept, reasons = dict[str | None, Array](), list[str]()
+        for side, frames in recorded.items():
+            hand = self._hands[side]
+            lost = hand.filter.of_recording(frames, times)
+            kept[side] = frames.copy()
+            kept[side][[i for i, reason in enumerate(lost) if reason]] = np.nan
+            reasons += [reason for reason in lost if reason]
+        return kept, reasons
 
     def _by_side(
         self, keypoints: ArrayLike | Mapping[str, ArrayLike]
@@ -345,6 +366,7 @@ class _Hand:
         rows: Its fingers that follow, as positions in those of the robot.
         palm: (4, 4) where it begins.
         in_hand: Whether the keypoints' origin is in the hand.
+        filter: Rejects frames of a tracker that has lost the hand.
     """
 
     def __init__(
@@ -368,15 +390,15 @@ class _Hand:
         self._config, self._own, self._robot, self._side = config, own, robot, side
         self.palm, (self._tips, _) = robot.palm(here, side), robot.contacts(here)
         self.rows, self._keys = np.array(rows), np.array(list(own.fingers.values()))
+        self.filter = FrameFilter(self._keys.tolist(), config.wrist)
         self.in_hand = False
         self._known = False
         self._first: tuple[Array, Array] | None = None
         self._smooth: Array | None = None
 
-    def sees(self, frame: Array) -> bool:
-        """Whether keypoints (21, 3) tell where all is that counts; the first must be in metres."""
-        used = np.concatenate([frame[self._keys], frame[[self._config.wrist, *KNUCKLES]]])
-        if not np.isfinite(used).all():
+    def accepts(self, frame: Array, elapsed: float) -> bool:
+        """Decide whether keypoints (21, 3) are those of a hand; the first must be in metres."""
+        if not self.filter.accepts(frame, elapsed):
             return False
         if not self._known:
             self._recognise(frame)

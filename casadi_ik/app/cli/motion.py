@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from functools import partial
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from casadi_ik.app.cli.table import Answer, Said, command
 from casadi_ik.app.report import Units, fields, files, headline
 from casadi_ik.errors import InputError, MissingExtraError
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.input_checks.keypoints import lost_contacts
 from casadi_ik.model.grasp import Grasp
 from casadi_ik.motion.follower import FollowStatus
 from casadi_ik.motion.frames import Frames, follow_frames, read_frames
@@ -56,8 +58,8 @@ def follow(said: Said) -> Answer:
       normals   (k, f, 3) if wanted: outward pad normals; NaN: a free one
     and if wanted
       times     (k,) when the frames came [s]; without them 30 in a second
-    A frame with bad numbers is skipped: the motors come to rest and go on with the
-    next.
+    A frame of a tracker that has lost the hand (NaN, zeros, -1, a jump) is skipped:
+    the motors come to rest and go on with the next.
 
     --retarget FILE.yaml says how a hand moves the robot's (docs/motion.md):
       fingers: {thumb: 4, index: 8, middle: 12, ring: 16}
@@ -88,6 +90,7 @@ def follow(said: Said) -> Answer:
     follower = solver.follow(start, said.period)
     retargeter = Retargeter(config, robot, start)
     began = time.perf_counter()
+    frames = frames.screened(retargeter)
     with located(str(path)):
         motion = follow_frames(robot, follower, frames, retargeter)
     count = len(motion) - 1
@@ -105,6 +108,7 @@ def follow(said: Said) -> Answer:
         "wrist": "stays: the keypoints' origin is in the hand (MediaPipe's world landmarks)"
         if stays
         else "",
+        "frames of a lost hand": _lost(frames),
         "cycles": f"{count} of {1e3 * said.period:g} ms, {1e6 * spent:.0f} us each",
         "how they went": ", ".join(f"{name} {count}" for name, count in counts.items() if count),
         "fastest motor": f"{100 * step.max():.0f} % of its velocity limit",
@@ -117,13 +121,28 @@ def follow(said: Said) -> Answer:
 
 
 def _start(solver: Solver, frames: Frames) -> Array:
-    """Where a robot begins of which nobody says where it is."""
-    first = frames.points[:1], frames.normals[:1]
-    if np.isfinite(first[0]).any():
+    """Return where the robot begins: at a solution of the first contacts, or at home."""
+    usable = (
+        i
+        for i, points in enumerate(frames.points)
+        if np.isfinite(points).any() and not lost_contacts(points)
+    )
+    i = next(usable, None)
+    if i is not None:
+        first = frames.points[i : i + 1], frames.normals[i : i + 1]
         solved = solver.solve_batch(*first)
         if solved.success[0]:
             return solved.q[0]
     return solver.robot.home
+
+
+def _lost(frames: Frames) -> str:
+    """Return how many frames were rejected and the most frequent reasons, "" if none was."""
+    if not frames.lost:
+        return ""
+    counts = Counter(frames.lost).most_common(2)
+    texts = ", ".join(f"{reason} ({count})" for reason, count in counts)
+    return f"{len(frames.lost)} of {len(frames.times)} held: {texts}"
 
 
 def _checked(solver: Solver) -> str:
