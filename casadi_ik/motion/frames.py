@@ -11,7 +11,13 @@ import numpy as np
 from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.input_checks.keypoints import KEYPOINTS, lost_contacts
-from casadi_ik.files.limits import LIMITS, RAISED, limit
+from casadi_ik.files.input_checks.times import (
+    LONGEST_INTERVAL,
+    LONGEST_WAYPOINT_INTERVAL,
+    check_time_unit,
+    cycle_count,
+)
+from casadi_ik.files.limits import LIMITS
 from casadi_ik.files.number_files import read_npz
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.motion.cycle import of_side
@@ -72,13 +78,8 @@ class Frames:
         Raises:
             InputError: There are too many of them.
         """
-        seconds, most = float(self.times[-1]), limit(LIMITS.stream_cycles) * period
-        if seconds > most:
-            raise InputError(
-                f"{self.path}: times: found {seconds:g} s, expected at most {most:g} s at this "
-                f"period {RAISED}"
-            )
-        return period * np.arange(1, int(np.ceil(seconds / period)) + 2, dtype=float)
+        count = cycle_count(float(self.times[-1]), period, f"{self.path}: times")
+        return period * np.arange(1, count + 2, dtype=float)
 
 
 def read_frames(path: Path, fingers: int, sides: Sequence[str] = ()) -> Frames:
@@ -123,7 +124,7 @@ def read_frames(path: Path, fingers: int, sides: Sequence[str] = ()) -> Frames:
         keypoints[side] = frames
     if "normals" in arrays:
         raise InputError(f"{path}: normals: found them beside keypoints, expected points")
-    times = _times(path, arrays, len(next(iter(keypoints.values()))))
+    times = _times(path, arrays, len(next(iter(keypoints.values()))), LONGEST_INTERVAL)
     nothing = np.zeros((len(times), 0, 3))
     return Frames(path, times, keypoints, nothing, nothing)
 
@@ -138,7 +139,8 @@ def _read_contacts(path: Path, arrays: dict[str, Array], fingers: int) -> Frames
     normals = arrays.get("normals", np.full(points.shape, np.nan))
     if normals.shape != points.shape:
         raise InputError(f"{path}: normals: found shape {normals.shape}, expected {points.shape}")
-    return Frames(path, _times(path, arrays, len(points)), {}, points, normals)
+    times = _times(path, arrays, len(points), LONGEST_WAYPOINT_INTERVAL)
+    return Frames(path, times, {}, points, normals)
 
 
 def _check_reach(vectors: Array, path: Path, key: str, origin: str) -> None:
@@ -153,14 +155,15 @@ def _check_reach(vectors: Array, path: Path, key: str, origin: str) -> None:
         )
 
 
-def _times(path: Path, arrays: dict[str, Array], count: int) -> Array:
-    """(k,) [s], the first 0."""
+def _times(path: Path, arrays: dict[str, Array], count: int, longest: float) -> Array:
+    """Return the times (k,) [s], the first 0; `longest` is their largest median interval [s]."""
     times = arrays.get("times", np.arange(count) / RATE)
     steady = times.shape == (count,) and np.isfinite(times).all()
     if not (steady and (np.diff(times) > 0).all()):
         raise InputError(
             f"{path}: times: expected {count} growing numbers of seconds, one per frame"
         )
+    check_time_unit(times, f"{path}: times", longest)
     return times - times[0]
 
 

@@ -14,6 +14,7 @@ from mcap.writer import Writer
 
 from casadi_ik.errors import InputError, MissingExtraError
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.input_checks.times import cycle_count
 from casadi_ik.files.writing import written_whole
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.logs.cdr import JOINT_TRAJECTORY, cdr_message, ros_channel, write_postures
@@ -232,7 +233,7 @@ def timed(path: Array, rates: Rates, period: float) -> Array:
         if way is not None:
             break
     assert way is not None
-    count = math.ceil(takes * way.duration / period)
+    count = cycle_count(takes * way.duration, period, "period")
     while True:
         q = unit * way(np.linspace(0.0, way.duration, count + 1))
         q = np.clip(q, path.min(axis=0), path.max(axis=0))  # of rounding
@@ -241,7 +242,7 @@ def timed(path: Array, rates: Rates, period: float) -> Array:
         over = max(velocity, math.sqrt(acceleration))
         if over <= 1.0:
             return q
-        count = max(count + 1, math.ceil(count * over))
+        count = max(count + 1, cycle_count(count * over * period, period, "period"))
 
 
 SUFFIXES = (".npz", ".csv", ".mcap")

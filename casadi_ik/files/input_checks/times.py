@@ -1,0 +1,69 @@
+"""The rules for times: seconds, and motions of a countable number of cycles."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from casadi_ik.errors import InputError
+from casadi_ik.files.arrays import Array
+from casadi_ik.files.limits import LIMITS, RAISED, limit
+
+LONGEST_INTERVAL = 1.0
+"""Median time between frames of a hand from which on times are not in seconds [s].
+
+Trackers send at least ten frames a second; in milliseconds these are 100 apart, and a kilohertz is
+1 apart."""
+
+LONGEST_WAYPOINT_INTERVAL = 5.0
+"""The same for contacts [s], which may be waypoints of a slow motion."""
+
+FEWEST_FRAMES = 3
+"""Fewer frames tell nothing about their unit."""
+
+UNITS = ((1e6, "nanoseconds", 1e-9), (1e3, "microseconds", 1e-6), (0.0, "milliseconds", 1e-3))
+"""Median interval from which on times are probably in a unit, the unit, and its seconds."""
+
+
+def check_time_unit(times: Array, where: str, longest: float = LONGEST_INTERVAL) -> None:
+    """Refuse times of frames that are probably not in seconds.
+
+    Args:
+        times: (k,) growing numbers.
+        where: File and key.
+        longest: Median interval from which on they are refused [s].
+
+    Raises:
+        InputError: The message names the interval and the likely unit.
+    """
+    if len(times) < FEWEST_FRAMES:
+        return
+    interval = float(np.median(np.diff(times)))
+    if interval < longest:
+        return
+    unit, factor = next((name, factor) for least, name, factor in UNITS if interval >= least)
+    raise InputError(
+        f"{where}: frames are {interval:.4g} s apart; expected seconds, less than {longest:g} "
+        f"between frames (numbers in {unit}? multiply by {factor:g})"
+    )
+
+
+def cycle_count(seconds: float, period: float, where: str) -> int:
+    """Return the number of cycles of a motion, rounded up.
+
+    Args:
+        seconds: Duration of the motion [s].
+        period: Of a cycle [s].
+        where: Name of the argument, or file and key.
+
+    Raises:
+        InputError: There are more than `FileLimits.stream_cycles`; the message has their number.
+    """
+    count, most = seconds / period, limit(LIMITS.stream_cycles)
+    if not count <= most:
+        raise InputError(
+            f"{where}: {seconds:.4g} s in cycles of {period:.4g} s are {count:.4g} cycles; "
+            f"expected at most {most:,} {RAISED}"
+        )
+    return math.ceil(count)
