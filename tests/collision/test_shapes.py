@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pinocchio
 import pytest
+import trimesh
 import yaml
 from capsule_arm import ARM, write_robot
+from scipy.spatial import KDTree
 
 import casadi_ik as ik
 from casadi_ik import model as robots
@@ -17,6 +19,7 @@ from casadi_ik.collision.clearance import SceneCheck
 from casadi_ik.collision.model import collision_model
 from casadi_ik.files.reading import Frame, checked, frame_matrix
 from casadi_ik.integrations.importing import capsules, imported
+from casadi_ik.integrations.importing.surfaces import Surface
 from casadi_ik.integrations.importing.write import collision_lines
 from casadi_ik.model.link_shapes import Touching, capsules_of
 from casadi_ik.model.schema import BoxEntry, CapsuleEntry, CollisionEntry, CylinderEntry
@@ -312,15 +315,29 @@ def test_how_far_capsules_stand_out_is_found_by_looking_at_few_points():
     faces = [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1), (2, 3, 7), (2, 7, 6)]
     triangles = corners[np.array([*faces, (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)])]
     found, beyond = capsules.fit(triangles, 3)
-    points = capsules.cut(triangles).reshape(-1, 3)
+    points, numbers = capsules.cut(triangles)
     held = np.min([one.beyond(points) for one in found], axis=0)
     assert held.max() <= 1e-12
     skin = np.concatenate([one.skin() for one in found])
     skin = skin[np.min([one.beyond(skin) for one in found], axis=0) >= -1e-6]
-    every = np.concatenate([points, capsules.cut(triangles).mean(axis=1)])
+    every = np.concatenate([points, points[numbers].mean(axis=1)])
     nearest = np.linalg.norm(skin[:, None] - every, axis=2).min(axis=1)
     assert beyond == pytest.approx(nearest.max(), abs=1e-9)
     assert len(found) > 1
+
+
+def test_a_fine_mesh_is_simplified_by_less_than_a_cell_and_enclosed_as_a_whole():
+    ball = trimesh.creation.icosphere(5, 0.02)
+    mesh = Surface(np.asarray(ball.vertices) * [1, 1, 2], np.asarray(ball.faces))
+    coarse = mesh.simplified(3000, 40)
+    assert mesh.simplified(len(mesh.triangles), 40) is mesh
+    assert 500 < len(coarse.triangles) < len(mesh.triangles) / 2
+    distances, _ = KDTree(coarse.points).query(mesh.points)
+    assert distances.max() <= np.sqrt(3) * 0.08 / 40
+    found, beyond = capsules.fit(mesh.points[mesh.triangles], 1)
+    assert found[0].beyond(mesh.points).max() <= 0
+    assert found[0].radius < 0.0215
+    assert beyond < 0.006
 
 
 def test_shapes_come_back_from_the_urdf(tmp_path):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import pytest
 import trimesh
@@ -10,7 +12,8 @@ from toy_robots import grasp_at
 
 import casadi_ik as ik
 from casadi_ik.integrations.importing.imported import largest_difference
-from casadi_ik.integrations.importing.robot_shapes import TriangleTree, robot_shapes
+from casadi_ik.integrations.importing.robot_shapes import robot_shapes
+from casadi_ik.integrations.importing.triangle_tree import TriangleTree
 from casadi_ik.model.urdf_mjcf import read_tree
 
 MOUNT = "mount: {xyz: [0.01, 0.02, 0.03], rpy: [0.1, 0.2, 0.3]}"
@@ -93,18 +96,28 @@ def test_meshes_meet_where_coal_says_so(rng):
         models[-1].addVertices(np.asarray(body.vertices))
         models[-1].addTriangles(np.asarray(body.faces))
         models[-1].endModel()
-    found = []
-    for one, other in rng.integers(len(bodies), size=(200, 2)):
-        pose = trimesh.transformations.random_rotation_matrix(rng.random(3))
-        pose[:3, 3] = rng.normal(0, 0.8, 3)
-        theirs = coal.collide(
-            models[one], coal.Transform3s(),
-            models[other], coal.Transform3s(pose[:3, :3], pose[:3, 3]),
-            coal.CollisionRequest(), coal.CollisionResult(),
-        )  # fmt: skip
-        found.append(trees[one].meets(trees[other], pose))
-        assert found[-1] == bool(theirs)
-    assert 40 < sum(found) < 160
+    intersections = 0
+    for first, second in product(range(len(bodies)), repeat=2):
+        poses = np.zeros((8, 4, 4))
+        for pose in poses:
+            pose[:] = trimesh.transformations.random_rotation_matrix(rng.random(3))
+            pose[:3, 3] = rng.normal(0, 0.8, 3)
+        expected = [
+            bool(
+                coal.collide(
+                    models[first], coal.Transform3s(),
+                    models[second], coal.Transform3s(pose[:3, :3], pose[:3, 3]),
+                    coal.CollisionRequest(), coal.CollisionResult(),
+                )
+            )
+            for pose in poses
+        ]  # fmt: skip
+        np.testing.assert_array_equal(trees[first].intersects(trees[second], poses), expected)
+        at_least_one = trees[first].intersects(trees[second], poses, stop_at_first=True)
+        assert at_least_one.any() == any(expected)
+        assert not (at_least_one & ~np.array(expected)).any()
+        intersections += sum(expected)
+    assert 40 < intersections < 160
 
 
 def test_one_file_with_its_palm(tmp_path, rng):

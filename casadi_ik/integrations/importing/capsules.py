@@ -6,8 +6,8 @@ Shapes of links come out as a description has them.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from trimesh.remesh import subdivide_to_size
 from casadi_ik.collision.solids import spread
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.reading import roll_pitch_yaw
-from casadi_ik.integrations.importing.surfaces import Surface
+from casadi_ik.integrations.importing.surfaces import Surface, clusters
 from casadi_ik.model.schema import BoxEntry, CapsuleEntry, ShapeEntry, SphereEntry
 
 Rows = NDArray[np.intp]
@@ -31,9 +31,16 @@ class ShapeFit:
         saving: Part of the volume that another capsule has to save, unless told.
         inside: Points that volumes are counted by.
         rounds: Rounds of random turns by which a capsule's axis is bettered.
+        last_rounds: Rounds of the last fit, of the capsules that a link gets.
         turns: Turns of a round.
-        corners: Corners of a part that directions pick, to look for a capsule; all of them are held
-            at last.
+        corners: Number of directions whose outermost corners determine a capsule; in the end it
+            encloses all corners.
+        cells: Cells of a grid along the longest edge of a mesh, of each of which one corner is
+            among those that determine a capsule.
+        triangles: Number of triangles above which splits are decided on a simplified mesh.
+        refined: Number of splits, the best by a rough fit, that are fitted again with a search for
+            better axes.
+        added: Number of corners outside a capsule that take part in its last fit.
         pieces: Triangles are cut until no edge is longer than this part of the mesh.
         box_saving: Part of the volume that another box has to save.
         box_points: Points along an edge of a box's skin.
@@ -46,9 +53,14 @@ class ShapeFit:
 
     saving: float = 0.04
     inside: int = 1500
-    rounds: int = 5
+    rounds: int = 4
+    last_rounds: int = 10
     turns: int = 12
     corners: int = 160
+    cells: int = 36
+    triangles: int = 2000
+    refined: int = 3
+    added: int = 60
     pieces: int = 12
     box_saving: float = 0.12
     box_points: int = 24
@@ -109,75 +121,170 @@ class FittedCapsule:
 def fit(
     triangles: Array, most: int = 4, saving: float = FIT.saving
 ) -> tuple[list[FittedCapsule], float]:
-    """Capsules that hold a mesh.
+    """Fit capsules that enclose a mesh.
+
+    Where to split the mesh is decided on a simplified copy of it; the capsules are then fitted to
+    the mesh itself.
 
     Args:
         triangles: (t, 3, 3) corners [m].
-        most: How many at most.
-        saving: Part of the volume that another capsule has to save.
+        most: Maximum number of capsules.
+        saving: Fraction of the volume that another capsule has to save.
 
     Returns:
-        The capsules, and by how much they stand out beyond the mesh at most [m], as far as samples
-        show.
+        The capsules, and the largest distance by which samples of their surface stand out beyond
+        the mesh [m].
     """
-    pieces = cut(triangles)
-    # A corner is one of some six triangles; what is asked of corners takes so much less.
-    corners, numbers = np.unique(pieces.reshape(-1, 3), axis=0, return_inverse=True)
-    numbers = numbers.reshape(-1, 3)
-    parts = [np.arange(len(pieces))]
+    mesh = Surface(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3))
+    coarse = mesh.simplified(FIT.triangles, FIT.cells)
+    pieces = _Pieces(cut(coarse.points[coarse.triangles]))
+    parts, capsules = _split(pieces, most, saving)
+    if coarse is not mesh:
+        pieces = _Pieces(cut(triangles))
+        outside = [
+            capsule.beyond(pieces.corners)[pieces.numbers].max(axis=1) for capsule in capsules
+        ]
+        nearest = np.argmin(outside, axis=0)
+        parts = [rows for i in range(len(capsules)) if len(rows := np.flatnonzero(nearest == i))]
+    capsules = [pieces.enclosing(part, FIT.last_rounds) for part in parts]
+    return capsules, excess(capsules, np.concatenate([pieces.corners, pieces.centroids]))
 
-    def held(rows: NDArray[np.intp]) -> FittedCapsule:
-        apart = np.zeros(len(corners), bool)
-        apart[numbers[rows]] = True
-        return around(pieces[rows].reshape(-1, 3), corners[apart])
 
-    found = [held(parts[0])]
-    inside = _inside(found[0])
+def _split(pieces: _Pieces, most: int, saving: float) -> tuple[list[Rows], list[FittedCapsule]]:
+    """Split a mesh into parts, and enclose each in a capsule, as long as that saves volume."""
+    parts = [np.arange(len(pieces.numbers))]
+    capsules = [pieces.enclosing(parts[0], FIT.rounds)]
+    samples = _inside(capsules[0])
     volume = 1.0
-    cuts: list[list[tuple[tuple[Rows, Rows], list[FittedCapsule]]] | None] = [None]
+    splits: list[list[_Split] | None] = [None]
+
+    def enclosed(i: int, pair: Sequence[FittedCapsule]) -> float:
+        """Return the fraction of the samples inside if a pair replaces capsule i."""
+        others = [capsule for j, capsule in enumerate(capsules) if j != i]
+        distances = np.min([capsule.beyond(samples) for capsule in (*others, *pair)], axis=0)
+        return float((distances <= 0).mean())
+
     while len(parts) < most:
-        options: list[tuple[float, int, tuple[Rows, Rows], list[FittedCapsule]]] = []
-        for i in range(len(parts)):
-            rest = [one for j, one in enumerate(found) if j != i]
-            if cuts[i] is None:
-                halved = [(parts[i][below], parts[i][~below]) for below in halves(pieces[parts[i]])]
-                cuts[i] = [(two, [held(one) for one in two]) for two in halved]
-            for two, pair in cuts[i] or ():
-                within = np.min([one.beyond(inside) for one in (*rest, *pair)], axis=0) <= 0
-                options.append((float(within.mean()), i, two, pair))
+        drafts: list[tuple[float, int, _Split]] = []
+        for i, part in enumerate(parts):
+            known = splits[i] = splits[i] or pieces.splits(part)
+            drafts += [(enclosed(i, split.draft), i, split) for split in known]
+        # The capsules of a draft tell which splits are worth the search for better ones.
+        drafts.sort(key=lambda draft: draft[0])
+        options = [
+            (enclosed(i, split.refined(pieces)), i, split) for _, i, split in drafts[: FIT.refined]
+        ]
         if not options:
             break
-        least, i, two, pair = min(options, key=lambda option: option[0])
+        least, i, split = min(options, key=lambda option: option[0])
         if least > volume - saving:
             break
         volume = least
-        parts[i : i + 1], found[i : i + 1], cuts[i : i + 1] = two, pair, [None, None]
-    return found, excess(found, np.concatenate([corners, pieces.mean(axis=1)]))
+        parts[i : i + 1], capsules[i : i + 1] = split.parts, split.refined(pieces)
+        splits[i : i + 1] = [None, None]
+    return parts, capsules
 
 
-def around(points: Array, apart: Array) -> FittedCapsule:
-    """A small capsule that holds points.
+class _Pieces:
+    """The triangles of a mesh without long edges, prepared for fits of parts of them.
+
+    Attributes:
+        corners: (c, 3) corners [m].
+        numbers: (t, 3) rows of the corners of each triangle.
+        centroids: (t, 3) centroids of the triangles [m].
+        outermost: (c,) whether a corner is the outermost one in its cell of a grid.
+    """
+
+    def __init__(self, mesh: tuple[Array, Rows]) -> None:
+        """Prepare a mesh of corners (c, 3) [m] and triangles (t, 3)."""
+        self.corners, self.numbers = mesh
+        self.centroids = self.corners[self.numbers].mean(axis=1)
+        self.outermost = np.zeros(len(self.corners), bool)
+        self.outermost[clusters(self.corners, FIT.cells)[0]] = True
+
+    def enclosing(self, rows: Rows, rounds: int) -> FittedCapsule:
+        """Return a small capsule that encloses the triangles of some rows.
+
+        Args:
+            rows: Rows of `numbers`.
+            rounds: Number of rounds of the search for a better axis.
+        """
+        member = np.zeros(len(self.corners), bool)
+        member[self.numbers[rows]] = True
+        outermost = self.corners[member & self.outermost]
+        enclosed = self.corners[member]
+        return around(
+            self.centroids[rows], outermost if len(outermost) else enclosed, enclosed, rounds
+        )
+
+    def splits(self, rows: Rows) -> list[_Split]:
+        """Return the ways to split the triangles of some rows in two."""
+        candidates = []
+        for below in halves(self.centroids[rows]):
+            parts = rows[below], rows[~below]
+            candidates.append(_Split(parts, [self.enclosing(part, 0) for part in parts]))
+        return candidates
+
+
+@dataclass(eq=False)
+class _Split:
+    """Two parts of a mesh.
+
+    Attributes:
+        parts: Rows of the triangles of each.
+        draft: A capsule for each, along the first directions.
+        best: The smallest ones that the search for better axes yields, once it is made.
+    """
+
+    parts: tuple[Rows, Rows]
+    draft: list[FittedCapsule]
+    best: list[FittedCapsule] = field(default_factory=list)
+
+    def refined(self, pieces: _Pieces) -> list[FittedCapsule]:
+        """Return a small capsule for each part."""
+        self.best = self.best or [pieces.enclosing(part, FIT.rounds) for part in self.parts]
+        return self.best
+
+
+def around(
+    points: Array, candidates: Array, enclosed: Array, rounds: int = FIT.rounds
+) -> FittedCapsule:
+    """Return a small capsule that encloses points.
 
     Args:
-        points: (k, 3) corners of triangles [m], as often as they have them: how they are spread
-            says which axes are tried.
-        apart: (m, 3) the same, each once.
+        points: (k, 3) centroids of triangles [m]: their spread tells which axes are tried.
+        candidates: (c, 3) corners of which the outermost determine the capsule.
+        enclosed: (m, 3) corners that the capsule encloses.
+        rounds: Number of rounds of the search for a better axis.
     """
-    middle = points.mean(axis=0)
-    _, _, axes = np.linalg.svd(points - middle, full_matrices=False)
+    offsets = points - points.mean(axis=0)
+    axes = np.linalg.eigh(offsets.T @ offsets)[1].T[::-1]
     rng = np.random.default_rng(0)
-    ways = rng.normal(size=(FIT.corners, 3))
-    picked = apart[np.unique((ways @ np.ascontiguousarray(apart.T)).argmax(axis=1))]
+    directions = rng.normal(size=(FIT.corners, 3))
+    extreme = (directions @ np.ascontiguousarray(candidates.T)).argmax(axis=1)
+    picked = candidates[np.unique(extreme)]
     best, axis = _along(picked, axes)
     spread = 0.3
-    for _ in range(FIT.rounds):
+    for _ in range(rounds):
         tried = axis + spread * rng.normal(size=(FIT.turns, 3))
-        one, way = _along(picked, tried / np.linalg.norm(tried, axis=1, keepdims=True))
-        if one.volume < best.volume:
-            best, axis = one, way
+        capsule, direction = _along(picked, tried / np.linalg.norm(tried, axis=1, keepdims=True))
+        if capsule.volume < best.volume:
+            best, axis = capsule, direction
         spread *= 0.5
-    held = best.radius + float(np.maximum(best.beyond(apart), 0).max()) + 1e-9
-    return FittedCapsule(best.first, best.last, held)
+    distance = best.beyond(enclosed)
+    if rounds:  # the corners that are outside take part, so that the radius need not cover them
+        outside = np.argpartition(-distance, min(FIT.added, len(distance)) - 1)[: FIT.added]
+        capsule, _ = _along(np.concatenate([picked, enclosed[outside]]), axis[None])
+        widened = capsule.beyond(enclosed)
+        if _widened(capsule, widened).volume < _widened(best, distance).volume:
+            best, distance = capsule, widened
+    return _widened(best, distance)
+
+
+def _widened(capsule: FittedCapsule, distances: Array) -> FittedCapsule:
+    """Return the capsule with a radius that encloses points at some distances (k,) from it."""
+    radius = capsule.radius + float(np.maximum(distances, 0).max()) + 1e-9
+    return FittedCapsule(capsule.first, capsule.last, radius)
 
 
 def _along(points: Array, axes: Array) -> tuple[FittedCapsule, Array]:
@@ -217,27 +324,28 @@ def _inside(capsule: FittedCapsule) -> Array:
     return points[capsule.beyond(points) <= 0][: FIT.inside]
 
 
-def halves(part: Array) -> list[NDArray[np.bool_]]:
-    """Ways to cut triangles (t, 3, 3) in two: which are on one side."""
-    middles = part.mean(axis=1)
-    _, _, axes = np.linalg.svd(middles - middles.mean(axis=0), full_matrices=False)
-    found = []
+def halves(centroids: Array) -> list[NDArray[np.bool_]]:
+    """Return ways to split triangles with centroids (t, 3) in two: masks (t,) of one part."""
+    offsets = centroids - centroids.mean(axis=0)
+    axes = np.linalg.eigh(offsets.T @ offsets)[1].T[::-1]
+    masks = []
     for axis in axes:
-        place = middles @ axis
+        place = centroids @ axis
         for share in (0.3, 0.5, 0.7):
             below = place < place.min() + share * np.ptp(place)
-            if 4 <= below.sum() <= len(part) - 4:
-                found.append(below)
-    return found
+            if 4 <= below.sum() <= len(centroids) - 4:
+                masks.append(below)
+    return masks
 
 
-def cut(triangles: Array) -> Array:
-    """The same surface in triangles without long edges."""
+def cut(triangles: Array) -> tuple[Array, Rows]:
+    """Subdivide triangles (t, 3, 3) with long edges; return corners (c, 3) and triangles (t, 3)."""
     corners = triangles.reshape(-1, 3)
     reach = float(np.ptp(corners, axis=0).max()) / FIT.pieces
     rows = np.arange(len(corners)).reshape(-1, 3)
     finer = subdivide_to_size(corners, rows, reach, max_iter=50)
-    return np.asarray(finer[0][finer[1]], dtype=float)
+    corners, numbers = np.unique(np.asarray(finer[0], dtype=float), axis=0, return_inverse=True)
+    return corners, numbers.reshape(-1)[finer[1]]
 
 
 def excess(shapes: Sequence[FittedCapsule | FittedBox], points: Array) -> float:
@@ -286,12 +394,13 @@ class FittedBox:
 
 def fit_boxes(triangles: Array, most: int = 3) -> list[FittedBox]:
     """Boxes that hold a mesh of triangles (t, 3, 3) [m], no more than `most`."""
-    parts = [cut(triangles)]
+    corners, numbers = cut(triangles)
+    parts = [corners[numbers]]
     found = [box_around(parts[0].reshape(-1, 3))]
     while len(parts) < most:
         options = []
         for i, part in enumerate(parts):
-            for below in halves(part):
+            for below in halves(part.mean(axis=1)):
                 two = part[below], part[~below]
                 pair = [box_around(one.reshape(-1, 3)) for one in two]
                 saved = found[i].volume - pair[0].volume - pair[1].volume
@@ -325,27 +434,30 @@ def fitted(
     known: Mapping[str, Sequence[ShapeEntry]] | None = None,
     most: int = FIT.most,
     saving: float = FIT.saving,
+    report: Callable[[int], object] | None = None,
 ) -> dict[str, list[ShapeEntry]]:
-    """Shapes that hold links.
+    """Return the shapes that enclose links, by link.
 
     Args:
-        surfaces: By link what is to be held, in the link's frame.
-        flat: Links that may be held by boxes: a palm, which fingers come near.
-        known: By link shapes that are simple already; they stay what they are.
-        most: Capsules of a large link, at the most.
-        saving: Part of the volume that another one has to save.
+        surfaces: Surfaces by link, in the link's frame.
+        flat: Links that boxes may enclose: a palm, which fingers come near.
+        known: Shapes by link that are simple already, and are not changed.
+        most: Maximum number of capsules of a large link.
+        saving: Fraction of the volume that another capsule has to save.
+        report: Function called with the number of links that have been enclosed since.
     """
-    found: dict[str, list[ShapeEntry]] = {}
+    shapes: dict[str, list[ShapeEntry]] = {}
     for link, surface in surfaces.items():
+        extent = float(np.ptp(surface.points, axis=0).max())
         if known and link in known:
-            found[link] = list(known[link])
-        elif len(surface.triangles) and float(np.ptp(surface.points, axis=0).max()) > FIT.least:
-            large = float(np.ptp(surface.points, axis=0).max()) > FIT.large
+            shapes[link] = list(known[link])
+        elif len(surface.triangles) and extent > FIT.least:
+            count = most if extent > FIT.large else FIT.most_of_small
             triangles = surface.points[surface.triangles]
-            found[link] = _held(
-                triangles, most if large else FIT.most_of_small, link in flat, saving
-            )
-    return found
+            shapes[link] = _held(triangles, count, link in flat, saving)
+        if report is not None:
+            report(1)
+    return shapes
 
 
 def _held(triangles: Array, most: int, flat: bool, saving: float) -> list[ShapeEntry]:
@@ -353,7 +465,7 @@ def _held(triangles: Array, most: int, flat: bool, saving: float) -> list[ShapeE
     capsules, beyond = fit(triangles, most, saving)
     boxes = fit_boxes(triangles) if flat else []
     if boxes:
-        closer = excess(boxes, cut(triangles).reshape(-1, 3))
+        closer = excess(boxes, cut(triangles)[0])
         if closer < beyond:
             return [_box(one, _up(closer, 1e3)) for one in boxes]
     return [_capsule(one, _up(beyond, 1e3)) for one in capsules]

@@ -6,18 +6,19 @@ Links whose shapes touch although the meshes that they hold do not are told from
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.collision.distances import between_segments
 from casadi_ik.files.arrays import Array
-from casadi_ik.integrations.importing.capsules import FIT, Rows, fitted
+from casadi_ik.files.progress import progress
+from casadi_ik.integrations.importing.capsules import FIT, fitted
 from casadi_ik.integrations.importing.surfaces import Surface, link_surfaces
+from casadi_ik.integrations.importing.triangle_tree import TriangleTree
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.link_shapes import Touching, capsules_of
 from casadi_ik.model.linkage import below, joint_positions, link_poses, rigid_bodies
@@ -41,18 +42,24 @@ class ContactSampling:
         samples: Random configurations, seed 0.
         enough: Configurations in which shapes touch that are enough to say that meshes never do.
         looked_at: Of those, in so many the meshes are looked at.
+        first: Of these, the number that are examined before all others.
         nested: Meshes that meet in a larger part of the configurations are built into each other.
         told_apart: Part of the configurations without contact that an allowed overlap has to leave
             free.
         depth: Part of the depth at which meshes meet that shapes may overlap.
+        triangles: Number of triangles up to which a mesh is tested as it is.
+        cells: Cells of the grid to which a finer mesh is simplified, along its longest edge.
     """
 
     samples: int = 2000
     enough: int = 100
     looked_at: int = 300
+    first: int = 10
     nested: float = 0.5
     told_apart: float = 0.5
     depth: float = 0.9
+    triangles: int = 3000
+    cells: int = 48
 
 
 SAMPLING = ContactSampling()
@@ -62,182 +69,156 @@ def may_touch(
     part: Part | RobotDescription,
     shapes: Mapping[str, Sequence[ShapeEntry]],
     surfaces: Mapping[str, Surface],
+    report: Callable[[int], object] | None = None,
 ) -> list[Touching]:
-    """Pairs of links that may touch, and why.
+    """Return the pairs of links whose shapes may overlap, each with the reason.
 
     Args:
         part: An arm, a hand or a robot.
-        shapes: By link its shapes.
-        surfaces: By link the meshes they hold.
+        shapes: Shapes by link.
+        surfaces: Meshes by link, which the shapes enclose.
+        report: Function called with the number of links whose pairs have been tested since.
     """
-    rng = np.random.default_rng(0)
-    poses = [
-        link_poses(part.root, part.joints, _values(part, rng)) for _ in range(SAMPLING.samples)
-    ]
+    poses = _random_poses(part, np.random.default_rng(0))
     bodies, neighbours = rigid_bodies(part)
     capsules = {
-        link: [c for one in found for c in capsules_of(one)] for link, found in shapes.items()
+        link: [capsule for entry in entries for capsule in capsules_of(entry)]
+        for link, entries in shapes.items()
     }
-    segments = {link: _segments(found, poses, link) for link, found in capsules.items()}
-    trees = cache(lambda link: TriangleTree(surfaces[link].points[surfaces[link].triangles]))
+    segments = {link: _segments(entries, poses[link]) for link, entries in capsules.items()}
 
-    def meet(rows: Sequence[int], one: str, other: str) -> Iterator[bool]:
-        """Whether the meshes of two links meet in some configurations."""
-        for row in rows:
-            between = np.linalg.inv(poses[row][one]) @ poses[row][other]
-            yield trees(one).meets(trees(other), between)
+    @cache
+    def tree(link: str) -> TriangleTree:
+        mesh = surfaces[link].simplified(SAMPLING.triangles, SAMPLING.cells)
+        return TriangleTree(mesh.points[mesh.triangles])
 
-    found: list[Touching] = []
-    for one, other in combinations(shapes, 2):
-        if bodies[one] == bodies[other] or frozenset((bodies[one], bodies[other])) in neighbours:
-            continue
-        least = np.full(SAMPLING.samples, np.inf)
-        for i, (_, _, radius) in enumerate(capsules[one]):
-            for j, (_, _, wide) in enumerate(capsules[other]):
-                apart, _ = between_segments(segments[one][:, i], segments[other][:, j])
-                least = np.minimum(least, apart - radius - wide)
-        # Of too fine a mesh only points are kept.
-        known = all(len(surfaces[link].triangles) for link in (one, other))
-        found += _verdict((one, other), least, meet if known else None)
-    return found
+    touching: list[Touching] = []
+    links = list(shapes)
+    for i, link in enumerate(links):
+        for other in links[i + 1 :]:
+            if bodies[link] == bodies[other]:
+                continue
+            if frozenset((bodies[link], bodies[other])) in neighbours:
+                continue
+            clearance = _clearances(
+                (capsules[link], capsules[other]), (segments[link], segments[other])
+            )
+            pair: MeshPair | None = None
+            # Only the points of a mesh are known if it has too many triangles.
+            if all(name in surfaces and len(surfaces[name].triangles) for name in (link, other)):
+                relative = _inverse(poses[link]) @ poses[other]
+                pair = MeshPair(tree, (link, other), relative)
+            touching += _allowed_overlap((link, other), clearance, pair)
+        if report is not None:
+            report(1)
+    return touching
 
 
-def _verdict(
-    links: tuple[str, str],
-    least: Array,
-    meet: Callable[[Sequence[int], str, str], Iterator[bool]] | None,
+def _random_poses(part: Part | RobotDescription, rng: np.random.Generator) -> dict[str, Array]:
+    """Return the pose (k, 4, 4) of every link in random configurations."""
+    lower, upper = (
+        np.array([getattr(motor, end) for motor in part.actuators]) for end in ("lower", "upper")
+    )
+    drawn = rng.uniform(lower, upper, (SAMPLING.samples, len(lower)))
+    motors = {motor.name: drawn[:, i] for i, motor in enumerate(part.actuators)}
+    poses = link_poses(part.root, part.joints, joint_positions(part.joints, motors))
+    return {link: np.broadcast_to(pose, (SAMPLING.samples, 4, 4)) for link, pose in poses.items()}
+
+
+def _inverse(poses: Array) -> Array:
+    """Return the inverses of poses (k, 4, 4)."""
+    inverses = np.zeros(poses.shape) + np.eye(4)
+    inverses[:, :3, :3] = poses[:, :3, :3].transpose(0, 2, 1)
+    inverses[:, :3, 3] = -np.einsum("kji,kj->ki", poses[:, :3, :3], poses[:, :3, 3])
+    return inverses
+
+
+Capsules = Sequence[tuple[Array, Array, float]]
+
+
+def _clearances(capsules: tuple[Capsules, Capsules], segments: tuple[Array, Array]) -> Array:
+    """Return the least distance (k,) of the capsules of two links [m], negative if they overlap."""
+    clearance = np.full(SAMPLING.samples, np.inf)
+    for i, (_, _, radius) in enumerate(capsules[0]):
+        for j, (_, _, other_radius) in enumerate(capsules[1]):
+            distance, _ = between_segments(segments[0][:, i], segments[1][:, j])
+            clearance = np.minimum(clearance, distance - radius - other_radius)
+    return clearance
+
+
+@dataclass(frozen=True, eq=False)
+class MeshPair:
+    """The meshes of two links.
+
+    Attributes:
+        tree: Function that returns the tree of a link's mesh.
+        links: Names of the links.
+        relative: (k, 4, 4) pose of the second link in the first by configuration.
+    """
+
+    tree: Callable[[str], TriangleTree]
+    links: tuple[str, str]
+    relative: Array
+
+    def intersects(
+        self, configurations: NDArray[np.intp], stop_at_first: bool = False
+    ) -> NDArray[np.bool_]:
+        """Return in which configurations the meshes intersect; see `TriangleTree.intersects`."""
+        first, second = map(self.tree, self.links)
+        return first.intersects(second, self.relative[configurations], stop_at_first)
+
+
+def _allowed_overlap(
+    links: tuple[str, str], clearance: Array, meshes: MeshPair | None
 ) -> list[Touching]:
-    """What is to be said of two links whose shapes are `least` (k,) [m] apart.
+    """Return the entry of two links whose shapes may overlap; [] if they may not.
 
     Args:
-        links: Their names.
-        least: In every configuration.
-        meet: In which of some configurations their meshes meet; None: they are not known.
+        links: Names of the links.
+        clearance: (k,) distance of their shapes by configuration [m].
+        meshes: Their meshes; None if they are unknown.
     """
-    hit = np.flatnonzero(least < 0)
+    hit = np.flatnonzero(clearance < 0)
     if len(hit) < SAMPLING.enough:
         return []
-    looked, always = hit[: SAMPLING.looked_at], len(hit) == SAMPLING.samples
-    said = f"their shapes touch in {len(hit)} of {SAMPLING.samples} random configurations, seed 0, "
-    if meet is None:
-        return [Touching(links, said + "their meshes were not looked at")] if always else []
-    if not any(meet(looked.tolist(), *links)):
-        return [Touching(links, said + "their meshes in none")]
+    examined, always = hit[: SAMPLING.looked_at], len(hit) == SAMPLING.samples
+    reason = (
+        f"their shapes touch in {len(hit)} of {SAMPLING.samples} random configurations, seed 0, "
+    )
+    if meshes is None:
+        return [Touching(links, reason + "their meshes were not looked at")] if always else []
+    # Most pairs that intersect do so in one of the first configurations.
+    batches = (examined[: SAMPLING.first], examined[SAMPLING.first :])
+    if not any(meshes.intersects(batch, stop_at_first=True).any() for batch in batches):
+        return [Touching(links, reason + "their meshes in none")]
     if not always:
         return []
-    met = np.array([*meet(looked.tolist(), *links)])
-    said += f"their meshes in {met.sum()} of {len(looked)}"
-    # As deep as where the meshes meet they may not be, if that tells the two apart.
-    depths = -least[looked]
-    depth = math.floor(SAMPLING.depth * float(depths[met].min()) * FIT.grid) / FIT.grid
-    if met.mean() > SAMPLING.nested or (depths[~met] < depth).mean() < SAMPLING.told_apart:
-        return [Touching(links, said + ", which these shapes cannot tell")]
-    return [Touching(links, said + ", all deeper", depth)]
+    intersecting = meshes.intersects(examined)
+    reason += f"their meshes in {intersecting.sum()} of {len(examined)}"
+    # The allowed overlap is less than where the meshes intersect, if that tells the two apart.
+    depths = -clearance[examined]
+    depth = math.floor(SAMPLING.depth * float(depths[intersecting].min()) * FIT.grid) / FIT.grid
+    if (
+        intersecting.mean() > SAMPLING.nested
+        or (depths[~intersecting] < depth).mean() < SAMPLING.told_apart
+    ):
+        return [Touching(links, reason + ", which these shapes cannot tell")]
+    return [Touching(links, reason + ", all deeper", depth)]
 
 
-def _values(part: Part | RobotDescription, rng: np.random.Generator) -> dict[str, float]:
-    """Random positions of all joints, couplings minded where they are of one joint or motor."""
-    drawn = {one.name: rng.uniform(one.lower, one.upper) for one in part.actuators}
-    found = joint_positions(part.joints, drawn)
-    return {name: float(value[0]) for name, value in found.items()}
+def _segments(capsules: Capsules, poses: Array) -> Array:
+    """Return the centres and half axes (k, c, 6) of a link's capsules in the root's frame.
 
-
-def _segments(
-    capsules: Sequence[tuple[Array, Array, float]], poses: Sequence[Mapping[str, Array]], link: str
-) -> Array:
-    """(k, c, 6) middles and halves of a link's capsules in the root's frame."""
-    stacked = np.stack([pose[link] for pose in poses])
-    rotations, origins = stacked[:, :3, :3], stacked[:, None, :3, 3]
-    middles, halves = (np.stack([one[i] for one in capsules]) for i in (0, 1))
-    turned = (np.einsum("kij,cj->kci", rotations, points) for points in (middles, halves))
-    middle, half = turned
-    return np.concatenate([middle + origins, half], axis=2)
-
-
-class TriangleTree:
-    """Triangles in a balanced tree of boxes, to find whether two meshes meet.
-
-    Level k has 2^k boxes along the axes of the mesh's frame; the last level has one for each
-    triangle, of which some are there twice to fill it.
+    Args:
+        capsules: The capsules in the link's frame.
+        poses: (k, 4, 4) poses of the link.
     """
-
-    def __init__(self, triangles: Array) -> None:
-        """Sort triangles (t, 3, 3) [m] into boxes."""
-        depth = max(len(triangles) - 1, 0).bit_length()
-        order = np.resize(np.arange(len(triangles)), 2**depth)[None]
-        middles = triangles.mean(axis=1)
-        while order.shape[1] > 1:  # halve each box along its longest side
-            inside = middles[order]
-            longest = np.ptp(inside, axis=1).argmax(axis=1)
-            along = np.take_along_axis(inside, longest[:, None, None], axis=2)[:, :, 0]
-            order = np.take_along_axis(order, along.argsort(axis=1), axis=1)
-            order = order.reshape(2 * len(order), -1)
-        self.triangles = triangles[order[:, 0]]
-        low, high = self.triangles.min(axis=1), self.triangles.max(axis=1)
-        self.levels = [((low + high) / 2, (high - low) / 2)]
-        for _ in range(depth):
-            low = low.reshape(-1, 2, 3).min(axis=1)
-            high = high.reshape(-1, 2, 3).max(axis=1)
-            self.levels.insert(0, ((low + high) / 2, (high - low) / 2))
-
-    def meets(self, other: TriangleTree, pose: Array) -> bool:
-        """Whether a triangle of one crosses one of another mesh, whose frame has a (4, 4) pose."""
-        waiting = [(0, 0, np.zeros(1, np.intp), np.zeros(1, np.intp))]
-        ends = len(self.levels) - 1, len(other.levels) - 1
-        while waiting:
-            level, its, rows, columns = waiting.pop()
-            if len(rows) > PAIRS_AT_ONCE:  # the rest later: a meeting found ends it all
-                waiting.append((level, its, rows[PAIRS_AT_ONCE:], columns[PAIRS_AT_ONCE:]))
-                rows, columns = rows[:PAIRS_AT_ONCE], columns[:PAIRS_AT_ONCE]
-            near = self._near(level, rows, other.levels[its], columns, pose)
-            rows, columns = rows[near], columns[near]
-            if (level, its) == ends:
-                theirs = other.triangles[columns] @ pose[:3, :3].T + pose[:3, 3]
-                if _crossing(self.triangles[rows], theirs).any():
-                    return True
-            elif len(rows):
-                if level < ends[0]:
-                    rows, columns = np.r_[2 * rows, 2 * rows + 1], np.r_[columns, columns]
-                if its < ends[1]:
-                    rows, columns = np.r_[rows, rows], np.r_[2 * columns, 2 * columns + 1]
-                waiting.append((min(level + 1, ends[0]), min(its + 1, ends[1]), rows, columns))
-        return False
-
-    def _near(
-        self, level: int, rows: Rows, theirs: tuple[Array, Array], columns: Rows, pose: Array
-    ) -> NDArray[np.bool_]:
-        """Whether the boxes of some pairs overlap along the axes of either frame."""
-        (middle, half), (at, reach) = self.levels[level], theirs
-        turn = pose[:3, :3]
-        apart = at[columns] @ turn.T + pose[:3, 3] - middle[rows]
-        ours = np.abs(apart) <= half[rows] + reach[columns] @ np.abs(turn).T
-        other = np.abs(apart @ turn) <= reach[columns] + half[rows] @ np.abs(turn)
-        return ours.all(axis=1) & other.all(axis=1)
-
-
-PAIRS_AT_ONCE = 256
-"""Pairs of boxes that are looked at in one piece."""
-
-
-def _crossing(first: Array, second: Array) -> NDArray[np.bool_]:
-    """Whether an edge of one of two triangles (k, 3, 3) goes through the other (Moeller-Trumbore).
-
-    Triangles in one plane do not cross.
-    """
-    found = np.zeros(len(first), bool)
-    for one, other in ((first, second), (second, first)):
-        corner = other[:, 0]
-        side, edge = other[:, 1] - corner, other[:, 2] - corner
-        for i in range(3):
-            along, start = one[:, (i + 1) % 3] - one[:, i], one[:, i] - corner
-            normal, turned = np.cross(along, edge), np.cross(start, side)
-            scale = (side * normal).sum(axis=1)
-            with np.errstate(all="ignore"):
-                u = (start * normal).sum(axis=1) / scale
-                v = (along * turned).sum(axis=1) / scale
-                t = (edge * turned).sum(axis=1) / scale
-                found |= (u >= 0) & (v >= 0) & (u + v <= 1) & (t >= 0) & (t <= 1)
-    return found
+    rotations, origins = poses[:, :3, :3], poses[:, None, :3, 3]
+    centres, half_axes = (
+        np.einsum("kij,cj->kci", rotations, np.stack([capsule[i] for capsule in capsules]))
+        for i in (0, 1)
+    )
+    return np.concatenate([centres + origins, half_axes], axis=2)
 
 
 def robot_shapes(
@@ -274,8 +255,10 @@ def robot_shapes(
         taken |= set(file.links)
     ordered = {link: surfaces[link] for link in robot.links if link in surfaces}
     palms = {side.palm_link for side in robot.sides} or {robot.palm_link}
-    shapes = fitted(ordered, palms, simple)
-    return shapes, may_touch(robot, shapes, surfaces), notes
+    with progress(2 * len(ordered)) as report:
+        shapes = fitted(ordered, palms, simple, report=report)
+        touching = may_touch(robot, shapes, surfaces, report)
+    return shapes, touching, notes
 
 
 def name_in_robot(name: str, names: tuple[str, ...], taken: set[str]) -> str:

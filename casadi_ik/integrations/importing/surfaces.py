@@ -49,6 +49,23 @@ class Surface:
         """The same shape in another frame, in which its own has a (4, 4) pose."""
         return Surface(self.points @ pose[:3, :3].T + pose[:3, 3], self.triangles)
 
+    def simplified(self, max_triangles: int, cells: int) -> Surface:
+        """Return the shape with fewer triangles if it has more than `max_triangles`.
+
+        The points in a cell of a grid become one of them, so that a point moves by no more than
+        the diagonal of a cell.
+
+        Args:
+            max_triangles: Number of triangles up to which the shape stays as it is.
+            cells: Number of cells along the longest edge of the bounding box.
+        """
+        if len(self.triangles) <= max_triangles:
+            return self
+        rows, numbers = clusters(self.points, cells)
+        a, b, c = numbers[self.triangles].T
+        triangles = np.stack([a, b, c], axis=1)[(a != b) & (b != c) & (c != a)]
+        return Surface(self.points[rows], triangles)
+
     def centroid(self) -> Array:
         """(3,) mean of the surface by area."""
         a, b, c = (self.points[self.triangles[:, i]] for i in range(3))
@@ -86,6 +103,29 @@ class Surface:
             inside = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1 + 1e-9) & (along > 0)
         found = along[inside & np.isfinite(along)]
         return start + float(found.min()) * direction if len(found) else None
+
+
+def clusters(points: Array, cells: int) -> tuple[Triangles, Triangles]:
+    """Group points by the cells of a grid.
+
+    Args:
+        points: (k, 3) points [m].
+        cells: Number of cells along the longest edge of their bounding box.
+
+    Returns:
+        (c,) row of the outermost point of each occupied cell, and (k,) the number of the cell that
+        each point is in.
+    """
+    low = points.min(axis=0)
+    cell = max(float(np.ptp(points, axis=0).max()) / cells, 1e-12)
+    key = ((points - low) / cell).astype(np.int64) @ np.array([1, 2 * cells, 4 * cells**2])
+    inward = -((points - points.mean(axis=0)) ** 2).sum(axis=1)
+    order = np.lexsort((inward, key))
+    starts = np.ones(len(order), bool)
+    starts[1:] = np.diff(key[order]) != 0
+    numbers = np.empty(len(points), np.int64)
+    numbers[order] = np.cumsum(starts) - 1
+    return order[starts], numbers
 
 
 def together(surfaces: list[Surface]) -> Surface | None:

@@ -1,0 +1,182 @@
+"""Intersection tests between triangle meshes, for many relative poses at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.files.arrays import Array
+
+Rows = NDArray[np.intp]
+Boxes = tuple[Array, Array]
+"""Centres and half edges (3, n) of axis-aligned boxes."""
+
+MAX_PAIRS = 4096
+"""Maximum number of pairs of boxes in one array operation; more do not fit into a core's cache."""
+
+
+class TriangleTree:
+    """A mesh in a balanced binary tree of axis-aligned boxes.
+
+    Level k has 2^k boxes; each box of the last level holds one triangle. Triangles are repeated to
+    fill the last level.
+    """
+
+    def __init__(self, triangles: Array) -> None:
+        """Build the tree of triangles (t, 3, 3) [m]."""
+        depth = max(len(triangles) - 1, 0).bit_length()
+        order = np.resize(np.arange(len(triangles)), 2**depth)[None]
+        centroids = triangles.mean(axis=1)
+        while order.shape[1] > 1:  # halve each box along its longest edge
+            points = centroids[order]
+            longest = np.ptp(points, axis=1).argmax(axis=1)
+            along = np.take_along_axis(points, longest[:, None, None], axis=2)[:, :, 0]
+            half = order.shape[1] // 2
+            order = np.take_along_axis(order, along.argpartition(half, axis=1), axis=1)
+            order = order.reshape(2 * len(order), -1)
+        leaves = triangles[order[:, 0]]
+        self.corners = np.ascontiguousarray(leaves.transpose(1, 2, 0))
+        """(3, 3, n): corner, coordinate, triangle."""
+        low, high = leaves.min(axis=1), leaves.max(axis=1)
+        self.levels = [_boxes(low, high)]
+        for _ in range(depth):
+            low = low.reshape(-1, 2, 3).min(axis=1)
+            high = high.reshape(-1, 2, 3).max(axis=1)
+            self.levels.insert(0, _boxes(low, high))
+
+    def intersects(
+        self, other: TriangleTree, poses: Array, stop_at_first: bool = False
+    ) -> NDArray[np.bool_]:
+        """Return in which relative poses a triangle of this mesh crosses one of another mesh.
+
+        Triangles in a common plane do not cross.
+
+        Args:
+            other: The other mesh.
+            poses: (k, 4, 4) poses of the other mesh's frame in the frame of this one.
+            stop_at_first: Whether to return as soon as one pose with an intersection is known.
+
+        Returns:
+            (k,) True where the meshes intersect; with `stop_at_first` at least one of these poses.
+        """
+        crossing = np.zeros(len(poses), bool)
+        rotations = np.ascontiguousarray(poses[:, :3, :3].transpose(1, 2, 0))
+        translations = np.ascontiguousarray(poses[:, :3, 3].T)
+        zeros = np.zeros(len(poses), np.intp)
+        stack = [(0, 0, zeros, zeros, np.arange(len(poses)))]
+        last = len(self.levels) - 1, len(other.levels) - 1
+        while stack:
+            level, other_level, rows, columns, pose = stack.pop()
+            if len(rows) > MAX_PAIRS:  # depth first: an intersection makes the remainder needless
+                stack.append(
+                    (level, other_level, rows[MAX_PAIRS:], columns[MAX_PAIRS:], pose[MAX_PAIRS:])
+                )
+                rows, columns, pose = rows[:MAX_PAIRS], columns[:MAX_PAIRS], pose[:MAX_PAIRS]
+            pending = ~crossing[pose]
+            if not pending.all():
+                rows, columns, pose = rows[pending], columns[pending], pose[pending]
+            rotation, translation = rotations[:, :, pose], translations[:, pose]
+            near = _overlap(
+                [part[:, rows] for part in self.levels[level]],
+                [part[:, columns] for part in other.levels[other_level]],
+                rotation,
+                translation,
+            )
+            rows, columns, pose = rows[near], columns[near], pose[near]
+            if not len(rows):
+                continue
+            if (level, other_level) == last:
+                rotation, translation = rotation[:, :, near], translation[:, near]
+                corners = [
+                    _dot(rotation, corner[:, columns]) + translation for corner in other.corners
+                ]
+                crossed = _cross(self.corners[:, :, rows], np.stack(corners))
+                crossing[pose[crossed]] = True
+                if stop_at_first and crossed.any():
+                    break
+                continue
+            # The larger boxes are split first, so that both trees shrink alike.
+            if level < last[0]:
+                rows = np.concatenate([2 * rows, 2 * rows + 1])
+                columns, pose = np.concatenate([columns] * 2), np.concatenate([pose] * 2)
+            if other_level < last[1]:
+                columns = np.concatenate([2 * columns, 2 * columns + 1])
+                rows, pose = np.concatenate([rows] * 2), np.concatenate([pose] * 2)
+            stack.append(
+                (min(level + 1, last[0]), min(other_level + 1, last[1]), rows, columns, pose)
+            )
+        return crossing
+
+
+def _boxes(low: Array, high: Array) -> Boxes:
+    return (
+        np.ascontiguousarray((low + high).T) / 2,
+        np.ascontiguousarray((high - low).T) / 2,
+    )
+
+
+def _dot(rotation: Array, vectors: Array) -> Array:
+    """Return the products (3, m) of matrices (3, 3, m) and vectors (3, m)."""
+    return np.stack(
+        [row[0] * vectors[0] + row[1] * vectors[1] + row[2] * vectors[2] for row in rotation]
+    )
+
+
+def _overlap(
+    box: list[Array], other: list[Array], rotation: Array, translation: Array
+) -> NDArray[np.bool_]:
+    """Return which pairs of boxes overlap along the axes of both frames (m,)."""
+    absolute = np.abs(rotation)
+    offset = _dot(rotation, other[0]) + translation - box[0]
+    reach = box[1] + _dot(absolute, other[1])
+    near = (np.abs(offset) <= reach).all(axis=0)
+    back, absolute = rotation.transpose(1, 0, 2), absolute.transpose(1, 0, 2)
+    reach = other[1] + _dot(absolute, box[1])
+    separated = (np.abs(_dot(back, offset)) > reach).any(axis=0)
+    return np.logical_and(near, ~separated)
+
+
+def _vector_product(a: Array, b: Array) -> Array:
+    return np.stack(
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    )
+
+
+def _inner(a: Array, b: Array) -> Array:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _spans_plane(triangle: Array, other: Array) -> NDArray[np.bool_]:
+    """Return for which pairs (3, 3, m) the second triangle crosses the plane of the first (m,)."""
+    origin = triangle[0]
+    normal = _vector_product(triangle[1] - origin, triangle[2] - origin)
+    heights = np.stack([_inner(corner - origin, normal) for corner in other])
+    return (heights.min(axis=0) <= 0) & (heights.max(axis=0) >= 0)
+
+
+def _cross(first: Array, second: Array) -> NDArray[np.bool_]:
+    """Return which pairs of triangles (3, 3, m) cross: an edge of one passes through the other.
+
+    Source: T. Moeller, B. Trumbore, Fast, minimum storage ray-triangle intersection, 1997.
+    """
+    crossed = np.zeros(first.shape[2], bool)
+    candidates = np.flatnonzero(_spans_plane(first, second))
+    candidates = candidates[_spans_plane(second[:, :, candidates], first[:, :, candidates])]
+    if not len(candidates):
+        return crossed
+    first, second = first[:, :, candidates], second[:, :, candidates]
+    through = np.zeros(len(candidates), bool)
+    for edges, faces in ((first, second), (second, first)):
+        corner = faces[0]
+        side, edge = faces[1] - corner, faces[2] - corner
+        for i in range(3):
+            along, start = edges[(i + 1) % 3] - edges[i], edges[i] - corner
+            normal, turned = _vector_product(along, edge), _vector_product(start, side)
+            scale = _inner(side, normal)
+            with np.errstate(all="ignore"):
+                u = _inner(start, normal) / scale
+                v = _inner(along, turned) / scale
+                t = _inner(edge, turned) / scale
+                through |= (u >= 0) & (v >= 0) & (u + v <= 1) & (t >= 0) & (t <= 1)
+    crossed[candidates[through]] = True
+    return crossed
