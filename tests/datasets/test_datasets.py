@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from commands import main
 from make_grasp_sets import ROBOTS, TABLES, Written, made
+from torch_zip import write_torch
 
 import casadi_ik as ik
 from casadi_ik.app.report import reasons
@@ -207,6 +208,39 @@ def test_bad_tables(changes: dict[str, Any], says: str, tmp_path: Path) -> None:
         ik.load_candidates(_table(tmp_path, **changes), KUKA)
     assert "\n" not in str(caught.value)
     assert "grasps.csv" in str(caught.value)
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_columns_that_are_not_joints(suffix: str, tmp_path: Path) -> None:
+    """As pandas writes a table: its index, a score, a note, and a cell that is empty."""
+    path = _table(tmp_path)
+    head, row = path.read_text().splitlines()
+    more = ["0,{},0.9,good", "1,{},0.8,bad", "2,{},,good"]
+    rows = [text.format(row) for text in more]
+    rows[1] = rows[1].replace("0.1", "", 1)
+    path.write_text("\n".join([f",{head},Score,label", *rows]) + "\n")
+    if suffix == "parquet":
+        pl = pytest.importorskip("polars")
+        frame = pl.read_csv(path).rename({"": "__index_level_0__"})
+        path = path.with_suffix(".parquet")
+        frame.write_parquet(path)
+    grasps = ik.load_candidates(path, KUKA, invalid="drop")
+    assert (grasps.rows, grasps.dropped) == ((0, 2), 1)
+    assert grasps[0].posture["bh_spread"] == pytest.approx(0.5)
+    with pytest.raises(ik.errors.DescriptionError, match="row 1: position"):
+        ik.load_candidates(path, KUKA)
+
+
+def test_files_of_dro_are_told_from_multidex(tmp_path: Path) -> None:
+    """Their rotations are three angles; read as columns of a matrix, hands would stand anywhere."""
+    row = np.zeros(6 + 8)
+    counts = {"num_total": 1, "num_upper_object": 1, "num_per_object": {"contactdb+apple": 1}}
+    info = {hand: {"robot_name": hand, **counts} for hand in ("allegro", "barrett")}
+    path = tmp_path / "cmap_dataset.pt"
+    write_torch(path, {"info": info, "metadata": [(row, "contactdb+apple", "barrett")]})
+    with pytest.raises(ik.errors.DescriptionError) as caught:
+        ik.load_candidates(path, KUKA, of="contactdb+apple")
+    assert all(name in str(caught.value) for name in ("cmap_dataset.pt", "info", "barrett"))
 
 
 def test_an_empty_set(tmp_path: Path) -> None:

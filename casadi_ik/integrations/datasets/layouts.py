@@ -299,7 +299,13 @@ def multidex(path: Path, content: Any) -> HandPoses:
     q: translation (3), the first two columns of the rotation (6), joints in the order of the hand.
     """
     where, found = str(path), _mapping(path, content)
-    entries = found.get("metadata")
+    info, entries = found.get("info"), found.get("metadata")
+    if isinstance(info, dict) and info and all(isinstance(hand, dict) for hand in info.values()):
+        hands = ", ".join(str(hand) for hand in info)
+        raise DescriptionError(
+            f"{where}: info: found hands {hands}, as D(R,O) Grasp writes them, with rotations as"
+            " Euler angles; expected a file of MultiDex (write the rows of a hand into a table)"
+        )
     if not isinstance(entries, list) or not entries:
         raise DescriptionError(f"{where}: metadata: expected a list of at least one grasp")
     rows: list[Array] = []

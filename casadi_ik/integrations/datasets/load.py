@@ -182,6 +182,15 @@ ANGLES = ("roll", "pitch", "yaw")
 
 SUFFIXES = (".csv", ".npz", ".parquet")
 
+NOT_JOINTS = ("index", "id", "name", "object", "label", "score", "quality", "confidence", "success")
+"""Columns of a table that are ignored, in any case of letters."""
+
+
+def _is_ignored(column: str) -> bool:
+    """Return whether a column is a note on a grasp, or the index that pandas writes."""
+    column = column.strip().lower()
+    return column in ("", *NOT_JOINTS) or column.startswith(("unnamed:", "__index_level_"))
+
 
 def read_table(path: Path) -> HandPoses:
     """Grasps of a table: x y z [m], qw qx qy qz or roll pitch yaw [rad], then joints by name.
@@ -219,28 +228,31 @@ def _of_csv(path: Path) -> dict[str, Array]:
             names, *rows = [row for row in csv.reader(file) if row] or [[]]
     except (csv.Error, UnicodeDecodeError) as error:
         raise DescriptionError(f"{path}: no CSV file: {error}") from error
-    names = [name.strip() for name in names]
-    if len(set(names)) < len(names):
+    columns = {j: name.strip() for j, name in enumerate(names) if not _is_ignored(name)}
+    if len(set(columns.values())) < len(columns):
         raise DescriptionError(f"{path}: found columns of the same name")
-    values = np.empty((len(rows), len(names)))
+    values = {name: np.full(len(rows), np.nan) for name in columns.values()}
     for i, row in enumerate(rows):
         if len(row) != len(names):
             raise DescriptionError(
                 f"{path}: row {i}: found {len(row)} values, expected {len(names)}"
             )
-        for j, text in enumerate(row):
+        for j, name in columns.items():
             try:
-                values[i, j] = float(text)
+                # An empty cell is a number that is missing; the row is invalid.
+                values[name][i] = float(row[j].strip() or "nan")
             except ValueError:
                 raise DescriptionError(
-                    f"{path}: row {i}: {names[j]}: found {text!r}, expected a number"
+                    f"{path}: row {i}: {name}: found {row[j]!r}, expected a number"
                 ) from None
-    return {name: values[:, j] for j, name in enumerate(names)}
+    return values
 
 
 def _of_npz(path: Path) -> dict[str, Array]:
     columns: dict[str, Array] = {}
     for name, array in read_npz(path, LIMITS.table_bytes).items():
+        if _is_ignored(name):
+            continue
         if array.ndim != 1:
             raise DescriptionError(
                 f"{path}: {name}: found shape {array.shape}, expected a column of numbers"
@@ -255,6 +267,8 @@ def _of_parquet(path: Path) -> Mapping[str, Array]:
     pl = polars_module()
     try:
         scanned = pl.scan_parquet(path)
+        names = [name for name in scanned.collect_schema().names() if not _is_ignored(name)]
+        scanned = scanned.select(names)
         schema = scanned.collect_schema()
         for name, kind in schema.items():
             if not kind.is_numeric():
