@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import yaml
 from torch_zip import write_torch
 
 import casadi_ik as ik
@@ -29,6 +30,8 @@ ROBOTS = {
     "allegro": "panda+allegro_right",
     "leap": "panda+leap",
     "shadow": "ur5e+shadow",
+    "panda_hand": "panda+panda_hand",
+    "robotiq_2f85": "ur5e+robotiq_2f85",
 }
 COUNT = 6
 
@@ -68,7 +71,8 @@ def made(name: str, folder: Path, seed: int = 0, robot: ik.ArmHand | None = None
     palms[:, :3, :3] = np.linalg.qr(rng.normal(size=(COUNT, 3, 3)))[0]
     palms[:, :3, 0] *= np.linalg.det(palms[:, :3, :3])[:, None]
     palms[:, :3, 3] = rng.uniform(-0.15, 0.15, (COUNT, 3))
-    path = folder / f"{stem}.{kind or ('pt' if layout == 'multidex' else 'npy')}"
+    kind = kind or {"multidex": "pt", "isaac": "yaml"}.get(layout, "npy")
+    path = folder / f"{stem}.{kind}"
     if layout == "table":
         motors = held.description.finger_motors
         values = q[:, [held.actuators.index(name) for name in motors]]
@@ -166,6 +170,23 @@ def _multidex(path: Path, frames: Array, convention: Convention, joints: Array) 
     write_torch(path, {"info": info, "metadata": [*metadata]})
 
 
+def _isaac(path: Path, frames: Array, convention: Convention, joints: Array) -> None:
+    grasps = {}
+    for i, (frame, row) in enumerate(zip(frames, joints, strict=True)):
+        w, *xyz = _quaternions(frame[None, :3, :3])[0].tolist()
+        position = dict(zip(convention.joints, row.tolist(), strict=True))
+        grasps[f"grasp_{i}"] = {
+            "confidence": 1.0,
+            "position": frame[:3, 3].tolist(),
+            "orientation": {"w": w, "xyz": xyz},
+            "cspace_position": position,
+            "pregrasp_cspace_position": position,
+        }
+    frames_of = {"object_frame": "/World/mug", "gripper_frame": "/World/gripper"}
+    head = {"format": "isaac_grasp", "format_version": 1.0, **frames_of}
+    path.write_text(yaml.safe_dump({**head, "grasps": grasps}), encoding="utf-8")
+
+
 def _table(path: Path, palms: Array, names: tuple[str, ...], joints: Array) -> None:
     columns = dict(zip("xyz", palms[:, :3, 3].T, strict=True))
     if path.suffix == ".csv":
@@ -217,6 +238,7 @@ WRITERS: dict[str, Callable[[Path, Array, Convention, Array], None]] = {
     "bodex": _bodex,
     "dexgraspbench": _dexgraspbench,
     "multidex": _multidex,
+    "isaac": _isaac,
 }
 
 TABLES = ("table.csv", "table.npz", "table.parquet")

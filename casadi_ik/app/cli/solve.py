@@ -28,7 +28,7 @@ from casadi_ik.app.report import duration, files, ranking_report, solution_repor
 from casadi_ik.collision.clearance import SceneCheck
 from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import CasadiIKError, MissingExtraError
-from casadi_ik.integrations.datasets import LAYOUTS, load_candidates
+from casadi_ik.integrations.datasets import LAYOUT_NAMES, load_candidates
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.grasp import Grasp
 from casadi_ik.model.objects import load_object
@@ -154,8 +154,8 @@ def _drawing(path: Path, grasp: Grasp) -> Callable[..., Any]:
     opt.OBJECT_POSE,
     Option(
         "--layout L",
-        f"of the file: {', '.join(LAYOUTS)}, table (default: detected from it)",
-        read=opt.one_of(*LAYOUTS, "table"),
+        f"of the file: {', '.join(LAYOUT_NAMES)} (default: detected from it)",
+        read=opt.one_of(*LAYOUT_NAMES),
     ),
     Option(
         "--hand FILE",

@@ -30,6 +30,13 @@ from casadi_ik.integrations.datasets.layouts import (
     of_robot,
     read_layout,
 )
+from casadi_ik.integrations.datasets.parallel import (
+    ISAAC_GRASP,
+    PARALLEL,
+    for_gripper,
+    isaac_grasp,
+    parallel_layout,
+)
 from casadi_ik.integrations.datasets.postures import (
     FIT,
     HandPoses,
@@ -291,6 +298,9 @@ TAKES = ("palm", "contacts")
 TABLE = "table"
 """The layout of files with named columns."""
 
+LAYOUT_NAMES = (*LAYOUTS, ISAAC_GRASP, *PARALLEL, TABLE)
+"""All layouts of files of grasps."""
+
 
 def load_candidates(
     path: str | Path,
@@ -313,10 +323,11 @@ def load_candidates(
         path: A YAML file with one grasp or a list (``candidates:``); a folder of such files; an npz
             file with points and normals, as `Solver.solve_batch` takes them; an npy or pt file of a
             data set; a table (CSV, npz, Parquet) with columns x y z, qw qx qy qz or roll pitch yaw,
-            and the robot's joints by name, the pose that of its palm frame. Nothing in a file is
+            and the robot's joints by name, the pose that of its palm frame; grasps of a parallel
+            gripper (isaac_grasp, ACRONYM, GraspNet, 4 x 4 poses with widths). Nothing in a file is
             run.
         robot: The robot, or its name; its hand must be that of the data.
-        layout: One of `LAYOUTS`, or "table"; None: told from the file.
+        layout: One of `LAYOUT_NAMES`; None: told from the file.
         hand: How the data name joints and where they have the hand's frame: one of
             ``models/datasets``, or a file of the same kind. None: the shipped one that fits.
         object_pose: (4, 4) where the object is in the base frame; None: grasps stay in its frame.
@@ -353,8 +364,8 @@ def load_candidates(
     """
     held = load_robot(robot) if isinstance(robot, str) else robot
     file = Path(path)
-    if layout is not None and layout not in (*LAYOUTS, TABLE):
-        known = ", ".join((*LAYOUTS, TABLE))
+    if layout is not None and layout not in LAYOUT_NAMES:
+        known = ", ".join(LAYOUT_NAMES)
         raise UnknownNameError(f"layout: found {layout!r}, expected one of {known}")
     if take not in TAKES:
         raise InputError(f"take: found {take!r}, expected one of {', '.join(TAKES)}")
@@ -385,6 +396,17 @@ def _loaded(
     invalid: Invalid,
 ) -> Candidates:
     kind = path.suffix.lower()
+    jaws = layout or parallel_layout(path)
+    if jaws == ISAAC_GRASP or jaws in PARALLEL:
+        if of is not None:
+            raise InputError(f"of: found {of!r}, but {path.name} has grasps of one object")
+        if jaws == ISAAC_GRASP:
+            convention = convention_for(robot, ISAAC_GRASP, hand)
+            given = isaac_grasp(path)
+        else:
+            given = for_gripper(PARALLEL[jaws](path), robot, clip=invalid == "clip")
+            convention = of_robot(robot, given.names)
+        return _of_hand(given.of_scale(scale), robot, convention, take, grasped, invalid)
     if kind in READERS and layout != TABLE:
         given, found = read_layout(path, layout)
         one = given.of(of).of_scale(scale)
