@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.compile.emitter import Form, emit
+from casadi_ik.compile.emitter import CodeOptions, emit
 
 
 @cache
@@ -106,16 +106,16 @@ WIDE = """\
 
 
 @cache
-def meaning(form: Form) -> str:
+def meaning(options: CodeOptions) -> str:
     """C text that says what the emitter's code means: types, operations, elementary functions."""
     forms, loops = driver_text("elementary"), driver_text("loops")
-    if form.single:
+    if options.single:
         single = driver_text("elementary_single") + driver_text("real")
         return f"{loops}#define SINGLE\n{single}"
     alone = loops + driver_text("elementary_alone") + forms
-    if form.lanes > 1:
+    if options.lanes > 1:
         own = driver_text("lanes") + driver_text("elementary_lanes") + forms
-        return alone + define({"LANES": form.lanes}) + own
+        return alone + define({"LANES": options.lanes}) + own
     few = driver_text("elementary_few") + forms
     return "".join(
         (
@@ -141,16 +141,16 @@ class Stages:
     functions: Mapping[Any, ca.Function]
     text: str
 
-    def source(self, form: Form) -> str:
+    def source(self, options: CodeOptions) -> str:
         """C code, as of `step_source`."""
-        text, names = emit(list(self.functions.values()), form)
-        behind = ", wanted" if form.lanes > 1 else ""
+        text, names = emit(list(self.functions.values()), options)
+        behind = ", wanted" if options.lanes > 1 else ""
         calls = "".join(
             f"#define {stage.name}(...) {name}(__VA_ARGS__{behind})\n"
             for stage, name in zip(self.functions, names, strict=True)
         )
-        given = "(real *) (arg)[0], (arg)[1], (const scalar *const *) (arg)[2]"
-        step = f"iterate({given}, (res)[0], (res)[1], (res)[2], wanted)"
+        arguments = "(real *) (arg)[0], (arg)[1], (const scalar *const *) (arg)[2]"
+        step = f"iterate({arguments}, (res)[0], (res)[1], (res)[2], wanted)"
         return (
             text
             + calls
@@ -160,26 +160,26 @@ class Stages:
         )
 
 
-def step_source(function: ca.Function | Stages, form: Form) -> str:
+def step_source(function: ca.Function | Stages, options: CodeOptions) -> str:
     """C code of a function, which drivers call by the macro `STEP(arg, res, wanted)`."""
     if isinstance(function, Stages):
-        return function.source(form)
-    text, (name,) = emit([function], form)
+        return function.source(options)
+    text, (name,) = emit([function], options)
     n_in, n_out = function.n_in(), function.n_out()
-    given = [*(f"(arg)[{i}]" for i in range(n_in)), *(f"(res)[{i}]" for i in range(n_out))]
-    wanted = ["wanted"] if form.lanes > 1 else []
+    arguments = [*(f"(arg)[{i}]" for i in range(n_in)), *(f"(res)[{i}]" for i in range(n_out))]
+    lane_mask = ["wanted"] if options.lanes > 1 else []
     return "".join(
         (
             text,
-            f"#define STEP(arg, res, wanted) {name}({', '.join(given + wanted)})\n",
+            f"#define STEP(arg, res, wanted) {name}({', '.join(arguments + lane_mask)})\n",
             define({"STEP_IN": n_in, "STEP_OUT": n_out}),
         )
     )
 
 
-def standing_alone(function: ca.Function | Stages, form: Form) -> str:
+def standing_alone(function: ca.Function | Stages, options: CodeOptions) -> str:
     """C code of a function and of all it needs."""
-    return meaning(form) + step_source(function, form)
+    return meaning(options) + step_source(function, options)
 
 
 def library_source(
@@ -196,11 +196,11 @@ def library_source(
         lanes: How many solves are made side by side.
         wide: Whether the machine has wide registers.
     """
-    form = Form(lanes)
+    options = CodeOptions(lanes)
     return "\n".join(
         (
             WIDE if wide else "",
-            standing_alone(function, form),
+            standing_alone(function, options),
             driver_text("common"),
             driver,
         )

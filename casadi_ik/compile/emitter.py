@@ -2,17 +2,17 @@
 
 `emit` walks the instructions of a Function and of all it calls and writes one C function for each,
 callees first. The text is the same for one number at a time, for vectors and for single precision:
-what `real`, `mask` and `real_sin` stand for is said by the C text before it (`runtime/scalar.c`,
-`runtime/lanes.c`, `runtime/single.c`). What is written:
+the C text before it defines `real`, `mask` and `real_sin` (`runtime/real.c`, `runtime/lanes.c`,
+`runtime/elementary_single.c`).
 
-- An SX Function is straight-line code (`straight_lines.py`).
-- An MX Function is a list of calls, with arrays on the stack between them.
+- An SX Function becomes straight-line code (`straight_lines.py`).
+- An MX Function becomes a list of calls, with arrays on the stack between them.
 - A Map calls a Function for each of its columns.
-- A Switch calls one of several Functions. Of vectors it calls each that any lane takes, and every
-  lane keeps the results of its own.
+- A Switch calls one of several Functions. With several lanes it calls each branch that any lane
+  takes, and every lane keeps the results of its branch.
 
-Other Functions are expanded into SX. Functions that differ by constants alone, as those of a left
-and a right arm do, are one in C, with a table of constants each.
+Other Functions are expanded into SX. Functions that differ in constants alone, such as those of a
+left and a right arm, share one C function, with a table of constants each.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ import numpy as np
 from casadi_ik.compile.straight_lines import (
     MASK,
     REAL,
-    Form,
-    Name,
+    CName,
+    CodeOptions,
     NoCodeError,
     as_mask,
     straight_lines,
@@ -37,22 +37,23 @@ from casadi_ik.compile.straight_lines import (
 from casadi_ik.errors import KernelError
 
 
-def emit(functions: Sequence[ca.Function], form: Form) -> tuple[str, list[Name]]:
-    """C text of functions and of all they call.
+def emit(functions: Sequence[ca.Function], options: CodeOptions) -> tuple[str, list[CName]]:
+    """Return the C text of functions and of all functions that they call.
 
     Args:
-        functions: Any; what is called more than once is written once.
-        form: What the code is for.
+        functions: Functions of any kind; a function that is called several times is written once.
+        options: Lanes and precision of the code.
 
     Returns:
         The text, and the names of the functions in C: `static void name(const real *i0, ...,
-        real *o0, ...)`, some of them macros, of lanes with `int wanted` behind, a bit for each lane
-        that counts. The nonzeros of an output are written where it is not NULL; the first never is.
+        real *o0, ...)`; some are macros. With several lanes, `int wanted` follows: a bit for each
+        lane whose results are needed. The nonzeros of an output are written unless its pointer is
+        NULL; the pointer of the first output never is.
 
     Raises:
-        KernelError: One holds what has no C code (a Python callback, an Ipopt call).
+        KernelError: A function contains an operation without C code, such as a Python callback.
     """
-    emitter = _Emitter(form)
+    emitter = _Emitter(options)
     names = []
     for function in functions:
         try:
@@ -62,30 +63,30 @@ def emit(functions: Sequence[ca.Function], form: Form) -> tuple[str, list[Name]]
     return emitter.text(names), names
 
 
-VARIES = re.compile(r"\bR\((-?[0-9][^()]*)\)|\b(f[0-9]+_\w+)\(")
-"""What functions that are alike differ in: constants, and which of some alike they call."""
+VARYING_PART = re.compile(r"\bR\((-?[0-9][^()]*)\)|\b(f[0-9]+_\w+)\(")
+"""A constant or a callee: the parts in which functions of one group may differ."""
 
 
-class _Written(NamedTuple):
-    """A function in C: its name, its parameters, its body, the kind of functions that it is of."""
+class _CFunction(NamedTuple):
+    """A C function: name, parameters, body, and the index of its group of similar functions."""
 
-    name: Name
-    given: str
+    name: CName
+    parameters: str
     body: str
-    kind: int
+    group: int
 
 
 class _Emitter:
-    """Writes functions, each once."""
+    """Writer of C functions, each once."""
 
-    def __init__(self, form: Form) -> None:
-        self.form = form
-        self._names: dict[int, tuple[Name, ca.Function]] = {}
-        self._written: dict[Name, _Written] = {}
-        self._kinds: dict[str, int] = {}
+    def __init__(self, options: CodeOptions) -> None:
+        self.options = options
+        self._names: dict[int, tuple[CName, ca.Function]] = {}
+        self._functions: dict[CName, _CFunction] = {}
+        self._groups: dict[str, int] = {}
 
-    def name(self, function: ca.Function) -> Name:
-        """The name of a function in C, which is written if it is not yet."""
+    def name(self, function: ca.Function) -> CName:
+        """Return the C name of a function; write the function on first use."""
         key = function.__hash__()
         if key not in self._names:
             body = self._body(function)
@@ -93,77 +94,82 @@ class _Emitter:
             self._names[key] = name, function
             inputs = [f"i{i}" for i in range(function.n_in())]
             outputs = [f"o{i}" for i in range(function.n_out())]
-            given = [f"const real *{each}" for each in inputs] + [f"real *{o}" for o in outputs]
-            head = ", ".join(given + (["int wanted"] if self.form.lanes > 1 else []))
-            unused = ", ".join(f"(void) {each}" for each in inputs + outputs)
+            parameters = [f"const real *{i}" for i in inputs] + [f"real *{o}" for o in outputs]
+            head = ", ".join(parameters + (["int wanted"] if self.options.lanes > 1 else []))
+            unused = ", ".join(f"(void) {x}" for x in inputs + outputs)
             self._write(name, head, f"  {unused};\n{body}")
         return self._names[key][0]
 
-    def _write(self, name: Name, given: str, body: str) -> None:
-        """Keep a function that calls none but those that are kept."""
+    def _write(self, name: CName, parameters: str, body: str) -> None:
+        """Store a function; all functions that it calls are stored already."""
 
-        def kind(found: re.Match[str]) -> str:
-            return f"<{self._written[found[2]].kind if found[2] else ''}>"
+        def group(match: re.Match[str]) -> str:
+            return f"<{self._functions[match[2]].group if match[2] else ''}>"
 
-        form = given + VARIES.sub(kind, body)
-        number = self._kinds.setdefault(form, len(self._kinds))
-        self._written[name] = _Written(name, given, body, number)
+        signature = parameters + VARYING_PART.sub(group, body)
+        number = self._groups.setdefault(signature, len(self._groups))
+        self._functions[name] = _CFunction(name, parameters, body, number)
 
-    def text(self, asked: Sequence[Name]) -> str:
-        """All of them, those that are alike as one with constants by name if they are called so."""
-        kinds: list[list[_Written]] = [[] for _ in self._kinds]
-        for function in self._written.values():
-            kinds[function.kind].append(function)
-        tables: dict[Name, list[str]] = {}
-        codes = [self._of_kind(number, kind, tables) for number, kind in enumerate(kinds)]
-        called = {*asked, *(name for code in codes for _, name in VARIES.findall(code))}
+    def text(self, entry_points: Sequence[CName]) -> str:
+        """Return the text of all functions; similar ones share code and have tables of constants."""
+        groups: list[list[_CFunction]] = [[] for _ in self._groups]
+        for function in self._functions.values():
+            groups[function.group].append(function)
+        tables: dict[CName, list[str]] = {}
+        codes = [self._group_code(index, group, tables) for index, group in enumerate(groups)]
+        called = {
+            *entry_points,
+            *(name for code in codes for _, name in VARYING_PART.findall(code)),
+        }
         texts = []
-        for number, (code, kind) in enumerate(zip(codes, kinds, strict=True)):
+        for index, (code, group) in enumerate(zip(codes, groups, strict=True)):
             texts.append(code)
-            for name in (each.name for each in kind if tables[each.name] and each.name in called):
+            for name in (f.name for f in group if tables[f.name] and f.name in called):
                 texts += [
                     f"static const scalar of_{name}[]={{{','.join(tables[name])}}};\n",
-                    f"#define {name}(...) alike{number}(of_{name}, __VA_ARGS__)\n",
+                    f"#define {name}(...) alike{index}(of_{name}, __VA_ARGS__)\n",
                 ]
         return "".join(texts)
 
-    def _of_kind(self, number: int, kind: list[_Written], tables: dict[Name, list[str]]) -> str:
-        """Code of functions that are alike; `tables` gets the constants in which each differs."""
-        first, *others = kind
-        own = [list[str]() for _ in kind]
+    def _group_code(
+        self, index: int, group: list[_CFunction], tables: dict[CName, list[str]]
+    ) -> str:
+        """Return the code of similar functions; `tables` receives the constants that differ."""
+        first, *duplicates = group
+        constants = [list[str]() for _ in group]
         places: list[int | None] = []
-        for varying in zip(*(VARIES.findall(each.body) for each in kind), strict=True):
+        for varying in zip(*(VARYING_PART.findall(f.body) for f in group), strict=True):
             parts = [tables[name] if name else [constant] for constant, name in varying]
             differs = any(part != parts[0] for part in parts)
-            places.append(len(own[0]) if differs else None)
-            for table, part in zip(own, parts, strict=True):
+            places.append(len(constants[0]) if differs else None)
+            for table, part in zip(constants, parts, strict=True):
                 table += part if differs else []
-        tables |= {each.name: table for each, table in zip(kind, own, strict=True)}
-        if not own[0]:
-            same = "".join(f"#define {other.name} {first.name}\n" for other in others)
-            return f"CODE void {first.name}({first.given}) {{\n{first.body}}}\n{same}"
-        at = iter(places)
+        tables |= {f.name: table for f, table in zip(group, constants, strict=True)}
+        if not constants[0]:
+            same = "".join(f"#define {duplicate.name} {first.name}\n" for duplicate in duplicates)
+            return f"CODE void {first.name}({first.parameters}) {{\n{first.body}}}\n{same}"
+        place_iterator = iter(places)
 
-        def placed(found: re.Match[str]) -> str:
-            place = next(at)
+        def substitute(match: re.Match[str]) -> str:
+            place = next(place_iterator)
             if place is None:
-                return found[0]
-            if not found[2]:
+                return match[0]
+            if not match[2]:
                 return f"R(constants[{place}])"
-            return f"alike{self._written[found[2]].kind}(constants+{place}, "
+            return f"alike{self._functions[match[2]].group}(constants+{place}, "
 
-        body = VARIES.sub(placed, first.body)
-        return f"CODE void alike{number}(const scalar *constants, {first.given}) {{\n{body}}}\n"
+        body = VARYING_PART.sub(substitute, first.body)
+        return f"CODE void alike{index}(const scalar *constants, {first.parameters}) {{\n{body}}}\n"
 
     def call(self, function: ca.Function, arguments: Sequence[str], wanted: str = "wanted") -> str:
-        """A call of a function."""
-        behind = [wanted] if self.form.lanes > 1 else []
-        return f"{self.name(function)}({', '.join([*arguments, *behind])});"
+        """Return the C statement that calls a function."""
+        lane_mask = [wanted] if self.options.lanes > 1 else []
+        return f"{self.name(function)}({', '.join([*arguments, *lane_mask])});"
 
     def _body(self, function: ca.Function) -> str:
         kind = function.class_name()
         if kind == "SXFunction":
-            return straight_lines(function, self.form, self.call)
+            return straight_lines(function, self.options, self.call)
         if kind == "Switch":
             return _switch_body(function, self)
         if kind == "Map":
@@ -171,105 +177,107 @@ class _Emitter:
         if kind == "MXFunction":
             try:
                 return _MXBody(function, self).text()
-            except _UnknownError:
+            except _UnsupportedOperationError:
                 pass
         try:
-            return straight_lines(function.expand(), self.form, self.call)
+            return straight_lines(function.expand(), self.options, self.call)
         except RuntimeError as error:
             raise NoCodeError(f"{function.name()!r}: {error}") from error
 
 
-# MX: calls, and what hands numbers from one to the other.
+# MX Functions: calls, and operations that move numbers between them.
 
 
-class _UnknownError(Exception):
-    """An operation that is not written as it is."""
+class _UnsupportedOperationError(Exception):
+    """The operation has no direct C code; the Function is expanded instead."""
 
 
 class _Array(NamedTuple):
-    """Numbers in C.
+    """An array in C.
 
     Attributes:
-        name: An expression of the first one's place.
-        size: How many.
-        fixed: Whether they are constants, of the type `scalar`.
+        name: C expression of the pointer to the first element.
+        size: Number of elements.
+        is_constant: True if the elements are constants of the type `scalar`.
     """
 
     name: str
     size: int
-    fixed: bool = False
+    is_constant: bool = False
 
     def at(self, index: int | str) -> str:
-        """One of them."""
-        return f"R({self.name}[{index}])" if self.fixed else f"{self.name}[{index}]"
+        """Return the C expression of an element."""
+        return f"R({self.name}[{index}])" if self.is_constant else f"{self.name}[{index}]"
 
 
 class _MXBody:
-    """Writes an MX function."""
+    """Writer of an MX Function."""
 
     def __init__(self, function: ca.Function, emitter: _Emitter) -> None:
         self._function = function
         self._emitter = emitter
         self._lines: list[str] = []
-        self._held: dict[int, _Array] = {}  # by place of the work vector
-        self._constants: dict[str, str] = {}  # names of arrays by their numbers
-        self._direct = self._outputs_of_calls()
+        self._work: dict[int, _Array] = {}  # by slot of the work vector
+        self._constants: dict[str, str] = {}  # array names by content
+        self._direct_outputs = self._calls_that_write_outputs()
 
-    def _outputs_of_calls(self) -> dict[tuple[int, int], int]:
-        """For results of calls that are an output and nothing else: which."""
+    def _calls_that_write_outputs(self) -> dict[tuple[int, int], int]:
+        """Return (instruction, result) -> output for results that are used as one output only."""
         function = self._function
-        made: dict[int, tuple[int, int]] = {}
+        sources: dict[int, tuple[int, int]] = {}
         uses: dict[tuple[int, int], list[int | None]] = {}
-        parts = [0] * function.n_out()
+        stores = [0] * function.n_out()
         for k in range(function.n_instructions()):
-            code, places = function.instruction_id(k), function.instruction_output(k)
+            code, slots = function.instruction_id(k), function.instruction_output(k)
             if code != ca.OP_INPUT:
-                output = places[0] if code == ca.OP_OUTPUT else None
-                for place in function.instruction_input(k):
-                    if place in made:
-                        uses.setdefault(made[place], []).append(output)
+                output = slots[0] if code == ca.OP_OUTPUT else None
+                for slot in function.instruction_input(k):
+                    if slot in sources:
+                        uses.setdefault(sources[slot], []).append(output)
             if code == ca.OP_OUTPUT:
-                parts[places[0]] += 1
+                stores[slots[0]] += 1
                 continue
-            for i, place in enumerate(places):
-                made.pop(place, None)
+            for i, slot in enumerate(slots):
+                sources.pop(slot, None)
                 if code == ca.OP_CALL:
-                    made[place] = k, i
+                    sources[slot] = k, i
         return {
-            key: found[0]
-            for key, found in uses.items()
-            if len(found) == 1 and found[0] is not None and parts[found[0]] == 1
+            key: outputs[0]
+            for key, outputs in uses.items()
+            if len(outputs) == 1 and outputs[0] is not None and stores[outputs[0]] == 1
         }
 
     def text(self) -> str:
-        """The body.
+        """Return the body.
 
         Raises:
-            _UnknownError: An operation is not known.
+            _UnsupportedOperationError: An operation is not known.
         """
         function = self._function
-        inputs, outputs = [0] * function.n_in(), [0] * function.n_out()  # numbers gone through
+        inputs, outputs = [0] * function.n_in(), [0] * function.n_out()  # elements consumed so far
         for k in range(function.n_instructions()):
             code = function.instruction_id(k)
-            given, places = function.instruction_input(k), function.instruction_output(k)
+            arguments, slots = function.instruction_input(k), function.instruction_output(k)
             if code == ca.OP_OUTPUT:
-                found, to = self._held[given[0]], f"o{places[0]}"
-                if found.name != to:
-                    copied = self._copy(found, f"{to}+{outputs[places[0]]}")
-                    self._lines.append(f"if ({to}) {copied}")
-                outputs[places[0]] += found.size
+                source, destination = self._work[arguments[0]], f"o{slots[0]}"
+                if source.name != destination:
+                    copied = self._copy(source, f"{destination}+{outputs[slots[0]]}")
+                    self._lines.append(f"if ({destination}) {copied}")
+                outputs[slots[0]] += source.size
                 continue
             value = function.instruction_MX(k)
             if code == ca.OP_INPUT:
-                self._held[places[0]] = _Array(f"(i{given[0]}+{inputs[given[0]]})", value.nnz())
-                inputs[given[0]] += value.nnz()
+                self._work[slots[0]] = _Array(
+                    f"(i{arguments[0]}+{inputs[arguments[0]]})", value.nnz()
+                )
+                inputs[arguments[0]] += value.nnz()
             elif code == ca.OP_CALL:
                 self._call(k, value.which_function())
-            elif len(places) == 1:
-                found = [self._held[place] for place in given]
-                self._held[places[0]] = self._operation(f"w{k}", code, value, found)
+            elif len(slots) == 1:
+                operands = [self._work[slot] for slot in arguments]
+                self._work[slots[0]] = self._operation(f"w{k}", code, value, operands)
             else:
-                raise _UnknownError
+                raise _UnsupportedOperationError
         tables = [
             f"static const scalar {name}[]={{{text}}};" for text, name in self._constants.items()
         ]
@@ -280,172 +288,180 @@ class _MXBody:
         return _Array(name, size)
 
     def _constant(self, name: str, numbers: Sequence[float]) -> _Array:
-        texts = ",".join(self._emitter.form.digits(number) for number in numbers or [0.0])
-        return _Array(self._constants.setdefault(texts, name), len(numbers), fixed=True)
+        texts = ",".join(self._emitter.options.digits(number) for number in numbers or [0.0])
+        return _Array(self._constants.setdefault(texts, name), len(numbers), is_constant=True)
 
     @staticmethod
-    def _copy(source: _Array, to: str) -> str:
-        return f"for (int k = 0; k < {source.size}; ++k) ({to})[k]={source.at('k')};"
+    def _copy(source: _Array, destination: str) -> str:
+        return f"for (int k = 0; k < {source.size}; ++k) ({destination})[k]={source.at('k')};"
 
     def _call(self, k: int, called: ca.Function) -> None:
         function, arguments = self._function, []
-        for i, place in enumerate(function.instruction_input(k)):
+        for i, slot in enumerate(function.instruction_input(k)):
             name = f"z{k}_{i}"
-            given = self._held.get(place) or self._constant(name, [0.0] * called.nnz_in(i))
-            if given.fixed and self._emitter.form.lanes > 1:
-                own = self._array(f"y{k}_{i}", given.size)
-                self._lines.append(self._copy(given, own.name))
-                given = own
-            arguments.append(given.name)
-        for i, place in enumerate(function.instruction_output(k)):
-            if (k, i) in self._direct:
-                arguments.append(f"o{self._direct[k, i]}")
-            elif place < 0 and i:
+            argument = self._work.get(slot) or self._constant(name, [0.0] * called.nnz_in(i))
+            if argument.is_constant and self._emitter.options.lanes > 1:
+                copy = self._array(f"y{k}_{i}", argument.size)
+                self._lines.append(self._copy(argument, copy.name))
+                argument = copy
+            arguments.append(argument.name)
+        for i, slot in enumerate(function.instruction_output(k)):
+            if (k, i) in self._direct_outputs:
+                arguments.append(f"o{self._direct_outputs[k, i]}")
+            elif slot < 0 and i:
                 arguments.append("NULL")
                 continue
             else:
                 arguments.append(self._array(f"w{k}_{i}", called.nnz_out(i)).name)
-            self._held[place] = _Array(arguments[-1], called.nnz_out(i))
+            self._work[slot] = _Array(arguments[-1], called.nnz_out(i))
         self._lines.append(self._emitter.call(called, arguments))
 
-    def _operation(self, name: str, code: int, value: ca.MX, given: Sequence[_Array]) -> _Array:
+    def _operation(self, name: str, code: int, value: ca.MX, operands: Sequence[_Array]) -> _Array:
         size = value.nnz()
         if code == ca.OP_ASSERTION:
             raise NoCodeError(f"an assertion of {self._function.name()!r}")
         if code == ca.OP_CONST:
             return self._constant(name, value.to_DM().nonzeros())
-        if code == ca.OP_RESHAPE or (code == ca.OP_SPARSITY_CAST and given[0].size == size):
-            return given[0]
+        if code == ca.OP_RESHAPE or (code == ca.OP_SPARSITY_CAST and operands[0].size == size):
+            return operands[0]
         if code == ca.OP_GETNONZEROS:
-            return self._chosen(name, given[0], _whole(value.mapping()))
+            return self._gather(name, operands[0], _integers(value.mapping()))
         if code == ca.OP_TRANSPOSE and value.is_dense():
             order = np.arange(size).reshape(value.shape[0], -1).ravel(order="F")
-            return self._chosen(name, given[0], order.tolist())
+            return self._gather(name, operands[0], order.tolist())
         if code == ca.OP_PROJECT:
-            before, after = value.dep().sparsity(), value.sparsity()
-            known = {place: i for i, place in enumerate(zip(*before.get_triplet(), strict=True))}
-            order = [known.get(place) for place in zip(*after.get_triplet(), strict=True)]
-            return self._chosen(name, given[0], order)
+            source_sparsity, sparsity = value.dep().sparsity(), value.sparsity()
+            index_of = {
+                position: i
+                for i, position in enumerate(zip(*source_sparsity.get_triplet(), strict=True))
+            }
+            order = [
+                index_of.get(position) for position in zip(*sparsity.get_triplet(), strict=True)
+            ]
+            return self._gather(name, operands[0], order)
         if code == ca.OP_HORZREPMAT:
-            made, source = self._array(name, size), given[0].at(f"k%{given[0].size}")
+            array, source = self._array(name, size), operands[0].at(f"k%{operands[0].size}")
             self._lines.append(f"for (int k = 0; k < {size}; ++k) {name}[k]={source};")
-            return made
+            return array
         if code == ca.OP_SETNONZEROS:
-            made = self._array(name, size)
-            self._lines.append(self._copy(given[0], name))
-            order = enumerate(_whole(value.mapping()))
-            self._lines += [f"{name}[{i}]={given[1].at(k)};" for k, i in order]
-            return made
+            array = self._array(name, size)
+            self._lines.append(self._copy(operands[0], name))
+            order = enumerate(_integers(value.mapping()))
+            self._lines += [f"{name}[{i}]={operands[1].at(k)};" for k, i in order]
+            return array
         if code in (ca.OP_VERTCAT, ca.OP_HORZCAT):
-            made, at = self._array(name, size), 0
-            for each in given:
-                self._lines.append(self._copy(each, f"{name}+{at}"))
-                at += each.size
-            return made
+            array, offset = self._array(name, size), 0
+            for element in operands:
+                self._lines.append(self._copy(element, f"{name}+{offset}"))
+                offset += element.size
+            return array
         if code in REAL or code in MASK:
-            return self._elementwise(name, code, given, size)
-        return self._of_matrices(name, code, value, given)
+            return self._elementwise(name, code, operands, size)
+        return self._matrix_operation(name, code, value, operands)
 
-    def _chosen(self, name: str, source: _Array, order: Sequence[int | None]) -> _Array:
-        """Numbers of an array, None for zero; a view of those that follow each other."""
+    def _gather(self, name: str, source: _Array, order: Sequence[int | None]) -> _Array:
+        """Gather elements of an array, None for zero; consecutive elements become a view."""
         first = order[0] if order else 0
         if first is not None and list(order) == list(range(first, first + len(order))):
-            return _Array(f"({source.name}+{first})", len(order), source.fixed)
+            return _Array(f"({source.name}+{first})", len(order), source.is_constant)
         self._lines += [f"real {name}[{max(len(order), 1)}];"] + [
             f"{name}[{k}]={'R(0.0)' if i is None else source.at(i)};" for k, i in enumerate(order)
         ]
         return _Array(name, len(order))
 
-    def _elementwise(self, name: str, code: int, given: Sequence[_Array], size: int) -> _Array:
-        if any(each.size not in (1, size) for each in given):
-            raise _UnknownError
+    def _elementwise(self, name: str, code: int, operands: Sequence[_Array], size: int) -> _Array:
+        if any(element.size not in (1, size) for element in operands):
+            raise _UnsupportedOperationError
         texts = (
-            as_mask(each.at("k" if each.size > 1 else 0), False)
-            if wanted
-            else each.at("k" if each.size > 1 else 0)
-            for each, wanted in zip(given, takes_masks(code), strict=False)
+            as_mask(element.at("k" if element.size > 1 else 0), False)
+            if takes_mask
+            else element.at("k" if element.size > 1 else 0)
+            for element, takes_mask in zip(operands, takes_masks(code), strict=False)
         )
         value = (MASK[code] if code in MASK else REAL[code]) % tuple(texts)
-        made = self._array(name, size)
+        array = self._array(name, size)
         value = f"TRUTH({value})" if code in MASK else value
         self._lines.append(f"for (int k = 0; k < {size}; ++k) {name}[k]={value};")
-        return made
+        return array
 
-    def _of_matrices(self, name: str, code: int, value: ca.MX, given: Sequence[_Array]) -> _Array:
-        """What is made of whole matrices, in loops."""
+    def _matrix_operation(
+        self, name: str, code: int, value: ca.MX, operands: Sequence[_Array]
+    ) -> _Array:
+        """Write an operation on whole matrices as loops."""
         matrices = [value.dep(i) for i in range(value.n_dep())]
         if not all(matrix.is_dense() for matrix in (value, *matrices)):
-            raise _UnknownError
-        first, x = given[0], given[0].at("k")
-        made, sum_ = self._array(name, value.nnz()), f"{name}[0]"
+            raise _UnsupportedOperationError
+        first, x = operands[0], operands[0].at("k")
+        array, accumulator = self._array(name, value.nnz()), f"{name}[0]"
         if code == ca.OP_MTIMES:
             rows, inner, columns = value.size1(), matrices[1].size2(), value.size2()
-            left, right = given[1].at(f"i+{rows}*k"), given[2].at(f"k+{inner}*j")
+            left, right = operands[1].at(f"i+{rows}*k"), operands[2].at(f"k+{inner}*j")
             self._lines += [
                 self._copy(first, name),
                 f"for (int j = 0; j < {columns}; ++j) for (int k = 0; k < {inner}; ++k) "
                 f"for (int i = 0; i < {rows}; ++i) {name}[i+{rows}*j]+={left}*{right};",
             ]
-            return made
-        if code == ca.OP_FIND and self._emitter.form.lanes == 1:
+            return array
+        if code == ca.OP_FIND and self._emitter.options.lanes == 1:
             zeros = f"while (k < {first.size} && EQUAL({x},R(0.0))) ++k;"
-            self._lines.append(f"{{ int k = 0; {zeros} {sum_}=R(k); }}")
-            return made
-        each = {
-            ca.OP_DOT: f"{sum_}+{x}*{given[-1].at('k')}",
-            ca.OP_NORM2: f"{sum_}+real_sq({x})",
-            ca.OP_NORMF: f"{sum_}+real_sq({x})",
-            ca.OP_NORMINF: f"real_fmax({sum_},real_fabs({x}))",
-            ca.OP_MMIN: f"real_fmin({sum_},{x})",
-            ca.OP_MMAX: f"real_fmax({sum_},{x})",
-            # How many zeros there are before the first number that is none.
-            ca.OP_FIND: f"{sum_}+IF(EQUAL({sum_},R(k))&EQUAL({x},R(0.0)),R(1.0))",
+            self._lines.append(f"{{ int k = 0; {zeros} {accumulator}=R(k); }}")
+            return array
+        update = {
+            ca.OP_DOT: f"{accumulator}+{x}*{operands[-1].at('k')}",
+            ca.OP_NORM2: f"{accumulator}+real_sq({x})",
+            ca.OP_NORMF: f"{accumulator}+real_sq({x})",
+            ca.OP_NORMINF: f"real_fmax({accumulator},real_fabs({x}))",
+            ca.OP_MMIN: f"real_fmin({accumulator},{x})",
+            ca.OP_MMAX: f"real_fmax({accumulator},{x})",
+            # Number of zeros before the first nonzero.
+            ca.OP_FIND: f"{accumulator}+IF(EQUAL({accumulator},R(k))&EQUAL({x},R(0.0)),R(1.0))",
         }.get(code)
-        if each is None:
-            raise _UnknownError
-        begin = first.at(0) if code in (ca.OP_MMIN, ca.OP_MMAX) else "R(0.0)"
-        self._lines.append(f"{sum_}={begin};")
-        self._lines.append(f"for (int k = 0; k < {first.size}; ++k) {sum_}={each};")
+        if update is None:
+            raise _UnsupportedOperationError
+        initial = first.at(0) if code in (ca.OP_MMIN, ca.OP_MMAX) else "R(0.0)"
+        self._lines.append(f"{accumulator}={initial};")
+        self._lines.append(f"for (int k = 0; k < {first.size}; ++k) {accumulator}={update};")
         if code in (ca.OP_NORM2, ca.OP_NORMF):
-            self._lines.append(f"{sum_}=real_sqrt({sum_});")
-        return made
+            self._lines.append(f"{accumulator}=real_sqrt({accumulator});")
+        return array
 
 
-def _whole(numbers: Any) -> list[int]:
+def _integers(numbers: Any) -> list[int]:
     return [int(number) for number in ca.DM(numbers).nonzeros()]
 
 
-# Map: the same for each column; Switch: one of several.
+# Map applies a function to each column; Switch selects one of several functions.
 
 
 def _map_body(function: ca.Function, emitter: _Emitter) -> str:
-    about = function.info()
-    one, count = about["f"], about["n"]
-    inputs = [f"i{i}+k*{one.nnz_in(i)}" for i in range(one.n_in())]
-    outputs = [f"o{i} ? o{i}+k*{one.nnz_out(i)} : NULL" for i in range(one.n_out())]
-    call = emitter.call(one, [*inputs, *outputs])
+    info = function.info()
+    mapped, count = info["f"], info["n"]
+    inputs = [f"i{i}+k*{mapped.nnz_in(i)}" for i in range(mapped.n_in())]
+    outputs = [f"o{i} ? o{i}+k*{mapped.nnz_out(i)} : NULL" for i in range(mapped.n_out())]
+    call = emitter.call(mapped, [*inputs, *outputs])
     return f"  for (int k = 0; k < {count}; ++k) {call}\n"
 
 
 def _switch_body(function: ca.Function, emitter: _Emitter) -> str:
-    about = function.info()
-    if about["project_in"] or about["project_out"]:
+    info = function.info()
+    if info["project_in"] or info["project_out"]:
         raise NoCodeError(f"branches of different sparsities: {function.name()!r}")
-    branches = [*about["f"], about["f_def"]]
+    branches = [*info["f"], info["f_def"]]
     inputs = [f"i{i}" for i in range(1, function.n_in())]
     outputs = [f"o{i}" for i in range(function.n_out())]
     last = len(branches) - 1
 
-    def cases(places: Sequence[str], wanted: str) -> Iterator[str]:
+    def cases(destinations: Sequence[str], lane_mask: str) -> Iterator[str]:
         for number, branch in enumerate(branches):
             label = f"case {number}" if number < last else "default"
-            yield f"    {label}: {emitter.call(branch, [*inputs, *places], wanted)} break;\n"
+            call = emitter.call(branch, [*inputs, *destinations], lane_mask)
+            yield f"    {label}: {call} break;\n"
 
-    if emitter.form.lanes == 1:
+    if emitter.options.lanes == 1:
         lines = [f"  switch (branch_of(i0[0], {last})) {{\n", *cases(outputs, ""), "  }\n"]
         return "".join(lines)
     sizes = [max(function.nnz_out(i), 1) for i in range(len(outputs))]
-    places = [f"p{i}" for i in range(len(outputs))]
+    destinations = [f"p{i}" for i in range(len(outputs))]
     return "".join(
         (
             *(f"  real own{i}[{size}];\n" for i, size in enumerate(sizes)),
@@ -459,7 +475,7 @@ def _switch_body(function: ca.Function, emitter: _Emitter) -> str:
             ),
             "    if (!mine) continue;\n",
             "    switch (b) {\n",
-            *cases(places, "mine"),
+            *cases(destinations, "mine"),
             "    }\n",
             "    if (mine == wanted) return;\n",
             *(f"    lanes_keep(mine, own{i}, {size}, o{i});\n" for i, size in enumerate(sizes)),

@@ -21,7 +21,7 @@ from casadi_ik.compile.codegen import (
     row_major,
     standing_alone,
 )
-from casadi_ik.compile.emitter import Form
+from casadi_ik.compile.emitter import CodeOptions
 from casadi_ik.compile.graphs import FunctionGraph
 from casadi_ik.compile.layout import Layout
 from casadi_ik.compile.lookup import TILE
@@ -94,7 +94,7 @@ class FollowSources:
         marks = {
             "PREFIX": self.prefix,
             "GUARD": self.prefix.upper(),
-            "CYCLE": standing_alone(row_major(cycle.graph.function), Form()),
+            "CYCLE": standing_alone(row_major(cycle.graph.function), CodeOptions()),
             "FOLLOW_CONSTANTS": self._constants(cycle),
             "FOLLOW_STATE": str(cycle.state.size),
             "FOLLOW_ASKED": str(cycle.parameters.size),
@@ -357,9 +357,11 @@ class SolverSources:
         return Part(name, f"{driver}_job", body, extra)
 
     @property
-    def form(self) -> Form:
-        """What the code of graphs is for."""
-        return Form() if self.single is None else Form(single=True, replaced=FOLLOWING)
+    def form(self) -> CodeOptions:
+        """Options of the code of graphs."""
+        if self.single is None:
+            return CodeOptions()
+        return CodeOptions(single=True, replaced=FOLLOWING)
 
     @property
     def substitutes(self) -> dict[str, str]:
@@ -456,7 +458,7 @@ class SolverSources:
     def judge(self) -> dict[str, str]:
         """Files of the kinematics in double precision that answers are judged by."""
         marks = {
-            "KINEMATICS": standing_alone(self.plan.judge.function, Form()),
+            "KINEMATICS": standing_alone(self.plan.judge.function, CodeOptions()),
             "POSITION_TOLERANCE": repr(self.tolerance.position),
             "ANGLE_TOLERANCE": repr(self.tolerance.angle),
             "LIMIT_SLACK": repr(LIMIT_SLACK),

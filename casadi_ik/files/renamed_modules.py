@@ -7,6 +7,7 @@ import importlib.util
 import sys
 import warnings
 from collections.abc import Sequence
+from importlib.abc import Loader
 from importlib.machinery import ModuleSpec
 from types import CodeType, ModuleType
 
@@ -62,7 +63,7 @@ class RenamedModuleFinder:
         return ModuleSpec(name, _RenamedModuleLoader(new))
 
 
-class _RenamedModuleLoader:
+class _RenamedModuleLoader(Loader):
     """Loader that returns the module of the new path."""
 
     def __init__(self, new: str) -> None:
