@@ -81,7 +81,7 @@ class Text:
 def texts_of(robots: Sequence[str], everything: bool) -> list[Text]:
     """The C that robots need, made on the way through all their uses."""
     found: dict[str, str] = {}
-    libraries.on_text.append(found.__setitem__)
+    libraries.text_listeners.append(found.__setitem__)
     found_wide = machine_lanes()
     with tempfile.TemporaryDirectory() as cache:
         changed = {"CASADI_IK_CACHE": cache, "CASADI_IK_CFLAGS": "-O0", "CASADI_IK_COMPILE": "wait"}

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from casadi_ik.collision.distances import Table, nearest
 from casadi_ik.collision.model import placed, size_of
 from casadi_ik.collision.solids import C_NAMES
-from casadi_ik.compile.cancellation import SLICE, check, drive
+from casadi_ik.compile.cancellation import SLICE, check, run_cancellable
 from casadi_ik.compile.codegen import c_struct, define, driver_text
 from casadi_ik.compile.function_kernel import FunctionKernel, doubles, machine_lanes, memory
 from casadi_ik.compile.graphs import FunctionGraph, recipe
@@ -291,7 +291,7 @@ class ClearanceKernel:
         job, _kept = self.job(given, poses, table, most, enough)
         job.least, job.closest = memory(least), memory(closest)
         job.every = None if every is None else memory(every)
-        drive(self.name, self.entry, job)
+        run_cancellable(self.name, self.entry, job)
         return least, closest
 
     def _by_numpy(

@@ -1,11 +1,10 @@
-"""The folder for compiled libraries, and whose files are loaded from it.
+"""The cache folder of compiled libraries, and the check that it can be trusted.
 
-A library is loaded into the process, so whoever can write one here can run code as the user. A
-folder counts as trusted if it and every folder above it belong to the user or to root and nobody
-else can write into them; of a folder above, a sticky one (/tmp) is enough, since what it holds
-can be moved by its owner only. What is checked is the real path, links followed, and only that
-path is used afterwards. Systems without owners of files (Windows) keep caches in the user's
-profile, and nothing is checked there.
+A library is loaded into the process, so whoever can write one can run code as the user. A folder is
+trusted if it and every parent belong to the user or to root and nobody else can write into them. A
+parent may be sticky (/tmp), since only owners can move what it contains. The check resolves
+symbolic links, and only the resolved path is used afterwards. Systems without file owners (Windows)
+keep caches in the user's profile, where nothing is checked.
 """
 
 from __future__ import annotations
@@ -24,23 +23,25 @@ from pathlib import Path
 
 
 class CacheWarning(RuntimeWarning):
-    """The folder for compiled kernels cannot be used: they are kept in a temporary one."""
+    """The cache folder cannot be used; compiled kernels are kept in a temporary folder."""
 
 
 _warned: set[str] = set()
 
 
 def cache_directory() -> Path:
-    """Where libraries are kept, whether it can be used or not.
+    """Return the cache folder, whether it can be used or not.
 
-    `CASADI_IK_CACHE`, else `casadi_ik` in `XDG_CACHE_HOME`, else in the platform's directory for
-    caches (`~/.cache`, `~/Library/Caches`, `%LOCALAPPDATA%`); a temporary one if there is no home.
+    It is `CASADI_IK_CACHE`, otherwise `casadi_ik` in `XDG_CACHE_HOME`, otherwise in the cache
+    folder of the platform (`~/.cache`, `~/Library/Caches`, `%LOCALAPPDATA%`), otherwise a temporary
+    folder.
 
     Raises:
-        OSError: A relative path, and the working folder is gone; or there is no temporary folder.
+        OSError: The path is relative and the working directory is gone, or there is no temporary
+            folder.
     """
-    if own := os.environ.get("CASADI_IK_CACHE"):
-        return Path(own).absolute()
+    if configured := os.environ.get("CASADI_IK_CACHE"):
+        return Path(configured).absolute()
     if xdg := os.environ.get("XDG_CACHE_HOME"):
         return Path(xdg).absolute() / "casadi_ik"
     if sys.platform == "win32" and (local := os.environ.get("LOCALAPPDATA")):
@@ -48,122 +49,122 @@ def cache_directory() -> Path:
     try:
         home = Path.home()
     except RuntimeError:
-        return private_directory()
+        return user_temp_dir()
     return home / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "casadi_ik"
 
 
 def trusted_cache() -> Path | None:
-    """The cache as a real path, made if it is missing; None, after a warning, if it is no use.
+    """Create the cache and return its resolved path; warn and return None if it cannot be used.
 
-    A folder that can be read but not written is of use.
+    A folder that can be read but not written can be used.
     """
-    place = "the folder for compiled kernels"
+    where = "the folder for compiled kernels"
     try:
         directory = cache_directory()
-        place = str(directory)
-        _make(directory)
+        where = str(directory)
+        _make_private(directory)
         real = Path(os.path.realpath(directory, strict=True))
-        problem = distrust(real)
+        problem = untrusted_reason(real)
         if not problem:
-            # Looked into, not listed: what is kept may be tens of thousands of files.
+            # One entry is enough: the cache may hold tens of thousands of files.
             with os.scandir(real) as entries:
                 next(entries, None)
             return real
     except (OSError, ValueError) as error:
-        problem = f"cannot be used: {reason(error)}"
-    warn_once(place, problem)
+        problem = f"cannot be used: {os_reason(error)}"
+    warn_once(where, problem)
     return None
 
 
-def private_directory() -> Path:
-    """The user's own folder among temporary files, for what the cache cannot keep.
+def user_temp_dir() -> Path:
+    """Create and return the user's private folder for temporary files.
 
     Raises:
-        OSError: It cannot be made, or others could write into it.
+        OSError: The folder cannot be created, or other users could write into it.
     """
     user = f"-{os.getuid()}" if _has_owners() else ""
     directory = Path(tempfile.gettempdir(), f"casadi_ik{user}")
-    _make(directory)
+    _make_private(directory)
     real = Path(os.path.realpath(directory, strict=True))
-    if problem := distrust(real):
+    if problem := untrusted_reason(real):
         raise PermissionError(errno.EPERM, problem, str(real))
     return real
 
 
-def warn_once(place: str, problem: str) -> None:
-    """Say once per process that what is compiled cannot be kept in a place."""
-    if place in _warned:
+def warn_once(where: str, problem: str) -> None:
+    """Warn once per process that a folder cannot keep compiled kernels."""
+    if where in _warned:
         return
-    _warned.add(place)
+    _warned.add(where)
     warnings.warn(
-        f"{place[:200]}: {problem}; kernels are kept among temporary files "
+        f"{where[:200]}: {problem}; kernels are kept among temporary files "
         "(CASADI_IK_CACHE names another folder)",
         CacheWarning,
         stacklevel=2,
     )
 
 
-def reason(error: Exception) -> str:
-    """Why the system refused."""
+def os_reason(error: Exception) -> str:
+    """Return the reason of an operating system error."""
     return (error.strerror if isinstance(error, OSError) else None) or str(error)
 
 
-def distrust(real: Path) -> str:
-    """Why others could have written into a folder, "" if they could not.
+def untrusted_reason(real: Path) -> str:
+    """Return why a folder cannot be trusted, "" if it can.
 
     Args:
-        real: An absolute path without links.
+        real: An absolute path without symbolic links.
 
     Raises:
-        OSError: It cannot be looked at.
+        OSError: The folder cannot be read.
     """
     if not _has_owners():
         return ""
     for folder in (real, *real.parents):
-        found = folder.lstat()
+        info = folder.lstat()
         where = "" if folder == real else f"{folder} "
-        if not stat.S_ISDIR(found.st_mode):
-            return f"{where}is no folder"
-        if problem := _others(found, sticky=folder != real):
+        if not stat.S_ISDIR(info.st_mode):
+            return f"{where}is not a folder"
+        if problem := _other_writers(info, sticky=folder != real):
             return f"{where}{problem}"
     return ""
 
 
-def own_file(path: Path) -> bool:
-    """Whether this is a plain file of the user (or root) that nobody else can write."""
+def is_private_file(path: Path) -> bool:
+    """Return True for a regular file of the user or root that nobody else can write."""
     try:
-        found = path.lstat()
+        info = path.lstat()
     except (OSError, ValueError):
         return False
-    return stat.S_ISREG(found.st_mode) and not (_has_owners() and _others(found, sticky=False))
+    return stat.S_ISREG(info.st_mode) and not (_has_owners() and _other_writers(info, sticky=False))
 
 
 def _has_owners() -> bool:
     return hasattr(os, "getuid")
 
 
-def _others(found: os.stat_result, sticky: bool) -> str:
-    """Who else could change it, in words.
+def _other_writers(info: os.stat_result, sticky: bool) -> str:
+    """Return who else could change a file or folder, "" for nobody.
 
     Args:
-        found: Of a folder or file.
-        sticky: Whether it is enough that others cannot move what it holds.
+        info: Status of the file or folder.
+        sticky: True if a sticky folder is acceptable.
     """
-    if found.st_uid not in (os.getuid(), 0) and not (sticky and _hidden_owner(found.st_uid)):
-        return f"belongs to another user (uid {found.st_uid})"
-    kept = sticky and found.st_mode & stat.S_ISVTX
-    if found.st_mode & stat.S_IWOTH and not kept:
+    if info.st_uid not in (os.getuid(), 0) and not (sticky and _is_overflow_owner(info.st_uid)):
+        return f"belongs to another user (uid {info.st_uid})"
+    is_sticky = sticky and info.st_mode & stat.S_ISVTX
+    if info.st_mode & stat.S_IWOTH and not is_sticky:
         return "can be written by every user"
-    if found.st_mode & stat.S_IWGRP and not kept and not (sticky and _own_group(found)):
-        return f"can be written by a group of users (gid {found.st_gid})"
+    if info.st_mode & stat.S_IWGRP and not is_sticky and not (sticky and _is_private_group(info)):
+        return f"can be written by a group of users (gid {info.st_gid})"
     return ""
 
 
 @cache
-def _hidden_owner(owner: int) -> bool:
-    """Whether a container shows this number for all owners it has none for, root among them.
+def _is_overflow_owner(owner: int) -> bool:
+    """Return True for the user id that a container shows for unmapped owners, root among them.
 
-    Above the cache such folders (/, /home) are taken for the system's own.
+    Parent folders of such owners (/, /home) are taken for the system's own.
     """
     try:
         nobody = int(Path("/proc/sys/kernel/overflowuid").read_text(encoding="ascii"))
@@ -173,20 +174,20 @@ def _hidden_owner(owner: int) -> bool:
     return owner == nobody and mapped != ["0", "0", str(2**32 - 1)]
 
 
-def _own_group(found: os.stat_result) -> bool:
-    """Whether the group is the owner's alone, as many systems make one for every user."""
+def _is_private_group(info: os.stat_result) -> bool:
+    """Return True if the owner is the only member of the group (user private groups)."""
     import grp
     import pwd
 
     try:
-        group, owner = grp.getgrgid(found.st_gid), pwd.getpwuid(found.st_uid)
+        group, owner = grp.getgrgid(info.st_gid), pwd.getpwuid(info.st_uid)
     except KeyError:
         return False
-    return owner.pw_gid == found.st_gid and set(group.gr_mem) <= {owner.pw_name}
+    return owner.pw_gid == info.st_gid and set(group.gr_mem) <= {owner.pw_name}
 
 
-def _make(directory: Path) -> None:
-    """The folder and those above it, for the user alone."""
+def _make_private(directory: Path) -> None:
+    """Create a folder and its parents with permissions for the user alone."""
     missing = []
     while not directory.is_dir():
         if directory.is_symlink() or directory.exists():
@@ -198,35 +199,35 @@ def _make(directory: Path) -> None:
 
 
 @contextlib.contextmanager
-def workshop(directory: Path) -> Iterator[Path]:
-    """A folder inside a folder for the files of one compilation, gone afterwards.
+def temporary_build_dir(directory: Path) -> Iterator[Path]:
+    """Create a folder for the files of one compilation, and remove it afterwards.
 
-    Nothing but this block removes it: a fork that ends in the meantime must not.
+    Only this block removes it, so that a forked child that exits meanwhile does not.
 
     Raises:
-        OSError: It cannot be made.
+        OSError: The folder cannot be created.
     """
-    place = Path(tempfile.mkdtemp(prefix=f"build-{os.getpid()}-", dir=directory))
+    folder = Path(tempfile.mkdtemp(prefix=f"build-{os.getpid()}-", dir=directory))
     try:
-        yield place
+        yield folder
     finally:
-        shutil.rmtree(place, ignore_errors=True)
+        shutil.rmtree(folder, ignore_errors=True)
 
 
-def places() -> list[Path]:
-    """Folders to look into: the cache, and a temporary one where that cannot be written."""
+def search_path() -> list[Path]:
+    """Return the folders to search: the cache, and a temporary folder if it is not writable."""
     directory = trusted_cache()
-    found = [] if directory is None else [directory]
+    info = [] if directory is None else [directory]
     writable = directory is not None and os.access(directory, os.W_OK)
-    return found if writable else [*found, *temporary(found)]
+    return info if writable else [*info, *temporary_folder(info)]
 
 
-def temporary(others: list[Path]) -> Iterator[Path]:
-    """The temporary folder, if it can be used and is not among others."""
+def temporary_folder(excluded: list[Path]) -> Iterator[Path]:
+    """Yield the temporary folder if it can be used and is not excluded."""
     try:
-        directory = private_directory()
+        directory = user_temp_dir()
     except OSError as error:
-        warn_once("a temporary folder", f"cannot be used: {reason(error)}")
+        warn_once("a temporary folder", f"cannot be used: {os_reason(error)}")
         return
-    if directory not in others:
+    if directory not in excluded:
         yield directory

@@ -1,7 +1,7 @@
-"""How work is told to stop, and what a fork must not take along.
+"""Cancellation of work in threads and compiled code, and locks that survive a fork.
 
-Ctrl-C and SIGTERM reach the main thread, which tells the others; compiled code returns to Python a
-few times a second to be told.
+Ctrl-C and SIGTERM reach the main thread, which cancels the others; compiled code returns to Python
+a few times a second to check.
 """
 
 from __future__ import annotations
@@ -21,38 +21,38 @@ from typing import Any
 
 
 class CancelledError(BaseException):
-    """The work of this thread is no longer wanted; not for those who handle exceptions."""
+    """The work of this thread is cancelled; a BaseException, so that handlers do not catch it."""
 
 
-class _Local(threading.local):
-    wanted: threading.Event | None = None
+class _ThreadState(threading.local):
+    event: threading.Event | None = None
     cached_only: bool = False
     virtual: bool = False
 
 
-_local = _Local()
+_local = _ThreadState()
 
 
 @contextmanager
 def cancellable(cancelled: threading.Event) -> Iterator[None]:
-    """Have the work of this thread stop soon after the event is set."""
-    _local.wanted = cancelled
+    """Make the work of this thread stop soon after the event is set."""
+    _local.event = cancelled
     try:
         yield
     finally:
-        _local.wanted = None
+        _local.event = None
 
 
 def is_cancelled() -> bool:
-    """Whether this thread has been told to stop."""
-    return _local.wanted is not None and _local.wanted.is_set()
+    """Return True if the work of this thread is cancelled."""
+    return _local.event is not None and _local.event.is_set()
 
 
 def stop_if_cancelled() -> None:
-    """To be called by whatever runs for long, several times a second.
+    """Raise if the work of this thread is cancelled; long work calls it several times a second.
 
     Raises:
-        CancelledError: This thread has been told to stop.
+        CancelledError: The work of this thread is cancelled.
     """
     if is_cancelled():
         raise CancelledError
@@ -60,68 +60,67 @@ def stop_if_cancelled() -> None:
 
 @contextmanager
 def cached_only() -> Iterator[None]:
-    """Have this thread take compiled libraries that are there, and build none."""
-    before, _local.cached_only = _local.cached_only, True
+    """Make this thread use existing compiled libraries and build none."""
+    previous, _local.cached_only = _local.cached_only, True
     try:
         yield
     finally:
-        _local.cached_only = before
+        _local.cached_only = previous
 
 
 def is_cached_only() -> bool:
-    """Whether this thread may build no library."""
+    """Return True if this thread may not build libraries."""
     return _local.cached_only
 
 
 @contextmanager
 def virtual_machine() -> Iterator[None]:
-    """Have this thread make functions that run in CasADi's virtual machine."""
-    before, _local.virtual = _local.virtual, True
+    """Make this thread create functions that run in CasADi's virtual machine."""
+    previous, _local.virtual = _local.virtual, True
     try:
         yield
     finally:
-        _local.virtual = before
+        _local.virtual = previous
 
 
 def is_virtual() -> bool:
-    """Whether functions that this thread makes run in CasADi's virtual machine."""
+    """Return True if functions of this thread run in CasADi's virtual machine."""
     return _local.virtual
 
 
 @contextmanager
 def interrupt_afterwards() -> Iterator[None]:
-    """Let Ctrl-C and SIGTERM wait for the end of the block, which calls CasADi.
+    """Delay Ctrl-C and SIGTERM until the end of the block, which calls CasADi.
 
-    CasADi swallows a KeyboardInterrupt while it converts arguments, and inside an evaluation for
-    Ipopt it takes one for a number that could not be computed.
+    CasADi swallows a KeyboardInterrupt while it converts arguments, and takes one inside an
+    evaluation for Ipopt as a failed evaluation.
 
     Raises:
-        KeyboardInterrupt: After the block, if Ctrl-C was pressed in it; or what else a handler
-            raises.
+        KeyboardInterrupt: Ctrl-C was pressed in the block (or what its handler raises).
     """
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     if threading.current_thread() is not threading.main_thread():
         handlers = {}
-    came: list[int] = []
+    signals: list[int] = []
     for number, handler in handlers.items():
         if callable(handler):
-            signal.signal(number, lambda number, _: came.append(number))
+            signal.signal(number, lambda number, _: signals.append(number))
     try:
         yield
     finally:
         for number, handler in handlers.items():
             if callable(handler):
                 signal.signal(number, handler)
-    for number in came[:1]:
+    for number in signals[:1]:
         signal.raise_signal(number)
 
 
 SLICE = 0.2
-"""Seconds after which a driver returns to Python, so that Ctrl-C works; then it is called again."""
+"""Time after which runtime code returns to Python to handle signals [s]; then it is resumed."""
 
 
 class DriverCode(IntEnum):
-    """Return values of the drivers (runtime/common.c)."""
+    """Return values of runtime code (runtime/common.c)."""
 
     DONE = 0
     SLICE_OVER = 1
@@ -131,23 +130,23 @@ class DriverCode(IntEnum):
     NO_MEMORY = -1
 
 
-def drive(name: str, entry: Any, job: ctypes.Structure) -> None:
-    """Call a driver until its job is done.
+def run_cancellable(name: str, entry: Any, job: ctypes.Structure) -> None:
+    """Call a runtime entry point until its job is done.
 
     Raises:
-        MemoryError: No work memory.
-        CancelledError: This thread has been told to stop.
+        MemoryError: There is no work memory.
+        CancelledError: The work of this thread is cancelled.
     """
     while (code := entry(ctypes.byref(job))) != DriverCode.DONE:
         check(name, code)
 
 
 def check(name: str, code: int) -> None:
-    """Raise unless the driver can be called again.
+    """Raise unless the entry point can be called again.
 
     Raises:
-        MemoryError: No work memory.
-        CancelledError: This thread has been told to stop.
+        MemoryError: There is no work memory.
+        CancelledError: The work of this thread is cancelled.
     """
     stop_if_cancelled()
     if code == DriverCode.NO_MEMORY:
@@ -155,7 +154,7 @@ def check(name: str, code: int) -> None:
 
 
 class ForkSafeLock:
-    """A lock that is free in a forked child."""
+    """A lock that is released in a forked child."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -173,7 +172,7 @@ class ForkSafeLock:
         self._lock.release()
 
     def renew(self) -> None:
-        """Be free, whoever holds it."""
+        """Release the lock, whoever holds it."""
         self._lock = threading.Lock()
 
 
@@ -185,7 +184,7 @@ def _after_fork() -> None:
         lock.renew()
     if sys.version_info >= (3, 12):
         return
-    # Up to Python 3.11 every cached property has a lock, held while its value is made.
+    # Up to Python 3.11 a cached property holds a lock while its value is computed.
     for name, module in list(sys.modules.items()):
         if not name.startswith("casadi_ik"):
             continue

@@ -1,7 +1,7 @@
-"""C text: of a whole library for a CasADi Function and a driver, and of numbers.
+"""C text of whole libraries: the code of a CasADi Function, and the runtime that calls it.
 
-The drivers (`runtime/*.c`) are fixed C code that calls "the step" by a macro; what they need to
-know of one function arrives as `#define` lines.
+The runtime (`runtime/*.c`) is fixed C code that calls the function through the macro `STEP`; the
+sizes of a function are `#define` lines.
 """
 
 from __future__ import annotations
@@ -24,56 +24,56 @@ from casadi_ik.compile.emitter import CodeOptions, emit
 
 @cache
 def driver_text(name: str) -> str:
-    """The text of `runtime/<name>.c`."""
+    """Return the text of `runtime/<name>.c`."""
     return (resources.files("casadi_ik.compile") / "runtime" / f"{name}.c").read_text(
         encoding="utf-8"
     )
 
 
 def c_struct(name: str, sizes: Mapping[str, int] | None = None, driver: str = "") -> Any:
-    """The struct `<name>` of `runtime/<name>.c` for ctypes; pointers of any kind are addresses.
+    """Return the C struct `<name>` of `runtime/<name>.c` for ctypes; pointers become addresses.
 
     Args:
-        name: As C has it.
-        sizes: What names in brackets stand for.
-        driver: Whose it is, if that has another name.
+        name: Name of the struct.
+        sizes: Lengths of arrays by the name in brackets.
+        driver: Name of the file if it differs from that of the struct.
     """
     text = re.sub(r"/\*.*?\*/", "", driver_text(driver or name), flags=re.DOTALL)
     body = text.partition(f"}} {name};")[0].rpartition("typedef struct {")[2]
     fields: list[tuple[str, Any]] = []
     for declaration in filter(str.strip, body.split(";")):
         if declaration.strip().isupper():
-            continue  # what a solver that stands alone adds
+            continue  # a macro for fields of a standalone solver
         if called := re.search(r"(?:\(\*|KERNEL\()(\w+)", declaration):
             fields.append((called[1], ctypes.c_void_p))
             continue
         kind: Any = ctypes.c_double if "scalar" in declaration else ctypes.c_int64
-        for one in declaration.split(","):
-            found = re.search(r"(\**)(\w+)(?:\[(\w+)\])?\s*$", one)
-            assert found is not None, one
-            pointer, field, size = found.groups()
-            own = ctypes.c_void_p if pointer else kind
-            fields.append((field, own * (sizes or {})[size] if size else own))
+        for name in declaration.split(","):
+            match = re.search(r"(\**)(\w+)(?:\[(\w+)\])?\s*$", name)
+            assert match is not None, name
+            pointer, field, size = match.groups()
+            field_type = ctypes.c_void_p if pointer else kind
+            fields.append((field, field_type * (sizes or {})[size] if size else field_type))
     return type(name, (ctypes.Structure,), {"_fields_": fields})
 
 
 def define(constants: Mapping[str, int]) -> str:
-    """The constants as `#define` lines."""
+    """Return constants as `#define` lines."""
     return "".join(f"#define {name} ({value})\n" for name, value in constants.items())
 
 
 def row_major(function: Any) -> Any:
-    """The same function with dense inputs and outputs whose memory is row by row.
+    """Return a function with dense, row-major inputs and outputs.
 
-    CasADi works on the nonzeros of matrices, column by column. Transposing inside the graph costs
-    nothing in an SX graph and lets numpy memory go in and out as it is.
+    CasADi stores the nonzeros of matrices column by column. A transposition inside an SX graph
+    costs nothing and lets NumPy memory pass without a copy.
 
     Args:
         function: Any CasADi Function, or stages.
 
     Returns:
-        Stages, and the function itself where it is dense and has vectors only; otherwise a function
-        of the same name and argument names, in which an r x c matrix is declared c x r.
+        Stages, or a dense function of vectors, unchanged; otherwise a function with the same names
+        in which an r x c matrix is declared c x r.
     """
     if isinstance(function, Stages):
         return function
@@ -85,7 +85,7 @@ def row_major(function: Any) -> Any:
     )
     if dense and all(1 in shape for shape in (*shapes_in, *shapes_out)):
         return function
-    # Of the two kinds of symbols only one fits, which the stubs cannot know.
+    # CasADi's stubs cannot tell which of the two symbol types a function takes.
     kind: Any = ca.SX if function.is_a("SXFunction") else ca.MX
     names_in, names_out = function.name_in(), function.name_out()
     symbols: list[Any] = [
@@ -102,26 +102,26 @@ WIDE = """\
 #pragma GCC target("avx2")
 #endif
 """
-"""Before all code: for machines with wide registers, whose instructions are fewer."""
+"""First lines of a library for machines with wide registers."""
 
 
 @cache
-def meaning(options: CodeOptions) -> str:
-    """C text that says what the emitter's code means: types, operations, elementary functions."""
+def type_definitions(options: CodeOptions) -> str:
+    """Return the C definitions that emitted code needs: types, operations, elementary functions."""
     forms, loops = driver_text("elementary"), driver_text("loops")
     if options.single:
         single = driver_text("elementary_single") + driver_text("real")
         return f"{loops}#define SINGLE\n{single}"
-    alone = loops + driver_text("elementary_alone") + forms
+    scalar_text = loops + driver_text("elementary_alone") + forms
     if options.lanes > 1:
-        own = driver_text("lanes") + driver_text("elementary_lanes") + forms
-        return alone + define({"LANES": options.lanes}) + own
-    few = driver_text("elementary_few") + forms
+        lane_text = driver_text("lanes") + driver_text("elementary_lanes") + forms
+        return scalar_text + define({"LANES": options.lanes}) + lane_text
+    vector_text = driver_text("elementary_few") + forms
     return "".join(
         (
-            alone,
-            f"#define FEW 2\n{few}#undef FEW\n",
-            f"#ifdef __AVX2__\n#define FEW 4\n{few}#undef FEW\n#endif\n",
+            scalar_text,
+            f"#define FEW 2\n{vector_text}#undef FEW\n",
+            f"#ifdef __AVX2__\n#define FEW 4\n{vector_text}#undef FEW\n#endif\n",
             driver_text("elementary_calls") + driver_text("real"),
         )
     )
@@ -129,24 +129,24 @@ def meaning(options: CodeOptions) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Stages:
-    """An iteration that C decides on: the functions it calls, and its text.
+    """An iteration whose control flow is C: the functions that it calls, and its text.
 
     Attributes:
-        functions: By members of an enum, whose names the text calls them by; dense vectors.
-        text: Defines ``iterate(real *state, const real *parameters, const scalar *const *own, real
-            *state_after, real *record, real *status, int wanted)``: `own` are the parameters of
-            each lane by themselves, `record` may be NULL.
+        functions: Functions of dense vectors by enum member; the text calls them by member name.
+        text: C code that defines ``iterate(real *state, const real *parameters, const scalar *const
+            *own, real *state_after, real *record, real *status, int wanted)``. `own` holds the
+            parameters of each lane; `record` may be NULL.
     """
 
     functions: Mapping[Any, ca.Function]
     text: str
 
     def source(self, options: CodeOptions) -> str:
-        """C code, as of `step_source`."""
+        """Return the C code of the stages and the macro `STEP`."""
         text, names = emit(list(self.functions.values()), options)
-        behind = ", wanted" if options.lanes > 1 else ""
+        lane_argument = ", wanted" if options.lanes > 1 else ""
         calls = "".join(
-            f"#define {stage.name}(...) {name}(__VA_ARGS__{behind})\n"
+            f"#define {stage.name}(...) {name}(__VA_ARGS__{lane_argument})\n"
             for stage, name in zip(self.functions, names, strict=True)
         )
         arguments = "(real *) (arg)[0], (arg)[1], (const scalar *const *) (arg)[2]"
@@ -161,7 +161,7 @@ class Stages:
 
 
 def step_source(function: ca.Function | Stages, options: CodeOptions) -> str:
-    """C code of a function, which drivers call by the macro `STEP(arg, res, wanted)`."""
+    """Return the C code of a function and the macro `STEP(arg, res, wanted)` that calls it."""
     if isinstance(function, Stages):
         return function.source(options)
     text, (name,) = emit([function], options)
@@ -177,9 +177,9 @@ def step_source(function: ca.Function | Stages, options: CodeOptions) -> str:
     )
 
 
-def standing_alone(function: ca.Function | Stages, options: CodeOptions) -> str:
-    """C code of a function and of all it needs."""
-    return meaning(options) + step_source(function, options)
+def standalone_source(function: ca.Function | Stages, options: CodeOptions) -> str:
+    """Return the C code of a function with all definitions that it needs."""
+    return type_definitions(options) + step_source(function, options)
 
 
 def library_source(
@@ -188,19 +188,19 @@ def library_source(
     lanes: int = 1,
     wide: bool = False,
 ) -> str:
-    """The text of a whole library: the function's code, what drivers share, a driver.
+    """Return the text of a library: code of the function, shared runtime, specific runtime.
 
     Args:
-        function: Dense and row-major.
-        driver: C text of the driver, with its constants.
-        lanes: How many solves are made side by side.
-        wide: Whether the machine has wide registers.
+        function: Dense, row-major function or stages.
+        driver: C text of the specific runtime with its constants.
+        lanes: Number of lanes.
+        wide: True if the machine has wide registers.
     """
     options = CodeOptions(lanes)
     return "\n".join(
         (
             WIDE if wide else "",
-            standing_alone(function, options),
+            standalone_source(function, options),
             driver_text("common"),
             driver,
         )
@@ -208,19 +208,19 @@ def library_source(
 
 
 def digits(value: float) -> str:
-    """A finite number as C writes it, as a double."""
+    """Return a finite number as a C literal of type double."""
     if not math.isfinite(value):
-        raise ValueError(f"{value} is no constant of C")
+        raise ValueError(f"{value} has no C literal")
     return repr(float(value))
 
 
 def number(value: float) -> str:
-    """A constant of the type `scalar`, whatever its precision."""
+    """Return a C constant of the type `scalar`."""
     return f"((scalar) {digits(value)})"
 
 
 def numbers(values: Iterable[Any]) -> str:
-    """Numbers between braces, in lines; rows of rows have braces of their own."""
+    """Return a C initializer of numbers, with nested braces for nested sequences."""
     parts = [
         numbers(value)
         if isinstance(value, Sequence | np.ndarray)
@@ -239,7 +239,7 @@ def numbers(values: Iterable[Any]) -> str:
 
 
 def define_arrays(arrays: Mapping[str, NDArray[Any]], scope: str = "static const") -> str:
-    """Arrays of the type `scalar`, of 16-bit or of common whole numbers, by name; none is empty."""
+    """Return definitions of nonempty arrays of type `scalar`, `int16_t` or `int`, by name."""
     text = ""
     for name, array in arrays.items():
         whole = "int16_t" if array.dtype == np.int16 else "int"

@@ -38,9 +38,9 @@ ZIG = ("-m", "ziglang", "cc", "-mcpu=baseline", "-fno-sanitize=all")
 SHOWN_ERROR_LINES, SHOWN_CHARACTERS = 3, 200
 """How much of a compiler's complaint is shown."""
 
-NO_ROOM = (errno.ENOSPC, errno.EDQUOT) if hasattr(errno, "EDQUOT") else (errno.ENOSPC,)
+DISK_FULL_CODES = (errno.ENOSPC, errno.EDQUOT) if hasattr(errno, "EDQUOT") else (errno.ENOSPC,)
 
-SMALL = 2**20
+MIN_FREE_BYTES = 2**20
 """A disk with less room [bytes] counts as full if a compiler failed on it."""
 
 
@@ -85,21 +85,25 @@ class Compiler:
             CancelledError: This thread has been told to stop.
         """
         command = [*self.command, *LEVEL, *self.flags, "-o", str(library), str(source), "-lm"]
-        place = {"TMPDIR": str(library.parent), "LC_ALL": "C"}
+        environment = {"TMPDIR": str(library.parent), "LC_ALL": "C"}
         try:
-            done = _run(command, os.environ | place)
+            done = _run(command, os.environ | environment)
         except OSError as error:
             raise KernelError(f"compiler {self.command[0]} cannot be run: {error}") from error
         if done.returncode == 0 and library.is_file():
             return
         if done.returncode == -signal.SIGINT:
             raise KeyboardInterrupt
-        if _full(library.parent, done.stderr):
+        if _disk_is_full(library.parent, done.stderr):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(library.parent))
         lines = done.stderr.splitlines()
         errors = [line for line in lines if "error" in line.lower()] or lines or ["no complaint"]
         complaint = "; ".join(line[:SHOWN_CHARACTERS] for line in errors[:SHOWN_ERROR_LINES])
-        ended = f"failed with {_ending(done.returncode)}" if done.returncode else "made no library"
+        ended = (
+            f"failed with {_describe_exit(done.returncode)}"
+            if done.returncode
+            else "made no library"
+        )
         raise KernelError(
             f"compiler {self} {ended} "
             f"(CC=... names another compiler, CC=none does without): {complaint}"
@@ -134,7 +138,7 @@ def _run(
     return subprocess.CompletedProcess(command, process.returncode, out, complaint)
 
 
-def _ending(code: int) -> str:
+def _describe_exit(code: int) -> str:
     """How a process ended, in words."""
     try:
         return signal.Signals(-code).name if code < 0 else f"exit code {code}"
@@ -142,11 +146,11 @@ def _ending(code: int) -> str:
         return f"exit code {code}"
 
 
-def _full(directory: Path, complaint: str) -> bool:
+def _disk_is_full(directory: Path, complaint: str) -> bool:
     """Whether it was for want of room that a compiler failed."""
-    if any(os.strerror(code) in complaint for code in NO_ROOM):
+    if any(os.strerror(code) in complaint for code in DISK_FULL_CODES):
         return True
-    return shutil.disk_usage(directory).free < SMALL
+    return shutil.disk_usage(directory).free < MIN_FREE_BYTES
 
 
 def find_compiler() -> Compiler | None:
@@ -157,7 +161,7 @@ def find_compiler() -> Compiler | None:
     that does not exist (`CC=none`) is a way to ask for the virtual machine. `CASADI_IK_CFLAGS` is
     appended to the flags.
     """
-    return _find(
+    return _find_cached(
         os.environ.get("CC", ""),
         os.environ.get("PATH", ""),
         os.environ.get("CASADI_IK_CFLAGS", ""),
@@ -165,30 +169,30 @@ def find_compiler() -> Compiler | None:
 
 
 @lru_cache(maxsize=16)
-def _find(cc: str, path: str, flags: str) -> Compiler | None:
+def _find_cached(cc: str, path: str, flags: str) -> Compiler | None:
     """`find_compiler` for one environment, remembered because it starts processes."""
     try:
-        further = shlex.split(flags)
+        extra_flags = shlex.split(flags)
     except ValueError as error:
         raise KernelError(f"CASADI_IK_CFLAGS={flags[:SHOWN_CHARACTERS]!r}: {error}") from error
     try:
-        wanted = [shlex.split(cc)] if cc.strip() else [[name] for name in CANDIDATES] + _zig()
+        commands = [shlex.split(cc)] if cc.strip() else [[name] for name in CANDIDATES] + _zig()
     except ValueError:  # a quotation without an end
         return None
-    for words in wanted:
+    for words in commands:
         program = shutil.which(words[0], path=path)
         if program is None:
             continue
         version = _version((program, *words[1:]))
         if version is not None:
-            return Compiler((program, *words[1:]), version, flags=(*FLAGS, *further))
+            return Compiler((program, *words[1:]), version, flags=(*FLAGS, *extra_flags))
     return None
 
 
 def _zig() -> list[list[str]]:
     """Its command, where it is installed."""
-    known = importlib.util.find_spec("ziglang") is not None and bool(sys.executable)
-    return [[sys.executable, *ZIG]] if known else []
+    is_installed = importlib.util.find_spec("ziglang") is not None and bool(sys.executable)
+    return [[sys.executable, *ZIG]] if is_installed else []
 
 
 def _version(command: tuple[str, ...]) -> str | None:
@@ -237,7 +241,7 @@ POLICY = "CASADI_IK_COMPILE"
 BACKGROUND, WAIT = "background", "wait"
 
 
-def waits() -> bool:
+def waits_for_compiler() -> bool:
     """Whether the first answer of a robot waits for the compiler.
 
     Raises:
@@ -251,10 +255,10 @@ def waits() -> bool:
     return policy == WAIT
 
 
-def tell(text: str) -> None:
+def print_note(text: str) -> None:
     """Write a line on what is compiled to stderr; if the caller waits for it, to terminals only."""
     stream = sys.stderr
-    if stream is not None and (not waits() or is_terminal(stream)):
+    if stream is not None and (not waits_for_compiler() or is_terminal(stream)):
         print(text, file=stream, flush=hasattr(stream, "flush"))
 
 
@@ -267,4 +271,4 @@ def announce(name: str, size: int) -> None:
     """
     # 150,000 to 280,000 characters of C in a second were measured.
     if (seconds := size / 200_000) >= 2.0:
-        tell(f"compiling {name} (about {seconds:.0f} s, once per machine)")
+        print_note(f"compiling {name} (about {seconds:.0f} s, once per machine)")

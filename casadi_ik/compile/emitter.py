@@ -111,7 +111,7 @@ class _Emitter:
         self._functions[name] = _CFunction(name, parameters, body, number)
 
     def text(self, entry_points: Sequence[CName]) -> str:
-        """Return the text of all functions; similar ones share code and have tables of constants."""
+        """Return the text of all functions; similar ones share code and have constant tables."""
         groups: list[list[_CFunction]] = [[] for _ in self._groups]
         for function in self._functions.values():
             groups[function.group].append(function)

@@ -1,6 +1,6 @@
-"""A CasADi Function as a fast callable on numpy arrays: one sample, a batch, step by step.
+"""CasADi Functions as callables on NumPy arrays: one sample, a batch, a recurrence.
 
-Compiled if the machine can, otherwise in CasADi's virtual machine.
+They run in compiled code if there is a compiler, otherwise in CasADi's virtual machine.
 """
 
 from __future__ import annotations
@@ -16,7 +16,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.compile.cancellation import SLICE, DriverCode, check, drive, stop_if_cancelled
+from casadi_ik.compile.cancellation import (
+    SLICE,
+    DriverCode,
+    check,
+    run_cancellable,
+    stop_if_cancelled,
+)
 from casadi_ik.compile.codegen import c_struct, define, driver_text, row_major
 from casadi_ik.compile.graphs import FunctionGraph
 from casadi_ik.compile.libraries import load_function, load_library
@@ -30,22 +36,22 @@ _BYTE: Any = ctypes.c_char
 
 
 class BufferedFunction:
-    """One function with its own input and output arrays; not to be shared by threads.
+    """A function with buffers for inputs and outputs; not thread-safe.
 
     Attributes:
-        inputs: Flat arrays of the inputs' memory; write into them.
-        outputs: Flat arrays of the outputs' memory; a call overwrites them.
+        inputs: Flat input buffers; callers write into them.
+        outputs: Flat output buffers; a call overwrites them.
     """
 
     def __init__(self, function: ca.Function) -> None:
-        """Make the arrays.
+        """Allocate the buffers.
 
         Args:
             function: Dense and row-major (`codegen.row_major`).
         """
         self.inputs = [np.zeros(function.numel_in(i)) for i in range(function.n_in())]
         self.outputs = [np.zeros(function.numel_out(i)) for i in range(function.n_out())]
-        # The stubs of CasADi describe the C++ signatures of a buffer, not Python's.
+        # CasADi's stubs describe the C++ signatures of a buffer, not the Python ones.
         buffer: Any
         buffer, self._evaluate = function.buffer()
         for i, array in enumerate(self.inputs):
@@ -56,16 +62,16 @@ class BufferedFunction:
         self._name = function.name()
 
     def __call__(self) -> bool:
-        """Evaluate; False if the function itself reports a failure, as generated code would."""
+        """Evaluate; return False if the function reports a failure, as generated code would."""
         try:
             self._evaluate()
         except SystemError as error:
-            # A buffer reports Ctrl-C inside an evaluation as this.
+            # A buffer reports Ctrl-C inside an evaluation as SystemError.
             if isinstance(error.__cause__, KeyboardInterrupt):
                 raise KeyboardInterrupt from error
             raise
         except RuntimeError as error:
-            # ... or, if it came while Ipopt was at work, as that.
+            # Inside Ipopt, Ctrl-C arrives as RuntimeError.
             if str(error) == "KeyboardInterrupt":
                 raise KeyboardInterrupt from error
             logger.warning("function %r failed: %s", self._name, error)
@@ -74,37 +80,37 @@ class BufferedFunction:
 
 
 def memory(array: NDArray[Any]) -> int:
-    """The address of an array's first element."""
+    """Return the address of an array's first element."""
     if array.flags.writeable and array.flags.c_contiguous and array.size:
-        # A third of the time of the way below, which knows every array.
+        # Takes a third of the time of array.ctypes, which handles every array.
         return ctypes.addressof(_BYTE.from_buffer(array))
     return array.ctypes.data
 
 
 def doubles(values: Any) -> NDArray[np.float64]:
-    """The values as an aligned C-contiguous array of doubles, copied only if they are not."""
+    """Return values as an aligned C-contiguous array of doubles; copy only if necessary."""
     array = np.asarray(values, dtype=np.float64, order="C")
     return array if array.flags.aligned else array.copy()
 
 
-SYMBOL_MACHINE = "casadi_ik_machine_lanes"
+MACHINE_SYMBOL = "casadi_ik_machine_lanes"
 
 
 def machine_lanes() -> int:
-    """Eight where registers hold eight doubles, else four; 0: one solve at a time.
+    """Return the number of lanes: 8 if registers hold eight doubles, otherwise 4; 0 without lanes.
 
-    The compiled answer is asked on every machine anew, since several may share a cache.
+    The compiled probe runs on every machine, since several machines may share a cache.
     """
-    if asked := os.environ.get("CASADI_IK_LANES"):
-        if asked not in ("1", "4", "8"):
-            raise KernelError(f"CASADI_IK_LANES={asked[:20]!r}: expected 1, 4 or 8")
-        return int(asked) if asked != "1" else 0
+    if configured := os.environ.get("CASADI_IK_LANES"):
+        if configured not in ("1", "4", "8"):
+            raise KernelError(f"CASADI_IK_LANES={configured[:20]!r}: expected 1, 4 or 8")
+        return int(configured) if configured != "1" else 0
     text = driver_text("machine_lanes")
-    library = load_library("machine_lanes", lambda: text, SYMBOL_MACHINE, text)
-    return 0 if library is None else int(library[SYMBOL_MACHINE]())
+    library = load_library("machine_lanes", lambda: text, MACHINE_SYMBOL, text)
+    return 0 if library is None else int(library[MACHINE_SYMBOL]())
 
 
-SYMBOL, SYMBOL_LANES = "casadi_ik_map", "casadi_ik_map_lanes"
+SYMBOL, LANES_SYMBOL = "casadi_ik_map", "casadi_ik_map_lanes"
 
 MapJob = c_struct("map_job")
 
@@ -116,8 +122,8 @@ def _map_job(
     output_steps: Sequence[int],
     count: int,
 ) -> tuple[Any, tuple[Any, ...]]:
-    """A job of the map driver, and memory that has to live as long."""
-    kept = tuple(
+    """Return a job of the map runtime, and buffers that must stay alive with it."""
+    buffers = tuple(
         (kind * len(values))(*values)
         for arrays, steps in ((inputs, input_steps), (outputs, output_steps))
         for kind, values in (
@@ -125,15 +131,15 @@ def _map_job(
             (ctypes.c_int64, steps),
         )
     )
-    return MapJob(*map(ctypes.addressof, kept), count=count, next=0, slice=SLICE), kept
+    return MapJob(*map(ctypes.addressof, buffers), count=count, next=0, slice=SLICE), buffers
 
 
 class SingleCall:
-    """One compiled call on fixed arrays; not to be shared by threads.
+    """A compiled call on fixed arrays; not thread-safe.
 
     Attributes:
-        inputs: Arrays of the inputs' shapes; write into them.
-        outputs: Arrays of the outputs' shapes; a call overwrites them.
+        inputs: Input arrays; callers write into them.
+        outputs: Output arrays; a call overwrites them.
     """
 
     def __init__(
@@ -164,18 +170,18 @@ class SingleCall:
 
 
 class FunctionKernel:
-    """Evaluates a Function, compiled to C if the machine can; several threads may call at once.
+    """A Function on NumPy arrays, compiled if possible; several threads may call it at once.
 
-    A scalar has the shape (), a column vector (r,), any other matrix (r, c), row by row.
+    A scalar has the shape (), a column vector (r,), any other matrix (r, c), row-major.
 
     Attributes:
         name: The function's name.
-        compiled: Whether calls run in compiled code (otherwise in CasADi's virtual machine, with
-            the same results up to the last places of sines and arcs).
+        compiled: True if calls run in compiled code; otherwise in CasADi's virtual machine, with
+            the same results up to rounding of sines and arcs.
         input_shapes: Shape of one sample of each input.
         output_shapes: Shape of one sample of each output.
-        entry: The compiled function, None if there is none.
-        library: What it is in.
+        entry: The compiled function; None if there is none.
+        library: Its library.
     """
 
     def __init__(
@@ -188,14 +194,14 @@ class FunctionKernel:
         """Compile the function or load it from the cache.
 
         Args:
-            function: Any Function; sparse inputs and outputs are made dense.
-            compiled: False keeps to the virtual machine.
-            in_lanes: Whether some samples of a batch are computed side by side, where the machine
-                has such registers; the results are the same bit for bit.
-            driver: C text of another driver of the function in the same library.
+            function: Any Function; sparse inputs and outputs become dense.
+            compiled: False uses the virtual machine.
+            in_lanes: True to compute several samples of a batch in lanes; the results are the same
+                bit for bit.
+            driver: C text of further runtime code in the same library.
 
         Raises:
-            KernelError: The function has no C code, or the compiler refused it.
+            KernelError: The function has no C code, or compiling failed.
         """
         graph = function if isinstance(function, FunctionGraph) else FunctionGraph.of(function)
         self.name = graph.name
@@ -211,7 +217,7 @@ class FunctionKernel:
         self._singles: list[SingleCall] = []
 
     def _load(self, in_lanes: bool, driver: str = "") -> Any:
-        """The compiled map, None if there is none."""
+        """Return the compiled map; None without a compiler."""
         lanes = machine_lanes() if in_lanes else 0
         text = define({"N_IN": len(self._input_sizes), "N_OUT": len(self._output_sizes)})
         if not lanes:
@@ -222,7 +228,7 @@ class FunctionKernel:
             text += f"#define {name} {{{', '.join(map(str, sizes))}}}\n"
         text += driver_text("map_job") + driver_text("map_lanes")
         try:
-            return self._map(f"{self.name}_lanes{lanes}", text, SYMBOL_LANES, lanes)
+            return self._map(f"{self.name}_lanes{lanes}", text, LANES_SYMBOL, lanes)
         except KernelError as error:
             logger.warning("%s: one sample at a time: %s", self.name, error)
             return self._load(in_lanes=False)
@@ -236,23 +242,23 @@ class FunctionKernel:
 
     @cached_property
     def function(self) -> ca.Function:
-        """The function, row-major."""
+        """The function with row-major inputs and outputs."""
         return row_major(self._graph.function)
 
     def __call__(self, *inputs: Any) -> tuple[NDArray[np.float64], ...]:
         """Evaluate one sample or a batch.
 
         Args:
-            inputs: One array per input, of its shape or with one leading batch dimension k;
-                inputs without it are the same for the whole batch.
+            inputs: One array per input, of its shape or with a leading batch dimension k; inputs
+                without it are shared by the whole batch.
 
         Returns:
             One new array per output, of shape (k, *shape), or of its shape if no input has a
             batch dimension.
 
         Raises:
-            InputError: Wrong number of inputs, a wrong shape, or batches of different lengths.
-            KernelError: The function itself reports a failure.
+            InputError: The number of inputs, a shape or the length of a batch is wrong.
+            KernelError: The function reports a failure.
         """
         if self.compiled and self._is_one_sample(inputs):
             return self._run_one(inputs, None)
@@ -266,7 +272,7 @@ class FunctionKernel:
         return outputs
 
     def _single(self) -> SingleCall:
-        """One call with memory of its own, to be made again and again."""
+        """Return a reusable call with buffers."""
         inputs, outputs = (
             [np.zeros(shape) for shape in shapes]
             for shapes in (self.input_shapes, self.output_shapes)
@@ -274,7 +280,7 @@ class FunctionKernel:
         return SingleCall(self.name, self.entry, inputs, outputs)
 
     def _is_one_sample(self, inputs: Sequence[Any]) -> bool:
-        """Whether nothing has to be checked or converted: that takes longer than a call."""
+        """Return True if no input needs a check or a conversion, which take longer than a call."""
         return len(inputs) == len(self.input_shapes) and all(
             type(array) is np.ndarray and array.shape == shape and array.dtype == np.float64
             for array, shape in zip(inputs, self.input_shapes, strict=True)
@@ -283,13 +289,13 @@ class FunctionKernel:
     def _run_one(
         self, arrays: Sequence[NDArray[np.float64]], count: int | None
     ) -> tuple[NDArray[np.float64], ...]:
-        """A single sample: kept memory takes half the time of new memory."""
+        """Evaluate one sample; reused buffers take half the time of new ones."""
         try:
             single = self._singles.pop()
         except IndexError:
             single = self._single()
-        for kept, array in zip(single.inputs, arrays, strict=True):
-            kept[...] = array
+        for buffer, array in zip(single.inputs, arrays, strict=True):
+            buffer[...] = array
         single()
         outputs = tuple(
             output.copy() if count is None else output[None].copy() for output in single.outputs
@@ -300,11 +306,11 @@ class FunctionKernel:
     def checked(
         self, inputs: Sequence[Any]
     ) -> tuple[list[NDArray[np.float64]], list[int], int | None]:
-        """Inputs of a call as arrays.
+        """Check and convert the inputs of a call.
 
         Returns:
-            The arrays; the doubles from one sample to the next of each, 0 where it is the same for
-            the whole batch; the length of the batch, None without one.
+            The arrays; the distance between samples of each [doubles], 0 if it is shared by the
+            batch; the length of the batch, None without a batch dimension.
 
         Raises:
             InputError: See `__call__`.
@@ -322,7 +328,7 @@ class FunctionKernel:
         ):
             array = doubles(values)
             if not shape and array.ndim == 2 and array.shape[1] == 1:
-                array = array[:, 0]  # vectors of one number
+                array = array[:, 0]  # vectors of length one
             arrays.append(array)
             if array.shape == shape:
                 steps.append(0)
@@ -348,7 +354,7 @@ class FunctionKernel:
         count: int,
     ) -> None:
         job, _kept = _map_job(arrays, steps, outputs, self._output_sizes, count)
-        drive(self.name, self.entry, job)
+        run_cancellable(self.name, self.entry, job)
 
     def _run_vm(
         self,
@@ -371,7 +377,7 @@ class FunctionKernel:
 
 
 def _shape(size: tuple[int, int]) -> tuple[int, ...]:
-    """The numpy shape of a CasADi matrix: scalars and columns lose the dimensions of length 1."""
+    """Return the NumPy shape of a CasADi matrix: () for a scalar, (r,) for a column."""
     rows, columns = size
     if columns != 1:
         return (rows, columns)
@@ -379,100 +385,104 @@ def _shape(size: tuple[int, int]) -> tuple[int, ...]:
 
 
 class Recurrence:
-    """Steps a function; not to be shared by threads.
+    """Repeated evaluation of (state, parameters) -> (state, record); not thread-safe.
 
     Attributes:
-        parameters: Of the next step; write into it.
-        record: Of the last step; the next overwrites it.
+        parameters: Parameters of the next step; callers write into it.
+        record: Record of the last step; the next step overwrites it.
     """
 
     def __init__(self, kernel: FunctionKernel) -> None:
-        """Lay the memory out.
+        """Allocate the buffers.
 
         Args:
-            kernel: Of two inputs and two outputs, the first of each of one size.
+            kernel: Kernel with two inputs and two outputs; the first of each have the same size.
         """
         (size,), (count,) = kernel.input_shapes
-        _, (told,) = kernel.output_shapes
+        _, (n_record,) = kernel.output_shapes
         self._kernel = kernel
-        self.parameters, self.record = np.zeros(count), np.zeros(told)
-        # Code of CasADi reads inputs while it writes outputs: state and next state stand apart.
+        self.parameters, self.record = np.zeros(count), np.zeros(n_record)
+        # Generated code reads inputs while it writes outputs, so two state buffers alternate.
         self._states = np.zeros(size), np.zeros(size)
-        self._now = 0
+        self._current = 0
         self._calls: tuple[SingleCall, ...] = ()
-        self._slow: BufferedFunction | None = None
+        self._interpreter: BufferedFunction | None = None
         if kernel.compiled:
             self._calls = tuple(
-                SingleCall(kernel.name, kernel.entry, [here, self.parameters], [there, self.record])
-                for here, there in (self._states, self._states[::-1])
+                SingleCall(
+                    kernel.name, kernel.entry, [source, self.parameters], [destination, self.record]
+                )
+                for source, destination in (self._states, self._states[::-1])
             )
         else:
-            self._slow = BufferedFunction(kernel.function)
+            self._interpreter = BufferedFunction(kernel.function)
 
     @property
     def state(self) -> Array:
-        """The state now; write into it to go on from elsewhere."""
-        return self._states[self._now]
+        """The current state; callers may overwrite it."""
+        return self._states[self._current]
 
     @property
     def before(self) -> Array:
         """The state before the last step."""
-        return self._states[1 - self._now]
+        return self._states[1 - self._current]
 
     def step(self) -> Array:
-        """Make one step; the new state.
+        """Make one step and return the new state.
 
         Raises:
-            KernelError: The function itself reports a failure.
+            KernelError: The function reports a failure.
         """
-        now = self._now
+        current = self._current
         if self._calls:
-            self._calls[now]()
+            self._calls[current]()
         else:
-            self._evaluate(self._states[now], self.parameters, self._states[1 - now], self.record)
-        self._now = 1 - now
-        return self._states[1 - now]
+            self._evaluate(
+                self._states[current], self.parameters, self._states[1 - current], self.record
+            )
+        self._current = 1 - current
+        return self._states[1 - current]
 
     def back(self) -> None:
-        """Undo the last step, of which one can be undone."""
-        self._now = 1 - self._now
+        """Undo the last step; only one step can be undone."""
+        self._current = 1 - self._current
 
     def run(self, state: Array, parameters: Array) -> tuple[Array, Array]:
-        """Make a row of steps; the own state stays as it is.
+        """Make several steps from a given state; `self.state` does not change.
 
         Args:
-            state: Where they begin.
-            parameters: (k, p) of each step.
+            state: (s,) first state.
+            parameters: (k, p) parameters of each step.
 
         Returns:
-            The states after the steps (k, s), and what they tell (k, r).
+            States after each step (k, s), and records (k, r).
 
         Raises:
-            KernelError: The function itself reports a failure.
+            KernelError: The function reports a failure.
         """
-        asked = doubles(parameters)
-        count = len(asked)
+        inputs = doubles(parameters)
+        count = len(inputs)
         states = np.empty((count + 1, len(state)))
         records = np.empty((count, len(self.record)))
         states[0] = state
         if not self._calls:
             for i in range(count):
                 stop_if_cancelled()
-                self._evaluate(states[i], asked[i], states[i + 1], records[i])
+                self._evaluate(states[i], inputs[i], states[i + 1], records[i])
             return states[1:], records
         if not count:
             return states[1:], records
-        # Every sample reads its state where the one before has written it.
-        size, given, told = states.shape[1], asked.shape[1], records.shape[1]
-        arrays = (states, asked), (size, given), (states[1:], records), (size, told)
+        # Every sample reads its state where the previous one has written it.
+        size, n_input, n_record = states.shape[1], inputs.shape[1], records.shape[1]
+        arrays = (states, inputs), (size, n_input), (states[1:], records), (size, n_record)
         job, _kept = _map_job(*arrays, count)
-        drive(self._kernel.name, self._kernel.entry, job)
+        run_cancellable(self._kernel.name, self._kernel.entry, job)
         return states[1:], records
 
-    def _evaluate(self, state: Array, parameters: Array, after: Array, record: Array) -> None:
-        slow = self._slow
-        assert slow is not None
-        slow.inputs[0][:], slow.inputs[1][:] = state, parameters
-        if not slow():
+    def _evaluate(self, state: Array, parameters: Array, next_state: Array, record: Array) -> None:
+        interpreter = self._interpreter
+        assert interpreter is not None
+        interpreter.inputs[0][:], interpreter.inputs[1][:] = state, parameters
+        if not interpreter():
             raise KernelError(f"{self._kernel.name}: the function reports a failure")
-        after[:], record[:] = slow.outputs
+        next_state[:], record[:] = interpreter.outputs

@@ -1,4 +1,4 @@
-"""Functions that need not be built to be known: signature, recipe, and what builds them."""
+"""Functions that are built on demand: their signature, recipe and builder."""
 
 from __future__ import annotations
 
@@ -22,27 +22,26 @@ checks that none of them uses CasADi."""
 
 
 DECIMALS = 12
-"""Numbers [SI units] that agree to so many decimals are the same to a recipe: the last places of a
-description follow the machine that read it."""
+"""Number of decimals [SI units] that enter a recipe; further digits of a description depend on the
+machine that read it."""
 
 
 def recipe(*parts: Any) -> str:
-    """A hash of data and of the code that makes graphs from it, 32 hexadecimal digits.
+    """Return a hash of data and of the code that builds graphs from it, 32 hexadecimal digits.
 
-    It is the same on every machine and with every version of Python.
+    The hash is the same on every machine and with every version of Python.
 
     Args:
-        parts: Everything the graph depends on: text, numbers, arrays, records, collections and
-            objects of such.
+        parts: Everything that the graph depends on: text, numbers, arrays, records, collections.
     """
     digest = hashlib.sha256(package_sources().encode())
-    for part in _plain(parts):
+    for part in _canonical_bytes(parts):
         digest.update(part)
     return digest.hexdigest()[:32]
 
 
-def _plain(value: Any) -> Iterator[bytes]:
-    """Bytes that tell a value from every other."""
+def _canonical_bytes(value: Any) -> Iterator[bytes]:
+    """Yield bytes that identify a value."""
     if value is None or isinstance(value, str | bool | int | np.integer):
         yield f"{value!r};".encode()
     elif isinstance(value, float | np.floating | np.ndarray):
@@ -51,26 +50,26 @@ def _plain(value: Any) -> Iterator[bytes]:
             array = np.round(array.astype("<f8"), DECIMALS) + 0.0  # no negative zeros
         yield f"{array.shape}{array.dtype.str}".encode() + array.tobytes()
     elif isinstance(value, Path):
-        yield value.name.encode()  # of a mesh to be drawn, wherever it is
+        yield value.name.encode()  # a mesh that is drawn only: its folder does not matter
     elif is_dataclass(value):
         yield type(value).__name__.encode()
         for item in fields(value):
-            yield from _plain(getattr(value, item.name))
+            yield from _canonical_bytes(getattr(value, item.name))
     elif isinstance(value, Mapping):
-        yield from _plain(list(value.items()))
+        yield from _canonical_bytes(list(value.items()))
     elif isinstance(value, Iterable):
         items = sorted(value, key=repr) if isinstance(value, Set) else list(value)
         yield f"{len(items)} of ".encode()
         for item in items:
-            yield from _plain(item)
+            yield from _canonical_bytes(item)
     else:
         yield type(value).__name__.encode()
-        yield from _plain(value.__getstate__())
+        yield from _canonical_bytes(value.__getstate__())
 
 
 @cache
 def package_sources() -> str:
-    """A hash of the code that graphs are made with."""
+    """Return a hash of the code that builds graphs."""
     digest = hashlib.sha256()
     root = Path(__file__).parents[1]
     for path in sorted(root.rglob("*.[pc]*"), key=lambda path: path.parts):
@@ -86,14 +85,15 @@ Shape = tuple[int, int]
 
 @dataclass(frozen=True)
 class FunctionGraph:
-    """A Function with its signature, built when it is needed.
+    """A Function with its signature, built on demand.
 
     Attributes:
         name: Identifier (letters, digits, underscores), also the kernel's file name.
         source: Builds the function, with the arguments in the order of `inputs`.
         inputs: Rows and columns by argument name.
-        outputs: Rows and columns of the results.
-        recipe: See `recipe`; a library of the same recipe is taken without building the function.
+        outputs: Rows and columns of the outputs.
+        recipe: Hash from `recipe`; a library with the same recipe is used without building the
+            function.
     """
 
     name: str
@@ -104,7 +104,7 @@ class FunctionGraph:
 
     @classmethod
     def of(cls, function: ca.Function) -> FunctionGraph:
-        """A function that is there already."""
+        """Wrap an existing function."""
         names = function.name_in()
         return cls(
             function.name(),
@@ -118,44 +118,45 @@ class FunctionGraph:
         """The function, checked against the signature.
 
         Raises:
-            InputError: It has another.
+            InputError: Its signature differs.
         """
         function = self.source()
-        found = (
+        sizes = (
             [function.size_in(i) for i in range(function.n_in())],
             [function.size_out(i) for i in range(function.n_out())],
         )
         expected = list(self.inputs.values()), list(self.outputs)
-        if found != expected:
-            raise InputError(f"function {self.name!r}: sizes {found}, expected {expected}")
+        if sizes != expected:
+            raise InputError(f"function {self.name!r}: sizes {sizes}, expected {expected}")
         return function
 
 
 RUNNING = 0
-"""The step's status output while the loop has to go on; any other integer ends it."""
+"""Status output of a step while the loop continues; any other integer ends it."""
 
 
 @dataclass(frozen=True)
 class StepGraph:
-    """One whole iteration of a method as one graph.
+    """One iteration of a method as a graph.
 
     Attributes:
         name: Identifier (letters, digits, underscores), also the kernel's file name.
-        source: The function ``(state, parameters) -> (state', record, status)``, or what builds
-            it when it is needed; all dense column vectors, status a scalar: `RUNNING` or the code
-            with which the loop ends.
-        state: Layout of the state, what an iteration hands to the next.
-        parameters: Layout of the parameters, constant during one solve (targets, tolerances,
-            gains), so that one kernel serves every target.
-        record: Layout of what is logged of each iteration.
-        compilable: False if the graph holds a node that has no C code (an Ipopt call); such a
+        source: The function ``(state, parameters) -> (state', record, status)``, or its builder;
+            all are dense column vectors, and the status is a scalar: `RUNNING` or the code with
+            which the loop ends.
+        state: Layout of the state, which an iteration passes to the next.
+        parameters: Layout of the parameters, constant during a solve (targets, tolerances, gains),
+            so that one kernel serves every target.
+        record: Layout of the log record of an iteration.
+        compilable: False if the graph contains a node without C code (an Ipopt call); such a
             graph runs in CasADi's virtual machine.
-        stage: Name of the number in the state by which the step chooses what to do, "" if it does
-            the same always. Solves in the same stage are made side by side.
-        recipe: See `recipe`; a library of the same recipe is taken without building the function.
-        apart: Name of the last parameter, if only C reads it: lanes do without it.
-        virtual: Of stages: the iteration without a compiler, with arrays `inputs` and `outputs` as
-            of the function; a call is one, False if it fails.
+        stage: Name of the state field that selects the stage, "" without stages. Solves in the
+            same stage share the lanes.
+        recipe: Hash from `recipe`; a library with the same recipe is used without building the
+            function.
+        apart: Name of the last parameter if only C reads it, so that lanes do not load it.
+        virtual: Builder of an iteration of stages without a compiler: a callable with arrays
+            `inputs` and `outputs` that returns False if the step fails.
     """
 
     name: str
@@ -175,25 +176,25 @@ class StepGraph:
 
     @property
     def stage_place(self) -> int:
-        """Where in the state the stage is, -1 if there is none."""
+        """Index of the stage in the state; -1 without stages."""
         return self.state.slice(self.stage).start if self.stage else -1
 
     @property
     def seated(self) -> int:
-        """How many of the parameters lanes need."""
+        """Number of parameters that lanes load."""
         return self.parameters.slice(self.apart).start if self.apart else self.parameters.size
 
     @cached_property
     def function(self) -> ca.Function | Stages:
-        """The function, checked against the layouts; or stages, which are not.
+        """The function, checked against the layouts; stages are not checked.
 
         Raises:
-            InputError: Its sizes are others.
+            InputError: Its sizes differ from the layouts.
         """
         function = self.source if isinstance(self.source, ca.Function) else self.source()
         if isinstance(function, Stages):
             return function
-        found = (
+        sizes = (
             [function.numel_in(i) for i in range(function.n_in())],
             [function.numel_out(i) for i in range(function.n_out())],
         )
@@ -201,6 +202,6 @@ class StepGraph:
             [self.state.size, self.parameters.size],
             [self.state.size, self.record.size, 1],
         )
-        if found != expected:
-            raise InputError(f"step graph {self.name!r}: sizes {found}, layouts say {expected}")
+        if sizes != expected:
+            raise InputError(f"step graph {self.name!r}: sizes {sizes}, layouts say {expected}")
         return function

@@ -1,8 +1,8 @@
-"""Named fields over a flat vector: one description for the graph, the loop and the log.
+"""Named fields of a flat vector: one description for the graph, the loop and the log.
 
-A step graph works on flat vectors of doubles. A `Layout` names the pieces of such a vector, packs
-and unpacks them (symbols as well as numbers), and gives the numpy record type in which the loop
-stores a row, which is byte for byte the row's CDR payload in the log.
+A step graph works on flat vectors of doubles. A `Layout` names the fields of such a vector, packs
+and unpacks symbols and numbers, and defines the NumPy record type in which the loop stores a row,
+which is byte for byte the CDR payload of the row in the log.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from casadi_ik.compile.codegen import define, driver_text
 from casadi_ik.errors import InputError
 
 STORAGE = ("f8", "f4", "u4", "i4", "u1")
-"""How a field may be stored in a record, widest first."""
+"""Storage types of a field in a record, widest first."""
 
 
 @dataclass(frozen=True)
 class Field:
-    """One named piece of a vector.
+    """A named field of a vector.
 
     Attributes:
         name: Identifier, also the column name in the log.
         shape: () for a scalar; arrays are stored row by row.
         dtype: Storage in a record, one of `STORAGE`; the vector itself always holds doubles.
         unit: SI unit, "" if dimensionless.
-        doc: What it is, one line.
+        doc: Description in one line.
     """
 
     name: str
@@ -53,8 +53,8 @@ class Layout:
     """An ordered set of fields.
 
     Attributes:
-        fields: The fields in the order of the vector. For a record the order is by falling width
-            (8, 4, 1 bytes), so that the packed row needs no padding; `Layout.record` sorts.
+        fields: Fields in the order of the vector. The fields of a record are sorted by decreasing
+            width (8, 4, 1 bytes), so that a packed row needs no padding; see `Layout.record`.
     """
 
     fields: tuple[Field, ...]
@@ -77,7 +77,7 @@ class Layout:
 
     @classmethod
     def record(cls, *fields: Field) -> Layout:
-        """A layout whose fields are sorted by falling storage width (stable)."""
+        """Return a layout whose fields are sorted by decreasing storage width (stable)."""
         return cls(tuple(sorted(fields, key=lambda item: -np.dtype(item.dtype).itemsize)))
 
     @cached_property
@@ -94,10 +94,10 @@ class Layout:
         return iter(self.fields)
 
     def slice(self, name: str) -> slice:
-        """Where the field lies in the vector.
+        """Return the slice of a field in the vector.
 
         Raises:
-            InputError: No such field.
+            InputError: There is no such field.
         """
         try:
             return self._slices[name]
@@ -106,19 +106,18 @@ class Layout:
 
     @cached_property
     def dtype(self) -> np.dtype[Any]:
-        """The packed numpy record type of one row (little endian, no padding)."""
+        """Packed NumPy record type of a row (little endian, without padding)."""
         return np.dtype([(item.name, "<" + item.dtype, item.shape) for item in self.fields])
 
     def symbols(self, name: str) -> ca.SX:
-        """A dense symbolic vector of this layout, shape (size, 1)."""
+        """Return a dense symbolic vector of this layout, shape (size, 1)."""
         return ca.SX.sym(name, self.size)
 
     def pack(self, values: Mapping[str, Any]) -> Any:
-        """Lay values out as a dense vector; symbols give a CasADi vector, numbers an array.
+        """Pack values into a dense vector: a CasADi vector for symbols, an array for numbers.
 
         Args:
-            values: One value per field, no more and no fewer, each of the field's shape
-                (matrices as CasADi or numpy objects).
+            values: One value for each field, of its shape (CasADi or NumPy objects).
 
         Raises:
             InputError: A field is missing, unknown or of the wrong size.
@@ -143,12 +142,12 @@ class Layout:
         return ca.vertcat(*parts) if symbolic else np.concatenate(parts) if parts else np.zeros(0)
 
     def pack_rows(self, values: Mapping[str, Any], count: int) -> NDArray[np.float64]:
-        """Lay numbers out as the vectors of several solves.
+        """Pack numbers into the vectors of several solves.
 
         Args:
-            values: One value per field, no more and no fewer: of the field's shape (or a number)
-                for all solves, or with a leading dimension of `count` for one each.
-            count: How many solves.
+            values: One value for each field: of its shape (or a number) for all solves, or with a
+                leading dimension of length `count`.
+            count: Number of solves.
 
         Returns:
             (count, size).
@@ -180,14 +179,13 @@ class Layout:
             raise InputError(f"layout: missing {sorted(missing)}, unknown {sorted(extra)}")
 
     def unpack(self, vector: Any) -> dict[str, Any]:
-        """The fields of a vector by name: the inverse of `pack`.
+        """Return the fields of a vector by name, the inverse of `pack`.
 
         Args:
             vector: CasADi vector (size, 1), or array (..., size).
 
         Returns:
-            Scalars and vectors as they are; a 2-D field as a matrix of its shape. Arrays keep
-            their leading dimensions.
+            Fields of their shapes; arrays keep their leading dimensions.
         """
         result: dict[str, Any] = {}
         for item in self.fields:
@@ -203,7 +201,7 @@ class Layout:
 
 
 def store_rows(layout: Layout, vectors: NDArray[np.float64], rows: NDArray[Any]) -> None:
-    """Convert record vectors and write them into rows.
+    """Convert record vectors to rows.
 
     Args:
         layout: Layout of the record.
@@ -221,19 +219,19 @@ def store_rows(layout: Layout, vectors: NDArray[np.float64], rows: NDArray[Any])
 
 
 def opaque(rows: NDArray[Any]) -> NDArray[Any]:
-    """Rows (k,) as indivisible bytes: numpy copies these at once, records field by field."""
+    """View rows (k,) as opaque bytes, which NumPy copies at once instead of field by field."""
     return np.ascontiguousarray(rows).view(np.dtype((np.void, rows.dtype.itemsize)))
 
 
 def split_rows(rows: NDArray[Any], counts: NDArray[np.int64]) -> tuple[NDArray[Any], ...]:
-    """Views of the rows (sum of counts,) of each solve, by how many each of them has (k,)."""
+    """Return views of the rows (sum of counts,) of each solve, given the counts (k,)."""
     ends = np.cumsum(counts)
     pairs = zip((ends - counts).tolist(), ends.tolist(), strict=True)
     return tuple(rows[start:end] for start, end in pairs)
 
 
 def row_driver(layout: Layout) -> str:
-    """C text that defines N_RECORD, ROW_BYTES and `store_row(record, row)` for a layout."""
+    """Return C code that defines N_RECORD, ROW_BYTES and `store_row(record, row)`."""
     offsets: Any = layout.dtype.fields
     lines = [
         f"  store_{item.dtype}(record + {layout.slice(item.name).start}, "

@@ -29,7 +29,14 @@ from pathlib import Path
 
 import casadi as ca
 
-from casadi_ik.compile.cache import own_file, places, reason, temporary, warn_once, workshop
+from casadi_ik.compile.cache import (
+    is_private_file,
+    os_reason,
+    search_path,
+    temporary_build_dir,
+    temporary_folder,
+    warn_once,
+)
 from casadi_ik.compile.cancellation import (
     ForkSafeLock,
     interrupt_afterwards,
@@ -48,15 +55,15 @@ from casadi_ik.compile.compiler import (
 from casadi_ik.compile.graphs import package_sources
 from casadi_ik.files.writing import remove_stale
 
-AHEAD = "casadi_ik_kernels"
+PREBUILT_PACKAGE = "casadi_ik_kernels"
 """The package of libraries made ahead."""
 
-PATIENCE = 120.0
+BUILD_WAIT = 120.0
 """Seconds that are waited for another process that builds the same library."""
 
 KEY = re.compile("[0-9a-f]{32}")
 
-on_text: list[Callable[[str, str], None]] = []
+text_listeners: list[Callable[[str, str], None]] = []
 """Who wants the text of every library, told apart by the name of its file ahead
 (tools/build_kernels.py)."""
 
@@ -122,37 +129,37 @@ def load_library(
     short = name[:100]
     ahead = f"{short}-{_hash(recipe)}" if recipe else ""
     with _lock:
-        if ahead and (library := _made_ahead(ahead, symbol)) is not None:
+        if ahead and (library := _load_prebuilt(ahead, symbol)) is not None:
             return library
         compiler = find_compiler()
         if compiler is None:
             warn_no_compiler()
             return None
-        note = f"{short}-{_key(compiler, *_versions(), recipe)}.key"
-        folders = places()
+        note = f"{short}-{_key(compiler, *_graph_versions(), recipe)}.key"
+        folders = search_path()
         for directory in folders if recipe else ():
-            if (library := _recognised(directory, short, note, symbol)) is not None:
+            if (library := _load_by_recipe(directory, short, note, symbol)) is not None:
                 return library
         if is_cached_only():
             raise NotCachedError(name)
         with interrupt_afterwards():
             source = text()
-        for listener in on_text:
+        for listener in text_listeners:
             listener(ahead, source)
         key = _key(compiler, source)
-        library = _loaded.get(key) or _kept_or_built(
+        library = _loaded.get(key) or _load_or_build(
             folders, f"{short}-{key}", source, compiler, symbol
         )
         if library is None:
             return None
         _loaded[key] = library
         for directory in folders if recipe else ():
-            _note(directory / note, key)
+            _remember_key(directory / note, key)
         return library
 
 
 @cache
-def _versions() -> tuple[str, str]:
+def _graph_versions() -> tuple[str, str]:
     """Of what makes graphs; reading them takes a millisecond."""
     return ca.CasadiMeta.version(), version("numpy")
 
@@ -172,9 +179,9 @@ def _hash(*parts: str) -> str:
 
 
 @cache
-def ahead_folder() -> Path | None:
+def prebuilt_folder() -> Path | None:
     """Where libraries made ahead for these sources are, None if there are none."""
-    found = importlib.util.find_spec(AHEAD)
+    found = importlib.util.find_spec(PREBUILT_PACKAGE)
     if found is None or not found.submodule_search_locations:
         return None
     folder = Path(found.submodule_search_locations[0])
@@ -193,11 +200,11 @@ def ahead_folder() -> Path | None:
     return None
 
 
-def _made_ahead(name: str, symbol: str) -> ctypes.CDLL | None:
+def _load_prebuilt(name: str, symbol: str) -> ctypes.CDLL | None:
     """A library made ahead, or None."""
     if name in _loaded:
         return _loaded[name]
-    folder = ahead_folder()
+    folder = prebuilt_folder()
     path = None if folder is None else folder / f"{name}.so"
     if path is None or not path.is_file():
         return None
@@ -211,22 +218,22 @@ def _made_ahead(name: str, symbol: str) -> ctypes.CDLL | None:
     return library
 
 
-def _recognised(directory: Path, name: str, note: str, symbol: str) -> ctypes.CDLL | None:
+def _load_by_recipe(directory: Path, name: str, note: str, symbol: str) -> ctypes.CDLL | None:
     """The library that a recipe led to before, or None."""
     path = directory / note
     try:
-        key = path.read_text(encoding="ascii") if own_file(path) else ""
+        key = path.read_text(encoding="ascii") if is_private_file(path) else ""
     except (OSError, ValueError):
         return None
     if not KEY.fullmatch(key):
         return None
-    library = _loaded.get(key) or _find(directory, f"{name}-{key}", symbol)
+    library = _loaded.get(key) or _load_from(directory, f"{name}-{key}", symbol)
     if library is not None:
         _loaded[key] = library
     return library
 
 
-def _note(path: Path, key: str) -> None:
+def _remember_key(path: Path, key: str) -> None:
     """Remember what a recipe led to; that it cannot be written costs time only."""
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -238,11 +245,11 @@ def _note(path: Path, key: str) -> None:
             part.unlink(missing_ok=True)
 
 
-def _find(directory: Path, stem: str, symbol: str) -> ctypes.CDLL | None:
+def _load_from(directory: Path, stem: str, symbol: str) -> ctypes.CDLL | None:
     """A whole, loadable library of that key that has the symbol, or None; torn ones are removed."""
     for path in directory.glob(f"{stem}-*.so"):
         try:
-            if not own_file(path):
+            if not is_private_file(path):
                 continue
             if path.name != f"{stem}-{_content_hash(path)}.so":
                 path.unlink(missing_ok=True)
@@ -259,7 +266,7 @@ def _content_hash(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
 
-def _kept_or_built(
+def _load_or_build(
     folders: list[Path], stem: str, source: str, compiler: Compiler, symbol: str
 ) -> ctypes.CDLL | None:
     """From disk, or compiled into the first place that has room; None if none has."""
@@ -267,32 +274,32 @@ def _kept_or_built(
     library = None
 
     def found() -> ctypes.CDLL | None:
-        return next(filter(None, (_find(folder, stem, symbol) for folder in folders)), None)
+        return next(filter(None, (_load_from(folder, stem, symbol) for folder in folders)), None)
 
     if (library := found()) is not None:
         return library
     announce(stem.rpartition("-")[0], len(source))
-    for place in chain(folders, temporary(folders)):
+    for place in chain(folders, temporary_folder(folders)):
         try:
             remove_stale(place, "build-*", 1)
             remove_stale(place, ".*.part", -2)
             remove_stale(place, ".*.lock")
-            with _sole_builder(place / f".{stem}.lock"):
-                library = found() or _compiled(place, stem, source, compiler, symbol)
+            with _exclusive_build(place / f".{stem}.lock"):
+                library = found() or _compile(place, stem, source, compiler, symbol)
             break
         except (OSError, UnloadableError) as error:
             problems[place] = error
     for place, error in problems.items():
         if library is None and isinstance(error, UnloadableError):
             raise error
-        warn_once(str(place), f"cannot be used: {reason(error)}")
+        warn_once(str(place), f"cannot be used: {os_reason(error)}")
     if library is None:
         warn_no_compiler("there is no room for what it makes")
     return library
 
 
 @contextlib.contextmanager
-def _sole_builder(path: Path) -> Iterator[None]:
+def _exclusive_build(path: Path) -> Iterator[None]:
     """Wait while another process is in this block with the same file.
 
     Windows and some file systems have no such locks; there two processes may build the same
@@ -303,7 +310,7 @@ def _sole_builder(path: Path) -> Iterator[None]:
     except ImportError:
         yield
         return
-    until = time.monotonic() + PATIENCE
+    until = time.monotonic() + BUILD_WAIT
     with path.open("w") as file:
         while time.monotonic() < until:
             try:
@@ -321,7 +328,7 @@ def _sole_builder(path: Path) -> Iterator[None]:
             path.unlink(missing_ok=True)
 
 
-def _compiled(
+def _compile(
     directory: Path, stem: str, source: str, compiler: Compiler, symbol: str
 ) -> ctypes.CDLL:
     """Compile into a directory.
@@ -330,7 +337,7 @@ def _compiled(
         OSError: It cannot be written, or is full.
         KernelError: The compiler refused, or made something else than the library.
     """
-    with workshop(directory) as place:
+    with temporary_build_dir(directory) as place:
         text, file = place / "kernel.c", place / "kernel.so"
         text.write_text(source, encoding="utf-8")
         compiler.build(text, file)

@@ -1,4 +1,4 @@
-"""The rows of a table that are nearest to a key, which a CasADi Function makes of its inputs."""
+"""Nearest-neighbour lookup in a table, with keys computed by a CasADi Function."""
 
 from __future__ import annotations
 
@@ -10,66 +10,67 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.compile.cancellation import SLICE, drive, stop_if_cancelled
+from casadi_ik.compile.cancellation import SLICE, run_cancellable, stop_if_cancelled
 from casadi_ik.compile.codegen import c_struct, define, driver_text
 from casadi_ik.compile.function_kernel import FunctionKernel, machine_lanes, memory
 from casadi_ik.compile.graphs import FunctionGraph
 
 SYMBOL = "casadi_ik_lookup"
 
-STEPS = 64
-"""Keys are compared in steps of 1 / STEPS: whole numbers of 16 bits in compiled code, without
-rounding errors in single precision in numpy. Both find the same rows, alone and in a batch."""
+STEPS_PER_UNIT = 64
+"""Resolution of keys [steps per unit]. Compiled code compares them as 16-bit integers, NumPy
+without rounding errors in single precision; both find the same rows."""
 
-LARGEST = 8 * STEPS
-"""Entries of a key beyond this many steps count as this many."""
+MAX_STEPS = 8 * STEPS_PER_UNIT
+"""Saturation of the entries of a key [steps]."""
 
 TILE = 16
-"""Rows that compiled code compares at once: their sums stay in registers."""
+"""Number of rows that compiled code compares at once, with sums in registers."""
 
 CHUNK = 256
-"""Samples that numpy compares at once: what fits into the cache."""
+"""Number of samples that NumPy compares at once, so that they fit into the cache."""
 
 
 _Job = c_struct("lookup_job")
 
 
 class LookupKernel:
-    """Finds the nearest rows of one table; several threads may ask at once.
+    """Lookup of the nearest rows of one table; several threads may use it at once.
 
     Attributes:
-        key: The function that makes keys.
-        constants: What the driver expects, but for the function and the machine.
-        compiled: Whether calls run in compiled code; numpy finds the same rows.
-        tiles: (tiles, pairs of entries, TILE, 2) keys of the table in steps, for compiled code.
-        entry: The compiled function, None if there is none.
+        key: Function that computes keys.
+        constants: Constants of the runtime that do not depend on the machine.
+        compiled: True if calls run in compiled code; NumPy finds the same rows.
+        tiles: (tiles, pairs of entries, TILE, 2) keys of the table [steps], for compiled code.
+        entry: The compiled function; None if there is none.
     """
 
     def __init__(
         self, key: ca.Function | FunctionGraph, rows: Sequence[Any], compiled: bool = True
     ) -> None:
-        """Compile or load from the cache, and note the keys of the table.
+        """Compile the lookup or load it from the cache, and compute the keys of the table.
 
         Args:
-            key: Any inputs -> (s, 1); NaN is an entry that is not known and does not count.
-            rows: The inputs that belong to the rows, each with a leading dimension t.
-            compiled: False keeps to the virtual machine and numpy.
+            key: Function of any inputs with output (s, 1); NaN marks an unknown entry, which is
+                ignored.
+            rows: Inputs of the table's rows, each with a leading dimension t.
+            compiled: False uses the virtual machine and NumPy.
 
         Raises:
-            KernelError: The function has no C code, or the compiler refused it.
+            KernelError: The function has no C code, or compiling failed.
         """
         graph = key if isinstance(key, FunctionGraph) else FunctionGraph.of(key)
         self.constants = {
             "N_KEY": graph.outputs[0][0],
             "TILE": TILE,
-            "STEPS": STEPS,
-            "LARGEST": LARGEST,
+            "STEPS": STEPS_PER_UNIT,
+            "LARGEST": MAX_STEPS,
         }
         self.key = FunctionKernel(graph, compiled, driver=self._driver() if compiled else "")
         (keys,) = self.key(*rows)
         self._keys = _rounded(np.nan_to_num(keys).reshape(len(keys), -1))
-        # Two entries of neighbouring rows side by side, tile by tile in the order of reading: whole
-        # columns a power of two apart would fall on each other in the cache.
+        # Pairs of entries, tile by tile in the order of reading: columns at distances that are a
+        # power of two would evict each other from the cache.
         width = self._keys.shape[1]
         padded = np.pad(self._keys, ((0, -len(keys) % TILE), (0, width % 2))).astype(np.int16)
         self.tiles = padded.reshape(-1, TILE, (width + 1) // 2, 2).transpose(0, 2, 1, 3).copy()
@@ -84,63 +85,63 @@ class LookupKernel:
         """Find the nearest rows.
 
         Args:
-            count: How many, at most as many as the table has.
-            inputs: Of the function, one at least with a leading batch dimension k.
+            count: Number of rows to find, at most the length of the table.
+            inputs: Inputs of the function; at least one has a leading batch dimension k.
 
         Returns:
-            (k, count) rows, nearest first; of equally near ones the first of the table.
+            (k, count) row numbers, nearest first; ties in the order of the table.
 
         Raises:
-            InputError: Wrong inputs, see `FunctionKernel`.
+            InputError: An input is invalid, see `FunctionKernel`.
         """
         arrays, steps, samples = self.key.checked(inputs)
-        found = np.empty((samples or 0, count), dtype=np.int64)
+        rows = np.empty((samples or 0, count), dtype=np.int64)
         if self.compiled:
-            self._run_compiled(arrays, steps, found)
+            self._run_compiled(arrays, steps, rows)
         else:
-            self._run_numpy(arrays, found)
-        return found
+            self._run_numpy(arrays, rows)
+        return rows
 
     def _run_compiled(
-        self, arrays: list[NDArray[np.float64]], steps: list[int], found: NDArray[np.int64]
+        self, arrays: list[NDArray[np.float64]], steps: list[int], rows: NDArray[np.int64]
     ) -> None:
-        job, _kept = self._job(arrays, found, steps)
-        drive(self.key.name, self.entry, job)
+        job, _kept = self._job(arrays, rows, steps)
+        run_cancellable(self.key.name, self.entry, job)
 
     def _job(
         self,
         inputs: Sequence[NDArray[np.float64]],
-        found: NDArray[np.int64],
+        rows: NDArray[np.int64],
         steps: Sequence[int] = (),
     ) -> tuple[Any, Any]:
-        """A job, and memory that has to live as long."""
+        """Return a job, and buffers that must stay alive with it."""
         sources = (ctypes.c_void_p * len(inputs))(*map(memory, inputs))
         strides = (ctypes.c_int64 * len(inputs))(*steps)
         job = _Job(
             inputs=ctypes.addressof(sources),
             input_steps=ctypes.addressof(strides),
             tiles=memory(self.tiles),
-            found=memory(found),
+            found=memory(rows),
             rows=len(self._keys),
-            wanted=found.shape[1],
-            count=len(found),
+            targets=rows.shape[1],
+            count=len(rows),
             slice=SLICE,
         )
         return job, (sources, strides)
 
-    def _run_numpy(self, arrays: list[NDArray[np.float64]], found: NDArray[np.int64]) -> None:
+    def _run_numpy(self, arrays: list[NDArray[np.float64]], rows: NDArray[np.int64]) -> None:
         (keys,) = self.key(*arrays)
-        keys = keys.reshape(len(found), self._keys.shape[1])  # also a single entry
+        keys = keys.reshape(len(rows), self._keys.shape[1])  # also a single entry
         for start in range(0, len(keys), CHUNK):
             stop_if_cancelled()
             part = keys[start : start + CHUNK]
             known = ~np.isnan(part)
-            wanted = 2 * _rounded(np.where(known, part, 0.0))
-            # |row - key|^2 over what is known, without the part that all rows share.
-            distance = known.astype(np.float32) @ self._keys.T**2 - wanted @ self._keys.T
+            targets = 2 * _rounded(np.where(known, part, 0.0))
+            # |row - key|^2 over known entries, without the term that all rows share.
+            distance = known.astype(np.float32) @ self._keys.T**2 - targets @ self._keys.T
             order = distance.argsort(axis=1, kind="stable")
-            found[start : start + CHUNK] = order[:, : found.shape[1]]
+            rows[start : start + CHUNK] = order[:, : rows.shape[1]]
 
 
 def _rounded(values: NDArray[np.float64]) -> NDArray[np.float32]:
-    return np.rint(values * STEPS).clip(-LARGEST, LARGEST).astype(np.float32)
+    return np.rint(values * STEPS_PER_UNIT).clip(-MAX_STEPS, MAX_STEPS).astype(np.float32)

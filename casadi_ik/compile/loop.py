@@ -1,6 +1,6 @@
-"""A step run to its end: the one loop, in compiled code or in CasADi's virtual machine.
+"""The loop that runs a step to its end, in compiled code or in CasADi's virtual machine.
 
-Every iteration may be recorded; a solve may be looked at one iteration at a time.
+It can record every iteration, and `Stepper` makes one iteration at a time.
 """
 
 from __future__ import annotations
@@ -25,39 +25,40 @@ from casadi_ik.compile.libraries import NotCachedError, load_function
 from casadi_ik.errors import InputError, KernelError
 
 NON_FINITE = -1
-"""Status of a solve whose state or status became NaN or infinite; its last finite state stays."""
+"""Status of a solve whose state or status became NaN or infinite; it keeps the last finite
+state."""
 
 FAILED = -2
-"""Status of a solve whose step reported a failure; the state before that step stays."""
+"""Status of a solve whose step reported a failure; it keeps the state before that step."""
 
 REPEATED = -3
-"""Status of a solve that came back to an earlier state bit for bit, and so would for ever."""
+"""Status of a solve that returned to an earlier state bit for bit and would cycle."""
 
 UNBEGUN = -4
-"""Status of a solve that a method has not begun yet."""
+"""Status of a solve that has not started."""
 
 FIRST_ROWS = 256
-"""Rows a trace starts with at least; it doubles when they are full."""
+"""Minimum initial capacity of a trace [rows]; the capacity doubles when it is full."""
 
 FIRST_MARK = 16
-"""Iteration, a power of two, of the first state that later ones are compared with."""
+"""First iteration (a power of two) whose state is compared with later ones to detect cycles."""
 
 CODE_LIMIT = 2**31 - 1
-"""A status has to be smaller than this (it is kept as int32)."""
+"""Bound of a status, which is stored as int32."""
 
 
 @dataclass(frozen=True, eq=False)
 class LoopResult:
-    """What a batch of k solves came to.
+    """Results of a batch of k solves.
 
     Attributes:
         states: Last states, shape (k, ns).
-        iterations: Steps made, shape (k,); the one that became non-finite counts.
+        iterations: Number of steps, shape (k,), including a step that became non-finite.
         status: Shape (k,): the step's status, `RUNNING` if the iterations ran out, `NON_FINITE`,
             `FAILED` or `REPEATED`.
-        time: Seconds inside the loop, shape (k,); solves side by side share them.
-        rows: The records of all iterations of all solves, one after the other, shape
-            (sum of iterations,), of the record layout's dtype; None if no trace was asked for.
+        time: Seconds inside the loop, shape (k,); solves in lanes share them.
+        rows: Records of all iterations, solve by solve, shape (sum of iterations,), of the record
+            layout's dtype; None without a trace.
     """
 
     states: NDArray[np.float64]
@@ -68,7 +69,7 @@ class LoopResult:
 
     @cached_property
     def trace(self) -> tuple[NDArray[Any], ...]:
-        """The rows of each solve, views into `rows`; empty if no trace was asked for."""
+        """Rows of each solve as views into `rows`; empty without a trace."""
         return () if self.rows is None else split_rows(self.rows, self.iterations)
 
 
@@ -78,27 +79,27 @@ def run_vm(
     parameters: NDArray[np.float64],
     max_iterations: int,
 ) -> None:
-    """Solve a batch; `result` has the first states and gets everything else.
+    """Solve a batch in the virtual machine; `result` has the first states and receives the rest.
 
     Args:
-        kernel: Of the step.
-        result: As `LoopKernel.run` makes it.
+        kernel: Loop of the step.
+        result: Result with the first states.
         parameters: Shape (k, np) or (np,).
-        max_iterations: Budget of each solve.
+        max_iterations: Maximum number of iterations of each solve.
     """
     step = kernel.step
-    call: Any = step.virtual() if step.virtual else BufferedFunction(kernel.function)
-    state, constants = call.inputs
-    new_state, record, code = call.outputs
+    step_call: Any = step.virtual() if step.virtual else BufferedFunction(kernel.function)
+    state, constants = step_call.inputs
+    new_state, record, code = step_call.outputs
     records = None if result.rows is None else _Records(step, result.rows)
     for i, row in enumerate(np.broadcast_to(parameters, (len(result.states), constants.size))):
         started = perf_counter()
         state[:] = result.states[i]
         constants[:] = row
-        status, iteration, mark = RUNNING, 0, b""
+        status, iteration, compared_state = RUNNING, 0, b""
         while status == RUNNING and iteration < max_iterations:
             stop_if_cancelled()
-            if not call():
+            if not step_call():
                 status = FAILED
                 break
             iteration += 1
@@ -109,11 +110,11 @@ def run_vm(
             else:
                 state[:] = new_state
                 status = int(code[0])
-                now = state.tobytes()
-                if status == RUNNING and now == mark:
+                current = state.tobytes()
+                if status == RUNNING and current == compared_state:
                     status = REPEATED
                 if iteration >= FIRST_MARK and iteration & (iteration - 1) == 0:
-                    mark = now
+                    compared_state = current
         result.states[i] = state
         result.iterations[i] = iteration
         result.status[i] = status
@@ -124,7 +125,7 @@ def run_vm(
 
 
 class _Records:
-    """Collects record vectors in a block, so that many are converted to rows at once."""
+    """Buffer of record vectors, which are converted to rows in blocks."""
 
     def __init__(self, step: StepGraph, rows: NDArray[Any]) -> None:
         self._layout = step.record
@@ -147,50 +148,52 @@ class _Records:
         self._written, self._filled = end, 0
 
     def trim(self) -> None:
-        """Give the room back that was not needed."""
+        """Release unused capacity."""
         self._rows.resize(self._written, refcheck=False)
 
 
 SYMBOL = "casadi_ik_loop"
 
 SLOTS = 32
-"""Solves under way at once, of which four or eight have the lanes."""
+"""Number of slots: solves in progress, of which four or eight occupy the lanes."""
 
-FEWEST = 4
-"""Solves from which on they are made side by side."""
+MIN_SIDE_BY_SIDE = 4
+"""Minimum number of solves for which lanes are used."""
 
-FOREVER = 2**62
-"""Steps of a call that has no bound."""
+UNBOUNDED = 2**62
+"""Number of steps of a call without a bound."""
 
-WORTH = 64
-"""Solves from which on a compiler is waited for, if no library that makes them side by side is at
-hand. One by one they take a millisecond or two, and the compiler the better part of a minute."""
+MIN_BATCH_FOR_LANES = 64
+"""Minimum batch size for which the loop with lanes is compiled if it is not in the cache.
 
-LOOKED = 1000
-"""Solves of small batches after which one looks again for a library that was not at hand."""
+Without lanes a solve takes one to two milliseconds; compiling takes most of a minute."""
 
-SPARE = 1.25
-"""How much more room a trace begins with than the last one needed."""
+CACHE_RECHECK_SOLVES = 1000
+"""Number of solves in small batches after which the cache is searched again."""
 
-ROOM_BYTES = 2**24
-"""What it begins with at most [bytes]."""
+TRACE_GROWTH = 1.25
+"""Initial capacity of a trace relative to what the previous trace needed."""
+
+MAX_FIRST_TRACE_BYTES = 2**24
+"""Maximum initial capacity of a trace [bytes]."""
 
 
 Job = c_struct("loop_job")
 
 
 @dataclass(frozen=True)
-class Followed:
-    """Where the starts of solves stand, and what writes them.
+class SlotSource:
+    """Memory from which the slots load solves, and the method's callback.
 
     Attributes:
         states: Address of the first state.
         parameters: Address of the first parameters.
-        step: Doubles from one state to the next.
-        slots: Solves under way at a time, at most `SLOTS`.
-        parameter_step: The same of parameters, 0: the same for all; None: as of states.
-        follow: Address of the function that says what follows, 0: nothing does.
-        method: Address of what it works on.
+        step: Distance between consecutive states [doubles].
+        slots: Number of slots, at most `SLOTS`.
+        parameter_step: Distance between consecutive parameters [doubles]; 0: shared by all solves;
+            None: `step`.
+        follow: Address of the callback for a slot whose solve has ended; 0: none.
+        method: Address of the callback's context.
     """
 
     states: int
@@ -203,21 +206,23 @@ class Followed:
 
 
 class CompiledBatch:
-    """A batch on its way through a compiled loop."""
+    """A batch that a compiled loop works on."""
 
-    def __init__(self, step: StepGraph, result: LoopResult, starts: Followed, budget: int) -> None:
-        """Keep the arrays; `result` gets everything.
+    def __init__(
+        self, step: StepGraph, result: LoopResult, starts: SlotSource, budget: int
+    ) -> None:
+        """Allocate the memory of the loop.
 
         Args:
             step: The step.
-            result: As `LoopKernel.run` makes it.
-            starts: Where solves begin.
-            budget: Iterations of each start.
+            result: Result with the first states; it receives everything else.
+            starts: Memory from which the slots load solves.
+            budget: Maximum number of iterations of each start.
         """
         self.name = step.name
         self.result = result
         slots = starts.slots
-        self._places = np.empty((0, 2), dtype=np.int64)
+        self._row_owners = np.empty((0, 2), dtype=np.int64)
         self._slots = np.full(slots, -1, dtype=np.int64)
         self._begun = np.zeros(slots, dtype=np.int64)
         self._mark = np.zeros((slots, step.state.size))
@@ -235,90 +240,88 @@ class CompiledBatch:
             slot_count=slots,
             count=len(result.status),
             max_iterations=budget,
-            left=FOREVER,
-            fewest=FEWEST,
+            left=UNBOUNDED,
+            fewest=MIN_SIDE_BY_SIDE,
             slice=SLICE,
             follow=starts.follow,
             method=starts.method,
         )
 
-    def run(self, several: Any, alone: Any) -> LoopResult:
-        """Solve.
+    def run(self, side_by_side: Any, one_by_one: Any) -> LoopResult:
+        """Solve the batch.
 
         Args:
-            several: The loop that makes some solves at a time, None if there is none.
-            alone: The loop that makes one after the other: the last few, too.
+            side_by_side: The loop with lanes; None if there is none.
+            one_by_one: The loop without lanes, which also makes the last few solves.
 
         Returns:
-            The result, its rows solve by solve.
+            The result, with rows in the order of the solves.
 
         Raises:
-            KernelError: No work memory, or the step failed.
+            MemoryError: There is no work memory.
         """
-        loop = several or alone
+        loop = side_by_side or one_by_one
         if self.result.rows is not None:
-            self._rows_to(len(self.result.rows))
+            self._resize_rows(len(self.result.rows))
         while (code := loop(ctypes.byref(self.job))) != DriverCode.DONE:
             check(self.name, code)
             if code == DriverCode.ROWS_FULL:
-                self._rows_to(2 * self.job.capacity)
+                self._resize_rows(2 * self.job.capacity)
             if code == DriverCode.FEW_LEFT:
-                loop = alone
-        self._rows_to(self.job.used)
+                loop = one_by_one
+        self._resize_rows(self.job.used)
         if self.result.rows is None or self.job.count == 1:
             return self.result
-        return replace(self.result, rows=self._in_order(self.result.rows))
+        return replace(self.result, rows=self._rows_by_solve(self.result.rows))
 
-    def _rows_to(self, count: int) -> None:
-        """Make room for so many rows, in place: a long trace is not copied."""
+    def _resize_rows(self, count: int) -> None:
+        """Resize the rows in place, so that a long trace is not copied."""
         rows = self.result.rows
         if rows is not None:
             rows.resize(count, refcheck=False)
-            self._places.resize((count, 2), refcheck=False)
-            self.job.rows, self.job.places = memory(rows), memory(self._places)
+            self._row_owners.resize((count, 2), refcheck=False)
+            self.job.rows, self.job.places = memory(rows), memory(self._row_owners)
             self.job.capacity = count
 
-    def _in_order(self, rows: NDArray[Any]) -> NDArray[Any]:
-        """Rows solve by solve, from the order in which they were made."""
+    def _rows_by_solve(self, rows: NDArray[Any]) -> NDArray[Any]:
+        """Reorder rows from the order of computation to the order of the solves."""
         iterations = self.result.iterations
         first = np.cumsum(iterations) - iterations
-        solve, iteration = self._places.T
+        solve, iteration = self._row_owners.T
         ordered = np.empty_like(rows)
         opaque(ordered)[first[solve] + iteration] = opaque(rows)
         return ordered
 
 
 class LoopKernel:
-    """Runs a step until it ends, for each solve of a batch; several threads may run it at once.
+    """The loop of one step, for batches of solves; several threads may run it at once.
 
     Attributes:
         step: The step.
-        compiled: Whether the loop runs in compiled code. Otherwise the same graph runs in
-            CasADi's virtual machine, with the same iterates and records up to the last places of
-            sines and arcs.
-        entry: The compiled loop that makes one solve after the other, None if there is none.
+        compiled: True if the loop runs in compiled code. Otherwise the same graph runs in CasADi's
+            virtual machine, with the same iterates and records up to rounding of sines and arcs.
+        entry: The compiled loop without lanes; None if there is none.
     """
 
     def __init__(self, step: StepGraph, compiled: bool = True) -> None:
-        """Compile the step with its loop or load them from the cache.
+        """Compile the step and its loop, or load them from the cache.
 
         Args:
             step: One iteration of a method.
-            compiled: False keeps to the virtual machine.
+            compiled: False uses the virtual machine.
 
         Raises:
-            KernelError: The step says it is compilable but has no C code, or the compiler
-                refused it.
+            KernelError: The step is declared compilable but has no C code, or compiling failed.
         """
         self.step = step
         library = self._load() if compiled and step.compilable else None
         self.compiled = library is not None
         self.entry: Any = None if library is None else library[SYMBOL]
         self._rows_each = 0.0
-        self._few = 0
+        self._solves_until_recheck = 0
 
     def _load(self, lanes: int = 1) -> ctypes.CDLL | None:
-        """The library of the loop that makes so many solves side by side."""
+        """Load the library of the loop with a number of lanes."""
         step = self.step
         name = step.name if lanes == 1 else f"{step.name}_lanes{lanes}"
         wide = lanes == 1 and machine_lanes() > 0
@@ -328,44 +331,44 @@ class LoopKernel:
 
     @property
     def lanes(self) -> int:
-        """How many solves of a batch are made side by side; 1 where that is not possible."""
+        """Number of lanes in which a batch is solved; 1 without lanes."""
         return 1 if self._side_by_side is None else machine_lanes()
 
-    def _for(self, count: int) -> Any:
-        """The loop that makes some solves of so many at a time; None: one after the other."""
-        if count < FEWEST:
+    def _loop_for(self, count: int) -> Any:
+        """Return the loop with lanes if it pays for a batch of this size, otherwise None."""
+        if count < MIN_SIDE_BY_SIDE:
             return None
-        if count >= WORTH or "_side_by_side" in vars(self):
+        if count >= MIN_BATCH_FOR_LANES or "_side_by_side" in vars(self):
             return self._side_by_side
-        self._few -= count
-        return None if self._few > 0 else self._at_hand
+        self._solves_until_recheck -= count
+        return None if self._solves_until_recheck > 0 else self._cached_side_by_side
 
     @property
-    def _at_hand(self) -> Any:
-        """The loop that makes some solves at a time, if it need not be compiled."""
+    def _cached_side_by_side(self) -> Any:
+        """The loop with lanes if it is in the cache, otherwise None."""
         try:
             with cached_only():
                 return self._side_by_side
         except NotCachedError:
-            self._few = LOOKED  # looking takes a millisecond
+            self._solves_until_recheck = CACHE_RECHECK_SOLVES  # a search of the cache takes 1 ms
             return None
 
     @cached_property
     def _side_by_side(self) -> Any:
-        """The loop that makes some solves at a time; None where there is none."""
+        """The loop with lanes; None if there is none."""
         lanes = machine_lanes() if self.compiled else 0
         if not lanes:
             return None
         try:
             library = self._load(lanes)
         except KernelError as error:
-            warnings.warn(f"one solve at a time: {error}", RuntimeWarning, stacklevel=2)
+            warnings.warn(f"batches run without lanes: {error}", RuntimeWarning, stacklevel=2)
             return None
         return None if library is None else library[SYMBOL]
 
     @property
     def constants(self) -> dict[str, int]:
-        """What the drivers expect, but what `row_driver` defines."""
+        """Constants that the runtime needs, except those of `row_driver`."""
         return {
             "N_STATE": self.step.state.size,
             "N_PARAMETERS": self.step.parameters.size,
@@ -380,13 +383,13 @@ class LoopKernel:
         }
 
     def _driver(self) -> str:
-        """C text of the driver, with its constants."""
+        """Return the C text of the loop with its constants."""
         texts = driver_text("loop_job"), driver_text("loop")
         return define(self.constants) + row_driver(self.step.record) + "".join(texts)
 
     @cached_property
     def function(self) -> Any:
-        """The step, row-major, or its stages."""
+        """The step as a row-major Function, or its stages."""
         return row_major(self.step.function)
 
     def run(
@@ -395,66 +398,66 @@ class LoopKernel:
         """Solve a batch.
 
         A solve ends when the step's status is not `RUNNING`, when the new state or the status is
-        not finite, when the new state is an earlier one once more (runtime/loop.c), or after
-        `max_iterations`. Neither the first state nor the parameters are looked at: a step may
-        take NaN there to mean something.
+        not finite, when the new state repeats an earlier one (runtime/loop.c), or after
+        `max_iterations`. The first state and the parameters are not checked, since NaN may have a
+        meaning for a step.
 
         Args:
             states: First states, shape (k, ns); not changed.
             parameters: Shape (k, np), or (np,) for all solves.
-            max_iterations: Budget of each solve, >= 0.
-            trace: Whether to keep the record of every iteration.
+            max_iterations: Maximum number of iterations of each solve, >= 0.
+            trace: True to keep the record of every iteration.
 
         Returns:
-            Last states, counts, status, times and, if asked for, the records.
+            Last states, iterations, status, times and, with a trace, the records.
 
         Raises:
             InputError: A shape or `max_iterations` is wrong.
         """
         stop_if_cancelled()
         first = doubles(states)
-        given = doubles(parameters)
+        values = doubles(parameters)
         n_state, n_parameters = self.step.state.size, self.step.parameters.size
         if first.ndim != 2 or first.shape[1] != n_state:
             raise InputError(
                 f"{self.step.name}: states have shape {first.shape}, expected (k, {n_state})"
             )
         count = len(first)
-        if given.shape not in ((n_parameters,), (count, n_parameters)):
+        if values.shape not in ((n_parameters,), (count, n_parameters)):
             raise InputError(
-                f"{self.step.name}: parameters have shape {given.shape}, "
+                f"{self.step.name}: parameters have shape {values.shape}, "
                 f"expected ({n_parameters},) or ({count}, {n_parameters})"
             )
         if max_iterations < 0:
             raise InputError(f"{self.step.name}: max_iterations is {max_iterations}, expected >= 0")
         result = self._empty(first.copy(), trace)
         if not self.compiled:
-            run_vm(self, result, given, max_iterations)
+            run_vm(self, result, values, max_iterations)
             return result
         if not max_iterations:
             return replace(result, rows=np.empty(0, self.step.record.dtype) if trace else None)
-        rows = Followed(
+        source = SlotSource(
             memory(result.states),
-            memory(given),
+            memory(values),
             n_state,
             slots=SLOTS,
-            parameter_step=0 if given.ndim == 1 else n_parameters,
+            parameter_step=0 if values.ndim == 1 else n_parameters,
         )
-        return self._drive(CompiledBatch(self.step, result, rows, max_iterations))
+        return self._drive(CompiledBatch(self.step, result, source, max_iterations))
 
-    def run_followed(
-        self, starts: Followed, count: int, max_iterations: int, trace: bool
+    def run_from_slots(
+        self, starts: SlotSource, count: int, max_iterations: int, trace: bool
     ) -> LoopResult:
-        """Solve a batch whose starts a method writes; see `follow` in runtime/loop_job.c.
+        """Solve a batch whose starts a callback writes; see `follow` in runtime/loop_job.c.
 
         Args:
-            starts: Where it writes them, and how it is called; in compiled code only.
-            count: Solves.
-            max_iterations: Budget of each start, >= 1.
-            trace: Whether to keep the record of every iteration.
+            starts: Memory of the starts and the callback; compiled code only.
+            count: Number of solves.
+            max_iterations: Maximum number of iterations of each start, >= 1.
+            trace: True to keep the record of every iteration.
 
         Returns:
-            As `run`, without states.
+            The result of `run` without states.
         """
         stop_if_cancelled()
         result = self._empty(np.empty((count, 0)), trace)
@@ -468,44 +471,45 @@ class LoopKernel:
             iterations=np.zeros(count, dtype=np.int64),
             status=np.full(count, RUNNING, dtype=np.int32),
             time=np.zeros(count),
-            rows=np.empty(self._room(count), dtype=self.step.record.dtype) if trace else None,
+            rows=np.empty(self._first_rows(count), dtype=self.step.record.dtype) if trace else None,
         )
 
     def _drive(self, batch: CompiledBatch) -> LoopResult:
         count = len(batch.result.status)
-        result = batch.run(self._for(count), self.entry)
+        result = batch.run(self._loop_for(count), self.entry)
         if count and result.rows is not None:
             self._rows_each = len(result.rows) / count
         return result
 
-    def _room(self, count: int) -> int:
-        """Rows to begin a trace of so many solves with, by what the last one came to.
+    def _first_rows(self, count: int) -> int:
+        """Return the initial capacity of a trace [rows], from the size of the previous trace.
 
-        To make room on the way costs more than to write the rows: it is cleared each time.
+        Growing a trace clears the new memory, which costs more than writing the rows.
         """
         if not self.compiled:
             return 0
-        rows = int(SPARE * self._rows_each * count) + FIRST_ROWS
-        return min(rows, max(ROOM_BYTES // max(self.step.record.dtype.itemsize, 1), FIRST_ROWS))
+        rows = int(TRACE_GROWTH * self._rows_each * count) + FIRST_ROWS
+        return min(
+            rows, max(MAX_FIRST_TRACE_BYTES // max(self.step.record.dtype.itemsize, 1), FIRST_ROWS)
+        )
 
 
 Vector = NDArray[np.float64]
 
-NextRound = Callable[[int, Vector], tuple[Vector, Vector] | None]
-"""From the status and the last state of a round to the state (ns,) and the parameters (np,) of the
+NextRestart = Callable[[int, Vector], tuple[Vector, Vector] | None]
+"""Maps the status and the last state of a restart to the state (ns,) and parameters (np,) of the
 next one; None if the solve is over."""
 
 
 class Stepper:
-    """Makes the iterations of a loop one by one.
+    """Runs a loop one iteration at a time.
 
-    Iterating over it steps until the solve is over, however long that takes; a budget is the
-    caller's.
+    Iterating over a stepper makes steps until the solve ends; the caller limits their number.
 
     Attributes:
         graph: The step.
-        iteration: Steps made so far.
-        status: 0 while running, else the code with which the solve ended.
+        iteration: Number of steps so far.
+        status: 0 while running, otherwise the code with which the solve ended.
     """
 
     def __init__(
@@ -513,15 +517,15 @@ class Stepper:
         loop: LoopKernel,
         state: Vector,
         parameters: Vector,
-        next_round: NextRound | None = None,
+        next_round: NextRestart | None = None,
     ) -> None:
-        """Start.
+        """Start a solve.
 
         Args:
-            loop: What makes the steps.
+            loop: Loop of the step.
             state: (ns,) the first state.
             parameters: (np,) targets, tolerances, gains.
-            next_round: How a solve of several rounds goes on; None: there is one round.
+            next_round: Callback that starts the next restart; None: no restarts.
         """
         self.graph = loop.step
         self.iteration = 0
@@ -533,20 +537,20 @@ class Stepper:
 
     @property
     def state(self) -> dict[str, Any]:
-        """What the next step starts from, by name."""
+        """Fields of the state from which the next step starts, by name."""
         return self.graph.state.unpack(self._state.copy())
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """What is constant during a round, by name."""
+        """Fields of the parameters of the current restart, by name."""
         return self.graph.parameters.unpack(self._parameters.copy())
 
     def step(self) -> dict[str, Any]:
         """Make one iteration.
 
         Returns:
-            What is logged of it, by name: the fields of `StepGraph.record`. After the end it
-            steps on from where the solve ended.
+            The fields of `StepGraph.record` by name. After the end of a solve it continues from
+            the last state.
         """
         result = self._loop.run(self._state[None], self._parameters[None], 1, trace=True)
         if not len(result.trace[0]):
@@ -562,6 +566,6 @@ class Stepper:
         return {field.name: row[field.name] for field in self.graph.record}
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        """The records from here to the end."""
+        """Yield the records of all remaining iterations."""
         while self.status == RUNNING:
             yield self.step()

@@ -19,7 +19,7 @@ from casadi_ik.compile.codegen import (
     driver_text,
     number,
     row_major,
-    standing_alone,
+    standalone_source,
 )
 from casadi_ik.compile.emitter import CodeOptions
 from casadi_ik.compile.graphs import FunctionGraph
@@ -94,7 +94,7 @@ class FollowSources:
         marks = {
             "PREFIX": self.prefix,
             "GUARD": self.prefix.upper(),
-            "CYCLE": standing_alone(row_major(cycle.graph.function), CodeOptions()),
+            "CYCLE": standalone_source(row_major(cycle.graph.function), CodeOptions()),
             "FOLLOW_CONSTANTS": self._constants(cycle),
             "FOLLOW_STATE": str(cycle.state.size),
             "FOLLOW_ASKED": str(cycle.parameters.size),
@@ -346,7 +346,7 @@ class SolverSources:
         body = "".join(
             (
                 f'#include "{self.prefix}_parts.h"\n\n',
-                standing_alone(function, self.form),
+                standalone_source(function, self.form),
                 f"#define NAMED {self.prefix}_{name}_kernel\n",
                 f"#define MEMORY {self.prefix}_memory\n",
                 driver_text("freestanding"),
@@ -458,7 +458,7 @@ class SolverSources:
     def judge(self) -> dict[str, str]:
         """Files of the kinematics in double precision that answers are judged by."""
         marks = {
-            "KINEMATICS": standing_alone(self.plan.judge.function, CodeOptions()),
+            "KINEMATICS": standalone_source(self.plan.judge.function, CodeOptions()),
             "POSITION_TOLERANCE": repr(self.tolerance.position),
             "ANGLE_TOLERANCE": repr(self.tolerance.angle),
             "LIMIT_SLACK": repr(LIMIT_SLACK),

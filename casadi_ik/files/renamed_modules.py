@@ -1,4 +1,4 @@
-"""Old import paths of documented modules: they work until version 0.3, with a DeprecationWarning."""
+"""Old import paths of documented modules, which work until version 0.3 with a warning."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from pathlib import Path
 
 from casadi_ik.collision.clearance import SceneCheck
 from casadi_ik.compile.cancellation import cached_only, virtual_machine
-from casadi_ik.compile.compiler import find_compiler, tell, waits
+from casadi_ik.compile.compiler import find_compiler, print_note, waits_for_compiler
 from casadi_ik.compile.libraries import NotCachedError
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arm_hand import ArmHand
@@ -108,7 +108,7 @@ class FirstAnswers:
                 with cached_only():
                     method.prepare()
             except NotCachedError:
-                ready = waits() or (process is not None and process.poll() is not None)
+                ready = waits_for_compiler() or (process is not None and process.poll() is not None)
                 if not ready and process is None:
                     self._process = started(method)
                     ready = self._process is None
@@ -141,7 +141,7 @@ def started(method: HandFirstMethod) -> subprocess.Popen[bytes] | None:
     except OSError:
         return None
     seconds = WAITING.motor * len(method.robot.actuators)
-    tell(
+    print_note(
         f"{method.robot.name}: compiled in the background (about {seconds:.0f} s, once per "
         "machine); until then CasADi's virtual machine answers"
     )

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 import casadi_ik as ik
 from casadi_ik.compile import FunctionGraph, FunctionKernel, LookupKernel
-from casadi_ik.compile.codegen import standing_alone
+from casadi_ik.compile.codegen import standalone_source
 from casadi_ik.compile.lookup import LARGEST, STEPS
-from casadi_ik.compile.straight_lines import Form
+from casadi_ik.compile.straight_lines import CodeOptions
 from casadi_ik.kinematics.smooth import part
 
 from .graphs import BOTH, needs_compiler, random_expression
@@ -70,7 +70,7 @@ def test_parts_are_called_with_what_is_there_or_put_together(in_lanes, rng):
     wanted = FunctionKernel(function, compiled=False)(*given)
     for one, other in zip(kernel(*given), wanted, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-13, atol=1e-13)
-    text = standing_alone(function, Form())
+    text = standalone_source(function, CodeOptions())
     assert text.count("CODE void f0_inner(") == 1
     assert text.count("f0_inner(") == 4
 

@@ -224,7 +224,7 @@ def test_kernels_made_ahead_serve_without_a_compiler(directory, tmp_path, monkey
         record = archive.read(f"{libraries.AHEAD}-{ik.__version__}.dist-info/RECORD").decode()
         assert {line.split(",")[0] for line in record.splitlines()} == set(archive.namelist())
     monkeypatch.syspath_prepend(str(tmp_path / "site"))
-    libraries.ahead_folder.cache_clear()
+    libraries.prebuilt_folder.cache_clear()
     monkeypatch.setenv("CC", "none")
     forget(monkeypatch)
     try:
@@ -235,7 +235,7 @@ def test_kernels_made_ahead_serve_without_a_compiler(directory, tmp_path, monkey
             assert not kernel().compiled
         assert "its kernels are not used" in str(caught[0].message)
     finally:
-        libraries.ahead_folder.cache_clear()
+        libraries.prebuilt_folder.cache_clear()
 
 
 @needs_compiler
@@ -294,7 +294,7 @@ def test_cc_may_have_arguments(directory, monkeypatch):
 def test_malformed_variables(directory, monkeypatch, variable, value, said):
     monkeypatch.setenv(variable, value)
     with pytest.raises(ik.errors.KernelError, match=said):
-        _ = compiler.find_compiler(), compiler.waits(), LoopKernel(counting_step())
+        _ = compiler.find_compiler(), compiler.waits_for_compiler(), LoopKernel(counting_step())
 
 
 @needs_compiler

@@ -1,31 +1,28 @@
-/* A step run to its end for every solve of a batch: the one loop, for vectors and for one number.
+/* The loop: runs a step until each solve of a batch ends.
  *
- * Compiled with LANES solves side by side (lanes.c), or, without, for one after the other; each
- * solve's iterates are the same bits. A method may say what follows when a solve's iterations end
- * (`follow`, see loop_job.c): the solve then goes on from another start in the same slot.
+ * Compiled with LANES solves in vector lanes (lanes.c), or with one; the iterates of a solve are the
+ * same bit for bit. When a solve ends, the method's callback `follow` (loop_job.c) may start it again
+ * in the same slot.
  *
- * Side by side a step costs least when all lanes take the same branches, so some more solves than
- * lanes are under way: a lane whose solve ends or changes its stage takes another one of the stage
- * the lanes are in, and when more wait for another stage than lanes are left at work, all turn to
- * that. The rows come as they are made; `places` says whose they are.
+ * A step in lanes is cheapest if all lanes take the same branch. There are therefore more slots than
+ * lanes: a lane whose solve ends or changes its stage is refilled with a solve in the current stage,
+ * and when more solves wait in another stage than lanes are busy, all lanes switch to that stage. Rows
+ * are stored in the order of computation; `places` holds their solve and iteration.
  *
- * A step is a function of state and parameters alone, so a state that comes back bit for bit comes
- * back for ever, and so does everything between: such a solve would run to its budget and ends as
- * REPEATED instead. Noticed as by Brent (1980): every state is compared with that of the last
- * iteration whose number is a power of two, so a cycle is found within its length after the first
- * such iteration in it that is no smaller than its length. It begins at FIRST_MARK: most solves end
- * before, and keeping states for a comparison costs.
+ * A step depends on state and parameters alone, so a state that repeats bit for bit repeats forever;
+ * such a solve ends as REPEATED. Cycles are detected as by Brent (1980): every state is compared with
+ * that of the last iteration whose number is a power of two. The comparison starts at FIRST_MARK,
+ * since most solves end earlier and storing states costs time.
  *
- * Expects the macros N_STATE, N_PARAMETERS, N_SEATED (those of the parameters that lanes need; a step
- * of stages finds the others in a third argument), N_RECORD, ROW_BYTES, RUNNING, NON_FINITE,
- * REPEATED, CODE_LIMIT, SLOTS, FIRST_MARK, STAGE (the place in the state of the number that tells
- * the stages apart, -1 if there is none) and the function store_row(record, row). Everything that
- * must survive a pause lives in the job's arrays: a call that returns SLICE_OVER or ROWS_FULL is
- * taken up again by calling once more, in either form of the loop.
+ * Requires the macros N_STATE, N_PARAMETERS, N_SEATED (number of parameters that lanes load; a step of
+ * stages reads the others through its third argument), N_RECORD, ROW_BYTES, RUNNING, NON_FINITE,
+ * REPEATED, CODE_LIMIT, SLOTS, FIRST_MARK, STAGE (index of the stage in the state; -1 without stages)
+ * and the function store_row(record, row). All data that must survive a pause are in the job: after
+ * SLICE_OVER or ROWS_FULL either form of the loop can be called again.
  */
 
 #define STAGES 12
-#define NOBODY (-1)
+#define EMPTY (-1)
 
 #ifndef LANES
 #define LANES 1
@@ -35,24 +32,24 @@ typedef scalar lanes;
 #endif
 #define LANE(pack, k, lane) (((scalar *) (pack))[(k) * LANES + (lane)])
 
-/* Solves that wait, by stage. */
+/* Waiting slots by stage. */
 typedef struct {
-  int known;                   /* stages met so far; more than STAGES share the last place */
+  int stage_count;                   /* stages met so far; more than STAGES share the last place */
   scalar stage[STAGES];
   int height[STAGES];
   int waiting[STAGES][SLOTS];  /* slots */
 } queues;
 
-/* What the lanes work on. */
+/* State of the lanes. */
 typedef struct {
-  int slot[LANES];             /* whose state, or NOBODY */
-  int queue;                   /* where its like wait */
-  int outcome;                 /* DONE, or why the loop stops */
+  int slot[LANES];             /* slot in each lane, or EMPTY */
+  int queue;                   /* queue of the current stage */
+  int outcome;                 /* DONE, or the reason to stop */
   lanes *now, *next, *parameters, *record;
-  const scalar *own[LANES];    /* parameters of each lane's solve */
-} bench;
+  const scalar *own[LANES];    /* all parameters of each lane */
+} lane_set;
 
-/* Rows stand by slot where a method writes them, else by solve. */
+/* States and parameters are indexed by slot if a callback writes them, otherwise by solve. */
 static scalar *state_of(const loop_job *job, int slot) {
   return job->states + (job->follow ? slot : job->slots[slot]) * job->state_step;
 }
@@ -63,31 +60,31 @@ static const scalar *parameters_of(const loop_job *job, int slot) {
 
 static int queue_of(queues *all, scalar stage) {
   int i;
-  for (i = 0; i < all->known; ++i) {
+  for (i = 0; i < all->stage_count; ++i) {
     if (all->stage[i] == stage) return i;
   }
-  if (all->known == STAGES) return STAGES - 1;
-  all->stage[all->known] = stage;
-  return all->known++;
+  if (all->stage_count == STAGES) return STAGES - 1;
+  all->stage[all->stage_count] = stage;
+  return all->stage_count++;
 }
 
-static void queue_up(queues *all, const loop_job *job, int slot) {
+static void enqueue(queues *all, const loop_job *job, int slot) {
   const scalar stage = STAGE < 0 ? 0 : state_of(job, slot)[STAGE < 0 ? 0 : STAGE];
   const int i = queue_of(all, stage == stage ? stage : -1);
   all->waiting[i][all->height[i]++] = slot;
 }
 
-/* Iterations since the solve's last start. */
-static int64_t spent(const loop_job *job, int slot) {
+/* Returns the iterations since the last start of the solve in a slot. */
+static int64_t iterations_since_start(const loop_job *job, int slot) {
   return job->iterations[job->slots[slot]] - job->begun[slot];
 }
 
-/* Where a slot's solve has ended, or none is: another start of it as the method says, or the next
+/* Refills a slot whose solve has ended: asks the method for a restart, otherwise loads the next
  * solve. */
-static void follow_up(bench *b, queues *all, loop_job *job, int slot) {
+static void refill_slot(lane_set *b, queues *all, loop_job *job, int slot) {
   for (;;) {
-    int fresh = job->slots[slot] == NOBODY, code = 0;
-    if (fresh) {
+    int is_new = job->slots[slot] == EMPTY, code = 0;
+    if (is_new) {
       if (job->solve == job->count) return;
       job->slots[slot] = job->solve++;
     }
@@ -95,81 +92,81 @@ static void follow_up(bench *b, queues *all, loop_job *job, int slot) {
       int32_t *status = job->status + job->slots[slot];
       code = job->follow(job->method, slot, job->slots[slot], status);
       if (code == GOES_ON) *status = RUNNING;
-    } else if (fresh) {
+    } else if (is_new) {
       code = GOES_ON;
     }
     if (code == GOES_ON) {
       job->begun[slot] = job->iterations[job->slots[slot]];
-      queue_up(all, job, slot);
+      enqueue(all, job, slot);
       return;
     }
     if (code != DONE) {
       b->outcome = code;
       return;
     }
-    job->slots[slot] = NOBODY;
+    job->slots[slot] = EMPTY;
   }
 }
 
-static void sit_down(bench *b, const loop_job *job, int lane, int slot) {
-  const scalar *state = state_of(job, slot), *given = parameters_of(job, slot);
+static void load_lane(lane_set *b, const loop_job *job, int lane, int slot) {
+  const scalar *state = state_of(job, slot), *parameters = parameters_of(job, slot);
   int k;
   for (k = 0; k < N_STATE; ++k) LANE(b->now, k, lane) = state[k];
 #if LANES == 1
-  b->parameters = (lanes *) given;
+  b->parameters = (lanes *) parameters;
 #else
-  for (k = 0; k < N_SEATED; ++k) LANE(b->parameters, k, lane) = given[k];
+  for (k = 0; k < N_SEATED; ++k) LANE(b->parameters, k, lane) = parameters[k];
 #endif
-  b->own[lane] = given;
+  b->own[lane] = parameters;
   b->slot[lane] = slot;
 }
 
-static void stand_up(bench *b, const loop_job *job, int lane, const lanes *state) {
-  scalar *to = state_of(job, b->slot[lane]);
+static void store_lane(lane_set *b, const loop_job *job, int lane, const lanes *state) {
+  scalar *destination = state_of(job, b->slot[lane]);
   int k;
-  for (k = 0; k < N_STATE; ++k) to[k] = LANE(state, k, lane);
-  b->slot[lane] = NOBODY;
+  for (k = 0; k < N_STATE; ++k) destination[k] = LANE(state, k, lane);
+  b->slot[lane] = EMPTY;
 }
 
-/* As many lanes as possible get a solve; returns how many have one. */
-static int fill(bench *b, queues *all, const loop_job *job) {
-  int lane, i, busy = 0, most = 0;
+/* Loads solves into empty lanes, switching the stage if that fills more; returns the busy lanes. */
+static int fill(lane_set *b, queues *all, const loop_job *job) {
+  int lane, i, busy = 0, fullest = 0;
   for (lane = 0; lane < LANES; ++lane) {
-    if (b->slot[lane] == NOBODY && all->height[b->queue] > 0) {
-      sit_down(b, job, lane, all->waiting[b->queue][--all->height[b->queue]]);
+    if (b->slot[lane] == EMPTY && all->height[b->queue] > 0) {
+      load_lane(b, job, lane, all->waiting[b->queue][--all->height[b->queue]]);
     }
-    busy += b->slot[lane] != NOBODY;
+    busy += b->slot[lane] != EMPTY;
   }
   if (busy == LANES) return busy;
-  for (i = 1; i < all->known; ++i) {
-    if (all->height[i] > all->height[most]) most = i;
+  for (i = 1; i < all->stage_count; ++i) {
+    if (all->height[i] > all->height[fullest]) fullest = i;
   }
-  if (all->height[most] <= busy) return busy;
+  if (all->height[fullest] <= busy) return busy;
   for (lane = 0; lane < LANES; ++lane) {
     const int slot = b->slot[lane];
-    if (slot == NOBODY) continue;
-    stand_up(b, job, lane, b->now);
-    queue_up(all, job, slot);
+    if (slot == EMPTY) continue;
+    store_lane(b, job, lane, b->now);
+    enqueue(all, job, slot);
   }
-  b->queue = most;
-  for (lane = 0; lane < LANES && all->height[most] > 0; ++lane) {
-    sit_down(b, job, lane, all->waiting[most][--all->height[most]]);
+  b->queue = fullest;
+  for (lane = 0; lane < LANES && all->height[fullest] > 0; ++lane) {
+    load_lane(b, job, lane, all->waiting[fullest][--all->height[fullest]]);
   }
   return lane;
 }
 
-static void write_row(const bench *b, loop_job *job, int lane, int64_t solve) {
-  scalar own[N_RECORD + 1];
+static void write_row(const lane_set *b, loop_job *job, int lane, int64_t solve) {
+  scalar record_values[N_RECORD + 1];
   int k;
-  for (k = 0; k < N_RECORD; ++k) own[k] = LANE(b->record, k, lane);
+  for (k = 0; k < N_RECORD; ++k) record_values[k] = LANE(b->record, k, lane);
   job->places[2 * job->used] = solve;
   job->places[2 * job->used + 1] = job->iterations[solve] - 1;
-  store_row(own, job->rows + ROW_BYTES * job->used++);
+  store_row(record_values, job->rows + ROW_BYTES * job->used++);
 }
 
-/* Which lanes have a finite state: x * 0 is 0 for finite x and NaN otherwise; sums have no branch
- * and no library call, and four of them need not wait for each other. */
-LANES_TARGET static void examine(const bench *b, int *finite) {
+/* Tests which lanes have a finite state: x * 0 is 0 for finite x and NaN otherwise. Sums need no
+ * branch, and four of them are independent of each other. */
+LANES_TARGET static void check_finite(const lane_set *b, int *finite) {
   lanes sum[4], total;
   int k, i;
   for (i = 0; i < 4; ++i) sum[i] = SPREAD(0.0);
@@ -181,13 +178,13 @@ LANES_TARGET static void examine(const bench *b, int *finite) {
   for (i = 0; i < LANES; ++i) finite[i] = LANE(&total, 0, i) == 0;
 }
 
-/* Whether later states are compared with that of this iteration. */
+/* Returns 1 if later states are compared with the state of this iteration. */
 static int is_marked(int64_t iteration) {
   return iteration >= FIRST_MARK && !(iteration & (iteration - 1));
 }
 
-/* Whether the state is once more the one marked; nearly always its first numbers tell. */
-static int is_repeated(const bench *b, const scalar *mark, int lane) {
+/* Returns 1 if the state equals the marked one; the first elements nearly always differ. */
+static int is_repeated(const lane_set *b, const scalar *mark, int lane) {
   int k;
   for (k = 0; k < N_STATE; ++k) {
     if (memcmp(&LANE(b->now, k, lane), mark + k, sizeof(scalar))) return 0;
@@ -195,24 +192,24 @@ static int is_repeated(const bench *b, const scalar *mark, int lane) {
   return 1;
 }
 
-static void end(bench *b, queues *all, loop_job *job, int lane, int32_t status, lanes *state) {
+static void end_solve(lane_set *b, queues *all, loop_job *job, int lane, int32_t status, lanes *state) {
   const int slot = b->slot[lane];
   job->status[job->slots[slot]] = status;
-  stand_up(b, job, lane, state);
-  follow_up(b, all, job, slot);
+  store_lane(b, job, lane, state);
+  refill_slot(b, all, job, slot);
 }
 
-/* What comes of a lane's solve after a step; the state is in `now`, the one before in `next`.
- * Whether another solve may take the lane. */
-static int settle(bench *b, queues *all, loop_job *job, int lane, scalar code, int finite) {
+/* Processes a lane after an iteration; the new state is in `now`, the previous one in `next`.
+ * Returns 1 if the lane is free. */
+static int finish_iteration(lane_set *b, queues *all, loop_job *job, int lane, scalar code, int finite) {
   const int slot = b->slot[lane];
-  const int64_t iteration = spent(job, slot);
+  const int64_t iteration = iterations_since_start(job, slot);
   scalar *mark = job->mark + slot * N_STATE;
   int32_t status;
   int k;
-  /* Written so that a NaN code fails the test too. */
+  /* A NaN code fails this test as well. */
   if (!(code > -CODE_LIMIT && code < CODE_LIMIT) || !finite) {
-    end(b, all, job, lane, NON_FINITE, b->next);
+    end_solve(b, all, job, lane, NON_FINITE, b->next);
     return 1;
   }
   status = (int32_t) code;
@@ -221,30 +218,30 @@ static int settle(bench *b, queues *all, loop_job *job, int lane, scalar code, i
     for (k = 0; k < N_STATE; ++k) mark[k] = LANE(b->now, k, lane);
   }
   if (status != RUNNING || iteration == job->max_iterations) {
-    end(b, all, job, lane, status, b->now);
+    end_solve(b, all, job, lane, status, b->now);
     return 1;
   }
 #if STAGE >= 0 && LANES > 1
   if (LANE(b->now, STAGE, lane) != LANE(b->next, STAGE, lane)) {
-    stand_up(b, job, lane, b->now);
-    queue_up(all, job, slot);
+    store_lane(b, job, lane, b->now);
+    enqueue(all, job, slot);
     return 1;
   }
 #endif
   return 0;
 }
 
-/* The seconds since last time, shared by the solves that had the lanes. */
-static void share(const int64_t *solves, int busy, const loop_job *job, scalar *since) {
+/* Adds the time since the last call to the solves in the lanes, in equal shares. */
+static void add_seconds(const int64_t *solves, int busy, const loop_job *job, scalar *since) {
   const scalar now = monotonic(), each = (now - *since) / busy;
   int lane;
   for (lane = 0; lane < LANES; ++lane) {
-    if (solves[lane] != NOBODY) job->seconds[solves[lane]] += each;
+    if (solves[lane] != EMPTY) job->seconds[solves[lane]] += each;
   }
   *since = now;
 }
 
-static void begin(bench *b, queues *all, loop_job *job, lanes *memory) {
+static void start_loop(lane_set *b, queues *all, loop_job *job, lanes *memory) {
   int slot, lane;
   b->now = memory;
   b->next = b->now + N_STATE;
@@ -252,30 +249,30 @@ static void begin(bench *b, queues *all, loop_job *job, lanes *memory) {
   b->record = b->parameters + N_PARAMETERS;
   b->queue = 0;
   b->outcome = DONE;
-  all->known = 0;
+  all->stage_count = 0;
   memset(all->height, 0, sizeof all->height);
-  for (lane = 0; lane < LANES; ++lane) b->slot[lane] = NOBODY;
+  for (lane = 0; lane < LANES; ++lane) b->slot[lane] = EMPTY;
   for (slot = 0; slot < job->slot_count && b->outcome == DONE; ++slot) {
     const int64_t solve = job->slots[slot];
-    if (solve == NOBODY || job->status[solve] != RUNNING
-        || spent(job, slot) == job->max_iterations) follow_up(b, all, job, slot);
-    else queue_up(all, job, slot);
+    if (solve == EMPTY || job->status[solve] != RUNNING
+        || iterations_since_start(job, slot) == job->max_iterations) refill_slot(b, all, job, slot);
+    else enqueue(all, job, slot);
   }
 }
 
-/* Whether so few solves are left that one after the other takes less time than side by side. */
+/* Returns 1 if so few solves remain that the loop without lanes is faster. */
 static int is_few(const loop_job *job) {
   int64_t left = 0;
   int slot;
   if (LANES == 1 || job->solve < job->count) return 0;
-  for (slot = 0; slot < job->slot_count; ++slot) left += job->slots[slot] != NOBODY;
+  for (slot = 0; slot < job->slot_count; ++slot) left += job->slots[slot] != EMPTY;
   return left < job->fewest;
 }
 
 LANES_TARGET DRIVER(loop, loop_job) {
   workspace space;
   queues all;
-  bench b;
+  lane_set b;
   lanes code, *last;
   int64_t ticks = 0, solves[LANES];
   scalar limit, since;
@@ -283,14 +280,14 @@ LANES_TARGET DRIVER(loop, loop_job) {
   if (outcome != DONE) return outcome;
   since = monotonic();
   limit = since + job->slice;
-  begin(&b, &all, job, (lanes *) space.extra);
+  start_loop(&b, &all, job, (lanes *) space.extra);
 
   while (b.outcome == DONE && (busy = fill(&b, &all, job))) {
     int changed = 0, wanted = 0;
     if (is_few(job)) b.outcome = FEW_LEFT;
     for (lane = 0; lane < LANES; ++lane) {
-      solves[lane] = b.slot[lane] == NOBODY ? NOBODY : job->slots[b.slot[lane]];
-      if (solves[lane] != NOBODY) wanted |= 1 << lane;
+      solves[lane] = b.slot[lane] == EMPTY ? EMPTY : job->slots[b.slot[lane]];
+      if (solves[lane] != EMPTY) wanted |= 1 << lane;
     }
     while (!changed) {
       if (job->rows && job->used + LANES > job->capacity) b.outcome = ROWS_FULL;
@@ -305,21 +302,21 @@ LANES_TARGET DRIVER(loop, loop_job) {
       space.res[2] = (real *) &code;
       STEP(space.arg, space.res, wanted);
       --job->left;
-      examine(&b, finite);
+      check_finite(&b, finite);
       last = b.now;
       b.now = b.next;
       b.next = last;
       for (lane = 0; lane < LANES; ++lane) {
-        if (solves[lane] == NOBODY) continue;
+        if (solves[lane] == EMPTY) continue;
         ++job->iterations[solves[lane]];
         if (job->rows) write_row(&b, job, lane, solves[lane]);
-        changed |= settle(&b, &all, job, lane, LANE(&code, 0, lane), finite[lane]);
+        changed |= finish_iteration(&b, &all, job, lane, LANE(&code, 0, lane), finite[lane]);
       }
     }
-    share(solves, busy, job, &since);
+    add_seconds(solves, busy, job, &since);
   }
   for (lane = 0; lane < LANES; ++lane) {
-    if (b.slot[lane] != NOBODY) stand_up(&b, job, lane, b.now);
+    if (b.slot[lane] != EMPTY) store_lane(&b, job, lane, b.now);
   }
   give_back(&space);
   return b.outcome;

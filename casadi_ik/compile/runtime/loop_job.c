@@ -1,33 +1,33 @@
-/* What a loop works on (loop.c). */
+/* Job of the loop (loop.c). */
 #ifndef SINGLE
 typedef double scalar;
 #endif
 
 typedef struct {
-  scalar *states;              /* N_STATE numbers of each solve, start in, end out; of each slot
-                                  where there is `follow`, which writes the starts */
-  scalar *parameters;          /* likewise */
-  int64_t state_step;          /* numbers from one to the next */
-  int64_t parameter_step;      /* likewise, 0 = the same for all */
+  scalar *states;              /* (count, N_STATE) first states in, last states out; with `follow`
+                                  (slot_count, N_STATE), written by it */
+  scalar *parameters;          /* likewise (., N_PARAMETERS) */
+  int64_t state_step;          /* distance between consecutive states */
+  int64_t parameter_step;      /* likewise; 0: shared by all solves */
   int64_t *iterations;         /* (count), zeros at the start */
-  int32_t *status;             /* (count), at the start RUNNING; UNBEGUN where there is `follow` */
+  int32_t *status;             /* (count), initially RUNNING; with `follow` UNBEGUN */
   scalar *seconds;             /* (count), zeros at the start */
-  int64_t *slots;              /* (slot_count) the solve in each slot, -1 = none */
-  int64_t *begun;              /* (slot_count) iterations of its solve before its last start */
-  scalar *mark;                /* (slot_count, N_STATE) states that later ones are compared with */
-  int64_t slot_count;          /* solves under way at a time, at most SLOTS */
-  unsigned char *rows;         /* (capacity) rows, or NULL: no trace */
+  int64_t *slots;              /* (slot_count) solve in each slot; -1: none */
+  int64_t *begun;              /* (slot_count) iterations of the solve before its last start */
+  scalar *mark;                /* (slot_count, N_STATE) marked states for the detection of cycles */
+  int64_t slot_count;          /* at most SLOTS */
+  unsigned char *rows;         /* (capacity) rows; NULL without a trace */
   int64_t *places;             /* (capacity, 2) solve and iteration of each row */
   int64_t capacity;
-  int64_t used;                /* rows written so far */
-  int64_t count;               /* solves */
-  int64_t solve;               /* first solve not yet begun */
-  int64_t max_iterations;      /* of one start, at least 1 */
-  int64_t left;                /* steps until a pause (SLICE_OVER) */
-  int64_t fewest;              /* with fewer solves left than that the loop for several stops */
-  scalar slice;                /* [s] after which Python gets a look at its signals */
-  /* What follows when the solve in a slot has ended (its status; RUNNING: at its budget) or is new
-   * (UNBEGUN): GOES_ON from the start written; DONE; or why the loop has to stop. */
+  int64_t used;                /* number of rows written */
+  int64_t count;               /* number of solves */
+  int64_t solve;               /* next solve to start */
+  int64_t max_iterations;      /* per start, at least 1 */
+  int64_t left;                /* steps until SLICE_OVER */
+  int64_t fewest;              /* the loop with lanes stops when fewer solves remain */
+  scalar slice;                /* time until SLICE_OVER, so that Python handles signals [s] */
+  /* Called when the solve in a slot has ended (with its status; RUNNING at max_iterations) or is new
+   * (UNBEGUN). Returns GOES_ON after writing a start, DONE, or the reason to stop the loop. */
   int (*follow)(void *method, int64_t slot, int64_t solve, int32_t *status);
   void *method;
 } loop_job;

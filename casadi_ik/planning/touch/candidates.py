@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.collision.clearance import CollisionQuery, SceneCheck
 from casadi_ik.collision.distances import Table, pose_row
-from casadi_ik.compile.cancellation import SLICE, drive
+from casadi_ik.compile.cancellation import SLICE, run_cancellable
 from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.model.pose import inverse
 from casadi_ik.planning.touch.hand_table import (
@@ -277,7 +277,7 @@ class Generator:
         job.postured, job.used = postured.ctypes.data, used.ctypes.data
         job.patches, job.n_patches = self._pairs.ctypes.data, len(self._pairs)
         job.wanted, job.found, job.most = count, 0, job.attempts + self.parameters.attempts
-        drive("touch", self._entry, job)
+        run_cancellable("touch", self._entry, job)
         found = job.found
         hand = table.q[shared[:found], postured[:found, table.thumb]].copy()
         for finger in range(f):
@@ -460,7 +460,7 @@ def snapped(
         count=len(q),
         slice=SLICE,
     )
-    drive("snap", table.kernel.library["casadi_ik_snap"], job)
+    run_cancellable("snap", table.kernel.library["casadi_ik_snap"], job)
     palm = rigid(arrays["palms"][:, :9].reshape(-1, 3, 3), arrays["palms"][:, 9:])
     return Candidates(palm, arrays["q"][:, motors], some.used)
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from casadi_ik.collision.clearance import SceneCheck
 from casadi_ik.collision.model import pair_table
 from casadi_ik.collision.scene import Scene
-from casadi_ik.compile.cancellation import SLICE, drive
+from casadi_ik.compile.cancellation import SLICE, run_cancellable
 from casadi_ik.compile.codegen import c_struct, define, driver_text
 from casadi_ik.compile.function_kernel import FunctionKernel
 from casadi_ik.compile.graphs import FunctionGraph, recipe
@@ -326,7 +326,7 @@ class HandShapes:
             np.ascontiguousarray(np.stack([fingers[a], place[a], fingers[b], place[b]], axis=1)),
             model.radii[a] + model.radii[b] + within.offsets[two],
         )
-        drive("touch", touch_library()["casadi_ik_apart"], TouchJob(**made.job))
+        run_cancellable("touch", touch_library()["casadi_ik_apart"], TouchJob(**made.job))
         return made
 
     @property

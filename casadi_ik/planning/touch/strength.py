@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.compile.cancellation import SLICE, drive
+from casadi_ik.compile.cancellation import SLICE, run_cancellable
 from casadi_ik.compile.codegen import c_struct
 from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.kinematics.arm_hand import ArmHand
@@ -308,7 +308,7 @@ def _solved(wrenches: Array, directions: Array) -> Array:
         count=k * d,
         slice=SLICE,
     )
-    drive("loads", _entry(), job)
+    run_cancellable("loads", _entry(), job)
     return solved
 
 

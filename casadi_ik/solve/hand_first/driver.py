@@ -25,7 +25,7 @@ from casadi_ik.compile.codegen import WIDE, define, define_arrays, driver_text, 
 from casadi_ik.compile.function_kernel import machine_lanes, memory
 from casadi_ik.compile.graphs import recipe
 from casadi_ik.compile.libraries import load_library
-from casadi_ik.compile.loop import FOREVER, SLOTS, UNBEGUN, Followed
+from casadi_ik.compile.loop import SLOTS, UNBEGUN, UNBOUNDED, SlotSource
 from casadi_ik.errors import KernelError
 from casadi_ik.files.arrays import Array, even_steps
 from casadi_ik.kinematics.contact_fit import fresh_fit
@@ -554,8 +554,8 @@ class Searches:
         step = 0 if given.ndim == 1 else given.shape[1]
         job = (ctypes.c_int64 * 11)(self._base, *map(memory, asked), step, *map(memory, answers))
         fields: Any = self._memory.dtype.fields
-        result = plan.solve.run_followed(
-            Followed(
+        result = plan.solve.run_from_slots(
+            SlotSource(
                 states=self._base + fields["state"][1],
                 parameters=self._base + fields["parameters"][1],
                 step=self._memory.dtype.itemsize // 8,
@@ -658,7 +658,7 @@ def _text(plan: SearchPlan, wide: bool) -> str:
         (
             WIDE if wide else "",
             "#include <math.h>\n#include <stdint.h>\n#include <string.h>\n",
-            define(codes | {"FOREVER": FOREVER}),
+            define(codes | {"FOREVER": UNBOUNDED}),
             *jobs,
             f"typedef struct {{\n{plan.members()}",
             f"  const int16_t *tiles[3];\n{sides}{pointers}}} search;\n",
