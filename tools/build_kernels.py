@@ -58,7 +58,7 @@ TARGETS = {
 WIDTHS = (4, 8)
 """Solves side by side; of ARM's registers the compiler takes two for four doubles."""
 
-NAME = libraries.AHEAD
+NAME = libraries.PREBUILT_PACKAGE
 
 
 @dataclass(frozen=True)

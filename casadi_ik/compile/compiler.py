@@ -1,4 +1,4 @@
-"""The machine's C compiler."""
+"""C compilers: discovery, flags, and compilation of one file to a shared library."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ from casadi_ik.compile.cancellation import SLICE, stop_if_cancelled
 from casadi_ik.errors import KernelError
 from casadi_ik.files.progress import is_terminal
 
-# No contraction: with fused multiply-adds the iterates would differ from the VM's. Errno of sqrt
-# and friends is never read, and without it they are single instructions of the same value. All
-# but the driver is hidden, so that a function named like one of libc cannot be taken for it.
+# Without contraction: fused multiply-adds would change iterates against the virtual machine. errno
+# of math functions is never read; without it sqrt is one instruction with the same result. All
+# symbols but the entry points are hidden, so that they cannot replace functions of libc.
 FLAGS = ("-fPIC", "-shared", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden")
 
 LEVEL = ("-O2",)
-"""Optimization: -O1 compiles in three quarters of the time, and `fast` then takes 6 to 8 % more.
-Results are the same bit for bit."""
+"""Optimization level. With -O1 compiling takes three quarters of the time and `fast` 6 to 8 %
+longer; results are the same bit for bit."""
 
 CANDIDATES = ("cc", "gcc", "clang")
 
 ZIG = ("-m", "ziglang", "cc", "-mcpu=baseline", "-fno-sanitize=all")
-"""The compiler of the Python package ziglang: for any machine of the kind, as gcc compiles."""
+"""Arguments of the compiler in the Python package ziglang: portable code, as gcc generates."""
 
 SHOWN_ERROR_LINES, SHOWN_CHARACTERS = 3, 200
-"""How much of a compiler's complaint is shown."""
+"""Maximum number of lines, and of characters per line, of a compiler's errors in a message."""
 
 DISK_FULL_CODES = (errno.ENOSPC, errno.EDQUOT) if hasattr(errno, "EDQUOT") else (errno.ENOSPC,)
 
 MIN_FREE_BYTES = 2**20
-"""A disk with less room [bytes] counts as full if a compiler failed on it."""
+"""Free space below which a failed compilation counts as a full disk [bytes]."""
 
 
 class NoCompilerWarning(RuntimeWarning):
@@ -49,16 +49,16 @@ class NoCompilerWarning(RuntimeWarning):
 
 
 class UnloadableError(KernelError):
-    """What a compiler made cannot be loaded."""
+    """A compiled library cannot be loaded."""
 
 
 @dataclass(frozen=True)
 class Compiler:
-    """A C compiler that answered.
+    """A working C compiler.
 
     Attributes:
-        command: Absolute path, then arguments of `CC` if it had any.
-        version: The first line of its `--version`.
+        command: Absolute path, and the arguments in `CC`.
+        version: First line of the output of `--version`.
         flags: Flags of every compilation.
     """
 
@@ -68,21 +68,21 @@ class Compiler:
 
     @property
     def identity(self) -> str:
-        """What decides the produced code, apart from the source."""
+        """Text that identifies the produced code, apart from the source."""
         return "\n".join((*self.command, self.version, *LEVEL, *self.flags))
 
     def build(self, source: Path, library: Path) -> None:
         """Compile one C file to a shared library.
 
         Args:
-            source: The file.
-            library: Where the library shall stand; the compiler's own files are put beside it.
+            source: Path of the C file.
+            library: Path of the library; temporary files of the compiler are put beside it.
 
         Raises:
-            KernelError: The compiler refused; the message has the first lines of its complaint.
+            KernelError: Compiling failed; the message has the first lines of the compiler's errors.
             OSError: The disk is full.
             KeyboardInterrupt: Ctrl-C reached the compiler.
-            CancelledError: This thread has been told to stop.
+            CancelledError: The work of this thread is cancelled.
         """
         command = [*self.command, *LEVEL, *self.flags, "-o", str(library), str(source), "-lm"]
         environment = {"TMPDIR": str(library.parent), "LC_ALL": "C"}
@@ -116,7 +116,7 @@ class Compiler:
 def _run(
     command: Sequence[str], environment: Mapping[str, str]
 ) -> subprocess.CompletedProcess[str]:
-    """Run a command to its end, or until this thread has been told to stop."""
+    """Run a command to its end, or until the work of this thread is cancelled."""
     process = subprocess.Popen(
         command,
         stdout=subprocess.PIPE,
@@ -139,7 +139,7 @@ def _run(
 
 
 def _describe_exit(code: int) -> str:
-    """How a process ended, in words."""
+    """Describe how a process ended."""
     try:
         return signal.Signals(-code).name if code < 0 else f"exit code {code}"
     except ValueError:
@@ -147,14 +147,14 @@ def _describe_exit(code: int) -> str:
 
 
 def _disk_is_full(directory: Path, complaint: str) -> bool:
-    """Whether it was for want of room that a compiler failed."""
+    """Return True if a compiler failed because the disk is full."""
     if any(os.strerror(code) in complaint for code in DISK_FULL_CODES):
         return True
     return shutil.disk_usage(directory).free < MIN_FREE_BYTES
 
 
 def find_compiler() -> Compiler | None:
-    """The compiler of the environment, or None.
+    """Return the compiler of the environment; None if there is none.
 
     The environment variable `CC` (command and arguments) counts alone if it is set; otherwise the
     first of cc, gcc, clang on the path, then the Python package ziglang (extra `compiler`). A `CC`
@@ -170,7 +170,7 @@ def find_compiler() -> Compiler | None:
 
 @lru_cache(maxsize=16)
 def _find_cached(cc: str, path: str, flags: str) -> Compiler | None:
-    """`find_compiler` for one environment, remembered because it starts processes."""
+    """Return the compiler of one environment; cached, since it starts processes."""
     try:
         extra_flags = shlex.split(flags)
     except ValueError as error:
@@ -190,13 +190,13 @@ def _find_cached(cc: str, path: str, flags: str) -> Compiler | None:
 
 
 def _zig() -> list[list[str]]:
-    """Its command, where it is installed."""
+    """Return the command of ziglang, if it is installed."""
     is_installed = importlib.util.find_spec("ziglang") is not None and bool(sys.executable)
     return [[sys.executable, *ZIG]] if is_installed else []
 
 
 def _version(command: tuple[str, ...]) -> str | None:
-    """The first line of `--version`, None if the program does not run (macOS has such a stub)."""
+    """Return the first line of `--version`; None if the program does not run (a stub on macOS)."""
     try:
         done = subprocess.run(
             [*command, "--version"], capture_output=True, text=True, errors="replace", timeout=30
@@ -212,10 +212,10 @@ _warned = False
 
 
 def warn_no_compiler(problem: str = "") -> None:
-    """Say once per process that kernels run in the virtual machine.
+    """Warn once per process that kernels run in the virtual machine.
 
     Args:
-        problem: Why; "": there is no compiler.
+        problem: The reason; "": there is no compiler.
     """
     global _warned
     if _warned:
@@ -242,10 +242,10 @@ BACKGROUND, WAIT = "background", "wait"
 
 
 def waits_for_compiler() -> bool:
-    """Whether the first answer of a robot waits for the compiler.
+    """Return True if the first solve of a robot waits for the compiler.
 
     Raises:
-        KernelError: The environment variable says neither.
+        KernelError: The environment variable has another value.
     """
     policy = os.environ.get(POLICY) or BACKGROUND
     if policy not in (BACKGROUND, WAIT):
@@ -263,12 +263,12 @@ def print_note(text: str) -> None:
 
 
 def announce(name: str, size: int) -> None:
-    """Say what is compiled and about how long that takes, if it is long.
+    """Print what is compiled and the expected time, if that is more than 2 s.
 
     Args:
-        name: Of the kernel.
-        size: Characters of its text.
+        name: Name of the kernel.
+        size: Length of its C text [characters].
     """
-    # 150,000 to 280,000 characters of C in a second were measured.
+    # Measured: 150,000 to 280,000 characters of C per second.
     if (seconds := size / 200_000) >= 2.0:
         print_note(f"compiling {name} (about {seconds:.0f} s, once per machine)")

@@ -1,4 +1,4 @@
-"""Compiled libraries: of this process, made ahead, of the machine's cache, or built here.
+"""Compiled libraries: loaded in this process, prebuilt, from the cache, or built now.
 
 A library's file name in the cache holds two hashes: of everything it was built from (the key) and
 of its own bytes. The second lets a torn file be known before it is loaded (loading one can kill the
@@ -56,15 +56,15 @@ from casadi_ik.compile.graphs import package_sources
 from casadi_ik.files.writing import remove_stale
 
 PREBUILT_PACKAGE = "casadi_ik_kernels"
-"""The package of libraries made ahead."""
+"""Package of prebuilt libraries."""
 
 BUILD_WAIT = 120.0
-"""Seconds that are waited for another process that builds the same library."""
+"""Time to wait for another process that builds the same library [s]."""
 
 KEY = re.compile("[0-9a-f]{32}")
 
 text_listeners: list[Callable[[str, str], None]] = []
-"""Who wants the text of every library, told apart by the name of its file ahead
+"""Callbacks that receive the prebuilt name and the text of every library
 (tools/build_kernels.py)."""
 
 _lock = ForkSafeLock()
@@ -72,7 +72,7 @@ _loaded: dict[str, ctypes.CDLL] = {}
 
 
 class NotCachedError(Exception):
-    """A library would have to be built where none may be."""
+    """A library would have to be built, but building is not allowed."""
 
 
 def load_function(
@@ -84,16 +84,16 @@ def load_function(
     lanes: int = 1,
     wide: bool = False,
 ) -> ctypes.CDLL | None:
-    """The compiled library of a function and a driver; see `load_library`.
+    """Load the compiled library of a function and its runtime; see `load_library`.
 
     Args:
-        name: Of the library's file.
-        build: Gives the function.
-        driver: C text of the driver, with its constants.
-        symbol: The function the driver exports.
-        recipe: What the function follows from (`graphs.recipe`), "" if that is not known.
-        lanes: As for `library_source`, like those below.
-        wide: Likewise.
+        name: Name of the library's file.
+        build: Builder of the function.
+        driver: C text of the runtime with its constants.
+        symbol: Name of the exported C function.
+        recipe: Recipe of the function (`graphs.recipe`), "" if it is unknown.
+        lanes: Number of lanes.
+        wide: True if the machine has wide registers.
     """
 
     def text() -> str:
@@ -106,26 +106,25 @@ def load_function(
 def load_library(
     name: str, text: Callable[[], str], symbol: str, recipe: str = ""
 ) -> ctypes.CDLL | None:
-    """A compiled library: from this process, made ahead, from disk, or built.
+    """Load a compiled library from this process, prebuilt, from disk, or build it.
 
     Args:
-        name: Of the library's file.
-        text: Gives its C text.
-        symbol: A function it exports.
-        recipe: What the text follows from, "" if that is not known. Where a library of that recipe
-            is found, the text is not made.
+        name: Name of the library's file.
+        text: Builder of its C text.
+        symbol: Name of an exported C function.
+        recipe: Recipe of the text, "" if it is unknown. A library with this recipe is used without
+            building the text.
 
     Returns:
-        The library, or None where there is no compiler, or no room for what it makes (a warning
-        says so once).
+        The library; None without a compiler or without disk space (with one warning).
 
     Raises:
-        KernelError: There is no C code, or the compiler refused it or made no library.
-        NotCachedError: It is not there yet, and nothing may be built (`cached_only`).
+        KernelError: There is no C code, or compiling failed.
+        NotCachedError: The library is not cached and may not be built (`cached_only`).
     """
     if is_virtual():
         return None
-    # The key tells apart what is called alike that far.
+    # The hash distinguishes names that are equal up to here.
     short = name[:100]
     ahead = f"{short}-{_hash(recipe)}" if recipe else ""
     with _lock:
@@ -160,19 +159,19 @@ def load_library(
 
 @cache
 def _graph_versions() -> tuple[str, str]:
-    """Of what makes graphs; reading them takes a millisecond."""
+    """Return the versions of the libraries that build graphs; reading them takes 1 ms."""
     return ca.CasadiMeta.version(), version("numpy")
 
 
 def _key(compiler: Compiler, *parts: str) -> str:
-    """Hash of everything a library is built from, 32 hexadecimal digits."""
+    """Return a hash of everything that a library is built from, 32 hexadecimal digits."""
     return _hash(platform.system(), platform.machine(), compiler.identity, *parts)
 
 
 def _hash(*parts: str) -> str:
     digest = hashlib.sha256()
     for part in parts:
-        # The length keeps the parts apart.
+        # The length separates the parts.
         digest.update(f"{len(part)}:".encode())
         digest.update(part.encode())
     return digest.hexdigest()[:32]
@@ -180,7 +179,7 @@ def _hash(*parts: str) -> str:
 
 @cache
 def prebuilt_folder() -> Path | None:
-    """Where libraries made ahead for these sources are, None if there are none."""
+    """Return the folder of libraries prebuilt from these sources; None if there are none."""
     found = importlib.util.find_spec(PREBUILT_PACKAGE)
     if found is None or not found.submodule_search_locations:
         return None
@@ -201,7 +200,7 @@ def prebuilt_folder() -> Path | None:
 
 
 def _load_prebuilt(name: str, symbol: str) -> ctypes.CDLL | None:
-    """A library made ahead, or None."""
+    """Load a prebuilt library; None if there is none."""
     if name in _loaded:
         return _loaded[name]
     folder = prebuilt_folder()
@@ -219,7 +218,7 @@ def _load_prebuilt(name: str, symbol: str) -> ctypes.CDLL | None:
 
 
 def _load_by_recipe(directory: Path, name: str, note: str, symbol: str) -> ctypes.CDLL | None:
-    """The library that a recipe led to before, or None."""
+    """Load the library that a recipe led to before; None if there is none."""
     path = directory / note
     try:
         key = path.read_text(encoding="ascii") if is_private_file(path) else ""
@@ -234,7 +233,7 @@ def _load_by_recipe(directory: Path, name: str, note: str, symbol: str) -> ctype
 
 
 def _remember_key(path: Path, key: str) -> None:
-    """Remember what a recipe led to; that it cannot be written costs time only."""
+    """Store the key that a recipe led to; a failure only costs time later."""
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         part.write_text(key, encoding="ascii")
@@ -246,7 +245,7 @@ def _remember_key(path: Path, key: str) -> None:
 
 
 def _load_from(directory: Path, stem: str, symbol: str) -> ctypes.CDLL | None:
-    """A whole, loadable library of that key that has the symbol, or None; torn ones are removed."""
+    """Load a library by its key if it is complete and has the symbol; remove incomplete ones."""
     for path in directory.glob(f"{stem}-*.so"):
         try:
             if not is_private_file(path):
@@ -269,7 +268,8 @@ def _content_hash(path: Path) -> str:
 def _load_or_build(
     folders: list[Path], stem: str, source: str, compiler: Compiler, symbol: str
 ) -> ctypes.CDLL | None:
-    """From disk, or compiled into the first place that has room; None if none has."""
+    """Load a library from disk or compile it into the first usable folder; None if there is
+    none."""
     problems: dict[Path, OSError | UnloadableError] = {}
     library = None
 
@@ -300,7 +300,7 @@ def _load_or_build(
 
 @contextlib.contextmanager
 def _exclusive_build(path: Path) -> Iterator[None]:
-    """Wait while another process is in this block with the same file.
+    """Wait while another process builds the same library.
 
     Windows and some file systems have no such locks; there two processes may build the same
     library, which is harmless. A process that is killed releases its lock.
@@ -331,17 +331,17 @@ def _exclusive_build(path: Path) -> Iterator[None]:
 def _compile(
     directory: Path, stem: str, source: str, compiler: Compiler, symbol: str
 ) -> ctypes.CDLL:
-    """Compile into a directory.
+    """Compile a library into a directory.
 
     Raises:
-        OSError: It cannot be written, or is full.
-        KernelError: The compiler refused, or made something else than the library.
+        OSError: The directory is not writable or full.
+        KernelError: Compiling failed, or the result is not a library.
     """
     with temporary_build_dir(directory) as place:
         text, file = place / "kernel.c", place / "kernel.so"
         text.write_text(source, encoding="utf-8")
         compiler.build(text, file)
-        # Loaded before it is shown to others, who might tidy the directory up.
+        # Load it before other processes see it, since they might remove it.
         try:
             library = ctypes.CDLL(str(file))
             library[symbol]

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import casadi_ik as ik
 from casadi_ik.compile import FunctionGraph, FunctionKernel, LookupKernel
 from casadi_ik.compile.codegen import standalone_source
-from casadi_ik.compile.lookup import LARGEST, STEPS
+from casadi_ik.compile.lookup import MAX_STEPS, STEPS_PER_UNIT
 from casadi_ik.compile.straight_lines import CodeOptions
 from casadi_ik.kinematics.smooth import part
 
@@ -370,7 +370,10 @@ def identity(size: int) -> ca.Function:
 
 def sorted_rows(table, keys, count):
     """Exact integers and a stable sort."""
-    rounded = [np.rint(x * STEPS).clip(-LARGEST, LARGEST) for x in (table, np.nan_to_num(keys))]
+    rounded = [
+        np.rint(x * STEPS_PER_UNIT).clip(-MAX_STEPS, MAX_STEPS)
+        for x in (table, np.nan_to_num(keys))
+    ]
     steps, wanted = (x.astype(np.int64) for x in rounded)
     apart = np.where(np.isnan(keys)[:, None], 0, steps[None] - wanted[:, None])
     return (apart**2).sum(axis=2).argsort(axis=1, kind="stable")[:, :count]

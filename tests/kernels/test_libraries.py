@@ -210,7 +210,7 @@ def test_processes_that_need_the_same_build_it_once(directory):
 @pytest.mark.parametrize("made_for", ["these sources", "others"])
 def test_kernels_made_ahead_serve_without_a_compiler(directory, tmp_path, monkeypatch, made_for):
     texts: dict[str, str] = {}
-    monkeypatch.setattr(libraries, "on_text", [texts.__setitem__])
+    monkeypatch.setattr(libraries, "text_listeners", [texts.__setitem__])
     assert works()
     (name,), (library,) = texts, kept(directory, ".so")
     files = {
@@ -221,7 +221,9 @@ def test_kernels_made_ahead_serve_without_a_compiler(directory, tmp_path, monkey
     library.unlink()
     with zipfile.ZipFile(wheel(files, "linux_x86_64", tmp_path)) as archive:
         archive.extractall(tmp_path / "site")
-        record = archive.read(f"{libraries.AHEAD}-{ik.__version__}.dist-info/RECORD").decode()
+        record = archive.read(
+            f"{libraries.PREBUILT_PACKAGE}-{ik.__version__}.dist-info/RECORD"
+        ).decode()
         assert {line.split(",")[0] for line in record.splitlines()} == set(archive.namelist())
     monkeypatch.syspath_prepend(str(tmp_path / "site"))
     libraries.prebuilt_folder.cache_clear()

@@ -24,7 +24,13 @@ from casadi_ik.compile import (
     StepGraph,
 )
 from casadi_ik.compile.function_kernel import machine_lanes
-from casadi_ik.compile.loop import FEWEST, FIRST_ROWS, ROOM_BYTES, SLOTS, WORTH
+from casadi_ik.compile.loop import (
+    FIRST_ROWS,
+    MAX_FIRST_TRACE_BYTES,
+    MIN_BATCH_FOR_LANES,
+    MIN_SIDE_BY_SIDE,
+    SLOTS,
+)
 
 from .graphs import (
     BOTH,
@@ -304,7 +310,7 @@ def test_keyboard_interrupt_reaches_a_compiled_loop():
 
 pytestmark = needs_compiler
 
-COUNTS = (FEWEST, 9, 2 * SLOTS + 3)
+COUNTS = (MIN_SIDE_BY_SIDE, 9, 2 * SLOTS + 3)
 """Solves in a batch: fewer than lanes, one that must wait, many more than are under way at once."""
 
 
@@ -426,13 +432,13 @@ def test_traces_of_other_lengths_than_the_last_one():
     """Room is made for as much as the last one needed: too much, too little, none at all."""
     kernel = LoopKernel(counting_step("lengths"))
     assert kernel.lanes > 1
-    for count, ends in ((40, 3), (40, 700), (9, 2), (FEWEST - 1, 900), (2, 0), (70, 5)):
+    for count, ends in ((40, 3), (40, 700), (9, 2), (MIN_SIDE_BY_SIDE - 1, 900), (2, 0), (70, 5)):
         ran = kernel.run(np.zeros((count, 1)), np.full((count, 1), ends), ends, trace=True)
         assert ran.rows is not None
         assert ran.rows.base is None
         assert ran.rows["count"].tolist() == [*range(1, ends + 1)] * count
-        room = kernel._room(count) * ran.rows.dtype.itemsize
-        assert len(ran.rows) * ran.rows.dtype.itemsize <= room <= ROOM_BYTES
+        room = kernel._first_rows(count) * ran.rows.dtype.itemsize
+        assert len(ran.rows) * ran.rows.dtype.itemsize <= room <= MAX_FIRST_TRACE_BYTES
 
 
 def test_few_solves_wait_for_no_compiler(monkeypatch, tmp_path, lanes):
@@ -448,14 +454,14 @@ def test_few_solves_wait_for_no_compiler(monkeypatch, tmp_path, lanes):
         return kernel.run(states, [500.0], 1000, trace=True).states.tobytes()
 
     early = LoopKernel(step)
-    few = run(early, WORTH - 1)
+    few = run(early, MIN_BATCH_FOR_LANES - 1)
     assert compiled() == 0
-    assert run(early, WORTH)[: len(few)] == few
+    assert run(early, MIN_BATCH_FOR_LANES)[: len(few)] == few
     assert compiled() == 1
     later = LoopKernel(step)
-    assert later._for(FEWEST - 1) is None
-    assert later._for(FEWEST) is not None
-    assert run(later, WORTH - 1) == few
+    assert later._loop_for(MIN_SIDE_BY_SIDE - 1) is None
+    assert later._loop_for(MIN_SIDE_BY_SIDE) is not None
+    assert run(later, MIN_BATCH_FOR_LANES - 1) == few
 
 
 def test_without_compiler_there_are_no_lanes():

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.compile.cancellation import SLICE, drive
+from casadi_ik.compile.cancellation import SLICE, run_cancellable
 from casadi_ik.compile.codegen import c_struct
 from casadi_ik.files.arrays import Array
 from casadi_ik.planning.touch.library import touch_library
@@ -103,7 +103,7 @@ class TriangleTree:
             count=count,
             slice=SLICE,
         )
-        drive("nearest", touch_library()["casadi_ik_nearest"], job)
+        run_cancellable("nearest", touch_library()["casadi_ik_nearest"], job)
         cosine = results["spread"]
         spread = np.where(cosine > 1 - 1e-12, 0.0, np.arccos(np.clip(cosine, -1, 1)))
         return NearestPoints(results["feet"], results["ways"], spread)
