@@ -268,8 +268,7 @@ def _content_hash(path: Path) -> str:
 def _load_or_build(
     folders: list[Path], stem: str, source: str, compiler: Compiler, symbol: str
 ) -> ctypes.CDLL | None:
-    """Load a library from disk or compile it into the first usable folder; None if there is
-    none."""
+    """Load a library from disk, or compile it into the first usable folder; None without one."""
     problems: dict[Path, OSError | UnloadableError] = {}
     library = None
 
