@@ -18,12 +18,13 @@ import numpy as np
 
 from casadi_ik.errors import DescriptionError, MissingExtraError, UnsupportedError
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.input_checks.poses import rotations_of
 from casadi_ik.files.limits import LIMITS
 from casadi_ik.files.number_files import UNREADABLE, read_npz, refuse_giants
 from casadi_ik.files.reading import parse_yaml, read_text
 from casadi_ik.integrations.datasets.postures import HandPoses
 from casadi_ik.kinematics.arm_hand import ArmHand
-from casadi_ik.model.pose import inverse, rotations_of
+from casadi_ik.model.pose import inverse
 
 PAD = 0.1034
 """Distance of the pads' middle from the base of the Panda hand, along the approach [m].
