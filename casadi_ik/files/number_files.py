@@ -6,6 +6,7 @@ import contextlib
 import io
 import logging
 import lzma
+import struct
 import tokenize
 import warnings
 import zipfile
@@ -34,6 +35,7 @@ UNREADABLE = (
     SyntaxError,
     tokenize.TokenError,
     zipfile.BadZipFile,
+    struct.error,
     zlib.error,
     lzma.LZMAError,
 )
@@ -203,6 +205,10 @@ PLY_TYPES = {
 }
 
 
+COMPRESSED = "binary_compressed"
+"""Name of compressed data in a PCD file."""
+
+
 @dataclass
 class _Head:
     """What the head of a PLY or PCD file says.
@@ -210,7 +216,7 @@ class _Head:
     Attributes:
         fields: Name, type and number of values of each field of a point.
         count: How many points there are.
-        form: "ascii", or how the bytes lie: "<" or ">".
+        form: "ascii", the order of bytes ("<" or ">"), or `COMPRESSED`.
     """
 
     fields: list[tuple[str, str, int]]
@@ -222,8 +228,10 @@ def read_points(path: Path, where: str) -> Array:
     """(k, 3) points of a file [as it has them]; those of no distance (NaN) are left out.
 
     Args:
-        path: ``.npy``, ``.npz`` (an array alone, or called ``points``), ``.ply`` and ``.pcd`` (text
-            or bytes), ``.xyz``, ``.txt``, ``.csv`` (x, y and z in the first three columns).
+        path: ``.npy``, ``.npz`` (an array alone, or called ``points``): (k, 3), (H, W, 3) as a
+            depth camera has it, or more columns, of which the first three are taken; ``.ply`` and
+            ``.pcd`` (text, binary or compressed); ``.xyz``, ``.txt``, ``.csv``: x, y and z in the
+            first three columns, or where a header line has these names.
         where: File and key, for the message.
 
     Raises:
@@ -279,9 +287,22 @@ def _at_most(count: int) -> int:
     return count
 
 
+MOST_COLUMNS = 16
+"""Most numbers of a point in an array: x, y, z, then colours, normals, intensities and the like."""
+
+
 def _npy(path: Path) -> Array:
     array = np.lib.format.open_memmap(path, mode="r")  # reserves nothing, unpickles nothing
-    _at_most(array.size // 3)
+    return _coordinates(array)
+
+
+def _coordinates(array: np.ndarray) -> Array:
+    """Return the points (k, 3) of an array of points or of an image of points."""
+    if array.dtype.names is not None and set("xyz") <= set(array.dtype.names):
+        array = np.stack([array[axis] for axis in "xyz"], axis=-1)
+    if array.ndim in (2, 3) and 3 <= array.shape[-1] <= MOST_COLUMNS:
+        _at_most(array.size // array.shape[-1])
+        array = array[..., :3].reshape(-1, 3)
     return np.asarray(array)
 
 
@@ -289,17 +310,38 @@ def _npz(path: Path) -> Array:
     arrays = read_npz(path, 24 * LIMITS.cloud_points)
     if len(arrays) > 1 and "points" not in arrays:
         raise ValueError(f"found {', '.join(arrays)}, expected one array, or one called points")
-    return arrays["points"] if "points" in arrays else next(iter(arrays.values()))
+    return _coordinates(arrays["points"] if "points" in arrays else next(iter(arrays.values())))
 
 
 def _table(path: Path) -> Array:
     with path.open("rb") as stream:
-        return _numbers(stream, [0, 1, 2], None)
+        return _numbers(stream, _columns_of_header(stream), None)
+
+
+def _columns_of_header(stream: IO[bytes]) -> list[int]:
+    """Pass over the header line of a table, if it has one, and return the columns of x, y and z."""
+    start = stream.tell()
+    line = stream.readline(10_000).removeprefix(b"\xef\xbb\xbf")
+    words = line.decode("latin-1").replace(",", " ").replace(";", " ").split()
+    names = [word.strip("\"'#/ ").lower() for word in words if word.strip("\"'#/ ")]
+    if set("xyz") <= set(names):
+        return [names.index(axis) for axis in "xyz"]
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = []
+    # A header, or the number of points alone; comments are passed over with the table.
+    is_comment = line.lstrip().startswith((b"#", b"//"))
+    if (words and not numbers and not is_comment) or len(numbers) == 1:
+        return [0, 1, 2]
+    stream.seek(start)
+    return [0, 1, 2]
 
 
 def _numbers(stream: IO[bytes], columns: list[int], count: int | None) -> Array:
-    """Columns of a table with blanks or commas between its numbers."""
-    rows, most = (line.replace(b",", b" ") for line in stream), limit(LIMITS.cloud_points) + 1
+    """Return columns of a table with blanks, commas or semicolons between its numbers."""
+    blanks = bytes.maketrans(b",;", b"  ")
+    rows, most = (line.translate(blanks) for line in stream), limit(LIMITS.cloud_points) + 1
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # nothing in it: told by the caller
         found = np.loadtxt(rows, comments=["#", "//"], usecols=columns, max_rows=most, ndmin=2)
@@ -319,6 +361,8 @@ def _headed(path: Path, read_head: Callable[[IO[bytes]], _Head]) -> Array:
         if head.form == "ascii":
             before = np.cumsum([0, *(count for _, _, count in head.fields)])
             return _numbers(stream, before[places].tolist(), head.count)
+        if head.form == COMPRESSED:
+            return _by_field(stream, head, places)
         row = np.dtype(
             [
                 (f"f{i}", f"{head.form}{kind}", count)
@@ -330,6 +374,59 @@ def _headed(path: Path, read_head: Callable[[IO[bytes]], _Head]) -> Array:
             raise ValueError(f"ends after {len(data) // row.itemsize} of {head.count} points")
         rows = np.frombuffer(data, row)
         return np.stack([rows[f"f{i}"].reshape(-1).astype(np.float64) for i in places], axis=1)
+
+
+def _by_field(stream: IO[bytes], head: _Head, places: list[int]) -> Array:
+    """Return the points of compressed data: all values of a field follow one another.
+
+    Raises:
+        ValueError: The data are damaged, or unpack to another size than the head announces.
+    """
+    packed_size, size = struct.unpack("<II", stream.read(8))
+    kinds = [np.dtype((f"<{kind}", (count,))) for _, kind, count in head.fields]
+    if size != head.count * sum(kind.itemsize for kind in kinds):
+        raise ValueError(f"unpacks to {size} bytes, not to {head.count} points")
+    refuse_giants("its data", size, LIMITS.cloud_bytes)
+    data = unpack_lzf(stream.read(packed_size), size)
+    starts = np.cumsum([0, *(head.count * kind.itemsize for kind in kinds)])
+    columns = [np.frombuffer(data, kinds[i], head.count, int(starts[i])) for i in places]
+    return np.stack([column.reshape(-1).astype(np.float64) for column in columns], axis=1)
+
+
+def unpack_lzf(packed: bytes, size: int) -> bytes:
+    """Unpack data of the LZF compression, which PCD files use.
+
+    A byte below 32 announces that many bytes plus one as they are. Any other byte and the next
+    ones are the length and the distance of bytes that are copied from what is already unpacked.
+
+    Raises:
+        ValueError: The data are damaged, or unpack to another size.
+    """
+    data, place = bytearray(), 0
+    try:
+        while place < len(packed):
+            control = packed[place]
+            place += 1
+            if control < 32:
+                data += packed[place : place + control + 1]
+                place += control + 1
+                continue
+            length = control >> 5
+            if length == 7:
+                length += packed[place]
+                place += 1
+            start = len(data) - ((control & 31) << 8) - packed[place] - 1
+            place, length = place + 1, length + 2
+            if start < 0 or len(data) + length > size:
+                raise ValueError("its compressed data are damaged")
+            # A copy may overlap its own source: then the source repeats.
+            source = bytes(data[start : start + length])
+            data += (source * (length // len(source) + 1))[:length]
+    except IndexError as error:
+        raise ValueError("its compressed data end too early") from error
+    if len(data) != size:
+        raise ValueError(f"unpacks to {len(data)} bytes, expected {size}")
+    return bytes(data)
 
 
 def _lines(stream: IO[bytes]) -> list[str]:
@@ -372,8 +469,8 @@ def _pcd_head(stream: IO[bytes]) -> _Head:
     else:
         raise ValueError("no PCD file")
     form = said["DATA"][0]
-    if form not in ("ascii", "binary"):
-        raise ValueError(f"its data are {form}, expected ascii or binary")
+    if form not in ("ascii", "binary", COMPRESSED):
+        raise ValueError(f"its data are {form}, expected ascii, binary or {COMPRESSED}")
     names = said["FIELDS"]
     counts = [int(one) for one in said.get("COUNT", ["1"] * len(names))]
     if not all(0 < one <= 1000 for one in counts):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import zipfile
 from pathlib import Path
 
@@ -134,7 +135,64 @@ def written(folder: Path, points: np.ndarray) -> list[Path]:
     data = np.zeros(len(points), [("p", "<f8", 3), ("n", "<f4", 2), ("c", "<u4")])
     data["p"] = points
     (folder / "j.pcd").write_bytes(head.encode() + b"binary\n" + data.tobytes())
+    (folder / "k.csv").write_text(
+        "id,x,y,z,label\n" + "\n".join(f"7,{row.replace(' ', ',')},8" for row in rows)
+    )
+    (folder / "l.xyz").write_text(f"{len(points)}\n" + "\n".join(rows))
+    (folder / "m.txt").write_text("//X Y Z R\n" + "\n".join(f"{row} 255" for row in rows))
+    (folder / "n.csv").write_text(
+        "\ufeff" + "a;b;c\n" + "\n".join(r.replace(" ", ";") for r in rows)
+    )
+    image = np.concatenate([points, np.full((-len(points) % 4, 3), np.nan)]).reshape(4, -1, 3)
+    np.save(folder / "o.npy", image)
+    np.savez(folder / "p.npz", points=np.concatenate([image, image], axis=2))
+    np.save(folder / "q.npy", np.hstack([points, points]))
+    named = np.zeros(len(points), [("rgb", "f4"), ("x", "f8"), ("y", "f8"), ("z", "f8")])
+    for axis, column in zip("xyz", points.T, strict=True):
+        named[axis] = column
+    np.save(folder / "r.npy", named)
+    columns = [points[:, 0], points[:, 1], points[:, 2], np.zeros((len(points), 2), "<f4")]
+    raw = b"".join(column.tobytes() for column in columns) + bytes(4 * len(points))
+    packed = pack_lzf(raw)
+    assert len(packed) < len(raw)
+    sizes = struct.pack("<II", len(packed), len(raw))
+    (folder / "s.pcd").write_bytes(head.encode() + b"binary_compressed\n" + sizes + packed)
     return sorted(folder.iterdir())
+
+
+def pack_lzf(data: bytes) -> bytes:
+    """Compress as LZF does: literals of at most 32 bytes, and references to what came before."""
+    packed, literals, seen, place = bytearray(), bytearray(), dict[bytes, int](), 0
+
+    def flush() -> None:
+        for start in range(0, len(literals), 32):
+            part = literals[start : start + 32]
+            packed.append(len(part) - 1)
+            packed.extend(part)
+        literals.clear()
+
+    while place < len(data):
+        key = data[place : place + 3]
+        start, length = seen.get(key, -1), 0
+        seen[key] = place
+        if len(key) == 3 and start >= 0 and place - start <= 8192:
+            most = min(264, len(data) - place)
+            while length < most and data[start + length] == data[place + length]:
+                length += 1
+        if length < 3:
+            literals.append(data[place])
+            place += 1
+            continue
+        flush()
+        back = place - start - 1
+        short = min(length - 2, 7)
+        packed.append((short << 5) | (back >> 8))
+        if short == 7:
+            packed.append(length - 2 - 7)
+        packed.append(back & 255)
+        place += length
+    flush()
+    return bytes(packed)
 
 
 def test_every_file_gives_the_same_points(robot, rng, tmp_path):
@@ -145,7 +203,7 @@ def test_every_file_gives_the_same_points(robot, rng, tmp_path):
     np.testing.assert_array_equal(clearances(robot, cloud(holed), q), expected)
     (tmp_path / "files").mkdir()
     files = written(tmp_path / "files", holed)
-    assert len(files) == 10
+    assert len(files) == 19
     for file in files:
         path = tmp_path / "scene.yaml"
         path.write_text(
@@ -156,6 +214,7 @@ def test_every_file_gives_the_same_points(robot, rng, tmp_path):
 
 
 HEAD = b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 9\n"
+PACKED = HEAD + b"DATA binary_compressed\n"
 
 
 @pytest.mark.parametrize(
@@ -168,7 +227,11 @@ HEAD = b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 9\n"
         ("a.ply", b"ply\nformat what 1.0\n", "cannot be read"),
         ("a.ply", b"ply\nelement vertex 99999999999\nend_header\n", "at most 10000000"),
         ("a.pcd", b"VERSION 0.7\nDATA ascii\n", "cannot be read"),
-        ("a.pcd", HEAD + b"DATA binary_compressed\n", "are binary_compressed"),
+        ("a.pcd", HEAD + b"DATA binary_compressed\n", "cannot be read"),
+        ("a.pcd", PACKED + struct.pack("<II", 2, 9) + b"ab", "9 bytes"),
+        ("a.pcd", PACKED + struct.pack("<II", 3, 108) + b"\xe0", "end"),
+        ("a.pcd", PACKED + struct.pack("<II", 3, 108) + b" \x05a", "dam"),
+        ("a.pcd", HEAD + b"DATA zipped\n", "are zipped"),
         ("a.pcd", HEAD + b"DATA binary\nabc", "after 0 of 9"),
         ("a.pcd", HEAD + b"TYPE Q F F\nDATA binary\n", "cannot be"),
         ("a.xyz", b"1 2\n3 4\n", "cannot be read"),
