@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from casadi_ik.collision.solids import (
+    Kind,
     Solid,
     box,
     capsule,
@@ -32,6 +33,7 @@ from casadi_ik.files.input_checks.poses import (
     one_pose,
     rotations_of,
 )
+from casadi_ik.files.input_checks.units import warn_of_obstacle
 from casadi_ik.files.limits import LIMITS
 from casadi_ik.files.number_files import finite_points, read_mesh, read_points
 from casadi_ik.files.reading import (
@@ -439,7 +441,9 @@ class Scene:
             where = f"{path}: solids.{name}"
             parts = tuple(solid.solids(where, path.parent))
             entry_there = _located(solid, path.parent)
-            self.items[name] = Item(name, parts, solid.matrix(where), solid.margin, entry_there)
+            item = Item(name, parts, solid.matrix(where), solid.margin, entry_there)
+            warn_of_obstacle(*_away_and_size(item), where)
+            self.items[name] = item
         self.grasped, self.enveloping = entry.grasped, entry.enveloping
         if entry.grasped is not None and entry.grasped not in self.items:
             known = ", ".join(self.items) or "none"
@@ -526,10 +530,26 @@ class Scene:
         return "\n".join(lines) + "\n"
 
     def _with(self, item: Item) -> Scene:
+        warn_of_obstacle(*_away_and_size(item), f"pose of {item.name!r}")
         scene = Scene.__new__(Scene)
         scene.__dict__.update(self.__dict__)
         scene.items = self.items | {item.name: item}
         return scene
+
+
+def _away_and_size(item: Item) -> tuple[float, float]:
+    """Return the largest distance of an item's solids from the base and their largest size [m]."""
+    away = size = 0.0
+    for solid, pose in item.parts:
+        placed = (item.pose @ pose)[..., :3, :]
+        if solid.kind is Kind.HALF_SPACE:  # it has no size, and only its surface is somewhere
+            distance = abs(np.sum(placed[..., 2] * placed[..., 3], axis=-1))
+            away = max(away, float(np.max(distance)))
+            continue
+        away = max(away, float(np.linalg.norm(placed[..., 3], axis=-1).max()))
+        edges = 2 * solid.size.max() if solid.kind in (Kind.BOX, Kind.CYLINDER) else None
+        size = max(size, float(2 * solid.reach if edges is None else edges))
+    return away, size
 
 
 def _located(entry: SolidEntry, folder: Path) -> SolidEntry:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from casadi_ik.errors import InputError
+from casadi_ik.errors import InputError, InputWarning
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.lazy_import import Shown, on_demand
 from casadi_ik.kinematics.robot_kernels import RobotKernels
@@ -157,7 +157,7 @@ class ArmHand(Shown):
             value, ends = start[beyond][0], f"{self.lower[i]:.3g} to {self.upper[i]:.3g}"
             text = f"{name}: {self.actuators[i]} is {value:g} rad, far beyond its limits {ends} rad"
             # From here, whoever asked: Python says the same once.
-            warnings.warn(f"{text}; degrees are np.deg2rad(...)", stacklevel=1)
+            warnings.warn(f"{text}; degrees are np.deg2rad(...)", InputWarning, stacklevel=1)
         return start
 
     @cached_property

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array, Bools, frozen
 from casadi_ik.files.input_checks.poses import MAX_SKEW, one_pose
+from casadi_ik.files.input_checks.units import warn_of_wide_tolerance
 from casadi_ik.model.pose import Free, inverse
 
 
@@ -215,6 +216,8 @@ class Contact:
     ) -> None:
         if tolerance is not None and not isinstance(tolerance, Tolerance):
             raise InputError(f"tolerance: found {tolerance!r}, expected a Tolerance")
+        if tolerance is not None:
+            warn_of_wide_tolerance(tolerance.position, tolerance.angle)
         object.__setattr__(self, "tolerance", tolerance)
         given = {"normal": normal, "tangent": tangent, "line": line, "plane": plane, "ball": ball}
         if direction is not None:

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.arrays import Array, Bools
+from casadi_ik.files.input_checks.units import warn_of_large_mesh
 from casadi_ik.files.limits import LIMITS, RAISED, limit
 from casadi_ik.files.number_files import read_mesh
 from casadi_ik.files.units import Size
@@ -425,7 +426,9 @@ def load_mesh_shape(files: Sequence[Path], scale: float, where: str) -> MeshShap
     pieces: list[Mesh] = []
     for file in files:
         points, triangles = read_mesh(file, where)
-        pieces += pieces_of(scale * points, triangles)
+        points = scale * points
+        warn_of_large_mesh(points, where if str(file) in where else f"{where}: {file.name}")
+        pieces += pieces_of(points, triangles)
     if len(pieces) > limit(LIMITS.object_pieces):
         most = f"at most {limit(LIMITS.object_pieces)} {RAISED}"
         raise DescriptionError(f"{where}: found {len(pieces)} pieces, expected {most}")

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from casadi_ik.errors import InputError, UnknownNameError
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.input_checks.poses import checked_pose
+from casadi_ik.files.input_checks.units import warn_of_far_contacts, warn_of_wide_tolerance
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import LENGTH, more_arrays
 from casadi_ik.model.grasp import Contact, Grasp, Tolerance
@@ -255,6 +256,7 @@ class Request:
         named = dict(more or {})
         directions = named.pop(DIRECTIONS, None)
         p, n = target_arrays(points, normals, len(self.robot.fingers), first_row, directions)
+        warn_of_far_contacts(p, "points", self._base_travel)
         tolerances = tuple(self.tolerances.values())
         others = more_arrays(named, p, n, first_row) if named else {}
         return TargetBatch(
@@ -330,6 +332,7 @@ class Request:
             if len(arrays) == 1
             else (np.array(both) for both in zip(*arrays, strict=True))
         )
+        warn_of_far_contacts(points, grasps[0].name or "contacts", self._base_travel)
         return TargetBatch(
             points,
             normals,
@@ -434,6 +437,13 @@ class Request:
         )
 
     @cached_property
+    def _base_travel(self) -> float:
+        """Distance that the robot's sliding motors go together [m]."""
+        motors = self.robot.description.actuators
+        ends = [max(abs(one.lower), abs(one.upper)) for one in motors if one.unit == "m"]
+        return float(sum(ends))
+
+    @cached_property
     def _usual(self) -> tuple[Tolerance, ...]:
         return tuple(self.tolerances.values())
 
@@ -481,6 +491,8 @@ def tolerances_by_finger(
         InputError: No tolerance, or one for a finger that is not among them.
     """
     if tolerance is None or isinstance(tolerance, Tolerance):
+        if tolerance is not None:
+            warn_of_wide_tolerance(tolerance.position, tolerance.angle)
         return dict.fromkeys(fingers, tolerance or Tolerance())
     if not isinstance(tolerance, Mapping):
         raise InputError(f"tolerance: found {tolerance!r}, expected a Tolerance, or one by finger")
@@ -491,4 +503,5 @@ def tolerances_by_finger(
             )
         if not isinstance(one, Tolerance):
             raise InputError(f"tolerance.{name}: found {one!r}, expected a Tolerance")
+        warn_of_wide_tolerance(one.position, one.angle, f"tolerance.{name}")
     return {name: tolerance.get(name, Tolerance()) for name in fingers}

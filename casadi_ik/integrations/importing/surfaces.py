@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.input_checks.units import warn_of_large_mesh
 from casadi_ik.files.limits import LIMITS
 from casadi_ik.files.number_files import read_mesh
 from casadi_ik.model.sandbox import package_folders
@@ -245,6 +246,7 @@ def _of_mesh(element: Element, missing: Missing) -> Surface | None:
     if len(scale) != 3 or max(map(abs, scale)) > LIMITS.mesh_coordinate:
         missing.broken(f"{missing.path.name}: mesh {name!r}: scale: expected three finite numbers")
         return None
+    warn_of_large_mesh(points * scale, f"{missing.path.name}: mesh {name!r}")
     return Surface(points * scale, triangles)
 
 

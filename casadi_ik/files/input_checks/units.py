@@ -1,0 +1,119 @@
+"""The rules for units: numbers that are probably not in metres or radians cause a warning.
+
+They remain accepted: a large obstacle or a wide tolerance may be meant. Each message names the
+value, the limit and the likely mistake.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+
+from casadi_ik.errors import InputWarning
+from casadi_ik.files.arrays import Array
+
+
+@dataclass(frozen=True)
+class UsualSizes:
+    """Largest values that cause no warning.
+
+    Attributes:
+        contact: Distance of a contact from the base [m].
+        obstacle: Edge or diameter of an obstacle [m].
+        obstacle_away: Distance of an obstacle from the base [m].
+        mesh: Edge of the box around a mesh [m].
+        position: Tolerance of a contact point [m].
+        angle: Tolerance of a normal [rad].
+    """
+
+    contact: float = 10.0
+    obstacle: float = 10.0
+    obstacle_away: float = 100.0
+    mesh: float = 10.0
+    position: float = 0.1
+    angle: float = math.radians(30.0)
+
+
+USUAL = UsualSizes()
+
+ROUNDING = 1e-9
+"""Relative excess that causes no warning: 30 deg are 30 deg however they are converted."""
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, InputWarning, stacklevel=3)
+
+
+def warn_of_far_contacts(points: Array, where: str, base_travel: float = 0.0) -> None:
+    """Warn of contact points (..., 3) that are more than `UsualSizes.contact` from the base.
+
+    Args:
+        points: Contact points [m]; NaN where free.
+        where: Name of the argument, or file and key.
+        base_travel: Distance that a mobile base goes [m].
+    """
+    most = USUAL.contact + base_travel
+    with np.errstate(invalid="ignore"):
+        beyond = np.abs(points) > most  # a point inside the box around the ball needs no length
+    if not beyond.any():
+        return
+    away = float(np.linalg.norm(points[beyond.any(axis=-1)][0]))
+    _warn(
+        f"{where}: a contact is {away:.4g} m from the robot's base; expected at most {most:.4g} m "
+        "(numbers in mm? 1 mm is 0.001)"
+    )
+
+
+def warn_of_wide_tolerance(position: float, angle: float, where: str = "tolerance") -> None:
+    """Warn of a tolerance above `UsualSizes.position` or `UsualSizes.angle`.
+
+    Args:
+        position: Largest distance of the contact point [m].
+        angle: Largest angle of the normal [rad].
+        where: Name of the argument, or file and key.
+    """
+    if position > USUAL.position * (1 + ROUNDING):
+        _warn(
+            f"{where}.position: found {position:g} m; expected at most {USUAL.position:g} m "
+            "(a number in mm? 1 mm is 0.001)"
+        )
+    if angle > USUAL.angle * (1 + ROUNDING):
+        _warn(
+            f"{where}.angle: found {angle:g} rad ({math.degrees(angle):.4g} deg); expected at most "
+            f"{USUAL.angle:.3g} rad (30 deg; a number in degrees? use np.deg2rad({angle:g}))"
+        )
+
+
+def warn_of_obstacle(away: float, size: float, where: str) -> None:
+    """Warn of an obstacle that is very large or very far away.
+
+    Args:
+        away: Distance of its origin from the base [m].
+        size: Its edge or diameter [m].
+        where: Name of the scene or file, and key.
+    """
+    if size > USUAL.obstacle * (1 + ROUNDING):
+        found, most = f"a solid is {size:.4g} m large", USUAL.obstacle
+    elif away > USUAL.obstacle_away:
+        found, most = f"a solid is {away:.4g} m from the robot's base", USUAL.obstacle_away
+    else:
+        return
+    _warn(f"{where}: {found}; expected at most {most:g} m (numbers in mm? 1 mm is 0.001)")
+
+
+def warn_of_large_mesh(points: Array, where: str) -> None:
+    """Warn of a mesh with corners (k, 3) whose box has an edge above `UsualSizes.mesh`.
+
+    Args:
+        points: Corners, scaled [m].
+        where: File, or file and key.
+    """
+    size = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+    if size > USUAL.mesh * (1 + ROUNDING):
+        _warn(
+            f"{where}: the mesh is {size:.4g} m large; expected at most {USUAL.mesh:g} m (a mesh "
+            "in mm? its scale is 0.001)"
+        )
