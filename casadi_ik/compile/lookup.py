@@ -123,7 +123,7 @@ class LookupKernel:
             tiles=memory(self.tiles),
             found=memory(rows),
             rows=len(self._keys),
-            targets=rows.shape[1],
+            wanted=rows.shape[1],
             count=len(rows),
             slice=SLICE,
         )
