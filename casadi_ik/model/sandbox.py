@@ -1,16 +1,19 @@
 """What reads somebody's macros and MJCF, run as a script: in a process of its own, with limits.
 
 Standard library only, since it starts once for every file: `confined.py` runs it. The words behind
-it are what to do, the file, and the limits: seconds of computing, bytes of memory and of output. It
-prints what came out and ends with 0, or prints a reason and ends with `REFUSED`.
+it are what to do, the file, the limits (seconds of computing, bytes of memory and of output) and
+the file's arguments, NAME:=VALUE. It prints what came out and ends with 0, or prints a reason and
+ends with `REFUSED`.
 """
 
 from __future__ import annotations
 
 import ast
+import contextlib
 import math
 import operator
 import os
+import re
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -19,7 +22,7 @@ from typing import Any
 REFUSED = 3
 """How the process ends if the file is refused."""
 
-PLAIN = (bool, int, float, str, list, tuple, dict, type(None))
+PLAIN = (bool, int, float, str, list, tuple, dict, set, type(None))
 """Values that an expression may hold."""
 
 OPERATORS: dict[type[ast.AST], Callable[..., Any]] = {
@@ -47,11 +50,28 @@ OPERATORS: dict[type[ast.AST], Callable[..., Any]] = {
 
 FUNCTIONS: dict[str, Callable[..., Any]] = {
     **{name: f for name, f in vars(math).items() if name[0] != "_" and callable(f)},
-    **{f.__name__: f for f in (abs, bool, float, int, len, max, min, round, str, sum)},
+    **{f.__name__: f for f in (abs, all, any, bool, float, int, len, max, min, round, str, sum)},
+    **{f.__name__: f for f in (dict, list, set, sorted, tuple)},
+    "enumerate": lambda values: list(enumerate(values)),
+    "range": lambda *ends: list(range(*ends)),
+    "zip": lambda *columns: list(zip(*columns, strict=False)),
 }
 
-OF_TEXT = ("startswith", "endswith", "lower", "upper", "strip", "replace", "split", "join")
-"""What may be called of a text."""
+TYPES = {kind.__name__: kind for kind in PLAIN[:-1]}
+"""Types that an expression may ask for by `isinstance`."""
+
+METHODS: dict[type, tuple[str, ...]] = {
+    str: (
+        *("startswith", "endswith", "lower", "upper", "title", "capitalize", "strip", "lstrip"),
+        *("rstrip", "removeprefix", "removesuffix", "replace", "split", "rsplit", "partition"),
+        *("rpartition", "join", "find", "rfind", "index", "count", "isdigit", "isalpha"),
+    ),
+    dict: ("get", "keys", "values", "items"),
+    list: ("index", "count"),
+    tuple: ("index", "count"),
+    set: ("union", "intersection", "difference", "issubset", "issuperset"),
+}
+"""Methods that an expression may call, by the type of their object."""
 
 SCOPES = ("math", "python", "xacro")
 """Before the name of a function."""
@@ -93,6 +113,7 @@ def evaluated(expression: str, names: Mapping[str, Any], more: Mapping[str, Any]
         RefusedError: It holds anything else.
     """
     functions = {**FUNCTIONS, **more}
+    variables: dict[str, Any] = {}  # variables of comprehensions
 
     def value(node: ast.AST) -> Any:
         match node:
@@ -141,21 +162,53 @@ def evaluated(expression: str, names: Mapping[str, Any], more: Mapping[str, Any]
                 return plain(found[name], node)
             case ast.Call(func=ast.Name(id=name), args=args, keywords=[]) if name in functions:
                 return functions[name](*map(value, args))
+            case ast.Call(func=ast.Name(id="dict"), args=[], keywords=pairs) if all(
+                pair.arg for pair in pairs
+            ):
+                return {pair.arg: value(pair.value) for pair in pairs}
             case ast.Call(
                 func=ast.Attribute(value=ast.Name(id=scope), attr=name), args=args, keywords=[]
             ) if scope in SCOPES and name in functions:
                 return functions[name](*map(value, args))
-            case ast.Call(func=ast.Attribute(value=of, attr=name), args=args, keywords=[]) if (
-                name in OF_TEXT
-            ):
-                text = value(of)
-                if type(text) is not str:
+            case ast.Call(
+                func=ast.Name(id="isinstance")
+                | ast.Attribute(value=ast.Name(id="python"), attr="isinstance"),
+                args=[of, ast.Name(id=kind)],
+                keywords=[],
+            ) if kind in TYPES:
+                return isinstance(value(of), TYPES[kind])
+            case ast.Call(func=ast.Attribute(value=of, attr=name), args=args, keywords=[]):
+                owner = value(of)
+                methods = [names for kind, names in METHODS.items() if isinstance(owner, kind)]
+                if not methods or name not in methods[0]:
                     raise refused(node)
-                return getattr(text, name)(*map(value, args))
+                kind = next(kind for kind in METHODS if isinstance(owner, kind))
+                result = getattr(kind, name)(owner, *map(value, args))
+                return list(result) if kind is dict and name != "get" else result
+            case (
+                ast.ListComp(elt=elt, generators=[ast.comprehension(target, of, tests)])
+                | ast.GeneratorExp(elt=elt, generators=[ast.comprehension(target, of, tests)])
+            ):
+                several = isinstance(target, ast.Tuple)
+                targets = target.elts if isinstance(target, ast.Tuple) else [target]
+                results = []
+                for item in value(of):
+                    items = item if several else (item,)
+                    for place, part in zip(targets, items, strict=True):
+                        if not isinstance(place, ast.Name):
+                            raise refused(node)
+                        variables[place.id] = part
+                    if all(value(test) for test in tests):
+                        results.append(value(elt))
+                return results
+            case ast.Set(elts=elts):
+                return {value(element) for element in elts}
             case _:
                 raise refused(node)
 
     def named(name: str) -> Any:
+        if name in variables:
+            return variables[name]
         try:
             return names[name]
         except KeyError:
@@ -169,7 +222,8 @@ def evaluated(expression: str, names: Mapping[str, Any], more: Mapping[str, Any]
     def refused(node: ast.AST) -> RefusedError:
         text = ast.get_source_segment(text_, node) or expression
         return RefusedError(
-            f"{text!r} is not evaluated, expected arithmetic, comparisons and functions of numbers"
+            f"{text!r} is not evaluated; expected arithmetic, comparisons, functions of numbers, "
+            "and methods of texts and lists"
         )
 
     text_ = expression.strip()
@@ -192,17 +246,36 @@ def package_folders(name: str, file: Path) -> tuple[list[Path], list[Path]]:
         return [Path(one) for one in os.environ.get(variable, "").split(os.pathsep) if one]
 
     above, told = file.resolve().parents, listed("ROS_PACKAGE_PATH")
-    near = [one / name for one in above] + [one for one in above if one.name == name]
+    near = [one / name for one in above] + [one for one in above if _is_package(one, name)]
     known = [one / name for one in told] + [one for one in told if one.name == name]
     known += [one / "share" / name for one in listed("AMENT_PREFIX_PATH")]
     return [one for one in near if one.is_dir()], [one for one in known if one.is_dir()]
 
 
-def expand_xacro(path: Path) -> str:
-    """A file with its macros expanded.
+def _is_package(folder: Path, name: str) -> bool:
+    """Return whether a folder is a ROS package: it has the name, or its package.xml states it."""
+    if folder.name == name:
+        return True
+    with contextlib.suppress(OSError, UnicodeDecodeError):
+        text = (folder / "package.xml").read_text(encoding="utf-8")[:MANIFEST]
+        return re.search(rf"<name>\s*{re.escape(name)}\s*</name>", text) is not None
+    return False
+
+
+MANIFEST = 100_000
+"""Maximum number of characters of a package.xml in which the package's name is looked up."""
+
+
+def expand_xacro(path: Path, arguments: Mapping[str, str]) -> str:
+    """Return the text of a file with its macros expanded.
 
     It reads files below its folder and those of packages it finds, and nothing else; expressions
-    are `evaluated`, no code of the file runs.
+    are `evaluated`, no code of the file runs. Parameters that a macro does not declare are ignored:
+    files of makers pass such to newer versions of their macros.
+
+    Args:
+        path: The file.
+        arguments: Values of the file's arguments by name.
 
     Raises:
         RefusedError: It asks for more.
@@ -223,7 +296,7 @@ def expand_xacro(path: Path) -> str:
     def find(name: str) -> str:
         near, known = package_folders(name, path)
         # A folder of that name alone is none: it may be anybody's.
-        near = [x for x in near if (x / "package.xml").is_file() or x == path.resolve().parents[1]]
+        near = [x for x in near if (x / "package.xml").is_file() or x in path.resolve().parents]
         if not near + known:
             raise RefusedError(
                 f"package {name!r} is not found: name the folder that holds it in the environment, "
@@ -232,13 +305,32 @@ def expand_xacro(path: Path) -> str:
         folders.append((near + known)[0].resolve())
         return str(folders[-1])
 
-    def argument(name: str) -> Any:
-        return library.substitution_args_context["arg"][name]
+    def argument(name: str, args: Mapping[str, Any] | None = None) -> Any:
+        known = library.substitution_args_context["arg"] if args is None else args
+        if name not in known and name == "name":
+            return path.name.partition(".")[0]
+        if name not in known:
+            raise RefusedError(
+                f"argument {name!r} has no default; write --xacro-args {name}:=VALUE, or "
+                f"xacro: [{name}:=VALUE] in a description"
+            )
+        return known[name]
+
+    call_macro = library.handle_macro_call
+
+    def call(node: Any, macros: Any, symbols: Any) -> Any:
+        if node.tagName.startswith("xacro:") and node.tagName != "xacro:call":
+            with contextlib.suppress(KeyError):
+                macro = library.resolve_macro(node.tagName[len("xacro:") :], macros, symbols)[2]
+                for name in [name for name, _ in node.attributes.items()]:
+                    if name not in macro.params:
+                        node.removeAttribute(name)
+        return call_macro(node, macros, symbols)
 
     def extension(text: str, context: Mapping[str, Any]) -> str:
         values = {k: substitution_args.convert_value(v, "auto") for k, v in context["arg"].items()}
         known = {"pi": math.pi, "true": True, "false": False, **values}
-        return str(evaluated(text, known, {"arg": values.__getitem__, "find": find}))
+        return str(evaluated(text, known, {"arg": argument, "find": find}))
 
     def variable(name: str) -> str:
         raise RefusedError(f"$(env {name}) is not read, expected no variables of the environment")
@@ -250,7 +342,9 @@ def expand_xacro(path: Path) -> str:
 
     ours = {
         (library, "safe_eval"): expression,
+        (library, "handle_macro_call"): call,
         (substitution_args, "_eval"): extension,
+        (substitution_args, "_eval_arg"): lambda name, args: argument(name, args),
         (substitution_args, "_eval_env"): variable,
         (substitution_args, "_eval_optenv"): lambda _, default="": default,
         (substitution_args, "_eval_find"): find,
@@ -264,16 +358,19 @@ def expand_xacro(path: Path) -> str:
         if event == "open":
             file, _, flags = arguments
             reads = isinstance(file, str) and not flags & (os.O_WRONLY | os.O_RDWR)
-            if not (reads and below(Path(file).resolve())):
+            place = Path(file).resolve() if reads else None
+            if place is None or not (below(place) or place in manifests):
                 raise RefusedError(f"reads {str(file)!r}, expected a file below {folders[0]}")
         elif event.startswith(FORBIDDEN) and event not in HARMLESS:
             raise RefusedError(f"asks for {event} {arguments[:1]}, expected macros alone")
+
+    manifests = {folder / "package.xml" for folder in path.resolve().parents}
 
     def below(place: Path) -> bool:
         return any(place.is_relative_to(folder) for folder in folders)
 
     sys.addaudithook(watch)
-    document: Any = library.process_file(str(path))
+    document: Any = library.process_file(str(path), mappings=dict(arguments))
     return str(document.toxml())
 
 
@@ -313,23 +410,40 @@ def _limited(seconds: int, memory: int) -> None:
             continue
 
 
+def reason(error: BaseException) -> str:
+    """Return why a file is refused: the message of `RefusedError` if a library has wrapped one."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, RefusedError):
+        cause = getattr(cause, "exc", None) or cause.__cause__ or cause.__context__
+    if cause is not None:
+        return str(cause)
+    text = str(error) or type(error).__name__
+    module = sys.modules.get("xacro.substitution_args")
+    context = getattr(sys.modules.get("xacro"), "substitution_args_context", {})
+    if module is not None and context.get("arg"):
+        text += f"; its arguments are {', '.join(context['arg'])} (--xacro-args NAME:=VALUE)"
+    return text
+
+
 def main(words: list[str]) -> int:
     """Do what the words say; see the module."""
-    what, path, (seconds, memory, most) = words[0], Path(words[1]), map(int, words[2:])
+    what, path, (seconds, memory, most) = words[0], Path(words[1]), map(int, words[2:5])
+    pairs = (word.partition(":=") for word in words[5:])
+    arguments = {name: value for name, _, value in pairs}
     _limited(seconds, memory)
     # What libraries say goes nowhere: behind the answer nothing may stand.
     answer = os.fdopen(os.dup(1), "wb")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     code = 0
     try:
-        found = expand_xacro(path).encode() if what == "xacro" else compile_mjcf(path)
+        found = expand_xacro(path, arguments).encode() if what == "xacro" else compile_mjcf(path)
         if len(found) > most:
             text = f"it becomes {len(found) >> 20} MiB, expected at most {most >> 20}"
             code, found = REFUSED, text.encode()
     except MemoryError:
         return 1
     except BaseException as error:
-        text = str(error) or type(error).__name__
+        text = reason(error)
         if text.startswith(UNKNOWN):
             return 1
         code, found = REFUSED, text[:4000].encode(errors="replace")

@@ -283,14 +283,15 @@ class _FromFile(Struct, frozen=True, kw_only=True):
         root: Link that it begins with; left out: the file's.
         locked: Joints that stand still, and where [rad or m].
         limits: Limits by joint that go before the file's [rad or m].
-        xacro: Whether its macros are expanded although it is not called ``.xacro``.
+        xacro: Values of the file's arguments, NAME:=VALUE; true: its macros are expanded although
+            it is not called ``.xacro``.
     """
 
     file: str
     root: str | None = None
     locked: dict[str, AnyValue] = msgspec.field(default_factory=dict)
     limits: dict[str, tuple[AnyValue, AnyValue]] = msgspec.field(default_factory=dict)
-    xacro: bool = False
+    xacro: bool | list[str] = False
 
 
 class ArmFromFile(_FromFile, frozen=True, kw_only=True):

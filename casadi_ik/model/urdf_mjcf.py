@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import subprocess
 import sys
 import tempfile
 from collections import Counter
+from collections.abc import Sequence
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -45,12 +47,13 @@ MACROS = "xacro"
 MODEL = "mujoco"
 
 
-def confined(what: str, path: Path) -> bytes:
+def confined(what: str, path: Path, arguments: Sequence[str] = ()) -> bytes:
     """What a file becomes.
 
     Args:
         what: `MACROS`: the text with its macros expanded. `MODEL`: MuJoCo's model as it saves one.
         path: The file.
+        arguments: Values of its arguments, NAME:=VALUE, if it has macros.
 
     Raises:
         DescriptionError: It cannot be read, asks for what is not done, or for too much.
@@ -63,7 +66,7 @@ def confined(what: str, path: Path) -> bytes:
     limits = (seconds, limit(LIMITS.reader_memory), limit(LIMITS.reader_output))
     # Not the script's folder, whose modules are called as some of others are.
     script, place = Path(foreign.__file__).resolve(), path.resolve()
-    command = [sys.executable, "-P", str(script), what, str(place), *map(str, limits)]
+    command = [sys.executable, "-P", str(script), what, str(place), *map(str, limits), *arguments]
     known = os.pathsep.join(str(Path(one).resolve()) for one in sys.path)
     try:
         with tempfile.TemporaryDirectory() as folder:  # MuJoCo keeps a log where it runs
@@ -430,12 +433,13 @@ MACRO_TAGS = ("{http://www.ros.org/wiki/xacro}", "{http://ros.org/wiki/xacro}")
 """How the tags of macros begin."""
 
 
-def read_tree(path: Path, xacro: bool = False) -> RobotTree:
+def read_tree(path: Path, xacro: bool | Sequence[str] = False) -> RobotTree:
     """Read a robot's file.
 
     Args:
         path: URDF, xacro or MJCF.
-        xacro: Whether its macros are expanded although it is not called ``.xacro``.
+        xacro: Values of its arguments, NAME:=VALUE; True: its macros are expanded although it is
+            not called ``.xacro``.
 
     Raises:
         DescriptionError: It is missing or malformed; the message names file and joint.
@@ -443,15 +447,19 @@ def read_tree(path: Path, xacro: bool = False) -> RobotTree:
     """
     with os_errors(f"{path}: cannot be read", DescriptionError):
         stamp = path.stat().st_mtime_ns
-    return _read(path, stamp, xacro or path.suffix == ".xacro")
+    arguments = () if isinstance(xacro, bool) else tuple(xacro)
+    for word in arguments:
+        if not re.fullmatch(r"\w+:=.*", word):
+            raise DescriptionError(f"{path}: xacro: argument {word!r} is not NAME:=VALUE")
+    return _read(path, stamp, bool(xacro) or path.suffix == ".xacro", arguments)
 
 
 @lru_cache(maxsize=8)
-def _read(path: Path, _: int, xacro: bool) -> RobotTree:
+def _read(path: Path, _: int, xacro: bool, arguments: tuple[str, ...]) -> RobotTree:
     text = read_robot_file(path)
     element = parse_xml(text, path)
     if xacro and element.tag == "robot":
-        element = parse_xml(confined(MACROS, path).decode(), path)
+        element = parse_xml(confined(MACROS, path, arguments).decode(), path)
     if element.tag not in ("robot", "mujoco"):
         raise DescriptionError(
             f"{path}: found <{element.tag}>, expected a URDF (<robot>) or an MJCF (<mujoco>)"

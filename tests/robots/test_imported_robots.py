@@ -372,5 +372,53 @@ def test_xacro_is_expanded(tmp_path, rng):
     )
 
 
+XACRO = """<robot name="$(arg name)" xmlns:xacro="http://www.ros.org/wiki/xacro">
+<xacro:arg name="side" default="left_"/>
+<xacro:property name="at" value="${dict(y=0.06, z=0.0)}"/>
+<xacro:property name="kinds" value="${python.set(['a', 'b'])}"/>
+<xacro:macro name="place" params="prefix">
+<xacro:if value="${prefix.find('right_') != -1}"><xacro:property name="z" value="0.5"/></xacro:if>
+<xacro:if value="${prefix.find('right_') == -1 and isinstance(prefix, str)
+  and len([c for c in prefix if c == '_']) == 1}">
+  <xacro:include filename="$(find my_description)/parts/fingers.xacro"/></xacro:if>
+</xacro:macro>
+<xacro:place prefix="$(arg side)" sim="false"/>
+<xacro:if value="${len(kinds) != 2}"><xacro:unknown/></xacro:if>
+</robot>"""
+
+
+def write_xacro(folder, text=XACRO):
+    """A description of a maker in a folder that has another name than its package."""
+    pytest.importorskip("xacro")
+    for name in ("clone/robots", "clone/parts"):
+        (folder / name).mkdir(parents=True)
+    (folder / "clone" / "package.xml").write_text("<package><name>my_description</name></package>")
+    parts = hand(folder / "clone" / "parts").read_text()
+    parts = parts.replace("<robot", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"')
+    parts = parts.replace('xyz="0 0.04 0.05"', "xyz=\"0 ${at['y']} $(arg height)\"")
+    (folder / "clone" / "parts" / "fingers.xacro").write_text(parts)
+    (folder / "clone" / "robots" / "my.urdf.xacro").write_text(text)
+
+
+def test_a_maker_s_macros_are_expanded_with_arguments(tmp_path):
+    write_xacro(tmp_path)
+    text = "hand: {file: clone/robots/my.urdf.xacro, xacro: ['height:=0.05']}"
+    robot = ik.load_robot(describe(tmp_path, text))
+    np.testing.assert_allclose(robot.links(robot.home)["left_1"][:3, 3], [0, 0.06, 0.05])
+    with pytest.raises(ik.errors.DescriptionError, match=r"'height'.* --xacro-args height:=VALUE"):
+        ik.load_robot(describe(tmp_path, "hand: {file: clone/robots/my.urdf.xacro}"))
+
+
+@pytest.mark.parametrize(
+    "expression",
+    ["open('/etc/passwd')", "''.__class__", "'x'.format(1)", "[].append(1)", "dict.x"],
+)
+def test_expressions_that_are_not_evaluated(tmp_path, expression):
+    write_xacro(tmp_path, XACRO.replace("len(kinds) != 2", expression))
+    text = "hand: {file: clone/robots/my.urdf.xacro, xacro: ['height:=0.05']}"
+    with pytest.raises(ik.errors.DescriptionError, match=r"is not (evaluated|defined)"):
+        ik.load_robot(describe(tmp_path, text))
+
+
 HEAD = """<robot name="hand" xmlns:xacro="http://www.ros.org/wiki/xacro">
 <xacro:property name="y" value="${2 * 0.03}"/>"""

@@ -57,6 +57,7 @@ SAME = 1e-9
     ),
     Option("--srdf FILE.srdf", "links that may touch, beside those that are found to"),
     Option("--xacro", "expand the macros of files that are not called .xacro"),
+    Option("--xacro-args NAME:=VALUE...", "values of the arguments of a file with macros"),
     opt.picture("--picture", "draw the hand and the guessed pads"),
     Option("--check", "compare the kinematics with pinocchio's (MuJoCo's) of the files"),
     opt.SIZE_LIMITS,
@@ -102,7 +103,7 @@ def import_robot(said: Said) -> Answer:
         tip=said.tip,
         palm=said.palm or (),
         mount=said.mount,
-        xacro=said.xacro,
+        xacro=said.xacro_args or bool(said.xacro),
     )
     with output(said.out) as part:
         part.write_text(found.written.text(), encoding="utf-8")
@@ -138,6 +139,7 @@ def _command(said: Said) -> str:
         if (value := getattr(said, option)) is not None:
             words += [f"--{option}", *([value] if isinstance(value, str) else value)]
     words += ["--xacro"] if said.xacro else []
+    words += ["--xacro-args", *said.xacro_args] if said.xacro_args else []
     words += ["--mount", *(f"{value:g}" for value in said.mount)] if said.mount else []
     return shlex.join(words)
 

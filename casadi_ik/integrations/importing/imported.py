@@ -264,7 +264,7 @@ def import_robot(
     tip: str | None = None,
     palm: Sequence[str] = (),
     mount: Sequence[float] | None = None,
-    xacro: bool = False,
+    xacro: bool | Sequence[str] = False,
 ) -> Imported:
     """Choose and guess everything that a description needs but home.
 
@@ -276,7 +276,8 @@ def import_robot(
         tip: Link of the arm that carries the hand; None: guessed.
         palm: Links that the fingers of a hand hang on, one of each; none: guessed.
         mount: (6,) pose of the hand's base on the tip [m, rad]; None: on it.
-        xacro: Whether macros are expanded in files that are not called ``.xacro``.
+        xacro: Values of the files' arguments, NAME:=VALUE; True: macros are expanded in files that
+            are not called ``.xacro``.
 
     Raises:
         CasadiIKError: A file cannot be read, or nothing says what to choose.
@@ -303,7 +304,7 @@ def import_robot(
         why |= dict.fromkeys(beside := others(tree, joints), "moves no side")
         still |= beside
     locked |= still
-    told = xacro and hand.suffix != ".xacro"
+    told = _stated_xacro(hand, xacro)
     hands, branches, notes = [], [], []
     for side, (link, how) in found.items():
         own = {one.name for one in kept_joints(tree, link)}
@@ -370,7 +371,14 @@ def _ends_of(part: Part, branch: Branch) -> list[str]:
     return [link for joint in branch.chain[-2:] for link in rigid(part, joint.child)]
 
 
-def _arm_line(tree: RobotTree, out: Path, tip: str | None, xacro: bool) -> FileLine:
+def _stated_xacro(path: Path, xacro: bool | Sequence[str]) -> bool | list[str]:
+    """Return what a description states about the macros of a file."""
+    if isinstance(xacro, bool):
+        return xacro and path.suffix != ".xacro"
+    return list(xacro)
+
+
+def _arm_line(tree: RobotTree, out: Path, tip: str | None, xacro: bool | Sequence[str]) -> FileLine:
     if tip is None:
         link, how = the_tip(tree)
     elif tip in tree.links:
@@ -381,7 +389,7 @@ def _arm_line(tree: RobotTree, out: Path, tip: str | None, xacro: bool) -> FileL
         )
     joints = kept_joints(tree, link, carried=False)
     limits, locked = assumed_limits(joints), assumed_locks(joints)
-    told = xacro and tree.path.suffix != ".xacro"
+    told = _stated_xacro(tree.path, xacro)
     return FileLine(file_text(tree.path, out), link, how, limits, locked, told)
 
 
@@ -397,7 +405,10 @@ def tree_of(path: Path, entry: Mapping[str, Any]) -> RobotTree:
         CasadiIKError: It cannot be read.
     """
     file = path.parent / Path(str(entry["file"])).expanduser()
-    return read_tree(file, entry.get("xacro") is True)
+    xacro = entry.get("xacro", False)
+    return read_tree(
+        file, [str(word) for word in xacro] if isinstance(xacro, list) else xacro is True
+    )
 
 
 def file_of(name: str, key: str = "ROBOT") -> Path:

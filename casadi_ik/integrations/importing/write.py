@@ -111,7 +111,8 @@ class FileLine:
         how: How the end was found.
         limits: What is assumed of joints without limits.
         locked: Joints that stand still.
-        xacro: Whether its macros are expanded although it is not called so.
+        xacro: Values of the file's arguments, NAME:=VALUE; True: its macros are expanded although
+            it is not called ``.xacro``.
         why: Why they do, by joint; what has no single axis is not among them.
     """
 
@@ -120,7 +121,7 @@ class FileLine:
     how: str
     limits: Mapping[str, tuple[float, float]]
     locked: Mapping[str, float]
-    xacro: bool = False
+    xacro: bool | Sequence[str] = False
     why: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -241,7 +242,7 @@ def _file_lines(key: str, line: FileLine, end: str, ends: Sequence[str]) -> list
     found = [
         f"{key}:",
         f"  file: {scalar(line.file)}",
-        *(["  xacro: true"] if line.xacro else []),
+        *([f"  xacro: {_xacro(line.xacro)}"] if line.xacro else []),
     ]
     for value, *more in [list(ends)] if ends else []:
         found += [*(f"  {text}" for text in more), f"  {end}: {value}  # {_guess(line.how)}"]
@@ -257,6 +258,12 @@ def _file_lines(key: str, line: FileLine, end: str, ends: Sequence[str]) -> list
             why = line.why.get(name, "has no single axis")
             found.append(f"    {scalar(name)}: {value:.6g}  # {why}")
     return found
+
+
+def _xacro(xacro: bool | Sequence[str]) -> str:
+    return (
+        "true" if isinstance(xacro, bool) else f"[{', '.join(json.dumps(word) for word in xacro)}]"
+    )
 
 
 def _guess(how: str) -> str:
