@@ -15,8 +15,8 @@ from casadi_ik.errors import DescriptionError
 from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.files.input_checks.units import warn_of_large_mesh
 from casadi_ik.files.limits import LIMITS, limit, raised_to
-from casadi_ik.files.number_files import read_mesh
 from casadi_ik.files.units import Size
+from casadi_ik.model.urdf_body import read_body
 
 Mesh = tuple[Array, NDArray[np.int64]]
 """Vertices (v, 3) [m] and triangles (t, 3) of vertex indices, outward by the right-hand rule."""
@@ -427,7 +427,7 @@ def load_mesh_shape(files: Sequence[Path], scale: float, where: str) -> MeshShap
     """
     pieces, notes = list[Mesh](), list[str]()
     for file in files:
-        points, triangles = read_mesh(file, where)
+        points, triangles = read_body(file, where)
         points = scale * points
         warn_of_large_mesh(points, where if str(file) in where else f"{where}: {file.name}")
         points, single = single_sided(points, triangles)
