@@ -35,7 +35,7 @@ from casadi_ik.files.input_checks.poses import (
 )
 from casadi_ik.files.input_checks.units import warn_of_obstacle
 from casadi_ik.files.limits import LIMITS
-from casadi_ik.files.number_files import finite_points, read_mesh, read_points
+from casadi_ik.files.number_files import finite_points, read_points
 from casadi_ik.files.reading import (
     Angles,
     Frame,
@@ -50,6 +50,7 @@ from casadi_ik.files.units import Distance, Factor, Length, Pure, Size
 from casadi_ik.model.link_shapes import Touching
 from casadi_ik.model.schema import TouchingEntry
 from casadi_ik.model.shapes import load_mesh_shape
+from casadi_ik.model.urdf_body import read_body
 
 Part = tuple[Solid, Array]
 """A solid and its (4, 4) pose in the frame of what it is part of."""
@@ -202,7 +203,7 @@ class MeshEntry(Entry, frozen=True, tag="mesh", kw_only=True):
             raise DescriptionError(f"{where}.file: found none, expected at least one")
         if self.parts:
             return hulls(load_mesh_shape(files, self.scale, f"{where}.file"), f"{where}.file")
-        meshes = [self.scale * read_mesh(file, f"{where}.file")[0] for file in files]
+        meshes = [self.scale * read_body(file, f"{where}.file")[0] for file in files]
         return [_centred(points, f"{where}.file") for points in meshes]
 
     @property

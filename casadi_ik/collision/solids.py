@@ -310,8 +310,44 @@ def hull(points: Array, where: str) -> Solid:
     inwards = (np.cross(b - a, c - a) * ways).sum(axis=1) < 0
     triangles = np.where(inwards[:, None], faces.simplices[:, ::-1], faces.simplices)
     # Triangles of one face have one normal.
-    normals = np.unique(np.round(ways, 9), axis=0)
+    normals, of_triangle = np.unique(np.round(ways, 9), axis=0, return_inverse=True)
+    if len(normals) > MAX_FACES:
+        areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+        weights = np.bincount(of_triangle.reshape(-1), weights=areas)
+        normals = _distinct_directions(normals[np.argsort(-weights, kind="stable")], MAX_FACES)
     return convex(points, normals, (points, triangles.astype(np.int64)))
+
+
+MAX_FACES = 1024
+"""Faces of a convex hull; similar faces of a finer one are replaced by the largest of them.
+
+The hull grows by that: where its radius of curvature is r, by less than 0.4 % of r.
+"""
+
+FIRST_ANGLE = float(np.deg2rad(2.0))
+"""Faces whose normals differ by less are similar; more where there are too many faces [rad]."""
+
+
+def _distinct_directions(directions: Array, count: int) -> Array:
+    """Return at most `count` of unit vectors (k, 3), such that every other is near to one of them.
+
+    Earlier vectors are preferred.
+    """
+    from scipy.spatial import cKDTree
+
+    tree, angle = cKDTree(directions), FIRST_ANGLE
+    while True:
+        covered, kept = np.zeros(len(directions), dtype=bool), list[int]()
+        for i in range(len(directions)):
+            if covered[i]:
+                continue
+            kept.append(i)
+            if len(kept) > count:
+                break
+            covered[tree.query_ball_point(directions[i], 2 * np.sin(angle / 2))] = True
+        else:
+            return directions[kept]
+        angle *= 1.25
 
 
 SPECK = 5e-3
@@ -337,7 +373,7 @@ def hulls(shape: MeshShape, where: str) -> list[tuple[Solid, Array]]:
         if flat and len(shape.pieces) > 1:
             if np.ptp(points, axis=0).max() < SPECK:
                 continue
-            across = np.linalg.svd(points - points.mean(axis=0))[2][2]
+            across = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][-1]
             points = np.concatenate([points - THIN / 2 * across, points + THIN / 2 * across])
         pose = np.eye(4)
         pose[:3, 3] = points.mean(axis=0)

@@ -189,6 +189,21 @@ def _find_cached(cc: str, path: str, flags: str) -> Compiler | None:
     return None
 
 
+def _quotation_hint() -> str:
+    """Return a hint for CC if it is the path of a program and has a blank, or an open quotation."""
+    cc = os.environ.get("CC", "").strip()
+    try:
+        words = shlex.split(cc)
+    except ValueError as error:
+        return f" ({str(error).lower()})"
+    pieces = cc.split(" ")
+    for count in range(2, len(pieces) + 1 if len(words) > 1 else 0):
+        program = " ".join(pieces[:count])
+        if Path(program).is_file():
+            return f'; quote the path for its blank: CC="{shlex.quote(program)}"'
+    return ""
+
+
 def _zig() -> list[list[str]]:
     """Return the command of ziglang, if it is installed."""
     is_installed = importlib.util.find_spec("ziglang") is not None and bool(sys.executable)
@@ -222,7 +237,7 @@ def warn_no_compiler(problem: str = "") -> None:
         return
     _warned = True
     found = problem or (
-        f"CC={os.environ['CC'][:SHOWN_CHARACTERS]!r} does not run"
+        f"CC={os.environ['CC'][:SHOWN_CHARACTERS]!r} does not run{_quotation_hint()}"
         if os.environ.get("CC", "").strip()
         else (
             f"none of {', '.join(CANDIDATES)} is on the path; "

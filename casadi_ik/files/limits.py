@@ -113,3 +113,15 @@ def limit(value: float) -> int:
             f"{VARIABLE}: found {text!r} in the environment, expected a factor above 0"
         )
     return max(1, int(value * factor))
+
+
+def raised_to(needed: float, value: float) -> str:
+    """Return how to raise a limit, whose default is `value`, to what is needed.
+
+    Example:
+        >>> from casadi_ik.files.limits import LIMITS, raised_to
+        >>> raised_to(3000, 256)
+        '(--size-limits 12, or CASADI_IK_LIMITS=12 in the environment, allows as many)'
+    """
+    factor = math.ceil(needed / value)
+    return f"(--size-limits {factor}, or {VARIABLE}={factor} in the environment, allows as many)"

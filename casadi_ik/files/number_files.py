@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.limits import LIMITS, RAISED, limit
+from casadi_ik.files.limits import LIMITS, RAISED, limit, raised_to
 from casadi_ik.files.reading import read_bytes
 
 UNREADABLE = (
@@ -126,7 +126,7 @@ def read_mesh(path: Path, where: str) -> tuple[Array, NDArray[np.int64]]:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise DescriptionError(f"{where}: cannot be read: {reason}") from error
     if len(triangles) > limit(LIMITS.mesh_faces):
-        most = f"at most {limit(LIMITS.mesh_faces)} {RAISED}"
+        most = f"at most {limit(LIMITS.mesh_faces)} {raised_to(len(triangles), LIMITS.mesh_faces)}"
         raise DescriptionError(f"{where}: found {len(triangles)} triangles, expected {most}")
     if not len(points):
         raise DescriptionError(f"{where}: is an empty mesh, expected triangles")

@@ -11,12 +11,12 @@ from numpy.typing import ArrayLike
 
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.number_files import FORMATS
 from casadi_ik.files.reading import Struct, read
 from casadi_ik.files.shipped import resolve
 from casadi_ik.files.units import Factor, Mass
 from casadi_ik.model.parts import known_source
 from casadi_ik.model.shapes import Mesh, MeshShape, Shape, load_mesh_shape
+from casadi_ik.model.urdf_body import BODY_FORMATS
 
 
 class MassEntry(Struct, frozen=True):
@@ -114,8 +114,8 @@ def load_object(name_or_path: str | Path) -> GraspObject:
 
     Args:
         name_or_path: A shipped name (`shipped_names("objects")`), the path of a YAML file, or that
-            of a mesh in metres: ``mug.obj``; ``mug.obj@0.08`` is larger by that factor, and
-            ``body.stl,handle.stl`` are one body.
+            of a mesh in metres or of a URDF: ``mug.obj``; ``mug.obj@0.08`` is larger by that
+            factor, and ``body.stl,handle.stl`` are one body.
 
     Raises:
         UnknownNameError: No shipped object has that name.
@@ -141,9 +141,9 @@ def load_object(name_or_path: str | Path) -> GraspObject:
 
 
 def is_mesh(name: str | Path) -> bool:
-    """Whether an object's name is that of meshes."""
+    """Return whether an object's name is that of meshes or URDFs."""
     files, _, _ = _mesh_words(str(name))
-    return all(file.lower().endswith(FORMATS) for file in files)
+    return all(file.lower().endswith(BODY_FORMATS) for file in files)
 
 
 def _mesh_words(name: str) -> tuple[list[str], str, str]:

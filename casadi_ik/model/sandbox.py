@@ -351,7 +351,9 @@ def expand_xacro(path: Path, arguments: Mapping[str, str]) -> str:
     }
     for (module, name), function in ours.items():
         if not hasattr(module, name):
-            raise RefusedError("this version of xacro is not known; pip install xacro==2.1.1")
+            raise RefusedError(
+                f"the installed xacro has no {module.__name__}.{name}; pip install 'xacro>=2.1,<3'"
+            )
         setattr(module, name, function)
 
     def watch(event: str, arguments: tuple[Any, ...]) -> None:

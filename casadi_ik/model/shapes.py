@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.files.input_checks.units import warn_of_large_mesh
-from casadi_ik.files.limits import LIMITS, RAISED, limit
-from casadi_ik.files.number_files import read_mesh
+from casadi_ik.files.limits import LIMITS, limit, raised_to
 from casadi_ik.files.units import Size
+from casadi_ik.model.urdf_body import read_body
 
 Mesh = tuple[Array, NDArray[np.int64]]
 """Vertices (v, 3) [m] and triangles (t, 3) of vertex indices, outward by the right-hand rule."""
@@ -362,13 +362,15 @@ RAYS = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3, 3)))[0]
 
 @dataclass(frozen=True, eq=False)
 class MeshShape(Body):
-    """A body bounded by triangles, in pieces that hang together.
+    """A body bounded by triangles, in connected pieces.
 
     Attributes:
         pieces: Corners (v, 3) [m] and triangles (t, 3) of each.
+        notes: Defects of the files, and how they were repaired.
     """
 
     pieces: tuple[Mesh, ...]
+    notes: tuple[str, ...] = ()
 
     def mesh(self, resolution: int = 32) -> Mesh:
         """Its corners and triangles; the resolution does not matter."""
@@ -423,16 +425,86 @@ def load_mesh_shape(files: Sequence[Path], scale: float, where: str) -> MeshShap
     Raises:
         DescriptionError: A file is missing, no mesh, or has too many pieces.
     """
-    pieces: list[Mesh] = []
+    pieces, notes = list[Mesh](), list[str]()
     for file in files:
-        points, triangles = read_mesh(file, where)
+        points, triangles = read_body(file, where)
         points = scale * points
         warn_of_large_mesh(points, where if str(file) in where else f"{where}: {file.name}")
-        pieces += pieces_of(points, triangles)
+        points, single = single_sided(points, triangles)
+        if len(single) < len(triangles):
+            notes.append(f"{len(triangles) - len(single):,} triangles were there twice: used once")
+        pieces += pieces_of(points, single)
     if len(pieces) > limit(LIMITS.object_pieces):
-        most = f"at most {limit(LIMITS.object_pieces)} {RAISED}"
+        hint = raised_to(len(pieces), LIMITS.object_pieces)
+        most = f"at most {limit(LIMITS.object_pieces)} {hint}"
         raise DescriptionError(f"{where}: found {len(pieces)} pieces, expected {most}")
-    return MeshShape(tuple(pieces))
+    return MeshShape(tuple(pieces), tuple(notes))
+
+
+MOSTLY_DOUBLE = 0.5
+"""A mesh is double-sided if more than this share of its triangles have another on the same corners.
+
+Bodies that touch share few: two cubes side by side 4 of 24.
+"""
+
+
+def single_sided(points: Array, triangles: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
+    """Return a double-sided mesh with every triangle once, facing outward; another as it is.
+
+    Exporters write both sides of every triangle where a viewer is to draw the inside, too.
+
+    Args:
+        points: (v, 3) corners [m].
+        triangles: (t, 3) triangles.
+    """
+    _, numbers = np.unique(points, axis=0, return_inverse=True)
+    merged = numbers.reshape(-1)[triangles]
+    _, first, copies = np.unique(
+        np.sort(merged, axis=1), axis=0, return_index=True, return_counts=True
+    )
+    if copies[copies > 1].sum() <= MOSTLY_DOUBLE * len(triangles):
+        return points, triangles
+    first = np.sort(first)
+    return points, _oriented(points, triangles[first], merged[first])
+
+
+def _oriented(
+    points: Array, triangles: NDArray[np.int64], merged: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Return triangles turned so that neighbours agree and each component faces outward.
+
+    Args:
+        points: (v, 3) corners [m].
+        triangles: (t, 3) triangles.
+        merged: (t, 3) the same, corners at the same place being one.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    t = len(triangles)
+    starts, ends = merged[:, [0, 1, 2]].T.ravel(), merged[:, [1, 2, 0]].T.ravel()
+    keys = np.stack([np.minimum(starts, ends), np.maximum(starts, ends)], axis=1)
+    _, edges, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+    edges = edges.reshape(-1)
+    order = np.argsort(edges, kind="stable")
+    pairs = order[counts[edges[order]] == 2].reshape(-1, 2)
+    # Neighbours agree if they run along their common edge in opposite directions.
+    agree = (starts[pairs[:, 0]] < ends[pairs[:, 0]]) != (starts[pairs[:, 1]] < ends[pairs[:, 1]])
+    one, other = (pairs % t).T
+    # Each triangle is two nodes, as it is and turned; edges connect the nodes that agree.
+    across = np.where(agree, 0, t)
+    rows = np.concatenate([one, one + t])
+    columns = np.concatenate([other + across, other + t - across])
+    graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(2 * t, 2 * t))
+    sides = connected_components(graph, directed=False)[1][:t]
+    graph = coo_array((np.ones(len(one)), (one, other)), shape=(t, t))
+    count, labels = connected_components(graph, directed=False)
+    roots = np.unique(labels, return_index=True)[1]
+    turned = sides != sides[roots[labels]]
+    corners = points[triangles]
+    volumes = np.einsum("ti,ti->t", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+    inward = np.bincount(labels, np.where(turned, -volumes, volumes), count) < 0
+    return np.where((turned ^ inward[labels])[:, None], triangles[:, ::-1], triangles)
 
 
 def pieces_of(points: Array, triangles: NDArray[np.int64]) -> list[Mesh]:
@@ -454,11 +526,12 @@ def pieces_of(points: Array, triangles: NDArray[np.int64]) -> list[Mesh]:
 
     meeting = coo_array((np.ones(len(of_two)), of_two.T), shape=(len(triangles),) * 2)
     _, labels = connected_components(meeting, directed=False)
-    found: list[Mesh] = []
-    for label in np.unique(labels):
-        kept, numbers = np.unique(triangles[labels == label], return_inverse=True)
-        found.append((points[kept], numbers.reshape(-1, 3).astype(np.int64)))
-    return found
+    order = np.argsort(labels, kind="stable")
+    pieces: list[Mesh] = []
+    for members in np.split(order, np.flatnonzero(np.diff(labels[order])) + 1):
+        kept, numbers = np.unique(triangles[members], return_inverse=True)
+        pieces.append((points[kept], numbers.reshape(-1, 3).astype(np.int64)))
+    return pieces
 
 
 def _edges(triangles: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -16,6 +16,7 @@ from casadi_ik.collision.solids import Kind, Solid
 from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.model.objects import GraspObject, load_object
+from casadi_ik.model.shapes import MeshShape
 from casadi_ik.planning.touch.nearest import NearestPoints, TriangleTree
 
 
@@ -24,7 +25,8 @@ class SurfaceParameters:
     """How finely a surface is looked at (lengths of Drost et al. 2010, scaled to fingertips).
 
     Attributes:
-        samples: Points on the surface.
+        samples: Maximum number of points on the surface.
+        density: Maximum mean number of them in a cube with edges of `patch`.
         smoothing: Normals are means over this radius [m], about that of a fingertip's pad.
         patch: A point is inside a face if all samples of this radius about it [m] ...
         bend: ... have normals within this angle of its own [rad].
@@ -34,6 +36,7 @@ class SurfaceParameters:
     """
 
     samples: int = 6000
+    density: int = 100
     smoothing: float = 4e-3
     patch: float = 5e-3
     bend: float = float(np.deg2rad(25.0))
@@ -62,18 +65,39 @@ class Grid:
     def of(
         cls, solids: Iterable[tuple[Solid, Array]], low: Array, high: Array, step: float
     ) -> Grid:
-        """The least distance of solids at poses (4, 4), infinite where there is none."""
+        """Return the grid of the least distance to solids, infinite where there is none.
+
+        Args:
+            solids: Solids with their poses (4, 4).
+            low: (3,) lower corner of the grid [m].
+            high: (3,) upper corner [m].
+            step: Edge of a cell [m].
+        """
         low, counts, middles = cells(low, high, step)
         value = np.full(len(middles), np.inf)
-        for solid, pose in solids:
-            seen = (middles - pose[:3, 3]) @ pose[:3, :3]
-            if solid.kind is Kind.CLOUD:
-                apart = _tree(solid.points).query(seen)[0] - solid.size[0]
-            else:
-                apart = solid.distance(seen)
-            np.minimum(value, apart, out=value)
+        placed = list(solids)
+        # A solid is not the nearest where even the ball about it is farther than another's centre.
+        bound = np.full(len(middles), np.inf)
+        for solid, pose in placed:
+            if np.isfinite(solid.reach) and solid.kind is not Kind.CLOUD:
+                np.minimum(bound, np.linalg.norm(middles - pose[:3, 3], axis=1), out=bound)
+        for solid, pose in placed:
+            near = np.linalg.norm(middles - pose[:3, 3], axis=1) - solid.reach <= bound
+            rows = np.flatnonzero(near)
+            chunk = max(1, MOST_NUMBERS // max(len(solid.planes), 1))
+            for start in range(0, len(rows), chunk):
+                some = rows[start : start + chunk]
+                local = (middles[some] - pose[:3, 3]) @ pose[:3, :3]
+                if solid.kind is Kind.CLOUD:
+                    distance = _tree(solid.points).query(local)[0] - solid.size[0]
+                else:
+                    distance = solid.distance(local)
+                value[some] = np.minimum(value[some], distance)
         return cls(low, counts, value)
 
+
+MOST_NUMBERS = 4_000_000
+"""Distances of cells from planes that are evaluated together; bounds the memory."""
 
 NEIGHBOURS = 12
 """Samples about each: by them the nearest of a point is found from one that is near."""
@@ -205,6 +229,7 @@ def load_surface(
     thing = load_object(name)
     vertices, triangles = thing.mesh(resolution=96)
     vertices, triangles, notes = _body(name, vertices, triangles)
+    notes = (*(thing.shape.notes if isinstance(thing.shape, MeshShape) else ()), *notes)
     corners = vertices[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     doubled = np.linalg.norm(normals, axis=1)
@@ -214,8 +239,15 @@ def load_surface(
     weights = np.stack([1 - u, u * (1 - v), u * v], axis=1)
     points = (corners[face] * weights[..., None]).sum(axis=1)
     faces = normals[face] / doubled[face, None]
+    # Of a small object fewer samples are as dense; without bound all are neighbours of all.
+    occupied = len(np.unique(np.floor(points / chosen.patch), axis=0))
+    count = min(chosen.samples, max(LEAST_SAMPLES, chosen.density * occupied))
+    points, faces = points[:count], faces[:count]
     return replace(_smoothed(name, thing, points, faces, corners[doubled > 0], chosen), notes=notes)
 
+
+LEAST_SAMPLES = 500
+"""Minimum number of samples of a small object."""
 
 SIZES = (5e-3, 2.0)
 """Least and largest edge of the box around an object that a hand may grasp [m]."""
