@@ -24,6 +24,7 @@ from casadi_ik.files.input_checks.keypoints import KEYPOINTS, KNUCKLES, FrameFil
 from casadi_ik.files.reading import Angles, Frame, Point, Struct, frame_matrix, read
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.grasp import real_array
+from casadi_ik.motion.motion import seconds
 
 OPENXR = (1, *range(2, 6), *range(7, 11), *range(12, 16), *range(17, 21), *range(22, 26))
 """Joints of OpenXR that are the keypoints: all but palm and metacarpals of four fingers."""
@@ -287,8 +288,7 @@ class Retargeter:
                 the hand (NaN, zeros, -1, a jump, a bone that is too long) is not an error: then
                 nothing is wanted, and `Wanted.reason` says why.
         """
-        if not 0 < elapsed < np.inf:
-            raise InputError(f"elapsed: found {elapsed}, expected seconds above 0")
+        elapsed = seconds("elapsed", elapsed)
         points, frames = np.full((len(self._robot.fingers), 3), np.nan), dict[str | None, Array]()
         reasons = list[str]()
         for side, joints in self._by_side(keypoints).items():
