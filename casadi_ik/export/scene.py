@@ -72,8 +72,8 @@ class ClosedArm:
         (grid, between), closer = self.values.levels, self.values.closer
         return {
             "PLACES": grid.ravel(),
-            "MORE_PLACES": between.ravel() if between.size else np.zeros(1),
-            "CLOSER": closer if len(closer) else np.zeros(1),
+            "MORE_PLACES": between.ravel(),
+            "CLOSER": closer,
             "ARM_LOW": self.lower,
             "ARM_RANGE": self.upper - self.lower,
         }
@@ -215,7 +215,7 @@ class SceneSources:
             "OWN_SOLIDS": str(self._own),
             "LINKS": str(len(self.links)),
             "ROUNDING": number(self.rounding),
-            "N_HAND": str(len(self.robot.description.hand_actuators)),
+            "N_HAND_PARTS": str(self._hand_parts),
             "N_CANDIDATES": str(candidates),
             "TRIED": str(self._rounds * candidates),
             "N_LOOKED": str(self._rounds * candidates + 1),
@@ -343,13 +343,22 @@ class SceneSources:
         columns = ", ".join(map(str, arm.columns))
         return arm.sizes, f"#define ARM_COLUMNS {{{columns}}}\n", arm.arrays
 
+    @property
+    def _hand_parts(self) -> int:
+        """Number of values that distinguish hand poses, as `AlternativeFinder.hand_parts`."""
+        return len(self.robot.description.hand_actuators) + 12
+
     def look_constants(self) -> str:
         """What the search for hands that are free knows."""
         closed = int(bool(self.closed_arms))
         ranges = np.maximum(self.robot.upper - self.robot.lower, FREE.least_range)
+        sizes = {"LOOK_ROUNDS": self._rounds, "HAS_CLOSED_ARM": closed}
+        sizes |= {"N_HAND_PARTS": self._hand_parts}
+        sizes |= {"STATE_TURN": self.method.step.layouts.state.slice("turn").start}
+        reals = {"LOOK_ALIKE": FREE.alike, "PALM_TURN": PALMS[0], "PALM_SHIFT": PALMS[3]}
         return (
-            define({"LOOK_ROUNDS": self._rounds, "HAS_CLOSED_ARM": closed})
-            + f"#define LOOK_ALIKE {number(FREE.alike)}\n"
+            define(sizes)
+            + "".join(f"#define {name} {number(float(value))}\n" for name, value in reals.items())
             + define_arrays({"LOOK_RANGES": ranges})
         )
 
@@ -366,14 +375,16 @@ class SceneSources:
             + f"#define IDLE_NEAR {number(FINGERS.near)}\n"
             + define_arrays(
                 {
-                    "HAND": np.array(hand),
+                    "HAND": np.array(hand, dtype=int),
                     "HAND_LOWER": robot.lower[hand],
                     "HAND_RANGE": (robot.upper - robot.lower)[hand],
                     "HAND_SPREAD": even_steps(len(robot.lower))[hand],
                     "IDLE_PARTS": np.array(FINGERS.parts),
-                    "FINGER_MOVED": np.array([[int(m in some) for m in hand] for some in fingers]),
+                    "FINGER_MOVED": np.array(
+                        [[m in some for m in hand] for some in fingers], dtype=int
+                    ),
                     "LINK_MOVED": np.array(
-                        [[int(link in some) for some in moved] for link in self.links]
+                        [[link in some for some in moved] for link in self.links], dtype=int
                     ),
                 }
             )
@@ -395,14 +406,14 @@ class SceneSources:
             "TOUCHES": np.array(
                 [[int(one.link in touching[f]) for one in capsules] for f in robot.fingers]
             ),
-            "PAIRS": pairs if len(pairs) else np.zeros((1, 2), dtype=int),
-            "PAIR_MOVING": np.array(crossing or [0]),
-            "OFFSETS": model.offsets if len(pairs) else np.zeros(1),
+            "PAIRS": pairs,
+            "PAIR_MOVING": np.array(crossing, dtype=int),
+            "OFFSETS": model.offsets,
             "SIZE_FACTORS": np.array([row.factors for row in EXPORTED.values()]),
-            "OWN_KIND": np.array([int(one.kind) for one in own] or [0]),
-            "OWN_SIZE": np.array([one.size for one in own] or [np.zeros(3)]),
-            "OWN_REACH": np.array([one.reach for one in own] or [0.0]),
-            "OWN_LINK": np.array([links[one.link] for one in shapes] or [0]),
+            "OWN_KIND": np.array([int(one.kind) for one in own], dtype=int),
+            "OWN_SIZE": np.array([one.size for one in own]).reshape(-1, 3),
+            "OWN_REACH": np.array([one.reach for one in own]),
+            "OWN_LINK": np.array([links[one.link] for one in shapes], dtype=int),
         }
         whole = {
             "N_CAPSULES": len(capsules),
@@ -509,7 +520,6 @@ class BodySceneSources(SceneSources):
             "N_CARRYING": len(motors),
             "N_LOTS": len(FREE.trunks),
         }
-        reals = {"PALM_TURN": PALMS[0], "PALM_SHIFT": PALMS[3], "TRUNK_AT_ENDS": AT_ENDS}
         arrays = {
             "LOTS": np.array(FREE.trunks),
             "CARRY_PLACES": np.array(list(carry)),
@@ -520,7 +530,7 @@ class BodySceneSources(SceneSources):
         return (
             super().look_constants()
             + define(places)
-            + "".join(f"#define {name} {number(float(value))}\n" for name, value in reals.items())
+            + f"#define TRUNK_AT_ENDS {number(AT_ENDS)}\n"
             + define_arrays(arrays)
         )
 

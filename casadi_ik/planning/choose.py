@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
@@ -30,7 +30,7 @@ from casadi_ik.solve.batches import judged
 from casadi_ik.solve.collision_free import free_answers
 from casadi_ik.solve.engine import Engine
 from casadi_ik.solve.method import Outcome
-from casadi_ik.solve.request import CLEARANCE, Request, free_palms
+from casadi_ik.solve.request import CLEARANCE, Request
 from casadi_ik.solve.solution import Choice, Ranking, Solution
 from casadi_ik.solve.status import Status
 from casadi_ik.solve.trials import Deduplicator, largest_of_each
@@ -103,7 +103,7 @@ class Answers:
 
 def choose(
     solver: Any,
-    grasps: Iterable[Grasp],
+    grasps: Sequence[Grasp],
     object_pose: ArrayLike | None = None,
     q0: ArrayLike | None = None,
     limit: int = 10,
@@ -153,7 +153,6 @@ def choose(
     begin = time.perf_counter()
     engine: Engine = solver._engine
     request: Request = solver._request
-    grasps = _candidates(grasps)
     limit = _count(limit, "limit")
     most = None if per_candidate is None else _count(per_candidate, "per_candidate")
     apart, start = checked_distance(apart), request.start(q0)
@@ -188,17 +187,6 @@ def choose(
     )
 
 
-def _candidates(grasps: Iterable[Grasp]) -> Sequence[Grasp]:
-    """Return the candidates as a sequence.
-
-    Raises:
-        InputError: They are not several grasps.
-    """
-    if isinstance(grasps, (Grasp, str, Mapping)) or not isinstance(grasps, Iterable):
-        raise InputError(f"grasps: found {type(grasps).__name__}, expected a sequence of grasps")
-    return grasps if isinstance(grasps, Sequence) else list(grasps)
-
-
 def _count(value: int, name: str) -> int:
     """A number of answers.
 
@@ -211,21 +199,15 @@ def _count(value: int, name: str) -> int:
 
 
 def _own(prefer: Callable[[ArmHand, Array], ArrayLike], robot: ArmHand) -> Callable[[Array], Array]:
-    """Return a caller's preference with its scores checked."""
+    """A preference of one's own, its answers checked."""
 
     def score(q: Array) -> Array:
-        try:
-            scores = np.asarray(prefer(robot, q.copy()), dtype=float)
-        except Exception as error:  # the caller's function may raise anything
-            problem = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-            raise InputError(
-                f"prefer: the function raised {problem}; expected scores ({len(q)},)"
-            ) from error
-        if scores.shape != (len(q),):
-            raise InputError(f"prefer: gave shape {scores.shape}, expected ({len(q)},)")
-        if np.isnan(scores).any():
+        found = np.asarray(prefer(robot, q.copy()), dtype=float)
+        if found.shape != (len(q),):
+            raise InputError(f"prefer: gave shape {found.shape}, expected ({len(q)},)")
+        if np.isnan(found).any():
             raise InputError("prefer: gave NaN, expected numbers")
-        return scores
+        return found
 
     return score
 
@@ -427,7 +409,7 @@ class _Part:
         kept: Bools = np.all(np.isfinite(every), axis=2)
         place, which = np.nonzero(kept)
         found, owner = every[place, which], rows[place]
-        parts = self.finder.hand_parts(found, free_palms(self.finder.robot, some)[place])
+        parts = self.finder.hand_parts(found)
         fresh = Deduplicator(len(rows), parts.shape[1], SEEKING.distinct).add(parts, place)
         return found[fresh], owner[fresh]
 

@@ -26,7 +26,7 @@ from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.arm_search import ArmSearch, Preference
 from casadi_ik.solve.hand_first.body import BodyStep
 from casadi_ik.solve.hand_first.method import HandFirstMethod
-from casadi_ik.solve.request import CLEARANCE, free_palms, preference
+from casadi_ik.solve.request import CLEARANCE, preference
 from casadi_ik.solve.solution import Alternative, ArmBranch
 from casadi_ik.solve.trials import (
     Bounds,
@@ -233,24 +233,23 @@ class AlternativeFinder:
             # Reachable thanks to the tolerances only, if at all.
             q = np.concatenate([q, trials.run(states, loose)])
             kept = q[trials.solved(targets, q, targets.enforce_limits)]
-        parts = self.hand_parts(kept, np.repeat(free_palms(self.robot, targets), len(kept)))
-        return [kept[i] for i in distinct(parts, SEEKING.distinct)]
+        return [kept[i] for i in distinct(self.hand_parts(kept), SEEKING.distinct)]
 
-    def hand_parts(self, q: Array, free: NDArray[np.bool_]) -> Array:
-        """What tells hands apart: motors as parts of their ranges, and palms that are free.
+    def hand_parts(self, q: Array) -> Array:
+        """Return the numbers that distinguish hand poses: motors, and the palm that an arm moves.
 
         Args:
-            q: (m, n).
-            free: (m,) whether contacts leave the palm free, see `free_palms`.
+            q: (m, n) configurations.
 
         Returns:
-            (m, h) or, where any palm is free, (m, h + 12).
+            (m, h) motors of the hand divided by their ranges; with an arm (m, h + 12), followed by
+            the pose of the palm (`palm_parts`). Contacts such as those of two opposed fingers leave
+            the palm free, so that equal postures of the hand are different hand poses.
         """
         parts = self._parts(q, self.hand)
-        if not free.any():
+        if not self._arm:
             return parts
-        palms = palm_parts(self.robot.palm(q))
-        return np.concatenate([parts, palms * free[:, None]], axis=1)
+        return np.concatenate([parts, palm_parts(self.robot.palm(q))], axis=1)
 
     def _arms(
         self,

@@ -34,7 +34,7 @@ from casadi_ik.solve.arm_search import Preference
 from casadi_ik.solve.batches import judged
 from casadi_ik.solve.free_hands import SideHands, UnconstrainedFingers
 from casadi_ik.solve.method import Outcome
-from casadi_ik.solve.request import CLEARANCE, free_palms
+from casadi_ik.solve.request import CLEARANCE
 from casadi_ik.solve.solution import BatchSolution, CollisionReport
 from casadi_ik.solve.status import Phase, Status
 from casadi_ik.solve.trials import (
@@ -248,11 +248,10 @@ class FreeSearch:
         self.room = np.full(count, np.inf if self.arm_search is None else -np.inf)
         self.tried = np.zeros(count, dtype=np.int64)
         self.hands: list[tuple[Array, NDArray[np.intp], Array]] = []
-        robot, hand = finder.robot, finder.hand
+        robot = finder.robot
         self._idle = UnconstrainedFingers(robot, targets)
         self._ranges = np.maximum(robot.upper - robot.lower, PARAMETERS.least_range)
-        self._palms = free_palms(robot, targets)
-        size = len(hand) + 12 * bool(self._palms.any())
+        size = len(finder.hand) + 12 * bool(robot.description.arm_actuators)
         self._known, self._searched = (
             Deduplicator(count, size, PARAMETERS.alike) for _ in range(2)
         )
@@ -334,7 +333,7 @@ class FreeSearch:
         # What stands about another hand may avoid.
         itself = np.append(held.table.within, False)[clear.pairs]
         np.maximum.at(self.room, owner, np.where(itself, surplus, np.inf))
-        parts = self.finder.hand_parts(q, self._palms[owner])
+        parts = self.finder.hand_parts(q)
         fresh = self._known.add(parts, owner)
         self._fresh[owner[fresh]] = True
         self.hands.append((q[fresh], owner[fresh], surplus[fresh]))

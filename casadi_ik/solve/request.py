@@ -172,17 +172,6 @@ def touched(robot: ArmHand, palms: Array, postures: Array) -> tuple[Array, Array
     return points, normals, {"tangents": np.where(free[:, None, None], tangents, np.nan)}
 
 
-def free_palms(robot: ArmHand, targets: TargetBatch) -> NDArray[np.bool_]:
-    """(k,) whether a hand that meets its contacts can still move as a whole.
-
-    A line or a plane is taken for the point it goes through.
-    """
-    if not robot.description.arm_actuators:
-        return np.zeros(len(targets), dtype=bool)
-    facing = np.concatenate([targets.vectors(name) for name in ("normals", "tangents")], axis=1)
-    return _leave_free(targets.points, facing)
-
-
 TURNS = np.cross(np.eye(3)[:, None], np.eye(3)[None])
 """`v @ TURNS[i]` is the cross product of axis i with v."""
 

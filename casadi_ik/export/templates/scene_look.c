@@ -50,19 +50,33 @@ static int swung_free(@PREFIX@_solver *solver, const scalar *hand) {
       && answered(solver, q) && least_room(solver, q) >= -LOOK_ROUNDING;
 }
 
-/* Whether a hand is like none before it. */
-static int is_new(const scalar *q, scalar *before, int64_t *count) {
-  scalar *own = before + *count * N_HAND;
+#if HAS_CLOSED_ARM
+/* Appends the numbers that distinguish a hand pose (motors of the hand divided by their ranges, then
+ * the pose of the palm) to those of earlier hand poses; returns 0 if they equal earlier ones. */
+static int is_new(search *job, const scalar *q, scalar *before, int64_t *count) {
+  scalar *parts = before + *count * N_HAND_PARTS, palm[16];
+  const scalar *inputs[1];
+  scalar *outputs[1];
+  map_job map = mapping(1, inputs, ALONE, outputs, ALONE);
   int64_t i;
   int k;
-  for (k = 0; k < N_HAND; ++k) own[k] = q[HAND[k]] / LOOK_RANGES[HAND[k]];
-  for (i = 0; HAS_CLOSED_ARM && i < *count; ++i) {
-    for (k = 0; k < N_HAND && fabs(own[k] - before[i * N_HAND + k]) < LOOK_ALIKE; ++k) continue;
-    if (k == N_HAND) return 0;
+  inputs[0] = q;
+  outputs[0] = palm;
+  if (PALM(&map) != DONE) return 0;
+  for (k = 0; k < N_HAND; ++k) parts[k] = q[HAND[k]] / LOOK_RANGES[HAND[k]];
+  for (i = 0; i < 12; ++i, ++k) parts[k] = palm[i] * (i % 4 < 3 ? PALM_TURN : PALM_SHIFT);
+  for (i = 0; i < *count; ++i) {
+    const scalar *other = before + i * N_HAND_PARTS;
+    for (k = 0; k < N_HAND_PARTS && fabs(parts[k] - other[k]) < LOOK_ALIKE; ++k) continue;
+    if (k == N_HAND_PARTS) return 0;
   }
   ++*count;
   return 1;
 }
+#else
+/* Without an arm in closed form every hand pose is tried. */
+#define is_new(job, q, before, count) 1
+#endif
 
 /* What is preferred of hands, higher is better; of all motors where the arm goes with the hand. */
 static scalar hand_rated(const @PREFIX@_solver *solver, const scalar *q) {
@@ -96,8 +110,8 @@ static void take_hand(@PREFIX@_solver *solver, scalar *q) {
     memcpy(look->q, q, sizeof look->q);
   }
   fits = @PREFIX@_hand_is_free(solver, solver->terms + TERMS_LOWER, solver->terms + TERMS_UPPER, q);
-  look->fresh |= is_new(q, look->known, &look->n_known);
-  if (!fits || !is_new(q, look->swung, &look->n_swung)) return;
+  look->fresh |= is_new(solver, q, look->known, &look->n_known);
+  if (!fits || !is_new(solver, q, look->swung, &look->n_swung)) return;
   /* Into the order in which they are looked at. */
   rated = hand_rated(solver, q);
   for (place = look->n_met++; place > 0; --place) {
@@ -172,6 +186,8 @@ static int begin_hand(search *job) {
   code = BEGIN(&map);
   job->state[STATE_PHASE] = CANDIDATE_PHASE;
   job->state[STATE_CANDIDATE] = N_CANDIDATES - 1;
+  /* A different palm for each posture, where contacts leave the palm free. */
+  job->state[STATE_TURN] = (scalar) (look->round * N_CANDIDATES + look->fit);
 @BODY{@
   job->state[STATE_FIRST] = N_CANDIDATES - 1;
 @}@
@@ -307,8 +323,10 @@ static int begin_carry(search *job, const scalar *q, const scalar *palms, int ph
   const scalar *inputs[5];
   scalar *outputs[2];
   map_job map = mapping(1, inputs, ALONE, outputs, ALONE);
-  int code, i;
-  for (i = 0; i < N_CANDIDATES * N_HAND; ++i) job->near[i] = q[HAND[i % N_HAND]];
+  int code, i, k;
+  for (i = 0; i < N_CANDIDATES; ++i) {
+    for (k = 0; k < N_HAND; ++k) job->near[i * N_HAND + k] = q[HAND[k]];
+  }
   inputs[0] = job->points;
   inputs[1] = job->normals;
   inputs[2] = q;

@@ -40,6 +40,6 @@ typedef struct {
 @}@
 @ONE_ARM{@
   @REAL@ met[@N_CANDIDATES@ * @GUARD@_MOTORS], rated[@N_CANDIDATES@];
-  @REAL@ known[@N_LOOKED@ * @N_HAND@], swung[@N_LOOKED@ * @N_HAND@];
+  @REAL@ known[@N_LOOKED@ * @N_HAND_PARTS@], swung[@N_LOOKED@ * @N_HAND_PARTS@];
 @}@
 } @PREFIX@_scene;
