@@ -239,9 +239,14 @@ def numbers(values: Iterable[Any]) -> str:
 
 
 def define_arrays(arrays: Mapping[str, NDArray[Any]], scope: str = "static const") -> str:
-    """Return definitions of nonempty arrays of type `scalar`, `int16_t` or `int`, by name."""
+    """Return definitions of C arrays of type `scalar`, `int16_t` or `int`, by name.
+
+    C has no empty arrays: a dimension of zero becomes one, and the array holds zeros.
+    """
     text = ""
     for name, array in arrays.items():
+        if not array.size:
+            array = np.zeros([max(size, 1) for size in array.shape], array.dtype)
         whole = "int16_t" if array.dtype == np.int16 else "int"
         kind = whole if array.dtype.kind in "iu" else "scalar"
         sizes = "".join(f"[{size}]" for size in array.shape)

@@ -350,7 +350,7 @@ static int choose_arms(@PREFIX@_solver *solver, const scalar *lower, const scala
  * that hand and palm have [m]. */
 static scalar put_aside(@PREFIX@_solver *solver, const scalar *lower, const scalar *upper,
                         scalar *q) {
-  int motors[N_HAND], links[@GUARD@_LINKS], k, closer;
+  int motors[N_HAND + 1], links[@GUARD@_LINKS], k, closer;
   scalar most, part = 0, tried[@GUARD@_MOTORS], best[@GUARD@_MOTORS];
   int64_t closest, place;
   clearance_job job;
@@ -410,7 +410,7 @@ int @PREFIX@_arm_is_free(@PREFIX@_solver *solver, const scalar *lower, const sca
 @}@
 @BODY{@
 void @PREFIX@_list_pairs(@PREFIX@_solver *solver, const scalar *lower, const scalar *upper) {
-  int motors[N_HAND], links[@GUARD@_LINKS];
+  int motors[N_HAND + 1], links[@GUARD@_LINKS];
   find_idle(solver, lower, upper, motors, links);
   solver->scene.listed = 0;
   (void) about(solver, links);

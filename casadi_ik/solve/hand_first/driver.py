@@ -187,6 +187,7 @@ class SearchPlan:
         """Type, length (None: a number) and meaning of what a search has in memory, 8 bytes."""
         f, n, h, _, state, parameters, candidates, pool, mended, more, _ = self.sizes.values()
         double, whole = "double", "int64_t"
+        h = max(h, 1)  # a tool has no motors, and C no empty arrays
         return {
             "points": (double, 3 * f, "the question: base frame, NaN = free"),
             "normals": (double, 3 * f, ""),
@@ -413,7 +414,8 @@ class Searches:
         self.here, self.terms, self.q = one["here"], one["terms"], one["q"]
         self.position_error, self.angle_error = one["position_error"], one["angle_error"]
         self.state, self.parameters = one["state"], one["parameters"]
-        self.postures = one["postures"].reshape(plan.options.candidates, -1)
+        shape = plan.options.candidates, plan.sizes["N_HAND"]
+        self.postures = one["postures"][: np.prod(shape)].reshape(shape)
         self._one = one
         self._counts = self.state[plan.layouts.state.slice("counts")]
         self._base = memory(searches.view(np.uint8))

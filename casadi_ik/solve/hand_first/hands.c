@@ -9,6 +9,6 @@ FIND_HANDS(search *job, const double *points, const double *normals, const doubl
   memcpy(job->terms + TERMS_UPPER, UPPER, sizeof UPPER);
   job->terms[TERMS_NEAREST] = (double) nearest;
   code = from_table(job, round);
-  memcpy(postures, job->postures, sizeof job->postures);
+  memcpy(postures, job->postures, N_CANDIDATES * N_HAND * sizeof(double));
   return code;
 }

@@ -123,7 +123,9 @@ static int from_spread(search *job, int64_t number) {
 
 /* Nearest to where the robot is first; its own posture before them, instead of the last. */
 static void order(search *job, int own) {
-  double here[N_HAND], near[N_HAND], sorted[N_CANDIDATES * N_HAND], distance[N_CANDIDATES];
+  /* One number more than needed: a tool has no motors, and C no empty arrays. */
+  double here[N_HAND + 1], near[N_HAND + 1], sorted[N_CANDIDATES * N_HAND + 1];
+  double distance[N_CANDIDATES];
   const int first = own && HAS_ARM && N_CANDIDATES > 1;
   const int count = first ? N_CANDIDATES - 1 : N_CANDIDATES;
   int i, j, k;
@@ -134,7 +136,7 @@ static void order(search *job, int own) {
     near[k] = here[k] / ORDER_RANGES[k];
   }
   for (i = 0; i < count; ++i) {
-    double place[N_HAND];
+    double place[N_HAND + 1];
     for (k = 0; k < N_HAND; ++k) place[k] = job->postures[i * N_HAND + k] / ORDER_RANGES[k];
     distance[i] = apart(place, near);
   }
@@ -146,7 +148,7 @@ static void order(search *job, int own) {
     for (k = 0; k < N_HAND; ++k) sorted[before * N_HAND + k] = job->postures[i * N_HAND + k];
   }
   for (k = 0; first && k < N_HAND; ++k) sorted[k] = here[k];
-  memcpy(job->postures, sorted, sizeof sorted);
+  memcpy(job->postures, sorted, N_CANDIDATES * N_HAND * sizeof(double));
 }
 
 /* Postures whose contacts look like the target, in later rounds the next best of another table. */

@@ -6,7 +6,7 @@
 
 /* Postures of every hand whose contacts look like its part of the target. */
 static int from_table(search *job, int64_t number) {
-  double here[N_MOTORS], hands[N_CANDIDATES * N_HAND];
+  double here[N_MOTORS], hands[N_CANDIDATES * N_HAND + 1];
   int side, i, k, finger = 0, first = 0;
   for (side = 0; side < N_SIDES; ++side) {
     const int fingers = SIDE_FINGERS[side], count = SIDE_HANDS[side];
