@@ -35,6 +35,7 @@ from casadi_ik.export.targets import (
     Example,
     SceneTargets,
     example,
+    frames_header,
     stored,
     targets_header,
     written,
@@ -118,28 +119,29 @@ def exported(
     capacity: int | None = None,
     single: bool = False,
     follow: bool = False,
+    count: int = COUNT,
 ) -> Exported:
-    """The solver of a robot as source code.
+    """Return the solver of a robot as source code.
 
     Args:
         robot: The robot.
-        prefix: What every name begins with.
-        capacity: How many solids may stand about; None: collisions are not looked at.
-        single: Whether it is in single precision.
-        follow: Whether a follower goes with it, in double precision.
+        prefix: Prefix of every public name.
+        capacity: Largest number of solids in the scene; None: collisions are not checked.
+        single: Whether to compute in single precision.
+        follow: Whether to add a follower of moving contacts; double precision only.
+        count: Number of targets that the test of the export solves.
 
     Raises:
         UnsupportedError: It cannot be exported.
     """
     sides = robot.description.sides
+    if not robot.actuators:
+        raise UnsupportedError(f"export: {robot.name} has no actuators; expected at least one")
     if sides and single and capacity is not None:
         raise UnsupportedError(
-            f"--single: {robot.name} has several sides, expected no --scene: their collisions are "
-            "looked at in double precision only"
+            f"--single: {robot.name} has several arms; expected no --scene, because its collisions "
+            "are checked in double precision only"
         )
-    as_hand = ArmHand(robot.description.as_hand) if sides else robot
-    if single:
-        robot = as_hand
     if single and follow:
         raise UnsupportedError("--follow: computes in double precision, expected no --single")
     method, solver = hand_first(robot), Solver(robot)
@@ -160,12 +162,12 @@ def exported(
         "EXAMPLE_WHAT": shown.what,
         "EXAMPLE_POINTS": written(shown.points),
         "EXAMPLE_NORMALS": written(shown.normals),
-        "TARGETS": str(COUNT),
+        "TARGETS": str(count),
         "ROUNDS_COUNT": str(sources.plan.rounds),
     }
     more: dict[str, str] = {}
     if follow:
-        more, about_it = FollowSources(as_hand, prefix, tolerance).files()
+        more, about_it = FollowSources(_as_hand(robot), prefix, tolerance).files()
         marks |= about_it
     files = (
         more
@@ -183,6 +185,11 @@ def exported(
     about = None if capacity is None else SceneTargets(solver, capacity)
     judge = sources.judge() if single else {}
     return Exported(solver, shown, marks, sources.final(files), about, judge)
+
+
+def _as_hand(robot: ArmHand) -> ArmHand:
+    """Return the robot itself, or a robot with several arms as one hand that has all motors."""
+    return ArmHand(robot.description.as_hand) if robot.description.sides else robot
 
 
 def _tested(project: Exported, pieces: Mapping[str, str]) -> dict[str, str]:
@@ -203,20 +210,22 @@ def c_project(
     capacity: int | None = None,
     single: bool = False,
     follow: bool = False,
+    count: int = COUNT,
 ) -> dict[str, str | bytes]:
-    """The files of a project in C, by path.
+    """Return the files of a C project by path.
 
     Args:
         robot: The robot.
-        prefix: What every name begins with.
-        capacity: How many solids may stand about; None: collisions are not looked at.
-        single: Whether it is in single precision.
-        follow: Whether a follower goes with it.
+        prefix: Prefix of every public name.
+        capacity: Largest number of solids in the scene; None: collisions are not checked.
+        single: Whether to compute in single precision.
+        follow: Whether to add a follower of moving contacts; double precision only.
+        count: Number of targets that the test of the project solves.
 
     Raises:
         UnsupportedError: The robot's solver cannot be exported.
     """
-    project = exported(robot, prefix, capacity, single, follow)
+    project = exported(robot, prefix, capacity, single, follow, count)
     files = {
         "example/main.c": "main.c",
         "test/test.c": "test_single.c" if single else "test.c",
@@ -232,7 +241,8 @@ def c_project(
         f"include/{prefix}.hpp": filled("solver.hpp", marks),
         **{path: filled(name, marks) for path, name in files.items()},
         **project.judge,
-        "test/targets.h": targets_header(project.solver, project.scene, single),
+        "test/targets.h": targets_header(project.solver, project.scene, single, count)
+        + (frames_header(Solver(_as_hand(robot))) if follow else ""),
     }
 
 

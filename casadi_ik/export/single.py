@@ -157,31 +157,30 @@ IN_DOUBLE = {
 """What stands for the marks in double precision."""
 
 ANSWERS = """\
-In single precision, for controllers without a unit for doubles: nothing is computed in double
-precision. What is called solved is so in double precision, too; see [below](#single-precision).
+This project is in single precision, for controllers without double-precision arithmetic. Answers
+that it reports as solved are solved in double precision as well; see [below](#single-precision).
 """
 
 ABOUT = """
 ## Single precision
 
-All numbers are `float`; `-Wdouble-promotion` tells that nothing else is computed with. The method
-is the one of the double-precision export, its bounds against division by nothing those of this
-precision; the iterates are others, and so may an answer be where a target has several.
+Every number is a `float`, and nothing is computed in double precision (`-Wdouble-promotion` checks
+this). The method is that of the double-precision export, with thresholds adapted to single
+precision. Iterates differ, so that the answer may be another one where a target has several.
 
-Rounding moves this robot's fingertips by less than {position:.1e} m and {angle:.1e} rad. Answers
-keep to tolerances less that, and to limits moved inwards by {angle:.1e} rad: what is called solved
-is solved for double precision as well. So tolerances from {least:.1g} m and {least_angle:.1g} rad
-on make sense; smaller ones than rounding are never met.
+Rounding moves the fingertips of this robot by less than {position:.1e} m and {angle:.1e} rad. The
+solver reduces tolerances by these amounts and moves limits inwards by {angle:.1e} rad. Therefore an
+answer that is reported as solved is solved in double precision as well. Use tolerances of
+{least:.1g} m and {least_angle:.1g} rad or more; tolerances below the rounding error are never met.
 
-How often it solves: of 10,000 random targets within reach at 5 mm and 3 deg all that double
-precision solves, of each of the robots kuka_lwr_barrett and panda+allegro_right. For this robot
-`make test` tells: of a thousand that double precision solves one may be missed, and every answer is
-judged by kinematics in double precision (`test/judge.c`).
+`make test` solves the stored targets. It fails if an answer that is reported as solved violates
+a tolerance or a limit in double precision (`test/judge.c`), or if more than one in a thousand of
+the targets that double precision solves is missed.
 """
 
 
 def in_single(single: SinglePrecision) -> dict[str, str]:
-    """What stands for the marks in single precision."""
+    """Return the substitutes of the template marks in single precision."""
     less = single.tolerance
     about = ABOUT.format(
         position=less.position,

@@ -101,6 +101,7 @@ class FollowSources:
             "FOLLOW_RECORD": str(cycle.record.size),
         }
         about = {
+            "FOLLOW": "",
             "FOLLOW_CALLS": filled("follow.h", marks),
             "FOLLOW_WASM": filled("follow_wasm.c", marks),
             "FOLLOW_JS": filled("follow.js", marks),

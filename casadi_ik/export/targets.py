@@ -28,10 +28,10 @@ from casadi_ik.solve.request import Request
 from casadi_ik.solve.status import Status
 
 COUNT = 1000
-"""How many are stored."""
+"""Number of targets that the test of an export solves."""
 
-BEYOND = 10
-"""Of these, how many are moved out of reach: they go through all rounds."""
+UNREACHABLE = 100
+"""One in this many targets is moved out of reach, so that its solve goes through all restarts."""
 
 SEED = 17
 
@@ -64,17 +64,30 @@ def example(robot: ArmHand) -> Example:
     return Example("Solves what the fingertips touch at home.", *robot.contacts(robot.home))
 
 
-def stored(solver: Solver, scene: SceneTargets | None = None) -> list[dict[str, Any]]:
-    """`COUNT` targets and the answers to them; q0 None: at home, and far from limits is wanted."""
+def stored(
+    solver: Solver, scene: SceneTargets | None = None, count: int = COUNT
+) -> list[dict[str, Any]]:
+    """Return random targets with the answers of Python.
+
+    Args:
+        solver: Solver of the robot, without a scene.
+        scene: Scene in which the targets are solved; None: collisions are not checked.
+        count: Number of targets.
+
+    Returns:
+        Records with the keys q0 (None: the robot is at home and prefers the middle of its limits),
+        points, normals, q, status, iterations, restarts; with a scene also clearance.
+    """
     robot = solver.robot
     rng = np.random.default_rng(SEED)
-    q = robot.random(rng, COUNT)
+    q = robot.random(rng, count)
     ends = np.where(rng.random(q.shape) < 0.5, robot.lower, robot.upper)
     points, normals = robot.contacts(np.where(rng.random(q.shape) < 0.2, ends, q))
-    points[:BEYOND] += rng.normal(0, 0.1, points[:BEYOND].shape)
-    near = np.arange(COUNT) % 4 == 1
+    beyond = -(-count // UNREACHABLE)
+    points[:beyond] += rng.normal(0, 0.1, points[:beyond].shape)
+    near = np.arange(count) % 4 == 1
     q0 = np.clip(q + 0.1, robot.lower, robot.upper)
-    found: list[dict[str, Any]] = [{} for _ in range(COUNT)]
+    found: list[dict[str, Any]] = [{} for _ in range(count)]
     for rows, starts in ((~near, None), (near, q0[near])):
         answers = _answers(solver, points[rows], normals[rows], starts)
         for i, row in enumerate(np.flatnonzero(rows).tolist()):
@@ -119,19 +132,23 @@ def _answers(
         yield answer.q, answer.status, answer.iterations, answer.restarts
 
 
-def targets_header(solver: Solver, scene: SceneTargets | None = None, single: bool = False) -> str:
-    """A C header with the `stored` targets and the scene.
+def targets_header(
+    solver: Solver, scene: SceneTargets | None = None, single: bool = False, count: int = COUNT
+) -> str:
+    """Return a C header with the `stored` targets and the scene.
 
     Args:
-        solver: Of the robot.
-        scene: What the targets are solved in.
-        single: For a solver in single precision: how targets end stands there without answers.
+        solver: Solver of the robot, without a scene.
+        scene: Scene in which the targets are solved; None: collisions are not checked.
+        single: Whether the header is for a solver in single precision: it then has the status of
+            each answer in double precision, and no configurations.
+        count: Number of targets.
     """
     f, n = len(solver.robot.fingers), len(solver.robot.actuators)
     whole, answer = (WHOLE[:1], "") if single else (WHOLE, f", q[{n}]")
     clearance = scene is not None and not single
     rows = []
-    for target in stored(solver, scene):
+    for target in stored(solver, scene, count):
         q0 = target["q0"] or solver.robot.home.tolist()
         row = [str(int(target["q0"] is not None)), *(str(target[name]) for name in whole)]
         row += map(numbers, (target["points"], target["normals"], q0))
@@ -142,12 +159,50 @@ def targets_header(solver: Solver, scene: SceneTargets | None = None, single: bo
     what = "how they end in double precision" if single else "what the Python package answers"
     return (
         f"/* Targets, and {what}. */\n"
-        f"enum {{ TARGETS = {COUNT} }};\n\n"
+        f"enum {{ TARGETS = {count} }};\n\n"
         f"typedef struct {{\n  int near, {', '.join(whole)};\n"
         f"  double points[{3 * f}], normals[{3 * f}], q0[{n}]{answer};\n"
         f"{'  double clearance;' + chr(10) if clearance else ''}}} target;\n\n"
         "static const target targets[TARGETS] = {\n" + "".join(rows) + "};\n"
     ) + ("" if scene is None else "\n" + scene.header("float" if single else "double"))
+
+
+FRAMES = 120
+"""Number of frames that the test of an exported follower asks for."""
+
+PERIOD = 0.004
+"""Time between two frames [s]."""
+
+FOLLOW_STATUS = ("HOLDING", "FOLLOWING", "LATE", "MISSED")
+"""Names of the codes that `follow.h` defines, in their order."""
+
+
+def frames_header(solver: Solver) -> str:
+    """Return C definitions of frames of moving contacts, with the answers of Python's follower.
+
+    The contacts move from those at home towards those of a random configuration, are missing for
+    a few frames, and end out of reach.
+    """
+    robot = solver.robot
+    f, n = len(robot.fingers), len(robot.actuators)
+    goal = robot.home + 0.2 * (robot.random(np.random.default_rng(SEED), 1)[0] - robot.home)
+    part = np.linspace(0, 1, FRAMES)[:, None]
+    points, normals = robot.contacts(robot.home + part * (goal - robot.home))
+    points[FRAMES // 2 : FRAMES // 2 + 5] = np.nan
+    normals[FRAMES // 2 : FRAMES // 2 + 5] = np.nan
+    points[-FRAMES // 6 :] += 3.0
+    follower = solver.follow(q0=robot.home, period=PERIOD)
+    rows = []
+    for target in zip(points, normals, strict=True):
+        q = follower(*target)
+        vectors = [written(vector) for vector in (*target, q)]
+        status = FOLLOW_STATUS.index(follower.state.status.name)
+        rows.append("{" + ", ".join([str(status), *vectors]) + "},\n")
+    return (
+        f"\nenum {{ FRAMES = {FRAMES} }};\n#define PERIOD {PERIOD}\n\n"
+        f"typedef struct {{\n  int status;\n  double points[{3 * f}], normals[{3 * f}], q[{n}];\n"
+        "} frame;\n\nstatic const frame frames[FRAMES] = {\n" + "".join(rows) + "};\n"
+    )
 
 
 def written(array: Array) -> str:

@@ -76,7 +76,7 @@ def test_stored_targets_bit_for_bit_under_sanitizers(project):
 def test_collisions_of_a_body_are_looked_at_in_double_precision(tmp_path, capsys):
     words = ["export", "g1+dex3", "--scene", "8", "--single", "--out", str(tmp_path / "g1")]
     assert main(words) == 2
-    assert "--single: g1+dex3 has several sides, expected no --scene" in capsys.readouterr().err
+    assert "--single: g1+dex3 has several arms; expected no --scene" in capsys.readouterr().err
     assert not any(tmp_path.iterdir())
 
 

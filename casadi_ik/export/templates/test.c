@@ -15,6 +15,20 @@ static int is_as_stored(const @PREFIX@_solver *solver, const target *stored) {
 @SCENE_TEST_SAME?@      && (@SCENE_TEST_OR?@!memcmp(solver->q, stored->q, sizeof stored->q));
 }
 
+@FOLLOW{@
+/* Counts the frames at which the follower answers otherwise than Python. */
+static int count_wrong_frames(void) {
+  static @PREFIX@_follower follower;
+  int i, wrong = @PREFIX@_follow_from(&follower, 0, PERIOD, 0, 0) != 0;
+  for (i = 0; i < FRAMES; ++i) {
+    const frame *now = frames + i;
+    wrong += @PREFIX@_follow(&follower, now->points, now->normals, 0) != now->status
+          || memcmp(follower.q, now->q, sizeof now->q);
+  }
+  return wrong;
+}
+
+@}@
 int main(void) {
   int i, wrong = 0, solved = 0, malformed = 0, calls = 0;
   double nothing[3 * @GUARD@_FINGERS] = {0};
@@ -35,6 +49,11 @@ int main(void) {
   malformed = @PREFIX@_solve(&one, nothing, nothing, 0) == @GUARD@_BAD_INPUT;
   printf("%d targets, %d solved, %d answers in %d calls of 3 iterations; wrong: %d\n", TARGETS,
          solved, TARGETS, calls, wrong);
+@FOLLOW{@
+  i = count_wrong_frames();
+  printf("%d frames of moving contacts; wrong: %d\n", FRAMES, i);
+  wrong += i;
+@}@
   if (!malformed) printf("a malformed target was not refused\n");
   return wrong || !malformed;
 }

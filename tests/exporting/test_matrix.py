@@ -1,0 +1,31 @@
+"""A cross-section of `studies/export_matrix.py`: grippers, tools and hands in every export mode."""
+
+from __future__ import annotations
+
+import re
+import shutil
+
+import pytest
+from export_matrix import run_cell
+
+COUNT = 50
+"""Targets per robot and mode: most of the time goes into compilation."""
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
+@pytest.mark.parametrize(
+    ("robot", "mode"),
+    [
+        ("panda+panda_hand", "scene"),
+        ("xarm7+tool", "scene"),
+        ("two_ur10e+tool", "single"),
+        ("robotiq_2f85", "follow"),
+    ],
+)
+def test_exports_compile_without_warnings_and_answer_as_python(robot, mode):
+    """Under sanitizers, with warnings as errors."""
+    cell = run_cell(robot, mode, COUNT)
+    assert cell.status == "pass", cell.message
+    solved = re.search(r"(\d+) solved", cell.message)
+    assert solved is not None
+    assert int(solved[1]) > COUNT / 2
