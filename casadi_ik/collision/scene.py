@@ -222,7 +222,7 @@ class ConvexEntry(Entry, frozen=True, tag="convex", kw_only=True):
 
     def solids(self, where: str, folder: Path) -> list[Part]:  # noqa: ARG002
         """The hull."""
-        return [_centred(np.array(self.points, dtype=float), f"{where}.points")]
+        return [_centred(np.array(self.points, dtype=float).reshape(-1, 3), f"{where}.points")]
 
 
 def _centred(points: Array, where: str) -> Part:

@@ -13,8 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from casadi_ik.api import Solver
-from casadi_ik.errors import InputError, MissingExtraError
+from casadi_ik.errors import InputError, InvalidPoseError, MissingExtraError
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.input_checks.keypoints import lost_contacts
+from casadi_ik.files.input_checks.poses import one_pose
 from casadi_ik.model.grasp import Contact, Grasp
 from casadi_ik.solve.status import Status
 
@@ -39,7 +41,7 @@ class ArmKinematics:
 
     Attributes:
         joint_names: The arm's motors, in the order of all arrays.
-        status: Of the last inverse kinematics.
+        status: Of the last inverse kinematics; INVALID if the pose was not rigid or not finite.
     """
 
     def __init__(self, solver: Solver) -> None:
@@ -76,7 +78,12 @@ class ArmKinematics:
         del position_weight
         found = np.array(current_joint_pos, dtype=float)
         q0 = self._configuration(found)
-        grasp = self._grasp(np.asarray(desired_ee_pose, dtype=float), orientation_weight != 0)
+        try:
+            pose = one_pose(desired_ee_pose, "desired_ee_pose")
+        except InvalidPoseError:  # of a tracker that has lost the hand: the arm is held
+            self.status = Status.INVALID
+            return found
+        grasp = self._grasp(pose, orientation_weight != 0)
         solution = self._solver.solve(grasp, q0=q0, prefer="q0", diagnose=False)
         self.status = solution.status
         if solution.success:
@@ -96,6 +103,22 @@ class ArmKinematics:
         return Grasp({robot.fingers[0]: Contact.at(tip) if turned else Contact(tip[:3, 3])})
 
 
+def _contacts_of(places: dict[str, list[float]], normals: dict[str, list[float]]) -> Grasp | None:
+    """Return the contacts of an action; None if they are those of a tracker without a hand."""
+    if lost_contacts(np.array(list(places.values()), dtype=float)):
+        return None
+    try:
+        return Grasp(
+            {
+                name: Contact(point, None if np.isnan(normals[name]).any() else normals[name])
+                for name, point in places.items()
+                if np.isfinite(point).all()
+            }
+        )
+    except InputError:  # no contact is left, or a normal is zero or infinite
+        return None
+
+
 @ProcessorStepRegistry.register("casadi_ik_contacts_to_joints")
 @dataclass
 class ContactsToJoints(RobotActionProcessorStep):
@@ -107,7 +130,7 @@ class ContactsToJoints(RobotActionProcessorStep):
     Attributes:
         solver: Of the robot.
         q: (n,) the last targets; None: the robot's home.
-        status: Of the last contacts.
+        status: Of the last contacts; INVALID if they were those of a tracker without a hand.
     """
 
     solver: Solver
@@ -122,14 +145,13 @@ class ContactsToJoints(RobotActionProcessorStep):
             {name: [action.pop(f"{name}.{key}", np.nan) for key in keys] for name in robot.fingers}
             for keys in (PLACE, NORMAL)
         )
-        contacts = {
-            name: Contact(point, None if np.isnan(normals[name]).any() else normals[name])
-            for name, point in places.items()
-            if np.isfinite(point).all()
-        }
-        solution = self.solver.solve(Grasp(contacts), q0=here, prefer="q0", diagnose=False)
-        self.status = solution.status
-        self.q = solution.q if solution.success else here
+        grasp = _contacts_of(places, normals)
+        if grasp is None:
+            self.status, self.q = Status.INVALID, here
+        else:
+            solution = self.solver.solve(grasp, q0=here, prefer="q0", diagnose=False)
+            self.status = solution.status
+            self.q = solution.q if solution.success else here
         return action | {
             f"{name}.pos": float(value) for name, value in zip(robot.actuators, self.q, strict=True)
         }

@@ -19,8 +19,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from casadi_ik.api import Solver
-from casadi_ik.errors import CasadiIKError, InputError, MissingExtraError
+from casadi_ik.errors import CasadiIKError, InputError, InvalidPoseError, MissingExtraError
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.input_checks.keypoints import lost_contacts
+from casadi_ik.files.input_checks.poses import unit_quaternions
 from casadi_ik.kinematics.arm_hand import load_robot
 from casadi_ik.logs.cdr import CdrReader, cdr, cdr_message
 from casadi_ik.logs.container import CDR_HEADER
@@ -56,6 +58,7 @@ def decode_contacts(data: bytes) -> tuple[Array, Array]:
 
     Raises:
         InputError: The bytes are no such message.
+        InvalidPoseError: The orientation of a pose is not a unit quaternion.
     """
     try:
         reader = CdrReader(data[len(CDR_HEADER) :])
@@ -67,7 +70,15 @@ def decode_contacts(data: bytes) -> tuple[Array, Array]:
     except (struct.error, ValueError) as error:
         raise InputError(f"contacts: no geometry_msgs/PoseArray in cdr: {error}") from error
     poses = values.reshape(count, POSE)
-    _, _, _, x, y, z, w = poses.T
+    unit, invalid = unit_quaternions(poses[:, 3:])
+    wrong = invalid & np.isfinite(poses[:, 3:]).all(axis=1)  # NaN marks a free normal
+    if wrong.any():
+        i = int(np.argmax(wrong))
+        raise InvalidPoseError(
+            f"contacts: poses[{i}].orientation: found {poses[i, 3:].tolist()}; expected a "
+            "quaternion of length 1"
+        )
+    x, y, z, w = unit.T
     normals = [w * w + x * x - y * y - z * z, 2 * (x * y + w * z), 2 * (x * z - w * y)]
     return poses[:, :3].copy(), np.column_stack(normals)
 
@@ -114,7 +125,11 @@ class ContactNode:
 
     def _answer(self, sample: Any) -> None:
         try:
-            q, self.status = self._fast(*decode_contacts(bytes(sample.payload)), self._q)
+            points, normals = decode_contacts(bytes(sample.payload))
+            self.refused = lost_contacts(points)
+            if self.refused:
+                return
+            q, self.status = self._fast(points, normals, self._q)
         except CasadiIKError as error:
             self.refused = str(error)
             return

@@ -274,7 +274,13 @@ class MovingSolver:
             >>> down.status.name, down.motion.notes["part"][-1].item()
             ('REACHED', 'leaving')
         """
-        start, chosen, target = self._request.start(q0), held.grasp, one_pose(pose)
+        chosen = getattr(held, "grasp", None)
+        if not isinstance(chosen, Grasp) or not hasattr(held, "q"):
+            raise InputError(
+                f"held: found {type(held).__name__}, expected an answer with its grasp and its q,"
+                " as choose and grasps_of return them"
+            )
+        start, target = self._request.start(q0), one_pose(pose)
         if chosen.known_pose is None:
             raise InputError("held: found a grasp without a known object_pose, expected one")
         self.robot.description.one_hand("place")

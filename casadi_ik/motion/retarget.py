@@ -19,10 +19,12 @@ from numpy.typing import ArrayLike
 
 from casadi_ik.errors import DescriptionError, InputError
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.input_checks.keypoint_orders import USUAL, OrderConverter
 from casadi_ik.files.input_checks.keypoints import KEYPOINTS, KNUCKLES, FrameFilter
 from casadi_ik.files.reading import Angles, Frame, Point, Struct, frame_matrix, read
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.grasp import real_array
+from casadi_ik.motion.motion import seconds
 
 OPENXR = (1, *range(2, 6), *range(7, 11), *range(12, 16), *range(17, 21), *range(22, 26))
 """Joints of OpenXR that are the keypoints: all but palm and metacarpals of four fingers."""
@@ -286,8 +288,7 @@ class Retargeter:
                 the hand (NaN, zeros, -1, a jump, a bone that is too long) is not an error: then
                 nothing is wanted, and `Wanted.reason` says why.
         """
-        if not 0 < elapsed < np.inf:
-            raise InputError(f"elapsed: found {elapsed}, expected seconds above 0")
+        elapsed = seconds("elapsed", elapsed)
         points, frames = np.full((len(self._robot.fingers), 3), np.nan), dict[str | None, Array]()
         reasons = list[str]()
         for side, joints in self._by_side(keypoints).items():
@@ -295,6 +296,11 @@ class Retargeter:
             frame = as_keypoints(joints, "keypoints" if side is None else f"keypoints.{side}")
             if frame.ndim != 2:
                 raise InputError(f"keypoints: found shape {frame.shape}, expected one frame")
+            if np.shape(joints)[0] == KEYPOINTS:
+                was_decided = hand.order.is_decided
+                frame = hand.in_usual_order(frame)
+                if hand.order.is_decided and not was_decided and not hand.has_begun:
+                    self._turn = None
             if hand.accepts(frame, elapsed):
                 frames[side] = hand.smoothed(frame, elapsed)
             else:
@@ -327,6 +333,8 @@ class Retargeter:
         kept, reasons = dict[str | None, Array](), list[str]()
         for side, frames in recorded.items():
             hand = self._hands[side]
+            frames = hand.order.converted(frames)
+            hand.order.assume_usual()
             lost = hand.filter.of_recording(frames, times)
             kept[side] = frames.copy()
             kept[side][[i for i, reason in enumerate(lost) if reason]] = np.nan
@@ -367,6 +375,7 @@ class _Hand:
         palm: (4, 4) where it begins.
         in_hand: Whether the keypoints' origin is in the hand.
         filter: Rejects frames of a tracker that has lost the hand.
+        order: Converts frames to the usual order.
     """
 
     def __init__(
@@ -391,10 +400,28 @@ class _Hand:
         self.palm, (self._tips, _) = robot.palm(here, side), robot.contacts(here)
         self.rows, self._keys = np.array(rows), np.array(list(own.fingers.values()))
         self.filter = FrameFilter(self._keys.tolist(), config.wrist)
+        self.order = OrderConverter("keypoints" if side is None else f"keypoints.{side}")
         self.in_hand = False
         self._known = False
         self._first: tuple[Array, Array] | None = None
         self._smooth: Array | None = None
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether there was a frame to follow."""
+        return self._first is not None
+
+    def in_usual_order(self, frame: Array) -> Array:
+        """Return a frame (21, 3) in the usual order.
+
+        Frames that were followed before another order was recognised are forgotten.
+        """
+        was_decided = self.order.is_decided
+        frame = self.order.converted(frame[None])[0]
+        if self.order.is_decided and not was_decided and self.order.name != USUAL:
+            self._first, self._smooth, self._known = None, None, False
+            self.filter = FrameFilter(self._keys.tolist(), self._config.wrist)
+        return frame
 
     def accepts(self, frame: Array, elapsed: float) -> bool:
         """Decide whether keypoints (21, 3) are those of a hand; the first must be in metres."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
@@ -103,7 +103,7 @@ class Answers:
 
 def choose(
     solver: Any,
-    grasps: Sequence[Grasp],
+    grasps: Iterable[Grasp],
     object_pose: ArrayLike | None = None,
     q0: ArrayLike | None = None,
     limit: int = 10,
@@ -153,6 +153,7 @@ def choose(
     begin = time.perf_counter()
     engine: Engine = solver._engine
     request: Request = solver._request
+    grasps = _candidates(grasps)
     limit = _count(limit, "limit")
     most = None if per_candidate is None else _count(per_candidate, "per_candidate")
     apart, start = checked_distance(apart), request.start(q0)
@@ -187,6 +188,17 @@ def choose(
     )
 
 
+def _candidates(grasps: Iterable[Grasp]) -> Sequence[Grasp]:
+    """Return the candidates as a sequence.
+
+    Raises:
+        InputError: They are not several grasps.
+    """
+    if isinstance(grasps, (Grasp, str, Mapping)) or not isinstance(grasps, Iterable):
+        raise InputError(f"grasps: found {type(grasps).__name__}, expected a sequence of grasps")
+    return grasps if isinstance(grasps, Sequence) else list(grasps)
+
+
 def _count(value: int, name: str) -> int:
     """A number of answers.
 
@@ -199,15 +211,21 @@ def _count(value: int, name: str) -> int:
 
 
 def _own(prefer: Callable[[ArmHand, Array], ArrayLike], robot: ArmHand) -> Callable[[Array], Array]:
-    """A preference of one's own, its answers checked."""
+    """Return a caller's preference with its scores checked."""
 
     def score(q: Array) -> Array:
-        found = np.asarray(prefer(robot, q.copy()), dtype=float)
-        if found.shape != (len(q),):
-            raise InputError(f"prefer: gave shape {found.shape}, expected ({len(q)},)")
-        if np.isnan(found).any():
+        try:
+            scores = np.asarray(prefer(robot, q.copy()), dtype=float)
+        except Exception as error:  # the caller's function may raise anything
+            problem = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+            raise InputError(
+                f"prefer: the function raised {problem}; expected scores ({len(q)},)"
+            ) from error
+        if scores.shape != (len(q),):
+            raise InputError(f"prefer: gave shape {scores.shape}, expected ({len(q)},)")
+        if np.isnan(scores).any():
             raise InputError("prefer: gave NaN, expected numbers")
-        return found
+        return scores
 
     return score
 

@@ -70,7 +70,10 @@ class SensitivityKernel:
         return FunctionKernel(graph, self._compiled, in_lanes=True)
 
     def __call__(self, targets: TargetBatch, q: Array, gradients: Array) -> Sensitivity:
-        """Derivatives of ``gradients @ q`` for answers q (k, n) to k targets, gradients (k, n)."""
+        """Return derivatives of ``gradients @ q`` for answers q (k, n), gradients (k, n)."""
+        if not len(q):
+            none = np.zeros((0, len(self._robot.fingers), 3))
+            return Sensitivity(none, none)
         low, high = targets.bounds(self._robot, np.inf)
         values: dict[str, Any] = {"q": q, "gradient": gradients}
         values["free"] = (q - low >= AT_LIMIT) & (high - q >= AT_LIMIT)

@@ -131,7 +131,8 @@ def unit_quaternions(quaternions: Array) -> tuple[Array, Bools]:
     Returns:
         (..., 4), NaN where a quaternion is not nearly of length 1; (...) True there.
     """
-    lengths = np.linalg.norm(quaternions, axis=-1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        lengths = np.linalg.norm(quaternions, axis=-1)
     invalid = np.asarray(~(np.abs(lengths - 1.0) <= MAX_LENGTH_ERROR))
     divisors = np.where(invalid, np.nan, lengths)
     return quaternions / divisors[..., None], invalid

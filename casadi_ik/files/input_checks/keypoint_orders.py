@@ -1,0 +1,187 @@
+"""The rule for orders of keypoints: those of known data sets are recognised by the bones.
+
+Lengths of bones and gaps between knuckles do not depend on the posture. In the right order they are
+those of a hand, up to its size: knuckles a palm's length from the wrist, bones that become shorter
+towards the tips.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.errors import InputWarning
+from casadi_ik.files.arrays import Array
+from casadi_ik.files.input_checks.keypoints import BONES, KEYPOINTS
+
+FINGERS = range(5)
+"""Thumb, index, middle, ring and little finger."""
+
+
+def _order(wrist: int, *fingers: tuple[int, ...]) -> NDArray[np.intp]:
+    """Return the places of the usual keypoints: the wrist, then four of each finger."""
+    return np.array([wrist, *(key for finger in fingers for key in finger)], dtype=np.intp)
+
+
+USUAL = "MediaPipe, OpenPose"
+"""Name of the usual order: the wrist, then from the thumb on four keypoints a finger, tips last."""
+
+_MANO = ((13, 14, 15, 16), (1, 2, 3, 17), (4, 5, 6, 18), (10, 11, 12, 19), (7, 8, 9, 20))
+
+ORDERS: dict[str, NDArray[np.intp]] = {
+    USUAL: np.arange(KEYPOINTS),
+    "MANO, HO-3D": _order(0, *_MANO),
+    "five tips, then MANO": _order(5, *((a + 5, b + 5, c + 5, d - 16) for a, b, c, d in _MANO)),
+    "InterHand2.6M": _order(20, *((4 * f + 3, 4 * f + 2, 4 * f + 1, 4 * f) for f in FINGERS)),
+    "RHD": _order(0, *((4 * f + 4, 4 * f + 3, 4 * f + 2, 4 * f + 1) for f in FINGERS)),
+    "BigHand2.2M, FPHA": _order(0, *((1 + f, 6 + 3 * f, 7 + 3 * f, 8 + 3 * f) for f in FINGERS)),
+    "five tips, wrist, then the other joints": _order(
+        5, *((6 + 3 * f, 7 + 3 * f, 8 + 3 * f, f) for f in FINGERS)
+    ),
+    "wrist, five tips, then the other joints": _order(
+        0, *((6 + 3 * f, 7 + 3 * f, 8 + 3 * f, 1 + f) for f in FINGERS)
+    ),
+    "STB": _order(0, *(tuple(range(17 - 4 * f, 21 - 4 * f)) for f in FINGERS)),
+    "little finger first, tips first": _order(
+        0, *(tuple(range(20 - 4 * f, 16 - 4 * f, -1)) for f in FINGERS)
+    ),
+    "wrist last": _order(20, *((4 * f, 4 * f + 1, 4 * f + 2, 4 * f + 3) for f in FINGERS)),
+    "wrist, five knuckles, ..., five tips": _order(
+        0, *((1 + f, 6 + f, 11 + f, 16 + f) for f in FINGERS)
+    ),
+    "wrist, five tips, ..., five knuckles": _order(
+        0, *((16 + f, 11 + f, 6 + f, 1 + f) for f in FINGERS)
+    ),
+    "five tips, ..., five knuckles, wrist": _order(
+        20, *((15 + f, 10 + f, 5 + f, f) for f in FINGERS)
+    ),
+}
+"""Places of the usual keypoints in frames of each order (21,): ``frame[ORDERS[name]]`` is usual."""
+
+PAIRS: NDArray[np.intp] = np.vstack([BONES, [(1, 5), (5, 9), (9, 13), (13, 17)]])
+"""(24, 2) pairs of keypoints whose distance does not depend on the posture, or hardly (1 to 5)."""
+
+LENGTHS = np.array(
+    [
+        *(40, 40, 32, 28),
+        *(92, 40, 24, 22),
+        *(90, 44, 28, 24),
+        *(84, 40, 26, 24),
+        *(80, 32, 20, 21),
+        *(66, 21, 20, 20),
+    ]
+)
+"""(24,) their distances in an adult's hand [mm], rounded; only their ratios count."""
+
+
+@dataclass(frozen=True)
+class OrderLimits:
+    """How clearly an order must fit to be recognised.
+
+    Attributes:
+        fits: Largest root mean square of the logarithms of ratios to `LENGTHS` in the right order.
+        better: By what another order must fit better than the usual one.
+        frames: Number of frames that are looked at.
+        smallest: Largest distance of two keypoints of a small fist [m].
+        largest: Largest distance of two keypoints of a large open hand [m].
+    """
+
+    fits: float = 0.35
+    better: float = 0.15
+    frames: int = 30
+    smallest: float = 0.08
+    largest: float = 0.3
+
+
+LIMITS = OrderLimits()
+
+
+def misfit(distances: Array, order: NDArray[np.intp]) -> float:
+    """Return how badly an order fits a hand: root mean square of logarithms of ratios, up to scale.
+
+    Args:
+        distances: (21, 21) between keypoints [m], or their medians over frames.
+        order: See `ORDERS`.
+    """
+    first, second = order[PAIRS].T
+    lengths = distances[first, second]
+    if not (np.isfinite(lengths).all() and (lengths > 0).all()):
+        return np.inf
+    logs = np.log(lengths / LENGTHS)
+    return float(np.std(logs))
+
+
+def distances_between(frames: Array) -> Array:
+    """Return the distances (21, 21) between keypoints of frames (k, 21, 3), medians over frames."""
+    return np.median(np.linalg.norm(frames[:, :, None] - frames[:, None], axis=-1), axis=0)
+
+
+class OrderConverter:
+    """Converts the frames of one hand to the usual order, once their order is recognised.
+
+    Attributes:
+        name: The order that was recognised, see `ORDERS`; "" as long as none is.
+        is_decided: Whether frames are converted by a known order from now on.
+    """
+
+    def __init__(self, where: str) -> None:
+        """Take the name of the argument, for warnings."""
+        self.name, self.is_decided = "", False
+        self._where, self._tries = where, 0
+        self._newest: Array | None = None
+
+    def assume_usual(self) -> None:
+        """Take the frames that come as in the usual order."""
+        self.name, self.is_decided = USUAL, True
+
+    def converted(self, frames: Array) -> Array:
+        """Return frames (k, 21, 3) in the usual order; unchanged while no order is recognised.
+
+        A warning says which order was found, or that a hand is in none of the known ones.
+        """
+        if self.is_decided:
+            return frames if self.name == USUAL else frames[:, ORDERS[self.name]]
+        complete = frames[np.isfinite(frames).all(axis=(1, 2))]
+        if not len(complete) or self._tries >= LIMITS.frames:
+            return frames
+        if self._newest is not None and np.array_equal(frames, self._newest):
+            return frames
+        self._newest, self._tries = frames.copy(), self._tries + 1
+        complete = complete[:: max(1, len(complete) // LIMITS.frames)]
+        self.name = recognised_order(complete)
+        if not self.name:
+            size = float(distances_between(complete).max())
+            if self._tries == 1 and LIMITS.smallest < size < LIMITS.largest:
+                self._warn("are in none of the known orders")
+            return frames
+        self.is_decided = True
+        if self.name == USUAL:
+            return frames
+        self._warn(f"are in the order of {self.name}, and are converted")
+        return frames[:, ORDERS[self.name]]
+
+    def _warn(self, found: str) -> None:
+        message = (
+            f"{self._where}: the joints {found}; expected the order of {USUAL}: 0 the wrist, "
+            "then four for each finger from the thumb on, tips 4, 8, 12, 16, 20"
+        )
+        warnings.warn(message, InputWarning, stacklevel=2)
+
+
+def recognised_order(frames: Array) -> str:
+    """Return the order of keypoints, "" if none fits clearly.
+
+    Args:
+        frames: (k, 21, 3) finite keypoints of one person [m].
+    """
+    distances = distances_between(frames)
+    misfits = {name: misfit(distances, order) for name, order in ORDERS.items()}
+    best = min(misfits, key=lambda name: misfits[name])
+    if misfits[best] > LIMITS.fits:
+        return ""
+    if best != USUAL and misfits[best] > misfits[USUAL] - LIMITS.better:
+        return ""
+    return best

@@ -1,0 +1,68 @@
+"""Arguments of another type than expected are refused by name, not by a traceback."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import casadi_ik as ik
+
+
+def failing(*_: Any) -> Any:
+    raise RuntimeError("a fault of the caller's")
+
+
+@pytest.fixture(scope="module")
+def grasp() -> ik.Grasp:
+    return ik.load_grasp("cup")
+
+
+@pytest.mark.parametrize("of", [lambda g: None, lambda g: g, lambda g: "cup", lambda g: {"a": g}])
+def test_candidates_that_are_none(solver: ik.Solver, grasp: ik.Grasp, of: Callable[..., Any]):
+    with pytest.raises(ik.errors.InputError, match=r"^grasps: found \w+, expected"):
+        solver.choose(of(grasp))
+
+
+def test_candidates_of_a_generator(solver: ik.Solver, grasp: ik.Grasp) -> None:
+    ranking = solver.choose(each for each in (grasp, ik.load_grasp("apple")))
+    assert (ranking.candidates, ranking.answered) == (2, 2)
+
+
+@pytest.mark.parametrize("prefer", [failing, lambda: 0.0, lambda robot, q: "high"])
+def test_a_preference_that_fails(solver: ik.Solver, grasp: ik.Grasp, prefer: Any) -> None:
+    with pytest.raises(ik.errors.InputError, match=r"^prefer: ") as caught:
+        solver.choose([grasp], prefer=prefer)
+    assert caught.value.__cause__ is not None
+
+
+@pytest.mark.parametrize("elapsed", [None, "soon", np.array([0.1, 0.2]), 0.0, np.nan])
+def test_a_time_between_frames(robot: ik.ArmHand, tmp_path: Path, elapsed: Any) -> None:
+    (tmp_path / "hand.yaml").write_text("fingers: {thumb: 4, finger_2: 8, finger_3: 12}")
+    retargeter = ik.motion.Retargeter(ik.motion.load_retarget(tmp_path / "hand.yaml"), robot)
+    with pytest.raises(ik.errors.InputError, match=r"^elapsed: "):
+        retargeter(np.random.default_rng(0).uniform(0, 0.1, (21, 3)), elapsed=elapsed)
+
+
+def test_sensitivity_of_no_answers(solver: ik.Solver) -> None:
+    q, contacts = np.zeros((0, 14)), np.zeros((0, 3, 3))
+    assert solver.sensitivity(q, contacts, contacts).points.shape == (0, 14, 3, 3)
+    weighted = solver.sensitivity(q, contacts, contacts, np.zeros((0, 14)))
+    assert weighted.points.shape == weighted.normals.shape == (0, 3, 3)
+
+
+@pytest.mark.parametrize("of", [lambda g: g, lambda g: None, lambda g: np.zeros(14)])
+def test_placing_what_is_not_an_answer(
+    solver: ik.Solver, grasp: ik.Grasp, of: Callable[..., Any]
+) -> None:
+    with pytest.raises(ik.errors.InputError, match=r"^held: "):
+        solver.place(of(grasp), np.eye(4), solver.robot.home)
+
+
+@pytest.mark.parametrize("points", [[], np.zeros((0, 3)), np.zeros((3, 3))])
+def test_a_convex_solid_of_too_few_points(points: Any) -> None:
+    with pytest.raises(ik.errors.DescriptionError, match=r"solids\.block\.points: found \d points"):
+        ik.Scene({"block": {"kind": "convex", "points": points}})

@@ -1,0 +1,102 @@
+"""Keypoints in orders of other data sets are recognised by the bones, and converted."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+from commands import main
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from made_up_hand import hand
+
+import casadi_ik as ik
+from casadi_ik.errors import InputWarning
+from casadi_ik.files.input_checks.keypoint_orders import ORDERS, USUAL, recognised_order
+
+OTHERS = [name for name in ORDERS if name != USUAL]
+
+
+def seen(i: int = 0) -> np.ndarray:
+    """(21, 3) a hand that moves and bends, with noise of a millimetre."""
+    noise = np.random.default_rng(i).normal(0, 1e-3, (21, 3))
+    return hand(0.2 + 0.05 * i, np.array([0.5, 0.01 * i, 0.9]), 0.1 * i) + noise
+
+
+def reordered(frames: np.ndarray, name: str) -> np.ndarray:
+    """Frames (..., 21, 3) in another order."""
+    found = np.empty_like(frames)
+    found[..., ORDERS[name], :] = frames
+    return found
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory):
+    path = tmp_path_factory.mktemp("retarget") / "hand.yaml"
+    path.write_text("fingers: {thumb: 4, finger_2: 8, finger_3: 12}")
+    return ik.motion.load_retarget(path)
+
+
+@settings(max_examples=40)
+@given(
+    st.sampled_from(list(ORDERS)),
+    st.floats(0.0, 1.2),
+    st.floats(0.6, 1.3),
+    st.integers(0, 10_000),
+    st.booleans(),
+)
+def test_every_order_is_recognised_in_one_frame(name, bend, size, seed, mirrored):
+    """Whatever the posture, the size and the place, with noise of a millimetre."""
+    rng = np.random.default_rng(seed)
+    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    turn = turn @ np.diag([1.0, 1.0, -1.0 if mirrored else 1.0])
+    frame = size * hand(bend, rng.normal(size=3)) @ turn + rng.normal(0, 1e-3, (21, 3))
+    assert recognised_order(reordered(frame, name)[None]) == name
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_a_retargeter_converts_them(robot, config, name):
+    plain, other = (ik.motion.Retargeter(config, robot) for _ in range(2))
+    expected = [plain(seen(i)) for i in range(4)]
+    with pytest.warns(InputWarning, match="order"):
+        found = [other(reordered(seen(0), name))]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found += [other(reordered(seen(i), name)) for i in range(1, 4)]
+    for one, another in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one.points, another.points)
+        np.testing.assert_array_equal(one.palm, another.palm)
+
+
+def test_lost_frames_before_tell_no_order(robot, config):
+    plain, other = (ik.motion.Retargeter(config, robot) for _ in range(2))
+    for lost in (np.zeros((21, 3)), -np.ones((21, 3)), np.full((21, 3), np.nan)):
+        assert other(lost).reason
+    with pytest.warns(InputWarning, match="MANO"):
+        found = other(reordered(seen(), "MANO, HO-3D"))
+    np.testing.assert_array_equal(found.points, plain(seen()).points)
+
+
+def test_the_usual_order_and_unknown_ones(robot, config):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ik.motion.Retargeter(config, robot)(seen())
+    mixed = seen()[np.random.default_rng(0).permutation(21)]
+    with pytest.warns(InputWarning, match="none of the known orders"):
+        ik.motion.Retargeter(config, robot)(mixed)
+
+
+def test_a_recording_in_the_order_of_mano(tmp_path, capsys):
+    frames = np.array([seen(i) for i in range(12)])
+    motions = []
+    for keypoints in (frames, reordered(frames, "MANO, HO-3D")):
+        path, out = tmp_path / "frames.npz", tmp_path / "motion.npz"
+        np.savez(path, keypoints=keypoints)
+        words = ["follow", path, "--robot", "kuka_lwr_barrett", "--period", "0.02", "--out", out]
+        assert main([str(word) for word in words]) in (0, 1)
+        motions.append((np.load(out)["q"], capsys.readouterr().err))
+    np.testing.assert_array_equal(motions[0][0], motions[1][0])
+    assert motions[0][1] == ""
+    assert motions[1][1].startswith("casadi-ik: warning: ")
+    assert "MANO" in motions[1][1]
