@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.collision.scene import Scene
-from casadi_ik.errors import InputError
+from casadi_ik.errors import CasadiIKError, InputError
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.input_checks.numbers import checked_integer, checked_number
 from casadi_ik.files.input_checks.poses import one_pose
 from casadi_ik.files.progress import progress
 from casadi_ik.kinematics.arm_hand import ArmHand
@@ -39,7 +40,7 @@ from casadi_ik.planning.touch.strength import (
     robustness,
     strengths,
 )
-from casadi_ik.planning.touch.surface import Surface
+from casadi_ik.planning.touch.surface import Surface, SurfaceSource, load_surface
 from casadi_ik.solve.solution import BatchSolution, Solution
 
 OPENINGS = (0.025, 0.015, 0.008)
@@ -192,12 +193,10 @@ class FoundGrasps(Sequence[FoundGrasp]):
             >>> found.robustness(position=0.0, angle=0.0, samples=1)
             array([1., 1., 1.])
         """
-        if not (0 <= position < np.inf and 0 <= angle < np.inf and samples >= 1):
-            raise InputError(
-                f"robustness: found {position!r} m, {angle!r} rad and {samples!r} samples, "
-                "expected numbers >= 0 and at least one sample"
-            )
-        _check_hold(hold)
+        position = checked_number(position, "robustness: position", "a length [m] >= 0", 0.0)
+        angle = checked_number(angle, "robustness: angle", "an angle [rad] >= 0", 0.0)
+        samples = checked_integer(samples, "robustness: samples", 1)
+        seed, hold = checked_integer(seed, "robustness: seed", 0), _checked_hold(hold)
         off = offsets(position, angle, samples, seed, self.surface.middle)
         shares = [robustness(self.robot, self.surface, one, self.mu, off, hold) for one in self]
         return np.array(shares)
@@ -239,7 +238,7 @@ class _Made:
 
 def grasps_of(
     solver: Any,
-    surface: Surface,
+    surface: Surface | SurfaceSource,
     pose: ArrayLike | None = None,
     fingers: int = 3,
     mu: float = 0.5,
@@ -259,10 +258,11 @@ def grasps_of(
 
     Args:
         solver: A `Solver`.
-        surface: From `load_surface`.
+        surface: A surface, or what `load_surface` takes: a name or path, vertices and triangles,
+            or a trimesh object.
         pose: (4, 4) of the object in the base frame; None: the identity.
         fingers: How many fingertips touch, the thumb among them; of a hand with fewer, all.
-        mu: Friction coefficient between fingertips and object.
+        mu: Friction coefficient between fingertips and object, from 0.01 to 10.
         hold: Mass [kg], and the squeeze [N] with which it has to be held in each of six
             directions, or with what the motors' torques suffice for, if that is less; None: it is
             enough that the grasp is force-closed.
@@ -279,7 +279,8 @@ def grasps_of(
         The grasps, best first, with how many candidates passed each stage.
 
     Raises:
-        InputError: Bad numbers, or no rigid pose.
+        InputError: An argument has the wrong type or value, or the surface cannot be grasped (see
+            `load_surface`).
         UnsupportedError: The hand has one finger, robot or hand have no shapes, the robot is a
             body, or the method cannot solve palms.
 
@@ -295,9 +296,12 @@ def grasps_of(
     begin, chosen = time.process_time(), TouchParameters()
     robot = solver.robot
     place = np.eye(4) if pose is None else one_pose(pose)
-    _check(fingers, mu, hold, limit, among, prefer)
-    goal = max(limit, among)
-    fingers = min(fingers, len(robot.fingers))
+    question = _checked(fingers, mu, hold, limit, among, seed, prefer)
+    mu, hold, limit, seed = question.mu, question.hold, question.limit, question.seed
+    goal = max(limit, question.among)
+    fingers = min(question.fingers, len(robot.fingers))
+    if not isinstance(surface, Surface):
+        surface = load_surface(surface)
     table = HandTable.of(robot)
     arms, judge, hands = _solvers(solver, table, surface, place, chosen)
     generator = Generator(table, surface, fingers, chosen, np.random.default_rng(seed), hands)
@@ -353,30 +357,82 @@ def _solvers(
     return arms, judge, HandCheck(table, judge.scene_check, place, tables)
 
 
-def _check(
-    fingers: int,
-    mu: float,
-    hold: tuple[float, float] | None,
-    limit: int,
-    among: int,
-    prefer: Judgement,
-) -> None:
-    """Refuse what cannot be asked for."""
-    if not isinstance(fingers, int) or fingers < 2:
-        raise InputError(f"fingers: found {fingers!r}, expected an integer >= 2")
-    if not 0 < mu < np.inf:
-        raise InputError(f"mu: found {mu!r}, expected a friction coefficient > 0")
-    _check_hold(hold)
-    for name, number in {"limit": limit, "among": among}.items():
-        if not isinstance(number, int) or number < 1:
-            raise InputError(f"{name}: found {number!r}, expected an integer >= 1")
-    if not callable(prefer) and prefer not in RANKINGS:
+MU_RANGE = (0.01, 10.0)
+"""Range of plausible friction coefficients: wider than from ice to soft rubber."""
+
+
+@dataclass(frozen=True)
+class _Question:
+    """The arguments of `grasps_of`, checked."""
+
+    fingers: int
+    mu: float
+    hold: tuple[float, float] | None
+    limit: int
+    among: int
+    seed: int
+    prefer: Judgement
+
+
+def _checked(
+    fingers: Any, mu: Any, hold: Any, limit: Any, among: Any, seed: Any, prefer: Any
+) -> _Question:
+    """Return the arguments of `grasps_of` as the types that they are documented to have.
+
+    Raises:
+        InputError: A type or value is not allowed.
+    """
+    low, high = MU_RANGE
+    if not callable(prefer) and not (isinstance(prefer, str) and prefer in RANKINGS):
         raise InputError(f"prefer: found {prefer!r}, expected {', '.join(RANKINGS)} or a function")
+    return _Question(
+        checked_integer(fingers, "fingers", 2),
+        checked_number(mu, "mu", f"a friction coefficient from {low:g} to {high:g}", low, high),
+        _checked_hold(hold),
+        checked_integer(limit, "limit", 1),
+        checked_integer(among, "among", 1),
+        checked_integer(seed, "seed", 0),
+        prefer,
+    )
 
 
-def _check_hold(hold: tuple[float, float] | None) -> None:
-    if hold is not None and not (len(hold) == 2 and min(hold) > 0):
-        raise InputError(f"hold: found {hold!r}, expected a mass [kg] and a squeeze [N], both > 0")
+def _checked_hold(hold: Any) -> tuple[float, float] | None:
+    """Return mass [kg] and squeeze [N], or None.
+
+    Raises:
+        InputError: `hold` is not two numbers above 0.
+    """
+    if hold is None:
+        return None
+    expected = "a mass [kg] and a squeeze [N], both > 0"
+    try:
+        mass, squeeze = hold
+    except (TypeError, ValueError) as error:
+        raise InputError(f"hold: found {hold!r}, expected {expected}") from error
+    least = float(np.finfo(float).tiny)
+    return (
+        checked_number(mass, "hold", expected, least),
+        checked_number(squeeze, "hold", expected, least),
+    )
+
+
+def _scores(prefer: Callable[[ArmHand, Array], ArrayLike], robot: ArmHand, q: Array) -> Array:
+    """Return the scores (m,) that a function gives configurations (m, n).
+
+    Raises:
+        InputError: The function fails, or does not return a number for each configuration.
+    """
+    try:
+        scores = np.asarray(prefer(robot, q), dtype=float)
+    except CasadiIKError:
+        raise
+    except Exception as error:  # anything that a caller's function does wrong
+        raise InputError(f"prefer: the function failed: {type(error).__name__}: {error}") from error
+    if scores.shape != (len(q),):
+        raise InputError(f"prefer: found scores of shape {scores.shape}, expected ({len(q)},)")
+    if np.isnan(scores).any():
+        raise InputError("prefer: found a score that is NaN, expected numbers")
+    return scores
 
 
 def _made(
@@ -542,11 +598,7 @@ def _ranked(
         "limits": lambda: (np.minimum(q - robot.lower, robot.upper - q) / span).min(axis=1),
         "q0": lambda: -np.abs((q - (robot.home if start is None else start)) / span).max(axis=1),
     }
-    score = (
-        scores[prefer]() if isinstance(prefer, str) else np.asarray(prefer(robot, q), dtype=float)
-    )
-    if score.shape != (len(q),):
-        raise InputError(f"prefer: gave shape {score.shape}, expected ({len(q)},)")
+    score = scores[prefer]() if isinstance(prefer, str) else _scores(prefer, robot, q)
     kept = np.argsort(-score, kind="stable")[:limit]
     chosen = [where[row] for row in kept]
     used = np.stack([part.some.used[i] for part, i in chosen])

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.collision.solids import Kind, Solid
-from casadi_ik.errors import InputError
+from casadi_ik.compile.cache import trusted_cache, user_temp_dir
+from casadi_ik.errors import InputError, os_errors
 from casadi_ik.files.arrays import Array, Bools
+from casadi_ik.files.input_checks.numbers import checked_integer, checked_number
+from casadi_ik.files.writing import written_whole
 from casadi_ik.model.objects import GraspObject, load_object
 from casadi_ik.model.shapes import MeshShape
 from casadi_ik.planning.touch.nearest import NearestPoints, TriangleTree
@@ -198,34 +202,68 @@ def _tree(points: Array) -> Any:
     return import_module("scipy.spatial").cKDTree(points)
 
 
+class TriangleMesh(Protocol):
+    """A mesh with vertices (v, 3) [m] and faces (t, 3), as a trimesh object is."""
+
+    @property
+    def vertices(self) -> Any: ...  # noqa: D102
+
+    @property
+    def faces(self) -> Any: ...  # noqa: D102
+
+
+SurfaceSource = str | Path | tuple[ArrayLike, ArrayLike] | TriangleMesh
+"""What a surface is made from, see `load_surface`."""
+
+EXPECTED_SOURCE = (
+    "expected a name or path, a pair (vertices (v, 3), triangles (t, 3)), or a trimesh object"
+)
+
+
 def load_surface(
-    name_or_path: str | Path,
+    name_or_path: SurfaceSource,
     scale: float = 1.0,
     seed: int = 0,
     parameters: SurfaceParameters | None = None,
 ) -> Surface:
     """Sample the surface of an object.
 
+    A mesh that is not a file is stored in the cache of the package, under a name that depends on
+    its contents alone, so that its grasps can be saved and used like others.
+
     Args:
-        name_or_path: A shipped object, the path of an object's file, or of a mesh in metres (STL,
-            OBJ, PLY, ...).
-        scale: Of a mesh: its unit in metres (0.001 for millimetres).
-        seed: Of the samples.
-        parameters: How finely; None: `SurfaceParameters()`.
+        name_or_path: Name of a shipped object, path of an object's file or of a mesh in metres
+            (STL, OBJ, PLY, ...), a pair of vertices (v, 3) [m] and triangles (t, 3), or an object
+            that has these as `vertices` and `faces`, such as that of trimesh.
+        scale: Factor that converts the coordinates of a mesh to metres (0.001 for millimetres).
+        seed: Seed of the samples.
+        parameters: Density of the samples; None: `SurfaceParameters()`.
 
     Raises:
         UnknownNameError: No shipped object has that name.
         DescriptionError: The file is missing or malformed.
-        InputError: A scale for an object that is no mesh, or a surface that is no body's: without
-            area, flat, too large or small for a hand, or with triangles that face opposite ways.
+        InputError: An argument has the wrong type or value, the object with a scale is not a mesh,
+            or the surface is not that of a body: without area, flat, too large or small for a hand,
+            or with triangles that face opposite ways.
 
     Example:
         >>> surface = ik.load_surface("tomato_soup_can")
         >>> surface.points.shape
         (6000, 3)
+        >>> corners = np.array([[0, 0, 0], [0.05, 0, 0], [0, 0.05, 0], [0, 0, 0.05]])
+        >>> tetrahedron = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
+        >>> ik.load_surface((corners, tetrahedron)).points.shape
+        (6000, 3)
     """
-    chosen = parameters or SurfaceParameters()
-    name = str(name_or_path) if scale == 1.0 else f"{name_or_path}@{scale:g}"
+    chosen = SurfaceParameters() if parameters is None else parameters
+    if not isinstance(chosen, SurfaceParameters):
+        raise InputError(f"parameters: found {chosen!r}, expected SurfaceParameters or None")
+    seed = checked_integer(seed, "seed", 0)
+    smallest = float(np.finfo(float).tiny)
+    scale = checked_number(scale, "scale", "a number > 0 (0.001 for millimetres)", smallest)
+    path = name_or_path if isinstance(name_or_path, str | Path) else _stored(name_or_path)
+    factor = f"{scale:g}" if float(f"{scale:g}") == scale else repr(scale)
+    name = str(path) if scale == 1.0 else f"{path}@{factor}"
     thing = load_object(name)
     vertices, triangles = thing.mesh(resolution=96)
     vertices, triangles, notes = _body(name, vertices, triangles)
@@ -244,6 +282,53 @@ def load_surface(
     count = min(chosen.samples, max(LEAST_SAMPLES, chosen.density * occupied))
     points, faces = points[:count], faces[:count]
     return replace(_smoothed(name, thing, points, faces, corners[doubled > 0], chosen), notes=notes)
+
+
+def _stored(source: Any) -> Path:
+    """Write a mesh into the cache, unless it is there, and return its path.
+
+    Raises:
+        InputError: The source is not a mesh.
+    """
+    if hasattr(source, "vertices") and hasattr(source, "faces"):
+        pair = source.vertices, source.faces
+    elif isinstance(source, tuple | list) and len(source) == 2:
+        pair = source
+    else:
+        shape = f" of shape {source.shape}" if isinstance(source, np.ndarray) else ""
+        found = f"{type(source).__name__}{shape}"
+        raise InputError(f"surface: found an object of type {found}, {EXPECTED_SOURCE}")
+    try:
+        vertices, triangles = np.asarray(pair[0], dtype=float), np.asarray(pair[1])
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"surface: found arrays that are not numbers, {EXPECTED_SOURCE}"
+        ) from error
+    shapes = [array.shape for array in (vertices, triangles)]
+    if not all(len(shape) == 2 and shape[0] > 0 and shape[1] == 3 for shape in shapes):
+        raise InputError(f"surface: found shapes {shapes[0]} and {shapes[1]}, {EXPECTED_SOURCE}")
+    if triangles.dtype.kind not in "iu" or not np.isfinite(vertices).all():
+        raise InputError(
+            "surface: found vertices that are not finite or triangles that are not integers, "
+            f"{EXPECTED_SOURCE}"
+        )
+    if not 0 <= triangles.min() <= triangles.max() < len(vertices):
+        raise InputError(
+            f"surface: found vertex numbers from {triangles.min()} to {triangles.max()}, "
+            f"expected 0 to {len(vertices) - 1}"
+        )
+    lines = [f"OFF\n{len(vertices)} {len(triangles)} 0"]
+    lines += [" ".join(map(repr, row)) for row in vertices.tolist()]
+    lines += [f"3 {a} {b} {c}" for a, b, c in triangles.tolist()]
+    text = "\n".join(lines) + "\n"
+    folder = (trusted_cache() or user_temp_dir()) / "meshes"
+    path = folder / f"mesh_{hashlib.sha256(text.encode()).hexdigest()[:16]}.off"
+    with os_errors(f"{path}: a mesh cannot be stored", InputError):
+        if not path.exists():
+            folder.mkdir(parents=True, exist_ok=True)
+            with written_whole(path) as part:
+                part.write_text(text, encoding="ascii")
+    return path
 
 
 LEAST_SAMPLES = 500
