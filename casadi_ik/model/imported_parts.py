@@ -78,7 +78,7 @@ def hand_from_file(
     tree.known_link(palm.link, f"{where}.palm: {tree.path.name}")
     chain = tree.chain(root, palm.link, f"{where}.palm: {tree.path.name}")
     hand = tuple(below(tree, palm.link))
-    carried = {joint.child for joint in hand}
+    carried = {palm.link, *(joint.child for joint in hand)}
     for name, pad in pads.items():
         tree.known_link(pad.link, f"{beside}: fingers.{name}.link: {tree.path.name}")
         if pad.link not in carried:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -227,6 +227,117 @@ def test_a_palm_with_arms_for_fingers_is_doubted(run: Command, tmp_path: Path) -
     assert "--palm: from 'base' of arm.urdf go chains as long as arms: write" in done.out
 
 
+def chain(folder: Path, names: Sequence[str], root: str = "base") -> str:
+    """Links and joints of an arm in a row, each 0.1 m from the one before."""
+    text, parent = "", root
+    for i, name in enumerate(names):
+        axis = ("0 0 1", "0 1 0", "0 1 0", "1 0 0")[i % 4]
+        text += link(f"{name}_link")
+        text += moves(name, parent, f"{name}_link", "0 0 0.1", axis, "-2 2")
+        parent = f"{name}_link"
+    return text
+
+
+ARM = ("pan", "lift", "elbow", "wrist_flex", "wrist_roll")
+
+
+@pytest.mark.parametrize(
+    ("last", "motors", "fingers"),
+    [
+        ("gripper", (5, 1), ("moving_jaw", "fixed_jaw")),
+        ("wrist_yaw", (6, 0), ("tool",)),
+    ],
+)
+def test_a_single_chain_is_an_arm_with_a_jaw_or_a_tool(
+    run: Command, tmp_path: Path, last: str, motors: tuple[int, int], fingers: tuple[str, ...]
+) -> None:
+    path = urdf(tmp_path / "so.urdf", link("base"), chain(tmp_path, (*ARM, last)))
+    out = tmp_path / "mine.yaml"
+    run("import", path, "--out", out).fine()
+    robot = ik.load_robot(out)
+    arm_motors = len(robot.description.arm_actuators)
+    assert (arm_motors, len(robot.actuators) - arm_motors) == motors
+    assert robot.fingers == fingers
+
+
+def test_the_fixed_jaw_of_a_named_palm_faces_the_one_that_moves(
+    run: Command, tmp_path: Path
+) -> None:
+    def box(at: str, size: str) -> str:
+        origin = f'<origin xyz="{at}"/>'
+        return f'<collision>{origin}<geometry><box size="{size}"/></geometry></collision>'
+
+    text = link("base") + chain(tmp_path, ARM[:4])
+    text += link("roll", inside=box("0 -0.03 0.05", "0.02 0.01 0.1"))
+    text += moves("wrist_roll", "wrist_flex_link", "roll", "0 0 0.1", "0 0 1", "-2 2")
+    text += link("end", inside=box("0 0 0.04", "0.02 0.01 0.08"))
+    text += moves("j", "roll", "end", "0 0.03 0.02", "1 0 0", "0 1")
+    path, out = urdf(tmp_path / "so.urdf", text), tmp_path / "mine.yaml"
+    run("import", path, "--palm", "roll", "--out", out).fine()
+    fingers = yaml.safe_load(out.read_text())["fingers"]
+    assert set(fingers) == {"moving_jaw", "fixed_jaw"}
+    assert fingers["fixed_jaw"]["link"] == "roll"
+    np.testing.assert_allclose(fingers["moving_jaw"]["normal"], [0, -1, 0], atol=1e-6)
+    assert fingers["fixed_jaw"]["xyz"][1] == pytest.approx(-0.025)
+    assert fingers["fixed_jaw"]["normal"][1] > 0.8
+
+
+def test_two_arms_without_hands_are_the_sides_of_a_body(run: Command, tmp_path: Path) -> None:
+    text = link("base")
+    for side in ("left", "right"):
+        text += chain(tmp_path, [f"{side}_{name}" for name in (*ARM, "wrist_yaw")])
+    path, out = urdf(tmp_path / "two.urdf", text), tmp_path / "mine.yaml"
+    run("import", path, "--out", out).fine()
+    sides = ik.load_robot(out).description.sides
+    assert [(side.name, len(side.arm), len(side.hand)) for side in sides] == [
+        ("left", 6, 0),
+        ("right", 6, 0),
+    ]
+
+
+def test_wheels_head_and_legs_are_not_fingers(run: Command, tmp_path: Path) -> None:
+    """An arm with a gripper on a mobile base: two wheels, a head, and a leg as long as an arm."""
+    text = link("base", "left_wheel", "right_wheel") + chain(tmp_path, ("head_pan", "head_tilt"))
+    for side in ("left", "right"):
+        text += moves(side, "base", f"{side}_wheel", "0 0 0", "0 1 0", "", kind="continuous")
+    text += chain(tmp_path, [f"leg_{i}" for i in range(6)])
+    text += chain(tmp_path, (*ARM, "wrist_yaw"))
+    for side in ("l", "r"):
+        text += chain(tmp_path, (f"{side}_finger",), "wrist_yaw_link")
+    path, out = urdf(tmp_path / "mobile.urdf", text), tmp_path / "mine.yaml"
+    run("import", path, "--out", out).fine()
+    robot = ik.load_robot(out)
+    assert (len(robot.description.arm_actuators), len(robot.actuators)) == (6, 8)
+    assert len(robot.fingers) == 2
+
+
+def test_two_hands_on_wrists_in_one_file_are_two_sides(run: Command, tmp_path: Path) -> None:
+    text = link("base")
+    for side in ("left", "right"):
+        text += chain(tmp_path, (f"{side}_wrist",))
+        for finger in ("thumb", "index", "ring"):
+            names = [f"{side}_{finger}_{i}" for i in range(4)]
+            text += chain(tmp_path, names, f"{side}_wrist_link").replace("0 0 0.1", "0 0 0.03")
+    path, out = urdf(tmp_path / "hands.urdf", text), tmp_path / "mine.yaml"
+    done = run("import", path, "--out", out).fine()
+    sides = ik.load_robot(out).description.sides
+    assert [(side.name, len(side.arm), len(side.hand)) for side in sides] == [
+        ("left", 1, 12),
+        ("right", 1, 12),
+    ]
+    assert all(len(side.fingers) == 3 for side in sides), done.out
+
+
+def test_a_wrist_is_called_a_wrist(run: Command, tmp_path: Path) -> None:
+    text = link("forearm") + chain(tmp_path, ("wrist",), "forearm")
+    for finger in ("thumb", "index"):
+        names = [f"{finger}_{i}" for i in range(5)]
+        text += chain(tmp_path, names, "wrist_link").replace("0 0 0.1", "0 0 0.03")
+    path = urdf(tmp_path / "hand.urdf", text)
+    done = run("import", path, "--out", tmp_path / "mine.yaml").fine()
+    assert "11 motors (1 wrist, 10 hand), 2 fingers" in done.out
+
+
 REFUSALS = {
     "no file": (("nothing.urdf",), "nothing.urdf: cannot be read: No such file"),
     "no such palm": (("hand.urdf", "--palm", "hip"), "--palm: hand.urdf has no link 'hip'"),
@@ -235,7 +346,6 @@ REFUSALS = {
     "mount without arm": (("hand.urdf", "--mount", *"123456"), "--mount: there is no arm"),
     "an arm for a hand": (("arm.urdf", "hand.urdf", "--palm", "mf_3"), "no joint moves below"),
     "one file twice": (("arm.urdf", "arm.urdf"), "arm.urdf: arm and hand are the same file"),
-    "two arms": (("two.urdf",), "as arms: write the link that the fingers hang on, such as l4, m4"),
     "arm that branches": (("two.urdf", "hand.urdf"), "--tip: missing; two.urdf branches at 'base'"),
     "description": (("hand.yaml",), "is a description already, expected --picture and no --out"),
     "output is the input": (("hand.urdf", "--out", "hand.urdf"), "expected a name ending in .yaml"),

@@ -37,6 +37,9 @@ from casadi_ik.kinematics.arm_hand import ArmHand, load_robot
 from casadi_ik.kinematics.arms.recognise import family_in_words, is_searched
 from casadi_ik.papers.chandra import calibration
 
+LEAST_ARM = 4
+"""Least number of motors that move a palm and are called an arm."""
+
 SAME = 1e-9
 """Poses that differ by no more [m, or in their axes] are the same."""
 
@@ -170,7 +173,9 @@ def _import_report(
     description, lines = robot.description, found.written
     arm = len(description.arm_actuators)
     count = len(description.actuators)
-    motors = f"{arm} arm, {count - arm} hand"
+    # Few motors that move the palm of a hand alone are its wrist.
+    noun = "wrist" if lines.arm is None and 0 < arm < LEAST_ARM else "arm"
+    motors = f"{arm} {noun}, {count - arm} hand"
     if description.sides:
         whose = [f"{len(description.trunk)} trunk"]
         whose += [f"{s.name} {len(s.arm)} arm, {len(s.hand)} hand" for s in description.sides]
@@ -188,7 +193,8 @@ def _import_report(
         side = f"{hand.side} " if hand.side else ""
         pairs[f"{side}palm"] = f"{hand.link}: {hand.how}"
         pairs[f"{side}closed form"] = family_in_words(one) if one.arm_actuators else ""
-        pairs[f"{side}thumb"] = f"{hand.thumb[0]}: {hand.thumb[1]}"
+        if hand.thumb is not None:
+            pairs[f"{side}thumb"] = f"{hand.thumb[0]}: {hand.thumb[1]}"
     for line in filter(None, (lines.arm, lines.hand)):
         if line.limits:
             pairs["limits"] = f"assumed, since {Path(line.file).name} states none: " + ", ".join(

@@ -22,7 +22,7 @@ from casadi_ik.model.linkage import (
     rigid,
 )
 from casadi_ik.model.parts import Part
-from casadi_ik.model.xml_tree import RobotTree
+from casadi_ik.model.xml_tree import RobotTree, TreeJoint
 
 WORDS = {
     "thumb": r"thumb|(?<![a-z])th(?=[jb_]|dist|prox|mid|tip|hub|base|$)",
@@ -39,7 +39,10 @@ class GuessParameters:
     """How fingers, thumb, pads and home are guessed.
 
     Attributes:
-        arm_joints: So many joints in a row are an arm, not a finger.
+        arm_joints: Least number of motors in a row of an arm beside other chains.
+        arm_length: Least length of the path along such an arm [m]; fingers are shorter.
+        lone_arm_joints: Least number of motors of an arm that is the only chain of its file.
+        palm_chains: Least number of chains of a palm that another palm is beside.
         postures: At random, over which opposition is averaged.
         clear: By how much the thumb has to be more opposed than the next finger, of 2, to be called
             clear.
@@ -51,6 +54,9 @@ class GuessParameters:
     """
 
     arm_joints: int = 6
+    arm_length: float = 0.25
+    lone_arm_joints: int = 5
+    palm_chains: int = 3
     postures: int = 64
     clear: float = 0.15
     parallel: float = 0.7
@@ -82,25 +88,117 @@ class Branch:
     named: bool
 
 
+JAW = r"jaw|finger|claw|knuckle|thumb"
+"""Names of a jaw at the end of a chain, or of its joint; that may also be called a gripper."""
+
+LEG = r"leg|foot|ankle|knee|hip|toe"
+"""Names of the joints and links of legs."""
+
+
 def palms(tree: RobotTree) -> list[str]:
-    """Links from which two or more chains that move go out, from the root down."""
+    """Return the links that carry two or more moving chains, from the root down."""
     return [link for link in tree.links if len(moving_below(tree, link)) >= 2]
 
 
+def motors_in_a_row(tree: RobotTree, joint: TreeJoint) -> int:
+    """Return the most joints without coupling in a row, from a joint outwards."""
+    further = (motors_in_a_row(tree, next_) for next_ in moving_below(tree, joint.child))
+    return (joint.coupling is None) + max(further, default=0)
+
+
+def is_limb(tree: RobotTree, joint: TreeJoint) -> bool:
+    """Return whether what a joint moves has as many motors as an arm, and is as long as one."""
+    return (
+        motors_in_a_row(tree, joint) >= GUESS.arm_joints
+        and _length(tree, joint.child) >= GUESS.arm_length
+    )
+
+
+def _length(tree: RobotTree, link: str) -> float:
+    """Return the length of the longest path of joints below a link [m]."""
+    steps = (
+        float(np.linalg.norm(joint.placement[:3, 3])) + _length(tree, joint.child)
+        for joint in tree.joints
+        if joint.parent == link
+    )
+    return max(steps, default=0.0)
+
+
 def holds_arms(tree: RobotTree, palm: str) -> bool:
-    """Whether what hangs on a link is rather arms than fingers."""
+    """Return whether chains below a link are as long as arms."""
     return bool(ends_of_arms(tree, palm))
 
 
 def ends_of_arms(tree: RobotTree, palm: str) -> list[str]:
-    """Of chains below a link that are as long as arms, the links that carry their last joints."""
+    """Return the links that carry the last joints of chains as long as arms, below a link."""
     return [
         joint.parent
         for first in moving_below(tree, palm)
-        if depth(tree, first.child) + 1 >= GUESS.arm_joints
+        if is_limb(tree, first)
         for joint in (first, *below(tree, first.child))
         if joint.type != "fixed" and not moving_below(tree, joint.child)
     ]
+
+
+@dataclass(frozen=True)
+class LimbEnd:
+    """The end of an arm or a leg, or a hand.
+
+    Attributes:
+        link: The palm, or the last link.
+        has_fingers: Whether joints move below the link.
+    """
+
+    link: str
+    has_fingers: bool
+
+
+def limb_ends(tree: RobotTree) -> list[LimbEnd]:
+    """Return the hands of a file, or the ends of its arms if it has no hands."""
+    ends = _ends_below(tree, tree.root, None)
+    hands = [end for end in ends if end.has_fingers]
+    arms = [end for end in ends if not _is_leg(tree, end.link)]
+    return hands or arms or ends
+
+
+def _ends_below(tree: RobotTree, link: str, last: TreeJoint | None) -> list[LimbEnd]:
+    """Return the ends of the limbs below a link, which a joint moves (None: the root)."""
+    chains = moving_below(tree, link)
+    chains = [joint for joint in chains if not _is_wheel(tree, joint)] or chains
+    if not chains:
+        if last is not None and re.search(f"{JAW}|gripper", last.name.lower()):
+            return [LimbEnd(last.parent, True)]
+        if last is not None and re.search(JAW, last.child.lower()):
+            return [LimbEnd(last.parent, True)]
+        return [LimbEnd(link, False)]
+    if len(chains) == 1:
+        return _ends_below(tree, chains[0].child, chains[0])
+    limbs = [joint for joint in chains if is_limb(tree, joint)]
+    if not limbs:  # several whole hands, each on a wrist
+        limbs = [joint for joint in chains if _carries_a_palm(tree, joint)]
+        limbs = limbs if len(limbs) > 1 else []
+    if not limbs:
+        return [LimbEnd(link, True)]
+    return [end for joint in limbs for end in _ends_below(tree, joint.child, joint)]
+
+
+def _carries_a_palm(tree: RobotTree, joint: TreeJoint) -> bool:
+    """Return whether a link from which three or more chains go out is moved by a joint."""
+    links = (joint.child, *(further.child for further in below(tree, joint.child)))
+    return any(len(moving_below(tree, link)) >= GUESS.palm_chains for link in links)
+
+
+def _is_wheel(tree: RobotTree, joint: TreeJoint) -> bool:
+    """Return whether a joint turns without limits and moves nothing else."""
+    leads = any(other.coupling and other.coupling.of == joint.name for other in tree.joints)
+    is_free = joint.type == "continuous" and joint.coupling is None and not leads
+    return is_free and not moving_below(tree, joint.child)
+
+
+def _is_leg(tree: RobotTree, link: str) -> bool:
+    """Return whether the names of a chain are those of a leg."""
+    chain = [joint for joint in above(tree, link) if joint.type != "fixed"]
+    return any(re.search(LEG, f"{joint.name} {joint.child}".lower()) for joint in chain[-3:])
 
 
 def find_fingers(part: Part, palm: str) -> list[Branch]:
@@ -275,8 +373,40 @@ def guess_pads(
     for i, branch in enumerate(branches):
         others = [tip for j, tip in enumerate(tips) if j != i]
         meeting = np.mean(others, axis=0) if others else poses[palm][:3, 3]
+        if not others and palm in surfaces:  # a jaw closes towards the nearest part of the palm
+            points = surfaces[palm].moved(poses[palm]).points
+            meeting = points[np.argmin(np.linalg.norm(points - tips[i], axis=1))]
         pads.append(_pad(part, branch, bodies[i], meeting))
     return pads
+
+
+def guess_fixed_jaw(part: Part, palm: str, pad: Pad, surface: Surface | None) -> Pad:
+    """Return the pad of a jaw that is fixed to the palm's link, opposite the one that moves.
+
+    Args:
+        part: The hand.
+        palm: The link.
+        pad: The pad of the jaw that moves.
+        surface: The shape of the palm's link; None if it is not known.
+    """
+    poses = _poses(part, _middle(part))
+    pose = np.linalg.inv(poses[palm]) @ poses[pad.link]
+    point, normal = _apply(pose, pad.point), pose[:3, :3] @ pad.normal
+    hit = None if surface is None else surface.hit(point, normal)
+    if hit is not None:
+        return Pad(palm, hit, -normal, "where a ray from the jaw that moves meets the palm's link")
+    ends = []
+    for joint in part.joints:
+        for value in (joint.lower, joint.upper) if joint.type != "fixed" else ():
+            moved = _poses(part, _middle(part) | {joint.name: value})
+            ends.append(_apply(np.linalg.inv(moved[palm]) @ moved[pad.link], pad.point))
+    closed = max(ends, key=lambda end: float((end - point) @ normal))
+    return Pad(palm, closed, -normal, "where the jaw that moves is when it is closed")
+
+
+def tool_pad(link: str) -> Pad:
+    """Return the pad of an arm without a hand: the origin of its last link, facing along z."""
+    return Pad(link, np.zeros(3), np.array([0.0, 0.0, 1.0]), "the arm's last frame faces along z")
 
 
 Body = tuple[Surface | None, Array, int]

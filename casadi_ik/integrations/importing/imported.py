@@ -17,15 +17,19 @@ import numpy as np
 from casadi_ik.errors import DescriptionError, InputError, MissingExtraError
 from casadi_ik.files.arrays import Array
 from casadi_ik.integrations.importing.guess import (
+    GUESS,
     Branch,
     ends_of_arms,
     find_fingers,
+    guess_fixed_jaw,
     guess_home,
     guess_pads,
     guess_palm_frame,
     guess_thumb,
     holds_arms,
+    limb_ends,
     palms,
+    tool_pad,
 )
 from casadi_ik.integrations.importing.robot_shapes import hand_links, name_in_robot, robot_shapes
 from casadi_ik.integrations.importing.surfaces import link_surfaces
@@ -33,7 +37,7 @@ from casadi_ik.integrations.importing.write import FileLine, HandLines, Written
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.imported_parts import hand_from_file
 from casadi_ik.model.joining import MOST_SIDES
-from casadi_ik.model.linkage import below, ends, moving_below, rigid
+from casadi_ik.model.linkage import above, below, ends, moving_below, rigid
 from casadi_ik.model.load_robot import load_description
 from casadi_ik.model.parts import Part
 from casadi_ik.model.schema import HandFromFile
@@ -68,32 +72,23 @@ def the_tip(tree: RobotTree) -> tuple[str, str]:
             f"--tip: missing; {tree.path.name} branches at {link!r}: write the link that carries "
             f"the hand, such as {', '.join(last_ones[:8])}"
         )
-    fixed = rigid(tree, last.child)
-    for pattern in FLANGES:
-        named = [one for one in fixed if re.search(pattern, one.lower())]
-        if named:
-            return named[0], f"it is fixed to the last joint ({last.name}) and called so"
+    frame = tool_frame(tree, last.child)
+    if frame != last.child:
+        return frame, f"it is fixed to the last joint ({last.name}) and called so"
     return last.child, f"the last joint ({last.name}) moves it"
 
 
-def the_palm(tree: RobotTree, palm: str | None) -> tuple[str, str]:
-    """The link that the fingers hang on, and how it was found.
+def checked_palm(tree: RobotTree, palm: str) -> str:
+    """Return the link that is given as a palm.
 
     Raises:
-        InputError: There is no such link, or nothing says which it is.
+        InputError: There is no such link.
     """
-    if palm is not None:
-        if palm not in tree.links:
-            raise InputError(
-                f"--palm: {tree.path.name} has no link {palm!r}; it has {', '.join(tree.links)}"
-            )
-        return palm, "--palm"
-    found = palms(tree)
-    if not found:
-        return tree.root, "there is a single chain of joints: the base"
-    if why := no_palm(tree, found[0]):
-        raise InputError(f"--palm: missing; {why}")
-    return found[0], "the first link from which several chains of joints go out"
+    if palm not in tree.links:
+        raise InputError(
+            f"--palm: {tree.path.name} has no link {palm!r}; it has {', '.join(tree.links)}"
+        )
+    return palm
 
 
 def no_palm(tree: RobotTree, link: str) -> str:
@@ -118,19 +113,18 @@ def the_palms(tree: RobotTree, asked: Sequence[str]) -> dict[str, tuple[str, str
     Raises:
         InputError: There are no such links, or nothing says which they are.
     """
-    several = [(link, "--palm") for link in asked]
-    all_palms = palms(tree)
-    if not asked and all_palms and holds_arms(tree, all_palms[0]):
-        hands = [link for link in all_palms if not holds_arms(tree, link)]
-        carried = {joint.child for link in hands for joint in below(tree, link)}
-        how = "several chains of joints go out, none as long as an arm"
-        several = [(link, how) for link in hands if link not in carried]
-    if not 1 < len(several) <= MOST_SIDES:
-        if len(asked) > MOST_SIDES:
-            raise InputError(f"--palm: found {len(asked)} links, expected {MOST_SIDES} at most")
-        return {"": the_palm(tree, asked[0] if asked else None)}
     for link in asked:
-        the_palm(tree, link)
+        checked_palm(tree, link)
+    several = [(link, "--palm") for link in asked] or guessed_palms(tree)
+    if len(several) > MOST_SIDES:
+        option = "found" if asked else f"{tree.path.name} has several arms: found"
+        raise InputError(
+            f"--palm: {option} {len(several)} links, expected {MOST_SIDES} at most; write those "
+            f"that fingers hang on or that end an arm: {', '.join(link for link, _ in several[:7])}"
+        )
+    if len(several) == 1:
+        return {"": several[0]}
+    for link in asked:
         if asked.count(link) > 1:
             raise InputError(f"--palm: {link!r} is given twice, expected one of each hand")
         if any(joint.child in asked for joint in below(tree, link)):
@@ -139,6 +133,40 @@ def the_palms(tree: RobotTree, asked: Sequence[str]) -> dict[str, tuple[str, str
     if "" in names or len(set(names)) < len(names):
         names = [f"side_{i + 1}" for i in range(len(several))]
     return dict(zip(names, several, strict=True))
+
+
+def guessed_palms(tree: RobotTree) -> list[tuple[str, str]]:
+    """Return the palms of a file's hands, or the ends of its arms, and how they were found."""
+    ends = limb_ends(tree)
+    if len(ends) == 1:
+        (end,) = ends
+        motors = [
+            joint
+            for joint in tree.chain(tree.root, end.link, str(tree.path))
+            if joint.type != "fixed" and joint.coupling is None
+        ]
+        if not palms(tree) and len(motors) + end.has_fingers < GUESS.lone_arm_joints:
+            return [(tree.root, "there is a single chain of joints: the base")]
+        if end.has_fingers and len(moving_below(tree, end.link)) > 1:
+            return [(end.link, "the first link from which several chains of joints go out")]
+    return [
+        (end.link, "several chains of joints go out, none as long as an arm")
+        if end.has_fingers and len(moving_below(tree, end.link)) > 1
+        else (end.link, "an arm with a jaw: the link on which the last joint is")
+        if end.has_fingers
+        else (tool_frame(tree, end.link), "an arm without a hand ends here")
+        for end in ends
+    ]
+
+
+def tool_frame(tree: RobotTree, link: str) -> str:
+    """Return the frame on the last link of an arm that a tool is screwed to: by its name."""
+    fixed = rigid(tree, link)
+    for pattern in FLANGES:
+        for name in fixed:
+            if re.search(pattern, name.lower()):
+                return name
+    return link
 
 
 def _side_name(link: str) -> str:
@@ -349,10 +377,28 @@ def _found_hand(
     """A hand's fingers with their pads, the thumb first, and what cannot be read."""
     branches = find_fingers(part, palm)
     if not branches:
-        raise DescriptionError(f"{tree.path}: no joint moves below the palm {palm!r}; try --palm")
+        motors = [joint for joint in above(part, palm) if joint.type != "fixed"]
+        if len(motors) < GUESS.lone_arm_joints:
+            raise DescriptionError(
+                f"{tree.path}: no joint moves below the palm {palm!r}; try --palm"
+            )
+        pad = tool_pad(palm)
+        lines = HandLines(side, np.eye(4), palm, how, {"tool": pad}, None)
+        return lines, [Branch("tool", (), palm, (palm,), False)], []
+    is_jaw = len(branches) == 1 and len(branches[0].chain) == 1 and bool(above(part, palm))
     wanted = {one for branch in branches for one in _ends_of(part, branch)}
-    surfaces, notes = link_surfaces(tree, wanted)
+    surfaces, notes = link_surfaces(tree, wanted | {palm} if is_jaw else wanted)
     pads = guess_pads(part, palm, branches, surfaces)
+    if is_jaw:
+        pads.append(guess_fixed_jaw(part, palm, pads[0], surfaces.get(palm)))
+        frame = guess_palm_frame(part, palm, branches, pads[:1], 0)
+        names = ["moving_jaw", "fixed_jaw"]
+        lines = HandLines(
+            *(side, frame, palm, how, dict(zip(names, pads, strict=True))),
+            ("moving_jaw", "the jaw that moves"),
+        )
+        fixed = Branch("fixed_jaw", (), palm, (palm,), False)
+        return lines, [replace(branches[0], name="moving_jaw"), fixed], notes
     thumb, thumb_how = guess_thumb(part, branches, pads)
     frame = guess_palm_frame(part, palm, branches, pads, thumb)
     names = [branch.name.removeprefix(f"{side}_") for branch in branches]

@@ -135,7 +135,7 @@ class HandLines:
         link: The link.
         how: How that was found.
         fingers: By name the pad.
-        thumb: The thumb's name, and how it was found.
+        thumb: The thumb's name, and how it was found; None: there is none.
     """
 
     side: str
@@ -143,7 +143,7 @@ class HandLines:
     link: str
     how: str
     fingers: Mapping[str, Pad]
-    thumb: tuple[str, str]
+    thumb: tuple[str, str] | None
 
     def palm_text(self) -> str:
         """The palm's frame, in one line."""
@@ -154,7 +154,9 @@ class HandLines:
 
     def finger_lines(self) -> list[str]:
         """The thumb and all pads."""
-        lines = [f"thumb: {scalar(self.thumb[0])}  # {_guess(self.thumb[1])}"]
+        lines = []
+        if self.thumb is not None:
+            lines.append(f"thumb: {scalar(self.thumb[0])}  # {_guess(self.thumb[1])}")
         lines.append("fingers:  # xyz [m] and outward normal of the pad, in the link's frame")
         for name, pad in self.fingers.items():
             lines.append(f"  # GUESS: {one_line(pad.how)}")
