@@ -24,13 +24,19 @@ def random_pose(rng: np.random.Generator) -> np.ndarray:
     return pose
 
 
-def on_pedestal(robot: ik.ArmHand, folder: Path, base: np.ndarray = IDENTITY) -> ik.ArmHand:
+def on_pedestal(
+    robot: ik.ArmHand,
+    folder: Path,
+    base: np.ndarray = IDENTITY,
+    continuous: tuple[str, ...] = (),
+) -> ik.ArmHand:
     """Return the robot imported from a URDF in which a fixed joint carries its root.
 
     Args:
         robot: The robot; its couplings must be linear, and its hand the tool if it has no motors.
         folder: Folder for the files.
         base: (4, 4) pose of the robot's root in the root of the file.
+        continuous: Names of the joints that the file gives no limits.
     """
     folder.mkdir(parents=True, exist_ok=True)
     text, body = robot.urdf(), robot.description
@@ -40,6 +46,10 @@ def on_pedestal(robot: ik.ArmHand, folder: Path, base: np.ndarray = IDENTITY) ->
         f'<origin xyz="{xyz}" rpy="{rpy}"/><parent link="floor_below"/>'
         f'<child link="{body.root}"/></joint></robot>'
     )
+    for name in continuous:
+        revolute = f'<joint name="{name}" type="revolute">'
+        assert revolute in text
+        text = text.replace(revolute, revolute.replace("revolute", "continuous"))
     (folder / "robot.urdf").write_text(text.replace("</robot>", pedestal))
 
     def frame(link: str, placement: np.ndarray) -> dict:

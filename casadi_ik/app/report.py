@@ -324,6 +324,8 @@ def _actuators(
         flag = "at lower" if value - one.lower <= AT_LIMIT else ""
         flag = "at upper" if one.upper - value <= AT_LIMIT else flag
         ends = [f"{end * scale:.4g}" for end in (one.lower, one.upper)]
+        if one.continuous:
+            flag, ends = "", ["none", "none"]
         shown = Text(beyond.get(one.name, flag), "yellow")
         rows.add_row(one.name, _number(value, one.unit, units), *ends, shown)
     return rows
@@ -339,6 +341,9 @@ def _beyond(robot: ArmHand, solution: Solution, units: Units) -> dict[str, str]:
     for one, value in zip(description.actuators, solution.q.tolist(), strict=True):
         ranges[one.name] = (value, one, one.unit)
     found = {}
+    for one in description.actuators:
+        if one.continuous:
+            del ranges[one.name]
     for name, (value, of, unit) in ranges.items():
         scale, called = units[unit]
         for side, far in (("below", of.lower - value), ("above", value - of.upper)):

@@ -139,8 +139,8 @@ class FollowSources:
             "PALM_WEIGHT": PALM_WEIGHT,
         }
         arrays = {
-            "LOWER": robot.lower,
-            "UPPER": robot.upper,
+            "LOWER": robot.description.stops[0],
+            "UPPER": robot.description.stops[1],
             "HOME": robot.home,
             "VELOCITY": own_velocities(robot),
             "WEIGHTS": contact_weights((self.tolerance,) * f),

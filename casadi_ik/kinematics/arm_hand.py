@@ -164,7 +164,8 @@ class ArmHand(Shown):
     def _far(self) -> tuple[Array, Array]:
         """(n,) middles of all motors, and how far from it is a turn beyond the limits."""
         units = [actuator.unit for actuator in self.description.actuators]
-        turn = np.where([unit == "rad" for unit in units], 2 * np.pi, np.inf)
+        limited = [unit == "rad" for unit in units] & ~self.description.continuous
+        turn = np.where(limited, 2 * np.pi, np.inf)
         return (self.lower + self.upper) / 2, (self.upper - self.lower) / 2 + turn
 
     def joints(self, q: ArrayLike) -> dict[str, Any]:

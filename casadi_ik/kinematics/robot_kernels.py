@@ -12,7 +12,7 @@ from casadi_ik.compile.function_kernel import FunctionKernel
 from casadi_ik.compile.graphs import FunctionGraph, Shape, recipe
 from casadi_ik.kinematics.couplings import joint_positions, toggle_margins
 from casadi_ik.kinematics.forward import Pose, actuated
-from casadi_ik.model.description import RobotDescription
+from casadi_ik.model.description import ENDLESS, RobotDescription
 
 
 class RobotKernels:
@@ -103,8 +103,18 @@ class RobotKernels:
         both = ca.vertcat(q, joint_positions(description, q))
         # As the file has them: bounds that were derived from these are not judged by themselves.
         strokes = description.strokes
-        lower = ca.DM(np.concatenate([strokes[0], description.joint_lower]))
-        upper = ca.DM(np.concatenate([strokes[1], description.joint_upper]))
+        names = np.array(description.actuator_names)[description.continuous]
+        motors, joints = (
+            np.isin(all_names, names)
+            for all_names in (description.actuator_names, description.joint_names)
+        )
+        endless = np.concatenate([motors, joints])
+        lower = np.concatenate([strokes[0], description.joint_lower])
+        upper = np.concatenate([strokes[1], description.joint_upper])
+        lower, upper = (
+            ca.DM(np.where(endless, sign * ENDLESS, ends))
+            for sign, ends in ((-1, lower), (1, upper))
+        )
         return ca.mmax(ca.fmax(lower - both, both - upper))
 
     @cached_property

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from casadi_ik.errors import UnknownNameError, UnsupportedError
 from casadi_ik.files.arrays import Array, frozen
@@ -16,6 +17,9 @@ from casadi_ik.model.joints import Actuator, Joint
 from casadi_ik.model.link_shapes import NO_SHAPES, Shapes
 from casadi_ik.model.linkage import above, links_of
 from casadi_ik.model.motor_ranges import motor_ranges
+
+ENDLESS = 1e6
+"""Limit of the motion of a motor without limits [rad]: 28 hours at 10 rad/s."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,6 +202,39 @@ class RobotDescription:
                 lower[coupling.of] = max(lower[coupling.of], least)
                 upper[coupling.of] = min(upper[coupling.of], most)
         return frozen(list(lower.values())), frozen(list(upper.values()))
+
+    @cached_property
+    def _independent_turns(self) -> NDArray[np.bool_]:
+        """(n,) True for motors that move one revolute joint, by their own angle."""
+        moved: dict[int, list[Joint]] = {i: [] for i in range(len(self.actuators))}
+        for joint in self.movable:
+            for motor in self.driving([joint.name]):
+                moved[motor].append(joint)
+        return np.array(
+            [
+                len(joints) == 1 and joints[0].type == "revolute" and joints[0].coupling is None
+                for joints in moved.values()
+            ],
+            dtype=bool,
+        )
+
+    @cached_property
+    def continuous(self) -> NDArray[np.bool_]:
+        """(n,) True for motors without limits, whose `lower` and `upper` are the search range."""
+        unlimited = np.array([actuator.continuous for actuator in self.actuators], dtype=bool)
+        return self._independent_turns & unlimited
+
+    @cached_property
+    def turning(self) -> tuple[int, ...]:
+        """Positions in q of the motors that may take the same pose in several turns."""
+        wide = self.continuous | (self.upper - self.lower >= 2 * np.pi)
+        return tuple(np.flatnonzero(self._independent_turns & wide).tolist())
+
+    @cached_property
+    def stops(self) -> tuple[Array, Array]:
+        """(n,) limits of motions: `lower` and `upper`, and ±`ENDLESS` for continuous motors."""
+        lower = np.where(self.continuous, -ENDLESS, self.lower)
+        return frozen(lower), frozen(np.where(self.continuous, ENDLESS, self.upper))
 
     @cached_property
     def joint_lower(self) -> Array:

@@ -21,7 +21,7 @@ from casadi_ik.model.schema import ArmFromFile, CollisionEntry, HandFromFile, Li
 from casadi_ik.model.urdf_mjcf import read_tree
 from casadi_ik.model.xml_tree import RobotTree, TreeJoint
 
-ENDLESS = 2 * math.pi
+CONTINUOUS_RANGE = 2 * math.pi
 """A joint without ends may turn this far to either side [rad]."""
 
 GRID = 257
@@ -171,6 +171,7 @@ class _Chosen:
                 joint.velocity,
                 joint.part,
                 joint.effort,
+                self._is_continuous(joint.name),
             )
             for joint in joints
             if joint.type != "fixed" and joint.coupling is None
@@ -179,6 +180,12 @@ class _Chosen:
         movable = {joint.name: joint for joint in joints if joint.type != "fixed"}
         check_couplings(movable, motors, self._tree.path)
         return joints, motors
+
+    def _is_continuous(self, name: str) -> bool:
+        """Return whether a joint has no limits."""
+        joint = self._tree.by_name[name]
+        limited = name in self._tree.motors or name in self._stated or joint.limits is not None
+        return joint.type == "continuous" and not limited
 
     def _joint(self, joint: TreeJoint) -> Joint:
         part = "arm" if joint.name in self._arm else "hand"
@@ -267,7 +274,7 @@ class _Chosen:
             slack = 1e-6 + 1e-3 * float(np.ptp(values))
             return float(values.min()) - slack, float(values.max()) + slack
         if joint.type == "continuous":
-            return -ENDLESS, ENDLESS
+            return -CONTINUOUS_RANGE, CONTINUOUS_RANGE
         raise DescriptionError(
             f"{self._where}: joint {joint.name!r} of link {joint.child!r} states no limits; write "
             f"limits: {{{joint.name}: [LOWER, UPPER]}} under {self._key.rpartition(' ')[2]}"

@@ -55,6 +55,8 @@ class Actuator:
         velocity: Velocity limit [unit/s], inf if unknown.
         part: "arm" or "hand".
         effort: Largest torque or force, at its own position [N m or N], inf if unknown.
+        continuous: True for a motor without limits; lower and upper are then the range that is
+            searched, one turn to either side of zero.
     """
 
     name: str
@@ -64,3 +66,4 @@ class Actuator:
     velocity: float
     part: str
     effort: float = np.inf
+    continuous: bool = False

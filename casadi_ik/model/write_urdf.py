@@ -40,8 +40,11 @@ def to_urdf(robot: RobotDescription) -> str:
         element = ElementTree.SubElement(root, "link", name=link)
         _draw(element, link, robot, part)
         _solid(element, link, robot)
+    motors = zip(robot.actuator_names, robot.continuous, strict=True)
+    continuous = {name for name, unlimited in motors if unlimited}
     for joint in robot.joints:
-        element = ElementTree.SubElement(root, "joint", name=joint.name, type=joint.type)
+        kind = "continuous" if joint.name in continuous else joint.type
+        element = ElementTree.SubElement(root, "joint", name=joint.name, type=kind)
         _origin(element, joint.placement)
         ElementTree.SubElement(element, "parent", link=joint.parent)
         ElementTree.SubElement(element, "child", link=joint.child)
@@ -51,11 +54,11 @@ def to_urdf(robot: RobotDescription) -> str:
         if joint.coupling is not None and joint.coupling.slope is None:
             element.append(ElementTree.Comment(f" {joint.coupling} "))
         velocity = joint.velocity if math.isfinite(joint.velocity) else 10.0
+        ends = {} if kind == "continuous" else {"lower": joint.lower, "upper": joint.upper}
         ElementTree.SubElement(
             element,
             "limit",
-            lower=repr(joint.lower),
-            upper=repr(joint.upper),
+            {name: repr(end) for name, end in ends.items()},
             effort=repr(joint.effort if math.isfinite(joint.effort) else 0.0),
             velocity=repr(velocity),
         )

@@ -318,7 +318,9 @@ def free_way(
     util.setLogLevel(util.LogLevel.LOG_NONE)
     util.RNG.setSeed(seed + 1)  # OMPL takes the first of a process
     n = len(start)
-    lower, upper = robot.lower, robot.upper
+    endless = robot.description.continuous
+    lower = np.where(endless, np.minimum(start, end) - np.pi, robot.lower)
+    upper = np.where(endless, np.maximum(start, end) + np.pi, robot.upper)
     if not (query is None or isinstance(query, CollisionQuery)):
         # What is held stays held: but for rounding the hand does not move.
         hand = np.isin(np.arange(n), robot.description.hand_actuators)

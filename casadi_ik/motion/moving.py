@@ -446,10 +446,13 @@ class MovingSolver:
         )
 
     def _bounds(self, targets: TargetBatch | None) -> tuple[Array, Array]:
-        """(n,) lower and upper."""
+        """Return the (n,) lower and upper limits of motions, see `RobotDescription.stops`."""
         if targets is None:
             targets = self._anything(0.0)
-        return targets.bounds(self.robot.description)
+        robot = self.robot.description
+        lower, upper = targets.bounds(robot)
+        endless = robot.continuous & (lower < upper)
+        return np.where(endless, robot.stops[0], lower), np.where(endless, robot.stops[1], upper)
 
     def _anything(self, place: float) -> TargetBatch:
         """A target with all contacts at a place, or none if that is NaN."""

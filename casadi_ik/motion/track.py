@@ -283,7 +283,8 @@ class Path:
         robot = self.engine.robot
         change = after - before
         largest = int(np.argmax(np.abs(change) / (robot.upper - robot.lower)))
-        at = (held - robot.lower <= 1e-6) | (robot.upper - held <= 1e-6)
+        lower, upper = robot.description.stops
+        at = (held - lower <= 1e-6) | (upper - held <= 1e-6)
         names = tuple(name for name, there in zip(robot.actuators, at, strict=True) if there)
         return Jump(i, robot.actuators[largest], float(change[largest]), names)
 

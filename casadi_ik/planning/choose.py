@@ -34,6 +34,7 @@ from casadi_ik.solve.request import CLEARANCE, Request
 from casadi_ik.solve.solution import Choice, Ranking, Solution
 from casadi_ik.solve.status import Status
 from casadi_ik.solve.trials import Deduplicator, largest_of_each
+from casadi_ik.solve.turns import in_nearest_turns, nearest_turns, search_start
 
 Judgement: TypeAlias = str | Callable[[ArmHand, Array], ArrayLike]
 """One of `PREFERENCES`, or what gives configurations (m, n) of a robot their scores (m,)."""
@@ -352,7 +353,10 @@ class _Search:
             some = targets.rows(np.searchsorted(numbers, answers.owner[mine]))
             none = np.zeros(len(mine), dtype=np.int64)
             status = np.full(len(mine), int(Status.SOLVED), dtype=np.int64)
-            outcome = Outcome(answers.q[mine], status, none, none, np.zeros(len(mine)), {})
+            robot = self.engine.robot.description
+            near = replace(some, prefer="q0" if self.prefer == "q0" else "limits")
+            q = in_nearest_turns(robot, near, answers.q[mine], self.start)
+            outcome = Outcome(q, status, none, none, np.zeros(len(mine)), {})
             query, method = self.engine.collision_query(some), self.engine.method.name
             batch = judged(self.engine.robot, method, some, outcome, query)
             found |= {int(row): batch.solution(i) for i, row in enumerate(mine.tolist())}
@@ -371,7 +375,7 @@ class _Part:
     ) -> None:
         self.search, self.finder, self.targets, self.query = search, finder, targets, query
         self.prefer, self.trials = search.prefer, finder.trials
-        ends = finder.robot.home, search.start
+        ends = finder.robot.home, search_start(finder.robot.description, search.start)
         self.home, self.starts = (np.tile(q, (len(targets), 1)) for q in ends)
         self.limits = self.trials.limits(targets)
         fixed = np.full(len(search.start), np.nan) if targets.fixed is None else targets.fixed
@@ -395,7 +399,14 @@ class _Part:
         for row, pair in (pairs | more).items():
             reasons[row] = f"{Status.COLLISION.name}: {pair[0]} and {pair[1]}"
         reasons[owner] = ""
+        q = self._in_nearest_turns(q, owner)
         return Answers(q, owner, self._score(q, owner), self.finder.arm_margins(q), reasons)
+
+    def _in_nearest_turns(self, q: Array, owner: NDArray[np.intp]) -> Array:
+        """Return answers in the turns nearest to the start, see `nearest_turns`."""
+        bounds = self.limits.first.lower, self.limits.first.upper
+        near = self.prefer == "q0"
+        return nearest_turns(self.finder.robot.description, q, self.starts[owner], bounds, near)
 
     def _freed(
         self, q: Array, rows: NDArray[np.intp], query: CollisionQuery

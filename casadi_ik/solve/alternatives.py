@@ -37,6 +37,7 @@ from casadi_ik.solve.trials import (
     palm_parts,
     palms_of,
 )
+from casadi_ik.solve.turns import nearest_turns, search_start
 from casadi_ik.solve.verdict import contact_verdicts, judge
 
 APART = 0.25
@@ -185,12 +186,15 @@ class AlternativeFinder:
         preference(prefer, started=True)
         apart = checked_distance(apart)
         limits = self.trials.limits(targets).first
+        robot, bounds, start = self.robot.description, (limits.lower, limits.upper), q0
+        q0 = search_start(robot, start)
         found: list[_Found] = []
         for number, q in enumerate(self._postures(targets, q0, limits)):
             found += self._arms(targets, q, number, limits, q0, seed, prefer, query)
         if not found:
             return ()
         q = np.stack([item.q for item in found])
+        q = nearest_turns(robot, q, q0, bounds, prefer == "q0")
         solved = self.trials.solved(targets, q, targets.enforce_limits)
         if query is not None:
             solved &= query.free(q)
@@ -198,7 +202,9 @@ class AlternativeFinder:
         order = [int(i) for i in np.lexsort(-keys[::-1]) if solved[i]]
         parts = self._parts(q[order], list(range(q.shape[1])))
         kept = distinct(parts, apart)[:limit]
-        return tuple(self._described(targets, found[order[i]], q0) for i in kept)
+        q = nearest_turns(robot, q, start, bounds, prefer == "q0")
+        chosen = [replace(found[order[i]], q=q[order[i]]) for i in kept]
+        return tuple(self._described(targets, alternative, start) for alternative in chosen)
 
     def best_arm(self, targets: TargetBatch, q: Array, q0: Array, seed: int, prefer: str) -> Array:
         """The solution (n,) with the hand where a given one has it, and the best arm for it.

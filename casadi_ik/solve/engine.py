@@ -37,6 +37,7 @@ from casadi_ik.solve.request import CLEARANCE, NO_PREFERENCE, preference
 from casadi_ik.solve.sensitivity import SensitivityKernel
 from casadi_ik.solve.solution import BatchSolution, Solution
 from casadi_ik.solve.status import Status
+from casadi_ik.solve.turns import in_nearest_turns, search_start
 from casadi_ik.solve.verdict import judge_errors, judge_one, made
 
 MANIPULABILITY = "manipulability"
@@ -280,9 +281,11 @@ class Engine:
         if (query := self.collision_query(targets)) is not None:
             clear = query.check(q[None])
             if not clear.free[0]:
-                if (other := resolve_at_once(self.finder, targets, query, q, start)) is None:
+                near = search_start(robot.description, start)
+                if (other := resolve_at_once(self.finder, targets, query, q, near)) is None:
                     return None
                 q, verdict, clear = other
+                q = in_nearest_turns(robot.description, targets, q, start)
                 seconds = time.perf_counter() - begin
             distance, closest = float(clear.distance[0]), clear.pair(0)
         return made(
@@ -399,19 +402,20 @@ class Engine:
 
         def solve(rows: slice) -> SolvedPart:
             started, asked, q0 = time.time_ns(), targets.rows(rows), starts[rows]
-            outcome = known or self._run(asked, q0, run.seed, trace)
+            near = search_start(self.robot.description, q0)
+            outcome = known or self._run(asked, near, run.seed, trace)
             if outcome.rows is not None:
                 parts.learn(len(outcome.q), outcome.rows.nbytes)
             query = self.collision_query(asked)
             if query is None and targets.prefer == MANIPULABILITY:
-                outcome = self._most_manipulable(asked, q0, run.seed, outcome)
+                outcome = self._most_manipulable(asked, near, run.seed, outcome)
             batch = judged(self.robot, self.method.name, asked, outcome, query)
             if query is not None and self.hand_first is not None:
                 batch = resolve_collisions(
                     lambda some: self.kinds_of(some).finder,
                     asked,
                     query,
-                    q0,
+                    near,
                     run.seed,
                     outcome,
                     batch,
@@ -419,12 +423,14 @@ class Engine:
                 )
                 outcome = replace(outcome, q=batch.q, time=batch.time)
             if run.diagnose:
-                batch = self._diagnosed(asked, q0, outcome, batch)
+                batch = self._diagnosed(asked, near, outcome, batch)
                 if self.check is not None and len(targets) == 1:
                     again = Run(starts[0], run.seed)
                     batch = with_way_out(
                         lambda some: self.solve(some, again).success, self.check, asked, batch
                     )
+            q = in_nearest_turns(self.robot.description, asked, batch.q, q0)
+            batch = replace(batch, q=q)
             parts.pace(1e-9 * (time.time_ns() - started))
             return SolvedPart(asked, q0, started, outcome, batch, query)
 

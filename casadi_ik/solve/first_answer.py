@@ -16,7 +16,7 @@ import subprocess
 import sys
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from casadi_ik.collision.clearance import SceneCheck
@@ -29,6 +29,7 @@ from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.batches import judged
 from casadi_ik.solve.hand_first.method import HandFirstMethod
 from casadi_ik.solve.solution import Solution
+from casadi_ik.solve.turns import in_nearest_turns, search_start
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,10 @@ class FirstAnswers:
                 # A robot of its own: its functions are not those of the compiled method.
                 self._early = virtual, ArmHand(virtual.robot)
             virtual, robot = self._early
-            outcome = virtual.run(targets, start[None], 0, False, rounds=1)
+            near = search_start(virtual.robot, start)[None]
+            outcome = virtual.run(targets, near, 0, False, rounds=1)
+            q = in_nearest_turns(virtual.robot, targets, outcome.q, start)
+            outcome = replace(outcome, q=q)
             query = None
             if check is not None:
                 query = SceneCheck(robot, check.scene, compiled=False).collision_query(targets)

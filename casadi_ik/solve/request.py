@@ -437,9 +437,9 @@ class Request:
         return tuple(self.tolerances.values())
 
     def held(self, fixed: Mapping[str, float] | None) -> Array | None:
-        """Held actuators as an array; see `fixed_array`."""
+        """Return held actuators as an array; see `fixed_array`."""
         robot = self.robot
-        return fixed_array(fixed or {}, robot.actuators, robot.lower, robot.upper)
+        return fixed_array(fixed or {}, robot.actuators, *robot.description.stops)
 
     def start(self, q0: ArrayLike | None, name: str = "q0") -> Array:
         """One configuration (n,) to start from; None is the robot's home.

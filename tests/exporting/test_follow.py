@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import main
+from moved_base import on_pedestal
 from processes import said
 
 import casadi_ik as ik
@@ -210,3 +211,48 @@ def test_in_javascript_too(tmp_path):
     for i, row in enumerate(found["rows"]):
         targets = robot.contacts(robot.home + 5e-4 * i * (robot.upper - robot.home))
         np.testing.assert_allclose(row, follower(*targets), atol=1e-9)
+
+
+SOLVED = """
+#include <stdio.h>
+#include "arm.h"
+static arm_solver solver;
+int main(void) { /* q0, points, normals */
+  double row[ARM_MOTORS + 6 * ARM_FINGERS];
+  int i;
+  arm_init(&solver);
+  while (fread(row, sizeof row, 1, stdin) == 1) {
+    const double *points = row + ARM_MOTORS;
+    printf("%d", arm_solve(&solver, points, points + 3 * ARM_FINGERS, row));
+    for (i = 0; i < ARM_MOTORS; ++i) printf(" %a", solver.q[i]);
+    puts("");
+  }
+  return 0;
+}
+"""
+
+
+@needs_gcc
+def test_a_joint_without_limits_has_no_border(tmp_path):
+    """A solver answers in the turn nearest to q0, and a follower turns on."""
+    source = on_pedestal(ik.load_robot("ur5e+panda_hand"), tmp_path, continuous=("ur5e_joint_1",))
+    out = tmp_path / "solver"
+    words = ["export", str(source.description.path), "--prefix", "arm", "--follow"]
+    assert main([*words, "--out", str(out)]) == 0
+    count = 1500
+    q = np.tile([5.0, -1.2, 1.1, -0.6, -1.3, 0.5, 0.02], (count, 1))
+    q[:, 0] += np.pi * (1 - np.cos(np.linspace(0, np.pi, count)))
+    points, normals = source.contacts(q)
+    targets = np.concatenate([points.reshape(count, -1), normals.reshape(count, -1)], axis=1)
+    program = built(out, "solved", SOLVED, "arm_*")
+    statuses, answers = asked(program, np.concatenate([q - 0.1, targets], axis=1)[::100])
+    assert set(statuses) == {1}
+    assert np.abs(answers[:, 0] - q[::100, 0]).max() < 1.0
+    program = built(out, "followed", FOLLOWED, "arm_follow", "-O1")
+    palms = np.zeros((count, 13))
+    statuses, answers = asked(program, q[0], np.concatenate([targets, palms], axis=1))
+    assert set(statuses) == {1}
+    assert np.abs(answers[:, 0] - q[:, 0]).max() < 0.5
+    follower = ik.Solver(source).follow(q0=q[0], period=PERIOD)
+    followed = [follower(*target) for target in zip(points, normals, strict=True)]
+    np.testing.assert_allclose(followed, answers, atol=1e-6)

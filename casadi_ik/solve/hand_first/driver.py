@@ -37,6 +37,7 @@ from casadi_ik.solve.hand_first.seeds import FEATURES, Seeds
 from casadi_ik.solve.hand_first.state import HandFirstLayouts, terms
 from casadi_ik.solve.method import Outcome, Quick
 from casadi_ik.solve.status import Phase, Status
+from casadi_ik.solve.turns import TURN
 from casadi_ik.solve.verdict import LIMIT_SLACK, TOLERANCE_SLACK, made
 
 MALFORMED = -9
@@ -180,12 +181,13 @@ class SearchPlan:
             "N_MENDED": self.pool if self.mends else self.options.candidates,
             "N_MORE": len(layouts.contacts.data) - 2,
             "N_SIDES": len(self.sides),
+            "N_TURNING": len(robot.turning),
         }
 
     @property
     def fields(self) -> dict[str, tuple[str, int | None, str]]:
         """Type, length (None: a number) and meaning of what a search has in memory, 8 bytes."""
-        f, n, h, _, state, parameters, candidates, pool, mended, more, _ = self.sizes.values()
+        f, n, h, _, state, parameters, candidates, pool, mended, more, *_ = self.sizes.values()
         double, whole = "double", "int64_t"
         h = max(h, 1)  # a tool has no motors, and C no empty arrays
         return {
@@ -193,6 +195,11 @@ class SearchPlan:
             "normals": (double, 3 * f, ""),
             "more": (double, 3 * f * more + 1, "contacts' other vectors, without a verdict here"),
             "here": (double, n, "where the robot is"),
+            "turns": (
+                double,
+                max(self.sizes["N_TURNING"], 1),
+                "full turns taken off `here`",
+            ),
             "terms": (double, self.sizes["N_TERMS"], "tolerances, bounds, 1 = nearest wanted"),
             "most": (whole, None, "rounds of a search; 0: its first alone, no search without"),
             "q": (double, n, "the answer"),
@@ -294,6 +301,7 @@ class SearchPlan:
     def _real_numbers(self) -> dict[str, float]:
         return {
             "LENGTH": LENGTH,
+            "TURN": TURN,
             "UNIT": UNIT,
             "SMALL_LENGTH": SMALL,
             "LARGE_LENGTH": LARGE,
@@ -332,6 +340,7 @@ class SearchPlan:
             "TABLE_SQUEEZE": np.array([1 - spread.at_limits for spread in spreads]),
             "TABLE_ROWS": np.array([spread.count for spread in spreads]),
             **(self._side_tables() if self.sides else {}),
+            **(self._turning_tables() if robot.turning else {}),
         }
 
     def _side_tables(self) -> dict[str, NDArray[Any]]:
@@ -347,6 +356,12 @@ class SearchPlan:
             "SIDE_MOTORS": np.array([len(own) for own in motors]),
             "SIDE_PLACES": places,
         }
+
+    def _turning_tables(self) -> dict[str, NDArray[Any]]:
+        """Return the places in q of the motors that turn, and which of them have no limits."""
+        robot = self.layouts.robot
+        turning = np.array(robot.turning, dtype=np.int64)
+        return {"TURNING": turning, "CONTINUOUS": robot.continuous[turning].astype(np.int64)}
 
     def _finger_tables(self) -> dict[str, NDArray[Any]]:
         """Those by which postures are mended, filled up with zeros."""

@@ -168,6 +168,35 @@ static int judge(search *job) {
   return DONE;
 }
 
+#if N_TURNING
+/* A search begins within half a turn of zero where a motor has no limits: its bounds are no stops. */
+static void take_turns(search *job) {
+  int i;
+  for (i = 0; i < N_TURNING; ++i) {
+    const int k = TURNING[i];
+    job->turns[i] = CONTINUOUS[i] ? TURN * floor(job->here[k] / TURN + 0.5) : 0.0;
+    job->here[k] -= job->turns[i];
+  }
+}
+
+/* Moves motors of the answer by full turns to be nearest to `here`: those without limits, and the
+ * others within their bounds if that is preferred. A motor whose bounds are equal is held. */
+static void nearest_turns(search *job) {
+  int i;
+  for (i = 0; i < N_TURNING; ++i) {
+    const int k = TURNING[i];
+    const double low = job->terms[TERMS_LOWER + k], high = job->terms[TERMS_UPPER + k];
+    const double q = job->q[k], turns = floor((job->here[k] - q) / TURN + 0.5);
+    if (CONTINUOUS[i] && low < high) {
+      job->q[k] = q + TURN * turns + job->turns[i];
+    } else if (job->terms[TERMS_NEAREST] > 0) {
+      const double least = ceil((low - q) / TURN), most = floor((high - q) / TURN);
+      job->q[k] = q + TURN * clipped(turns, least < 0 ? least : 0.0, most > 0 ? most : 0.0);
+    }
+  }
+}
+#endif
+
 /* What follows when the loop has come to an end of the target's iterations, or it is new: the next
  * round (GOES_ON), or the answer (DONE); SLICE_OVER where this call may not begin one. */
 static int follow(void *method, int64_t slot, int64_t solve, int32_t *status) {
@@ -176,6 +205,9 @@ static int follow(void *method, int64_t slot, int64_t solve, int32_t *status) {
   (void) slot, (void) solve;
   if (*status != SOLVED_STATUS) {
     if (!job->may_begin) return SLICE_OVER;
+#if N_TURNING
+    if (goes_on) take_turns(job);
+#endif
     if (goes_on) job->round = job->again = job->n_bests = 0;
     else goes_on = choose_round(job);
   }
@@ -189,6 +221,9 @@ static int follow(void *method, int64_t slot, int64_t solve, int32_t *status) {
               : *status < 0 ? INVALID_STATUS : *status;
   if (job->again) job->terms[TERMS_NEAREST] = 1.0;
   memcpy(job->q, job->state + STATE_Q, sizeof job->q);
+#if N_TURNING
+  nearest_turns(job);
+#endif
   job->restarts = (int64_t) job->state[STATE_EARLIER]
                 + (int64_t) clipped((double) (int64_t) job->state[STATE_CANDIDATE], 0.0,
                                     N_CANDIDATES - 1);

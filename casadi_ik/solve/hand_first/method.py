@@ -290,7 +290,7 @@ class HandFirstMethod(LoopedMethod):
             self.robot,
             list(map(runs, self._sides)),
             targets,
-            np.clip(q0, *targets.bounds(self.robot)),
+            np.where(self.robot.continuous, q0, np.clip(q0, *targets.bounds(self.robot))),
             self.step.layouts.labels,
             self.graph.record.dtype if trace else None,
         )
