@@ -69,20 +69,20 @@ def lost_reason(frame: Array, used: NDArray[np.intp], wrist: int = 0) -> str:
     points = frame[used]
     if not np.isfinite(points).all():
         return "a keypoint is not finite"
-    for number in SENTINELS:
-        lost = (points == number).all(axis=1) & (used != wrist)
-        if lost.any():
-            return f"keypoint {used[lost][0]} is exactly {number:g} {number:g} {number:g}"
-    gaps = np.abs(points[:, None] - points).max(axis=2) + np.eye(len(points))
-    if not gaps.min() > 0:
+    rows = points.tolist()
+    for key, (x, y, z) in zip(used.tolist(), rows, strict=True):
+        if not (x == y == z and x in SENTINELS):
+            continue
+        if key == wrist:  # the origin may be there
+            away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+            if away[used == wrist][0] <= LIMITS.spread * float(np.median(away)):
+                continue
+        return f"keypoint {key} is exactly {x:g} {y:g} {z:g}"
+    if len(set(map(tuple, rows))) < len(rows):
         return "two keypoints coincide"
-    if any((frame[wrist] == number).all() for number in SENTINELS):
-        away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-        if away[used == wrist][0] > LIMITS.spread * float(np.median(away)):
-            return f"keypoint {wrist} is exactly {' '.join(f'{x:g}' for x in frame[wrist])}"
-    index, little = (frame[key] - frame[wrist] for key in KNUCKLES)
-    area = np.linalg.norm(np.cross(index, little))
-    if not area > LIMITS.flatness * np.linalg.norm(index) * np.linalg.norm(little):
+    index, little = frame[KNUCKLES[0]] - frame[wrist], frame[KNUCKLES[1]] - frame[wrist]
+    squares, along = float(index @ index) * float(little @ little), float(index @ little)
+    if not squares - along**2 > LIMITS.flatness**2 * squares:
         return "wrist and knuckles are on a line"
     return ""
 
@@ -90,7 +90,8 @@ def lost_reason(frame: Array, used: NDArray[np.intp], wrist: int = 0) -> str:
 def bone_lengths(frames: Array) -> Array:
     """Return the lengths (..., 20) of the bones of frames (..., 21, 3) [m]."""
     with np.errstate(invalid="ignore", over="ignore"):
-        return np.linalg.norm(frames[..., BONES[:, 1], :] - frames[..., BONES[:, 0], :], axis=-1)
+        along = frames[..., BONES[:, 1], :] - frames[..., BONES[:, 0], :]
+        return np.sqrt(np.einsum("...i,...i->...", along, along))
 
 
 class FrameFilter:
@@ -107,7 +108,8 @@ class FrameFilter:
         self._reference: Array | None = None
         self._accepted: Array | None = None
         self._newest: Array | None = None
-        self._elapsed = 0.0
+        self._lengths = np.zeros(len(BONES))
+        self._elapsed, self._count = 0.0, 0
         self.reason = ""
 
     def of_recording(self, frames: Array, times: Array) -> list[str]:
@@ -145,8 +147,11 @@ class FrameFilter:
         self.reason = self._problem(frame)
         if self.reason:
             return False
-        self._bones.append(bone_lengths(frame))
-        self._reference = _median(self._bones)
+        self._bones.append(self._lengths)
+        self._count += 1
+        # The median is of 1, 2, 4, ... frames at first, then taken when all frames are new.
+        if self._count % LIMITS.memory == 0 or self._count & (self._count - 1) == 0:
+            self._reference = _median(self._bones)
         self._accepted, self._elapsed = self._newest, 0.0
         return True
 
@@ -154,9 +159,9 @@ class FrameFilter:
         reason = lost_reason(frame, self._used, self._wrist)
         if reason:
             return reason
+        self._lengths = lengths = bone_lengths(frame)
         if self._reference is not None:
-            lengths = bone_lengths(frame)
-            palm = np.nanmax(np.append(self._reference[[4, 16]], 0.0))
+            palm = max(self._reference[4], self._reference[16])
             most = LIMITS.stretch * self._reference + LIMITS.palm_lengths * palm
             long = lengths > most
             if long.any():
@@ -166,8 +171,11 @@ class FrameFilter:
                     f"{self._reference[bone]:.3g} m in other frames"
                 )
         if self._accepted is not None:
-            moved = np.linalg.norm(frame[self._used] - self._accepted[self._used], axis=1)
-            if moved.max() > LIMITS.speed * self._elapsed + LIMITS.slack:
+            away = frame[self._used] - self._accepted[self._used]
+            most = LIMITS.speed * self._elapsed + LIMITS.slack
+            squares = np.einsum("ij,ij->i", away, away)
+            if squares.max() > most**2:
+                moved = np.sqrt(squares)
                 key = self._used[int(np.argmax(moved))]
                 return f"keypoint {key} jumps by {moved.max():.3g} m in {self._elapsed:.3g} s"
         return ""

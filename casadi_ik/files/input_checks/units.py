@@ -56,8 +56,7 @@ def warn_of_far_contacts(points: Array, where: str, base_travel: float = 0.0) ->
         base_travel: Distance that a mobile base goes [m].
     """
     most = USUAL.contact + base_travel
-    with np.errstate(invalid="ignore"):
-        beyond = np.abs(points) > most  # a point inside the box around the ball needs no length
+    beyond = np.abs(points) > most  # most points need no length: they are inside the box
     if not beyond.any():
         return
     away = float(np.linalg.norm(points[beyond.any(axis=-1)][0]))
