@@ -12,7 +12,7 @@ import casadi_ik as ik
 from casadi_ik.compile import FunctionKernel
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arms.recognise import srs_arm
-from casadi_ik.kinematics.arms.search import PARAMETERS, ArmTrials, Farthest
+from casadi_ik.kinematics.arms.search import ARM_SEARCH, ArmTrials, Farthest
 from casadi_ik.kinematics.closed_chain import closed_chain, split
 from casadi_ik.kinematics.forward import Pose, actuated
 
@@ -80,7 +80,7 @@ class HeldThumb:
             rest = np.flatnonzero(~found)
             if len(rest):
                 (margin,) = self._margin(rotation[rest], origin[rest], float(trial))
-                found[rest] = margin >= PARAMETERS.allowed
+                found[rest] = margin >= ARM_SEARCH.tolerance
         return found
 
     def in_reach(self, rotation: Array, origin: Array) -> NDArray[np.bool_]:

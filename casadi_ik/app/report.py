@@ -23,7 +23,7 @@ from rich.text import Text
 
 from casadi_ik.files.lazy_import import on_demand
 from casadi_ik.kinematics.arm_hand import ArmHand
-from casadi_ik.kinematics.arms.recognise import family_in_words
+from casadi_ik.kinematics.arms.recognise import describe_arm
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.solve.diagnosis import Diagnosis
 from casadi_ik.solve.solution import BatchSolution, Choice, Ranking, Solution
@@ -457,7 +457,7 @@ def robot_report(robot: RobotDescription, description: str = "") -> Group:
     pairs = {
         "fingers": f"{len(robot.fingers)}: {', '.join(fingers)}",
         "actuators": f"{len(robot.actuators)}: {', '.join(robot.actuator_names)}",
-        "arm": f"closed form: {family_in_words(robot)}" if robot.arm_actuators else "",
+        "arm": f"closed form: {describe_arm(robot)}" if robot.arm_actuators else "",
     }
     about = [Text(f"  {description}")] if description else []
     return Group(Text(robot.name, "bold"), *about, fields(pairs))

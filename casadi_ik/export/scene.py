@@ -21,7 +21,7 @@ from casadi_ik.export.single import ARM_ROUNDING, SinglePrecision, filled
 from casadi_ik.files.arrays import Array, even_steps
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.arms.family import ArmFamily
-from casadi_ik.kinematics.arms.search import PARAMETERS, arms_graph
+from casadi_ik.kinematics.arms.search import ARM_SEARCH, arms_graph
 from casadi_ik.kinematics.robot_kernels import RobotKernels
 from casadi_ik.solve.alternatives import side_links
 from casadi_ik.solve.arm_search import SearchValues
@@ -183,7 +183,7 @@ class SceneSources:
     @property
     def allowed(self) -> float:
         """How far within its bounds an arm has to be, [rad] negative: rounding at a limit."""
-        return PARAMETERS.allowed if self.single is None else -ARM_ROUNDING
+        return ARM_SEARCH.tolerance if self.single is None else -ARM_ROUNDING
 
     @property
     def margin(self) -> dict[str, str]:

@@ -17,7 +17,7 @@ from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.arms.family import SIGNS, ArmFamily, ClosedForm
-from casadi_ik.kinematics.arms.search import PARAMETERS
+from casadi_ik.kinematics.arms.search import ARM_SEARCH
 from casadi_ik.kinematics.forward import Pose, actuated
 from casadi_ik.kinematics.linear_algebra import manipulability
 from casadi_ik.model.description import RobotDescription
@@ -310,7 +310,7 @@ class AlternativeFinder:
     def _exact(self, targets: TargetBatch, found: list[_Found]) -> list[_Found]:
         """Arms that are only nearly of their form are brought to the contacts."""
         family = self.trials.method.step.arm
-        if not found or family is None or family.exact:
+        if not found or family is None or family.is_exact:
             return found
         starts = np.stack([item.q for item in found])
         ends = LocalRefinement(self.trials, targets).run(np.zeros(len(found), np.intp), starts)
@@ -467,14 +467,14 @@ class ArmBranches:
             return self._margins(palm, values, lower, upper)
 
         if not self.family.redundancy:
-            allowed = margins(np.zeros(1))[0] >= PARAMETERS.allowed
+            allowed = margins(np.zeros(1))[0] >= ARM_SEARCH.tolerance
             return [self._branch(int(row), None) for row in np.flatnonzero(allowed)]
         positions = self._positions(palm, lower, upper)
         refined = self._edges is None and not self.family.is_iterative
         if refined:
             peaks = _peaks(positions, margins)
             positions = np.unique(np.concatenate([positions, peaks]))
-        allowed = margins(positions) >= PARAMETERS.allowed
+        allowed = margins(positions) >= ARM_SEARCH.tolerance
         # With a row of none on either side every stretch has a beginning and an end.
         padded = np.pad(allowed, ((1, 1), (0, 0)))
         rows, first = np.nonzero((padded[1:-1] & ~padded[:-2]).T)
@@ -496,7 +496,7 @@ class ArmBranches:
         return arms[:, self._row(branch)]
 
     def _row(self, branch: ArmBranch) -> int:
-        signs = tuple(getattr(branch, part) for part in self.family.parts)
+        signs = tuple(getattr(branch, part) for part in self.family.sign_names)
         return SIGNS.index(signs) * self.family.roots + branch.root
 
     def best(
@@ -578,7 +578,7 @@ class ArmBranches:
 
     def _branch(self, row: int, stretch: tuple[float, float] | None) -> ArmBranch:
         number, root = divmod(row, self.family.roots)
-        signs = dict(zip(self.family.parts, SIGNS[number], strict=True))
+        signs = dict(zip(self.family.sign_names, SIGNS[number], strict=True))
         return ArmBranch(**signs, swivel=stretch, root=root)
 
 
@@ -600,7 +600,7 @@ def _peaks(grid: Array, margins: Callable[[Array], Array]) -> Array:
     margin = margins(grid)
     padded = np.pad(margin, ((1, 1), (0, 0)), constant_values=-np.inf)
     top = (padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:])
-    at, rows = np.nonzero(top & (margin < PARAMETERS.allowed))
+    at, rows = np.nonzero(top & (margin < ARM_SEARCH.tolerance))
     step, each = grid[1] - grid[0], np.arange(len(at))
     first, last = np.maximum(grid[at] - step, grid[0]), np.minimum(grid[at] + step, grid[-1])
     for _ in range(SEEKING.thirds if len(at) else 0):
@@ -617,6 +617,6 @@ def _ends(
     each = np.arange(len(inner))
     for _ in range(SEEKING.halvings if len(inner) else 0):
         middle = (inner + outer) / 2
-        allowed = margins(middle)[each, rows] >= PARAMETERS.allowed
+        allowed = margins(middle)[each, rows] >= ARM_SEARCH.tolerance
         inner, outer = np.where(allowed, middle, inner), np.where(allowed, outer, middle)
     return inner

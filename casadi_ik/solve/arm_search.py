@@ -26,7 +26,7 @@ from casadi_ik.compile.libraries import load_library
 from casadi_ik.files.arrays import Array, evenly
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.arms.family import ArmFamily
-from casadi_ik.kinematics.arms.search import PARAMETERS, arms_graph
+from casadi_ik.kinematics.arms.search import ARM_SEARCH, arms_graph
 from casadi_ik.solve.request import CLEARANCE
 
 SYMBOL = "casadi_ik_arm_search"
@@ -165,7 +165,7 @@ class ArmSearch:
     @property
     def exact(self) -> bool:
         """Whether the arms that are found carry their palms exactly."""
-        return self._family.exact
+        return self._family.is_exact
 
     def _load(self) -> Any:
         parts = map(driver_text, ("map_job", "clearance_job", "arm_search"))
@@ -268,7 +268,7 @@ class ArmSearch:
                 palms=palms[rows].ctypes.data,
                 starts=starts[rows].ctypes.data,
                 owner=None if whose is None else whose[rows].ctypes.data,
-                allowed=PARAMETERS.allowed,
+                allowed=ARM_SEARCH.tolerance,
                 count=rows.stop - rows.start,
                 chosen=memory(chosen[rows]),
                 score=memory(score[rows]),
@@ -329,7 +329,7 @@ class ArmSearch:
             turned = arms + TURN * np.floor((start - arms) / TURN + 0.5)
             arms = np.where((turned >= lower) & (turned <= upper), turned, arms)
         margin = np.minimum(arms - lower, upper - arms).min(axis=1)
-        inside = np.flatnonzero(reached & (margin >= PARAMETERS.allowed))
+        inside = np.flatnonzero(reached & (margin >= ARM_SEARCH.tolerance))
         q = np.tile(own, (len(inside), 1))
         q[:, self._columns] = np.clip(arms[inside], lower, upper)
         return q, np.append(np.tile(np.arange(rows), len(values)), rows)[inside]

@@ -22,7 +22,7 @@ import casadi_ik as ik
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arms.family import SIGNS, ArmFamily
 from casadi_ik.kinematics.arms.offset_wrist import OffsetWristArm
-from casadi_ik.kinematics.arms.recognise import arm_family, family_in_words, family_of, srs_arm
+from casadi_ik.kinematics.arms.recognise import arm_family, describe_arm, family_of, srs_arm
 from casadi_ik.kinematics.arms.screws import Screws, arm_screws
 from casadi_ik.kinematics.forward import Pose
 from casadi_ik.solve.alternatives import ArmBranches
@@ -101,7 +101,7 @@ def apart(one: Array, other: Array) -> Array:
 
 @pytest.mark.parametrize("name", KINDS)
 def test_an_arm_is_recognised_by_its_axes(name):
-    assert family_in_words(robot_of(name).description) == KINDS[name]
+    assert describe_arm(robot_of(name).description) == KINDS[name]
     assert family(name).exact == (name not in MODEL_ERROR and name not in OFFSET)
 
 
@@ -477,7 +477,7 @@ def test_the_stretches_are_all_that_is_allowed_and_no_more(name):
         # The configuration itself, turned by whole turns, is one of them.
         near = [arm.branches.arms(palm, b, np.linspace(*b.swivel, 2000)) for b in found]
         off = min(np.abs(np.angle(np.exp(1j * (arms - own)))).max(axis=1).min() for arms in near)
-        assert off < 0.02 or not arm.branches.family.exact
+        assert off < 0.02 or not arm.branches.family.is_exact
     assert inside_anywhere > 0
 
 

@@ -20,7 +20,7 @@ from casadi_ik.files.reading import convert, read_yaml
 from casadi_ik.files.shipped import BODIES, resolve, shipped_names
 from casadi_ik.files.units import json_schema
 from casadi_ik.integrations.datasets.layouts import ConventionFile
-from casadi_ik.kinematics.arms.recognise import family_in_words
+from casadi_ik.kinematics.arms.recognise import describe_arm
 from casadi_ik.model.load_grasp import CandidatesFile, GraspFile
 from casadi_ik.model.load_robot import load_description
 from casadi_ik.model.objects import ObjectFile
@@ -89,7 +89,7 @@ def _catalogue() -> list[RenderableType]:
         path = resolve(name, "arms")
         arm = convert(read_yaml(path), ArmFile, path)
         count = sum(joint.type != "fixed" for joint in arm.joints)
-        form = family_in_words(load_description(f"{name}+{some_hand}"))
+        form = describe_arm(load_description(f"{name}+{some_hand}"))
         arms.add_row(name, str(count), form, _short(arm.description))
     hands = table("hand", "motors", "fingers", "what it is", right=("motors", "fingers"))
     for name in shipped_names("hands"):

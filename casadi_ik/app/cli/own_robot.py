@@ -34,7 +34,7 @@ from casadi_ik.integrations.importing import imported
 from casadi_ik.integrations.importing.capsules import worst
 from casadi_ik.integrations.importing.imported import Imported, largest_difference, no_palm
 from casadi_ik.kinematics.arm_hand import ArmHand, load_robot
-from casadi_ik.kinematics.arms.recognise import family_in_words, is_searched
+from casadi_ik.kinematics.arms.recognise import describe_arm, is_searched
 from casadi_ik.papers.chandra import calibration
 
 LEAST_ARM = 4
@@ -192,7 +192,7 @@ def _import_report(
     for hand, one in zip(lines.hands, arms, strict=True):
         side = f"{hand.side} " if hand.side else ""
         pairs[f"{side}palm"] = f"{hand.link}: {hand.how}"
-        pairs[f"{side}closed form"] = family_in_words(one) if one.arm_actuators else ""
+        pairs[f"{side}closed form"] = describe_arm(one) if one.arm_actuators else ""
         if hand.thumb is not None:
             pairs[f"{side}thumb"] = f"{hand.thumb[0]}: {hand.thumb[1]}"
     for line in filter(None, (lines.arm, lines.hand)):

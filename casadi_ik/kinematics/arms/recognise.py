@@ -1,15 +1,15 @@
-"""The registry of families: which of them an arm is of, from its screws alone.
+"""Recognition of the family of an arm from its screws.
 
-This is the one place that knows the families. They are tried in this order:
+This is the only module that knows all families. They are tried in this order:
 
 1. spherical shoulder and wrist (S-R-S), exact;
 2. six joints, or seven with one swept: spherical wrist or shoulder with two axes that meet or are
-   parallel, or three parallel axes; the exact one of several, else the one with the least model
-   error, to be polished by Newton's steps;
-3. offset wrist: the last axis passes by where the two before it meet;
-4. locked joints: a stretch of seven or six joints is of one of these families.
+   parallel, or three parallel axes; an exact family if there is one, otherwise the one with the
+   smallest model error, whose solutions are refined by Newton steps;
+3. offset wrist: the last axis misses the intersection of the previous two;
+4. locked joints: seven or six consecutive joints belong to one of these families.
 
-What is of none is searched by damped steps (`kinematics.palm`).
+Arms of no family are solved by damped steps (`kinematics.palm`).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arms.family import ArmFamily, Sphere
-from casadi_ik.kinematics.arms.locked_joints import LockedJointArm, in_words, part
+from casadi_ik.kinematics.arms.locked_joints import LockedJointArm, describe_family, sub_chain
 from casadi_ik.kinematics.arms.offset_wrist import OffsetWristArm
 from casadi_ik.kinematics.arms.screws import (
     Screws,
@@ -41,36 +41,36 @@ from casadi_ik.kinematics.arms.six_joints import (
 from casadi_ik.kinematics.arms.srs import SrsArm
 from casadi_ik.model.description import RobotDescription
 
-MEETING = 1e-9
-"""How far axes of an exact arm pass each other [m], or are off perpendicular [rad]."""
+EXACT_TOLERANCE = 1e-9
+"""Largest distance between axes that meet [m] and deviation of right angles [rad] of exact arms."""
 
-NEAR = 1e-2
-"""Largest model error [m and rad]: what is left is for Newton's steps."""
+MAX_MODEL_ERROR = 1e-2
+"""Largest model error that Newton steps can remove [m and rad]."""
 
-APART = 1e-2
-"""Links [m] and angles [rad] below which an arm is too degenerate to be solved like this."""
+MIN_LINK = 1e-2
+"""Smallest links [m] and angles [rad] of an arm that is not degenerate."""
 
 
 def arm_family(robot: RobotDescription) -> ArmFamily | None:
-    """The family of a robot's arm, None if it has to be searched."""
+    """Return the family of a robot's arm; None if it has none."""
     try:
         screws = arm_screws(robot)
     except UnsupportedError:
         return None
-    return family_of(screws) or _locked(screws)
+    return family_of(screws) or _locked_joint_family(screws)
 
 
 def family_of(screws: Screws) -> ArmFamily | None:
-    """The family of a chain none of whose joints is locked."""
+    """Return the family of a chain without locked joints; None if it has none."""
     for recognise in FAMILIES:
-        found = recognise(screws)
-        if found is not None:
-            return found
+        family = recognise(screws)
+        if family is not None:
+            return family
     return None
 
 
 def srs_arm(robot: RobotDescription) -> SrsArm | None:
-    """A robot's arm if it is an S-R-S arm."""
+    """Return a robot's arm if it is an S-R-S arm, otherwise None."""
     try:
         return _srs(arm_screws(robot))
     except UnsupportedError:
@@ -78,29 +78,26 @@ def srs_arm(robot: RobotDescription) -> SrsArm | None:
 
 
 def is_searched(robot: RobotDescription) -> bool:
-    """Whether a robot has an arm of no family."""
+    """Return True if a robot has an arm without a family."""
     return bool(robot.arm_actuators) and arm_family(robot) is None
 
 
-def family_in_words(robot: RobotDescription) -> str:
-    """What a robot's arm is, for a reader."""
+def describe_arm(robot: RobotDescription) -> str:
+    """Describe a robot's arm in words."""
     if not robot.arm_actuators:
         return "no arm"
     family = arm_family(robot)
-    return "none, searched" if family is None else in_words(family)
+    return "none, searched" if family is None else describe_family(family)
 
 
-def _locked(screws: Screws) -> LockedJointArm | None:
-    """As few joints as possible are locked, rather the last ones than the first.
-
-    Rather so that the family needs no search of its own.
-    """
+def _locked_joint_family(screws: Screws) -> LockedJointArm | None:
+    """Return the family with as few locked joints as possible, preferably the last ones."""
     count = len(screws)
     for length in (7, 6):
         for recognise in FAMILIES:
             for first in range(count - length + 1 if count > length else 0):
                 solved = tuple(range(first, first + length))
-                inner = recognise(part(screws, solved))
+                inner = recognise(sub_chain(screws, solved))
                 if inner is not None:
                     locked = tuple(joint for joint in range(count) if joint not in solved)
                     return LockedJointArm(inner, screws, solved, locked)
@@ -108,156 +105,160 @@ def _locked(screws: Screws) -> LockedJointArm | None:
 
 
 def _srs(screws: Screws) -> SrsArm | None:
-    """Exact S-R-S arms only."""
+    """Recognise an exact S-R-S arm."""
     if len(screws) != 7:
         return None
-    ends = [_sphere(screws, places) for places in ((0, 1, 2), (4, 5, 6))]
-    # The elbow point is where axis 4 is closest to the lines of axes 3 and 5: on both links.
-    elbow, passes = meeting_point(screws, (2, 3, 4))
-    if passes > MEETING or any(end is None or end[2] > MEETING for end in ends):
+    spheres = [_sphere(screws, indices) for indices in ((0, 1, 2), (4, 5, 6))]
+    # The elbow point is nearest to axes 3, 4 and 5, and lies on both links.
+    elbow, miss = meeting_point(screws, (2, 3, 4))
+    if miss > EXACT_TOLERANCE or any(end is None or end[2] > EXACT_TOLERANCE for end in spheres):
         return None
-    shoulder, wrist = (end[1] for end in ends if end is not None)
+    shoulder, wrist = (end[1] for end in spheres if end is not None)
     for link in (elbow - shoulder.point, wrist.point - elbow):
-        if abs(link @ screws.axes[3]) > MEETING or np.linalg.norm(link) < 1e-6:
+        if abs(link @ screws.axes[3]) > EXACT_TOLERANCE or np.linalg.norm(link) < 1e-6:
             return None
     return SrsArm(screws, elbow, shoulder, wrist)
 
 
-def _six(screws: Screws) -> SixJoints | None:
-    """The one with the least model error."""
+def _six_joints(screws: Screws) -> SixJoints | None:
+    """Recognise the family of six joints with the smallest model error."""
     if len(screws) not in (6, 7):
         return None
     swept = len(screws) == 7
-    tried: Sequence[Callable[[Screws, bool], SixJoints | None]]
-    tried = (_meeting, _parallel_pair) if swept else (_meeting, _parallel_pair, _parallel_triple)
-    found = [
+    recognisers: Sequence[Callable[[Screws, bool], SixJoints | None]]
+    recognisers = (
+        (_meeting, _parallel_pair) if swept else (_meeting, _parallel_pair, _parallel_triple)
+    )
+    candidates = [
         family
         for chain in (screws, screws.reversed())
-        for recognise in tried
-        if (family := recognise(chain, swept)) is not None and family.model_error <= NEAR
+        for recognise in recognisers
+        if (family := recognise(chain, swept)) is not None and family.model_error <= MAX_MODEL_ERROR
     ]
-    # Of those that are exact the first: the fewest operations.
-    return min(found, key=lambda one: 0.0 if one.exact else one.model_error, default=None)
+    # Among exact families the first one needs the fewest operations.
+    return min(
+        candidates, key=lambda first: 0.0 if first.is_exact else first.model_error, default=None
+    )
 
 
 def _offset_wrist(screws: Screws) -> OffsetWristArm | None:
-    """Of two the one with the smaller offset."""
+    """Recognise an offset wrist; of two solutions the one with the smaller offset."""
     if len(screws) not in (6, 7):
         return None
-    swept, found = len(screws) == 7, []
+    swept, candidates = len(screws) == 7, []
     for chain in (screws, screws.reversed()):
-        *_, fifth, sixth = _places(swept)
-        point, passes = meeting_point(chain, (fifth - 1, fifth))
-        if passes > MEETING:
+        *_, fifth, sixth = _indices(swept)
+        point, miss = meeting_point(chain, (fifth - 1, fifth))
+        if miss > EXACT_TOLERANCE:
             continue
-        away, axis = chain.points[sixth] - point, chain.axes[sixth]
-        offset = away - axis * (axis @ away)
-        beside = _through(chain, (sixth,), point)
+        offset, axis = chain.points[sixth] - point, chain.axes[sixth]
+        offset = offset - axis * (axis @ offset)
+        nominal = _through(chain, (sixth,), point)
         for recognise in (_meeting, _parallel_pair):
-            ideal = recognise(beside, swept)
-            if ideal is not None and ideal.exact:
-                found.append(OffsetWristArm(chain, ideal, offset))
-    return min(found, key=lambda one: float(np.linalg.norm(one.offset)), default=None)
+            ideal = recognise(nominal, swept)
+            if ideal is not None and ideal.is_exact:
+                candidates.append(OffsetWristArm(chain, ideal, offset))
+    return min(candidates, key=lambda first: float(np.linalg.norm(first.offset)), default=None)
 
 
-FAMILIES: tuple[Callable[[Screws], ArmFamily | None], ...] = (_srs, _six, _offset_wrist)
-"""What recognises each family, in the order in which they are tried."""
+FAMILIES: tuple[Callable[[Screws], ArmFamily | None], ...] = (_srs, _six_joints, _offset_wrist)
+"""Recognition functions of the families, in the order in which they are tried."""
 
 
 def _meeting(screws: Screws, swept: bool) -> SphericalArm | None:
-    first, second, third, *_ = _places(swept)
-    end = _sphere(screws, _places(swept)[3:])
-    if end is None or divergence(screws, first, second) < APART:
+    first, second, third, *_ = _indices(swept)
+    end = _sphere(screws, _indices(swept)[3:])
+    if end is None or divergence(screws, first, second) < MIN_LINK:
         return None
-    screws, sphere, off = end
-    shoulder, passes = meeting_point(screws, (first, second))
+    screws, sphere, sphere_error = end
+    shoulder, miss = meeting_point(screws, (first, second))
     screws = _through(screws, (first, second), shoulder)
     swing = np.cross(screws.axes[third], sphere.point - screws.points[third])
-    away = np.cross(screws.axes[third], shoulder - screws.points[third])
-    if min(np.linalg.norm(swing), np.linalg.norm(away)) < APART:
+    offset = np.cross(screws.axes[third], shoulder - screws.points[third])
+    if min(np.linalg.norm(swing), np.linalg.norm(offset)) < MIN_LINK:
         return None
-    return MeetingAxes(screws, swept, max(off, passes), sphere, shoulder)
+    return MeetingAxes(screws, swept, max(sphere_error, miss), sphere, shoulder)
 
 
 def _parallel_pair(screws: Screws, swept: bool) -> SphericalArm | None:
-    first, second, third, *_ = _places(swept)
-    end = _sphere(screws, _places(swept)[3:])
-    if end is None or divergence(screws, first, second) < APART:
+    first, second, third, *_ = _indices(swept)
+    end = _sphere(screws, _indices(swept)[3:])
+    if end is None or divergence(screws, first, second) < MIN_LINK:
         return None
-    screws, sphere, off = end
-    lean = divergence(screws, second, third)
+    screws, sphere, sphere_error = end
+    misalignment = divergence(screws, second, third)
     screws = _aligned(screws, second, (third,))
-    upper = _across(screws, second, screws.points[third] - screws.points[second])
-    fore = _across(screws, second, sphere.point - screws.points[third])
-    if min(upper, fore) < APART:
+    upper = _distance_across(screws, second, screws.points[third] - screws.points[second])
+    fore = _distance_across(screws, second, sphere.point - screws.points[third])
+    if min(upper, fore) < MIN_LINK:
         return None
-    return ParallelPair(screws, swept, max(off, lean), sphere)
+    return ParallelPair(screws, swept, max(sphere_error, misalignment), sphere)
 
 
 def _parallel_triple(screws: Screws, swept: bool) -> ParallelTriple | None:
-    first, second, third, fourth, fifth, sixth = _places(swept)
-    lean = max(divergence(screws, second, place) for place in (third, fourth))
-    if lean > NEAR or divergence(screws, first, second) < APART:
+    first, second, third, fourth, fifth, sixth = _indices(swept)
+    misalignment = max(divergence(screws, second, index) for index in (third, fourth))
+    if misalignment > MAX_MODEL_ERROR or divergence(screws, first, second) < MIN_LINK:
         return None
-    if min(divergence(screws, fifth, place) for place in (second, sixth)) < APART:
+    if min(divergence(screws, fifth, index) for index in (second, sixth)) < MIN_LINK:
         return None
     screws = _aligned(screws, second, (third, fourth))
-    wrist, passes = meeting_point(screws, (fifth, sixth))
+    wrist, miss = meeting_point(screws, (fifth, sixth))
     screws = _through(screws, (fifth, sixth), wrist)
     links = (
         screws.points[third] - screws.points[second],
         screws.points[fourth] - screws.points[third],
     )
-    if min(_across(screws, second, link) for link in links) < APART:
+    if min(_distance_across(screws, second, link) for link in links) < MIN_LINK:
         return None
-    return ParallelTriple(screws, swept, max(lean, passes), wrist)
+    return ParallelTriple(screws, swept, max(misalignment, miss), wrist)
 
 
-def _places(swept: bool) -> tuple[int, int, int, int, int, int]:
+def _indices(swept: bool) -> tuple[int, int, int, int, int, int]:
     first = int(swept)
     return first, first + 1, first + 2, first + 3, first + 4, first + 5
 
 
-def _sphere(screws: Screws, places: tuple[int, int, int]) -> tuple[Screws, Sphere, float] | None:
-    """The sphere of three screws, the chain with an ideal one, and how far it is from that.
+def _sphere(screws: Screws, indices: tuple[int, int, int]) -> tuple[Screws, Sphere, float] | None:
+    """Return the chain with an ideal spherical joint of three screws, the joint, and its error.
 
-    None where they are far from one.
+    Returns None if the screws are far from a spherical joint.
     """
-    one, two, three = places
-    point, passes = meeting_point(screws, places)
-    oblique = max(obliqueness(screws, one, two), obliqueness(screws, two, three))
-    if max(passes, oblique) > NEAR:
+    first, two, three = indices
+    point, miss = meeting_point(screws, indices)
+    oblique = max(obliqueness(screws, first, two), obliqueness(screws, two, three))
+    if max(miss, oblique) > MAX_MODEL_ERROR:
         return None
-    z, y, third = screws.axes[list(places)]
+    z, y, third = screws.axes[list(indices)]
     y = _unit(y - z * (z @ y))
     third = _unit(third - y * (y @ third))
     x = np.cross(y, z).astype(float)
     axes = screws.axes.copy()
-    axes[list(places)] = z, y, third
-    ideal = _through(replace(screws, axes=axes), places, point)
+    axes[list(indices)] = z, y, third
+    ideal = _through(replace(screws, axes=axes), indices, point)
     offset = float(np.arctan2(third @ x, third @ z))
-    sphere = Sphere(places, point, np.column_stack([x, y, z]), offset)
-    return ideal, sphere, max(passes, oblique)
+    sphere = Sphere(indices, point, np.column_stack([x, y, z]), offset)
+    return ideal, sphere, max(miss, oblique)
 
 
-def _through(screws: Screws, places: Sequence[int], point: Array) -> Screws:
-    """Some axes moved to a point."""
+def _through(screws: Screws, indices: Sequence[int], point: Array) -> Screws:
+    """Return screws with some axes moved through a point."""
     points = screws.points.copy()
-    points[list(places)] = point
+    points[list(indices)] = point
     return replace(screws, points=points)
 
 
-def _aligned(screws: Screws, one: int, others: Sequence[int]) -> Screws:
-    """Some axes made parallel to one, each pointing as it did."""
+def _aligned(screws: Screws, reference: int, indices: Sequence[int]) -> Screws:
+    """Return screws with some axes made parallel to a reference axis, keeping their signs."""
     axes = screws.axes.copy()
-    for other in others:
-        axes[other] = axes[one] * np.sign(axes[one] @ axes[other])
+    for index in indices:
+        axes[index] = axes[reference] * np.sign(axes[reference] @ axes[index])
     return replace(screws, axes=axes)
 
 
-def _across(screws: Screws, place: int, vector: Array) -> float:
-    """Length of a vector across an axis [m]."""
-    return float(np.linalg.norm(np.cross(screws.axes[place], vector)))
+def _distance_across(screws: Screws, index: int, vector: Array) -> float:
+    """Return the length of a vector's component perpendicular to an axis [m]."""
+    return float(np.linalg.norm(np.cross(screws.axes[index], vector)))
 
 
 def _unit(vector: Array) -> Array:

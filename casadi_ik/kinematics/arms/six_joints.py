@@ -1,9 +1,9 @@
-"""Families of six joints, and of seven of which one is swept: the redundancy is its position.
+"""Families of six joints, and of seven joints with one that is swept as the redundancy parameter.
 
 Pieper (1968): the last three axes meet in a point, or the first three, seen from the palm. The
-point is moved by the other three alone; it has a closed form if the first two of them meet, or if
-the second and third are parallel. Then the last three make the rotation that is left. Universal
-Robots and others have three parallel axes in the middle instead.
+other three joints position this point; they have a closed form if the first two of their axes meet,
+or if the second and third are parallel. The spherical joint then makes the remaining rotation.
+Universal Robots and others have three parallel axes instead.
 """
 
 from __future__ import annotations
@@ -16,30 +16,30 @@ import casadi as ca
 import numpy as np
 
 from casadi_ik.files.arrays import Array
-from casadi_ik.kinematics.arms.family import Bend, ClosedForm, Redundancy, Sphere
+from casadi_ik.kinematics.arms.family import ClosedForm, ElbowBranch, Redundancy, Sphere
 from casadi_ik.kinematics.arms.screws import (
+    CosSin,
     Screws,
-    Turn,
     about_axis,
+    cos_sin_of,
     subproblem_1,
     subproblem_4,
-    turn,
 )
 from casadi_ik.kinematics.forward import Pose
 from casadi_ik.kinematics.smooth import Expr, safe_norm
 
 Signs = tuple[Expr, ...] | None
-"""First and second sign of a bend; None: of all."""
+"""First and second sign of an elbow branch; None: all branches."""
 
 
 @dataclass(frozen=True, eq=False)
 class SixJoints(ClosedForm):
-    """Six joints, and before them one that is swept, if there are seven.
+    """An arm of six solved joints, after a swept joint if there are seven.
 
     Attributes:
-        screws: Of the nominal arm, in the order of the solution.
-        swept: Whether the first screw is that of the swept joint.
-        model_error: How far the nominal arm is from the real one [m and rad].
+        screws: Screws of the nominal arm, in the order of the solution.
+        swept: True if the first screw belongs to a swept joint.
+        model_error: Deviation of the nominal arm from the real one [m and rad].
     """
 
     screws: Screws
@@ -47,359 +47,387 @@ class SixJoints(ClosedForm):
     model_error: float
 
     @abstractmethod
-    def six(self, motion: Pose, signs: Signs) -> list[Bend]:
-        """The four bends for a motion of the six, or that of two signs."""
+    def branches_of_six(self, motion: Pose, signs: Signs) -> list[ElbowBranch]:
+        """Return the four elbow branches for a motion of the six joints, or that of two signs."""
 
     @property
     def redundancy(self) -> tuple[Redundancy, ...]:
-        """The swept joint."""
+        """The swept joint, if there is one."""
         return (Redundancy(self.screws.joints[0]),) if self.swept else ()
 
     @property
-    def places(self) -> tuple[int, ...]:
-        """Places of the six screws that are solved for."""
+    def indices(self) -> tuple[int, ...]:
+        """Indices of the six solved screws."""
         return tuple(range(int(self.swept), len(self.screws)))
 
-    def bends(self, palm: Pose, redundancy: Expr, signs: Signs = None) -> list[Bend]:
-        """Those of the six for what the swept joint leaves them."""
-        found = self.six(self.left(palm, redundancy), signs)
+    def bends(self, palm: Pose, redundancy: Expr, signs: Signs = None) -> list[ElbowBranch]:
+        """Return the elbow branches of the six joints behind the swept joint."""
+        branches = self.branches_of_six(self.remaining_motion(palm, redundancy), signs)
         if not self.swept:
-            return found
-        own = {self.screws.joints[0]: redundancy[0]}
-        return [Bend(bend.joints | own, bend.ends, bend.slack) for bend in found]
+            return branches
+        swept_joint = {self.screws.joints[0]: redundancy[0]}
+        return [ElbowBranch(bend.joints | swept_joint, bend.ends, bend.slack) for bend in branches]
 
-    def left(self, palm: Pose, redundancy: Expr) -> Pose:
-        """The motion for a palm pose that the swept joint leaves to the other six."""
+    def remaining_motion(self, palm: Pose, redundancy: Expr) -> Pose:
+        """Return the motion that the six joints must make for a palm pose."""
         motion = self.screws.motion(palm)
         if not self.swept:
             return motion
         swept = redundancy[0]
-        back = Turn(ca.cos(swept), -ca.sin(swept)).about(self.screws.axes[0])
+        inverse = CosSin(ca.cos(swept), -ca.sin(swept)).rotation(self.screws.axes[0])
         point = ca.DM(self.screws.points[0])
-        return Pose(back @ motion.rotation, point + back @ (motion.origin - point))
+        return Pose(inverse @ motion.rotation, point + inverse @ (motion.origin - point))
 
 
 @dataclass(frozen=True, eq=False)
 class SphericalArm(SixJoints):
-    """An arm that ends in a sphere, or begins with one and is seen from the palm.
+    """An arm with a spherical wrist, or with a spherical shoulder and seen from the palm.
 
     Attributes:
-        end: The sphere.
+        end: The spherical joint.
     """
 
     end: Sphere
 
     @property
     def kind(self) -> str:
-        """Where the sphere is, and which joint is swept."""
+        """Position of the spherical joint, and the swept joint."""
         sphere = f"spherical {'shoulder' if self.screws.reverse else 'wrist'}"
         return f"{sphere}, joint {self.screws.joints[0] + 1} swept" if self.swept else sphere
 
     @abstractmethod
-    def beyond_reach(self, motion: Pose, lower: Expr, upper: Expr) -> Expr:
-        """`beyond` for a motion of all screws."""
+    def motion_out_of_reach(self, motion: Pose, lower: Expr, upper: Expr) -> Expr:
+        """Return `distance_out_of_reach` for a motion of all screws."""
 
-    def beyond(self, palm: Pose, lower: Expr, upper: Expr) -> Expr:
-        """By where the sphere's point has to be."""
-        return self.beyond_reach(self.screws.motion(palm), lower, upper)
+    def distance_out_of_reach(self, palm: Pose, lower: Expr, upper: Expr) -> Expr:
+        """Return the bound from the required position of the spherical joint's point."""
+        return self.motion_out_of_reach(self.screws.motion(palm), lower, upper)
 
-    def _base(self, joints: dict[int, Expr], turns: list[Turn], motion: Pose, slack: Expr) -> Bend:
-        """A bend of the first three screws, and what they leave to the sphere."""
-        left = motion.rotation
-        for place, one in zip(self.places, turns, strict=False):
-            left = one.back.about(self.screws.axes[place]) @ left
-        return Bend(joints, (self.end.triples(self.screws, left),), slack)
+    def _branch(
+        self, joints: dict[int, Expr], angles: list[CosSin], motion: Pose, slack: Expr
+    ) -> ElbowBranch:
+        """Return the elbow branch of three angles and the remaining rotation."""
+        remaining_motion = motion.rotation
+        for index, angle in zip(self.indices, angles, strict=False):
+            remaining_motion = angle.inverse.rotation(self.screws.axes[index]) @ remaining_motion
+        return ElbowBranch(joints, (self.end.triples(self.screws, remaining_motion),), slack)
 
-    def _swing(self, place: int) -> tuple[Array, Array, Array]:
-        """Where the sphere's point goes about a screw: ``constant + cosine c + sine s``, (3,)."""
-        axis, point = self.screws.axes[place], self.screws.points[place]
+    def _circle(self, index: int) -> tuple[Array, Array, Array]:
+        """Return the circle of the sphere's point about a screw: constant, cosine and sine part."""
+        axis, point = self.screws.axes[index], self.screws.points[index]
         foot = point + axis * (axis @ (self.end.point - point))
         return foot, self.end.point - foot, np.cross(axis, self.end.point - foot)
 
     def _target(self, motion: Pose) -> Expr:
-        """Where the sphere's point has to be, for a motion of all six."""
+        """Return the required position of the sphere's point for a motion of the six joints."""
         return motion.rotation @ ca.DM(self.end.point) + motion.origin
 
     def _span(
         self, vectors: tuple[Array, Array, Array], lower: Expr, upper: Expr
     ) -> tuple[Expr, Expr]:
-        """Smallest and largest length [m] of what the third screw swings, within its bounds."""
+        """Return the smallest and largest length [m] of a vector that the third screw rotates."""
         constant, cosine, sine = vectors
-        joint = self.screws.joints[self.places[2]]
+        joint = self.screws.joints[self.indices[2]]
         middle = float(constant @ constant + cosine @ cosine)
-        ahead, aside = 2 * float(constant @ cosine), 2 * float(constant @ sine)
-        swing, turning = float(np.hypot(ahead, aside)), float(np.arctan2(aside, ahead))
-        ends = lower[joint] - turning, upper[joint] - turning
-        most = _largest_cosine(*ends)
-        least = -_largest_cosine(ends[0] - np.pi, ends[1] - np.pi)
-        near, far = (ca.sqrt(ca.fmax(middle + swing * c, 0.0)) for c in (least, most))
-        return near, far
+        cos_part, sin_part = 2 * float(constant @ cosine), 2 * float(constant @ sine)
+        swing, phase = float(np.hypot(cos_part, sin_part)), float(np.arctan2(sin_part, cos_part))
+        interval = lower[joint] - phase, upper[joint] - phase
+        max_cosine = _largest_cosine(*interval)
+        min_cosine = -_largest_cosine(interval[0] - np.pi, interval[1] - np.pi)
+        min_distance, max_distance = (
+            ca.sqrt(ca.fmax(middle + swing * c, 0.0)) for c in (min_cosine, max_cosine)
+        )
+        return min_distance, max_distance
 
 
 @dataclass(frozen=True, eq=False)
 class MeetingAxes(SphericalArm):
-    """The first two of the six screws meet: the third alone sets the distance to the sphere.
+    """An arm whose first two screws meet; the third alone sets the distance to the sphere.
 
     Attributes:
-        shoulder: (3,) where they meet [m].
+        shoulder: (3,) intersection of the first two axes [m].
     """
 
     shoulder: Array
 
     @property
-    def parts(self) -> tuple[str, str, str]:
-        """Elbow, then what is between elbow and palm or base, then the sphere."""
+    def sign_names(self) -> tuple[str, str, str]:
+        """The elbow, the joint beyond it, the spherical joint."""
         if self.screws.reverse:
             return ("elbow", "wrist", "shoulder")
         return ("elbow", "shoulder", "wrist")
 
-    def six(self, motion: Pose, signs: Signs) -> list[Bend]:
-        """The four bends, or that of two signs."""
-        first, second, third = self.places[:3]
+    def branches_of_six(self, motion: Pose, signs: Signs) -> list[ElbowBranch]:
+        """Return the four elbow branches, or that of two signs."""
+        first, second, third = self.indices[:3]
         axes = self.screws.axes
         from_shoulder = self._target(motion) - ca.DM(self.shoulder)
-        constant, cosine, sine = self._swing(third)
+        constant, cosine, sine = self._circle(third)
         constant = constant - self.shoulder
-        ahead, aside = 2 * float(constant @ cosine), 2 * float(constant @ sine)
+        cos_part, sin_part = 2 * float(constant @ cosine), 2 * float(constant @ sine)
         fixed = float(constant @ constant + cosine @ cosine)
         *elbows, reachable = subproblem_4(
-            ca.SX(ahead), ca.SX(aside), ca.sumsqr(from_shoulder) - fixed
+            ca.SX(cos_part), ca.SX(sin_part), ca.sumsqr(from_shoulder) - fixed
         )
         bends = []
         height = ca.dot(ca.DM(axes[first]), from_shoulder)
-        for elbow in _picked(elbows, signs, 0):
+        for elbow in _with_sign(elbows, signs, 0):
             point = ca.DM(constant) + ca.DM(cosine) * elbow.cosine + ca.DM(sine) * elbow.sine
-            parts = (ca.dot(ca.DM(axes[first]), part) for part in about_axis(axes[second], point))
-            still, ahead_, aside_ = parts
-            *tilts, tiltable = subproblem_4(ahead_, aside_, height - still)
-            for tilt in _picked(tilts, signs, 1):
-                tilted = tilt.about(axes[second]) @ point
+            sign_names = (
+                ca.dot(ca.DM(axes[first]), part) for part in about_axis(axes[second], point)
+            )
+            constant_part, tilt_cos_part, tilt_sin_part = sign_names
+            *tilts, tiltable = subproblem_4(tilt_cos_part, tilt_sin_part, height - constant_part)
+            for tilt in _with_sign(tilts, signs, 1):
+                tilted = tilt.rotation(axes[second]) @ point
                 pan = subproblem_1(axes[first], tilted, from_shoulder)
                 joints = self.angle(first, pan) | self.angle(second, tilt)
                 joints |= self.angle(third, elbow)
                 slack = ca.fmin(reachable, tiltable)
-                bends.append(self._base(joints, [pan, tilt, elbow], motion, slack))
+                bends.append(self._branch(joints, [pan, tilt, elbow], motion, slack))
         return bends
 
-    def beyond_reach(self, motion: Pose, lower: Expr, upper: Expr) -> Expr:
-        """By the distance of the sphere's point from where the first two meet."""
-        constant, cosine, sine = self._swing(self.places[2])
-        near, far = self._span((constant - self.shoulder, cosine, sine), lower, upper)
+    def motion_out_of_reach(self, motion: Pose, lower: Expr, upper: Expr) -> Expr:
+        """Return the bound from the distance between the sphere's point and the shoulder."""
+        constant, cosine, sine = self._circle(self.indices[2])
+        min_distance, max_distance = self._span(
+            (constant - self.shoulder, cosine, sine), lower, upper
+        )
         if not self.swept:
-            return _outside(safe_norm(self._target(motion) - ca.DM(self.shoulder)), near, far)
-        # Turned about the swept axis the two points pass each other on circles.
+            return _distance_outside(
+                safe_norm(self._target(motion) - ca.DM(self.shoulder)), min_distance, max_distance
+            )
+        # About the swept axis both points move on circles.
         axis, foot = self.screws.axes[0], self.screws.points[0]
-        still = ca.DM(self.shoulder - foot)
-        seen = motion.rotation @ ca.DM(self.end.point) + motion.origin - ca.DM(foot)
-        along = ca.dot(ca.DM(axis), seen - still)
+        constant_part = ca.DM(self.shoulder - foot)
+        from_foot = motion.rotation @ ca.DM(self.end.point) + motion.origin - ca.DM(foot)
+        axial_distance = ca.dot(ca.DM(axis), from_foot - constant_part)
         radius = float(np.linalg.norm(np.cross(axis, self.shoulder - foot)))
-        far_out = safe_norm(ca.cross(ca.DM(axis), seen))
-        least = ca.sqrt(along**2 + (far_out - radius) ** 2 + 1e-300)
-        most = ca.sqrt(along**2 + (far_out + radius) ** 2 + 1e-300)
-        return ca.fmax(least - far, 0.0) + ca.fmin(most - near, 0.0)
+        radial_distance = safe_norm(ca.cross(ca.DM(axis), from_foot))
+        min_separation = ca.sqrt(axial_distance**2 + (radial_distance - radius) ** 2 + 1e-300)
+        max_separation = ca.sqrt(axial_distance**2 + (radial_distance + radius) ** 2 + 1e-300)
+        return ca.fmax(min_separation - max_distance, 0.0) + ca.fmin(
+            max_separation - min_distance, 0.0
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class ParallelPair(SphericalArm):
-    """The second and third of the six screws are parallel: they bend the arm in a plane.
+    """An arm whose second and third screws are parallel, so that they bend it in a plane.
 
-    The first one sets how far the sphere's point is aside of that plane.
+    The first screw sets the distance of the sphere's point from that plane.
     """
 
     @property
-    def parts(self) -> tuple[str, str, str]:
-        """What turns the plane, what bends in it, and the sphere."""
+    def sign_names(self) -> tuple[str, str, str]:
+        """The joint that turns the plane, the joint that bends in it, the spherical joint."""
         if self.screws.reverse:
             return ("wrist", "elbow", "shoulder")
         return ("shoulder", "elbow", "wrist")
 
-    def six(self, motion: Pose, signs: Signs) -> list[Bend]:
-        """The four bends, or that of two signs."""
-        first, second, third = self.places[:3]
+    def branches_of_six(self, motion: Pose, signs: Signs) -> list[ElbowBranch]:
+        """Return the four elbow branches, or that of two signs."""
+        first, second, third = self.indices[:3]
         axes, points = self.screws.axes, self.screws.points
         target = self._target(motion)
-        across = axes[second]
+        normal = axes[second]
         base, hinge = points[first], points[second]
-        out = target - ca.DM(base)
-        # The plane's normal turned by the first screw, seen from the target.
-        parts = (ca.dot(ca.DM(across), part) for part in about_axis(-axes[first], out))
-        still, ahead, aside = parts
-        wanted = float(across @ (self.end.point - base))
-        *pans, pannable = subproblem_4(ahead, aside, wanted - still)
-        constant, cosine, sine = self._swing(third)
+        from_base = target - ca.DM(base)
+        # Component along the plane's normal, which the first screw rotates.
+        sign_names = (ca.dot(ca.DM(normal), part) for part in about_axis(-axes[first], from_base))
+        constant_part, cos_part, sin_part = sign_names
+        target_offset = float(normal @ (self.end.point - base))
+        *pans, pannable = subproblem_4(cos_part, sin_part, target_offset - constant_part)
+        constant, cosine, sine = self._circle(third)
         constant = constant - hinge
-        constant = constant - across * (across @ constant)
-        bent, bent_aside = 2 * float(constant @ cosine), 2 * float(constant @ sine)
+        constant = constant - normal * (normal @ constant)
+        elbow_cos_part, elbow_sin_part = 2 * float(constant @ cosine), 2 * float(constant @ sine)
         fixed = float(constant @ constant + cosine @ cosine)
         bends = []
-        for pan in _picked(pans, signs, 0):
-            inside = pan.back.about(axes[first]) @ out + ca.DM(base - hinge)
-            inside = inside - ca.DM(across) * ca.dot(ca.DM(across), inside)
-            height = ca.sumsqr(inside) - fixed
-            *elbows, bendable = subproblem_4(ca.SX(bent), ca.SX(bent_aside), height)
-            for elbow in _picked(elbows, signs, 1):
+        for pan in _with_sign(pans, signs, 0):
+            in_plane = pan.inverse.rotation(axes[first]) @ from_base + ca.DM(base - hinge)
+            in_plane = in_plane - ca.DM(normal) * ca.dot(ca.DM(normal), in_plane)
+            height = ca.sumsqr(in_plane) - fixed
+            *elbows, bendable = subproblem_4(ca.SX(elbow_cos_part), ca.SX(elbow_sin_part), height)
+            for elbow in _with_sign(elbows, signs, 1):
                 point = ca.DM(constant) + ca.DM(cosine) * elbow.cosine + ca.DM(sine) * elbow.sine
-                tilt = subproblem_1(axes[second], point, inside)
+                tilt = subproblem_1(axes[second], point, in_plane)
                 joints = self.angle(first, pan) | self.angle(second, tilt)
                 joints |= self.angle(third, elbow)
                 slack = ca.fmin(pannable, bendable)
-                bends.append(self._base(joints, [pan, tilt, elbow], motion, slack))
+                bends.append(self._branch(joints, [pan, tilt, elbow], motion, slack))
         return bends
 
-    def beyond_reach(self, motion: Pose, lower: Expr, upper: Expr) -> Expr:
-        """By the distance of the sphere's point from the first two axes."""
-        first, second, third = self.places[:3]
+    def motion_out_of_reach(self, motion: Pose, lower: Expr, upper: Expr) -> Expr:
+        """Return the bound from the distance between the sphere's point and the first two axes."""
+        first, second, third = self.indices[:3]
         if self.swept:
             return ca.SX(0)
-        constant, cosine, sine = self._swing(third)
-        hinge, across = self.screws.points[second], self.screws.axes[second]
+        constant, cosine, sine = self._circle(third)
+        hinge, normal = self.screws.points[second], self.screws.axes[second]
         constant = constant - hinge
-        constant = constant - across * (across @ constant)
-        near, far = self._span((constant, cosine, sine), lower, upper)
+        constant = constant - normal * (normal @ constant)
+        min_distance, max_distance = self._span((constant, cosine, sine), lower, upper)
         axis, base = self.screws.axes[first], self.screws.points[first]
-        out = self._target(motion) - ca.DM(base)
-        aside = float(across @ (self.end.point - base))
-        wide = ca.sqrt(ca.fmax(ca.sumsqr(out) - ca.dot(ca.DM(axis), out) ** 2 - aside**2, 1e-24))
+        from_base = self._target(motion) - ca.DM(base)
+        sin_part = float(normal @ (self.end.point - base))
+        wide = ca.sqrt(
+            ca.fmax(ca.sumsqr(from_base) - ca.dot(ca.DM(axis), from_base) ** 2 - sin_part**2, 1e-24)
+        )
         to_hinge = hinge - base
-        lift, arm = float(axis @ to_hinge), float(np.cross(across, axis) @ to_hinge)
-        up = ca.dot(ca.DM(axis), out) - lift
-        # The plane may face the target or turn its back on it.
+        lift, arm = float(axis @ to_hinge), float(np.cross(normal, axis) @ to_hinge)
+        up = ca.dot(ca.DM(axis), from_base) - lift
+        # The plane can face the target from either side.
         reaches = [
-            _outside(ca.sqrt((wide - s * arm) ** 2 + up**2 + 1e-24), near, far) for s in (1, -1)
+            _distance_outside(
+                ca.sqrt((wide - s * arm) ** 2 + up**2 + 1e-24), min_distance, max_distance
+            )
+            for s in (1, -1)
         ]
         return ca.if_else(ca.fabs(reaches[0]) <= ca.fabs(reaches[1]), *reaches)
 
 
 @dataclass(frozen=True, eq=False)
 class ParallelTriple(SixJoints):
-    """Second to fourth of the six screws are parallel, fifth and sixth meet.
+    """An arm whose second to fourth screws are parallel and whose last two meet.
 
     Attributes:
-        wrist: (3,) where fifth and sixth meet [m].
+        wrist: (3,) intersection of the fifth and sixth axis [m].
     """
 
     wrist: Array
 
     @property
     def kind(self) -> str:
-        """What the arm is."""
+        """Description of the arm."""
         return "three parallel axes"
 
     @property
-    def parts(self) -> tuple[str, str, str]:
-        """What turns the plane, what leans out of it, what bends in it."""
+    def sign_names(self) -> tuple[str, str, str]:
+        """The joints that turn the plane, tilt out of it, bend in it."""
         return ("shoulder", "wrist", "elbow")
 
-    def six(self, motion: Pose, signs: Signs) -> list[Bend]:
-        """The four bends, or that of two signs."""
-        first, second, _, _, fifth, sixth = self.places
+    def branches_of_six(self, motion: Pose, signs: Signs) -> list[ElbowBranch]:
+        """Return the four elbow branches, or that of two signs."""
+        first, second, _, _, fifth, sixth = self.indices
         axes, points = self.screws.axes, self.screws.points
-        across = axes[second]
-        out = motion.rotation @ ca.DM(self.wrist) + motion.origin - ca.DM(points[first])
-        still, ahead, aside = (
-            ca.dot(ca.DM(across), part) for part in about_axis(-axes[first], out)
+        normal = axes[second]
+        from_base = motion.rotation @ ca.DM(self.wrist) + motion.origin - ca.DM(points[first])
+        constant_part, cos_part, sin_part = (
+            ca.dot(ca.DM(normal), part) for part in about_axis(-axes[first], from_base)
         )
-        wanted = float(across @ (self.wrist - points[first]))
-        *pans, pannable = subproblem_4(ahead, aside, wanted - still)
-        leans = [float(across @ part) for part in _parts(axes[fifth], axes[sixth])]
+        target_offset = float(normal @ (self.wrist - points[first]))
+        *pans, pannable = subproblem_4(cos_part, sin_part, target_offset - constant_part)
+        leans = [float(normal @ part) for part in _coefficients(axes[fifth], axes[sixth])]
         bends = []
-        for pan in _picked(pans, signs, 0):
-            facing = pan.back.about(axes[first]) @ motion.rotation
-            height = ca.dot(ca.DM(across), facing @ ca.DM(axes[sixth])) - leans[0]
+        for pan in _with_sign(pans, signs, 0):
+            facing = pan.inverse.rotation(axes[first]) @ motion.rotation
+            height = ca.dot(ca.DM(normal), facing @ ca.DM(axes[sixth])) - leans[0]
             *tilts, leanable = subproblem_4(ca.SX(leans[1]), ca.SX(leans[2]), height)
-            for tilt in _picked(tilts, signs, 1):
+            for tilt in _with_sign(tilts, signs, 1):
                 slack = ca.fmin(pannable, leanable)
                 bends.append(self._planar(pan, tilt, facing, motion, slack))
         return bends
 
-    def _planar(self, pan: Turn, tilt: Turn, facing: Expr, motion: Pose, slack: Expr) -> Bend:
-        """What is left to the three parallel screws."""
-        first, second, third, fourth, fifth, sixth = self.places
+    def _planar(
+        self, pan: CosSin, tilt: CosSin, facing: Expr, motion: Pose, slack: Expr
+    ) -> ElbowBranch:
+        """Solve the three parallel screws for the remaining motion."""
+        first, second, third, fourth, fifth, sixth = self.indices
         axes, points = self.screws.axes, self.screws.points
-        across = axes[second]
-        seen = tilt.back.about(axes[fifth]) @ ca.DM(across)
-        roll = subproblem_1(axes[sixth], facing.T @ ca.DM(across), seen)
-        # The motion of the three: a turn about `across`, and where it takes the fourth axis.
-        turned = facing @ roll.back.about(axes[sixth]) @ tilt.back.about(axes[fifth])
-        start = _perpendicular(across)
-        whole = subproblem_1(across, ca.DM(start), turned @ ca.DM(start))
-        at = motion.rotation @ ca.DM(self.wrist) + motion.origin - ca.DM(points[first])
-        wrist = pan.back.about(axes[first]) @ at + ca.DM(points[first])
+        normal = axes[second]
+        from_foot = tilt.inverse.rotation(axes[fifth]) @ ca.DM(normal)
+        roll = subproblem_1(axes[sixth], facing.T @ ca.DM(normal), from_foot)
+        # The motion of the three: a rotation about `normal`, and the position of the fourth axis.
+        rotation_before = (
+            facing @ roll.inverse.rotation(axes[sixth]) @ tilt.inverse.rotation(axes[fifth])
+        )
+        start = _perpendicular(normal)
+        total = subproblem_1(normal, ca.DM(start), rotation_before @ ca.DM(start))
+        from_base_point = motion.rotation @ ca.DM(self.wrist) + motion.origin - ca.DM(points[first])
+        wrist = pan.inverse.rotation(axes[first]) @ from_base_point + ca.DM(points[first])
         hinge = points[second]
-        to_fourth = wrist + turned @ ca.DM(points[fourth] - self.wrist) - ca.DM(hinge)
-        inside = to_fourth - ca.DM(across) * ca.dot(ca.DM(across), to_fourth)
+        to_fourth = wrist + rotation_before @ ca.DM(points[fourth] - self.wrist) - ca.DM(hinge)
+        in_plane = to_fourth - ca.DM(normal) * ca.dot(ca.DM(normal), to_fourth)
         upper, fore = (
-            link - across * (across @ link)
+            link - normal * (normal @ link)
             for link in (points[third] - hinge, points[fourth] - points[third])
         )
-        ahead, aside = 2 * float(upper @ fore), 2 * float(upper @ np.cross(across, fore))
+        cos_part, sin_part = 2 * float(upper @ fore), 2 * float(upper @ np.cross(normal, fore))
         fixed = float(upper @ upper + fore @ fore)
-        *elbows, bendable = subproblem_4(ca.SX(ahead), ca.SX(aside), ca.sumsqr(inside) - fixed)
-        ends = []
+        *elbows, bendable = subproblem_4(
+            ca.SX(cos_part), ca.SX(sin_part), ca.sumsqr(in_plane) - fixed
+        )
+        flips = []
         for elbow in elbows:
-            reached = ca.DM(upper) + elbow.about(across) @ ca.DM(fore)
-            lift = subproblem_1(across, reached, inside)
-            last = whole.plus(lift.back).plus(elbow.back)
-            last = turn(last.cosine, last.sine)
-            ends.append(
+            wrist_position = ca.DM(upper) + elbow.rotation(normal) @ ca.DM(fore)
+            lift = subproblem_1(normal, wrist_position, in_plane)
+            last = total.compose(lift.inverse).compose(elbow.inverse)
+            last = cos_sin_of(last.cosine, last.sine)
+            flips.append(
                 self.angle(second, lift)
                 | self.angle(third, self._signed(third, elbow))
                 | self.angle(fourth, self._signed(fourth, last))
             )
         joints = self.angle(first, pan) | self.angle(fifth, tilt) | self.angle(sixth, roll)
-        return Bend(joints, ((ends[0], ends[1]),), ca.fmin(slack, bendable))
+        return ElbowBranch(joints, ((flips[0], flips[1]),), ca.fmin(slack, bendable))
 
-    def _signed(self, place: int, about_second: Turn) -> Turn:
-        """A turn about the second axis as one about another of the three."""
-        same = self.screws.axes[place] @ self.screws.axes[self.places[1]] > 0
-        return about_second if same else about_second.back
+    def _signed(self, index: int, about_second: CosSin) -> CosSin:
+        """Convert an angle about the second axis to one about another of the three axes."""
+        is_parallel = self.screws.axes[index] @ self.screws.axes[self.indices[1]] > 0
+        return about_second if is_parallel else about_second.inverse
 
-    def beyond(self, palm: Pose, lower: Expr, upper: Expr) -> Expr:
-        """By the distance of the wrist from the shoulder's axes, the elbow bent as it likes."""
+    def distance_out_of_reach(self, palm: Pose, lower: Expr, upper: Expr) -> Expr:
+        """Return the bound from the distance between wrist and shoulder axes."""
         del lower, upper
-        _, second, third, fourth, *_ = self.places
+        _, second, third, fourth, *_ = self.indices
         points = self.screws.points
         axis = self.screws.axes[second]
         links = np.diff([*points[[second, third, fourth]], self.wrist], axis=0)
         flat = links - np.outer(links @ axis, axis)
-        far = float(np.linalg.norm(flat, axis=1).sum())
+        max_distance = float(np.linalg.norm(flat, axis=1).sum())
         motion = self.screws.motion(palm)
-        first = self.places[0]
-        about, base = self.screws.axes[first], points[first]
-        out = motion.rotation @ ca.DM(self.wrist) + motion.origin - ca.DM(base)
-        aside = float(axis @ (self.wrist - base))
+        first = self.indices[0]
+        first_axis, base = self.screws.axes[first], points[first]
+        from_base = motion.rotation @ ca.DM(self.wrist) + motion.origin - ca.DM(base)
+        sin_part = float(axis @ (self.wrist - base))
         hinge = points[second] - base
-        lift, arm = float(about @ hinge), abs(float(np.cross(axis, about) @ hinge))
-        up = ca.dot(ca.DM(about), out) - lift
-        wide = ca.sqrt(ca.fmax(ca.sumsqr(out) - ca.dot(ca.DM(about), out) ** 2 - aside**2, 1e-24))
-        return ca.fmax(ca.sqrt((wide - arm) ** 2 + up**2 + 1e-24) - far, 0.0)
+        lift, arm = float(first_axis @ hinge), abs(float(np.cross(axis, first_axis) @ hinge))
+        up = ca.dot(ca.DM(first_axis), from_base) - lift
+        wide = ca.sqrt(
+            ca.fmax(
+                ca.sumsqr(from_base) - ca.dot(ca.DM(first_axis), from_base) ** 2 - sin_part**2,
+                1e-24,
+            )
+        )
+        return ca.fmax(ca.sqrt((wide - arm) ** 2 + up**2 + 1e-24) - max_distance, 0.0)
 
 
-def _picked(turns: Sequence[Turn], signs: Signs, place: int) -> Sequence[Turn]:
-    """Both turns, or the one of a sign."""
+def _with_sign(angles: Sequence[CosSin], signs: Signs, index: int) -> Sequence[CosSin]:
+    """Return both angles, or the one of a sign."""
     if signs is None:
-        return turns
-    one, other = turns
-    return (one.or_other(signs[place] > 0, other),)
+        return angles
+    first, second = angles
+    return (first.select(signs[index] > 0, second),)
 
 
 def _largest_cosine(first: Expr, last: Expr) -> Expr:
-    """The largest cosine of the angles from `first` to `last` [rad]."""
-    turns = ca.floor(last / (2 * np.pi)) * 2 * np.pi
-    return ca.if_else(turns >= first, 1.0, ca.fmax(ca.cos(first), ca.cos(last)))
+    """Return the largest cosine of the angles from `first` to `last` [rad]."""
+    last_full_turn = ca.floor(last / (2 * np.pi)) * 2 * np.pi
+    return ca.if_else(last_full_turn >= first, 1.0, ca.fmax(ca.cos(first), ca.cos(last)))
 
 
-def _outside(distance: Expr, near: Expr, far: Expr) -> Expr:
-    """How far a distance is out of a span: > 0 beyond it, < 0 short of it."""
-    return distance - ca.fmin(ca.fmax(distance, near), far)
+def _distance_outside(distance: Expr, min_distance: Expr, max_distance: Expr) -> Expr:
+    """Return by how much a distance is outside an interval: > 0 above, < 0 below."""
+    return distance - ca.fmin(ca.fmax(distance, min_distance), max_distance)
 
 
-def _parts(axis: Array, vector: Array) -> tuple[Array, Array, Array]:
+def _coefficients(axis: Array, vector: Array) -> tuple[Array, Array, Array]:
     constant = axis * (axis @ vector)
     return constant, vector - constant, np.cross(axis, vector)
 
 
 def _perpendicular(axis: Array) -> Array:
     helper = np.eye(3)[int(np.argmin(np.abs(axis)))]
-    across = np.cross(axis, helper).astype(float)
-    return across / np.linalg.norm(across)
+    normal = np.cross(axis, helper).astype(float)
+    return normal / np.linalg.norm(normal)

@@ -19,7 +19,7 @@ from casadi_ik.compile.layout import Layout
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arms.family import ArmFamily
 from casadi_ik.kinematics.arms.recognise import arm_family
-from casadi_ik.kinematics.arms.search import PARAMETERS, ArmTrials, Farthest
+from casadi_ik.kinematics.arms.search import ARM_SEARCH, ArmTrials, Farthest
 from casadi_ik.kinematics.box_qp import Bounded, clip, damped_step
 from casadi_ik.kinematics.contact_fit import FIT, Tried, fresh_fit, judge, judge_contacts
 from casadi_ik.kinematics.contacts import LENGTH, Kinds
@@ -252,13 +252,13 @@ class BodyStep(HandFirstStep):
             columns = list(side.arm)
             bounds = p["lower"][columns], p["upper"][columns]
             if side.family is None:
-                found += [s["q"][columns], ca.MX(PARAMETERS.outside), ca.MX(0), ca.MX(0)]
+                found += [s["q"][columns], ca.MX(ARM_SEARCH.outside), ca.MX(0), ca.MX(0)]
                 continue
             search = ArmTrials(side.family, Farthest())
             best = s["arm"][side.arms], s["swivel"][side.place]
             arm, margin, swivel = search.trial(Pose(*pose), bounds, s["spent"], best, visit)
-            hits: Expr = margin >= PARAMETERS.allowed
-            if not side.family.exact:
+            hits: Expr = margin >= ARM_SEARCH.tolerance
+            if not side.family.is_exact:
                 polish = newton_polish(side.robot, side.family.model_error)
                 limits = (p[name][side.motors] for name in ("lower", "upper"))
                 arm, hits = polish(arm, *pose, *limits)

@@ -15,7 +15,7 @@ import numpy as np
 from casadi_ik.compile.codegen import define, define_arrays, number, row_major
 from casadi_ik.compile.function_kernel import BufferedFunction
 from casadi_ik.files.arrays import Array, even_steps
-from casadi_ik.kinematics.arms.search import PARAMETERS as ARM_SEARCH
+from casadi_ik.kinematics.arms.search import ARM_SEARCH
 from casadi_ik.kinematics.contact_fit import BALANCE, FIT, fresh_fit
 from casadi_ik.kinematics.contacts import LENGTH
 from casadi_ik.kinematics.palm import NUMERIC_ARM, start_table
@@ -61,7 +61,7 @@ def text(step: HandFirstStep) -> str:
         "HAS_FAMILY": step.placements is not None,
         "HAS_CHOICE": step.choices is not None,
         "IS_COMPLETE": not numeric,
-        "IS_EXACT": step.arm is not None and step.arm.exact,
+        "IS_EXACT": step.arm is not None and step.arm.is_exact,
         "NEAR_IS_SEARCHED": step.searched_if_near,
     }
     numbers = {
@@ -263,7 +263,7 @@ class Iteration:
                 if not within:
                     put(margin=ARM_SEARCH.no_margin)
                     return goes_to(placement())
-                return with_arm(step.arm is not None and step.arm.exact and x["fits"] > 0)
+                return with_arm(step.arm is not None and step.arm.is_exact and x["fits"] > 0)
             case Stage.ARM_STEPS:
                 exact = said["cost"] < FIT.exact * FIT.exact
                 sent = int(said["at_end"]) if settled and x["earlier"] > 0 else 0

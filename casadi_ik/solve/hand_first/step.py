@@ -28,7 +28,7 @@ import casadi as ca
 from casadi_ik.compile.codegen import Stages
 from casadi_ik.compile.graphs import StepGraph, recipe
 from casadi_ik.kinematics.arms.family import ArmFamily
-from casadi_ik.kinematics.arms.search import PARAMETERS, ArmTrials, Farthest, Nearest, is_allowed
+from casadi_ik.kinematics.arms.search import ARM_SEARCH, ArmTrials, Farthest, Nearest, is_allowed
 from casadi_ik.kinematics.box_qp import clip
 from casadi_ik.kinematics.contact_fit import (
     Tried,
@@ -134,10 +134,10 @@ def reach_row(
         x.origin + x.rotation @ shift,
     )
     bounds = p["lower"][list(columns)], p["upper"][list(columns)]
-    beyond = arm.beyond(moved, *bounds)
+    beyond = arm.distance_out_of_reach(moved, *bounds)
     if beyond is None:
         return None
-    if not arm.exact:
+    if not arm.is_exact:
         # What the nominal arm cannot reach by so little the real one may.
         error = arm.model_error
         beyond -= ca.fmin(ca.fmax(beyond, -error), error)
@@ -261,7 +261,7 @@ class HandFirstStep:
         """Trials of a placement, of one in later rounds, of a choice, of one that finds nothing."""
         far, near = self.placements, self.choices
         of_placement = (far.trials, far.all_trials) if far else (0, 0)
-        return *of_placement, *((near.trials, near.patience) if near else (0, 0))
+        return *of_placement, *((near.trials, near.hopeful_trials) if near else (0, 0))
 
     @cached_property
     def stages(self) -> dict[Any, Callable[[], ca.Function]]:
@@ -277,7 +277,7 @@ class HandFirstStep:
             # What no place of locked joints brought within limits is searched in later rounds, and
             # so is what Newton's steps did not lead to from the nominal arm: near a singularity
             # they lead nowhere near.
-            if self.arm is None or not self.arm.complete:
+            if self.arm is None or not self.arm.is_complete:
                 found[Stage.ARM_STEPS] = self._arm_step
         if self.placements is not None:
             found[Stage.ARM_PLACEMENT] = partial(self._placement, self.placements)
@@ -359,7 +359,7 @@ class HandFirstStep:
             "palm_rotation": rotation,
             "palm_origin": origin,
             "cost": 0.0,
-            "margin": PARAMETERS.no_margin,
+            "margin": ARM_SEARCH.no_margin,
             "starts": 0.0,
         } | fresh_fit()
         record = self.layouts.row(s, p, q, Phase.CANDIDATE)
@@ -396,7 +396,7 @@ class HandFirstStep:
         visit, best = s["candidate"] + s["earlier"], (s["arm"], s["swivel"])
         arm, margin, swivel = search.trial(Pose(*pose), bounds, s["spent"], best, visit)
         hits: Expr = ca.MX(1)
-        if not search.family.exact:
+        if not search.family.is_exact:
             polish = newton_polish(self.robot, search.family.model_error)
             arm, hits = polish(arm, *pose, p["lower"], p["upper"])
         outputs = self._kept(Stage.ARM_PLACEMENT, search)(*inputs, arm, margin, swivel, hits)
@@ -419,11 +419,11 @@ class HandFirstStep:
         arm = ca.SX.sym("arm", len(columns))
         score, swivel, hits = (ca.SX.sym(name) for name in ("score", "swivel", "hits"))
         # What is looked for in a part of the range is not compared with what was found before.
-        begins = ca.SX(0) if near else search.begins(s["spent"])
-        former = ca.if_else(begins, PARAMETERS.no_margin, s["margin"])
+        begins = ca.SX(0) if near else search.starts_subinterval(s["spent"])
+        former = ca.if_else(begins, ARM_SEARCH.no_margin, s["margin"])
         better, best_score = score > former, ca.fmax(score, former)
-        allowed = is_allowed(best_score) if near else best_score >= PARAMETERS.allowed
-        if not search.family.exact and not near:
+        allowed = is_allowed(best_score) if near else best_score >= ARM_SEARCH.tolerance
+        if not search.family.is_exact and not near:
             # Newton's steps keep within limits, whether or not the nominal arm did.
             better, allowed = ca.logic_or(better, hits), ca.logic_or(allowed, hits)
         best = ca.if_else(better, arm, s["arm"])

@@ -360,8 +360,8 @@ class ThumbFirstStep(ThumbFirstLayouts):
         for score in (Nearest.by_ranges(ranges), Farthest()):
             search = ArmTrials(family, score)
             arm, value, swivel = search.trial(palm, bounds, first, (here, first), first, here)
-            if search.is_nearest and search.closer is not None:
-                around = ca.MX(search.closer)
+            if search.is_nearest and search.first_local_trial is not None:
+                around = ca.MX(search.first_local_trial)
                 other, better, _ = search.trial(palm, bounds, around, (arm, swivel), first, here)
                 arm = ca.if_else(better > value, other, arm)
             cases.append(ca.Function("near_or_far", inputs, [arm]))
