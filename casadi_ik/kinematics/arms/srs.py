@@ -117,8 +117,8 @@ class SrsArm(ClosedForm):
             elbow, slack, *spheres = self._without_swivel(palm, sign)
             joints = (self.shoulder_joints, self.wrist_joints)
             flips = tuple(
-                sphere.read(self.screws, constant + cosine * direction + sine * sine_part)
-                for sphere, (constant, direction, sine_part) in zip(joints, spheres, strict=True)
+                sphere.angles_of(self.screws, constant + cosine * cos_term + sine * sin_term)
+                for sphere, (constant, cos_term, sin_term) in zip(joints, spheres, strict=True)
             )
             branches.append(ElbowBranch({3: elbow}, flips, slack))
         return branches
@@ -174,9 +174,9 @@ class SrsArm(ClosedForm):
         A_0 = rotation_between(stretched / ca.fmax(safe_norm(stretched), MIN_LENGTH), direction)
         # e(line psi) = line line' + cos (I - line line') + sin [line].
         outer = direction @ direction.T
-        sign_names = [part @ A_0 for part in (outer, ca.DM.eye(3) - outer, skew(direction))]
-        matrices = [self.shoulder_joints.euler_matrix(A) for A in sign_names]
-        matrices += [self.wrist_joints.euler_matrix(B.T @ (A.T @ rotation)) for A in sign_names]
+        rotations = [part @ A_0 for part in (outer, ca.DM.eye(3) - outer, skew(direction))]
+        matrices = [self.shoulder_joints.euler_matrix(A) for A in rotations]
+        matrices += [self.wrist_joints.euler_matrix(B.T @ (A.T @ rotation)) for A in rotations]
         elbow = self.screws.centred(3, turn.angle)
         return part(
             "bent_arm",
