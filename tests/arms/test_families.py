@@ -102,7 +102,7 @@ def apart(one: Array, other: Array) -> Array:
 @pytest.mark.parametrize("name", KINDS)
 def test_an_arm_is_recognised_by_its_axes(name):
     assert describe_arm(robot_of(name).description) == KINDS[name]
-    assert family(name).exact == (name not in MODEL_ERROR and name not in OFFSET)
+    assert family(name).is_exact == (name not in MODEL_ERROR and name not in OFFSET)
 
 
 @pytest.mark.parametrize(
@@ -182,7 +182,7 @@ def test_what_is_in_reach_is_never_said_to_be_beyond_and_far_away_nothing_is_in_
     robot, found = robot_of(name), family(name)
     rotation, origin = ca.SX.sym("rotation", 3, 3), ca.SX.sym("origin", 3)
     lower, upper = (ca.DM(end[: len(found.screws)]) for end in (robot.lower, robot.upper))
-    beyond = found.beyond(Pose(rotation, origin), lower, upper)
+    beyond = found.distance_out_of_reach(Pose(rotation, origin), lower, upper)
     asked = ca.Function("beyond", [rotation, origin], [beyond])
     q = robot.random(np.random.default_rng(3), 300)
     palm = robot.palm(q)
@@ -305,7 +305,7 @@ def test_no_root_of_an_offset_wrist_is_lost(name):
         palm, arm = robot.palm(q), q[: len(found.screws)]
         rows = arms(found, palm, arm)
         swept = arm[0] if found.redundancy else 0.0
-        rotation, origin, *_ = found._begin()(swept, palm[:3, :3], palm[:3, 3])
+        rotation, origin, *_ = found._start()(swept, palm[:3, :3], palm[:3, 3])
         for signs in SIGNS:
 
             def left(t: float, given: tuple = (rotation, origin), signs: tuple = signs) -> float:

@@ -270,9 +270,9 @@ class ClosedForm(ArmFamily):
         }
         return unwrapped, score.cost(unwrapped, reference), margin(unwrapped, lower, upper)
 
-    def cos_sin(self, index: int, cos_sin: CosSin) -> dict[int, Expr]:
+    def angle(self, index: int, cos_sin: CosSin) -> dict[int, Expr]:
         """Return the angle of a screw's joint, centred on its range."""
-        return {self.screws.joints[index]: self.screws.centred(index, cos_sin.cos_sin)}
+        return {self.screws.joints[index]: self.screws.centred(index, cos_sin.angle)}
 
 
 def margin(joints: dict[int, Expr], lower: Expr, upper: Expr) -> Expr:

@@ -93,7 +93,7 @@ class LockedJointArm(ArmFamily):
         bounds = [ca.MX.sym(word, n) for word in ("lower", "upper", "near")]
         locked, free = self._split(redundancy)
         inner_palm = self._inner_palm()(rotation, origin, locked)
-        best = self.inner.best(f"{name}_inner", score.sub_chain(solved))
+        best = self.inner.best(f"{name}_inner", score.restrict(solved))
         branches, total = best(free, *inner_palm, *(end[solved] for end in bounds))
         outputs = [self._joined_arm()(branches, locked), total]
         return ca.Function(name, [redundancy, rotation, origin, *bounds], outputs)

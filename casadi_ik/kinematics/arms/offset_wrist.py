@@ -171,7 +171,7 @@ class OffsetWristArm(ArmFamily):
         """
         rotation, origin = ca.SX.sym("rotation", 3, 3), ca.SX.sym("origin", 3)
         redundancy = ca.SX.sym("redundancy", self.size)
-        six_motion = self._real_arm.six_motion(Pose(rotation, origin), redundancy)
+        six_motion = self._real_arm.remaining_motion(Pose(rotation, origin), redundancy)
         outputs = [six_motion.rotation, six_motion.origin, ca.SX(1), ca.SX(-1)]
         return ca.Function("begin", [redundancy, rotation, origin], outputs)
 
@@ -193,11 +193,11 @@ class OffsetWristArm(ArmFamily):
         inverse = CosSin(ca.cos(t), -ca.sin(t)).rotation(self.screws.axes[-1])
         shift = ca.DM(self.offset) - inverse @ ca.DM(self.offset)
         shifted_palm = Pose(rotation, origin + rotation @ shift)
-        (bend,) = self.ideal.six(shifted_palm, (sign_1, sign_2))
-        ((plus, minus),) = bend.flips
+        (bend,) = self.ideal.branches_of_six(shifted_palm, (sign_1, sign_2))
+        ((plus, minus),) = bend.wrist_flips
         flips = {joint: ca.if_else(flip > 0, angle, minus[joint]) for joint, angle in plus.items()}
         joints = bend.joints | flips
-        arm = ca.vertcat(*(joints[self.screws.joints[index]] for index in self.ideal.samples))
+        arm = ca.vertcat(*(joints[self.screws.joints[index]] for index in self.ideal.indices))
         residual = flips[self.last] - t
         residual -= FULL_TURN * ca.floor(residual / FULL_TURN + 0.5)
         inputs = [rotation, origin, t, sign_1, sign_2, flip]
@@ -211,7 +211,7 @@ class OffsetWristArm(ArmFamily):
 
     def _all_joints(self, six: Expr, redundancy: Expr) -> Expr:
         """Return all joints (n, 1) in their order from the six in the order of the screws."""
-        joints = {self.screws.joints[p]: six[i] for i, p in enumerate(self.ideal.samples)}
+        joints = {self.screws.joints[p]: six[i] for i, p in enumerate(self.ideal.indices)}
         for i, parameter in enumerate(self.redundancy):
             joints[parameter.joint or 0] = redundancy[i]
         return ca.vertcat(*(joints[i] for i in range(len(joints))))

@@ -66,7 +66,10 @@ class SixJoints(ClosedForm):
         if not self.swept:
             return branches
         swept_joint = {self.screws.joints[0]: redundancy[0]}
-        return [ElbowBranch(bend.joints | swept_joint, bend.ends, bend.slack) for bend in branches]
+        return [
+            ElbowBranch(bend.joints | swept_joint, bend.wrist_flips, bend.slack)
+            for bend in branches
+        ]
 
     def remaining_motion(self, palm: Pose, redundancy: Expr) -> Pose:
         """Return the motion that the six joints must make for a palm pose."""
