@@ -320,7 +320,7 @@ def test_no_root_of_an_offset_wrist_is_lost(name):
                 # Two arms near each other at the edge of reach may both be missed.
                 if float(slack) < 0.05 or abs(float(rest)) > 1e-9:
                     continue
-                whole = np.array(found._whole()(six, swept)).ravel()
+                whole = np.array(found._all_joints_function()(six, swept)).ravel()
                 total += 1
                 lost += not len(rows) or apart(rows, whole).min() > 1e-6
     assert total > 15
