@@ -221,9 +221,7 @@ def test_smoothing_does_not_depend_on_how_often_it_is_called(robot, retarget):
         found.append(wanted.palm)
     np.testing.assert_allclose(found[1:], [found[0]] * 2, atol=1e-12)
     for bad in (0.0, -1.0, np.nan, np.inf):
-        with pytest.raises(
-            ik.errors.InputError, match=r"elapsed: found .*, expected seconds above 0"
-        ):
+        with pytest.raises(ik.errors.InputError, match="elapsed: found "):
             retargeter(frames[0], elapsed=bad)
 
 

@@ -79,12 +79,12 @@ LENGTHS = np.array(
 
 @dataclass(frozen=True)
 class OrderLimits:
-    """How clearly an order must fit to be recognised.
+    """Limits at which an order of keypoints is recognised.
 
     Attributes:
         fits: Largest root mean square of the logarithms of ratios to `LENGTHS` in the right order.
-        better: By what another order must fit better than the usual one.
-        frames: Number of frames that are looked at.
+        better: Difference by which another order must fit better than the usual one.
+        frames: Largest number of frames that are compared.
         smallest: Largest distance of two keypoints of a small fist [m].
         largest: Largest distance of two keypoints of a large open hand [m].
     """

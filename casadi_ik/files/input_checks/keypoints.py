@@ -33,15 +33,15 @@ SENTINELS = (0.0, -1.0)
 
 @dataclass(frozen=True)
 class FrameLimits:
-    """How far a frame of a hand may differ from the person's other frames.
+    """Largest differences between a frame of a hand and the person's other frames.
 
     Attributes:
         speed: Largest speed of a keypoint [m/s]; hands of people are slower than 10 m/s.
-        slack: Distance that a keypoint may jump besides [m]: noise of fast trackers.
+        slack: Distance that a keypoint may jump at any speed [m]: noise of fast trackers.
         stretch: Largest length of a bone over its median length in the frames before [-].
-        palm_lengths: What a bone may be longer besides, in lengths of the palm [-].
-        spread: A wrist at exactly zero is lost if it is farther from the middle of the hand than
-            so many times the median distance of the keypoints from there [-].
+        palm_lengths: Length that a bone may have beyond that, in lengths of the palm [-].
+        spread: Largest distance of a wrist at exactly zero from the middle of the hand, over the
+            median distance of the keypoints from there [-].
         memory: Number of frames whose median is compared with.
         flatness: Least sine of the angle between the directions to the two knuckles [-].
     """

@@ -15,7 +15,7 @@ A rotation with three decimals has at most 1.74e-3, and the nearest rotation is 
 away."""
 
 EXACT_SKEW = 1e-12
-"""Up to this skew a rotation is left as it is [-]."""
+"""Largest skew of a rotation that is not changed: rounding of double precision [-]."""
 
 MAX_LENGTH_ERROR = 1e-2
 """Largest difference of a quaternion's length from 1: two decimals change it by up to 0.01 [-]."""
@@ -83,7 +83,7 @@ def checked_pose(pose: ArrayLike, name: str = "object_pose") -> Array:
     """Return a pose (4, 4), or poses (k, 4, 4), with exact rotations.
 
     Args:
-        pose: What a user gives.
+        pose: Poses of a user or a file.
         name: Name of the argument, or file and key.
 
     Raises:
