@@ -67,6 +67,10 @@ NOT_IN_CHUNKS = (
 )
 
 
+class ForeignLogError(LogError):
+    """An MCAP file that this package did not write, such as a ROS bag."""
+
+
 class NothingWrittenError(LogError):
     """A log whose writer ended before anything was whole: nothing can be lost with it."""
 
@@ -361,7 +365,7 @@ def scan(stream: IO[bytes], path: Path) -> Contents:
         for record in reader.records:
             length = stream.tell() - start
             if isinstance(record, Message) and not torn:
-                raise LogError(NOT_IN_CHUNKS)
+                raise ForeignLogError(NOT_IN_CHUNKS)
             try:
                 if torn:
                     damaged |= isinstance(record, Chunk) and bool(unpack(record, "a chunk"))

@@ -543,13 +543,11 @@ def matched(logs: Sequence[Log], first: str, second: str) -> Matched:
 
 
 def _endings(logs: Sequence[Log], method: str) -> dict[bytes, Ending]:
-    found: dict[bytes, Ending] = {}
-    for log in logs:
-        if method not in log.methods:
-            continue
-        part = log.solves(method=method).part
+    endings: dict[bytes, Ending] = {}
+    tables = ((log, log.solves(method=method)) for log in logs if method in log.methods)
+    for log, part in ((log, part) for log, table in tables for part in table.parts):
         for solve_id, row in zip(part.solve_id.tolist(), part.rows, strict=True):
             key = target_key(row["target_points"], row["target_normals"], targets_beside(row))
             success, iterations, seconds = row[["success", "iterations", "time"]].item()
-            found.setdefault(key, Ending(log, method, solve_id, success > 0, iterations, seconds))
-    return found
+            endings.setdefault(key, Ending(log, method, solve_id, success > 0, iterations, seconds))
+    return endings

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from casadi_ik.compile.layout import Field, Layout
 from casadi_ik.errors import InputError, LogError
 from casadi_ik.files.writing import plain
-from casadi_ik.logs.container import check_size
+from casadi_ik.logs.container import ForeignLogError, check_size
 
 KINDS = ("iteration", "solve", "event")
 """The kinds of messages, each on a topic of its own per method."""
@@ -277,14 +277,15 @@ def own_record(records: Sequence[Metadata]) -> Mapping[str, str]:
     """Our record among those of a file.
 
     Raises:
-        LogError: There is none, there are several, it fails its checksum, or it is of a version
-            that is not known here.
+        ForeignLogError: There is none.
+        LogError: There are several, it fails its checksum, or it is of an unknown version.
     """
     found = [record.metadata for record in records if record.name == METADATA_NAME]
     if len(found) != 1:
         names = ", ".join(sorted({repr(record.name)[1:-1] for record in records})) or "none"
         problem = f"metadata {METADATA_NAME!r} twice" if found else f"no metadata {METADATA_NAME!r}"
-        raise LogError(f"not a log of casadi_ik: {problem} (found: {names})")
+        kind = LogError if found else ForeignLogError
+        raise kind(f"not a log of casadi_ik: {problem} (found: {names})")
     (record,) = found
     if record != signed(record):
         raise LogError("the log is damaged: its metadata fail their checksum")

@@ -84,7 +84,8 @@ def open_log(path: Paths) -> Log:
 
     Raises:
         LogError: A file is missing, is no MCAP file, is damaged, or is not a log of casadi_ik; or
-            the files are not of one robot, or a method is not of one kind in all of them.
+            the files are not of one robot. A folder may hold MCAP files of others, which are left
+            out with a warning.
 
     Example:
         >>> ik.logs.open("cup.mcap").methods
@@ -212,7 +213,7 @@ class Log:
         wanted = _numbers(filters.get("solve"))
         status, event, phase = (filters.get(name) for name in ("status", "event", "phase"))
         methods = self._methods(filters.get("method"))
-        parts = [self._read(name, "solve", wanted) for name in methods]
+        parts = [part for name in methods for part in self._read(name, "solve", wanted)]
         self._check_known("status", status, parts, "status")
         self._check_known("event", event, parts, "events")
         self._check_known("phase", phase, parts, "phase_iterations")
@@ -275,13 +276,13 @@ class Log:
             fields = [*fields, "phase"]
         parts = []
         for name, wanted in wanted_of.items():
-            part = self._read(name, kind, wanted, fields)
-            keep = np.ones(len(part), dtype=bool)
-            if phase is not None and "phase" in part.names:
-                keep &= np.isin(part.rows["phase"], _codes(part, "phase", phase))
-            if kind == "event" and event is not None:
-                keep &= np.isin(part.rows["kind"], _codes(part, "kind", event))
-            parts.append(part.where(keep))
+            for part in self._read(name, kind, wanted, fields):
+                keep = np.ones(len(part), dtype=bool)
+                if phase is not None and "phase" in part.names:
+                    keep &= np.isin(part.rows["phase"], _codes(part, "phase", phase))
+                if kind == "event" and event is not None:
+                    keep &= np.isin(part.rows["kind"], _codes(part, "kind", event))
+                parts.append(part.where(keep))
         return Table(kind, tuple(parts))
 
     def _read(
@@ -290,8 +291,11 @@ class Log:
         kind: str,
         wanted: Counts | None = None,
         fields: Sequence[str] | None = None,
-    ) -> MethodRows:
-        """The rows of a method in all files, by solve and iteration.
+    ) -> list[MethodRows]:
+        """Read the rows of a method in all files, by solve and iteration.
+
+        Logs of other objects or scenes have other fields or other names of codes. Their rows
+        cannot stand in one array, so the rows of each kind of log are a part.
 
         Args:
             method: One that at least one file holds.
@@ -299,44 +303,50 @@ class Log:
             wanted: Numbers of the solves, sorted; None: all.
             fields: Names of the fields wanted; None: all.
 
+        Returns:
+            At least one part; only parts with rows, if any has rows.
+
         Raises:
-            LogError: A file cannot be read, a method has other fields in it than in the others,
-                or a solve is in two.
+            LogError: A file cannot be read, or a solve is in two.
         """
-        sources, parts = self.sources, list[MethodRows]()
+        sources = self.sources
+        alike: dict[object, list[MethodRows]] = {}
         for i, shard in enumerate(self.shards):
             if method not in shard.methods:
                 continue
             offset = sources.offsets[i]
-            own = None if wanted is None else wanted[wanted >= offset] - offset
-            whole = kind == "solve" and own is None
-            part = shard.solves(method) if whole else shard.read(method, kind, own, fields)
-            first = parts[0] if parts else part
-            if part.rows.dtype != first.rows.dtype or part.labels != first.labels:
-                other = next(each.path for each in self.shards if method in each.methods)
-                raise LogError(
-                    f"{shard.path}: method {method!r} has other fields or names than in {other}"
-                )
+            numbers = None if wanted is None else wanted[wanted >= offset] - offset
+            whole = kind == "solve" and numbers is None
+            part = shard.solves(method) if whole else shard.read(method, kind, numbers, fields)
             if offset:
                 rows = part.rows.copy()
                 if "solve_id" in part.names:
                     rows["solve_id"] += np.uint32(offset)
                 part = replace(part, rows=rows, solve_id=part.solve_id + offset)
-            parts.append(replace(part, shard=sources.of(i, method, part.solve_id)))
-        joined = _joined(parts)
+            part = replace(part, shard=sources.of(i, method, part.solve_id), shards=sources.names)
+            form = part.rows.dtype.descr, sorted(part.labels.items())
+            alike.setdefault(repr(form), []).append(part)
+        parts = [self._sorted(_joined(group), kind) for group in alike.values()]
+        return [part for part in parts if len(part)] or parts[:1]
+
+    def _sorted(self, part: MethodRows, kind: str) -> MethodRows:
+        """Sort rows by solve and iteration.
+
+        Raises:
+            LogError: A solve is there twice.
+        """
         # Every solve has fewer than 2**24 iterations.
-        key = joined.solve_id * 2**24 + joined.iteration
+        key = part.solve_id * 2**24 + part.iteration
         if np.any(np.diff(key) < 0):
             order = np.argsort(key, kind="stable")
-            joined, key = joined.where(order), key[order]
+            part, key = part.where(order), key[order]
         if kind != "event":
-            number = key if kind == "iteration" else joined.solve_id
+            number = key if kind == "iteration" else part.solve_id
             twice = np.flatnonzero(np.diff(number) == 0)
             if len(twice):
-                solve = joined.solve_id[twice[0]]
-                where = self.shards[0].path
-                raise LogError(f"{where}: solve {solve} of method {method!r} is there twice")
-        return replace(joined, shards=sources.names)
+                solve, where = part.solve_id[twice[0]], self.shards[0].path
+                raise LogError(f"{where}: solve {solve} of method {part.method!r} is there twice")
+        return part
 
     def _methods(self, method: Names) -> tuple[str, ...]:
         if method is None:

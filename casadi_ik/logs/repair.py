@@ -32,6 +32,7 @@ from casadi_ik.logs.container import (
     Unpacked,
     add_chunk,
     beginning,
+    check_magic,
     counts_of,
     ending,
     index_messages,
@@ -84,18 +85,17 @@ def finish_log(path: str | os.PathLike[str]) -> Finished:
     """
     path = Path(path)
     with reading(path, "finish") as stream:
+        _, closed = check_magic(stream)
         contents = scan(stream, path)
         whole = contents.complete and _ends_well(stream, contents)
-        cut = 0 if whole else _close(contents)
+        replaced = 0 if whole else _close(contents)
+    # Of a file that was closed nothing is torn: only its summary is written anew.
+    cut = 0 if closed else replaced
     return Finished(path, not whole, len(contents.chunks), sum(contents.counts.values()), cut)
 
 
 def _close(contents: Contents) -> int:
-    """Cut what is torn and write the end of the file.
-
-    Returns:
-        The bytes that were torn; none if the data had an end and only a summary was missing.
-    """
+    """Write the end of a file behind its last whole record; return the bytes that were there."""
     tail = b""
     if contents.owed:
         tail = index_messages(contents.chunks[-1], contents.owed, contents.end)
@@ -110,7 +110,7 @@ def _close(contents: Contents) -> int:
         stream.write(tail)
         stream.flush()
         os.fsync(stream.fileno())
-    return 0 if contents.complete else contents.size - contents.end
+    return contents.size - contents.end
 
 
 def _ends_well(stream: IO[bytes], contents: Contents) -> bool:

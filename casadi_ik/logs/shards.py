@@ -28,6 +28,7 @@ from casadi_ik.errors import LogError, UnknownNameError, os_errors, printable
 from casadi_ik.files.arrays import Counts
 from casadi_ik.logs.container import (
     NOT_IN_CHUNKS,
+    ForeignLogError,
     NothingWrittenError,
     read_chunk,
     read_contents,
@@ -102,7 +103,7 @@ class Shard:
             self.robot: str = self.metadata["robot"]
             self.clock = clock_of(self.metadata)
             if not contents.chunks and any(contents.counts.values()):
-                raise LogError(NOT_IN_CHUNKS)
+                raise ForeignLogError(NOT_IN_CHUNKS)
             self._topics = self._described()
             self.methods: tuple[str, ...] = tuple(dict.fromkeys(name for name, _ in self._topics))
         self._solves: dict[str, MethodRows] = {}
@@ -254,26 +255,41 @@ def log_files(path: Paths) -> list[tuple[Path, str]]:
 
 
 def open_shards(path: Paths) -> tuple[list[Shard], list[Path]]:
-    """The shards of a log, and the files that were left out: those in which nothing is whole.
+    """Open the shards of a log.
 
     A writer that is killed before its first chunk leaves an empty or torn file, with which
-    nothing is lost. Among others it is named and left out.
+    nothing is lost. Among others it is left out with a warning. So is an MCAP file of another
+    program in a folder, as long as the folder holds a log.
+
+    Returns:
+        The shards, and the files in which nothing is whole.
 
     Raises:
         LogError: A file is missing, is no MCAP file, is damaged, or is not a log of casadi_ik; or
             nothing is whole in any.
     """
     files = log_files(path)
+    given = [path] if isinstance(path, str | os.PathLike) else path
+    named = {Path(item) for item in given}
     shards: list[Shard] = []
     empty: list[Path] = []
+    foreign: list[ForeignLogError] = []
     for file, name in files:
         try:
             shards.append(Shard(file, name))
+        except ForeignLogError as error:
+            if file in named:
+                raise
+            foreign.append(error)
         except NothingWrittenError as error:
             if len(files) == 1:
                 raise
             empty.append(file)
             logger.warning("%s; left out, nothing in it is whole", printable(str(error)))
+    if foreign and not shards:
+        raise foreign[0]
+    for error in foreign:
+        logger.warning("%s; left out", printable(str(error)))
     if not shards:
         raise LogError(f"{files[0][0]}: nothing in it is whole, nor in {len(files) - 1} others")
     return shards, empty

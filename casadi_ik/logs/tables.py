@@ -103,11 +103,12 @@ class MethodRows:
 class Table:
     """Rows of one kind: of one method, or of several one after the other.
 
-    What belongs to one method (`rows`, `labels`, ...) can be asked for if there is but one.
+    What belongs to one part (`rows`, `labels`, ...) is available if there is only one.
 
     Attributes:
         kind: "solve", "iteration" or "event".
-        parts: The rows by method.
+        parts: The rows by method; of logs whose fields or names of codes differ (other objects or
+            scenes) those of a method are several parts.
 
     Example:
         >>> table = ik.logs.open("cup.mcap").solves()
@@ -127,10 +128,16 @@ class Table:
 
         Raises:
             UnknownNameError: There is none, or there are several.
+            LogError: Rows of the method differ in their fields.
         """
-        if len(self.parts) != 1:
-            known = ", ".join(part.method for part in self.parts) or "none"
+        if len({part.method for part in self.parts}) != 1:
+            known = ", ".join(dict.fromkeys(part.method for part in self.parts)) or "none"
             raise UnknownNameError(f"{self.kind}s: of which method? There are: {known}")
+        if len(self.parts) > 1:
+            raise LogError(
+                f"{self.kind}s: the logs have {len(self.parts)} kinds of rows (other objects or"
+                " scenes), expected one; use parts or frame()"
+            )
         return self.parts[0]
 
     @property

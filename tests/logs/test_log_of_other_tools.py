@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from made_up_solves import main, make_block, rewritten
+from made_up_solves import LABELS, LAYOUT, Field, Layout, TraceFormat, main, make_block, rewritten
 from mcap.data_stream import RecordBuilder
 from mcap.reader import make_reader
 from mcap.records import Chunk, MessageIndex, Metadata
@@ -137,6 +137,52 @@ def test_messages_outside_chunks_are_refused(
         assert main(["log", *words, str(path)]) == 2
         assert capsys.readouterr().err.count("\n") == 1
     assert path.read_bytes() == before
+
+
+def write_bag(path: Path) -> None:
+    """Write an MCAP file of another program."""
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2", "a recorder")
+        schema = writer.register_schema("std_msgs/msg/Float64", "ros2msg", b"float64 data\n")
+        channel = writer.register_channel("/x", "cdr", schema)
+        writer.add_message(channel, 1, bytes(12), 1)
+        writer.finish()
+
+
+def test_a_folder_with_logs_of_other_objects_and_a_bag(
+    tmp_path: Path, write: Write, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Logs differ in fields (other fingers' names, no Jacobian) and are still read together."""
+    folder = tmp_path / "study"
+    (folder / "bags").mkdir(parents=True)
+    names = {**LABELS, "position_error": ("thumb", "index", "middle")}
+    lean = Layout.record(Field("q", (14,)), Field("phase", dtype="u1"))
+    first = write(make_block(5, 6), name="study/apple.mcap")
+    write(make_block(7, form=TraceFormat(LAYOUT, names)), name="study/cup.mcap")
+    write(make_block(8, form=TraceFormat(lean, LABELS)), name="study/mug.mcap")
+    write_bag(folder / "bags" / "ride.mcap")
+    log = logs.open(folder)
+    assert len(log.solves()) == 4
+    assert sorted(log.solves().frame()["iterations"].to_list()) == [5, 6, 7, 8]
+    assert log.iterations().frame().height == 5 + 6 + 7 + 8
+    numbers = [number for part in log.solves().parts for number in part.solve_id.tolist()]
+    assert sorted(numbers) == [0, 1, 2, 3]
+    for number in numbers:
+        solve = logs.one_solve(log, number)
+        assert len(solve.rows) == solve.iterations == 5 + number
+    for words in (["info"], ["solves"], ["events"], ["compare"], ["why", "3"], ["finish"]):
+        code = main(["log", words[0], str(folder), *words[1:]])
+        assert code == (2 if words == ["compare"] else 0), words  # which has one method only
+        capsys.readouterr()
+    # A bag that is named, or alone in a folder, is refused.
+    for path in (
+        folder / "bags",
+        folder / "bags" / "ride.mcap",
+        [first, folder / "bags/ride.mcap"],
+    ):
+        with pytest.raises(errors.LogError, match="not a log"):
+            logs.open(path)
 
 
 @pytest.mark.parametrize("code", [errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS])

@@ -163,10 +163,8 @@ def test_files_that_do_not_belong_together(write: Write, tmp_path: Path) -> None
         logs.open([first, other])
     form = dataclasses.replace(FORMAT, labels={**FORMAT.labels, "q": JOINTS[::-1]})
     third = write(make_block(6, first=2, form=form), name="3.mcap")
-    with pytest.raises(
-        errors.LogError, match=r"3\.mcap: method 'enhanced-dls' has other fields or names"
-    ):
-        logs.open([first, third]).iterations()
+    with pytest.raises(errors.LogError, match="2 kinds of rows"):
+        _ = logs.open([first, third]).iterations().rows
     with pytest.raises(errors.LogError, match="no log was named"):
         logs.open([])
     (tmp_path / "only").mkdir()

@@ -23,7 +23,7 @@ from casadi_ik.app.cli.outputs import check_outputs, output, write_json
 from casadi_ik.app.cli.table import Answer, Said, command
 from casadi_ik.app.report import counted, duration, fields, files, headline, indented, table
 from casadi_ik.errors import InputError, MissingExtraError, UnknownNameError, printable
-from casadi_ik.logs.container import NothingWrittenError
+from casadi_ik.logs.container import ForeignLogError, NothingWrittenError
 from casadi_ik.logs.events import SERIOUS, plain_name, quantity, told
 from casadi_ik.logs.explanation import Matched, explain, matched, side_by_side
 from casadi_ik.logs.repair import finish_log, merge_logs
@@ -265,6 +265,10 @@ def finish(said: Said) -> Answer:
             if len(found) == 1:
                 raise
             about = {"done": f"left as it is: {EMPTY}"}
+        except ForeignLogError as error:
+            if len(found) == 1:
+                raise
+            about = {"done": f"left as it is: {str(error).removeprefix(f'{path}: ')}"}
         else:
             cut = f"{_size(done.cut)} of a torn tail cut" if done.cut else "a summary was written"
             about = {
@@ -418,7 +422,7 @@ def _methods(log: logs.Log, about: logs.LogInfo) -> RenderableType:
         found = log.solves(method=method)
         tallies = []
         for table_of, field in ((found, "status"), (log.events(method=method), "kind")):
-            tally = Counter(table_of.part.readable(field))
+            tally = Counter(name for part in table_of.parts for name in part.readable(field))
             lines = (f"{count} {name}" for name, count in tally.most_common())
             tallies.append("\n".join(lines) or "none")
         numbers = str(counts["solve"]), str(counts["iteration"])
@@ -426,17 +430,18 @@ def _methods(log: logs.Log, about: logs.LogInfo) -> RenderableType:
     return rows
 
 
-def _smallest(found: logs.Table) -> str:
-    """Smallest singular value of every Jacobian over all solves, or that it was not measured."""
-    field = "lowest_sigma"
-    if field not in found.names:
-        return "not measured"
-    values = np.concatenate([[np.full(found.rows[field].shape[1], np.nan)], found.rows[field]])
-    lowest = np.fmin.reduce(values, axis=0).tolist()
-    return "\n".join(
+def _smallest(solves: logs.Table) -> str:
+    """Return the smallest singular value of every Jacobian, or that it was not measured."""
+    field, lowest = "lowest_sigma", dict[str, float]()
+    for part in solves.parts:
+        for i, name in enumerate(part.labels.get(field, ()) if field in part.names else ()):
+            values = [lowest.get(name, math.nan), *part.rows[field][:, i].tolist()]
+            lowest[name] = float(np.fmin.reduce(values))
+    lines = (
         f"{plain_name(name)} {'not measured' if math.isnan(value) else f'{value:.2g}'}"
-        for name, value in zip(found.labels[field], lowest, strict=True)
+        for name, value in lowest.items()
     )
+    return "\n".join(lines) or "not measured"
 
 
 def _origin(log: logs.Log) -> dict[str, str]:
