@@ -2,20 +2,21 @@
 
 Standard library only, since it starts once for every file: `confined.py` runs it. The words behind
 it are what to do, the file, the limits (seconds of computing, bytes of memory and of output) and
-the file's arguments, NAME:=VALUE. It prints what came out and ends with 0, or prints a reason and
-ends with `REFUSED`.
+the file's arguments, NAME:=VALUE. It prints a line with notes as a JSON list, then what came out,
+and ends with 0; or prints a reason and ends with `REFUSED`.
 """
 
 from __future__ import annotations
 
 import ast
 import contextlib
+import json
 import math
 import operator
 import os
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +91,9 @@ NUMBERS = (
 
 LARGEST = 1e6
 """None of them is larger."""
+
+NOTES = 100
+"""Maximum number of notes."""
 
 UNKNOWN = "Caught an unknown exception"
 """MuJoCo's words for having no memory."""
@@ -266,7 +270,7 @@ MANIFEST = 100_000
 """Maximum number of characters of a package.xml in which the package's name is looked up."""
 
 
-def expand_xacro(path: Path, arguments: Mapping[str, str]) -> str:
+def expand_xacro(path: Path, arguments: Mapping[str, str], notes: list[str]) -> str:
     """Return the text of a file with its macros expanded.
 
     It reads files below its folder and those of packages it finds, and nothing else; expressions
@@ -276,6 +280,7 @@ def expand_xacro(path: Path, arguments: Mapping[str, str]) -> str:
     Args:
         path: The file.
         arguments: Values of the file's arguments by name.
+        notes: List to which is added what was ignored.
 
     Raises:
         RefusedError: It asks for more.
@@ -325,6 +330,7 @@ def expand_xacro(path: Path, arguments: Mapping[str, str]) -> str:
                 for name in [name for name, _ in node.attributes.items()]:
                     if name not in macro.params:
                         node.removeAttribute(name)
+                        notes.append(f"{node.tagName}: parameter {name!r} is not declared: ignored")
         return call_macro(node, macros, symbols)
 
     def extension(text: str, context: Mapping[str, Any]) -> str:
@@ -376,8 +382,79 @@ def expand_xacro(path: Path, arguments: Mapping[str, str]) -> str:
     return str(document.toxml())
 
 
-def compile_mjcf(path: Path) -> bytes:
-    """MuJoCo's model of a file, as it saves one.
+def _compiled(library: Any, path: Path, notes: list[str]) -> Any:
+    """Return MuJoCo's model of a file, without the meshes and pictures that cannot be read.
+
+    Raises:
+        ValueError: MuJoCo cannot read it.
+    """
+    try:
+        return library.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        text = str(error)
+        if text.startswith(UNKNOWN):
+            raise
+    left_out: set[str] = set()
+    while True:
+        spec = _without(library, path, left_out)
+        try:
+            return spec.compile()
+        except ValueError as error:
+            text = str(error)
+        broken = {_mesh_name(mesh) for mesh in spec.meshes if _names_mesh(text, mesh)}
+        if not broken:
+            raise ValueError(text)
+        left_out |= broken
+        reason = " ".join(text.split()).replace(str(path.parent) + os.sep, "")
+        notes += [f"mesh {name!r} is left out: {reason}" for name in sorted(broken)]
+
+
+def _without(library: Any, path: Path, left_out: Collection[str]) -> Any:
+    """Return what a file describes, without pictures, masses and some meshes."""
+    spec = library.MjSpec.from_file(str(path))
+    spec.compiler.boundmass, spec.compiler.boundinertia = BOUND_MASS, BOUND_INERTIA
+    for material in spec.materials:
+        material.textures = [""] * len(material.textures)
+    for item in [*spec.textures, *spec.skins]:
+        spec.delete(item)
+    for geom in spec.geoms:
+        if geom.meshname in left_out:
+            geom.meshname, geom.type = "", library.mjtGeom.mjGEOM_SPHERE
+            geom.size = [TINY, 0, 0]
+            geom.contype = geom.conaffinity = 0
+    for mesh in spec.meshes:
+        if _mesh_name(mesh) in left_out:
+            spec.delete(mesh)
+        else:  # masses are not needed, and those of thin meshes are refused
+            mesh.inertia = library.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    return spec
+
+
+def _mesh_name(mesh: Any) -> str:
+    return str(mesh.name or Path(mesh.file).stem)
+
+
+def _names_mesh(message: str, mesh: Any) -> bool:
+    """Return whether an error message of MuJoCo is about a mesh."""
+    file = Path(mesh.file).name
+    return bool(file and re.search(rf"[/\\']{re.escape(file)}'", message)) or bool(
+        mesh.name and f"mesh '{mesh.name}'" in message
+    )
+
+
+BOUND_MASS, BOUND_INERTIA = 1e-3, 1e-6
+"""Least mass [kg] and inertia [kg m^2] of bodies whose shapes are left out."""
+
+TINY = 1e-5
+"""Radius of a ball in the place of a mesh that is left out [m]; it is no shape of the link."""
+
+
+def compile_mjcf(path: Path, notes: list[str]) -> bytes:
+    """Return MuJoCo's model of a file, as MuJoCo saves one.
+
+    Args:
+        path: The file.
+        notes: List to which is added what was left out.
 
     Raises:
         ValueError: MuJoCo cannot read it, or it has numbers that no robot has.
@@ -386,7 +463,7 @@ def compile_mjcf(path: Path) -> bytes:
     import numpy as np
 
     library: Any = mujoco
-    model = library.MjModel.from_xml_path(str(path))
+    model = _compiled(library, path, notes)
     for name in NUMBERS:
         if not (np.abs(getattr(model, name)) <= LARGEST).all():
             raise RefusedError(f"{name}: expected finite numbers up to {LARGEST:g}")
@@ -436,12 +513,18 @@ def main(words: list[str]) -> int:
     # What libraries say goes nowhere: behind the answer nothing may stand.
     answer = os.fdopen(os.dup(1), "wb")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    code = 0
+    code, notes = 0, list[str]()
     try:
-        found = expand_xacro(path, arguments).encode() if what == "xacro" else compile_mjcf(path)
+        found = (
+            expand_xacro(path, arguments, notes).encode()
+            if what == "xacro"
+            else compile_mjcf(path, notes)
+        )
         if len(found) > most:
             text = f"it becomes {len(found) >> 20} MiB, expected at most {most >> 20}"
             code, found = REFUSED, text.encode()
+        if not code:
+            found = json.dumps(notes[:NOTES]).encode() + b"\n" + found
     except MemoryError:
         return 1
     except BaseException as error:

@@ -5,6 +5,7 @@ Somebody's macros and MJCF are read by a process of its own, which may die of th
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import re
@@ -13,6 +14,7 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -47,7 +49,7 @@ MACROS = "xacro"
 MODEL = "mujoco"
 
 
-def confined(what: str, path: Path, arguments: Sequence[str] = ()) -> bytes:
+def confined(what: str, path: Path, arguments: Sequence[str] = ()) -> tuple[bytes, tuple[str, ...]]:
     """What a file becomes.
 
     Args:
@@ -87,7 +89,8 @@ def confined(what: str, path: Path, arguments: Sequence[str] = ()) -> bytes:
     else:
         code, said = done.returncode, done.stdout
     if code == 0:
-        return said
+        notes, _, content = said.partition(b"\n")
+        return content, tuple(f"{path.name}: {note}" for note in json.loads(notes))
     reason = f"takes more than {seconds} s of computing or {limits[1] >> 20} MiB {RAISED}"
     if code == foreign.REFUSED:
         reason = " ".join(said.decode(errors="replace").split())
@@ -102,18 +105,18 @@ SAVED = "model.mjb"
 """What MuJoCo is told that a model is called, which it had saved."""
 
 
-def mujoco_model(path: Path) -> tuple[Any, Any]:
-    """The module and its model of a file.
+def mujoco_model(path: Path) -> tuple[Any, Any, tuple[str, ...]]:
+    """Return the module, its model of a file, and notes on what was left out.
 
     Raises:
         DescriptionError: MuJoCo cannot read it.
         MissingExtraError: MuJoCo is not installed.
     """
-    saved = confined(MODEL, path)
+    saved, notes = confined(MODEL, path)
     import mujoco
 
     library: Any = mujoco  # its types are made when it is imported
-    return library, library.MjModel.from_binary_path(SAVED, {SAVED: saved})
+    return library, library.MjModel.from_binary_path(SAVED, {SAVED: saved}), notes
 
 
 def read_mjcf(path: Path) -> RobotTree:
@@ -128,7 +131,7 @@ def read_mjcf(path: Path) -> RobotTree:
         DescriptionError: See `mujoco_model`; or something that has no form here.
         MissingExtraError: MuJoCo is not installed.
     """
-    mujoco, model = mujoco_model(path)
+    mujoco, model, notes = mujoco_model(path)
     check_size(model.nbody, model.njnt, path)
     couplings = _equalities(mujoco, model, path)
     motors = _tendons(mujoco, model, couplings)
@@ -143,7 +146,7 @@ def read_mjcf(path: Path) -> RobotTree:
         root = roots[0].child
         joints.remove(roots[0])
     shapes = mjcf_shapes(mujoco, model, names)
-    return RobotTree(path, root, tuple(joints), motors, shapes, model=(mujoco, model))
+    return RobotTree(path, root, tuple(joints), motors, shapes, model=(mujoco, model), notes=notes)
 
 
 def joint_name(model: Any, joint: int) -> str:
@@ -457,9 +460,10 @@ def read_tree(path: Path, xacro: bool | Sequence[str] = False) -> RobotTree:
 @lru_cache(maxsize=8)
 def _read(path: Path, _: int, xacro: bool, arguments: tuple[str, ...]) -> RobotTree:
     text = read_robot_file(path)
-    element = parse_xml(text, path)
+    element, notes = parse_xml(text, path), ()
     if xacro and element.tag == "robot":
-        element = parse_xml(confined(MACROS, path, arguments).decode(), path)
+        expanded, notes = confined(MACROS, path, arguments)
+        element = parse_xml(expanded.decode(), path)
     if element.tag not in ("robot", "mujoco"):
         raise DescriptionError(
             f"{path}: found <{element.tag}>, expected a URDF (<robot>) or an MJCF (<mujoco>)"
@@ -472,4 +476,4 @@ def _read(path: Path, _: int, xacro: bool, arguments: tuple[str, ...]) -> RobotT
                 f"{path}: found macros (<xacro:{one.tag.rpartition('}')[2]}>), expected plain "
                 "URDF; to have them expanded, call the file .xacro, or import it with --xacro"
             )
-    return read_urdf(element, path)
+    return replace(read_urdf(element, path), notes=notes)

@@ -337,6 +337,7 @@ class RobotTree:
         shapes: Those of its links for collisions.
         element: Of a URDF what it was read from, its macros expanded.
         model: Of an MJCF the module and its model.
+        notes: What of the file was ignored or left out, a sentence each.
     """
 
     path: Path
@@ -346,6 +347,7 @@ class RobotTree:
     shapes: FileShapes = NO_FILE_SHAPES
     element: Element | None = None
     model: tuple[Any, Any] | None = None
+    notes: tuple[str, ...] = ()
 
     @cached_property
     def links(self) -> tuple[str, ...]:

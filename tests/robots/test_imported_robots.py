@@ -350,6 +350,27 @@ def test_tendon_is_a_motor_that_its_joints_share_by_their_ranges(mjcf, rng):
     np.testing.assert_allclose([robot.lower[4], robot.upper[4]], [0, 3.1], atol=1e-9)
 
 
+def test_meshes_that_cannot_be_read_are_left_out_of_an_mjcf(mjcf, rng):
+    path = mjcf.parent / "hand.xml"
+    flat = "0 0 0  0.01 0 0  0 0.01 0  0.01 0.01 1e-9"
+    assets = f"""<asset><mesh name="gone" file="assets/gone.stl"/>
+      <mesh name="flat" vertex="{flat}"/><mesh name="torn" file="torn.stl"/>
+      <texture name="wood" type="2d" file="wood.png"/><material name="wood" texture="wood"/></asset>
+      <worldbody>"""
+    text = path.read_text().replace("<worldbody>", assets)
+    for mesh in ("gone", "torn"):
+        geom = f'<geom type="mesh" mesh="{mesh}" material="wood"/><geom type="sphere" size="0.01"/>'
+        text = text.replace('<geom type="sphere" size="0.01"/>', geom, 1)
+    (mjcf.parent / "torn.stl").write_bytes(b"solid nothing")
+    path.write_text(text)
+    robot, tree = ik.load_robot(mjcf), read_tree(path)
+    assert largest_difference(robot, tree, robot.random(rng, 5)) < 1e-12
+    assert {name for note in tree.notes for name in ("gone", "torn", "flat") if name in note} >= {
+        "gone",
+        "torn",
+    }
+
+
 def test_mjcf_hand_on_an_arm_is_solved(mjcf, rng):
     arm(mjcf.parent, 4)
     path = describe(mjcf.parent, "arm: {file: arm.urdf}\nhand: {file: hand.xml, palm: palm}")

@@ -272,6 +272,7 @@ class Imported:
         """
         robot = load_description(path)
         shapes, touching, notes = robot_shapes(robot, self.files)
+        notes = [*(note for file in self.files if file is not None for note in file.notes), *notes]
         text = "" if srdf is None else file_text(srdf, path)
         written = replace(
             self.written,
@@ -366,7 +367,7 @@ def import_robot(
         mount=None if arm is None else list(mount or [0.0] * 6),
         mount_how="--mount" if mount else "GUESS: the hand's base on the arm's tip",
         hands=hands,
-        notes=notes,
+        notes=[*(() if arm_tree is None else arm_tree.notes), *tree.notes, *notes],
     )
     return Imported(written, tuple(branches), (arm_tree, tree))
 
