@@ -130,15 +130,16 @@ class Table:
             UnknownNameError: There is none, or there are several.
             LogError: Rows of the method differ in their fields.
         """
-        if len({part.method for part in self.parts}) != 1:
-            known = ", ".join(dict.fromkeys(part.method for part in self.parts)) or "none"
-            raise UnknownNameError(f"{self.kind}s: of which method? There are: {known}")
-        if len(self.parts) > 1:
+        if len(self.parts) == 1:
+            return self.parts[0]
+        methods = list(dict.fromkeys(part.method for part in self.parts))
+        if len(methods) == 1:
             raise LogError(
                 f"{self.kind}s: the logs have {len(self.parts)} kinds of rows (other objects or"
                 " scenes), expected one; use parts or frame()"
             )
-        return self.parts[0]
+        known = ", ".join(methods) or "none"
+        raise UnknownNameError(f"{self.kind}s: of which method? There are: {known}")
 
     @property
     def method(self) -> str:
