@@ -12,6 +12,7 @@ followers that are narrower than their motors'::
         --count 300 --ratio                                         # every arm with every hand
     python studies/misses.py --robots kuka_lwr_barrett --sampler noise --noise 4 2 \
         --tolerance default
+    python studies/misses.py --robots catalogue --sampler tolerances # wide and narrow tolerances
 
 A run that is killed goes on where it stopped. Every miss is listed with its configuration.
 """
@@ -20,9 +21,10 @@ from __future__ import annotations
 
 import argparse
 import time
+import warnings
 import zlib
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -44,10 +46,10 @@ from runner.report import (
     publish,
     rate_metric,
 )
-from samplers import SAMPLERS, finger_sets, noisy, random_hands, suits
+from samplers import SAMPLERS, displaced, finger_sets, noisy, random_hands, suits
 
 import casadi_ik as ik
-from casadi_ik.errors import InputError
+from casadi_ik.errors import InputError, InputWarning
 from casadi_ik.files.arrays import Array
 
 MADE = {path.stem: path for path in (Path(__file__).parent / "robots").glob("*.yaml")}
@@ -58,8 +60,18 @@ ROBOTS = (
     *("seven_axes_four_fingers", "six_axes_coupled_barrett"),
 )
 USUAL = ("random", "one-arm", "corners", "limits", "singular")
-OTHERS = {"palms": "palms of random hands", "noise": "noisy contacts of random hands"}
-"""What is asked for is a palm with a hand's posture, or contacts that a camera saw."""
+DISPLACED = "tolerances"
+"""The sampler of contacts that are displaced within their tolerance."""
+
+OTHERS = {
+    "palms": "palms of random hands",
+    "noise": "noisy contacts of random hands",
+    DISPLACED: "displaced contacts of random hands",
+}
+"""Targets that are palms with the posture of a hand, or contacts that no configuration has."""
+
+ANGLES, DISTANCES, SHARES = (1, 3, 10, 30, 60), (1, 5, 20), (0.5, 0.8, 0.95)
+"""Tolerances [deg] and [mm], and shares of them by which contacts are displaced."""
 
 REFERENCE, SCALE = "kuka_lwr_barrett", 1000
 """`--ratio`: times over those of so many random targets of this robot, in the same process."""
@@ -86,6 +98,14 @@ NOISY = """
 normals, so that not all can be met. *Possible:* of so many of the missed, those for which Ipopt
 finds a configuration within tolerance (minimise t with every error at most t times its tolerance)
 from the configuration before the noise, the answer or random ones, {} starts at most.
+"""
+
+DISPLACEMENTS = """
+Every point of the contacts of a configuration is displaced in a random direction by a share of the
+position tolerance, and every normal is rotated about a random axis by that share of the angle
+tolerance. The configuration itself is therefore a solution. The tolerances are all pairs of
+{} deg and {} mm. The columns with shares have the solved targets in percent; the last two columns
+have the tolerance with the fewest solved targets, and how many these are in percent.
 """
 
 CLIMBING = """
@@ -119,6 +139,7 @@ class Part:
         noise: Standard deviation of contacts [mm] and [deg], of noisy ones.
         looked: How many missed ones of noisy contacts are given to Ipopt.
         ratio: Whether times are set beside those of the reference.
+        share: Share of the tolerance by which contacts are displaced.
     """
 
     robot: str
@@ -132,6 +153,7 @@ class Part:
     noise: tuple[float, float] = (0.0, 0.0)
     looked: int = 0
     ratio: bool = False
+    share: float = 0.0
 
     @property
     def path(self) -> Path:
@@ -139,6 +161,8 @@ class Part:
         kind = self.sampler
         if any(self.noise):
             kind += f" {self.noise[0]:g} {self.noise[1]:g}, {self.looked} looked at"
+        if self.share:
+            kind += f" {self.share:g}"
         name = f"{self.number:05d}-{self.size}-{self.seed}.json"
         return Path(self.robot) / f"{kind}, {self.fingers}" / self.tolerance / name
 
@@ -183,7 +207,9 @@ SOLVERS: dict[tuple[str, str], ik.Solver] = {}
 def _solver(robot: ik.ArmHand, tolerance: str) -> ik.Solver:
     key = robot.name, tolerance
     if key not in SOLVERS:
-        SOLVERS[key] = ik.Solver(robot, tolerance=tolerance_of(tolerance))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", InputWarning)  # wide tolerances are a part of the study
+            SOLVERS[key] = ik.Solver(robot, tolerance=tolerance_of(tolerance))
     return SOLVERS[key]
 
 
@@ -215,6 +241,10 @@ def solve(part: Part) -> dict[str, Any]:
     if part.sampler == "noise":
         metres, angle = 1e-3 * part.noise[0], float(np.radians(part.noise[1]))
         points, normals = noisy(points, normals, rng, metres, angle)
+    if part.share:
+        allowed = tolerance_of(part.tolerance)
+        metres, angle = part.share * allowed.position, part.share * allowed.angle
+        points, normals = displaced(points, normals, rng, metres, angle)
     held = finger_sets(robot, [part.fingers])[part.fingers]
     free = np.setdiff1d(np.arange(len(robot.fingers)), held)
     points[:, free] = normals[:, free] = np.nan
@@ -260,7 +290,10 @@ def solve(part: Part) -> dict[str, Any]:
 
 
 def robots_of(words: Sequence[str]) -> list[str]:
-    """Names of robots; "pairs" is every shipped arm with every shipped hand, "tour" each once."""
+    """Names of robots; "pairs" is every shipped arm with every shipped hand, "tour" each once.
+
+    "catalogue" is every shipped arm, hand, arm with a hand, and body.
+    """
     arms, hands = ik.shipped_names("arms"), ik.shipped_names("hands")
     names: list[str] = []
     for word in words:
@@ -270,6 +303,10 @@ def robots_of(words: Sequence[str]) -> list[str]:
             names += sorted(pairs, key=lambda pair: zlib.crc32(pair.encode()))
         elif word == "tour":
             names += [f"{arm}+{hands[i % len(hands)]}" for i, arm in enumerate(arms)]
+        elif word == "catalogue":
+            bodies = ik.shipped_names("bodies")
+            bodies = [f"{body}+leap" if body == "two_ur10e" else body for body in bodies]
+            names += [*ik.shipped_names("arm_hands"), *hands, *arms, *bodies]
         else:
             names.append(word)
     return list(dict.fromkeys(names))
@@ -283,7 +320,9 @@ def parts_of(options: argparse.Namespace) -> Iterator[Part]:
         for name, robot in robots.items():
             for sampler in options.sampler:
                 palms = sampler == "palms"
-                if sampler == "climb" or not suits(robot, sampler):
+                if sampler == DISPLACED:
+                    yield from displaced_parts(options, name, robot, number, block)
+                if sampler in ("climb", DISPLACED) or not suits(robot, sampler):
                     continue
                 if palms and not robot.description.arm_actuators:
                     continue
@@ -298,6 +337,22 @@ def parts_of(options: argparse.Namespace) -> Iterator[Part]:
                             looked=options.looked if noisy_ else 0,
                             ratio=options.ratio,
                         )
+
+
+def displaced_parts(
+    options: argparse.Namespace, name: str, robot: ik.ArmHand, number: int, block: int
+) -> Iterator[Part]:
+    """Yield the parts of a block with displaced contacts: all tolerances and shares."""
+    for angle in ANGLES:
+        for distance in DISTANCES:
+            tolerance = f"{1e-3 * distance:g},{np.radians(angle):.12g}"
+            for share in SHARES:
+                yield Part(
+                    *(name, DISPLACED, "all", tolerance, number, block),
+                    seed=options.seed,
+                    arm_hand=robot,
+                    share=share,
+                )
 
 
 @dataclass(frozen=True)
@@ -373,6 +428,8 @@ def rows_of(options: argparse.Namespace) -> tuple[list[Row], str]:
     many = len(robots_of(options.robots)) > 2 * len(ROBOTS)
     groups: dict[tuple[str, str, str], list[tuple[Part, Row]]] = {}
     for part, found in done:
+        if part.share:
+            continue
         kind = "all kinds" if many else part.kind
         groups.setdefault((part.robot, kind, part.tolerance), []).append((part, found))
     rows: list[Row] = []
@@ -398,6 +455,46 @@ def rows_of(options: argparse.Namespace) -> tuple[list[Row], str]:
         ]
         rows.append(row)
     return rows, codes
+
+
+def displaced_table(options: argparse.Namespace, metrics: list[Metric]) -> list[str]:
+    """Return the result and the section of the report on displaced contacts; [] without any."""
+    solved: dict[str, dict[tuple[str, float], tuple[int, int]]] = {}
+    for part, counts in read_parts(options.out, parts_of(options))[0]:
+        if part.share:
+            by_robot, key = solved.setdefault(part.robot, {}), (part.tolerance, part.share)
+            success, count = by_robot.get(key, (0, 0))
+            success += counts["count"] - len(counts["missed"])
+            by_robot[key] = success, count + counts["count"]
+    if not solved:
+        return []
+
+    def percent(cells: Iterable[tuple[int, int]]) -> float:
+        successes, counts = zip(*cells, strict=True)
+        return 100 * sum(successes) / sum(counts)
+
+    lines = []
+    for robot, by_key in solved.items():
+        shares = [
+            f"{percent(cell for (_, own), cell in by_key.items() if own == share):.3f}"
+            for share in SHARES
+        ]
+        by_tolerance = {
+            tolerance: percent(cell for (own, _), cell in by_key.items() if own == tolerance)
+            for tolerance, _ in by_key
+        }
+        worst = min(by_tolerance, key=by_tolerance.__getitem__)
+        count = sum(count for _, count in by_key.values())
+        cells = [tolerance_name(worst), f"{by_tolerance[worst]:.3f}"]
+        lines.append([robot, f"{count:,}", *shares, *cells])
+        success = sum(success for success, _ in by_key.values())
+        metrics.append(rate_metric(f"misses/{robot}/displaced", success, count))
+    every = [cell for by_key in solved.values() for cell in by_key.values()]
+    result = f"Of {sum(count for _, count in every):,} displaced targets of {len(solved)} robots, "
+    result += f"{percent(every):.3f} % are solved."
+    heads = ["robot", "n", *(f"at {share:g}" for share in SHARES), "worst tolerance", "solved %"]
+    text = DISPLACEMENTS.format(*(", ".join(map(str, some)) for some in (ANGLES, DISTANCES)))
+    return [result, "## Tolerances", text, markdown_table(heads, lines)]
 
 
 def climbed_rows(options: argparse.Namespace) -> tuple[list[Row], str]:
@@ -533,7 +630,10 @@ def write_report(options: argparse.Namespace, run_by: str) -> None:
     rows, metrics = [row for row in drawn if row not in noise], list[Metric]()
     total = sum(row["count"] for row in [*rows, *climbed])
     lost = sum(len(row["missed"]) for row in [*rows, *climbed])
-    body = [INTRODUCTION, f"{total:,} solves, {lost} missed."]
+    result, *tolerances = displaced_table(options, metrics) or [""]
+    body = [result] if result else []
+    if total or noise or not result:
+        body += [INTRODUCTION, f"{total:,} solves, {lost} missed."]
     options.report.mkdir(parents=True, exist_ok=True)
     if options.ratio and rows and all("+" in row["robot"] for row in rows):
         heat_map(rows, options.report / "pairs.png")
@@ -542,9 +642,10 @@ def write_report(options: argparse.Namespace, run_by: str) -> None:
     if noise:
         body += ["## Noisy contacts", NOISY.format(*options.noise, STARTS)]
         body += [table_of(noise, metrics)]
+    body += tolerances
     if climbed:
         body += ["## Climbing", CLIMBING, climbed_table(climbed, metrics)]
-    body += why([*rows, *climbed])
+    body += why([*rows, *climbed]) if total or not result else []
     if lost > SHOWN:
         every = [
             {"robot": row["robot"], "kind": row["kind"], "tolerance": row["tolerance"]}
@@ -562,7 +663,10 @@ def main(arguments: list[str] | None = None) -> None:
     """Solve what is missing and write the report."""
     parser = argparse.ArgumentParser(description="Reachable targets that hand-first misses.")
     parser.add_argument(
-        "--robots", nargs="+", default=ROBOTS, help="names; pairs: all of the catalogue; tour"
+        "--robots",
+        nargs="+",
+        default=ROBOTS,
+        help="names; pairs, tour, or catalogue",
     )
     kinds = (*SAMPLERS, *OTHERS, "climb")
     parser.add_argument("--sampler", nargs="+", default=USUAL, choices=kinds, metavar="SAMPLER",

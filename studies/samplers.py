@@ -162,6 +162,25 @@ def noisy(
     return points, normals / np.linalg.norm(normals, axis=2, keepdims=True)
 
 
+def displaced(
+    points: Array, normals: Array, rng: np.random.Generator, metres: float, angle: float
+) -> tuple[Array, Array]:
+    """Return contacts (k, f, 3) displaced by a distance, and normals rotated by an angle.
+
+    Args:
+        points: (k, f, 3) contact points [m].
+        normals: (k, f, 3) unit normals.
+        rng: Source of the directions and of the rotation axes, which are uniform.
+        metres: Displacement of every point [m].
+        angle: Rotation of every normal [rad].
+    """
+    shift, axis = rng.normal(size=points.shape), rng.normal(size=normals.shape)
+    axis -= (axis * normals).sum(axis=2, keepdims=True) * normals
+    points = points + metres * shift / np.linalg.norm(shift, axis=2, keepdims=True)
+    axis /= np.linalg.norm(axis, axis=2, keepdims=True)
+    return points, normals * np.cos(angle) + np.cross(axis, normals) * np.sin(angle)
+
+
 def finger_sets(robot: ik.ArmHand, asked: list[str]) -> dict[str, list[int]]:
     """Places in `robot.fingers` of those that have a contact, by name of the set.
 

@@ -7,7 +7,7 @@ import json
 import misses
 import numpy as np
 import pytest
-from samplers import SAMPLERS, finger_sets, palm_slopes, singular_arms, suits
+from samplers import SAMPLERS, displaced, finger_sets, palm_slopes, singular_arms, suits
 
 import casadi_ik as ik
 
@@ -87,3 +87,23 @@ def test_a_heat_map_of_pairs(tmp_path):
     ]
     misses.heat_map(rows, tmp_path / "pairs.png")
     assert (tmp_path / "pairs.png").stat().st_size > 5_000
+
+
+def test_tolerances_are_counted_by_robot(tmp_path, monkeypatch):
+    """Displaced contacts are within their tolerance; the report sums them up by robot."""
+    monkeypatch.setattr(misses, "ANGLES", (3, 30))
+    monkeypatch.setattr(misses, "DISTANCES", (5,))
+    words = ["--robots", "kuka_lwr_barrett", "--sampler", "tolerances", "--count", "20"]
+    misses.main([*words, "--out", str(tmp_path)])
+    assert len(list((tmp_path / "kuka_lwr_barrett").rglob("*.json"))) == 2 * len(misses.SHARES)
+    text = (tmp_path / "report" / "report.md").read_text()
+    assert "Of 120 displaced targets of 1 robots" in text
+    assert "| kuka_lwr_barrett | 120 |" in text
+
+
+def test_displaced_contacts_are_within_their_tolerance(robot, rng):
+    q = robot.random(rng, 50)
+    points, normals = displaced(*robot.contacts(q), rng, 0.004, 0.4)
+    position, angle = robot.errors(q, points, normals)
+    np.testing.assert_allclose(position, 0.004, rtol=1e-9)
+    np.testing.assert_allclose(angle, 0.4, rtol=1e-9)
