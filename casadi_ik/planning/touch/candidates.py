@@ -1,9 +1,8 @@
-"""Grasps of a surface: oriented point pairs of hand and object that fit, made exact, and reached.
+"""Candidate grasps of a surface: hands whose fingertips touch it, before the arm is solved.
 
 Geometric hashing of oriented point pairs (Drost et al. 2010) between two opposing fingertips and
-two patches of the object gives palm poses; further fingers are looked up in the hand's table. The
-palm and the hand are then moved until every fingertip touches; the arm and the scene come last,
-through `Solver.solve_palms` and `Solver.solve_batch`.
+two patches of the object gives palm poses; postures of further fingers are looked up in the table
+of the hand. Palm and hand are then refined until every fingertip touches.
 """
 
 from __future__ import annotations
@@ -32,77 +31,82 @@ from casadi_ik.planning.touch.surface import Grid, Surface
 
 @dataclass(frozen=True)
 class TouchParameters:
-    """How grasps are looked for.
+    """Parameters of the search for grasps.
 
     Attributes:
-        facing: Two patches oppose each other if both normals are within this angle of the line
-            between them [rad].
-        object_pairs: Pairs of patches that are drawn at once.
-        first: Candidates that are looked for at first.
-        round: Most that are looked for at once.
-        attempts: Pairs of hand and object that are tried for them at most.
-        most: Pairs after which no more are tried.
-        seldom: Where so many are like others before a new one comes, no more are made.
-        lost: Hands after which no more are tried if the arm has reached none of them.
-        least_often: The chance of what was never clear beside what was most often.
-        deep: Most that counts of how far between two fingertips is from the palm [m].
-        object_step: Edge of the cells that tell how far the object is [m], at least ...
-        scene_step: ... and how far what stands about it is.
-        cells: About how many cells there are at most along either.
-        lean: Planes lean by at most this angle at first [rad]; balls may more, everywhere.
-        near: A further fingertip is at most this far from the surface at first [m].
-        clear: Fingertips that do not touch are at least this far from it [m].
-        tries: Postures of a further finger that are tried against collisions.
-        steps: Of damped least squares on palm and hand.
-        free_lean: Within this angle a pad leans for nothing [rad].
-        slide: Weight of sliding along the surface beside leaving it.
-        turn: Metres that count as much as a radian of lean.
-        touch: What a fingertip may be off the surface at last [m].
-        max_spread: Largest angle between the triangles that meet at a contact and their mean, and
-            between this and the direction in which the pad meets them [rad]; beyond, it is an edge.
-        last_lean: What it may lean at last [rad].
-        apart: Two grasps differ if a fingertip or the palm is so far elsewhere [m] ...
-        turned: ... or the palm is turned by so much [rad].
+        max_facing_angle: Two patches oppose each other if both normals are within this angle of the
+            line between them [rad].
+        pairs_per_draw: Pairs of patches that are drawn at once.
+        first_batch: Candidates generated in the first batch.
+        max_batch: Maximum number of candidates generated in one batch.
+        max_attempts_per_batch: Maximum number of pairs of hand and object tried for one batch.
+        max_attempts: Maximum number of pairs of hand and object tried in all.
+        max_consecutive_duplicates: Stop generating after this many duplicates in a row.
+        max_unreachable_hands: Give up if the arm has reached none of this many hand poses.
+        min_trial_probability: Probability of trying a palm depth or direction that was never free
+            of collision, relative to the one that was so most often.
+        max_pinch_depth: Saturation of the depth score: distance of the pinch midpoint from the
+            palm [m].
+        object_cell: Minimum edge of the cells of the object's distance grid [m].
+        scene_cell: Minimum edge of the cells of the scene's distance grid [m].
+        max_cells: Approximate maximum number of cells along an edge of either grid.
+        max_initial_lean: Largest lean of a plane pad before refinement [rad]; balls lean more.
+        max_initial_height: Largest distance of a further fingertip from the surface before
+            refinement [m].
+        idle_clearance: Least distance from the surface of fingertips that do not touch [m].
+        max_posture_trials: Postures of a further finger that are checked for collisions.
+        refinement_steps: Steps of damped least squares on palm and hand.
+        free_lean: Lean of a plane pad that has no cost in the refinement [rad].
+        sliding_weight: Weight of sliding along the surface, relative to distance from it.
+        lean_length: Length that costs as much as a radian of lean [m].
+        max_height: Largest distance of a pad from the surface in a grasp [m].
+        max_spread: Largest angle between the triangles that meet at a contact and their mean
+            normal, and between this and the direction in which the pad meets them [rad]; beyond, it
+            is an edge.
+        max_lean: Largest lean of a plane pad in a grasp [rad].
+        min_separation: Grasps are distinct if a fingertip or the palm differs by more than
+            this [m].
+        min_rotation: Grasps are distinct if the palm is rotated by more than this [rad].
     """
 
-    facing: float = float(np.deg2rad(45.0))
-    object_pairs: int = 40_000
-    first: int = 24
-    round: int = 2000
-    attempts: int = 100_000
-    most: int = 1_000_000
-    seldom: int = 3000
-    lost: int = 300
-    least_often: float = 0.03
-    deep: float = 0.2
-    object_step: float = 5e-3
-    scene_step: float = 25e-3
-    cells: int = 36
-    lean: float = float(np.deg2rad(25.0))
-    near: float = 8e-3
-    clear: float = 8e-3
-    tries: int = 24
-    steps: int = 4
+    max_facing_angle: float = float(np.deg2rad(45.0))
+    pairs_per_draw: int = 40_000
+    first_batch: int = 24
+    max_batch: int = 2000
+    max_attempts_per_batch: int = 100_000
+    max_attempts: int = 1_000_000
+    max_consecutive_duplicates: int = 3000
+    max_unreachable_hands: int = 300
+    min_trial_probability: float = 0.03
+    max_pinch_depth: float = 0.2
+    object_cell: float = 5e-3
+    scene_cell: float = 25e-3
+    max_cells: int = 36
+    max_initial_lean: float = float(np.deg2rad(25.0))
+    max_initial_height: float = 8e-3
+    idle_clearance: float = 8e-3
+    max_posture_trials: int = 24
+    refinement_steps: int = 4
     free_lean: float = float(np.deg2rad(8.0))
-    slide: float = 0.25
-    turn: float = 0.02
-    touch: float = 1e-3
+    sliding_weight: float = 0.25
+    lean_length: float = 0.02
+    max_height: float = 1e-3
     max_spread: float = float(np.deg2rad(20.0))
-    last_lean: float = float(np.deg2rad(15.0))
-    apart: float = 0.010
-    turned: float = float(np.deg2rad(15.0))
+    max_lean: float = float(np.deg2rad(15.0))
+    min_separation: float = 0.010
+    min_rotation: float = float(np.deg2rad(15.0))
 
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Palms and hands, k of them, in the object's frame.
+    """Palm poses and hand postures of k candidates, in the object's frame.
 
     Attributes:
-        palm: (k, 4, 4) pose of the palm in the object's frame.
+        palm: (k, 4, 4) poses of the palm.
         hand: (k, m) positions of the fingers' motors [rad or m].
-        used: (k, f) which fingers touch.
-        tips: (k, f, 3) fingertips [m]; empty where they were not looked up.
-        contacts: Contacts with the surface; None where they were not looked up.
+        used: (k, f) True for fingers that touch.
+        tips: (k, f, 3) fingertips [m]; empty if they were not computed.
+        contacts: Contacts with the surface; None if they were not computed.
     """
 
     palm: Array
@@ -115,42 +119,51 @@ class Candidates:
         return len(self.hand)
 
     def rows(self, rows: NDArray) -> Candidates:
-        """Some of them."""
+        """Return the candidates with the given row numbers."""
         tips = self.tips[rows] if len(self.tips) else self.tips
         contacts = None if self.contacts is None else self.contacts.rows(rows)
         return Candidates(self.palm[rows], self.hand[rows], self.used[rows], tips, contacts)
 
-    def alike(self, others: Candidates, chosen: TouchParameters) -> Bools:
-        """(k, n) which have palm and fingertips about where others have them."""
-        turns, theirs = (one.palm[:, :3, :3].reshape(-1, 9) for one in (self, others))
-        same = turns @ theirs.T > 1 + 2 * np.cos(chosen.turned)
+    def duplicates(self, others: Candidates, parameters: TouchParameters) -> Bools:
+        """Return (k, n) True where palm and fingertips are near those of another candidate."""
+        rotations, other_rotations = (
+            hands.palm[:, :3, :3].reshape(-1, 9) for hands in (self, others)
+        )
+        same = rotations @ other_rotations.T > 1 + 2 * np.cos(parameters.min_rotation)
         same &= (self.used[:, None] == others.used).all(axis=2)
-        same &= _apart(self.palm[:, :3, 3], others.palm[:, :3, 3]) < chosen.apart
+        limit = parameters.min_separation
+        same &= _distances(self.palm[:, :3, 3], others.palm[:, :3, 3]) < limit
         for finger in range(self.used.shape[1]):
-            off = _apart(self.tips[:, finger], others.tips[:, finger]) < chosen.apart
-            same &= off | ~self.used[:, finger, None]
+            near = _distances(self.tips[:, finger], others.tips[:, finger]) < limit
+            same &= near | ~self.used[:, finger, None]
         return same
 
-    def unlike(self, others: Candidates, chosen: TouchParameters) -> NDArray[np.intp]:
-        """Rows that are unlike all of others."""
-        return np.flatnonzero(~self.alike(others, chosen).any(axis=1))
+    def new_rows(self, others: Candidates, parameters: TouchParameters) -> NDArray[np.intp]:
+        """Return the rows of candidates that duplicate none of the others."""
+        return np.flatnonzero(~self.duplicates(others, parameters).any(axis=1))
 
-    def distinct(self, chosen: TouchParameters, together: int = 256) -> NDArray[np.intp]:
-        """In their order the first of those that are alike."""
-        left, found = np.arange(len(self)), np.zeros(0, dtype=np.intp)
-        while len(left):
-            rows, left = left[:together], left[together:]
-            same = self.rows(rows).alike(self.rows(rows), chosen)
-            first = np.ones(len(rows), dtype=bool)
+    def distinct_rows(self, parameters: TouchParameters, block: int = 256) -> NDArray[np.intp]:
+        """Return the rows of candidates that do not duplicate an earlier one.
+
+        Args:
+            parameters: Thresholds of a duplicate.
+            block: Candidates that are compared pairwise at once.
+        """
+        remaining, distinct = np.arange(len(self)), np.zeros(0, dtype=np.intp)
+        while len(remaining):
+            rows, remaining = remaining[:block], remaining[block:]
+            same = self.rows(rows).duplicates(self.rows(rows), parameters)
+            is_first = np.ones(len(rows), dtype=bool)
             for i in range(len(rows)):
-                first[i + 1 :] &= ~(first[i] & same[i, i + 1 :])
-            found = np.append(found, rows[first])
-            left = left[self.rows(left).unlike(self.rows(rows[first]), chosen)]
-        return found
+                is_first[i + 1 :] &= ~(is_first[i] & same[i, i + 1 :])
+            distinct = np.append(distinct, rows[is_first])
+            compared = self.rows(rows[is_first])
+            remaining = remaining[self.rows(remaining).new_rows(compared, parameters)]
+        return distinct
 
 
-def _apart(points: Array, others: Array) -> Array:
-    """(k, n) distances of points (k, 3) and (n, 3)."""
+def _distances(points: Array, others: Array) -> Array:
+    """Return the distances (k, n) between points (k, 3) and (n, 3)."""
     return np.sqrt(((points[:, None] - others) ** 2).sum(axis=2))
 
 
@@ -162,27 +175,28 @@ WHY_NONE = {
     "made exact": "fingertips do not come to rest on the surface inside a face",
     "still clear": "palm or fingers would be in the object",
     "force-closed": "contacts do not oppose each other within friction",
-    "hold ": "it is too heavy for that squeeze, friction and the motors' torques",
+    "hold ": "the object is too heavy for that squeeze, friction and the motors' torques",
     "arm reaches": "the object is out of the arm's reach, or only from sides that hold nothing",
     "contacts as claimed": "contacts are off, lean, or are not closed once the arm is solved",
     "free in the scene": "arm or hand would hit something of the scene, or the object",
 }
-"""What it means that nothing passes a stage."""
+"""Likely cause if no candidate passes a stage, by a part of the stage's name."""
 
 
 @dataclass
 class Generator:
-    """Candidates of one surface and one hand.
+    """Generator of candidates for one surface and one hand.
 
     Attributes:
-        table: The hand's.
-        surface: The object's.
-        fingers: How many fingertips touch.
-        parameters: How they are looked for.
-        rng: Random numbers.
-        counts: How many passed each stage.
-        asked: How many of them the arm was asked to reach.
-        alike: How many of the last round were like others.
+        table: Table of the hand.
+        surface: Surface of the object.
+        fingers: Number of fingertips that touch.
+        parameters: Parameters of the search.
+        rng: Random number generator.
+        hand_check: Collision check of hands without the arm.
+        counts: Number of candidates that passed each stage.
+        arm_queries: Number of hand poses that the arm was asked to reach.
+        duplicates: Number of duplicates in the last batch.
     """
 
     table: HandTable
@@ -190,75 +204,80 @@ class Generator:
     fingers: int
     parameters: TouchParameters
     rng: np.random.Generator
-    clear: HandCheck
+    hand_check: HandCheck
     counts: dict[str, int] = field(default_factory=dict)
-    asked: int = 0
-    alike: int = 0
+    arm_queries: int = 0
+    duplicates: int = 0
 
     def __post_init__(self) -> None:
         self._entry = touch_library()["casadi_ik_touch"]
         self._pairs = np.zeros((0, 4), dtype=np.int64)
-        self._job, self._kept = self._made(int(self.rng.integers(2**62)))
-        self.look()
+        self._job, self._buffers = self._new_job(int(self.rng.integers(2**62)))
+        self.draw_pairs()
 
-    def look(self) -> None:
-        """Draw more pairs of patches; those are kept that two fingertips may fit."""
-        surface, chosen = self.surface, self.parameters
-        good = np.flatnonzero(surface.inside)
-        if len(good) < 2:
+    def draw_pairs(self) -> None:
+        """Draw more pairs of opposing patches and keep those that two fingertips may fit."""
+        surface, parameters = self.surface, self.parameters
+        eligible = np.flatnonzero(surface.inside)
+        if len(eligible) < 2:
             return
-        i, j = good[self.rng.integers(len(good), size=(2, chosen.object_pairs))]
-        way = surface.points[j] - surface.points[i]
-        length = np.linalg.norm(way, axis=1)
-        first = -np.einsum("ki,ki->k", way, surface.normals[i])
-        second = np.einsum("ki,ki->k", way, surface.normals[j])
-        facing = np.minimum(first, second) > np.cos(chosen.facing) * length
-        kept = np.flatnonzero(facing & (length > 5e-3))
-        i, j, way = i[kept], j[kept], way[kept]
-        turns = np.arccos(np.clip(np.stack([first, second])[:, kept] / length[kept], -1, 1))
-        # Balls touch where they are so far from the middle, and may lean.
+        i, j = eligible[self.rng.integers(len(eligible), size=(2, parameters.pairs_per_draw))]
+        line = surface.points[j] - surface.points[i]
+        length = np.linalg.norm(line, axis=1)
+        first = -np.einsum("ki,ki->k", line, surface.normals[i])
+        second = np.einsum("ki,ki->k", line, surface.normals[j])
+        oppose = np.minimum(first, second) > np.cos(parameters.max_facing_angle) * length
+        rows = np.flatnonzero(oppose & (length > 5e-3))
+        i, j, line = i[rows], j[rows], line[rows]
+        angles = np.arccos(np.clip(np.stack([first, second])[:, rows] / length[rows], -1, 1))
+        # The centre of a ball is a radius above the patch, and its pad normal may lean.
         table = self.table
-        others = np.arange(len(table.radii)) != table.thumb
+        is_finger = np.arange(len(table.radii)) != table.thumb
         radii, roll = (
-            np.array([own[table.thumb], own[others].mean()]) for own in (table.radii, table.roll)
+            np.array([values[table.thumb], values[is_finger].mean()])
+            for values in (table.radii, table.roll)
         )
-        way = way + radii[1] * surface.normals[j] - radii[0] * surface.normals[i]
-        turns = np.abs(turns + roll[:, None] * self.rng.uniform(-1, 1, turns.shape))
-        found = table.cells(table.key(np.linalg.norm(way, axis=1), *np.cos(turns)))
-        pairs = np.stack([i, j, *found], axis=1)[found[1] > 0]
+        line = line + radii[1] * surface.normals[j] - radii[0] * surface.normals[i]
+        angles = np.abs(angles + roll[:, None] * self.rng.uniform(-1, 1, angles.shape))
+        first_pair, count = table.cells(table.key(np.linalg.norm(line, axis=1), *np.cos(angles)))
+        pairs = np.stack([i, j, first_pair, count], axis=1)[count > 0]
         self._pairs = np.ascontiguousarray(np.concatenate([self._pairs, pairs]))
 
     @property
-    def fits(self) -> bool:
-        """Whether any two opposing patches have the distance and angles of two fingertips."""
+    def has_pairs(self) -> bool:
+        """True if two opposing patches have the distance and angles of two fingertips."""
         return len(self._pairs) > 0
 
-    def counted(self, stage: str, number: int) -> None:
-        """Count what passed a stage."""
+    def count(self, stage: str, number: int) -> None:
+        """Add to the number of candidates that passed a stage."""
         self.counts[stage] = self.counts.get(stage, 0) + int(number)
 
     def candidates(self, count: int) -> Candidates:
-        """Of so many palms and hands those whose fingertips touch, clear of all but the arm."""
-        table, surface, chosen = self.table, self.surface, self.parameters
-        some = self.draw(count)
-        if len(some):
-            some = snapped(table, surface, some, chosen)
-            tips = pads_of(table, some).points
-            contacts = touching(table, surface, some)
-            # Whether an edge of the surface is near is known for samples.
-            feet = np.where(some.used[..., None], contacts.foot, tips)
-            fits = surface.inside[surface.foot(feet)[1]]
-            ok = contacts.accepted(chosen, table.roll) & fits
-            rows = np.flatnonzero((ok | ~some.used).all(axis=1))
-            some = replace(some, tips=tips, contacts=contacts).rows(rows)
-        self.counted("made exact", len(some))
-        some = some.rows(np.flatnonzero(self.clear(some)))
-        self.counted("still clear", len(some))
-        return some
+        """Generate hands whose fingertips touch, free of collision apart from the arm.
 
-    def why_none(self) -> str:
-        """What no candidate passed."""
-        if not self.fits:
+        Args:
+            count: Number of hands before refinement.
+        """
+        table, surface, parameters = self.table, self.surface, self.parameters
+        hands = self.draw(count)
+        if len(hands):
+            hands = refined(table, surface, hands, parameters)
+            tips = pads_of(table, hands).points
+            contacts = touching(table, surface, hands)
+            # Edges of the surface are known at samples.
+            feet = np.where(hands.used[..., None], contacts.foot, tips)
+            on_face = surface.inside[surface.foot(feet)[1]]
+            ok = contacts.accepted(parameters, table.roll) & on_face
+            rows = np.flatnonzero((ok | ~hands.used).all(axis=1))
+            hands = replace(hands, tips=tips, contacts=contacts).rows(rows)
+        self.count("made exact", len(hands))
+        hands = hands.rows(np.flatnonzero(self.hand_check(hands)))
+        self.count("still clear", len(hands))
+        return hands
+
+    def failure_reason(self) -> str:
+        """Return the stage that no candidate passed, and the likely cause."""
+        if not self.has_pairs:
             return (
                 "no two patches of the object are as far apart, and face each other as well, as "
                 "the thumb and another fingertip can"
@@ -268,73 +287,70 @@ class Generator:
         return f"of {self.counts['attempts']:,} attempts none came to: {stage}{why}"
 
     def draw(self, count: int) -> Candidates:
-        """So many, if they are found: two fingertips fit, the others find something to touch."""
+        """Draw up to `count` hands: two fingertips fit, the others find something to touch."""
         job, table = self._job, self.table
         f = len(table.radii)
         palms, shared = np.empty((count, 12)), np.empty(count, dtype=np.int64)
-        postured, used = np.empty((2, count, f), dtype=np.int64)
+        postures, used = np.empty((2, count, f), dtype=np.int64)
         job.palms, job.shared = palms.ctypes.data, shared.ctypes.data
-        job.postured, job.used = postured.ctypes.data, used.ctypes.data
+        job.postured, job.used = postures.ctypes.data, used.ctypes.data
         job.patches, job.n_patches = self._pairs.ctypes.data, len(self._pairs)
-        job.wanted, job.found, job.most = count, 0, job.attempts + self.parameters.attempts
+        job.wanted, job.found = count, 0
+        job.most = job.attempts + self.parameters.max_attempts_per_batch
         run_cancellable("touch", self._entry, job)
-        found = job.found
-        hand = table.q[shared[:found], postured[:found, table.thumb]].copy()
+        n = job.found
+        hand = table.q[shared[:n], postures[:n, table.thumb]].copy()
         for finger in range(f):
-            posture = table.q[shared[:found], postured[:found, finger]]
-            table.put(hand, np.arange(found), posture, finger)
+            table.put(hand, np.arange(n), table.q[shared[:n], postures[:n, finger]], finger)
         self.counts |= {
             "attempts": job.attempts,
             "two fingertips fit": job.fit,
             "they are clear": job.free,
         }
-        self.counted(f"{self.fingers} fingertips touch, all clear", found)
-        palm = rigid(palms[:found, :9].reshape(-1, 3, 3), palms[:found, 9:])
-        return Candidates(palm, hand, used[:found].astype(bool))
+        self.count(f"{self.fingers} fingertips touch, all clear", n)
+        palm = rigid(palms[:n, :9].reshape(-1, 3, 3), palms[:n, 9:])
+        return Candidates(palm, hand, used[:n].astype(bool))
 
-    def _made(self, seed: int) -> tuple[Any, tuple[Any, ...]]:
-        """What the driver works on, but for what follows from a round; what has to live as long."""
-        table, surface, chosen, shapes = (
-            self.table,
-            self.surface,
-            self.parameters,
-            self.clear.shapes,
-        )
+    def _new_job(self, seed: int) -> tuple[Any, tuple[Any, ...]]:
+        """Return the job of the driver, and the objects that own its memory."""
+        table, surface, parameters = self.table, self.surface, self.parameters
+        check, shapes = self.hand_check, self.hand_check.shapes
         low, high = surface.points.min(axis=0), surface.points.max(axis=0)
-        thing, around = self.clear.grids(low, high, chosen)
+        object_grid, scene_grid = check.grids(low, high, parameters)
         arrays: dict[str, Any] = {
             "points": table.points,
             "normals": table.normals,
-            "off_object": self.clear.off(True),
-            "off_scene": self.clear.off(False),
+            "off_object": check.standoffs(of_object=True),
+            "off_scene": check.standoffs(of_object=False),
             "radii": table.radii,
-            "cos_lean": np.cos(chosen.lean + table.roll),
+            "cos_lean": np.cos(parameters.max_initial_lean + table.roll),
             "pairs": table.pairs.astype(np.int64),
-            "depths": table.depths / chosen.deep,
+            "depths": table.depths / parameters.max_pinch_depth,
             "samples": surface.points,
             "outward": surface.normals,
             "inside": surface.inside.astype(np.int64),
             "near_height": surface.grid.value,
             "near_sample": surface.grid.sample,
-            "object_value": thing.value,
-            "scene_value": around.value,
+            "object_value": object_grid.value,
+            "scene_value": scene_grid.value,
         }
         arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         job = TouchJob(
             **shapes.job,
             **{name: array.ctypes.data for name, array in arrays.items()},
             thumb=table.thumb,
-            near=chosen.near,
-            clear=chosen.clear,
-            least_often=chosen.least_often,
+            near=parameters.max_initial_height,
+            clear=parameters.idle_clearance,
+            least_often=parameters.min_trial_probability,
             fingers=self.fingers,
-            tries=chosen.tries,
+            tries=parameters.max_posture_trials,
             seed=seed,
         )
-        for name, grid in (("near", surface.grid), ("object", thing), ("scene", around)):
+        grids = {"near": surface.grid, "object": object_grid, "scene": scene_grid}
+        for name, grid in grids.items():
             getattr(job, f"{name}_low")[:] = grid.low.tolist()
             getattr(job, f"{name}_count")[:] = grid.counts.tolist()
-        job.up[:] = self.clear.pose[2, :3].tolist()
+        job.up[:] = check.pose[2, :3].tolist()
         for name in ("depth", "way"):
             getattr(job, f"{name}_clear")[:] = [1.0] * BINS
             getattr(job, f"{name}_tried")[:] = [2.0] * BINS
@@ -395,8 +411,8 @@ class Touching:
             roll: (f,) additional lean that pads may have [rad].
         """
         aside = np.arccos(np.clip((self.toward * self.inward).sum(axis=-1), -1, 1))
-        touches: Bools = np.abs(self.height) < parameters.touch
-        touches &= self.lean < parameters.last_lean + roll
+        touches: Bools = np.abs(self.height) < parameters.max_height
+        touches &= self.lean < parameters.max_lean + roll
         return touches & (np.maximum(self.spread, aside) < parameters.max_spread)
 
 
@@ -429,22 +445,22 @@ def touching(table: HandTable, surface: Surface, hands: Candidates) -> Touching:
     return Touching(*(spread_out(part) for part in parts))
 
 
-def snapped(
-    table: HandTable, surface: Surface, some: Candidates, chosen: TouchParameters
+def refined(
+    table: HandTable, surface: Surface, hands: Candidates, parameters: TouchParameters
 ) -> Candidates:
-    """Palms and hands moved until every fingertip touches: damped least squares, limits kept."""
-    _, start = surface.foot(pads_of(table, some).points)
-    palms, q = pose_row(some.palm), table.configuration(some.hand)
+    """Move palms and hands until every fingertip touches: damped least squares within limits."""
+    _, start = surface.foot(pads_of(table, hands).points)
+    palms, q = pose_row(hands.palm), table.configuration(hands.hand)
     robot, motors = table.robot, table.motors
     arrays: dict[str, Any] = {
         "palms": palms,
         "q": q,
-        "used": some.used.astype(np.int64),
+        "used": hands.used.astype(np.int64),
         "motors": motors.astype(np.int64),
         "lower": robot.lower[motors],
         "upper": robot.upper[motors],
         "radii": table.radii,
-        "free_lean": chosen.free_lean + table.roll,
+        "free_lean": parameters.free_lean + table.roll,
         "samples": surface.points,
         "normals": surface.normals,
         "faces": surface.faces,
@@ -454,113 +470,122 @@ def snapped(
     arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     job = SnapJob(
         **{name: array.ctypes.data for name, array in arrays.items()},
-        slide=chosen.slide,
-        turn=chosen.turn,
-        steps=chosen.steps,
+        slide=parameters.sliding_weight,
+        turn=parameters.lean_length,
+        steps=parameters.refinement_steps,
         count=len(q),
         slice=SLICE,
     )
     run_cancellable("snap", table.kernel.library["casadi_ik_snap"], job)
     palm = rigid(arrays["palms"][:, :9].reshape(-1, 3, 3), arrays["palms"][:, 9:])
-    return Candidates(palm, arrays["q"][:, motors], some.used)
+    return Candidates(palm, arrays["q"][:, motors], hands.used)
 
 
 class HandCheck:
-    """Whether palms and hands hit the object, what stands about it, or themselves; arms aside.
+    """Collision check of hands with the object, the scene and themselves, without the arm.
 
-    The arm stays at home and the world is moved instead, so that the collision kernel of solves
-    serves before there is an arm.
+    The arm stays at home and the world is moved instead, so that the collision kernel of the solver
+    can be used before the arm is solved.
     """
 
     def __init__(
         self, table: HandTable, check: SceneCheck, pose: Array, tables: dict[bytes, Any]
     ) -> None:
-        """Take over the scene of a solver.
+        """Use the scene of a solver.
 
         Args:
-            table: The hand's.
-            check: Of the scene in which the object is grasped.
-            pose: (4, 4) of the object in the base frame.
-            tables: Of the same hand and object wherever it was before: pairs that count.
+            table: Table of the hand.
+            check: Check of the scene in which the object is grasped.
+            pose: (4, 4) pose of the object in the base frame.
+            tables: Cache of the same hand and object, shared between poses of the object.
         """
         self.table, self.check, self.pose, self._tables = table, check, pose, tables
-        self._every = check.table(check.scene, frozenset()).held
-        at = self._every.poses(check.scene.items)
-        self._items = rigid(at[:, :9].reshape(-1, 3, 3), at[:, 9:])
+        self._all_pairs = check.table(check.scene, frozenset()).held
+        rows = self._all_pairs.poses(check.scene.items)
+        self._items = rigid(rows[:, :9].reshape(-1, 3, 3), rows[:, 9:])
         self.shapes = table.shape(check)
 
-    def grids(self, low: Array, high: Array, chosen: TouchParameters) -> tuple[Grid, Grid]:
-        """Distances of the object, and of what stands about it, in the object's frame.
+    def grids(self, low: Array, high: Array, parameters: TouchParameters) -> tuple[Grid, Grid]:
+        """Return the distance grids of the object and of the scene, in the object's frame.
 
         Args:
             low: (3,) lower corner of the object [m].
-            high: (3,) upper corner.
-            chosen: How finely.
+            high: (3,) upper corner of the object [m].
+            parameters: Sizes of the cells.
         """
         scene, size = self.check.scene, float((high - low).max())
-        if OBJECT not in self._tables:
+        if OBJECT_GRID not in self._tables:
             parts = scene.items[str(scene.grasped)].parts
-            step = max(chosen.object_step, size / chosen.cells)
-            grown = max(float(self.off(True).max(initial=0.0)), 0.0) + 2 * step
-            self._tables[OBJECT] = Grid.of(parts, low - grown, high + grown, step)
+            step = max(parameters.object_cell, size / parameters.max_cells)
+            margin = max(float(self.standoffs(of_object=True).max(initial=0.0)), 0.0) + 2 * step
+            self._tables[OBJECT_GRID] = Grid.of(parts, low - margin, high + margin, step)
         reach = sum(
-            float(np.abs(part[..., :3]).max(initial=0.0))
-            for part in (self.shapes.capsules, self.shapes.fixed)
+            float(np.abs(segments[..., :3]).max(initial=0.0))
+            for segments in (self.shapes.capsules, self.shapes.fixed)
         )
-        others = [
-            (solid, inverse(self.pose) @ item.pose @ at)
+        obstacles = [
+            (solid, inverse(self.pose) @ item.pose @ pose)
             for item in scene.items.values()
             if item.name != scene.grasped
-            for solid, at in item.parts
+            for solid, pose in item.parts
         ]
-        step = max(chosen.scene_step, (size + 2 * reach) / chosen.cells)
-        return self._tables[OBJECT], Grid.of(others, low - reach, high + reach, step)
+        step = max(parameters.scene_cell, (size + 2 * reach) / parameters.max_cells)
+        return self._tables[OBJECT_GRID], Grid.of(obstacles, low - reach, high + reach, step)
 
-    def off(self, object_: bool) -> Array:
-        """(c,) what the middles of the hand's capsules keep off the object, or what is about it."""
-        every, shapes = self._every, self.shapes
-        first = len(every.radii) + every.own
-        grasped = np.array([name == self.check.scene.grasped for name in every.items], dtype=bool)
-        with_ = every.pairs[:, 1] >= first
-        with_[with_] = grasped[every.pairs[with_, 1] - first] == object_
-        least = np.full(len(every.radii), -np.inf)
-        np.maximum.at(least, every.pairs[with_, 0], every.offsets[with_])
-        return (least + every.radii + self.check.scene.margin)[shapes.numbers]
+    def standoffs(self, of_object: bool) -> Array:
+        """Return the least distances (c,) of the axes of the hand's capsules from solids [m].
 
-    def __call__(self, some: Candidates) -> Bools:
-        """(k,) which are clear."""
-        q = self.table.configuration(some.hand)
-        world = self.table.palm @ inverse(self.pose @ some.palm)
-        ok = np.zeros(len(some), dtype=bool)
-        code = some.used @ (1 << np.arange(some.used.shape[1]))
+        Args:
+            of_object: From the object; else from the rest of the scene.
+        """
+        pairs, shapes = self._all_pairs, self.shapes
+        first = len(pairs.radii) + pairs.own
+        is_grasped = np.array(
+            [name == self.check.scene.grasped for name in pairs.items], dtype=bool
+        )
+        counts = pairs.pairs[:, 1] >= first
+        counts[counts] = is_grasped[pairs.pairs[counts, 1] - first] == of_object
+        least = np.full(len(pairs.radii), -np.inf)
+        np.maximum.at(least, pairs.pairs[counts, 0], pairs.offsets[counts])
+        return (least + pairs.radii + self.check.scene.margin)[shapes.numbers]
+
+    def __call__(self, hands: Candidates) -> Bools:
+        """Return (k,) True for hands that are free of collision."""
+        q = self.table.configuration(hands.hand)
+        world = self.table.palm @ inverse(self.pose @ hands.palm)
+        is_free = np.zeros(len(hands), dtype=bool)
+        code = hands.used @ (1 << np.arange(hands.used.shape[1]))
         for value in set(code.tolist()):
             rows = np.flatnonzero(code == value)
-            table = self._table(some.used[rows[0]])
+            table = self._pairs_for(hands.used[rows[0]])
             poses = pose_row(world[rows, None] @ self._items)
-            around = CollisionQuery(self.check.kernel, table, poses, self.check.scene.margin)
-            ok[rows] = around.free(q[rows])
-        return ok
+            query = CollisionQuery(self.check.kernel, table, poses, self.check.scene.margin)
+            is_free[rows] = query.free(q[rows])
+        return is_free
 
-    def arm_clear(self, q: Array) -> Bools:
-        """(k,) whether arms of configurations (k, n) are clear of all; hands aside."""
+    def arm_is_free(self, q: Array) -> Bools:
+        """Return (k,) True for configurations (k, n) whose arm is free of collision."""
         check = self.check
         table = check.table(check.scene, frozenset()).swung
-        around = CollisionQuery(
+        query = CollisionQuery(
             check.kernel, table, table.poses(check.scene.items), check.scene.margin
         )
-        return around.free(q)
+        return query.free(q)
 
-    def _table(self, used: Bools) -> Table:
-        """The pairs that count: fingertips that are used may touch the object."""
+    def _pairs_for(self, used: Bools) -> Table:
+        """Return the pairs to check: fingertips that are used may touch the object."""
         key = used.tobytes()
         if key not in self._tables:
             names = zip(self.table.robot.fingers, used, strict=True)
-            pads = [self.check.bodies_of_fingers[name] for name, on in names if on]
-            touched, grasped = frozenset[str]().union(*pads), self.check.scene.grasped
-            kept = [not (pair[1] == grasped and pair[0] in touched) for pair in self._every.names]
-            self._tables[key] = self._every.only(np.array(kept, dtype=bool))
+            pads = [self.check.bodies_of_fingers[name] for name, is_used in names if is_used]
+            touching_links, grasped = frozenset[str]().union(*pads), self.check.scene.grasped
+            checked = [
+                not (pair[1] == grasped and pair[0] in touching_links)
+                for pair in self._all_pairs.names
+            ]
+            self._tables[key] = self._all_pairs.only(np.array(checked, dtype=bool))
         return self._tables[key]
 
 
-OBJECT = b"object"
-"""Under which the grid of an object is kept."""
+OBJECT_GRID = b"object"
+"""Key of the object's grid in the cache of a `HandCheck`."""

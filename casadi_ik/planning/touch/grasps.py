@@ -1,4 +1,4 @@
-"""Grasps of a surface that an arm-hand can make, ranked: see `Solver.grasps_of`."""
+"""Find and rank grasps of a surface that an arm-hand can make: see `Solver.grasps_of`."""
 
 from __future__ import annotations
 
@@ -44,18 +44,18 @@ from casadi_ik.planning.touch.surface import Surface, SurfaceSource, load_surfac
 from casadi_ik.solve.solution import BatchSolution, Solution
 
 OPENINGS = (0.025, 0.015, 0.008)
-"""How far fingertips are from the object before they close, the first that is clear [m]."""
+"""Distances of fingertips from the object before they close; the first free one is used [m]."""
 
-INWARD = 5e-3
-"""How far fingertips would go into the object to squeeze it, in the mean [m]."""
+SQUEEZE_DEPTH = 5e-3
+"""Mean depth of fingertips in the object at the posture `Grasp.squeeze` [m]."""
 
 RETREAT = 0.06
-"""How far the palm is back before it comes to the grasp [m]."""
+"""Distance of the palm from the grasp at the pregrasp [m]."""
 
-ROUGHLY = float(np.deg2rad(3.0))
-"""How far an object may be turned that was seen by a camera [rad]."""
+POSE_ANGLE_ERROR = float(np.deg2rad(3.0))
+"""Default angle error of an object's pose from a camera [rad]."""
 
-SURE = float(np.cos(np.pi / 8))
+CLOSURE_FRICTION = float(np.cos(np.pi / 8))
 """Force closure is judged with friction reduced by this factor.
 
 The friction cones so reduced lie within every pyramid of eight or more edges inscribed in the full
@@ -63,7 +63,7 @@ cones: another linear program with such pyramids agrees.
 """
 
 Judgement = str | Callable[[ArmHand, Array], ArrayLike]
-"""What grasps are ranked by: a name of `RANKINGS`, or scores (m,) of configurations (m, n)."""
+"""Ranking of grasps: a name of `RANKINGS`, or a function from configurations to scores (m,)."""
 
 RANKINGS = ("load", "clearance", "limits", "q0")
 
@@ -73,21 +73,20 @@ class FoundGrasp:
     """A grasp that the arm-hand can make.
 
     Attributes:
-        grasp: Contacts in the base frame: where fingertips are and their pads face; with the
-            object's name and pose, the hand's posture, and the same hand before (`pregrasp`) and as
-            it squeezes (`squeeze`), as palms and postures.
-        solution: How it is made, judged in the scene.
-        load: Weight that the worst of six directions holds per newton of squeeze (the sum of the
-            normal forces) with friction, the less the more the object gives way: half where it
-            moves 20 mm, or turns 30 deg, as pads roll and motors yield like springs [N/N].
-        closure: The same over forces and torques (about the middle of the object, divided by half
+        grasp: Contacts in the base frame, with the object's name and pose, the posture of the hand,
+            and the hand before it closes (`pregrasp`) and as it squeezes (`squeeze`).
+        solution: Solution in the scene.
+        load: Weight held in the worst of six directions per newton of squeeze (sum of the normal
+            forces), with friction. It is reduced by the object's displacement, as pads roll and
+            motors yield like springs: halved at 20 mm or 30 deg [N/N].
+        closure: The same over forces and torques (about the centre of the object, divided by half
             its size); above 0 the grasp is force-closed.
-        score: What it was ranked by, higher is better.
-        forces: (3,) by finger, with which to squeeze, of the fingertip on the object, base frame:
-            the object stays at rest, and is best held against any pull. Their normal parts sum to
+        score: Score by which it was ranked; higher is better.
+        forces: Force (3,) of each fingertip on the object, base frame, with which to squeeze: the
+            object stays at rest, and is best held against any pull. The normal components sum to
             1 N.
         most_squeeze: Largest sum of normal forces for which the torques of the motors suffice [N];
-            inf where the robot's description tells none (`effort` of a joint).
+            inf if the robot's description has no `effort` of its joints.
     """
 
     grasp: Grasp
@@ -100,17 +99,17 @@ class FoundGrasp:
 
     @property
     def q(self) -> Array:
-        """(n,) the posture: what `Solver.reach` goes to."""
+        """Configuration (n,) of the grasp, the goal of `Solver.reach`."""
         return self.solution.q
 
     @property
     def clearance(self) -> float | None:
-        """Smallest distance of a pair that must not touch [m]."""
+        """Smallest distance between bodies that must not touch [m]."""
         return self.solution.clearance
 
     @property
     def pregrasp(self) -> Grasp | None:
-        """Palm and posture before it; None: no opening of the hand was clear."""
+        """Palm and posture before the hand closes; None if every opening of it collides."""
         return self.grasp.pregrasp
 
 
@@ -119,13 +118,13 @@ class FoundGrasps(Sequence[FoundGrasp]):
     """Distinct grasps of an object, best first.
 
     Attributes:
-        entries: The grasps; itself a sequence of them.
-        counts: How many candidates passed each stage, in order.
-        prefer: What they are ranked by.
+        entries: The grasps; `FoundGrasps` is a sequence of them.
+        counts: Number of candidates that passed each stage, in order.
+        prefer: Name of the ranking.
         time: Processor time [s].
-        reason: Why there is none; "" if there are some.
+        reason: Why there is no grasp; "" if there are some.
         robot: The robot.
-        surface: The object's.
+        surface: Surface of the object.
         mu: Friction coefficient.
     """
 
@@ -145,42 +144,41 @@ class FoundGrasps(Sequence[FoundGrasp]):
         return iter(self.entries)
 
     @overload
-    def __getitem__(self, place: int) -> FoundGrasp: ...
+    def __getitem__(self, index: int) -> FoundGrasp: ...
 
     @overload
-    def __getitem__(self, place: slice) -> tuple[FoundGrasp, ...]: ...
+    def __getitem__(self, index: slice) -> tuple[FoundGrasp, ...]: ...
 
-    def __getitem__(self, place: int | slice) -> FoundGrasp | tuple[FoundGrasp, ...]:
-        return self.entries[place]
+    def __getitem__(self, index: int | slice) -> FoundGrasp | tuple[FoundGrasp, ...]:
+        return self.entries[index]
 
     @property
     def grasps(self) -> tuple[Grasp, ...]:
         """The grasps, for `Solver.choose`."""
-        return tuple(one.grasp for one in self.entries)
+        return tuple(entry.grasp for entry in self.entries)
 
     def robustness(
         self,
         position: float = 5e-3,
-        angle: float = ROUGHLY,
+        angle: float = POSE_ANGLE_ERROR,
         hold: tuple[float, float] | None = None,
         samples: int = 64,
         seed: int = 0,
     ) -> Array:
-        """How the grasps bear that the object is not quite where it was thought to be.
+        """Return how often each grasp still closes on an object that is displaced.
 
-        The share of displacements at which the fingers, each moving until it touches, still close
-        on the object.
+        The palm goes where it was planned, and each finger moves until it touches the object.
 
         Args:
-            position: How far the object is off, in random directions [m].
-            angle: How far it is turned, about random axes [rad].
-            hold: Mass [kg], and the squeeze [N] with which it has to be held then, as for
-                `Solver.grasps_of`; None: it is enough that the hand closes.
-            samples: Displacements of each grasp.
-            seed: Of their directions.
+            position: Displacement of the object, in random directions [m].
+            angle: Rotation of the object, about random axes [rad].
+            hold: Mass [kg] that the contacts have to hold, and the squeeze [N], as for
+                `Solver.grasps_of`; None: the contacts have to be force-closed.
+            samples: Number of displacements of each grasp.
+            seed: Seed of their directions.
 
         Returns:
-            (k,) shares, one for each grasp.
+            (k,) shares of the displacements, one for each grasp.
 
         Raises:
             InputError: A negative or infinite number, no sample, or a bad `hold`.
@@ -197,23 +195,27 @@ class FoundGrasps(Sequence[FoundGrasp]):
         angle = checked_number(angle, "robustness: angle", "an angle [rad] >= 0", 0.0)
         samples = checked_integer(samples, "robustness: samples", 1)
         seed, hold = checked_integer(seed, "robustness: seed", 0), _checked_hold(hold)
-        off = offsets(position, angle, samples, seed, self.surface.middle)
-        shares = [robustness(self.robot, self.surface, one, self.mu, off, hold) for one in self]
+        displacements = offsets(position, angle, samples, seed, self.surface.middle)
+        shares = [
+            robustness(self.robot, self.surface, entry, self.mu, displacements, hold)
+            for entry in self
+        ]
         return np.array(shares)
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """The same in short lines."""
+        """Summary in short lines."""
         lines = [f"{len(self)} distinct grasps in {self.time:.2f} s of processor time"]
         lines += [f"  {number:>9,} {stage}" for stage, number in self.counts.items()]
         lines += [f"{self.surface.name}: {note}" for note in self.surface.notes]
         if self.reason:
             return (*lines, f"none: {self.reason}")
         lines.append(f"best by {self.prefer}:")
-        for place, one in enumerate(self.entries[:10], 1):
-            room = "" if one.clearance is None else f", clearance {1e3 * one.clearance:.1f} mm"
-            score = "" if self.prefer == "load" else f"{self.prefer} {one.score:.4g}, "
-            lines.append(f"  {place:>2}. {score}load {one.load:.3f} N/N{room}")
+        for rank, entry in enumerate(self.entries[:10], 1):
+            clearance = entry.clearance
+            room = "" if clearance is None else f", clearance {1e3 * clearance:.1f} mm"
+            score = "" if self.prefer == "load" else f"{self.prefer} {entry.score:.4g}, "
+            lines.append(f"  {rank:>2}. {score}load {entry.load:.3f} N/N{room}")
         return tuple(lines)
 
     def __str__(self) -> str:
@@ -224,16 +226,45 @@ class FoundGrasps(Sequence[FoundGrasp]):
 
 
 @dataclass(frozen=True, eq=False)
-class _Made:
-    """Grasps of a round that pass all: k of them."""
+class _Batch:
+    """Grasps of a batch that pass all stages, k of them.
 
-    batch: BatchSolution
+    Attributes:
+        solutions: Solutions of the batch.
+        rows: (k,) rows of the grasps among these.
+        hands: Hands at the solved configurations.
+        loads: (k,) see `FoundGrasp.load`.
+        closures: (k,) see `FoundGrasp.closure`.
+        forces: (k, c, 3) forces on the object, in its frame.
+        most_squeezes: (k,) see `FoundGrasp.most_squeeze`.
+    """
+
+    solutions: BatchSolution
     rows: NDArray[np.intp]
-    some: Candidates
+    hands: Candidates
     loads: Array
     closures: Array
     forces: Array
-    most: Array
+    most_squeezes: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Solvers:
+    """Solvers of a search.
+
+    Attributes:
+        arms: Solver of palms without a scene.
+        judge: Solver in the scene with the object.
+        pose: (4, 4) pose of the object in the base frame.
+        jobs: Number of threads.
+        q0: (n,) configuration of the robot; None: home.
+    """
+
+    arms: Any
+    judge: Any
+    pose: Array
+    jobs: int
+    q0: Array | None
 
 
 def grasps_of(
@@ -250,33 +281,34 @@ def grasps_of(
     q0: ArrayLike | None = None,
     among: int = 200,
 ) -> FoundGrasps:
-    """Find grasps of an object that the arm and the hand can make, free of collision.
+    """Find grasps of an object that arm and hand can make without collision.
 
-    Two opposing fingertips are matched with two opposing patches of the surface, the others
-    look for something to touch, palm and hand are moved until all touch within 1 mm and 15 deg
-    (pads that are balls 40), the arm follows, and what remains is judged in the scene and ranked.
+    Two opposing fingertips are matched with two opposing patches of the surface, further fingertips
+    are placed where they touch, palm and hand are refined until all are within 1 mm and 15 deg (40
+    deg for balls), and the arm is solved. Grasps that are free of collision are checked once more
+    and ranked.
 
     Args:
         solver: A `Solver`.
         surface: A surface, or what `load_surface` takes: a name or path, vertices and triangles,
             or a trimesh object.
         pose: (4, 4) of the object in the base frame; None: the identity.
-        fingers: How many fingertips touch, the thumb among them; of a hand with fewer, all.
+        fingers: Number of fingertips that touch, the thumb among them; a hand with fewer uses all.
         mu: Friction coefficient between fingertips and object, from 0.01 to 10.
         hold: Mass [kg], and the squeeze [N] with which it has to be held in each of six
-            directions, or with what the motors' torques suffice for, if that is less; None: it is
-            enough that the grasp is force-closed.
-        limit: How many distinct grasps at most.
-        jobs: Threads; the answer does not depend on them.
-        seed: Of all random numbers.
-        prefer: What comes first: "load", "clearance", "limits", "q0", or a function of the
-            robot and configurations (m, n) that gives scores (m,), higher is better.
-        q0: (n,) where the robot is [rad or m]; None is `robot.home`.
-        among: Of so many distinct grasps, if there are, the best are given: with a small `limit`
-            this decides how good they are, and how long it takes.
+            directions, or the largest squeeze of the motors, if that is less; None: the grasp has
+            to be force-closed.
+        limit: Maximum number of distinct grasps.
+        jobs: Number of threads; the result does not depend on it.
+        seed: Seed of all random numbers.
+        prefer: Ranking: "load", "clearance", "limits", "q0", or a function of the robot and
+            configurations (m, n) that returns scores (m,), higher is better.
+        q0: (n,) current configuration of the robot [rad or m]; None is `robot.home`.
+        among: Number of distinct grasps to find, of which the best are returned: with a small
+            `limit` it decides how good they are, and how long the search takes.
 
     Returns:
-        The grasps, best first, with how many candidates passed each stage.
+        The grasps, best first, with the number of candidates that passed each stage.
 
     Raises:
         InputError: An argument has the wrong type or value, or the surface cannot be grasped (see
@@ -293,68 +325,73 @@ def grasps_of(
         (5, True)
     """
     solver.robot.description.one_hand("grasps_of")
-    begin, chosen = time.process_time(), TouchParameters()
+    begin, parameters = time.process_time(), TouchParameters()
     robot = solver.robot
-    place = np.eye(4) if pose is None else one_pose(pose)
+    object_pose = np.eye(4) if pose is None else one_pose(pose)
     question = _checked(fingers, mu, hold, limit, among, seed, prefer)
-    mu, hold, limit, seed = question.mu, question.hold, question.limit, question.seed
-    goal = max(limit, question.among)
-    fingers = min(question.fingers, len(robot.fingers))
+    goal = max(question.limit, question.among)
     if not isinstance(surface, Surface):
         surface = load_surface(surface)
     table = HandTable.of(robot)
-    arms, judge, hands = _solvers(solver, table, surface, place, chosen)
-    generator = Generator(table, surface, fingers, chosen, np.random.default_rng(seed), hands)
+    arms, judge, hand_check = _solvers(solver, table, surface, object_pose, parameters)
     start = None if q0 is None else robot.configuration(q0)
-    parts: list[_Made] = []
-    known, drawn, tried, alike, wanted = 0, 0, 0, 0, chosen.first
+    solvers = _Solvers(arms, judge, object_pose, jobs, start)
+    rng = np.random.default_rng(question.seed)
+    count = min(question.fingers, len(robot.fingers))
+    generator = Generator(table, surface, count, parameters, rng, hand_check)
+    batches: list[_Batch] = []
+    n_found, n_drawn, n_attempts, n_duplicates = 0, 0, 0, 0
+    size = parameters.first_batch
     with progress(goal) as show:
-        while generator.fits and known < goal and tried < chosen.most:
-            if tried:
-                generator.look()
-            some = generator.candidates(wanted)
-            drawn, tried = drawn + wanted, generator.counts["attempts"]
-            before = [part.some for part in parts]
-            made = _made(generator, some, before, arms, judge, place, mu, hold, jobs, start)
-            new = 0 if made is None else len(made.rows)
-            if made is not None:
-                parts.append(made)
-                show(min(new, goal - known))
-                known += new
-            alike = generator.alike if new else alike + generator.alike
-            if alike > max(goal, chosen.seldom * max(new, 1)):
-                break  # nearly each is like one found before
-            if generator.asked >= chosen.lost and not known:
-                break  # the arm reaches none
-            share = 1.2 * (goal - known) / known if known else 1.0
-            wanted = int(np.clip(share * drawn, chosen.first, min(10 * drawn, chosen.round)))
-    found = _ranked(robot, generator, hands, parts, place, limit, prefer, start, mu)
-    return replace(found, time=time.process_time() - begin)
+        while generator.has_pairs and n_found < goal and n_attempts < parameters.max_attempts:
+            if n_attempts:
+                generator.draw_pairs()
+            hands = generator.candidates(size)
+            n_drawn, n_attempts = n_drawn + size, generator.counts["attempts"]
+            batch = _solved_batch(generator, hands, batches, solvers, question)
+            n_new = 0 if batch is None else len(batch.rows)
+            if batch is not None:
+                batches.append(batch)
+                show(min(n_new, goal - n_found))
+                n_found += n_new
+            n_duplicates = generator.duplicates + (0 if n_new else n_duplicates)
+            if n_duplicates > max(goal, parameters.max_consecutive_duplicates * max(n_new, 1)):
+                break
+            if generator.arm_queries >= parameters.max_unreachable_hands and not n_found:
+                break
+            share = 1.2 * (goal - n_found) / n_found if n_found else 1.0
+            largest = min(10 * n_drawn, parameters.max_batch)
+            size = int(np.clip(share * n_drawn, parameters.first_batch, largest))
+    ranked = _ranked(generator, batches, solvers, question, prefer)
+    return replace(ranked, time=time.process_time() - begin)
 
 
 _SOLVERS: WeakKeyDictionary[Any, dict[tuple[str, int, TouchParameters], tuple[Any, Any, Any]]] = (
     WeakKeyDictionary()
 )
+"""Cache by solver, then object and parameters: solver of palms, solver in the scene, tables."""
 
 
 def _solvers(
-    solver: Any, table: HandTable, surface: Surface, place: Array, chosen: TouchParameters
+    solver: Any, table: HandTable, surface: Surface, pose: Array, parameters: TouchParameters
 ) -> tuple[Any, Any, HandCheck]:
-    """What solves palms, what judges grasps and hands with the object in the scene; made once."""
-    # A file may be another mesh by now.
-    key = surface.name, hash(surface.points.tobytes()), chosen
-    made = _SOLVERS.setdefault(solver, {})
-    if key not in made:
-        kinds = {"tolerance": Tolerance(chosen.touch, chosen.turned / 15)}
-        kinds |= {"options": {"max_rounds": 1}}
-        scene = (solver.scene or Scene()).holding(surface.name, place)
-        one = type(solver)
-        made[key] = one(solver.robot, **kinds), one(solver.robot, scene=scene, **kinds), {}
-    arms, judge, tables = made[key]
-    # What is worked out for the object at one place serves at the next.
-    judge = judge.moved(surface.name, place)
-    made[key] = arms, judge, tables
-    return arms, judge, HandCheck(table, judge.scene_check, place, tables)
+    """Return the solver of palms, the solver in the scene with the object, and the hand check.
+
+    They are made once for an object; its contents are part of the key, since files may change.
+    """
+    key = surface.name, hash(surface.points.tobytes()), parameters
+    cache = _SOLVERS.setdefault(solver, {})
+    if key not in cache:
+        tolerance = Tolerance(parameters.max_height, parameters.min_rotation / 15)
+        options: dict[str, Any] = {"tolerance": tolerance, "options": {"max_rounds": 1}}
+        scene = (solver.scene or Scene()).holding(surface.name, pose)
+        make = type(solver)
+        cache[key] = make(solver.robot, **options), make(solver.robot, scene=scene, **options), {}
+    arms, judge, tables = cache[key]
+    # Tables that do not depend on the pose are used again at the next one.
+    judge = judge.moved(surface.name, pose)
+    cache[key] = arms, judge, tables
+    return arms, judge, HandCheck(table, judge.scene_check, pose, tables)
 
 
 MU_RANGE = (0.01, 10.0)
@@ -371,7 +408,6 @@ class _Question:
     limit: int
     among: int
     seed: int
-    prefer: Judgement
 
 
 def _checked(
@@ -392,7 +428,6 @@ def _checked(
         checked_integer(limit, "limit", 1),
         checked_integer(among, "among", 1),
         checked_integer(seed, "seed", 0),
-        prefer,
     )
 
 
@@ -435,82 +470,93 @@ def _scores(prefer: Callable[[ArmHand, Array], ArrayLike], robot: ArmHand, q: Ar
     return scores
 
 
-def _made(
+def _solved_batch(
     generator: Generator,
-    some: Candidates,
-    before: Sequence[Candidates],
-    arms: Any,
-    judge: Any,
-    place: Array,
-    mu: float,
-    hold: tuple[float, float] | None,
-    jobs: int,
-    start: Array | None,
-) -> _Made | None:
-    """Those that are unlike those before, hold, are reached by the arm and free in the scene."""
-    robot, table = arms.robot, generator.table
-    clear, chosen = len(some), generator.parameters
-    for part in before if clear else ():
-        some = some.rows(some.unlike(part, chosen))
-    generator.alike = clear - len(some)
-    generator.counted("unlike those before", len(some))
-    if not len(some):
+    hands: Candidates,
+    batches: Sequence[_Batch],
+    solvers: _Solvers,
+    question: _Question,
+) -> _Batch | None:
+    """Return the candidates that are new, force-closed, reached by the arm and free; None if none.
+
+    Args:
+        generator: Generator of the candidates; its counts are updated.
+        hands: The candidates.
+        batches: Grasps of earlier batches.
+        solvers: Solvers of the search.
+        question: Friction coefficient and load.
+    """
+    arms, judge, pose = solvers.arms, solvers.judge, solvers.pose
+    robot, table, parameters = arms.robot, generator.table, generator.parameters
+    mu, hold, n_candidates = question.mu, question.hold, len(hands)
+    for batch in batches if n_candidates else ():
+        hands = hands.rows(hands.new_rows(batch.hands, parameters))
+    generator.duplicates = n_candidates - len(hands)
+    generator.count("unlike those before", len(hands))
+    if not len(hands):
         return None
-    firm = closed(_wrenches(generator, some, SURE * mu))
-    rows = np.argsort(-firm, kind="stable")[: np.count_nonzero(firm > CLOSED)]
-    generator.counted("force-closed", len(rows))
-    new = rows[some.rows(rows).distinct(chosen)]
-    generator.counted("unlike each other", len(new))
-    generator.alike += len(rows) - len(new)
-    generator.asked += len(new)
-    if not len(new):
+    closure = closed(_wrenches(generator, hands, CLOSURE_FRICTION * mu))
+    rows = np.argsort(-closure, kind="stable")[: np.count_nonzero(closure > CLOSED)]
+    generator.count("force-closed", len(rows))
+    distinct = rows[hands.rows(rows).distinct_rows(parameters)]
+    generator.count("unlike each other", len(distinct))
+    generator.duplicates += len(rows) - len(distinct)
+    generator.arm_queries += len(distinct)
+    if not len(distinct):
         return None
-    some = some.rows(new)
-    palms, hands = place @ some.palm, table.configuration(some.hand)
-    reached = arms.solve_palms(palms, hands, start, jobs=jobs)
-    q, met = reached.q, reached.success.copy()
-    hits = np.flatnonzero(met)
-    hits = hits[~generator.clear.arm_clear(q[hits])]
-    met[hits] = False
-    if len(hits) > met.sum():  # other arms for these hands; else other hands come cheaper
-        other = judge.solve_palms(palms[hits], hands[hits], start, jobs=jobs)
-        q[hits], met[hits] = other.q, other.success
-    generator.counted("arm reaches", int(reached.success.sum()))
-    rows = np.flatnonzero(met)
+    hands = hands.rows(distinct)
+    palms, postures = pose @ hands.palm, table.configuration(hands.hand)
+    reached = arms.solve_palms(palms, postures, solvers.q0, jobs=solvers.jobs)
+    q, is_free = reached.q, reached.success.copy()
+    colliding = np.flatnonzero(is_free)
+    colliding = colliding[~generator.hand_check.arm_is_free(q[colliding])]
+    is_free[colliding] = False
+    # Other arms for these hands cost more than other hands, unless most arms collide.
+    if len(colliding) > is_free.sum():
+        again = judge.solve_palms(
+            palms[colliding], postures[colliding], solvers.q0, jobs=solvers.jobs
+        )
+        q[colliding], is_free[colliding] = again.q, again.success
+    generator.count("arm reaches", int(reached.success.sum()))
+    rows = np.flatnonzero(is_free)
     if not len(rows):
         return None
-    some, q = some.rows(rows), q[rows]
-    points, normals = (np.where(some.used[..., None], part, np.nan) for part in robot.contacts(q))
-    batch = judge.solve_batch(points, normals, q0=q, jobs=jobs)
-    rows = np.flatnonzero(batch.success)
-    generator.counted("free in the scene", len(rows))
+    hands, q = hands.rows(rows), q[rows]
+    points, normals = (
+        np.where(hands.used[..., None], values, np.nan) for values in robot.contacts(q)
+    )
+    solutions = judge.solve_batch(points, normals, q0=q, jobs=solvers.jobs)
+    rows = np.flatnonzero(solutions.success)
+    generator.count("free in the scene", len(rows))
     if not len(rows):
         return None
-    final = _as_solved(generator, some.rows(rows), batch.q[rows], place)
-    kept = _confirmed(generator, final, mu)
-    generator.counted("contacts as claimed", len(kept))
-    final, rows = final.rows(kept), rows[kept]
+    hands = _as_solved(generator, hands.rows(rows), solutions.q[rows], pose)
+    confirmed = _confirmed(generator, hands, mu)
+    generator.count("contacts as claimed", len(confirmed))
+    hands, rows = hands.rows(confirmed), rows[confirmed]
     if not len(rows):
         return None
-    strength = _strengths(generator, final, mu, hold)
-    held = strength.hold(hold)
+    strength = _strengths(generator, hands, mu, hold)
+    is_held = strength.hold(hold)
     if hold is not None:
-        generator.counted(f"hold {hold[0]:g} kg at {hold[1]:g} N", int(held.sum()))
-    parts = strength.load, strength.closure, strength.forces, strength.most
-    return _Made(batch, rows[held], final.rows(held), *(part[held] for part in parts))
+        generator.count(f"hold {hold[0]:g} kg at {hold[1]:g} N", int(is_held.sum()))
+    values = strength.load, strength.closure, strength.forces, strength.most
+    return _Batch(
+        solutions, rows[is_held], hands.rows(is_held), *(value[is_held] for value in values)
+    )
 
 
-def _as_solved(generator: Generator, hands: Candidates, q: Array, place: Array) -> Candidates:
+def _as_solved(generator: Generator, hands: Candidates, q: Array, pose: Array) -> Candidates:
     """Return hands as configurations q (k, n) place them, with their contacts.
 
     Args:
         generator: Generator of the candidates.
         hands: The hands before the arm was solved; they say which fingers touch.
         q: (k, n) solved configurations.
-        place: (4, 4) pose of the object in the base frame.
+        pose: (4, 4) pose of the object in the base frame.
     """
     table = generator.table
-    palm = inverse(place) @ table.robot.palm(q)
+    palm = inverse(pose) @ table.robot.palm(q)
     solved = replace(hands, palm=palm, hand=np.take(q, table.motors, axis=1), contacts=None)
     return replace(
         solved,
@@ -524,7 +570,7 @@ def _confirmed(generator: Generator, hands: Candidates, mu: float) -> NDArray[np
     assert hands.contacts is not None
     ok = hands.contacts.accepted(generator.parameters, generator.table.roll)
     rows = np.flatnonzero((ok | ~hands.used).all(axis=1))
-    firm = closed(_wrenches(generator, hands.rows(rows), SURE * mu))
+    firm = closed(_wrenches(generator, hands.rows(rows), CLOSURE_FRICTION * mu))
     return rows[firm > CLOSED]
 
 
@@ -571,117 +617,111 @@ def _strengths(
 
 
 def _ranked(
-    robot: ArmHand,
     generator: Generator,
-    hands: HandCheck,
-    parts: list[_Made],
-    place: Array,
-    limit: int,
+    batches: list[_Batch],
+    solvers: _Solvers,
+    question: _Question,
     prefer: Judgement,
-    start: Array | None,
-    mu: float,
 ) -> FoundGrasps:
-    """The distinct ones, best first."""
-    where = [(part, i) for part in parts for i in range(len(part.rows))]
-    name, about = prefer if isinstance(prefer, str) else "own", (robot, generator.surface, mu)
-    if not where:
-        return FoundGrasps((), generator.counts, name, 0.0, generator.why_none(), *about)
-    q = np.concatenate([part.batch.q[part.rows] for part in parts])
-    load = np.concatenate([part.loads for part in parts])
-    closure = np.concatenate([part.closures for part in parts])
-    most = np.concatenate([part.most for part in parts])
-    clearance = np.concatenate([np.asarray(part.batch.clearance)[part.rows] for part in parts])
-    span = robot.upper - robot.lower
+    """Return the best grasps of all batches."""
+    robot, pose = solvers.arms.robot, solvers.pose
+    entries = [(batch, i) for batch in batches for i in range(len(batch.rows))]
+    name = prefer if isinstance(prefer, str) else "own"
+    context = robot, generator.surface, question.mu
+    if not entries:
+        reason = generator.failure_reason()
+        return FoundGrasps((), generator.counts, name, 0.0, reason, *context)
+    q = np.concatenate([batch.solutions.q[batch.rows] for batch in batches])
+    load = np.concatenate([batch.loads for batch in batches])
+    closure = np.concatenate([batch.closures for batch in batches])
+    most_squeeze = np.concatenate([batch.most_squeezes for batch in batches])
+    clearance = np.concatenate(
+        [np.asarray(batch.solutions.clearance)[batch.rows] for batch in batches]
+    )
+    span, q0 = robot.upper - robot.lower, robot.home if solvers.q0 is None else solvers.q0
     scores = {
         "load": lambda: load,
         "clearance": lambda: clearance,
         "limits": lambda: (np.minimum(q - robot.lower, robot.upper - q) / span).min(axis=1),
-        "q0": lambda: -np.abs((q - (robot.home if start is None else start)) / span).max(axis=1),
+        "q0": lambda: -np.abs((q - q0) / span).max(axis=1),
     }
     score = scores[prefer]() if isinstance(prefer, str) else _scores(prefer, robot, q)
-    kept = np.argsort(-score, kind="stable")[:limit]
-    chosen = [where[row] for row in kept]
-    used = np.stack([part.some.used[i] for part, i in chosen])
-    hands_kept = Candidates(np.zeros((len(kept), 4, 4)), np.zeros((len(kept), 0)), used)
-    some = _as_solved(generator, hands_kept, q[kept], place)
-    # Of the fingertips that touch, in the order of the fingers.
-    forces = np.zeros((*some.used.shape, 3))
-    squeezes = np.stack([part.forces[i] for part, i in chosen])
-    forces[some.used] = (squeezes @ place[:3, :3].T).reshape(-1, 3)
-    solutions = [part.batch.solution(int(part.rows[i])) for part, i in chosen]
-    grasps = _grasps(robot, generator, hands, some, q[kept], place, forces)
-    entries = []
-    for i, (row, solution, grasp) in enumerate(zip(kept, solutions, grasps, strict=True)):
+    best = np.argsort(-score, kind="stable")[: question.limit]
+    chosen = [entries[row] for row in best]
+    used = np.stack([batch.hands.used[i] for batch, i in chosen])
+    which_touch = Candidates(np.zeros((len(best), 4, 4)), np.zeros((len(best), 0)), used)
+    hands = _as_solved(generator, which_touch, q[best], pose)
+    forces = np.zeros((*used.shape, 3))
+    touching_forces = np.stack([batch.forces[i] for batch, i in chosen])
+    forces[used] = (touching_forces @ pose[:3, :3].T).reshape(-1, 3)
+    grasps = _grasps(generator, hands, q[best], pose, forces)
+    ranked = []
+    for i, (row, (batch, k), grasp) in enumerate(zip(best, chosen, grasps, strict=True)):
         by_finger = {name: forces[i, robot.fingers.index(name)] for name in grasp.contacts}
+        solution = batch.solutions.solution(int(batch.rows[k]))
         values = float(load[row]), float(closure[row]), float(score[row])
-        entries.append(FoundGrasp(grasp, solution, *values, by_finger, float(most[row])))
-    return FoundGrasps(tuple(entries), generator.counts, name, 0.0, "", *about)
+        ranked.append(FoundGrasp(grasp, solution, *values, by_finger, float(most_squeeze[row])))
+    return FoundGrasps(tuple(ranked), generator.counts, name, 0.0, "", *context)
 
 
 def _grasps(
-    robot: ArmHand,
-    generator: Generator,
-    hands: HandCheck,
-    some: Candidates,
-    q: Array,
-    place: Array,
-    forces: Array,
+    generator: Generator, hands: Candidates, q: Array, pose: Array, forces: Array
 ) -> list[Grasp]:
-    """The grasps of postures q (k, n), with the hand before each and as it squeezes.
+    """Return the grasps of configurations, with the hand before it closes and as it squeezes.
 
     Args:
-        robot: The robot.
-        generator: Of the candidates.
-        hands: Tells which hands are clear.
-        some: The hands as they touch.
-        q: (k, n) the postures.
-        place: (4, 4) of the object.
-        forces: (k, f, 3) on the object, base frame.
+        generator: Generator of the candidates.
+        hands: Hands at the configurations, with their contacts.
+        q: (k, n) configurations.
+        pose: (4, 4) pose of the object in the base frame.
+        forces: (k, f, 3) forces on the object, base frame.
     """
-    table, surface = generator.table, generator.surface
-    assert some.contacts is not None
+    table, robot = generator.table, generator.table.robot
+    assert hands.contacts is not None
+    is_ball = table.radii > 0
     points, normals = robot.contacts(q)
-    middles = points - table.radii[:, None] * normals
-    toward = np.nan_to_num(some.contacts.toward) @ place[:3, :3].T
-    touched = np.where(table.radii[:, None] > 0, middles + table.radii[:, None] * toward, points)
+    centers = points - table.radii[:, None] * normals
+    toward = np.nan_to_num(hands.contacts.toward) @ pose[:3, :3].T
+    contact_points = np.where(is_ball[:, None], centers + table.radii[:, None] * toward, points)
     palms = robot.palm(q)
-    seen_forces, seen_pads = (
-        np.einsum("kfi,kij->kfj", one, palms[:, :3, :3]) for one in (forces, touched - middles)
+    palm_forces, palm_offsets = (
+        np.einsum("kfi,kij->kfj", vectors, palms[:, :3, :3])
+        for vectors in (forces, contact_points - centers)
     )
-    squeezed = table.squeezed(some, seen_pads, seen_forces, INWARD)
-    opened, known = some.hand.copy(), np.zeros(len(some), dtype=bool)
-    seen = some
+    squeezed = table.squeezed(hands, palm_offsets, palm_forces, SQUEEZE_DEPTH)
+    opened, is_open = hands.hand.copy(), np.zeros(len(hands), dtype=bool)
     for opening in OPENINGS:
-        left = np.flatnonzero(~known)
-        if len(left):
-            tried = table.opened(seen.rows(left), opening)
-            clear = hands(tried)
-            opened[left[clear]], known[left[clear]] = tried.hand[clear], True
+        rows = np.flatnonzero(~is_open)
+        if len(rows):
+            trial = table.opened(hands.rows(rows), opening)
+            is_free = generator.hand_check(trial)
+            opened[rows[is_free]], is_open[rows[is_free]] = trial.hand[is_free], True
     motors = [robot.actuators[i] for i in table.motors]
-    stem = Path(surface.object.name).stem
-    found = []
-    for i in range(len(some)):
+    stem = Path(generator.surface.object.name).stem
+    grasps = []
+    for i in range(len(hands)):
         contacts = {}
-        for j in np.flatnonzero(some.used[i]):
-            ball = toward[i, j] if table.radii[j] else None
-            contacts[robot.fingers[j]] = Contact(touched[i, j], normals[i, j], ball=ball)
-        back = palms[i].copy()
-        away = back[:3, 3] - np.mean([one.point for one in contacts.values()], axis=0)
-        back[:3, 3] += RETREAT * away / max(float(np.linalg.norm(away)), 1e-9)
-        hand, before, after = (
-            dict(zip(motors, one[i].tolist(), strict=True)) for one in (some.hand, opened, squeezed)
+        for j in np.flatnonzero(hands.used[i]):
+            ball = toward[i, j] if is_ball[j] else None
+            contacts[robot.fingers[j]] = Contact(contact_points[i, j], normals[i, j], ball=ball)
+        retreated = palms[i].copy()
+        way = retreated[:3, 3] - np.mean([contact.point for contact in contacts.values()], axis=0)
+        retreated[:3, 3] += RETREAT * way / max(float(np.linalg.norm(way)), 1e-9)
+        posture, open_posture, squeezing_posture = (
+            dict(zip(motors, positions[i].tolist(), strict=True))
+            for positions in (hands.hand, opened, squeezed)
         )
-        pregrasp = Grasp(robot=robot.name, palm=back, posture=before) if known[i] else None
-        found.append(
+        pregrasp = Grasp(robot=robot.name, palm=retreated, posture=open_posture)
+        grasps.append(
             Grasp(
                 contacts,
                 robot=robot.name,
                 name=f"{stem} {'+'.join(contacts)}",
-                object=surface.name,
-                object_pose=place,
-                posture=hand,
-                pregrasp=pregrasp,
-                squeeze=Grasp(robot=robot.name, palm=palms[i], posture=after),
+                object=generator.surface.name,
+                object_pose=pose,
+                posture=posture,
+                pregrasp=pregrasp if is_open[i] else None,
+                squeeze=Grasp(robot=robot.name, palm=palms[i], posture=squeezing_posture),
             )
         )
-    return found
+    return grasps
