@@ -328,6 +328,24 @@ def test_two_hands_on_wrists_in_one_file_are_two_sides(run: Command, tmp_path: P
     assert all(len(side.fingers) == 3 for side in sides), done.out
 
 
+def test_no_hidden_file_is_there_while_shapes_are_fitted(
+    run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from casadi_ik.integrations.importing import imported
+
+    names: list[set[str]] = []
+    fit = imported.robot_shapes
+
+    def watched(*arguments: Any) -> Any:
+        names.append({path.name for path in tmp_path.iterdir()})
+        return fit(*arguments)
+
+    monkeypatch.setattr(imported, "robot_shapes", watched)
+    run("import", hand(tmp_path), "--out", tmp_path / "mine.yaml").fine()
+    assert names == [{"hand.urdf"}]
+    assert (tmp_path / "mine.yaml").exists()
+
+
 def test_a_wrist_is_called_a_wrist(run: Command, tmp_path: Path) -> None:
     text = link("forearm") + chain(tmp_path, ("wrist",), "forearm")
     for finger in ("thumb", "index"):

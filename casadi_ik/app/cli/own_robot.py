@@ -112,7 +112,7 @@ def import_robot(said: Said) -> Answer:
         part.write_text(found.written.text(), encoding="utf-8")
         found = found.at_home(part)
         part.write_text(found.written.text(), encoding="utf-8")
-        found = found.with_shapes(part, srdf)
+        found = found.with_shapes(part, srdf, discard=True)
         part.write_text(found.written.text(), encoding="utf-8")
         robot = imported.loaded(part)
         differences = _differences(robot, found) if said.check else {}

@@ -260,17 +260,20 @@ class Imported:
         named = dict(zip(description.actuator_names, home, strict=True))
         return replace(self, written=replace(self.written, home=named))
 
-    def with_shapes(self, path: Path, srdf: Path | None = None) -> Imported:
+    def with_shapes(self, path: Path, srdf: Path | None = None, discard: bool = False) -> Imported:
         """With the shapes of its links, for the description as it was written to a path.
 
         Args:
             path: The description.
             srdf: A file that says which links may touch.
+            discard: Whether to remove the description once it is loaded.
 
         Raises:
             CasadiIKError: The description cannot be loaded.
         """
         robot = load_description(path)
+        if discard:  # shapes take seconds: a process that is killed meanwhile leaves no file behind
+            path.unlink()
         shapes, touching, notes = robot_shapes(robot, self.files)
         notes = [*(note for file in self.files if file is not None for note in file.notes), *notes]
         text = "" if srdf is None else file_text(srdf, path)
