@@ -1,4 +1,4 @@
-"""How well contacts hold an object, many grasps at once; also where it is not quite there."""
+"""Strength of grasps, many at once, and their robustness to errors of the object's pose."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ if TYPE_CHECKING:
     from casadi_ik.planning.touch.grasps import FoundGrasp
 
 EDGES = 8
-"""Edges of the pyramid within a friction cone."""
+"""Edges of the pyramid inscribed in a friction cone."""
 
 DIRECTIONS = np.concatenate([np.eye(6), -np.eye(6)])
-"""(12, 6) wrenches: forces along and torques about the axes, both ways."""
+"""(12, 6) wrenches: forces along and torques about the axes, in both directions."""
 
 FORCES = [0, 1, 2, 6, 7, 8]
-"""Those of them that are forces."""
+"""Rows of `DIRECTIONS` that are forces."""
 
 GRAVITY = 9.80665
 """Standard acceleration of free fall [m/s^2]."""
 
 USUAL = (0.2, 18.0)
-"""Mass [kg] and squeeze [N] for which stiffness counts where none are said."""
+"""Default mass [kg] and squeeze [N] of the displacement that reduces a load."""
 
 CLOSED = 1e-4
 """Load from which a grasp counts as force-closed [N/N]."""
 
 STEPS, ENOUGH = 50, 1e-9
-"""Most iterations of a linear program, and the mean of x z that is followed by the last."""
+"""Maximum iterations of a linear program, and the mean of x z below which it ends."""
 
 
 def generators(
@@ -54,16 +54,16 @@ def generators(
     length: float,
     patch: float = 0.005,
 ) -> Array:
-    """Wrenches of soft fingers with a normal force of 1: the edges of their friction cones.
+    """Return wrenches of soft fingers with a normal force of 1: the edges of the friction cones.
 
     Args:
         points: (k, c, 3) contacts [m].
         normals: (k, c, 3) unit, into the object.
         mu: Friction coefficient, or (k, c) of each contact.
-        center: (3,) about which torques are [m].
-        length: By which torques are divided [m].
-        patch: Radius of a pad's contact patch [m]: it holds 2/3 mu patch about its normal
-            (Coulomb friction under even pressure).
+        center: (3,) reference point of torques [m].
+        length: Length by which torques are divided [m].
+        patch: Radius of a pad's contact patch [m]: it resists a torque of 2/3 mu patch about its
+            normal (Coulomb friction under even pressure).
 
     Returns:
         (k, 6, c * (EDGES + 2)).
@@ -97,32 +97,32 @@ def narrowed(mu: float, spread: Array) -> Array:
 
 
 def loads(wrenches: Array, directions: Array = DIRECTIONS) -> Array:
-    """Largest s with -s d = W x, x >= 0, sum x <= 1: what a squeeze of 1 N holds against d.
+    """Return the largest s with -s d = W x, x >= 0, sum x <= 1: the load held by 1 N of squeeze.
 
     Args:
-        wrenches: (k, 6, g) of the cones' edges.
-        directions: (d, 6).
+        wrenches: (k, 6, g) edges of the friction cones.
+        directions: (d, 6) directions of the load.
 
     Returns:
-        (k, d) loads [N per N]; 0 where nothing is held.
+        (k, d) loads [N per N]; 0 for directions in which nothing is held.
     """
     return np.maximum(_solved(wrenches, directions)[..., -2], 0.0)
 
 
 def closed(wrenches: Array) -> Array:
-    """(k,) loads against the mean of the wrenches (k, 6, g): above 0 if a grasp is force-closed.
+    """Return (k,) loads against the mean of the wrenches (k, 6, g), above 0 for force closure.
 
-    Only then all of them can be above 0 and in balance. One program tells it, not twelve as by
-    `loads`.
+    Only with force closure can all wrenches have positive weights and be in balance. This takes
+    one linear program; `loads` takes twelve.
     """
     return np.maximum(_solved(wrenches, wrenches.mean(axis=2)[:, None])[:, 0, -2], 0.0)
 
 
 def loads_and_squeezes(wrenches: Array) -> tuple[Array, Array]:
-    """The loads of `DIRECTIONS`, and forces at rest from which a grasp is best pulled any way.
+    """Return the loads of `DIRECTIONS`, and balanced forces that best resist any pull.
 
-    These are the mean of what holds as much against each of six forces with least squeeze: as
-    those cancel, the object is at rest.
+    The forces are the mean of those that hold the same load in six directions with the least
+    squeeze: as these loads cancel, the object is at rest.
 
     Args:
         wrenches: (k, 6, c * (EDGES + 2)) from `generators`.
@@ -142,15 +142,15 @@ def loads_and_squeezes(wrenches: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class GiveParameters:
-    """How a grasp gives way when the object is pulled; those of the study `touch_hold`.
+    """Compliance of a grasp; values of the study `touch_hold`.
 
     Attributes:
-        springs: Of motors that turn and that slide [N m/rad, N/m].
-        far: What the object may move [m] ...
-        turned: ... and turn [rad].
-        spin: Turn after which a pad's friction about its normal is used up [rad].
-        flat: Radius of the ball that a plane counts as [m].
-        contact: Compliance of a contact itself [m/N].
+        springs: Stiffness of revolute and of prismatic motors [N m/rad, N/m].
+        far: Displacement of the object that halves a load [m].
+        turned: Rotation of the object that halves a load [rad].
+        spin: Rotation at which the torsional friction of a pad is used up [rad].
+        flat: Radius of the ball by which a plane pad is modelled [m].
+        contact: Compliance of a contact [m/N].
     """
 
     springs: tuple[float, float] = (3.0, 2000.0)
@@ -166,14 +166,14 @@ GIVE = GiveParameters()
 
 @dataclass(frozen=True, eq=False)
 class Strengths:
-    """How well grasps hold: k of them, of c contacts.
+    """Strength of k grasps of c contacts.
 
     Attributes:
-        load: (k,) what the worst of six directions holds by friction, less by how far the object
-            gives way [N/N].
-        closure: (k,) what the worst of `DIRECTIONS` holds.
-        forces: (k, c, 3) on the object at rest; their normal parts sum to 1 N.
-        most: (k,) largest squeeze for which motors' efforts suffice [N].
+        load: (k,) load held in the worst of six directions by friction, reduced by the object's
+            displacement [N/N].
+        closure: (k,) load held in the worst of `DIRECTIONS` [N/N].
+        forces: (k, c, 3) forces on the object at rest; their normal components sum to 1 N.
+        most: (k,) largest squeeze for which the efforts of the motors suffice [N].
     """
 
     load: Array
@@ -182,11 +182,11 @@ class Strengths:
     most: Array
 
     def hold(self, hold: tuple[float, float] | None) -> Bools:
-        """(k,) which are force-closed, and hold a mass [kg] with a squeeze [N] if that is said."""
-        held: Bools = self.closure > CLOSED
+        """Return (k,) True for force-closed grasps that hold a mass [kg] with a squeeze [N]."""
+        is_held: Bools = self.closure > CLOSED
         if hold is None:
-            return held
-        return held & (self.load * np.minimum(hold[1], self.most) >= hold[0] * GRAVITY)
+            return is_held
+        return is_held & (self.load * np.minimum(hold[1], self.most) >= hold[0] * GRAVITY)
 
 
 def strengths(
@@ -199,29 +199,29 @@ def strengths(
     mu: float,
     hold: tuple[float, float] | None,
 ) -> Strengths:
-    """How well grasps hold a mass [kg] with a squeeze [N] (None: `USUAL`).
+    """Return the strength of grasps that hold a mass [kg] with a squeeze [N] (None: `USUAL`).
 
     Args:
         wrenches: (k, 6, c * (EDGES + 2)) from `generators`.
-        arms: (k, c, 3) contacts from the middle of the object [m].
+        arms: (k, c, 3) contacts from the centre of the object [m].
         normals: (k, c, 3) unit, into the object.
-        radii: (k, c) of pads [m]; 0 of planes.
-        jacobians: (k, c, 3, m) of contacts over motors.
+        radii: (k, c) radii of pads [m]; 0 for planes.
+        jacobians: (k, c, 3, m) derivatives of contacts by motors.
         motors: The m motors.
         mu: Friction coefficient.
-        hold: Mass [kg] and squeeze [N] for which the object's giving way counts.
+        hold: Mass [kg] and squeeze [N] for which the displacement is computed.
     """
     mass, squeeze = USUAL if hold is None else hold
-    found, forces = loads_and_squeezes(wrenches)
+    direction_loads, forces = loads_and_squeezes(wrenches)
     torques = np.abs(np.einsum("kcim,kci->km", jacobians, forces))
     efforts = np.array([motor.effort for motor in motors])
     most = (efforts / np.maximum(torques, 1e-12)).min(axis=1)
     springs = np.array([GIVE.springs[motor.unit == "m"] for motor in motors])
     pressed = np.minimum(squeeze, most)[:, None, None] * forces
     stiff = np.maximum(stiffnesses(arms, normals, pressed, radii, jacobians, springs, mu), 0.0)
-    # What the object gives way by is a part of what it may.
-    load = found[:, FORCES].min(axis=1) * stiff / (stiff + mass * GRAVITY / GIVE.far)
-    return Strengths(load, found.min(axis=1), forces, most)
+    # The displacement is a share of the one that halves the load.
+    load = direction_loads[:, FORCES].min(axis=1) * stiff / (stiff + mass * GRAVITY / GIVE.far)
+    return Strengths(load, direction_loads.min(axis=1), forces, most)
 
 
 def stiffnesses(
@@ -235,11 +235,11 @@ def stiffnesses(
     patch: float = 0.005,
     give: GiveParameters = GIVE,
 ) -> Array:
-    """Least stiffness of grasps (k,) [N/m] against moving, and turning about their middle.
+    """Return the least stiffness of grasps (k,) [N/m] to displacement and rotation of the object.
 
-    Motors are springs, and pads are balls that roll on the object without sliding: as it turns, the
-    contact moves on, and the squeeze turns it further or back (Cutkosky and Kao 1989, with faces
-    flat and fingertips that do not turn). Below 0 the object rolls out of the hand.
+    Motors are springs, and pads are balls that roll on the object without sliding: as it rotates,
+    the contact moves, and the squeeze rotates it further or back (Cutkosky and Kao 1989, with flat
+    faces and fingertips that do not rotate). Below 0 the object rolls out of the hand.
 
     Args:
         arms: (k, c, 3) contacts from the middle of the object [m].
@@ -247,10 +247,10 @@ def stiffnesses(
         forces: (k, c, 3) on the object at rest [N].
         radii: (k, c) of pads [m]; 0 of planes.
         jacobians: (k, c, 3, m) of contacts over motors.
-        springs: (m,) of motors [N m/rad or N/m].
+        springs: (m,) stiffness of motors [N m/rad or N/m].
         mu: Friction coefficient.
         patch: Radius of a contact patch [m].
-        give: What motors and contacts give.
+        give: Compliance of contacts.
     """
     k, c, _, m = jacobians.shape
     length = give.far / give.turned  # of a turn that counts as a metre
@@ -272,7 +272,7 @@ def stiffnesses(
 
 
 def cross_matrices(vectors: Array) -> Array:
-    """(..., 3, 3) matrices of the cross product."""
+    """Return the cross-product matrices (..., 3, 3) of vectors (..., 3)."""
     return np.cross(vectors[..., None, :], np.eye(3)).swapaxes(-1, -2)
 
 
@@ -283,9 +283,9 @@ COLUMN = 14 * 4
 
 
 def _solved(wrenches: Array, directions: Array) -> Array:
-    """(k, d, g + 2) x, s and slack of the linear programs of `loads`, by compiled code.
+    """Return (k, d, g + 2) x, s and slack of the linear programs of `loads`, by compiled code.
 
-    Directions are the same for all, (d, 6), or their own, (k, d, 6).
+    Directions are common to all grasps, (d, 6), or specific to each, (k, d, 6).
 
     Raises:
         UnsupportedError: There is no compiler.
@@ -318,83 +318,84 @@ def _entry() -> Any:
 
 
 OPEN, FAR, PLACES = 0.020, 0.020, 33
-"""Fingertips come from so far before contacts, go on so far beyond [m]; places between."""
+"""Travel of fingertips before and beyond their contacts [m], and number of positions on it."""
 
 STEEP = float(np.deg2rad(45.0))
-"""A flat pad that leans more does not touch with its face [rad]."""
+"""A plane pad that leans more does not touch with its face [rad]."""
 
 
 def robustness(
     robot: ArmHand,
     surface: Surface,
-    one: FoundGrasp,
+    entry: FoundGrasp,
     mu: float,
     offsets: Array,
     hold: tuple[float, float] | None = None,
 ) -> float:
-    """The share of places of the object at which the hand still closes on it.
+    """Return the share of displacements of the object at which the hand still closes on it.
 
-    The palm is where it was to be, and the fingers of the grasp close from 20 mm before their
-    contacts, each until it touches or is 20 mm beyond. It is closed if the contacts that there are
-    then hold any small force and torque. Fingers that share a motor are looked at one by one.
+    The palm is where it was planned, and the fingers of the grasp close from 20 mm before their
+    contacts, each until it touches or is 20 mm beyond. The hand closes if the resulting contacts
+    resist any small force and torque. Fingers that share a motor are treated independently.
 
     Args:
         robot: The robot.
-        surface: The object's.
-        one: The grasp.
+        surface: Surface of the object.
+        entry: The grasp.
         mu: Friction coefficient.
-        offsets: (k, 4, 4) where the object is really, in the frame in which it was thought to be.
-        hold: Mass [kg], and the squeeze [N] with which it has to be held; None: it is enough that
-            the contacts are force-closed.
+        offsets: (k, 4, 4) displacements of the object, in its frame.
+        hold: Mass [kg] that the contacts have to hold, and the squeeze [N]; None: they have to be
+            force-closed.
     """
-    table, pose = HandTable.of(robot), one.grasp.known_pose
+    table, pose = HandTable.of(robot), entry.grasp.known_pose
     assert pose is not None
-    palm = inverse(pose) @ robot.palm(one.q)
-    hand = one.q[table.motors][None]
-    used = np.array([[name in one.grasp.contacts for name in robot.fingers]])
-    same = Candidates(palm[None], hand, used)
-    way = np.concatenate(
-        [table.opened(same, float(back)).hand for back in np.linspace(OPEN, -FAR, PLACES)]
+    palm = inverse(pose) @ robot.palm(entry.q)
+    hand = entry.q[table.motors][None]
+    used = np.array([[name in entry.grasp.contacts for name in robot.fingers]])
+    hands = Candidates(palm[None], hand, used)
+    path = np.concatenate(
+        [table.opened(hands, float(back)).hand for back in np.linspace(OPEN, -FAR, PLACES)]
     )
-    points, normals, linear, angular = table.at(way)
-    which = np.flatnonzero(used[0])
-    # (s, c, 3, m) in the frame in which the object was thought to be.
-    linear, angular = (palm[:3, :3] @ part[:, which] for part in (linear, angular))
+    points, normals, linear, angular = table.at(path)
+    touching = np.flatnonzero(used[0])
+    # (s, c, 3, m) in the planned frame of the object.
+    linear, angular = (palm[:3, :3] @ part[:, touching] for part in (linear, angular))
     motors = [robot.description.actuators[i] for i in table.motors]
-    # (s, c, 3) where the object was thought to be, then (k, s, c, 3) where it is.
-    points = points[:, which] @ palm[:3, :3].T + palm[:3, 3]
-    normals = normals[:, which] @ palm[:3, :3].T
-    seen = np.linalg.inv(offsets)
-    tips = np.einsum("kij,scj->ksci", seen[:, :3, :3], points) + seen[:, None, None, :3, 3]
-    faces = np.einsum("kij,scj->ksci", seen[:, :3, :3], normals)
-    height = surface.foot(tips)[0] - table.radii[which]
+    # (s, c, 3) in the planned frame of the object, then (k, s, c, 3) in the displaced ones.
+    points = points[:, touching] @ palm[:3, :3].T + palm[:3, 3]
+    normals = normals[:, touching] @ palm[:3, :3].T
+    inverse_offsets = np.linalg.inv(offsets)
+    tips = np.einsum("kij,scj->ksci", inverse_offsets[:, :3, :3], points)
+    tips += inverse_offsets[:, None, None, :3, 3]
+    faces = np.einsum("kij,scj->ksci", inverse_offsets[:, :3, :3], normals)
+    height = surface.foot(tips)[0] - table.radii[touching]
     within = height <= 0
     first = within.argmax(axis=1)  # (k, c)
     touches = within.any(axis=1) & (first > 0)
-    # The place before it touches or the one after: that which is nearer to the surface.
-    before = np.maximum(first - 1, 0)
-    nearer = np.abs(_at(height, before)) < np.abs(_at(height, first))
-    there = np.where(nearer, before, first)
-    contacts = surface.nearest(_at(tips, there))
+    # The position before the contact or the one after it, whichever is nearer to the surface.
+    previous = np.maximum(first - 1, 0)
+    nearer = np.abs(_at(height, previous)) < np.abs(_at(height, first))
+    position = np.where(nearer, previous, first)
+    contacts = surface.nearest(_at(tips, position))
     inward = -contacts.normal
-    lean = np.arccos(np.clip((_at(faces, there) * inward).sum(axis=-1), -1, 1))
-    touches &= lean < STEEP + table.roll[which]
-    closed = np.zeros(len(offsets), dtype=bool)
+    lean = np.arccos(np.clip((_at(faces, position) * inward).sum(axis=-1), -1, 1))
+    touches &= lean < STEEP + table.roll[touching]
+    is_closed = np.zeros(len(offsets), dtype=bool)
     for row_of in np.unique(touches, axis=0):
         rows = np.flatnonzero((touches == row_of).all(axis=1))
         if row_of.sum() < 2:
             continue
-        at, fingers = there[rows][:, row_of], np.flatnonzero(row_of)
+        at, fingers = position[rows][:, row_of], np.flatnonzero(row_of)
         points, normals = (part[rows][:, row_of] for part in (contacts.point, inward))
         friction = narrowed(mu, contacts.spread[rows][:, row_of])
-        radii = np.broadcast_to(table.radii[which[fingers]], at.shape)
-        turns = seen[rows, None, :3, :3]
-        jacobians = turns @ linear[at, fingers]
+        radii = np.broadcast_to(table.radii[touching[fingers]], at.shape)
+        rotations = inverse_offsets[rows, None, :3, :3]
+        jacobians = rotations @ linear[at, fingers]
         jacobians += np.cross(
-            turns @ angular[at, fingers], (radii[..., None] * normals)[..., None], axis=2
+            rotations @ angular[at, fingers], (radii[..., None] * normals)[..., None], axis=2
         )
         length = surface.size / 2
-        found = strengths(
+        strength = strengths(
             generators(points, normals, friction, surface.middle, length),
             points - surface.middle,
             normals,
@@ -404,25 +405,25 @@ def robustness(
             mu,
             hold,
         )
-        closed[rows] = found.hold(hold)
-    return float(closed.mean())
+        is_closed[rows] = strength.hold(hold)
+    return float(is_closed.mean())
 
 
 def _at(values: NDArray[Any], places: NDArray[np.intp]) -> NDArray[Any]:
-    """(k, c, ...) values (k, s, c, ...) at places (k, c)."""
+    """Return values (k, s, c, ...) at positions (k, c) of the second axis, (k, c, ...)."""
     k, c = places.shape
     return values[np.arange(k)[:, None], places, np.arange(c)]
 
 
 def offsets(position: float, angle: float, samples: int, seed: int, middle: Array) -> Array:
-    """(k, 4, 4) displacements by a distance [m] and an angle [rad] in random directions.
+    """Return (k, 4, 4) displacements by a distance [m] and an angle [rad] in random directions.
 
     Args:
-        position: How far the object is off [m].
-        angle: How far it is turned, about its middle [rad].
-        samples: How many, k.
-        seed: Of the directions.
-        middle: (3,) of the object [m].
+        position: Distance [m].
+        angle: Angle of the rotation about the centre of the object [rad].
+        samples: Number of displacements, k.
+        seed: Seed of the directions.
+        middle: (3,) centre of the object [m].
     """
     rng = np.random.default_rng(seed)
     ways, axes = rng.normal(size=(2, samples, 3))

@@ -1,4 +1,4 @@
-"""Surfaces of objects as oriented samples: where a fingertip may touch, and how far points are."""
+"""Surfaces of objects: oriented samples, distance grids and exact nearest points."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from casadi_ik.planning.touch.nearest import NearestPoints, TriangleTree
 
 @dataclass(frozen=True)
 class SurfaceParameters:
-    """How finely a surface is looked at (lengths of Drost et al. 2010, scaled to fingertips).
+    """Resolution of a surface (lengths of Drost et al. 2010, scaled to fingertips).
 
     Attributes:
         samples: Maximum number of points on the surface.
         density: Maximum mean number of them in a cube with edges of `patch`.
-        smoothing: Normals are means over this radius [m], about that of a fingertip's pad.
-        patch: A point is inside a face if all samples of this radius about it [m] ...
-        bend: ... have normals within this angle of its own [rad].
+        smoothing: Radius over which normals are averaged [m], about that of a fingertip's pad.
+        patch: Radius within which a surface has no edge around a point inside a face [m].
+        bend: Normals that differ by more than this within `patch` are an edge [rad].
         step: Edge of a cell of the distance grid [m].
-        around: How far beyond the object the grid reaches [m].
-        cells: Most cells along an edge of the grid; large objects get larger cells.
+        around: Distance of the grid's border from the object [m].
+        cells: Maximum number of cells along an edge of the grid; large objects have larger cells.
     """
 
     samples: int = 6000
@@ -51,13 +51,13 @@ class SurfaceParameters:
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Distances in the middles of cells.
+    """Distances at the centres of cells.
 
     Attributes:
         low: (4,) lower corner, and edge of a cell [m].
-        counts: (3,) how many cells there are along each axis.
+        counts: (3,) number of cells along each axis.
         value: (cells,) distances [m].
-        sample: (cells,) what is there; empty where that is not known.
+        sample: (cells,) nearest sample of the surface; empty if it is not known.
     """
 
     low: Array
@@ -77,21 +77,21 @@ class Grid:
             high: (3,) upper corner [m].
             step: Edge of a cell [m].
         """
-        low, counts, middles = cells(low, high, step)
-        value = np.full(len(middles), np.inf)
+        low, counts, centers = cells(low, high, step)
+        value = np.full(len(centers), np.inf)
         placed = list(solids)
         # A solid is not the nearest where even the ball about it is farther than another's centre.
-        bound = np.full(len(middles), np.inf)
+        bound = np.full(len(centers), np.inf)
         for solid, pose in placed:
             if np.isfinite(solid.reach) and solid.kind is not Kind.CLOUD:
-                np.minimum(bound, np.linalg.norm(middles - pose[:3, 3], axis=1), out=bound)
+                np.minimum(bound, np.linalg.norm(centers - pose[:3, 3], axis=1), out=bound)
         for solid, pose in placed:
-            near = np.linalg.norm(middles - pose[:3, 3], axis=1) - solid.reach <= bound
+            near = np.linalg.norm(centers - pose[:3, 3], axis=1) - solid.reach <= bound
             rows = np.flatnonzero(near)
-            chunk = max(1, MOST_NUMBERS // max(len(solid.planes), 1))
+            chunk = max(1, MAX_DISTANCES // max(len(solid.planes), 1))
             for start in range(0, len(rows), chunk):
                 some = rows[start : start + chunk]
-                local = (middles[some] - pose[:3, 3]) @ pose[:3, :3]
+                local = (centers[some] - pose[:3, 3]) @ pose[:3, :3]
                 if solid.kind is Kind.CLOUD:
                     distance = _tree(solid.points).query(local)[0] - solid.size[0]
                 else:
@@ -100,35 +100,44 @@ class Grid:
         return cls(low, counts, value)
 
 
-MOST_NUMBERS = 4_000_000
+MAX_DISTANCES = 4_000_000
 """Distances of cells from planes that are evaluated together; bounds the memory."""
 
 NEIGHBOURS = 12
-"""Samples about each: by them the nearest of a point is found from one that is near."""
+"""Neighbours of each sample, along which the sample nearest to a point is searched."""
 
 
 def cells(low: Array, high: Array, step: float) -> tuple[Array, NDArray[np.int64], Array]:
-    """Lower corner and edge (4,), numbers (3,) and middles (cells, 3) of the cells of a box [m]."""
+    """Divide a box into cells.
+
+    Args:
+        low: (3,) lower corner [m].
+        high: (3,) upper corner [m].
+        step: Edge of a cell [m].
+
+    Returns:
+        (4,) lower corner and edge, (3,) numbers along the axes, and (cells, 3) centres [m].
+    """
     counts = np.ceil((high - low) / step).astype(np.int64)
     axes = [low[i] + step * (np.arange(counts[i]) + 0.5) for i in range(3)]
-    middles = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    return np.append(low, step), counts, middles.reshape(-1, 3)
+    centers = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    return np.append(low, step), counts, centers.reshape(-1, 3)
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """An object's surface.
+    """Surface of an object.
 
     Attributes:
-        name: As `load_object` takes it, with its scale.
+        name: Name of the object, as `load_object` takes it, with its scale.
         object: The object.
         points: (m, 3) samples [m], object frame.
         normals: (m, 3) unit outward normals, smoothed.
-        faces: (m, 3) unit outward normals of the triangles themselves.
-        inside: (m,) whether a fingertip's pad fits: no edge of the surface is near.
+        faces: (m, 3) unit outward normals of the triangles at the samples.
+        inside: (m,) True where a fingertip's pad fits: no edge of the surface is near.
         corners: (t, 3, 3) corners of the triangles [m], outward by the right-hand rule.
-        parameters: How it was sampled.
-        notes: What is odd about the mesh, and what was made of it; empty for a closed one.
+        parameters: Resolution.
+        notes: Defects of the mesh, and how they were repaired.
 
     Example:
         >>> surface = ik.load_surface("tomato_soup_can")
@@ -149,17 +158,17 @@ class Surface:
 
     @cached_property
     def size(self) -> float:
-        """Diagonal of the box around it [m]."""
+        """Diagonal of the bounding box [m]."""
         return float(np.linalg.norm(np.ptp(self.points, axis=0)))
 
     @cached_property
     def middle(self) -> Array:
-        """(3,) mean of the samples [m]: about where the centre of mass is."""
+        """(3,) mean of the samples [m], an estimate of the centre of mass."""
         return self.points.mean(axis=0)
 
     @cached_property
     def tree(self):
-        """Nearest samples of points."""
+        """Search tree of the samples."""
         return _tree(self.points)
 
     @cached_property
@@ -177,22 +186,23 @@ class Surface:
 
     @cached_property
     def grid(self) -> Grid:
-        """Heights about the surface, and its samples there."""
-        chosen = self.parameters
+        """Grid of signed distances and nearest samples around the surface."""
+        parameters = self.parameters
         low, high = self.points.min(axis=0), self.points.max(axis=0)
-        step = max(chosen.step, (float((high - low).max()) + 2 * chosen.around) / chosen.cells)
-        low, counts, middles = cells(low - chosen.around, high + chosen.around, step)
-        height, sample = self.foot(middles)
-        apart = np.linalg.norm(middles - self.points[sample], axis=1)
-        return Grid(low, counts, np.copysign(apart, height), sample.astype(np.int64))
+        extent = float((high - low).max()) + 2 * parameters.around
+        step = max(parameters.step, extent / parameters.cells)
+        low, counts, centers = cells(low - parameters.around, high + parameters.around, step)
+        height, sample = self.foot(centers)
+        distance = np.linalg.norm(centers - self.points[sample], axis=1)
+        return Grid(low, counts, np.copysign(distance, height), sample.astype(np.int64))
 
     @cached_property
     def neighbours(self) -> NDArray[np.int64]:
-        """(m, NEIGHBOURS) the samples that are nearest to each."""
+        """(m, NEIGHBOURS) nearest samples of each sample."""
         return self.tree.query(self.points, NEIGHBOURS)[1].astype(np.int64)
 
     def foot(self, points: Array) -> tuple[Array, NDArray[np.intp]]:
-        """Nearest points of the surface: heights (...) [m], negative inside, and samples (...)."""
+        """Return heights (...) over the nearest samples [m], negative inside, and these (...)."""
         _, sample = self.tree.query(points)
         height = ((points - self.points[sample]) * self.faces[sample]).sum(axis=-1)
         return height, sample
@@ -213,7 +223,7 @@ class TriangleMesh(Protocol):
 
 
 SurfaceSource = str | Path | tuple[ArrayLike, ArrayLike] | TriangleMesh
-"""What a surface is made from, see `load_surface`."""
+"""Source of a surface, see `load_surface`."""
 
 EXPECTED_SOURCE = (
     "expected a name or path, a pair (vertices (v, 3), triangles (t, 3)), or a trimesh object"
@@ -255,37 +265,39 @@ def load_surface(
         >>> ik.load_surface((corners, tetrahedron)).points.shape
         (6000, 3)
     """
-    chosen = SurfaceParameters() if parameters is None else parameters
-    if not isinstance(chosen, SurfaceParameters):
-        raise InputError(f"parameters: found {chosen!r}, expected SurfaceParameters or None")
+    parameters = SurfaceParameters() if parameters is None else parameters
+    if not isinstance(parameters, SurfaceParameters):
+        raise InputError(f"parameters: found {parameters!r}, expected SurfaceParameters or None")
     seed = checked_integer(seed, "seed", 0)
     smallest = float(np.finfo(float).tiny)
     scale = checked_number(scale, "scale", "a number > 0 (0.001 for millimetres)", smallest)
     path = name_or_path if isinstance(name_or_path, str | Path) else _stored(name_or_path)
     factor = f"{scale:g}" if float(f"{scale:g}") == scale else repr(scale)
     name = str(path) if scale == 1.0 else f"{path}@{factor}"
-    thing = load_object(name)
-    vertices, triangles = thing.mesh(resolution=96)
+    loaded = load_object(name)
+    vertices, triangles = loaded.mesh(resolution=96)
     vertices, triangles, notes = _body(name, vertices, triangles)
-    notes = (*(thing.shape.notes if isinstance(thing.shape, MeshShape) else ()), *notes)
+    notes = (*(loaded.shape.notes if isinstance(loaded.shape, MeshShape) else ()), *notes)
     corners = vertices[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    doubled = np.linalg.norm(normals, axis=1)
+    area = np.linalg.norm(normals, axis=1)
     rng = np.random.default_rng(seed)
-    face = rng.choice(len(triangles), chosen.samples, p=doubled / doubled.sum())
-    u, v = np.sqrt(rng.random(chosen.samples)), rng.random(chosen.samples)
+    face = rng.choice(len(triangles), parameters.samples, p=area / area.sum())
+    u, v = np.sqrt(rng.random(parameters.samples)), rng.random(parameters.samples)
     weights = np.stack([1 - u, u * (1 - v), u * v], axis=1)
     points = (corners[face] * weights[..., None]).sum(axis=1)
-    faces = normals[face] / doubled[face, None]
-    # Of a small object fewer samples are as dense; without bound all are neighbours of all.
-    occupied = len(np.unique(np.floor(points / chosen.patch), axis=0))
-    count = min(chosen.samples, max(LEAST_SAMPLES, chosen.density * occupied))
+    faces = normals[face] / area[face, None]
+    # On a small object fewer samples suffice, and their number of neighbours stays bounded.
+    occupied = len(np.unique(np.floor(points / parameters.patch), axis=0))
+    count = min(parameters.samples, max(LEAST_SAMPLES, parameters.density * occupied))
     points, faces = points[:count], faces[:count]
-    return replace(_smoothed(name, thing, points, faces, corners[doubled > 0], chosen), notes=notes)
+    return replace(
+        _smoothed(name, loaded, points, faces, corners[area > 0], parameters), notes=notes
+    )
 
 
 def _stored(source: Any) -> Path:
-    """Write a mesh into the cache, unless it is there, and return its path.
+    """Write a mesh into the cache, unless it has it, and return its path.
 
     Raises:
         InputError: The source is not a mesh.
@@ -335,26 +347,26 @@ LEAST_SAMPLES = 500
 """Minimum number of samples of a small object."""
 
 SIZES = (5e-3, 2.0)
-"""Least and largest edge of the box around an object that a hand may grasp [m]."""
+"""Range of the largest edge of the bounding box of an object [m]."""
 
 FLAT = 1e-4
-"""What is thinner has no two sides for a hand [m]."""
+"""A mesh that is thinner than this is a flat sheet [m]."""
 
 DISAGREE = 0.05
-"""Share of edges whose two triangles may face opposite ways: scans have some."""
+"""Maximum share of edges whose triangles face opposite ways; scans have some."""
 
 
 def _body(
     name: str, vertices: Array, triangles: NDArray[np.int64]
 ) -> tuple[Array, NDArray[np.int64], tuple[str, ...]]:
-    """A mesh whose triangles face outwards, and what was odd about it.
+    """Return a mesh whose triangles face outward, and notes on its defects.
 
     Raises:
-        InputError: It is no body's, see `load_surface`.
+        InputError: The mesh is not that of a body, see `load_surface`.
     """
     corners = vertices[triangles]
-    crossed = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    if not np.linalg.norm(crossed, axis=1).sum() > 0:
+    area_vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    if not np.linalg.norm(area_vectors, axis=1).sum() > 0:
         raise InputError(f"{name}: found a surface without area, expected a mesh of a body")
     largest = np.ptp(vertices, axis=0).max()
     if not SIZES[0] <= largest <= SIZES[1]:
@@ -362,32 +374,32 @@ def _body(
             f"{name}: found a size of {largest:.3g} m, expected metres, from {SIZES[0]:g} to "
             f"{SIZES[1]:g} m; scale=0.001 is for millimetres"
         )
-    middle = vertices.mean(axis=0)
-    _, axes = np.linalg.eigh(np.cov((vertices - middle).T))
-    thin = np.ptp(vertices @ axes[:, 0])
-    if thin < FLAT:
+    center = vertices.mean(axis=0)
+    _, axes = np.linalg.eigh(np.cov((vertices - center).T))
+    thickness = np.ptp(vertices @ axes[:, 0])
+    if thickness < FLAT:
         raise InputError(
-            f"{name}: found a flat sheet ({1e3 * thin:.2g} mm), expected a mesh of a body"
+            f"{name}: found a flat sheet ({1e3 * thickness:.2g} mm), expected a mesh of a body"
         )
     notes: list[str] = []
-    _, same = np.unique(np.round(vertices, 7), axis=0, return_inverse=True)
-    merged = same.reshape(-1)[triangles]
+    _, numbers = np.unique(np.round(vertices, 7), axis=0, return_inverse=True)
+    merged = numbers.reshape(-1)[triangles]
     edges = merged[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     edges = edges[edges[:, 0] != edges[:, 1]]
     forward = edges[:, 0] < edges[:, 1]
     key = np.sort(edges, axis=1) @ np.array([len(vertices), 1])
     _, edge, users = np.unique(key, return_inverse=True, return_counts=True)
-    ways = np.bincount(edge, weights=forward)
-    wrong = int(((users == 2) & (ways != 1)).sum())
-    if wrong > DISAGREE * len(users):
+    n_forward = np.bincount(edge, weights=forward)
+    n_opposite = int(((users == 2) & (n_forward != 1)).sum())
+    if n_opposite > DISAGREE * len(users):
         raise InputError(
-            f"{name}: found triangles that face opposite ways at {wrong:,} of {len(users):,} "
+            f"{name}: found triangles that face opposite ways at {n_opposite:,} of {len(users):,} "
             "edges, expected outward normals; trimesh.repair.fix_normals mends such a mesh"
         )
     border = int((users == 1).sum())
     if border:
         notes.append(f"the mesh is open: {border:,} edges have one triangle only")
-    volume = ((corners[:, 0] - middle) * crossed).sum() / 6
+    volume = ((corners[:, 0] - center) * area_vectors).sum() / 6
     if volume < 0:
         notes.append("the mesh was inside out: its triangles are turned")
         triangles = triangles[:, ::-1]
@@ -396,16 +408,16 @@ def _body(
 
 def _smoothed(
     name: str,
-    thing: GraspObject,
+    source: GraspObject,
     points: Array,
     faces: Array,
     corners: Array,
-    chosen: SurfaceParameters,
+    parameters: SurfaceParameters,
 ) -> Surface:
-    """The surface of samples whose normals are averaged over their neighbours."""
+    """Return the surface with normals averaged over neighbouring samples."""
     tree = _tree(points)
 
-    def links(radius: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    def neighbours(radius: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         pairs = tree.query_pairs(radius, output_type="ndarray")
         every = np.arange(len(points))
         return (
@@ -413,14 +425,14 @@ def _smoothed(
             np.concatenate([pairs[:, 1], pairs[:, 0], every]),
         )
 
-    # Sides of a thin wall that face away from each other are no neighbours.
-    one, other = links(chosen.smoothing)
-    alike = (faces[one] * faces[other]).sum(axis=1) > 0
+    # The two sides of a thin wall are not neighbours.
+    i, j = neighbours(parameters.smoothing)
+    same_side = (faces[i] * faces[j]).sum(axis=1) > 0
     normals = np.zeros_like(points)
-    np.add.at(normals, one[alike], faces[other[alike]])
+    np.add.at(normals, i[same_side], faces[j[same_side]])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    one, other = links(chosen.patch)
-    bent = (normals[one] * faces[other]).sum(axis=1) < np.cos(chosen.bend)
+    i, j = neighbours(parameters.patch)
+    is_edge = (normals[i] * faces[j]).sum(axis=1) < np.cos(parameters.bend)
     inside = np.ones(len(points), dtype=bool)
-    inside[one[bent]] = False
-    return Surface(name, thing, points, normals, faces, inside, corners, chosen)
+    inside[i[is_edge]] = False
+    return Surface(name, source, points, normals, faces, inside, corners, parameters)
