@@ -97,19 +97,18 @@ def run_cell(robot: str, mode: str, count: int, flags: Sequence[str] = SANITIZER
         sources = [str(path.relative_to(project)) for path in sorted(project.glob("src/*.c"))]
         tests = [str(path.relative_to(project)) for path in sorted(project.glob("test/*.c"))]
         precision = ("-Wdouble-promotion",) if "single" in mode else ()
-        # The single-precision sources must not compute in double precision; its test does.
         command = ("gcc", *WARNINGS, *precision, *flags, "-O0", "-ffp-contract=off")
         command += ("-Iinclude", "-Isrc", "-Itest")
-        for program, text in (("stored", tests), ("shown", ["example/main.c"])):
-            built = subprocess.run(
-                (*command, *text, *sources, "-lm", "-o", program),
-                cwd=project,
-                capture_output=True,
-                text=True,
-            )
+        objects = [Path(source).with_suffix(".o").name for source in sources]
+        for words in (
+            ("-c", *sources),
+            (*tests, *objects, "-lm", "-o", "stored"),
+            ("example/main.c", *objects, "-lm", "-o", "shown"),
+        ):
+            built = subprocess.run((*command, *words), cwd=project, capture_output=True, text=True)
             if built.returncode:
                 errors = [line for line in built.stderr.splitlines() if "error" in line]
-                return cell("fail", f"{program}: {(errors or ['not compiled'])[0]}")
+                return cell("fail", (errors or ["not compiled"])[0])
         try:
             tested = subprocess.run(
                 project / "stored", capture_output=True, text=True, timeout=TIMEOUT

@@ -1,6 +1,6 @@
-"""What is written of a robot: a C project, a WebAssembly module; and kernels compiled ahead.
+"""C projects and WebAssembly modules of a robot's solver, and kernels compiled ahead of use.
 
-A folder is built beside its place, and put there when it is whole.
+A folder is written under a temporary name beside its final place, and renamed when complete.
 """
 
 from __future__ import annotations
@@ -45,19 +45,19 @@ from casadi_ik.model.grasp import Contact, Grasp
 from casadi_ik.planning.touch.library import touch_library
 
 MARK = ".casadi_ik_export"
-"""A file by which a folder is known as an export."""
+"""Name of the file that identifies a folder as an export."""
 
 EXPORTED = ("hand-first",)
-"""The methods that can be exported."""
+"""Names of the methods that can be exported."""
 
 IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
 
 def checked_prefix(prefix: str | None, robot: str) -> str:
-    """What names begin with; of the robot's name if it is not said.
+    """Return the prefix of all exported names; by default it is derived from the robot's name.
 
     Raises:
-        InputError: No name of C.
+        InputError: The prefix is not an identifier of C.
     """
     if prefix is None:
         made = re.sub(r"\W+", "_", robot, flags=re.ASCII).strip("_").lower()
@@ -68,7 +68,7 @@ def checked_prefix(prefix: str | None, robot: str) -> str:
 
 
 def check_method(method: str) -> None:
-    """Whether it can be exported.
+    """Check that a method can be exported.
 
     Raises:
         UnsupportedError: It cannot.
@@ -80,29 +80,33 @@ def check_method(method: str) -> None:
 
 
 def check_folder(out: Path) -> None:
-    """Whether a folder may be written: it is not there, empty, or an export.
+    """Check that a folder may be written: it does not exist, is empty, or is an export.
 
     Raises:
-        InputError: Something else is there.
+        InputError: The path is another file or folder.
     """
     with os_errors(f"--out: {out}", InputError):
         if out.is_symlink() or (out.exists() and not out.is_dir()):
-            raise InputError(f"--out: {out} is no folder, expected a new one, or an earlier export")
+            raise InputError(
+                f"--out: {out} is not a folder; expected a new one or an earlier export"
+            )
         if out.is_dir() and any(out.iterdir()) and not (out / MARK).is_file():
-            raise InputError(f"--out: {out} is not empty, and no earlier export; nothing written")
+            raise InputError(
+                f"--out: {out} is not empty and not an earlier export; nothing was written"
+            )
 
 
 @dataclass(frozen=True, eq=False)
 class Exported:
-    """A robot's solver on its way out.
+    """The sources of an exported solver, and the data of its tests.
 
     Attributes:
-        solver: Its answers are those of the export.
-        example: What the example solves.
-        marks: What stands for the marks of the templates.
+        solver: Solver in Python, whose answers the export reproduces.
+        example: Target of the example program.
+        marks: Substitutes of the template marks.
         sources: Headers and C files by path.
-        scene: What its targets are solved in; None: the export knows no scene.
-        judge: Files of the kinematics that judge answers in single precision.
+        scene: Scene of the test targets; None: the export does not check collisions.
+        judge: Files of double-precision kinematics that verify single-precision answers.
     """
 
     solver: Solver
@@ -132,7 +136,7 @@ def exported(
         count: Number of targets that the test of the export solves.
 
     Raises:
-        UnsupportedError: It cannot be exported.
+        UnsupportedError: The robot cannot be exported in this way.
     """
     sides = robot.description.sides
     if not robot.actuators:
@@ -143,12 +147,12 @@ def exported(
             "are checked in double precision only"
         )
     if single and follow:
-        raise UnsupportedError("--follow: computes in double precision, expected no --single")
+        raise UnsupportedError("--follow: computes in double precision; expected no --single")
     method, solver = hand_first(robot), Solver(robot)
     if not method.kernel.compiled:
         raise UnsupportedError(
-            "export: its test needs answers from compiled code, and there is no C compiler here; "
-            "pip install 'casadi-ik[compiler]' brings one"
+            "export: no C compiler is installed, which computes the answers of the test; "
+            "pip install 'casadi-ik[compiler]' installs one"
         )
     allowing = SinglePrecision(robot) if single else None
     scene = None
@@ -193,7 +197,7 @@ def _as_hand(robot: ArmHand) -> ArmHand:
 
 
 def _tested(project: Exported, pieces: Mapping[str, str]) -> dict[str, str]:
-    """The marks of a project, and those that its test has in addition where there is a scene."""
+    """Return the substitutes of the template marks; with a scene including those of its test."""
     if project.scene is None:
         return project.marks
     prefix = project.marks["PREFIX"]
@@ -247,10 +251,10 @@ def c_project(
 
 
 def write_folder(out: Path, files: Mapping[str, str | bytes]) -> None:
-    """Write a folder as a whole; an earlier export is replaced.
+    """Write a folder atomically, replacing an earlier export.
 
     Raises:
-        InputError: It cannot be written; nothing is left of it.
+        InputError: The folder cannot be written; no part of it remains.
     """
     check_folder(out)
     try:
@@ -281,7 +285,7 @@ def write_folder(out: Path, files: Mapping[str, str | bytes]) -> None:
         raise InputError(f"--out: {out}: cannot be written: {error.strerror}") from error
 
 
-# No contraction: with fused multiply-adds the answers would be others in the last places.
+# Fused multiply-adds would change the last bits of the answers.
 COMMAND = (
     *("-m", "ziglang", "cc", "-target", "wasm32-wasi", "-mexec-model=reactor", "-std=c11"),
     *("-O2", "-msimd128", "-ffp-contract=off", "-fno-math-errno", "-fno-sanitize=all", "-s"),
@@ -291,12 +295,12 @@ COMMAND = (
 def wasm_project(
     robot: ArmHand, prefix: str, capacity: int | None = None, follow: bool = False
 ) -> dict[str, str | bytes]:
-    """The files of a module with its wrapper, by path.
+    """Return the files of a WebAssembly module and its JavaScript wrapper by path.
 
     Raises:
         MissingExtraError: ziglang is not installed.
         UnsupportedError: The robot's solver cannot be exported.
-        KernelError: The compiler refused.
+        KernelError: The compilation failed.
     """
     if importlib.util.find_spec("ziglang") is None:
         raise MissingExtraError("--target wasm needs ziglang: pip install 'casadi-ik[compiler]'")
@@ -328,15 +332,15 @@ def wasm_project(
 
 
 def _numbers(values: list[float]) -> str:
-    """A JavaScript array, NaN included."""
+    """Return a JavaScript array of numbers that may be NaN."""
     return "[" + ", ".join("NaN" if value != value else repr(value) for value in values) + "]"
 
 
 def _module(project: Exported) -> bytes:
-    """The sources, compiled.
+    """Compile the sources to WebAssembly.
 
     Raises:
-        KernelError: The compiler refused.
+        KernelError: The compilation failed.
     """
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
@@ -351,20 +355,20 @@ def _module(project: Exported) -> bytes:
         command = [sys.executable, *COMMAND, *include, *texts, "-lm", "-o", str(made)]
         done = subprocess.run(command, capture_output=True, text=True, errors="replace")
         if done.returncode or not made.is_file():
-            complaint = "; ".join(done.stderr.splitlines()[:3]) or "no complaint"
-            raise KernelError(f"zig made no WebAssembly module: {complaint[:500]}")
+            complaint = "; ".join(done.stderr.splitlines()[:3]) or "no message"
+            raise KernelError(f"zig could not compile the WebAssembly module: {complaint[:500]}")
         return made.read_bytes()
 
 
 def uses(robot: ArmHand, everything: bool = False) -> Iterator[tuple[str, Callable[[], object]]]:
-    """Ways to use a robot that compile something, in words and as what does it.
+    """Yield the uses of a robot that compile kernels: a description, and a function that runs it.
 
     Args:
         robot: The robot.
-        everything: Whether scenes, choices, motions and diagnoses are among them.
+        everything: Whether to include scenes, choices, motions and diagnoses.
     """
     solver = Solver(robot)
-    q = robot.random(np.random.default_rng(0), 64)  # enough for solves side by side
+    q = robot.random(np.random.default_rng(0), 64)  # enough targets for vectorised solves
 
     def targets() -> tuple[np.ndarray, np.ndarray]:
         return robot.contacts(q)

@@ -1,4 +1,4 @@
-"""Templates, and what they say in double and in single precision."""
+"""Template rendering, and the substitutes for double and single precision."""
 
 from __future__ import annotations
 
@@ -31,39 +31,43 @@ TOKEN = re.compile(
 _TURNS = ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh")
 _OTHERS = ("exp", "log", "log10", "pow", "sqrt", "hypot", "fabs", "floor", "ceil", "fmod", "fmax")
 LIBM = frozenset((*_TURNS, *_OTHERS, "fmin", "rint", "round", "copysign", "frexp", "ldexp"))
-"""Functions of the C library whose forms for single precision have an f behind their name."""
+"""Functions of the C library whose single-precision variants have the suffix f."""
 
 FLOAT = np.finfo(np.float32)
 EPSILON = float(FLOAT.eps)
 
 ROUNDING = 8 * EPSILON
-"""What rounding makes of kinematics at most, as an angle [rad] and as a part of how far the robot
-reaches: three times what 20,000 random solves of kuka_lwr_barrett and panda+allegro_right found."""
+"""Bound of the rounding error of kinematics: an angle [rad], and a fraction of the robot's reach.
+
+Source: three times the largest error in 20,000 random solves of kuka_lwr_barrett and
+panda+allegro_right."""
 
 ARM_ROUNDING = 16 * ROUNDING
-"""What rounding makes of the joints of an arm that is found again from where its palm is [rad]:
-one that stands at a limit is beyond it by as much, and put back."""
+"""Bound of the rounding error of arm joints that are computed from the pose of the palm [rad].
+
+A joint at a limit may exceed it by this amount, and is then clamped."""
 
 FOLLOWING = ((FIT.exact * FIT.exact, ARM_ROUNDING * ARM_ROUNDING),)
-"""Numbers in the graphs that say what is zero but for rounding, and what they are in single
-precision: the cost at which a fit, or an arm that is searched for, is exact. Single precision would
-never come to it, and an arm would be searched for from every start, in thirteen times as many
-iterations."""
+"""Thresholds in the graphs that are replaced in single precision: pairs of old and new values.
+
+A fit or an arm whose cost is below the threshold is exact. Single precision does not reach the
+value of double precision, and would search an arm from every start, in thirteen times as many
+iterations.
+"""
 
 SMALL, LARGE = 1e-15, 1e15
-"""Between these the squares of a length are neither rounded to zero nor infinite."""
+"""Lengths between these have squares that neither underflow nor overflow."""
 
 SAMPLES = 1024
-"""Random configurations that say how far a robot reaches."""
+"""Number of random configurations that estimate the reach of a robot."""
 
 
 def in_single_precision(text: str) -> str:
-    """The same C code with single precision wherever it has double.
+    """Return C code with its double-precision types, constants and functions in single precision.
 
-    Types, numbers and calls of the C library are exchanged, so that no operation is left in double
-    precision. Numbers too large or too small for it become the largest and the smallest there are,
-    not infinite and nought: such bounds say "any" and "more than nothing", and a divisor kept above
-    nought that is nought after all makes fits go astray.
+    No operation remains in double precision. Constants outside the range of single precision become
+    the largest or smallest positive number, not infinity or zero: such constants are bounds, and a
+    lower bound of a divisor must stay positive.
     """
     return TOKEN.sub(_exchanged, text)
 
@@ -78,7 +82,7 @@ def _exchanged(match: re.Match[str]) -> str:
 
 
 def _number(text: str) -> str:
-    """A number as C writes it in single precision."""
+    """Return a single-precision constant of C."""
     value = float(text)
     if value > float(FLOAT.max):
         text = repr(float(FLOAT.max))
@@ -89,7 +93,7 @@ def _number(text: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class SinglePrecision:
-    """What a solver in single precision allows for, so that double precision confirms its answers.
+    """Allowances for rounding, with which double precision confirms answers in single precision.
 
     Attributes:
         robot: The robot.
@@ -99,21 +103,21 @@ class SinglePrecision:
 
     @cached_property
     def reach(self) -> float:
-        """How far contacts come from the origin of the base frame [m]."""
+        """Largest distance of a contact from the origin of the base frame [m]."""
         points, _ = self.robot.contacts(self.robot.random(np.random.default_rng(0), SAMPLES))
         return float(np.linalg.norm(points, axis=-1).max())
 
     @property
     def tolerance(self) -> Tolerance:
-        """What rounding may make of an error: answers keep to tolerances less this."""
+        """Rounding error by which tolerances are reduced."""
         return Tolerance(ROUNDING * self.reach, ROUNDING)
 
     @cached_property
     def bounds(self) -> tuple[Array, Array]:
-        """The robot's limits (n,), moved inwards by rounding; exact in single precision.
+        """The robot's limits (n,), moved inwards by the rounding error; exact in single precision.
 
         Raises:
-            UnsupportedError: There is nothing between them then.
+            UnsupportedError: A range is smaller than the rounding error.
         """
         lower, upper = self.robot.lower, self.robot.upper
         low = (lower + ROUNDING * np.maximum(1.0, np.abs(lower))).astype(np.float32)
@@ -121,14 +125,13 @@ class SinglePrecision:
         for name, one, other in zip(self.robot.actuators, low, high, strict=True):
             if one >= other:
                 raise UnsupportedError(
-                    f"--single: motor {name!r}: between its limits there is too little room "
-                    "for single precision"
+                    f"--single: the range of motor {name!r} is too small for single precision"
                 )
         return low.astype(float), high.astype(float)
 
     @property
     def reals(self) -> dict[str, float]:
-        """Numbers of the search that follow the precision."""
+        """Constants of the search that depend on the precision."""
         return {
             "LIMIT_SLACK": 0.0,
             "TOLERANCE_SLACK": 0.0,
@@ -138,7 +141,7 @@ class SinglePrecision:
 
     @property
     def arrays(self) -> dict[str, Array]:
-        """Arrays of the search that follow the precision."""
+        """Arrays of the search that depend on the precision."""
         lower, upper = self.bounds
         return {"LOWER": lower, "UPPER": upper}
 
@@ -148,13 +151,13 @@ IN_DOUBLE = {
     "MATHS": "#include <math.h>",
     "AND_SUM": ", sum = 0;",
     "ANSWERS": (
-        "The answers are bit for bit those of the Python package (method hand-first) on a machine "
-        "of the same\narithmetic, whatever the optimisation, as long as multiply-adds are not "
-        "fused (`-ffp-contract=off`).\n"
+        "Answers are bit for bit those of the Python package (method hand-first) on machines with "
+        "IEEE 754\narithmetic, at any optimisation level, without fused multiply-adds "
+        "(`-ffp-contract=off`).\n"
     ),
-    "COMPARED": "answers compared bit for bit",
+    "COMPARED": "and compares the answers bit for bit with those of Python",
 }
-"""What stands for the marks in double precision."""
+"""Substitutes of the template marks in double precision."""
 
 ANSWERS = """\
 This project is in single precision, for controllers without double-precision arithmetic. Answers
@@ -200,11 +203,11 @@ def in_single(single: SinglePrecision) -> dict[str, str]:
         "JUDGE": " test/judge.c",
         "PRECISION": ", single precision",
         "PRECISION_NOTE": (
-            " *\n * In single precision. Answers keep to tolerances less what rounding makes of\n"
-            f" * them: {less.position:.1e} m and {less.angle:.1e} rad.\n"
+            " *\n * Single precision: the solver reduces tolerances by the rounding error,\n"
+            f" * {less.position:.1e} m and {less.angle:.1e} rad.\n"
         ),
         "ANSWERS": ANSWERS,
-        "COMPARED": "answers judged in double precision",
+        "COMPARED": "and verifies the answers in double precision",
         "ABOUT_PRECISION": about,
     }
 
@@ -214,13 +217,13 @@ SECTION = re.compile(r"^@([A-Z_]+)\{@\n(.*?)^@\}@\n", re.MULTILINE | re.DOTALL)
 
 
 def filled(name: str, substitutes: Mapping[str, str]) -> str:
-    """The text of `templates/<name>` with every mark replaced.
+    """Return the text of `templates/<name>` with all marks replaced.
 
-    A mark with a question mark stands for nothing where an export has no such thing; lines between
-    `@NAME{@` and `@}@` are there for exports that have a NAME.
+    A mark `@NAME?@` is optional: it is removed if there is no substitute. Lines between `@NAME{@`
+    and `@}@` are kept only if there is a substitute for NAME.
 
     Raises:
-        KeyError: Another mark stands for nothing.
+        KeyError: A mark that is not optional has no substitute.
     """
     text = (resources.files("casadi_ik.export") / "templates" / name).read_text(encoding="utf-8")
     text = SECTION.sub(lambda m: m[2] if m[1] in substitutes else "", text)

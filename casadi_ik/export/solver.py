@@ -1,4 +1,4 @@
-"""The sources of a solver and of a follower: templates filled, each kernel in a file of its own."""
+"""Sources of a solver and of a follower: rendered templates, and a file per kernel."""
 
 from __future__ import annotations
 
@@ -52,7 +52,10 @@ from casadi_ik.solve.verdict import LIMIT_SLACK, TOLERANCE_SLACK
 
 
 def palm_marks(robot: ArmHand, prefix: str, real: str) -> dict[str, str]:
-    """What stands for the marks of palms; nothing for a body, without an arm, or a free palm."""
+    """Return the substitutes for solving given palms; none where contacts leave the palm free.
+
+    Robots without an arm, or with several arms, have none either.
+    """
     if not robot.description.arm_actuators or robot.description.sides:
         return {}
     motors = robot.description.finger_motors
@@ -76,12 +79,12 @@ def palm_marks(robot: ArmHand, prefix: str, real: str) -> dict[str, str]:
 
 @dataclass(frozen=True, eq=False)
 class FollowSources:
-    """What a follower adds to the sources of a solver.
+    """Sources of an exported follower.
 
     Attributes:
         robot: The robot.
-        prefix: What every name begins with.
-        tolerance: When a contact counts as reached.
+        prefix: Prefix of every public name.
+        tolerance: Tolerance of contacts.
     """
 
     robot: ArmHand
@@ -89,7 +92,7 @@ class FollowSources:
     tolerance: Tolerance
 
     def files(self) -> tuple[dict[str, str], dict[str, str]]:
-        """The C file by path, and what stands for the marks of the other templates."""
+        """Return the C file by path, and the substitutes of marks in the other templates."""
         cycle = Cycle(self.robot.description, usual(len(self.robot.fingers)))
         marks = {
             "PREFIX": self.prefix,
@@ -112,11 +115,12 @@ class FollowSources:
             ),
             "FOLLOW_STATUS_DTS": (
                 "export const FollowStatus: {\n"
-                "  /** The frame was none: the motors come to rest and wait. */\n"
+                "  /** Invalid frame: the motors decelerate to rest and wait. */\n"
                 "  readonly HOLDING: 0;\n"
-                "  /** Every contact is within tolerance. */\n  readonly FOLLOWING: 1;\n"
-                "  /** Velocities and accelerations permit no more. */\n  readonly LATE: 2;\n"
-                "  /** No posture on this branch meets the contacts. */\n  readonly MISSED: 3;\n"
+                "  /** All contacts are within tolerance. */\n  readonly FOLLOWING: 1;\n"
+                "  /** Velocity and acceleration limits delay the motors. */\n  readonly LATE: 2;\n"
+                "  /** No configuration on this branch meets the contacts. */\n"
+                "  readonly MISSED: 3;\n"
                 "};\n"
             ),
         }
@@ -160,13 +164,13 @@ def _places(label: str, layout: Layout) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class Part:
-    """A kernel.
+    """An exported kernel.
 
     Attributes:
-        name: Of its file and function.
-        job: What it works on.
-        text: Its file.
-        work: Numbers that it works with.
+        name: Name of its file and function.
+        job: C type of its argument.
+        text: Text of its file.
+        work: Size of its work memory in numbers.
     """
 
     name: str
@@ -177,12 +181,12 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class SideSources:
-    """What finds the hands of a side of an exported body.
+    """Sources that seed the hand of one side of a robot with several arms.
 
     Attributes:
-        plan: The search of the side by itself.
-        solver: What names of the body's solver begin with.
-        place: Of the side.
+        plan: Search of the side alone.
+        solver: Prefix of the names of the robot's solver.
+        place: Index of the side.
     """
 
     plan: SearchPlan
@@ -191,18 +195,18 @@ class SideSources:
 
     @property
     def prefix(self) -> str:
-        """What its own names begin with."""
+        """Prefix of its names."""
         return f"{self.solver}_side_{self.place}"
 
     @property
     def member(self) -> str:
-        """Its memory in the struct of the solver."""
+        """Member of the solver's struct that holds its memory."""
         own = f"{self.plan.members()}  {self.solver}_memory *memory;\n"
         return f"  struct {self.prefix} {{\n{own}  }} side_{self.place};\n"
 
     @property
     def declared(self) -> str:
-        """Its function."""
+        """Declaration of its function."""
         return (
             f"int {self.prefix}_hands(struct {self.prefix} *job, const scalar *points, "
             "const scalar *normals,\n    const scalar *here, int64_t nearest, int64_t round, "
@@ -211,7 +215,7 @@ class SideSources:
 
     @property
     def called(self) -> str:
-        """A case of what has hands found."""
+        """Case of the switch that calls its function."""
         return (
             f"    case {self.place}:\n"
             f"      job->side_{self.place}.memory = &job->memory;\n"
@@ -220,14 +224,14 @@ class SideSources:
         )
 
     def source(self, names: Iterable[str]) -> str:
-        """Its file, with the kernels of these names."""
+        """Return the text of its file, which calls the named kernels."""
         texts = driver_text("loops") + "".join(map(source_text, ("spread", "seeds", "hands")))
         calls = "".join(
             f"#define {name.upper()}(work) {self.prefix}_{name}_kernel(work, job->memory)\n"
             for name in names
         )
         return (
-            f"/* The hands of {plain(self.plan.layouts.robot.name)}. */\n"
+            f"/* Seeds of the hand of {plain(self.plan.layouts.robot.name)}. */\n"
             f'#include "{self.solver}_parts.h"\n\n'
             "enum { DONE = 0, SLICE_OVER = 1 };\n\n"
             f"typedef struct {self.prefix} search;\n\n"
@@ -248,22 +252,22 @@ static int hands_of(search *job, int side, const scalar *points, const scalar *n
 
 
 def tiles(prefix: str, plan: SearchPlan) -> str:
-    """Where the search finds its tables; there is only one where fingers mend postures."""
+    """Return the macro that selects a lookup table; hands with repaired seeds have only one."""
     first, later = (f"{prefix}_table_{i}" for i in (0, 0 if plan.mends else 1))
     return f"#define TILES(table) ((table) ? {later} : {first})\n"
 
 
 @dataclass(frozen=True, eq=False)
 class SolverSources:
-    """The sources of a solver.
+    """Sources of a solver.
 
     Attributes:
         robot: The robot.
-        method: Hand-first for it.
-        prefix: What every name in it begins with.
-        tolerance: When a contact counts as reached, unless set otherwise.
-        scene: What it knows of collisions; None: nothing.
-        single: What it allows for in single precision; None: it is in double.
+        method: The method hand-first for the robot.
+        prefix: Prefix of every public name.
+        tolerance: Default tolerance of contacts.
+        scene: Sources of the scene; None: collisions are not checked.
+        single: Allowances for rounding; None: double precision.
     """
 
     robot: ArmHand
@@ -275,25 +279,25 @@ class SolverSources:
 
     @cached_property
     def plan(self) -> SearchPlan:
-        """The search for one target."""
+        """Search for one target."""
         return self.method.plan(enforce_limits=True)
 
     @cached_property
     def sides(self) -> tuple[SideSources, ...]:
-        """Those of a body."""
+        """Sources of the sides of a robot with several arms."""
         return tuple(SideSources(one, self.prefix, i) for i, one in enumerate(self.plan.sides))
 
     @property
     def _searches(self) -> dict[str, SearchPlan]:
-        """What looks hands up, by what its names begin with behind the solver's."""
+        """Searches that look up hand seeds, by the infix of their names."""
         found = {f"side_{side.place}_": side.plan for side in self.sides}
         return found or {"": self.plan}
 
     @cached_property
     def parts(self) -> tuple[Part, ...]:
-        """The kernels."""
+        """Exported kernels."""
         plan, n_state = self.plan, self.plan.layouts.state.size
-        # The record of an iteration is never asked for.
+        # Exports do not record iterations.
         loop = define(plan.solve.constants | {"N_RECORD": 0, "ROW_BYTES": 0})
         loop += "#define store_row(record, row) ((void) (record), (void) (row))\n"
         parts = (
@@ -307,7 +311,7 @@ class SolverSources:
         return parts + self._scene_parts()
 
     def _hand_parts(self, name: str, plan: SearchPlan) -> tuple[Part, ...]:
-        """Those that find hands."""
+        """Return the kernels that look up hand seeds."""
         lookup = plan.seeds.table.lookup
         tables = zip(plan.seeds.tables(enforce_limits=True), plan.seeds.spreads, strict=False)
         rows = max(spread.count for _, spread in tables) + TILE
@@ -366,7 +370,7 @@ class SolverSources:
 
     @property
     def substitutes(self) -> dict[str, str]:
-        """What stands for the marks of the templates."""
+        """Substitutes of the template marks."""
         robot, sizes = self.robot, self.plan.sizes
         jobs = "".join(driver_text(f"{name}_job") for name in ("loop", "map", "lookup"))
         jobs += self.scene.jobs() if self.scene else ""
@@ -415,19 +419,19 @@ class SolverSources:
         }
 
     def _seeds(self) -> str:
-        """How the search comes by tables, or by the hands of its sides."""
+        """Return the macros through which the search obtains seeds."""
         if not self.sides:
             return tiles(self.prefix, self.plan)
         return HANDS_OF.replace("@CASES@", "".join(side.called for side in self.sides))
 
     @property
     def side_files(self) -> dict[str, str]:
-        """Their texts by path."""
+        """Files of the sides by path."""
         return {f"src/{side.prefix}.c": side.source(side.plan.of_hands) for side in self.sides}
 
     @cached_property
     def _tables(self) -> dict[str, NDArray[np.int16]]:
-        """The lookup tables' keys by the names of their arrays."""
+        """Keys of the lookup tables by the names of their arrays."""
         return {
             f"{self.prefix}_{name}table_{i}": np.ascontiguousarray(table.lookup.tiles).reshape(-1)
             for name, plan in self._searches.items()
@@ -435,11 +439,10 @@ class SolverSources:
         }
 
     def tables(self) -> str:
-        """The file of the lookup tables' keys."""
-        head = (
-            f'/* Shapes of hand postures, to be compared with targets. */\n#include "{self.prefix}'
-        )
-        return head + '_parts.h"\n\n' + define_arrays(self._tables, "const")
+        """Return the file with the keys of the lookup tables."""
+        head = "/* Keys of hand postures, which are compared with targets. */\n"
+        include = f'#include "{self.prefix}_parts.h"\n\n'
+        return head + include + define_arrays(self._tables, "const")
 
     @property
     def _bounds(self) -> tuple[Array, Array]:
@@ -457,7 +460,7 @@ class SolverSources:
         return found
 
     def judge(self) -> dict[str, str]:
-        """Files of the kinematics in double precision that answers are judged by."""
+        """Return the files of double-precision kinematics that verify answers."""
         marks = {
             "KINEMATICS": standalone_source(self.plan.judge.function, CodeOptions()),
             "POSITION_TOLERANCE": repr(self.tolerance.position),
@@ -467,24 +470,24 @@ class SolverSources:
         return {f"test/{name}": filled(name, marks) for name in ("judge.c", "judge.h")}
 
     def final(self, files: dict[str, str]) -> dict[str, str]:
-        """Files in C, in the precision that is wanted."""
+        """Return C files in the precision of the export."""
         if self.single is None:
             return files
         return {path: in_single_precision(text) for path, text in files.items()}
 
 
 def hand_first(robot: ArmHand) -> HandFirstMethod:
-    """The method whose solver is exported, compiled."""
+    """Return the method hand-first of a robot, with its kernels compiled."""
     method = HandFirstMethod(robot.description, HandFirstParameters())
     method.prepare()
     return method
 
 
 def plain(name: str) -> str:
-    """A name as it may stand in a comment of any language: names may come from any file."""
+    """Return a name without characters that could end a comment; files are untrusted."""
     return re.sub(r"[^\w .+-]", "_", name)
 
 
 def _strings(names: tuple[str, ...]) -> str:
-    """String literals, of C and JavaScript alike."""
+    """Return a list of string literals of C and JavaScript."""
     return ", ".join(json.dumps(name, ensure_ascii=False) for name in names)

@@ -1,4 +1,4 @@
-"""Targets with the answers of this package: what an exported solver is tested and shown by."""
+"""Test targets with the answers of this package, and the example of an exported solver."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ WHOLE = ("status", "iterations", "restarts")
 
 @dataclass(frozen=True, eq=False)
 class Example:
-    """One target.
+    """The target of the example program.
 
     Attributes:
-        what: What it is, in words.
+        what: Description in a sentence.
         points: (f, 3) [m].
         normals: (f, 3), NaN where free.
     """
@@ -54,14 +54,14 @@ class Example:
 
 
 def example(robot: ArmHand) -> Example:
-    """The robot's first shipped grasp, or where its fingertips are when it is at home."""
+    """Return the robot's first shipped grasp, or its contacts at home."""
     names = shipped_grasps(robot.name)
     if names:
         grasp = load_grasp(names[0])
         points, normals = grasp.arrays(robot.fingers)
         if not np.isnan(points).any() and not grasp.more(robot.fingers):
             return Example(f"Solves the shipped grasp {names[0]}.", points, normals)
-    return Example("Solves what the fingertips touch at home.", *robot.contacts(robot.home))
+    return Example("Solves the contacts of the home configuration.", *robot.contacts(robot.home))
 
 
 def stored(
@@ -105,10 +105,10 @@ def stored(
 def _answers(
     solver: Solver, points: Array, normals: Array, starts: Array | None
 ) -> Iterator[tuple[Array, int, int, int]]:
-    """The answers to k targets, each with the numbers that `WHOLE` names.
+    """Yield the answers to k targets, each with the integers that `WHOLE` names.
 
-    A batch solves the sides of a body without a trunk one by one; an export, like `fast`, solves it
-    as any body.
+    A batch solves the sides of a robot with several arms and no trunk independently. An export
+    solves them together, as `Solver.fast` does.
     """
     robot = solver.robot.description
     if not robot.sides or robot.trunk:
@@ -206,30 +206,30 @@ def frames_header(solver: Solver) -> str:
 
 
 def written(array: Array) -> str:
-    """An array as C text, NaN included."""
+    """Return an array initialiser of C; numbers may be NaN."""
     values = (digits(v) if np.isfinite(v) else "NAN" for v in array.ravel().tolist())
     return "{" + ", ".join(values) + "}"
 
 
 DRAWN = 64
-"""Random configurations, at whose fingertips solids are put."""
+"""Number of random configurations, at whose fingertips solids are placed."""
 
 SIZE = 0.15
-"""Of a solid, as a part of how far the robot reaches."""
+"""Size of a solid as a fraction of the robot's reach."""
 
 MARGIN = 1e-3
-"""To be kept [m]."""
+"""Required clearance [m]."""
 
 GRASPED = 1
-"""Number of the solid that is grasped."""
+"""Index of the grasped solid."""
 
 
 class SceneTargets:
-    """Targets in a scene of a few solids, and the answers to them.
+    """A scene of up to four solids, and the answers to targets in it.
 
     Attributes:
-        solver: Without a scene.
-        scene: As many solids as fit in, four at most.
+        solver: Solver without a scene.
+        scene: Scene with as many solids as the capacity allows.
     """
 
     def __init__(self, solver: Solver, capacity: int) -> None:
@@ -258,7 +258,7 @@ class SceneTargets:
             try:
                 self._check = SceneCheck(robot, scene)
             except DescriptionError:
-                # About a hand alone there is less room: what stands in its base is left out.
+                # Solids that penetrate the base of a hand alone are left out.
                 solids.popitem()
             else:
                 self.scene = scene
@@ -270,7 +270,7 @@ class SceneTargets:
         return Engine(robot, method, check=self._check)
 
     def answered(self, target: dict[str, Any]) -> dict[str, Any]:
-        """A stored target with the answer to it in the scene: another arm or hand at the most."""
+        """Return a stored target with its answer in the scene, as an export searches it."""
         if target["status"] != Status.SOLVED:
             return target | {"clearance": None}
         if self.solver.robot.description.sides:
@@ -285,7 +285,7 @@ class SceneTargets:
         return target | {"q": found[0].tolist(), "clearance": found[1]}
 
     def _touching(self, target: dict[str, Any]) -> dict[str, Any]:
-        """Of a body only whether its answer touches something is known, not what else is found."""
+        """Return whether the answer of a robot with several arms collides; no other is searched."""
         points, normals = (np.reshape(target[key], (1, -1, 3)) for key in ("points", "normals"))
         request = Request(self.solver.robot, self.solver.tolerances, True)
         query = self._check.collision_query(request.of_arrays(points, normals, None))
@@ -297,7 +297,7 @@ class SceneTargets:
     def _free(
         self, points: Array, normals: Array, q: Array, q0: list[float] | None
     ) -> tuple[Array, float] | None:
-        """An answer that touches nothing, beside a given one, and its clearance [m]."""
+        """Return a collision-free answer and its clearance [m]; None if the search fails."""
         engine, request = self._engine, Request(self.solver.robot, self.solver.tolerances, True)
         prefer = "limits" if q0 is None else "q0"
         targets = request.of_arrays(points, normals, None, prefer=prefer)
@@ -314,7 +314,7 @@ class SceneTargets:
         return q, float(clear.distance[0])
 
     def solids(self) -> list[dict[str, Any]]:
-        """The scene as an export takes it."""
+        """Return the solids of the scene as arguments of an export."""
         found = []
         for name, item in self.scene.items.items():
             (solid, place) = item.parts[0]
@@ -322,7 +322,7 @@ class SceneTargets:
         return found
 
     def header(self, real: str = "double") -> str:
-        """The scene as a C header has it, of such numbers."""
+        """Return the scene as C definitions with numbers of the type `real`."""
         rows = ",\n".join(
             f"{{{one['kind']}, {int(one['grasped'])}, {numbers(one['size'])}, "
             f"{numbers(one['pose'])}}}"
@@ -337,7 +337,7 @@ class SceneTargets:
         )
 
     def json(self) -> str:
-        """The scene as JavaScript has it."""
+        """Return the scene as JSON."""
         return json.dumps({"margin": self.scene.margin, "solids": self.solids()}) + "\n"
 
 
@@ -346,7 +346,7 @@ IN_TEST_C = {
         "      && (!(stored->clearance == stored->clearance)\n"
         "          || solver->clearance == stored->clearance)\n"
     ),
-    # What comes nearest to an answer is not compared.
+    # In a collision the answer of largest clearance is not compared.
     "SCENE_TEST_OR": f"stored->status == {int(Status.COLLISION)} || ",
     "SCENE_TEST_SET": (
         "  @P_set_margin(&one, MARGIN);\n  @P_set_margin(&other, MARGIN);\n"
@@ -374,7 +374,7 @@ IN_TEST_MJS = {
         "}\n"
     ),
 }
-"""What the tests of an export have in addition."""
+"""Substitutes of the marks of tests in a scene."""
 
 OF_BODY_C = {
     "SCENE_TEST_FREED": (
@@ -392,4 +392,4 @@ OF_BODY_MJS = {
         "  }\n"
     ),
 }
-"""Of a body's answer that touches something only that much is stored: another may be found."""
+"""Substitutes for robots with several arms: where the stored answer collides, any is accepted."""

@@ -361,7 +361,7 @@ def test_bad_words_are_refused(tmp_path, capsys, words, complaint):
 def test_what_is_no_export_is_left_alone(tmp_path, capsys):
     (tmp_path / "thesis.tex").write_text("years of work")
     assert main(["export", "kuka_lwr_barrett", "--out", str(tmp_path)]) == 2
-    assert "is not empty, and no earlier export" in capsys.readouterr().err
+    assert "is not empty and not an earlier export" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 

@@ -338,8 +338,8 @@ def _calibration_report(found: calibration.Calibration, units: Units) -> list[Re
 @command(
     Option("ROBOT", "a shipped name or a YAML file"),
     opt.out("DIR", "folder to write"),
-    Option("--method M", "hand-first is the only one that can be", "hand-first"),
-    Option("--prefix NAME", "what all names begin with (default: the robot's name)"),
+    Option("--method M", "method to export; only hand-first is supported", "hand-first"),
+    Option("--prefix NAME", "prefix of all names (default: the robot's name)"),
     Option(
         "--target c|wasm",
         "plain C, or a WebAssembly module for JavaScript (needs 'casadi-ik[compiler]')",
@@ -347,16 +347,14 @@ def _calibration_report(found: calibration.Calibration, units: Units) -> list[Re
     ),
     Option(
         "--scene CAPACITY",
-        "collisions are checked: the robot with itself, and with so many solids at most",
+        "check collisions with the robot itself and up to CAPACITY solids",
         read=opt.whole(1),
     ),
-    Option("--single", "in single precision, for controllers that have no other (--target c)"),
-    Option(
-        "--follow", "with a follower of moving contacts that keeps velocities and accelerations"
-    ),
+    Option("--single", "compute in single precision (--target c)"),
+    Option("--follow", "add a follower of moving contacts"),
 )
 def export(said: Said) -> Answer:
-    """Write a robot's solver as source code that needs this package no more.
+    """Write a robot's solver as standalone source code.
 
     Examples:
       casadi-ik export kuka_lwr_barrett --out solver && make -C solver test
@@ -364,15 +362,18 @@ def export(said: Said) -> Answer:
       casadi-ik export kuka_lwr_barrett --out solver --follow && make -C solver test
       casadi-ik export my_robot.yaml --out page --target wasm
 
-    DIR becomes a project that needs nothing but a C compiler (--target wasm: a
-    browser or node): library, header, example, a test of 1,000 stored targets, a
-    benchmark, README. It solves one target at a time, in doubles; its answers are
-    bit for bit those of this package. With --single, for controllers without a unit
-    for doubles, all of it is in single precision: an answer is one in double
-    precision, too, if another than here. An earlier export in DIR is replaced; any
-    other folder that is not empty is refused. With --scene, being solved includes
-    that nothing touches; where the answer does, the other ways are looked at in
-    which the arm can hold the hand, and then other hands.
+    DIR becomes a project with library, header, example, README, benchmark and a test
+    of 1,000 targets. It needs only a C compiler (--target wasm: a browser or node),
+    and its answers are bit for bit those of this package. An earlier export in DIR
+    is replaced; any other folder that is not empty is refused.
+
+    With --single nothing is computed in double precision. Answers also pass the
+    double-precision check but may differ from those computed here; the test of the
+    project allows one missed target in a thousand. Robots with several arms cannot
+    combine it with --scene.
+
+    With --scene a target is solved only if the robot does not collide. If an answer
+    collides, other arm configurations and then other hand poses are examined.
 
     exit codes: 0 written, 2 bad input (nothing is written)
     """

@@ -1,5 +1,5 @@
-/* Time of a solve: random arms and hands within limits, bench [SECONDS] [TARGETS]. The mean of CPU time
- * is what the solves take whatever else the machine does; all others are by the clock on the wall. */
+/* Measures the time of a solve for contacts of random configurations: bench [SECONDS] [TARGETS].
+ * cpu_mean is processor time, which other programs do not affect; all other figures are wall time. */
 #define _POSIX_C_SOURCE 199309L
 #include <stdio.h>
 #include <stdlib.h>

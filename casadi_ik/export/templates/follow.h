@@ -1,14 +1,14 @@
 
-/* How a cycle of a follower ended. */
+/* Status of a cycle of a follower. */
 enum {
-  @GUARD@_HOLDING = 0,   /* the frame was none: the motors come to rest and wait */
-  @GUARD@_FOLLOWING = 1, /* every contact is within tolerance */
-  @GUARD@_LATE = 2,      /* the motors are under way: velocities and accelerations permit no more */
-  @GUARD@_MISSED = 3     /* no posture on this branch meets the contacts */
+  @GUARD@_HOLDING = 0,   /* invalid frame: the motors decelerate to rest and wait */
+  @GUARD@_FOLLOWING = 1, /* all contacts are within tolerance */
+  @GUARD@_LATE = 2,      /* velocity and acceleration limits delay the motors */
+  @GUARD@_MISSED = 3     /* no configuration on this branch meets the contacts */
 };
 
-/* A robot that follows moving contacts. Read q (where the motors are to be at the end of the cycle),
- * velocity, the errors and status. Leave the rest. */
+/* A robot that follows moving contacts. Its results are q (positions of the motors at the end of the
+ * cycle), velocity, the errors and status. The other members are private. */
 typedef struct {
   double q[@GUARD@_MOTORS], velocity[@GUARD@_MOTORS];
   double position_error[@GUARD@_FINGERS], angle_error[@GUARD@_FINGERS]; /* of q; 0 where free */
@@ -18,16 +18,16 @@ typedef struct {
   double asked[@FOLLOW_ASKED@], record[@FOLLOW_RECORD@];
 } @PREFIX@_follower;
 
-/* Begins at rest: at q0, or at home if that is a null pointer. period: time from cycle to cycle [s].
- * velocity and acceleration: limits of the motors; null pointers: the description's, and from rest to
- * the velocity limit in a quarter of a second. Returns 0, or @GUARD@_BAD_INPUT for what is no number
- * or not positive: the follower is none then. */
+/* Starts at rest at q0, or at home if that is a null pointer. period is the time between two cycles
+ * [s]. velocity and acceleration are limits of the motors; null pointers select the velocities of the
+ * robot's description, and accelerations that reach them from rest in a quarter of a second. Returns
+ * 0, or @GUARD@_BAD_INPUT if a value is not finite or not positive; the follower is unusable then. */
 int @PREFIX@_follow_from(@PREFIX@_follower *follower, const double *q0, double period,
                          const double *velocity, const double *acceleration);
 
-/* One cycle: positions, velocities and accelerations of the motors stay within limits, whatever the
- * targets do. points and normals as in @PREFIX@_begin. palm: a pose of the palm (rotation row by row,
- * then the origin) that counts as far as the contacts leave it free; a null pointer: anywhere. What is
- * malformed is no error of a stream (@GUARD@_HOLDING). Collisions are not looked at. */
+/* Computes one cycle. Positions, velocities and accelerations of the motors stay within limits for all
+ * targets. points and normals are as in @PREFIX@_begin. palm is a pose of the palm (rotation row by row,
+ * then the origin) that is used as far as the contacts leave the palm free; it may be a null pointer.
+ * An invalid frame is not an error; its status is @GUARD@_HOLDING. Collisions are not checked. */
 int @PREFIX@_follow(@PREFIX@_follower *follower, const double *points, const double *normals,
                     const double *palm);

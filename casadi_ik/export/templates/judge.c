@@ -1,4 +1,4 @@
-/* Kinematics in double precision: for the test alone, no part of the solver. */
+/* Kinematics in double precision, for the test only. */
 @KINEMATICS@
 #include "judge.h"
 

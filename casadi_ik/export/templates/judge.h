@@ -1,4 +1,5 @@
-/* How far fingertips are from their targets [m], [rad], and motors and joints beyond their limits. */
+/* Computes the errors of the contacts [m, rad] and the largest excess of a motor or joint over its
+ * limits. */
 #define POSITION @POSITION_TOLERANCE@
 #define ANGLE @ANGLE_TOLERANCE@
 #define LIMITS @LIMIT_SLACK@

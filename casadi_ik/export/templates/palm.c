@@ -1,5 +1,5 @@
 
-/* Where the fingertips are if the hand has a posture and its palm a pose; 0: that is none. */
+/* Computes the contacts of a hand posture at a palm pose; returns 0, or the status of bad input. */
 int @PREFIX@_touched(@PREFIX@_solver *solver, const scalar *palm, const scalar *posture,
                      scalar *points, scalar *normals) {
   scalar q[N_MOTORS], turn[9];

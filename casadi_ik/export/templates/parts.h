@@ -1,4 +1,4 @@
-/* What the files of this solver share; programs include @PREFIX@.h only. */
+/* Declarations shared by the files of this solver; programs include @PREFIX@.h only. */
 #ifndef @GUARD@_PARTS_H
 #define @GUARD@_PARTS_H
 

@@ -1,13 +1,13 @@
 
-/* What may stand about: how many solids at most, and their kinds. */
+/* Capacity of the scene, and the kinds of its solids. */
 enum {
   @GUARD@_SCENE = @CAPACITY@,
 @KINDS_C@
   @GUARD@_NOTHING = -1
 };
-enum { @GUARD@_COLLISION = 6 /* contacts and limits are met, but something touches */ };
+enum { @GUARD@_COLLISION = 6 /* contacts and limits are met, but the robot is in collision */ };
 
-/* The robot's own shapes: capsules, then boxes and cylinders. */
+/* Shapes of the robot: capsules, then boxes and cylinders. */
 enum { @GUARD@_CAPSULES = @CAPSULES@, @GUARD@_OWN_SOLIDS = @OWN_SOLIDS@, @GUARD@_LINKS = @LINKS@ };
 extern const char *const @PREFIX@_link_names[@GUARD@_LINKS];
 
@@ -24,7 +24,7 @@ typedef struct {
   int32_t grasped[@GUARD@_SCENE], pairs[2 * @MOST_PAIRS@];
   @REAL@ offsets[@MOST_PAIRS@];
   int64_t n_busy, n_held, n_pairs;
-  /* The search for a hand that is free, where the answer touches something. */
+  /* State of the search for a collision-free answer. */
 @ONE_ARM{@
   int64_t looking, again, round, fit, n_met, next, iterations, restarts, fresh, n_known, n_swung;
 @}@
@@ -34,7 +34,7 @@ typedef struct {
 @}@
   @REAL@ q[@GUARD@_MOTORS], room; /* the answer of largest clearance */
 @BODY{@
-  /* Hands of each side that touch nothing by themselves, and where their palms are. */
+  /* Collision-free hands of each side, and the poses of their palms. */
   int64_t n_hands[@SIDES@];
   @REAL@ hands[@SIDES@][@N_LOOKED@][@GUARD@_MOTORS], palms[@SIDES@][@N_LOOKED@][12];
 @}@

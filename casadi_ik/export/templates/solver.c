@@ -1,4 +1,4 @@
-/* The solver itself: the search for a target. */
+/* The search for a target. */
 #include "@PREFIX@_parts.h"
 
 enum { DONE = 0, SLICE_OVER = 1, GOES_ON = 3 };

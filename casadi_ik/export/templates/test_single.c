@@ -16,7 +16,7 @@ static void copied(float *to, const double *from, int count) {
   while (count--) to[count] = (float) from[count];
 }
 
-/* Whether an answer is one, in double precision. */
+/* Returns 1 if an answer meets its target in double precision. */
 static int is_met(const @PREFIX@_solver *solver, const target *stored) {
   double q[@GUARD@_MOTORS], position[@GUARD@_FINGERS], angle[@GUARD@_FINGERS], beyond;
   int i, met = 1;
@@ -56,6 +56,6 @@ int main(void) {
   malformed = @PREFIX@_solve(&one, nothing, nothing, 0) == @GUARD@_BAD_INPUT;
   printf("%d targets, %d solved of %d that are in double precision, %d missed, answers in %d calls of "
          "3 iterations; wrong: %d\n", TARGETS, solved, wanted, missed, calls, wrong);
-  if (!malformed) printf("a malformed target was not refused\n");
+  if (!malformed) printf("a malformed target was accepted\n");
   return wrong || missed > (TARGETS + 999) / 1000 || !malformed;
 }
