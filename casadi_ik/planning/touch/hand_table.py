@@ -1,4 +1,4 @@
-"""What a hand's fingertips can do by themselves: postures, opposing pairs, Jacobians."""
+"""Table of a hand: postures of its fingers, opposing pairs of fingertips, Jacobians."""
 
 from __future__ import annotations
 
@@ -32,22 +32,22 @@ if TYPE_CHECKING:
 
 
 BINS = 20
-"""By so many the driver tells apart how often what it tries is clear."""
+"""Number of bins of the driver's statistics of collision-free trials."""
 
 
 @dataclass(frozen=True)
 class HandTableParameters:
-    """How finely a hand is looked at.
+    """Resolution of the table of a hand.
 
     Attributes:
-        postures: Of each finger, for each value of the motors that it shares with others.
-        shared: Values of the motors that fingers share.
+        postures: Postures of each finger, for each value of the motors that fingers share.
+        shared: Number of values of the motors that fingers share.
         facing: Two fingertips oppose each other if both normals are within this angle of the line
-            between them [rad]; of balls so much farther as they may lean more.
-        roll: By so much more than a plane a pad leans that is a ball [rad].
+            between them [rad]; for balls the angle is larger by `roll`.
+        roll: Additional lean of a pad that is a ball, compared with a plane [rad].
         cell: Edge of a cell of distances [m].
         turn: Edge of a cell of angles [rad].
-        pairs: Most pairs that are kept.
+        pairs: Maximum number of pairs.
     """
 
     postures: int = 512
@@ -64,13 +64,13 @@ class HandTable:
 
     Attributes:
         robot: The robot.
-        motors: Positions in q of the motors that move fingers.
+        motors: Indices in q of the motors that move fingers.
         q: (s, n, m) positions of these motors, for s values of the shared ones.
-        radii: (f,) of the pads' balls [m], 0 of planes.
-        roll: (f,) by how much more than a plane they may lean [rad].
-        points: (s, n, f, 3) middles of pads' balls, of planes contact points, palm frame [m].
-        pairs: (p, 4) of thumb and another finger: shared value, finger, posture of either.
-        depths: (p,) how far between their pads is from the palm frame [m].
+        radii: (f,) radii of the pads' balls [m], 0 for planes.
+        roll: (f,) additional lean compared with a plane [rad].
+        points: (s, n, f, 3) centres of balls, contact points of planes, palm frame [m].
+        pairs: (p, 4) pairs of thumb and another finger: shared value, finger, both postures.
+        depths: (p,) distances of the midpoints of their pads from the palm frame [m].
         shapes: The capsules of these postures; None until `shape`.
         normals: (s, n, f, 3) outward pad normals in the palm frame.
     """
@@ -111,19 +111,19 @@ class HandTable:
 
     @classmethod
     def of(cls, robot: ArmHand) -> HandTable:
-        """The table of a robot, made once per process."""
+        """Return the table of a robot, made once per process."""
         if robot not in _TABLES:
             _TABLES[robot] = cls(robot)
         return _TABLES[robot]
 
     def put(self, hand: Array, rows: NDArray[np.intp], posture: Array, finger: int) -> None:
-        """Take a finger's own motors from a posture."""
+        """Copy the positions of a finger's motors from a posture into hands, in place."""
         own = self.of_finger[self.robot.fingers[finger]]
         columns = np.flatnonzero(np.isin(self.motors, own))
         hand[np.ix_(rows, columns)] = posture[:, columns]
 
     def opened(self, some: Candidates, opening: float) -> Candidates:
-        """The same palms with fingertips moved back from what they touch [m]; negative: into it."""
+        """Return hands with fingertips moved back from the object [m]; negative: into it."""
         hand = some.hand
         lower, upper = self.robot.lower[self.motors], self.robot.upper[self.motors]
         for _ in range(4):
@@ -136,15 +136,15 @@ class HandTable:
         return replace(some, hand=hand)
 
     def squeezed(self, some: Candidates, touched: Array, forces: Array, inward: float) -> Array:
-        """(k, m) hands whose motors go on in proportion to the torques of forces.
+        """Return hands (k, m) whose motors advance in proportion to the torques of forces.
 
-        So do motors that are held by equal springs: sent there, they exert these forces.
+        Motors held by equal springs exert these forces if they are sent there.
 
         Args:
             some: The hands as they touch.
-            touched: (k, f, 3) where their pads do, from the middles [m], palm frame.
-            forces: (k, f, 3) of fingertips on the object, palm frame; 0 of those that do not touch.
-            inward: How far fingertips would go, in the mean [m].
+            touched: (k, f, 3) contact points, from the centres of the pads [m], palm frame.
+            forces: (k, f, 3) forces on the object, palm frame; 0 for fingers that do not touch.
+            inward: Mean advance of the fingertips [m].
         """
         _, _, linear, angular = self.at(some.hand)
         linear = linear + np.cross(angular, touched[..., None], axis=2)
@@ -156,17 +156,17 @@ class HandTable:
         return np.clip(some.hand + step, lower, upper)
 
     def configuration(self, hands: Array) -> Array:
-        """(k, n) configurations with hands (k, m), the arm at home."""
+        """Return configurations (k, n) with hands (k, m), the arm at home."""
         q = np.tile(self.robot.home, (len(hands), 1))
         q[:, self.motors] = hands
         return q
 
     def at(self, hands: Array) -> tuple[Array, Array, Array, Array]:
-        """Pads of hands (k, m) in the palm frame.
+        """Return the pads of hands (k, m) in the palm frame.
 
         Returns:
-            Middles of balls, of planes contact points (k, f, 3) [m], outward normals (k, f, 3), and
-            Jacobians (k, f, 3, m) of these points and of rotations over the fingers' motors.
+            Centres of balls or contact points of planes (k, f, 3) [m], outward normals (k, f, 3),
+            and Jacobians (k, f, 3, m) of these points and of rotations by the fingers' motors.
         """
         f, m = len(self.robot.fingers), len(self.motors)
         flat = self.kernel(self.configuration(hands))
@@ -175,7 +175,7 @@ class HandTable:
         return points, normals, linear, angular
 
     def _sort_pairs(self) -> None:
-        """Pairs of a posture of the thumb and one of another finger that oppose each other."""
+        """Find pairs of postures of the thumb and another finger that oppose each other."""
         robot, chosen = self.robot, self.parameters
         thumb = self.thumb
         found, keys = [], []
@@ -207,7 +207,7 @@ class HandTable:
         self.depths = np.linalg.norm(middles, axis=1)
 
     def shape(self, check: SceneCheck) -> HandShapes:
-        """The capsules of the postures; pairs that hit the hand or each other are left out."""
+        """Return the capsules of the postures, and remove pairs that collide; done once."""
         if self.shapes is None:
             self.shapes = shapes = HandShapes.of(self, check)
             share, other, a, b = self.pairs.T
@@ -221,7 +221,7 @@ class HandTable:
         return self.shapes
 
     def key(self, length: Array, first: Array, second: Array) -> NDArray[np.int64]:
-        """Cells of pairs: distance [m] and the cosines of both normals with the line."""
+        """Return the cells of pairs, from distances [m] and cosines of normals with the line."""
         chosen = self.parameters
         turns = [
             np.minimum(np.arccos(np.clip(c, -1, 1)) / chosen.turn, 99).astype(np.int64)
@@ -230,7 +230,7 @@ class HandTable:
         return ((length / chosen.cell).astype(np.int64) * 100 + turns[0]) * 100 + turns[1]
 
     def cells(self, key: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """First pair of cells and how many there are."""
+        """Return the first pair of each cell and the number of its pairs."""
         first = np.searchsorted(self._keys, key, "left")
         return first, np.searchsorted(self._keys, key, "right") - first
 
@@ -331,7 +331,7 @@ class HandShapes:
 
     @property
     def job(self) -> dict[str, Any]:
-        """What the driver is told of it."""
+        """Fields of the driver's job."""
         s, n, c, _ = self.capsules.shape
         arrays = ("capsules", "fixed", "lengths", "first", "pads", "apart", "crossing", "reach")
         return {name: getattr(self, name).ctypes.data for name in arrays} | {
@@ -347,7 +347,7 @@ class HandShapes:
 
 
 def _finger_of(table: HandTable, link: str) -> int | None:
-    """The finger that a link is of: whose joints lead to it, or whose motors move it."""
+    """Return the finger whose joints lead to a link, or whose motors move it."""
     robot = table.robot.description
     joints = {joint.name for joint in robot.chain(link)}
     shared = [len(joints.intersection(finger.joints)) for finger in robot.fingers]
@@ -366,7 +366,7 @@ _TABLES: WeakKeyDictionary[ArmHand, HandTable] = WeakKeyDictionary()
 
 
 def hand_kernel(robot: RobotDescription) -> FunctionKernel:
-    """Pads and their Jacobians over the fingers' motors, in the palm frame, of q."""
+    """Return the kernel of pads and their Jacobians by the fingers' motors, in the palm frame."""
     motors = sorted({i for name in robot.finger_names for i in robot.finger_actuators(name)})
     f, m, n = len(robot.finger_names), len(motors), len(robot.actuators)
     name = ca.Function.fix_name(f"{robot.name}_hand_contacts")
@@ -379,7 +379,7 @@ def hand_kernel(robot: RobotDescription) -> FunctionKernel:
         for finger in robot.finger_names:
             point, normal = moving.kinematics.contact(finger)
             linear, angular = moving.contact_jacobian(finger, motors)
-            # The middle of a ball is so far behind the point.
+            # The centre of a ball is a radius behind the contact point.
             behind = robot.finger(finger).radius * normal
             linear = linear + skew(behind) @ angular
             parts[0].append(palm.inverse_apply(point - behind).T)
@@ -396,14 +396,14 @@ def hand_kernel(robot: RobotDescription) -> FunctionKernel:
 
 
 def _sobol(dimensions: int, count: int, seed: int) -> Array:
-    """(count, dimensions) points of [0, 1]."""
+    """Return Sobol points (count, dimensions) in [0, 1]."""
     power = int(np.ceil(np.log2(max(count, 2))))
     qmc: Any = import_module("scipy.stats").qmc
     return qmc.Sobol(dimensions, rng=seed).random_base2(power)[:count]
 
 
 def rigid(rotation: Array, origin: Array) -> Array:
-    """(k, 4, 4) poses."""
+    """Return poses (k, 4, 4) from rotations and origins."""
     pose = np.zeros((*origin.shape[:-1], 4, 4))
     pose[..., :3, :3], pose[..., :3, 3], pose[..., 3, 3] = rotation, origin, 1.0
     return pose
