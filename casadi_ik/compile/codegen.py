@@ -156,8 +156,12 @@ class Stages:
             + calls
             + self.text
             + f"#define STEP(arg, res, wanted) {step}\n"
-            + define({"STEP_IN": 2, "STEP_OUT": 3})
+            + define({"STEP_IN": 2, "STEP_OUT": 3, "STEP_STAGES": len(self.functions)})
         )
+
+
+MAX_GRAPH_STAGES = 12
+"""Number of queues in the loop for a step that is one graph, whose stages cannot be counted."""
 
 
 def step_source(function: ca.Function | Stages, options: CodeOptions) -> str:
@@ -172,7 +176,7 @@ def step_source(function: ca.Function | Stages, options: CodeOptions) -> str:
         (
             text,
             f"#define STEP(arg, res, wanted) {name}({', '.join(arguments + lane_mask)})\n",
-            define({"STEP_IN": n_in, "STEP_OUT": n_out}),
+            define({"STEP_IN": n_in, "STEP_OUT": n_out, "STEP_STAGES": MAX_GRAPH_STAGES}),
         )
     )
 

@@ -16,12 +16,13 @@
  *
  * Requires the macros N_STATE, N_PARAMETERS, N_SEATED (number of parameters that lanes load; a step of
  * stages reads the others through its third argument), N_RECORD, ROW_BYTES, RUNNING, NON_FINITE,
- * REPEATED, CODE_LIMIT, SLOTS, FIRST_MARK, STAGE (index of the stage in the state; -1 without stages)
- * and the function store_row(record, row). All data that must survive a pause are in the job: after
+ * REPEATED, CODE_LIMIT, SLOTS, FIRST_MARK, STAGE (index of the stage in the state; -1 without
+ * stages), STEP_STAGES (number of stages) and the function store_row(record, row). All data that must survive a pause are in the job: after
  * SLICE_OVER or ROWS_FULL either form of the loop can be called again.
  */
 
-#define STAGES 12
+/* A queue for every stage, and one for a stage number that is not a number. */
+#define N_QUEUES (STEP_STAGES + 1)
 #define EMPTY (-1)
 
 #ifndef LANES
@@ -34,10 +35,10 @@ typedef scalar lanes;
 
 /* Waiting slots by stage. */
 typedef struct {
-  int stage_count;                   /* stages met so far; more than STAGES share the last place */
-  scalar stage[STAGES];
-  int height[STAGES];
-  int waiting[STAGES][SLOTS];  /* slots */
+  int stage_count;             /* stages met so far */
+  scalar stage[N_QUEUES];
+  int height[N_QUEUES];
+  int waiting[N_QUEUES][SLOTS];  /* slots */
 } queues;
 
 /* State of the lanes. */
@@ -63,7 +64,7 @@ static int queue_of(queues *all, scalar stage) {
   for (i = 0; i < all->stage_count; ++i) {
     if (all->stage[i] == stage) return i;
   }
-  if (all->stage_count == STAGES) return STAGES - 1;
+  if (all->stage_count == N_QUEUES) return N_QUEUES - 1;
   all->stage[all->stage_count] = stage;
   return all->stage_count++;
 }
