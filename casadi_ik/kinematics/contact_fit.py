@@ -106,7 +106,27 @@ class BalanceParameters:
     farthest: float = 2.0
 
 
-FIT, BALANCE = FitParameters(), BalanceParameters()
+@dataclass(frozen=True)
+class TolerantFitParameters:
+    """Numbers of a fit whose residuals begin where the tolerances end.
+
+    Attributes:
+        free: Fraction of the tolerance within which an error costs nothing.
+        promising: Largest `tolerance_ratio` at a minimum of the exact fit from which a tolerant fit
+            starts.
+        near: Largest `tolerance_ratio` at which a minimum counts as a near miss.
+        patience: Evaluations with little gain before a tolerant fit is given up.
+        budget: Evaluations in all.
+    """
+
+    free: float = 0.95
+    promising: float = 1.0
+    near: float = 2.0
+    patience: int = 4
+    budget: int = 40
+
+
+FIT, BALANCE, TOLERANT = FitParameters(), BalanceParameters(), TolerantFitParameters()
 
 TINY = 1e-100
 """What is divided by is no smaller."""
@@ -196,6 +216,25 @@ def judge_contacts(
 
     fine = ca.fmin(part, fine)
     return replace(judge(s, tried, within(fine), within(FIT.fine * fine)), within=within(part))
+
+
+def judge_beyond_tolerance(
+    s: dict[str, Expr], p: dict[str, Expr], tried: Tried, rows: ContactRows, part: float = 1.0
+) -> Judged:
+    """Judge a step whose residuals are those of `beyond_tolerance`; see `judge`.
+
+    Args:
+        s: State.
+        p: Parameters.
+        tried: The step.
+        rows: Rows of the contacts.
+        part: Fraction of the tolerances at which the fit ends.
+    """
+    residual = ca.if_else(gains(tried), tried.there, tried.before)
+    left = (part - TOLERANT.free) * _allowed(p)
+    lengths = ca.vertcat(*(ca.norm_2(residual[own]) for own in rows.slices))
+    within = ca.mmax(lengths - left) <= 0
+    return judge(s, tried, within, within, TOLERANT.patience, TOLERANT.budget)
 
 
 def gains(tried: Tried) -> Expr:
@@ -315,6 +354,22 @@ class WholeContacts:
             lambda step: clip(q + step, bounds),
         )
 
+    def fitted_beyond_tolerance(self, q: Expr, damping: Expr, parameters: Expr) -> Tried:
+        """Return one damped step of the least squares of `beyond_tolerance` within the bounds.
+
+        Args:
+            q: (n, 1) configuration before the step.
+            damping: Scalar.
+            parameters: Parameters of the method.
+        """
+        bounds, p = self._bounds(q, parameters), self._layout.unpack(parameters)
+
+        def excess(at: Expr) -> tuple[Expr, Expr]:
+            residual, jacobian = self.at(at, parameters)
+            return beyond_tolerance(residual, jacobian, self._rows, p)
+
+        return lm_step(excess, q, damping, bounds, lambda step: clip(q + step, bounds))
+
     def balanced(self, q: Expr, damping: Expr, number: Expr, parameters: Expr) -> Tried:
         """One step towards the smallest largest error, see `balanced`; nothing is promised of it.
 
@@ -360,11 +415,59 @@ class Balanced:
     fit: dict[str, Expr]
 
 
-def near_tolerance(residual: Expr, rows: ContactRows, p: dict[str, Expr]) -> Expr:
-    """Whether the contacts of a residual are met, or missed by little."""
-    positions, chords = rows.errors(residual)
-    tolerances = p["position_tolerance"], chord(p["angle_tolerance"])
-    return within_tolerance(positions / BALANCE.near, chords / BALANCE.near, *tolerances)
+def tolerance_ratio(cost: Expr, p: dict[str, Expr]) -> Expr:
+    """Return the root mean square error of a residual, relative to its tolerances.
+
+    It is at most 1 at a minimum near which all contacts can be within tolerance: the cost of a
+    minimum does not exceed that of a configuration near it, and the cost of a configuration within
+    tolerance does not exceed the sum of the squared tolerances.
+
+    Args:
+        cost: Sum of squares of the residual.
+        p: Parameters.
+    """
+    squares = ca.sum1(p["weights"][:, 0] * (p["position_tolerance"] / LENGTH) ** 2)
+    squares += ca.sum1(p["weights"][:, 1] * chord(p["angle_tolerance"]) ** 2)
+    return ca.sqrt(cost / ca.fmax(squares, TINY))
+
+
+def beyond_tolerance(
+    residual: Expr, jacobian: Expr, rows: ContactRows, p: dict[str, Expr]
+) -> tuple[Expr, Expr]:
+    """Return the part of a residual that exceeds the tolerances, and its Jacobian.
+
+    The residual r of a contact, with tolerance t, becomes (1 - t / |r|) r where |r| > t, and zero
+    elsewhere; rows that follow those of the contacts remain as they are.
+
+    Args:
+        residual: (m, 1) residual whose first rows are those of the contacts.
+        jacobian: (m, n) its Jacobian.
+        rows: Rows of the contacts.
+        p: Parameters.
+    """
+    free = TOLERANT.free * _allowed(p)
+    residuals, slopes = [], []
+    for i, own in enumerate(rows.slices):
+        dense, columns = _in_columns(jacobian[own, :])
+        excess, bent = _shortened(*dense.shape)(residual[own], dense, free[i])
+        residuals.append(excess)
+        slopes.append(bent @ columns)
+    return (
+        ca.vertcat(*residuals, residual[rows.size :]),
+        ca.vertcat(*slopes, jacobian[rows.size :, :]),
+    )
+
+
+@cache
+def _shortened(rows: int, columns: int) -> ca.Function:
+    """Return the graph (residual, slopes, tolerance) -> (excess, slopes of it) of a contact."""
+    residual, slopes = ca.SX.sym("residual", rows), ca.SX.sym("slopes", rows, columns)
+    free = ca.SX.sym("free")
+    length = ca.fmax(ca.norm_2(residual), TINY)
+    along, ratio = residual / length, ca.fmin(free / length, 1.0)
+    exceeds = ca.if_else(length > free, 1.0, 0.0)
+    bent = (1 - ratio) * slopes + exceeds * ratio * (along @ (along.T @ slopes))
+    return part("shortened", [residual, slopes, free], [(1 - ratio) * residual, bent])
 
 
 def differs(cost: Expr, before: Expr) -> Expr:

@@ -48,7 +48,6 @@ def test_what_a_configuration_meets_is_solved(name, count, fingers):
     points, normals = displaced(robot, np.random.default_rng(1), count, 0.98, fingers)
     batch = ik.Solver(robot).solve_batch(points, normals)
     assert np.flatnonzero(~batch.success).tolist() == []
-    assert batch.phases["balance"].any()
 
 
 def test_limits_and_held_actuators_are_kept(robot):
@@ -90,9 +89,9 @@ def test_fits_that_come_back_to_a_minimum_that_misses_end_the_rounds_of_tables(r
     batch = solver.solve_batch(points, normals)
     missed = ~batch.success
     assert missed.sum() >= 10
-    # Two rounds of tables instead of six.
+    # Two or three rounds of tables instead of six.
     given_up = 8 * (2 + 3 + 2) - 1
-    assert np.median(batch.restarts[missed]) == given_up
+    assert given_up <= np.median(batch.restarts[missed]) <= given_up + 8
     assert np.median(batch.phases["balance"][missed]) < 15
     patient = ik.Solver(robot, options={"same_minimum": (10**6, 10**6), "far_cost": (1e9, 1e9)})
     assert not patient.solve_batch(points[missed], normals[missed]).success.any()

@@ -21,7 +21,15 @@ from casadi_ik.kinematics.arms.family import ArmFamily
 from casadi_ik.kinematics.arms.recognise import arm_family
 from casadi_ik.kinematics.arms.search import ARM_SEARCH, ArmTrials, Farthest
 from casadi_ik.kinematics.box_qp import Bounded, clip, damped_step
-from casadi_ik.kinematics.contact_fit import FIT, Tried, fresh_fit, judge, judge_contacts
+from casadi_ik.kinematics.contact_fit import (
+    FIT,
+    Tried,
+    fresh_fit,
+    judge,
+    judge_beyond_tolerance,
+    judge_contacts,
+    tolerance_ratio,
+)
 from casadi_ik.kinematics.contacts import LENGTH, Kinds
 from casadi_ik.kinematics.forward import ActuatedKinematics, Pose, actuated
 from casadi_ik.kinematics.palm import base_rotation, best_palm, hand_contacts, newton_polish
@@ -95,12 +103,15 @@ class BodySide:
         found = best_palm(contacts, self.layouts.contacts, self._own.unpack(given), turn, self.base)
         return part("best_palm", [at, given, turn], found)(hand, self._own.pack(own), number)
 
-    def fitted(self, x: PalmAndHand, damping: Expr, own: dict[str, Expr], q: Expr) -> Tried:
-        """One damped step of palm and hand, see `fit_step`."""
+    def fitted(
+        self, x: PalmAndHand, damping: Expr, own: dict[str, Expr], q: Expr, tolerant: bool
+    ) -> Tried:
+        """Make one damped step of palm and hand, see `fit_step`."""
         given, around = self._own.symbols("own"), ca.SX.sym("damping")
         there = PalmAndHand(ca.SX.sym("R", 3, 3), ca.SX.sym("t", 3), ca.SX.sym("h", x.hand.numel()))
         at = ca.SX.sym("q", q.numel())
-        step = fit_step(self.layouts, None, there, around, self._own.unpack(given), at, [given])
+        parameters = self._own.unpack(given)
+        step = fit_step(self.layouts, None, there, around, parameters, at, [given], tolerant)
         rest = step.before, step.there, step.promised, step.size
         whole = part("fitted", [*there, around, given, at], [*step.reached, *rest])
         *reached, before, left, promised, size = whole(*x, damping, self._own.pack(own), q)
@@ -170,6 +181,7 @@ class BodyStep(HandFirstStep):
         found: dict[Stage | SideStage, Callable[[], ca.Function]] = {
             Stage.START: self._start,
             Stage.REFINEMENT: self._refinement,
+            Stage.TOLERANT_REFINEMENT: self._tolerant_refinement,
             Stage.BALANCE: self._balance,
             Stage.ARM_PLACEMENT: self._all_arms,
             Stage.TRUNK: self._trunk,
@@ -178,6 +190,7 @@ class BodyStep(HandFirstStep):
             for stage, build in (
                 (Stage.CANDIDATE, self._side_candidate),
                 (Stage.HAND_FIT, self._side_fit),
+                (Stage.TOLERANT_HAND_FIT, partial(self._side_fit, tolerant=True)),
             ):
                 key: Stage | SideStage = stage
                 if side.place:
@@ -204,14 +217,21 @@ class BodyStep(HandFirstStep):
         said = {"within": ca.logic_not(side.asked(p))}
         return self._function(stage, [*inputs, hands], s, changed, said, record)
 
-    def _side_fit(self, stage: Stage | SideStage, side: BodySide) -> ca.Function:
+    def _side_fit(
+        self, stage: Stage | SideStage, side: BodySide, tolerant: bool = False
+    ) -> ca.Function:
+        """Build one damped step of the palm and the hand of a side."""
         inputs, s, p = self._vectors()
         own, rows = side.parameters(p), side.layouts.contacts
         hand = list(side.robot.hand_actuators)
         q = s["q"][side.motors]
         x = PalmAndHand(s["palm_rotation"], s["palm_origin"], q[hand])
-        tried = side.fitted(x, s["damping"], own, q)
-        judged = judge_contacts(s, own, tried, rows, STAGES.before_the_arm, STAGES.fit_part)
+        tried = side.fitted(x, s["damping"], own, q, tolerant)
+        part_of_tolerance = STAGES.before_the_arm
+        if tolerant:
+            judged = judge_beyond_tolerance(s, own, tried, rows, part_of_tolerance)
+        else:
+            judged = judge_contacts(s, own, tried, rows, part_of_tolerance, STAGES.fit_part)
         keep, reached = judged.accepted, tried.reached
         changed = {
             "q": with_rows(s["q"], side.hand, ca.if_else(keep, reached.hand, x.hand)),
@@ -222,7 +242,7 @@ class BodyStep(HandFirstStep):
         said = {
             "settled": judged.settled,
             "within": judged.within,
-            "near": self._left(keep, tried, own, rows),
+            "miss": tolerance_ratio(judged.cost, own),
             "cost": ca.sumsqr(tried.before),
         }
         of_side = ca.DM.zeros(len(self.robot.fingers), 2)

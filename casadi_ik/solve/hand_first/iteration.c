@@ -3,8 +3,9 @@
  * Of each hand posture of a round a solve takes the palm pose that suits it best (candidate), and
  * fits palm and hand to the contacts as if the hand could fly (hand fit). The arm carries the palm
  * there: in closed form (arm placement, or arm choice if what is near to where the robot is is
- * wanted), or step by step (arm steps). Where it cannot follow exactly, all motors move (refinement),
- * and where that misses by little the largest error is brought down (balance). What does not lead to
+ * wanted), or step by step (arm steps). Where it cannot follow exactly, all motors move (refinement).
+ * Where a fit or a refinement misses, it continues with errors within tolerance at no cost (tolerant
+ * hand fit, tolerant refinement); then the largest error is brought down (balance). What does not lead to
  * a solution ends with the next posture; after the last one the best there was is left.
  *
  * Of a body every hand flies to its contacts by itself, one side after the other. Then all arms are
@@ -208,10 +209,23 @@ static int to_next_candidate(solve s) {
 }
 #endif
 
-/* Whether the cost of a fit is another than that of the fit that was balanced before. */
-static int differs(double cost, double before) {
-  const double off = cost - before;
-  return (off < 0 ? -off : off) > SAME_COST * before;
+/* Return 1 if the tolerances may hold near the minimum of the exact fit that a solve has come to, and
+ * it is not the minimum that missed before. Near misses at that minimum are counted. */
+static int is_new_miss(solve s, double *missed, double before) {
+  const double cost = Y(COST), difference = cost - before;
+  if (SAID(MISS) > NEAR_MISS) return 0;
+  if ((difference < 0 ? -difference : difference) <= SAME_COST * before) {
+    Y(RETURNS) = X(RETURNS) + 1;
+    return 0;
+  }
+  *missed = cost;
+  return SAID(MISS) <= PROMISING;
+}
+
+/* Count a fit that ends no closer than one before; `least` is what the closest one left. */
+static void count_return(solve s, double *least, double before, double value) {
+  Y(RETURNS) = X(RETURNS) + (value > CLOSER * before);
+  if (value < before) *least = value;
 }
 
 static void keep_best(solve s, double cost) {
@@ -256,31 +270,38 @@ static int placement(solve s) {
   return ARM_STEPS_STAGE;
 }
 
-static int after_hand_fit(solve s) {
-  /* The last goes on to the arm even if it does not fit: refinement starts from the nearest. */
-  const int last = X(CANDIDATE) + 1 >= N_CANDIDATES, alone = P(ALONE) > 0;
-  const int first = X(CANDIDATE) + X(EARLIER) <= 0 && X(SPENT) < 1;
-  int goes_on = SAYS(WITHIN) || last;
-  /* The hand as it is is only worth a fit if its contacts are shaped a little like these. */
-  if (N_CANDIDATES > 1 && P(NEAREST) > 0 && first && SAID(COST) > OWN_HAND) {
-    return to_next_candidate(s);
-  }
-  if (!SAYS(SETTLED)) return goes_to(s, (int) X(PHASE));
-  if (!SAYS(WITHIN) && SAYS(NEAR)) {
-    /* Nor does one that fits nearly have to fit, if it is another than before: it is balanced. */
-    if (!differs(Y(COST), X(NEAR))) {
-      Y(RETURNS) = X(RETURNS) + 1;
-    } else if (!alone) {
-      Y(NEAR) = Y(COST);
-      goes_on = 1;
-    }
-  }
-  if (!goes_on) return to_next_candidate(s);
+/* The arm follows a hand that fits. It also follows the last hand posture of a restart, so that the
+ * refinement starts from it. */
+static int after_fitted_hand(solve s) {
+  const int is_last = X(CANDIDATE) + 1 >= N_CANDIDATES, alone = P(ALONE) > 0;
+  if (!SAYS(WITHIN) && !is_last) return to_next_candidate(s);
 #if N_SIDES
   return after_side(s, 0);
 #endif
   goes_to(s, HAS_CHOICE && P(NEAREST) > 0 ? ARM_CHOICE_STAGE : placement(s));
   return !alone ? RUNNING_STATUS : SAYS(WITHIN) ? SOLVED_STATUS : STALLED_STATUS;
+}
+
+static int after_tolerant_hand_fit(solve s) {
+  if (!SAYS(SETTLED)) return goes_to(s, (int) X(PHASE));
+  /* Only a minimum near which no hand fits is skipped when another candidate leads to it. */
+  if (SAYS(WITHIN)) Y(NEAR) = 0;
+  else count_return(s, &Y(LEAST_EXCESS), X(LEAST_EXCESS), Y(COST));
+  return after_fitted_hand(s);
+}
+
+static int after_hand_fit(solve s) {
+  const int first = X(CANDIDATE) + X(EARLIER) <= 0 && X(SPENT) < 1;
+  /* The hand as it is is only worth a fit if its contacts are shaped a little like these. */
+  if (N_CANDIDATES > 1 && P(NEAREST) > 0 && first && SAID(COST) > OWN_HAND) {
+    return to_next_candidate(s);
+  }
+  if (!SAYS(SETTLED)) return goes_to(s, (int) X(PHASE));
+  if (!SAYS(WITHIN) && is_new_miss(s, &Y(NEAR), X(NEAR))) {
+    begin_fit(s);
+    return goes_to(s, TOLERANT_HAND_FIT_STAGE + ((int) X(PHASE) - HAND_FIT_STAGE));
+  }
+  return after_fitted_hand(s);
 }
 
 #if !N_SIDES
@@ -356,23 +377,24 @@ static int after_refinement(solve s) {
   keep_best(s, Y(COST));
   if (!SAYS(SETTLED)) return goes_to(s, REFINEMENT_STAGE);
   if (SAYS(WITHIN)) return SOLVED_STATUS;
-  if (!SAYS(NEAR)) return to_next_candidate(s);
-  if (!differs(Y(COST), X(BALANCED))) {
-    Y(RETURNS) = X(RETURNS) + 1;
-    return to_next_candidate(s);
-  }
-  Y(BALANCED) = Y(COST);
+  if (!is_new_miss(s, &Y(BALANCED), X(BALANCED))) return to_next_candidate(s);
+  begin_fit(s);
+  return goes_to(s, TOLERANT_REFINEMENT_STAGE);
+}
+
+static int after_tolerant_refinement(solve s) {
+  if (!SAYS(SETTLED)) return goes_to(s, TOLERANT_REFINEMENT_STAGE);
+  if (SAYS(WITHIN)) return SOLVED_STATUS;
+  begin_fit(s);
   return goes_to(s, BALANCE_STAGE);
 }
 
 static int after_balance(solve s) {
-  const double largest = SAID(COST);
   if (SAYS(WITHIN)) return SOLVED_STATUS;
   if (!SAYS(SETTLED)) return goes_to(s, BALANCE_STAGE);
   begin_fit(s);
   Y(POWER) = 0;
-  Y(RETURNS) = X(RETURNS) + (largest > CLOSER * X(LEAST));
-  if (largest < X(LEAST)) Y(LEAST) = largest;
+  count_return(s, &Y(LEAST), X(LEAST), SAID(COST));
   return to_next_candidate(s);
 }
 
@@ -405,6 +427,8 @@ CODE void iterate(real *x, const real *p, const double *const *own, real *y, rea
     case START_STAGE: START(x, p, y, said, record); break;
     case CANDIDATE_STAGE: OF_SIDE(CANDIDATE, x, p, hand, y, said, record); break;
     case HAND_FIT_STAGE: OF_SIDE(HAND_FIT, x, p, y, said, record); break;
+    case TOLERANT_HAND_FIT_STAGE: OF_SIDE(TOLERANT_HAND_FIT, x, p, y, said, record); break;
+    case TOLERANT_REFINEMENT_STAGE: TOLERANT_REFINEMENT(x, p, y, said, record); break;
     case ARM_PLACEMENT_STAGE: ARM_PLACEMENT(x, p, y, said, record); break;
     case ARM_STEPS_STAGE: ARM_STEPS(x, p, y, said, record); break;
     case ARM_CHOICE_STAGE: ARM_CHOICE(x, p, y, said, record); break;
@@ -419,6 +443,8 @@ CODE void iterate(real *x, const real *p, const double *const *own, real *y, rea
       case START_STAGE: code = after_start(s); break;
       case CANDIDATE_STAGE: code = after_candidate(s); break;
       case HAND_FIT_STAGE: code = after_hand_fit(s); break;
+      case TOLERANT_HAND_FIT_STAGE: code = after_tolerant_hand_fit(s); break;
+      case TOLERANT_REFINEMENT_STAGE: code = after_tolerant_refinement(s); break;
 #if N_SIDES
       case ARM_PLACEMENT_STAGE: code = after_all_placements(s); break;
       case TRUNK_STAGE: code = after_trunk(s); break;

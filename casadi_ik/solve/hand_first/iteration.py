@@ -16,7 +16,7 @@ from casadi_ik.compile.codegen import define, define_arrays, number, row_major
 from casadi_ik.compile.function_kernel import BufferedFunction
 from casadi_ik.files.arrays import Array, even_steps
 from casadi_ik.kinematics.arms.search import ARM_SEARCH
-from casadi_ik.kinematics.contact_fit import BALANCE, FIT, fresh_fit
+from casadi_ik.kinematics.contact_fit import BALANCE, FIT, TOLERANT, fresh_fit
 from casadi_ik.kinematics.contacts import LENGTH
 from casadi_ik.kinematics.palm import NUMERIC_ARM, start_table
 from casadi_ik.model.description import RobotDescription, Side
@@ -26,6 +26,9 @@ from casadi_ik.solve.status import Status
 
 if TYPE_CHECKING:
     from casadi_ik.solve.hand_first.step import HandFirstStep
+
+SIDE_STAGES = ("CANDIDATE", "HAND_FIT", "TOLERANT_HAND_FIT")
+"""Stages that have a function for every side of a multi-arm robot."""
 
 MOST_SIDES = 4
 """Of a body."""
@@ -70,6 +73,8 @@ def text(step: HandFirstStep) -> str:
         "FIT_GROWTH": FIT.growth,
         "SAME_COST": BALANCE.same,
         "CLOSER": BALANCE.closer,
+        "PROMISING": TOLERANT.promising,
+        "NEAR_MISS": TOLERANT.near,
         "OWN_HAND": STAGES.own_hand,
         "WHOLE": STAGES.whole,
         "EXACT_COST": FIT.exact * FIT.exact,
@@ -93,7 +98,7 @@ def text(step: HandFirstStep) -> str:
     if numeric:
         arms, palms = start_table(robot)
         arrays |= {"START_ARMS": arms, "START_PALMS": palms.T}
-    more = [f"{name}_{i}" for name in ("CANDIDATE", "HAND_FIT") for i in range(1, MOST_SIDES)]
+    more = [f"{name}_{i}" for name in SIDE_STAGES for i in range(1, MOST_SIDES)]
     known = {stage.name for stage in step.stages}
     missing = [name for name in (*(stage.name for stage in Stage), *more) if name not in known]
     source = resources.files("casadi_ik.solve.hand_first") / "iteration.c"
@@ -215,8 +220,26 @@ class Iteration:
             closed = complete or (step.arm is not None and not searched)
             return Stage.ARM_PLACEMENT if closed else Stage.ARM_STEPS
 
-        def differs(before: float) -> bool:
-            return abs(cost - before) > BALANCE.same * before
+        def is_new_miss(name: str) -> bool:
+            if said["miss"] > TOLERANT.near:
+                return False
+            if abs(cost - x[name]) <= BALANCE.same * x[name]:
+                put(returns=x["returns"] + 1)
+                return False
+            put(**{name: cost})
+            return said["miss"] <= TOLERANT.promising
+
+        def count_return(name: str, value: float) -> None:
+            put(returns=x["returns"] + (value > BALANCE.closer * x[name]))
+            put(**{name: min(value, x[name])})
+
+        def after_fitted_hand() -> Status:
+            if not within and x["candidate"] + 1 < candidates:
+                return to_next_candidate()
+            ended = Status.SOLVED if within else Status.STALLED
+            chooses = step.choices is not None and nearest
+            following = Stage.ARM_CHOICE if chooses else placement()
+            return goes_to(following, ended if p["alone"][()] > 0 else Status.RUNNING)
 
         match stage:
             case Stage.START:
@@ -232,25 +255,23 @@ class Iteration:
                 y["q"][:] = self._x["best_q"]
                 return Status.STALLED
             case Stage.HAND_FIT:
-                last, alone = x["candidate"] + 1 >= candidates, p["alone"][()] > 0
                 first = x["candidate"] + x["earlier"] <= 0 and x["spent"] < 1
                 if candidates > 1 and nearest and first and said["cost"] > STAGES.own_hand:
                     return to_next_candidate()
                 if not settled:
                     return goes_to(Stage.HAND_FIT)
-                goes_on = within or last
-                if near and not within:
-                    if not differs(x["near"]):
-                        put(returns=x["returns"] + 1)
-                    elif not alone:
-                        put(near=cost)
-                        goes_on = True
-                if not goes_on:
-                    return to_next_candidate()
-                ended = Status.SOLVED if within else Status.STALLED
-                chooses = step.choices is not None and nearest
-                following = Stage.ARM_CHOICE if chooses else placement()
-                return goes_to(following, ended if alone else Status.RUNNING)
+                if not within and is_new_miss("near"):
+                    put(**fresh_fit())
+                    return goes_to(Stage.TOLERANT_HAND_FIT)
+                return after_fitted_hand()
+            case Stage.TOLERANT_HAND_FIT:
+                if not settled:
+                    return goes_to(stage)
+                if within:
+                    put(near=0)
+                else:
+                    count_return("least_excess", cost)
+                return after_fitted_hand()
             case Stage.ARM_PLACEMENT:
                 if not within and y["spent"][()] < step.trials[x["earlier"] > 0]:
                     return goes_to(Stage.ARM_PLACEMENT)
@@ -287,18 +308,23 @@ class Iteration:
                     return goes_to(Stage.REFINEMENT)
                 if within:
                     return Status.SOLVED
-                if near and differs(x["balanced"]):
-                    put(balanced=cost)
-                    return goes_to(Stage.BALANCE)
-                put(returns=x["returns"] + near)
-                return to_next_candidate()
+                if not is_new_miss("balanced"):
+                    return to_next_candidate()
+                put(**fresh_fit())
+                return goes_to(Stage.TOLERANT_REFINEMENT)
+            case Stage.TOLERANT_REFINEMENT:
+                if not settled:
+                    return goes_to(stage)
+                if within:
+                    return Status.SOLVED
+                put(**fresh_fit())
+                return goes_to(Stage.BALANCE)
             case Stage.BALANCE:
                 if within:
                     return Status.SOLVED
                 if not settled:
                     return goes_to(Stage.BALANCE)
-                vain = said["cost"] > BALANCE.closer * x["least"]
-                put(**fresh_fit(), power=0, returns=x["returns"] + vain)
-                put(least=min(said["cost"], x["least"]))
+                put(**fresh_fit(), power=0)
+                count_return("least", said["cost"])
                 return to_next_candidate()
         raise AssertionError(stage)

@@ -53,6 +53,8 @@ class Stage(IntEnum):
     ARM_CHOICE = Phase.ARM_CHOICE
     TRUNK = Phase.TRUNK
     ARM_STEPS = max(Phase) + 1
+    TOLERANT_HAND_FIT = max(Phase) + 2
+    TOLERANT_REFINEMENT = max(Phase) + 3
 
 
 BY_SIDE = 32
@@ -63,7 +65,8 @@ SAID = Layout(
     (
         Field("settled", doc="whether the fit or the balance is at its end"),
         Field("within", doc="whether contacts are within tolerance; of an arm, within its bounds"),
-        Field("near", doc="whether it misses by little; of an arm, whether it is the real one"),
+        Field("near", doc="whether an arm is the real one; whether its steps end near the pose"),
+        Field("miss", doc="root mean square error of a fit, relative to the tolerances"),
         Field("cost", doc="before a fit of the hand; of an arm's step; largest part of a balance"),
         Field("at_end", doc="joint of the arm, from 1, to be sent to the other end; 0: none"),
     )
@@ -75,11 +78,13 @@ PLACES = {
     Stage.TRUNK: len(STAGES),
     Stage.START: STAGES.index(Phase.REFINEMENT),
     Stage.ARM_STEPS: STAGES.index(Phase.ARM_PLACEMENT),
+    Stage.TOLERANT_HAND_FIT: STAGES.index(Phase.HAND_FIT),
+    Stage.TOLERANT_REFINEMENT: STAGES.index(Phase.REFINEMENT),
 }
 """Where a stage is counted."""
 
 CARRIED = (
-    *("passed", "near", "balanced", "least", "returns"),
+    *("passed", "near", "least_excess", "balanced", "least", "returns"),
     *("best_cost", "best_q", "counts"),
 )
 """What a round leaves to the next: how far the numeric arm's list of starts is through, which fits
@@ -148,6 +153,7 @@ class HandFirstLayouts:
                 Field("spent", doc="evaluations in this phase"),
                 Field("power", doc="powers done while the contacts are balanced"),
                 Field("near", doc="cost of the near fit that last went on to the arm, 0: none"),
+                Field("least_excess", doc="smallest cost of a tolerant hand fit that failed"),
                 Field("balanced", doc="cost of the refinement last balanced, 0: none"),
                 Field("least", doc="smallest largest part of the tolerances balanced to so far"),
                 Field("held", doc="1 if held motors leave hand or arm less than its motions"),
@@ -389,6 +395,7 @@ def _build(name: str, layouts: HandFirstLayouts) -> ca.Function:
             "best_q": here,
             "best_cost": sys.float_info.max,
             "least": sys.float_info.max,
+            "least_excess": sys.float_info.max,
             "held": _is_held(layouts, t),
             "phase": ca.if_else(t["nearest"], float(Stage.START), float(Stage.CANDIDATE)),
             "candidate": -t["nearest"],

@@ -10,7 +10,8 @@ placement   some arms in closed form for that palm pose;
 arm steps   one damped step of the arm towards it, where no closed form helps;
 choice      some arms in closed form, near to where the robot is;
 refinement  one damped step of all motors, from the least violating arm;
-balance     one step of all motors towards the smallest largest error.
+balance     one step of all motors towards the smallest largest error;
+tolerant    the steps of hand fit and refinement with errors within tolerance at no cost.
 
 Three contacts with normals fix palm and hand: thirteen unknowns (palm 6, hand 7 for the Barrett)
 against fifteen equations. The palm's coordinates are its pose; a step turns and shifts it in its
@@ -33,11 +34,13 @@ from casadi_ik.kinematics.box_qp import clip
 from casadi_ik.kinematics.contact_fit import (
     Tried,
     balanced,
+    beyond_tolerance,
     fresh_fit,
     judge,
+    judge_beyond_tolerance,
     judge_contacts,
     lm_step,
-    near_tolerance,
+    tolerance_ratio,
 )
 from casadi_ik.kinematics.contacts import (
     LENGTH,
@@ -155,8 +158,9 @@ def fit_step(
     p: dict[str, Expr],
     q: Expr,
     given: Sequence[Expr],
+    tolerant: bool = False,
 ) -> Tried:
-    """One damped step; it turns and shifts the palm along one screw.
+    """Make one damped step that turns and shifts the palm along one screw.
 
     With the palm on a screw, a palm that turns about the common axis of several joints while they
     turn back leaves the contacts exactly alone: the long valleys of nearly singular hands are
@@ -170,6 +174,7 @@ def fit_step(
         p: Parameters.
         q: (n, 1) with the hand's part at `x.hand`.
         given: Symbols that the parameters are made of.
+        tolerant: Whether only the excess over the tolerances counts, see `beyond_tolerance`.
     """
     bounds = layouts.hand_bounds(q, p, first=6)
     there = PalmAndHand(ca.SX.sym("R", 3, 3), ca.SX.sym("t", 3), ca.SX.sym("h", x.hand.numel()))
@@ -179,7 +184,13 @@ def fit_step(
         rotation, origin = compose((x.rotation, x.origin), exp_se3(step[:6]))
         return PalmAndHand(rotation, origin, clip(x.hand + step[6:], bounds))
 
-    return lm_step(lambda place: seen(*place), x, damping, bounds, moved, lambda place: place.hand)
+    def at(place: PalmAndHand) -> tuple[Expr, Expr]:
+        residual, jacobian = seen(*place)
+        if not tolerant:
+            return residual, jacobian
+        return beyond_tolerance(residual, jacobian, layouts.contacts, p)
+
+    return lm_step(at, x, damping, bounds, moved, lambda place: place.hand)
 
 
 def _rows(
@@ -270,10 +281,12 @@ class HandFirstStep:
             Stage.START: self._start,
             Stage.CANDIDATE: self._candidate,
             Stage.REFINEMENT: self._refinement,
+            Stage.TOLERANT_REFINEMENT: self._tolerant_refinement,
             Stage.BALANCE: self._balance,
         }
         if self.robot.arm_actuators:
             found[Stage.HAND_FIT] = self._hand_fit
+            found[Stage.TOLERANT_HAND_FIT] = self._tolerant_hand_fit
             # What no place of locked joints brought within limits is searched in later rounds, and
             # so is what Newton's steps did not lead to from the nominal arm: near a singularity
             # they lead nowhere near.
@@ -320,18 +333,6 @@ class HandFirstStep:
 
     def _with_hand(self, q: Expr, hand: Expr) -> Expr:
         return with_rows(q, self.robot.hand_actuators, hand)
-
-    def _left(
-        self,
-        accepted: Expr,
-        tried: Tried,
-        p: dict[str, Expr],
-        contacts: ContactRows | None = None,
-    ) -> Expr:
-        """Whether a step leaves the contacts near their tolerances."""
-        contacts = contacts or self.layouts.contacts
-        left = ca.if_else(accepted, tried.there, tried.before)
-        return near_tolerance(left[: contacts.size], contacts, p)
 
     def _start(self) -> ca.Function:
         """Nothing moves."""
@@ -382,11 +383,30 @@ class HandFirstStep:
         said = {
             "settled": judged.settled,
             "within": judged.within,
-            "near": self._left(keep, tried, p),
+            "miss": tolerance_ratio(judged.cost, p),
             "cost": ca.sumsqr(tried.before),
         }
         record = self.layouts.row(s, p, s["q"], Phase.HAND_FIT, tried, keep)
         return self._function(Stage.HAND_FIT, inputs, s, changed, said, record)
+
+    def _tolerant_hand_fit(self) -> ca.Function:
+        """Build one damped step of palm and hand that reduces the excess over the tolerances."""
+        inputs, s, p = self._vectors()
+        columns = list(self.robot.hand_actuators)
+        x = PalmAndHand(s["palm_rotation"], s["palm_origin"], s["q"][columns])
+        tried = fit_step(self.layouts, self.arm, x, s["damping"], p, s["q"], inputs, True)
+        rows = self.layouts.contacts
+        judged = judge_beyond_tolerance(s, p, tried, rows, STAGES.before_the_arm)
+        keep, reached = judged.accepted, tried.reached
+        changed = {
+            "q": self._with_hand(s["q"], ca.if_else(keep, reached.hand, x.hand)),
+            "palm_rotation": ca.if_else(keep, reached.rotation, x.rotation),
+            "palm_origin": ca.if_else(keep, reached.origin, x.origin),
+            "fits": judged.within,
+        } | judged.fit
+        said = {"settled": judged.settled, "within": judged.within}
+        record = self.layouts.row(s, p, s["q"], Phase.HAND_FIT, tried, keep)
+        return self._function(Stage.TOLERANT_HAND_FIT, inputs, s, changed, said, record)
 
     def _placement(self, search: ArmTrials) -> ca.Function:
         inputs, s, p = self._vectors(ca.MX)
@@ -479,10 +499,20 @@ class HandFirstStep:
         said = {
             "settled": judged.settled,
             "within": judged.within,
-            "near": self._left(judged.accepted, tried, p),
+            "miss": tolerance_ratio(judged.cost, p),
         }
         record = self.layouts.row(s, p, s["q"], Phase.REFINEMENT, tried, judged.accepted)
         return self._function(Stage.REFINEMENT, inputs, s, changed, said, record)
+
+    def _tolerant_refinement(self) -> ca.Function:
+        """Build one damped step of all motors that reduces the excess over the tolerances."""
+        inputs, s, p = self._vectors()
+        tried = self.layouts.whole.fitted_beyond_tolerance(s["q"], s["damping"], inputs[1])
+        judged = judge_beyond_tolerance(s, p, tried, self.layouts.contacts)
+        changed = {"q": ca.if_else(judged.accepted, tried.reached, s["q"])} | judged.fit
+        said = {"settled": judged.settled, "within": judged.within}
+        record = self.layouts.row(s, p, s["q"], Phase.REFINEMENT, tried, judged.accepted)
+        return self._function(Stage.TOLERANT_REFINEMENT, inputs, s, changed, said, record)
 
     def _balance(self) -> ca.Function:
         inputs, s, p = self._vectors()
