@@ -38,6 +38,8 @@ from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import usual
 from casadi_ik.model.targets import TargetBatch, Tolerance
+from casadi_ik.motion import recovery
+from casadi_ik.motion.clear import motor_units
 from casadi_ik.motion.cycle import Cycle
 from casadi_ik.motion.follower import PALM_WEIGHT
 from casadi_ik.motion.inputs import FADING, contact_weights
@@ -102,6 +104,7 @@ class FollowSources:
             "FOLLOW_STATE": str(cycle.state.size),
             "FOLLOW_ASKED": str(cycle.parameters.size),
             "FOLLOW_RECORD": str(cycle.record.size),
+            "FOLLOW_TRAIL": str(recovery.CAPACITY),
         }
         about = {
             "FOLLOW": "",
@@ -132,6 +135,7 @@ class FollowSources:
             "N_FINGERS": f,
             "N_MOTORS": len(robot.actuators),
             "MOVES_PALM": int(bool(cycle.palms)),
+            "TRAIL_CAPACITY": recovery.CAPACITY,
         }
         places |= _places("STATE", cycle.state) | _places("ASKED", cycle.parameters)
         numbers = {
@@ -141,12 +145,18 @@ class FollowSources:
             "PULL": FOLLOWING_PULL,
             "RUN_UP": RUN_UP,
             "PALM_WEIGHT": PALM_WEIGHT,
+            "TRAIL_SPACING": recovery.SPACING,
+            "TRAIL_PATIENCE": recovery.PATIENCE,
+            "TRAIL_SEARCH_TIME": recovery.SEARCH_TIME,
+            "TRAIL_GAIN": recovery.GAIN,
+            "TRAIL_PROGRESS": recovery.PROGRESS,
         }
         arrays = {
             "LOWER": robot.description.stops[0],
             "UPPER": robot.description.stops[1],
             "HOME": robot.home,
             "VELOCITY": own_velocities(robot),
+            "UNITS": motor_units(robot),
             "WEIGHTS": contact_weights((self.tolerance,) * f),
             "POSITION_TOLERANCES": np.full(f, self.tolerance.position),
             "ANGLE_TOLERANCES": np.full(f, self.tolerance.angle),

@@ -432,17 +432,28 @@ class Guard:
         """Of a configuration (n,)."""
         return self._query.check(q[None])
 
-    def step(self, asked: FollowerInputs) -> tuple[Array, bool]:
-        """One step of the graph, or less of it.
+    def are_free(self, q: Array) -> bool:
+        """Return whether configurations (m, n) are free."""
+        return bool((self._query.check(q).surplus >= self.exact).all())
+
+    def step(self, asked: FollowerInputs, step: Array | None = None) -> tuple[Array, bool]:
+        """Make a step, or the part of it after which the motors can stop in time.
+
+        Args:
+            asked: The graph.
+            step: (n,) step of the motors; None: that of the graph.
 
         Returns:
             The state, and whether the motors had to brake.
         """
         n, run = self._n, asked.run
         before = run.state
-        rooms, slopes = asked.views["rooms"], asked.views["slopes"]
-        rooms[...], slopes[...] = self._obstacles(before[2 * n : 3 * n])
-        after = run.step()
+        if step is None:
+            rooms, slopes = asked.views["rooms"], asked.views["slopes"]
+            rooms[...], slopes[...] = self._obstacles(before[2 * n : 3 * n])
+            after = run.step()
+        else:
+            after = asked.step_by(step)
         q, wanted = before[:n], after[n : 2 * n]
         part, step, rest = self._free_step(q, before[n : 2 * n], wanted)
         held = part < 1.0

@@ -251,6 +251,8 @@ class Cycle:
                 Field("angle_error", (f,), unit="rad"),
                 Field("goal_position_error", (f,), unit="m", doc="of the goal"),
                 Field("goal_angle_error", (f,), unit="rad"),
+                Field("error_ratio", doc="largest error of the motors over its tolerance"),
+                Field("goal_error_ratio", doc="largest error of the goal over its tolerance"),
                 Field("sound", doc="finite if all numbers of the target are, and no normal is 0"),
             )
         )
@@ -298,11 +300,11 @@ class Cycle:
         s, p = self.state.unpack(state), self.parameters.unpack(parameters)
         locked_on = s["locked_on"] > 0.5
         low, high = step_bounds(s, p)
-        most = ca.fmin(p["fastest"], TUNING.cap * motor_scales(self.robot))
+        longest = ca.fmin(p["fastest"], TUNING.cap * motor_scales(self.robot))
         # Rounding of what stops at a limit must not lead past it: both are within the limits.
         low, high = (
             ca.fmin(ca.fmax(s["goal"] + ca.if_else(locked_on, step, free), p["lower"]), p["upper"])
-            for step, free in ((low, -most), (high, most))
+            for step, free in ((low, -longest), (high, longest))
         )
         along = ca.if_else(locked_on, s["moved"], 0.0)
         first = ca.fmin(ca.fmax(s["goal"] + along, low), high)
@@ -359,6 +361,8 @@ class Cycle:
             "angle_error": own_angle,
             "goal_position_error": position,
             "goal_angle_error": angle,
+            "error_ratio": _error_ratio(own_position, own_angle, p),
+            "goal_error_ratio": _error_ratio(position, angle, p),
             "sound": ca.sum1(after["left"]),
         }
         outputs = shared(self.state.pack(after), self.record.pack(record))
@@ -441,3 +445,13 @@ class Cycle:
                 error = condition.measure(tip, goals[i])
                 found[aspect].append(ca.if_else(weights[i, aspect] > 0, error, 0.0))
         return ca.vertcat(*found[0]), ca.vertcat(*found[1])
+
+
+def _error_ratio(position: Expr, angle: Expr, p: dict[str, Expr]) -> Expr:
+    """Return the largest error of the contacts over its tolerance."""
+    tolerances = p["position_tolerance"], p["angle_tolerance"]
+    ratios = [
+        error / ca.fmax(tolerance, 1e-12)
+        for error, tolerance in zip((position, angle), tolerances, strict=True)
+    ]
+    return ca.mmax(ca.vertcat(*ratios))

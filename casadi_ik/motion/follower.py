@@ -15,8 +15,9 @@ from casadi_ik.files.input_checks.keypoints import lost_contacts
 from casadi_ik.files.input_checks.poses import one_pose
 from casadi_ik.kinematics.contacts import Kinds, by_kinds, usual
 from casadi_ik.model.grasp import Grasp, real_array
-from casadi_ik.motion.clear import OBSTACLES, Guard, stopping_way
+from casadi_ik.motion.clear import OBSTACLES, Guard, motor_units, stopping_way
 from casadi_ik.motion.inputs import FollowerInputs, FollowPlan
+from casadi_ik.motion.recovery import Recovery
 from casadi_ik.solve.solution import Pair
 from casadi_ik.solve.verdict import TOLERANCE_SLACK
 
@@ -133,6 +134,9 @@ class Follower:
         self._posture = plan.posture
         self._guard = None if plan.check is None else Guard(plan)
         self._asked = self._of(self._usual)
+        fastest, change = plan.rates.steps(plan.period)
+        units = motor_units(robot)
+        self._recovery = Recovery(units, fastest, change, plan.period, self._guard)
         self.reset(plan.q0)
 
     def _of(self, kinds: Kinds) -> FollowerInputs:
@@ -170,6 +174,7 @@ class Follower:
         inside = self._inside(q)
         self._asked.run.state[:] = self._asked.state_at(inside)
         self._reason, self._cycles, self._stopped = NO_FRAME, 0, False
+        self._recovery.reset(inside)
 
     def branch(self, q: ArrayLike) -> None:
         """Change the branch: the motors go to a posture, every one on its own, and follow there.
@@ -193,6 +198,7 @@ class Follower:
         """
         n, state, goal = self._n, self._asked.run.state, self._inside(q)
         state[2 * n : 3 * n], state[3 * n] = goal, 0.0
+        self._recovery.follow()
         self._posture = goal
         for asked in self._all_asked.values():
             asked.lead_to(goal)
@@ -230,15 +236,14 @@ class Follower:
         poses, self._reason = self._poses(palm)
         if isinstance(target, Grasp):
             self._ask_grasp(target, normals)
-            after = self._hold() if self._reason else self._step(poses, palm_weight)
-            return after[: self._n].copy()
+            return self._finish(self._hold() if self._reason else self._step(poses, palm_weight))
         points = self._vectors("points", target)
         facing = None if normals is None else self._vectors("normals", normals)
         # All coordinates of a lost hand are alike: seldom the case, and cheap to see.
         if points[0, 0] == points[-1, 0]:
             self._reason = self._reason or lost_contacts(points)
         if self._reason:
-            return self._hold()[: self._n].copy()
+            return self._finish(self._hold())
         if self._asked.cycle.kinds != self._usual:
             self._take_up(self._usual)
         self._tolerances = self._own
@@ -246,17 +251,28 @@ class Follower:
         after = self._step(poses, palm_weight)
         if not self._asked.sound:
             after = self._step_partly(points, facing, poses, palm_weight)
-        return after[: self._n].copy()
+        return self._finish(after)
+
+    def _finish(self, state: Array) -> Array:
+        """Return where the motors are after a cycle, (n,), and update the recovery."""
+        n = self._n
+        q = state[:n].copy()
+        if self._reason:
+            self._recovery.follow()
+        else:
+            self._recovery.update(self._asked, q, state[n : 2 * n], self._stopped)
+        return q
 
     def _step(self, palms: Poses, palm_weight: tuple[float, float]) -> Array:
         """The state after a step towards what was asked."""
         asked = self._asked
         if palms:
             asked.ask_palms(palms, palm_weight)
-        if self._guard is None:
-            after = asked.run.step()
+        step = self._recovery.step(asked.run.state)
+        if self._guard is not None:
+            after, self._stopped = self._guard.step(asked, step)
         else:
-            after, self._stopped = self._guard.step(asked)
+            after = asked.run.step() if step is None else asked.step_by(step)
         if palms:
             asked.free_palms()
         return after
@@ -283,6 +299,7 @@ class Follower:
 
     def _hold(self) -> Array:
         """Return the state after a step in which the motors come to rest."""
+        self._recovery.follow()
         self._asked.ask_nothing()
         self._go_to_rest(self._asked)
         return self._step({}, (PALM_WEIGHT, PALM_WEIGHT))

@@ -104,6 +104,8 @@ class FollowerInputs:
         self._usual, self._tolerances = contact_weights(tolerances), tolerance_rows(tolerances)
         self._fill(**plan.habits)
         self._told = self.run.record
+        names = "error_ratio", "goal_error_ratio"
+        self._ratios = tuple(cycle.record.slice(name).start for name in names)
         self._points, self._normals = self.views["points"], self.views["normals"]
         self._mode = ""
 
@@ -206,6 +208,40 @@ class FollowerInputs:
         problem = TargetBatch(points, normals, Tolerance(), enforce_limits=True, more=more)
         position, angle, _ = deviations(robot, problem, q[None])
         return position[0], angle[0]
+
+    @property
+    def error_ratio(self) -> float:
+        """Largest error of the motors over its tolerance in the last step."""
+        return float(self._told[self._ratios[0]])
+
+    @property
+    def goal_error_ratio(self) -> float:
+        """Largest error of the goal over its tolerance in the last step."""
+        return float(self._told[self._ratios[1]])
+
+    def error_ratio_at(self, q: Array) -> float:
+        """Return the `error_ratio` of the present target at a posture (n,), but for one step."""
+        state, record = self.run.state.copy(), self._told.copy()
+        self.step_from_rest(q)
+        ratio = self.error_ratio
+        self.run.back()
+        self.run.state[:], self._told[:] = state, record
+        return ratio
+
+    def step_from_rest(self, q: Array) -> Array:
+        """Make a step from rest at a posture (n,) instead of the present state; the new state."""
+        n, state = len(q), self.run.state
+        state[:n], state[n : 2 * n], state[2 * n : 3 * n], state[3 * n :] = q, 0.0, q, 0.0
+        return self.run.step()
+
+    def step_by(self, step: Array) -> Array:
+        """Make a given step (n,) of the motors instead of one to the contacts; the new state."""
+        n, before = len(step), self.run.state.copy()
+        q = before[:n] + step
+        state = self.step_from_rest(q)
+        state[:n], state[n : 2 * n], state[2 * n : 3 * n], state[3 * n] = q, step, q, 0.0
+        self.run.before[:] = before
+        return state
 
     def lead_to(self, posture: Array) -> None:
         """Where motions lead that the contacts leave free, (n,)."""

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import main
+from excursions import excursion
 from moved_base import on_pedestal
 from processes import said
 
@@ -148,6 +149,22 @@ def test_what_moves_within_reach_is_followed_closely(robot, project):
     assert set(status) == {1}
     np.testing.assert_array_equal(q[-second:], q[-1:].repeat(second, axis=0))
     assert np.linalg.norm(robot.contacts(q)[0] - points, axis=2).max() < 2e-3
+
+
+@needs_gcc
+def test_the_way_back_is_as_in_python(robot, project):
+    program = built(project, "back", FOLLOWED, "arm_follow", "-O1", *SANITIZERS)
+    rng = np.random.default_rng(7)
+    postures = np.concatenate([robot.random(rng, 1) for _ in range(4)])
+    start = robot.home + 0.5 * (postures[-1] - robot.home)
+    targets = list(excursion(robot, start, "out", PERIOD))
+    rows = np.array([[*points.ravel(), *normals.ravel()] for points, normals in targets])
+    status, q = asked(program, start, np.hstack([rows, np.zeros((len(rows), 13))]))
+    follower = ik.Solver(robot).follow(start, PERIOD)
+    expected = np.array([follower(*target) for target in targets])
+    np.testing.assert_array_equal(q, expected)
+    assert {1, 3} <= set(status)
+    assert status[-1] == 1
 
 
 @needs_gcc

@@ -7,6 +7,14 @@ enum {
   @GUARD@_MISSED = 3     /* no configuration on this branch meets the contacts */
 };
 
+/* The way back of a follower that is stuck: a trail of postures of its past, and a line to one. */
+typedef struct {
+  double trail[@FOLLOW_TRAIL@][@GUARD@_MOTORS], start[@GUARD@_MOTORS], line[@GUARD@_MOTORS];
+  double least, least_ratio, longest_step, done, line_step, next_step, line_fastest, line_change;
+  int64_t count, cycles_to_check, patience, comparisons, cycles_stuck, candidate, destination;
+  int64_t is_returning, has_line;
+} @PREFIX@_recovery;
+
 /* A robot that follows moving contacts. Its results are q (positions of the motors at the end of the
  * cycle), velocity, the errors and status. The other members are private. */
 typedef struct {
@@ -16,6 +24,7 @@ typedef struct {
   double period, change[@GUARD@_MOTORS];
   double state[@FOLLOW_STATE@], after[@FOLLOW_STATE@];
   double asked[@FOLLOW_ASKED@], record[@FOLLOW_RECORD@];
+  @PREFIX@_recovery recovery;
 } @PREFIX@_follower;
 
 /* Starts at rest at q0, or at home if that is a null pointer. period is the time between two cycles

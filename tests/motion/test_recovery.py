@@ -1,0 +1,44 @@
+"""A follower that is stuck after an excursion of its target finds the way back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from excursions import excursion
+
+import casadi_ik as ik
+
+PERIOD = 0.01
+
+
+def free_starts(robot, count):
+    """Return postures (count, n) at which the robot does not touch itself."""
+    careful, rng = ik.Solver(robot, scene=ik.Scene()), np.random.default_rng(7)
+    starts = robot.home + 0.5 * (robot.random(rng, 100) - robot.home)
+    return starts[clearances(careful, starts).free][:count]
+
+
+def clearances(solver, q):
+    problems = solver._request.of_arrays(*solver.robot.contacts(q[:1]), None)
+    return solver._engine.collision_query(problems).check(q)
+
+
+@pytest.mark.parametrize("kind", ["out", "turn"])
+@pytest.mark.parametrize("has_scene", [True, False])
+@pytest.mark.parametrize("name", ["kuka_lwr_barrett", "g1+dex3"])
+def test_a_target_that_comes_back_is_followed_again(name, has_scene, kind):
+    robot = ik.load_robot(name)
+    solver = ik.Solver(robot, scene=ik.Scene() if has_scene else None)
+    for start in free_starts(robot, 4):
+        follower = solver.follow(start, PERIOD)
+        path = [start, start]
+        path += [follower(*target) for target in excursion(robot, start, kind, PERIOD)]
+        q = np.array(path)
+        assert follower.state.status is ik.motion.FollowStatus.FOLLOWING
+        assert not has_scene or clearances(solver, q).free.all()
+        steps = np.diff(q, axis=0)
+        assert (np.abs(steps) <= follower.velocity * PERIOD * (1 + 1e-9)).all()
+        changes = np.diff(steps, axis=0)
+        assert (np.abs(changes) <= follower.acceleration * PERIOD**2 * (1 + 1e-9) + 1e-12).all()
+        assert (q >= robot.lower).all()
+        assert (q <= robot.upper).all()
