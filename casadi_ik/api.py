@@ -15,13 +15,13 @@ from casadi_ik.collision.clearance import Clearances, SceneCheck
 from casadi_ik.collision.scene import Scene, grasped_in
 from casadi_ik.compile.loop import Stepper
 from casadi_ik.errors import InputError
-from casadi_ik.files.input_checks.poses import checked_pose, one_pose
+from casadi_ik.files.input_checks.poses import checked_pose, single_pose
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.logs import Compression, Keep
 from casadi_ik.logs.writer import recorder_of
 from casadi_ik.model.grasp import Grasp
 from casadi_ik.model.pose import Free
-from casadi_ik.model.targets import LIMITS, TargetBatch, Tolerance
+from casadi_ik.model.targets import LIMIT_MODES, TargetBatch, Tolerance
 from casadi_ik.motion.moving import MovingSolver
 from casadi_ik.papers.qiu.step import FINGER_STEPS
 from casadi_ik.planning.choose import choose
@@ -95,8 +95,8 @@ class Solver(MovingSolver):
         """
         if not isinstance(robot, ArmHand):
             raise InputError(f"robot: found {robot!r}, expected what load_robot returns")
-        if limits not in LIMITS:
-            raise InputError(f"limits: found {limits!r}, expected one of {', '.join(LIMITS)}")
+        if limits not in LIMIT_MODES:
+            raise InputError(f"limits: found {limits!r}, expected one of {', '.join(LIMIT_MODES)}")
         if scene is not None and not isinstance(scene, Scene):
             raise InputError(f"scene: found {scene!r}, expected a Scene, or None")
         if finger_step is not None and finger_step not in FINGER_STEPS:
@@ -523,7 +523,7 @@ class Solver(MovingSolver):
         # Not `copy`, which builds what is unpickled anew.
         other = object.__new__(type(self))
         other.__dict__.update(self.__dict__)
-        moved = check.moved(name, one_pose(pose))
+        moved = check.moved(name, single_pose(pose))
         other.scene, other._engine = moved.scene, self._engine.about(moved)
         other._asked = (*self._asked[:-1], moved.scene)
         return other

@@ -15,12 +15,12 @@ from shape_fitting.links import in_our_links
 from shape_fitting.writing import write
 
 from casadi_ik.files.reading import read
-from casadi_ik.files.shipped import resolve
+from casadi_ik.files.shipped import resolve_description
 from casadi_ik.integrations.importing.capsules import FIT, fitted, worst
 from casadi_ik.integrations.importing.robot_shapes import may_touch
 from casadi_ik.integrations.importing.surfaces import Surface, together
 from casadi_ik.model.linkage import link_poses
-from casadi_ik.model.parts import described_part
+from casadi_ik.model.parts import part_from_file
 from casadi_ik.model.schema import ArmFile, HandFile
 
 
@@ -45,8 +45,8 @@ def main() -> None:
         help="which of the file's shapes to hold; collision: of a link without any what is seen",
     )
     given = parser.parse_args()
-    path = resolve(given.name, given.kind)
-    part = described_part(read(path, HandFile if given.kind == "hands" else ArmFile)[0], path)
+    path = resolve_description(given.name, given.kind)
+    part = part_from_file(read(path, HandFile if given.kind == "hands" else ArmFile)[0], path)
     parts: dict[str, list[Surface]] = {}
     for wanted in given.shapes:
         found = in_our_links(part, given.file, set(given.without), seen=wanted == "seen")

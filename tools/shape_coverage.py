@@ -23,10 +23,10 @@ from shape_fitting.links import in_our_links
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.reading import read
-from casadi_ik.files.shipped import resolve
+from casadi_ik.files.shipped import resolve_description
 from casadi_ik.integrations.importing.surfaces import Surface, together
 from casadi_ik.model.link_shapes import LinkCapsule, LinkSolid
-from casadi_ik.model.parts import Part, described_part
+from casadi_ik.model.parts import RobotPart, part_from_file
 from casadi_ik.model.schema import ArmFile, HandFile
 
 SHARE = "example_robot_data/cmeel.prefix/share/example-robot-data/robots"
@@ -116,8 +116,8 @@ def main() -> None:
     for (kind, name), files in FILES.items():
         if given.only and name not in given.only:
             continue
-        path = resolve(name, kind)
-        part = described_part(read(path, ArmFile if kind == "arms" else HandFile)[0], path)
+        path = resolve_description(name, kind)
+        part = part_from_file(read(path, ArmFile if kind == "arms" else HandFile)[0], path)
         for file in files:
             place = given.folder / file
             print(name, file, flush=True)
@@ -127,7 +127,7 @@ def main() -> None:
     print(given.out / "report.md")
 
 
-def _table(name: str, file: str, part: Part, place: Path) -> list[str]:
+def _table(name: str, file: str, part: RobotPart, place: Path) -> list[str]:
     head = [f"## {name}: `{file}`", ""]
     if not place.is_file():
         return [*head, "Not in the folder.", ""]
@@ -165,18 +165,18 @@ def _table(name: str, file: str, part: Part, place: Path) -> list[str]:
     ]
 
 
-def _shapes(part: Part, link: str) -> tuple[list[LinkCapsule], list[LinkSolid]]:
+def _shapes(part: RobotPart, link: str) -> tuple[list[LinkCapsule], list[LinkSolid]]:
     capsules = [c for c in part.shapes.capsules if c.link == link and c.covers < 0]
     return capsules, [s for s in part.shapes.solids if s.link == link]
 
 
-def _beyond(part: Part, link: str, mesh: Surface) -> Array:
+def _beyond(part: RobotPart, link: str, mesh: Surface) -> Array:
     """How far corners and middles of triangles are out of a link's shapes [m]."""
     points = np.concatenate([mesh.points, mesh.points[mesh.triangles].mean(axis=1)])
     return outside(points, *_shapes(part, link))
 
 
-def _ratio(part: Part, link: str, mesh: Surface) -> float:
+def _ratio(part: RobotPart, link: str, mesh: Surface) -> float:
     """Volume of a link's shapes over that of its mesh's hull."""
     capsules, solids = _shapes(part, link)
     reach = [np.abs(c.center) + np.abs(c.half) + c.radius for c in capsules]

@@ -28,7 +28,7 @@ from casadi_ik.app.cli.main import main as command
 from casadi_ik.app.cli.table import parse
 from casadi_ik.app.cli.view import opened
 from casadi_ik.app.viewer.grasp_page import GraspPage
-from casadi_ik.files.shipped import resolve
+from casadi_ik.files.shipped import resolve_description
 
 ROBOT = "kuka_lwr_barrett"
 WINDOW = (1200, 760)
@@ -120,7 +120,7 @@ def chosen(folder: Path) -> list[str]:
     grasps = folder / "candidates"
     grasps.mkdir()
     for name in CANDIDATES:
-        shutil.copy(resolve(name, "grasps"), grasps)
+        shutil.copy(resolve_description(name, "grasps"), grasps)
     scene = ["--scene", "table"]
     command(["choose", str(grasps), "--robot", ROBOT, *scene, "--out", str(ranked)])
     return [str(ranked), *scene]

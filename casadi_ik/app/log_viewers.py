@@ -31,7 +31,7 @@ from casadi_ik.app.drawing import palette
 from casadi_ik.errors import LogError, MissingExtraError, os_errors
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.shipped import models_folder
-from casadi_ik.files.writing import written_whole
+from casadi_ik.files.writing import atomic_write
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.logs.cdr import ros_channel, write_postures
 from casadi_ik.logs.container import CDR_HEADER
@@ -73,7 +73,7 @@ def write_view(path: str | os.PathLike[str], solve: OneSolve, robot: ArmHand) ->
             f"solve {solve.solve_id + 1} of {solve.method}: the log kept no iterations of it"
         )
     refused = os_errors(f"{path}: cannot write the viewer file", LogError)
-    with refused, written_whole(Path(path)) as part, part.open("xb") as stream:
+    with refused, atomic_write(Path(path)) as part, part.open("xb") as stream:
         writer = Writer(stream)
         writer.start(profile="ros2", library="casadi_ik")
         _View(writer, solve, robot).write()

@@ -21,7 +21,7 @@ from rich.style import Style
 from rich.table import Table
 from rich.text import Text
 
-from casadi_ik.files.lazy_import import on_demand
+from casadi_ik.files.lazy_import import import_lazily
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.arms.recognise import describe_arm
 from casadi_ik.model.description import RobotDescription
@@ -183,7 +183,7 @@ def page_of(answer: object) -> str:
     if robot is None or q is None or not np.isfinite(q).all():
         return text
     try:
-        image = on_demand("casadi_ik.app.pictures.thumbnail").thumbnail(robot, q)
+        image = import_lazily("casadi_ik.app.pictures.thumbnail").thumbnail(robot, q)
     except ImportError:  # the extra is not installed
         return text
     source = f"data:image/png;base64,{b64encode(image).decode()}"

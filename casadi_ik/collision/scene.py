@@ -30,8 +30,8 @@ from casadi_ik.files.arrays import Array
 from casadi_ik.files.input_checks.poses import (
     checked_pose,
     checked_quaternion,
-    one_pose,
-    rotations_of,
+    rotations_from_quaternions,
+    single_pose,
 )
 from casadi_ik.files.input_checks.units import warn_of_obstacle
 from casadi_ik.files.limits import LIMITS
@@ -41,12 +41,12 @@ from casadi_ik.files.reading import (
     Frame,
     Point,
     Struct,
-    checked,
     frame_matrix,
     read,
+    validated,
 )
-from casadi_ik.files.shipped import resolve
-from casadi_ik.files.units import Distance, Factor, Length, Pure, Size
+from casadi_ik.files.shipped import resolve_description
+from casadi_ik.files.units import Distance, Factor, Length, PureNumber, Size
 from casadi_ik.model.link_shapes import Touching
 from casadi_ik.model.schema import TouchingEntry
 from casadi_ik.model.shapes import load_mesh_shape
@@ -55,8 +55,8 @@ from casadi_ik.model.urdf_body import read_body
 Part = tuple[Solid, Array]
 """A solid and its (4, 4) pose in the frame of what it is part of."""
 
-Quaternion = tuple[Pure, Pure, Pure, Pure]
-PoseRow = tuple[Pure, Pure, Pure, Length]
+Quaternion = tuple[PureNumber, PureNumber, PureNumber, PureNumber]
+PoseRow = tuple[PureNumber, PureNumber, PureNumber, Length]
 
 
 class Entry(
@@ -110,13 +110,13 @@ class Entry(
         if len(turns) > 1:
             raise DescriptionError(f"{where}: found {' and '.join(turns)}, expected one of them")
         if self.pose is not None:
-            return one_pose(self.pose, f"{where}.pose")
+            return single_pose(self.pose, f"{where}.pose")
         pose = frame_matrix(Frame(self.xyz or (0.0, 0.0, 0.0), self.rpy or (0.0, 0.0, 0.0)))
         for key, shift in (("quaternion_wxyz", 0), ("quaternion_xyzw", 1)):
             given = getattr(self, key)
             if given is not None:
                 unit = checked_quaternion(given, f"{where}.{key}")
-                pose[:3, :3] = rotations_of(np.roll(unit, shift)[None])[0]
+                pose[:3, :3] = rotations_from_quaternions(np.roll(unit, shift)[None])[0]
         return pose
 
 
@@ -421,7 +421,7 @@ class Scene:
             "enveloping": enveloping,
         }
         where = Path(name)
-        entry, _ = checked(data, SceneFile, where)
+        entry, _ = validated(data, SceneFile, where)
         for key, points in clouds.items():
             entry.solids[key] = msgspec.structs.replace(entry.solids[key], points=points)
         self._take(entry, where)
@@ -577,7 +577,7 @@ def load_scene(name_or_path: str | Path) -> Scene:
         >>> ik.load_scene("table")
         <Scene table: table, margin 0 m>
     """
-    return Scene._of_file(resolve(name_or_path, "scenes"))
+    return Scene._of_file(resolve_description(name_or_path, "scenes"))
 
 
 def grasped_in(scene: Scene | None) -> str:

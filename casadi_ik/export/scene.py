@@ -18,7 +18,7 @@ from casadi_ik.compile.function_kernel import FunctionKernel
 from casadi_ik.compile.graphs import FunctionGraph
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.export.single import ARM_ROUNDING, SinglePrecision, filled
-from casadi_ik.files.arrays import Array, even_steps
+from casadi_ik.files.arrays import Array, spread_steps
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.arms.family import ArmFamily
 from casadi_ik.kinematics.arms.search import ARM_SEARCH, arms_graph
@@ -378,7 +378,7 @@ class SceneSources:
                     "HAND": np.array(hand, dtype=int),
                     "HAND_LOWER": robot.lower[hand],
                     "HAND_RANGE": (robot.upper - robot.lower)[hand],
-                    "HAND_SPREAD": even_steps(len(robot.lower))[hand],
+                    "HAND_SPREAD": spread_steps(len(robot.lower))[hand],
                     "IDLE_PARTS": np.array(FINGERS.parts),
                     "FINGER_MOVED": np.array(
                         [[m in some for m in hand] for some in fingers], dtype=int
@@ -525,7 +525,7 @@ class BodySceneSources(SceneSources):
             "CARRY_PLACES": np.array(list(carry)),
             "CARRY_VALUES": np.array(list(carry.values())),
             "CARRYING": np.array(motors),
-            "CARRYING_STEPS": even_steps(len(motors)),
+            "CARRYING_STEPS": spread_steps(len(motors)),
         }
         return (
             super().look_constants()

@@ -18,24 +18,24 @@ Rows = NDArray[np.intp]
 """Positions in another array."""
 
 
-def frozen(values: ArrayLike) -> Array:
+def read_only(values: ArrayLike) -> Array:
     """Numbers as an array that cannot be changed."""
     array = np.asarray(values, dtype=float)
     array.flags.writeable = False
     return array
 
 
-def evenly(count: int, dimensions: int, first: int = 0) -> Array:
+def spread_points(count: int, dimensions: int, first: int = 0) -> Array:
     """(count, dimensions) points of an additive recurrence, evenly spread over the unit cube.
 
     From one on, counted from 0: with all before they are spread evenly as well.
 
     Roberts' generalised golden ratio: the root of x^(d+1) = x + 1 gives the increments.
     """
-    return (0.5 + np.arange(first + 1, first + count + 1)[:, None] * even_steps(dimensions)) % 1.0
+    return (0.5 + np.arange(first + 1, first + count + 1)[:, None] * spread_steps(dimensions)) % 1.0
 
 
-def even_steps(dimensions: int) -> Array:
+def spread_steps(dimensions: int) -> Array:
     """(dimensions,) from one point of an even spread to the next."""
     ratio = 2.0
     for _ in range(64):

@@ -7,7 +7,7 @@ from types import ModuleType
 from typing import Any
 
 
-def on_demand(name: str) -> ModuleType:
+def import_lazily(name: str) -> ModuleType:
     """A part of the package that an extra brings to life, by its name.
 
     What is shown knows what shows it by this name alone: pictures stand on everything else.
@@ -18,7 +18,7 @@ def on_demand(name: str) -> ModuleType:
     return importlib.import_module(name)
 
 
-class Shown:
+class ReprMixin:
     """What prints as the command line reports it, and shows itself in notebooks.
 
     `casadi_ik.app.report` knows what there is to say about each kind.
@@ -28,9 +28,9 @@ class Shown:
         return f"<{type(self).__name__} {str(self).partition(chr(10))[0]}>"
 
     def __str__(self) -> str:
-        reports: Any = on_demand("casadi_ik.app.report")
+        reports: Any = import_lazily("casadi_ik.app.report")
         return str(reports.as_text(reports.report_of(self)))
 
     def _repr_html_(self) -> str:
-        reports: Any = on_demand("casadi_ik.app.report")
+        reports: Any = import_lazily("casadi_ik.app.report")
         return str(reports.page_of(self))

@@ -8,10 +8,12 @@ from dataclasses import dataclass
 
 from casadi_ik.errors import InputError
 
-VARIABLE = "CASADI_IK_LIMITS"
+LIMITS_VARIABLE = "CASADI_IK_LIMITS"
 """Factor in the environment by which all limits are multiplied."""
 
-RAISED = f"(--size-limits 4, or {VARIABLE}=4 in the environment, allows four times as much)"
+RAISE_HINT = (
+    f"(--size-limits 4, or {LIMITS_VARIABLE}=4 in the environment, allows four times as much)"
+)
 """Said where a limit is met."""
 
 
@@ -19,7 +21,7 @@ RAISED = f"(--size-limits 4, or {VARIABLE}=4 in the environment, allows four tim
 class FileLimits:
     """How much of somebody else's file is read; SECURITY.md promises these numbers.
 
-    Sizes, counts, time and memory go through `limit`, so that `CASADI_IK_LIMITS` raises them.
+    `scaled_limit` multiplies sizes, counts, time and memory by `CASADI_IK_LIMITS`.
 
     Attributes:
         yaml_bytes: Bytes of a YAML file.
@@ -97,31 +99,32 @@ class FileLimits:
 LIMITS = FileLimits()
 
 
-def limit(value: float) -> int:
+def scaled_limit(value: float) -> int:
     """A limit of size, time or memory, times the factor of the environment.
 
     Raises:
         InputError: The factor is no positive number.
     """
-    text = os.environ.get(VARIABLE, "1")
+    text = os.environ.get(LIMITS_VARIABLE, "1")
     try:
         factor = float(text)
     except ValueError:
         factor = math.nan
     if not 0 < factor < 1e9:
         raise InputError(
-            f"{VARIABLE}: found {text!r} in the environment, expected a factor above 0"
+            f"{LIMITS_VARIABLE}: found {text!r} in the environment, expected a factor above 0"
         )
     return max(1, int(value * factor))
 
 
-def raised_to(needed: float, value: float) -> str:
+def raise_hint(needed: float, value: float) -> str:
     """Return how to raise a limit, whose default is `value`, to what is needed.
 
     Example:
-        >>> from casadi_ik.files.limits import LIMITS, raised_to
-        >>> raised_to(3000, 256)
+        >>> from casadi_ik.files.limits import raise_hint
+        >>> raise_hint(3000, 256)
         '(--size-limits 12, or CASADI_IK_LIMITS=12 in the environment, allows as many)'
     """
     factor = math.ceil(needed / value)
-    return f"(--size-limits {factor}, or {VARIABLE}={factor} in the environment, allows as many)"
+    setting = f"{LIMITS_VARIABLE}={factor}"
+    return f"(--size-limits {factor}, or {setting} in the environment, allows as many)"

@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.limits import LIMITS, RAISED, limit, raised_to
+from casadi_ik.files.limits import LIMITS, RAISE_HINT, raise_hint, scaled_limit
 from casadi_ik.files.reading import read_bytes
 
-UNREADABLE = (
+READ_ERRORS = (
     ValueError,
     EOFError,
     MemoryError,
@@ -42,7 +42,7 @@ UNREADABLE = (
 """What numpy and zipfile were seen to raise on a damaged or encrypted member."""
 
 
-def refuse_giants(where: str, size: int, most: int) -> None:
+def check_unpacked_size(where: str, size: int, most: int) -> None:
     """Refuse what takes more memory than it should.
 
     Args:
@@ -53,9 +53,9 @@ def refuse_giants(where: str, size: int, most: int) -> None:
     Raises:
         DescriptionError: It has more.
     """
-    if size > limit(most):
+    if size > scaled_limit(most):
         raise DescriptionError(
-            f"{where}: unpacks to {size} bytes, expected at most {limit(most)} {RAISED}"
+            f"{where}: unpacks to {size} bytes, expected at most {scaled_limit(most)} {RAISE_HINT}"
         )
 
 
@@ -77,7 +77,7 @@ def read_npz(path: Path, most: int) -> dict[str, Array]:
         if not zipfile.is_zipfile(path):
             raise DescriptionError(f"{path}: not an npz file")
         with zipfile.ZipFile(path) as members:
-            refuse_giants(str(path), sum(one.file_size for one in members.infolist()), most)
+            check_unpacked_size(str(path), sum(one.file_size for one in members.infolist()), most)
         with np.load(path, allow_pickle=False) as archive:
             for name in archive.files:
                 array = archive[name]
@@ -87,16 +87,16 @@ def read_npz(path: Path, most: int) -> dict[str, Array]:
                         f"{path}: {name}: found values of type {kind}, expected numbers"
                     )
                 size += 8 * array.size
-                refuse_giants(str(path), size, most)
+                check_unpacked_size(str(path), size, most)
                 found[name] = array.astype(np.float64)
     except OSError as error:
         raise DescriptionError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (*UNREADABLE, KeyError) as error:
+    except (*READ_ERRORS, KeyError) as error:
         raise DescriptionError(f"{path}: damaged: {error}") from error
     return found
 
 
-FORMATS = (".stl", ".obj", ".ply", ".dae", ".off", ".glb")
+MESH_FORMATS = (".stl", ".obj", ".ply", ".dae", ".off", ".glb")
 """Names' ends of what is read."""
 
 LOOKS = ("library_images", "library_effects", "library_materials", "bind_material")
@@ -117,16 +117,19 @@ def read_mesh(path: Path, where: str) -> tuple[Array, NDArray[np.int64]]:
         raise DescriptionError(f"{where}: no such file {str(path)!r}")
     kind = path.suffix.lower()
     where = f"{where}: {path.name}"
-    if kind not in FORMATS:
-        raise DescriptionError(f"{where}: found {kind!r}, expected one of {', '.join(FORMATS)}")
-    data = read_bytes(path, where, limit(LIMITS.mesh_bytes), RAISED)
+    if kind not in MESH_FORMATS:
+        raise DescriptionError(
+            f"{where}: found {kind!r}, expected one of {', '.join(MESH_FORMATS)}"
+        )
+    data = read_bytes(path, where, scaled_limit(LIMITS.mesh_bytes), RAISE_HINT)
     try:
         points, triangles = _parsed(data, kind[1:])
     except Exception as error:  # whatever a broken file leads a reader into
         reason = " ".join(str(error).split()) or type(error).__name__
         raise DescriptionError(f"{where}: cannot be read: {reason}") from error
-    if len(triangles) > limit(LIMITS.mesh_faces):
-        most = f"at most {limit(LIMITS.mesh_faces)} {raised_to(len(triangles), LIMITS.mesh_faces)}"
+    if len(triangles) > scaled_limit(LIMITS.mesh_faces):
+        hint = raise_hint(len(triangles), LIMITS.mesh_faces)
+        most = f"at most {scaled_limit(LIMITS.mesh_faces)} {hint}"
         raise DescriptionError(f"{where}: found {len(triangles)} triangles, expected {most}")
     if not len(points):
         raise DescriptionError(f"{where}: is an empty mesh, expected triangles")
@@ -251,14 +254,16 @@ def read_points(path: Path, where: str) -> Array:
     if not path.is_file():
         raise DescriptionError(f"{where}: no such file {str(path)!r}")
     try:
-        if path.stat().st_size > limit(LIMITS.cloud_bytes):
-            raise ValueError(f"found more than {limit(LIMITS.cloud_bytes)} bytes {RAISED}")
+        if path.stat().st_size > scaled_limit(LIMITS.cloud_bytes):
+            raise ValueError(
+                f"found more than {scaled_limit(LIMITS.cloud_bytes)} bytes {RAISE_HINT}"
+            )
         found = reader(path)
     except DescriptionError as error:
         raise DescriptionError(f"{where}: {error}") from error
     except OSError as error:
         raise DescriptionError(f"{where}: {path.name}: {error.strerror or error}") from error
-    except (*UNREADABLE, TypeError, LookupError, StopIteration) as error:
+    except (*READ_ERRORS, TypeError, LookupError, StopIteration) as error:
         reason = " ".join(str(error).split())
         raise DescriptionError(f"{where}: {path.name} cannot be read: {reason}") from error
     return finite_points(found, f"{where}: {path.name}")
@@ -280,10 +285,9 @@ def finite_points(points: np.ndarray, where: str) -> Array:
 
 
 def _at_most(count: int) -> int:
-    if not 0 <= count <= limit(LIMITS.cloud_points):
-        raise ValueError(
-            f"found {count} points, expected at most {limit(LIMITS.cloud_points)} {RAISED}"
-        )
+    max_count = scaled_limit(LIMITS.cloud_points)
+    if not 0 <= count <= max_count:
+        raise ValueError(f"found {count} points, expected at most {max_count} {RAISE_HINT}")
     return count
 
 
@@ -341,7 +345,7 @@ def _columns_of_header(stream: IO[bytes]) -> list[int]:
 def _numbers(stream: IO[bytes], columns: list[int], count: int | None) -> Array:
     """Return columns of a table with blanks, commas or semicolons between its numbers."""
     blanks = bytes.maketrans(b",;", b"  ")
-    rows, most = (line.translate(blanks) for line in stream), limit(LIMITS.cloud_points) + 1
+    rows, most = (line.translate(blanks) for line in stream), scaled_limit(LIMITS.cloud_points) + 1
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # nothing in it: told by the caller
         found = np.loadtxt(rows, comments=["#", "//"], usecols=columns, max_rows=most, ndmin=2)
@@ -386,7 +390,7 @@ def _by_field(stream: IO[bytes], head: _Head, places: list[int]) -> Array:
     kinds = [np.dtype((f"<{kind}", (count,))) for _, kind, count in head.fields]
     if size != head.count * sum(kind.itemsize for kind in kinds):
         raise ValueError(f"unpacks to {size} bytes, not to {head.count} points")
-    refuse_giants("its data", size, LIMITS.cloud_bytes)
+    check_unpacked_size("its data", size, LIMITS.cloud_bytes)
     data = unpack_lzf(stream.read(packed_size), size)
     starts = np.cumsum([0, *(head.count * kind.itemsize for kind in kinds)])
     columns = [np.frombuffer(data, kinds[i], head.count, int(starts[i])) for i in places]

@@ -21,13 +21,13 @@ from casadi_ik.files.limits import LIMITS
 from casadi_ik.files.units import (
     QUANTITY,
     UNITS,
+    Angle,
     Length,
-    Pure,
-    Turn,
+    PureNumber,
     check_units,
-    in_si,
     item_name,
-    leaves,
+    leaf_values,
+    to_si,
     units_in,
 )
 
@@ -169,9 +169,9 @@ def _count(value: Any, count: int, depth: int) -> int:
 
 
 T = TypeVar("T")
-Vector = tuple[Pure, Pure, Pure]
+Vector = tuple[PureNumber, PureNumber, PureNumber]
 Point = tuple[Length, Length, Length]
-Angles = tuple[Turn, Turn, Turn]
+Angles = tuple[Angle, Angle, Angle]
 
 
 class Struct(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -222,19 +222,19 @@ def read_yaml(path: Path) -> Any:
     Raises:
         DescriptionError: See `parse_yaml`.
     """
-    return in_si(parse_yaml(path))
+    return to_si(parse_yaml(path))
 
 
 def read(path: Path, type_: type[T]) -> tuple[T, dict[str, str]]:
-    """Read a YAML file of a type; see `checked`.
+    """Read a YAML file of a type; see `validated`.
 
     Raises:
         DescriptionError: With file, key, what was found and what was expected.
     """
-    return checked(parse_yaml(path), type_, path)
+    return validated(parse_yaml(path), type_, path)
 
 
-def checked(raw: Any, type_: type[T], path: Path) -> tuple[T, dict[str, str]]:
+def validated(raw: Any, type_: type[T], path: Path) -> tuple[T, dict[str, str]]:
     """Parsed YAML as a type: all numbers finite, every unit of the dimension that its place has.
 
     Args:
@@ -248,16 +248,16 @@ def checked(raw: Any, type_: type[T], path: Path) -> tuple[T, dict[str, str]]:
     Raises:
         DescriptionError: With file, key, what was found and what was expected.
     """
-    data = in_si(raw)
-    for key, value in leaves(data):
+    data = to_si(raw)
+    for key, value in leaf_values(data):
         if isinstance(value, float) and not math.isfinite(value):
             raise DescriptionError(f"{path}: {key}: found {value}, expected a finite number")
-    entry = convert(data, type_, path)
+    entry = convert_entry(data, type_, path)
     check_units(raw, type_, path)
     return entry, units_in(raw)
 
 
-def convert(data: Any, type_: type[T], path: Path) -> T:
+def convert_entry(data: Any, type_: type[T], path: Path) -> T:
     """Check parsed YAML against a type.
 
     Raises:

@@ -6,15 +6,15 @@ from pathlib import Path
 
 from casadi_ik.errors import DescriptionError, UnknownNameError, did_you_mean
 
-FOREIGN = (".urdf", ".xacro", ".xml", ".mjcf")
+ROBOT_FILE_FORMATS = (".urdf", ".xacro", ".xml", ".mjcf")
 """Names' ends of robots' files that are imported."""
 
 
-BODIES = "bodies"
+BODIES_FOLDER = "bodies"
 """The folder of robots with several arms, or with a trunk."""
 
 
-KINDS = ("arm_hands", BODIES, "arms", "hands")
+ROBOT_FOLDERS = ("arm_hands", BODIES_FOLDER, "arms", "hands")
 """The folders of robots and of what they are put together from."""
 
 
@@ -43,14 +43,16 @@ def shipped_names(kind: str) -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in (models_folder() / kind).glob("*.yaml")))
 
 
-def resolve(name_or_path: str | Path, kind: str, beside: Path | None = None) -> Path:
+def resolve_description(
+    name_or_path: str | Path, kind: str, relative_to: Path | None = None
+) -> Path:
     """The file behind a shipped name or a path.
 
     Args:
         name_or_path: A shipped name, or the path of a YAML file (anything with a path separator
             or ending in .yaml or .yml).
         kind: Folder under ``models``.
-        beside: A file relative to whose folder a relative path is looked up first.
+        relative_to: A file relative to whose folder a relative path is looked up first.
 
     Raises:
         UnknownNameError: No shipped description has that name.
@@ -59,8 +61,8 @@ def resolve(name_or_path: str | Path, kind: str, beside: Path | None = None) -> 
     text = str(name_or_path)
     if isinstance(name_or_path, Path) or "/" in text or text.endswith((".yaml", ".yml")):
         path = Path(text).expanduser()
-        if beside is not None and not path.is_absolute():
-            path = beside.parent / path
+        if relative_to is not None and not path.is_absolute():
+            path = relative_to.parent / path
         if not path.is_file():
             problem = "is a folder, expected a YAML file" if path.is_dir() else "no such file"
             raise DescriptionError(f"{path}: {problem}")
@@ -76,14 +78,14 @@ def resolve(name_or_path: str | Path, kind: str, beside: Path | None = None) -> 
 
 
 def resolve_robot(
-    name_or_path: str | Path, beside: Path | None = None
+    name_or_path: str | Path, relative_to: Path | None = None
 ) -> Path | tuple[Path | None, Path | None]:
     """The file of a robot, or those of an arm and a hand, of which one may stand alone.
 
     Args:
         name_or_path: A shipped arm-hand, body, arm or hand, "ARM+HAND" or "BODY+HAND" of shipped
             names, or the path of a YAML file.
-        beside: See `resolve`.
+        relative_to: See `resolve_description`.
 
     Raises:
         UnknownNameError: No shipped description has that name.
@@ -91,34 +93,34 @@ def resolve_robot(
     """
     text = str(name_or_path)
     path_like = isinstance(name_or_path, Path) or "/" in text or text.endswith((".yaml", ".yml"))
-    if text.endswith(FOREIGN):
+    if text.endswith(ROBOT_FILE_FORMATS):
         raise DescriptionError(
             f"{text}: is a robot's file, expected a description, which says where its fingertips "
             f"are: casadi-ik import {text} --out {Path(text).stem}.yaml makes one"
         )
     arm, plus, hand = text.partition("+")
-    if not path_like and text in shipped_names(BODIES):
-        return resolve(text, BODIES)
-    if not path_like and plus and arm in shipped_names(BODIES):
-        return resolve(arm, BODIES), resolve(hand, "hands")
-    arms, bodies = shipped_names("arms"), f"bodies: {', '.join(shipped_names(BODIES))}"
+    if not path_like and text in shipped_names(BODIES_FOLDER):
+        return resolve_description(text, BODIES_FOLDER)
+    if not path_like and plus and arm in shipped_names(BODIES_FOLDER):
+        return resolve_description(arm, BODIES_FOLDER), resolve_description(hand, "hands")
+    arms, bodies = shipped_names("arms"), f"bodies: {', '.join(shipped_names(BODIES_FOLDER))}"
     if not path_like and plus and arm not in arms:
         listed = f"arms: {', '.join(arms)}; {bodies}"
-        body = did_you_mean(text, shipped_names(BODIES), listed)
+        body = did_you_mean(text, shipped_names(BODIES_FOLDER), listed)
         raise UnknownNameError(
             f"no shipped arm or body is called {arm!r}; {did_you_mean(arm, arms, body)} (or give "
             "the path of a YAML file)"
         )
     if not path_like and plus:
-        return resolve(arm, "arms"), resolve(hand, "hands")
+        return resolve_description(arm, "arms"), resolve_description(hand, "hands")
     if not path_like and text in arms:
-        return resolve(text, "arms"), None
+        return resolve_description(text, "arms"), None
     if not path_like and text in shipped_names("hands") and text not in shipped_names("arm_hands"):
-        return None, resolve(text, "hands")
+        return None, resolve_description(text, "hands")
     try:
-        return resolve(name_or_path, "arm_hands", beside)
+        return resolve_description(name_or_path, "arm_hands", relative_to)
     except UnknownNameError:
-        known = [name for kind in KINDS for name in shipped_names(kind)]
+        known = [name for kind in ROBOT_FOLDERS for name in shipped_names(kind)]
         listed = f"shipped: {', '.join(shipped_names('arm_hands'))}; {bodies}"
         raise UnknownNameError(
             f"no shipped arm-hand is called {text!r}; {did_you_mean(text, known, listed)} (or give "

@@ -1,7 +1,7 @@
 """Units in files: what they are in SI, and whether they fit where they stand.
 
 Numbers may carry a unit (``90 deg``, ``50 mm``, ``110 deg/s``); without one they are SI. A field
-declares its dimension and what it has to be above by its type (`Length`, `Size`, `Turn`, ...); a
+declares its dimension and what it has to be above by its type (`Length`, `Size`, `Angle`, ...); a
 plain `float` takes any.
 
 JSON Schemas come from the very types that check files, so that editors complete keys: draft 7, the
@@ -57,9 +57,9 @@ class Dimension(str):
 Length = Annotated[float, Dimension("m")]
 Size = Annotated[float, Dimension("m"), msgspec.Meta(gt=0)]
 Distance = Annotated[float, Dimension("m"), msgspec.Meta(ge=0)]
-Turn = Annotated[float, Dimension("rad")]
+Angle = Annotated[float, Dimension("rad")]
 Mass = Annotated[float, Dimension("kg"), msgspec.Meta(gt=0)]
-Pure = Annotated[float, Dimension("")]
+PureNumber = Annotated[float, Dimension("")]
 Factor = Annotated[float, Dimension(""), msgspec.Meta(gt=0)]
 JointValue = Annotated[float, Dimension("joint")]
 JointRate = Annotated[float, Dimension("joint /s"), msgspec.Meta(gt=0)]
@@ -76,12 +76,12 @@ def quantity(text: Any) -> tuple[float, str] | None:
     return float(match[1]) * UNITS[match[2]], match[2]
 
 
-def in_si(value: Any) -> Any:
+def to_si(value: Any) -> Any:
     """Nested data with every quantity as a float."""
     if isinstance(value, dict):
-        return {key: in_si(item) for key, item in value.items()}
+        return {key: to_si(item) for key, item in value.items()}
     if isinstance(value, list):
-        return [in_si(item) for item in value]
+        return [to_si(item) for item in value]
     found = quantity(value)
     return value if found is None else found[0]
 
@@ -95,18 +95,18 @@ def item_name(items: Any, place: int) -> str:
 
 def units_in(value: Any) -> dict[str, str]:
     """The SI unit of every quantity that has one, by key."""
-    found = ((key, quantity(text)) for key, text in leaves(value))
+    found = ((key, quantity(text)) for key, text in leaf_values(value))
     return {key: DIMENSIONS.get(one[1], one[1]) for key, one in found if one and one[1]}
 
 
-def leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+def leaf_values(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
     """What nested data consist of, each with its key ("sides.left.at.xyz[0]")."""
     if isinstance(value, dict):
         for name, item in value.items():
-            yield from leaves(item, f"{key}.{name}" if key else str(name))
+            yield from leaf_values(item, f"{key}.{name}" if key else str(name))
     elif isinstance(value, list):
         for i, item in enumerate(value):
-            yield from leaves(item, f"{key}[{item_name(value, i)}]")
+            yield from leaf_values(item, f"{key}[{item_name(value, i)}]")
     else:
         yield key, value
 
@@ -158,7 +158,7 @@ def _hints(type_: Any) -> dict[str, Any]:
 def _fits(value: Any, type_: Any) -> bool:
     """Whether a member of a union is meant, of a value that fits one of them."""
     try:
-        msgspec.convert(in_si(value), type_)
+        msgspec.convert(to_si(value), type_)
     except msgspec.ValidationError:
         return False
     return True

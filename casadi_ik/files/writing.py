@@ -70,18 +70,18 @@ def _alive(process: int) -> bool:
     return True
 
 
-def target_of(path: Path) -> Path:
+def resolve_links(path: Path) -> Path:
     """Where a file really stands, links followed."""
     return Path(os.path.realpath(path))
 
 
-def part_of(target: Path) -> Path:
+def temporary_path(target: Path) -> Path:
     """A hidden neighbour of the same suffix, to be written before it is put in place."""
     return target.with_name(f".{target.stem}.{secrets.token_hex(4)}.part{target.suffix}")
 
 
 @contextlib.contextmanager
-def written_whole(path: Path) -> Iterator[Path]:
+def atomic_write(path: Path) -> Iterator[Path]:
     """Gives a path to write to, and puts what was written in its place once it is complete.
 
     An error of the package about what is written meanwhile names the path that was asked for.
@@ -89,8 +89,8 @@ def written_whole(path: Path) -> Iterator[Path]:
     Raises:
         OSError: It cannot be written; nothing is left behind, and what stood there stays.
     """
-    target = target_of(path)
-    part = part_of(target)
+    target = resolve_links(path)
+    part = temporary_path(target)
     remove_stale(target.parent, f".{glob.escape(target.stem)}.*.part{glob.escape(target.suffix)}")
     try:
         yield part
@@ -103,7 +103,7 @@ def written_whole(path: Path) -> Iterator[Path]:
             part.unlink()
 
 
-def plain(value: Any, infinite: Callable[[float], Any] = str) -> Any:
+def to_json(value: Any, infinite: Callable[[float], Any] = str) -> Any:
     """A value as standard JSON holds it: arrays as lists, enums by name, records by their fields.
 
     Args:
@@ -115,17 +115,17 @@ def plain(value: Any, infinite: Callable[[float], Any] = str) -> Any:
     if is_dataclass(value):
         value = {one.name: getattr(value, one.name) for one in fields(value) if one.repr}
     if isinstance(value, Mapping):
-        return {str(key): plain(item, infinite) for key, item in value.items()}
+        return {str(key): to_json(item, infinite) for key, item in value.items()}
     if hasattr(value, "tolist"):  # of numpy, which is not imported to say what the program can do
         value = value.tolist()
     if isinstance(value, list | tuple | set | frozenset):
-        return [plain(item, infinite) for item in value]
+        return [to_json(item, infinite) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return infinite(value)
     return value if value is None or isinstance(value, bool | int | float | str) else str(value)
 
 
-class InBackground:
+class BackgroundWriter:
     """One thread that does jobs in their order, at most one behind.
 
     To check, compress and write a log takes as long as to solve what it holds; all of it runs in

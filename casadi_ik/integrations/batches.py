@@ -28,8 +28,8 @@ import numpy as np
 from casadi_ik.api import Solver
 from casadi_ik.errors import CasadiIKError, InputError, UnsupportedError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.writing import remove_stale, written_whole
-from casadi_ik.model.pose import moved
+from casadi_ik.files.writing import atomic_write, remove_stale
+from casadi_ik.model.pose import transform_arrays
 from casadi_ik.solve.diagnosis import Diagnosis
 from casadi_ik.solve.solution import BatchSolution
 from casadi_ik.solve.status import Status
@@ -274,7 +274,7 @@ class BatchFolder:
             folder.mkdir(parents=True, exist_ok=True)
             remove_stale(folder, ".part-*")
         if not path.exists():
-            with written_whole(path) as part:
+            with atomic_write(path) as part:
                 part.write_text(json.dumps(mine, indent=1) + "\n", encoding="utf-8")
 
     def done(self) -> set[int]:
@@ -292,9 +292,9 @@ class BatchFolder:
             OSError: It cannot be written.
         """
         if solved.log is not None:
-            with written_whole(self.log(solved.number)) as part:
+            with atomic_write(self.log(solved.number)) as part:
                 part.write_bytes(solved.log)
-        with written_whole(self.part(solved.number)) as part:
+        with atomic_write(self.part(solved.number)) as part:
             part.write_bytes(solved.answers)
 
     def answers(self, number: int, first_row: int, count: int) -> dict[str, np.ndarray]:
@@ -382,7 +382,9 @@ def solve_parts(
         parallel = joblib.Parallel(return_as="generator_unordered", batch_size=one)
         parts = source.without(done)
         if object_pose is not None:
-            parts = (replace(part, arrays=moved(part.arrays, object_pose)) for part in parts)
+            parts = (
+                replace(part, arrays=transform_arrays(part.arrays, object_pose)) for part in parts
+            )
         how = folder.logs is not None, own if dask is None else None
         calls = (joblib.delayed(solve_part)(pickled, asked, part, *how) for part in parts)
         solved = iter(parallel(calls))

@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 from casadi_ik.api import Solver
 from casadi_ik.errors import InputError, InvalidPoseError, MissingExtraError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.keypoints import lost_contacts
-from casadi_ik.files.input_checks.poses import one_pose
+from casadi_ik.files.input_checks.keypoints import lost_contacts_reason
+from casadi_ik.files.input_checks.poses import single_pose
 from casadi_ik.model.grasp import Contact, Grasp
 from casadi_ik.solve.status import Status
 
@@ -79,7 +79,7 @@ class ArmKinematics:
         found = np.array(current_joint_pos, dtype=float)
         q0 = self._configuration(found)
         try:
-            pose = one_pose(desired_ee_pose, "desired_ee_pose")
+            pose = single_pose(desired_ee_pose, "desired_ee_pose")
         except InvalidPoseError:  # of a tracker that has lost the hand: the arm is held
             self.status = Status.INVALID
             return found
@@ -105,7 +105,7 @@ class ArmKinematics:
 
 def _contacts_of(places: dict[str, list[float]], normals: dict[str, list[float]]) -> Grasp | None:
     """Return the contacts of an action; None if they are those of a tracker without a hand."""
-    if lost_contacts(np.array(list(places.values()), dtype=float)):
+    if lost_contacts_reason(np.array(list(places.values()), dtype=float)):
         return None
     try:
         return Grasp(

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from casadi_ik.api import Solver
 from casadi_ik.errors import CasadiIKError, InputError, InvalidPoseError, MissingExtraError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.keypoints import lost_contacts
+from casadi_ik.files.input_checks.keypoints import lost_contacts_reason
 from casadi_ik.files.input_checks.poses import unit_quaternions
 from casadi_ik.kinematics.arm_hand import load_robot
 from casadi_ik.logs.cdr import CdrReader, cdr, cdr_message
@@ -126,7 +126,7 @@ class ContactNode:
     def _answer(self, sample: Any) -> None:
         try:
             points, normals = decode_contacts(bytes(sample.payload))
-            self.refused = lost_contacts(points)
+            self.refused = lost_contacts_reason(points)
             if self.refused:
                 return
             q, self.status = self._fast(points, normals, self._q)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from casadi_ik.errors import InputError, InputWarning
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.lazy_import import Shown, on_demand
+from casadi_ik.files.lazy_import import ReprMixin, import_lazily
 from casadi_ik.kinematics.robot_kernels import RobotKernels
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.grasp import real_array
@@ -20,7 +20,7 @@ from casadi_ik.model.load_robot import load_description
 from casadi_ik.model.write_urdf import to_urdf
 
 
-class ArmHand(Shown):
+class ArmHand(ReprMixin):
     """A robot: an arm with a hand, an arm alone, or a hand on a fixed base.
 
     Attributes:
@@ -407,7 +407,7 @@ class ArmHand(Shown):
             MissingExtraError: viser is not installed.
             InputError: See `configuration`.
         """
-        return on_demand("casadi_ik.app.viewer").view_grasp(
+        return import_lazily("casadi_ik.app.viewer").view_grasp(
             self, q=self.configuration(q), **options
         )
 

@@ -34,8 +34,14 @@ from casadi_ik.kinematics.forward import ActuatedKinematics, Kinematics
 from casadi_ik.kinematics.se3 import angle_between, log_so3, normal_error, perpendicular, skew
 from casadi_ik.kinematics.smooth import Expr, safe_norm
 from casadi_ik.model.description import RobotDescription
-from casadi_ik.model.grasp import MORE, fault, faulty, squared, unit_vectors
-from casadi_ik.model.targets import DIRECTIONS, TargetBatch
+from casadi_ik.model.grasp import (
+    EXTRA_VECTORS,
+    invalid_mask,
+    invalid_reason,
+    orthogonal_tangents,
+    unit_vectors,
+)
+from casadi_ik.model.targets import DIRECTIONS_KEY, TargetBatch
 
 LENGTH = 0.1
 """Position errors are divided by this [m], so that they weigh like the normals' (unit vectors)."""
@@ -449,7 +455,7 @@ def resting(goals: Sequence[Vectors], k: int) -> list[Rates]:
     return [dict.fromkeys(goal, ca.SX(3, k)) for goal in goals]
 
 
-NAMES = tuple(f"{name}s" for name in MORE)
+NAMES = tuple(f"{name}s" for name in EXTRA_VECTORS)
 """Names of the arrays."""
 
 
@@ -477,7 +483,7 @@ def more_arrays(
     for name, value in more.items():
         if name not in NAMES:
             raise UnknownNameError(
-                f"{name!r} does not exist; expected one of {', '.join((*NAMES, DIRECTIONS))}"
+                f"{name!r} does not exist; expected one of {', '.join((*NAMES, DIRECTIONS_KEY))}"
             )
         if value is None:
             continue
@@ -498,13 +504,13 @@ def more_arrays(
             units[name], zero = unit_vectors(array)
         wrong |= given & (zero | ~np.isfinite(array).all(axis=2))
     vectors = {name[:-1]: array for name, array in units.items()}
-    wrong |= faulty({"point": points, "normal": normals, **vectors})
+    wrong |= invalid_mask({"point": points, "normal": normals, **vectors})
     for row, finger in np.argwhere(wrong)[:1].tolist():
         of_contact = {"points": points, "normals": normals, **found}
         problem = _problem({name: array[row, finger] for name, array in of_contact.items()})
         raise RowError(f"row {first_row + row}, finger {finger}: {problem}", first_row + row)
     if "tangents" in units:
-        units["tangents"] = squared(units["tangents"], normals)
+        units["tangents"] = orthogonal_tangents(units["tangents"], normals)
     return units
 
 
@@ -520,7 +526,7 @@ def _problem(vectors: Mapping[str, Array]) -> str:
         if name in NAMES and zero:
             return f"{name[:-1]}: found {vector.tolist()}, expected a direction, not zero"
         units[name[:-1]] = unit if name in NAMES else vector
-    return fault(units) or "malformed"
+    return invalid_reason(units) or "malformed"
 
 
 def by_kinds(targets: TargetBatch) -> Iterator[tuple[Kinds, slice | NDArray[np.intp], TargetBatch]]:

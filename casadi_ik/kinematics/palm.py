@@ -16,7 +16,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from casadi_ik.files.arrays import Array, even_steps, evenly
+from casadi_ik.files.arrays import Array, spread_points, spread_steps
 from casadi_ik.kinematics.box_qp import Bounded, clip
 from casadi_ik.kinematics.contact_fit import FIT, Tried, lm_step
 from casadi_ik.kinematics.contacts import (
@@ -130,7 +130,7 @@ def best_palm(
 
 def even_turn(number: Expr) -> Expr:
     """Unit quaternion (4, 1) of a number from 0, evenly spread over all rotations (Shoemake)."""
-    first, *steps = (float(step) for step in even_steps(3))
+    first, *steps = (float(step) for step in spread_steps(3))
     share = ca.fmod(0.5 + first * number, 1.0)
     one, other = (2 * np.pi * ca.fmod(0.5 + step * number, 1.0) for step in steps)
     short, long = ca.sqrt(1 - share), ca.sqrt(share)
@@ -176,7 +176,7 @@ def start_table(robot: RobotDescription) -> tuple[Array, Array]:
     Of a palm the rotation, row by row, and the origin / `LENGTH`.
     """
     columns = list(robot.arm_actuators)
-    spread = evenly(NUMERIC_ARM.table, len(columns))
+    spread = spread_points(NUMERIC_ARM.table, len(columns))
     arms = robot.lower[columns] + spread * (robot.upper - robot.lower)[columns]
     q = ca.SX.sym("q", len(columns))
     palm = _palm(robot, q)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.compile import LookupKernel
 from casadi_ik.compile.graphs import FunctionGraph, recipe
-from casadi_ik.files.arrays import Array, evenly
+from casadi_ik.files.arrays import Array, spread_points
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import LENGTH
 
@@ -114,7 +114,7 @@ class PostureTable:
 
     def spread(self, first: int, count: int) -> Array:
         """(count, k) postures spread like those of the table, from one on: it may be beyond it."""
-        spread = (evenly(count, len(self.ranges), first) - 0.5) / self._squeeze + 0.5
+        spread = (spread_points(count, len(self.ranges), first) - 0.5) / self._squeeze + 0.5
         return self._lower + np.clip(spread, 0.0, 1.0) * self.ranges
 
     def nearest(

@@ -12,7 +12,7 @@ from casadi_ik.compile.function_kernel import FunctionKernel
 from casadi_ik.compile.graphs import FunctionGraph, Shape, recipe
 from casadi_ik.kinematics.couplings import joint_positions, toggle_margins
 from casadi_ik.kinematics.forward import Pose, actuated
-from casadi_ik.model.description import ENDLESS, RobotDescription
+from casadi_ik.model.description import CONTINUOUS_LIMIT, RobotDescription
 
 
 class RobotKernels:
@@ -112,7 +112,7 @@ class RobotKernels:
         lower = np.concatenate([strokes[0], description.joint_lower])
         upper = np.concatenate([strokes[1], description.joint_upper])
         lower, upper = (
-            ca.DM(np.where(endless, sign * ENDLESS, ends))
+            ca.DM(np.where(endless, sign * CONTINUOUS_LIMIT, ends))
             for sign, ends in ((-1, lower), (1, upper))
         )
         return ca.mmax(ca.fmax(lower - both, both - upper))

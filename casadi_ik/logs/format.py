@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.compile.layout import Field, Layout
 from casadi_ik.errors import InputError, LogError
-from casadi_ik.files.writing import plain
+from casadi_ik.files.writing import to_json
 from casadi_ik.logs.container import ForeignLogError, check_size
 
 KINDS = ("iteration", "solve", "event")
@@ -252,7 +252,7 @@ def log_metadata(
             "packages": json.dumps(package_versions(PACKAGES)),
             "python": platform.python_version(),
             "machine": json.dumps(machine()),
-            "parameters": json.dumps(plain(parameters)),
+            "parameters": json.dumps(to_json(parameters)),
         }
     )
 

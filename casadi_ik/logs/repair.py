@@ -24,7 +24,7 @@ from mcap.summary import Summary
 from casadi_ik.compile.layout import Layout
 from casadi_ik.errors import LogError, os_errors
 from casadi_ik.files.arrays import Counts
-from casadi_ik.files.writing import written_whole
+from casadi_ik.files.writing import atomic_write
 from casadi_ik.logs.container import (
     COMPRESSORS,
     Contents,
@@ -175,7 +175,7 @@ def merge_logs(shards: Paths, target: str | os.PathLike[str]) -> Merged:
     merge = _Merge(Log(opened, left_out))
     solves = {part.method: len(part) for part in merge.log.solves().parts}
     refused = os_errors(f"{path}: cannot write the merged log", LogError)
-    with refused, written_whole(path) as part, part.open("xb") as stream:
+    with refused, atomic_write(path) as part, part.open("xb") as stream:
         merge.write(stream)
         size = stream.tell()
     messages = sum(counts_of(merge.summary).values())

@@ -27,7 +27,7 @@ from mcap.summary import Summary
 from numpy.typing import NDArray
 
 from casadi_ik.errors import InputError, LogError
-from casadi_ik.files.writing import InBackground
+from casadi_ik.files.writing import BackgroundWriter
 from casadi_ik.logs.container import (
     COMPRESSORS,
     MESSAGE,
@@ -431,7 +431,7 @@ class _Chunks:
         self._waiting: list[Messages] = []
         self._size = 0
         self._new: list[McapRecord] = []
-        self._background = InBackground()
+        self._background = BackgroundWriter()
 
     @property
     def closed(self) -> bool:

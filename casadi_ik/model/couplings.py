@@ -16,7 +16,7 @@ import numpy as np
 
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.units import AnyValue, Pure, Size, Turn
+from casadi_ik.files.units import Angle, AnyValue, PureNumber, Size
 
 FLAT = 1e-16
 """A triangle's two slacks are kept above FLAT b c [m^2]."""
@@ -107,7 +107,7 @@ class Linear(CouplingKind, frozen=True, tag="linear"):
         offset: [rad] or [m].
     """
 
-    ratio: Pure = 1.0
+    ratio: PureNumber = 1.0
     offset: AnyValue = 0.0
 
     def check(self, where: str) -> None:
@@ -138,7 +138,7 @@ class LeadScrew(CouplingKind, frozen=True, tag="lead-screw"):
 
     b: Size
     c: Size
-    theta_0: Turn = 0.0
+    theta_0: Angle = 0.0
 
     source_unit: ClassVar[str] = "m"
     lengths: ClassVar[tuple[str, ...]] = ("b", "c")
@@ -183,8 +183,8 @@ class FourBar(CouplingKind, frozen=True, tag="four-bar"):
     q: Size
     g: Size
     h: Size
-    phi_0: Turn
-    theta_3_0: Turn
+    phi_0: Angle
+    theta_3_0: Angle
 
     source_unit: ClassVar[str] = "rad"
     lengths: ClassVar[tuple[str, ...]] = ("p", "q", "g", "h")
@@ -235,7 +235,7 @@ class Polynomial(CouplingKind, frozen=True, tag="polynomial"):
         coefficients: The constant first [rad or m per power of the source's unit].
     """
 
-    coefficients: tuple[Pure, ...]
+    coefficients: tuple[PureNumber, ...]
 
     monotone: ClassVar[bool] = False
 

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.errors import UnknownNameError, UnsupportedError
-from casadi_ik.files.arrays import Array, frozen
+from casadi_ik.files.arrays import Array, read_only
 from casadi_ik.model.joints import Actuator, Joint
 from casadi_ik.model.link_shapes import NO_SHAPES, Shapes
-from casadi_ik.model.linkage import above, links_of
+from casadi_ik.model.linkage import chain_to, links_of
 from casadi_ik.model.motor_ranges import motor_ranges
 
-ENDLESS = 1e6
+CONTINUOUS_LIMIT = 1e6
 """Limit of the motion of a motor without limits [rad]: 28 hours at 10 rad/s."""
 
 
@@ -179,13 +179,13 @@ class RobotDescription:
     @cached_property
     def _ranges(self) -> tuple[Array, Array]:
         found = motor_ranges(self.movable, self.actuators, self.home, f"robot {self.name!r}")
-        return frozen(found[0]), frozen(found[1])
+        return read_only(found[0]), read_only(found[1])
 
     @cached_property
     def strokes(self) -> tuple[Array, Array]:
         """(n,) what the actuators could do by themselves, whatever their joints' limits say."""
         lower = [actuator.lower for actuator in self.actuators]
-        return frozen(lower), frozen([actuator.upper for actuator in self.actuators])
+        return read_only(lower), read_only([actuator.upper for actuator in self.actuators])
 
     @cached_property
     def mechanical(self) -> tuple[Array, Array]:
@@ -201,7 +201,7 @@ class RobotDescription:
                 least, most = coupling.stroke
                 lower[coupling.of] = max(lower[coupling.of], least)
                 upper[coupling.of] = min(upper[coupling.of], most)
-        return frozen(list(lower.values())), frozen(list(upper.values()))
+        return read_only(list(lower.values())), read_only(list(upper.values()))
 
     @cached_property
     def _independent_turns(self) -> NDArray[np.bool_]:
@@ -232,19 +232,19 @@ class RobotDescription:
 
     @cached_property
     def stops(self) -> tuple[Array, Array]:
-        """(n,) limits of motions: `lower` and `upper`, and ±`ENDLESS` for continuous motors."""
-        lower = np.where(self.continuous, -ENDLESS, self.lower)
-        return frozen(lower), frozen(np.where(self.continuous, ENDLESS, self.upper))
+        """(n,) limits of motions; ±`CONTINUOUS_LIMIT` for continuous motors."""
+        lower = np.where(self.continuous, -CONTINUOUS_LIMIT, self.lower)
+        return read_only(lower), read_only(np.where(self.continuous, CONTINUOUS_LIMIT, self.upper))
 
     @cached_property
     def joint_lower(self) -> Array:
         """(m,) lower limits of the movable joints."""
-        return frozen([joint.lower for joint in self.movable])
+        return read_only([joint.lower for joint in self.movable])
 
     @cached_property
     def joint_upper(self) -> Array:
         """(m,) upper limits of the movable joints."""
-        return frozen([joint.upper for joint in self.movable])
+        return read_only([joint.upper for joint in self.movable])
 
     @cached_property
     def links(self) -> tuple[str, ...]:
@@ -287,7 +287,7 @@ class RobotDescription:
         """
         if link not in self.links:
             raise UnknownNameError(f"robot {self.name!r} has no link {link!r}")
-        return tuple(above(self, link))
+        return tuple(chain_to(self, link))
 
     @cached_property
     def arm_actuators(self) -> tuple[int, ...]:

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.errors import InputError
-from casadi_ik.files.arrays import Array, Bools, frozen
-from casadi_ik.files.input_checks.poses import MAX_SKEW, one_pose
+from casadi_ik.files.arrays import Array, Bools, read_only
+from casadi_ik.files.input_checks.poses import MAX_SKEW, single_pose
 from casadi_ik.files.input_checks.units import warn_of_wide_tolerance
 from casadi_ik.model.pose import Free, inverse
 
@@ -43,10 +43,10 @@ class Tolerance:
                 raise InputError(f"tolerance.{name}: found {value!r}, expected a number > 0")
 
 
-UNIT = 1e-15
+UNIT_ROUNDING = 1e-15
 """A vector whose length is so near to 1 has been normalised before."""
 
-SMALL, LARGE = 1e-100, 1e100
+MIN_PLAIN_LENGTH, MAX_PLAIN_LENGTH = 1e-100, 1e100
 """Between these the squares of a length are neither rounded to zero nor infinite."""
 
 
@@ -78,13 +78,13 @@ def unit_vectors(vectors: Array) -> tuple[Array, NDArray[np.bool_]]:
     """
     with np.errstate(over="ignore", under="ignore"):
         length = _length(vectors)
-    odd = (length < SMALL) | (length > LARGE)
+    odd = (length < MIN_PLAIN_LENGTH) | (length > MAX_PLAIN_LENGTH)
     if odd.any():
         # By powers of two, which change no digit; in two halves, as one may be out of range.
         power = np.where(odd, -np.frexp(np.abs(vectors).max(axis=-1))[1], 0)[..., None]
         vectors = np.ldexp(np.ldexp(vectors, power // 2), power - power // 2)
         length = _length(vectors)
-    length = np.where(np.abs(length - 1) < UNIT, 1.0, length)
+    length = np.where(np.abs(length - 1) < UNIT_ROUNDING, 1.0, length)
     zero = length == 0
     return vectors / np.where(zero, np.nan, length)[..., None], zero
 
@@ -95,7 +95,7 @@ def _length(vectors: Array) -> Array:
     return np.sqrt(squares[..., 0] + squares[..., 1] + squares[..., 2])
 
 
-MORE: Mapping[str, str] = {
+EXTRA_VECTORS: Mapping[str, str] = {
     "tangent": "where the contact frame's second axis must point, across the normal",
     "line": "the contact may be anywhere on the line through the point in this direction",
     "plane": "the contact may be anywhere on the plane through the point with this normal",
@@ -103,20 +103,20 @@ MORE: Mapping[str, str] = {
 }
 """What a contact may have beside point and normal, by name; arrays have an s at the end."""
 
-PLACES = ("line", "plane", "ball")
+POINT_CONSTRAINTS = ("line", "plane", "ball")
 """Those that say where the point is touched: a contact has one at most."""
 
 
-def fault(vectors: Mapping[str, Array]) -> str | None:
+def invalid_reason(vectors: Mapping[str, Array]) -> str | None:
     """What is wrong with the vectors of one contact: the first line of it, or None.
 
     Args:
         vectors: By name; "point" [m] and unit vectors, absent if free.
     """
-    for name in MORE:
+    for name in EXTRA_VECTORS:
         if name in vectors and "point" not in vectors:
             return f"{name}: found one without a point, expected both"
-    places = [name for name in PLACES if name in vectors]
+    places = [name for name in POINT_CONSTRAINTS if name in vectors]
     if len(places) > 1:
         return f"{' and '.join(places[:2])}: found both, expected one of them"
     if "tangent" not in vectors:
@@ -133,18 +133,18 @@ def fault(vectors: Mapping[str, Array]) -> str | None:
     return None
 
 
-def faulty(vectors: Mapping[str, Array]) -> Bools:
-    """Which contacts `fault` has something to say about, all at once.
+def invalid_mask(vectors: Mapping[str, Array]) -> Bools:
+    """Which contacts `invalid_reason` has something to say about, all at once.
 
     Args:
         vectors: (..., 3) by name, as there, of all contacts; NaN where free.
     """
     given = {name: ~np.isnan(array[..., 0]) for name, array in vectors.items()}
     bad = np.zeros_like(given["point"])
-    for name in MORE:
+    for name in EXTRA_VECTORS:
         if name in given:
             bad |= given[name] & ~given["point"]
-    places = [given[name] for name in PLACES if name in given]
+    places = [given[name] for name in POINT_CONSTRAINTS if name in given]
     if places:
         bad |= np.sum(places, axis=0) > 1
     if "tangent" in given:
@@ -153,13 +153,13 @@ def faulty(vectors: Mapping[str, Array]) -> Bools:
     return bad
 
 
-def squared(tangent: Array, normal: Array) -> Array:
+def orthogonal_tangents(tangent: Array, normal: Array) -> Array:
     """Tangents (..., 3) without what rounding left of them along the normals, unit."""
     across = tangent - normal * np.einsum("...i,...i->...", normal, tangent)[..., None]
     return across / np.sqrt(np.einsum("...i,...i->...", across, across))[..., None]
 
 
-FREE = np.full(3, np.nan)
+FREE_VECTOR = np.full(3, np.nan)
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,18 +226,20 @@ class Contact:
             ]
             if others:
                 raise InputError(f"direction: found it beside {others[0]}, expected it alone")
-            object.__setattr__(self, "point", frozen(np.full(3, np.nan)))
+            object.__setattr__(self, "point", read_only(np.full(3, np.nan)))
             object.__setattr__(self, "normal", _unit(direction, "direction"))
             return
         if point is None:
             raise InputError("point: missing, expected three numbers (or a direction alone)")
         vectors = {"point": _vector(point, "point")}
         vectors |= {name: _unit(v, name) for name, v in given.items() if v is not None}
-        problem = fault(vectors)
+        problem = invalid_reason(vectors)
         if problem:
             raise InputError(problem)
         if "tangent" in vectors:
-            vectors["tangent"] = frozen(squared(vectors["tangent"], vectors["normal"]))
+            vectors["tangent"] = read_only(
+                orthogonal_tangents(vectors["tangent"], vectors["normal"])
+            )
         for name, vector in vectors.items():
             object.__setattr__(self, name, vector)
 
@@ -263,13 +265,13 @@ class Contact:
             [1. 0. 0.] [0. 1. 0.]
         """
         if pose is None or not isinstance(self, Contact):
-            return Contact(np.zeros(3), [1, 0, 0], tangent=[0, 1, 0]).at(one_pose(self))
-        motion = one_pose(pose)
+            return Contact(np.zeros(3), [1, 0, 0], tangent=[0, 1, 0]).at(single_pose(self))
+        motion = single_pose(pose)
         turn = motion[:3, :3]
         if not np.isfinite(self.point).all():
             assert self.normal is not None
             return Contact(direction=turn @ self.normal, tolerance=self.tolerance)
-        vectors = {name: getattr(self, name) for name in ("normal", *MORE)}
+        vectors = {name: getattr(self, name) for name in ("normal", *EXTRA_VECTORS)}
         turned = {name: turn @ vector for name, vector in vectors.items() if vector is not None}
         return Contact(turn @ self.point + motion[:3, 3], tolerance=self.tolerance, **turned)
 
@@ -363,7 +365,7 @@ class Grasp:
             >>> print(np.round(higher.contacts["thumb"].point - grasp.contacts["thumb"].point, 6))
             [0.   0.   0.01]
         """
-        motion = one_pose(pose)
+        motion = single_pose(pose)
         place = self.object_pose
         if isinstance(place, Free):
             place = motion
@@ -433,9 +435,9 @@ class Grasp:
                     f"contacts.{name}: no such finger; the robot's fingers: {', '.join(fingers)}"
                 )
         contacts = [self.contacts.get(finger) for finger in fingers]
-        points = [FREE if contact is None else contact.point for contact in contacts]
+        points = [FREE_VECTOR if contact is None else contact.point for contact in contacts]
         normals = [
-            FREE if contact is None or contact.normal is None else contact.normal
+            FREE_VECTOR if contact is None or contact.normal is None else contact.normal
             for contact in contacts
         ]
         return np.array(points), np.array(normals)
@@ -456,7 +458,7 @@ class Grasp:
         """
         found: dict[str, Array] = {}
         for finger, contact in self.contacts.items():
-            for name in MORE:
+            for name in EXTRA_VECTORS:
                 vector = getattr(contact, name)
                 if vector is not None:
                     rows = found.setdefault(f"{name}s", np.full((len(fingers), 3), np.nan))
@@ -466,10 +468,10 @@ class Grasp:
 
 def _frozen_palms(palm: Any) -> Array | Mapping[str, Array]:
     if not isinstance(palm, Mapping):
-        return frozen(one_pose(palm, "palm").copy())
+        return read_only(single_pose(palm, "palm").copy())
     if not palm:
         raise InputError("palm: found no side, expected a pose by side")
-    poses = {side: frozen(one_pose(one, f"palm.{side}").copy()) for side, one in palm.items()}
+    poses = {side: read_only(single_pose(one, f"palm.{side}").copy()) for side, one in palm.items()}
     return MappingProxyType(poses)
 
 
@@ -477,12 +479,14 @@ def _unit(value: Any, name: str) -> Array:
     vector = _vector(value, name)
     x, y, z = vector.tolist()
     length = math.sqrt(x * x + y * y + z * z)
-    if SMALL < length < LARGE:  # `unit_vectors`, whose arrays take long for a single one
-        return vector if abs(length - 1) < UNIT else frozen(vector / length)
+    if (
+        MIN_PLAIN_LENGTH < length < MAX_PLAIN_LENGTH
+    ):  # `unit_vectors`, whose arrays take long for a single one
+        return vector if abs(length - 1) < UNIT_ROUNDING else read_only(vector / length)
     vector, zero = unit_vectors(vector)
     if zero:
         raise InputError(f"{name}: found [0.0, 0.0, 0.0], expected a direction, not zero")
-    return frozen(vector)
+    return read_only(vector)
 
 
 def _vector(value: Any, name: str) -> Array:
@@ -494,4 +498,4 @@ def _vector(value: Any, name: str) -> Array:
         raise InputError(f"{name}: found shape {array.shape}, expected (3,)")
     if not all(map(math.isfinite, array.tolist())):
         raise InputError(f"{name}: found {array.tolist()}, expected finite numbers")
-    return frozen(array)
+    return read_only(array)

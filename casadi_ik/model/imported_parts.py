@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from casadi_ik.errors import DescriptionError
-from casadi_ik.files.arrays import frozen
+from casadi_ik.files.arrays import read_only
 from casadi_ik.files.reading import frame_matrix
 from casadi_ik.model.couplings import Coupling, Linear
 from casadi_ik.model.joints import Actuator, Joint
 from casadi_ik.model.link_shapes import NO_SHAPES, link_shapes
-from casadi_ik.model.linkage import below, ends, motion
-from casadi_ik.model.parts import Part, check_couplings
+from casadi_ik.model.linkage import joint_motion, joints_below, leaf_links
+from casadi_ik.model.parts import RobotPart, check_couplings
 from casadi_ik.model.schema import ArmFromFile, CollisionEntry, HandFromFile, LinkFrame, PadEntry
 from casadi_ik.model.urdf_mjcf import read_tree
 from casadi_ik.model.xml_tree import RobotTree, TreeJoint
@@ -30,7 +30,7 @@ GRID = 257
 Entry = ArmFromFile | HandFromFile
 
 
-def arm_from_file(entry: ArmFromFile, key: str, beside: Path) -> Part:
+def arm_from_file(entry: ArmFromFile, key: str, beside: Path) -> RobotPart:
     """The chain of joints from root to tip.
 
     Args:
@@ -45,7 +45,7 @@ def arm_from_file(entry: ArmFromFile, key: str, beside: Path) -> Part:
     tree, where, root = _opened(entry, key, beside)
     tip = entry.tip
     if tip is None:
-        last = ends(tree, root)
+        last = leaf_links(tree, root)
         if len(last) != 1:
             raise DescriptionError(
                 f"{where}.tip: missing; {tree.path.name} ends in several links, write one of "
@@ -60,7 +60,7 @@ def arm_from_file(entry: ArmFromFile, key: str, beside: Path) -> Part:
 
 def hand_from_file(
     entry: HandFromFile, pads: Mapping[str, PadEntry], key: str, beside: Path
-) -> Part:
+) -> RobotPart:
     """Everything below the palm, and the chain that leads to it.
 
     Args:
@@ -77,7 +77,7 @@ def hand_from_file(
     palm = palm_frame(entry.palm or root)
     tree.known_link(palm.link, f"{where}.palm: {tree.path.name}")
     chain = tree.chain(root, palm.link, f"{where}.palm: {tree.path.name}")
-    hand = tuple(below(tree, palm.link))
+    hand = tuple(joints_below(tree, palm.link))
     carried = {palm.link, *(joint.child for joint in hand)}
     for name, pad in pads.items():
         tree.known_link(pad.link, f"{beside}: fingers.{name}.link: {tree.path.name}")
@@ -112,7 +112,7 @@ def _part(
     end: LinkFrame,
     source: dict[str, str],
     where: str,
-) -> Part:
+) -> RobotPart:
     """The joints of an arm, or of what moves a palm, and those of a hand, as a part."""
     root = chosen[0][0].parent if chosen[0] else end.link
     joints, actuators = _Chosen(tree, entry, *chosen, where).parts()
@@ -123,7 +123,7 @@ def _part(
         entries = {link: list(simple[link]) for link in links if link in simple}
         shapes = link_shapes(CollisionEntry(links=entries), links, tree.path)
     frame = frame_matrix(end)
-    return Part(
+    return RobotPart(
         *(tree.path.stem, f"{where}: ", root, joints, actuators, source, end.link, frame, {}),
         shapes,
     )
@@ -137,14 +137,14 @@ class _Chosen:
         tree: RobotTree,
         entry: Entry,
         chain: tuple[TreeJoint, ...],
-        below: tuple[TreeJoint, ...],
+        joints_below: tuple[TreeJoint, ...],
         where: str,
     ) -> None:
         self._tree = tree
         self._where = f"{where}: {tree.path.name}"
         self._key = where
         self._arm = {joint.name for joint in chain}
-        self._joints = {joint.name: joint for joint in (*chain, *below)}
+        self._joints = {joint.name: joint for joint in (*chain, *joints_below)}
         for key, names in (("locked", entry.locked), ("limits", entry.limits)):
             for name in names:
                 tree.known_joint(name, f"{where}.{key}: {tree.path.name}")
@@ -194,7 +194,7 @@ class _Chosen:
         moves = "prismatic" if joint.type == "prismatic" else "revolute"
         placement, kind, low, high = joint.placement, "fixed", 0.0, 0.0
         if held is not None:
-            placement, coupling = placement @ motion(moves, joint.axis, held), None
+            placement, coupling = placement @ joint_motion(moves, joint.axis, held), None
         elif joint.type != "fixed":
             kind = moves
             low, high = self._limits(joint.name)
@@ -203,8 +203,8 @@ class _Chosen:
             joint.parent,
             joint.child,
             kind,
-            frozen(placement),
-            frozen(joint.axis),
+            read_only(placement),
+            read_only(joint.axis),
             low,
             high,
             joint.velocity,

@@ -12,16 +12,23 @@ from pathlib import Path
 import numpy as np
 
 from casadi_ik.errors import DescriptionError, UnknownNameError
-from casadi_ik.files.arrays import Array, frozen
+from casadi_ik.files.arrays import Array, read_only
 from casadi_ik.files.reading import Frame, Vector, frame_matrix, read
-from casadi_ik.files.shipped import resolve
+from casadi_ik.files.shipped import resolve_description
 from casadi_ik.model.description import Finger, RobotDescription, Side
 from casadi_ik.model.imported_parts import arm_from_file, hand_from_file, palm_frame
 from casadi_ik.model.joints import Actuator, Joint
 from casadi_ik.model.link_shapes import NO_SHAPES
-from casadi_ik.model.linkage import above, below, known
+from casadi_ik.model.linkage import chain_to, joints_below, require_name
 from casadi_ik.model.motor_ranges import motor_ranges
-from casadi_ik.model.parts import Part, described_part, mirrored, of_side, unique, usable
+from casadi_ik.model.parts import (
+    RobotPart,
+    mirrored,
+    part_from_file,
+    prefix_side,
+    require_unique,
+    require_usable_name,
+)
 from casadi_ik.model.schema import (
     ArmFile,
     ArmFromFile,
@@ -64,15 +71,15 @@ def flattened(joints: Sequence[Joint], root: str, kept: Collection[str]) -> Flat
             places[joint.child] = (link, placement)
         else:
             places[joint.child] = (joint.child, np.eye(4))
-        found.append(replace(joint, parent=link, placement=frozen(placement)))
+        found.append(replace(joint, parent=link, placement=read_only(placement)))
     return FlatJoints(tuple(found), places)
 
 
-def joined(
+def join_parts(
     name: str,
     root: str,
     joints: Sequence[Joint],
-    parts: Sequence[tuple[str, Part]],
+    parts: Sequence[tuple[str, RobotPart]],
     kept: Collection[str],
     home: dict[str, float],
     units: dict[str, str],
@@ -97,9 +104,9 @@ def joined(
         DescriptionError: With file, key, what was found and what was expected.
     """
     actuators = [one for _, part in parts for one in part.actuators]
-    unique((one.name for one in actuators), f"{where}: actuators")
-    unique((joint.name for joint in joints), f"{where}: joints")
-    unique((root, *(joint.child for joint in joints)), f"{where}: links")
+    require_unique((one.name for one in actuators), f"{where}: actuators")
+    require_unique((joint.name for joint in joints), f"{where}: joints")
+    require_unique((root, *(joint.child for joint in joints)), f"{where}: links")
     flat, all_sources = flattened(joints, root, kept), dict(sources)
     for owner, part in parts:
         # A tag that is used already gets the owner's name before it.
@@ -115,7 +122,7 @@ def joined(
         fingers=(),
         named_thumb=None,
         palm_link=root,
-        palm_placement=frozen(np.eye(4)),
+        palm_placement=read_only(np.eye(4)),
         home=_home(home, units, actuators, joints, where),
         sources=all_sources,
         shapes=sum((part.shapes for _, part in parts), NO_SHAPES),
@@ -123,14 +130,14 @@ def joined(
     return robot, flat
 
 
-ALONG = 0.995
+MAX_NORMAL_COSINE = 0.995
 """Cosine with the normal above which the contact frame's x axis is no tangent."""
 
 
-def the_fingers(
+def build_fingers(
     names: Sequence[str],
     thumb: str | None,
-    hand: Part,
+    hand: RobotPart,
     flat: FlatJoints,
     where: str,
     side: str = "",
@@ -148,7 +155,7 @@ def the_fingers(
     Raises:
         DescriptionError: With file, key, what was found and what was expected.
     """
-    unique(names, f"{where}fingers")
+    require_unique(names, f"{where}fingers")
     if not names:
         raise DescriptionError(f"{where}fingers: found none, expected at least one")
     asked = [("fingers", name) for name in names]
@@ -167,10 +174,10 @@ def the_fingers(
     return tuple(_finger(name, hand, flat, side) for name in names)
 
 
-def _finger(name: str, hand: Part, flat: FlatJoints, side: str) -> Finger:
+def _finger(name: str, hand: RobotPart, flat: FlatJoints, side: str) -> Finger:
     entry = hand.pads[name]
     where = f"{hand.where}fingers.{name.removeprefix(side)}"
-    link, pose = flat.places[known(entry.link, hand.links, "link", f"{where}.link")]
+    link, pose = flat.places[require_name(entry.link, hand.links, "link", f"{where}.link")]
     length = float(np.linalg.norm(entry.normal))
     if not length > 1e-9:
         raise DescriptionError(f"{where}.normal: is zero, expected a direction")
@@ -190,10 +197,10 @@ def _finger(name: str, hand: Part, flat: FlatJoints, side: str) -> Finger:
     return Finger(
         name,
         link,
-        frozen(pose @ frame_matrix(entry)),
-        frozen(normal),
+        read_only(pose @ frame_matrix(entry)),
+        read_only(normal),
         tuple(chain[::-1]),
-        frozen(_tangent(entry.tangent, normal, where)),
+        read_only(_tangent(entry.tangent, normal, where)),
         entry.pad.radius if isinstance(entry.pad, BallPad) else 0.0,
     )
 
@@ -202,7 +209,7 @@ def _tangent(given: Vector | None, normal: Array, where: str) -> Array:
     """The pad's second axis (3,): what is given, else x (y if the normal is along x)."""
     along = given
     if given is None:
-        along = (1.0, 0.0, 0.0) if abs(normal[0]) < ALONG else (0.0, 1.0, 0.0)
+        along = (1.0, 0.0, 0.0) if abs(normal[0]) < MAX_NORMAL_COSINE else (0.0, 1.0, 0.0)
     across = np.asarray(along, dtype=float)
     across = across - normal * (normal @ across)
     length = float(np.linalg.norm(across))
@@ -242,10 +249,10 @@ def _home(
                 f"{where}: home.{name}: {value:.6g} is outside the limits [{low:.6g}, {high:.6g}] "
                 "of the actuator and its joints"
             )
-    return frozen(np.clip(asked, lower, upper))
+    return read_only(np.clip(asked, lower, upper))
 
 
-def a_part(entry: str | ArmFromFile | HandFile, key: str, beside: Path) -> Part:
+def load_part(entry: str | ArmFromFile | HandFile, key: str, beside: Path) -> RobotPart:
     """The trunk, arm or hand that a robot's file names or holds.
 
     Args:
@@ -259,20 +266,20 @@ def a_part(entry: str | ArmFromFile | HandFile, key: str, beside: Path) -> Part:
     if isinstance(entry, ArmFromFile):
         return arm_from_file(entry, key, beside)
     if isinstance(entry, HandFile):
-        return described_part(entry, beside)
+        return part_from_file(entry, beside)
     kind = key.rpartition(".")[2]
     try:
-        path = resolve(entry, f"{kind}s", beside=beside)
+        path = resolve_description(entry, f"{kind}s", relative_to=beside)
     except (UnknownNameError, DescriptionError) as error:
         raise DescriptionError(f"{beside}: {key}: {error}") from error
-    return described_part(read(path, HandFile if kind == "hand" else ArmFile)[0], path)
+    return part_from_file(read(path, HandFile if kind == "hand" else ArmFile)[0], path)
 
 
-def with_wrist(hand: Part) -> Part:
+def assign_wrist_to_arm(hand: RobotPart) -> RobotPart:
     """The hand, of which what moves the palm itself counts as arm, if all fingers are beyond it."""
-    wrist = {joint.name for joint in above(hand, hand.tip_link)}
+    wrist = {joint.name for joint in chain_to(hand, hand.tip_link)}
     beyond = all(
-        hand.tip_link in {joint.child for joint in above(hand, pad.link)}
+        hand.tip_link in {joint.child for joint in chain_to(hand, pad.link)}
         for pad in hand.pads.values()
     )
     if not wrist or not beyond:
@@ -296,14 +303,16 @@ def with_wrist(hand: Part) -> Part:
 
 def fixed_joint(name: str, parent: str, child: str, pose: Array) -> Joint:
     """What mounts a link (4, 4) on another."""
-    axis = frozen(np.array([0.0, 0.0, 1.0]))
-    return Joint(name, parent, child, "fixed", frozen(pose), axis, 0.0, 0.0, np.inf, None, "mount")
+    axis = read_only(np.array([0.0, 0.0, 1.0]))
+    return Joint(
+        name, parent, child, "fixed", read_only(pose), axis, 0.0, 0.0, np.inf, None, "mount"
+    )
 
 
-STANDING = Part("base", "", "base", [], [], {}, "base", np.eye(4), {})
+FIXED_BASE = RobotPart("base", "", "base", [], [], {}, "base", np.eye(4), {})
 """What carries the sides of a body that stands still."""
 
-MOST_SIDES = 4
+MAX_SIDES = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,7 +328,7 @@ class _OneSide:
     """
 
     name: str
-    hand: Part
+    hand: RobotPart
     fingers: Sequence[str]
     thumb: str | None
     motors: tuple[tuple[str, ...], ...] = ()
@@ -348,28 +357,28 @@ def body_from_parts(
                 "at: {} is the trunk's end"
             )
     arms = {
-        name: _mirrored(a_part(entry.arm, f"sides.{name}.arm", where), entry, "arm", name, where)
+        name: _mirrored(load_part(entry.arm, f"sides.{name}.arm", where), entry, "arm", name, where)
         for name, entry in body.sides.items()
     }
-    trunk = None if body.trunk is None else a_part(body.trunk, "trunk", where)
+    trunk = None if body.trunk is None else load_part(body.trunk, "trunk", where)
     roots = {arm.root for arm in arms.values()}
     alike = len(roots) == 1 and all(entry.at is None for entry in body.sides.values())
     # Arms that have the trunk's end, or each other's root, share that link.
     shared = roots.pop() if alike and (trunk is None or roots == {trunk.tip_link}) else None
-    base = STANDING if trunk is None else trunk
+    base = FIXED_BASE if trunk is None else trunk
     if trunk is None and shared is not None:
-        base = replace(STANDING, root=shared, tip_link=shared)
+        base = replace(FIXED_BASE, root=shared, tip_link=shared)
     joints, parts = list(base.joints), [(base.name, base)]
     home, sides = dict(base.home), []
     for name, entry in body.sides.items():
-        arm = of_side(arms[name], name, shared)
+        arm = prefix_side(arms[name], name, shared)
         key = f"sides.{name}.hand"
         named = entry.hand if entry.hand is not None else hand
         if named is None:
             raise DescriptionError(f"{where}: {key}: missing; write one, or load BODY+HAND by name")
-        own = _mirrored(a_part(named, key, where), entry, "hand", name, where)
+        own = _mirrored(load_part(named, key, where), entry, "hand", name, where)
         mount = own.mount if entry.mount is None else frame_matrix(entry.mount)
-        own = with_wrist(of_side(own, name, shared))
+        own = assign_wrist_to_arm(prefix_side(own, name, shared))
         if shared is None:
             at = base.tip @ frame_matrix(entry.at or Frame())
             joints.append(fixed_joint(f"{name}_base", base.tip_link, arm.root, at))
@@ -390,7 +399,7 @@ def body_from_parts(
         )
         sides.append(_OneSide(name, own, fingers, thumb, tuple(split)))
     palms = {side.hand.tip_link for side in sides}
-    drawn = joined(
+    drawn = join_parts(
         *(body.name, base.root, joints, parts, palms | {base.tip_link}),
         *(home | body.home, units, body.sources, str(where)),
     )
@@ -417,7 +426,7 @@ def body_from_file(body: ImportedBody, where: Path, units: dict[str, str]) -> Ro
         side, chains[name] = _side_in_file(name, entry, whole, where)
         sides.append(side)
     end = _trunk_end(body.trunk, sides, chains, whole, where)
-    drawn = joined(
+    drawn = join_parts(
         *(body.name, whole.root, whole.joints, [("robot", whole)]),
         {end, *(side.hand.tip_link for side in sides)},
         *(body.home, units, body.sources, str(where)),
@@ -426,14 +435,14 @@ def body_from_file(body: ImportedBody, where: Path, units: dict[str, str]) -> Ro
 
 
 def _side_in_file(
-    name: str, entry: FileSide, whole: Part, where: Path
+    name: str, entry: FileSide, whole: RobotPart, where: Path
 ) -> tuple[_OneSide, list[str]]:
     """A side, and the links from the root to its palm."""
     key, palm = f"{where}: sides.{name}.", palm_frame(entry.palm)
-    known(palm.link, whole.links, "link", f"{key}palm")
+    require_name(palm.link, whole.links, "link", f"{key}palm")
     pads = {f"{name}_{finger}": pad for finger, pad in entry.fingers.items()}
     for finger, pad in entry.fingers.items():
-        known(pad.link, whole.links, "link", f"{key}fingers.{finger}.link")
+        require_name(pad.link, whole.links, "link", f"{key}fingers.{finger}.link")
         if palm.link not in _links_to(pad.link, whole):
             raise DescriptionError(
                 f"{key}fingers.{finger}.link: {pad.link!r} does not hang on the palm "
@@ -455,7 +464,7 @@ def _trunk_end(
     said: str | None,
     sides: Sequence[_OneSide],
     chains: dict[str, list[str]],
-    whole: Part,
+    whole: RobotPart,
     where: Path,
 ) -> str:
     """The link that the sides stand on: what is said, or the last one that carries all palms."""
@@ -470,14 +479,14 @@ def _trunk_end(
         raise DescriptionError(f"{where}: trunk: missing; one side does not say where it ends")
     first, *others = chains.values()
     common = [link for link in first if all(link in one for one in others)]
-    end = common[-1] if said is None else known(said, whole.links, "link", f"{where}: trunk")
+    end = common[-1] if said is None else require_name(said, whole.links, "link", f"{where}: trunk")
     for name, chain in chains.items():
         if end not in chain:
             raise DescriptionError(
                 f"{where}: trunk: found {end!r}, which does not carry the palm of {name!r}; "
                 f"expected a link that carries all, such as {common[-1]!r}"
             )
-    for joint in above(whole, common[-1], end) if others else ():
+    for joint in chain_to(whole, common[-1], end) if others else ():
         if joint.type != "fixed":
             raise DescriptionError(
                 f"{where}: trunk: found {end!r}, but joint {joint.name!r} beyond it moves every "
@@ -487,16 +496,16 @@ def _trunk_end(
 
 
 def _check_sides(name: str, sides: Collection[str], where: Path) -> None:
-    usable(name, f"{where}: name")
+    require_usable_name(name, f"{where}: name")
     if not sides:
         raise DescriptionError(f"{where}: sides: found none, expected at least one")
-    if len(sides) > MOST_SIDES:
-        raise DescriptionError(f"{where}: sides: found {len(sides)}, expected {MOST_SIDES} at most")
+    if len(sides) > MAX_SIDES:
+        raise DescriptionError(f"{where}: sides: found {len(sides)}, expected {MAX_SIDES} at most")
     for side in sides:
-        usable(side, f"{where}: sides")
+        require_usable_name(side, f"{where}: sides")
 
 
-def _mirrored(part: Part, entry: PartSide, key: str, side: str, where: Path) -> Part:
+def _mirrored(part: RobotPart, entry: PartSide, key: str, side: str, where: Path) -> RobotPart:
     """A part of a side, or its mirror image if the side says so."""
     for found in entry.mirror:
         if found not in ("arm", "hand"):
@@ -506,9 +515,9 @@ def _mirrored(part: Part, entry: PartSide, key: str, side: str, where: Path) -> 
     return mirrored(part) if key in entry.mirror else part
 
 
-def _links_to(link: str, whole: Part) -> list[str]:
+def _links_to(link: str, whole: RobotPart) -> list[str]:
     """Links from the root to one, both included."""
-    return [whole.root, *(joint.child for joint in above(whole, link))]
+    return [whole.root, *(joint.child for joint in chain_to(whole, link))]
 
 
 def _with_sides(
@@ -534,11 +543,11 @@ def _with_sides(
     found: list[Side] = []
     for side in sides:
         key = f"{where}: sides.{side.name}."
-        own = the_fingers(side.fingers, side.thumb, side.hand, flat, key, f"{side.name}_")
+        own = build_fingers(side.fingers, side.thumb, side.hand, flat, key, f"{side.name}_")
         own = [replace(one, joints=_moving(robot, one.link)) for one in own]
         palm, pose = flat.places[side.hand.tip_link]
         names = tuple(one.name for one in own)
-        placement = frozen(pose @ side.hand.tip)
+        placement = read_only(pose @ side.hand.tip)
         arm, hand = side.motors or _motors_of(robot, palm, own, end)
         found.append(Side(side.name, palm, placement, side.thumb, names, arm, hand))
         fingers += own
@@ -568,7 +577,7 @@ def _motors_of(
 
 def _carried(robot: RobotDescription, palm: str, fingers: Iterable[Finger]) -> set[str]:
     """The joints below a palm, and those of fingers."""
-    below_it = {one.name for one in below(robot, palm) if one.type != "fixed"}
+    below_it = {one.name for one in joints_below(robot, palm) if one.type != "fixed"}
     return below_it.union(*(one.joints for one in fingers))
 
 

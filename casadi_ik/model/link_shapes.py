@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from casadi_ik.errors import DescriptionError
-from casadi_ik.files.arrays import Array, frozen
+from casadi_ik.files.arrays import Array, read_only
 from casadi_ik.files.reading import Frame, frame_matrix
-from casadi_ik.model.linkage import known
+from casadi_ik.model.linkage import require_name
 from casadi_ik.model.schema import (
     BoxEntry,
     CapsuleEntry,
@@ -21,7 +21,7 @@ from casadi_ik.model.schema import (
     ShapeEntry,
     SphereEntry,
 )
-from casadi_ik.model.xml_tree import attribute, parse_xml, read_robot_file
+from casadi_ik.model.xml_tree import parse_xml, read_robot_file, required_attribute
 
 
 def srdf_pairs(path: Path) -> list[tuple[tuple[str, str], str]]:
@@ -36,7 +36,7 @@ def srdf_pairs(path: Path) -> list[tuple[tuple[str, str], str]]:
     found: list[tuple[tuple[str, str], str]] = []
     for i, pair in enumerate(element.iter("disable_collisions")):
         where = f"{path}: disable_collisions[{i}]"
-        links = attribute(pair, "link1", where), attribute(pair, "link2", where)
+        links = required_attribute(pair, "link1", where), required_attribute(pair, "link2", where)
         found.append((links, f"{path.name}: {pair.get('reason', 'no reason given')}"))
     return found
 
@@ -121,10 +121,12 @@ class Shapes:
         across = np.diagonal(mirror)[:3]
         return Shapes(
             tuple(
-                replace(one, center=frozen(one.center * across), half=frozen(one.half * across))
+                replace(
+                    one, center=read_only(one.center * across), half=read_only(one.half * across)
+                )
                 for one in self.capsules
             ),
-            tuple(replace(one, pose=frozen(mirror @ one.pose @ mirror)) for one in self.solids),
+            tuple(replace(one, pose=read_only(mirror @ one.pose @ mirror)) for one in self.solids),
             self.touching,
         )
 
@@ -173,7 +175,7 @@ def link_shapes(entry: CollisionEntry | None, links: Iterable[str], path: Path) 
     capsules: list[LinkCapsule] = []
     solids: list[LinkSolid] = []
     for link, shapes in entry.links.items():
-        known(link, names, "link", f"{where}: collision.links.{link}")
+        require_name(link, names, "link", f"{where}: collision.links.{link}")
         for shape in shapes:
             covers = -1
             if isinstance(shape, BoxEntry | CylinderEntry):
@@ -184,7 +186,7 @@ def link_shapes(entry: CollisionEntry | None, links: Iterable[str], path: Path) 
     for i, pair in enumerate(entry.touching):
         key = f"{where}: collision.touching[{i}]"
         for link in pair.links:
-            known(link, names, "link", f"{key}.links")
+            require_name(link, names, "link", f"{key}.links")
         if not pair.reason.strip():
             raise DescriptionError(f"{key}.reason: is empty, expected why they may touch")
         touching.append(Touching(pair.links, pair.reason, pair.depth or math.inf))
@@ -198,10 +200,10 @@ def link_shapes(entry: CollisionEntry | None, links: Iterable[str], path: Path) 
 
 
 def _solid(link: str, shape: BoxEntry | CylinderEntry) -> LinkSolid:
-    pose = frozen(frame_matrix(Frame(shape.xyz, shape.rpy)))
+    pose = read_only(frame_matrix(Frame(shape.xyz, shape.rpy)))
     if isinstance(shape, BoxEntry):
-        return LinkSolid(link, "box", frozen(shape.size), pose)
-    return LinkSolid(link, "cylinder", frozen((shape.radius, shape.length, 0.0)), pose)
+        return LinkSolid(link, "box", read_only(shape.size), pose)
+    return LinkSolid(link, "cylinder", read_only((shape.radius, shape.length, 0.0)), pose)
 
 
 def capsules_of(shape: ShapeEntry) -> list[tuple[Array, Array, float]]:
@@ -213,10 +215,10 @@ def capsules_of(shape: ShapeEntry) -> list[tuple[Array, Array, float]]:
     box.
     """
     if isinstance(shape, SphereEntry):
-        return [(frozen(shape.center), frozen(np.zeros(3)), shape.radius)]
+        return [(read_only(shape.center), read_only(np.zeros(3)), shape.radius)]
     if isinstance(shape, CapsuleEntry):
         one, other = np.array(shape.ends[0]), np.array(shape.ends[1])
-        return [(frozen((one + other) / 2), frozen((other - one) / 2), shape.radius)]
+        return [(read_only((one + other) / 2), read_only((other - one) / 2), shape.radius)]
     pose = frame_matrix(Frame(shape.xyz, shape.rpy))
     if isinstance(shape, CylinderEntry):
         if shape.length < 2 * shape.radius:
@@ -257,4 +259,4 @@ def _bar(
         best = min(best, (volume, inside, radius))
     _, inside, radius = best
     rotation = pose[:3, :3]
-    return frozen(rotation @ center + pose[:3, 3]), frozen(rotation @ axis * inside), radius
+    return read_only(rotation @ center + pose[:3, 3]), read_only(rotation @ axis * inside), radius

@@ -16,7 +16,7 @@ from casadi_ik.files.arrays import Array
 from casadi_ik.model.joints import Joint
 
 
-class Linking(Protocol):
+class TreeEdge(Protocol):
     """What hangs a link on another one."""
 
     @property
@@ -30,7 +30,7 @@ class Linking(Protocol):
         ...
 
 
-class Moving(Linking, Protocol):
+class TypedEdge(TreeEdge, Protocol):
     """The same, of a type: "fixed" or one that moves."""
 
     @property
@@ -39,12 +39,12 @@ class Moving(Linking, Protocol):
         ...
 
 
-L = TypeVar("L", bound=Linking)
-J = TypeVar("J", bound=Moving)
-J_co = TypeVar("J_co", bound=Moving, covariant=True)
+L = TypeVar("L", bound=TreeEdge)
+J = TypeVar("J", bound=TypedEdge)
+J_co = TypeVar("J_co", bound=TypedEdge, covariant=True)
 
 
-class Jointed(Protocol[J_co]):
+class JointTree(Protocol[J_co]):
     """Links held together by joints: a file's, a part's or a robot's."""
 
     @property
@@ -75,7 +75,7 @@ def parents_first(joints: Iterable[L], root: str) -> tuple[L, ...]:
     return tuple(placed)
 
 
-def known(name: str, names: Collection[str], noun: str, where: str) -> str:
+def require_name(name: str, names: Collection[str], noun: str, where: str) -> str:
     """The name of a link or joint, if it is among some.
 
     Raises:
@@ -86,12 +86,12 @@ def known(name: str, names: Collection[str], noun: str, where: str) -> str:
     return name
 
 
-def links_of(tree: Jointed[Moving]) -> tuple[str, ...]:
+def links_of(tree: JointTree[TypedEdge]) -> tuple[str, ...]:
     """All links, the root first."""
     return (tree.root, *(joint.child for joint in tree.joints))
 
 
-def above(tree: Jointed[J], link: str, top: str | None = None) -> list[J]:
+def chain_to(tree: JointTree[J], link: str, top: str | None = None) -> list[J]:
     """The joints down to a link, in order: from the root, or from a link above it."""
     by_child = {joint.child: joint for joint in tree.joints}
     found: list[J] = []
@@ -101,7 +101,7 @@ def above(tree: Jointed[J], link: str, top: str | None = None) -> list[J]:
     return found[::-1]
 
 
-def below(tree: Jointed[J], link: str) -> list[J]:
+def joints_below(tree: JointTree[J], link: str) -> list[J]:
     """All joints that a link carries, directly or not."""
     carried, found = {link}, []
     for joint in tree.joints:
@@ -111,7 +111,7 @@ def below(tree: Jointed[J], link: str) -> list[J]:
     return found
 
 
-def rigid(tree: Jointed[Moving], link: str) -> list[str]:
+def rigid_links(tree: JointTree[TypedEdge], link: str) -> list[str]:
     """A link and all that is fixed to it below."""
     found = [link]
     for joint in tree.joints:
@@ -120,24 +120,24 @@ def rigid(tree: Jointed[Moving], link: str) -> list[str]:
     return found
 
 
-def moving_below(tree: Jointed[J], link: str) -> list[J]:
+def moving_below(tree: JointTree[J], link: str) -> list[J]:
     """The first moving joints below a link, those behind fixed ones included."""
-    carried = rigid(tree, link)
+    carried = rigid_links(tree, link)
     return [one for one in tree.joints if one.type != "fixed" and one.parent in carried]
 
 
-def depth(tree: Jointed[Moving], link: str) -> int:
+def joint_depth(tree: JointTree[TypedEdge], link: str) -> int:
     """The most moving joints in a row below a link."""
-    return max((1 + depth(tree, one.child) for one in moving_below(tree, link)), default=0)
+    return max((1 + joint_depth(tree, one.child) for one in moving_below(tree, link)), default=0)
 
 
-def ends(tree: Jointed[Moving], link: str) -> list[str]:
+def leaf_links(tree: JointTree[TypedEdge], link: str) -> list[str]:
     """The links below a link that carry nothing."""
     parents = {joint.parent for joint in tree.joints}
-    return [joint.child for joint in below(tree, link) if joint.child not in parents]
+    return [joint.child for joint in joints_below(tree, link) if joint.child not in parents]
 
 
-def rigid_bodies(tree: Jointed[Moving]) -> tuple[dict[str, str], set[frozenset[str]]]:
+def rigid_bodies(tree: JointTree[TypedEdge]) -> tuple[dict[str, str], set[frozenset[str]]]:
     """By link the link it is fixed to that moves, or the root; and which of these share a joint."""
     bodies, neighbours = {tree.root: tree.root}, set()
     for joint in tree.joints:
@@ -185,12 +185,12 @@ def link_poses(
     for joint in joints:
         pose = poses[joint.parent] @ joint.placement
         if joint.name in values:
-            pose = pose @ motion(joint.type, joint.axis, values[joint.name])
+            pose = pose @ joint_motion(joint.type, joint.axis, values[joint.name])
         poses[joint.child] = pose
     return poses
 
 
-def motion(kind: str, axis: Array, positions: ArrayLike) -> Array:
+def joint_motion(kind: str, axis: Array, positions: ArrayLike) -> Array:
     """(4, 4) or (k, 4, 4): what a joint of a type does at positions () or (k,) [rad or m]."""
     value = np.asarray(positions, dtype=float)[..., None, None]
     moved = np.zeros((*value.shape[:-2], 4, 4)) + np.eye(4)

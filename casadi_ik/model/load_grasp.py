@@ -16,15 +16,15 @@ from casadi_ik.files.reading import (
     Point,
     Struct,
     Vector,
-    checked,
     frame_matrix,
     parse_yaml,
     read,
     roll_pitch_yaw,
+    validated,
 )
-from casadi_ik.files.shipped import resolve, shipped_names
-from casadi_ik.files.units import AnyValue, Length, Turn
-from casadi_ik.model.grasp import MORE, Contact, Grasp, Tolerance
+from casadi_ik.files.shipped import resolve_description, shipped_names
+from casadi_ik.files.units import Angle, AnyValue, Length
+from casadi_ik.model.grasp import EXTRA_VECTORS, Contact, Grasp, Tolerance
 
 
 class ToleranceEntry(Struct, frozen=True):
@@ -36,7 +36,7 @@ class ToleranceEntry(Struct, frozen=True):
     """
 
     position: Length = Tolerance.position
-    angle: Turn = Tolerance.angle
+    angle: Angle = Tolerance.angle
 
 
 class ContactEntry(Struct, frozen=True):
@@ -64,7 +64,7 @@ class ContactEntry(Struct, frozen=True):
     direction: Vector | None = None
 
 
-class ObjectEntry(Struct, frozen=True):
+class GraspedObjectEntry(Struct, frozen=True):
     """The object that is grasped and where it is.
 
     Attributes:
@@ -93,7 +93,7 @@ class GraspFile(Struct, frozen=True):
     contacts: dict[str, ContactEntry] = msgspec.field(default_factory=dict)
     robot: str = ""
     description: str = ""
-    object: ObjectEntry | None = None
+    object: GraspedObjectEntry | None = None
     posture: dict[str, AnyValue] = msgspec.field(default_factory=dict)
     palm: Frame | None = None
     palms: dict[str, Frame] = msgspec.field(default_factory=dict)
@@ -113,12 +113,12 @@ def load_grasp(name_or_path: str | Path) -> Grasp:
         >>> ik.load_grasp("cup").robot
         'kuka_lwr_barrett'
     """
-    path = resolve(name_or_path, "grasps")
+    path = resolve_description(name_or_path, "grasps")
     entry, _ = read(path, GraspFile)
-    return grasp_of(entry, path, path.stem)
+    return grasp_from_entry(entry, path, path.stem)
 
 
-def grasp_of(entry: GraspFile, path: Path, name: str, where: str = "") -> Grasp:
+def grasp_from_entry(entry: GraspFile, path: Path, name: str, where: str = "") -> Grasp:
     """A grasp as a file has it.
 
     Args:
@@ -165,11 +165,11 @@ def _contact(entry: ContactEntry) -> Contact:
     return Contact(**given)
 
 
-def grasp_data(grasp: Grasp) -> dict[str, Any]:
+def grasp_to_dict(grasp: Grasp) -> dict[str, Any]:
     """A grasp as a file has it, to the last digit; what comes before and after it is left out."""
     contacts: dict[str, dict[str, Any]] = {}
     for finger, contact in grasp.contacts.items():
-        given = {key: getattr(contact, key) for key in ("point", "normal", *MORE)}
+        given = {key: getattr(contact, key) for key in ("point", "normal", *EXTRA_VECTORS)}
         if np.isnan(contact.point).any():
             given = {"direction": contact.normal}
         entry: dict[str, Any] = {
@@ -230,7 +230,7 @@ class CandidatesFile(Struct, frozen=True):
     candidates: list[GraspFile]
     robot: str = ""
     description: str = ""
-    object: ObjectEntry | None = None
+    object: GraspedObjectEntry | None = None
 
 
 def load_grasp_files(path: Path) -> tuple[Grasp, ...]:
@@ -255,7 +255,7 @@ def _of_file(path: Path) -> tuple[Grasp, ...]:
     raw = parse_yaml(path)
     if not (isinstance(raw, dict) and "candidates" in raw):
         return (load_grasp(path),)
-    file, _ = checked(raw, CandidatesFile, path)
+    file, _ = validated(raw, CandidatesFile, path)
     if not file.candidates:
         raise DescriptionError(f"{path}: candidates: found none, expected at least one grasp")
     found = []
@@ -263,5 +263,5 @@ def _of_file(path: Path) -> tuple[Grasp, ...]:
         whole = msgspec.structs.replace(
             entry, robot=entry.robot or file.robot, object=entry.object or file.object
         )
-        found.append(grasp_of(whole, path, f"{path.stem}[{i}]", f"candidates[{i}]."))
+        found.append(grasp_from_entry(whole, path, f"{path.stem}[{i}]", f"candidates[{i}]."))
     return tuple(found)

@@ -10,22 +10,27 @@ import msgspec
 import numpy as np
 
 from casadi_ik.errors import DescriptionError
-from casadi_ik.files.arrays import Array, frozen
-from casadi_ik.files.reading import Frame, checked, frame_matrix, parse_yaml, read
-from casadi_ik.files.shipped import BODIES, resolve_robot
+from casadi_ik.files.arrays import Array, read_only
+from casadi_ik.files.reading import Frame, frame_matrix, parse_yaml, read, validated
+from casadi_ik.files.shipped import BODIES_FOLDER, resolve_robot
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.imported_parts import hand_from_file
 from casadi_ik.model.joining import (
-    a_part,
+    assign_wrist_to_arm,
     body_from_file,
     body_from_parts,
+    build_fingers,
     fixed_joint,
-    joined,
-    the_fingers,
-    with_wrist,
+    join_parts,
+    load_part,
 )
 from casadi_ik.model.link_shapes import link_shapes
-from casadi_ik.model.parts import Part, described_part, told_apart, usable
+from casadi_ik.model.parts import (
+    RobotPart,
+    part_from_file,
+    prefix_shared_names,
+    require_usable_name,
+)
 from casadi_ik.model.schema import (
     ArmFile,
     ArmHandFile,
@@ -58,7 +63,7 @@ def load_description(name_or_path: str | Path) -> RobotDescription:
     if not isinstance(found, tuple):
         return _robot(found)
     first, hand = found
-    if first is None or first.parent.name != BODIES:
+    if first is None or first.parent.name != BODIES_FOLDER:
         return _pair(first, hand)
     body, units = read(first, BodyFile)
     if hand is None:
@@ -67,7 +72,7 @@ def load_description(name_or_path: str | Path) -> RobotDescription:
     return body_from_parts(named, first, units, hand.stem)
 
 
-FLANGE = Part(
+FLANGE = RobotPart(
     *("flange", "flange: ", "flange"),
     *([], [], {}, "flange", np.eye(4), {}),
     pads={"flange": PadEntry(link="flange", normal=(0.0, 0.0, 1.0))},
@@ -79,9 +84,9 @@ def _pair(arm_path: Path | None, hand_path: Path | None) -> RobotDescription:
     """A shipped arm with a shipped hand, as their files say that they are put together."""
     arm, hand = None, FLANGE
     if arm_path is not None:
-        arm = described_part(read(arm_path, ArmFile)[0], arm_path)
+        arm = part_from_file(read(arm_path, ArmFile)[0], arm_path)
     if hand_path is not None:
-        hand = described_part(read(hand_path, HandFile)[0], hand_path)
+        hand = part_from_file(read(hand_path, HandFile)[0], hand_path)
     name = "+".join(path.stem for path in (arm_path, hand_path) if path is not None)
     return _arm_hand(name, arm, hand.mount, hand, list(hand.pads), hand.thumb, {}, {}, {}, name)
 
@@ -98,7 +103,7 @@ def file_type(raw: Any) -> type[ArmHandFile | ImportedFile | BodyFile | Imported
 
 def _robot(path: Path) -> RobotDescription:
     raw = parse_yaml(path)
-    top, units = checked(raw, file_type(raw), path)
+    top, units = validated(raw, file_type(raw), path)
     if isinstance(top, BodyFile):
         robot = body_from_parts(top, path, units)
     elif isinstance(top, ImportedBody):
@@ -112,10 +117,10 @@ def _robot(path: Path) -> RobotDescription:
 
 
 def _on_arm(top: ArmHandFile | ImportedFile, units: dict[str, str], path: Path) -> RobotDescription:
-    usable(top.name, f"{path}: name")
-    arm = None if top.arm is None else a_part(top.arm, "arm", path)
+    require_usable_name(top.name, f"{path}: name")
+    arm = None if top.arm is None else load_part(top.arm, "arm", path)
     if isinstance(top, ArmHandFile):
-        hand = a_part(top.hand, "hand", path)
+        hand = load_part(top.hand, "hand", path)
     else:
         entry, key = top.hand or top.robot, "hand" if top.hand else "robot"
         if entry is None or (top.hand and top.robot):
@@ -124,7 +129,7 @@ def _on_arm(top: ArmHandFile | ImportedFile, units: dict[str, str], path: Path) 
             raise DescriptionError(f"{path}: arm: found beside 'robot', which has its own")
         hand = hand_from_file(entry, top.fingers, key, path)
     if arm is None and top.mount != Frame():
-        arm = Part("base", f"{path}: ", "base", [], [], {}, "base", np.eye(4), {})
+        arm = RobotPart("base", f"{path}: ", "base", [], [], {}, "base", np.eye(4), {})
     return _arm_hand(
         *(top.name, arm, frame_matrix(top.mount), hand, list(top.fingers), top.thumb),
         *(top.home, units, top.sources, str(path)),
@@ -133,9 +138,9 @@ def _on_arm(top: ArmHandFile | ImportedFile, units: dict[str, str], path: Path) 
 
 def _arm_hand(
     name: str,
-    arm: Part | None,
+    arm: RobotPart | None,
     mount: Array,
-    hand: Part,
+    hand: RobotPart,
     fingers: list[str],
     thumb: str | None,
     home: dict[str, float],
@@ -145,8 +150,8 @@ def _arm_hand(
 ) -> RobotDescription:
     """The robot of an arm (if there is one) and a hand on it."""
     if arm is not None:
-        hand = told_apart(hand, arm)
-    hand = with_wrist(hand)
+        hand = prefix_shared_names(hand, arm)
+    hand = assign_wrist_to_arm(hand)
     joints, root, parts = list(hand.joints), hand.root, [(hand.name, hand)]
     if arm is not None:
         fixed = fixed_joint("mount", arm.tip_link, hand.root, arm.tip @ mount)
@@ -154,13 +159,13 @@ def _arm_hand(
         parts.insert(0, (arm.name, arm))
     home = home or {motor: at for _, part in parts for motor, at in part.home.items()}
     palms = {hand.tip_link}
-    robot, flat = joined(name, root, joints, parts, palms, home, units, sources, where)
+    robot, flat = join_parts(name, root, joints, parts, palms, home, units, sources, where)
     if thumb is None and hand.thumb in fingers:
         thumb = hand.thumb
     return replace(
         robot,
-        fingers=the_fingers(fingers, thumb, hand, flat, f"{where}: "),
+        fingers=build_fingers(fingers, thumb, hand, flat, f"{where}: "),
         named_thumb=thumb,
         palm_link=hand.tip_link,
-        palm_placement=frozen(hand.tip),
+        palm_placement=read_only(hand.tip),
     )

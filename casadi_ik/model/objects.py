@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.reading import Struct, read
-from casadi_ik.files.shipped import resolve
+from casadi_ik.files.shipped import resolve_description
 from casadi_ik.files.units import Factor, Mass
-from casadi_ik.model.parts import known_source
+from casadi_ik.model.parts import require_source
 from casadi_ik.model.shapes import Mesh, MeshShape, Shape, load_mesh_shape
 from casadi_ik.model.urdf_body import BODY_FORMATS
 
@@ -121,15 +121,15 @@ def load_object(name_or_path: str | Path) -> GraspObject:
         UnknownNameError: No shipped object has that name.
         DescriptionError: The file is missing or malformed; the message names file and key.
     """
-    if is_mesh(name_or_path):
+    if is_mesh_name(name_or_path):
         return _of_mesh(str(name_or_path))
-    path = resolve(name_or_path, "objects")
+    path = resolve_description(name_or_path, "objects")
     entry, _ = read(path, ObjectFile)
     problem = entry.shape.check()
     if problem:
         raise DescriptionError(f"{path}: shape.{problem}")
     for key, tags in (("shape", entry.shape.source), ("mass", entry.mass.source)):
-        known_source(tags, entry.sources, f"{path}: {key}.source")
+        require_source(tags, entry.sources, f"{path}: {key}.source")
     shape = entry.shape
     if isinstance(shape, MeshFileEntry):
         names = [shape.file] if isinstance(shape.file, str) else shape.file
@@ -140,7 +140,7 @@ def load_object(name_or_path: str | Path) -> GraspObject:
     )
 
 
-def is_mesh(name: str | Path) -> bool:
+def is_mesh_name(name: str | Path) -> bool:
     """Return whether an object's name is that of meshes or URDFs."""
     files, _, _ = _mesh_words(str(name))
     return all(file.lower().endswith(BODY_FORMATS) for file in files)

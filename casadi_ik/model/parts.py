@@ -11,13 +11,13 @@ import msgspec
 import numpy as np
 
 from casadi_ik.errors import DescriptionError
-from casadi_ik.files.arrays import Array, frozen
+from casadi_ik.files.arrays import Array, read_only
 from casadi_ik.files.limits import LIMITS
 from casadi_ik.files.reading import frame_matrix
 from casadi_ik.model.couplings import Linear
 from casadi_ik.model.joints import Actuator, Joint
 from casadi_ik.model.link_shapes import NO_SHAPES, Shapes, link_shapes
-from casadi_ik.model.linkage import known, links_of, parents_first
+from casadi_ik.model.linkage import links_of, parents_first, require_name
 from casadi_ik.model.schema import ActuatorEntry, ArmFile, HandFile, JointEntry, PadEntry
 
 
@@ -83,17 +83,17 @@ def _check_coupling(
         )
 
 
-def unique(names: Iterable[str], where: str) -> None:
+def require_unique(names: Iterable[str], where: str) -> None:
     """Refuse a name that appears twice."""
     seen: set[str] = set()
     for name in names:
-        usable(name, where)
+        require_usable_name(name, where)
         if name in seen:
             raise DescriptionError(f"{where}: {name!r} appears twice")
         seen.add(name)
 
 
-def usable(name: str, where: str) -> None:
+def require_usable_name(name: str, where: str) -> None:
     """Refuse a name that is empty, or too long to be read in a table or a file's name."""
     if not 0 < len(name) <= LIMITS.name_text:
         raise DescriptionError(
@@ -101,7 +101,7 @@ def usable(name: str, where: str) -> None:
         )
 
 
-def known_source(tags: str, sources: dict[str, str], where: str) -> None:
+def require_source(tags: str, sources: dict[str, str], where: str) -> None:
     """Refuse source tags (separated by blanks or commas) that are empty or not explained."""
     for tag in tags.replace(",", " ").split():
         if tag not in sources:
@@ -110,12 +110,12 @@ def known_source(tags: str, sources: dict[str, str], where: str) -> None:
         raise DescriptionError(f"{where}: is empty; every number needs its source")
 
 
-PREFIX = "hand_"
+HAND_PREFIX = "hand_"
 """Put before a name of the hand that the arm has as well."""
 
 
 @dataclass(frozen=True)
-class Part:
+class RobotPart:
     """An arm or a hand.
 
     Attributes:
@@ -159,8 +159,8 @@ class Part:
         return {one.name for one in (*self.joints, *self.actuators)}
 
 
-def told_apart(hand: Part, arm: Part) -> Part:
-    """The hand, with `PREFIX` before every name of a link, joint or motor that the arm has too."""
+def prefix_shared_names(hand: RobotPart, arm: RobotPart) -> RobotPart:
+    """Return the hand with `HAND_PREFIX` before every name that the arm has too."""
     movers = arm.movers | {"mount"}
     return _renamed(
         hand,
@@ -169,7 +169,7 @@ def told_apart(hand: Part, arm: Part) -> Part:
     )
 
 
-def of_side(part: Part, side: str, shared: str | None = None) -> Part:
+def prefix_side(part: RobotPart, side: str, shared: str | None = None) -> RobotPart:
     """The part, with the side's name before all names that do not begin with it.
 
     Args:
@@ -186,7 +186,7 @@ def of_side(part: Part, side: str, shared: str | None = None) -> Part:
     return replace(named, pads={own(name): pad for name, pad in named.pads.items()}, thumb=thumb)
 
 
-def mirrored(part: Part) -> Part:
+def mirrored(part: RobotPart) -> RobotPart:
     """The part's mirror image, left for right: y is turned round in its root's frame.
 
     Every frame of it is mirrored in its own y. A joint turns about the mirrored axis; where the
@@ -198,13 +198,13 @@ def mirrored(part: Part) -> Part:
     turned: set[str] = set()
     joints = []
     for joint in part.joints:
-        axis = joint.axis * ACROSS
+        axis = joint.axis * MIRROR_SIGNS
         if joint.type == "revolute":
             axis = -axis
         if joint.type != "fixed" and axis @ joint.axis < 0 and joint.name not in stays:
             axis = -axis
             turned.add(joint.name)
-        joints.append(replace(joint, axis=frozen(axis), placement=_mirrored(joint.placement)))
+        joints.append(replace(joint, axis=read_only(axis), placement=_mirrored(joint.placement)))
     # A motor that is no joint runs with those that follow it.
     followed = {j.coupling.of for j in joints if j.coupling is not None and j.name in turned}
     turned |= followed - {joint.name for joint in joints}
@@ -223,13 +223,13 @@ def mirrored(part: Part) -> Part:
     )
 
 
-ACROSS = np.array([1.0, -1.0, 1.0])
+MIRROR_SIGNS = np.array([1.0, -1.0, 1.0])
 """What a vector is multiplied by in the mirror."""
 
 
 def _mirrored(pose: Array) -> Array:
-    mirror = np.diag([*ACROSS, 1.0])
-    return frozen(mirror @ pose @ mirror)
+    mirror = np.diag([*MIRROR_SIGNS, 1.0])
+    return read_only(mirror @ pose @ mirror)
 
 
 def _mirrored_pad(pad: PadEntry) -> PadEntry:
@@ -256,7 +256,7 @@ def _run_back(joint: Joint, turned: set[str]) -> Joint:
     return replace(joint, coupling=coupling, lower=lower, upper=upper)
 
 
-def _renamed(part: Part, link: Callable[[str], str], mover: Callable[[str], str]) -> Part:
+def _renamed(part: RobotPart, link: Callable[[str], str], mover: Callable[[str], str]) -> RobotPart:
     """The part with other names of links, and of joints and motors."""
     joints = [
         replace(
@@ -288,14 +288,14 @@ def _free(name: str, taken: Collection[str], own: Collection[str]) -> str:
     if name not in taken:
         return name
     while name in taken or name in own:
-        name = PREFIX + name
+        name = HAND_PREFIX + name
     return name
 
 
 JOINT_TYPES = ("revolute", "prismatic", "fixed")
 
 
-def described_part(file: ArmFile | HandFile, path: Path) -> Part:
+def part_from_file(file: ArmFile | HandFile, path: Path) -> RobotPart:
     """An arm or a hand of a file of ours, checked.
 
     Args:
@@ -310,13 +310,13 @@ def described_part(file: ArmFile | HandFile, path: Path) -> Part:
     joints = _joints(file.joints, file.root, file.sources, kind, path)
     motors = _actuators(file.actuators if hand else None, joints, file.sources, kind, path)
     links = (file.root, *(joint.child for joint in joints))
-    known(end.link, links, "link", f"{path}: {key}.link")
-    known_source(end.source, file.sources, f"{path}: {key}.source")
+    require_name(end.link, links, "link", f"{path}: {key}.link")
+    require_source(end.source, file.sources, f"{path}: {key}.source")
     for name, finger in file.fingers.items() if hand else ():
-        known_source(finger.source, file.sources, f"{path}: fingers.{name}.source")
+        require_source(finger.source, file.sources, f"{path}: fingers.{name}.source")
     if file.collision is not None and file.collision.links:
-        known_source(file.collision.source, file.sources, f"{path}: collision.source")
-    part = Part(
+        require_source(file.collision.source, file.sources, f"{path}: collision.source")
+    part = RobotPart(
         file.name,
         f"{path}: ",
         file.root,
@@ -338,8 +338,8 @@ def _joints(
 ) -> list[Joint]:
     """Checked joints, parents before children."""
     names = [entry.name for entry in entries]
-    unique(names, f"{path}: joints")
-    unique([root, *(entry.child for entry in entries)], f"{path}: joints: child links")
+    require_unique(names, f"{path}: joints")
+    require_unique([root, *(entry.child for entry in entries)], f"{path}: joints: child links")
     for entry in entries:
         where = f"{path}: joint {entry.name!r}"
         if entry.type not in JOINT_TYPES:
@@ -351,7 +351,7 @@ def _joints(
             raise DescriptionError(f"{where}: limits: lower {low:.6g} is above upper {high:.6g}")
         if not np.linalg.norm(entry.axis) > 1e-9:
             raise DescriptionError(f"{where}: axis: is zero, expected a direction")
-        known_source(entry.source, sources, f"{where}: source")
+        require_source(entry.source, sources, f"{where}: source")
         if entry.coupling is not None:
             entry.coupling.check(f"{where}: coupling")
     ordered = parents_first(entries, root)
@@ -373,8 +373,8 @@ def _joint(entry: JointEntry, part: str) -> Joint:
         parent=entry.parent,
         child=entry.child,
         type=entry.type,
-        placement=frozen(frame_matrix(entry.origin)),
-        axis=frozen(axis / np.linalg.norm(axis)),
+        placement=read_only(frame_matrix(entry.origin)),
+        axis=read_only(axis / np.linalg.norm(axis)),
         lower=entry.limits[0],
         upper=entry.limits[1],
         velocity=entry.velocity or math.inf,
@@ -413,7 +413,7 @@ def _actuators(
         velocity = entry.velocity or (joint.velocity if joint else math.inf)
         effort = entry.effort or (joint.effort if joint else math.inf)
         if entry.source or joint is None:
-            known_source(entry.source, sources, f"{where}: source")
+            require_source(entry.source, sources, f"{where}: source")
         unit = ("m" if joint.type == "prismatic" else "rad") if joint else entry.unit
         actuators.append(Actuator(name, unit, low, high, velocity, part, effort))
     check_couplings(by_name, actuators, path)

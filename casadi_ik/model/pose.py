@@ -52,7 +52,7 @@ def inverse(pose: Array) -> Array:
     return back
 
 
-def moved(arrays: Mapping[str, Array], pose: Array) -> dict[str, Array]:
+def transform_arrays(arrays: Mapping[str, Array], pose: Array) -> dict[str, Array]:
     """Points and directions, (..., 3) each, from a frame at a pose into the base frame.
 
     Args:

@@ -204,7 +204,7 @@ class PadEntry(Frame, frozen=True, kw_only=True):
     pad: BallPad | PlanePad = PlanePad()
 
 
-class ContactEntry(PadEntry, frozen=True, kw_only=True):
+class FingertipEntry(PadEntry, frozen=True, kw_only=True):
     """The contact frame of a finger of a described hand; see `PadEntry`.
 
     Attributes:
@@ -269,7 +269,7 @@ class HandFile(_Part, frozen=True, kw_only=True):
     """
 
     palm: LinkFrame
-    fingers: dict[str, ContactEntry]
+    fingers: dict[str, FingertipEntry]
     actuators: dict[str, ActuatorEntry] | None = None
     thumb: str | None = None
     mount: Frame = Frame()

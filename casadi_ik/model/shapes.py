@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.files.input_checks.units import warn_of_large_mesh
-from casadi_ik.files.limits import LIMITS, limit, raised_to
+from casadi_ik.files.limits import LIMITS, raise_hint, scaled_limit
 from casadi_ik.files.units import Size
 from casadi_ik.model.urdf_body import read_body
 
@@ -434,9 +434,9 @@ def load_mesh_shape(files: Sequence[Path], scale: float, where: str) -> MeshShap
         if len(single) < len(triangles):
             notes.append(f"{len(triangles) - len(single):,} triangles were there twice: used once")
         pieces += pieces_of(points, single)
-    if len(pieces) > limit(LIMITS.object_pieces):
-        hint = raised_to(len(pieces), LIMITS.object_pieces)
-        most = f"at most {limit(LIMITS.object_pieces)} {hint}"
+    if len(pieces) > scaled_limit(LIMITS.object_pieces):
+        hint = raise_hint(len(pieces), LIMITS.object_pieces)
+        most = f"at most {scaled_limit(LIMITS.object_pieces)} {hint}"
         raise DescriptionError(f"{where}: found {len(pieces)} pieces, expected {most}")
     return MeshShape(tuple(pieces), tuple(notes))
 

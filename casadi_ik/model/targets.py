@@ -14,7 +14,7 @@ from casadi_ik.files.input_checks.poses import checked_pose
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.grasp import Tolerance, real_array, unit_vectors
 
-LIMITS = ("enforce", "ignore")
+LIMIT_MODES = ("enforce", "ignore")
 """How joint limits are taken: as part of being solved, or not at all (the paper's reading)."""
 
 
@@ -193,7 +193,7 @@ def fixed_array(
     return values
 
 
-DIRECTIONS = "directions"
+DIRECTIONS_KEY = "directions"
 """Name of the array of contacts that are a direction alone."""
 
 
@@ -226,7 +226,7 @@ def target_arrays(
     arrays = []
     given = {"points": points, "normals": normals}
     if directions is not None:
-        given[DIRECTIONS] = directions
+        given[DIRECTIONS_KEY] = directions
     for name, value in given.items():
         try:
             array = real_array(value)
@@ -256,9 +256,11 @@ def target_arrays(
     _refuse(placeless, first_row, "normals", "is given for a finger without a point")
     if lone:
         ways, zero = unit_vectors(lone[0])
-        _refuse(zero, first_row, DIRECTIONS, "is zero, expected a direction")
+        _refuse(zero, first_row, DIRECTIONS_KEY, "is zero, expected a direction")
         faces = ~np.isnan(ways[..., 0])
-        _refuse(faces & ~free_point, first_row, DIRECTIONS, "has a point too, expected it alone")
+        _refuse(
+            faces & ~free_point, first_row, DIRECTIONS_KEY, "has a point too, expected it alone"
+        )
         unit = np.where(faces[..., None], ways, unit)
         free_point = free_point & ~faces
     empty = np.flatnonzero(free_point.all(axis=1))

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.limits import LIMITS
-from casadi_ik.files.number_files import FORMATS, read_mesh
+from casadi_ik.files.number_files import MESH_FORMATS, read_mesh
 from casadi_ik.model.sandbox import package_folders
-from casadi_ik.model.xml_tree import parse_xml, pose_of, read_robot_file, values_of
+from casadi_ik.model.xml_tree import origin_pose, parse_numbers, parse_xml, read_robot_file
 
-BODY_FORMATS = (*FORMATS, ".urdf")
+BODY_FORMATS = (*MESH_FORMATS, ".urdf")
 """Endings of files that bound a body by triangles."""
 
 Triangles = tuple[Array, NDArray[np.int64]]
@@ -79,7 +79,7 @@ def _link_poses(root: Element, path: Path) -> dict[str, Array]:
 
 
 def _pose(element: Element, path: Path) -> Array:
-    pose = pose_of(element)
+    pose = origin_pose(element)
     if pose is None:
         raise DescriptionError(f"{path}: <{element.tag}>: its origin is not six finite numbers")
     return pose
@@ -96,7 +96,7 @@ def _geometry(element: Element, path: Path) -> Triangles:
     file = _mesh_file(name, path)
     if file is None:
         raise DescriptionError(f"{path}: no such mesh {name!r}, expected it beside the URDF")
-    scale = values_of(shape.get("scale", "1 1 1"))
+    scale = parse_numbers(shape.get("scale", "1 1 1"))
     sizes = sorted(map(abs, scale)) or [0.0]
     if len(scale) != 3 or not 0 < sizes[0] <= sizes[-1] <= LIMITS.mesh_coordinate:
         raise DescriptionError(f"{path}: {name}: scale: expected three numbers that are not zero")
@@ -111,7 +111,7 @@ def _simple(shape: Element, path: Path) -> Triangles:
 
     create = trimesh.creation
     keys = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length")}
-    size = [value for key in keys.get(shape.tag, ()) for value in values_of(shape.get(key, ""))]
+    size = [value for key in keys.get(shape.tag, ()) for value in parse_numbers(shape.get(key, ""))]
     expected = {"box": 3, "sphere": 1, "cylinder": 2}.get(shape.tag)
     if len(size) != expected or not min(size) > 0:
         raise DescriptionError(

@@ -24,36 +24,38 @@ import numpy as np
 
 from casadi_ik.errors import DescriptionError, MissingExtraError, os_errors
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.limits import LIMITS, RAISED, limit
+from casadi_ik.files.limits import LIMITS, RAISE_HINT, scaled_limit
 from casadi_ik.model import sandbox as foreign
 from casadi_ik.model.couplings import Coupling, Linear, Polynomial
-from casadi_ik.model.linkage import motion, parents_first
+from casadi_ik.model.linkage import joint_motion, parents_first
 from casadi_ik.model.xml_tree import (
     Element,
     RobotTree,
     TreeJoint,
-    attribute,
     check_size,
     check_vector,
-    fixed,
+    finite_number,
+    fixed_tree_joint,
     mjcf_pose,
     mjcf_shapes,
-    number,
+    origin_pose,
     parse_xml,
-    pose_of,
     read_robot_file,
+    required_attribute,
     urdf_shapes,
 )
 
-MACROS = "xacro"
-MODEL = "mujoco"
+XACRO_READER = "xacro"
+MJCF_READER = "mujoco"
 
 
-def confined(what: str, path: Path, arguments: Sequence[str] = ()) -> tuple[bytes, tuple[str, ...]]:
+def run_sandbox(
+    what: str, path: Path, arguments: Sequence[str] = ()
+) -> tuple[bytes, tuple[str, ...]]:
     """What a file becomes.
 
     Args:
-        what: `MACROS`: the text with its macros expanded. `MODEL`: MuJoCo's model as it saves one.
+        what: `XACRO_READER` (text with expanded macros) or `MJCF_READER` (MuJoCo's saved model).
         path: The file.
         arguments: Values of its arguments, NAME:=VALUE, if it has macros.
 
@@ -62,10 +64,13 @@ def confined(what: str, path: Path, arguments: Sequence[str] = ()) -> tuple[byte
         MissingExtraError: xacro or MuJoCo is not installed.
     """
     if find_spec(what) is None:
-        noun = "has xacro macros" if what == MACROS else "is MJCF"
+        noun = "has xacro macros" if what == XACRO_READER else "is MJCF"
         raise MissingExtraError(f"{path}: {noun}; to read it: pip install 'casadi-ik[{what}]'")
-    seconds, doing = limit(LIMITS.reader_seconds), "expand" if what == MACROS else "read"
-    limits = (seconds, limit(LIMITS.reader_memory), limit(LIMITS.reader_output))
+    seconds, doing = (
+        scaled_limit(LIMITS.reader_seconds),
+        "expand" if what == XACRO_READER else "read",
+    )
+    limits = (seconds, scaled_limit(LIMITS.reader_memory), scaled_limit(LIMITS.reader_output))
     # Not the script's folder, whose modules are called as some of others are.
     script, place = Path(foreign.__file__).resolve(), path.resolve()
     command = [sys.executable, "-P", str(script), what, str(place), *map(str, limits), *arguments]
@@ -91,7 +96,7 @@ def confined(what: str, path: Path, arguments: Sequence[str] = ()) -> tuple[byte
     if code == 0:
         notes, _, content = said.partition(b"\n")
         return content, tuple(f"{path.name}: {note}" for note in json.loads(notes))
-    reason = f"takes more than {seconds} s of computing or {limits[1] >> 20} MiB {RAISED}"
+    reason = f"takes more than {seconds} s of computing or {limits[1] >> 20} MiB {RAISE_HINT}"
     if code == foreign.REFUSED:
         reason = " ".join(said.decode(errors="replace").split())
     raise DescriptionError(f"{path}: {what} cannot {doing} it: {reason}")
@@ -112,7 +117,7 @@ def mujoco_model(path: Path) -> tuple[Any, Any, tuple[str, ...]]:
         DescriptionError: MuJoCo cannot read it.
         MissingExtraError: MuJoCo is not installed.
     """
-    saved, notes = confined(MODEL, path)
+    saved, notes = run_sandbox(MJCF_READER, path)
     import mujoco
 
     library: Any = mujoco  # its types are made when it is imported
@@ -163,7 +168,7 @@ def _of_body(
     parent = names[model.body_parentid[body]]
     first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
     if count == 0:
-        return [fixed(f"{names[body]}_fixed", parent, names[body], placement)]
+        return [fixed_tree_joint(f"{names[body]}_fixed", parent, names[body], placement)]
     found: list[TreeJoint] = []
     for joint in range(first, first + count):
         last = joint == first + count - 1
@@ -184,7 +189,7 @@ def _of_body(
         zero = float(model.qpos0[model.jnt_qposadr[joint]])
         if kind in ("revolute", "continuous"):
             # The axis goes through the anchor: the link's frame is there while the joint turns.
-            pose = placement @ anchor @ motion("revolute", axis, -zero)
+            pose = placement @ anchor @ joint_motion("revolute", axis, -zero)
             after: Array = np.asarray(np.linalg.inv(anchor), dtype=np.float64)
         else:
             pose, after = placement.copy(), np.eye(4)
@@ -198,7 +203,7 @@ def _of_body(
             TreeJoint(name, parent, carried, kind, pose, axis, limits, math.inf, coupling, effort)
         )
         if not still:
-            found.append(fixed(f"{name}_anchor", carried, child, after))
+            found.append(fixed_tree_joint(f"{name}_anchor", carried, child, after))
         parent, placement = child, np.eye(4)
     return found
 
@@ -289,7 +294,7 @@ def _tendons(
     return motors
 
 
-KINDS = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
+URDF_JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 
 
 def read_urdf(element: Element, path: Path) -> RobotTree:
@@ -302,10 +307,12 @@ def read_urdf(element: Element, path: Path) -> RobotTree:
     Raises:
         DescriptionError: It describes no tree, or nonsense; the message names file and joint.
     """
-    links = [attribute(link, "name", f"{path}: a link") for link in element.findall("link")]
+    links = [
+        required_attribute(link, "name", f"{path}: a link") for link in element.findall("link")
+    ]
     elements = element.findall("joint")
     check_size(len(links), sum(one.get("type") != "fixed" for one in elements), path)
-    names = [attribute(joint, "name", f"{path}: a joint") for joint in elements]
+    names = [required_attribute(joint, "name", f"{path}: a joint") for joint in elements]
     _once(links, "link", path)
     _once(names, "joint", path)
     joints = dict(zip(names, elements, strict=True))
@@ -328,10 +335,12 @@ def _once(names: list[str], noun: str, path: Path) -> None:
 def _check(joint: Element, links: list[str], where: str) -> None:
     """Everything that pinocchio would refuse without saying where."""
     kind = joint.get("type")
-    if kind not in KINDS:
-        raise DescriptionError(f"{where}: type: found {kind!r}, expected one of {', '.join(KINDS)}")
+    if kind not in URDF_JOINT_TYPES:
+        raise DescriptionError(
+            f"{where}: type: found {kind!r}, expected one of {', '.join(URDF_JOINT_TYPES)}"
+        )
     for end in ("parent", "child"):
-        link = attribute(joint.find(end), "link", f"{where}: {end}")
+        link = required_attribute(joint.find(end), "link", f"{where}: {end}")
         if link not in links:
             raise DescriptionError(f"{where}: {end}: there is no link {link!r}")
     for name in ("xyz", "rpy"):
@@ -340,10 +349,10 @@ def _check(joint: Element, links: list[str], where: str) -> None:
     check_vector(axis, "xyz", f"{where}: axis")
     if kind not in ("fixed", "floating") and not np.linalg.norm(_direction(axis)) > 1e-9:
         raise DescriptionError(f"{where}: axis: is zero, expected a direction")
-    limit = joint.find("limit")
-    ends = _ends(limit, where)
+    limit_element = joint.find("limit")
+    ends = _ends(limit_element, where)
     for rate in ("velocity", "effort"):
-        number(limit, rate, f"{where}: limit", math.inf)
+        finite_number(limit_element, rate, f"{where}: limit", math.inf)
     low, high = (end or 0.0 for end in ends)
     if low > high:
         raise DescriptionError(f"{where}: limit: lower {low:.6g} is above upper {high:.6g}")
@@ -379,24 +388,28 @@ def _root(links: list[str], joints: dict[str, Element], path: Path) -> str:
 
 
 def _joint(element: Element, name: str, where: str) -> TreeJoint:
-    kind, axis, limit = element.get("type", ""), np.array([0.0, 0.0, 1.0]), element.find("limit")
+    kind, axis, limit_element = (
+        element.get("type", ""),
+        np.array([0.0, 0.0, 1.0]),
+        element.find("limit"),
+    )
     if kind in ("revolute", "continuous", "prismatic"):
         axis = np.array(_direction(element.find("axis")))
         axis /= np.linalg.norm(axis)
     velocity, effort = (
-        abs(number(limit, rate, f"{where}: limit", math.inf) or math.inf)
+        abs(finite_number(limit_element, rate, f"{where}: limit", math.inf) or math.inf)
         for rate in ("velocity", "effort")
     )
-    placement = pose_of(element)
+    placement = origin_pose(element)
     assert placement is not None  # its vectors are checked
     return TreeJoint(
         name,
-        attribute(element.find("parent"), "link", where),
-        attribute(element.find("child"), "link", where),
+        required_attribute(element.find("parent"), "link", where),
+        required_attribute(element.find("child"), "link", where),
         kind,
         placement,
         axis,
-        _limits(limit, where) if kind in ("revolute", "prismatic") else None,
+        _limits(limit_element, where) if kind in ("revolute", "prismatic") else None,
         velocity,
         _mimic(element, where),
         effort,
@@ -409,16 +422,19 @@ def _direction(axis: Element | None) -> list[float]:
     return [float(word) for word in text.split()] or [1.0, 0.0, 0.0]
 
 
-def _limits(limit: Element | None, where: str) -> tuple[float, float] | None:
+def _limits(limit_element: Element | None, where: str) -> tuple[float, float] | None:
     """The range that is stated; an end that is left out is zero in URDF if the other is there."""
-    ends = _ends(limit, where)
+    ends = _ends(limit_element, where)
     if ends == [None, None] or max(abs(end or 0.0) for end in ends) > LIMITS.joint_limit:
         return None
     return ends[0] or 0.0, ends[1] or 0.0
 
 
-def _ends(limit: Element | None, where: str) -> list[float | None]:
-    return [number(limit, name, f"{where}: limit", math.inf) for name in ("lower", "upper")]
+def _ends(limit_element: Element | None, where: str) -> list[float | None]:
+    return [
+        finite_number(limit_element, name, f"{where}: limit", math.inf)
+        for name in ("lower", "upper")
+    ]
 
 
 def _mimic(element: Element, where: str) -> Coupling | None:
@@ -426,9 +442,9 @@ def _mimic(element: Element, where: str) -> Coupling | None:
     if mimic is None or element.get("type") == "fixed":
         return None
     where = f"{where}: mimic"
-    ratio = number(mimic, "multiplier", where)
-    offset = number(mimic, "offset", where)
-    leader = attribute(mimic, "joint", where)
+    ratio = finite_number(mimic, "multiplier", where)
+    offset = finite_number(mimic, "offset", where)
+    leader = required_attribute(mimic, "joint", where)
     return Linear(leader, 1.0 if ratio is None else ratio, offset or 0.0)
 
 
@@ -462,7 +478,7 @@ def _read(path: Path, _: int, xacro: bool, arguments: tuple[str, ...]) -> RobotT
     text = read_robot_file(path)
     element, notes = parse_xml(text, path), ()
     if xacro and element.tag == "robot":
-        expanded, notes = confined(MACROS, path, arguments)
+        expanded, notes = run_sandbox(XACRO_READER, path, arguments)
         element = parse_xml(expanded.decode(), path)
     if element.tag not in ("robot", "mujoco"):
         raise DescriptionError(

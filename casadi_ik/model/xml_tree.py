@@ -15,10 +15,10 @@ import numpy as np
 
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.limits import LIMITS, RAISED, limit
+from casadi_ik.files.limits import LIMITS, RAISE_HINT, scaled_limit
 from casadi_ik.files.reading import Frame, frame_matrix, read_text, roll_pitch_yaw
 from casadi_ik.model.couplings import Coupling
-from casadi_ik.model.linkage import above, known, links_of
+from casadi_ik.model.linkage import chain_to, links_of, require_name
 from casadi_ik.model.schema import BoxEntry, CapsuleEntry, CylinderEntry, ShapeEntry, SphereEntry
 
 Element = ElementTree.Element
@@ -34,7 +34,7 @@ def read_robot_file(path: Path) -> str:
     Raises:
         DescriptionError: It cannot be read, or is larger than any robot.
     """
-    return read_text(path, limit(LIMITS.robot_bytes), RAISED, "utf-8-sig")
+    return read_text(path, scaled_limit(LIMITS.robot_bytes), RAISE_HINT, "utf-8-sig")
 
 
 def parse_xml(text: str, path: Path) -> Element:
@@ -80,7 +80,7 @@ def _look_through(text: str) -> None:
     parser.Parse(text.encode("utf-8"), True)
 
 
-def attribute(element: Element | None, name: str, where: str) -> str:
+def required_attribute(element: Element | None, name: str, where: str) -> str:
     """An attribute of an element.
 
     Raises:
@@ -100,13 +100,13 @@ def check_size(links: int, moving: int, path: Path) -> None:
     """
     counts = ("links", links, LIMITS.links), ("moving joints", moving, LIMITS.moving_joints)
     for noun, count, most in counts:
-        if count > limit(most):
+        if count > scaled_limit(most):
             raise DescriptionError(
-                f"{path}: found {count} {noun}, expected at most {limit(most)} {RAISED}"
+                f"{path}: found {count} {noun}, expected at most {scaled_limit(most)} {RAISE_HINT}"
             )
 
 
-def number(
+def finite_number(
     element: Element | None, name: str, where: str, most: float = LIMITS.robot_number
 ) -> float | None:
     """A number of an element; None if it is not there.
@@ -203,7 +203,7 @@ def mjcf_shapes(mujoco: Any, model: Any, names: Sequence[str]) -> FileShapes:
             meshes.add(name)
         else:
             pose = mjcf_pose(mujoco, model.geom_pos[geom], model.geom_quat[geom])
-            entries.setdefault(name, []).append(entry_of(*shape, pose))
+            entries.setdefault(name, []).append(shape_entry(*shape, pose))
     return _told(entries, meshes)
 
 
@@ -213,7 +213,7 @@ def collides(model: Any, geom: int) -> bool:
 
 
 def simple_geom(mujoco: Any, model: Any, geom: int) -> tuple[str, list[float]] | None:
-    """Kind and sizes [m] of a geom of an MJCF, as `entry_of` takes them; None: a mesh, or such."""
+    """Kind and sizes [m] of a geom of an MJCF, for `shape_entry`; None for a mesh or the like."""
     types, (x, y, z) = mujoco.mjtGeom, model.geom_size[geom].tolist()
     return {
         int(types.mjGEOM_BOX): ("box", [2 * x, 2 * y, 2 * z]),
@@ -231,7 +231,7 @@ def mjcf_pose(mujoco: Any, position: Array, quaternion: Array) -> Array:
     return pose
 
 
-def entry_of(kind: str, size: Sequence[float], pose: Array) -> ShapeEntry:
+def shape_entry(kind: str, size: Sequence[float], pose: Array) -> ShapeEntry:
     """A simple shape as a description has it.
 
     Args:
@@ -254,8 +254,8 @@ def entry_of(kind: str, size: Sequence[float], pose: Array) -> ShapeEntry:
 
 def _of_element(collision: Element) -> ShapeEntry | None:
     """A shape of a URDF; None if it is a mesh, or not what URDF knows."""
-    shape, pose = simple_shape(collision), pose_of(collision)
-    return None if shape is None or pose is None else entry_of(*shape, pose)
+    shape, pose = simple_shape(collision), origin_pose(collision)
+    return None if shape is None or pose is None else shape_entry(*shape, pose)
 
 
 def simple_shape(element: Element) -> tuple[str, list[float]] | None:
@@ -265,24 +265,25 @@ def simple_shape(element: Element) -> tuple[str, list[float]] | None:
         return None
     (shape,) = geometry
     keys = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length")}
-    size = [v for key in keys.get(shape.tag, ()) for v in values_of(shape.get(key, ""))]
+    size = [v for key in keys.get(shape.tag, ()) for v in parse_numbers(shape.get(key, ""))]
     expected = {"box": 3, "sphere": 1, "cylinder": 2}.get(shape.tag, 0)
     sound = expected and len(size) == expected and min(size) > 0
     return (shape.tag, size) if sound else None
 
 
-def pose_of(element: Element) -> Array | None:
+def origin_pose(element: Element) -> Array | None:
     """(4, 4) of the element's origin; None if that is nonsense."""
     origin = element.find("origin")
     xyz, rpy = (
-        values_of("0 0 0" if origin is None else origin.get(key, "0 0 0")) for key in ("xyz", "rpy")
+        parse_numbers("0 0 0" if origin is None else origin.get(key, "0 0 0"))
+        for key in ("xyz", "rpy")
     )
     if [len(xyz), len(rpy)] != [3, 3]:
         return None
     return frame_matrix(Frame((xyz[0], xyz[1], xyz[2]), (rpy[0], rpy[1], rpy[2])))
 
 
-def values_of(text: str) -> list[float]:
+def parse_numbers(text: str) -> list[float]:
     """The numbers of an attribute; none if one is not finite, or larger than any robot's."""
     try:
         values = [float(word) for word in text.split()]
@@ -370,7 +371,7 @@ class RobotTree:
         Raises:
             DescriptionError: The one is not below the other.
         """
-        chain = above(self, link, root)
+        chain = chain_to(self, link, root)
         if (chain[0].parent if chain else link) != root:
             raise DescriptionError(f"{where}: link {link!r} does not hang on link {root!r}")
         return tuple(chain)
@@ -381,7 +382,7 @@ class RobotTree:
         Raises:
             DescriptionError: There is none; the message lists the links.
         """
-        return known(link, self.links, "link", where)
+        return require_name(link, self.links, "link", where)
 
     def known_joint(self, joint: str, where: str) -> str:
         """The joint, if there is one of that name.
@@ -392,10 +393,10 @@ class RobotTree:
         moving = [one.name for one in self.joints if one.type != "fixed"]
         if joint in self.by_name:
             return joint
-        return known(joint, moving, "joint", where)
+        return require_name(joint, moving, "joint", where)
 
 
-def fixed(name: str, parent: str, child: str, placement: Array) -> TreeJoint:
+def fixed_tree_joint(name: str, parent: str, child: str, placement: Array) -> TreeJoint:
     """A joint that does not move."""
     axis = np.array([0.0, 0.0, 1.0])
     return TreeJoint(name, parent, child, "fixed", placement, axis, None, math.inf, None)

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 
 from casadi_ik.errors import InputError, InvalidPoseError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.keypoints import lost_contacts
-from casadi_ik.files.input_checks.poses import one_pose
+from casadi_ik.files.input_checks.keypoints import lost_contacts_reason
+from casadi_ik.files.input_checks.poses import single_pose
 from casadi_ik.kinematics.contacts import Kinds, by_kinds, usual
 from casadi_ik.model.grasp import Grasp, real_array
 from casadi_ik.motion.clear import OBSTACLES, Guard, motor_units, stopping_way
@@ -241,7 +241,7 @@ class Follower:
         facing = None if normals is None else self._vectors("normals", normals)
         # All coordinates of a lost hand are alike: seldom the case, and cheap to see.
         if points[0, 0] == points[-1, 0]:
-            self._reason = self._reason or lost_contacts(points)
+            self._reason = self._reason or lost_contacts_reason(points)
         if self._reason:
             return self._finish(self._hold())
         if self._asked.cycle.kinds != self._usual:
@@ -357,7 +357,7 @@ class Follower:
         for side, pose in poses.items():
             name = "palm" if side is None else f"palm.{side}"
             try:
-                exact[side] = one_pose(pose, name)
+                exact[side] = single_pose(pose, name)
             except InvalidPoseError as error:
                 return {}, str(error)
             if (exact[side] == IDENTITY).all():

@@ -10,10 +10,10 @@ import numpy as np
 
 from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.keypoints import KEYPOINTS, lost_contacts
+from casadi_ik.files.input_checks.keypoints import KEYPOINTS, lost_contacts_reason
 from casadi_ik.files.input_checks.times import (
-    LONGEST_INTERVAL,
-    LONGEST_WAYPOINT_INTERVAL,
+    MAX_FRAME_INTERVAL,
+    MAX_WAYPOINT_INTERVAL,
     check_time_unit,
     cycle_count,
 )
@@ -55,7 +55,7 @@ class Frames:
         if self.keypoints:
             keypoints, reasons = retargeter.screened(self.keypoints, self.times)
             return replace(self, keypoints=keypoints, lost=tuple(reasons))
-        reasons = [lost_contacts(frame) for frame in self.points]
+        reasons = [lost_contacts_reason(frame) for frame in self.points]
         points = self.points.copy()
         points[[i for i, reason in enumerate(reasons) if reason]] = np.nan
         return replace(self, points=points, lost=tuple(filter(None, reasons)))
@@ -124,7 +124,7 @@ def read_frames(path: Path, fingers: int, sides: Sequence[str] = ()) -> Frames:
         keypoints[side] = frames
     if "normals" in arrays:
         raise InputError(f"{path}: normals: found them beside keypoints, expected points")
-    times = _times(path, arrays, len(next(iter(keypoints.values()))), LONGEST_INTERVAL)
+    times = _times(path, arrays, len(next(iter(keypoints.values()))), MAX_FRAME_INTERVAL)
     nothing = np.zeros((len(times), 0, 3))
     return Frames(path, times, keypoints, nothing, nothing)
 
@@ -139,7 +139,7 @@ def _read_contacts(path: Path, arrays: dict[str, Array], fingers: int) -> Frames
     normals = arrays.get("normals", np.full(points.shape, np.nan))
     if normals.shape != points.shape:
         raise InputError(f"{path}: normals: found shape {normals.shape}, expected {points.shape}")
-    times = _times(path, arrays, len(points), LONGEST_WAYPOINT_INTERVAL)
+    times = _times(path, arrays, len(points), MAX_WAYPOINT_INTERVAL)
     return Frames(path, times, {}, points, normals)
 
 

@@ -15,7 +15,7 @@ from mcap.writer import Writer
 from casadi_ik.errors import InputError, MissingExtraError
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.input_checks.times import cycle_count
-from casadi_ik.files.writing import written_whole
+from casadi_ik.files.writing import atomic_write
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.logs.cdr import JOINT_TRAJECTORY, cdr_message, ros_channel, write_postures
 
@@ -329,7 +329,7 @@ class Motion:
             InputError: Another suffix.
             OSError: It cannot be written.
         """
-        with written_whole(Path(path)) as part:
+        with atomic_write(Path(path)) as part:
             self.write_to(part)
 
     def write_to(self, path: Path) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.poses import one_pose
+from casadi_ik.files.input_checks.poses import single_pose
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import by_kinds
 from casadi_ik.model.grasp import Grasp
@@ -280,7 +280,7 @@ class MovingSolver:
                 f"held: found {type(held).__name__}, expected an answer with its grasp and its q,"
                 " as choose and grasps_of return them"
             )
-        start, target = self._request.start(q0), one_pose(pose)
+        start, target = self._request.start(q0), single_pose(pose)
         if chosen.known_pose is None:
             raise InputError("held: found a grasp without a known object_pose, expected one")
         self.robot.description.one_hand("place")

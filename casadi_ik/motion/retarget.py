@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from casadi_ik.errors import DescriptionError, InputError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.keypoint_orders import USUAL, OrderConverter
+from casadi_ik.files.input_checks.keypoint_orders import STANDARD_ORDER, OrderConverter
 from casadi_ik.files.input_checks.keypoints import KEYPOINTS, KNUCKLES, FrameFilter
 from casadi_ik.files.reading import Angles, Frame, Point, Struct, frame_matrix, read
 from casadi_ik.kinematics.arm_hand import ArmHand
@@ -418,7 +418,7 @@ class _Hand:
         """
         was_decided = self.order.is_decided
         frame = self.order.converted(frame[None])[0]
-        if self.order.is_decided and not was_decided and self.order.name != USUAL:
+        if self.order.is_decided and not was_decided and self.order.name != STANDARD_ORDER:
             self._first, self._smooth, self._known = None, None, False
             self.filter = FrameFilter(self._keys.tolist(), self._config.wrist)
         return frame

@@ -18,11 +18,11 @@ from numpy.typing import ArrayLike, NDArray
 from casadi_ik.collision.clearance import ROUNDING, CollisionQuery
 from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array, Bools
-from casadi_ik.files.input_checks.poses import one_pose
+from casadi_ik.files.input_checks.poses import single_pose
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import by_kinds
 from casadi_ik.model.grasp import Grasp
-from casadi_ik.model.pose import inverse, moved
+from casadi_ik.model.pose import inverse, transform_arrays
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.alternatives import APART, SEEKING, AlternativeFinder, checked_distance
 from casadi_ik.solve.arm_search import Preference
@@ -159,7 +159,7 @@ def choose(
     most = None if per_candidate is None else _count(per_candidate, "per_candidate")
     apart, start = checked_distance(apart), request.start(q0)
     word = "own" if callable(prefer) else engine.preference(prefer, q0 is not None)
-    pose = None if object_pose is None else one_pose(object_pose, "object_pose")
+    pose = None if object_pose is None else single_pose(object_pose, "object_pose")
     wanted: Preference = _own(prefer, engine.robot) if callable(prefer) else word
     asked = list(_asked(request, grasps, pose, fixed))
     search = _Search(engine, asked, start, wanted, limit, seed)
@@ -266,7 +266,7 @@ def _placed(targets: TargetBatch, grasps: Sequence[Grasp], pose: Array | None) -
         stack = np.stack(places)
         shift = stack[:, None, :3, 3] if name == "points" else 0.0
         arrays[name] = (array - shift) @ stack[:, :3, :3]
-    arrays = moved(arrays, pose)
+    arrays = transform_arrays(arrays, pose)
     points, normals = arrays.pop("points"), arrays.pop("normals")
     named = grasps[0].object
     at = np.broadcast_to(pose, (len(grasps), 4, 4)) if named or places else None

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from casadi_ik.files.arrays import Array, evenly
+from casadi_ik.files.arrays import Array, spread_points
 from casadi_ik.files.reading import Frame, frame_matrix
 from casadi_ik.model.pose import Free
 from casadi_ik.model.targets import TargetBatch
@@ -21,7 +21,7 @@ LOTS = (1, 15, 240)
 def poses_within(free: Free, count: int) -> Array:
     """(count, 4, 4) poses, evenly spread; the first one is in the middle."""
     lower, upper = np.asarray(free.lower), np.asarray(free.upper)
-    spread = evenly(count, 6)
+    spread = spread_points(count, 6)
     spread[0] = 0.5
     values = lower + spread * (upper - lower)
     return np.array([frame_matrix(Frame(tuple(row[:3]), tuple(row[3:]))) for row in values])
@@ -63,7 +63,7 @@ def solve_with_object(
     """
     every, first = poses_within(free, sum(LOTS)), 0
     span = np.maximum(np.asarray(free.upper) - np.asarray(free.lower), 1e-12)
-    middle, steps = every[0], evenly(sum(LOTS), 6) - 0.5
+    middle, steps = every[0], spread_points(sum(LOTS), 6) - 0.5
     for count in LOTS:
         rows = np.arange(first, first + count)
         some = placed(targets, every[rows])

@@ -23,7 +23,7 @@ from casadi_ik.compile.codegen import c_struct, driver_text
 from casadi_ik.compile.function_kernel import MapJob, doubles, machine_lanes, memory
 from casadi_ik.compile.graphs import recipe
 from casadi_ik.compile.libraries import load_library
-from casadi_ik.files.arrays import Array, evenly
+from casadi_ik.files.arrays import Array, spread_points
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.arms.family import ArmFamily
 from casadi_ik.kinematics.arms.search import ARM_SEARCH, arms_graph
@@ -98,7 +98,7 @@ class SearchValues:
         low, high = (np.array([float(end[i]) for end in ends]) for i in (0, 1))
         axes = np.meshgrid(*((np.arange(c) + 0.5) / c for c in counts), indexing="ij")
         grid = np.stack([axis.ravel() for axis in axes], axis=1)
-        between = evenly(2 * len(grid), size) if locked else grid + 0.5 / SEARCH.values
+        between = spread_points(2 * len(grid), size) if locked else grid + 0.5 / SEARCH.values
         levels = low + (high - low) * grid, low + (high - low) * between
         step = (high[-1] - low[-1]) / counts[-1]
         return cls(levels, step * np.linspace(-1, 1, SEARCH.closer + 2)[1:-1])

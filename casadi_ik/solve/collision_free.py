@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.collision.clearance import ROUNDING, Clearances, CollisionQuery
 from casadi_ik.collision.distances import Table
-from casadi_ik.files.arrays import Array, even_steps
+from casadi_ik.files.arrays import Array, spread_steps
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import by_kinds
 from casadi_ik.model.targets import TargetBatch, Tolerance
@@ -587,7 +587,7 @@ def _shifted(robot: ArmHand, seed: int, numbers: NDArray[np.intp], count: int) -
     others are looked at with it.
     """
     cloud = np.random.default_rng(seed).random((count, len(robot.lower)))
-    shift = numbers[:, None] * even_steps(len(robot.lower))
+    shift = numbers[:, None] * spread_steps(len(robot.lower))
     part = (cloud + shift[:, None]) % 1.0
     return robot.lower + part * (robot.upper - robot.lower)
 

@@ -9,7 +9,7 @@ from enum import StrEnum
 from functools import cached_property
 
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.lazy_import import Shown
+from casadi_ik.files.lazy_import import ReprMixin
 from casadi_ik.model.targets import Tolerance
 from casadi_ik.solve.proofs.proof import Proof
 from casadi_ik.solve.verdict import ContactVerdict, PalmVerdict
@@ -153,7 +153,7 @@ class Lazy:
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class Diagnosis(Shown):
+class Diagnosis(ReprMixin):
     """Cause of an unsolved grasp, with evidence.
 
     What would help (`reliefs`, `freed`, and `lines`, which tells of them) is looked for when first

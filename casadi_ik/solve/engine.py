@@ -17,7 +17,7 @@ from casadi_ik.collision.clearance import CollisionQuery, SceneCheck
 from casadi_ik.errors import InputError, RowError, UnsupportedError
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.progress import is_interactive, progress
-from casadi_ik.files.writing import InBackground
+from casadi_ik.files.writing import BackgroundWriter
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import Kinds, by_kinds, usual
 from casadi_ik.model.grasp import Tolerance
@@ -333,7 +333,7 @@ class Engine:
         if recorder is not None and form.measures is not None:
             form.measures.prepare()
         batches = []
-        with InBackground() as background, progress(len(targets), run.shown) as show:
+        with BackgroundWriter() as background, progress(len(targets), run.shown) as show:
             for part in self._parts(targets, starts, run, known):
                 show(len(part.batch))
                 if recorder is not None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.collision.clearance import ROUNDING, CollisionQuery
-from casadi_ik.files.arrays import Array, Bools, even_steps
+from casadi_ik.files.arrays import Array, Bools, spread_steps
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.arm_search import ArmSearch, Preference
@@ -195,7 +195,9 @@ class UnconstrainedFingers:
         self._motors: Bools = hand & ~(~free[:, :, None] & busy).any(axis=1)
         if targets.fixed is not None:
             self._motors &= np.isnan(targets.fixed)
-        parts = (0.5 + np.arange(PARAMETERS.postures)[:, None] * even_steps(len(robot.lower))) % 1.0
+        parts = (
+            0.5 + np.arange(PARAMETERS.postures)[:, None] * spread_steps(len(robot.lower))
+        ) % 1.0
         ranges = robot.upper - robot.lower
         self._limits = robot.lower, robot.upper
         self._places = robot.lower + parts * ranges

@@ -21,7 +21,7 @@ from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import LENGTH, more_arrays
 from casadi_ik.model.grasp import Contact, Grasp, Tolerance
 from casadi_ik.model.pose import Free
-from casadi_ik.model.targets import DIRECTIONS, TargetBatch, fixed_array, target_arrays
+from casadi_ik.model.targets import DIRECTIONS_KEY, TargetBatch, fixed_array, target_arrays
 
 CLEARANCE = "clearance"
 """The preference for what is far from everything; for solvers with a scene."""
@@ -243,7 +243,7 @@ class Request:
             InputError: See `target_arrays` and `more_arrays`.
         """
         named = dict(more or {})
-        directions = named.pop(DIRECTIONS, None)
+        directions = named.pop(DIRECTIONS_KEY, None)
         p, n = target_arrays(points, normals, len(self.robot.fingers), first_row, directions)
         warn_of_far_contacts(p, "points", self._base_travel)
         tolerances = tuple(self.tolerances.values())

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.lazy_import import Shown, on_demand
+from casadi_ik.files.lazy_import import ReprMixin, import_lazily
 from casadi_ik.kinematics.arm_hand import ArmHand, load_robot
 from casadi_ik.model.grasp import Contact, Grasp, Tolerance
 from casadi_ik.solve.diagnosis import Diagnosis
@@ -95,7 +95,7 @@ class CollisionReport:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Solution(Shown):
+class Solution(ReprMixin):
     """The answer to one grasp.
 
     Attributes:
@@ -174,7 +174,7 @@ class Solution(Shown):
         if grasp is None:
             reached = zip(robot.fingers, *robot.contacts(self.q), strict=True)
             grasp = Grasp({name: Contact(point, normal) for name, point, normal in reached})
-        return on_demand("casadi_ik.app.pictures").draw_solution(
+        return import_lazily("casadi_ik.app.pictures").draw_solution(
             robot, self, grasp, path, **options
         )
 
@@ -198,7 +198,7 @@ class Solution(Shown):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class BatchSolution(Shown):
+class BatchSolution(ReprMixin):
     """The answers to a batch of k targets; the fields of `Solution` as arrays.
 
     Attributes:
@@ -386,7 +386,7 @@ class Chosen(Protocol):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Choice(Shown):
+class Choice(ReprMixin):
     """One of the answers of a `Ranking`.
 
     Attributes:
@@ -417,7 +417,7 @@ class Choice(Shown):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Ranking(Shown, Sequence[Choice]):
+class Ranking(ReprMixin, Sequence[Choice]):
     """Ranked answers to many candidate grasps, best first.
 
     Attributes:

@@ -13,11 +13,11 @@ import numpy as np
 
 from casadi_ik.errors import DescriptionError, InputError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.limits import LIMITS, RAISED, limit
+from casadi_ik.files.limits import LIMITS, RAISE_HINT, scaled_limit
 from casadi_ik.files.number_files import read_npz
-from casadi_ik.files.writing import plain
+from casadi_ik.files.writing import to_json
 from casadi_ik.model.grasp import Grasp
-from casadi_ik.model.load_grasp import GraspFile, grasp_data, grasp_of
+from casadi_ik.model.load_grasp import GraspFile, grasp_from_entry, grasp_to_dict
 from casadi_ik.solve.solution import Ranking, Solution
 
 
@@ -27,11 +27,11 @@ def solution_data(solution: Solution) -> dict[str, Any]:
     names += ["time", "contacts", "diagnosis"]
     names += ["palm"] if solution.palm is not None else []
     names += ["clearance", "closest", "collision"] if solution.clearance is not None else []
-    found = plain({name: getattr(solution, name) for name in names}, infinite=lambda _: None)
+    found = to_json({name: getattr(solution, name) for name in names}, infinite=lambda _: None)
     if solution.diagnosis is not None:
         told = ("established", "reliefs", "freed", "lines")
         more = {name: getattr(solution.diagnosis, name) for name in told}
-        found["diagnosis"] |= plain(more, infinite=lambda _: None)
+        found["diagnosis"] |= to_json(more, infinite=lambda _: None)
     for contact in found["contacts"].values():
         del contact["tolerance"]
     return found
@@ -52,8 +52,8 @@ def ranking_data(ranking: Ranking, names: Sequence[str]) -> dict[str, Any]:
                 "candidate": one.candidate,
                 "name": names[one.candidate],
                 "score": one.score,
-                "grasp": grasp_data(one.grasp),
-                **({} if before is None else {"pregrasp": grasp_data(before)}),
+                "grasp": grasp_to_dict(one.grasp),
+                **({} if before is None else {"pregrasp": grasp_to_dict(before)}),
                 "solution": solution_data(one.solution),
             }
         )
@@ -119,12 +119,12 @@ class RankedEntry(msgspec.Struct, frozen=True):
         if self.grasp is None:
             expected = "expected what `casadi-ik choose` writes now"
             raise DescriptionError(f"{path}: {where}grasp: missing, {expected}")
-        grasp = grasp_of(
+        grasp = grasp_from_entry(
             self.grasp, path, self.name or f"{path.stem}[{place - 1}]", f"{where}grasp."
         )
         if self.pregrasp is None:
             return grasp
-        before = grasp_of(self.pregrasp, path, grasp.name, f"{where}pregrasp.")
+        before = grasp_from_entry(self.pregrasp, path, grasp.name, f"{where}pregrasp.")
         return replace(grasp, pregrasp=before)
 
 
@@ -200,9 +200,9 @@ def read_ranked(path: Path) -> list[RankedEntry]:
             message names file and key.
     """
     try:
-        size, most = path.stat().st_size, limit(LIMITS.ranked_bytes)
+        size, most = path.stat().st_size, scaled_limit(LIMITS.ranked_bytes)
         if size > most:
-            raise InputError(f"{path}: found {size} bytes, expected at most {most} {RAISED}")
+            raise InputError(f"{path}: found {size} bytes, expected at most {most} {RAISE_HINT}")
         held = path.read_bytes() if path.suffix.lower() != ".npz" else _member(path)
         found = msgspec.json.decode(held, type=_RankedFile).ranked
     except OSError as error:

@@ -16,10 +16,10 @@ import numpy as np
 
 from casadi_ik.errors import InputError, UnsupportedError, os_errors
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.limits import RAISED, limit
-from casadi_ik.files.number_files import UNREADABLE
+from casadi_ik.files.limits import RAISE_HINT, scaled_limit
+from casadi_ik.files.number_files import READ_ERRORS
 from casadi_ik.kinematics.contacts import NAMES
-from casadi_ik.model.targets import DIRECTIONS
+from casadi_ik.model.targets import DIRECTIONS_KEY
 
 if TYPE_CHECKING:
     import polars
@@ -77,7 +77,7 @@ class TargetFile:
             there = {name.removesuffix(".npy") for name in archive.namelist()}
             members = {
                 key: opened.enter_context(self._member(archive, key))
-                for key in (*KEYS, *(key for key in (*NAMES, DIRECTIONS) if key in there))
+                for key in (*KEYS, *(key for key in (*NAMES, DIRECTIONS_KEY) if key in there))
             }
             count = members["points"].count
             for key, member in members.items():
@@ -105,7 +105,7 @@ class TargetFile:
             archive = zipfile.ZipFile(self.path)
         except OSError as error:
             raise InputError(f"{self.path}: cannot be read: {error.strerror or error}") from error
-        except UNREADABLE as error:
+        except READ_ERRORS as error:
             raise InputError(f"{self.path}: damaged: {error}") from error
         with archive:
             yield archive
@@ -125,7 +125,7 @@ class TargetFile:
                 shape, column_major, dtype = np.lib.format.read_array_header_2_0(stream)
             else:
                 raise ValueError("a version of the npy format that is not for numbers")
-        except (*UNREADABLE, OSError) as error:
+        except (*READ_ERRORS, OSError) as error:
             raise InputError(f"{where}: cannot be read: {error}") from error
         with stream:
             if dtype.kind not in "fiu":
@@ -150,10 +150,10 @@ def refuse_bombs(where: str, unpacked: int, packed: int) -> None:
     Raises:
         InputError: It does.
     """
-    if unpacked > limit(max(2**28, 200 * packed)):
+    if unpacked > scaled_limit(max(2**28, 200 * packed)):
         raise InputError(
             f"{where}: unpacks to {unpacked >> 20} MiB from {packed} bytes, expected at most "
-            f"{limit(200)} times its size {RAISED}"
+            f"{scaled_limit(200)} times its size {RAISE_HINT}"
         )
 
 
@@ -197,7 +197,7 @@ class _Member:
     def _bytes(self, size: int) -> bytes:
         try:
             return self.stream.read(size)
-        except (*UNREADABLE, OSError) as error:
+        except (*READ_ERRORS, OSError) as error:
             raise InputError(f"{self.where}: cannot be read: {error}") from error
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.compile.layout import Layout
-from casadi_ik.files.arrays import Array, Rows, evenly
+from casadi_ik.files.arrays import Array, Rows, spread_points
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contact_fit import fresh_fit
 from casadi_ik.kinematics.contacts import LENGTH
@@ -259,7 +259,7 @@ def other_trunks(
     body = trials.robot.description
     of = np.repeat(np.arange(len(q)), count)
     moving = [*body.trunk_actuators, *(place for arm, _ in body.side_actuators for place in arm)]
-    spread = evenly(first + count, len(moving))[first:]
+    spread = spread_points(first + count, len(moving))[first:]
     spread[1::2] = np.clip((spread[1::2] - 0.5) * AT_ENDS + 0.5, 0.0, 1.0)
     limits = trials.limits(targets).of(owner[of])
     begun = q[of]

@@ -17,7 +17,7 @@ import casadi_ik as ik
 from casadi_ik import model as robots
 from casadi_ik.collision.clearance import SceneCheck
 from casadi_ik.collision.model import collision_model
-from casadi_ik.files.reading import Frame, checked, frame_matrix
+from casadi_ik.files.reading import Frame, frame_matrix, validated
 from casadi_ik.integrations.importing import capsules, imported
 from casadi_ik.integrations.importing.surfaces import Surface
 from casadi_ik.integrations.importing.write import collision_lines
@@ -299,7 +299,7 @@ def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
         "b": [CapsuleEntry(ends=((0, 0, 0), (0, 0, 0.1)), radius=0.02)],
     }
     lines = collision_lines(shapes, [Touching(("a link", "b"), "they do", 0.003)], "shapes")
-    entry, _ = checked(yaml.safe_load("\n".join(lines))["collision"], CollisionEntry, tmp_path)
+    entry, _ = validated(yaml.safe_load("\n".join(lines))["collision"], CollisionEntry, tmp_path)
     assert entry.links["a link"] == shapes["a link"]
     assert entry.links["b"] == shapes["b"]
     assert entry.touching[0].depth == 0.003

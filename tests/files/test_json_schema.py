@@ -16,7 +16,7 @@ from commands import main
 
 import casadi_ik as ik
 from casadi_ik.app.cli.lists import FILES, schema_of
-from casadi_ik.files.reading import checked
+from casadi_ik.files.reading import validated
 from casadi_ik.model.load_robot import file_type
 
 ROOT = Path(__file__).parents[2]
@@ -85,7 +85,7 @@ def reads(kind: str, data: Any) -> bool:
     """What the reader of that kind of file says."""
     type_ = file_type(data) if kind in ("robot", "body") else FILES[kind][0]
     try:
-        checked(data, type_, Path("file"))
+        validated(data, type_, Path("file"))
     except ik.errors.DescriptionError:
         return False
     return True

@@ -18,7 +18,7 @@ from casadi_ik.files.reading import (
     frame_matrix,
     read,
 )
-from casadi_ik.files.shipped import models_folder, resolve
+from casadi_ik.files.shipped import models_folder, resolve_description
 
 
 class Entry(Struct, frozen=True):
@@ -140,13 +140,16 @@ def test_frame_is_that_of_urdf(rng):
 
 def test_shipped_names_and_paths(tmp_path):
     assert "kuka_lwr_barrett" in ik.shipped_names("arm_hands")
-    assert resolve("kuka_lwr4", "arms") == models_folder() / "arms" / "kuka_lwr4.yaml"
+    assert resolve_description("kuka_lwr4", "arms") == models_folder() / "arms" / "kuka_lwr4.yaml"
     (tmp_path / "part.yaml").write_text("")
-    assert resolve("part.yaml", "arms", beside=tmp_path / "robot.yaml") == tmp_path / "part.yaml"
-    assert resolve(tmp_path / "part.yaml", "arms") == tmp_path / "part.yaml"
+    assert (
+        resolve_description("part.yaml", "arms", beside=tmp_path / "robot.yaml")
+        == tmp_path / "part.yaml"
+    )
+    assert resolve_description(tmp_path / "part.yaml", "arms") == tmp_path / "part.yaml"
     with pytest.raises(
         ik.errors.UnknownNameError, match="no shipped arm-hand is called 'kuka'; shipped: "
     ):
-        resolve("kuka", "arm_hands")
+        resolve_description("kuka", "arm_hands")
     with pytest.raises(ik.errors.DescriptionError, match=r"nowhere\.yaml: no such file"):
-        resolve(str(tmp_path / "nowhere.yaml"), "arms")
+        resolve_description(str(tmp_path / "nowhere.yaml"), "arms")

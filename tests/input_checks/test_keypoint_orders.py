@@ -13,9 +13,13 @@ from made_up_hand import hand
 
 import casadi_ik as ik
 from casadi_ik.errors import InputWarning
-from casadi_ik.files.input_checks.keypoint_orders import ORDERS, USUAL, recognised_order
+from casadi_ik.files.input_checks.keypoint_orders import (
+    KEYPOINT_ORDERS,
+    STANDARD_ORDER,
+    recognise_order,
+)
 
-OTHERS = [name for name in ORDERS if name != USUAL]
+OTHERS = [name for name in KEYPOINT_ORDERS if name != STANDARD_ORDER]
 
 
 def seen(i: int = 0) -> np.ndarray:
@@ -27,7 +31,7 @@ def seen(i: int = 0) -> np.ndarray:
 def reordered(frames: np.ndarray, name: str) -> np.ndarray:
     """Frames (..., 21, 3) in another order."""
     found = np.empty_like(frames)
-    found[..., ORDERS[name], :] = frames
+    found[..., KEYPOINT_ORDERS[name], :] = frames
     return found
 
 
@@ -40,7 +44,7 @@ def config(tmp_path_factory):
 
 @settings(max_examples=40)
 @given(
-    st.sampled_from(list(ORDERS)),
+    st.sampled_from(list(KEYPOINT_ORDERS)),
     st.floats(0.0, 1.2),
     st.floats(0.6, 1.3),
     st.integers(0, 10_000),
@@ -52,7 +56,7 @@ def test_every_order_is_recognised_in_one_frame(name, bend, size, seed, mirrored
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     turn = turn @ np.diag([1.0, 1.0, -1.0 if mirrored else 1.0])
     frame = size * hand(bend, rng.normal(size=3)) @ turn + rng.normal(0, 1e-3, (21, 3))
-    assert recognised_order(reordered(frame, name)[None]) == name
+    assert recognise_order(reordered(frame, name)[None]) == name
 
 
 @pytest.mark.parametrize("name", OTHERS)

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 import casadi_ik as ik
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.poses import MAX_SKEW, checked_pose, skew_of
+from casadi_ik.files.input_checks.poses import MAX_SKEW, checked_pose, matrix_skew
 from casadi_ik.papers.chandra.calibration import read_measurements
 
 POINT = np.array([0.4, 0.1, 0.3])
@@ -88,7 +88,7 @@ MATRICES: dict[str, Callable[[Array], Array]] = {
     "fingertip": lambda R: frame_of(ik.Contact.at(pose_of(R))),
     "contact": lambda R: frame_of(CONTACT.at(pose_of(R))),
     "axes of a contact": lambda R: frame_of(
-        ik.Contact(POINT, normal=R[:, 0], tangent=R[:, 1]) if skew_of(R) < 1 else CONTACT
+        ik.Contact(POINT, normal=R[:, 0], tangent=R[:, 1]) if matrix_skew(R) < 1 else CONTACT
     ),
     "grasp": lambda R: frame_of(ik.Grasp({"thumb": CONTACT}).at(pose_of(R)).contacts["thumb"]),
     "palm": lambda R: turned_palm(pose_of(R)),
@@ -183,7 +183,7 @@ def test_rounded_rotations_are_taken_at_every_entrance(wxyz, decimals):
     exact = matrix_of(wxyz)
     for name, entrance in MATRICES.items():
         rotation = entrance(np.round(exact, decimals))
-        assert skew_of(rotation) < 1e-12, name
+        assert matrix_skew(rotation) < 1e-12, name
         assert np.linalg.det(rotation) > 0, name
         assert angle_between(rotation, exact) < 0.1, name
 
@@ -193,7 +193,7 @@ def test_rounded_rotations_are_taken_at_every_entrance(wxyz, decimals):
 def test_rounded_quaternions_are_taken_at_every_entrance(wxyz, decimals):
     for name, entrance in QUATERNIONS.items():
         rotation = entrance(np.round(wxyz, decimals))
-        assert skew_of(rotation) < 1e-12, name
+        assert matrix_skew(rotation) < 1e-12, name
         assert angle_between(rotation, matrix_of(wxyz)) < 0.15, name
 
 

@@ -41,9 +41,7 @@ def test_old_paths_give_the_modules_and_warnings():
 
 
 def test_new_paths_give_no_warning():
-    script = (
-        "import casadi_ik as ik; ik.load_robot('ar10'); ik.logs; ik.motion; ik.solve"
-    )
+    script = "import casadi_ik as ik; ik.load_robot('ar10'); ik.logs; ik.motion; ik.solve"
     done = python("-W", "error::DeprecationWarning:casadi_ik", "-c", script)
     assert done.returncode == 0, done.stderr
 

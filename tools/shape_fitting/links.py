@@ -9,8 +9,8 @@ import numpy as np
 
 from casadi_ik.files.arrays import Array
 from casadi_ik.integrations.importing.surfaces import Surface, link_surfaces
-from casadi_ik.model.linkage import below, link_poses
-from casadi_ik.model.parts import Part
+from casadi_ik.model.linkage import joints_below, link_poses
+from casadi_ik.model.parts import RobotPart
 from casadi_ik.model.urdf_mjcf import read_tree
 from casadi_ik.model.xml_tree import RobotTree, TreeJoint
 
@@ -30,7 +30,7 @@ class Axis:
 
 
 def in_our_links(
-    part: Part, file: Path, without: set[str], seen: bool = False
+    part: RobotPart, file: Path, without: set[str], seen: bool = False
 ) -> dict[str, list[Surface]]:
     """The shapes of the file's links by our link, in its frame; `seen` as for `link_surfaces`."""
     tree = read_tree(file)
@@ -104,7 +104,7 @@ def tree_poses(tree: RobotTree) -> dict[str, Array]:
 
 
 def match(
-    part: Part, axes: list[Axis], tree: RobotTree, theirs: dict[str, Array], base: Array
+    part: RobotPart, axes: list[Axis], tree: RobotTree, theirs: dict[str, Array], base: Array
 ) -> dict[str, TreeJoint]:
     """By our joint the file's, below that of the joint before."""
     by_child = {joint.child: joint for joint in part.joints}
@@ -114,7 +114,7 @@ def match(
         while above in by_child and by_child[above].name not in found:
             above = by_child[above].parent
         start = found[by_child[above].name].child if above in by_child else tree.root
-        for joint in below(tree, start):
+        for joint in joints_below(tree, start):
             pose = base @ theirs[joint.child]
             if joint.type == "fixed" or joint in found.values():
                 continue

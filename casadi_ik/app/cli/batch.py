@@ -34,8 +34,8 @@ from casadi_ik.app.cli.table import Answer, Said, command
 from casadi_ik.app.report import ROWS_SHOWN, Totals, files
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.files.progress import progress
-from casadi_ik.files.shipped import resolve
-from casadi_ik.files.writing import plain, remove_stale
+from casadi_ik.files.shipped import resolve_description
+from casadi_ik.files.writing import remove_stale, to_json
 from casadi_ik.integrations.batches import (
     BatchFolder,
     check_installed,
@@ -44,7 +44,7 @@ from casadi_ik.integrations.batches import (
     solve_parts,
 )
 from casadi_ik.kinematics.arm_hand import ArmHand
-from casadi_ik.model.pose import moved
+from casadi_ik.model.pose import transform_arrays
 from casadi_ik.solve.target_files import Source, TargetFile, polars_module, source_of
 
 BLOCK = 4096
@@ -194,7 +194,7 @@ def _solve_blocks(
     check_outputs({"--log": said.log, "--out": said.out}, inputs=[path])
     pose, solver, pace = the_object_pose(said), the_solver(said, robot), _Pace(said.jobs)
     given = targets.blocks(pace.begin)
-    given = given if pose is None else (moved(block, pose) for block in given)
+    given = given if pose is None else (transform_arrays(block, pose) for block in given)
     blocks = solver.solve_blocks(given, jobs=said.jobs, log=said.log, **asked)
     show_progress = progress(count, say=partial(say, "progress"))
     with _growing_file(said.out, robot) as answers, closing(blocks), show_progress as show:
@@ -303,16 +303,16 @@ def _question(
     """Everything that decides the answers, so that no part of another batch is taken for ours."""
     scene = None
     if said.scene is not None:
-        file = resolve(said.scene, "scenes")
+        file = resolve_description(said.scene, "scenes")
         scene = hashlib.sha256(file.read_bytes()).hexdigest()[:16]
     return {
         "code": code_version(),
         "targets": source.fingerprint,
         "part_size": source.size,
         "robot": hashlib.sha256(solver.robot.urdf().encode()).hexdigest()[:16],
-        "solver": plain(solver.parameters),
+        "solver": to_json(solver.parameters),
         "scene": scene,
-        "object_pose": plain(the_object_pose(said)),
+        "object_pose": to_json(the_object_pose(said)),
         **asked,
         "log": None if said.log is None else str(said.log),
     }

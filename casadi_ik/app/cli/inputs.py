@@ -20,7 +20,7 @@ from casadi_ik.errors import (
 )
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.reading import Frame, frame_matrix
-from casadi_ik.files.shipped import resolve, resolve_robot
+from casadi_ik.files.shipped import resolve_description, resolve_robot
 from casadi_ik.kinematics.arm_hand import ArmHand, load_robot
 from casadi_ik.logs import Log
 from casadi_ik.logs.solve import check_robot
@@ -53,7 +53,7 @@ def the_grasp(said: Said) -> tuple[Path, Grasp]:
         UnknownNameError: No shipped grasp has that name.
         DescriptionError: The file is missing or malformed.
     """
-    path, pose = resolve(said.grasp, "grasps"), the_object_pose(said)
+    path, pose = resolve_description(said.grasp, "grasps"), the_object_pose(said)
     grasp = load_grasp(path)
     return path, grasp if pose is None else grasp.in_object_frame().at(pose)
 
@@ -72,7 +72,7 @@ def the_robot(name: str | None, path: Path | None = None, grasp: Grasp | None = 
     if path is None or grasp is None or not grasp.robot:
         raise InputError(f"{path}: robot: missing, expected it in the file or --robot")
     with located(f"{path}: robot", (UnknownNameError, DescriptionError)):
-        found = resolve_robot(grasp.robot, beside=path)
+        found = resolve_robot(grasp.robot, relative_to=path)
     return load_robot(grasp.robot if isinstance(found, tuple) else found)
 
 

@@ -16,8 +16,8 @@ from casadi_ik.app.cli.outputs import output, writing
 from casadi_ik.app.cli.table import COMMANDS, GROUPS, Answer, Said, command, load, names
 from casadi_ik.app.report import headline, robot_report, table
 from casadi_ik.collision.scene import SceneFile
-from casadi_ik.files.reading import convert, read_yaml
-from casadi_ik.files.shipped import BODIES, resolve, shipped_names
+from casadi_ik.files.reading import convert_entry, read_yaml
+from casadi_ik.files.shipped import BODIES_FOLDER, resolve_description, shipped_names
 from casadi_ik.files.units import json_schema
 from casadi_ik.integrations.datasets.layouts import ConventionFile
 from casadi_ik.kinematics.arms.recognise import describe_arm
@@ -75,8 +75,8 @@ def robots(_: Said) -> Answer:
     """List the shipped robots: fingers and actuators."""
     parts: list[RenderableType] = []
     for name in shipped_names("arm_hands"):
-        path = resolve(name, "arm_hands")
-        about = convert(read_yaml(path), ArmHandFile, path).description
+        path = resolve_description(name, "arm_hands")
+        about = convert_entry(read_yaml(path), ArmHandFile, path).description
         parts.append(robot_report(load_description(path), about))
     return Answer(Group(*parts, *_catalogue()))
 
@@ -86,24 +86,24 @@ def _catalogue() -> list[RenderableType]:
     arms = table("arm", "joints", "closed form", "what it is", right=("joints",))
     some_hand = shipped_names("hands")[0]
     for name in shipped_names("arms"):
-        path = resolve(name, "arms")
-        arm = convert(read_yaml(path), ArmFile, path)
+        path = resolve_description(name, "arms")
+        arm = convert_entry(read_yaml(path), ArmFile, path)
         count = sum(joint.type != "fixed" for joint in arm.joints)
         form = describe_arm(load_description(f"{name}+{some_hand}"))
         arms.add_row(name, str(count), form, _short(arm.description))
     hands = table("hand", "motors", "fingers", "what it is", right=("motors", "fingers"))
     for name in shipped_names("hands"):
-        path = resolve(name, "hands")
-        hand = convert(read_yaml(path), HandFile, path)
+        path = resolve_description(name, "hands")
+        hand = convert_entry(read_yaml(path), HandFile, path)
         motors = hand.actuators or [
             joint for joint in hand.joints if joint.type != "fixed" and joint.coupling is None
         ]
         hands.add_row(name, str(len(motors)), str(len(hand.fingers)), _short(hand.description))
     example = 'any arm with any hand: load_robot("ARM+HAND"), --robot ARM+HAND, such as'
     bodies = table("body", "trunk", "motors", "sides", "what it is", right=("motors",))
-    for name in shipped_names(BODIES):
-        path = resolve(name, BODIES)
-        body = convert(read_yaml(path), BodyFile, path)
+    for name in shipped_names(BODIES_FOLDER):
+        path = resolve_description(name, BODIES_FOLDER)
+        body = convert_entry(read_yaml(path), BodyFile, path)
         whole = all(side.hand is not None for side in body.sides.values())
         motors = str(len(load_description(name).actuators)) if whole else "by its hand"
         trunk = body.trunk if isinstance(body.trunk, str) else ""
@@ -132,8 +132,8 @@ def grasps(_: Said) -> Answer:
     """List the shipped grasps."""
     by_robot: dict[str, Table] = {}
     for name in shipped_names("grasps"):
-        path = resolve(name, "grasps")
-        entry = convert(read_yaml(path), GraspFile, path)
+        path = resolve_description(name, "grasps")
+        entry = convert_entry(read_yaml(path), GraspFile, path)
         rows = by_robot.setdefault(entry.robot, table("grasp", "object", "description"))
         rows.add_row(name, entry.object.name if entry.object else "", entry.description)
     parts: list[RenderableType] = []
@@ -157,8 +157,8 @@ def scenes(_: Said) -> Answer:
 def _described(kind: str, head: str, schema: type[ObjectFile | SceneFile]) -> Table:
     rows = table(head, "description")
     for name in shipped_names(kind):
-        path = resolve(name, kind)
-        rows.add_row(name, convert(read_yaml(path), schema, path).description)
+        path = resolve_description(name, kind)
+        rows.add_row(name, convert_entry(read_yaml(path), schema, path).description)
     return rows
 
 

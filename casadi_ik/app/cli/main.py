@@ -176,15 +176,15 @@ def _abandon_stdout() -> None:
 @contextmanager
 def _size_limits(factor: float | None) -> Iterator[None]:
     """All limits of files times a factor meanwhile, in what is started as well."""
-    from casadi_ik.files.limits import VARIABLE
+    from casadi_ik.files.limits import LIMITS_VARIABLE
 
-    before = os.environ.get(VARIABLE)
+    before = os.environ.get(LIMITS_VARIABLE)
     if factor is not None:
-        os.environ[VARIABLE] = repr(factor)
+        os.environ[LIMITS_VARIABLE] = repr(factor)
     try:
         yield
     finally:
         if factor is not None:
-            del os.environ[VARIABLE]
+            del os.environ[LIMITS_VARIABLE]
         if before is not None:
-            os.environ[VARIABLE] = before
+            os.environ[LIMITS_VARIABLE] = before

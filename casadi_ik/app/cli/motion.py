@@ -19,7 +19,7 @@ from casadi_ik.app.cli.table import Answer, Said, command
 from casadi_ik.app.report import Units, fields, files, headline
 from casadi_ik.errors import InputError, MissingExtraError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.keypoints import lost_contacts
+from casadi_ik.files.input_checks.keypoints import lost_contacts_reason
 from casadi_ik.model.grasp import Grasp
 from casadi_ik.motion.follower import FollowStatus
 from casadi_ik.motion.frames import Frames, follow_frames, read_frames
@@ -125,7 +125,7 @@ def _start(solver: Solver, frames: Frames) -> Array:
     usable = (
         i
         for i, points in enumerate(frames.points)
-        if np.isfinite(points).any() and not lost_contacts(points)
+        if np.isfinite(points).any() and not lost_contacts_reason(points)
     )
     i = next(usable, None)
     if i is not None:

@@ -13,7 +13,7 @@ from typing import Any
 
 from casadi_ik.app.cli.options import PROGRAM
 from casadi_ik.errors import CasadiIKError, os_errors, shortened
-from casadi_ik.files.writing import part_of, target_of, written_whole
+from casadi_ik.files.writing import atomic_write, resolve_links, temporary_path
 
 
 class OutputError(CasadiIKError):
@@ -43,12 +43,12 @@ def check_outputs(outputs: Mapping[str, Path | None], inputs: Iterable[Path] = (
     taken: dict[object, str] = {}
     for path in inputs:
         with contextlib.suppress(OSError):
-            taken |= dict.fromkeys(_identities(target_of(path)), "the input")
+            taken |= dict.fromkeys(_identities(resolve_links(path)), "the input")
     for option, path in outputs.items():
         if path is None:
             continue
         with writing(path, option):
-            target = target_of(path)
+            target = resolve_links(path)
             same = _identities(target)
             for identity in same:
                 if identity in taken:
@@ -57,7 +57,7 @@ def check_outputs(outputs: Mapping[str, Path | None], inputs: Iterable[Path] = (
                     raise OutputError(f"{path}: {option}: {problem}")
             taken |= dict.fromkeys(same, option)
             _refuse_special(target)
-            part = part_of(target)
+            part = temporary_path(target)
             part.touch(exist_ok=False)
             part.unlink()
 
@@ -73,7 +73,7 @@ def output(path: Path, option: str = "--out") -> Iterator[Path]:
     Raises:
         OutputError: It cannot be written; nothing is left behind.
     """
-    with writing(path, option), written_whole(path) as part:
+    with writing(path, option), atomic_write(path) as part:
         yield part
 
 
@@ -102,7 +102,7 @@ def writing(path: Path, option: str) -> contextlib.AbstractContextManager[None]:
 
 def folder_of(path: Path) -> Path:
     """The folder an output will stand in, whatever links lead there."""
-    return target_of(path).parent
+    return resolve_links(path).parent
 
 
 def _identities(target: Path) -> list[object]:

@@ -39,7 +39,7 @@ from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.description import Finger, RobotDescription
 from casadi_ik.model.grasp import Contact, Grasp
 from casadi_ik.model.objects import load_object
-from casadi_ik.model.parts import PREFIX
+from casadi_ik.model.parts import HAND_PREFIX
 from casadi_ik.model.pose import inverse
 
 View = tuple[float, float]
@@ -270,7 +270,7 @@ def file_meshes(description: RobotDescription, seen: bool = False) -> dict[str, 
         entry = raw.get(key)
         if not isinstance(entry, dict) or "file" not in entry:
             continue
-        prefix = PREFIX if key == "hand" else ""
+        prefix = HAND_PREFIX if key == "hand" else ""
         # A name that arm and hand both have is prefixed in the hand.
         named = {link.removeprefix(prefix) if prefix else link: link for link in links}
         named |= {link: link for link in links if f"{prefix}{link}" not in links or not prefix}

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from casadi_ik.app.drawing import palette
 from casadi_ik.errors import InputError, PictureError, os_errors
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.writing import written_whole
+from casadi_ik.files.writing import atomic_write
 from casadi_ik.logs import Table
 from casadi_ik.logs.events import EVENT_COLORS, bits_of
 from casadi_ik.model.targets import Tolerance
@@ -76,7 +76,7 @@ def save_picture(picture: Figure | bytes, path: str | PathLike[str]) -> None:
     if isinstance(picture, Figure):
         picture.savefig(drawn, format="png", dpi=picture.dpi)
     refused = os_errors(f"{target}: cannot write the picture", PictureError)
-    with refused, written_whole(target) as part:
+    with refused, atomic_write(target) as part:
         part.write_bytes(picture if isinstance(picture, bytes) else drawn.getvalue())
 
 

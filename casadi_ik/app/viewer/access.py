@@ -35,7 +35,7 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from casadi_ik.errors import InputError, UnsupportedError
-from casadi_ik.files.writing import written_whole
+from casadi_ik.files.writing import atomic_write
 
 logger = logging.getLogger(__name__)
 
@@ -275,7 +275,7 @@ class Viewer:
         self.page.select(held)
         text = text.replace("<title>Viser</title>", f"<title>{self._server.access.title}</title>")
         if path is not None:
-            with written_whole(Path(path)) as part:
+            with atomic_write(Path(path)) as part:
                 part.write_text(text, encoding="utf-8")
         return text
 

@@ -61,7 +61,7 @@ from casadi_ik.files.shipped import shipped_names
 from casadi_ik.kinematics.arm_hand import ArmHand, load_robot
 from casadi_ik.model.grasp import Tolerance
 from casadi_ik.model.load_grasp import load_grasp, shipped_grasps
-from casadi_ik.model.targets import LIMITS
+from casadi_ik.model.targets import LIMIT_MODES
 from casadi_ik.solve.request import CLEARANCE, PREFERENCES
 from casadi_ik.solve.solution import Alternative
 
@@ -465,7 +465,7 @@ class Panel:
             initial_value=PREFER[settings.prefer],
             hint="which of several solutions; methods that cannot choose take no notice",
         )
-        limits = gui.add_dropdown("Limits", LIMITS, initial_value=settings.limits)
+        limits = gui.add_dropdown("Limits", LIMIT_MODES, initial_value=settings.limits)
         far, turned = 1e3 * settings.tolerance.position, np.rad2deg(settings.tolerance.angle)
         position = gui.add_number("Tolerance [mm]", far, min=0.001, max=100.0, step=0.1)
         angle = gui.add_number(

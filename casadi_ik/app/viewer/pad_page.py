@@ -25,7 +25,7 @@ from casadi_ik.app.viewer.viser_scene import DrawnRobot, Handles, cameras, light
 from casadi_ik.errors import CasadiIKError, DescriptionError, os_errors
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.reading import Frame, frame_matrix, read_yaml
-from casadi_ik.files.writing import written_whole
+from casadi_ik.files.writing import atomic_write
 from casadi_ik.integrations.importing.surfaces import Surface, together
 from casadi_ik.integrations.importing.write import vector
 from casadi_ik.kinematics.arm_hand import ArmHand
@@ -247,7 +247,7 @@ def save_pads(path: Path, pads: Mapping[str, LinkPad]) -> None:
         point = (inverse(named) @ np.append(pad.point, 1.0))[:3]
         text = corrected(text, finger, point, place[:3, :3].T @ pad.normal)
     refused = os_errors(f"{path}: cannot be written", DescriptionError)
-    with refused, written_whole(path) as part:
+    with refused, atomic_write(path) as part:
         part.write_text(text, encoding="utf-8")
         _check(part, pads)
 

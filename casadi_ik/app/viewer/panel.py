@@ -20,7 +20,7 @@ from casadi_ik.app.viewer.request import Answer
 from casadi_ik.files.arrays import Array
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.grasp import Grasp
-from casadi_ik.model.load_grasp import grasp_data
+from casadi_ik.model.load_grasp import grasp_to_dict
 from casadi_ik.solve.verdict import ContactVerdict
 
 logger = logging.getLogger(__name__)
@@ -324,7 +324,7 @@ def grasp_text(grasp: Grasp, comment: str = "") -> str:
         comment: A line before it.
     """
     lines = [f"# {comment}"] if comment else []
-    for key, value in grasp_data(grasp).items():
+    for key, value in grasp_to_dict(grasp).items():
         if key == "contacts":
             lines.append("contacts:  # points [m] and outward normals of the pads, base frame")
             for finger, contact in value.items():

@@ -19,7 +19,7 @@ from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import CasadiIKError, UnsupportedError
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arm_hand import ArmHand
-from casadi_ik.model.grasp import PLACES, Contact, Grasp, Tolerance
+from casadi_ik.model.grasp import POINT_CONSTRAINTS, Contact, Grasp, Tolerance
 from casadi_ik.model.pose import inverse
 from casadi_ik.solve.request import CLEARANCE, Request, tolerances_by_finger
 from casadi_ik.solve.solution import Alternative, Solution
@@ -76,7 +76,7 @@ class Held:
         found = self.contact.at(self.control)
         if self.normal or not np.isfinite(found.point).all():
             return found
-        places = {name: getattr(found, name) for name in PLACES}
+        places = {name: getattr(found, name) for name in POINT_CONSTRAINTS}
         return Contact(found.point, tolerance=found.tolerance, **places)
 
 
@@ -186,7 +186,9 @@ def request_of(
         ways = (contact.normal, contact.ball, frame[:3, 0])
         normal = next(way for way in ways if way is not None)
         control = facing(place, normal, frame[:3, :3])
-        if contact.normal is None and all(getattr(contact, name) is None for name in PLACES):
+        if contact.normal is None and all(
+            getattr(contact, name) is None for name in POINT_CONSTRAINTS
+        ):
             # Its normal is at hand if it is wanted after all.
             whole = Contact(place, normal, contact.tolerance)
             held[finger] = Held(whole.at(inverse(control)), control, used, normal=False)

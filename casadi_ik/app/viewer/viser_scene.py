@@ -33,7 +33,7 @@ from casadi_ik.app.viewer.access import Server
 from casadi_ik.app.viewer.request import OBJECT, Held, PageRequest
 from casadi_ik.collision.clearance import Closest
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.poses import rotations_of
+from casadi_ik.files.input_checks.poses import rotations_from_quaternions
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.solve.verdict import ContactVerdict
 
@@ -65,7 +65,7 @@ def pose_of(position: ArrayLike, wxyz: ArrayLike) -> Array:
         ValueError: They are not of these sizes, or not finite.
     """
     pose = np.eye(4)
-    pose[:3, :3] = rotations_of(usable(wxyz, 4)[None])[0]
+    pose[:3, :3] = rotations_from_quaternions(usable(wxyz, 4)[None])[0]
     pose[:3, 3] = usable(position, 3)
     if not np.isfinite(pose).all():
         raise ValueError("found a quaternion of no length")

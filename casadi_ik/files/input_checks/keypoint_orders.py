@@ -26,13 +26,13 @@ def _order(wrist: int, *fingers: tuple[int, ...]) -> NDArray[np.intp]:
     return np.array([wrist, *(key for finger in fingers for key in finger)], dtype=np.intp)
 
 
-USUAL = "MediaPipe, OpenPose"
+STANDARD_ORDER = "MediaPipe, OpenPose"
 """Name of the usual order: the wrist, then from the thumb on four keypoints a finger, tips last."""
 
 _MANO = ((13, 14, 15, 16), (1, 2, 3, 17), (4, 5, 6, 18), (10, 11, 12, 19), (7, 8, 9, 20))
 
-ORDERS: dict[str, NDArray[np.intp]] = {
-    USUAL: np.arange(KEYPOINTS),
+KEYPOINT_ORDERS: dict[str, NDArray[np.intp]] = {
+    STANDARD_ORDER: np.arange(KEYPOINTS),
     "MANO, HO-3D": _order(0, *_MANO),
     "five tips, then MANO": _order(5, *((a + 5, b + 5, c + 5, d - 16) for a, b, c, d in _MANO)),
     "InterHand2.6M": _order(20, *((4 * f + 3, 4 * f + 2, 4 * f + 1, 4 * f) for f in FINGERS)),
@@ -96,7 +96,7 @@ class OrderLimits:
     largest: float = 0.3
 
 
-LIMITS = OrderLimits()
+ORDER_LIMITS = OrderLimits()
 
 
 def misfit(distances: Array, order: NDArray[np.intp]) -> float:
@@ -104,7 +104,7 @@ def misfit(distances: Array, order: NDArray[np.intp]) -> float:
 
     Args:
         distances: (21, 21) between keypoints [m], or their medians over frames.
-        order: See `ORDERS`.
+        order: See `KEYPOINT_ORDERS`.
     """
     first, second = order[PAIRS].T
     lengths = distances[first, second]
@@ -123,7 +123,7 @@ class OrderConverter:
     """Converts the frames of one hand to the usual order, once their order is recognised.
 
     Attributes:
-        name: The order that was recognised, see `ORDERS`; "" as long as none is.
+        name: The order that was recognised, see `KEYPOINT_ORDERS`; "" as long as none is.
         is_decided: Whether frames are converted by a known order from now on.
     """
 
@@ -135,7 +135,7 @@ class OrderConverter:
 
     def assume_usual(self) -> None:
         """Take the frames that come as in the usual order."""
-        self.name, self.is_decided = USUAL, True
+        self.name, self.is_decided = STANDARD_ORDER, True
 
     def converted(self, frames: Array) -> Array:
         """Return frames (k, 21, 3) in the usual order; unchanged while no order is recognised.
@@ -143,45 +143,45 @@ class OrderConverter:
         A warning says which order was found, or that a hand is in none of the known ones.
         """
         if self.is_decided:
-            return frames if self.name == USUAL else frames[:, ORDERS[self.name]]
+            return frames if self.name == STANDARD_ORDER else frames[:, KEYPOINT_ORDERS[self.name]]
         complete = frames[np.isfinite(frames).all(axis=(1, 2))]
-        if not len(complete) or self._tries >= LIMITS.frames:
+        if not len(complete) or self._tries >= ORDER_LIMITS.frames:
             return frames
         if self._newest is not None and np.array_equal(frames, self._newest):
             return frames
         self._newest, self._tries = frames.copy(), self._tries + 1
-        complete = complete[:: max(1, len(complete) // LIMITS.frames)]
-        self.name = recognised_order(complete)
+        complete = complete[:: max(1, len(complete) // ORDER_LIMITS.frames)]
+        self.name = recognise_order(complete)
         if not self.name:
             size = float(distances_between(complete).max())
-            if self._tries == 1 and LIMITS.smallest < size < LIMITS.largest:
+            if self._tries == 1 and ORDER_LIMITS.smallest < size < ORDER_LIMITS.largest:
                 self._warn("are in none of the known orders")
             return frames
         self.is_decided = True
-        if self.name == USUAL:
+        if self.name == STANDARD_ORDER:
             return frames
         self._warn(f"are in the order of {self.name}, and are converted")
-        return frames[:, ORDERS[self.name]]
+        return frames[:, KEYPOINT_ORDERS[self.name]]
 
     def _warn(self, found: str) -> None:
         message = (
-            f"{self._where}: the joints {found}; expected the order of {USUAL}: 0 the wrist, "
-            "then four for each finger from the thumb on, tips 4, 8, 12, 16, 20"
+            f"{self._where}: the joints {found}; expected the order of {STANDARD_ORDER}: 0 the "
+            "wrist, then four for each finger from the thumb on, tips 4, 8, 12, 16, 20"
         )
         warnings.warn(message, InputWarning, stacklevel=2)
 
 
-def recognised_order(frames: Array) -> str:
+def recognise_order(frames: Array) -> str:
     """Return the order of keypoints, "" if none fits clearly.
 
     Args:
         frames: (k, 21, 3) finite keypoints of one person [m].
     """
     distances = distances_between(frames)
-    misfits = {name: misfit(distances, order) for name, order in ORDERS.items()}
+    misfits = {name: misfit(distances, order) for name, order in KEYPOINT_ORDERS.items()}
     best = min(misfits, key=lambda name: misfits[name])
-    if misfits[best] > LIMITS.fits:
+    if misfits[best] > ORDER_LIMITS.fits:
         return ""
-    if best != USUAL and misfits[best] > misfits[USUAL] - LIMITS.better:
+    if best != STANDARD_ORDER and misfits[best] > misfits[STANDARD_ORDER] - ORDER_LIMITS.better:
         return ""
     return best

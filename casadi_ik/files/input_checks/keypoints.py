@@ -55,10 +55,10 @@ class FrameLimits:
     flatness: float = 1e-4
 
 
-LIMITS = FrameLimits()
+FRAME_LIMITS = FrameLimits()
 
 
-def lost_reason(frame: Array, used: NDArray[np.intp], wrist: int = 0) -> str:
+def lost_frame_reason(frame: Array, used: NDArray[np.intp], wrist: int = 0) -> str:
     """Return why a single frame cannot be a hand; "" if it can.
 
     Args:
@@ -75,14 +75,14 @@ def lost_reason(frame: Array, used: NDArray[np.intp], wrist: int = 0) -> str:
             continue
         if key == wrist:  # the origin may be there
             away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-            if away[used == wrist][0] <= LIMITS.spread * float(np.median(away)):
+            if away[used == wrist][0] <= FRAME_LIMITS.spread * float(np.median(away)):
                 continue
         return f"keypoint {key} is exactly {x:g} {y:g} {z:g}"
     if len(set(map(tuple, rows))) < len(rows):
         return "two keypoints coincide"
     index, little = frame[KNUCKLES[0]] - frame[wrist], frame[KNUCKLES[1]] - frame[wrist]
     squares, along = float(index @ index) * float(little @ little), float(index @ little)
-    if not squares - along**2 > LIMITS.flatness**2 * squares:
+    if not squares - along**2 > FRAME_LIMITS.flatness**2 * squares:
         return "wrist and knuckles are on a line"
     return ""
 
@@ -104,7 +104,7 @@ class FrameFilter:
     def __init__(self, used: Sequence[int], wrist: int = 0) -> None:
         """Take the keypoints that count, and that of the wrist."""
         self._used, self._wrist = np.unique(np.array([*used, wrist, *KNUCKLES])), wrist
-        self._bones: deque[Array] = deque(maxlen=LIMITS.memory)
+        self._bones: deque[Array] = deque(maxlen=FRAME_LIMITS.memory)
         self._reference: Array | None = None
         self._accepted: Array | None = None
         self._newest: Array | None = None
@@ -122,8 +122,10 @@ class FrameFilter:
             times: (k,) [s].
         """
         recording = FrameFilter(self._used.tolist(), self._wrist)
-        usable = [frame for frame in frames if not lost_reason(frame, self._used, self._wrist)]
-        for frame in usable[:: max(1, -(-len(usable) // LIMITS.memory))]:
+        usable = [
+            frame for frame in frames if not lost_frame_reason(frame, self._used, self._wrist)
+        ]
+        for frame in usable[:: max(1, -(-len(usable) // FRAME_LIMITS.memory))]:
             recording._bones.append(bone_lengths(frame))
         recording._reference = self._reference = _median(recording._bones)
         self._bones = recording._bones.copy()
@@ -150,19 +152,19 @@ class FrameFilter:
         self._bones.append(self._lengths)
         self._count += 1
         # The median is of 1, 2, 4, ... frames at first, then taken when all frames are new.
-        if self._count % LIMITS.memory == 0 or self._count & (self._count - 1) == 0:
+        if self._count % FRAME_LIMITS.memory == 0 or self._count & (self._count - 1) == 0:
             self._reference = _median(self._bones)
         self._accepted, self._elapsed = self._newest, 0.0
         return True
 
     def _problem(self, frame: Array) -> str:
-        reason = lost_reason(frame, self._used, self._wrist)
+        reason = lost_frame_reason(frame, self._used, self._wrist)
         if reason:
             return reason
         self._lengths = lengths = bone_lengths(frame)
         if self._reference is not None:
             palm = max(self._reference[4], self._reference[16])
-            most = LIMITS.stretch * self._reference + LIMITS.palm_lengths * palm
+            most = FRAME_LIMITS.stretch * self._reference + FRAME_LIMITS.palm_lengths * palm
             long = lengths > most
             if long.any():
                 bone = int(np.argmax(long))
@@ -172,7 +174,7 @@ class FrameFilter:
                 )
         if self._accepted is not None:
             away = frame[self._used] - self._accepted[self._used]
-            most = LIMITS.speed * self._elapsed + LIMITS.slack
+            most = FRAME_LIMITS.speed * self._elapsed + FRAME_LIMITS.slack
             squares = np.einsum("ij,ij->i", away, away)
             if squares.max() > most**2:
                 moved = np.sqrt(squares)
@@ -192,7 +194,7 @@ def _median(lengths: Sequence[Array] | deque[Array]) -> Array | None:
     return ordered[middle, np.arange(rows.shape[1])]
 
 
-def lost_contacts(points: Array) -> str:
+def lost_contacts_reason(points: Array) -> str:
     """Return why contact points (f, 3) are those of a lost hand; "" if they may be contacts."""
     known = points[np.isfinite(points).all(axis=1)]
     if not len(known):

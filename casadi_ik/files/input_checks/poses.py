@@ -27,7 +27,7 @@ LAST_ROW_ERROR = 1e-6
 """Rounding error of the last row, as a matrix inverse leaves it [-]."""
 
 
-def skew_of(matrices: Array) -> Array:
+def matrix_skew(matrices: Array) -> Array:
     """Return the largest entry of |R^T R - I| of matrices (..., 3, 3)."""
     with np.errstate(over="ignore", invalid="ignore"):  # of matrices that are refused
         product = np.swapaxes(matrices, -1, -2) @ matrices
@@ -43,7 +43,7 @@ def nearest_rotations(matrices: Array) -> tuple[Array, Bools]:
     Returns:
         (..., 3, 3) rotations, the identity where a matrix is not nearly one; (...) True there.
     """
-    skew = skew_of(matrices)
+    skew = matrix_skew(matrices)
     invalid = np.asarray(~((skew <= MAX_SKEW) & (np.linalg.det(matrices) > 0)))
     inexact = skew > EXACT_SKEW
     if not inexact.any():
@@ -74,7 +74,7 @@ def rotation_problem(matrix: Array) -> str:
     """Describe why a matrix (3, 3) is not a rotation."""
     expected = f"expected a rotation (R^T R = I within {MAX_SKEW:g}, determinant +1)"
     return (
-        f"the matrix is not a rotation: R^T R differs from I by {skew_of(matrix):.3g}, the "
+        f"the matrix is not a rotation: R^T R differs from I by {matrix_skew(matrix):.3g}, the "
         f"determinant is {np.linalg.det(matrix):.3g}; {expected}"
     )
 
@@ -110,7 +110,7 @@ def checked_pose(pose: ArrayLike, name: str = "object_pose") -> Array:
     return exact
 
 
-def one_pose(pose: ArrayLike, name: str = "pose") -> Array:
+def single_pose(pose: ArrayLike, name: str = "pose") -> Array:
     """Return a single pose (4, 4), see `checked_pose`.
 
     Raises:
@@ -157,7 +157,7 @@ def checked_quaternion(quaternion: ArrayLike, where: str) -> Array:
     return unit
 
 
-def rotations_of(quaternions: Array) -> Array:
+def rotations_from_quaternions(quaternions: Array) -> Array:
     """Return the rotations (k, 3, 3) of quaternions (k, 4), w x y z, of nearly length 1.
 
     Rows of another length give NaN, which the entrances report as invalid rows.

@@ -8,25 +8,25 @@ import numpy as np
 
 from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.limits import LIMITS, RAISED, limit
+from casadi_ik.files.limits import LIMITS, RAISE_HINT, scaled_limit
 
-LONGEST_INTERVAL = 1.0
+MAX_FRAME_INTERVAL = 1.0
 """Median time between frames of a hand from which on times are not in seconds [s].
 
 Trackers send at least ten frames a second; in milliseconds these are 100 apart, and a kilohertz is
 1 apart."""
 
-LONGEST_WAYPOINT_INTERVAL = 5.0
+MAX_WAYPOINT_INTERVAL = 5.0
 """The same for contacts [s], which may be waypoints of a slow motion."""
 
-FEWEST_FRAMES = 3
+MIN_FRAMES = 3
 """Fewer frames tell nothing about their unit."""
 
-UNITS = ((1e6, "nanoseconds", 1e-9), (1e3, "microseconds", 1e-6), (0.0, "milliseconds", 1e-3))
+TIME_UNITS = ((1e6, "nanoseconds", 1e-9), (1e3, "microseconds", 1e-6), (0.0, "milliseconds", 1e-3))
 """Median interval from which on times are probably in a unit, the unit, and its seconds."""
 
 
-def check_time_unit(times: Array, where: str, longest: float = LONGEST_INTERVAL) -> None:
+def check_time_unit(times: Array, where: str, longest: float = MAX_FRAME_INTERVAL) -> None:
     """Refuse times of frames that are probably not in seconds.
 
     Args:
@@ -37,12 +37,12 @@ def check_time_unit(times: Array, where: str, longest: float = LONGEST_INTERVAL)
     Raises:
         InputError: The message names the interval and the likely unit.
     """
-    if len(times) < FEWEST_FRAMES:
+    if len(times) < MIN_FRAMES:
         return
     interval = float(np.median(np.diff(times)))
     if interval < longest:
         return
-    unit, factor = next((name, factor) for least, name, factor in UNITS if interval >= least)
+    unit, factor = next((name, factor) for least, name, factor in TIME_UNITS if interval >= least)
     raise InputError(
         f"{where}: frames are {interval:.4g} s apart; expected seconds, less than {longest:g} "
         f"between frames (numbers in {unit}? multiply by {factor:g})"
@@ -60,10 +60,10 @@ def cycle_count(seconds: float, period: float, where: str) -> int:
     Raises:
         InputError: There are more than `FileLimits.stream_cycles`; the message has their number.
     """
-    count, most = seconds / period, limit(LIMITS.stream_cycles)
+    count, most = seconds / period, scaled_limit(LIMITS.stream_cycles)
     if not count <= most:
         raise InputError(
             f"{where}: {seconds:.4g} s in cycles of {period:.4g} s are {count:.4g} cycles; "
-            f"expected at most {most:,} {RAISED}"
+            f"expected at most {most:,} {RAISE_HINT}"
         )
     return math.ceil(count)

@@ -37,9 +37,9 @@ class UsualSizes:
     angle: float = math.radians(30.0)
 
 
-USUAL = UsualSizes()
+USUAL_SIZES = UsualSizes()
 
-ROUNDING = 1e-9
+ROUNDING_MARGIN = 1e-9
 """Relative excess that causes no warning: 30 deg are 30 deg however they are converted."""
 
 
@@ -55,7 +55,7 @@ def warn_of_far_contacts(points: Array, where: str, base_travel: float = 0.0) ->
         where: Name of the argument, or file and key.
         base_travel: Distance that a mobile base goes [m].
     """
-    most = USUAL.contact + base_travel
+    most = USUAL_SIZES.contact + base_travel
     beyond = np.abs(points) > most  # most points need no length: they are inside the box
     if not beyond.any():
         return
@@ -74,15 +74,15 @@ def warn_of_wide_tolerance(position: float, angle: float, where: str = "toleranc
         angle: Largest angle of the normal [rad].
         where: Name of the argument, or file and key.
     """
-    if position > USUAL.position * (1 + ROUNDING):
+    if position > USUAL_SIZES.position * (1 + ROUNDING_MARGIN):
         _warn(
-            f"{where}.position: found {position:g} m; expected at most {USUAL.position:g} m "
+            f"{where}.position: found {position:g} m; expected at most {USUAL_SIZES.position:g} m "
             "(a number in mm? 1 mm is 0.001)"
         )
-    if angle > USUAL.angle * (1 + ROUNDING):
+    if angle > USUAL_SIZES.angle * (1 + ROUNDING_MARGIN):
         _warn(
             f"{where}.angle: found {angle:g} rad ({math.degrees(angle):.4g} deg); expected at most "
-            f"{USUAL.angle:.3g} rad (30 deg; a number in degrees? use np.deg2rad({angle:g}))"
+            f"{USUAL_SIZES.angle:.3g} rad (30 deg; a number in degrees? use np.deg2rad({angle:g}))"
         )
 
 
@@ -94,10 +94,10 @@ def warn_of_obstacle(away: float, size: float, where: str) -> None:
         size: Its edge or diameter [m].
         where: Name of the scene or file, and key.
     """
-    if size > USUAL.obstacle * (1 + ROUNDING):
-        found, most = f"a solid is {size:.4g} m large", USUAL.obstacle
-    elif away > USUAL.obstacle_away:
-        found, most = f"a solid is {away:.4g} m from the robot's base", USUAL.obstacle_away
+    if size > USUAL_SIZES.obstacle * (1 + ROUNDING_MARGIN):
+        found, most = f"a solid is {size:.4g} m large", USUAL_SIZES.obstacle
+    elif away > USUAL_SIZES.obstacle_away:
+        found, most = f"a solid is {away:.4g} m from the robot's base", USUAL_SIZES.obstacle_away
     else:
         return
     _warn(f"{where}: {found}; expected at most {most:g} m (numbers in mm? 1 mm is 0.001)")
@@ -111,8 +111,8 @@ def warn_of_large_mesh(points: Array, where: str) -> None:
         where: File, or file and key.
     """
     size = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
-    if size > USUAL.mesh * (1 + ROUNDING):
+    if size > USUAL_SIZES.mesh * (1 + ROUNDING_MARGIN):
         _warn(
-            f"{where}: the mesh is {size:.4g} m large; expected at most {USUAL.mesh:g} m (a mesh "
-            "in mm? its scale is 0.001)"
+            f"{where}: the mesh is {size:.4g} m large; expected at most {USUAL_SIZES.mesh:g} m (a "
+            "mesh in mm? its scale is 0.001)"
         )

@@ -14,15 +14,15 @@ import numpy as np
 
 from casadi_ik.errors import DescriptionError, InvalidPoseError, UnsupportedError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.poses import rotations_of
+from casadi_ik.files.input_checks.poses import rotations_from_quaternions
 from casadi_ik.files.limits import LIMITS
-from casadi_ik.files.number_files import refuse_giants
+from casadi_ik.files.number_files import check_unpacked_size
 from casadi_ik.files.reading import Frame, Point, Struct, frame_matrix, read
-from casadi_ik.files.shipped import resolve, shipped_names
+from casadi_ik.files.shipped import resolve_description, shipped_names
 from casadi_ik.integrations.datasets.postures import HandPoses, of_fixed_axes, of_two_columns
 from casadi_ik.integrations.datasets.unpickling import Packed, read_npy, read_torch
 from casadi_ik.kinematics.arm_hand import ArmHand
-from casadi_ik.model.linkage import motion
+from casadi_ik.model.linkage import joint_motion
 from casadi_ik.model.pose import inverse
 
 
@@ -132,7 +132,9 @@ class Convention:
         """(k, 4, 4) poses of the robot's link that the data's poses, and their wrists, give."""
         poses, names = given.poses, given.names or tuple(one.name for one in self.wrist)
         for one in self.wrist:
-            moved = motion("revolute", np.array(one.axis), given.joints[:, names.index(one.name)])
+            moved = joint_motion(
+                "revolute", np.array(one.axis), given.joints[:, names.index(one.name)]
+            )
             moved[:, :3, 3] = one.xyz
             poses = poses @ moved
         return poses @ inverse(self.pose)
@@ -145,7 +147,7 @@ def load_convention(name_or_path: str | Path) -> Convention:
         UnknownNameError: No shipped convention has that name.
         DescriptionError: The file is missing or malformed.
     """
-    path = resolve(name_or_path, "datasets")
+    path = resolve_description(name_or_path, "datasets")
     entry, _ = read(path, ConventionFile)
     joints: dict[str, tuple[str, float]] = {}
     for name, said in entry.joints.items():
@@ -197,7 +199,7 @@ def of_robot(robot: ArmHand, names: tuple[str, ...]) -> Convention:
 
 
 def _layouts(name: str) -> list[str]:
-    entry, _ = read(resolve(name, "datasets"), ConventionFile)
+    entry, _ = read(resolve_description(name, "datasets"), ConventionFile)
     return entry.layouts
 
 
@@ -387,7 +389,7 @@ def numbers(where: str, found: Mapping[str, Any], key: str) -> Array:
         value = value.value
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
         raise DescriptionError(f"{where}: {key}: expected an array of numbers")
-    refuse_giants(f"{where}: {key}", 8 * value.size, LIMITS.dataset_bytes)
+    check_unpacked_size(f"{where}: {key}", 8 * value.size, LIMITS.dataset_bytes)
     return value.astype(np.float64)
 
 
@@ -413,7 +415,10 @@ def _object_pose(where: str, found: Mapping[str, Any]) -> Array:
     if row.shape != (7,):
         raise DescriptionError(f"{where}: obj_pose: found {row.size} numbers, expected 7")
     held = HandPoses(
-        f"{where}: obj_pose", row[None, :3], rotations_of(row[None, 3:]), np.zeros((1, 0))
+        f"{where}: obj_pose",
+        row[None, :3],
+        rotations_from_quaternions(row[None, 3:]),
+        np.zeros((1, 0)),
     )
     if held.faults:
         raise InvalidPoseError(f"{where}: obj_pose: {held.faults[0]}")
@@ -428,7 +433,7 @@ def _of_stages(where: str, found: Mapping[str, Any], stages: Mapping[str, Array]
     for name, rows in stages.items():
         if rows.shape != shape:
             raise DescriptionError(f"{where}: {name}: found shape {rows.shape}, expected {shape}")
-        given = HandPoses(where, rows[:, :3], rotations_of(rows[:, 3:7]), rows[:, 7:])
+        given = HandPoses(where, rows[:, :3], rotations_from_quaternions(rows[:, 3:7]), rows[:, 7:])
         poses = back @ given.poses
         made[name] = replace(given, position=poses[:, :3, 3], rotation=poses[:, :3, :3])
     scales = _scales(where, found, len(stages["grasp"]))

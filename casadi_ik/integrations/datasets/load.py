@@ -19,9 +19,9 @@ from casadi_ik.errors import (
     os_errors,
 )
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.poses import rotations_of
-from casadi_ik.files.limits import LIMITS, RAISED, limit
-from casadi_ik.files.number_files import read_npz, refuse_giants
+from casadi_ik.files.input_checks.poses import rotations_from_quaternions
+from casadi_ik.files.limits import LIMITS, RAISE_HINT, scaled_limit
+from casadi_ik.files.number_files import check_unpacked_size, read_npz
 from casadi_ik.integrations.datasets.layouts import (
     LAYOUTS,
     READERS,
@@ -49,8 +49,8 @@ from casadi_ik.kinematics.arm_hand import ArmHand, load_robot
 from casadi_ik.kinematics.contacts import NAMES
 from casadi_ik.model.grasp import Contact, Grasp
 from casadi_ik.model.load_grasp import load_grasp_files
-from casadi_ik.model.objects import GraspObject, is_mesh, load_object
-from casadi_ik.model.targets import DIRECTIONS
+from casadi_ik.model.objects import GraspObject, is_mesh_name, load_object
+from casadi_ik.model.targets import DIRECTIONS_KEY
 from casadi_ik.solve.target_files import TargetFile, polars_module
 
 Invalid = Literal["error", "drop", "clip"]
@@ -210,7 +210,7 @@ def read_table(path: Path) -> HandPoses:
     readers = dict(zip(map(str, SUFFIXES), (_of_csv, _of_npz, _of_parquet), strict=True))
     with os_errors(f"{path}: cannot be read", DescriptionError):
         if path.suffix.lower() == ".csv":
-            refuse_giants(str(path), path.stat().st_size, LIMITS.table_bytes)
+            check_unpacked_size(str(path), path.stat().st_size, LIMITS.table_bytes)
         columns = readers[path.suffix.lower()](path)
     turned = QUATERNION if QUATERNION[0] in columns else ANGLES
     for name in (*PLACE, *turned):
@@ -225,7 +225,7 @@ def read_table(path: Path) -> HandPoses:
     def block(of: tuple[str, ...]) -> Array:
         return np.stack([columns[name] for name in of], axis=1) if of else np.zeros((count, 0))
 
-    rotate = rotations_of if turned is QUATERNION else of_fixed_axes
+    rotate = rotations_from_quaternions if turned is QUATERNION else of_fixed_axes
     return HandPoses(str(path), block(PLACE), rotate(block(turned)), block(names), names)
 
 
@@ -283,7 +283,7 @@ def _of_parquet(path: Path) -> Mapping[str, Array]:
                     f"{path}: {name}: found values of type {kind}, expected numbers"
                 )
         count = int(scanned.select(pl.len()).collect().item())
-        refuse_giants(str(path), 8 * len(schema) * count, LIMITS.table_bytes)
+        check_unpacked_size(str(path), 8 * len(schema) * count, LIMITS.table_bytes)
         frame = scanned.select(pl.all().cast(pl.Float64).fill_null(np.nan)).collect()
     except (pl.exceptions.PolarsError, OSError) as error:
         raise DescriptionError(f"{path}: no Parquet file: {error}") from error
@@ -517,16 +517,17 @@ def _thing(
     """What is grasped, and the name by which it is found again; a mesh as large as it is said."""
     if not isinstance(grasped, str):
         return grasped, "" if grasped is None else grasped.name
-    if scales and is_mesh(grasped) and "@" not in grasped:
+    if scales and is_mesh_name(grasped) and "@" not in grasped:
         grasped = f"{grasped}@{scales[0]:.6g}"
     thing = load_object(grasped)
     return thing, grasped
 
 
 def _refuse_too_many(where: str, count: int) -> None:
-    if count > limit(LIMITS.candidates):
+    if count > scaled_limit(LIMITS.candidates):
         raise DescriptionError(
-            f"{where}: found {count} grasps, expected at most {limit(LIMITS.candidates)} {RAISED}"
+            f"{where}: found {count} grasps, expected at most {scaled_limit(LIMITS.candidates)} "
+            f"{RAISE_HINT}"
         )
 
 
@@ -589,7 +590,7 @@ def _contact(vectors: dict[str, np.ndarray]) -> Contact | None:
     given = {name: vector for name, vector in vectors.items() if not np.isnan(vector).all()}
     if not given:
         return None
-    if DIRECTIONS in given and "points" not in given:
-        return Contact(direction=given[DIRECTIONS])
+    if DIRECTIONS_KEY in given and "points" not in given:
+        return Contact(direction=given[DIRECTIONS_KEY])
     more: dict[str, Any] = {name[:-1]: given[name] for name in NAMES if name in given}
     return Contact(given.get("points"), given.get("normals"), **more)

@@ -18,9 +18,9 @@ import numpy as np
 
 from casadi_ik.errors import DescriptionError, MissingExtraError, UnsupportedError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.poses import rotations_of
+from casadi_ik.files.input_checks.poses import rotations_from_quaternions
 from casadi_ik.files.limits import LIMITS
-from casadi_ik.files.number_files import UNREADABLE, read_npz, refuse_giants
+from casadi_ik.files.number_files import READ_ERRORS, check_unpacked_size, read_npz
 from casadi_ik.files.reading import parse_yaml, read_text
 from casadi_ik.integrations.datasets.postures import HandPoses
 from casadi_ik.kinematics.arm_hand import ArmHand
@@ -161,7 +161,7 @@ def parallel_layout(path: Path) -> str:
     if kind == ".npy":
         try:
             shape = np.lib.format.open_memmap(path, mode="r").shape
-        except (OSError, *UNREADABLE):
+        except (OSError, *READ_ERRORS):
             return ""
         return "graspnet" if len(shape) == 2 and shape[1] == 17 else ""
     return ""
@@ -195,7 +195,7 @@ def isaac_grasp(path: Path) -> HandPoses:
             row = [[values[name]] for name in names]
             rows.append(_flat(where, row, (1,) * len(names), "positions of joints"))
     values = np.array(pose_rows)
-    rotation = rotations_of(values[:, 3:])
+    rotation = rotations_from_quaternions(values[:, 3:])
 
     def stage(joints: list[list[float]], pregrasp: HandPoses | None) -> HandPoses:
         place = values[:, :3]
@@ -296,7 +296,7 @@ def _poses(where: str, value: Any) -> Array:
         found = np.zeros(0)
     if found.ndim != 3 or found.shape[1:] != (4, 4) or not len(found):
         raise DescriptionError(f"{where}: found shape {found.shape}, expected (k, 4, 4)")
-    refuse_giants(where, 8 * found.size, LIMITS.dataset_bytes)
+    check_unpacked_size(where, 8 * found.size, LIMITS.dataset_bytes)
     return found
 
 
@@ -341,9 +341,9 @@ def _arrays(path: Path) -> Mapping[str, Array]:
 def _load_npy(path: Path) -> Array:
     try:
         rows = np.lib.format.open_memmap(path, mode="r")
-    except (OSError, *UNREADABLE) as error:
+    except (OSError, *READ_ERRORS) as error:
         raise DescriptionError(f"{path}: cannot be read: {error}") from error
-    refuse_giants(str(path), 8 * rows.size, LIMITS.dataset_bytes)
+    check_unpacked_size(str(path), 8 * rows.size, LIMITS.dataset_bytes)
     if rows.dtype.kind not in "fiu":
         raise DescriptionError(f"{path}: found values of type {rows.dtype}, expected numbers")
     return np.array(rows, dtype=float)
@@ -359,12 +359,14 @@ def _read_hdf5(path: Path) -> tuple[Any, Any, Any]:
         with library.File(path, "r") as file:
             for name in ("grasps/transforms", "grasps/qualities/flex/object_in_gripper"):
                 if name in file:
-                    refuse_giants(f"{path}: {name}", 8 * file[name].size, LIMITS.dataset_bytes)
+                    check_unpacked_size(
+                        f"{path}: {name}", 8 * file[name].size, LIMITS.dataset_bytes
+                    )
             transforms = file["grasps/transforms"][()]
             quality = file.get("grasps/qualities/flex/object_in_gripper")
             scale = file.get("object/scale")
             success = None if quality is None else quality[()]
             return transforms, success, None if scale is None else scale[()]
-    except (OSError, KeyError, AttributeError, *UNREADABLE) as error:
+    except (OSError, KeyError, AttributeError, *READ_ERRORS) as error:
         reason = " ".join(str(error).split())
         raise DescriptionError(f"{path}: not a file of ACRONYM: {reason}") from error

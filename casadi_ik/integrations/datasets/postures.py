@@ -14,7 +14,7 @@ from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.files.input_checks.poses import nearest_rotations, rotation_problem
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.description import RobotDescription
-from casadi_ik.model.linkage import link_poses, motion
+from casadi_ik.model.linkage import joint_motion, link_poses
 from casadi_ik.model.pose import inverse
 
 
@@ -221,7 +221,7 @@ class HandPoses:
 
 def of_fixed_axes(angles: Array) -> Array:
     """(k, 3, 3) rotations about fixed axes by (k, 3) roll, pitch, yaw [rad], as URDF has them."""
-    x, y, z = (motion("revolute", axis, angles[:, i]) for i, axis in enumerate(np.eye(3)))
+    x, y, z = (joint_motion("revolute", axis, angles[:, i]) for i, axis in enumerate(np.eye(3)))
     return (z @ y @ x)[:, :3, :3]
 
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.limits import LIMITS
-from casadi_ik.files.number_files import UNREADABLE, refuse_giants
+from casadi_ik.files.number_files import READ_ERRORS, check_unpacked_size
 
 TYPES = re.compile(r"^[<>|=]?([biufcSUO]\d{0,5}|b1|\?)$")
 """Element types that arrays may have."""
@@ -176,7 +176,7 @@ def reading(path: Path, kind: str) -> Iterator[None]:
     """
     try:
         size = path.stat().st_size
-        refuse_giants(str(path), size, LIMITS.dataset_bytes)
+        check_unpacked_size(str(path), size, LIMITS.dataset_bytes)
         yield
     except OSError as error:
         raise DescriptionError(f"{path}: cannot be read: {error.strerror or error}") from error
@@ -185,7 +185,7 @@ def reading(path: Path, kind: str) -> Iterator[None]:
             f"{path}: its pickle holds {_line(error)}, expected arrays, containers, texts and "
             "numbers only"
         ) from error
-    except (*UNREADABLE, AttributeError, KeyError, IndexError, TypeError) as error:
+    except (*READ_ERRORS, AttributeError, KeyError, IndexError, TypeError) as error:
         raise DescriptionError(f"{path}: damaged, expected {kind}: {_line(error)}") from error
 
 
@@ -338,7 +338,7 @@ def read_torch(path: Path) -> Any:
             raise DescriptionError(f"{path}: found no zip, expected a file of torch.save")
         with ZipFile(path) as archive:
             size = sum(one.file_size for one in archive.infolist())
-            refuse_giants(str(path), size, LIMITS.dataset_bytes)
+            check_unpacked_size(str(path), size, LIMITS.dataset_bytes)
             held = [n for n in archive.namelist() if n.count("/") <= 1 and n.endswith("data.pkl")]
             if not held:
                 raise DescriptionError(f"{path}: data.pkl: missing, expected a file of torch.save")

@@ -13,15 +13,15 @@ from casadi_ik.integrations.importing.surfaces import Surface, together
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.joints import Joint
 from casadi_ik.model.linkage import (
-    above,
-    below,
-    depth,
+    chain_to,
+    joint_depth,
     joint_positions,
+    joints_below,
     link_poses,
     moving_below,
-    rigid,
+    rigid_links,
 )
-from casadi_ik.model.parts import Part
+from casadi_ik.model.parts import RobotPart
 from casadi_ik.model.xml_tree import RobotTree, TreeJoint
 
 WORDS = {
@@ -135,7 +135,7 @@ def ends_of_arms(tree: RobotTree, palm: str) -> list[str]:
         joint.parent
         for first in moving_below(tree, palm)
         if is_limb(tree, first)
-        for joint in (first, *below(tree, first.child))
+        for joint in (first, *joints_below(tree, first.child))
         if joint.type != "fixed" and not moving_below(tree, joint.child)
     ]
 
@@ -184,7 +184,7 @@ def _ends_below(tree: RobotTree, link: str, last: TreeJoint | None) -> list[Limb
 
 def _carries_a_palm(tree: RobotTree, joint: TreeJoint) -> bool:
     """Return whether a link from which three or more chains go out is moved by a joint."""
-    links = (joint.child, *(further.child for further in below(tree, joint.child)))
+    links = (joint.child, *(further.child for further in joints_below(tree, joint.child)))
     return any(len(moving_below(tree, link)) >= GUESS.palm_chains for link in links)
 
 
@@ -197,44 +197,44 @@ def _is_wheel(tree: RobotTree, joint: TreeJoint) -> bool:
 
 def _is_leg(tree: RobotTree, link: str) -> bool:
     """Return whether the names of a chain are those of a leg."""
-    chain = [joint for joint in above(tree, link) if joint.type != "fixed"]
+    chain = [joint for joint in chain_to(tree, link) if joint.type != "fixed"]
     return any(re.search(LEG, f"{joint.name} {joint.child}".lower()) for joint in chain[-3:])
 
 
-def find_fingers(part: Part, palm: str) -> list[Branch]:
+def find_fingers(part: RobotPart, palm: str) -> list[Branch]:
     """The fingers below a palm, in the file's order."""
     found: list[Branch] = []
     for joint in moving_below(part, palm):
         for start, end in _ends(part, joint):
-            links = [start.child, *(one.child for one in below(part, start.child))]
+            links = [start.child, *(one.child for one in joints_below(part, start.child))]
             names = [*links, *(one.name for one in part.joints if one.child in links)]
-            to_end = above(part, end.child, palm)
+            to_end = chain_to(part, end.child, palm)
             word, chain = _word(names), tuple(one for one in to_end if one.type != "fixed")
             link = _tip(part, end.child)
             found.append(Branch(word or "", chain, link, tuple(links), bool(word)))
     return _called(found)
 
 
-def _ends(part: Part, joint: Joint) -> list[tuple[Joint, Joint]]:
+def _ends(part: RobotPart, joint: Joint) -> list[tuple[Joint, Joint]]:
     """The fingers that a joint carries: the first joint that is one's own, and its last.
 
     Two chains of two joints or more that hang on one joint are two fingers; of shorter ones
     (linkages) the longest counts.
     """
     next_ = moving_below(part, joint.child)
-    long = [one for one in next_ if depth(part, one.child) >= 1]
+    long = [one for one in next_ if joint_depth(part, one.child) >= 1]
     if len(long) >= 2:
         return [pair for one in long for pair in _ends(part, one)]
     if not next_:
         return [(joint, joint)]
-    longest = max(next_, key=lambda one: depth(part, one.child))
+    longest = max(next_, key=lambda one: joint_depth(part, one.child))
     further = _ends(part, longest)
     return further if len(further) > 1 else [(joint, further[0][1])]
 
 
-def _tip(part: Part, link: str) -> str:
+def _tip(part: RobotPart, link: str) -> str:
     """The last link, or the frame of a tip that is fixed to it."""
-    ends = [one for one in rigid(part, link)[1:] if "tip" in one.lower()]
+    ends = [one for one in rigid_links(part, link)[1:] if "tip" in one.lower()]
     return ends[0] if len(ends) == 1 else link
 
 
@@ -276,7 +276,7 @@ def _stem(links: tuple[str, ...]) -> str:
     return re.sub(r"[^a-z0-9_]+", "_", common).strip("_")
 
 
-def guess_thumb(part: Part, branches: list[Branch], pads: list[Pad]) -> tuple[int, str]:
+def guess_thumb(part: RobotPart, branches: list[Branch], pads: list[Pad]) -> tuple[int, str]:
     """The thumb's place among the fingers, and how it was found."""
     named = [i for i, branch in enumerate(branches) if branch.named and branch.name == "thumb"]
     if len(named) == 1:
@@ -308,7 +308,7 @@ def guess_thumb(part: Part, branches: list[Branch], pads: list[Pad]) -> tuple[in
 
 
 def guess_palm_frame(
-    part: Part, palm: str, branches: list[Branch], pads: list[Pad], thumb: int
+    part: RobotPart, palm: str, branches: list[Branch], pads: list[Pad], thumb: int
 ) -> Array:
     """(4, 4) in the palm's link: origin amid the fingers' bases, z outwards, y to the thumb."""
     poses = _poses(part, _middle(part))
@@ -359,7 +359,7 @@ class Pad:
 
 
 def guess_pads(
-    part: Part, palm: str, branches: list[Branch], surfaces: dict[str, Surface]
+    part: RobotPart, palm: str, branches: list[Branch], surfaces: dict[str, Surface]
 ) -> list[Pad]:
     """A pad for every finger."""
     middle = _middle(part)
@@ -380,7 +380,7 @@ def guess_pads(
     return pads
 
 
-def guess_fixed_jaw(part: Part, palm: str, pad: Pad, surface: Surface | None) -> Pad:
+def guess_fixed_jaw(part: RobotPart, palm: str, pad: Pad, surface: Surface | None) -> Pad:
     """Return the pad of a jaw that is fixed to the palm's link, opposite the one that moves.
 
     Args:
@@ -414,14 +414,14 @@ Body = tuple[Surface | None, Array, int]
 chain's joints moves it."""
 
 
-def _body(part: Part, branch: Branch, surfaces: dict[str, Surface]) -> Body:
+def _body(part: RobotPart, branch: Branch, surfaces: dict[str, Surface]) -> Body:
     rest = _poses(part, {})
     for index in reversed(range(len(branch.chain))):
         joint = branch.chain[index]
         inverse = np.linalg.inv(rest[joint.child])
         parts = [
             surfaces[link].moved(inverse @ rest[link])
-            for link in rigid(part, joint.child)
+            for link in rigid_links(part, joint.child)
             if link in surfaces
         ]
         whole = together(parts)
@@ -454,7 +454,7 @@ def _long_way(body: Surface, joint: Joint) -> Array:
     return _unit(way, np.array([0.0, 0.0, 1.0]))
 
 
-def _pad(part: Part, branch: Branch, body: Body, meeting: Array) -> Pad:
+def _pad(part: RobotPart, branch: Branch, body: Body, meeting: Array) -> Pad:
     shape, end, index = body
     joint = branch.chain[index]
     sign, why = _closing(part, branch, index, end, meeting)
@@ -505,7 +505,7 @@ def _skin(shape: Surface, u: Array, normal: Array) -> tuple[Array, str, float]:
 
 
 def _closing(
-    part: Part, branch: Branch, index: int, end: Array, meeting: Array
+    part: RobotPart, branch: Branch, index: int, end: Array, meeting: Array
 ) -> tuple[float, str]:
     """Which way the last joint turns when the finger closes, and how that was decided."""
     joint = branch.chain[index]
@@ -542,12 +542,12 @@ def _closing(
     return sign, "faces the other fingers"
 
 
-def _middle(part: Part) -> dict[str, float]:
+def _middle(part: RobotPart) -> dict[str, float]:
     """Every joint in the middle of its range [rad or m]."""
     return {one.name: (one.lower + one.upper) / 2 for one in part.joints if one.type != "fixed"}
 
 
-def _random(part: Part, rng: np.random.Generator) -> dict[str, float]:
+def _random(part: RobotPart, rng: np.random.Generator) -> dict[str, float]:
     """Every joint anywhere in the middle half of its range, couplings left out."""
     return {
         one.name: one.lower + (0.25 + 0.5 * rng.random()) * (one.upper - one.lower)
@@ -556,14 +556,14 @@ def _random(part: Part, rng: np.random.Generator) -> dict[str, float]:
     }
 
 
-def _poses(part: Part, values: Mapping[str, float]) -> dict[str, Array]:
+def _poses(part: RobotPart, values: Mapping[str, float]) -> dict[str, Array]:
     """(4, 4) pose of every link in the root's frame."""
     return link_poses(part.root, part.joints, values)
 
 
-def _moving_link(part: Part, link: str) -> str:
+def _moving_link(part: RobotPart, link: str) -> str:
     """The link itself, or the next one above that a joint moves."""
-    moving = [one.child for one in above(part, link) if one.type != "fixed"]
+    moving = [one.child for one in chain_to(part, link) if one.type != "fixed"]
     return moving[-1] if moving else part.root
 
 

@@ -36,10 +36,10 @@ from casadi_ik.integrations.importing.surfaces import link_surfaces
 from casadi_ik.integrations.importing.write import FileLine, HandLines, Written
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.imported_parts import hand_from_file
-from casadi_ik.model.joining import MOST_SIDES
-from casadi_ik.model.linkage import above, below, ends, moving_below, rigid
+from casadi_ik.model.joining import MAX_SIDES
+from casadi_ik.model.linkage import chain_to, joints_below, leaf_links, moving_below, rigid_links
 from casadi_ik.model.load_robot import load_description
-from casadi_ik.model.parts import Part
+from casadi_ik.model.parts import RobotPart
 from casadi_ik.model.schema import HandFromFile
 from casadi_ik.model.urdf_mjcf import joint_name, read_tree
 from casadi_ik.model.xml_tree import RobotTree, TreeJoint
@@ -67,7 +67,7 @@ def the_tip(tree: RobotTree) -> tuple[str, str]:
         last = movers[0]
         link = last.child
     if last is None or (len(movers) > 1 and holds_arms(tree, link)):
-        last_ones = ends(tree, tree.root)
+        last_ones = leaf_links(tree, tree.root)
         raise InputError(
             f"--tip: missing; {tree.path.name} branches at {link!r}: write the link that carries "
             f"the hand, such as {', '.join(last_ones[:8])}"
@@ -116,10 +116,10 @@ def the_palms(tree: RobotTree, asked: Sequence[str]) -> dict[str, tuple[str, str
     for link in asked:
         checked_palm(tree, link)
     several = [(link, "--palm") for link in asked] or guessed_palms(tree)
-    if len(several) > MOST_SIDES:
+    if len(several) > MAX_SIDES:
         option = "found" if asked else f"{tree.path.name} has several arms: found"
         raise InputError(
-            f"--palm: {option} {len(several)} links, expected {MOST_SIDES} at most; write those "
+            f"--palm: {option} {len(several)} links, expected {MAX_SIDES} at most; write those "
             f"that fingers hang on or that end an arm: {', '.join(link for link, _ in several[:7])}"
         )
     if len(several) == 1:
@@ -127,7 +127,7 @@ def the_palms(tree: RobotTree, asked: Sequence[str]) -> dict[str, tuple[str, str
     for link in asked:
         if asked.count(link) > 1:
             raise InputError(f"--palm: {link!r} is given twice, expected one of each hand")
-        if any(joint.child in asked for joint in below(tree, link)):
+        if any(joint.child in asked for joint in joints_below(tree, link)):
             raise InputError(f"--palm: {link!r} carries another palm, expected hands side by side")
     names = [_side_name(link) for link, _ in several]
     if "" in names or len(set(names)) < len(names):
@@ -137,9 +137,9 @@ def the_palms(tree: RobotTree, asked: Sequence[str]) -> dict[str, tuple[str, str
 
 def guessed_palms(tree: RobotTree) -> list[tuple[str, str]]:
     """Return the palms of a file's hands, or the ends of its arms, and how they were found."""
-    ends = limb_ends(tree)
-    if len(ends) == 1:
-        (end,) = ends
+    limb_end_links = limb_ends(tree)
+    if len(limb_end_links) == 1:
+        (end,) = limb_end_links
         motors = [
             joint
             for joint in tree.chain(tree.root, end.link, str(tree.path))
@@ -155,13 +155,13 @@ def guessed_palms(tree: RobotTree) -> list[tuple[str, str]]:
         else (end.link, "an arm with a jaw: the link on which the last joint is")
         if end.has_fingers
         else (tool_frame(tree, end.link), "an arm without a hand ends here")
-        for end in ends
+        for end in limb_end_links
     ]
 
 
 def tool_frame(tree: RobotTree, link: str) -> str:
     """Return the frame on the last link of an arm that a tool is screwed to: by its name."""
-    fixed = rigid(tree, link)
+    fixed = rigid_links(tree, link)
     for pattern in FLANGES:
         for name in fixed:
             if re.search(pattern, name.lower()):
@@ -178,7 +178,7 @@ def _side_name(link: str) -> str:
 def kept_joints(tree: RobotTree, end: str, carried: bool = True) -> list[TreeJoint]:
     """The joints from the root to a link, and those below it unless it is an arm's end."""
     chain = list(tree.chain(tree.root, end, str(tree.path)))
-    return chain + (below(tree, end) if carried else [])
+    return chain + (joints_below(tree, end) if carried else [])
 
 
 def assumed_limits(joints: list[TreeJoint]) -> dict[str, tuple[float, float]]:
@@ -344,7 +344,7 @@ def import_robot(
             file=str(hand.resolve()),
             palm=link,
             locked={name: value for name, value in locked.items() if name in own},
-            limits={name: ends for name, ends in limits.items() if name in own},
+            limits={name: bounds for name, bounds in limits.items() if name in own},
             xacro=told,
         )
         part = hand_from_file(entry, {}, key, out)
@@ -376,12 +376,12 @@ def import_robot(
 
 
 def _found_hand(
-    tree: RobotTree, part: Part, side: str, palm: str, how: str
+    tree: RobotTree, part: RobotPart, side: str, palm: str, how: str
 ) -> tuple[HandLines, list[Branch], list[str]]:
     """A hand's fingers with their pads, the thumb first, and what cannot be read."""
     branches = find_fingers(part, palm)
     if not branches:
-        motors = [joint for joint in above(part, palm) if joint.type != "fixed"]
+        motors = [joint for joint in chain_to(part, palm) if joint.type != "fixed"]
         if len(motors) < GUESS.lone_arm_joints:
             raise DescriptionError(
                 f"{tree.path}: no joint moves below the palm {palm!r}; try --palm"
@@ -389,7 +389,7 @@ def _found_hand(
         pad = tool_pad(palm)
         lines = HandLines(side, np.eye(4), palm, how, {"tool": pad}, None)
         return lines, [Branch("tool", (), palm, (palm,), False)], []
-    is_jaw = len(branches) == 1 and len(branches[0].chain) == 1 and bool(above(part, palm))
+    is_jaw = len(branches) == 1 and len(branches[0].chain) == 1 and bool(chain_to(part, palm))
     wanted = {one for branch in branches for one in _ends_of(part, branch)}
     surfaces, notes = link_surfaces(tree, wanted | {palm} if is_jaw else wanted)
     pads = guess_pads(part, palm, branches, surfaces)
@@ -416,9 +416,9 @@ def _found_hand(
     return lines, [replace(branches[i], name=names[i]) for i in order], notes
 
 
-def _ends_of(part: Part, branch: Branch) -> list[str]:
+def _ends_of(part: RobotPart, branch: Branch) -> list[str]:
     """The links of a finger's last two phalanges, one of which has a shape, one hopes."""
-    return [link for joint in branch.chain[-2:] for link in rigid(part, joint.child)]
+    return [link for joint in branch.chain[-2:] for link in rigid_links(part, joint.child)]
 
 
 def _stated_xacro(path: Path, xacro: bool | Sequence[str]) -> bool | list[str]:

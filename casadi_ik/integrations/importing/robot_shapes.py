@@ -21,8 +21,8 @@ from casadi_ik.integrations.importing.surfaces import Surface, link_surfaces
 from casadi_ik.integrations.importing.triangle_tree import TriangleTree
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.link_shapes import Touching, capsules_of
-from casadi_ik.model.linkage import below, joint_positions, link_poses, rigid_bodies
-from casadi_ik.model.parts import PREFIX, Part
+from casadi_ik.model.linkage import joint_positions, joints_below, link_poses, rigid_bodies
+from casadi_ik.model.parts import HAND_PREFIX, RobotPart
 from casadi_ik.model.schema import ShapeEntry
 from casadi_ik.model.xml_tree import RobotTree
 
@@ -30,7 +30,7 @@ from casadi_ik.model.xml_tree import RobotTree
 def hand_links(robot: RobotDescription) -> frozenset[str]:
     """The links that the mount carries: all of the hand's file; none if there is no mount."""
     mounted = {joint.child for joint in robot.joints if joint.part == "mount"}
-    carried = {joint.child for link in mounted for joint in below(robot, link)}
+    carried = {joint.child for link in mounted for joint in joints_below(robot, link)}
     return frozenset(mounted | carried)
 
 
@@ -66,7 +66,7 @@ SAMPLING = ContactSampling()
 
 
 def may_touch(
-    part: Part | RobotDescription,
+    part: RobotPart | RobotDescription,
     shapes: Mapping[str, Sequence[ShapeEntry]],
     surfaces: Mapping[str, Surface],
     report: Callable[[int], object] | None = None,
@@ -114,7 +114,7 @@ def may_touch(
     return touching
 
 
-def _random_poses(part: Part | RobotDescription, rng: np.random.Generator) -> dict[str, Array]:
+def _random_poses(part: RobotPart | RobotDescription, rng: np.random.Generator) -> dict[str, Array]:
     """Return the pose (k, 4, 4) of every link in random configurations."""
     lower, upper = (
         np.array([getattr(motor, end) for motor in part.actuators]) for end in ("lower", "upper")
@@ -263,5 +263,5 @@ def robot_shapes(
 
 def name_in_robot(name: str, names: tuple[str, ...], taken: set[str]) -> str:
     """What a link or joint of a file is called in the robot."""
-    prefixed = PREFIX + name
+    prefixed = HAND_PREFIX + name
     return prefixed if prefixed in names and name in taken else name

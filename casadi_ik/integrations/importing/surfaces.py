@@ -22,10 +22,10 @@ from casadi_ik.model.xml_tree import (
     RobotTree,
     collides,
     mjcf_pose,
-    pose_of,
+    origin_pose,
+    parse_numbers,
     simple_geom,
     simple_shape,
-    values_of,
 )
 
 AROUND = 24
@@ -220,7 +220,7 @@ def _of_urdf(
 
 def _of_element(shape: Element, missing: Missing) -> Surface | None:
     """An element ``collision`` or ``visual`` in its link's frame."""
-    mesh, simple, pose = shape.find("geometry/mesh"), simple_shape(shape), pose_of(shape)
+    mesh, simple, pose = shape.find("geometry/mesh"), simple_shape(shape), origin_pose(shape)
     surface = None
     if mesh is not None:
         surface = _of_mesh(mesh, missing)
@@ -235,7 +235,7 @@ def _of_mesh(element: Element, missing: Missing) -> Surface | None:
     if place is None:
         missing.absent(name)
         return None
-    scale = values_of(element.get("scale", "1 1 1"))
+    scale = parse_numbers(element.get("scale", "1 1 1"))
     try:
         points, triangles = read_mesh(place, missing.path.name)
     except DescriptionError as error:

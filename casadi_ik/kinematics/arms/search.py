@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 
 from casadi_ik.compile.graphs import FunctionGraph
-from casadi_ik.files.arrays import Array, even_steps
+from casadi_ik.files.arrays import Array, spread_steps
 from casadi_ik.kinematics.arms.family import ArmFamily, ClosedForm, Score, better
 from casadi_ik.kinematics.forward import Pose
 from casadi_ik.kinematics.smooth import Expr, shared
@@ -320,7 +320,7 @@ class ArmTrials:
                 run > 0, half_range * ((2 * index + 1) / subintervals - 1), 0
             )
             half_range = ca.if_else(run > 0, half_range / subintervals, half_range)
-            by_visit = visit * float(even_steps(1)[0])
+            by_visit = visit * float(spread_steps(1)[0])
             shift = ca.if_else(run > 0, (by_visit - ca.floor(by_visit) - 0.5) / 3, 0)
         step = 2 * half_range / self._samples
         centre, width = middle, half_range
@@ -346,7 +346,7 @@ class ArmTrials:
         values = []
         for i in range(samples):
             number = (visit * len(self._levels) + trial) * samples + i
-            fractions = number * ca.DM(even_steps(size).tolist())
+            fractions = number * ca.DM(spread_steps(size).tolist())
             fractions = fractions - ca.floor(fractions + 0.5)
             value = centre + width * fractions * (high - low)
             values.append(ca.fmin(ca.fmax(value, low), high))

@@ -16,7 +16,7 @@ from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import CasadiIKError, InputError
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.input_checks.numbers import checked_integer, checked_number
-from casadi_ik.files.input_checks.poses import one_pose
+from casadi_ik.files.input_checks.poses import single_pose
 from casadi_ik.files.progress import progress
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.grasp import Contact, Grasp, Tolerance
@@ -327,7 +327,7 @@ def grasps_of(
     solver.robot.description.one_hand("grasps_of")
     begin, parameters = time.process_time(), TouchParameters()
     robot = solver.robot
-    object_pose = np.eye(4) if pose is None else one_pose(pose)
+    object_pose = np.eye(4) if pose is None else single_pose(pose)
     question = _checked(fingers, mu, hold, limit, among, seed, prefer)
     goal = max(question.limit, question.among)
     if not isinstance(surface, Surface):

@@ -18,7 +18,7 @@ from casadi_ik.compile.cache import trusted_cache, user_temp_dir
 from casadi_ik.errors import InputError, os_errors
 from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.files.input_checks.numbers import checked_integer, checked_number
-from casadi_ik.files.writing import written_whole
+from casadi_ik.files.writing import atomic_write
 from casadi_ik.model.objects import GraspObject, load_object
 from casadi_ik.model.shapes import MeshShape
 from casadi_ik.planning.touch.nearest import NearestPoints, TriangleTree
@@ -338,7 +338,7 @@ def _stored(source: Any) -> Path:
     with os_errors(f"{path}: a mesh cannot be stored", InputError):
         if not path.exists():
             folder.mkdir(parents=True, exist_ok=True)
-            with written_whole(path) as part:
+            with atomic_write(path) as part:
                 part.write_text(text, encoding="ascii")
     return path
 

@@ -27,10 +27,10 @@ from casadi_ik.compile.graphs import recipe
 from casadi_ik.compile.libraries import load_library
 from casadi_ik.compile.loop import SLOTS, UNBEGUN, UNBOUNDED, SlotSource
 from casadi_ik.errors import KernelError
-from casadi_ik.files.arrays import Array, even_steps
+from casadi_ik.files.arrays import Array, spread_steps
 from casadi_ik.kinematics.contact_fit import fresh_fit
 from casadi_ik.kinematics.contacts import LENGTH
-from casadi_ik.model.grasp import LARGE, SMALL, UNIT
+from casadi_ik.model.grasp import MAX_PLAIN_LENGTH, MIN_PLAIN_LENGTH, UNIT_ROUNDING
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.hand_first.parameters import HandFirstParameters
 from casadi_ik.solve.hand_first.seeds import FEATURES, Seeds
@@ -302,9 +302,9 @@ class SearchPlan:
         return {
             "LENGTH": LENGTH,
             "TURN": TURN,
-            "UNIT": UNIT,
-            "SMALL_LENGTH": SMALL,
-            "LARGE_LENGTH": LARGE,
+            "UNIT": UNIT_ROUNDING,
+            "SMALL_LENGTH": MIN_PLAIN_LENGTH,
+            "LARGE_LENGTH": MAX_PLAIN_LENGTH,
             "TOLERANCE_SLACK": TOLERANCE_SLACK,
             "LIMIT_SLACK": LIMIT_SLACK,
             "SLICE": SLICE,
@@ -330,8 +330,8 @@ class SearchPlan:
             "LOWER": robot.lower,
             "UPPER": robot.upper,
             "ORDER_RANGES": np.maximum((robot.upper - robot.lower)[hand], SMALLEST),
-            "HAND_STEPS": even_steps(len(hand)),
-            "ALL_STEPS": even_steps(len(robot.actuators)),
+            "HAND_STEPS": spread_steps(len(hand)),
+            "ALL_STEPS": spread_steps(len(robot.actuators)),
             "ANYWHERE_LOWER": lower,
             "ANYWHERE_RANGE": upper - lower,
             **(self._finger_tables() if self.mends else {}),

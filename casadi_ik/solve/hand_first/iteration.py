@@ -14,7 +14,7 @@ import numpy as np
 
 from casadi_ik.compile.codegen import define, define_arrays, number, row_major
 from casadi_ik.compile.function_kernel import BufferedFunction
-from casadi_ik.files.arrays import Array, even_steps
+from casadi_ik.files.arrays import Array, spread_steps
 from casadi_ik.kinematics.arms.search import ARM_SEARCH
 from casadi_ik.kinematics.contact_fit import BALANCE, FIT, TOLERANT, fresh_fit
 from casadi_ik.kinematics.contacts import LENGTH
@@ -91,9 +91,9 @@ def text(step: HandFirstStep) -> str:
         whole["N_TRUNK"] = len(trunk)
         arrays |= {
             "TRUNK_MOTORS": np.array([*trunk, 0]),
-            "TRUNK_STEPS": np.array([*even_steps(len(trunk)), 0.0]),
+            "TRUNK_STEPS": np.array([*spread_steps(len(trunk)), 0.0]),
             "SIDE_REACH": np.array([_reach(robot, side) for side in robot.sides]),
-            "BODY_ARM_STEPS": even_steps(len(layouts.arm)),
+            "BODY_ARM_STEPS": spread_steps(len(layouts.arm)),
         }
     if numeric:
         arms, palms = start_table(robot)

@@ -13,7 +13,7 @@ import numpy as np
 
 from casadi_ik.compile import FunctionGraph, FunctionKernel
 from casadi_ik.compile.graphs import recipe
-from casadi_ik.files.arrays import Array, evenly
+from casadi_ik.files.arrays import Array, spread_points
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import LENGTH
 from casadi_ik.kinematics.forward import actuated
@@ -237,7 +237,7 @@ def _rows(
     moved = robot.finger_actuators(robot.finger_names[finger])
     places = [hand.index(actuator) for actuator in moved if actuator in hand]
     lower, upper = robot.lower[hand][places], robot.upper[hand][places]
-    spread = (evenly(count, len(places)) - 0.5) / (1 - options.at_limits) + 0.5
+    spread = (spread_points(count, len(places)) - 0.5) / (1 - options.at_limits) + 0.5
     postures = np.zeros((len(hand), count))
     postures[places] = (lower + np.clip(spread, 0.0, 1.0) * (upper - lower)).T
     columns = np.array(tips.map(count)(postures)).reshape(6, count, -1)[:, :, finger]

@@ -24,7 +24,7 @@ from scipy.optimize import lsq_linear
 from casadi_ik.errors import InputError, UnknownNameError
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.reading import Frame, frame_matrix, read_yaml
-from casadi_ik.files.shipped import resolve
+from casadi_ik.files.shipped import resolve_description
 from casadi_ik.kinematics.couplings import joint_positions
 from casadi_ik.kinematics.se3 import exp_so3, matrix_to_rpy
 from casadi_ik.model.load_robot import load_description
@@ -396,7 +396,7 @@ def write_description(
         InputError: The robot's joints are not described in our own files.
         OSError: The file cannot be written.
     """
-    top_path = resolve(robot, "arm_hands")
+    top_path = resolve_description(robot, "arm_hands")
     top = read_yaml(top_path)
     if any(isinstance(part, dict) and "file" in part for part in top.values()):
         raise InputError(
@@ -404,9 +404,9 @@ def write_description(
             "in files of others"
         )
     if isinstance(top["hand"], str):
-        top["hand"] = read_yaml(resolve(top["hand"], "hands", beside=top_path))
+        top["hand"] = read_yaml(resolve_description(top["hand"], "hands", relative_to=top_path))
     if top.get("arm") is not None and Path(top["arm"]).suffix:
-        top["arm"] = str(resolve(top["arm"], "arms", beside=top_path).resolve())
+        top["arm"] = str(resolve_description(top["arm"], "arms", relative_to=top_path).resolve())
     hand = top["hand"]
     hand["sources"][TAG] = (
         f"Estimated from {len(calibration.weights)} measured fingertip poses{origin and ' in '}"
