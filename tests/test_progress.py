@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.compile.compiler import tell
+from casadi_ik.compile.compiler import print_note
 
 
 class LogStream:
@@ -40,6 +40,6 @@ def test_a_stream_without_isatty(
     monkeypatch.setattr(sys, "stderr", stream)
     assert len(solver.solve_batch(points, normals).success) == 5
     monkeypatch.setenv("CASADI_IK_COMPILE", policy)
-    tell("compiling")
+    print_note("compiling")
     if isinstance(stream, LogStream) and policy == "background":
         assert stream.text.endswith("compiling\n")

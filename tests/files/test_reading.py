@@ -143,7 +143,7 @@ def test_shipped_names_and_paths(tmp_path):
     assert resolve_description("kuka_lwr4", "arms") == models_folder() / "arms" / "kuka_lwr4.yaml"
     (tmp_path / "part.yaml").write_text("")
     assert (
-        resolve_description("part.yaml", "arms", beside=tmp_path / "robot.yaml")
+        resolve_description("part.yaml", "arms", relative_to=tmp_path / "robot.yaml")
         == tmp_path / "part.yaml"
     )
     assert resolve_description(tmp_path / "part.yaml", "arms") == tmp_path / "part.yaml"
