@@ -11,7 +11,9 @@ While motors can keep up with the contacts they are *at* the goal: the bounds ar
 and accelerations permit, and the anchor is where the motors' own momentum leads. So motions that
 the contacts leave free are smooth, and near singular postures accelerations stay moderate at the
 price of a small error. Errors that this leaves fade over some cycles (`left` is what may still be
-there), since bounds and errors that have to vanish at once would fight each other.
+there), since bounds and errors that have to vanish at once would fight each other. The anchor moves
+towards the posture only as far as these errors leave tolerance, so a distant posture does not pull
+contacts out of tolerance where limits block its way.
 
 When contacts cannot be met so (they leap, or are too fast, or out of reach), goal and motors part:
 the goal goes on within the limits of position and velocity, and the motors run after it as fast as
@@ -308,11 +310,20 @@ class Cycle:
         )
         along = ca.if_else(locked_on, s["moved"], 0.0)
         first = ca.fmin(ca.fmax(s["goal"] + along, low), high)
-        free = p["keep"] * s["moved"] + p["drift"] * (p["posture"] - s["goal"])
+        drift = p["drift"] * self._slack(s["left"], p)
+        free = p["keep"] * s["moved"] + drift * (p["posture"] - s["goal"])
         anchor = s["goal"] + ca.if_else(locked_on, free, 0.0)
         left = ca.if_else(locked_on, p["patience"] * s["left"], 0.0)
         outputs = shared(first, low, high, anchor, left)
         return ca.Function("begin", [state, parameters], outputs)
+
+    def _slack(self, residual: Expr, p: dict[str, Expr]) -> Expr:
+        """Return the part of the tolerance that a residual leaves: 1 without errors, 0 beyond."""
+        tolerance = ca.fmin(
+            ca.mmin(p["position_tolerance"]) / LENGTH, ca.mmin(p["angle_tolerance"])
+        )
+        largest = ca.mmax(ca.fabs(residual[: self.contacts.size]))
+        return ca.fmax(1.0 - largest / ca.fmax(tolerance, 1e-12), 0.0)
 
     def _step(self, minded: bool) -> ca.Function:
         """Return a step ``(origin, goal, low, high, anchor, left, parameters) -> goal'``.
