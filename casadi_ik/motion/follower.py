@@ -376,7 +376,7 @@ class Follower:
         }
         if self._stopped:
             # What was recorded is of the step that was not made.
-            errors["position_error"], errors["angle_error"] = asked.errors(self._plan.robot, q)
+            errors["position_error"], errors["angle_error"] = asked.errors(q)
         clear = None if self._guard is None else self._guard.clearance(q)
         return FollowState(
             status=self._status(errors),

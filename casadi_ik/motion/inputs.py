@@ -93,6 +93,7 @@ class FollowerInputs:
 
     def __init__(self, plan: FollowPlan, kinds: Kinds, obstacles: int) -> None:
         """Compile what is not compiled yet."""
+        self._robot = plan.robot
         self.cycle = cycle = Cycle(plan.robot.description, kinds, obstacles)
         self.run = Recurrence(FunctionKernel(cycle.graph, plan.compiled))
         self.views: dict[str, Array] = cycle.parameters.unpack(self.run.parameters)
@@ -192,7 +193,13 @@ class FollowerInputs:
         for side in self.cycle.palms:
             self._fill(**{of_side("palm_weight", side): 0.0})
 
-    def errors(self, robot: ArmHand, q: Array) -> tuple[Array, Array]:
+    def exact_error_ratio(self, q: Array) -> float:
+        """Return the largest error of the present target over its tolerance at a posture (n,)."""
+        errors = np.stack(self.errors(q))
+        tolerances = np.stack([self.views["position_tolerance"], self.views["angle_tolerance"]])
+        return float(np.nanmax(errors / np.maximum(tolerances, 1e-12)))
+
+    def errors(self, q: Array) -> tuple[Array, Array]:
         """How far a posture (n,) is off what was asked last: (f,) [m], (f,) [rad], NaN if free."""
         weights = self.views["weights"]
 
@@ -206,7 +213,7 @@ class FollowerInputs:
         points, normals = asked("points", weights[:, 0] > 0), asked("normals", weights[:, 1] > 0)
         normals /= np.linalg.norm(normals, axis=2, keepdims=True)
         problem = TargetBatch(points, normals, Tolerance(), enforce_limits=True, more=more)
-        position, angle, _ = deviations(robot, problem, q[None])
+        position, angle, _ = deviations(self._robot, problem, q[None])
         return position[0], angle[0]
 
     @property

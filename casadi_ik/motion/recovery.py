@@ -30,7 +30,7 @@ CAPACITY = 128
 PATIENCE = 0.2
 """Time without progress after which a follower is stuck [s]."""
 
-SEARCH_TIME = 0.25
+SEARCH_TIME = 0.5
 """Time in which all postures of a full trail are compared [s]."""
 
 GAIN = 0.5
@@ -42,11 +42,14 @@ PROGRESS = 0.99
 RESOLUTION = 0.02
 """Distance of the postures at which a line is checked, in units as `SPACING`."""
 
-CHECKS = 16
+CHECKS = 8
 """Postures of a line that are checked in a cycle."""
 
 ATTEMPTS = 40
 """Maximum number of lines on one way back."""
+
+MET = 1 + TOLERANCE_SLACK
+"""Largest error ratio at which the contacts are met."""
 
 
 def brake(distance: float, change: float) -> float:
@@ -123,12 +126,9 @@ class Recovery:
         if self._cycles_to_check <= 0:
             self._extend(q)
         ratio = asked.error_ratio
-        if ratio <= 1 + TOLERANCE_SLACK:
-            if self._least < math.inf:
-                self._start_clock(math.inf)
-        elif stopped or asked.goal_error_ratio > 1 + TOLERANCE_SLACK:
-            self._look_for_progress(asked, ratio)
-        else:
+        if stopped or (ratio > MET and asked.goal_error_ratio > MET):
+            self._look_for_progress(asked, ratio, q if stopped else None)
+        elif self._least < math.inf:
             self._start_clock(math.inf)
 
     def _distances(self, q: Array) -> Array:
@@ -162,8 +162,17 @@ class Recovery:
                 distance = 0.0
         self._cycles_to_check = max(math.floor((SPACING - distance) / self._longest_step), 1)
 
-    def _look_for_progress(self, asked: FollowerInputs, ratio: float) -> None:
-        """Compare postures of the trail once the error has not decreased for a while."""
+    def _look_for_progress(
+        self, asked: FollowerInputs, ratio: float, stopped_at: Array | None
+    ) -> None:
+        """Compare postures of the trail once the error has not decreased for a while.
+
+        Args:
+            asked: The graph after the cycle.
+            ratio: Error ratio of the step that the graph wanted.
+            stopped_at: (n,) posture if the guard has stopped motors, so that they are not where
+                the graph wanted them; else None.
+        """
         if ratio < PROGRESS * self._least:
             self._start_clock(ratio)
             return
@@ -171,6 +180,9 @@ class Recovery:
         if self._cycles_stuck <= self._patience:
             return
         if self._candidate < 0:
+            if stopped_at is not None and asked.exact_error_ratio(stopped_at) <= MET:
+                self._start_clock(math.inf)
+                return
             self._candidate, self._least_ratio = self._count - 1, math.inf
         for _ in range(self._comparisons):
             if self._candidate >= 0:

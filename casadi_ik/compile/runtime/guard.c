@@ -42,7 +42,9 @@ LANES_INLINE lanes balls_apart(const clearance_job *about, int64_t pair, const l
   return lanes_sqrt(dot(r, r)) - (about->radii[i] + about->halves[i] + about->offsets[pair] + reach);
 }
 
-/* Looks at all pairs where a way begins: at those exactly that are nearer than `sure`. */
+/* Lists the pairs whose bounding balls are nearer than the horizon at a configuration, with a lower
+ * bound of their distances that is exact below `sure`. The balls are compared in scalars: all lanes
+ * hold the same configuration, and few pairs pass. */
 static LANES_TARGET void look(const guard_job *job, placing *space, surroundings *here,
                               const scalar *from, scalar sure) {
   const clearance_job *about = job->about;
@@ -50,9 +52,19 @@ static LANES_TARGET void look(const guard_job *job, placing *space, surroundings
   place_at(space, from);
   here->n_near = here->spent = 0;
   for (pair = 0; pair < about->n_pairs; ++pair) {
-    scalar known = lanes_at(balls_apart(about, pair, space->placed), 0);
+    const int i = about->pairs[2 * pair], j = about->pairs[2 * pair + 1], solid = j - N_CAPSULES;
+    const lanes *a = space->placed + 6 * i;
+    const lanes *b = space->placed + (solid < 0 ? 6 * j : 6 * N_CAPSULES + 12 * solid + 9);
+    const scalar x = lanes_at(a[0], 0) - lanes_at(b[0], 0);
+    const scalar y = lanes_at(a[1], 0) - lanes_at(b[1], 0);
+    const scalar z = lanes_at(a[2], 0) - lanes_at(b[2], 0);
+    const scalar radii = about->radii[i] + about->halves[i] + about->offsets[pair]
+                         + (solid < 0 ? about->radii[j] + about->halves[j] : about->solids[solid].reach);
+    const scalar square = x * x + y * y + z * z, beyond = here->horizon + radii;
+    scalar known;
     lanes distance;
-    if (known >= here->horizon) continue;
+    if (beyond > 0 && square >= beyond * beyond) continue;
+    known = sqrt(square) - radii;
     if (!(known >= sure)) {
       known = sure;
       if (apart(about, pair, space->placed, SPREAD(sure), space->lines, &distance)) {
