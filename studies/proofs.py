@@ -144,7 +144,7 @@ def reachable(part: Part, case: tuple[str, float, float, bool]) -> dict[str, Any
     problems = TargetBatch(*targets, ik.Tolerance(tolerance, 10 * tolerance), limits)
     prover = Prover(robot.description)
     places = robot.joints(q) | dict(zip(robot.actuators, q.T, strict=True))
-    proofs = prover.prove(problems, prover.space.of(places, problems))
+    proofs = prover.prove(problems, prover.space.from_positions(places, problems))
     false = [q[row].tolist() for row, proof in enumerate(proofs) if proof is not None]
     return {"count": len(q), "false": false}
 

@@ -21,7 +21,7 @@ from typing import TypeAlias
 import casadi as ca
 
 from casadi_ik.kinematics.linear_algebra import PIVOT_FLOOR
-from casadi_ik.kinematics.smooth import Expr, part
+from casadi_ik.kinematics.smooth import Expr, call_function
 
 
 @dataclass(frozen=True)
@@ -388,7 +388,7 @@ def _squares(pattern: Pattern) -> ca.Function:
             chosen[i, column] = 1
             gradient[column] += gradient_of[i]
         normal += chosen.T @ normal_of[: len(columns), : len(columns)] @ chosen
-    return part("squares", [jacobian, residual], [normal, gradient])
+    return call_function("squares", [jacobian, residual], [normal, gradient])
 
 
 @dataclass(frozen=True)
@@ -422,7 +422,9 @@ def _blocks(sparsity: ca.Sparsity) -> list[_Block]:
 @cache
 def _block_squares(rows: int, columns: int) -> ca.Function:
     block, right = ca.SX.sym("block", rows, columns), ca.SX.sym("right", rows)
-    return part("block_squares", [block, right], [ca.triu(block.T @ block), block.T @ right])
+    return call_function(
+        "block_squares", [block, right], [ca.triu(block.T @ block), block.T @ right]
+    )
 
 
 @cache
@@ -443,7 +445,7 @@ def _in_box(pattern: Pattern, count: int, passes: int, duals: int) -> ca.Functio
     unknowns = ca.vertcat(ca.SX(0, 1), *unknown.values())
     needed = {symbol.element_hash() for symbol in ca.symvar(unknowns)}
     places = [i for i, each in enumerate(known.numbers.nz) if each.element_hash() in needed]
-    solved = part("solved", [known.numbers[places], held, values], [unknowns])
+    solved = call_function("solved", [known.numbers[places], held, values], [unknowns])
     numbers = begun.numbers[places]
     force = ca.vertcat(*order.resting(begun))
     at_low = ca.logic_and(low >= 0, force > 0)
@@ -462,7 +464,7 @@ def _in_box(pattern: Pattern, count: int, passes: int, duals: int) -> ca.Functio
         at_high = ca.if_else(held, ca.logic_and(at_high, force < 0), inside > high)
     inside = ca.fmin(ca.fmax(inside, low), high)
     whole = order.completed(begun, dict(zip(bounded, ca.vertsplit(inside), strict=True)))
-    return part("in_box", [matrix, damping, slope, low, high], [whole])
+    return call_function("in_box", [matrix, damping, slope, low, high], [whole])
 
 
 def clip(value: Expr, bounded: Bounded) -> Expr:

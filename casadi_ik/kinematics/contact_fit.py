@@ -25,7 +25,7 @@ from casadi_ik.kinematics.contacts import (
     within_tolerance,
 )
 from casadi_ik.kinematics.forward import actuated
-from casadi_ik.kinematics.smooth import Expr, part
+from casadi_ik.kinematics.smooth import Expr, call_function
 from casadi_ik.model.description import RobotDescription
 
 
@@ -194,7 +194,7 @@ def judge_contacts(
     p: dict[str, Expr],
     tried: Tried,
     rows: ContactRows,
-    part: float = 1.0,
+    call_function: float = 1.0,
     fine: Expr = 1.0,
 ) -> Judged:
     """Judge a step by the contacts, its residuals those of `rows`; see `judge`.
@@ -204,18 +204,22 @@ def judge_contacts(
         p: Parameters.
         tried: The step.
         rows: The contacts.
-        part: Of the tolerances; what is within that is within them.
+        call_function: Of the tolerances; what is within that is within them.
         fine: What part of them, if less, is good enough to stop at, should the cost fall slowly.
     """
     residual = ca.if_else(gains(tried), tried.there, tried.before)
     positions, chords = rows.errors(residual)
     tolerances = p["position_tolerance"], chord(p["angle_tolerance"])
 
-    def within(part: Expr) -> Expr:
-        return within_tolerance(positions, chords, *(part * allowed for allowed in tolerances))
+    def within(call_function: Expr) -> Expr:
+        return within_tolerance(
+            positions, chords, *(call_function * allowed for allowed in tolerances)
+        )
 
-    fine = ca.fmin(part, fine)
-    return replace(judge(s, tried, within(fine), within(FIT.fine * fine)), within=within(part))
+    fine = ca.fmin(call_function, fine)
+    return replace(
+        judge(s, tried, within(fine), within(FIT.fine * fine)), within=within(call_function)
+    )
 
 
 def judge_beyond_tolerance(
@@ -335,7 +339,7 @@ class WholeContacts:
         slopes = whole_jacobian(self._robot, self._rows, q, p)
         both = (_in_columns(slopes[own, :]) for own in self._rows.slices)
         jacobian = ca.vertcat(*(dense @ columns for dense, columns in both))
-        return part("whole_at", [q, parameters], [ca.densify(residual), jacobian])
+        return call_function("whole_at", [q, parameters], [ca.densify(residual), jacobian])
 
     def fitted(self, q: Expr, damping: Expr, parameters: Expr) -> Tried:
         """One damped least-squares step within the bounds.
@@ -467,7 +471,7 @@ def _shortened(rows: int, columns: int) -> ca.Function:
     along, ratio = residual / length, ca.fmin(free / length, 1.0)
     exceeds = ca.if_else(length > free, 1.0, 0.0)
     bent = (1 - ratio) * slopes + exceeds * ratio * (along @ (along.T @ slopes))
-    return part("shortened", [residual, slopes, free], [(1 - ratio) * residual, bent])
+    return call_function("shortened", [residual, slopes, free], [(1 - ratio) * residual, bent])
 
 
 def differs(cost: Expr, before: Expr) -> Expr:
@@ -544,7 +548,7 @@ def _stretched(rows: int, columns: int) -> ca.Function:
     along = residual / (allowed * ca.fmax(length, TINY))
     right = size / stretch * residual
     bent = size * (slopes + along @ ((stretch - 1) * (along.T @ slopes)))
-    return part("stretched", [residual, slopes, *numbers], [right, bent])
+    return call_function("stretched", [residual, slopes, *numbers], [right, bent])
 
 
 def balanced(

@@ -1,9 +1,9 @@
-"""From actuators to joints: the map theta = c(q), its Jacobian and its bounds, by kind of coupling.
+"""Couplings from actuators to joints: the map theta = c(q), its derivative and its bounds.
 
-Each kind is a row of `ROWS`. What a joint can do while its source is within an interval is there
-twice, by arithmetics that share nothing: `interval` as a graph, for the search for proofs that a
-target is unreachable, and `bounds` in numpy, for the check of these proofs. Both hold every
-position, rounding included; where an end is not needed to be sharp it may be further out.
+`COUPLING_ROWS` has one row per kind of coupling. The range of a joint over an interval of its
+source is implemented twice, independently: `interval` as a graph for the search for proofs that a
+target is unreachable, and `bounds` in numpy for the check of these proofs. Both enclose every
+position, including rounding errors; the enclosures need not be tight.
 """
 
 from __future__ import annotations
@@ -24,51 +24,51 @@ from casadi_ik.model.couplings import Coupling, FourBar, LeadScrew, Linear, Poly
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.joints import Joint
 
-OUTWARDS = 1e-12
-"""By how much the ends of an interval are moved outwards [rad or m], and as a part of the sizes
-that are added up: more than the rounding errors of a coupling."""
+INTERVAL_MARGIN = 1e-12
+"""Margin of an interval [rad or m], also relative to the terms of a sum; larger than the rounding
+errors of a coupling."""
 
-AT_TOGGLE = 1e-6
-"""A four-bar within this of a toggle (of the square of a length, relative) counts as there; angles
-of its turning points are widened by as much [rad]."""
+TOGGLE_MARGIN = 1e-6
+"""Relative distance of a squared length from a toggle of a four-bar below which it counts as
+toggled; also the margin of the angles of its extrema [rad]."""
 
 Bounds = tuple[Array, Array]
-"""Lower and upper ends (k,)."""
+"""Lower and upper bounds (k,)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Interval:
-    """An interval [rad or m]; both ends are scalar graphs."""
+    """An interval [rad or m] whose bounds are scalar graphs."""
 
     lower: Expr
     upper: Expr
 
     @property
     def middle(self) -> Expr:
-        """The middle."""
+        """Midpoint."""
         return (self.lower + self.upper) / 2
 
     @property
-    def half(self) -> Expr:
-        """Half its width, rounded up, never negative."""
-        return ca.fmax((self.upper - self.lower) / 2, 0.0) + OUTWARDS
+    def half_width(self) -> Expr:
+        """Half of the width, rounded up, never negative."""
+        return ca.fmax((self.upper - self.lower) / 2, 0.0) + INTERVAL_MARGIN
 
 
 @dataclass(frozen=True, eq=False)
 class CouplingRow:
-    """A kind of coupling.
+    """Formulas of a kind of coupling.
 
-    `follow`, `rate` and `toggle` take the coupling's numbers (anything with their names as
-    attributes: the data, or symbols where a calibration estimates them), the position of what is
-    followed [rad or m] and the data as described, from which branches are taken.
+    `follow`, `rate` and `toggle` take the parameters of the coupling (an object with their names
+    as attributes: the description, or symbols that a calibration estimates), the position of the
+    source [rad or m], and the description, which selects the branch.
 
     Attributes:
         follow: Position of the joint [rad or m].
-        rate: Its derivative by the position of what it follows.
-        interval: ``(coupling, source) ->`` an `Interval` that holds the joint while what it follows
-            is within an `Interval`.
-        bounds: ``(coupling, lower, upper) ->`` the same in numpy, of k intervals, by formulas of
-            its own.
+        rate: Derivative of the joint position by the position of its source.
+        interval: ``(coupling, source) ->`` an `Interval` that contains the joint position while
+            the source is within an `Interval`.
+        bounds: ``(coupling, lower, upper) ->`` such bounds in numpy for k intervals, from
+            independent formulas.
         toggle: Squared sine of the transmission angle, see `toggle_margins`; None if the kind has
             no singular position.
     """
@@ -80,64 +80,67 @@ class CouplingRow:
     toggle: Callable[[Any, Expr, Any], Expr] | None = None
 
 
-def linkage(numbers: Any, known: FourBar) -> mechanisms.Linkage:
-    """A four-bar with the branch of the known pose (phi_0, theta_3_0) of its description."""
-    described = mechanisms.Linkage(known.p, known.q, known.g, known.h)
-    branch = mechanisms.branch_from_pose(described, known.phi_0, known.theta_3_0)
+def linkage_of(numbers: Any, description: FourBar) -> mechanisms.Linkage:
+    """Return a four-bar on the branch of its reference pose (phi_0, theta_3_0)."""
+    nominal = mechanisms.Linkage(description.p, description.q, description.g, description.h)
+    branch = mechanisms.branch_from_pose(nominal, description.phi_0, description.theta_3_0)
     return mechanisms.Linkage(numbers.p, numbers.q, numbers.g, numbers.h, branch)
 
 
-def _bent(numbers: Any, source: Expr, known: FourBar) -> Expr:
-    # Continuous about the known pose, whatever the estimate of its angle.
-    bar, phi = linkage(numbers, known), numbers.phi_0 + source
-    return mechanisms.theta3(phi, bar, known.theta_3_0) - numbers.theta_3_0
+def _four_bar_angle(numbers: Any, source: Expr, description: FourBar) -> Expr:
+    # The branch follows the described reference pose, so that the angle is continuous there for
+    # every estimate of the parameters.
+    bar, phi = linkage_of(numbers, description), numbers.phi_0 + source
+    return mechanisms.theta3(phi, bar, description.theta_3_0) - numbers.theta_3_0
 
 
 def _horner(coefficients: Sequence[float], source: Expr) -> Expr:
-    """A polynomial, its constant first."""
+    """Return the value of a polynomial, coefficients from the constant upwards."""
     value: Expr = ca.DM(coefficients[-1])
     for coefficient in reversed(coefficients[:-1]):
         value = value * source + coefficient
     return value
 
 
-def _slopes(coefficients: Sequence[float]) -> list[float]:
-    """The coefficients of a polynomial's derivative."""
+def _derivative_coefficients(coefficients: Sequence[float]) -> list[float]:
+    """Return the coefficients of the derivative of a polynomial."""
     return [power * value for power, value in enumerate(coefficients)][1:]
 
 
 def polynomial_interval(coefficients: Sequence[float], source: Interval) -> Interval:
-    """Where a polynomial is over an interval, by its Taylor series about the middle.
+    """Return an interval that contains a polynomial, from its Taylor series at the midpoint.
 
     Args:
-        coefficients: The constant first.
-        source: [rad or m].
+        coefficients: Coefficients from the constant upwards.
+        source: Interval of the argument [rad or m].
     """
-    middle, half = source.middle, source.half
-    slopes, factorial, power = list(coefficients), 1.0, half
-    value = lower = upper = _horner(slopes, middle)
+    middle, half_width = source.middle, source.half_width
+    derivative, factorial, power = list(coefficients), 1.0, half_width
+    value = lower = upper = _horner(derivative, middle)
     for order in range(1, len(coefficients)):
-        slopes, factorial = _slopes(slopes), factorial * order
-        part = _horner(slopes, middle) / factorial * power
-        # An odd power of what is left has either sign, an even one none.
-        least, most = (-ca.fabs(part), ca.fabs(part)) if order % 2 else (part, part)
-        lower, upper = lower + ca.fmin(least, 0.0), upper + ca.fmax(most, 0.0)
-        power = power * half
-    far = ca.fabs(middle) + half
-    slack = OUTWARDS * (1 + ca.fabs(value) + _horner([abs(c) for c in coefficients], far))
-    return Interval(lower - slack, upper + slack)
+        derivative, factorial = _derivative_coefficients(derivative), factorial * order
+        term = _horner(derivative, middle) / factorial * power
+        # An odd power of the deviation has either sign, an even power is positive.
+        smallest, largest = (-ca.fabs(term), ca.fabs(term)) if order % 2 else (term, term)
+        lower, upper = lower + ca.fmin(smallest, 0.0), upper + ca.fmax(largest, 0.0)
+        power = power * half_width
+    largest_argument = ca.fabs(middle) + half_width
+    margin = INTERVAL_MARGIN * (
+        1 + ca.fabs(value) + _horner([abs(c) for c in coefficients], largest_argument)
+    )
+    return Interval(lower - margin, upper + margin)
 
 
 def polynomial_bounds(coefficients: Sequence[float], lower: Array, upper: Array) -> Bounds:
-    """Where a polynomial is over k intervals: between its least and largest Bernstein coefficient.
+    """Return bounds of a polynomial over k intervals, from its Bernstein coefficients.
 
     Args:
-        coefficients: The constant first.
-        lower: (k,) ends [rad or m].
-        upper: (k,).
+        coefficients: Coefficients from the constant upwards.
+        lower: (k,) lower bounds of the argument [rad or m].
+        upper: (k,) upper bounds of the argument [rad or m].
     """
     n, width = len(coefficients) - 1, upper - lower
-    # sum a_i t^i over t in [0, 1], as lower + t width is put into the polynomial.
+    # Substituting lower + t width gives sum a_i t^i with t in [0, 1].
     a = np.zeros((n + 1, len(lower)))
     for coefficient in reversed(coefficients):
         a[1:] = a[1:] * lower + a[:-1] * width
@@ -145,140 +148,152 @@ def polynomial_bounds(coefficients: Sequence[float], lower: Array, upper: Array)
     bernstein = [
         sum(math.comb(j, i) / math.comb(n, i) * a[i] for i in range(j + 1)) for j in range(n + 1)
     ]
-    slack = 1e-11 * (1 + np.abs(a).sum(axis=0))
-    return np.min(bernstein, axis=0) - slack, np.max(bernstein, axis=0) + slack
+    margin = 1e-11 * (1 + np.abs(a).sum(axis=0))
+    return np.min(bernstein, axis=0) - margin, np.max(bernstein, axis=0) + margin
 
 
-def _screwed_interval(screw: LeadScrew, source: Interval) -> Interval:
-    """A triangle is monotone in the slider's length, whose sign it does not know."""
+def _lead_screw_interval(screw: LeadScrew, source: Interval) -> Interval:
+    """Return the interval of the joint, which is monotone in the absolute length of the slider."""
     a, b = ca.fabs(source.lower), ca.fabs(source.upper)
-    around = ca.logic_and(source.lower < 0, source.upper > 0)
-    lengths = ca.if_else(around, 0.0, ca.fmin(a, b)), ca.fmax(a, b)
-    least, most = (ROWS[LeadScrew].follow(screw, length, screw) for length in lengths)
-    return Interval(ca.fmin(least, most) - OUTWARDS, ca.fmax(least, most) + OUTWARDS)
+    contains_zero = ca.logic_and(source.lower < 0, source.upper > 0)
+    lengths = ca.if_else(contains_zero, 0.0, ca.fmin(a, b)), ca.fmax(a, b)
+    angle_a, angle_b = (COUPLING_ROWS[LeadScrew].follow(screw, length, screw) for length in lengths)
+    return Interval(
+        ca.fmin(angle_a, angle_b) - INTERVAL_MARGIN, ca.fmax(angle_a, angle_b) + INTERVAL_MARGIN
+    )
 
 
-def _screwed_bounds(screw: LeadScrew, lower: Array, upper: Array) -> Bounds:
-    least = np.where((lower < 0) & (upper > 0), 0.0, np.minimum(abs(lower), abs(upper)))
-    return _triangle(screw, least), _triangle(screw, np.maximum(abs(lower), abs(upper)))
+def _lead_screw_bounds(screw: LeadScrew, lower: Array, upper: Array) -> Bounds:
+    shortest = np.where((lower < 0) & (upper > 0), 0.0, np.minimum(abs(lower), abs(upper)))
+    return _triangle_angle(screw, shortest), _triangle_angle(
+        screw, np.maximum(abs(lower), abs(upper))
+    )
 
 
-def _triangle(screw: LeadScrew, s: Array) -> Array:
-    """The angle opposite the slider, by the law of cosines, rounding at flat triangles included."""
+def _triangle_angle(screw: LeadScrew, s: Array) -> Array:
+    """Return the joint angle by the law of cosines, with a margin at flat triangles."""
     cosine = (screw.b**2 + screw.c**2 - s**2) / (2 * screw.b * screw.c)
     angle = np.arccos(np.clip(cosine, -1.0, 1.0))
-    flat = np.sqrt(np.maximum(1 - cosine**2, 0.0)) < 1e-4
-    # Near a flat triangle the cosine's rounding is worth up to 1e-7 rad either way.
-    return np.where(flat, np.where(cosine > 0, angle - 1e-7, angle + 1e-7), angle) - screw.theta_0
+    is_flat = np.sqrt(np.maximum(1 - cosine**2, 0.0)) < 1e-4
+    # At a flat triangle the rounding error of the cosine changes the angle by up to 1e-7 rad.
+    return (
+        np.where(is_flat, np.where(cosine > 0, angle - 1e-7, angle + 1e-7), angle) - screw.theta_0
+    )
 
 
-def _bent_interval(bar: FourBar, source: Interval) -> Interval:
-    """A four-bar: its ends, and in between the poses in which rod and ground align.
+def _four_bar_interval(bar: FourBar, source: Interval) -> Interval:
+    """Return the interval of a four-bar from its ends and the extrema between them.
 
-    Where the interval may hold a toggle the joint may be anywhere on its turn.
+    Extrema are the poses in which rod and ground align. If the source interval may contain a
+    toggle the joint interval is the full circle.
     """
 
-    def follow_(angle: Expr) -> Expr:
-        return ROWS[FourBar].follow(bar, angle, bar)
+    def joint_angle(angle: Expr) -> Expr:
+        return COUPLING_ROWS[FourBar].follow(bar, angle, bar)
 
     phi = Interval(source.lower + bar.phi_0, source.upper + bar.phi_0)
-    ends = follow_(source.lower), follow_(source.upper)
-    lower, upper = ca.fmin(*ends), ca.fmax(*ends)
-    for turn in _turning_points(bar):
-        value, inside = follow_(ca.SX(turn - bar.phi_0)), _holds(phi, turn)
-        lower = ca.if_else(inside, ca.fmin(lower, value), lower)
-        upper = ca.if_else(inside, ca.fmax(upper, value), upper)
-    anywhere = _may_toggle(bar, phi)
-    for wrap in _wraps(bar):
-        anywhere = ca.logic_or(anywhere, _holds(phi, wrap))
+    end_angles = joint_angle(source.lower), joint_angle(source.upper)
+    lower, upper = ca.fmin(*end_angles), ca.fmax(*end_angles)
+    for extremum in _turning_points(bar):
+        value, is_inside = joint_angle(ca.SX(extremum - bar.phi_0)), _may_contain(phi, extremum)
+        lower = ca.if_else(is_inside, ca.fmin(lower, value), lower)
+        upper = ca.if_else(is_inside, ca.fmax(upper, value), upper)
+    is_unbounded = _may_toggle(bar, phi)
+    for wrap in _wrap_angles(bar):
+        is_unbounded = ca.logic_or(is_unbounded, _may_contain(phi, wrap))
     return Interval(
-        ca.if_else(anywhere, -np.pi, lower) - OUTWARDS,
-        ca.if_else(anywhere, np.pi, upper) + OUTWARDS,
+        ca.if_else(is_unbounded, -np.pi, lower) - INTERVAL_MARGIN,
+        ca.if_else(is_unbounded, np.pi, upper) + INTERVAL_MARGIN,
     )
 
 
 def _may_toggle(bar: FourBar, phi: Interval) -> Expr:
-    """Whether |PC|^2 may leave ((q - h)^2, (q + h)^2), between which rod and coupler bend."""
+    """Return whether |PC|^2 may leave ((q - h)^2, (q + h)^2), where rod and coupler align."""
     cosines = ca.cos(phi.lower), ca.cos(phi.upper)
-    highest = ca.if_else(_holds(phi, 0.0), 1.0, ca.fmax(*cosines))
-    lowest = ca.if_else(_holds(phi, np.pi), -1.0, ca.fmin(*cosines))
-    size = bar.p**2 + bar.g**2
-    least, most = size - 2 * bar.p * bar.g * highest, size - 2 * bar.p * bar.g * lowest
-    margin = AT_TOGGLE * (bar.q + bar.h) ** 2
-    short, long = (bar.q - bar.h) ** 2 + margin, (bar.q + bar.h) ** 2 - margin
-    return ca.logic_or(least < short, most > long)
+    highest = ca.if_else(_may_contain(phi, 0.0), 1.0, ca.fmax(*cosines))
+    lowest = ca.if_else(_may_contain(phi, np.pi), -1.0, ca.fmin(*cosines))
+    sum_of_squares = bar.p**2 + bar.g**2
+    smallest, largest = (
+        sum_of_squares - 2 * bar.p * bar.g * highest,
+        sum_of_squares - 2 * bar.p * bar.g * lowest,
+    )
+    margin = TOGGLE_MARGIN * (bar.q + bar.h) ** 2
+    lower_limit, upper_limit = (bar.q - bar.h) ** 2 + margin, (bar.q + bar.h) ** 2 - margin
+    return ca.logic_or(smallest < lower_limit, largest > upper_limit)
 
 
 def _turning_points(bar: FourBar) -> list[float]:
-    """Crank angles [rad] at which rod and ground align, so that the joint turns back."""
-    found = []
+    """Return the crank angles [rad] at which rod and ground align: extrema of the joint angle."""
+    angles = []
     for reach in (bar.g + bar.q, bar.g - bar.q):
         if abs(reach) > 0:
             cosine = (bar.p**2 + reach**2 - bar.h**2) / (2 * bar.p * reach)
-            if abs(cosine) <= 1 + AT_TOGGLE:
+            if abs(cosine) <= 1 + TOGGLE_MARGIN:
                 angle = float(np.arccos(np.clip(cosine, -1, 1)))
-                found += [angle, -angle]
-    return found
+                angles += [angle, -angle]
+    return angles
 
 
-def _wraps(bar: FourBar) -> list[float]:
-    """Crank angles [rad] at which the joint is half a turn from its zero, where its value jumps."""
+def _wrap_angles(bar: FourBar) -> list[float]:
+    """Return the crank angles [rad] at which the joint angle wraps from pi to -pi."""
     arm = bar.p + bar.h * np.exp(1j * (bar.theta_3_0 + np.pi))
     size = abs(arm)
-    if size < AT_TOGGLE * bar.p:
+    if size < TOGGLE_MARGIN * bar.p:
         return [0.0, np.pi]
     cosine = (size**2 + bar.g**2 - bar.q**2) / (2 * bar.g * size)
-    if abs(cosine) > 1 + AT_TOGGLE:
+    if abs(cosine) > 1 + TOGGLE_MARGIN:
         return []
     angle = float(np.arccos(np.clip(cosine, -1, 1)))
     return [angle - float(np.angle(arm)), -angle - float(np.angle(arm))]
 
 
-def _holds(interval: Interval, angle: float) -> Expr:
-    """Whether an interval may hold an angle, by whole turns."""
-    last = (interval.upper + AT_TOGGLE - angle) / (2 * np.pi)
-    first = (interval.lower - AT_TOGGLE - angle) / (2 * np.pi)
+def _may_contain(interval: Interval, angle: float) -> Expr:
+    """Return whether an interval may contain an angle modulo 2 pi."""
+    last = (interval.upper + TOGGLE_MARGIN - angle) / (2 * np.pi)
+    first = (interval.lower - TOGGLE_MARGIN - angle) / (2 * np.pi)
     return ca.floor(last) >= ca.ceil(first)
 
 
-def _bent_bounds(bar: FourBar, lower: Array, upper: Array, samples: int = 17) -> Bounds:
-    """Samples, and between them the largest slope g / (h sin) of the coupler's angle."""
-    part = np.linspace(0.0, 1.0, samples)
-    phi = bar.phi_0 + lower[:, None] + (upper - lower)[:, None] * part
+def _four_bar_bounds(bar: FourBar, lower: Array, upper: Array, samples: int = 17) -> Bounds:
+    """Return bounds of a four-bar from samples and the largest slope g / (h sin) between them."""
+    fractions = np.linspace(0.0, 1.0, samples)
+    phi = bar.phi_0 + lower[:, None] + (upper - lower)[:, None] * fractions
     step = (upper - lower) / (samples - 1)
     crank = bar.p * np.exp(1j * phi)
-    # |PC|^2 moves by no more than 2 p g between samples a step of the crank apart.
-    squares, reach = abs(crank - bar.g) ** 2, bar.p * bar.g * step
+    # |PC|^2 changes by at most 2 p g per radian of the crank; half a step to the nearest sample.
+    squares, change = abs(crank - bar.g) ** 2, bar.p * bar.g * step
     inner, outer = (bar.q - bar.h) ** 2, (bar.q + bar.h) ** 2
-    least, most = squares.min(axis=1) - reach, squares.max(axis=1) + reach
-    sine = np.minimum((least - inner) * (outer - least), (most - inner) * (outer - most))
-    loose = sine <= 1e-9 * (bar.q * bar.h) ** 2
-    sine = np.sqrt(np.where(loose, 1.0, sine)) / (2 * bar.q * bar.h)
-    values = _coupler(bar, phi)
+    smallest, largest = squares.min(axis=1) - change, squares.max(axis=1) + change
+    sine = np.minimum(
+        (smallest - inner) * (outer - smallest), (largest - inner) * (outer - largest)
+    )
+    is_unbounded = sine <= 1e-9 * (bar.q * bar.h) ** 2
+    sine = np.sqrt(np.where(is_unbounded, 1.0, sine)) / (2 * bar.q * bar.h)
+    values = _coupler_angle(bar, phi)
     gap = bar.g / (bar.h * sine) * step / 2
     low, high = values.min(axis=1) - gap, values.max(axis=1) + gap
-    loose |= (low < -3.0) | (high > 3.0)
-    return np.where(loose, -np.pi, low), np.where(loose, np.pi, high)
+    is_unbounded |= (low < -3.0) | (high > 3.0)
+    return np.where(is_unbounded, -np.pi, low), np.where(is_unbounded, np.pi, high)
 
 
-def _coupler(bar: FourBar, phi: Array) -> Array:
-    """Angle of the coupler against the crank less its zero, within half a turn [rad]."""
+def _coupler_angle(bar: FourBar, phi: Array) -> Array:
+    """Return the angle of the coupler to the crank minus its zero, in (-pi, pi] [rad]."""
 
     def angle(phi: Array, side: int) -> Array:
         p, c = bar.p * np.exp(1j * phi), bar.g
         line = c - p
-        far = np.abs(line)
-        # Q is h from P and q from C: along the line P C by a, across it by b.
-        along = (bar.h**2 - bar.q**2 + far**2) / (2 * far)
-        across = np.sqrt(np.maximum(bar.h**2 - along**2, 0.0))
-        coupler = (along + 1j * side * across) * line / far
+        distance = np.abs(line)
+        # Q has the distance h from P and q from C: components parallel and perpendicular to PC.
+        parallel = (bar.h**2 - bar.q**2 + distance**2) / (2 * distance)
+        perpendicular = np.sqrt(np.maximum(bar.h**2 - parallel**2, 0.0))
+        coupler = (parallel + 1j * side * perpendicular) * line / distance
         return np.angle(coupler * np.exp(-1j * (phi + bar.theta_3_0)))
 
-    sides = [abs(angle(np.array([bar.phi_0]), side)[0]) for side in (1, -1)]
-    return angle(phi, 1 if sides[0] < sides[1] else -1)
+    deviations = [abs(angle(np.array([bar.phi_0]), side)[0]) for side in (1, -1)]
+    return angle(phi, 1 if deviations[0] < deviations[1] else -1)
 
 
-ROWS: dict[type[Any], CouplingRow] = {
+COUPLING_ROWS: dict[type[Any], CouplingRow] = {
     Linear: CouplingRow(
         follow=lambda c, source, _: c.ratio * source + c.offset,
         rate=lambda c, _, __: ca.DM(c.ratio),
@@ -288,65 +303,69 @@ ROWS: dict[type[Any], CouplingRow] = {
     LeadScrew: CouplingRow(
         follow=lambda c, s, _: mechanisms.angle_from_slider(s, c.b, c.c) - c.theta_0,
         rate=lambda c, s, _: mechanisms.angle_rate(s, c.b, c.c),
-        interval=_screwed_interval,
-        bounds=_screwed_bounds,
+        interval=_lead_screw_interval,
+        bounds=_lead_screw_bounds,
         toggle=lambda c, s, _: mechanisms.slider_toggle(s, c.b, c.c),
     ),
     Polynomial: CouplingRow(
         follow=lambda c, x, _: _horner(c.coefficients, x),
-        rate=lambda c, x, _: _horner(_slopes(c.coefficients), x),
+        rate=lambda c, x, _: _horner(_derivative_coefficients(c.coefficients), x),
         interval=lambda c, source: polynomial_interval(c.coefficients, source),
         bounds=lambda c, lower, upper: polynomial_bounds(c.coefficients, lower, upper),
     ),
     FourBar: CouplingRow(
-        follow=_bent,
-        rate=lambda c, x, known: mechanisms.theta3_rate(c.phi_0 + x, linkage(c, known)),
-        interval=_bent_interval,
-        bounds=_bent_bounds,
-        toggle=lambda c, x, known: mechanisms.linkage_toggle(c.phi_0 + x, linkage(c, known)),
+        follow=_four_bar_angle,
+        rate=lambda c, x, description: mechanisms.theta3_rate(
+            c.phi_0 + x, linkage_of(c, description)
+        ),
+        interval=_four_bar_interval,
+        bounds=_four_bar_bounds,
+        toggle=lambda c, x, description: mechanisms.linkage_toggle(
+            c.phi_0 + x, linkage_of(c, description)
+        ),
     ),
 }
-"""The kinds of couplings."""
+"""Formulas by kind of coupling."""
 
 
 def coupling_row(coupling: Coupling) -> CouplingRow:
-    """The row of a coupling's kind.
+    """Return the formulas of a coupling.
 
     Raises:
-        UnsupportedError: There is none.
+        UnsupportedError: The kind of coupling has no graphs.
     """
     try:
-        return ROWS[type(coupling)]
+        return COUPLING_ROWS[type(coupling)]
     except KeyError:
         kind = type(coupling).__name__
-        raise UnsupportedError(f"coupling: no graphs for the kind {kind}") from None
+        raise UnsupportedError(f"coupling: kind {kind} is not supported by graphs") from None
 
 
 def joint_positions(robot: RobotDescription, q: ca.SX) -> ca.SX:
-    """Positions of all movable joints.
+    """Return the positions of all movable joints.
 
     Args:
-        robot: The description; its couplings form chains that end at actuators.
+        robot: Description of the robot; its couplings form chains that end at actuators.
         q: (n, 1) actuator positions [rad or m].
 
     Returns:
-        theta (m, 1) in the order of `robot.joint_names`.
+        Joint positions theta (m, 1) in the order of `robot.joint_names` [rad or m].
     """
     values = _positions(robot, q)
     return ca.vertcat(*(values[name] for name in robot.joint_names))
 
 
 def toggle_margins(robot: RobotDescription, q: ca.SX) -> dict[str, ca.SX]:
-    """How far every mechanism that has a singular (toggle) position is from it.
+    """Return the distance of every mechanism from its singular (toggle) position.
 
     Args:
-        robot: The description.
+        robot: Description of the robot.
         q: (n, 1) actuator positions [rad or m].
 
     Returns:
-        By joint that follows such a coupling the squared sine of its transmission angle: 1 at
-        best, 0 where the joint's rate over its source blows up, negative where the mechanism
-        cannot be assembled. Smooth, never NaN.
+        Squared sine of the transmission angle by name of the driven joint: 1 at best, 0 where the
+        rate of the joint is unbounded, negative where the mechanism cannot be assembled. Smooth,
+        never NaN.
     """
     values = _positions(robot, q)
     margins = {}
@@ -358,12 +377,12 @@ def toggle_margins(robot: RobotDescription, q: ca.SX) -> dict[str, ca.SX]:
 
 
 def has_toggle(joint: Joint) -> bool:
-    """Whether a joint follows through a mechanism that has a singular position."""
+    """Return whether a mechanism with a singular position drives a joint."""
     return joint.coupling is not None and coupling_row(joint.coupling).toggle is not None
 
 
 def _positions(robot: RobotDescription, q: ca.SX) -> dict[str, ca.SX]:
-    """Positions of all actuators and movable joints by name."""
+    """Return the positions of all actuators and movable joints by name."""
     values = {name: q[i] for i, name in enumerate(robot.actuator_names)}
     joints = {joint.name: joint for joint in robot.movable}
 
@@ -378,12 +397,12 @@ def _positions(robot: RobotDescription, q: ca.SX) -> dict[str, ca.SX]:
 
 
 def follow(joint: Joint, source: Expr, numbers: Any = None) -> Expr:
-    """Position of a joint [rad or m] from the position of what it follows.
+    """Return the position of a joint [rad or m] from the position of its source.
 
     Args:
-        joint: The joint; one that follows nothing stands where the source does.
-        source: [rad or m].
-        numbers: Other numbers of the coupling, as attributes; None: those described.
+        joint: Driven joint; a joint without a coupling has the position of the source.
+        source: Position of the actuator or joint that drives it [rad or m].
+        numbers: Parameters of the coupling as attributes (default: those of the description).
     """
     coupling = joint.coupling
     if coupling is None:
@@ -392,11 +411,11 @@ def follow(joint: Joint, source: Expr, numbers: Any = None) -> Expr:
 
 
 def coupling_rate(joint: Joint, source: Expr) -> Expr:
-    """Rate d theta / d source of a joint that follows something: eq. (10), for every coupling.
+    """Return the rate d theta / d source of a driven joint: eq. (10), for every coupling.
 
     Args:
-        joint: The joint; one that follows nothing has rate 1.
-        source: Position of what it follows [rad or m].
+        joint: Driven joint; a joint without a coupling has rate 1.
+        source: Position of the actuator or joint that drives it [rad or m].
 
     Returns:
         For a four-bar f of eq. (11), for a lead screw the derivative of eq. (8) [rad/m].
@@ -407,25 +426,27 @@ def coupling_rate(joint: Joint, source: Expr) -> Expr:
     return coupling_row(coupling).rate(coupling, source, coupling)
 
 
-def joint_intervals(robot: RobotDescription, given: dict[str, Interval]) -> dict[str, Interval]:
-    """Intervals of all joints that are given or follow what is given, by joint name.
+def joint_intervals(
+    robot: RobotDescription, known_intervals: dict[str, Interval]
+) -> dict[str, Interval]:
+    """Return the intervals of all joints that depend on known intervals, by joint name.
 
     Args:
-        robot: The description.
-        given: By name of the actuator or joint.
+        robot: Description of the robot.
+        known_intervals: Intervals by name of the actuator or joint.
     """
     joints = {joint.name: joint for joint in robot.movable}
-    found = dict(given)
+    intervals = dict(known_intervals)
 
-    def known(name: str) -> Interval | None:
+    def interval_of(name: str) -> Interval | None:
         joint = joints.get(name)
-        if name not in found and joint is not None and joint.coupling is not None:
-            source = known(joint.coupling.of)
+        if name not in intervals and joint is not None and joint.coupling is not None:
+            source = interval_of(joint.coupling.of)
             if source is not None:
-                found[name] = coupling_row(joint.coupling).interval(joint.coupling, source)
-        return found.get(name)
+                intervals[name] = coupling_row(joint.coupling).interval(joint.coupling, source)
+        return intervals.get(name)
 
-    return {name: interval for name in joints if (interval := known(name)) is not None}
+    return {name: interval for name in joints if (interval := interval_of(name)) is not None}
 
 
 def joint_bounds(
@@ -435,24 +456,24 @@ def joint_bounds(
     upper: Array,
     names: Sequence[str],
 ) -> dict[str, Bounds]:
-    """Bounds (k,) of joints of the fingers, by name.
+    """Return bounds (k,) of finger joints, by name.
 
     Args:
-        robot: The description.
+        robot: Description of the robot.
         motors: Names of the actuators.
-        lower: (k, h) ends of the motors.
-        upper: (k, h).
-        names: Of the joints wanted.
+        lower: (k, h) lower bounds of the motors.
+        upper: (k, h) upper bounds of the motors.
+        names: Names of the joints.
     """
-    found = {name: (lower[:, i], upper[:, i]) for i, name in enumerate(motors)}
+    known_bounds = {name: (lower[:, i], upper[:, i]) for i, name in enumerate(motors)}
     joints = {joint.name: joint for joint in robot.movable}
 
     def bounds(name: str) -> Bounds:
-        if name not in found:
+        if name not in known_bounds:
             coupling = joints[name].coupling
             assert coupling is not None, f"joint {name!r} follows no motor of the hand"
             low, high = coupling_row(coupling).bounds(coupling, *bounds(coupling.of))
-            found[name] = low - 1e-11, high + 1e-11
-        return found[name]
+            known_bounds[name] = low - 1e-11, high + 1e-11
+        return known_bounds[name]
 
     return {name: bounds(name) for name in names}

@@ -29,7 +29,7 @@ from casadi_ik.kinematics.contacts import (
 )
 from casadi_ik.kinematics.forward import Pose, actuated, sparse
 from casadi_ik.kinematics.se3 import align, skew
-from casadi_ik.kinematics.smooth import Expr, part, shared
+from casadi_ik.kinematics.smooth import Expr, call_function, with_cse
 from casadi_ik.model.description import RobotDescription
 
 
@@ -260,7 +260,7 @@ def _pose_at(robot: RobotDescription) -> Callable[..., Any]:
     wanted = Pose(ca.SX.sym("rotation", 3, 3), ca.SX.sym("origin", 3))
     error = _error(_palm(robot, arm), wanted)
     inputs = [arm, wanted.rotation, wanted.origin]
-    return part("pose_at", inputs, [error, pose_jacobian(robot, arm)])
+    return call_function("pose_at", inputs, [error, pose_jacobian(robot, arm)])
 
 
 def newton_polish(robot: RobotDescription, model_error: float) -> ca.Function:
@@ -284,7 +284,7 @@ def newton_polish(robot: RobotDescription, model_error: float) -> ca.Function:
     reached = ca.if_else(there < before, tried.reached, inside)
     hits = ca.fmin(before, there) < FIT.exact * FIT.exact
     given = [rotation, origin, p["lower"], p["upper"]]
-    step = ca.Function("newton_step", [start, *given], shared(reached, hits))
+    step = ca.Function("newton_step", [start, *given], with_cse(reached, hits))
     inputs: list[Expr] = [ca.MX.sym("x", x.shape) for x in step.mx_in()]
     arm, *given = inputs
     found: Expr = ca.MX(0)

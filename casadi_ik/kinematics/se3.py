@@ -21,7 +21,7 @@ from typing import TypeAlias
 import casadi as ca
 import numpy as np
 
-from casadi_ik.kinematics.smooth import Expr, even_function, part, safe_norm, safe_sqrt
+from casadi_ik.kinematics.smooth import Expr, call_function, even_function, safe_norm, safe_sqrt
 
 TINY_SQUARED = 1e-8
 """Two Taylor terms are exact to rounding below; the closed forms here never cancel above."""
@@ -370,4 +370,4 @@ def _squared() -> ca.Function:
     upper = ca.SX.sym("upper", ca.Sparsity.upper(4))
     matrix = ca.triu2symm(upper)
     square = matrix @ matrix
-    return part("squared", [upper], [ca.triu(square / ca.trace(square))])
+    return call_function("squared", [upper], [ca.triu(square / ca.trace(square))])

@@ -1,8 +1,8 @@
-"""Guards that keep values and first derivatives finite where a formula reads 0/0; shared pieces.
+"""Expressions that stay finite where a formula reads 0/0, and functions called from graphs.
 
-A formula in `s = theta^2` that is analytic at zero is written twice, as its closed form and as
-its Taylor series. Where the series is taken the closed form is evaluated at the fixed point
-where the two meet, so neither it nor its derivative is ever NaN.
+A formula in `s = theta^2` that is analytic at zero is evaluated as its closed form or as its Taylor
+series. Below the switching point the closed form is evaluated at the switching point, so that
+neither its value nor its derivative is ever NaN.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ def even_function(
     """Return `closed(s)`, or its Taylor polynomial where `s` is small.
 
     Args:
-        s: scalar, the square of an angle [rad^2] or of a sine or chord.
-        closed: the formula; never called below `below`.
-        series: Taylor coefficients in powers of `s`, constant first.
-        below: the series is used for `s < below`.
+        s: Scalar square of an angle [rad^2], a sine or a chord.
+        closed: Closed form; never evaluated below `below`.
+        series: Taylor coefficients in powers of `s`, from the constant upwards.
+        below: Switching point; the series is used for `s < below`.
 
     Returns:
         Scalar.
@@ -37,11 +37,11 @@ def even_function(
 
 
 def safe_sqrt(s: Expr, floor: float = 1e-300) -> Expr:
-    """Square root with `s` kept above a floor: no NaN, and derivative 0 below the floor.
+    """Return the square root of `max(s, floor)`, whose derivative is 0 below the floor.
 
     Args:
-        s: scalar.
-        floor: smallest value of s [unit of s].
+        s: Scalar.
+        floor: Smallest argument of the root [unit of s].
 
     Returns:
         Scalar, at least sqrt(floor).
@@ -50,45 +50,46 @@ def safe_sqrt(s: Expr, floor: float = 1e-300) -> Expr:
 
 
 def safe_norm(x: Expr) -> Expr:
-    """Euclidean norm of a vector (n, 1); at the zero vector 1e-150 with derivative 0, not NaN."""
+    """Return the Euclidean norm of a vector (n, 1); 1e-150 with derivative 0 at the zero vector."""
     return safe_sqrt(ca.dot(x, x))
 
 
-def shared(*outputs: Expr) -> list[Any]:
-    """The same expressions, every equal piece computed once; to be given to a Function.
+def with_cse(*outputs: Expr) -> list[Any]:
+    """Return expressions after common subexpression elimination.
 
-    CasADi does not merge equal pieces of an SX graph by itself.
+    CasADi does not merge equal subexpressions of an SX graph by default.
     """
     merged: Any = ca.cse(list(outputs))
     return merged
 
 
-def part(name: str, inputs: Sequence[Expr], outputs: Sequence[Expr]) -> ca.Function:
-    """A Function that graphs call where others are written out: code stands once for all calls.
+def call_function(name: str, inputs: Sequence[Expr], outputs: Sequence[Expr]) -> ca.Function:
+    """Return a Function that is called instead of inlined, so that its code exists once.
 
     Args:
-        name: Identifier.
-        inputs: Symbols.
-        outputs: Expressions of them; every equal piece is computed once.
+        name: Identifier of the function in the generated code.
+        inputs: Symbols of the arguments.
+        outputs: Expressions of the inputs.
     """
-    return ca.Function(name, list(inputs), shared(*outputs), {"never_inline": True})
+    return ca.Function(name, list(inputs), with_cse(*outputs), {"never_inline": True})
 
 
-def part_of(
-    name: str, inputs: Sequence[Expr], given: Sequence[Expr], outputs: Sequence[Expr]
+def hoisted_call_function(
+    name: str, inputs: Sequence[Expr], outer: Sequence[Expr], outputs: Sequence[Expr]
 ) -> Callable[..., Any]:
-    """A `part` that is called several times in one graph.
+    """Return a `call_function` whose call-invariant subexpressions are computed once per graph.
 
     Args:
-        name: Identifier.
-        inputs: Symbols for what differs from call to call.
-        given: Symbols of the graph itself; what depends on them alone is computed once for all.
-        outputs: Expressions of both.
+        name: Identifier of the function in the generated code.
+        inputs: Symbols of the arguments, which differ between calls.
+        outer: Symbols of the calling graph; subexpressions that depend on them alone are computed
+            outside the function.
+        outputs: Expressions of `inputs` and `outer`.
 
     Returns:
-        The function of the inputs, for use in that graph.
+        Callable of the inputs, for use in the calling graph.
     """
     varying: Any
-    varying, symbols, known = ca.extract_parametric(shared(*outputs), list(given))
-    called = part(name, [*inputs, *given, ca.vertcat(*symbols)], varying)
-    return lambda *values: called(*values, *given, ca.vertcat(*known))
+    varying, symbols, invariant = ca.extract_parametric(with_cse(*outputs), list(outer))
+    function = call_function(name, [*inputs, *outer, ca.vertcat(*symbols)], varying)
+    return lambda *values: function(*values, *outer, ca.vertcat(*invariant))

@@ -57,7 +57,7 @@ from casadi_ik.kinematics.contacts import (
 )
 from casadi_ik.kinematics.forward import actuated, motor_scales
 from casadi_ik.kinematics.se3 import skew
-from casadi_ik.kinematics.smooth import Expr, shared
+from casadi_ik.kinematics.smooth import Expr, with_cse
 from casadi_ik.model.description import RobotDescription
 
 
@@ -314,7 +314,7 @@ class Cycle:
         free = p["keep"] * s["moved"] + drift * (p["posture"] - s["goal"])
         anchor = s["goal"] + ca.if_else(locked_on, free, 0.0)
         left = ca.if_else(locked_on, p["patience"] * s["left"], 0.0)
-        outputs = shared(first, low, high, anchor, left)
+        outputs = with_cse(first, low, high, anchor, left)
         return ca.Function("begin", [state, parameters], outputs)
 
     def _slack(self, residual: Expr, p: dict[str, Expr]) -> Expr:
@@ -340,7 +340,7 @@ class Cycle:
         return ca.Function(
             "minding" if minded else "step",
             [origin, goal, low, high, anchor, left, parameters],
-            shared(ca.densify(end)),
+            with_cse(ca.densify(end)),
         )
 
     def _end(self) -> ca.Function:
@@ -376,7 +376,7 @@ class Cycle:
             "goal_error_ratio": _error_ratio(position, angle, p),
             "sound": ca.sum1(after["left"]),
         }
-        outputs = shared(self.state.pack(after), self.record.pack(record))
+        outputs = with_cse(self.state.pack(after), self.record.pack(record))
         return ca.Function("end", [state, first, wanted, low, high, parameters], outputs)
 
     def _goal(

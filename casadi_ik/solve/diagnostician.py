@@ -17,7 +17,7 @@ from casadi_ik.solve.closest import Closest, FloatingPalmFit, HandFits, closest
 from casadi_ik.solve.diagnosis import ArmReach, Diagnosis, HandFit, Lazy, NearContact, Reason
 from casadi_ik.solve.hand_first.method import HandFirstMethod
 from casadi_ik.solve.proofs.proof import Proof, ProofKind
-from casadi_ik.solve.proofs.prove import EFFORT, Prover
+from casadi_ik.solve.proofs.prove import PROVER_EFFORT, Prover
 from casadi_ik.solve.remedies import RemedyFinder
 from casadi_ik.solve.trials import LocalRefinement, Rows, Subproblems
 from casadi_ik.solve.verdict import (
@@ -222,7 +222,7 @@ class Diagnostician:
     def _proofs(self, targets: TargetBatch, most: Counts) -> list[Proof | None]:
         """Proofs of targets; of a body that one side cannot, wherever the trunk takes it."""
         if not self._sides:
-            return self._prover.prove(targets, most=most)
+            return self._prover.prove(targets, max_boxes=most)
         robot = self.robot.description
         proofs: list[Proof | None] = [None] * len(targets)
         for prover, side in zip(self._sides, robot.sides, strict=True):
@@ -232,7 +232,9 @@ class Diagnostician:
             if not len(rows) or targets.fixed is not None:
                 continue
             part = targets.rows(rows).of_fingers(fingers)
-            for row, proof in zip(rows.tolist(), prover.prove(part, most=most[rows]), strict=True):
+            for row, proof in zip(
+                rows.tolist(), prover.prove(part, max_boxes=most[rows]), strict=True
+            ):
                 proofs[row] = proof
         return proofs
 
@@ -341,7 +343,7 @@ def _refused(hand: HandFit | None, reach: ArmReach | None, proof: Proof | None) 
 def _worth(ratio: Array) -> Counts:
     """(k,) boxes a proof may take of targets that are missed by a factor (k,)."""
     share = np.clip((ratio - 1) / (DIAGNOSIS.clearly - 1), 0.0, 1.0)
-    return np.maximum(EFFORT.most * share, DIAGNOSIS.least).astype(np.int64)
+    return np.maximum(PROVER_EFFORT.max_boxes * share, DIAGNOSIS.least).astype(np.int64)
 
 
 def _enough(targets: TargetBatch, fair: Verdict) -> list[Tolerance]:

@@ -16,7 +16,7 @@ from casadi_ik.compile import FunctionGraph, FunctionKernel, LookupKernel
 from casadi_ik.compile.codegen import standalone_source
 from casadi_ik.compile.lookup import MAX_STEPS, STEPS_PER_UNIT
 from casadi_ik.compile.straight_lines import CodeOptions
-from casadi_ik.kinematics.smooth import part
+from casadi_ik.kinematics.smooth import call_function
 
 from .graphs import BOTH, needs_compiler, random_expression
 
@@ -56,7 +56,7 @@ def test_matrices_are_row_major(compiled, kind):
 def test_parts_are_called_with_what_is_there_or_put_together(in_lanes, rng):
     """Neighbours in memory, results of another part, comparisons, and a result nobody asks for."""
     x, w = ca.SX.sym("x", 3), ca.SX.sym("w", 2)
-    inner = part("inner", [x, w], [2 * ca.sin(x) + w[0], ca.sumsqr(x) * w[1]])
+    inner = call_function("inner", [x, w], [2 * ca.sin(x) + w[0], ca.sumsqr(x) * w[1]])
     y, z = ca.SX.sym("y", 3), ca.SX.sym("z", 4)
     once, length = inner(y + 1, z[1:3])
     again, _ = inner(once, z[1:3])
@@ -319,7 +319,10 @@ def test_elementary_functions_computed_together(scale):
     inner = np.ascontiguousarray(whole[:, :size])
     np.testing.assert_array_equal(inner[:, :COUNT].ravel(), sine(samples.ravel())[0])
     np.testing.assert_array_equal(whole[:, size : 2 * size].ravel(), cosine(inner.ravel() + 1)[0])
-    rows = [np.ascontiguousarray(part).ravel() for part in (inner[:, 1:], inner[:, :-1])]
+    rows = [
+        np.ascontiguousarray(call_function).ravel()
+        for call_function in (inner[:, 1:], inner[:, :-1])
+    ]
     np.testing.assert_array_equal(whole[:, 2 * size : 3 * size - 1].ravel(), angle(*rows)[0])
 
 

@@ -17,14 +17,14 @@ from toy_robots import replace as put
 
 import casadi_ik as ik
 from casadi_ik.files.arrays import Array
-from casadi_ik.kinematics.couplings import ROWS, Interval
+from casadi_ik.kinematics.couplings import COUPLING_ROWS, Interval
 from casadi_ik.model.couplings import Polynomial
 from casadi_ik.model.targets import TargetBatch
-from casadi_ik.solve.proofs.box_tests import Seen, pair_rows
+from casadi_ik.solve.proofs.box_tests import PointInPalm, pair_rows
 from casadi_ik.solve.proofs.boxes import box_contacts
 from casadi_ik.solve.proofs.premises import arm_cones
 from casadi_ik.solve.proofs.proof import Proof, ProofKind
-from casadi_ik.solve.proofs.prove import EFFORT, Prover
+from casadi_ik.solve.proofs.prove import PROVER_EFFORT, Prover
 
 pytestmark = pytest.mark.usefixtures("usual_flags")
 
@@ -39,7 +39,7 @@ def asked(targets: tuple[Array, Array], position: float, angle: float, limits: b
 def wrongly(robot: ik.ArmHand, prover: Prover, q: Array, problems: TargetBatch) -> int:
     """How many proofs would refute a box of hands that holds the hand of q."""
     places = robot.joints(q) | dict(zip(robot.actuators, q.T, strict=True))
-    proofs = prover.prove(problems, prover.space.of(places, problems))
+    proofs = prover.prove(problems, prover.space.from_positions(places, problems))
     return sum(proof is not None for proof in proofs)
 
 
@@ -154,10 +154,10 @@ def test_coupled_mechanisms_and_other_arms(tmp_path: Path, made) -> None:
 def test_bounds_of_polynomials_hold(coefficients: list[float], ends: list[float]) -> None:
     """Both arithmetics, and as sharply as the interval is short."""
     low, high = sorted(ends)
-    value = ROWS[Polynomial].bounds(
+    value = COUPLING_ROWS[Polynomial].bounds(
         coupling := Polynomial("a", tuple(coefficients)), *map(np.atleast_1d, (low, high))
     )
-    found = ROWS[Polynomial].interval(coupling, Interval(ca.SX(low), ca.SX(high)))
+    found = COUPLING_ROWS[Polynomial].interval(coupling, Interval(ca.SX(low), ca.SX(high)))
     graph = [float(ca.evalf(end)) for end in (found.lower, found.upper)]
     reached = coupling.followed(np.linspace(low, high, 101))
     for least, most in (graph, (value[0][0], value[1][0])):
@@ -259,7 +259,7 @@ def test_bounds_of_a_box_hold_for_what_is_in_it(robot: ik.ArmHand, prover: Prove
         points, normals = moved(robot.contacts(q), rng, *tolerance)
         problems = asked((points, normals), *tolerance, True)
         places = robot.joints(q) | dict(zip(robot.actuators, q.T, strict=True))
-        (inside,) = prover.space.of(places, problems)
+        (inside,) = prover.space.from_positions(places, problems)
         lower, upper = prover.space.box(problems)
         half = (upper - lower) * 10.0 ** rng.uniform(-3, -0.5)
         middle = inside + rng.uniform(-1, 1, len(inside)) * half
@@ -280,12 +280,12 @@ def _bounds(prover: Prover) -> ca.Function:
     """Values and widths of the rows, and the ends of the distance of shoulder and wrist."""
     h = len(prover.space.coordinates)
     shapes = {"lower": (h, 1), "upper": (h, 1), "points": (3, 3), "normals": (3, 3)}
-    shapes |= {"tolerance": (3, 2), "asked": (3, 2)}
+    shapes |= {"tolerance": (3, 2), "constrained": (3, 2)}
     p = {name: ca.SX.sym(name, *shape) for name, shape in shapes.items()}
     ranges = prover.space.intervals(p["lower"], p["upper"])
     contacts = box_contacts(prover.space, ranges, (p["upper"] - p["lower"]) / 2, p, True)
     rows = [row for a, b in combinations(contacts, 2) for row in pair_rows(a, b)]
-    seen = Seen.point(contacts, ca.SX(ca.DM(prover._arm.shoulder)))
+    seen = PointInPalm.from_point(contacts, ca.SX(ca.DM(prover._arm.shoulder)))
     least, most, _ = seen.distances(ca.SX(ca.DM(prover._arm.wrist)))
     outputs = [ca.vertcat(*(getattr(row, name) for row in rows)) for name in ("value", "width")]
     return ca.Function("bounds", list(p.values()), [*outputs, ca.vertcat(least, most)])
@@ -336,9 +336,9 @@ def test_what_is_missed_by_little_gets_few_boxes(
     solver, boxes = ik.Solver(robot), []
     prove = solver._engine.diagnostician._prover.prove
 
-    def noted(problems: TargetBatch, most: Array) -> list[Proof | None]:
-        boxes.extend(most.tolist())
-        return prove(problems, most=most)
+    def noted(problems: TargetBatch, max_boxes: Array) -> list[Proof | None]:
+        boxes.extend(max_boxes.tolist())
+        return prove(problems, max_boxes=max_boxes)
 
     monkeypatch.setattr(solver._engine.diagnostician._prover, "prove", noted)
     rng = np.random.default_rng(2)
@@ -346,8 +346,8 @@ def test_what_is_missed_by_little_gets_few_boxes(
     solver.solve_batch(*moved((points, normals), rng, 1e-2, 0.11), diagnose=True)
     points[0, 0] += 0.2
     solver.solve_batch(points[:1], normals[:1], diagnose=True)
-    assert boxes[-1] == EFFORT.most
-    assert min(boxes) < EFFORT.most / 4
+    assert boxes[-1] == PROVER_EFFORT.max_boxes
+    assert min(boxes) < PROVER_EFFORT.max_boxes / 4
 
 
 def test_codes_of_the_log_stay() -> None:

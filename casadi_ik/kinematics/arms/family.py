@@ -19,7 +19,7 @@ import numpy as np
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arms.screws import CosSin, Screws
 from casadi_ik.kinematics.forward import Pose
-from casadi_ik.kinematics.smooth import Expr, shared
+from casadi_ik.kinematics.smooth import Expr, with_cse
 
 SIGNS = tuple(product((1, -1), (1, -1), (1, -1)))
 """The three signs of each branch, in the order of the branches."""
@@ -227,7 +227,7 @@ class ClosedForm(ArmFamily):
         bends = self.bends(palm, redundancy)
         arms = [arm for bend in bends for arm in bend.arms()]
         slack = ca.vertcat(*(bend.slack for bend in bends for _ in bend.arms()))
-        outputs = shared(ca.horzcat(*arms).T, slack)
+        outputs = with_cse(ca.horzcat(*arms).T, slack)
         return ca.Function("arms", [*inputs, redundancy], outputs)
 
     def best(self, name: str, score: Score) -> ca.Function:
@@ -237,7 +237,7 @@ class ClosedForm(ArmFamily):
         n = len(self.screws)
         symbols = [ca.SX.sym(word, n) for word in ("lower", "upper", "near")]
         best = self.best_of(self.bends(palm, redundancy), score, *symbols)
-        return ca.Function(name, [redundancy, *inputs, *symbols], shared(*best))
+        return ca.Function(name, [redundancy, *inputs, *symbols], with_cse(*best))
 
     def best_of(
         self, bends: Sequence[ElbowBranch], score: Score, lower: Expr, upper: Expr, reference: Expr

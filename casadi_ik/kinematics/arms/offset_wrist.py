@@ -26,7 +26,7 @@ from casadi_ik.kinematics.arms.family import SIGNS, ArmFamily, Redundancy, Score
 from casadi_ik.kinematics.arms.screws import CosSin, Screws
 from casadi_ik.kinematics.arms.six_joints import SphericalArm
 from casadi_ik.kinematics.forward import Pose
-from casadi_ik.kinematics.smooth import Expr, shared
+from casadi_ik.kinematics.smooth import Expr, with_cse
 
 FULL_TURN = 2 * np.pi
 
@@ -201,13 +201,13 @@ class OffsetWristArm(ArmFamily):
         residual = flips[self.last] - t
         residual -= FULL_TURN * ca.floor(residual / FULL_TURN + 0.5)
         inputs = [rotation, origin, t, sign_1, sign_2, flip]
-        return ca.Function("branch", inputs, shared(arm, bend.slack, residual))
+        return ca.Function("branch", inputs, with_cse(arm, bend.slack, residual))
 
     def _condition(self) -> ca.Function:
         """Return the function of the residual alone, with the inputs of `_branch`."""
         all_joints = self._branch()
         inputs = all_joints.sx_in()
-        return ca.Function("condition", inputs, shared(all_joints(*inputs)[2]))
+        return ca.Function("condition", inputs, with_cse(all_joints(*inputs)[2]))
 
     def _all_joints(self, six: Expr, redundancy: Expr) -> Expr:
         """Return all joints (n, 1) in their order from the six in the order of the screws."""
@@ -240,7 +240,7 @@ class OffsetWristArm(ArmFamily):
         outputs = ca.vertcat(*joints.values()), score.total(score.cost(joints, reference), smallest)
         inputs = [six, slack, residual, redundancy, lower, upper, reference]
         name = "loose" if tolerance == SEARCH.coarse_tolerance else "strict"
-        return ca.Function(name, inputs, shared(*outputs))
+        return ca.Function(name, inputs, with_cse(*outputs))
 
     def _all_roots(self) -> ca.Function:
         """Return (rotation, origin, three signs) -> all roots (`ROOTS`, 6) and their margins."""
@@ -280,7 +280,9 @@ def _secant_step() -> ca.Function:
     slope = ca.if_else(has_moved, (residual - previous_residual) / divisor, -1.0)
     slope = ca.fmin(ca.fmax(slope, -5.0), SEARCH.max_slope)
     step = ca.fmin(ca.fmax(-residual / slope, -SEARCH.max_step), SEARCH.max_step)
-    return ca.Function("next_turn", [t, residual, previous_t, previous_residual], shared(t + step))
+    return ca.Function(
+        "next_turn", [t, residual, previous_t, previous_residual], with_cse(t + step)
+    )
 
 
 def _opposite_turns(value: Expr) -> tuple[Expr, Expr]:
@@ -298,7 +300,7 @@ def _best_branch(count: int) -> ca.Function:
     for row in rows[1:]:
         keep_best = best[0] >= row[0]
         best = [ca.if_else(keep_best, a, b) for a, b in zip(best, row, strict=True)]
-    return ca.Function("best_branch", [value for row in rows for value in row], shared(*best[1:]))
+    return ca.Function("best_branch", [value for row in rows for value in row], with_cse(*best[1:]))
 
 
 def _extremum_between() -> ca.Function:
@@ -320,7 +322,7 @@ def _extremum_between() -> ca.Function:
             position,
             fraction,
         )
-    return ca.Function("between", residuals, shared(fraction))
+    return ca.Function("between", residuals, with_cse(fraction))
 
 
 def _sign_changes() -> ca.Function:
@@ -355,7 +357,7 @@ def _sign_changes() -> ca.Function:
             ]
         count = count + changes
     outputs = [value for root_values in roots for value in root_values]
-    return ca.Function("changes", [*samples, *residuals], shared(*outputs))
+    return ca.Function("changes", [*samples, *residuals], with_cse(*outputs))
 
 
 def _linear_zero(x0: Expr, y0: Expr, x1: Expr, y1: Expr) -> Expr:
@@ -379,7 +381,7 @@ def _anderson_bjorck_step() -> ca.Function:
     start = ca.if_else(has_crossed, x1, x0)
     y_start = ca.if_else(has_crossed, y1, weight * y0)
     outputs = [start, y_start, t, y, _linear_zero(start, y_start, t, y)]
-    return ca.Function("narrowed", inputs, shared(*outputs))
+    return ca.Function("narrowed", inputs, with_cse(*outputs))
 
 
 def _root_slack() -> ca.Function:

@@ -21,7 +21,7 @@ from casadi_ik.compile.graphs import FunctionGraph
 from casadi_ik.files.arrays import Array, spread_steps
 from casadi_ik.kinematics.arms.family import ArmFamily, ClosedForm, Score, better
 from casadi_ik.kinematics.forward import Pose
-from casadi_ik.kinematics.smooth import Expr, shared
+from casadi_ik.kinematics.smooth import Expr, with_cse
 
 FULL_TURN = 2 * np.pi
 
@@ -304,7 +304,7 @@ class ArmTrials:
         if not self.is_nearest:
             offset = ca.fmod(trial, self._start_count) * FULL_TURN / self._start_count
             reference = (lower + upper) / 2 + offset if family.is_iterative else reference
-        return ca.Function("values", inputs, shared(reference, *values))
+        return ca.Function("values", inputs, with_cse(reference, *values))
 
     def _values_of_one(
         self, trial: Expr, current: Expr, low: Expr, high: Expr, visit: Expr
@@ -380,7 +380,7 @@ class ArmTrials:
         bends = family.bends(palm, value, (sign,))
         inputs = [rotation, origin, lower, upper, reference, sign]
         best = family.best_of(bends, self.score, lower, upper, reference)
-        at_value = ca.Function("best_bent", [value, *inputs], shared(*best))
+        at_value = ca.Function("best_bent", [value, *inputs], with_cse(*best))
         block = ca.SX.sym("block")
         roots: Expr = family.breakpoints(palm, (sign,), lower, upper)
         size = ARM_SEARCH.block
@@ -391,7 +391,9 @@ class ArmTrials:
             ),
             ca.SX.zeros(size, 1),
         )
-        roots_of = ca.Function("breakpoints", [block, *inputs], shared(*ca.vertsplit(block_roots)))
+        roots_of = ca.Function(
+            "breakpoints", [block, *inputs], with_cse(*ca.vertsplit(block_roots))
+        )
         trial = ca.SX.sym("trial")
         parity = ca.if_else(ca.fmod(trial, 2) > 0.5, 1.0, -1.0)
         turn = ca.Function("turn", [trial], [parity, ca.floor((trial - 1) / 2)])
@@ -423,9 +425,9 @@ def _with_common_part(best: ca.Function, fixed: list[Expr]) -> Callable[[Expr], 
     value, *inputs = best.sx_in()
     outputs = best(value, *inputs)
     varying, symbols, constant = ca.extract_parametric(list(outputs), inputs)
-    common = ca.Function("hoisted", inputs, shared(ca.vertcat(*constant)))
+    common = ca.Function("hoisted", inputs, with_cse(ca.vertcat(*constant)))
     names = ca.vertcat(*symbols)
-    varying_part = ca.Function(best.name(), [value, *inputs, names], shared(*varying))
+    varying_part = ca.Function(best.name(), [value, *inputs, names], with_cse(*varying))
     common_values = common(*fixed)
     return lambda value: varying_part(value, *fixed, common_values)
 
@@ -449,7 +451,7 @@ def _best_value(count: int, size: int) -> ca.Function:
     return ca.Function(
         "best_value",
         [part for candidate in candidates for part in candidate],
-        shared(arm, score, value),
+        with_cse(arm, score, value),
     )
 
 
@@ -473,7 +475,7 @@ def arms_graph(family: ArmFamily, name: str, recipe: str) -> FunctionGraph:
         arms, slack = family.arms()(ca.reshape(x[:9], 3, 3).T, x[9:12], x[12:])
         both = ca.vertcat(ca.vec(arms.T), slack)
         return ca.Function(
-            name, [x], [both] if family.is_iterative else shared(both), ["x"], ["arms"]
+            name, [x], [both] if family.is_iterative else with_cse(both), ["x"], ["arms"]
         )
 
     outputs = ((rows * (len(family.screws) + 1), 1),)

@@ -22,7 +22,7 @@ from casadi_ik.kinematics.arms.family import ClosedForm, ElbowBranch, Redundancy
 from casadi_ik.kinematics.arms.screws import Screws, subproblem_4
 from casadi_ik.kinematics.forward import Pose
 from casadi_ik.kinematics.se3 import rotation_between, skew
-from casadi_ik.kinematics.smooth import Expr, part, safe_norm
+from casadi_ik.kinematics.smooth import Expr, call_function, safe_norm
 
 MIN_LENGTH = 1e-12
 """Length below which a vector has no direction [m]."""
@@ -134,7 +134,7 @@ class SrsArm(ClosedForm):
         for sphere, form in zip((self.shoulder_joints, self.wrist_joints), spheres, strict=True):
             for i, index in enumerate(sphere.indices):
                 for bound in (lower[index], upper[index]):
-                    c, a, b = (_bound_form(part, i, bound) for part in form)
+                    c, a, b = (_bound_form(call_function, i, bound) for call_function in form)
                     if i == 1:
                         c = c - ca.cos(bound + sphere.offset)
                     size = ca.fmax(ca.sqrt(a * a + b * b), MIN_LENGTH)
@@ -174,11 +174,13 @@ class SrsArm(ClosedForm):
         A_0 = rotation_between(stretched / ca.fmax(safe_norm(stretched), MIN_LENGTH), direction)
         # e(line psi) = line line' + cos (I - line line') + sin [line].
         outer = direction @ direction.T
-        rotations = [part @ A_0 for part in (outer, ca.DM.eye(3) - outer, skew(direction))]
+        rotations = [
+            call_function @ A_0 for call_function in (outer, ca.DM.eye(3) - outer, skew(direction))
+        ]
         matrices = [self.shoulder_joints.euler_matrix(A) for A in rotations]
         matrices += [self.wrist_joints.euler_matrix(B.T @ (A.T @ rotation)) for A in rotations]
         elbow = self.screws.centred(3, turn.angle)
-        return part(
+        return call_function(
             "bent_arm",
             [squared, direction, rotation, sign],
             [elbow, slack, *map(ca.densify, matrices)],

@@ -23,7 +23,7 @@ from casadi_ik.kinematics.box_qp import Bounded, damped_step
 from casadi_ik.kinematics.linear_algebra import singular_values
 from casadi_ik.kinematics.screws import TipChain, TipMotion, finger_chain, relative_chain
 from casadi_ik.kinematics.se3 import normal_error, perpendicular
-from casadi_ik.kinematics.smooth import Expr, safe_norm, shared
+from casadi_ik.kinematics.smooth import Expr, safe_norm, with_cse
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.solve.limits import coupling_fields, coupling_values, kept_within, limit_mask
 from casadi_ik.solve.status import Status
@@ -346,7 +346,7 @@ class ScrewControlStep:
         )
         kind = self.task.kind.replace("-", "_")
         name = ca.Function.fix_name(f"screw_control_{kind}_{self.robot.name}")
-        function = ca.Function(name, [state, parameters], shared(after, record, status))
+        function = ca.Function(name, [state, parameters], with_cse(after, record, status))
         return StepGraph(name, function, self.state, self.parameters, self.record)
 
     def parameter_vector(self, target: dict[str, Any], numbers: dict[str, Any]) -> Array:

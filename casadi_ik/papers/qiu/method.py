@@ -20,7 +20,7 @@ from casadi_ik.kinematics.closed_chain import VIRTUAL, closed_chain, split
 from casadi_ik.kinematics.contacts import contact_errors, goal_contacts, within_tolerance
 from casadi_ik.kinematics.forward import actuated
 from casadi_ik.kinematics.linear_algebra import condition_number, damped_pinv_times, singular_values
-from casadi_ik.kinematics.smooth import Expr, safe_norm, shared
+from casadi_ik.kinematics.smooth import Expr, safe_norm, with_cse
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.papers.qiu.fingers import finger_step_function, planar_fingers
@@ -231,7 +231,7 @@ class EnhancedStep(QiuStep[QiuParameters]):
             sigma_thumb=_smallest(position.jacobian) * MILLIMETRE,
             sigma_palm=_smallest(palm.jacobian[:, : len(robot.arm_actuators)]),
         )
-        return ca.Function("reach", [state, parameters], shared(after, record, status))
+        return ca.Function("reach", [state, parameters], with_cse(after, record, status))
 
     def _align(self) -> ca.Function:
         """One iteration of hand alignment (section II-C), after the fingers' own step."""
@@ -271,7 +271,9 @@ class EnhancedStep(QiuStep[QiuParameters]):
             sigma_closed_chain=ca.mmin(spectrum),
             condition_closed_chain=condition_number(spectrum),
         )
-        return ca.Function("align_rest", [state, parameters, closed], shared(after, record, status))
+        return ca.Function(
+            "align_rest", [state, parameters, closed], with_cse(after, record, status)
+        )
 
     def _palm_tasks(
         self, J_cc: ca.SX, translation: ca.SX, rotation: ca.SX, p: dict[str, ca.SX]
@@ -402,7 +404,7 @@ class OriginalStep(QiuStep[OriginalParameters]):
             tasks.insert(0, palm_orientation_task(body, desired, arm, euler))
         errors = ca.horzcat(*contact_errors(body.kinematics, goals, robot.finger_names))
         seen = [ca.densify(ca.horzcat(task.jacobian, task.error)) for task in tasks]
-        return ca.Function("view", [state, parameters], shared(errors, *seen))
+        return ca.Function("view", [state, parameters], with_cse(errors, *seen))
 
     def _solve(self, count: int) -> ca.Function:
         """The step of one task alone over the actuators that move it, errors not above `longest`.
@@ -416,7 +418,7 @@ class OriginalStep(QiuStep[OriginalParameters]):
         else:
             solver = selective(p["gamma"], longest, longest)
         step = solver(Task(pair[:, :-1], pair[:, -1], is_position=True))
-        return ca.Function(f"solve_{count}", [parameters, longest, pair], shared(step))
+        return ca.Function(f"solve_{count}", [parameters, longest, pair], with_cse(step))
 
     def _pairs(self) -> tuple[list[ca.SX], list[Task]]:
         """Symbols of all [J, e], and the tasks over all actuators that they stand for."""
@@ -434,7 +436,7 @@ class OriginalStep(QiuStep[OriginalParameters]):
         J = ca.vertcat(*(task.jacobian for task in tasks))
         e = ca.vertcat(*(task.error for task in tasks))
         step = damped_pinv_times(ca.densify(J), e, p["damping"])
-        return ca.Function("stacked", [parameters, *pairs], shared(step))
+        return ca.Function("stacked", [parameters, *pairs], with_cse(step))
 
     def _combined(self) -> ca.Function:
         """One step from those of all tasks."""
@@ -445,7 +447,7 @@ class OriginalStep(QiuStep[OriginalParameters]):
             steps.append(_spread(given[i].T, columns, n).T)
         damping = self.options.damping if self.options.projectors == "damped" else None
         step = ca.densify(combine(tasks, steps, self.options.projection, damping))
-        return ca.Function("combined", [*pairs, *given], shared(step))
+        return ca.Function("combined", [*pairs, *given], with_cse(step))
 
     def _ending(self) -> ca.Function:
         """Take the step, or end."""
@@ -469,7 +471,7 @@ class OriginalStep(QiuStep[OriginalParameters]):
             }
         )
         return ca.Function(
-            "ending", [state, parameters, errors, step], shared(after, record, status)
+            "ending", [state, parameters, errors, step], with_cse(after, record, status)
         )
 
 

@@ -33,7 +33,7 @@ from casadi_ik.kinematics.contact_fit import (
 from casadi_ik.kinematics.contacts import LENGTH, Kinds
 from casadi_ik.kinematics.forward import ActuatedKinematics, Pose, actuated
 from casadi_ik.kinematics.palm import base_rotation, best_palm, hand_contacts, newton_polish
-from casadi_ik.kinematics.smooth import Expr, part, part_of, shared
+from casadi_ik.kinematics.smooth import Expr, call_function, hoisted_call_function, with_cse
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.solve.hand_first.parameters import BODY, STAGES
 from casadi_ik.solve.hand_first.state import BY_SIDE, HandFirstLayouts, Stage, with_rows
@@ -101,7 +101,9 @@ class BodySide:
         at = ca.SX.sym("hand", hand.numel())
         contacts = hand_contacts(self.robot, at, self.robot.hand_actuators)
         found = best_palm(contacts, self.layouts.contacts, self._own.unpack(given), turn, self.base)
-        return part("best_palm", [at, given, turn], found)(hand, self._own.pack(own), number)
+        return call_function("best_palm", [at, given, turn], found)(
+            hand, self._own.pack(own), number
+        )
 
     def fitted(
         self, x: PalmAndHand, damping: Expr, own: dict[str, Expr], q: Expr, tolerant: bool
@@ -113,7 +115,7 @@ class BodySide:
         parameters = self._own.unpack(given)
         step = fit_step(self.layouts, None, there, around, parameters, at, [given], tolerant)
         rest = step.before, step.there, step.promised, step.size
-        whole = part("fitted", [*there, around, given, at], [*step.reached, *rest])
+        whole = call_function("fitted", [*there, around, given, at], [*step.reached, *rest])
         *reached, before, left, promised, size = whole(*x, damping, self._own.pack(own), q)
         return Tried(PalmAndHand(*reached), before, left, promised, size)
 
@@ -294,7 +296,7 @@ class BodyStep(HandFirstStep):
         for side in self.sides:
             rotation, origin = self._palm(s, side)
             found += [base.rotation.T @ rotation, base.inverse_apply(origin)]
-        return ca.Function("seen", inputs, shared(*map(ca.densify, found)))
+        return ca.Function("seen", inputs, with_cse(*map(ca.densify, found)))
 
     def palms(self) -> FunctionGraph:
         """Where the palms are.
@@ -313,7 +315,7 @@ class BodyStep(HandFirstStep):
             found += [ca.vec(pose.rotation.T), pose.origin]
             placed = ca.horzcat(base.rotation.T @ pose.rotation, base.inverse_apply(pose.origin))
             seen += [ca.vec(placed.T), ca.SX([0.0, 0.0, 0.0, 1.0])]
-        outputs = shared(*(ca.densify(ca.vertcat(*some)) for some in (found, seen)))
+        outputs = with_cse(*(ca.densify(ca.vertcat(*some)) for some in (found, seen)))
         return FunctionGraph.of(ca.Function("palms", [q], outputs))
 
     def _palm(self, s: dict[str, Expr], side: BodySide) -> tuple[Expr, Expr]:
@@ -420,4 +422,4 @@ class BodyStep(HandFirstStep):
             slopes += [asked * linear / LENGTH, asked * half * angular]
             turned += [shift, -asked * crossed / half]
         found = (ca.vertcat(*each) for each in (apart, slopes, turned))
-        return part_of("palms_off", [q], given, list(found))
+        return hoisted_call_function("palms_off", [q], given, list(found))

@@ -19,7 +19,7 @@ from casadi_ik.kinematics.contacts import LENGTH
 from casadi_ik.kinematics.forward import actuated
 from casadi_ik.kinematics.posture_table import PostureTable
 from casadi_ik.kinematics.se3 import align
-from casadi_ik.kinematics.smooth import Expr, shared
+from casadi_ik.kinematics.smooth import Expr, with_cse
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.solve.hand_first.parameters import HandFirstParameters
 
@@ -222,7 +222,7 @@ def _seen(name: str, robot: RobotDescription) -> ca.Function:
         own.append(ca.dot(factors, _features(here[:, i])))
         cost += own[i] + w_point * ca.sumsqr(point) + w_normal * ca.sumsqr(normal)
     outputs = ca.horzcat(*wanted), ca.vertcat(*own), cost
-    return ca.Function(name, [points, normals, hand], shared(*outputs))
+    return ca.Function(name, [points, normals, hand], with_cse(*outputs))
 
 
 def _features(tip: Expr) -> Expr:

@@ -16,7 +16,7 @@ from casadi_ik.kinematics.box_qp import Bounded
 from casadi_ik.kinematics.contact_fit import Tried, WholeContacts, fresh_fit
 from casadi_ik.kinematics.contacts import ContactRows, Kinds, suffix, usual
 from casadi_ik.kinematics.palm import SIX
-from casadi_ik.kinematics.smooth import Expr, part, shared
+from casadi_ik.kinematics.smooth import Expr, call_function, with_cse
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.solve.limits import bits, coupling_fields, coupling_values
 from casadi_ik.solve.status import Phase
@@ -304,7 +304,7 @@ class HandFirstLayouts:
                 "status": 0.0,  # filled in by the iteration
             }
         )
-        return part("row", [q, residual, *numbers.values(), weights, lower, upper], [row])
+        return call_function("row", [q, residual, *numbers.values(), weights, lower, upper], [row])
 
 
 def with_rows(q: Expr, rows: Sequence[int], values: Expr) -> Expr:
@@ -403,7 +403,7 @@ def _build(name: str, layouts: HandFirstLayouts) -> ca.Function:
         | fresh_fit()
     )
     inputs = [*vectors.values(), here, given, postures]
-    return ca.Function(name, inputs, shared(state, parameters))
+    return ca.Function(name, inputs, with_cse(state, parameters))
 
 
 def _is_held(layouts: HandFirstLayouts, t: dict[str, Expr]) -> Expr:

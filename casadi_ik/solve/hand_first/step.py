@@ -64,7 +64,7 @@ from casadi_ik.kinematics.palm import (
     pose_step,
 )
 from casadi_ik.kinematics.se3 import compose, exp_se3, skew
-from casadi_ik.kinematics.smooth import Expr, part_of, shared
+from casadi_ik.kinematics.smooth import Expr, hoisted_call_function, with_cse
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.solve.hand_first.iteration import Iteration, text
 from casadi_ik.solve.hand_first.parameters import STAGES
@@ -178,7 +178,7 @@ def fit_step(
     """
     bounds = layouts.hand_bounds(q, p, first=6)
     there = PalmAndHand(ca.SX.sym("R", 3, 3), ca.SX.sym("t", 3), ca.SX.sym("h", x.hand.numel()))
-    seen = part_of("fit_at", there, given, _rows(layouts, arm, there, p))
+    seen = hoisted_call_function("fit_at", there, given, _rows(layouts, arm, there, p))
 
     def moved(step: Expr) -> PalmAndHand:
         rotation, origin = compose((x.rotation, x.origin), exp_se3(step[:6]))
@@ -329,7 +329,7 @@ class HandFirstStep:
         """A stage's function from what it changes in the state and what it says."""
         after = self.layouts.state.pack(s | changed)
         says = SAID.pack({name: ca.SX(0) for name in SAID.names} | said)
-        return ca.Function(stage.name.lower(), inputs, shared(after, says, record))
+        return ca.Function(stage.name.lower(), inputs, with_cse(after, says, record))
 
     def _with_hand(self, q: Expr, hand: Expr) -> Expr:
         return with_rows(q, self.robot.hand_actuators, hand)

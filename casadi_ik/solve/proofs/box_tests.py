@@ -1,28 +1,31 @@
-"""Whether no hand within a box of postures can meet a target: one test, as a graph.
+"""Test that proves that no hand posture in a box can meet a target, as a graph.
 
-Every contact of such a hand lies in a ball (`proofs.boxes`), every contact asked for within its
-tolerances. Hence inequalities between what is kept by all motions of the palm, and between that
-and what the arm can do. All are necessary: what is refuted is impossible, what is not may be, too.
+Every contact that a hand in the box can make lies in a ball (`proofs.boxes`), and every admissible
+contact lies within the tolerances of the target. The test evaluates necessary conditions: relations
+between contacts that no palm motion changes, and relations between the contacts and the workspace
+of the arm. A refuted box contains no solution; a box that is not refuted may still contain none.
 
-*Pairs.* What two contacts keep however the palm is moved: distance, angle, heights, handedness.
-Each as a row ``|value| <= width``: the value asked for less that of the middle of the box, and a
-width that holds the tolerances and all that the box lets the contacts move. That is bounded twice,
-and the smaller bound taken: by the balls of the contacts, and by the slopes of the value itself,
-which see only what changes it. What the slopes leave out are the products of two changes, and
-`near` and `close` of the contacts. With unit vectors a, b asked for, a = (n + T u) + r in the frame
-of the palm and |r| <= close: products are split so that one factor is what is asked for, whose
-length is known.
+*Pairs.* A palm motion preserves distance, angle, heights and handedness of two contacts. Each of
+these invariants is an inequality ``|value| <= width``: the value is the invariant of the target
+minus that at the centre of the box, and the width covers the tolerances and the variation within
+the box. The width is the smaller of two bounds: one from the balls of the contacts, one from the
+slopes of the invariant itself, which ignores motion that does not change it. The second bound adds
+the products of two variations, `point_remainder` and `normal_remainder` of the contacts. With
+target unit vectors a, b and a = (n + T u) + r in the palm frame, |r| <= normal_remainder, products
+are split such that one factor is a target vector, whose length is known.
 
 *Rigid fit.* The largest trace tr(R S) over all rotations R is the largest eigenvalue of Horn's
-symmetric 4 x 4 matrix (Horn 1987). Newton's method on its characteristic polynomial falls towards
-it from above (Theobald 2005), so that every iterate is a bound.
+symmetric 4 x 4 matrix (Horn 1987). Newton's method on its characteristic polynomial converges to
+it from above (Theobald 2005), so that every iterate is an upper bound.
 
-*Wrist.* Where the contacts put the wrist, against the distances from the shoulder an arm can hold.
+*Wrist.* The distance of the wrist, located by the contacts, from the shoulder must be one that the
+arm can assume.
 
-*Cones.* For a place of the wrist the elbow of a seven-joint arm can be anywhere on a circle. The
-limit of joint 2 leaves an arc of it, in which the upper arm is within a cone about axis 1; the
-limit of joint 6 another, in which the forearm is within a cone about axis 7, which goes with the
-palm. No elbow is in both if the middles of the arcs are further apart than half their lengths.
+*Cones.* At a given wrist position the elbow of a seven-joint arm lies on a circle. The limit of
+joint 2 leaves an arc of the circle, on which the upper arm is within a cone about axis 1; the limit
+of joint 6 leaves another arc, on which the forearm is within a cone about axis 7, which moves with
+the palm. No elbow position is on both arcs if the midpoints of the arcs are separated by more than
+the sum of their half lengths.
 """
 
 from __future__ import annotations
@@ -37,22 +40,22 @@ import numpy as np
 from casadi_ik.compile.graphs import FunctionGraph, recipe
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.linear_algebra import solve_spd
-from casadi_ik.kinematics.smooth import Expr, safe_norm, shared
-from casadi_ik.solve.proofs.boxes import SLACK, BoxContact, HandSpace, box_contacts
+from casadi_ik.kinematics.smooth import Expr, safe_norm, with_cse
+from casadi_ik.solve.proofs.boxes import BOUND_MARGIN, BoxContact, HandSpace, box_contacts
 from casadi_ik.solve.proofs.premises import ArmCones, ArmSpan
 
-ANGLE_SLACK = 1e-7
-"""What angles and cosines of the arm's cones are let off by."""
+ANGLE_MARGIN = 1e-7
+"""Margin of angles [rad] and cosines of the arm's cones against rounding errors."""
 
 
 @dataclass(frozen=True, eq=False)
 class BoxTest:
-    """The step for one robot.
+    """Test of boxes of hand postures for one robot.
 
     Attributes:
-        space: The hand's coordinates.
-        arm: The arm; None if the palm does not move.
-        cones: What the limits of its shoulder and wrist leave; None for other arms.
+        space: Coordinates of the hand.
+        arm: Shoulder and wrist of the arm; None if the palm does not move.
+        cones: Cones that the limits of shoulder and wrist leave; None for arms of another family.
     """
 
     space: HandSpace
@@ -60,186 +63,244 @@ class BoxTest:
     cones: ArmCones | None
 
     def graph(self) -> FunctionGraph:
-        """The graph.
+        """Return the graph of the test.
 
         Returns:
-            ``(lower, upper, joint_lower, joint_upper, points, normals, tolerance, asked, span,
-            cosines) -> (refuted, scores)``: coordinates (h,), joints of the fingers (m,), contacts
-            (f, 3), tolerances and what is asked (f, 2), the wrist's smallest and largest distance
-            (2,), cosines of the arm's cones (2,).
-            Refuted by the hand and by the reach (2,) where > 0; scores (h,): what each coordinate
-            leaves open.
+            ``(lower, upper, joint_lower, joint_upper, points, normals, tolerance, constrained,
+            span, cosines) -> (refuted, scores)``. Inputs: bounds of the coordinates (h,), limits of
+            the finger joints (m,), contacts (f, 3), tolerances of position and angle (f, 2),
+            1 where a point or normal is constrained (f, 2), smallest and largest distance of the
+            wrist from the shoulder (2,), cosines of the arm's cones (2,). Outputs: values > 0 if
+            the hand alone or the arm refutes the box (2,), and the contribution of each coordinate
+            to the remaining uncertainty (h,).
         """
         robot = self.space.robot
         h, m, f = len(robot.finger_motors), len(robot.finger_joints), len(robot.fingers)
         shapes = {"lower": (h, 1), "upper": (h, 1), "joint_lower": (m, 1), "joint_upper": (m, 1)}
-        shapes |= {"points": (f, 3), "normals": (f, 3), "tolerance": (f, 2), "asked": (f, 2)}
+        shapes |= {"points": (f, 3), "normals": (f, 3), "tolerance": (f, 2), "constrained": (f, 2)}
         shapes |= {"span": (2, 1), "cosines": (2, 1)}
         name = ca.Function.fix_name(f"{robot.name}_box_test")
 
         def build() -> ca.Function:
             symbols = {key: ca.SX.sym(key, *shape) for key, shape in shapes.items()}
-            outputs = shared(*map(ca.densify, self._outputs(symbols)))
+            outputs = with_cse(*map(ca.densify, self._outputs(symbols)))
             return ca.Function(
                 name, list(symbols.values()), outputs, list(shapes), ["refuted", "scores"]
             )
 
-        place: tuple[Array, ...] = () if self.arm is None else (self.arm.shoulder, self.arm.wrist)
-        place += () if self.cones is None else (self.cones.last,)
-        known = recipe(name, robot, place)
-        return FunctionGraph(name, build, shapes, ((2, 1), (h, 1)), known)
+        arm_geometry: tuple[Array, ...] = (
+            () if self.arm is None else (self.arm.shoulder, self.arm.wrist)
+        )
+        arm_geometry += () if self.cones is None else (self.cones.last,)
+        graph_recipe = recipe(name, robot, arm_geometry)
+        return FunctionGraph(name, build, shapes, ((2, 1), (h, 1)), graph_recipe)
 
     def _outputs(self, p: dict[str, ca.SX]) -> tuple[Expr, Expr]:
         ranges = self.space.intervals(p["lower"], p["upper"])
-        half = (p["upper"] - p["lower"]) / 2
-        contacts = box_contacts(self.space, ranges, half, p, self.arm is not None)
-        hand, reach = [ca.SX(-1)], [ca.SX(-1)]
+        half_widths = (p["upper"] - p["lower"]) / 2
+        contacts = box_contacts(self.space, ranges, half_widths, p, self.arm is not None)
+        hand_tests, arm_tests = [ca.SX(-1)], [ca.SX(-1)]
         for i, name in enumerate(self.space.robot.finger_joints):
-            hand.append(ranges[name].lower - p["joint_upper"][i])
-            hand.append(p["joint_lower"][i] - ranges[name].upper)
-        rows: list[Row] = []
+            hand_tests.append(ranges[name].lower - p["joint_upper"][i])
+            hand_tests.append(p["joint_lower"][i] - ranges[name].upper)
+        rows: list[Inequality] = []
         if self.arm is None:
-            hand += [test for contact in contacts for test in contact.alone()]
+            hand_tests += [test for contact in contacts for test in contact.fixed_hand_tests()]
         else:
             for a, b in combinations(contacts, 2):
                 rows += pair_rows(a, b)
-                hand += pair_angles(a, b)
-            hand += [ca.fabs(row.value) - row.width for row in rows]
-            hand.append(rigid_excess(contacts))
-            tests, reached = self._reach(contacts, self.arm, p)
-            reach, rows = reach + tests, rows + reached
-        refuted = ca.vertcat(ca.mmax(ca.vertcat(*hand)), ca.mmax(ca.vertcat(*reach)))
-        return refuted, self._scores(contacts, rows, p["asked"])
+                hand_tests += pair_angles(a, b)
+            hand_tests += [ca.fabs(row.value) - row.width for row in rows]
+            hand_tests.append(rigid_excess(contacts))
+            new_tests, arm_rows = self._arm_tests(contacts, self.arm, p)
+            arm_tests, rows = arm_tests + new_tests, rows + arm_rows
+        refuted = ca.vertcat(ca.mmax(ca.vertcat(*hand_tests)), ca.mmax(ca.vertcat(*arm_tests)))
+        return refuted, self._scores(contacts, rows, p["constrained"])
 
-    def _reach(
+    def _arm_tests(
         self, contacts: list[BoxContact], arm: ArmSpan, p: dict[str, ca.SX]
-    ) -> tuple[list[Expr], list[Row]]:
-        """Tests of the arm, and rows of what decides most of them."""
-        ball = carried(contacts, ca.SX(ca.DM(arm.wrist)), 1)
-        found, rows = wrist_excess(contacts, arm, p["span"], ball)
+    ) -> tuple[list[Expr], list[Inequality]]:
+        """Return the tests of the arm, and the inequalities that decide most of them."""
+        wrist_ball = palm_ball(contacts, ca.SX(ca.DM(arm.wrist)), 1)
+        tests, rows = wrist_excess(contacts, arm, p["span"], wrist_ball)
         if self.cones is not None:
-            last = carried(contacts, ca.SX(ca.DM(self.cones.last)), 0)
-            found.append(cone_excess(self.cones, ball, last, p["span"], p["cosines"]))
-        return found, rows
+            axis_ball = palm_ball(contacts, ca.SX(ca.DM(self.cones.last)), 0)
+            tests.append(cone_excess(self.cones, wrist_ball, axis_ball, p["span"], p["cosines"]))
+        return tests, rows
 
-    def _scores(self, contacts: list[BoxContact], rows: list[Row], asked: Expr) -> Expr:
-        """By coordinate what it leaves open: most of all in rows that are nearly broken.
+    def _scores(
+        self, contacts: list[BoxContact], rows: list[Inequality], constrained: Expr
+    ) -> Expr:
+        """Return the contribution of each coordinate to the remaining uncertainty, (h, 1).
 
-        0.1 m count as much as one radian; a coordinate that moves a finger counts a tenth of one
-        that widens a row nearly broken.
+        A coordinate scores highest if it widens inequalities that are nearly violated; mere motion
+        of a contact has a tenth of that weight. 0.1 m count as one radian.
         """
-        found = []
+        scores = []
         for k in range(len(self.space.coordinates)):
-            most = ca.SX(0)
+            largest = ca.SX(0)
             for i, contact in enumerate(contacts):
-                share = asked[i, 0] * contact.moved[k] / 0.1 + asked[i, 1] * contact.turned[k]
-                most = ca.fmax(most, share)
-            found.append(0.1 * most if rows else most)
+                motion = (
+                    constrained[i, 0] * contact.radius_shares[k] / 0.1
+                    + constrained[i, 1] * contact.chord_shares[k]
+                )
+                largest = ca.fmax(largest, motion)
+            scores.append(0.1 * largest if rows else largest)
         for row in rows:
             square = (row.value / row.width) ** 2
-            for k, share in enumerate(row.shares):
-                found[k] += square * square * share / row.width
-        return ca.vertcat(*found)
+            for k, motion in enumerate(row.shares):
+                scores[k] += square * square * motion / row.width
+        return ca.vertcat(*scores)
 
 
 @dataclass(frozen=True, eq=False)
-class Row:
-    """One inequality; `shares` is what each coordinate adds to its width."""
+class Inequality:
+    """A necessary condition ``|value| <= width`` of a box.
+
+    Attributes:
+        value: Deviation of an invariant at the centre of the box from that of the target.
+        width: Largest admissible deviation within the box and the tolerances.
+        shares: Contribution of each coordinate to the width, h of them.
+    """
 
     value: Expr
     width: Expr
     shares: list[Expr]
 
 
-def pair_rows(a: BoxContact, b: BoxContact) -> Iterator[Row]:
-    """The rows of two contacts; all zero where something of them is not asked for."""
-    asked, here = b.target - a.target, b.point - a.point
-    long, short, far = safe_norm(asked), safe_norm(here), a.radius + b.radius
-    both, near = a.placed * b.placed, a.near + b.near
-    apart = b.moves - a.moves
-    moved = [one + other for one, other in zip(a.moved, b.moved, strict=True)]
-    turned = [one + other for one, other in zip(a.turned, b.turned, strict=True)]
-    drift, swing_a, swing_b = (_lengths(slopes) for slopes in (apart, a.turns, b.turns))
-    line = here / short
-    along = ca.fabs(line.T @ apart)
-    aside = _lengths(apart - line @ (line.T @ apart))
-    most = ca.sqrt((short + ca.sum2(along)) ** 2 + ca.sum2(aside) ** 2) - short
-    yield Row(both * (long - short), ca.fmin(far, most + near), moved)
-    faced = both * a.faced * b.faced
-    cosine = ca.dot(a.facing, b.facing) - ca.dot(a.normal, b.normal)
-    sloped = _total(b.normal.T @ a.turns + a.normal.T @ b.turns)
-    sloped += ca.sum2(swing_a) * ca.sum2(swing_b) + a.close + b.close + a.close * b.close
-    yield Row(faced * cosine, ca.fmin(a.chord + b.chord, sloped), turned)
-    for one, swing in ((a, swing_a), (b, swing_b)):
-        height = ca.dot(one.facing, asked) - ca.dot(one.normal, here)
-        shares = [m + t * long for m, t in zip(moved, one.turned, strict=True)]
-        sloped = _total(here.T @ one.turns + one.normal.T @ apart)
-        sloped += ca.sum2(swing) * ca.sum2(drift) + one.close * long + (1 + one.close) * near
-        yield Row(both * one.faced * height, ca.fmin(far + one.chord * long, sloped), shares)
-    across, there = ca.cross(a.normal, b.normal), ca.cross(a.facing, b.facing)
-    yield Row(
-        faced * (ca.dot(there, asked) - ca.dot(across, here)),
-        far + (a.chord + b.chord) * long,
-        [m + t * long for m, t in zip(moved, turned, strict=True)],
+def pair_rows(a: BoxContact, b: BoxContact) -> Iterator[Inequality]:
+    """Yield the inequalities of two contacts; zero where a point or normal is unconstrained."""
+    target_line, line = b.target_point - a.target_point, b.point - a.point
+    target_distance, distance, radii = safe_norm(target_line), safe_norm(line), a.radius + b.radius
+    has_points, point_remainders = a.has_point * b.has_point, a.point_remainder + b.point_remainder
+    line_slopes = b.point_slopes - a.point_slopes
+    point_shares = [
+        share_a + share_b for share_a, share_b in zip(a.radius_shares, b.radius_shares, strict=True)
+    ]
+    normal_shares = [
+        share_a + share_b for share_a, share_b in zip(a.chord_shares, b.chord_shares, strict=True)
+    ]
+    line_slope_lengths, normal_slopes_a, normal_slopes_b = (
+        _column_norms(slopes) for slopes in (line_slopes, a.normal_slopes, b.normal_slopes)
+    )
+    direction = line / distance
+    parallel = ca.fabs(direction.T @ line_slopes)
+    perpendicular = _column_norms(line_slopes - direction @ (direction.T @ line_slopes))
+    growth = ca.sqrt((distance + ca.sum2(parallel)) ** 2 + ca.sum2(perpendicular) ** 2) - distance
+    yield Inequality(
+        has_points * (target_distance - distance),
+        ca.fmin(radii, growth + point_remainders),
+        point_shares,
+    )
+    has_normals = has_points * a.has_normal * b.has_normal
+    cosine = ca.dot(a.target_normal, b.target_normal) - ca.dot(a.normal, b.normal)
+    slope_bound = _sum_of_magnitudes(b.normal.T @ a.normal_slopes + a.normal.T @ b.normal_slopes)
+    slope_bound += (
+        ca.sum2(normal_slopes_a) * ca.sum2(normal_slopes_b)
+        + a.normal_remainder
+        + b.normal_remainder
+        + a.normal_remainder * b.normal_remainder
+    )
+    yield Inequality(has_normals * cosine, ca.fmin(a.chord + b.chord, slope_bound), normal_shares)
+    for contact, normal_slope_lengths in ((a, normal_slopes_a), (b, normal_slopes_b)):
+        height = ca.dot(contact.target_normal, target_line) - ca.dot(contact.normal, line)
+        shares = [
+            m + t * target_distance for m, t in zip(point_shares, contact.chord_shares, strict=True)
+        ]
+        slope_bound = _sum_of_magnitudes(
+            line.T @ contact.normal_slopes + contact.normal.T @ line_slopes
+        )
+        slope_bound += (
+            ca.sum2(normal_slope_lengths) * ca.sum2(line_slope_lengths)
+            + contact.normal_remainder * target_distance
+            + (1 + contact.normal_remainder) * point_remainders
+        )
+        yield Inequality(
+            has_points * contact.has_normal * height,
+            ca.fmin(radii + contact.chord * target_distance, slope_bound),
+            shares,
+        )
+    normal_of_normals, target_normal_of_normals = (
+        ca.cross(a.normal, b.normal),
+        ca.cross(a.target_normal, b.target_normal),
+    )
+    yield Inequality(
+        has_normals
+        * (ca.dot(target_normal_of_normals, target_line) - ca.dot(normal_of_normals, line)),
+        radii + (a.chord + b.chord) * target_distance,
+        [m + t * target_distance for m, t in zip(point_shares, normal_shares, strict=True)],
     )
 
 
-def _lengths(slopes: Expr) -> Expr:
-    """(1, h) lengths of columns."""
+def _column_norms(slopes: Expr) -> Expr:
+    """Return the norms of columns, (1, h)."""
     return ca.horzcat(*(safe_norm(slopes[:, k]) for k in range(slopes.shape[1])))
 
 
-def _total(slopes: Expr) -> Expr:
-    """How far slopes (1, h) carry a value within the box."""
+def _sum_of_magnitudes(slopes: Expr) -> Expr:
+    """Return the largest change within the box of a value with slopes (1, h)."""
     return ca.sum2(ca.fabs(slopes))
 
 
 def pair_angles(a: BoxContact, b: BoxContact) -> Iterator[Expr]:
-    """Tests > 0 if angles cannot be as asked: of the normals, and of each with the line of points.
+    """Yield tests of angles: between the normals, and of each normal with the line of points.
 
-    They say more than cosines where the angles are near 0 or half a turn, as of normals that face
-    each other.
+    A test > 0 refutes the box. Angles are sharper than cosines near 0 and pi, for example for
+    opposed normals.
     """
-    asked, here = b.target - a.target, b.point - a.point
-    long, short, far = safe_norm(asked), safe_norm(here), a.radius + b.radius
-    both, most = a.placed * b.placed, ca.fmax(long, short)
-    cosines = ca.dot(a.facing, b.facing), ca.dot(a.normal, b.normal)
-    turns = _turn(a.chord), _turn(b.chord)
-    yield both * a.faced * b.faced * _apart(cosines, turns)
-    # The line between the points turns by no more than asin(far / length), of either length.
-    sine = ca.fmin(far / most, 1.0)
+    target_line, line = b.target_point - a.target_point, b.point - a.point
+    target_distance, distance, radii = safe_norm(target_line), safe_norm(line), a.radius + b.radius
+    has_points, longer_distance = a.has_point * b.has_point, ca.fmax(target_distance, distance)
+    cosines = ca.dot(a.target_normal, b.target_normal), ca.dot(a.normal, b.normal)
+    rotations = _cos_sin_of_chord(a.chord), _cos_sin_of_chord(b.chord)
+    yield has_points * a.has_normal * b.has_normal * _angle_excess(cosines, rotations)
+    # The line between the points rotates by at most asin(radii / longer distance).
+    sine = ca.fmin(radii / longer_distance, 1.0)
     tilt = ca.sqrt(1 - sine * sine), sine
-    for one, turn in zip((a, b), turns, strict=True):
-        cosines = ca.dot(one.facing, asked) / long, ca.dot(one.normal, here) / short
-        test = ca.if_else(far < most, _apart(cosines, (turn, tilt)), -1.0)
-        yield both * one.faced * test
+    for contact, rotation in zip((a, b), rotations, strict=True):
+        cosines = (
+            ca.dot(contact.target_normal, target_line) / target_distance,
+            ca.dot(contact.normal, line) / distance,
+        )
+        test = ca.if_else(radii < longer_distance, _angle_excess(cosines, (rotation, tilt)), -1.0)
+        yield has_points * contact.has_normal * test
 
 
-def _turn(chord: Expr) -> tuple[Expr, Expr]:
-    """Cosine and sine of the angle of a chord, half a turn at most."""
-    half = ca.fmin(chord, 2.0) / 2
-    return 1 - 2 * half * half, 2 * half * ca.sqrt(ca.fmax(1 - half * half, 0.0))
+def _cos_sin_of_chord(chord: Expr) -> tuple[Expr, Expr]:
+    """Return cosine and sine of the angle that a chord subtends, at most pi."""
+    half_chord = ca.fmin(chord, 2.0) / 2
+    return 1 - 2 * half_chord * half_chord, 2 * half_chord * ca.sqrt(
+        ca.fmax(1 - half_chord * half_chord, 0.0)
+    )
 
 
-def _apart(cosines: tuple[Expr, Expr], turns: tuple[tuple[Expr, Expr], tuple[Expr, Expr]]) -> Expr:
-    """> 0 if two angles differ by more than the sum of two others (cosine, sine), if < pi."""
-    rounding = 1e-8  # more than is lost where a sine is taken from a cosine near 1
-    one, other = cosines
+def _angle_excess(
+    cosines: tuple[Expr, Expr], widths: tuple[tuple[Expr, Expr], tuple[Expr, Expr]]
+) -> Expr:
+    """Return a value > 0 if two angles differ by more than the sum of two others.
+
+    Args:
+        cosines: Cosines of the two angles.
+        widths: Cosine and sine of the angles whose sum is the largest admissible difference; a sum
+            of pi or more admits every difference.
+    """
+    rounding = 1e-8  # exceeds the cancellation error of a sine computed from a cosine near 1
+    cosine_a, cosine_b = cosines
     sines = [ca.sqrt(ca.fmax(1 - c * c, 0.0)) for c in cosines]
-    (cos_a, sin_a), (cos_b, sin_b) = turns
-    widest = cos_a * cos_b - sin_a * sin_b
-    excess = widest - rounding - (one * other + sines[0] * sines[1])
-    # Both are at most half a turn: their sum is less than that where cosine a > -cosine b.
+    (cos_a, sin_a), (cos_b, sin_b) = widths
+    cosine_of_sum = cos_a * cos_b - sin_a * sin_b
+    excess = cosine_of_sum - rounding - (cosine_a * cosine_b + sines[0] * sines[1])
+    # Both angles are at most pi: their sum is below pi exactly where cos a > -cos b.
     return ca.if_else(cos_a + cos_b > rounding, excess, -1.0)
 
 
 def largest_trace(S: Expr, bound: Expr, steps: int = 7) -> Expr:
-    """An upper bound of tr(R S) over all rotations R, (1, 1).
+    """Return an upper bound of tr(R S) over all rotations R, (1, 1).
 
     Args:
-        S: (3, 3), the sum of weight x_source x_target'.
-        bound: A bound that is known, > 0; the result is as close as rounding to `bound` allows.
-        steps: Newton's.
+        S: (3, 3) sum of weight x_source x_target'.
+        bound: A coarser upper bound, > 0; the rounding error of the result is relative to it.
+        steps: Number of Newton steps.
     """
     s = S / bound
     xx, xy, xz = s[0, 0], s[0, 1], s[0, 2]
@@ -257,41 +318,48 @@ def largest_trace(S: Expr, bound: Expr, steps: int = 7) -> Expr:
     for _ in range(steps):
         value = ((x * x + c2) * x + c1) * x + c0
         slope = (4 * x * x + 2 * c2) * x + c1
-        # Where the value is rounding errors these must not carry it past the root.
-        ahead = ca.logic_and(value > 1e-13, slope > 0)
-        x = x - ca.if_else(ahead, value / ca.fmax(slope, 1e-300), 0.0)
+        # A step whose numerator is rounding noise must not pass the root.
+        is_above_root = ca.logic_and(value > 1e-13, slope > 0)
+        x = x - ca.if_else(is_above_root, value / ca.fmax(slope, 1e-300), 0.0)
     return x * bound
 
 
 def rigid_excess(contacts: list[BoxContact]) -> Expr:
-    """> 0 if no motion of the palm brings all contacts within their balls and chords.
+    """Return a value > 0 if no palm motion brings all contacts within their balls and chords.
 
-    The least weighted sum of squares of what is left, against what would be allowed.
+    The test compares the residual of the best weighted rigid fit with the largest sum of weighted
+    squares that the balls and chords allow.
     """
-    heavy = [contact.placed / contact.radius**2 for contact in contacts]
-    light = [contact.faced / contact.chord**2 for contact in contacts]
-    total = sum(heavy, ca.SX(1e-300))
-    there = sum((w * c.target for w, c in zip(heavy, contacts, strict=True)), ca.SX(3, 1)) / total
-    here = sum((w * c.point for w, c in zip(heavy, contacts, strict=True)), ca.SX(3, 1)) / total
+    point_weights = [contact.has_point / contact.radius**2 for contact in contacts]
+    normal_weights = [contact.has_normal / contact.chord**2 for contact in contacts]
+    total = sum(point_weights, ca.SX(1e-300))
+    target_mean = (
+        sum((w * c.target_point for w, c in zip(point_weights, contacts, strict=True)), ca.SX(3, 1))
+        / total
+    )
+    mean = (
+        sum((w * c.point for w, c in zip(point_weights, contacts, strict=True)), ca.SX(3, 1))
+        / total
+    )
     S, size, allowed = ca.SX(3, 3), ca.SX(1e-300), ca.SX(0)
-    for w, v, contact in zip(heavy, light, contacts, strict=True):
-        x, y = contact.point - here, contact.target - there
-        S += w * (x @ y.T) + v * (contact.normal @ contact.facing.T)
+    for w, v, contact in zip(point_weights, normal_weights, contacts, strict=True):
+        x, y = contact.point - mean, contact.target_point - target_mean
+        S += w * (x @ y.T) + v * (contact.normal @ contact.target_normal.T)
         size += w * (ca.sumsqr(x) + ca.sumsqr(y)) + 2 * v
-        allowed += contact.placed + contact.faced
-    least = size - 2 * largest_trace(S, size / 2)
-    # What is left of a double root in doubles, as a part of the largest terms.
-    return (least - 3e-8 * size) / ca.fmax(allowed, 1.0) - 1
+        allowed += contact.has_point + contact.has_normal
+    smallest_residual = size - 2 * largest_trace(S, size / 2)
+    # 3e-8: relative accuracy of a double root in double precision.
+    return (smallest_residual - 3e-8 * size) / ca.fmax(allowed, 1.0) - 1
 
 
 @dataclass(frozen=True, eq=False)
 class Ball:
-    """What holds a point or a direction of the palm, base frame.
+    """Ball in the base frame that contains a point or a unit vector of the palm.
 
     Attributes:
-        centre: (3, 1).
-        radius: Of the ball.
-        shares: What each coordinate of the box adds to it, h of them.
+        centre: (3, 1) centre.
+        radius: Radius.
+        shares: Contribution of each coordinate of the box to the radius, h of them.
     """
 
     centre: Expr
@@ -299,208 +367,267 @@ class Ball:
     shares: list[Expr]
 
 
-def _combination(
-    contacts: list[BoxContact], vector: Expr, whole: int, asked: bool
+def _combination_coefficients(
+    contacts: list[BoxContact], vector: Expr, sum_of_points: int, of_targets: bool
 ) -> list[tuple[Expr, Expr]]:
-    """Coefficients of the contacts' points and normals that give a vector, nearly.
+    """Return coefficients of points and normals that approximately combine to a vector.
 
-    Those with the least weighted sum of squares; those of the points sum to `whole`.
+    They have the smallest weighted sum of squares among those whose point coefficients sum to
+    `sum_of_points`.
 
     Args:
-        contacts: Of the box.
-        vector: (3, 1).
-        whole: 1 for a point, 0 for a direction.
-        asked: Whether of what is asked for, base frame; else of what the hand makes, palm frame.
+        contacts: Contacts of the box.
+        vector: (3, 1) vector to represent.
+        sum_of_points: 1 for a point, 0 for a direction.
+        of_targets: True to combine the targets (base frame), False to combine the contacts of the
+            hand (palm frame).
     """
-    sources = [(c.target, c.facing) if asked else (c.point, c.normal) for c in contacts]
-    heavy = [contact.placed / contact.radius**2 for contact in contacts]
-    total = sum(heavy, ca.SX(1e-300))
-    share = [w / total for w in heavy]
-    mean = sum((w * point for w, (point, _) in zip(share, sources, strict=True)), ca.SX(3, 1))
+    sources = [
+        (c.target_point, c.target_normal) if of_targets else (c.point, c.normal) for c in contacts
+    ]
+    point_weights = [contact.has_point / contact.radius**2 for contact in contacts]
+    total = sum(point_weights, ca.SX(1e-300))
+    point_shares = [w / total for w in point_weights]
+    mean = sum(
+        (w * point for w, (point, _) in zip(point_shares, sources, strict=True)), ca.SX(3, 1)
+    )
     columns, weights = [], []
-    for w, contact, (point, direction) in zip(heavy, contacts, sources, strict=True):
+    for w, contact, (point, direction) in zip(point_weights, contacts, sources, strict=True):
         columns += [point - mean, direction]
-        weights += [w, contact.faced / contact.chord**2]
+        weights += [w, contact.has_normal / contact.chord**2]
     A, W = ca.horzcat(*columns), ca.diag(ca.vertcat(*weights))
     normal = A @ W @ A.T
     scale = normal[0, 0] + normal[1, 1] + normal[2, 2]
     normal += 1e-9 * (scale + 1e-300) * ca.DM.eye(3)
-    found = W @ A.T @ solve_spd(ca.densify(normal), vector - whole * mean)
-    # The mean draws on every contact, too.
-    left = whole - sum((found[2 * i] for i in range(len(contacts))), ca.SX(0))
-    return [(found[2 * i] + w * left, found[2 * i + 1]) for i, w in enumerate(share)]
+    coefficients = W @ A.T @ solve_spd(ca.densify(normal), vector - sum_of_points * mean)
+    # The mean distributes the missing sum over all contacts.
+    missing = sum_of_points - sum((coefficients[2 * i] for i in range(len(contacts))), ca.SX(0))
+    return [
+        (coefficients[2 * i] + w * missing, coefficients[2 * i + 1])
+        for i, w in enumerate(point_shares)
+    ]
 
 
-def carried(contacts: list[BoxContact], vector: Expr, whole: int) -> Ball:
-    """The ball that holds a point (whole 1) or a unit vector (whole 0) of the palm.
+def palm_ball(contacts: list[BoxContact], vector: Expr, sum_of_points: int) -> Ball:
+    """Return the ball that contains a point or a unit vector of the palm.
 
-    With contacts x, normals n and any coefficients a point of the palm is sum(a x) + sum(b n) +
-    rest; the same sum of what is asked for differs by at most sum(|a| radius) + sum(|b| chord) +
-    |rest|, or by the slopes' bound of the same, if that is smaller.
+    With contacts x, normals n and any coefficients a, b a point of the palm equals
+    sum(a x) + sum(b n) + unexplained. The same combination of the targets deviates by at most
+    sum(|a| radius) + sum(|b| chord) + |unexplained|, or by the bound from the slopes if that is
+    smaller.
+
+    Args:
+        contacts: Contacts of the box.
+        vector: (3, 1) point or unit vector, palm frame.
+        sum_of_points: 1 for a point, 0 for a unit vector.
     """
-    centre, rest = ca.SX(3, 1), vector
-    slopes, radius, sloped = ca.SX(3, contacts[0].moves.shape[1]), ca.SX(0), ca.SX(0)
-    pairs = zip(_combination(contacts, vector, whole, asked=False), contacts, strict=True)
+    centre, unexplained = ca.SX(3, 1), vector
+    slopes, radius, slope_radius = ca.SX(3, contacts[0].point_slopes.shape[1]), ca.SX(0), ca.SX(0)
+    pairs = zip(
+        _combination_coefficients(contacts, vector, sum_of_points, of_targets=False),
+        contacts,
+        strict=True,
+    )
     for (p, n), contact in pairs:
-        centre += p * contact.target + n * contact.facing
-        rest -= p * contact.point + n * contact.normal
-        slopes += p * contact.moves + n * contact.turns
+        centre += p * contact.target_point + n * contact.target_normal
+        unexplained -= p * contact.point + n * contact.normal
+        slopes += p * contact.point_slopes + n * contact.normal_slopes
         radius += ca.fabs(p) * contact.radius + ca.fabs(n) * contact.chord
-        sloped += ca.fabs(p) * contact.near + ca.fabs(n) * contact.close
-    # What moves the contacts as a whole moves the palm among them.
-    shares = _columns(slopes)
-    sloped += sum(shares, ca.SX(0))
-    return Ball(centre, safe_norm(rest) + SLACK + ca.fmin(radius, sloped), shares)
+        slope_radius += ca.fabs(p) * contact.point_remainder + ca.fabs(n) * contact.normal_remainder
+    # A common motion of the contacts is a motion of the palm relative to them.
+    shares = _list_of_column_norms(slopes)
+    slope_radius += sum(shares, ca.SX(0))
+    return Ball(
+        centre, safe_norm(unexplained) + BOUND_MARGIN + ca.fmin(radius, slope_radius), shares
+    )
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
-    """Where the palm sees a point of the base: the same sum, of what is asked for.
+class PointInPalm:
+    """Position in the palm frame of a point of the base, as a combination of the targets.
 
-    In the palm frame the wrist stands still, and it is known which way a slope carries the point.
+    In the palm frame the wrist is constant and the direction of every slope is known.
 
     Attributes:
-        centre: (3, 1) in the middle of the box [m], palm frame.
-        slopes: (3, h) by u [m].
-        loose: How far the point can be from there besides [m].
+        centre: (3, 1) position at the centre of the box [m], palm frame.
+        slopes: (3, h) derivatives by the scaled coordinates u [m].
+        remainder: Largest deviation beyond that of the slopes [m].
     """
 
     centre: Expr
     slopes: Expr
-    loose: Expr
+    remainder: Expr
 
     @classmethod
-    def point(cls, contacts: list[BoxContact], point: Expr) -> Seen:
-        """A point (3, 1) of the base."""
-        centre, rest = ca.SX(3, 1), point
-        slopes, loose = ca.SX(3, contacts[0].moves.shape[1]), ca.SX(SLACK)
+    def from_point(cls, contacts: list[BoxContact], point: Expr) -> PointInPalm:
+        """Return the position of a point (3, 1) given in the base frame."""
+        centre, unexplained = ca.SX(3, 1), point
+        slopes, remainder = ca.SX(3, contacts[0].point_slopes.shape[1]), ca.SX(BOUND_MARGIN)
         for (p, n), contact in zip(
-            _combination(contacts, point, 1, asked=True), contacts, strict=True
+            _combination_coefficients(contacts, point, 1, of_targets=True), contacts, strict=True
         ):
             centre += p * contact.point + n * contact.normal
-            rest -= p * contact.target + n * contact.facing
-            slopes += p * contact.moves + n * contact.turns
-            loose += ca.fabs(p) * contact.near + ca.fabs(n) * contact.close
-        return cls(centre, slopes, loose + safe_norm(rest))
+            unexplained -= p * contact.target_point + n * contact.target_normal
+            slopes += p * contact.point_slopes + n * contact.normal_slopes
+            remainder += (
+                ca.fabs(p) * contact.point_remainder + ca.fabs(n) * contact.normal_remainder
+            )
+        return cls(centre, slopes, remainder + safe_norm(unexplained))
 
-    def distances(self, other: Expr) -> tuple[Expr, Expr, Expr]:
-        """Smallest and largest distance from a point (3, 1) of the palm [m].
+    def distances(self, p_palm: Expr) -> tuple[Expr, Expr, Expr]:
+        """Return the smallest and largest distance from a point (3, 1) of the palm [m].
 
-        And (1, h) what each coordinate adds to what is between.
+        Returns:
+            Smallest distance, largest distance, and the contribution of each coordinate to their
+            difference (1, h).
         """
-        away = self.centre - other
-        length = safe_norm(away)
-        line = away / length
-        along = line.T @ self.slopes
-        aside = self.slopes - line @ along
-        shares = ca.fabs(along)
-        ahead, far = ca.sum2(shares), sum(_columns(aside), ca.SX(0))
-        most = ca.sqrt((length + ahead) ** 2 + far**2) + self.loose
-        return length - ahead - self.loose, most, shares
+        offset = self.centre - p_palm
+        length = safe_norm(offset)
+        direction = offset / length
+        parallel = direction.T @ self.slopes
+        perpendicular = self.slopes - direction @ parallel
+        shares = ca.fabs(parallel)
+        parallel_motion, perpendicular_motion = (
+            ca.sum2(shares),
+            sum(_list_of_column_norms(perpendicular), ca.SX(0)),
+        )
+        largest = (
+            ca.sqrt((length + parallel_motion) ** 2 + perpendicular_motion**2) + self.remainder
+        )
+        return length - parallel_motion - self.remainder, largest, shares
 
 
-def _columns(matrix: Expr) -> list[Expr]:
+def _list_of_column_norms(matrix: Expr) -> list[Expr]:
+    """Return the norms of columns as a list."""
     return [safe_norm(matrix[:, k]) for k in range(matrix.shape[1])]
 
 
 def wrist_excess(
     contacts: list[BoxContact], arm: ArmSpan, span: Expr, ball: Ball
-) -> tuple[list[Expr], list[Row]]:
-    """Tests that are > 0 if the wrist is out of the arm's span, and rows of what decides them.
+) -> tuple[list[Expr], list[Inequality]]:
+    """Return tests that are > 0 if the arm cannot reach the wrist, and the deciding inequalities.
 
     Args:
-        contacts: Of the box.
-        arm: The arm.
-        span: Smallest and largest distance [m].
-        ball: That holds the wrist, see `carried`.
+        contacts: Contacts of the box.
+        arm: Shoulder and wrist of the arm.
+        span: Smallest and largest distance of the wrist from the shoulder [m].
+        ball: Ball that contains the wrist, see `palm_ball`.
     """
-    shoulder, near, far = ca.SX(ca.DM(arm.shoulder)), span[0], span[1]
-    point, found = ca.SX(ca.DM(arm.wrist)), []
+    shoulder, nearest, farthest = ca.SX(ca.DM(arm.shoulder)), span[0], span[1]
+    point, tests = ca.SX(ca.DM(arm.wrist)), []
     for contact in contacts:
-        away = safe_norm(contact.target - shoulder)
-        length = safe_norm(point - contact.point)
-        found.append(contact.placed * (away - length - contact.radius - far))
-        found.append(contact.placed * (length - contact.radius - away - far))
-        found.append(contact.placed * (near - away - length - contact.radius))
-    seen = Seen.point(contacts, shoulder)
-    least, most, shares = seen.distances(point)
-    away = safe_norm(seen.centre - point)
-    found += [least - far, near - most]
-    rows = [Row(_outside(away, span), ca.fmax(away - least, most - away), ca.horzsplit(shares))]
-    # Far from the contacts the shoulder is seen less sharply than the wrist.
-    away = safe_norm(ball.centre - shoulder)
-    found += [away - ball.radius - far, near - away - ball.radius]
-    return found, [*rows, Row(_outside(away, span), ball.radius, ball.shares)]
+        distance = safe_norm(contact.target_point - shoulder)
+        palm_distance = safe_norm(point - contact.point)
+        tests.append(contact.has_point * (distance - palm_distance - contact.radius - farthest))
+        tests.append(contact.has_point * (palm_distance - contact.radius - distance - farthest))
+        tests.append(contact.has_point * (nearest - distance - palm_distance - contact.radius))
+    shoulder_in_palm = PointInPalm.from_point(contacts, shoulder)
+    smallest, largest, shares = shoulder_in_palm.distances(point)
+    distance = safe_norm(shoulder_in_palm.centre - point)
+    tests += [smallest - farthest, nearest - largest]
+    rows = [
+        Inequality(
+            _distance_outside(distance, span),
+            ca.fmax(distance - smallest, largest - distance),
+            ca.horzsplit(shares),
+        )
+    ]
+    # The shoulder is far from the contacts, so that its position in the palm frame is less certain
+    # than that of the wrist in the base frame.
+    distance = safe_norm(ball.centre - shoulder)
+    tests += [distance - ball.radius - farthest, nearest - distance - ball.radius]
+    return tests, [*rows, Inequality(_distance_outside(distance, span), ball.radius, ball.shares)]
 
 
-def _outside(distance: Expr, span: Expr) -> Expr:
+def _distance_outside(distance: Expr, span: Expr) -> Expr:
+    """Return the distance of a value from an interval; 0 within it."""
     return ca.fmax(ca.fmax(distance - span[1], span[0] - distance), 0.0)
 
 
 def cone_excess(arm: ArmCones, wrist: Ball, last: Ball, span: Expr, cosines: Expr) -> Expr:
-    """> 0 if no elbow is within both cones.
+    """Return a value > 0 if no elbow position is within both cones.
 
     Args:
-        arm: The cones.
-        wrist: Ball that holds the wrist, base frame.
-        last: Ball that holds axis 7.
+        arm: Cones of the arm.
+        wrist: Ball that contains the wrist, base frame.
+        last: Ball that contains axis 7, base frame.
         span: Smallest and largest distance of the wrist from the shoulder [m].
-        cosines: (2, 1) of the half angles.
+        cosines: (2, 1) cosines of the half angles of the cones.
     """
     a, b = arm.lengths
-    reach, loose = wrist.centre - ca.DM(arm.shoulder), wrist.radius + ANGLE_SLACK
-    length = safe_norm(reach)
-    known = ca.logic_and(loose < length, span[1] > 0)
-    line = reach / length
-    tilt = ca.asin(ca.fmin(loose / length, 1.0))
-    near = ca.fmax(ca.fmax(length - loose, span[0]), 1e-9)
-    far = ca.fmax(ca.fmin(length + loose, span[1]), near)
-    # The elbow's circle, seen from the shoulder and from the wrist: its angles to the line.
-    upper, upper_give = _opening(a, b, near, far)
-    fore, fore_give = _opening(b, a, near, far)
+    shoulder_to_wrist, wrist_margin = (
+        wrist.centre - ca.DM(arm.shoulder),
+        wrist.radius + ANGLE_MARGIN,
+    )
+    length = safe_norm(shoulder_to_wrist)
+    is_bounded = ca.logic_and(wrist_margin < length, span[1] > 0)
+    direction = shoulder_to_wrist / length
+    tilt = ca.asin(ca.fmin(wrist_margin / length, 1.0))
+    nearest = ca.fmax(ca.fmax(length - wrist_margin, span[0]), 1e-9)
+    farthest = ca.fmax(ca.fmin(length + wrist_margin, span[1]), nearest)
+    # Angles between the line and the elbow circle, at the shoulder and at the wrist.
+    upper_angle, upper_margin = _triangle_angle(a, b, nearest, farthest)
+    forearm_angle, forearm_margin = _triangle_angle(b, a, nearest, farthest)
     first, axis = ca.SX(ca.DM(arm.first)), last.centre
-    slack = tilt + ANGLE_SLACK
-    one = _arc(line, first, upper, cosines[0] - slack - upper_give)
-    # Seen from the wrist the circle is on the other side of the line.
-    other = _arc(line, axis, -fore, cosines[1] - slack - fore_give - last.radius)
-    cross = ca.cross(one[0], other[0])
-    between = ca.atan2(ca.dot(cross, line), ca.dot(one[0], other[0]))
-    apart = ca.fabs(between) - one[1] - other[1] - ANGLE_SLACK
-    excess = ca.fmax(ca.fmax(one[2], other[2]), apart)
-    return ca.if_else(known, excess, -1.0)
+    margin = tilt + ANGLE_MARGIN
+    upper_arc = _feasible_arc(direction, first, upper_angle, cosines[0] - margin - upper_margin)
+    # From the wrist the line points the opposite way, so that the sign of the angle changes.
+    forearm_arc = _feasible_arc(
+        direction, axis, -forearm_angle, cosines[1] - margin - forearm_margin - last.radius
+    )
+    cross = ca.cross(upper_arc[0], forearm_arc[0])
+    arc_angle = ca.atan2(ca.dot(cross, direction), ca.dot(upper_arc[0], forearm_arc[0]))
+    arc_gap = ca.fabs(arc_angle) - upper_arc[1] - forearm_arc[1] - ANGLE_MARGIN
+    excess = ca.fmax(ca.fmax(upper_arc[2], forearm_arc[2]), arc_gap)
+    return ca.if_else(is_bounded, excess, -1.0)
 
 
-def _opening(a: float, b: float, near: Expr, far: Expr) -> tuple[Expr, Expr]:
-    """Angle at the end of side a of a triangle with the sides a, b and one in [near, far].
+def _triangle_angle(a: float, b: float, nearest: Expr, farthest: Expr) -> tuple[Expr, Expr]:
+    """Return the angle between side a and a side c of a triangle with the sides a, b, c.
 
-    Its middle, and how much less or more it can be.
+    Args:
+        a: Length of the adjacent side [m].
+        b: Length of the opposite side [m].
+        nearest: Lower bound of c [m].
+        farthest: Upper bound of c [m].
+
+    Returns:
+        Midpoint and half width of the interval of the angle [rad].
     """
 
     def cosine(side: Expr) -> Expr:
         return ca.fmax(ca.fmin((side * side + a * a - b * b) / (2 * a * side), 1.0), -1.0)
 
-    ends = cosine(near), cosine(far)
-    least, most = ca.fmin(*ends), ca.fmax(*ends)
+    cosines = cosine(nearest), cosine(farthest)
+    smallest, largest = ca.fmin(*cosines), ca.fmax(*cosines)
     if a > b:
-        # In between, where the angle at the end of b is a right one.
-        turn = float(np.sqrt(a * a - b * b))
-        inside = ca.logic_and(near < turn, far > turn)
-        least = ca.if_else(inside, ca.fmin(least, cosine(ca.SX(turn))), least)
-    low, high = ca.acos(most), ca.acos(least)
-    return (low + high) / 2, (high - low) / 2 + ANGLE_SLACK
+        # The cosine has a minimum where sides b and c are perpendicular.
+        tangent_length = float(np.sqrt(a * a - b * b))
+        contains_tangent = ca.logic_and(nearest < tangent_length, farthest > tangent_length)
+        smallest = ca.if_else(
+            contains_tangent, ca.fmin(smallest, cosine(ca.SX(tangent_length))), smallest
+        )
+    low, high = ca.acos(largest), ca.acos(smallest)
+    return (low + high) / 2, (high - low) / 2 + ANGLE_MARGIN
 
 
-def _arc(line: Expr, axis: Expr, opening: Expr, cosine: Expr) -> tuple[Expr, Expr, Expr]:
-    """Where on the circle a direction at an angle to the line has at least a cosine to an axis.
+def _feasible_arc(line: Expr, axis: Expr, opening: Expr, cosine: Expr) -> tuple[Expr, Expr, Expr]:
+    """Return the arc of a cone about `line` on which a direction is close enough to an axis.
+
+    Args:
+        line: (3, 1) unit axis of the cone that the direction lies on.
+        axis: (3, 1) axis to which the direction must be close.
+        opening: Angle between the direction and `line` [rad].
+        cosine: Smallest admissible dot product of the direction and `axis`.
 
     Returns:
-        The middle of the arc (3, 1) as a vector across the line, half its length [rad], and a test
-        that is > 0 if there is no such arc.
+        Midpoint of the arc as a vector perpendicular to the line (3, 1), half of its length [rad],
+        and a test that is > 0 if the arc is empty.
     """
-    along = ca.dot(axis, line)
-    across = axis - along * line
-    size = ca.fabs(ca.sin(opening)) * safe_norm(across)
-    least = cosine - ca.cos(opening) * along
-    half = ca.acos(ca.fmax(ca.fmin(least / ca.fmax(size, 1e-6), 1.0), -1.0))
-    middle = ca.if_else(opening < 0, -across, across)
-    return middle, ca.if_else(size < 1e-6, np.pi, half), least - size
+    parallel = ca.dot(axis, line)
+    perpendicular = axis - parallel * line
+    size = ca.fabs(ca.sin(opening)) * safe_norm(perpendicular)
+    required = cosine - ca.cos(opening) * parallel
+    half_arc = ca.acos(ca.fmax(ca.fmin(required / ca.fmax(size, 1e-6), 1.0), -1.0))
+    middle = ca.if_else(opening < 0, -perpendicular, perpendicular)
+    return middle, ca.if_else(size < 1e-6, np.pi, half_arc), required - size

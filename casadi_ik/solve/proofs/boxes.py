@@ -1,11 +1,12 @@
-"""Boxes of hand postures, and where each box lets the contacts be: guaranteed, as graphs.
+"""Boxes of hand postures, and guaranteed bounds of the contacts within a box, as graphs.
 
-From the middle of their intervals the joints are moved one after the other, the last of the finger
-first. A turn by delta about an axis at the distance rho moves a point by 2 rho sin(delta / 2), and
-a unit normal at the angle alpha to the axis by 2 sin(alpha) sin(delta / 2); what the joints beyond
-have moved before adds to rho and to sin(alpha) at most. The same numbers bound what the slopes at
-the middle leave out: the second derivative of a point by two joints is no longer than its distance
-from the axis of the joint nearer to the tip.
+The bounds move the joints from the centres of their intervals successively, the distal joint of a
+finger first. A rotation by delta about an axis at the distance rho moves a point by
+2 rho sin(delta / 2), and a unit normal at the angle alpha to the axis by
+2 sin(alpha) sin(delta / 2); the motion of the more distal joints adds at most its size to rho
+and to sin(alpha). The same distances bound the remainder of a linearisation at the centre: the
+norm of the second derivative of a point by two joints is at most its distance from the axis of the
+distal joint.
 """
 
 from __future__ import annotations
@@ -23,40 +24,40 @@ from casadi_ik.kinematics.forward import Kinematics, forward
 from casadi_ik.kinematics.smooth import Expr, safe_norm
 from casadi_ik.model.description import Finger, RobotDescription
 from casadi_ik.model.targets import TargetBatch
-from casadi_ik.solve.proofs.premises import OUTWARDS, motor_box
+from casadi_ik.solve.proofs.premises import LIMIT_MARGIN, motor_box
 
-SLACK = 1e-9
-"""What every ball [m] and every chord of normals is widened by: far more than rounding errors."""
+BOUND_MARGIN = 1e-9
+"""Margin of balls [m] and of chords of normals, far larger than rounding errors."""
 
 
 @dataclass(frozen=True, eq=False)
 class HandSpace:
-    """The coordinates of a hand, whose box is divided; every finger joint follows one of them.
+    """Coordinates of a hand, on which every finger joint depends.
 
-    A coordinate is the joint that a motor turns, where it turns one only: a slider's length bends
-    the slopes, the angle it makes does not. Otherwise it is the motor itself.
+    A coordinate is the joint that a motor drives if it drives only one, otherwise the motor. The
+    contacts are nearly linear in the angle of a joint, but not in the length of a slider.
 
     Attributes:
-        robot: The description.
+        robot: Description of the robot.
     """
 
     robot: RobotDescription
 
     @cached_property
     def coordinates(self) -> tuple[str, ...]:
-        """Names of the coordinates, one for each of `robot.finger_motors`."""
-        found = []
+        """Names of the coordinates, one per motor of `robot.finger_motors`."""
+        names = []
         for motor in self.robot.finger_motors:
-            moved = [
+            driven_joints = [
                 joint.name
                 for joint in self.robot.movable
                 if joint.name == motor or (joint.coupling and joint.coupling.of == motor)
             ]
-            found.append(moved[0] if len(moved) == 1 else motor)
-        return tuple(found)
+            names.append(driven_joints[0] if len(driven_joints) == 1 else motor)
+        return tuple(names)
 
-    def followed(self, joint: str) -> tuple[int, float | None]:
-        """Which coordinate a joint follows, and its rate; None if that is not constant."""
+    def driving_coordinate(self, joint: str) -> tuple[int, float | None]:
+        """Return the driving coordinate of a joint, and its rate (None if variable)."""
         by_name = {item.name: item for item in self.robot.movable}
         rate: float | None = 1.0
         while joint not in self.coordinates:
@@ -68,109 +69,121 @@ class HandSpace:
         return self.coordinates.index(joint), rate
 
     def intervals(self, lower: ca.SX, upper: ca.SX) -> dict[str, Interval]:
-        """Intervals of all joints of the fingers, by name.
+        """Return the intervals of all finger joints, by name.
 
         Args:
-            lower: (h, 1) ends of the coordinates.
-            upper: (h, 1).
+            lower: (h, 1) lower bounds of the coordinates.
+            upper: (h, 1) upper bounds of the coordinates.
         """
-        given = {name: Interval(lower[i], upper[i]) for i, name in enumerate(self.coordinates)}
-        found = joint_intervals(self.robot, given)
-        return {name: found[name] for name in self.robot.finger_joints}
+        coordinates = {
+            name: Interval(lower[i], upper[i]) for i, name in enumerate(self.coordinates)
+        }
+        intervals = joint_intervals(self.robot, coordinates)
+        return {name: intervals[name] for name in self.robot.finger_joints}
 
-    def of(self, places: Mapping[str, Array], targets: TargetBatch) -> Array:
-        """(k, h) coordinates of joint and motor positions, turned by whole periods into the box.
+    def from_positions(self, positions: Mapping[str, Array], targets: TargetBatch) -> Array:
+        """Return coordinates (k, h), shifted by whole periods into the box of the targets.
 
         Args:
-            places: (k,) by name of the joint or motor [rad or m].
-            targets: Whose limits count.
+            positions: (k,) positions by name of the joint or motor [rad or m].
+            targets: Targets whose limits define the box.
         """
         lower, upper = self.box(targets)
-        found = np.stack([places[name] for name in self.coordinates], axis=1)
-        turns = np.floor((found - lower) / (upper - lower))
-        turns[(found >= lower) & (found <= upper)] = 0
-        return found - turns * (upper - lower)
+        values = np.stack([positions[name] for name in self.coordinates], axis=1)
+        revolutions = np.floor((values - lower) / (upper - lower))
+        revolutions[(values >= lower) & (values <= upper)] = 0
+        return values - revolutions * (upper - lower)
 
     def box(self, targets: TargetBatch) -> tuple[Array, Array]:
-        """(h,) ends of the coordinates within all that the problems let the hand do."""
-        ends = motor_box(self.robot, targets)
-        low, high = (np.array(part).ravel() for part in self._of_motors(ends[0], ends[1]))
+        """Return lower and upper bounds (h,) of the coordinates that the targets allow."""
+        motor_bounds = motor_box(self.robot, targets)
+        low, high = (
+            np.array(part).ravel()
+            for part in self._coordinates_of_motors(motor_bounds[0], motor_bounds[1])
+        )
         if targets.enforce_limits:
-            # The limits of a coupled joint may be narrower than those of its motor.
+            # A coupled joint may have narrower limits than its motor.
             for joint in self.robot.movable:
                 if joint.name in self.coordinates:
                     i = self.coordinates.index(joint.name)
-                    low[i] = max(low[i], joint.lower - OUTWARDS)
-                    high[i] = min(high[i], joint.upper + OUTWARDS)
+                    low[i] = max(low[i], joint.lower - LIMIT_MARGIN)
+                    high[i] = min(high[i], joint.upper + LIMIT_MARGIN)
         return low, high
 
     @cached_property
-    def _of_motors(self) -> ca.Function:
+    def _coordinates_of_motors(self) -> ca.Function:
         motors = self.robot.finger_motors
         lower, upper = (ca.SX.sym(name, len(motors)) for name in ("lower", "upper"))
-        given = {name: Interval(lower[i], upper[i]) for i, name in enumerate(motors)}
-        found = joint_intervals(self.robot, given) | given
-        intervals = [found[name] for name in self.coordinates]
-        ends = [one.lower for one in intervals], [one.upper for one in intervals]
-        return ca.Function("coordinates", [lower, upper], [ca.vertcat(*side) for side in ends])
+        motor_intervals = {name: Interval(lower[i], upper[i]) for i, name in enumerate(motors)}
+        all_intervals = joint_intervals(self.robot, motor_intervals) | motor_intervals
+        intervals = [all_intervals[name] for name in self.coordinates]
+        bounds = (
+            [interval.lower for interval in intervals],
+            [interval.upper for interval in intervals],
+        )
+        return ca.Function("coordinates", [lower, upper], [ca.vertcat(*side) for side in bounds])
 
 
 @dataclass(frozen=True, eq=False)
 class BoxContact:
-    """Every contact that a finger can make within a box, and what is asked of it.
+    """Bounds of the contact of a finger within a box, with the target of the finger.
 
-    u are the coordinates from the middle of the box by half the box, in [-1, 1].
+    u are the coordinates relative to the centre of the box, scaled by its half widths to [-1, 1].
 
     Attributes:
-        point: (3, 1) in the middle of the box [m], frame of the palm; of a hand that cannot move as
-            a whole base frame.
-        normal: (3, 1) likewise, unit.
-        moves: (3, h) slopes of the point by u [m].
-        turns: (3, h) slopes of the normal by u.
-        target: (3, 1) the point asked for [m], base frame.
-        facing: (3, 1) the normal asked for.
-        placed: 1 if a point is asked for, else 0.
-        faced: 1 if a normal is asked for.
-        radius: How far point and target can be apart once the palm is in place [m].
-        chord: How far the normals can be apart.
-        near: The same for the point as the slopes have it [m].
-        close: The same for the normals.
-        moved: What each coordinate adds to the radius [m], h of them.
-        turned: What each adds to the chord.
+        point: (3, 1) contact at the centre of the box [m]; palm frame, or base frame if the palm
+            is fixed.
+        normal: (3, 1) unit normal, in the same frame.
+        point_slopes: (3, h) derivatives of the point by u [m].
+        normal_slopes: (3, h) derivatives of the normal by u.
+        target_point: (3, 1) target point [m], base frame.
+        target_normal: (3, 1) target unit normal, base frame.
+        has_point: 1 if the point is constrained, else 0.
+        has_normal: 1 if the normal is constrained, else 0.
+        radius: Largest distance between contact and target at the best palm pose [m].
+        chord: Largest distance between the unit normals at the best palm pose.
+        point_remainder: Tolerance of the point plus the remainder of its linearisation [m].
+        normal_remainder: Tolerance of the normal plus the remainder of its linearisation.
+        radius_shares: Contribution of each coordinate to the radius [m], h of them.
+        chord_shares: Contribution of each coordinate to the chord, h of them.
     """
 
     point: Expr
     normal: Expr
-    moves: Expr
-    turns: Expr
-    target: Expr
-    facing: Expr
-    placed: Expr
-    faced: Expr
+    point_slopes: Expr
+    normal_slopes: Expr
+    target_point: Expr
+    target_normal: Expr
+    has_point: Expr
+    has_normal: Expr
     radius: Expr
     chord: Expr
-    near: Expr
-    close: Expr
-    moved: list[Expr]
-    turned: list[Expr]
+    point_remainder: Expr
+    normal_remainder: Expr
+    radius_shares: list[Expr]
+    chord_shares: list[Expr]
 
-    def alone(self) -> Iterator[Expr]:
-        """Whether a finger of a hand that cannot move as a whole misses its contact: > 0."""
-        yield self.placed * (safe_norm(self.target - self.point) - self.radius)
-        yield self.faced * (safe_norm(self.facing - self.normal) - self.chord)
+    def fixed_hand_tests(self) -> Iterator[Expr]:
+        """Yield tests that are > 0 if the finger misses its contact while the palm is fixed."""
+        yield self.has_point * (safe_norm(self.target_point - self.point) - self.radius)
+        yield self.has_normal * (safe_norm(self.target_normal - self.normal) - self.chord)
 
 
 def box_contacts(
-    space: HandSpace, intervals: dict[str, Interval], half: Expr, p: dict[str, ca.SX], in_palm: bool
+    space: HandSpace,
+    intervals: dict[str, Interval],
+    half_widths: Expr,
+    p: dict[str, ca.SX],
+    in_palm: bool,
 ) -> list[BoxContact]:
-    """The contacts of all fingers.
+    """Return the contacts of all fingers within a box.
 
     Args:
-        space: The hand's coordinates.
-        intervals: Of the joints of the fingers.
-        half: (h, 1) half the box.
-        p: points, normals, tolerance and asked, see `BoxTest.graph`.
-        in_palm: Whether the palm can move.
+        space: Coordinates of the hand.
+        intervals: Intervals of the finger joints, by name.
+        half_widths: (h, 1) half widths of the box.
+        p: points, normals, tolerance and constrained, see `BoxTest.graph`.
+        in_palm: True for contacts in the palm frame, False for a fixed palm.
     """
     robot = space.robot
     theta = ca.SX.zeros(len(robot.movable), 1)
@@ -178,12 +191,14 @@ def box_contacts(
         if name in intervals:
             theta[i] = intervals[name].middle
     body = forward(robot, theta)
-    found = []
+    contacts = []
     for i, finger in enumerate(robot.fingers):
-        names = "points", "normals", "tolerance", "asked"
-        asked = {name: p[name][i, :].T for name in names}
-        found.append(_contact(space, body, finger, intervals, half, asked, in_palm))
-    return found
+        names = "points", "normals", "tolerance", "constrained"
+        target_point = {name: p[name][i, :].T for name in names}
+        contacts.append(
+            _contact(space, body, finger, intervals, half_widths, target_point, in_palm)
+        )
+    return contacts
 
 
 def _contact(
@@ -191,62 +206,68 @@ def _contact(
     body: Kinematics,
     finger: Finger,
     intervals: dict[str, Interval],
-    half: Expr,
-    asked: dict[str, Expr],
+    half_widths: Expr,
+    p: dict[str, Expr],
     in_palm: bool,
 ) -> BoxContact:
-    kinds = {joint.name: joint for joint in space.robot.movable}
+    joints_by_name = {joint.name: joint for joint in space.robot.movable}
     point, normal = body.contact(finger.name)
     h = len(space.coordinates)
-    moves, turns = ca.SX.zeros(3, h), ca.SX.zeros(3, h)
-    moved, turned = [ca.SX(0)] * h, [ca.SX(0)] * h
-    radius, chord, bend, total = ca.SX(0), ca.SX(0), ca.SX(0), ca.SX(0)
-    uneven_move, uneven_turn = ca.SX(0), ca.SX(0)
-    widths = [intervals[name].half for name in finger.joints]
+    point_slopes, normal_slopes = ca.SX.zeros(3, h), ca.SX.zeros(3, h)
+    radius_shares, chord_shares = [ca.SX(0)] * h, [ca.SX(0)] * h
+    radius, chord, point_curvature, total_rotation = ca.SX(0), ca.SX(0), ca.SX(0), ca.SX(0)
+    uneven_point, uneven_normal = ca.SX(0), ca.SX(0)
+    widths = [intervals[name].half_width for name in finger.joints]
     for j, name in reversed(list(enumerate(finger.joints))):
         axis, width = body.axes[name], widths[j]
-        if kinds[name].type == "prismatic":
-            move, turn, lever = axis, ca.SX.zeros(3, 1), ca.SX(1)
-            reach, swing = width, ca.SX(0)
+        if joints_by_name[name].type == "prismatic":
+            point_slope, normal_slope, lever = axis, ca.SX.zeros(3, 1), ca.SX(1)
+            point_share, normal_share = width, ca.SX(0)
         else:
-            move = ca.cross(axis, point - body.links[kinds[name].child].origin)
-            turn = ca.cross(axis, normal)
-            sine, lever = ca.sin(ca.fmin(width, np.pi) / 2), safe_norm(move) + radius
-            reach = 2 * sine * lever
-            swing = 2 * sine * ca.fmin(safe_norm(turn) + chord, 1.0)
-            total += width
-        radius, chord = radius + reach, chord + swing
-        bend += lever * width * (width / 2 + sum(widths[:j], ca.SX(0)))
-        k, rate = space.followed(name)
-        moved[k], turned[k] = moved[k] + reach, turned[k] + swing
+            point_slope = ca.cross(axis, point - body.links[joints_by_name[name].child].origin)
+            normal_slope = ca.cross(axis, normal)
+            sine, lever = ca.sin(ca.fmin(width, np.pi) / 2), safe_norm(point_slope) + radius
+            point_share = 2 * sine * lever
+            normal_share = 2 * sine * ca.fmin(safe_norm(normal_slope) + chord, 1.0)
+            total_rotation += width
+        radius, chord = radius + point_share, chord + normal_share
+        point_curvature += lever * width * (width / 2 + sum(widths[:j], ca.SX(0)))
+        k, rate = space.driving_coordinate(name)
+        radius_shares[k], chord_shares[k] = (
+            radius_shares[k] + point_share,
+            chord_shares[k] + normal_share,
+        )
         if rate is None:
-            # What follows unevenly counts as if it went its own way.
-            uneven_move += safe_norm(move) * width
-            uneven_turn += safe_norm(turn) * width
+            # A joint with a varying rate counts as independent of its coordinate.
+            uneven_point += safe_norm(point_slope) * width
+            uneven_normal += safe_norm(normal_slope) * width
         else:
-            moves[:, k] += move * rate * half[k]
-            turns[:, k] += turn * rate * half[k]
+            point_slopes[:, k] += point_slope * rate * half_widths[k]
+            normal_slopes[:, k] += normal_slope * rate * half_widths[k]
     if in_palm:
         palm = body.palm
         point, normal = palm.inverse_apply(point), palm.rotation.T @ normal
-        moves, turns = palm.rotation.T @ moves, palm.rotation.T @ turns
-    target = asked["points"]
-    far = SLACK + 1e-12 * (ca.norm_1(target) + ca.norm_1(point))
-    position = asked["tolerance"][0] + far
-    angle = 2 * ca.sin(ca.fmin(asked["tolerance"][1], np.pi) / 2) + SLACK
+        point_slopes, normal_slopes = (
+            palm.rotation.T @ point_slopes,
+            palm.rotation.T @ normal_slopes,
+        )
+    target_point = p["points"]
+    rounding = BOUND_MARGIN + 1e-12 * (ca.norm_1(target_point) + ca.norm_1(point))
+    position_tolerance = p["tolerance"][0] + rounding
+    angle_tolerance = 2 * ca.sin(ca.fmin(p["tolerance"][1], np.pi) / 2) + BOUND_MARGIN
     return BoxContact(
         point=point,
         normal=normal,
-        moves=moves,
-        turns=turns,
-        target=target,
-        facing=asked["normals"],
-        placed=asked["asked"][0],
-        faced=asked["asked"][1],
-        radius=radius + position,
-        chord=ca.fmin(ca.fmin(chord, 2.0) + angle, 2.0 + SLACK),
-        near=bend + uneven_move + position,
-        close=total * total / 2 + uneven_turn + angle,
-        moved=moved,
-        turned=turned,
+        point_slopes=point_slopes,
+        normal_slopes=normal_slopes,
+        target_point=target_point,
+        target_normal=p["normals"],
+        has_point=p["constrained"][0],
+        has_normal=p["constrained"][1],
+        radius=radius + position_tolerance,
+        chord=ca.fmin(ca.fmin(chord, 2.0) + angle_tolerance, 2.0 + BOUND_MARGIN),
+        point_remainder=point_curvature + uneven_point + position_tolerance,
+        normal_remainder=total_rotation * total_rotation / 2 + uneven_normal + angle_tolerance,
+        radius_shares=radius_shares,
+        chord_shares=chord_shares,
     )

@@ -1,4 +1,4 @@
-"""The search for proofs: divides the box of all hands until every part of it is refuted."""
+"""Search for proofs of impossibility: bisect the box of all hand postures until all is refuted."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.proofs.box_tests import BoxTest
 from casadi_ik.solve.proofs.boxes import HandSpace
 from casadi_ik.solve.proofs.premises import (
-    NO_CONE,
+    NO_CONE_LIMIT,
     ArmCones,
     arm_cones,
     arm_span,
-    endless_fingers,
+    fingers_without_limits,
     joint_limits,
     motor_box,
 )
@@ -30,146 +30,185 @@ from casadi_ik.solve.proofs.proof import Proof, ProofKind
 
 @dataclass(frozen=True)
 class ProverEffort:
-    """How long the search for a proof goes on; chosen with ``studies/proofs.py``.
+    """Limits of the search for proofs. Source: ``studies/proofs.py``.
 
     Attributes:
-        first: Boxes of a target after which its first search, with all fingers, is given up.
-        some: The same of searches with some of the fingers.
-        most: The same of the last search, again with all fingers.
-        alone: Boxes of each finger of a fixed hand, before any has more.
-        pair: Boxes of two fingers, looked at first: what contradicts each other by much.
-        one: Boxes of one finger, whose contact may be too far for the arm.
-        subset: Fingers of more are looked at by so many, too: fewer motors to divide.
-        chunk: Boxes that are looked at in one go: so many that calls cost little, few enough for
-            a cache.
-        together: Targets whose boxes are divided side by side.
-        part: A coordinate is not divided any more where less is left of it than this part of the
-            smallest tolerance [m].
+        first_search_boxes: Maximum number of boxes per target in the first search with all fingers.
+        subset_boxes: Maximum number of boxes per target and subset of fingers.
+        max_boxes: Maximum number of boxes per target in the last search with all fingers.
+        fixed_finger_boxes: Maximum number of boxes of each finger of a fixed hand in the first
+            search.
+        pair_boxes: Maximum number of boxes of two fingers, searched first because pairs reveal
+            gross contradictions.
+        single_finger_boxes: Maximum number of boxes of one finger, whose contact may be out of
+            the reach of the arm.
+        subset_size: Number of fingers in a subset; hands with more fingers are also searched by
+            subsets, which have fewer motors to divide.
+        boxes_per_call: Boxes evaluated in one call: enough to hide the cost of a call, few enough
+            for the cache.
+        targets_per_pass: Number of targets searched together.
+        min_width_fraction: A coordinate narrower than this fraction of the smallest position
+            tolerance is not divided further.
     """
 
-    first: int = 3000
-    some: int = 3000
-    most: int = 80_000
-    alone: int = 200
-    pair: int = 100
-    one: int = 400
-    subset: int = 3
-    chunk: int = 4096
-    together: int = 256
-    part: float = 0.01
+    first_search_boxes: int = 3000
+    subset_boxes: int = 3000
+    max_boxes: int = 80_000
+    fixed_finger_boxes: int = 200
+    pair_boxes: int = 100
+    single_finger_boxes: int = 400
+    subset_size: int = 3
+    boxes_per_call: int = 4096
+    targets_per_pass: int = 256
+    min_width_fraction: float = 0.01
 
 
-EFFORT = ProverEffort()
+PROVER_EFFORT = ProverEffort()
 
-SLIDING = {
+SLIDING_ARRAYS = {
     f"{name}s"
     for condition in CONDITIONS.values()
     if condition.aspect == PLACE
     for name in condition.data
     if name != "point"
 }
-"""Arrays that let a contact be elsewhere than at its point: no proof counts such a finger."""
+"""Arrays that let a contact slide away from its point; proofs ignore such fingers."""
 
 Boxes = tuple[Rows, Array, Array]
-"""Numbers of targets, lower and upper ends (h,) of a box each."""
+"""Boxes of one chunk: target index (k,), lower and upper bounds (k, h)."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
-    """The results of k searches: whether proved, boxes, and whether the arm was needed."""
+class _SearchResult:
+    """Results of k searches.
 
-    proved: Bools
+    Attributes:
+        is_proved: (k,) True if every box was refuted.
+        boxes: (k,) number of boxes evaluated.
+        needs_arm: (k,) True if some box was refuted by the reach of the arm alone.
+    """
+
+    is_proved: Bools
     boxes: Counts
-    reach: Bools
+    needs_arm: Bools
 
 
 class Prover:
-    """Looks for proofs of impossibility on one robot.
+    """Search for proofs of impossibility for one robot.
 
     Attributes:
-        space: The coordinates whose box is divided.
+        space: Coordinates of the hand whose box is divided.
     """
 
     def __init__(self, robot: RobotDescription, compiled: bool = True) -> None:
-        """Keep the robot; the test is built when it is first needed."""
+        """Store the robot; the test is built at the first use.
+
+        Args:
+            robot: Description of the robot.
+            compiled: False to run the test in CasADi's virtual machine.
+        """
         self._robot = robot
         self._compiled = compiled
         self.space = HandSpace(robot)
         self._arm = arm_span(robot)
 
     def prove(
-        self, targets: TargetBatch, holding: Array | None = None, most: Counts | None = None
+        self,
+        targets: TargetBatch,
+        known_hands: Array | None = None,
+        max_boxes: Counts | None = None,
     ) -> list[Proof | None]:
-        """Proofs of k targets, None where none was found.
+        """Return proofs of k targets, None where the search found no proof.
 
-        No proof says nothing: neither that a target can be reached nor that it cannot.
+        The absence of a proof implies nothing about whether a target can be reached.
 
         Args:
-            targets: The targets.
-            holding: (k, h) coordinates of hands (`HandSpace`) that reach them. Only boxes that
-                hold these are looked at: what comes out as proved would be proved wrongly, and
-                whatever would be proved wrongly comes out, in a fraction of the time.
-            most: (k,) boxes of a target after which it is given up, if not before.
+            targets: Targets to prove impossible.
+            known_hands: (k, h) coordinates (`HandSpace`) of hands that reach the targets, to test
+                the prover: the search is restricted to boxes that contain them, so that every
+                proof returned is a false proof, at a fraction of the full cost.
+            max_boxes: (k,) maximum number of boxes of each target, if smaller than the default.
         """
-        found: list[Proof | None] = []
-        for start in range(0, len(targets), EFFORT.together):
-            some = slice(start, start + EFFORT.together)
-            known = None if holding is None else holding[some]
-            bound = np.full(len(targets), EFFORT.most)[some] if most is None else most[some]
-            found += self._together(targets.rows(some), known, bound)
-        return found
+        proofs: list[Proof | None] = []
+        for start in range(0, len(targets), PROVER_EFFORT.targets_per_pass):
+            rows = slice(start, start + PROVER_EFFORT.targets_per_pass)
+            known_rows = None if known_hands is None else known_hands[rows]
+            box_limits = (
+                np.full(len(targets), PROVER_EFFORT.max_boxes)[rows]
+                if max_boxes is None
+                else max_boxes[rows]
+            )
+            proofs += self._prove_pass(targets.rows(rows), known_rows, box_limits)
+        return proofs
 
-    def _together(
-        self, targets: TargetBatch, holding: Array | None, bound: Counts
+    def _prove_pass(
+        self, targets: TargetBatch, known_hands: Array | None, box_limits: Counts
     ) -> list[Proof | None]:
-        known = ~np.isnan(targets.points[:, :, 0])
-        for name in SLIDING & targets.more.keys():
-            # Anywhere on a line or a plane: the point itself need not be reached.
-            known &= np.isnan(targets.more[name][..., 0])
-        known &= ~np.array(endless_fingers(self._robot, motor_box(self._robot, targets)))
+        is_usable = ~np.isnan(targets.points[:, :, 0])
+        for name in SLIDING_ARRAYS & targets.more.keys():
+            # A contact on a line or a plane need not reach the point itself.
+            is_usable &= np.isnan(targets.more[name][..., 0])
+        is_usable &= ~np.array(fingers_without_limits(self._robot, motor_box(self._robot, targets)))
         proofs: list[Proof | None] = [None] * len(targets)
-        for group, most in self._groups():
-            chosen = np.zeros(known.shape[1], dtype=bool)
-            chosen[group] = True
-            asked = known & chosen
-            still = np.array([proof is None for proof in proofs])
-            rows = np.flatnonzero(still & asked.any(axis=1))
+        for group, max_boxes in self._finger_groups():
+            is_in_group = np.zeros(is_usable.shape[1], dtype=bool)
+            is_in_group[group] = True
+            is_constrained = is_usable & is_in_group
+            is_open = np.array([proof is None for proof in proofs])
+            rows = np.flatnonzero(is_open & is_constrained.any(axis=1))
             if not len(rows):
                 continue
-            kept = None if holding is None else holding[rows]
-            boxes = np.minimum(most, bound[rows])
-            result = self._search(targets.rows(rows), asked[rows], boxes, kept)
-            for place in np.flatnonzero(result.proved).tolist():
-                row = int(rows[place])
-                kind = ProofKind.REACH if result.reach[place] else ProofKind.HAND
-                names = (self._robot.finger_names[i] for i in np.flatnonzero(asked[row]))
+            known_rows = None if known_hands is None else known_hands[rows]
+            boxes = np.minimum(max_boxes, box_limits[rows])
+            result = self._search(targets.rows(rows), is_constrained[rows], boxes, known_rows)
+            for i in np.flatnonzero(result.is_proved).tolist():
+                row = int(rows[i])
+                kind = ProofKind.REACH if result.needs_arm[i] else ProofKind.HAND
+                names = (self._robot.finger_names[i] for i in np.flatnonzero(is_constrained[row]))
                 proofs[row] = Proof(
                     kind=ProofKind.FINGER if self._arm is None else kind,
                     fingers=tuple(names),
-                    boxes=int(result.boxes[place]),
+                    boxes=int(result.boxes[i]),
                     tolerance=targets.tolerances,
                     target=targets.rows(slice(row, row + 1)),
                 ).sealed()
         return proofs
 
-    def _groups(self) -> list[tuple[list[int], int]]:
-        """Fingers that may contradict each other, and boxes; of a fixed hand each by itself."""
+    def _finger_groups(self) -> list[tuple[list[int], int]]:
+        """Return the groups of fingers to search, with the maximum number of boxes."""
         fingers = list(range(len(self._robot.fingers)))
         if self._arm is None:
-            # One that reaches its contact must not take all the time before the one that does not.
-            return [([i], most) for most in (EFFORT.alone, EFFORT.most) for i in fingers]
-        # Few fingers that contradict each other say more than all of them.
-        alone = [[[i] for i in fingers], list(map(list, combinations(fingers, 2)))]
-        few = [
-            (group, most)
-            for groups, most in zip((*alone, alone[0]), (1, EFFORT.pair, EFFORT.one), strict=True)
+            # A short search of every finger first: a finger that reaches its contact is never
+            # refuted and would exhaust the effort before the finger that misses.
+            return [
+                ([i], max_boxes)
+                for max_boxes in (PROVER_EFFORT.fixed_finger_boxes, PROVER_EFFORT.max_boxes)
+                for i in fingers
+            ]
+        # A contradiction of few fingers is more informative: search small groups first.
+        subgroups = [[[i] for i in fingers], list(map(list, combinations(fingers, 2)))]
+        small_groups = [
+            (group, max_boxes)
+            for groups, max_boxes in zip(
+                (*subgroups, subgroups[0]),
+                (1, PROVER_EFFORT.pair_boxes, PROVER_EFFORT.single_finger_boxes),
+                strict=True,
+            )
             for group in groups
             if len(group) < len(fingers)
         ]
-        if len(fingers) <= EFFORT.subset:
-            return [*few, (fingers, EFFORT.most)]
-        subsets = [(list(some), EFFORT.some) for some in combinations(fingers, EFFORT.subset)]
-        return [*few, (fingers, EFFORT.first), *subsets, (fingers, EFFORT.most)]
+        if len(fingers) <= PROVER_EFFORT.subset_size:
+            return [*small_groups, (fingers, PROVER_EFFORT.max_boxes)]
+        subsets = [
+            (list(subset_boxes), PROVER_EFFORT.subset_boxes)
+            for subset_boxes in combinations(fingers, PROVER_EFFORT.subset_size)
+        ]
+        return [
+            *small_groups,
+            (fingers, PROVER_EFFORT.first_search_boxes),
+            *subsets,
+            (fingers, PROVER_EFFORT.max_boxes),
+        ]
 
     @cached_property
     def _test(self) -> FunctionKernel:
@@ -180,72 +219,81 @@ class Prover:
         cones = arm_cones(self._robot)
         if cones is None or self._arm is None:
             return None
-        same = np.allclose(cones.shoulder, self._arm.shoulder, rtol=0, atol=1e-9)
-        return cones if same and np.allclose(cones.wrist, self._arm.wrist, 0, 1e-9) else None
+        same_shoulder = np.allclose(cones.shoulder, self._arm.shoulder, rtol=0, atol=1e-9)
+        return (
+            cones if same_shoulder and np.allclose(cones.wrist, self._arm.wrist, 0, 1e-9) else None
+        )
 
     def _search(
-        self, targets: TargetBatch, fingers: Bools, most: Counts, holding: Array | None
-    ) -> _Found:
-        """Divide the boxes of k targets, some of them a level deeper in each pass.
+        self, targets: TargetBatch, fingers: Bools, max_boxes: Counts, known_hands: Array | None
+    ) -> _SearchResult:
+        """Bisect the boxes of k targets until all are refuted or the effort is exhausted.
 
         Args:
-            targets: The targets.
-            fingers: (k, f) which contacts count.
-            most: (k,) boxes of a target after which it is given up.
-            holding: (k, h) see `prove`.
+            targets: Targets to prove impossible.
+            fingers: (k, f) mask of the contacts to consider.
+            max_boxes: (k,) maximum number of boxes of each target.
+            known_hands: (k, h) hands that reach the targets, see `prove`.
         """
         count = len(targets)
         points = np.where(fingers[..., None], targets.points, 0.0)
-        faced = fingers & ~np.isnan(targets.normals[:, :, 0])
-        normals = np.where(faced[..., None], targets.normals, 0.0)
-        asked = np.stack([fingers, faced], axis=2).astype(float)
+        has_normal = fingers & ~np.isnan(targets.normals[:, :, 0])
+        normals = np.where(has_normal[..., None], targets.normals, 0.0)
+        constrained = np.stack([fingers, has_normal], axis=2).astype(float)
         tolerance = np.stack([targets.position_tolerance, targets.angle_tolerance], axis=1)
-        finest = max(1e-9, EFFORT.part * float(targets.position_tolerance.min()))
-        # A kernel's column is a vector: of a hand with one motor there is no second dimension.
-        size, ends = self._test.input_shapes[0], self._test.input_shapes[2]
-        limits = [np.reshape(end, ends) for end in joint_limits(self._robot, targets)]
-        arm = np.zeros(2), np.full(2, NO_CONE)
+        min_width = max(
+            1e-9, PROVER_EFFORT.min_width_fraction * float(targets.position_tolerance.min())
+        )
+        # Kernels drop the second dimension of columns, so that a hand with one motor needs a
+        # reshape.
+        size, limit_shape = self._test.input_shapes[0], self._test.input_shapes[2]
+        limits = [np.reshape(end, limit_shape) for end in joint_limits(self._robot, targets)]
+        arm_inputs = np.zeros(2), np.full(2, NO_CONE_LIMIT)
         if self._arm is not None:
-            cosines = arm[1] if self._cones is None else self._cones.cosines(targets)
-            arm = np.array(self._arm.span(targets)), cosines
+            cosines = arm_inputs[1] if self._cones is None else self._cones.cosines(targets)
+            arm_inputs = np.array(self._arm.span(targets)), cosines
         lower, upper = (np.tile(end, (count, 1)) for end in self.space.box(targets))
-        waiting: list[Boxes] = [(np.arange(count), lower, upper)]
+        queue: list[Boxes] = [(np.arange(count), lower, upper)]
         boxes = np.zeros(count, dtype=np.int64)
-        given_up, reach = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
-        while waiting:
-            target, lower, upper = waiting.pop()
-            wanted = ~given_up[target]
-            target, lower, upper = target[wanted], lower[wanted], upper[wanted]
+        given_up, needs_arm = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
+        while queue:
+            target, lower, upper = queue.pop()
+            is_active = ~given_up[target]
+            target, lower, upper = target[is_active], lower[is_active], upper[is_active]
             boxes += np.bincount(target, minlength=count)
             refuted, scores = self._test(
                 *(end.reshape(len(end), *size) for end in (lower, upper)),
                 *(*limits, points[target], normals[target]),
-                *(tolerance, asked[target], *arm),
+                *(tolerance, constrained[target], *arm_inputs),
             )
             refuted, scores = refuted > 0, scores.reshape(lower.shape)
-            reach[target[refuted[:, 1] & ~refuted[:, 0]]] = True
-            if not lower.shape[1]:  # a tool has no postures to divide
+            needs_arm[target[refuted[:, 1] & ~refuted[:, 0]]] = True
+            if not lower.shape[1]:  # a rigid tool has no coordinates to divide
                 given_up[target[~refuted.any(axis=1)]] = True
                 continue
             widest = scores.argmax(axis=1)
             rows = np.arange(len(target))
-            tiny = (upper - lower)[rows, widest] < finest
-            tiny |= scores[rows, widest] <= 0
-            left = ~refuted.any(axis=1)
-            given_up[target[left & tiny]] = True
-            given_up |= boxes > most
-            left = np.flatnonzero(left & ~given_up[target])
-            halves = _halves(target[left], lower[left], upper[left], widest[left])
-            if holding is not None:
-                known = holding[halves[0]]
-                inside = ((halves[1] <= known) & (known <= halves[2])).all(axis=1)
-                halves = halves[0][inside], halves[1][inside], halves[2][inside]
-            waiting += _parts(*halves)
-        return _Found(~given_up, boxes, reach)
+            is_narrow = (upper - lower)[rows, widest] < min_width
+            is_narrow |= scores[rows, widest] <= 0
+            is_open = ~refuted.any(axis=1)
+            given_up[target[is_open & is_narrow]] = True
+            given_up |= boxes > max_boxes
+            is_open = np.flatnonzero(is_open & ~given_up[target])
+            halves = _halves(target[is_open], lower[is_open], upper[is_open], widest[is_open])
+            if known_hands is not None:
+                hands = known_hands[halves[0]]
+                contains_hand = ((halves[1] <= hands) & (hands <= halves[2])).all(axis=1)
+                halves = (
+                    halves[0][contains_hand],
+                    halves[1][contains_hand],
+                    halves[2][contains_hand],
+                )
+            queue += _chunks(*halves)
+        return _SearchResult(~given_up, boxes, needs_arm)
 
 
 def _halves(target: Rows, lower: Array, upper: Array, widest: Rows) -> Boxes:
-    """Boxes divided amid their widest coordinates."""
+    """Return the halves of boxes bisected along one coordinate each (k,)."""
     rows = np.arange(len(target))
     middle = (lower[rows, widest] + upper[rows, widest]) / 2
     lower, upper = np.concatenate([lower, lower]), np.concatenate([upper, upper])
@@ -254,8 +302,8 @@ def _halves(target: Rows, lower: Array, upper: Array, widest: Rows) -> Boxes:
     return np.concatenate([target, target]), lower, upper
 
 
-def _parts(target: Rows, lower: Array, upper: Array) -> Iterator[Boxes]:
-    """Boxes in parts that are looked at together."""
-    for start in range(0, len(target), EFFORT.chunk):
-        some = slice(start, start + EFFORT.chunk)
-        yield target[some], lower[some], upper[some]
+def _chunks(target: Rows, lower: Array, upper: Array) -> Iterator[Boxes]:
+    """Yield boxes in chunks that are evaluated in one call."""
+    for start in range(0, len(target), PROVER_EFFORT.boxes_per_call):
+        rows = slice(start, start + PROVER_EFFORT.boxes_per_call)
+        yield target[rows], lower[rows], upper[rows]

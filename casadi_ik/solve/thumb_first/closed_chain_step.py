@@ -30,7 +30,7 @@ from casadi_ik.kinematics.contacts import (
 )
 from casadi_ik.kinematics.forward import ActuatedKinematics, actuated, motor_scales
 from casadi_ik.kinematics.linear_algebra import damped_pinv_times, project_to_null_space
-from casadi_ik.kinematics.smooth import Expr, safe_norm, shared
+from casadi_ik.kinematics.smooth import Expr, safe_norm, with_cse
 from casadi_ik.model.description import RobotDescription
 
 THUMB_MERIT = 4.0
@@ -302,7 +302,7 @@ def _solved_and_fixed(sparsities: list[ca.Sparsity]) -> ca.Function:
         over,
     ]
     inputs = [thumb, thumb_error, others, others_error, lower, upper, damping, held, values]
-    return ca.Function("solved_and_fixed", inputs, shared(*map(ca.densify, outputs)))
+    return ca.Function("solved_and_fixed", inputs, with_cse(*map(ca.densify, outputs)))
 
 
 def quadratic_program(linear: Linear, room: Room) -> tuple[Expr, Expr]:

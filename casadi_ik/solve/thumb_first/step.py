@@ -46,7 +46,7 @@ from casadi_ik.kinematics.palm import (
     nearest_start,
     pose_step,
 )
-from casadi_ik.kinematics.smooth import Expr, shared
+from casadi_ik.kinematics.smooth import Expr, with_cse
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.solve.limits import bits
 from casadi_ik.solve.status import Phase, Status
@@ -379,7 +379,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
         )
         contacts = hand_contacts(self.robot, hand, self.robot.hand_actuators)
         rotation, origin = best_palm(contacts, self.contacts, p, base=base_rotation(self.robot))
-        return ca.Function("guess", [state, parameters], shared(hand, rotation, origin))
+        return ca.Function("guess", [state, parameters], with_cse(hand, rotation, origin))
 
     def _begin(self) -> ca.Function:
         state, parameters, s, p = self._vectors(ca.SX)
@@ -413,7 +413,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
         status = ca.if_else(exhausted, float(Status.STALLED), float(Status.RUNNING))
         record = self.row(s, p, q, Phase.CANDIDATE, status, merit(self.robot, self.contacts, q, p))
         inputs = [state, parameters, hand, rotation, origin, arm, passed]
-        return ca.Function("begin", inputs, shared(after, record, status))
+        return ca.Function("begin", inputs, with_cse(after, record, status))
 
     def _placement(self) -> ca.Function:
         """A step of the arm alone towards the estimated palm pose."""
@@ -446,7 +446,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
             step_size=tried.size,
             accepted=judged.accepted,
         )
-        return ca.Function("placement", [state, parameters], shared(after, record, status))
+        return ca.Function("placement", [state, parameters], with_cse(after, record, status))
 
     def _alignment(self) -> ca.Function:
         state, parameters, _, _ = self._vectors(ca.MX)
@@ -464,7 +464,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
         lower, upper = (p["lower"] - s["q"]) / scales, (p["upper"] - s["q"]) / scales
         outputs = [linear.thumb, linear.thumb_error, linear.others, linear.others_error]
         outputs += [lower, upper, s["damping"]]
-        return ca.Function("problem", [state, parameters], shared(*outputs))
+        return ca.Function("problem", [state, parameters], with_cse(*outputs))
 
     def _take(self) -> ca.Function:
         """Take the step if it lowers the cost; decide whether the solve is at its end."""
@@ -529,7 +529,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
             accepted=accepted,
         )
         inputs = [state, parameters, step, held]
-        return ca.Function("take", inputs, shared(after, record, status))
+        return ca.Function("take", inputs, with_cse(after, record, status))
 
     def _met(self, there: Merit, p: dict[str, Expr], times: float = 1.0) -> Expr:
         """Whether every contact is within so many times its tolerance."""
@@ -573,4 +573,4 @@ def balance_stage(layouts: ThumbFirstLayouts) -> ca.Function:
         step_size=tried.size,
         accepted=found.accepted,
     )
-    return ca.Function("balance", [state, parameters], shared(after, record, status))
+    return ca.Function("balance", [state, parameters], with_cse(after, record, status))

@@ -21,7 +21,7 @@ from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics import dual_quaternion as dq
 from casadi_ik.kinematics.couplings import follow
 from casadi_ik.kinematics.se3 import exp_so3, perpendicular
-from casadi_ik.kinematics.smooth import Expr, shared
+from casadi_ik.kinematics.smooth import Expr, with_cse
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.joints import Joint
 
@@ -202,12 +202,12 @@ class HandModel:
             pose = self._pose(finger, q, p)
             name = ca.Function.fix_name(f"calibrate_{kind}_{self.robot.name}_{finger}")
             if kind == "pose":
-                function = ca.Function(name, [q, p], shared(ca.densify(pose)))
+                function = ca.Function(name, [q, p], with_cse(ca.densify(pose)))
             else:
                 seen = ca.SX.sym("measured", 8)
                 turn, _ = dq.log(dq.error(pose, seen))
                 error = ca.vertcat(dq.translation(pose) - dq.translation(seen), turn)
-                outputs = shared(error, ca.densify(ca.jacobian(error, p)))
+                outputs = with_cse(error, ca.densify(ca.jacobian(error, p)))
                 function = ca.Function(name, [q, p, seen], outputs)
             self._kernels[key] = FunctionKernel(function, self.compiled)
         return self._kernels[key]
