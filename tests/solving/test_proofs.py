@@ -316,7 +316,7 @@ def test_what_is_not_proved_is_not_unreachable(
     monkeypatch.setattr(
         solver._engine.diagnostician._prover,
         "prove",
-        lambda problems, most: [None] * len(problems),
+        lambda problems, max_boxes: [None] * len(problems),
     )
     points, normals = ik.load_grasp("cup").arrays(robot.fingers)
     solution = solver.solve(grasp_of(robot, points - [1, 0, 0], normals))
