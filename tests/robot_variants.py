@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from toy_robots import copy_shipped_robot, edited
@@ -100,3 +101,18 @@ def _revolute(name: str, parent: str, child: str, axis: list[int], origin: dict)
     limits = ["-40 deg", "40 deg"]
     entry = {"name": name, "parent": parent, "child": child, "axis": axis, "origin": origin}
     return entry | {"limits": limits, "source": "assumed", "velocity": "2 rad/s"}
+
+
+def with_fixed_motor(robot: ik.ArmHand, motor: str) -> ik.ArmHand:
+    """A robot in which the joint of a motor is fixed at zero."""
+    body = robot.description
+    assert motor in body.actuator_names
+    moving = [i for i, actuator in enumerate(body.actuators) if actuator.name != motor]
+    joints = tuple(
+        replace(joint, type="fixed") if joint.name == motor else joint for joint in body.joints
+    )
+    motors = tuple(body.actuators[i] for i in moving)
+    name = f"{body.name}_without_{motor}"
+    return ik.ArmHand(
+        replace(body, name=name, joints=joints, actuators=motors, home=body.home[moving])
+    )

@@ -239,6 +239,10 @@ class AlternativeFinder:
             # Reachable thanks to the tolerances only, if at all.
             q = np.concatenate([q, trials.run(states, loose)])
             kept = q[trials.solved(targets, q, targets.enforce_limits)]
+        if not len(kept):
+            # The restarts of the whole search find what the rounds from tables miss.
+            q = method.run(targets, q0[None], 0, trace=False).q
+            kept = q[trials.solved(targets, q, targets.enforce_limits)]
         return [kept[i] for i in distinct(self.hand_parts(kept), SEEKING.distinct)]
 
     def hand_parts(self, q: Array) -> Array:

@@ -222,7 +222,7 @@ class Diagnostician:
     def _proofs(self, targets: TargetBatch, most: Counts) -> list[Proof | None]:
         """Proofs of targets; of a body that one side cannot, wherever the trunk takes it."""
         if not self._sides:
-            return self._prover.prove(targets, max_boxes=most)
+            return self._prover.prove(_with_contact_bounds(targets), max_boxes=most)
         robot = self.robot.description
         proofs: list[Proof | None] = [None] * len(targets)
         for prover, side in zip(self._sides, robot.sides, strict=True):
@@ -355,24 +355,36 @@ def _enough(targets: TargetBatch, fair: Verdict) -> list[Tolerance]:
 
 
 def _held_alone(targets: TargetBatch, row: int) -> TargetBatch:
-    """One of several targets whose hands are held differently; its contacts place the palm."""
+    """Return one of several targets whose hands are held differently."""
     one = targets.rows(slice(row, row + 1))
     assert one.fixed is not None
-    return replace(one, fixed=one.fixed[0], palms=None)
+    return replace(one, fixed=one.fixed[0])
+
+
+def _with_contact_bounds(targets: TargetBatch) -> TargetBatch:
+    """Return palm targets with contact tolerances that every palm within its tolerance keeps.
+
+    A proof for them holds for the palm poses: a palm that is rotated about its origin moves a
+    contact by the chord of the angle times their distance.
+    """
+    if targets.palms is None:
+        return targets
+    allowed = targets.largest_tolerance
+    levers = np.linalg.norm(targets.points - targets.palms[:, None, :3, 3], axis=2)
+    chord = 2 * np.sin(min(allowed.angle, np.pi) / 2)
+    tolerance = tuple(
+        Tolerance(allowed.position + chord * lever, allowed.angle)
+        for lever in np.nanmax(levers, axis=0, initial=0.0).tolist()
+    )
+    return replace(targets, tolerance=tolerance)
 
 
 def _of_palms(robot: ArmHand, targets: TargetBatch, found: list[Diagnosis]) -> list[Diagnosis]:
-    """Diagnoses by the contacts that palms lead to, with what they say of the palms."""
+    """Return the diagnoses with the errors of the palms, if the targets have palm poses."""
     palms = judge_palms(robot, targets, np.stack([one.q for one in found]))
     if palms is None:
         return found
-    told = []
-    for row, one in enumerate(found):
-        verdict = palms.of(row)
-        # Contacts can be met within their tolerances by a palm that is not.
-        short = one.reason is Reason.REACHABLE and not verdict.ok
-        told.append(replace(one, palm=verdict, reason=Reason.NOT_FOUND if short else one.reason))
-    return told
+    return [replace(one, palm=palms.of(row)) for row, one in enumerate(found)]
 
 
 def _free_of(targets: TargetBatch, fingers: list[int]) -> TargetBatch:

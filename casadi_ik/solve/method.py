@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -44,6 +44,51 @@ class Outcome:
     def trace(self) -> tuple[NDArray[Any], ...]:
         """The rows of each solve, views into `rows`; empty if no trace was asked for."""
         return () if self.rows is None else split_rows(self.rows, self.iterations)
+
+    def continued(
+        self,
+        rows: NDArray[np.intp],
+        q: Array,
+        improved: NDArray[np.bool_],
+        other: Outcome,
+        trace: Sequence[NDArray[Any]] | None,
+    ) -> Outcome:
+        """Return the outcome after a second search for some of its targets.
+
+        Args:
+            rows: (m,) the targets.
+            q: (m, n) configurations reached by the second search.
+            improved: (m,) True where they replace those of the first search.
+            other: The second search; its iterations, restarts and seconds are added.
+            trace: Its records by target, as records of this outcome; None if no trace is kept.
+        """
+        every = self.q.copy()
+        every[rows[improved]] = q[improved]
+
+        def total(first: NDArray[Any], second: NDArray[Any]) -> NDArray[Any]:
+            added = first.copy()
+            added[rows] += second
+            return added
+
+        records = None
+        if trace is not None and self.rows is not None:
+            parts = [[part] for part in self.trace]
+            for row, second in zip(rows.tolist(), trace, strict=True):
+                parts[row].append(second)
+            records = np.concatenate([part for both in parts for part in both])
+        phases = {
+            name: total(count, other.phases[name]) if name in other.phases else count
+            for name, count in self.phases.items()
+        }
+        return replace(
+            self,
+            q=every,
+            iterations=total(self.iterations, other.iterations),
+            restarts=total(self.restarts, other.restarts),
+            time=total(self.time, other.time),
+            phases=phases,
+            rows=records,
+        )
 
     @classmethod
     def interleaved(

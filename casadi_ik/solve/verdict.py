@@ -111,12 +111,18 @@ class Verdict:
 
     @property
     def all_ok(self) -> NDArray[np.bool_]:
-        """(k,) whether every contact is met, and the palm where one is given."""
+        """(k,) True where every contact is met; of palm targets, where the palm pose is.
+
+        The contacts of a palm target are derived from its palm pose and the hand posture. Their
+        errors are reported, but only the palm pose is required.
+        """
+        if self.palm is not None:
+            return self.palm.ok
         met: NDArray[np.bool_] = np.logical_and.reduce(self.ok, axis=1)
-        return met if self.palm is None else met & self.palm.ok
+        return met
 
     def solved(self, limits: bool) -> NDArray[np.bool_]:
-        """(k,) whether every contact is met and, if asked, the robot's limits are kept."""
+        """(k,) True where the target is met and, if `limits`, the robot's limits are kept."""
         return self.all_ok & self.limits_ok if limits else self.all_ok
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from robot_variants import with_fixed_motor
 from toy_robots import grasp_of
 
 import casadi_ik as ik
@@ -50,6 +51,51 @@ def test_every_call_solves_the_same_targets(robot):
         assert solver.solve(grasp, diagnose=False).success
         assert solver.solve_all(grasp, limit=1)
         assert len(solver.choose([grasp]))
+
+
+def displaced_palms(robot, q, tolerance, part):
+    """Return palm poses of configurations, displaced by a part of the tolerance."""
+    rng, palms = np.random.default_rng(11), np.array(robot.palm(q))
+    shift, axis = rng.normal(size=(2, len(q), 3))
+    shift *= part * tolerance.position / np.linalg.norm(shift, axis=1, keepdims=True)
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    cross = np.cross(axis[:, None], np.eye(3)[None]).swapaxes(1, 2)
+    angle = part * tolerance.angle
+    turn = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    palms[:, :3, :3] = turn @ palms[:, :3, :3]
+    palms[:, :3, 3] += shift
+    return palms
+
+
+@pytest.mark.parametrize("degrees", [10.0, 30.0])
+def test_an_arm_of_five_axes_reaches_palm_poses_within_tolerance(degrees):
+    """Exact poses are out of its reach; it solved 2 to 9 of 20."""
+    robot = with_fixed_motor(ik.load_robot("viperx_300s+so100_jaw"), "vx300s_joint_4")
+    tolerance = ik.Tolerance(0.005, np.radians(degrees))
+    q = robot.random(np.random.default_rng(7), 20)
+    palms = displaced_palms(robot, q, tolerance, 0.8)
+    solver = ik.Solver(robot, tolerance=tolerance)
+    motors = robot.description.finger_motors
+    for prefer in ("limits", "q0"):
+        batch = solver.solve_palms(palms, q, prefer=prefer)
+        assert np.flatnonzero(~batch.success).tolist() == []
+        assert (np.asarray(batch.palm_position_error) <= tolerance.position).all()
+        assert (np.asarray(batch.palm_angle_error) <= tolerance.angle).all()
+    for palm, hand in zip(palms, q, strict=True):
+        posture = {name: float(hand[robot.actuators.index(name)]) for name in motors}
+        grasp = ik.Grasp(palm=palm, posture=posture)
+        assert solver.solve(grasp, diagnose=False).success
+        assert len(solver.choose([grasp]))
+        assert solver.solve_all(grasp, limit=1)
+
+
+def test_palms_of_an_arm_with_limits_are_solved_within_tolerance(robot):
+    """Displaced poses are beyond the limits or the reach of the arm: 12 % were missed."""
+    tolerance = ik.Tolerance(0.005, np.radians(30.0))
+    q = robot.random(np.random.default_rng(7), 100)
+    palms = displaced_palms(robot, q, tolerance, 0.8)
+    batch = ik.Solver(robot, tolerance=tolerance).solve_palms(palms, q, diagnose=True)
+    assert np.flatnonzero(~batch.success).tolist() == []
 
 
 def test_the_loop_has_a_queue_for_every_stage():

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from casadi_ik.compile import FunctionKernel, LoopResult, StepGraph
 from casadi_ik.compile.loop import UNBEGUN, Stepper
 from casadi_ik.files.arrays import Array, Counts
+from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.arms.recognise import arm_family
 from casadi_ik.kinematics.contacts import Kinds, usual
 from casadi_ik.kinematics.robot_kernels import RobotKernels
@@ -21,6 +22,7 @@ from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.hand_first.body import BodyStep
 from casadi_ik.solve.hand_first.driver import Searches, SearchPlan, SearchPool, can_search
+from casadi_ik.solve.hand_first.palm_target import PALM_KINDS, palm_contacts, palm_robot
 from casadi_ik.solve.hand_first.parameters import HandFirstParameters
 from casadi_ik.solve.hand_first.seeds import Seeds
 from casadi_ik.solve.hand_first.state import CARRIED, beginning
@@ -32,6 +34,7 @@ from casadi_ik.solve.proofs.premises import ArmSpan, arm_span, palms_in_span
 from casadi_ik.solve.request import PREFERENCES
 from casadi_ik.solve.status import Phase, Status
 from casadi_ik.solve.trace import RecordedJacobian, packed
+from casadi_ik.solve.verdict import judge
 
 SideRun = Callable[[TargetBatch, Array], Outcome]
 """Solves the targets of a side from where it is."""
@@ -263,6 +266,15 @@ class HandFirstMethod(LoopedMethod):
 
         `rounds` are so many of each search at most instead of all.
         """
+        outcome = self._run_contacts(targets, q0, seed, trace, rounds)
+        if targets.palms is None:
+            return outcome
+        return self._run_palms(targets, q0, outcome, seed, trace, rounds)
+
+    def _run_contacts(
+        self, targets: TargetBatch, q0: Array, seed: int, trace: bool, rounds: int | None
+    ) -> Outcome:
+        """Solve a batch by its contacts; see `run`."""
         self._check(targets)
         if not self.is_compiled:
             method = self.in_virtual_machine() if self.robot.sides else self
@@ -277,6 +289,68 @@ class HandFirstMethod(LoopedMethod):
             most[~reachable] = 0  # a first round leads near what the arm cannot reach
         with self._searches.lent(targets.enforce_limits, len(targets)) as searches:
             return searches.batch(targets, q0, self.terms(targets), most, trace)
+
+    def _run_palms(
+        self,
+        targets: TargetBatch,
+        q0: Array,
+        outcome: Outcome,
+        seed: int,
+        trace: bool,
+        rounds: int | None,
+    ) -> Outcome:
+        """Search for the palm poses that the search by contacts has missed.
+
+        Args:
+            targets: k targets with palm poses.
+            q0: (k, n) starts.
+            outcome: The result of the search by contacts.
+            seed: See `run`.
+            trace: See `run`.
+            rounds: See `run`.
+        """
+        solved = self._meets_palms(targets, outcome.q)
+        missed = ~solved
+        if (reachable := palms_in_span(self._span, targets)) is not None:
+            missed &= reachable
+        rows = np.flatnonzero(missed)
+        arm = list(self.robot.arm_actuators)
+        if len(rows) and arm:
+            contacts = palm_contacts(self.robot, targets.rows(rows))
+            palms = self._palm_method.run(contacts, q0[rows][:, arm], seed, trace, rounds)
+            q = outcome.q[rows]
+            q[:, arm] = palms.q
+            met = self._meets_palms(targets.rows(rows), q)
+            solved[rows] = met
+            outcome = outcome.continued(rows, q, met, palms, self._of_hand(palms, q, trace))
+        content = outcome.status == Status.SOLVED
+        status = np.where(content & ~solved, int(Status.STALLED), outcome.status)
+        status[solved] = Status.SOLVED
+        return replace(outcome, status=status)
+
+    def _of_hand(self, palms: Outcome, q: Array, trace: bool) -> list[NDArray[np.void]] | None:
+        """Return traces of the palm search as traces of the arm-hand; None without a trace."""
+        if not trace:
+            return None
+        arm, record = list(self.robot.arm_actuators), self.graph.record.dtype
+        return [
+            _of_body(self.robot, rows, at, arm, [], record)
+            for rows, at in zip(palms.trace, q, strict=True)
+        ]
+
+    def _meets_palms(self, targets: TargetBatch, q: Array) -> NDArray[np.bool_]:
+        """Return for k configurations whether they meet their palm poses."""
+        return judge(self._arm_hand, targets, q).solved(targets.enforce_limits)
+
+    @cached_property
+    def _arm_hand(self) -> ArmHand:
+        return ArmHand(self.robot)
+
+    @cached_property
+    def _palm_method(self) -> HandFirstMethod:
+        """The method for palm poses; see `palm_robot`."""
+        robot = palm_robot(self.robot)
+        return HandFirstMethod(robot, self.options, self._compiled, PALM_KINDS)
 
     def _side_by_side(
         self, targets: TargetBatch, q0: Array, seed: int, trace: bool, rounds: int | None
