@@ -146,6 +146,7 @@ class FollowSources:
             "RUN_UP": RUN_UP,
             "PALM_WEIGHT": PALM_WEIGHT,
             "TRAIL_SPACING": recovery.SPACING,
+            "TRAIL_CHECK_PERIOD": recovery.CHECK_PERIOD,
             "TRAIL_PATIENCE": recovery.PATIENCE,
             "TRAIL_SEARCH_TIME": recovery.SEARCH_TIME,
             "TRAIL_GAIN": recovery.GAIN,

@@ -27,6 +27,9 @@ SPACING = 0.1
 CAPACITY = 128
 """Maximum number of postures of a trail; beyond it every second one is dropped, not the first."""
 
+CHECK_PERIOD = 0.01
+"""Minimum time between two checks whether a posture is added to the trail [s]."""
+
 PATIENCE = 0.2
 """Time without progress after which a follower is stuck [s]."""
 
@@ -77,6 +80,7 @@ class Recovery:
         self._units, self._fastest, self._change = units, fastest, change
         self._guard = guard
         self._longest_step = float((fastest / units).max())
+        self._check_cycles = max(math.floor(CHECK_PERIOD / period), 1)
         self._patience = math.ceil(PATIENCE / period)
         self._comparisons = min(math.ceil(CAPACITY * period / SEARCH_TIME), CAPACITY)
         self._trail = np.zeros((CAPACITY, len(units)))
@@ -160,7 +164,8 @@ class Recovery:
             else:
                 self._append(q)
                 distance = 0.0
-        self._cycles_to_check = max(math.floor((SPACING - distance) / self._longest_step), 1)
+        cycles = math.floor((SPACING - distance) / self._longest_step)
+        self._cycles_to_check = max(cycles, self._check_cycles)
 
     def _look_for_progress(
         self, asked: FollowerInputs, ratio: float, stopped_at: Array | None

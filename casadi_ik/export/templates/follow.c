@@ -197,7 +197,7 @@ static void extend_trail(@PREFIX@_recovery *recovery, const double *q) {
     }
   }
   last = fmin(floor((TRAIL_SPACING - last) / recovery->longest_step), 1e9);
-  recovery->cycles_to_check = last < 1 ? 1 : (int64_t) last;
+  recovery->cycles_to_check = last < recovery->check_cycles ? recovery->check_cycles : (int64_t) last;
 }
 
 /* Compares postures of the trail once the error has not decreased for a while. */
@@ -341,6 +341,8 @@ int @PREFIX@_follow_from(@PREFIX@_follower *follower, const double *q0, double p
     follower->recovery.longest_step = fmax(follower->recovery.longest_step, longest);
   }
   follower->recovery.patience = sound ? (int64_t) fmin(ceil(TRAIL_PATIENCE / period), 1e9) : 0;
+  follower->recovery.check_cycles =
+      sound ? (int64_t) fmax(fmin(floor(TRAIL_CHECK_PERIOD / period), 1e9), 1.0) : 1;
   follower->recovery.comparisons =
       sound ? (int64_t) fmin(ceil(TRAIL_CAPACITY * period / TRAIL_SEARCH_TIME), TRAIL_CAPACITY) : 0;
   copied(follower->recovery.trail[0], follower->q, N_MOTORS);

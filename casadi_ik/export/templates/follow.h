@@ -11,7 +11,7 @@ enum {
 typedef struct {
   double trail[@FOLLOW_TRAIL@][@GUARD@_MOTORS], start[@GUARD@_MOTORS], line[@GUARD@_MOTORS];
   double least, least_ratio, longest_step, done, line_step, next_step, line_fastest, line_change;
-  int64_t count, cycles_to_check, patience, comparisons, cycles_stuck, candidate, destination;
+  int64_t count, cycles_to_check, check_cycles, patience, comparisons, cycles_stuck, candidate, destination;
   int64_t is_returning, has_line;
 } @PREFIX@_recovery;
 
