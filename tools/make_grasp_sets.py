@@ -14,9 +14,11 @@ import csv
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 from torch_zip import write_torch
 
 import casadi_ik as ik
@@ -210,7 +212,7 @@ def _table(path: Path, palms: Array, names: tuple[str, ...], joints: Array) -> N
         writer.writerows(np.stack(list(columns.values()), axis=1).tolist())
 
 
-def _scaled(rows: Array, factor: float) -> Array:
+def _scaled(rows: NDArray[Any], factor: float) -> Array:
     """Return rows x y z, w x y z, joints with the joints scaled."""
     return np.hstack([rows[:, :7], factor * rows[:, 7:]])
 

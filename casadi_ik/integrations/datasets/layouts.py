@@ -1,6 +1,6 @@
-"""The layouts of other people's grasps: what stands where in their files.
+"""Layouts of published data sets of grasps, and conventions of hands.
 
-A convention says what a data set calls a hand's joints, and where it has the hand's frame.
+A convention states the joint names of a hand in a data set, and the pose of its hand frame.
 """
 
 from __future__ import annotations
@@ -19,7 +19,11 @@ from casadi_ik.files.limits import LIMITS
 from casadi_ik.files.number_files import check_unpacked_size
 from casadi_ik.files.reading import Frame, Point, Struct, frame_matrix, read
 from casadi_ik.files.shipped import resolve_description, shipped_names
-from casadi_ik.integrations.datasets.postures import HandPoses, of_fixed_axes, of_two_columns
+from casadi_ik.integrations.datasets.postures import (
+    HandPoses,
+    rotations_from_columns,
+    rotations_from_rpy,
+)
 from casadi_ik.integrations.datasets.unpickling import Packed, read_npy, read_torch
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.linkage import joint_motion
@@ -27,24 +31,24 @@ from casadi_ik.model.pose import inverse
 
 
 class HandFrame(Frame, frozen=True, kw_only=True):
-    """Where the data set's frame of the hand is, in the frame of one of the robot's links.
+    """Pose of the data set's hand frame in the frame of a link of the robot.
 
     Attributes:
-        link: The robot's link.
-        xyz: Origin of the data set's frame in the link's [m].
-        rpy: Its axes, turned about the fixed axes of the link's frame [rad].
+        link: Link of the robot.
+        xyz: Origin of the hand frame in the link frame [m].
+        rpy: Rotation of the hand frame about the fixed axes of the link frame [rad].
     """
 
     link: str
 
 
 class WristJoint(Struct, frozen=True):
-    """A joint of the data set's hand before the robot's link.
+    """A joint of the data set between its hand frame and the robot's link.
 
     Attributes:
-        name: The data set's.
-        axis: It turns about, in its own frame.
-        xyz: Its origin in the frame before: the data set's, or that of the joint before [m].
+        name: Name in the data set.
+        axis: Rotation axis in the joint frame.
+        xyz: Origin in the hand frame, or in the frame of the previous wrist joint [m].
     """
 
     name: str
@@ -53,17 +57,17 @@ class WristJoint(Struct, frozen=True):
 
 
 class ConventionFile(Struct, frozen=True):
-    """How a data set has a hand: ``models/datasets/*.yaml``.
+    """Convention of a hand in a data set: ``models/datasets/*.yaml``.
 
     Attributes:
-        layouts: In which layouts.
+        layouts: Layouts that use the convention.
         description: One sentence.
-        source: Where that is from, and how it was checked.
-        frame: Where the data set's frame of the hand is.
-        joints: The data set's names, in the order of its arrays, and the robot's joints or motors;
-            a minus sign before one: it turns the other way.
-        wrist: Joints between the data set's frame and `frame`, before the others in its arrays:
-            they place the hand, and are not asked for.
+        source: Source of the convention, and how it was checked.
+        frame: Pose of the data set's hand frame.
+        joints: Robot joints or motors by name in the data set, in the order of its arrays; a minus
+            sign reverses the direction.
+        wrist: Joints between the data set's hand frame and `frame`, first in its arrays; they place
+            the hand.
     """
 
     layouts: list[str]
@@ -76,14 +80,14 @@ class ConventionFile(Struct, frozen=True):
 
 @dataclass(frozen=True, eq=False)
 class Convention:
-    """How the data of a hand are read as those of a robot's.
+    """Convention by which data of a hand are converted to a robot.
 
     Attributes:
-        name: Where it is written down.
-        link: The robot's link in whose frame the data set's frame is.
-        pose: (4, 4) of that frame in the link's.
-        joints: Names of the data set, in the order of its arrays: the robot's joint, and 1 or -1.
-        wrist: Joints of the data set before the link, before the others in its arrays.
+        name: Name of the convention.
+        link: Link of the robot to which the hand frame is attached.
+        pose: (4, 4) pose of the hand frame in the link frame.
+        joints: Robot joint and sign (1 or -1) by name in the data set, in the order of its arrays.
+        wrist: Joints of the data set between its hand frame and the link, first in its arrays.
     """
 
     name: str
@@ -93,83 +97,86 @@ class Convention:
     wrist: tuple[WristJoint, ...] = ()
 
     def fits(self, robot: ArmHand) -> bool:
-        """Whether the robot has this hand."""
+        """Return True if the robot has this hand."""
         description = robot.description
         names = {joint for joint, _ in self.joints.values()}
-        known = {*description.joint_names, *description.actuator_names}
-        return self.link in description.links and names <= known
+        robot_names = {*description.joint_names, *description.actuator_names}
+        return self.link in description.links and names <= robot_names
 
-    def positions(self, given: HandPoses) -> dict[str, Array]:
-        """Positions (k,) of the robot's joints and motors, by name.
+    def positions(self, poses: HandPoses) -> dict[str, Array]:
+        """Return the positions (k,) of the robot's joints and motors by name.
 
         Raises:
-            DescriptionError: Names that the data set does not have, or another number of joints.
+            DescriptionError: A name is unknown or missing, or the number of joints differs.
         """
-        wrist = tuple(one.name for one in self.wrist)
-        every = (*wrist, *self.joints)
-        names = given.names or every
-        width = given.joints.shape[1]
+        wrist = tuple(joint.name for joint in self.wrist)
+        all_names = (*wrist, *self.joints)
+        names = poses.names or all_names
+        width = poses.joints.shape[1]
         if len(names) != width:
             raise DescriptionError(
-                f"{given.where}: joints: found {width}, expected {len(names)}: {', '.join(names)}"
+                f"{poses.where}: joints: found {width}, expected {len(names)}: {', '.join(names)}"
             )
         for name in names:
-            if name not in every:
+            if name not in all_names:
                 raise DescriptionError(
-                    f"{given.where}: {name}: no such joint, expected {', '.join(every)}"
+                    f"{poses.where}: {name}: no such joint, expected {', '.join(all_names)}"
                 )
-        missing = [name for name in every if name not in names]
+        missing = [name for name in all_names if name not in names]
         if missing:
-            raise DescriptionError(f"{given.where}: {missing[0]}: missing, expected a position")
-        found: dict[str, Array] = {}
+            raise DescriptionError(f"{poses.where}: {missing[0]}: missing, expected a position")
+        positions: dict[str, Array] = {}
         for i, name in enumerate(names):
             if name in self.joints:
                 joint, sign = self.joints[name]
-                found[joint] = sign * given.joints[:, i]
-        return found
+                positions[joint] = sign * poses.joints[:, i]
+        return positions
 
-    def frames(self, given: HandPoses) -> Array:
-        """(k, 4, 4) poses of the robot's link that the data's poses, and their wrists, give."""
-        poses, names = given.poses, given.names or tuple(one.name for one in self.wrist)
-        for one in self.wrist:
-            moved = joint_motion(
-                "revolute", np.array(one.axis), given.joints[:, names.index(one.name)]
+    def frames(self, hand_poses: HandPoses) -> Array:
+        """Return the poses (k, 4, 4) of the robot's link from hand poses and wrist joints."""
+        poses, names = (
+            hand_poses.poses,
+            hand_poses.names or tuple(joint.name for joint in self.wrist),
+        )
+        for joint in self.wrist:
+            wrist_motion = joint_motion(
+                "revolute", np.array(joint.axis), hand_poses.joints[:, names.index(joint.name)]
             )
-            moved[:, :3, 3] = one.xyz
-            poses = poses @ moved
+            wrist_motion[:, :3, 3] = joint.xyz
+            poses = poses @ wrist_motion
         return poses @ inverse(self.pose)
 
 
 def load_convention(name_or_path: str | Path) -> Convention:
-    """A convention: a shipped one by name, or a file of one's own.
+    """Load a convention by its built-in name or from a file.
 
     Raises:
-        UnknownNameError: No shipped convention has that name.
+        UnknownNameError: There is no built-in convention of that name.
         DescriptionError: The file is missing or malformed.
     """
     path = resolve_description(name_or_path, "datasets")
     entry, _ = read(path, ConventionFile)
     joints: dict[str, tuple[str, float]] = {}
-    for name, said in entry.joints.items():
-        joint = said.removeprefix("-")
-        if joint in (other for other, _ in joints.values()):
+    for name, value in entry.joints.items():
+        joint = value.removeprefix("-")
+        if joint in (robot_joint for robot_joint, _ in joints.values()):
             raise DescriptionError(f"{path}: joints.{name}: {joint} is named twice")
-        joints[name] = joint, -1.0 if said.startswith("-") else 1.0
+        joints[name] = joint, -1.0 if value.startswith("-") else 1.0
     return Convention(path.stem, entry.frame.link, frame_matrix(entry.frame), joints, entry.wrist)
 
 
 def convention_for(robot: ArmHand, layout: str, hand: str | Path | None) -> Convention:
-    """The convention of a layout for the hand of a robot.
+    """Return the convention of a layout for the hand of a robot.
 
     Args:
         robot: The robot.
-        layout: Of the file.
-        hand: A convention by name or path; None: the shipped one that fits.
+        layout: Layout of the file.
+        hand: Name or path of a convention; None: the built-in convention that fits.
 
     Raises:
-        UnsupportedError: None is shipped that fits, or the one that is named does not.
+        UnsupportedError: No built-in convention fits, or the named one does not.
         UnknownNameError: See `load_convention`.
-        DescriptionError: See there.
+        DescriptionError: See `load_convention`.
     """
     if hand is not None:
         named = load_convention(hand)
@@ -180,17 +187,17 @@ def convention_for(robot: ArmHand, layout: str, hand: str | Path | None) -> Conv
         return named
     shipped = [name for name in shipped_names("datasets") if layout in _layouts(name)]
     for name in shipped:
-        found = load_convention(name)
-        if found.fits(robot):
-            return found
+        convention = load_convention(name)
+        if convention.fits(robot):
+            return convention
     raise UnsupportedError(
         f"layout {layout}: no hand of it is that of robot {robot.name!r}; known: "
-        f"{', '.join(shipped)} (or say by a file of your own what its joints are called)"
+        f"{', '.join(shipped)} (or write a convention file with its joint names)"
     )
 
 
-def of_robot(robot: ArmHand, names: tuple[str, ...]) -> Convention:
-    """The convention of a table that uses the robot's own names, and its palm frame."""
+def convention_of_robot(robot: ArmHand, names: tuple[str, ...]) -> Convention:
+    """Return the convention of the robot's own joint names and palm frame."""
     description = robot.description
     joints: dict[str, tuple[str, float]] = {name: (name, 1.0) for name in names}
     return Convention(
@@ -204,26 +211,26 @@ def _layouts(name: str) -> list[str]:
 
 
 STAGES = ("pregrasp", "grasp", "squeeze")
-"""Of a grasp, in this order."""
+"""Stages of a grasp, in this order."""
 
-TRANSLATION, TURN = ("WRJTx", "WRJTy", "WRJTz"), ("WRJRx", "WRJRy", "WRJRz")
-"""Where DexGraspNet has the pose of a hand among its joints."""
+TRANSLATION_KEYS, ROTATION_KEYS = ("WRJTx", "WRJTy", "WRJTz"), ("WRJRx", "WRJRy", "WRJRz")
+"""Keys of the pose of a hand among the joints of DexGraspNet."""
 
 
 def getagrip(path: Path, content: Any) -> HandPoses:
-    """A dictionary of arrays: trans (k, 3), rot (k, 3, 3), joint_angles (k, 16).
+    """Read a dictionary of arrays: trans (k, 3), rot (k, 3, 3), joint_angles (k, 16).
 
-    Postures are those before the fingers close.
+    The postures are those before the fingers close.
     """
-    where, found = str(path), _mapping(path, content)
+    where, arrays = str(path), _mapping(path, content)
     position, rotation, joints = (
-        numbers(where, found, name) for name in ("trans", "rot", "joint_angles")
+        numbers(where, arrays, name) for name in ("trans", "rot", "joint_angles")
     )
     return HandPoses(where, position, rotation, joints)
 
 
 def dexgraspnet(path: Path, content: Any) -> HandPoses:
-    """A list of dictionaries with qpos: translation, angles about fixed axes, joints by name.
+    """Read a list of dictionaries with qpos: translation, angles about fixed axes, joints.
 
     Their scale is that of the object's mesh.
     """
@@ -238,15 +245,17 @@ def dexgraspnet(path: Path, content: Any) -> HandPoses:
         qpos = entry.get("qpos") if isinstance(entry, dict) else None
         if not isinstance(qpos, dict):
             raise DescriptionError(f"{where}: qpos: missing, expected numbers by joint")
-        for key in (*TRANSLATION, *TURN):
+        for key in (*TRANSLATION_KEYS, *ROTATION_KEYS):
             if key not in qpos:
                 raise DescriptionError(f"{where}: qpos.{key}: missing, expected a number")
         if not names:
-            names = tuple(str(key) for key in qpos if key not in (*TRANSLATION, *TURN))
-        order = (*TRANSLATION, *TURN, *names)
+            names = tuple(
+                str(key) for key in qpos if key not in (*TRANSLATION_KEYS, *ROTATION_KEYS)
+            )
+        order = (*TRANSLATION_KEYS, *ROTATION_KEYS, *names)
         if set(qpos) != set(order):
-            odd = sorted(map(str, set(qpos) ^ set(order)))[0]
-            raise DescriptionError(f"{where}: qpos.{odd}: expected the joints of row 0")
+            unexpected = sorted(map(str, set(qpos) ^ set(order)))[0]
+            raise DescriptionError(f"{where}: qpos.{unexpected}: expected the joints of row 0")
         rows.append([_number(f"{where}: qpos.{key}", qpos[key]) for key in order])
         if "scale" in entry:
             scales.append(_scale(where, _number(f"{where}: scale", entry["scale"])))
@@ -256,7 +265,7 @@ def dexgraspnet(path: Path, content: Any) -> HandPoses:
     return HandPoses(
         str(path),
         values[:, :3],
-        of_fixed_axes(values[:, 3:6]),
+        rotations_from_rpy(values[:, 3:6]),
         values[:, 6:],
         names,
         scales=tuple(scales),
@@ -264,44 +273,44 @@ def dexgraspnet(path: Path, content: Any) -> HandPoses:
 
 
 def bodex(path: Path, content: Any) -> HandPoses:
-    """A dictionary: robot_pose (1, k, stages, 7 + joints), the pose as x y z, w x y z."""
-    where, found = str(path), _mapping(path, content)
-    rows = numbers(where, found, "robot_pose")
+    """Read robot_pose (1, k, stages, 7 + joints) of a dictionary, poses as x y z, w x y z."""
+    where, arrays = str(path), _mapping(path, content)
+    rows = numbers(where, arrays, "robot_pose")
     if rows.ndim != 4 or rows.shape[0] != 1 or rows.shape[2] < 2 or rows.shape[3] <= 7:
         raise DescriptionError(
             f"{path}: robot_pose: found shape {rows.shape}, expected (1, k, stages, 7 + joints)"
         )
     stages = {name: rows[0, :, i] for i, name in enumerate(STAGES[: rows.shape[2]])}
-    return _of_stages(where, found, stages)
+    return _poses_of_stages(where, arrays, stages)
 
 
 def dexgraspbench(path: Path, content: Any) -> HandPoses:
-    """A dictionary: grasp_qpos (7 + joints) or (k, 7 + joints), the pose as x y z, w x y z.
+    """Read grasp_qpos (7 + joints) or (k, 7 + joints) of a dictionary, poses as x y z, w x y z.
 
-    Beside it, in the same shape, pregrasp_qpos and squeeze_qpos.
+    pregrasp_qpos and squeeze_qpos have the same shape.
     """
-    where, found = str(path), _mapping(path, content)
+    where, arrays = str(path), _mapping(path, content)
     stages: dict[str, Array] = {}
     for name in STAGES:
         key = f"{name}_qpos"
-        if key not in found and name != "grasp":
+        if key not in arrays and name != "grasp":
             continue
-        rows = np.atleast_2d(numbers(where, found, key))
+        rows = np.atleast_2d(numbers(where, arrays, key))
         if rows.ndim != 2 or rows.shape[1] <= 7:
             raise DescriptionError(
                 f"{path}: {key}: found shape {rows.shape}, expected (k, 7 + joints)"
             )
         stages[name] = rows
-    return _of_stages(where, found, stages)
+    return _poses_of_stages(where, arrays, stages)
 
 
 def multidex(path: Path, content: Any) -> HandPoses:
-    """A dictionary of torch: metadata, a list of (q, object, hand), where the file has several.
+    """Read metadata, a list of (q, object, hand), of a dictionary of torch.
 
-    q: translation (3), the first two columns of the rotation (6), joints in the order of the hand.
+    q: translation (3), first two columns of the rotation (6), joints in the order of the hand.
     """
-    where, found = str(path), _mapping(path, content)
-    info, entries = found.get("info"), found.get("metadata")
+    where, contents = str(path), _mapping(path, content)
+    info, entries = contents.get("info"), contents.get("metadata")
     if isinstance(info, dict) and info and all(isinstance(hand, dict) for hand in info.values()):
         hands = ", ".join(str(hand) for hand in info)
         raise DescriptionError(
@@ -317,15 +326,15 @@ def multidex(path: Path, content: Any) -> HandPoses:
         if not isinstance(entry, (tuple, list)) or len(entry) < 2 or type(entry[1]) is not str:
             raise DescriptionError(f"{row}: expected q and the name of its object")
         q = numbers(row, {"q": entry[0]}, "q")
-        sound = q.ndim == 1 and 9 < len(q) <= LIMITS.grasp_numbers
-        if not sound or (rows and len(q) != len(rows[0])):
+        is_valid = q.ndim == 1 and 9 < len(q) <= LIMITS.grasp_numbers
+        if not is_valid or (rows and len(q) != len(rows[0])):
             expected = f"({len(rows[0])},)" if rows else "(9 + joints,)"
             raise DescriptionError(f"{row}: q: found shape {q.shape}, expected {expected}")
         rows.append(q)
         objects.append(entry[1])
     values = np.stack(rows)
-    turns = of_two_columns(values[:, 3:9])
-    return HandPoses(where, values[:, :3], turns, values[:, 9:], objects=tuple(objects))
+    rotations = rotations_from_columns(values[:, 3:9])
+    return HandPoses(where, values[:, :3], rotations, values[:, 9:], objects=tuple(objects))
 
 
 LAYOUTS: Mapping[str, Callable[[Path, Any], HandPoses]] = {
@@ -336,38 +345,38 @@ LAYOUTS: Mapping[str, Callable[[Path, Any], HandPoses]] = {
     "dexonomy": dexgraspbench,
     "multidex": multidex,
 }
-"""Of npy files and those of torch, by name."""
+"""Readers of layouts in npy and torch files, by name."""
 
 READERS: Mapping[str, Callable[[Path], Any]] = {
     ".npy": read_npy,
     ".pt": read_torch,
     ".pth": read_torch,
 }
-"""What reads a file, by its ending."""
+"""Readers of files by suffix."""
 
-MARKS = {
+LAYOUT_KEYS = {
     "joint_angles": "getagrip",
     "robot_pose": "bodex",
     "grasp_qpos": "dexgraspbench",
     "metadata": "multidex",
 }
-"""Keys that tell layouts from one another."""
+"""Layouts by the key that identifies them."""
 
 
 def read_layout(path: Path, layout: str | None) -> tuple[HandPoses, str]:
-    """Grasps of a file that ends as one of `READERS`, and their layout.
+    """Read the grasps of a file with a suffix in `READERS`, and their layout.
 
     Args:
-        path: The file.
-        layout: One of `LAYOUTS`; None: told from the file's keys.
+        path: Path of the file.
+        layout: One of `LAYOUTS`; None: recognised from the keys of the file.
 
     Raises:
-        DescriptionError: It is not of the layout, or of none.
+        DescriptionError: The file does not have the layout, or an unknown one.
     """
     content = READERS[path.suffix.lower()](path)
     if layout is None:
         keys = content if isinstance(content, dict) else {}
-        layout = next((found for mark, found in MARKS.items() if mark in keys), None)
+        layout = next((name for key, name in LAYOUT_KEYS.items() if key in keys), None)
         if isinstance(content, list) or "qpos" in keys:
             layout = "dexgraspnet"
     if layout is None:
@@ -375,16 +384,16 @@ def read_layout(path: Path, layout: str | None) -> tuple[HandPoses, str]:
     return LAYOUTS[layout](path, content), layout
 
 
-def numbers(where: str, found: Mapping[str, Any], key: str) -> Array:
-    """An array of a file.
+def numbers(where: str, contents: Mapping[str, Any], key: str) -> Array:
+    """Return an array of a file.
 
     Raises:
-        DescriptionError: There is none of that name, or one of other things than numbers.
+        DescriptionError: There is no array of that name, or it is not numeric.
     """
-    if key not in found:
-        known = ", ".join(str(name) for name in found)
-        raise DescriptionError(f"{where}: {key}: missing, expected an array; found {known}")
-    value = found[key]
+    if key not in contents:
+        names = ", ".join(str(name) for name in contents)
+        raise DescriptionError(f"{where}: {key}: missing, expected an array; found {names}")
+    value = contents[key]
     if isinstance(value, Packed):
         value = value.value
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
@@ -395,7 +404,7 @@ def numbers(where: str, found: Mapping[str, Any], key: str) -> Array:
 
 def _mapping(path: Path, content: Any) -> Mapping[str, Any]:
     if not isinstance(content, dict):
-        raise DescriptionError(f"{path}: found no dictionary of arrays, expected one")
+        raise DescriptionError(f"{path}: expected a dictionary of arrays")
     return content
 
 
@@ -407,51 +416,53 @@ def _number(where: str, value: Any) -> float:
     return float(value)
 
 
-def _object_pose(where: str, found: Mapping[str, Any]) -> Array:
-    """(4, 4) where the object is in the frame of the poses; where none is said, in its origin."""
-    if "obj_pose" not in found:
+def _object_pose(where: str, contents: Mapping[str, Any]) -> Array:
+    """Return the pose (4, 4) of the object in the frame of the poses; identity if not stated."""
+    if "obj_pose" not in contents:
         return np.eye(4)
-    row = numbers(where, found, "obj_pose").reshape(-1)
+    row = numbers(where, contents, "obj_pose").reshape(-1)
     if row.shape != (7,):
         raise DescriptionError(f"{where}: obj_pose: found {row.size} numbers, expected 7")
-    held = HandPoses(
-        f"{where}: obj_pose",
-        row[None, :3],
-        rotations_from_quaternions(row[None, 3:]),
-        np.zeros((1, 0)),
+    pose = HandPoses(
+        f"{where}: obj_pose", row[None, :3], rotations_from_quaternions(row[None, 3:]), np.zeros((1, 0))
     )
-    if held.faults:
-        raise InvalidPoseError(f"{where}: obj_pose: {held.faults[0]}")
-    return held.poses[0]
+    if pose.faults:
+        raise InvalidPoseError(f"{where}: obj_pose: {pose.faults[0]}")
+    return pose.poses[0]
 
 
-def _of_stages(where: str, found: Mapping[str, Any], stages: Mapping[str, Array]) -> HandPoses:
-    """Rows (k, 7 + joints) of the stages, with poses as x y z, w x y z."""
+def _poses_of_stages(
+    where: str, contents: Mapping[str, Any], stages: Mapping[str, Array]
+) -> HandPoses:
+    """Return hand poses from rows (k, 7 + joints) of the stages, poses as x y z, w x y z."""
     shape = stages["grasp"].shape
-    back = inverse(_object_pose(where, found))
-    made: dict[str, HandPoses] = {}
+    object_inverse = inverse(_object_pose(where, contents))
+    by_stage: dict[str, HandPoses] = {}
     for name, rows in stages.items():
         if rows.shape != shape:
             raise DescriptionError(f"{where}: {name}: found shape {rows.shape}, expected {shape}")
-        given = HandPoses(where, rows[:, :3], rotations_from_quaternions(rows[:, 3:7]), rows[:, 7:])
-        poses = back @ given.poses
-        made[name] = replace(given, position=poses[:, :3, 3], rotation=poses[:, :3, :3])
-    scales = _scales(where, found, len(stages["grasp"]))
+        hand_poses = HandPoses(where, rows[:, :3], rotations_from_quaternions(rows[:, 3:7]), rows[:, 7:])
+        poses = object_inverse @ hand_poses.poses
+        by_stage[name] = replace(hand_poses, position=poses[:, :3, 3], rotation=poses[:, :3, :3])
+    scales = _scales(where, contents, len(stages["grasp"]))
     return replace(
-        made["grasp"], scales=scales, pregrasp=made.get("pregrasp"), squeeze=made.get("squeeze")
+        by_stage["grasp"],
+        scales=scales,
+        pregrasp=by_stage.get("pregrasp"),
+        squeeze=by_stage.get("squeeze"),
     )
 
 
-def _scales(where: str, found: Mapping[str, Any], count: int) -> tuple[float, ...]:
-    """Of the object of each grasp; none where none is said."""
-    if "obj_scale" not in found:
+def _scales(where: str, contents: Mapping[str, Any], count: int) -> tuple[float, ...]:
+    """Return the scale of the object of each grasp; empty if not stated."""
+    if "obj_scale" not in contents:
         return ()
-    value = found["obj_scale"]
+    value = contents["obj_scale"]
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         value = np.array([value], dtype=float)
     values = numbers(where, {"obj_scale": value}, "obj_scale").reshape(-1)
     if len(values) == count:
-        return tuple(_scale(where, one) for one in values)
+        return tuple(_scale(where, value) for value in values)
     if not len(values) or (values != values[0]).any():
         raise DescriptionError(
             f"{where}: obj_scale: found {len(values)} numbers, expected one or {count}"

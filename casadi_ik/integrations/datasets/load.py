@@ -1,4 +1,4 @@
-"""Candidates for `Solver.choose` from any file: grasp files, targets, data sets, tables."""
+"""Reader of candidates for `Solver.choose`: grasp files, target files, data sets, tables."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from casadi_ik.integrations.datasets.layouts import (
     READERS,
     Convention,
     convention_for,
-    of_robot,
+    convention_of_robot,
     read_layout,
 )
 from casadi_ik.integrations.datasets.parallel import (
@@ -38,12 +38,12 @@ from casadi_ik.integrations.datasets.parallel import (
     parallel_layout,
 )
 from casadi_ik.integrations.datasets.postures import (
-    FIT,
+    POSTURE_FIT,
     HandPoses,
     HandPostures,
     hand_postures,
-    of_fixed_axes,
-    palms_of,
+    palms_and_pads,
+    rotations_from_rpy,
 )
 from casadi_ik.kinematics.arm_hand import ArmHand, load_robot
 from casadi_ik.kinematics.contacts import NAMES
@@ -54,27 +54,27 @@ from casadi_ik.model.targets import DIRECTIONS_KEY
 from casadi_ik.solve.target_files import TargetFile, polars_module
 
 Invalid = Literal["error", "drop", "clip"]
-"""What becomes of a row that the hand cannot take."""
+"""Treatment of rows that the hand cannot take."""
 
-INVALIDS = ("error", "drop", "clip")
+INVALID_CHOICES = ("error", "drop", "clip")
 
 
 @dataclass(frozen=True)
-class Reading:
-    """How candidates are read.
+class ReadingSettings:
+    """Settings of the reader.
 
     Attributes:
-        noticed: A fingertip that was shifted less than this [m] counts as where it was.
-        block: Rows of targets that are read at once.
-        touching: A pad that is nearer to the object than this [m] touches it.
+        min_shift: Smallest shift of a fingertip that is reported [m].
+        block: Number of rows of targets that are read at once.
+        contact_distance: Largest distance of a pad that touches the object [m].
     """
 
-    noticed: float = 1e-4
+    min_shift: float = 1e-4
     block: int = 4096
-    touching: float = 0.01
+    contact_distance: float = 0.01
 
 
-READING = Reading()
+READING_SETTINGS = ReadingSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,13 +83,12 @@ class Candidates(Sequence[Grasp]):
 
     Attributes:
         grasps: The grasps.
-        rows: (k,) their numbers in the file.
-        dropped: How many rows of the file were left out, as they are invalid.
-        clipped: How many have a joint that was beyond its limits, and is at them now.
-        shift: (k,) how far the fingertip that is moved farthest is from where the file has it [m],
-            in the frame of the palm: by clipping, or since joints are coupled that are free in the
-            data.
-        scale: By what factor the object is larger than its mesh; None: the file does not say.
+        rows: (k,) row numbers in the file.
+        dropped: Number of invalid rows that were dropped.
+        clipped: Number of rows with a joint that was clipped to its limits.
+        shift: (k,) largest shift of a fingertip against the file in the palm frame [m]: by
+            clipping, or by couplings of joints that are free in the data.
+        scale: Scale of the object relative to its mesh; None if the file does not state it.
 
     Example:
         >>> points, normals = robot.contacts(robot.random(np.random.default_rng(2), 20))
@@ -121,120 +120,141 @@ class Candidates(Sequence[Grasp]):
         return iter(self.grasps)
 
     @overload
-    def __getitem__(self, place: int) -> Grasp: ...
+    def __getitem__(self, index: int) -> Grasp: ...
 
     @overload
-    def __getitem__(self, place: slice) -> tuple[Grasp, ...]: ...
+    def __getitem__(self, index: slice) -> tuple[Grasp, ...]: ...
 
-    def __getitem__(self, place: int | slice) -> Grasp | tuple[Grasp, ...]:
-        return self.grasps[place]
+    def __getitem__(self, index: int | slice) -> Grasp | tuple[Grasp, ...]:
+        return self.grasps[index]
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What became of rows that could not be taken as they are, in short lines."""
-        whole, found = len(self) + self.dropped, []
+        """Notes on dropped, clipped and shifted rows."""
+        total, notes = len(self) + self.dropped, []
         if self.dropped:
-            found.append(f"{self.dropped} of {whole} rows left out: invalid")
+            notes.append(f"{self.dropped} of {total} rows dropped: invalid")
         if self.clipped:
-            found.append(f"{self.clipped} of {whole} rows have joints put at their limits")
-        moved = 1e3 * self.shift[self.shift > READING.noticed]
-        if len(moved):
-            found.append(
-                f"fingertips of {len(moved)} candidates shifted, as the hand's joints are limited "
-                f"and coupled: median {np.median(moved):.1f} mm, at most {moved.max():.1f} mm"
+            notes.append(f"{self.clipped} of {total} rows have joints clipped to their limits")
+        shifts = 1e3 * self.shift[self.shift > READING_SETTINGS.min_shift]
+        if len(shifts):
+            notes.append(
+                f"fingertips of {len(shifts)} candidates shifted, as the hand's joints are limited "
+                f"and coupled: median {np.median(shifts):.1f} mm, at most {shifts.max():.1f} mm"
             )
-        return tuple(found)
+        return tuple(notes)
 
     def __str__(self) -> str:
         size = "" if self.scale is None else f" of an object of scale {self.scale:g}"
         return "\n".join([f"{len(self)} candidates{size}", *(f"  {note}" for note in self.notes)])
 
 
-def kept_rows(
+def valid_rows(
     where: str,
     rows: Sequence[int],
     faults: Mapping[int, str],
-    beyond: Mapping[int, str],
+    out_of_limits: Mapping[int, str],
     invalid: Invalid,
 ) -> NDArray[np.intp]:
-    """Places of the rows that are taken.
+    """Return the indices of the valid rows.
 
     Args:
         where: File, for messages.
-        rows: Their numbers in the file.
-        faults: What is wrong with a row, by its number.
-        beyond: What is beyond its limits in a row, by its number.
-        invalid: What becomes of these: "clip" takes rows that are beyond limits only.
+        rows: Row numbers in the file.
+        faults: Problems by row number.
+        out_of_limits: Violated limits by row number.
+        invalid: Treatment of invalid rows; "clip" accepts rows that only violate limits.
 
     Raises:
-        DescriptionError: There are invalid rows that are not to be left out, or none is left.
+        DescriptionError: There are invalid rows that may not be dropped, or no valid row.
     """
-    bad = {**({} if invalid == "clip" else beyond), **faults}
-    if bad and (invalid != "drop" or len(bad) == len(rows)):
-        first = min(bad)
-        clips = invalid == "error" and set(beyond) - set(faults)
-        more = ", 'clip' puts joints at their limits" if clips else ""
-        wayout = f"; invalid='drop' leaves such rows out{more} (--invalid)"
-        kind = InvalidPoseError if bad[first].startswith("rotation") else DescriptionError
-        raise kind(
-            f"{where}: row {first}: {bad[first]}; {len(bad)} of {len(rows)} rows are invalid"
-            f"{'' if invalid == 'drop' else wayout}"
+    invalid_rows = {**({} if invalid == "clip" else out_of_limits), **faults}
+    if invalid_rows and (invalid != "drop" or len(invalid_rows) == len(rows)):
+        first = min(invalid_rows)
+        clip_would_help = invalid == "error" and set(out_of_limits) - set(faults)
+        clip_hint = ", 'clip' clips joints to their limits" if clip_would_help else ""
+        hint = f"; invalid='drop' drops such rows{clip_hint} (--invalid)"
+        error_type = (
+            InvalidPoseError if invalid_rows[first].startswith("rotation") else DescriptionError
         )
-    return np.array([i for i, row in enumerate(rows) if row not in bad], dtype=np.intp)
+        raise error_type(
+            f"{where}: row {first}: {invalid_rows[first]}; "
+            f"{len(invalid_rows)} of {len(rows)} rows are invalid"
+            f"{'' if invalid == 'drop' else hint}"
+        )
+    return np.array([i for i, row in enumerate(rows) if row not in invalid_rows], dtype=np.intp)
 
 
-PLACE = ("x", "y", "z")
-QUATERNION = ("qw", "qx", "qy", "qz")
-ANGLES = ("roll", "pitch", "yaw")
+POSITION_COLUMNS = ("x", "y", "z")
+QUATERNION_COLUMNS = ("qw", "qx", "qy", "qz")
+ANGLE_COLUMNS = ("roll", "pitch", "yaw")
 
-SUFFIXES = (".csv", ".npz", ".parquet")
+TABLE_SUFFIXES = (".csv", ".npz", ".parquet")
 
-NOT_JOINTS = ("index", "id", "name", "object", "label", "score", "quality", "confidence", "success")
-"""Columns of a table that are ignored, in any case of letters."""
+IGNORED_COLUMNS = (
+    "index",
+    "id",
+    "name",
+    "object",
+    "label",
+    "score",
+    "quality",
+    "confidence",
+    "success",
+)
+"""Columns of a table that are ignored, regardless of case."""
 
 
 def _is_ignored(column: str) -> bool:
     """Return whether a column is a note on a grasp, or the index that pandas writes."""
     column = column.strip().lower()
-    return column in ("", *NOT_JOINTS) or column.startswith(("unnamed:", "__index_level_"))
+    return column in ("", *IGNORED_COLUMNS) or column.startswith(("unnamed:", "__index_level_"))
 
 
 def read_table(path: Path) -> HandPoses:
-    """Grasps of a table: x y z [m], qw qx qy qz or roll pitch yaw [rad], then joints by name.
+    """Read a table of grasps: x y z [m], qw qx qy qz or roll pitch yaw [rad], joints by name.
 
     Raises:
-        DescriptionError: It is damaged, columns are missing, or not of numbers.
-        UnsupportedError: Parquet, and polars is not installed.
+        DescriptionError: The table is damaged, or columns are missing or not numeric.
+        UnsupportedError: The file is Parquet, and polars is not installed.
     """
     readers: Mapping[str, Callable[[Path], Mapping[str, Array]]]
-    readers = dict(zip(map(str, SUFFIXES), (_of_csv, _of_npz, _of_parquet), strict=True))
+    readers = dict(
+        zip(map(str, TABLE_SUFFIXES), (_read_csv, _read_npz_table, _read_parquet), strict=True)
+    )
     with os_errors(f"{path}: cannot be read", DescriptionError):
         if path.suffix.lower() == ".csv":
             check_unpacked_size(str(path), path.stat().st_size, LIMITS.table_bytes)
         columns = readers[path.suffix.lower()](path)
-    turned = QUATERNION if QUATERNION[0] in columns else ANGLES
-    for name in (*PLACE, *turned):
+    rotation_columns = QUATERNION_COLUMNS if QUATERNION_COLUMNS[0] in columns else ANGLE_COLUMNS
+    for name in (*POSITION_COLUMNS, *rotation_columns):
         if name not in columns:
             raise DescriptionError(
                 f"{path}: {name}: missing, expected columns x y z, qw qx qy qz or roll pitch yaw, "
                 f"and joints; found {', '.join(columns)}"
             )
-    names = tuple(name for name in columns if name not in (*PLACE, *turned))
-    count = len(columns[PLACE[0]])
+    names = tuple(name for name in columns if name not in (*POSITION_COLUMNS, *rotation_columns))
+    count = len(columns[POSITION_COLUMNS[0]])
 
-    def block(of: tuple[str, ...]) -> Array:
-        return np.stack([columns[name] for name in of], axis=1) if of else np.zeros((count, 0))
+    def block(column_names: tuple[str, ...]) -> Array:
+        return (
+            np.stack([columns[name] for name in column_names], axis=1)
+            if column_names
+            else np.zeros((count, 0))
+        )
 
-    rotate = rotations_from_quaternions if turned is QUATERNION else of_fixed_axes
-    return HandPoses(str(path), block(PLACE), rotate(block(turned)), block(names), names)
+    rotate = rotations_from_quaternions if rotation_columns is QUATERNION_COLUMNS else rotations_from_rpy
+    return HandPoses(
+        str(path), block(POSITION_COLUMNS), rotate(block(rotation_columns)), block(names), names
+    )
 
 
-def _of_csv(path: Path) -> dict[str, Array]:
+def _read_csv(path: Path) -> dict[str, Array]:
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             names, *rows = [row for row in csv.reader(file) if row] or [[]]
     except (csv.Error, UnicodeDecodeError) as error:
-        raise DescriptionError(f"{path}: no CSV file: {error}") from error
+        raise DescriptionError(f"{path}: not a CSV file: {error}") from error
     columns = {j: name.strip() for j, name in enumerate(names) if not _is_ignored(name)}
     if len(set(columns.values())) < len(columns):
         raise DescriptionError(f"{path}: found columns of the same name")
@@ -246,7 +266,7 @@ def _of_csv(path: Path) -> dict[str, Array]:
             )
         for j, name in columns.items():
             try:
-                # An empty cell is a number that is missing; the row is invalid.
+                # An empty cell is a missing number, which makes the row invalid.
                 values[name][i] = float(row[j].strip() or "nan")
             except ValueError:
                 raise DescriptionError(
@@ -255,7 +275,7 @@ def _of_csv(path: Path) -> dict[str, Array]:
     return values
 
 
-def _of_npz(path: Path) -> dict[str, Array]:
+def _read_npz_table(path: Path) -> dict[str, Array]:
     columns: dict[str, Array] = {}
     for name, array in read_npz(path, LIMITS.table_bytes).items():
         if _is_ignored(name):
@@ -270,7 +290,7 @@ def _of_npz(path: Path) -> dict[str, Array]:
     return columns
 
 
-def _of_parquet(path: Path) -> Mapping[str, Array]:
+def _read_parquet(path: Path) -> Mapping[str, Array]:
     pl = polars_module()
     try:
         scanned = pl.scan_parquet(path)
@@ -286,20 +306,20 @@ def _of_parquet(path: Path) -> Mapping[str, Array]:
         check_unpacked_size(str(path), 8 * len(schema) * count, LIMITS.table_bytes)
         frame = scanned.select(pl.all().cast(pl.Float64).fill_null(np.nan)).collect()
     except (pl.exceptions.PolarsError, OSError) as error:
-        raise DescriptionError(f"{path}: no Parquet file: {error}") from error
+        raise DescriptionError(f"{path}: not a Parquet file: {error}") from error
     return {name: frame[name].to_numpy() for name in frame.columns}
 
 
 Take = Literal["palm", "contacts"]
-"""What a pose and posture of a hand are taken for."""
+"""Use of a hand's pose and posture as a target."""
 
-TAKES = ("palm", "contacts")
+TAKE_CHOICES = ("palm", "contacts")
 
-TABLE = "table"
-"""The layout of files with named columns."""
+TABLE_LAYOUT = "table"
+"""Layout of files with named columns."""
 
-LAYOUT_NAMES = (*LAYOUTS, ISAAC_GRASP, *PARALLEL, TABLE)
-"""All layouts of files of grasps."""
+LAYOUT_NAMES = (*LAYOUTS, ISAAC_GRASP, *PARALLEL, TABLE_LAYOUT)
+"""Names of all layouts of grasp files."""
 
 
 def load_candidates(
@@ -316,44 +336,43 @@ def load_candidates(
 ) -> Candidates:
     """Load the grasps of a file or a folder for `Solver.choose`.
 
-    Where the data have joints free that are coupled in the hand, the posture is the one whose
-    fingertips are nearest to those of the data; how far they are away is `Candidates.shift`.
+    If joints that are free in the data are coupled in the hand, the posture is the one whose
+    fingertips are nearest to those of the data; `Candidates.shift` is their distance.
 
     Args:
         path: A YAML file with one grasp or a list (``candidates:``); a folder of such files; an npz
             file with points and normals, as `Solver.solve_batch` takes them; an npy or pt file of a
             data set; a table (CSV, npz, Parquet) with columns x y z, qw qx qy qz or roll pitch yaw,
-            and the robot's joints by name, the pose that of its palm frame; grasps of a parallel
-            gripper (isaac_grasp, ACRONYM, GraspNet, 4 x 4 poses with widths). Nothing in a file is
-            run.
+            and the robot's joints by name, with the pose of the palm frame; grasps of a parallel
+            gripper (isaac_grasp, ACRONYM, GraspNet, 4 x 4 poses with widths). No code in a file is
+            executed.
         robot: The robot, or its name; its hand must be that of the data.
-        layout: One of `LAYOUT_NAMES`; None: told from the file.
-        hand: How the data name joints and where they have the hand's frame: one of
-            ``models/datasets``, or a file of the same kind. None: the shipped one that fits.
-        object_pose: (4, 4) where the object is in the base frame; None: grasps stay in its frame.
-        take: What a palm and a posture are taken for. "palm": the palm is given and the hand too,
-            only the arm is looked for. "contacts": the fingertips are asked for, where they are.
-        grasped: The object, its shipped name, or the path of its file or mesh (several meshes are
-            one body): of "contacts" only pads nearer to its surface than 10 mm count, and they are
-            where the surface is; `Grasp.object` names it for collisions. Where the file says by
-            what `scale` the object is larger than its mesh, a mesh is.
-        of: Whose grasps, by the file's own name, where a file has those of several objects.
-        scale: Which size of the object, where a file has grasps of several.
-        invalid: What becomes of a row of a data set or table with a joint beyond its limits, with
-            numbers that are none, or of whose fingertips none touches the object. "error": the
-            file is refused, "drop": the row is left out, "clip": joints are put at their limits,
-            and what else is wrong is refused.
+        layout: One of `LAYOUT_NAMES`; None: recognised from the file.
+        hand: Convention of joint names and hand frame: a name in ``models/datasets``, or a file of
+            the same format; None: the built-in convention that fits.
+        object_pose: (4, 4) pose of the object in the base frame; None: grasps stay in its frame.
+        take: "palm": the target is the palm pose with the posture, so that only the arm is solved.
+            "contacts": the target is the set of fingertip contacts.
+        grasped: The object, its built-in name, or the path of its file or mesh (several meshes are
+            one body). For "contacts", only pads within 10 mm of its surface count, and contacts are
+            projected onto it; `Grasp.object` names it for collisions. A mesh is scaled if the file
+            states a `scale`.
+        of: Name of the object in the file, if the file has grasps of several objects.
+        scale: Scale of the object, if the file has grasps of several sizes.
+        invalid: Treatment of rows of a data set or table with a joint beyond its limits, invalid
+            numbers, or no fingertip on the object. "error": the file is refused; "drop": the row is
+            dropped; "clip": joints are clipped to their limits, and other problems are refused.
 
     Returns:
-        The grasps in the order of the file, at least one; how many were left out or clipped, and
-        how far fingertips were shifted.
+        The grasps in the order of the file, at least one, with counts of dropped and clipped rows
+        and the shifts of fingertips.
 
     Raises:
         DescriptionError: The file is missing or malformed, has invalid rows, or grasps of several
             objects or sizes; the message names file, row and key.
-        UnsupportedError: The robot has not the hand of the data.
-        UnknownNameError: No such robot, layout, convention or object.
-        InputError: No rigid object_pose, or another word than those of `take` and `invalid`.
+        UnsupportedError: The robot does not have the hand of the data.
+        UnknownNameError: A robot, layout, convention or object of that name does not exist.
+        InputError: object_pose is not rigid, or `take` or `invalid` has another value.
 
     Example:
         >>> points, normals = robot.contacts(robot.random(np.random.default_rng(2), 20))
@@ -362,29 +381,33 @@ def load_candidates(
         >>> ranked.candidates, len(ranked)
         (20, 3)
     """
-    held = load_robot(robot) if isinstance(robot, str) else robot
+    arm_hand = load_robot(robot) if isinstance(robot, str) else robot
     file = Path(path)
     if layout is not None and layout not in LAYOUT_NAMES:
-        known = ", ".join(LAYOUT_NAMES)
-        raise UnknownNameError(f"layout: found {layout!r}, expected one of {known}")
-    if take not in TAKES:
-        raise InputError(f"take: found {take!r}, expected one of {', '.join(TAKES)}")
-    if invalid not in INVALIDS:
-        raise InputError(f"invalid: found {invalid!r}, expected one of {', '.join(INVALIDS)}")
+        expected = ", ".join(LAYOUT_NAMES)
+        raise UnknownNameError(f"layout: found {layout!r}, expected one of {expected}")
+    if take not in TAKE_CHOICES:
+        raise InputError(f"take: found {take!r}, expected one of {', '.join(TAKE_CHOICES)}")
+    if invalid not in INVALID_CHOICES:
+        raise InputError(
+            f"invalid: found {invalid!r}, expected one of {', '.join(INVALID_CHOICES)}"
+        )
     if not file.exists():
         raise DescriptionError(f"{file}: no such file or folder, expected candidates")
     if isinstance(grasped, Path):
         grasped = str(grasped)
     elif not (grasped is None or isinstance(grasped, (str, GraspObject))):
         grasped = ",".join(map(str, grasped))
-    found = _loaded(file, held, layout, hand, take, grasped, of, scale, invalid)
-    _refuse_other_units(file, found)
+    candidates = _load(file, arm_hand, layout, hand, take, grasped, of, scale, invalid)
+    _check_units(file, candidates)
     if object_pose is None:
-        return found
-    return replace(found, grasps=tuple(g.in_object_frame().at(object_pose) for g in found))
+        return candidates
+    return replace(
+        candidates, grasps=tuple(g.in_object_frame().at(object_pose) for g in candidates)
+    )
 
 
-def _loaded(
+def _load(
     path: Path,
     robot: ArmHand,
     layout: str | None,
@@ -395,37 +418,45 @@ def _loaded(
     scale: float | None,
     invalid: Invalid,
 ) -> Candidates:
-    kind = path.suffix.lower()
-    jaws = layout or parallel_layout(path)
-    if jaws == ISAAC_GRASP or jaws in PARALLEL:
+    suffix = path.suffix.lower()
+    gripper_layout = layout or parallel_layout(path)
+    if gripper_layout == ISAAC_GRASP or gripper_layout in PARALLEL:
         if of is not None:
             raise InputError(f"of: found {of!r}, but {path.name} has grasps of one object")
-        if jaws == ISAAC_GRASP:
+        if gripper_layout == ISAAC_GRASP:
             convention = convention_for(robot, ISAAC_GRASP, hand)
-            given = isaac_grasp(path)
+            poses = isaac_grasp(path)
         else:
-            given = for_gripper(PARALLEL[jaws](path), robot, clip=invalid == "clip")
-            convention = of_robot(robot, given.names)
-        return _of_hand(given.of_scale(scale), robot, convention, take, grasped, invalid)
-    if kind in READERS and layout != TABLE:
-        given, found = read_layout(path, layout)
-        one = given.of(of).of_scale(scale)
-        return _of_hand(one, robot, convention_for(robot, found, hand), take, grasped, invalid)
+            poses = for_gripper(PARALLEL[gripper_layout](path), robot, clip=invalid == "clip")
+            convention = convention_of_robot(robot, poses.names)
+        return _candidates_of_hand(poses.of_scale(scale), robot, convention, take, grasped, invalid)
+    if suffix in READERS and layout != TABLE_LAYOUT:
+        poses, found_layout = read_layout(path, layout)
+        selected = poses.of(of).of_scale(scale)
+        return _candidates_of_hand(
+            selected, robot, convention_for(robot, found_layout, hand), take, grasped, invalid
+        )
     if scale is not None:
-        raise InputError(f"scale: found {scale:g}, but {path.name} says of no size")
+        raise InputError(f"scale: found {scale:g}, but {path.name} states no sizes")
     if of is not None:
         raise InputError(f"of: found {of!r}, but {path.name} has grasps of one object")
-    if kind in SUFFIXES and (layout == TABLE or (layout is None and not _has_targets(path))):
-        given = read_table(path)
-        known = (*robot.description.joint_names, *robot.actuators)
-        names = tuple(name for name in given.names if name in known)
-        own = _own(robot, names) if hand is None else convention_for(robot, TABLE, hand)
-        return _of_hand(given, robot, own, take, grasped, invalid)
+    if suffix in TABLE_SUFFIXES and (
+        layout == TABLE_LAYOUT or (layout is None and not _has_targets(path))
+    ):
+        poses = read_table(path)
+        robot_names = (*robot.description.joint_names, *robot.actuators)
+        names = tuple(name for name in poses.names if name in robot_names)
+        convention = (
+            _own_convention(robot, names)
+            if hand is None
+            else convention_for(robot, TABLE_LAYOUT, hand)
+        )
+        return _candidates_of_hand(poses, robot, convention, take, grasped, invalid)
     if layout is not None:
-        expected = ", ".join(READERS if layout != TABLE else SUFFIXES)
+        expected = ", ".join(READERS if layout != TABLE_LAYOUT else TABLE_SUFFIXES)
         raise DescriptionError(f"{path}: found no {expected} file, expected one of {layout}")
-    if kind == ".npz":
-        return Candidates(tuple(_of_targets(path, robot.fingers)))
+    if suffix == ".npz":
+        return Candidates(tuple(_grasps_of_targets(path, robot.fingers)))
     grasps = load_grasp_files(path)
     for grasp in grasps:
         try:
@@ -435,21 +466,21 @@ def _loaded(
     return Candidates(grasps)
 
 
-def _refuse_other_units(path: Path, grasps: Sequence[Grasp]) -> None:
+def _check_units(path: Path, grasps: Sequence[Grasp]) -> None:
     for grasp in grasps:
         for finger, contact in grasp.contacts.items():
-            away = 0.0 if contact.point is None else float(np.linalg.norm(contact.point))
-            if away > FIT.far:
+            distance = 0.0 if contact.point is None else float(np.linalg.norm(contact.point))
+            if distance > POSTURE_FIT.max_distance:
                 raise DescriptionError(
-                    f"{path}: {grasp.name}: {finger}: point: found {away:.4g} m away, expected at "
-                    f"most {FIT.far:g} m (numbers in mm?)"
+                    f"{path}: {grasp.name}: {finger}: point: found {distance:.4g} m away, "
+                    f"expected at most {POSTURE_FIT.max_distance:g} m (numbers in mm?)"
                 )
 
 
-def _own(robot: ArmHand, names: tuple[str, ...]) -> Convention:
-    """A table's joints are called as the robot's; those of the fingers' motors have to be there."""
+def _own_convention(robot: ArmHand, names: tuple[str, ...]) -> Convention:
+    """Return the convention of the robot's own joint names; the finger motors are required."""
     motors = robot.description.finger_motors
-    return of_robot(robot, (*names, *(name for name in motors if name not in names)))
+    return convention_of_robot(robot, (*names, *(name for name in motors if name not in names)))
 
 
 def _has_targets(path: Path) -> bool:
@@ -459,71 +490,77 @@ def _has_targets(path: Path) -> bool:
         with np.load(path, allow_pickle=False) as archive:
             return "points" in archive.files
     except (OSError, ValueError, EOFError, KeyError):
-        return True  # whose reader says best what is wrong
+        return True  # the reader of targets reports the problem
 
 
-def _of_hand(
-    given: HandPoses,
+def _candidates_of_hand(
+    poses: HandPoses,
     robot: ArmHand,
     convention: Convention,
     take: Take,
     grasped: str | GraspObject | None,
     invalid: Invalid,
 ) -> Candidates:
-    """Grasps of hands whose poses and joints are given in the object's frame."""
-    thing, name = _thing(grasped, given.scales)
-    _refuse_too_many(given.where, len(given.rows))
-    joints = convention.positions(given)
+    """Return the candidates of hand poses and joints in the object's frame."""
+    grasped_object, name = _load_object(grasped, poses.scales)
+    _check_count(poses.where, len(poses.rows))
+    joints = convention.positions(poses)
     hands = None
     if take == "palm" or not set(robot.description.finger_joints) <= set(joints):
-        hands = hand_postures(robot, given.where, joints)
+        hands = hand_postures(robot, poses.where, joints)
         joints = hands.joints
-    palms, points, normals = palms_of(robot, convention.link, convention.frames(given), joints)
-    faults = dict(given.faults)
-    beyond = {} if hands is None else {given.rows[i]: text for i, text in hands.beyond.items()}
+    palms, points, normals = palms_and_pads(
+        robot, convention.link, convention.frames(poses), joints
+    )
+    faults = dict(poses.faults)
+    out_of_limits = (
+        {} if hands is None else {poses.rows[i]: text for i, text in hands.out_of_limits.items()}
+    )
     contacts: dict[int, dict[str, Contact]] = {}
-    for i, row in enumerate(given.rows if take == "contacts" else ()):
+    for i, row in enumerate(poses.rows if take == "contacts" else ()):
         try:
-            contacts[i] = _contacts(robot, points[i], normals[i], thing)
+            contacts[i] = _contacts_of_pads(robot, points[i], normals[i], grasped_object)
         except DescriptionError as error:
             faults.setdefault(row, str(error))
-    kept = kept_rows(given.where, given.rows, faults, beyond, invalid)
+    selected = valid_rows(poses.where, poses.rows, faults, out_of_limits, invalid)
     stages = {
-        name: _palm_grasps(stage.select(kept), robot, convention)
-        for name, stage in (("pregrasp", given.pregrasp), ("squeeze", given.squeeze))
+        name: _palm_grasps(stage.select(selected), robot, convention)
+        for name, stage in (("pregrasp", poses.pregrasp), ("squeeze", poses.squeeze))
         if stage is not None
     }
-    stem = Path(given.where).stem
+    stem = Path(poses.where).stem
     grasps = []
-    for place, i in enumerate(kept):
-        asked: dict[str, Any]
-        asked = {"contacts": contacts[i]} if take == "contacts" else _palm(palms[i], hands, i)
-        asked |= {stage: found[place] for stage, found in stages.items()}
-        title = f"{stem}[{given.rows[i]}]"
-        grasps.append(Grasp(robot=robot.name, name=title, object=name, **asked))
+    for k, i in enumerate(selected):
+        fields: dict[str, Any]
+        fields = (
+            {"contacts": contacts[i]} if take == "contacts" else _palm_fields(palms[i], hands, i)
+        )
+        fields |= {stage: stage_grasps[k] for stage, stage_grasps in stages.items()}
+        title = f"{stem}[{poses.rows[i]}]"
+        grasps.append(Grasp(robot=robot.name, name=title, object=name, **fields))
     return Candidates(
         tuple(grasps),
-        tuple(given.rows[i] for i in kept),
-        len(given.rows) - len(kept),
-        sum(given.rows[i] in beyond for i in kept),
-        hands.shift[kept] if take == "palm" and hands is not None else np.zeros(len(kept)),
-        given.scales[0] if given.scales else None,
+        tuple(poses.rows[i] for i in selected),
+        len(poses.rows) - len(selected),
+        sum(poses.rows[i] in out_of_limits for i in selected),
+        hands.shift[selected] if take == "palm" and hands is not None else np.zeros(len(selected)),
+        poses.scales[0] if poses.scales else None,
     )
 
 
-def _thing(
+def _load_object(
     grasped: str | GraspObject | None, scales: tuple[float, ...]
 ) -> tuple[GraspObject | None, str]:
-    """What is grasped, and the name by which it is found again; a mesh as large as it is said."""
+    """Return the grasped object, scaled as the file states, and the name that loads it again."""
     if not isinstance(grasped, str):
         return grasped, "" if grasped is None else grasped.name
     if scales and is_mesh_name(grasped) and "@" not in grasped:
         grasped = f"{grasped}@{scales[0]:.6g}"
-    thing = load_object(grasped)
-    return thing, grasped
+    grasped_object = load_object(grasped)
+    return grasped_object, grasped
 
 
-def _refuse_too_many(where: str, count: int) -> None:
+def _check_count(where: str, count: int) -> None:
     if count > scaled_limit(LIMITS.candidates):
         raise DescriptionError(
             f"{where}: found {count} grasps, expected at most {scaled_limit(LIMITS.candidates)} "
@@ -531,66 +568,69 @@ def _refuse_too_many(where: str, count: int) -> None:
         )
 
 
-def _palm(pose: Array, hands: HandPostures | None, row: int) -> dict[str, Any]:
+def _palm_fields(pose: Array, hands: HandPostures | None, row: int) -> dict[str, Any]:
     assert hands is not None
     posture = dict(zip(hands.motors, hands.positions[row].tolist(), strict=True))
     return {"palm": pose, "posture": posture}
 
 
-def _palm_grasps(given: HandPoses, robot: ArmHand, convention: Convention) -> list[Grasp]:
-    """Palms and postures as they are given, or as near as the hand can take them."""
-    hands = hand_postures(robot, given.where, convention.positions(given))
-    palms = palms_of(robot, convention.link, convention.frames(given), hands.joints)[0]
-    return [Grasp(robot=robot.name, **_palm(palms[i], hands, i)) for i in range(len(palms))]
+def _palm_grasps(poses: HandPoses, robot: ArmHand, convention: Convention) -> list[Grasp]:
+    """Return grasps of palm poses with the nearest postures that the hand can take."""
+    hands = hand_postures(robot, poses.where, convention.positions(poses))
+    palms = palms_and_pads(robot, convention.link, convention.frames(poses), hands.joints)[0]
+    return [Grasp(robot=robot.name, **_palm_fields(palms[i], hands, i)) for i in range(len(palms))]
 
 
-def _contacts(
-    robot: ArmHand, points: Array, normals: Array, thing: GraspObject | None
+def _contacts_of_pads(
+    robot: ArmHand, points: Array, normals: Array, grasped_object: GraspObject | None
 ) -> dict[str, Contact]:
-    """Contacts of pads (f, 3), where the object is if there is one."""
-    if thing is None:
+    """Return the contacts of pads (f, 3), projected onto the object if there is one."""
+    if grasped_object is None:
         rows = zip(robot.fingers, points, normals, strict=True)
         return {finger: Contact(point, normal) for finger, point, normal in rows}
-    off = thing.signed_distance(points)
-    near = np.flatnonzero(np.abs(off) <= READING.touching)
-    outward = thing.normal(points[near])
-    surface = points[near] - off[near, None] * outward
-    found = {
-        robot.fingers[finger]: Contact(surface[i], -outward[i]) for i, finger in enumerate(near)
+    distance = grasped_object.signed_distance(points)
+    touching_pads = np.flatnonzero(np.abs(distance) <= READING_SETTINGS.contact_distance)
+    outward = grasped_object.normal(points[touching_pads])
+    surface = points[touching_pads] - distance[touching_pads, None] * outward
+    contacts = {
+        robot.fingers[finger]: Contact(surface[i], -outward[i])
+        for i, finger in enumerate(touching_pads)
     }
-    if not found:
+    if not contacts:
         raise DescriptionError(
-            f"no pad is within {1e3 * READING.touching:g} mm of {thing.name}'s surface: the "
-            f"nearest is {1e3 * float(np.abs(off).min()):.1f} mm away"
+            f"no pad is within {1e3 * READING_SETTINGS.contact_distance:g} mm of the surface of "
+            f"{grasped_object.name}: the nearest is "
+            f"{1e3 * float(np.abs(distance).min()):.1f} mm away"
         )
-    return found
+    return contacts
 
 
-def _of_targets(path: Path, fingers: tuple[str, ...]) -> list[Grasp]:
-    found: list[Grasp] = []
+def _grasps_of_targets(path: Path, fingers: tuple[str, ...]) -> list[Grasp]:
+    grasps: list[Grasp] = []
     file = TargetFile(path, len(fingers))
-    _refuse_too_many(str(path), file.rows())
-    for block in file.blocks(lambda: READING.block):
+    _check_count(str(path), file.rows())
+    for block in file.blocks(lambda: READING_SETTINGS.block):
         for row in range(len(block["points"])):
             try:
-                given = {name: rows[row] for name, rows in block.items()}
+                vectors = {name: rows[row] for name, rows in block.items()}
                 contacts = {
                     finger: contact
                     for i, finger in enumerate(fingers)
-                    if (contact := _contact({name: v[i] for name, v in given.items()})) is not None
+                    if (contact := _contact_of_finger({name: v[i] for name, v in vectors.items()}))
+                    is not None
                 }
-                found.append(Grasp(contacts, name=f"{path.stem}[{len(found)}]"))
+                grasps.append(Grasp(contacts, name=f"{path.stem}[{len(grasps)}]"))
             except InputError as error:
-                raise DescriptionError(f"{path}: row {len(found)}: {error}") from error
-    return found
+                raise DescriptionError(f"{path}: row {len(grasps)}: {error}") from error
+    return grasps
 
 
-def _contact(vectors: dict[str, np.ndarray]) -> Contact | None:
-    """What an npz file says of a finger; None where that is free."""
-    given = {name: vector for name, vector in vectors.items() if not np.isnan(vector).all()}
-    if not given:
+def _contact_of_finger(vectors: dict[str, np.ndarray]) -> Contact | None:
+    """Return the contact of a finger in a target file; None if the finger is free."""
+    stated = {name: vector for name, vector in vectors.items() if not np.isnan(vector).all()}
+    if not stated:
         return None
-    if DIRECTIONS_KEY in given and "points" not in given:
-        return Contact(direction=given[DIRECTIONS_KEY])
-    more: dict[str, Any] = {name[:-1]: given[name] for name in NAMES if name in given}
-    return Contact(given.get("points"), given.get("normals"), **more)
+    if DIRECTIONS_KEY in stated and "points" not in stated:
+        return Contact(direction=stated[DIRECTIONS_KEY])
+    optional: dict[str, Any] = {name[:-1]: stated[name] for name in NAMES if name in stated}
+    return Contact(stated.get("points"), stated.get("normals"), **optional)

@@ -1,4 +1,4 @@
-"""Postures of a hand as a data set has them, and the nearest that a robot's hand can take."""
+"""Postures of hands in data sets, and the nearest postures that a robot's hand can take."""
 
 from __future__ import annotations
 
@@ -19,54 +19,54 @@ from casadi_ik.model.pose import inverse
 
 
 @dataclass(frozen=True)
-class PostureFit:
-    """How postures of data sets become what a robot's motors can take.
+class PostureFitSettings:
+    """Settings of the fit of data set postures to a robot's motors.
 
     Attributes:
-        far: A hand farther from its object than this [m] is one in millimetres.
-        beyond: A joint may be so far beyond its limits [rad or m]; it is then at the limit.
-        apart: How far a joint may be from where its coupling puts it [rad or m].
-        steps: Of the search for the nearest posture, at most.
-        difference: A motor moves so far for a derivative [rad or m].
-        stay: Squared metres at a fingertip that a radian of a motor counts as: what decides between
-            postures whose fingertips are as near.
-        settled: Steps are over when no motor moves farther [rad or m].
+        max_distance: Distance of a hand from its object above which the data are in mm [m].
+        limit_tolerance: Violation of a joint limit that is clipped without notice [rad or m].
+        coupling_tolerance: Largest deviation of a joint from its coupling [rad or m].
+        max_steps: Maximum number of steps of the fit.
+        step_of_derivative: Step of numerical derivatives [rad or m].
+        regularisation: Weight of the squared motion of a motor [m^2/rad^2], which selects among
+            postures with equal fingertips.
+        step_tolerance: The fit ends when no motor moves farther [rad or m].
     """
 
-    far: float = 5.0
-    beyond: float = 0.02
-    apart: float = 0.02
-    steps: int = 40
-    difference: float = 1e-7
-    stay: float = 1e-6
-    settled: float = 1e-6
+    max_distance: float = 5.0
+    limit_tolerance: float = 0.02
+    coupling_tolerance: float = 0.02
+    max_steps: int = 40
+    step_of_derivative: float = 1e-7
+    regularisation: float = 1e-6
+    step_tolerance: float = 1e-6
 
 
-FIT = PostureFit()
+POSTURE_FIT = PostureFitSettings()
 
-LARGE = 4 * np.pi
-"""A joint that is turned farther than this [rad] is one in degrees."""
+MAX_ANGLE = 4 * np.pi
+"""Joint angle above which the data are in degrees [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
 class HandPoses:
     """k grasps by one hand.
 
-    A row that is none (numbers that are not finite or in other units, no rotation) is among
-    `faults`; its numbers are zeros, and its rotation is none.
+    Invalid rows (numbers that are not finite or in other units, invalid rotations) are listed in
+    `faults`; their numbers are zeros, and their rotations identities.
 
     Attributes:
         where: File and key, for messages.
-        position: (k, 3) origin of the hand's frame in the object's [m].
-        rotation: (k, 3, 3) its axes, exact rotations.
+        position: (k, 3) origin of the hand frame in the object frame [m].
+        rotation: (k, 3, 3) rotation of the hand frame.
         joints: (k, m) joint positions [rad or m].
-        names: Of the joints as the file calls them; none: the order of the hand's description.
-        objects: What each grasp is of, as the file calls it; none: all are of one thing.
-        scales: By what factor the object of each grasp is larger than its mesh; none: not said.
-        rows: (k,) their numbers in the file.
-        faults: What is wrong with a row, by its number in the file.
-        pregrasp: The same hands before they close; None: not said.
-        squeeze: The same hands as they squeeze; None: not said.
+        names: Joint names in the file; empty: the order of the hand's description.
+        objects: Name of the object of each grasp; empty: one object.
+        scales: Scale of the object of each grasp relative to its mesh; empty: not stated.
+        rows: (k,) row numbers in the file.
+        faults: Problems by row number.
+        pregrasp: The hands before they close; None if not stated.
+        squeeze: The hands while they squeeze; None if not stated.
     """
 
     where: str
@@ -82,154 +82,161 @@ class HandPoses:
     squeeze: HandPoses | None = None
 
     def __post_init__(self) -> None:
-        """Check what is given.
+        """Check shapes and rows.
 
         Raises:
-            DescriptionError: No grasps, or another number of poses than postures.
+            DescriptionError: There are no grasps, or the numbers of poses and postures differ.
         """
         count = len(self.position)
         shapes = {"position": (count, 3), "rotation": (count, 3, 3)}
         for name, shape in shapes.items():
-            found = getattr(self, name).shape
-            if found != shape:
-                self._fail(f"{name}: found shape {found}, expected {shape}")
+            shape_found = getattr(self, name).shape
+            if shape_found != shape:
+                self._fail(f"{name}: found shape {shape_found}, expected {shape}")
         if not count:
             self._fail("found no grasps, expected at least one")
         if self.joints.ndim != 2 or len(self.joints) != count:
             self._fail(f"joints: found shape {self.joints.shape}, expected ({count}, joints)")
         object.__setattr__(self, "rows", self.rows or tuple(range(count)))
-        faults = {**self._faults(), **self.faults}
+        faults = {**self._find_faults(), **self.faults}
         for stage in ("pregrasp", "squeeze"):
-            other = getattr(self, stage)
-            if other is not None:
-                faults = {row: f"{stage}: {text}" for row, text in other.faults.items()} | faults
+            stage_poses = getattr(self, stage)
+            if stage_poses is not None:
+                faults = {
+                    row: f"{stage}: {text}" for row, text in stage_poses.faults.items()
+                } | faults
         object.__setattr__(self, "faults", faults)
 
     def of(self, name: str | None) -> HandPoses:
-        """The grasps of one thing.
+        """Return the grasps of one object.
 
         Args:
-            name: What the file calls it; None: there is only one.
+            name: Name in the file; None: there is only one object.
 
         Raises:
-            DescriptionError: There are several, or none of that name.
+            DescriptionError: There are several objects, or none of that name.
         """
         if name is None and len(set(self.objects)) <= 1:
             return self
-        known = sorted(set(self.objects))
-        said = f"{len(known)} objects ({', '.join(known[:3])}{', ...' if known[3:] else ''})"
+        names = sorted(set(self.objects))
+        description = f"{len(names)} objects ({', '.join(names[:3])}{', ...' if names[3:] else ''})"
         if name is None:
-            self._fail(f"found grasps of {said}, expected one; say which (of)")
-        if name not in known:
-            self._fail(f"of: found {name!r}, expected one of {said}")
-        kept = self.select(np.flatnonzero(np.array(self.objects) == name))
-        return replace(kept, where=f"{self.where}: {name}")
+            self._fail(f"found grasps of {description}, expected one; select it by `of`")
+        if name not in names:
+            self._fail(f"of: found {name!r}, expected one of {description}")
+        selected = self.select(np.flatnonzero(np.array(self.objects) == name))
+        return replace(selected, where=f"{self.where}: {name}")
 
     def of_scale(self, scale: float | None) -> HandPoses:
-        """The grasps of one size of the object.
+        """Return the grasps of one size of the object.
 
         Args:
-            scale: Which; None: there is only one.
+            scale: Scale of the object; None: there is only one size.
 
         Raises:
-            DescriptionError: There are several, or none of that size.
+            DescriptionError: There are several sizes, or none of that scale.
         """
         if not self.scales:
             if scale is not None:
-                self._fail(f"scale: found {scale:g}, but the file says of no size")
+                self._fail(f"scale: found {scale:g}, but the file states no sizes")
             return self
-        digits = np.array([float(f"{one:.5g}") for one in self.scales])
+        digits = np.array([float(f"{value:.5g}") for value in self.scales])
         sizes, counts = np.unique(digits, return_counts=True)
         pairs = zip(sizes, counts, strict=True)
-        said = f"{len(sizes)} sizes (scale {', '.join(f'{s:g}: {n} rows' for s, n in pairs)})"
+        description = (
+            f"{len(sizes)} sizes (scale {', '.join(f'{s:g}: {n} rows' for s, n in pairs)})"
+        )
         if scale is None:
             if len(sizes) > 1:
-                self._fail(f"found grasps of {said}, expected one; say which (scale, --scale)")
+                self._fail(
+                    f"found grasps of {description}, expected one; select it by `scale` (--scale)"
+                )
             return self
-        kept = np.flatnonzero(np.isclose(digits, scale, rtol=1e-4, atol=0.0))
-        if not len(kept):
-            self._fail(f"scale: found {scale:g}, expected one of {said}")
-        return self.select(kept)
+        selected = np.flatnonzero(np.isclose(digits, scale, rtol=1e-4, atol=0.0))
+        if not len(selected):
+            self._fail(f"scale: found {scale:g}, expected one of {description}")
+        return self.select(selected)
 
-    def select(self, kept: NDArray[np.intp]) -> HandPoses:
-        """Some of the grasps, by their places."""
+    def select(self, indices: NDArray[np.intp]) -> HandPoses:
+        """Return grasps by their indices."""
 
-        def some(values: tuple[Any, ...]) -> tuple[Any, ...]:
-            return tuple(values[i] for i in kept) if values else ()
+        def selected(values: tuple[Any, ...]) -> tuple[Any, ...]:
+            return tuple(values[i] for i in indices) if values else ()
 
-        rows = some(self.rows)
+        rows = selected(self.rows)
         return replace(
             self,
-            position=self.position[kept],
-            rotation=self.rotation[kept],
-            joints=self.joints[kept],
-            objects=some(self.objects),
-            scales=some(self.scales),
+            position=self.position[indices],
+            rotation=self.rotation[indices],
+            joints=self.joints[indices],
+            objects=selected(self.objects),
+            scales=selected(self.scales),
             rows=rows,
             faults={row: text for row, text in self.faults.items() if row in rows},
-            pregrasp=None if self.pregrasp is None else self.pregrasp.select(kept),
-            squeeze=None if self.squeeze is None else self.squeeze.select(kept),
+            pregrasp=None if self.pregrasp is None else self.pregrasp.select(indices),
+            squeeze=None if self.squeeze is None else self.squeeze.select(indices),
         )
 
-    def _faults(self) -> dict[int, str]:
-        """What is wrong with rows; these are zeros from now on, and rotations exact."""
-        found: dict[int, str] = {}
+    def _find_faults(self) -> dict[int, str]:
+        """Return the problems of rows; set invalid rows to zero and make rotations exact."""
+        faults: dict[int, str] = {}
 
         def note(bad: Bools, texts: Callable[[int], str]) -> None:
             for i in np.flatnonzero(bad):
-                found.setdefault(self.rows[i], texts(int(i)))
+                faults.setdefault(self.rows[i], texts(int(i)))
 
         for name in ("position", "rotation", "joints"):
             finite = np.isfinite(getattr(self, name)).reshape(len(self.position), -1).all(axis=1)
-            more = " (and quaternions of length 1)" if name == "rotation" else ""
-            text = f"{name}: holds NaN or infinity, expected finite numbers{more}"
+            hint = " (and quaternions of length 1)" if name == "rotation" else ""
+            text = f"{name}: holds NaN or infinity, expected finite numbers{hint}"
             note(np.asarray(~finite), lambda _, text=text: text)
-        away = np.linalg.norm(self.position, axis=1)
+        distance = np.linalg.norm(self.position, axis=1)
         note(
-            away > FIT.far,
+            distance > POSTURE_FIT.max_distance,
             lambda i: (
-                f"position: found {away[i]:.4g} m from the object, expected at most {FIT.far:g} m "
-                "(numbers in mm?)"
+                f"position: found {distance[i]:.4g} m from the object, expected at most "
+                f"{POSTURE_FIT.max_distance:g} m (numbers in mm?)"
             ),
         )
         note(
-            np.asarray((np.abs(self.joints) > LARGE).any(axis=1)),
+            np.asarray((np.abs(self.joints) > MAX_ANGLE).any(axis=1)),
             lambda _: (
                 "joints: found angles beyond two turns, expected radians (numbers in degrees?)"
             ),
         )
-        whole = np.array([row not in found for row in self.rows])
-        rotation = np.where(whole[:, None, None], self.rotation, np.eye(3))
+        is_valid = np.array([row not in faults for row in self.rows])
+        rotation = np.where(is_valid[:, None, None], self.rotation, np.eye(3))
         exact, invalid = nearest_rotations(rotation)
         note(invalid, lambda i: f"rotation: {rotation_problem(rotation[i])}")
-        whole = np.array([row not in found for row in self.rows])
-        object.__setattr__(self, "rotation", np.where(whole[:, None, None], exact, np.eye(3)))
+        is_valid = np.array([row not in faults for row in self.rows])
+        object.__setattr__(self, "rotation", np.where(is_valid[:, None, None], exact, np.eye(3)))
         for name in ("position", "joints"):
-            object.__setattr__(self, name, np.where(whole[:, None], getattr(self, name), 0.0))
-        return found
+            object.__setattr__(self, name, np.where(is_valid[:, None], getattr(self, name), 0.0))
+        return faults
 
     def _fail(self, problem: str) -> NoReturn:
         raise DescriptionError(f"{self.where}: {problem}")
 
     @property
     def poses(self) -> Array:
-        """(k, 4, 4)."""
+        """Poses of the hand frame in the object frame, (k, 4, 4)."""
         poses = np.tile(np.eye(4), (len(self.position), 1, 1))
         poses[:, :3, :3], poses[:, :3, 3] = self.rotation, self.position
         return poses
 
 
-def of_fixed_axes(angles: Array) -> Array:
-    """(k, 3, 3) rotations about fixed axes by (k, 3) roll, pitch, yaw [rad], as URDF has them."""
+def rotations_from_rpy(angles: Array) -> Array:
+    """Return rotations (k, 3, 3) from roll, pitch, yaw (k, 3) about fixed axes [rad]."""
     x, y, z = (joint_motion("revolute", axis, angles[:, i]) for i, axis in enumerate(np.eye(3)))
     return (z @ y @ x)[:, :3, :3]
 
 
-def of_two_columns(columns: Array) -> Array:
-    """(k, 3, 3) rotations of (k, 6) two columns, from whose right angle both are as far as before.
+def rotations_from_columns(columns: Array) -> Array:
+    """Return rotations (k, 3, 3) from their first two columns (k, 6).
 
-    Their sum and their difference are at a right angle whatever they are. Columns that are none, or
-    the same, become NaN. After `robust_compute_rotation_matrix_from_ortho6d` of GenDexGrasp.
+    Both columns are corrected by the same angle, since their sum and difference are always
+    orthogonal. Zero or equal columns give NaN. Source:
+    `robust_compute_rotation_matrix_from_ortho6d` of GenDexGrasp.
     """
 
     def unit(vectors: Array) -> Array:
@@ -237,32 +244,32 @@ def of_two_columns(columns: Array) -> Array:
 
     with np.errstate(invalid="ignore", divide="ignore"):
         first, second = unit(columns[:, :3]), unit(columns[:, 3:])
-        middle, across = unit(first + second), unit(first - second)
-        first, second = unit(middle + across), unit(middle - across)
+        middle, orthogonal = unit(first + second), unit(first - second)
+        first, second = unit(middle + orthogonal), unit(middle - orthogonal)
     return np.stack([first, second, np.cross(first, second)], axis=2)
 
 
-def palms_of(
+def palms_and_pads(
     robot: ArmHand, link: str, frames: Array, joints: Mapping[str, Array]
 ) -> tuple[Array, Array, Array]:
-    """Palms and fingertips of hands whose frames are given.
+    """Return palms and pads of hands from poses of one of their links.
 
     Args:
         robot: The robot.
-        link: The link whose frames are given.
-        frames: (k, 4, 4) its poses.
+        link: Name of the link.
+        frames: (k, 4, 4) poses of the link.
         joints: Positions (k,) by joint.
 
     Returns:
-        Poses (k, 4, 4) of the robot's palm frame, contact points (k, f, 3) and normals (k, f, 3),
-        in the frame in which the link's are given.
+        Palm poses (k, 4, 4), contact points (k, f, 3) and normals (k, f, 3), in the frame of the
+        poses.
     """
     described = robot.description
     poses = link_poses(described.root, described.joints, joints)
-    back = inverse(poses[link])
-    moved = frames @ back
-    palms = moved @ poses[described.palm_link] @ described.palm_placement
-    pads = np.stack([moved @ poses[f.link] @ f.placement for f in described.fingers], axis=1)
+    link_inverse = inverse(poses[link])
+    root_pose = frames @ link_inverse
+    palms = root_pose @ poses[described.palm_link] @ described.palm_placement
+    pads = np.stack([root_pose @ poses[f.link] @ f.placement for f in described.fingers], axis=1)
     normals = [pads[:, i, :3, :3] @ f.normal for i, f in enumerate(described.fingers)]
     return palms, pads[:, :, :3, 3], np.stack(normals, axis=1)
 
@@ -272,27 +279,26 @@ class HandPostures:
     """Postures of a hand that its motors can take.
 
     Attributes:
-        motors: That move fingers.
-        positions: (k, m) of these, within their limits [rad or m].
-        beyond: By row what is beyond its limits in the data.
-        shift: (k,) how far the fingertip that is moved farthest is from where the data have it [m].
-        joints: Positions (k,) of all joints as the data have them, what they do not say as it
-            follows [rad or m].
+        motors: Names of the finger motors.
+        positions: (k, m) positions within limits [rad or m].
+        out_of_limits: Violated limits in the data, by row.
+        shift: (k,) largest distance of a fingertip from its position in the data [m].
+        joints: Positions (k,) of all joints: those of the data, and those that follow from them
+            [rad or m].
     """
 
     motors: tuple[str, ...]
     positions: Array
-    beyond: Mapping[int, str]
+    out_of_limits: Mapping[int, str]
     shift: Array
     joints: Mapping[str, Array]
 
 
 def hand_postures(robot: ArmHand, where: str, joints: Mapping[str, Array]) -> HandPostures:
-    """The nearest postures that a hand can take.
+    """Return the nearest postures that a hand can take.
 
-    What is beyond its limits is put there. Where a joint is not where its coupling has it, the
-    motors of its finger are those that bring the fingertip nearest to where the data have it, in
-    the frame of the palm.
+    Positions are clipped to limits. If a joint contradicts its coupling, the motors of its finger
+    bring the fingertip as near as possible to its position in the data, in the palm frame.
 
     Args:
         robot: The robot.
@@ -300,30 +306,40 @@ def hand_postures(robot: ArmHand, where: str, joints: Mapping[str, Array]) -> Ha
         joints: Positions (k,) by joint or motor.
 
     Raises:
-        DescriptionError: A motor is not among the joints, nor follows from them.
+        DescriptionError: A motor is not among the joints and does not follow from them.
     """
     described = robot.description
     motors = described.finger_motors
-    moved = _motors_of(described, joints)
+    motor_values = _motors_of(described, joints)
     for name in motors:
-        if name not in moved:
+        if name not in motor_values:
             raise DescriptionError(f"{where}: {name}: missing, expected a position")
     columns = [robot.actuators.index(name) for name in motors]
-    given = np.stack([moved[name] for name in motors], axis=1)
-    found = np.clip(given, robot.lower[columns], robot.upper[columns])
-    said = {name: joints[name] for name in described.finger_joints if name in joints}
-    whole = joints_at(robot, motors, found) | said
-    wanted = _tips_of_joints(robot, whole)
-    free = _free(robot, columns, said, joints_at(robot, motors, given))
+    stated = np.stack([motor_values[name] for name in motors], axis=1)
+    positions = np.clip(stated, robot.lower[columns], robot.upper[columns])
+    stated_joints = {name: joints[name] for name in described.finger_joints if name in joints}
+    all_joints = joints_of_motors(robot, motors, positions) | stated_joints
+    target_tips = _tips_of_joints(robot, all_joints)
+    free = _inconsistent_motors(
+        robot, columns, stated_joints, joints_of_motors(robot, motors, stated)
+    )
     rows = np.flatnonzero(free.any(axis=1))
     if len(rows):
-        found[rows] = _nearest(robot, columns, found[rows], free[rows], wanted[rows])
-    shift = np.linalg.norm(_tips(robot, columns, found) - wanted, axis=2).max(axis=1)
-    return HandPostures(motors, found, _beyond(robot, motors, given, said), shift, whole)
+        positions[rows] = _nearest_postures(
+            robot, columns, positions[rows], free[rows], target_tips[rows]
+        )
+    shift = np.linalg.norm(_tips(robot, columns, positions) - target_tips, axis=2).max(axis=1)
+    return HandPostures(
+        motors,
+        positions,
+        _limit_violations(robot, motors, stated, stated_joints),
+        shift,
+        all_joints,
+    )
 
 
-def joints_at(robot: ArmHand, motors: tuple[str, ...], positions: Array) -> dict[str, Array]:
-    """Positions (k,) of all joints with motors at (k, m), the others where they are at home."""
+def joints_of_motors(robot: ArmHand, motors: tuple[str, ...], positions: Array) -> dict[str, Array]:
+    """Return the positions (k,) of all joints for motors (k, m); other motors are at home."""
     return robot.joints(
         _configurations(robot, [robot.actuators.index(n) for n in motors], positions)
     )
@@ -336,28 +352,32 @@ def _configurations(robot: ArmHand, columns: list[int], positions: Array) -> Arr
 
 
 def _motors_of(robot: RobotDescription, joints: Mapping[str, Array]) -> dict[str, Array]:
-    """The joints, and the motors whose joints are given alone: by the first that follows them."""
-    found = dict(joints)
+    """Return positions of joints, and of motors that follow from a coupled joint."""
+    values = dict(joints)
     for joint in robot.movable:
         slope = joint.coupling.slope if joint.coupling is not None else None
         if joint.coupling is None or slope is None or joint.name not in joints:
             continue
         if joint.coupling.of in robot.actuator_names:
-            found.setdefault(joint.coupling.of, (joints[joint.name] - slope[1]) / slope[0])
-    return found
+            values.setdefault(joint.coupling.of, (joints[joint.name] - slope[1]) / slope[0])
+    return values
 
 
-def _beyond(
-    robot: ArmHand, motors: tuple[str, ...], given: Array, said: Mapping[str, Array]
+def _limit_violations(
+    robot: ArmHand, motors: tuple[str, ...], stated: Array, stated_joints: Mapping[str, Array]
 ) -> dict[int, str]:
-    """By row the joint or motor that is farthest beyond its limits."""
+    """Return for each row the joint or motor with the largest limit violation."""
     described = robot.description
-    places = [described.joint_names.index(name) for name in said if name not in motors]
+    joint_indices = [
+        described.joint_names.index(name) for name in stated_joints if name not in motors
+    ]
     columns = [robot.actuators.index(name) for name in motors]
-    names = (*motors, *(described.joint_names[i] for i in places))
-    lower = np.concatenate([robot.lower[columns], described.joint_lower[places]])
-    upper = np.concatenate([robot.upper[columns], described.joint_upper[places]])
-    values = np.column_stack([given, *(said[described.joint_names[i]] for i in places)])
+    names = (*motors, *(described.joint_names[i] for i in joint_indices))
+    lower = np.concatenate([robot.lower[columns], described.joint_lower[joint_indices]])
+    upper = np.concatenate([robot.upper[columns], described.joint_upper[joint_indices]])
+    values = np.column_stack(
+        [stated, *(stated_joints[described.joint_names[i]] for i in joint_indices)]
+    )
     excess = np.maximum(lower - values, values - upper)
     worst = excess.argmax(axis=1)
     return {
@@ -365,80 +385,93 @@ def _beyond(
             row
         ): f"{names[i]}: found {values[row, i]:.4g}, expected {lower[i]:.4g} to {upper[i]:.4g}"
         for row, i in enumerate(worst)
-        if excess[row, i] > FIT.beyond
+        if excess[row, i] > POSTURE_FIT.limit_tolerance
     }
 
 
-def _free(
-    robot: ArmHand, columns: list[int], said: Mapping[str, Array], reached: Mapping[str, Array]
+def _inconsistent_motors(
+    robot: ArmHand,
+    columns: list[int],
+    stated_joints: Mapping[str, Array],
+    coupled_joints: Mapping[str, Array],
 ) -> Bools:
-    """(k, m) motors of the fingers whose joints are not where their couplings have them."""
+    """Return (k, m) True for motors of fingers with joints that contradict their couplings."""
     described = robot.description
-    free = np.zeros((len(next(iter(reached.values()))), len(columns)), dtype=bool)
+    free = np.zeros((len(next(iter(coupled_joints.values()))), len(columns)), dtype=bool)
     for finger in described.fingers:
-        mine = np.isin(columns, described.finger_actuators(finger.name))
+        is_of_finger = np.isin(columns, described.finger_actuators(finger.name))
         for name in finger.joints:
-            if name in said:
-                free |= (np.abs(said[name] - reached[name]) > FIT.apart)[:, None] & mine
+            if name in stated_joints:
+                free |= (
+                    np.abs(stated_joints[name] - coupled_joints[name])
+                    > POSTURE_FIT.coupling_tolerance
+                )[:, None] & is_of_finger
     return free
 
 
 def _tips_of_joints(robot: ArmHand, joints: Mapping[str, Array]) -> Array:
-    """(k, f, 3) fingertips in the palm frame, of joints whatever couples them."""
+    """Return fingertips (k, f, 3) in the palm frame for joints, regardless of couplings."""
     described = robot.description
-    here = np.tile(np.eye(4), (len(next(iter(joints.values()))), 1, 1))
-    palms, points, _ = palms_of(robot, described.palm_link, here, joints)
+    identity = np.tile(np.eye(4), (len(next(iter(joints.values()))), 1, 1))
+    palms, points, _ = palms_and_pads(robot, described.palm_link, identity, joints)
     return (points - palms[:, None, :3, 3]) @ palms[:, :3, :3]
 
 
 def _tips(robot: ArmHand, columns: list[int], positions: Array) -> Array:
-    """(k, f, 3) fingertips in the palm frame, with motors at (k, m)."""
+    """Return fingertips (k, f, 3) in the palm frame for motors (k, m)."""
     q = _configurations(robot, columns, positions)
     points, palms = robot.contacts(q)[0], robot.palm(q)
     return (points - palms[:, None, :3, 3]) @ palms[:, :3, :3]
 
 
-def _nearest(robot: ArmHand, columns: list[int], start: Array, free: Bools, wanted: Array) -> Array:
-    """Postures (k, m) within limits whose fingertips are nearest to where they are wanted.
+def _nearest_postures(
+    robot: ArmHand, columns: list[int], start: Array, free: Bools, target_tips: Array
+) -> Array:
+    """Return postures (k, m) within limits whose fingertips are nearest to the targets.
 
-    Damped steps (Levenberg-Marquardt), by row; a motor at its limit that would go beyond is held.
+    Each row makes damped steps (Levenberg-Marquardt); motors that would leave their limits are
+    held.
 
     Args:
         robot: The robot.
-        columns: Of the motors.
-        start: (k, m) where to begin, and what to stay near where fingertips are as near.
-        free: (k, m) motors that may move.
-        wanted: (k, f, 3) fingertips in the palm frame [m].
+        columns: Indices of the motors.
+        start: (k, m) initial postures, to which the regularisation refers.
+        free: (k, m) True for motors that may move.
+        target_tips: (k, f, 3) target fingertips in the palm frame [m].
     """
     lower, upper = robot.lower[columns], robot.upper[columns]
     count, m = start.shape
 
-    def off(x: Array) -> Array:
-        return (wanted - _tips(robot, columns, x)).reshape(count, -1)
+    def tip_errors(x: Array) -> Array:
+        return (target_tips - _tips(robot, columns, x)).reshape(count, -1)
 
-    def cost(x: Array, miss: Array) -> Array:
-        return (miss**2).sum(axis=1) + FIT.stay * ((x - start) ** 2).sum(axis=1)
+    def cost(x: Array, error: Array) -> Array:
+        return (error**2).sum(axis=1) + POSTURE_FIT.regularisation * ((x - start) ** 2).sum(axis=1)
 
-    x, miss = start.copy(), off(start)
-    least, damping = cost(x, miss), np.full(count, 1e-4)
-    for _ in range(FIT.steps):
-        slopes = [miss - off(x + FIT.difference * one) for one in np.eye(m)]
-        jacobian = np.stack(slopes, axis=2) / FIT.difference
-        pull = np.einsum("krm,kr->km", jacobian, miss) - FIT.stay * (x - start)
-        held = ~free | ((x <= lower) & (pull < 0)) | ((x >= upper) & (pull > 0))
-        jacobian = np.where(held[:, None], 0.0, jacobian)
-        square = np.swapaxes(jacobian, 1, 2) @ jacobian + (damping + FIT.stay)[
+    x, error = start.copy(), tip_errors(start)
+    best_cost, damping = cost(x, error), np.full(count, 1e-4)
+    for _ in range(POSTURE_FIT.max_steps):
+        differences = [
+            error - tip_errors(x + POSTURE_FIT.step_of_derivative * unit) for unit in np.eye(m)
+        ]
+        jacobian = np.stack(differences, axis=2) / POSTURE_FIT.step_of_derivative
+        gradient = np.einsum("krm,kr->km", jacobian, error) - POSTURE_FIT.regularisation * (
+            x - start
+        )
+        is_held = ~free | ((x <= lower) & (gradient < 0)) | ((x >= upper) & (gradient > 0))
+        jacobian = np.where(is_held[:, None], 0.0, jacobian)
+        square = np.swapaxes(jacobian, 1, 2) @ jacobian + (damping + POSTURE_FIT.regularisation)[
             :, None, None
         ] * np.eye(m)
-        step = np.linalg.solve(square, np.where(held, 0.0, pull)[..., None])[..., 0]
-        tried = np.clip(np.asarray(x + step, dtype=np.float64), lower, upper)
-        new = off(tried)
-        value = cost(tried, new)
-        better = value < least
-        moved = np.abs(tried - x).max(axis=1)
-        x, miss = np.where(better[:, None], tried, x), np.where(better[:, None], new, miss)
-        least = np.where(better, value, least)
+        step = np.linalg.solve(square, np.where(is_held, 0.0, gradient)[..., None])[..., 0]
+        trial = np.clip(np.asarray(x + step, dtype=np.float64), lower, upper)
+        new = tip_errors(trial)
+        value = cost(trial, new)
+        better = value < best_cost
+        step_size = np.abs(trial - x).max(axis=1)
+        x, error = np.where(better[:, None], trial, x), np.where(better[:, None], new, error)
+        best_cost = np.where(better, value, best_cost)
         damping = np.where(better, damping / 10, damping * 10)
-        if (moved < FIT.settled).all():
+        if (step_size < POSTURE_FIT.step_tolerance).all():
             break
     return x
