@@ -424,7 +424,10 @@ def _object_pose(where: str, contents: Mapping[str, Any]) -> Array:
     if row.shape != (7,):
         raise DescriptionError(f"{where}: obj_pose: found {row.size} numbers, expected 7")
     pose = HandPoses(
-        f"{where}: obj_pose", row[None, :3], rotations_from_quaternions(row[None, 3:]), np.zeros((1, 0))
+        f"{where}: obj_pose",
+        row[None, :3],
+        rotations_from_quaternions(row[None, 3:]),
+        np.zeros((1, 0)),
     )
     if pose.faults:
         raise InvalidPoseError(f"{where}: obj_pose: {pose.faults[0]}")
@@ -441,7 +444,9 @@ def _poses_of_stages(
     for name, rows in stages.items():
         if rows.shape != shape:
             raise DescriptionError(f"{where}: {name}: found shape {rows.shape}, expected {shape}")
-        hand_poses = HandPoses(where, rows[:, :3], rotations_from_quaternions(rows[:, 3:7]), rows[:, 7:])
+        hand_poses = HandPoses(
+            where, rows[:, :3], rotations_from_quaternions(rows[:, 3:7]), rows[:, 7:]
+        )
         poses = object_inverse @ hand_poses.poses
         by_stage[name] = replace(hand_poses, position=poses[:, :3, 3], rotation=poses[:, :3, :3])
     scales = _scales(where, contents, len(stages["grasp"]))

@@ -243,7 +243,9 @@ def read_table(path: Path) -> HandPoses:
             else np.zeros((count, 0))
         )
 
-    rotate = rotations_from_quaternions if rotation_columns is QUATERNION_COLUMNS else rotations_from_rpy
+    rotate = (
+        rotations_from_quaternions if rotation_columns is QUATERNION_COLUMNS else rotations_from_rpy
+    )
     return HandPoses(
         str(path), block(POSITION_COLUMNS), rotate(block(rotation_columns)), block(names), names
     )
