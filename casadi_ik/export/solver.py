@@ -36,7 +36,7 @@ from casadi_ik.export.single import (
 )
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arm_hand import ArmHand
-from casadi_ik.kinematics.contacts import usual
+from casadi_ik.kinematics.contacts import point_normal_kinds
 from casadi_ik.model.targets import TargetBatch, Tolerance
 from casadi_ik.motion import recovery
 from casadi_ik.motion.clear import motor_units
@@ -95,7 +95,7 @@ class FollowSources:
 
     def files(self) -> tuple[dict[str, str], dict[str, str]]:
         """Return the C file by path, and the substitutes of marks in the other templates."""
-        cycle = Cycle(self.robot.description, usual(len(self.robot.fingers)))
+        cycle = Cycle(self.robot.description, point_normal_kinds(len(self.robot.fingers)))
         marks = {
             "PREFIX": self.prefix,
             "GUARD": self.prefix.upper(),

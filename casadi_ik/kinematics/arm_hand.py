@@ -1,4 +1,4 @@
-"""The robot as a user holds it: its description and its compiled forward kinematics."""
+"""Robots with their compiled forward kinematics."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class ArmHand(ReprMixin):
     """A robot: an arm with a hand, an arm alone, or a hand on a fixed base.
 
     Attributes:
-        description: The frozen data behind it.
+        description: Immutable description of links, joints and fingers.
 
     Example:
         >>> robot.name, robot.fingers, robot.thumb
@@ -36,11 +36,11 @@ class ArmHand(ReprMixin):
     """
 
     def __init__(self, description: RobotDescription) -> None:
-        """Wrap a description; kernels are compiled when first used and cached on the machine."""
+        """Wrap a description; kernels are compiled at the first use and cached on the machine."""
         self.description = description
 
     def __reduce__(self) -> tuple[type[ArmHand], tuple[RobotDescription]]:
-        """Its data; a copy finds the compiled kernels on the machine it comes to."""
+        """Return the description; a copy uses the kernels cached on its machine."""
         return type(self), (self.description,)
 
     def __repr__(self) -> str:
@@ -58,7 +58,7 @@ class ArmHand(ReprMixin):
 
     @property
     def thumb(self) -> str:
-        """The finger that is placed first."""
+        """Name of the finger that thumb-first methods place first."""
         return self.description.thumb
 
     @property
@@ -68,7 +68,7 @@ class ArmHand(ReprMixin):
 
     @property
     def sides(self) -> tuple[str, ...]:
-        """Names of the sides of a body; () of an arm with one hand.
+        """Names of the sides of a multi-arm robot; () for one arm-hand.
 
         Example:
             >>> robot.sides
@@ -78,17 +78,17 @@ class ArmHand(ReprMixin):
 
     @property
     def trunk(self) -> tuple[str, ...]:
-        """Names of the actuators that move every palm of a body."""
+        """Names of the actuators that move every palm of a multi-arm robot."""
         return self.description.trunk
 
     def side(self, name: str) -> ArmHand:
-        """An arm-hand of a body by itself, the trunk as the first joints of its arm.
+        """Return one arm-hand of a multi-arm robot, with the trunk as the first joints of its arm.
 
-        Its base is the body's, its motors, links and fingers keep their names. All other sides are
-        left out: collisions with them are not checked.
+        The base frame and the names of motors, links and fingers remain. The other sides are
+        removed, so that collisions with them are not checked.
 
         Raises:
-            UnknownNameError: There is none; the message lists the sides.
+            UnknownNameError: The side does not exist; the message lists the sides.
 
         Example:
             >>> ik.load_robot("g1+dex3").side("left").actuators[:2]
@@ -98,28 +98,28 @@ class ArmHand(ReprMixin):
 
     @property
     def lower(self) -> Array:
-        """(n,) lower limits of the actuators [rad or m], those of their joints included."""
+        """Lower limits of the actuators (n,), including those of their joints [rad or m]."""
         return self.description.lower
 
     @property
     def upper(self) -> Array:
-        """(n,) upper limits of the actuators [rad or m], those of their joints included."""
+        """Upper limits of the actuators (n,), including those of their joints [rad or m]."""
         return self.description.upper
 
     @property
     def home(self) -> Array:
-        """(n,) home position [rad or m]."""
+        """Home configuration (n,) [rad or m]."""
         return self.description.home
 
     def configuration(self, q: ArrayLike | None, name: str = "q") -> Array:
-        """A configuration as an array, checked; None gives `home`.
+        """Return a configuration as a checked array; `home` for None.
 
         Args:
             q: (n,) or (k, n) actuator positions [rad or m].
-            name: What to call it in an error.
+            name: Name of the argument in errors.
 
         Raises:
-            InputError: Wrong shape or a number that is not finite.
+            InputError: The shape is wrong or a value is not finite.
         """
         if q is None:
             return self.home.copy()
@@ -131,14 +131,14 @@ class ArmHand(ReprMixin):
         if array.ndim not in (1, 2) or array.shape[-1] != n:
             raise InputError(f"{name}: found shape {array.shape}, expected ({n},) or (k, {n})")
         if not np.all(np.isfinite(array)):
-            raise InputError(f"{name}: holds NaN or infinity, expected finite numbers")
+            raise InputError(f"{name}: contains NaN or infinity; expected finite numbers")
         return array
 
     def start(self, q0: ArrayLike | None, name: str = "q0") -> Array:
-        """A configuration to start from, checked; None gives `home`.
+        """Return a checked start configuration; `home` for None.
 
-        A warning says if a motor that turns would be more than a turn beyond its limits, as it is
-        where q0 is in degrees.
+        A motor more than one revolution beyond its limits raises a warning, because q0 may be in
+        degrees.
 
         Raises:
             InputError: As for `configuration`.
@@ -150,32 +150,34 @@ class ArmHand(ReprMixin):
         start = self.configuration(q0, name)
         if q0 is None:
             return start
-        middle, far = self._far
-        beyond = np.abs(start - middle) > far
-        if beyond.any():
-            *_, i = np.argwhere(beyond)[0].tolist()
-            value, ends = start[beyond][0], f"{self.lower[i]:.3g} to {self.upper[i]:.3g}"
-            text = f"{name}: {self.actuators[i]} is {value:g} rad, far beyond its limits {ends} rad"
-            # From here, whoever asked: Python says the same once.
+        middle, max_distance = self._plausible_range
+        is_far = np.abs(start - middle) > max_distance
+        if is_far.any():
+            *_, i = np.argwhere(is_far)[0].tolist()
+            value, limits = start[is_far][0], f"{self.lower[i]:.3g} to {self.upper[i]:.3g}"
+            text = (
+                f"{name}: {self.actuators[i]} is {value:g} rad, far beyond its limits {limits} rad"
+            )
+            # One fixed location, so that Python shows the warning once.
             warnings.warn(f"{text}; degrees are np.deg2rad(...)", InputWarning, stacklevel=1)
         return start
 
     @cached_property
-    def _far(self) -> tuple[Array, Array]:
-        """(n,) middles of all motors, and how far from it is a turn beyond the limits."""
+    def _plausible_range(self) -> tuple[Array, Array]:
+        """Centres of the motor ranges (n,), and distances from them that are plausible (n,)."""
         units = [actuator.unit for actuator in self.description.actuators]
         limited = [unit == "rad" for unit in units] & ~self.description.continuous
         turn = np.where(limited, 2 * np.pi, np.inf)
         return (self.lower + self.upper) / 2, (self.upper - self.lower) / 2 + turn
 
     def joints(self, q: ArrayLike) -> dict[str, Any]:
-        """Positions of all movable joints after the couplings.
+        """Return the positions of all movable joints after the couplings.
 
         Args:
             q: (n,) or (k, n) actuator positions.
 
         Returns:
-            By joint name a float, or (k,) for a batch [rad or m].
+            Positions by joint name: floats, or (k,) for a batch [rad or m].
 
         Raises:
             InputError: See `configuration`.
@@ -189,17 +191,17 @@ class ArmHand(ReprMixin):
         """
         configuration, names = self.configuration(q), self.description.joint_names
         (theta,) = self._kernels.joints(_for_kernels(configuration))
-        # Of a robot of one joint kernels give a single number.
+        # Kernels of a robot with one joint return scalars.
         return _by_name(names, theta.reshape(*configuration.shape[:-1], len(names)))
 
     def toggle_margins(self, q: ArrayLike) -> dict[str, Any]:
-        """How far every lead screw and four-bar is from its singular (toggle) position.
+        """Return the distance of every lead screw and four-bar from its singular (toggle) position.
 
         Args:
             q: (n,) or (k, n) actuator positions.
 
         Returns:
-            By joint the squared sine of its transmission angle, a float or (k,) for a batch: 1 at
+            Squared sine of the transmission angle by joint, a float or (k,) for a batch: 1 at
             best, 0 at the toggle, negative where the mechanism cannot be assembled. Empty if the
             robot has no such couplings.
 
@@ -214,14 +216,14 @@ class ArmHand(ReprMixin):
         return _by_name(names, margins.reshape(*configuration.shape[:-1], len(names)))
 
     def contacts(self, q: ArrayLike) -> tuple[Array, Array]:
-        """Where the fingertips are and which way they face.
+        """Return the contact points and pad normals of all fingertips.
 
         Args:
             q: (n,) or (k, n) actuator positions.
 
         Returns:
-            points (f, 3) [m] and outward pad normals (f, 3), unit, in the base frame; with a
-            leading k for a batch.
+            Points (f, 3) [m] and outward unit pad normals (f, 3), base frame; (k, f, 3) for a
+            batch.
 
         Raises:
             InputError: See `configuration`.
@@ -235,11 +237,11 @@ class ArmHand(ReprMixin):
         return points, normals
 
     def contact_frames(self, q: ArrayLike) -> Array:
-        """Contact frames of all fingers, in the base frame.
+        """Return the contact frames of all fingers, base frame.
 
-        The origin is the contact point. The first axis is the outward pad normal, the second the
-        pad's tangent: the one the description names (``tangent``), else the x axis of its contact
-        frame made orthogonal to the normal. The third is normal x tangent.
+        The origin is the contact point. The first axis is the outward pad normal. The second
+        is the tangent of the pad: ``tangent`` of the description, else the x axis of the contact
+        frame, orthogonalised to the normal. The third is normal x tangent.
 
         Args:
             q: (n,) or (k, n) actuator positions.
@@ -258,12 +260,12 @@ class ArmHand(ReprMixin):
         return self.frames_at(self.configuration(q))
 
     def frames_at(self, q: Array) -> Array:
-        """`contact_frames` of configurations that need not be finite; NaN gives NaN."""
+        """Return `contact_frames` without checking q; NaN gives NaN."""
         (frames,) = self._kernels.contact_frames(_for_kernels(q))
         return frames.reshape(*frames.shape[:-2], len(self.fingers), 4, 4)
 
     def errors(self, q: ArrayLike, points: ArrayLike, normals: ArrayLike) -> tuple[Array, Array]:
-        """How far the fingertips are from contacts.
+        """Return the errors of the fingertips with respect to contacts.
 
         Args:
             q: (n,) or (k, n) actuator positions.
@@ -288,7 +290,7 @@ class ArmHand(ReprMixin):
         return position, angle
 
     def deviations(self, q: Array, points: Array, normals: Array) -> tuple[Array, Array, Array]:
-        """`errors` and `beyond_limits` at once, of configurations that need not be finite.
+        """Return `errors` and `beyond_limits` without checking q.
 
         Args:
             q: (n,) or (k, n) actuator positions; NaN gives NaN.
@@ -296,18 +298,16 @@ class ArmHand(ReprMixin):
             normals: (f, 3) or (k, f, 3), unit; NaN where free.
 
         Returns:
-            Distances [m] (f,) or (k, f), angles [rad] the same, and () or (k,) by how much the
-            worst actuator or joint is beyond its limits [rad or m].
+            Distances [m] and angles [rad], each (f,) or (k, f), and the largest violation of a
+            limit [rad or m], () or (k,).
         """
         position, angle, beyond = self._kernels.deviations(_for_kernels(q), points, normals)
-        # A kernel's single number has no dimension of its own, even that of a single finger.
+        # Kernels return scalars for a single finger.
         by_finger = (*beyond.shape, len(self.fingers))
         return position.reshape(by_finger), angle.reshape(by_finger), beyond
 
     def beyond_limits(self, q: ArrayLike) -> Array:
-        """By how much the worst actuator or joint is beyond its limits [rad or m], () or (k,).
-
-        Negative within limits.
+        """Return the largest violation of a limit [rad or m], () or (k,); negative within limits.
 
         Raises:
             InputError: See `configuration`.
@@ -316,15 +316,15 @@ class ArmHand(ReprMixin):
         return beyond
 
     def palm(self, q: ArrayLike, side: str | None = None) -> Array:
-        """(4, 4) or (k, 4, 4) pose of the palm frame in the base frame.
+        """Return the pose of the palm frame in the base frame, (4, 4) or (k, 4, 4).
 
         Args:
             q: (n,) or (k, n) actuator positions.
-            side: Of a body, whose palm; None: the only one.
+            side: Side of a multi-arm robot (default: the only one).
 
         Raises:
-            InputError: See `configuration`; or a body of several sides and none said.
-            UnknownNameError: No such side.
+            InputError: See `configuration`; or the side of a multi-arm robot is missing.
+            UnknownNameError: The side does not exist.
 
         Example:
             >>> robot.palm(robot.home).shape
@@ -333,8 +333,8 @@ class ArmHand(ReprMixin):
         if side is None and len(self.sides) == 1:
             (side,) = self.sides
         if side is not None:
-            asked = self.description.side_named(side)
-            return self.links(q)[asked.palm_link] @ asked.palm_placement
+            selected = self.description.side_named(side)
+            return self.links(q)[selected.palm_link] @ selected.palm_placement
         if self.sides:
             raise InputError(f"side: found None, expected one of {', '.join(self.sides)}")
         (pose,) = self._kernels.palm(_for_kernels(self.configuration(q)))
@@ -342,26 +342,26 @@ class ArmHand(ReprMixin):
 
     @cached_property
     def hands(self) -> dict[str | None, tuple[int, ...]]:
-        """Fingers, as positions in `fingers`, by side; None is the only hand of an arm.
+        """Indices in `fingers` by side; the key is None for a single hand.
 
         Example:
             >>> robot.hands
             {None: (0, 1, 2)}
         """
-        place = {name: i for i, name in enumerate(self.fingers)}
+        index = {name: i for i, name in enumerate(self.fingers)}
         sides = self.description.sides
         if not sides:
-            return {None: tuple(place.values())}
-        return {side.name: tuple(place[name] for name in side.fingers) for side in sides}
+            return {None: tuple(index.values())}
+        return {side.name: tuple(index[name] for name in side.fingers) for side in sides}
 
     def links(self, q: ArrayLike) -> dict[str, Array]:
-        """Pose of every link frame in the base frame, by link name.
+        """Return the pose of every link frame in the base frame, by link name.
 
         Args:
             q: (n,) or (k, n) actuator positions.
 
         Returns:
-            By link name (4, 4), or (k, 4, 4) for a batch.
+            Poses by link name: (4, 4), or (k, 4, 4) for a batch.
 
         Raises:
             InputError: See `configuration`.
@@ -376,7 +376,7 @@ class ArmHand(ReprMixin):
         return {name: stacked[..., i, :, :] for i, name in enumerate(names)}
 
     def random(self, rng: np.random.Generator, count: int) -> Array:
-        """(count, n) configurations uniform within the limits.
+        """Return configurations (count, n) uniform within the limits.
 
         Example:
             >>> robot.random(np.random.default_rng(0), 100).shape
@@ -385,7 +385,7 @@ class ArmHand(ReprMixin):
         return rng.uniform(self.lower, self.upper, (count, len(self.actuators)))
 
     def urdf(self) -> str:
-        """The robot as URDF text, see `casadi_ik.model.to_urdf`.
+        """Return the robot as URDF text, see `casadi_ik.model.to_urdf`.
 
         Example:
             >>> robot.urdf().count("<joint ") >= 15
@@ -394,11 +394,11 @@ class ArmHand(ReprMixin):
         return self._urdf
 
     def view(self, q: ArrayLike | None = None, **options: Any) -> Any:
-        """Show the robot in the browser, and in a notebook; needs the extra `view`.
+        """Show the robot in the browser or a notebook; requires the extra `view`.
 
         Args:
-            q: (n,) where it is [rad or m]; None is `home`.
-            options: As `casadi_ik.app.viewer.view_grasp` has them: grasp, scene, host, port.
+            q: (n,) configuration [rad or m] (default: `home`).
+            options: Options of `casadi_ik.app.viewer.view_grasp`: grasp, scene, host, port.
 
         Returns:
             The running `casadi_ik.app.viewer.Viewer`.
@@ -421,7 +421,7 @@ class ArmHand(ReprMixin):
 
 
 def _for_kernels(q: Array) -> Array:
-    """(n,) or (k, n); of a robot of one motor () or (k,), as its kernels have a single number."""
+    """Return q with the shape that kernels take: without the last axis for a single motor."""
     return q[..., 0] if q.shape[-1] == 1 else q
 
 
@@ -429,11 +429,11 @@ def load_robot(name_or_path: str | Path) -> ArmHand:
     """Load a robot.
 
     Args:
-        name_or_path: A shipped name (`casadi-ik robots` lists them), a shipped arm with a shipped
-            hand ("panda+allegro_right"), or the path of your own YAML.
+        name_or_path: Name of a shipped robot (see `casadi-ik robots`), of a shipped arm and hand
+            ("panda+allegro_right"), or path of a YAML file.
 
     Raises:
-        UnknownNameError: No shipped robot has that name.
+        UnknownNameError: The name is not that of a shipped robot.
         DescriptionError: The file is missing or malformed; the message names file and key.
 
     Example:
@@ -444,7 +444,7 @@ def load_robot(name_or_path: str | Path) -> ArmHand:
 
 
 def _by_name(names: tuple[str, ...], values: Array) -> dict[str, Any]:
-    """Values (m,) or (k, m) by name: floats, or (k,) for a batch."""
+    """Return values (m,) or (k, m) by name: floats, or (k,) for a batch."""
     if values.ndim == 1:
         return {name: float(value) for name, value in zip(names, values, strict=True)}
     return dict(zip(names, values.T, strict=True))

@@ -1,7 +1,7 @@
-"""Contacts as a least-squares problem, and when a fit of them is at its end.
+"""Least-squares and minimax fits of the contacts, and their convergence criteria.
 
-A step is judged by what it made of the cost. The damping follows the ratio of what was gained to
-what the linear model promised (Nielsen 1999: Damping parameter in Marquardt's method).
+A trial step is evaluated by the change of the cost. The damping follows the ratio of the actual to
+the predicted decrease (Nielsen 1999: Damping parameter in Marquardt's method).
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from typing import Any
 import casadi as ca
 
 from casadi_ik.compile.layout import Layout
-from casadi_ik.kinematics.box_qp import Bounded, clip, damped_step, in_box, squares
+from casadi_ik.kinematics.box_qp import BoxBounds, clip, damped_step, normal_equations, solve_box_qp
 from casadi_ik.kinematics.contacts import (
     LENGTH,
     ContactRows,
     chord,
-    resting,
-    tip_rates,
+    fixed_goal_rates,
+    tip_jacobians,
     tip_vectors,
     within_tolerance,
 )
@@ -31,25 +31,25 @@ from casadi_ik.model.description import RobotDescription
 
 @dataclass(frozen=True)
 class FitParameters:
-    """When a fit is at its end, and how it is damped.
+    """Damping and convergence criteria of a fit.
 
     Attributes:
-        damping: Of the normal matrix, whose rows are of order one per radian and 0.1 m.
+        damping: Initial damping of the normal matrix, whose rows are of order one per radian and
+            0.1 m.
         damping_floor: Smallest damping.
-        damping_ceiling: Damping at which a step that gains nothing shows that nothing is to be
-            gained.
-        damping_down: Smallest factor of the damping after a step that gained.
-        growth: Factor of the damping after a step that gained nothing; doubles with every such
-            step.
-        slow: A step that leaves more than this part of the cost gained little.
-        quadratic: A step that leaves less than this part is converging fast: worth another one.
-        patience: Evaluations with little gain before a fit is given up.
-        budget: Evaluations in all.
-        promising: Cost below which a fit is close enough to be worth `persistence` times as much.
-        persistence: See above.
-        exact: Root of the cost at which contacts count as met exactly (0.1 nm per 100 mm, or rad).
-        fine: Part of the tolerance that is as good as exact.
-        passes: Corrections of the active set in a step.
+        damping_ceiling: Damping at which a rejected step ends the fit.
+        damping_down: Smallest factor of the damping after an accepted step.
+        growth: Factor of the damping after a rejected step; doubles with every further rejection.
+        slow: Ratio of costs after and before a step above which progress is slow.
+        quadratic: Ratio of costs below which convergence is fast, so that another step pays.
+        patience: Number of consecutive steps with slow progress that ends the fit.
+        budget: Maximum number of steps.
+        promising: Cost below which `patience` and `budget` are multiplied by `persistence`.
+        persistence: Factor of the effort for fits near a solution.
+        exact: Square root of the cost below which contacts are met exactly (0.1 nm per 100 mm, or
+            rad).
+        fine: Fraction of the tolerance below which errors count as exact.
+        passes: Number of corrections of the active set in a step.
     """
 
     damping: float = 1e-3
@@ -69,297 +69,323 @@ class FitParameters:
 
 
 @dataclass(frozen=True)
-class BalanceParameters:
-    """How the largest error by its tolerance is brought down, and when that is given up.
+class MinimaxParameters:
+    """Parameters of the minimax stage, which reduces the largest error relative to its tolerance.
 
     Attributes:
-        powers: Powers in turn.
-        near: A fit that misses the tolerances by no more than this factor is worth balancing.
-        same: Relative difference of cost below which a fit counts as one that was balanced before.
-        steady: A step that leaves more than this part of the sum ends a power.
-        hopeless: Were all parts at most so large, the sum would be at most their number times this
-            to the power: one that is steady above that says that the contacts cannot be met near
-            here.
-        closer: A balance that leaves no less than this part of the least that others left is one
-            of them.
-        budget: Steps in all.
-        damping: The rows are errors by tolerances: their damping is that of a fit, times this.
+        powers: Successive exponents p of the p-norm of the error ratios.
+        max_tolerance_ratio: Largest ratio of error to tolerance from which the minimax stage
+            starts.
+        same_cost_tolerance: Relative difference of costs below which two minima are the same.
+        stall_ratio: Ratio of sums after and before a step above which the next power begins.
+        infeasible_ratio: If the sum stalls above n * infeasible_ratio**power for n errors, the
+            largest error cannot fall below its tolerance near this configuration.
+        improvement_ratio: Ratio of the largest errors of two minimax fits above which the second is
+            no improvement.
+        budget: Maximum number of steps.
+        damping: Factor of the damping relative to a fit, because rows are divided by tolerances.
         damping_floor: Smallest damping of a fit.
-        damping_ceiling: Damping at which a power ends.
-        eased: Factor of the damping after a step that gained.
-        tightened: The same after one that did not.
-        farthest: A step to parts larger than so many times the largest before is refused.
+        damping_ceiling: Damping at which the next power begins.
+        damping_decrease: Factor of the damping after an accepted step.
+        damping_increase: Factor of the damping after a rejected step.
+        max_growth: Error ratio, relative to the largest before the step, at which ratios saturate.
     """
 
     powers: tuple[float, ...] = (4.0, 10.0, 24.0, 60.0, 150.0, 400.0)
-    near: float = 2.0
-    same: float = 1e-2
-    steady: float = 0.95
-    hopeless: float = 1.05
-    closer: float = 0.99
+    max_tolerance_ratio: float = 2.0
+    same_cost_tolerance: float = 1e-2
+    stall_ratio: float = 0.95
+    infeasible_ratio: float = 1.05
+    improvement_ratio: float = 0.99
     budget: int = 60
     damping: float = 100.0
     damping_floor: float = 1e-8
     damping_ceiling: float = 10.0
-    eased: float = 1 / 8
-    tightened: float = 4.0
-    farthest: float = 2.0
+    damping_decrease: float = 1 / 8
+    damping_increase: float = 4.0
+    max_growth: float = 2.0
 
 
 @dataclass(frozen=True)
 class TolerantFitParameters:
-    """Numbers of a fit whose residuals begin where the tolerances end.
+    """Parameters of a fit of the errors beyond the tolerances.
 
     Attributes:
-        free: Fraction of the tolerance within which an error costs nothing.
-        promising: Largest `tolerance_ratio` at a minimum of the exact fit from which a tolerant fit
-            starts.
-        near: Largest `tolerance_ratio` at which a minimum counts as a near miss.
-        patience: Evaluations with little gain before a tolerant fit is given up.
-        budget: Evaluations in all.
+        free_fraction: Fraction of the tolerance within which an error costs nothing.
+        max_start_ratio: Largest `tolerance_ratio` at a minimum of the exact fit from which a
+            tolerant fit starts.
+        near_miss_ratio: Largest `tolerance_ratio` at which a minimum counts as a near miss.
+        patience: Number of consecutive steps with slow progress that ends the fit.
+        budget: Maximum number of steps.
     """
 
-    free: float = 0.95
-    promising: float = 1.0
-    near: float = 2.0
+    free_fraction: float = 0.95
+    max_start_ratio: float = 1.0
+    near_miss_ratio: float = 2.0
     patience: int = 4
     budget: int = 40
 
 
-FIT, BALANCE, TOLERANT = FitParameters(), BalanceParameters(), TolerantFitParameters()
+FIT, MINIMAX, TOLERANT_FIT = FitParameters(), MinimaxParameters(), TolerantFitParameters()
 
-TINY = 1e-100
-"""What is divided by is no smaller."""
+MIN_DIVISOR = 1e-100
+"""Lower bound of divisors."""
 
 
 @dataclass(frozen=True, eq=False)
-class Tried:
-    """A damped step that was tried.
+class TrialStep:
+    """A damped step whose residual has been evaluated.
 
     Attributes:
-        reached: Where it leads: whatever the stage's unknowns are.
-        before: Residual before.
-        there: Residual there.
-        promised: By how much the linear model says the cost falls.
-        size: Largest change of a motor.
+        x: Unknowns of the stage after the step.
+        residual_before: Residual before the step.
+        residual: Residual after the step.
+        predicted_decrease: Decrease of the cost that the linear model predicts.
+        max_change: Largest change of a motor position [rad or m].
     """
 
-    reached: Any
-    before: Expr
-    there: Expr
-    promised: Expr
-    size: Expr
+    x: Any
+    residual_before: Expr
+    residual: Expr
+    predicted_decrease: Expr
+    max_change: Expr
 
 
 def lm_step(
-    at: Callable[[Any], tuple[Expr, Expr]],
+    linearise: Callable[[Any], tuple[Expr, Expr]],
     x: Any,
     damping: Expr,
-    bounds: Bounded,
-    moved: Callable[[Expr], Any],
-    motors: Callable[[Any], Expr] = lambda there: there,
-) -> Tried:
-    """One damped least-squares step within bounds: of all motors, of palm and hand, of the arm.
+    bounds: BoxBounds,
+    retract: Callable[[Expr], Any],
+    motors: Callable[[Any], Expr] = lambda x: x,
+) -> TrialStep:
+    """Return a damped least-squares step within bounds.
 
     Args:
-        at: Residual (m, 1) and Jacobian (m, n) at a place.
-        x: The place where it begins.
+        linearise: Residual (m, 1) and Jacobian (m, n) as a function of the unknowns.
+        x: Unknowns before the step: all motors, palm and hand, or the arm.
         damping: Scalar.
-        bounds: Of the motors.
-        moved: From a step (n, 1) to the place that it leads to.
-        motors: (k, 1) of a place.
+        bounds: Bounds of the motors.
+        retract: Unknowns as a function of a step (n, 1).
+        motors: Motor positions (k, 1) as a function of the unknowns.
     """
-    before, jacobian = at(x)
-    damped = damped_step(jacobian, before, damping, bounds, FIT.passes)
-    reached = moved(damped.step)
-    change = ca.fabs(motors(reached) - bounds.value)
-    # A tool has no motors that could move.
-    size = ca.mmax(change) if change.numel() else ca.SX(0)
-    return Tried(reached, before, at(reached)[0], damped.promised, size)
+    residual_before, jacobian = linearise(x)
+    damped = damped_step(jacobian, residual_before, damping, bounds, FIT.passes)
+    x_after = retract(damped.step)
+    change = ca.fabs(motors(x_after) - bounds.value)
+    # A rigid tool has no motors.
+    max_change = ca.mmax(change) if change.numel() else ca.SX(0)
+    return TrialStep(
+        x_after, residual_before, linearise(x_after)[0], damped.predicted_decrease, max_change
+    )
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
-    """A damped step after it was judged by its cost; `fit` goes into the state."""
+class StepOutcome:
+    """Outcome of a damped step.
+
+    Attributes:
+        accepted: 1 if the step decreases the cost.
+        within: 1 if the errors are within tolerance.
+        settled: 1 if the fit has ended.
+        cost: Cost after the step if accepted, else before it.
+        lm_state: New values of the state fields of the fit.
+    """
 
     accepted: Expr
     within: Expr
     settled: Expr
     cost: Expr
-    fit: dict[str, Expr]
+    lm_state: dict[str, Expr]
 
 
-def judge_contacts(
+def evaluate_contact_step(
     s: dict[str, Expr],
     p: dict[str, Expr],
-    tried: Tried,
+    trial: TrialStep,
     rows: ContactRows,
-    call_function: float = 1.0,
-    fine: Expr = 1.0,
-) -> Judged:
-    """Judge a step by the contacts, its residuals those of `rows`; see `judge`.
+    tolerance_fraction: float = 1.0,
+    stop_fraction: Expr = 1.0,
+) -> StepOutcome:
+    """Evaluate a step whose residual is that of the contacts; see `evaluate_step`.
 
     Args:
         s: State.
         p: Parameters.
-        tried: The step.
-        rows: The contacts.
-        call_function: Of the tolerances; what is within that is within them.
-        fine: What part of them, if less, is good enough to stop at, should the cost fall slowly.
+        trial: Trial step.
+        rows: Rows of the contacts.
+        tolerance_fraction: Fraction of the tolerances that counts as within tolerance.
+        stop_fraction: Fraction of the tolerances at which a slowly converging fit stops, if
+            smaller than `tolerance_fraction`.
     """
-    residual = ca.if_else(gains(tried), tried.there, tried.before)
+    residual = ca.if_else(decreases_cost(trial), trial.residual, trial.residual_before)
     positions, chords = rows.errors(residual)
     tolerances = p["position_tolerance"], chord(p["angle_tolerance"])
 
-    def within(call_function: Expr) -> Expr:
+    def are_within(tolerance_fraction: Expr) -> Expr:
         return within_tolerance(
-            positions, chords, *(call_function * allowed for allowed in tolerances)
+            positions, chords, *(tolerance_fraction * tolerance for tolerance in tolerances)
         )
 
-    fine = ca.fmin(call_function, fine)
+    stop_fraction = ca.fmin(tolerance_fraction, stop_fraction)
     return replace(
-        judge(s, tried, within(fine), within(FIT.fine * fine)), within=within(call_function)
+        evaluate_step(s, trial, are_within(stop_fraction), are_within(FIT.fine * stop_fraction)),
+        within=are_within(tolerance_fraction),
     )
 
 
-def judge_beyond_tolerance(
-    s: dict[str, Expr], p: dict[str, Expr], tried: Tried, rows: ContactRows, part: float = 1.0
-) -> Judged:
-    """Judge a step whose residuals are those of `beyond_tolerance`; see `judge`.
+def evaluate_excess_step(
+    s: dict[str, Expr],
+    p: dict[str, Expr],
+    trial: TrialStep,
+    rows: ContactRows,
+    tolerance_fraction: float = 1.0,
+) -> StepOutcome:
+    """Evaluate a step whose residual is that of `beyond_tolerance`; see `evaluate_step`.
 
     Args:
         s: State.
         p: Parameters.
-        tried: The step.
+        trial: Trial step.
         rows: Rows of the contacts.
-        part: Fraction of the tolerances at which the fit ends.
+        tolerance_fraction: Fraction of the tolerances at which the fit ends.
     """
-    residual = ca.if_else(gains(tried), tried.there, tried.before)
-    left = (part - TOLERANT.free) * _allowed(p)
-    lengths = ca.vertcat(*(ca.norm_2(residual[own]) for own in rows.slices))
-    within = ca.mmax(lengths - left) <= 0
-    return judge(s, tried, within, within, TOLERANT.patience, TOLERANT.budget)
+    residual = ca.if_else(decreases_cost(trial), trial.residual, trial.residual_before)
+    max_excess = (tolerance_fraction - TOLERANT_FIT.free_fraction) * _tolerances(p)
+    lengths = ca.vertcat(*(ca.norm_2(residual[rows_of_contact]) for rows_of_contact in rows.slices))
+    within = ca.mmax(lengths - max_excess) <= 0
+    return evaluate_step(s, trial, within, within, TOLERANT_FIT.patience, TOLERANT_FIT.budget)
 
 
-def gains(tried: Tried) -> Expr:
-    """Whether the step lowers the cost."""
-    return ca.sumsqr(tried.there) < ca.sumsqr(tried.before)
+def decreases_cost(trial: TrialStep) -> Expr:
+    """Return whether a step decreases the cost."""
+    return ca.sumsqr(trial.residual) < ca.sumsqr(trial.residual_before)
 
 
-def judge(
+def evaluate_step(
     s: dict[str, Expr],
-    tried: Tried,
+    trial: TrialStep,
     within: Expr,
     exact: Expr,
     patience: int = FIT.patience,
     budget: int = FIT.budget,
-) -> Judged:
-    """Accept a step that lowers the cost, and decide whether the fit is at its end.
+) -> StepOutcome:
+    """Accept a step that decreases the cost, and decide whether the fit has ended.
 
     Args:
         s: State.
-        tried: The step.
-        within: Whether what is left of the residual after it is good enough to stop at, should
-            it fall slowly.
-        exact: Whether it is so good that nothing more is to be gained.
-        patience: Evaluations with little gain before the fit is given up.
-        budget: Evaluations in all.
+        trial: Trial step.
+        within: 1 if the residual is small enough to stop unless convergence is fast.
+        exact: 1 if the residual is small enough to stop in any case.
+        patience: Number of consecutive steps with slow progress that ends the fit.
+        budget: Maximum number of steps.
     """
-    cost_before, cost_there = ca.sumsqr(tried.before), ca.sumsqr(tried.there)
-    accepted = gains(tried)
-    cost = ca.if_else(accepted, cost_there, cost_before)
-    left = cost / ca.fmax(cost_before, 1e-300)
-    waited = ca.if_else(left > FIT.slow, s["waited"] + 1, 0.0)
-    spent = s["spent"] + 1
-    worth = ca.if_else(cost < FIT.promising, float(FIT.persistence), 1.0)
-    over = ca.logic_or(waited >= patience * worth, spent >= budget * worth)
-    stuck = ca.logic_and(ca.logic_not(accepted), s["damping"] > FIT.damping_ceiling)
-    over = ca.logic_or(over, stuck)
-    slowing = ca.logic_and(within, left > FIT.quadratic)
-    kept = (cost_before - cost_there) / ca.fmax(tried.promised, 1e-300)
-    bent = 2 * kept - 1
-    factor = ca.if_else(accepted, ca.fmax(FIT.damping_down, 1 - bent * bent * bent), s["growth"])
-    settled = ca.logic_or(
-        ca.logic_or(exact, cost < FIT.exact * FIT.exact), ca.logic_or(over, slowing)
+    cost_before, cost_after = ca.sumsqr(trial.residual_before), ca.sumsqr(trial.residual)
+    accepted = decreases_cost(trial)
+    cost = ca.if_else(accepted, cost_after, cost_before)
+    cost_ratio = cost / ca.fmax(cost_before, 1e-300)
+    slow_steps = ca.if_else(cost_ratio > FIT.slow, s["waited"] + 1, 0.0)
+    evaluations = s["spent"] + 1
+    effort = ca.if_else(cost < FIT.promising, float(FIT.persistence), 1.0)
+    is_exhausted = ca.logic_or(slow_steps >= patience * effort, evaluations >= budget * effort)
+    is_stuck = ca.logic_and(ca.logic_not(accepted), s["damping"] > FIT.damping_ceiling)
+    is_exhausted = ca.logic_or(is_exhausted, is_stuck)
+    is_good_enough = ca.logic_and(within, cost_ratio > FIT.quadratic)
+    gain_ratio = (cost_before - cost_after) / ca.fmax(trial.predicted_decrease, 1e-300)
+    centred_ratio = 2 * gain_ratio - 1
+    factor = ca.if_else(
+        accepted,
+        ca.fmax(FIT.damping_down, 1 - centred_ratio * centred_ratio * centred_ratio),
+        s["growth"],
     )
-    fit = fresh_fit() | {
+    settled = ca.logic_or(
+        ca.logic_or(exact, cost < FIT.exact * FIT.exact), ca.logic_or(is_exhausted, is_good_enough)
+    )
+    lm_state = initial_lm_state() | {
         "damping": ca.fmax(s["damping"] * factor, FIT.damping_floor),
         "growth": ca.if_else(accepted, FIT.growth, 2 * s["growth"]),
-        "waited": waited,
-        "spent": spent,
+        "waited": slow_steps,
+        "spent": evaluations,
     }
-    fit = {name: ca.if_else(settled, fresh_fit()[name], fit[name]) for name in fit}
-    return Judged(accepted, within, settled, cost, fit | {"cost": cost})
+    lm_state = {
+        name: ca.if_else(settled, initial_lm_state()[name], lm_state[name]) for name in lm_state
+    }
+    return StepOutcome(accepted, within, settled, cost, lm_state | {"cost": cost})
 
 
-def fresh_fit() -> dict[str, float]:
-    """Counters and damping of a fit that begins."""
+def initial_lm_state() -> dict[str, float]:
+    """Return the initial values of the state fields of a fit."""
     return {"damping": FIT.damping, "growth": FIT.growth, "waited": 0.0, "spent": 0.0}
 
 
-def whole_residual(robot: RobotDescription, rows: ContactRows, q: Expr, p: dict[str, Expr]) -> Expr:
-    """Residual of `ContactRows` at q, base frame."""
+def contact_residual(
+    robot: RobotDescription, rows: ContactRows, q: Expr, p: dict[str, Expr]
+) -> Expr:
+    """Return the residual of `ContactRows` at q, base frame."""
     kinematics = actuated(robot, q).kinematics
     tips = [tip_vectors(kinematics, name) for name in robot.finger_names]
     return rows.residual(tips, rows.goals(p), p["weights"])
 
 
-def whole_jacobian(robot: RobotDescription, rows: ContactRows, q: Expr, p: dict[str, Expr]) -> Expr:
-    """Its Jacobian (size, n)."""
+def contact_jacobian(
+    robot: RobotDescription, rows: ContactRows, q: Expr, p: dict[str, Expr]
+) -> Expr:
+    """Return the Jacobian (size, n) of `contact_residual`."""
     body = actuated(robot, q)
     n, goals = len(robot.actuators), rows.goals(p)
     tips = [tip_vectors(body.kinematics, name) for name in robot.finger_names]
     rates = [
-        {key: ca.sparsify(rate) for key, rate in tip_rates(body, name, range(n)).items()}
+        {key: ca.sparsify(rate) for key, rate in tip_jacobians(body, name, range(n)).items()}
         for name in robot.finger_names
     ]
-    return rows.jacobian(tips, rates, goals, resting(goals, n), p["weights"])
+    return rows.jacobian(tips, rates, goals, fixed_goal_rates(goals, n), p["weights"])
 
 
-class WholeContacts:
-    """The contacts as least squares of all motors q (n, 1), and of a method's parameters."""
+class ContactLeastSquares:
+    """Least-squares problem of the contacts in all motors q (n, 1)."""
 
     def __init__(self, robot: RobotDescription, rows: ContactRows, parameters: Layout) -> None:
-        """Remember what they are made of.
+        """Store the ingredients; the graph is built at the first use.
 
         Args:
-            robot: The description.
-            rows: The contacts' rows.
-            parameters: Layout with the rows' fields, tolerances and bounds.
+            robot: Description of the robot.
+            rows: Rows of the contacts.
+            parameters: Layout of the parameters of a method: fields of the rows, tolerances and
+                bounds.
         """
         self._robot, self._rows, self._layout = robot, rows, parameters
 
     @cached_property
-    def at(self) -> ca.Function:
-        """(q, parameters) -> residual of `ContactRows` and its Jacobian, structurally sparse."""
+    def linearised(self) -> ca.Function:
+        """Graph ``(q, parameters) -> (residual, jacobian)`` with a sparse Jacobian."""
         parameters = self._layout.symbols("parameters")
         q, p = ca.SX.sym("q", len(self._robot.actuators)), self._layout.unpack(parameters)
-        residual = whole_residual(self._robot, self._rows, q, p)
-        # Rows of a contact are alike, so that a fit and its balance are solved by the same code.
-        slopes = whole_jacobian(self._robot, self._rows, q, p)
-        both = (_in_columns(slopes[own, :]) for own in self._rows.slices)
-        jacobian = ca.vertcat(*(dense @ columns for dense, columns in both))
+        residual = contact_residual(self._robot, self._rows, q, p)
+        # Rows of a contact have one pattern, so that least squares and minimax share functions.
+        slopes = contact_jacobian(self._robot, self._rows, q, p)
+        factors = (_in_columns(slopes[rows_of_contact, :]) for rows_of_contact in self._rows.slices)
+        jacobian = ca.vertcat(*(dense @ columns for dense, columns in factors))
         return call_function("whole_at", [q, parameters], [ca.densify(residual), jacobian])
 
-    def fitted(self, q: Expr, damping: Expr, parameters: Expr) -> Tried:
-        """One damped least-squares step within the bounds.
+    def lm_trial(self, q: Expr, damping: Expr, parameters: Expr) -> TrialStep:
+        """Return a damped least-squares step within the bounds.
 
         Args:
-            q: (n, 1) where it begins.
+            q: (n, 1) configuration before the step.
             damping: Scalar.
-            parameters: Of the method.
+            parameters: Parameters of the method.
         """
         bounds = self._bounds(q, parameters)
         return lm_step(
-            lambda there: self.at(there, parameters),
+            lambda x: self.linearised(x, parameters),
             q,
             damping,
             bounds,
             lambda step: clip(q + step, bounds),
         )
 
-    def fitted_beyond_tolerance(self, q: Expr, damping: Expr, parameters: Expr) -> Tried:
-        """Return one damped step of the least squares of `beyond_tolerance` within the bounds.
+    def excess_trial(self, q: Expr, damping: Expr, parameters: Expr) -> TrialStep:
+        """Return a damped step of the least squares of `beyond_tolerance` within the bounds.
 
         Args:
             q: (n, 1) configuration before the step.
@@ -368,55 +394,59 @@ class WholeContacts:
         """
         bounds, p = self._bounds(q, parameters), self._layout.unpack(parameters)
 
-        def excess(at: Expr) -> tuple[Expr, Expr]:
-            residual, jacobian = self.at(at, parameters)
+        def excess(x: Expr) -> tuple[Expr, Expr]:
+            residual, jacobian = self.linearised(x, parameters)
             return beyond_tolerance(residual, jacobian, self._rows, p)
 
         return lm_step(excess, q, damping, bounds, lambda step: clip(q + step, bounds))
 
-    def balanced(self, q: Expr, damping: Expr, number: Expr, parameters: Expr) -> Tried:
-        """One step towards the smallest largest error, see `balanced`; nothing is promised of it.
+    def minimax_trial(
+        self, q: Expr, damping: Expr, powers_done: Expr, parameters: Expr
+    ) -> TrialStep:
+        """Return a step that reduces the p-norm of the error ratios, see `minimax_step`.
 
         Args:
-            q: (n, 1) where it begins.
+            q: (n, 1) configuration before the step.
             damping: Scalar, of the state.
-            number: How many powers are done.
-            parameters: Of the method.
+            powers_done: Number of completed powers of `MINIMAX.powers`.
+            parameters: Parameters of the method.
         """
         p, bounds = self._layout.unpack(parameters), self._bounds(q, parameters)
-        before, jacobian = self.at(q, parameters)
-        right, slopes = reweighted(before, jacobian, self._rows, number, p)
-        normal, gradient = squares(slopes, right)
+        residual_before, jacobian = self.linearised(q, parameters)
+        right, slopes = reweighted(residual_before, jacobian, self._rows, powers_done, p)
+        normal, gradient = normal_equations(slopes, right)
         low, high = bounds.lower - q, bounds.upper - q
-        step = in_box(normal, BALANCE.damping * damping, gradient, low, high, FIT.passes)
-        reached = clip(q + step, bounds)
-        size = ca.mmax(ca.fabs(reached - q))
-        return Tried(reached, before, self.at(reached, parameters)[0], ca.SX(0), size)
+        step = solve_box_qp(normal, MINIMAX.damping * damping, gradient, low, high, FIT.passes)
+        x_after = clip(q + step, bounds)
+        max_change = ca.mmax(ca.fabs(x_after - q))
+        return TrialStep(
+            x_after, residual_before, self.linearised(x_after, parameters)[0], ca.SX(0), max_change
+        )
 
-    def _bounds(self, q: Expr, parameters: Expr) -> Bounded:
+    def _bounds(self, q: Expr, parameters: Expr) -> BoxBounds:
         p = self._layout.unpack(parameters)
-        return Bounded(q, p["lower"], p["upper"], first=0)
+        return BoxBounds(q, p["lower"], p["upper"], first=0)
 
 
 @dataclass(frozen=True, eq=False)
-class Balanced:
-    """A step that was tried and what comes of it.
+class MinimaxStep:
+    """Outcome of a trial step of the minimax stage.
 
     Attributes:
-        q: (n, 1) where it leads, or where it began if it gained nothing.
-        accepted: Whether it gained.
-        within: Whether every contact is met at q.
-        over: Whether nothing more is to be hoped for.
-        largest: Largest part at q.
-        fit: Damping, power and steps spent, for the state.
+        q: (n, 1) configuration after the step, or before it if the step is rejected.
+        accepted: 1 if the step decreases the p-norm.
+        within: 1 if every contact is within tolerance at q.
+        is_finished: 1 if the stage has ended.
+        largest: Largest ratio of error to tolerance at q.
+        state: New values of the state fields of the stage.
     """
 
     q: Expr
     accepted: Expr
     within: Expr
-    over: Expr
+    is_finished: Expr
     largest: Expr
-    fit: dict[str, Expr]
+    state: dict[str, Expr]
 
 
 def tolerance_ratio(cost: Expr, p: dict[str, Expr]) -> Expr:
@@ -430,9 +460,9 @@ def tolerance_ratio(cost: Expr, p: dict[str, Expr]) -> Expr:
         cost: Sum of squares of the residual.
         p: Parameters.
     """
-    squares = ca.sum1(p["weights"][:, 0] * (p["position_tolerance"] / LENGTH) ** 2)
-    squares += ca.sum1(p["weights"][:, 1] * chord(p["angle_tolerance"]) ** 2)
-    return ca.sqrt(cost / ca.fmax(squares, TINY))
+    largest_cost = ca.sum1(p["weights"][:, 0] * (p["position_tolerance"] / LENGTH) ** 2)
+    largest_cost += ca.sum1(p["weights"][:, 1] * chord(p["angle_tolerance"]) ** 2)
+    return ca.sqrt(cost / ca.fmax(largest_cost, MIN_DIVISOR))
 
 
 def beyond_tolerance(
@@ -449,13 +479,13 @@ def beyond_tolerance(
         rows: Rows of the contacts.
         p: Parameters.
     """
-    free = TOLERANT.free * _allowed(p)
+    free_lengths = TOLERANT_FIT.free_fraction * _tolerances(p)
     residuals, slopes = [], []
-    for i, own in enumerate(rows.slices):
-        dense, columns = _in_columns(jacobian[own, :])
-        excess, bent = _shortened(*dense.shape)(residual[own], dense, free[i])
+    for i, rows_of_contact in enumerate(rows.slices):
+        dense, columns = _in_columns(jacobian[rows_of_contact, :])
+        excess, slope = _shortened(*dense.shape)(residual[rows_of_contact], dense, free_lengths[i])
         residuals.append(excess)
-        slopes.append(bent @ columns)
+        slopes.append(slope @ columns)
     return (
         ca.vertcat(*residuals, residual[rows.size :]),
         ca.vertcat(*slopes, jacobian[rows.size :, :]),
@@ -467,153 +497,177 @@ def _shortened(rows: int, columns: int) -> ca.Function:
     """Return the graph (residual, slopes, tolerance) -> (excess, slopes of it) of a contact."""
     residual, slopes = ca.SX.sym("residual", rows), ca.SX.sym("slopes", rows, columns)
     free = ca.SX.sym("free")
-    length = ca.fmax(ca.norm_2(residual), TINY)
-    along, ratio = residual / length, ca.fmin(free / length, 1.0)
+    length = ca.fmax(ca.norm_2(residual), MIN_DIVISOR)
+    direction, ratio = residual / length, ca.fmin(free / length, 1.0)
     exceeds = ca.if_else(length > free, 1.0, 0.0)
-    bent = (1 - ratio) * slopes + exceeds * ratio * (along @ (along.T @ slopes))
-    return call_function("shortened", [residual, slopes, free], [(1 - ratio) * residual, bent])
+    excess_slopes = (1 - ratio) * slopes + exceeds * ratio * (direction @ (direction.T @ slopes))
+    return call_function(
+        "shortened", [residual, slopes, free], [(1 - ratio) * residual, excess_slopes]
+    )
 
 
-def differs(cost: Expr, before: Expr) -> Expr:
-    """Whether the cost of a fit is another than that of the fit balanced before."""
-    return ca.fabs(cost - before) > BALANCE.same * before
+def is_new_cost(cost: Expr, before: Expr) -> Expr:
+    """Return whether the cost of a fit differs from that of the previous minimax start."""
+    return ca.fabs(cost - before) > MINIMAX.same_cost_tolerance * before
 
 
 @dataclass(frozen=True, eq=False)
-class _Weighed:
-    """The contacts' errors as they count for a power."""
+class _ContactWeights:
+    """Error ratios of the contacts and their weights in the p-norm.
+
+    Attributes:
+        scaled: Residual rows divided by the tolerances (size, 1).
+        ratios: Ratio of error to tolerance of each position and orientation (2 f, 1).
+        largest: Largest ratio.
+        power: Exponent p.
+        weights: Weights ``(ratio / largest)**(p - 2)``.
+    """
 
     scaled: Expr
-    parts: Expr
+    ratios: Expr
     largest: Expr
     power: Expr
     weights: Expr
 
 
-def _weighed(before: Expr, contacts: ContactRows, number: Expr, p: dict[str, Expr]) -> _Weighed:
-    """Of a residual, for the power of a number."""
-    scaled = _scaled(before, contacts, p)
-    parts = _lengths(scaled, contacts)
-    largest = ca.fmax(ca.mmax(parts), TINY)
+def _contact_weights(
+    residual: Expr, contacts: ContactRows, powers_done: Expr, p: dict[str, Expr]
+) -> _ContactWeights:
+    """Return the error ratios of a residual and their weights for the current power."""
+    scaled = _relative_to_tolerances(residual, contacts, p)
+    ratios = _contact_norms(scaled, contacts)
+    largest = ca.fmax(ca.mmax(ratios), MIN_DIVISOR)
     power = sum(
-        (ca.if_else(number == i, value, 0.0) for i, value in enumerate(BALANCE.powers)), ca.SX(0)
+        (ca.if_else(powers_done == i, value, 0.0) for i, value in enumerate(MINIMAX.powers)),
+        ca.SX(0),
     )
-    return _Weighed(scaled, parts, largest, power, (parts / largest) ** (power - 2))
+    return _ContactWeights(scaled, ratios, largest, power, (ratios / largest) ** (power - 2))
 
 
 def reweighted(
-    before: Expr, jacobian: Expr, contacts: ContactRows, number: Expr, p: dict[str, Expr]
+    residual_before: Expr,
+    jacobian: Expr,
+    contacts: ContactRows,
+    powers_done: Expr,
+    p: dict[str, Expr],
 ) -> tuple[Expr, Expr]:
-    """The least squares that a step solves.
+    """Return the reweighted least-squares problem of a Gauss-Newton step of the p-norm.
 
-    The rows of a contact count by its weight, and along its error k - 1 times as much for the power
-    k: they are stretched that way, and its residual, which lies along it, is shortened.
+    The rows of a contact are weighted by `_ContactWeights.weights`. Along its error the weight is
+    p - 1 times as large: the Jacobian is stretched along the error and the residual is shortened.
 
     Args:
-        before: Residual (size, 1) of the contacts.
-        jacobian: (size, n) its Jacobian.
-        contacts: Their rows.
-        number: How many of `BALANCE.powers` are done.
+        residual_before: Residual (size, 1) of the contacts.
+        jacobian: Jacobian (size, n) of the residual.
+        contacts: Rows of the contacts.
+        powers_done: Number of completed powers of `MINIMAX.powers`.
         p: Parameters.
 
     Returns:
         Residual (size, 1) and Jacobian (size, n).
     """
-    weighed = _weighed(before, contacts, number, p)
-    allowed = _allowed(p)
+    weights = _contact_weights(residual_before, contacts, powers_done, p)
+    tolerances = _tolerances(p)
     residual, rows = [], []
-    for i, own in enumerate(contacts.slices):
-        dense, columns = _in_columns(jacobian[own, :])
-        given = (weighed.parts[i], weighed.weights[i], weighed.power, allowed[i])
-        right, slopes = _stretched(*dense.shape)(before[own], dense, *given)
-        residual.append(right)
-        rows.append(slopes @ columns)
+    for i, rows_of_contact in enumerate(contacts.slices):
+        dense, columns = _in_columns(jacobian[rows_of_contact, :])
+        scalars = (weights.ratios[i], weights.weights[i], weights.power, tolerances[i])
+        contact_residual, contact_slopes = _stretched(*dense.shape)(
+            residual_before[rows_of_contact], dense, *scalars
+        )
+        residual.append(contact_residual)
+        rows.append(contact_slopes @ columns)
     return ca.vertcat(*residual), ca.vertcat(*rows)
 
 
 def _in_columns(rows: Expr) -> tuple[Expr, ca.DM]:
-    """Two factors of rows (m, n): what is structurally not zero in one of them, and its columns."""
+    """Return rows (m, n) as the product of a dense matrix and a selection of columns."""
     columns = sorted(set(rows.sparsity().get_col()))
     return ca.densify(rows[:, columns]), ca.DM.eye(rows.shape[1])[columns, :]
 
 
 @cache
 def _stretched(rows: int, columns: int) -> ca.Function:
-    """Of a contact: residual, slopes, part of its tolerance, weight, power, tolerance -> both."""
+    """Return ``(residual, slopes, ratio, weight, power, tolerance) -> (residual, slopes)``."""
     residual, slopes = ca.SX.sym("residual", rows), ca.SX.sym("slopes", rows, columns)
-    numbers = length, weight, power, allowed = [
+    scalars = length, weight, power, tolerance = [
         ca.SX.sym(name) for name in ("length", "weight", "power", "allowed")
     ]
-    stretch, size = ca.sqrt(power - 1), ca.sqrt(weight) / allowed
-    along = residual / (allowed * ca.fmax(length, TINY))
-    right = size / stretch * residual
-    bent = size * (slopes + along @ ((stretch - 1) * (along.T @ slopes)))
-    return call_function("stretched", [residual, slopes, *numbers], [right, bent])
+    stretch, size = ca.sqrt(power - 1), ca.sqrt(weight) / tolerance
+    direction = residual / (tolerance * ca.fmax(length, MIN_DIVISOR))
+    stretched_residual = size / stretch * residual
+    stretched_slopes = size * (slopes + direction @ ((stretch - 1) * (direction.T @ slopes)))
+    return call_function(
+        "stretched", [residual, slopes, *scalars], [stretched_residual, stretched_slopes]
+    )
 
 
-def balanced(
-    value: Expr, tried: Tried, contacts: ContactRows, s: dict[str, Expr], p: dict[str, Expr]
-) -> Balanced:
-    """What comes of a step.
+def minimax_step(
+    q: Expr, trial: TrialStep, contacts: ContactRows, s: dict[str, Expr], p: dict[str, Expr]
+) -> MinimaxStep:
+    """Evaluate a trial step of the minimax stage.
 
     Args:
-        value: (n, 1) where it begins.
-        tried: The step, with the residuals of the contacts.
-        contacts: Their rows.
-        s: State with damping, power (how many of `BALANCE.powers` are done) and spent.
+        q: (n, 1) configuration before the step.
+        trial: Trial step with the residuals of the contacts.
+        contacts: Rows of the contacts.
+        s: State with damping, power (number of completed `MINIMAX.powers`) and spent.
         p: Parameters.
     """
-    weighed = _weighed(tried.before, contacts, s["power"], p)
-    weights, parts, largest = weighed.weights, weighed.parts, weighed.largest
-    power = weighed.power
-    parts_there = _lengths(_scaled(tried.there, contacts, p), contacts)
-    # Bounded, since a large number to a high power is none.
-    grown = ca.fmin(parts_there / largest, BALANCE.farthest)
-    total, total_there = ca.dot(weights, parts**2), ca.dot(grown ** (power - 2), parts_there**2)
-    accepted = total_there < total
-    left = ca.if_else(accepted, parts_there, parts)
-    damping = BALANCE.damping * s["damping"]
-    steady = ca.if_else(
-        accepted, total_there > BALANCE.steady * total, damping > BALANCE.damping_ceiling
+    before = _contact_weights(trial.residual_before, contacts, s["power"], p)
+    weights, ratios_before, largest = before.weights, before.ratios, before.largest
+    power = before.power
+    ratios_after = _contact_norms(_relative_to_tolerances(trial.residual, contacts, p), contacts)
+    # Saturated because large ratios overflow at high powers.
+    growth = ca.fmin(ratios_after / largest, MINIMAX.max_growth)
+    sum_before, sum_after = (
+        ca.dot(weights, ratios_before**2),
+        ca.dot(growth ** (power - 2), ratios_after**2),
     )
-    done = s["power"] + steady
-    spent = s["spent"] + 1
-    over = ca.logic_or(done >= len(BALANCE.powers), spent >= BALANCE.budget)
-    powers = ca.if_else(accepted, total_there, total) * largest ** (power - 2)
-    hopeless = powers > len(contacts.slices) * BALANCE.hopeless**power
-    over = ca.logic_or(over, ca.logic_and(steady, hopeless))
-    eased = ca.if_else(accepted, BALANCE.eased, BALANCE.tightened)
-    fit = {
-        "damping": ca.fmax(s["damping"] * eased, BALANCE.damping_floor),
-        "power": done,
-        "spent": spent,
+    accepted = sum_after < sum_before
+    ratios = ca.if_else(accepted, ratios_after, ratios_before)
+    damping = MINIMAX.damping * s["damping"]
+    is_stalled = ca.if_else(
+        accepted, sum_after > MINIMAX.stall_ratio * sum_before, damping > MINIMAX.damping_ceiling
+    )
+    powers_done = s["power"] + is_stalled
+    steps = s["spent"] + 1
+    is_finished = ca.logic_or(powers_done >= len(MINIMAX.powers), steps >= MINIMAX.budget)
+    power_sum = ca.if_else(accepted, sum_after, sum_before) * largest ** (power - 2)
+    is_infeasible = power_sum > len(contacts.slices) * MINIMAX.infeasible_ratio**power
+    is_finished = ca.logic_or(is_finished, ca.logic_and(is_stalled, is_infeasible))
+    damping_factor = ca.if_else(accepted, MINIMAX.damping_decrease, MINIMAX.damping_increase)
+    state = {
+        "damping": ca.fmax(s["damping"] * damping_factor, MINIMAX.damping_floor),
+        "power": powers_done,
+        "spent": steps,
     }
-    return Balanced(
-        q=ca.if_else(accepted, tried.reached, value),
+    return MinimaxStep(
+        q=ca.if_else(accepted, trial.x, q),
         accepted=accepted,
-        within=ca.mmax(left) <= 1,
-        over=over,
-        largest=ca.mmax(left),
-        fit=fit,
+        within=ca.mmax(ratios) <= 1,
+        is_finished=is_finished,
+        largest=ca.mmax(ratios),
+        state=state,
     )
 
 
-def _scaled(values: Expr, contacts: ContactRows, p: dict[str, Expr]) -> Expr:
-    """Rows (size, k) of the contacts as parts of the tolerances."""
-    return values / _each(_allowed(p), contacts)
+def _relative_to_tolerances(values: Expr, contacts: ContactRows, p: dict[str, Expr]) -> Expr:
+    """Return rows (size, k) of the contacts divided by the tolerances."""
+    return values / _repeat_by_rows(_tolerances(p), contacts)
 
 
-def _allowed(p: dict[str, Expr]) -> Expr:
-    """The tolerances (2 f, 1) in the units of residuals."""
-    both = ca.vertcat(p["position_tolerance"] / LENGTH, chord(p["angle_tolerance"]))
-    return ca.fmax(both, TINY)
+def _tolerances(p: dict[str, Expr]) -> Expr:
+    """Return the tolerances (2 f, 1) in the units of the residual."""
+    tolerances = ca.vertcat(p["position_tolerance"] / LENGTH, chord(p["angle_tolerance"]))
+    return ca.fmax(tolerances, MIN_DIVISOR)
 
 
-def _each(values: Expr, contacts: ContactRows) -> Expr:
-    """A value for each place and facing (2 f, 1) as one for each of its rows (size, 1)."""
-    sizes = [own.stop - own.start for own in contacts.slices]
+def _repeat_by_rows(values: Expr, contacts: ContactRows) -> Expr:
+    """Repeat a value of each position and orientation (2 f, 1) for each of its rows (size, 1)."""
+    sizes = [rows.stop - rows.start for rows in contacts.slices]
     return ca.vertcat(*(ca.repmat(values[i], size, 1) for i, size in enumerate(sizes)))
 
 
-def _lengths(scaled: Expr, contacts: ContactRows) -> Expr:
-    return ca.vertcat(*(ca.norm_2(scaled[own]) for own in contacts.slices))
+def _contact_norms(scaled: Expr, contacts: ContactRows) -> Expr:
+    return ca.vertcat(*(ca.norm_2(scaled[rows]) for rows in contacts.slices))

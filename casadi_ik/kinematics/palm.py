@@ -1,8 +1,8 @@
-"""The palm pose that brings the hand closest to the contacts, and arms brought there by steps.
+"""Palm pose that best fits the contacts, and iterative inverse kinematics of arms.
 
-An arm of no family starts from a table of arm configurations in the order of how far their palm is
-from the one wanted: the next start is the nearest that is farther than the last one. Where a family
-solves a nominal arm beside the real one, Newton's steps lead from there to the real one.
+An arm without a closed form starts from a table of arm configurations, in increasing distance of
+their palm from the target pose. Where a closed form solves a nominal arm, Newton steps lead from
+the nominal to the real arm.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ import casadi as ca
 import numpy as np
 
 from casadi_ik.files.arrays import Array, spread_points, spread_steps
-from casadi_ik.kinematics.box_qp import Bounded, clip
-from casadi_ik.kinematics.contact_fit import FIT, Tried, lm_step
+from casadi_ik.kinematics.box_qp import BoxBounds, clip
+from casadi_ik.kinematics.contact_fit import FIT, TrialStep, lm_step
 from casadi_ik.kinematics.contacts import (
     LENGTH,
     ContactRows,
     Rates,
     Vectors,
-    tip_rates,
+    tip_jacobians,
     tip_vectors,
 )
 from casadi_ik.kinematics.forward import Pose, actuated, sparse
@@ -35,49 +35,49 @@ from casadi_ik.model.description import RobotDescription
 
 @dataclass(frozen=True, eq=False)
 class HandContacts:
-    """Fingertips of a hand posture in the palm frame, and what moves them.
+    """Fingertips of a hand posture in the palm frame, with their Jacobians.
 
     Attributes:
-        tips: Per finger.
-        rates: Jacobians over the hand's actuators.
+        tips: Vectors of each fingertip.
+        jacobians: Jacobians of these vectors by the actuators of the hand.
     """
 
     tips: list[Vectors]
-    rates: list[Rates]
+    jacobians: list[Rates]
 
 
 def hand_contacts(robot: RobotDescription, hand: Expr, columns: tuple[int, ...]) -> HandContacts:
-    """Fingertips and their Jacobians (3, k) over the hand's actuators, in the palm frame.
+    """Return the fingertips and their Jacobians (3, k) in the palm frame.
 
     Args:
-        robot: The description.
-        hand: (k, 1) positions of the hand's actuators.
-        columns: Their positions in q.
+        robot: Description of the robot.
+        hand: (k, 1) positions of the actuators of the hand [rad or m].
+        columns: Indices of these actuators in q.
     """
-    # With the arm at zero the palm is a constant, and everything up to it folds away.
+    # With the arm at zero the palm pose is a constant, so that the arm adds no operations.
     q = ca.SX.zeros(len(robot.actuators), 1)
     for i, column in enumerate(columns):
         q[column] = hand[i]
     body = actuated(robot, q)
-    palm = body.kinematics.palm
-    tips, rates = [], []
+    palm_pose = body.kinematics.palm
+    tips, jacobians = [], []
     for name in robot.finger_names:
         tip = tip_vectors(body.kinematics, name)
-        turned = {key: palm.rotation.T @ axis for key, axis in tip.items() if key != "point"}
-        tips.append({"point": palm.inverse_apply(tip["point"]), **turned})
-        rates.append(
+        axes = {key: palm_pose.rotation.T @ axis for key, axis in tip.items() if key != "point"}
+        tips.append({"point": palm_pose.inverse_apply(tip["point"]), **axes})
+        jacobians.append(
             {
-                key: ca.sparsify(palm.rotation.T @ rate)
-                for key, rate in tip_rates(body, name, columns).items()
+                key: ca.sparsify(palm_pose.rotation.T @ rate)
+                for key, rate in tip_jacobians(body, name, columns).items()
             }
         )
-    return HandContacts(tips, rates)
+    return HandContacts(tips, jacobians)
 
 
 def base_rotation(robot: RobotDescription) -> Array:
-    """Return the rotation (3, 3) that the fixed joints before the first motor make.
+    """Return the rotation R (3, 3) of the fixed joints before the first motor.
 
-    A choice relative to it does not depend on how the robot is mounted.
+    Choices relative to it do not depend on how the robot is mounted.
     """
     rotation = np.eye(3)
     for joint in robot.chain(robot.movable[0].child) if robot.movable else ():
@@ -94,18 +94,18 @@ def best_palm(
 ) -> tuple[Expr, Expr]:
     """Return the palm pose that brings a given posture closest to the contacts.
 
-    A line or a plane is taken for the point it goes through.
+    A line or a plane is represented by its point.
 
     Args:
-        contacts: Of the posture.
-        rows: What is asked.
+        contacts: Contacts of the posture.
+        rows: Rows of the target contacts.
         p: Parameters with the target.
-        number: Where contacts leave the palm's rotation free (two fingers that face each other, one
-            finger), another one for every number from 0, evenly spread; None: always the same.
-        base: (3, 3) rotation that these turns are relative to; None: the base frame.
+        number: Index from 0 that selects the rotation where the contacts leave it free (two
+            opposed fingers, or one finger), from a uniform sequence; None for a fixed choice.
+        base: (3, 3) rotation to which this choice is relative; None for the base frame.
 
     Returns:
-        rotation (3, 3) and origin (3, 1) [m], base frame.
+        Rotation R_base_palm (3, 3) and origin p_base_palm (3, 1) [m].
     """
     goals, weights = rows.goals(p), p["weights"]
     f = len(goals)
@@ -124,128 +124,143 @@ def best_palm(
             if axis in goal:
                 B = B + weights[i, 1] * goal[axis] @ tip[axis].T
     R_base = sparse(np.eye(3) if base is None else base)
-    rotation = R_base @ align(R_base.T @ B, None if number is None else even_turn(number))
+    rotation = R_base @ align(R_base.T @ B, None if number is None else uniform_quaternion(number))
     return rotation, target_centre - rotation @ hand_centre
 
 
-def even_turn(number: Expr) -> Expr:
-    """Unit quaternion (4, 1) of a number from 0, evenly spread over all rotations (Shoemake)."""
-    first, *steps = (float(step) for step in spread_steps(3))
-    share = ca.fmod(0.5 + first * number, 1.0)
-    one, other = (2 * np.pi * ca.fmod(0.5 + step * number, 1.0) for step in steps)
-    short, long = ca.sqrt(1 - share), ca.sqrt(share)
+def uniform_quaternion(number: Expr) -> Expr:
+    """Return the unit quaternion (4, 1) of an index in a uniform sequence (Shoemake 1992)."""
+    first, *angle_steps = (float(step) for step in spread_steps(3))
+    fraction = ca.fmod(0.5 + first * number, 1.0)
+    angle_a, angle_b = (2 * np.pi * ca.fmod(0.5 + step * number, 1.0) for step in angle_steps)
+    radius_a, radius_b = ca.sqrt(1 - fraction), ca.sqrt(fraction)
     return ca.vertcat(
-        short * ca.sin(one), short * ca.cos(one), long * ca.sin(other), long * ca.cos(other)
+        radius_a * ca.sin(angle_a),
+        radius_a * ca.cos(angle_a),
+        radius_b * ca.sin(angle_b),
+        radius_b * ca.cos(angle_b),
     )
 
 
-SIX = 6
-"""An arm with fewer free motors brings a palm where it is asked for by chance only."""
+POSE_DIMENSION = 6
+"""Number of free motors below which an arm cannot reach a generic palm pose."""
 
 
 @dataclass(frozen=True)
 class NumericArmParameters:
-    """How an arm is searched step by step.
+    """Parameters of the iterative search for an arm configuration.
 
     Attributes:
-        table: Configurations of the arm to start from.
-        starts: Of these, how many are tried for a palm pose; all rounds of a solve together try
-            them all.
-        near: A start of an arm of fewer than `SIX` free motors that ends as near as this (cost, by
-            the sum of the squared tolerances) is good enough: a hand on a wrist takes 20
-            evaluations of its arm instead of 250.
-        gap: A joint that can turn all around but for so much [rad] may rest at the wrong end of its
-            range: what is beyond one end is nearly what is beyond the other.
-        at_end: How near to a limit [rad] counts as at it.
+        table_size: Number of start configurations of the arm.
+        starts: Maximum number of starts per palm pose; all restarts of a solve together use the
+            whole table.
+        good_start_cost: Cost, relative to the sum of the squared tolerances, at which the search
+            ends for an arm of fewer than `POSE_DIMENSION` free motors. Source: a hand on a wrist
+            takes 20 evaluations of its arm instead of 250.
+        max_range_gap: Largest gap between the limits of a joint modulo 2 pi [rad] for which the
+            solution of a joint at one limit may be near the other limit.
+        limit_distance: Distance from a limit below which a joint is at the limit [rad].
     """
 
-    table: int = 1024
+    table_size: int = 1024
     starts: int = 22
-    near: float = 4.0
-    gap: float = 1.0
-    at_end: float = 1e-6
+    good_start_cost: float = 4.0
+    max_range_gap: float = 1.0
+    limit_distance: float = 1e-6
 
 
-NUMERIC_ARM = NumericArmParameters()
+NUMERIC_ARM_PARAMETERS = NumericArmParameters()
 
 
 @cache
 def start_table(robot: RobotDescription) -> tuple[Array, Array]:
-    """Configurations of the arm (table, a) to start from, and their palms (table, 12).
+    """Return start configurations of the arm (table, a) and features of their palms (table, 12).
 
-    Of a palm the rotation, row by row, and the origin / `LENGTH`.
+    The features of a palm pose are its rotation, row by row, and its origin / `LENGTH`.
     """
     columns = list(robot.arm_actuators)
-    spread = spread_points(NUMERIC_ARM.table, len(columns))
+    spread = spread_points(NUMERIC_ARM_PARAMETERS.table_size, len(columns))
     arms = robot.lower[columns] + spread * (robot.upper - robot.lower)[columns]
     q = ca.SX.sym("q", len(columns))
-    palm = _palm(robot, q)
+    palm = _palm_of_arm(robot, q)
     features = ca.vertcat(ca.vec(palm.rotation.T), palm.origin / LENGTH)
     return arms, np.array(ca.Function("features", [q], [features])(arms.T)).T
 
 
 def nearest_start(robot: RobotDescription) -> ca.Function:
-    """The next start for a palm pose.
+    """Return the graph that selects the next start for a palm pose.
 
     Returns:
-        ``(rotation, origin, passed) -> (arm, distance)``: the configuration whose palm is nearest
-        of those farther than `passed`, and its distance.
+        ``(rotation, origin, previous_distance) -> (arm, distance)``: among the start configurations
+        whose palm is farther than `previous_distance` the nearest one, and its distance.
     """
     arms, table = start_table(robot)
     rotation, origin = ca.MX.sym("rotation", 3, 3), ca.MX.sym("origin", 3)
-    passed = ca.MX.sym("passed")
-    wanted = ca.vertcat(ca.vec(rotation.T), origin / LENGTH)
-    distances = ca.DM((table**2).sum(axis=1)) - 2 * ca.DM(table) @ wanted
-    index, distance = _next_nearest(distances + ca.sumsqr(wanted), passed)
+    previous_distance = ca.MX.sym("passed")
+    features = ca.vertcat(ca.vec(rotation.T), origin / LENGTH)
+    distances = ca.DM((table**2).sum(axis=1)) - 2 * ca.DM(table) @ features
+    index, distance = _next_nearest(distances + ca.sumsqr(features), previous_distance)
     arm = ca.DM(arms.T) @ (ca.DM(range(len(arms))) == index)
-    return ca.Function("nearest_start", [rotation, origin, passed], [ca.densify(arm), distance])
+    return ca.Function(
+        "nearest_start", [rotation, origin, previous_distance], [ca.densify(arm), distance]
+    )
 
 
-def _next_nearest(distances: Expr, passed: Expr) -> tuple[Expr, Expr]:
-    """Index and distance of the nearest row beyond `passed`; of the nearest of all after the last.
+def _next_nearest(distances: Expr, previous_distance: Expr) -> tuple[Expr, Expr]:
+    """Return index and distance of the nearest row beyond `previous_distance`.
 
-    As operations on whole vectors, since unrolled they would be most of the method's code.
+    After the last row the search wraps around to the nearest row. The operations act on whole
+    vectors, because unrolled they would dominate the code size of the method.
     """
-    beyond = distances > passed
-    over = 1 - ca.norm_inf(beyond)
-    masked = ca.if_else(ca.logic_or(beyond, ca.repmat(over, distances.numel(), 1)), distances, 1e30)
+    is_farther = distances > previous_distance
+    is_exhausted = 1 - ca.norm_inf(is_farther)
+    masked = ca.if_else(
+        ca.logic_or(is_farther, ca.repmat(is_exhausted, distances.numel(), 1)), distances, 1e30
+    )
     nearest = ca.mmin(masked)
     return ca.find(masked <= nearest), nearest
 
 
-def next_at_end(robot: RobotDescription, arm: Expr, turned: Expr, p: dict[str, Expr]) -> Expr:
-    """The next joint that rests at an end of its range and may be sent to the other one.
+def next_joint_at_limit(
+    robot: RobotDescription, arm: Expr, joints_done: Expr, p: dict[str, Expr]
+) -> Expr:
+    """Return the next joint at a limit whose solution may be near the opposite limit.
 
     Args:
-        robot: The description.
-        arm: (a, 1) where the arm came to rest.
-        turned: How many joints were seen to.
+        robot: Description of the robot.
+        arm: (a, 1) positions of the converged arm.
+        joints_done: Number of leading joints already considered.
         p: Parameters.
 
     Returns:
-        Its number in the arm, from 1; 0 if none is left.
+        Index of the joint in the arm, from 1; 0 if there is none.
     """
     columns = list(robot.arm_actuators)
     lower, upper = p["lower"][columns], p["upper"][columns]
-    found, end = ca.SX(0), NUMERIC_ARM.at_end
+    result, limit_distance = ca.SX(0), NUMERIC_ARM_PARAMETERS.limit_distance
     for i, column in enumerate(columns):
         if robot.actuators[column].unit != "rad":
             continue
         gap = 2 * np.pi - (upper[i] - lower[i])
-        ends = ca.logic_or(arm[i] - lower[i] <= end, upper[i] - arm[i] <= end)
-        due = ca.logic_and(ca.logic_and(ends, ca.fabs(gap) < NUMERIC_ARM.gap), turned <= i)
-        found = ca.if_else(ca.logic_and(due, found <= 0), i + 1, found)
-    return found
+        is_at_limit = ca.logic_or(
+            arm[i] - lower[i] <= limit_distance, upper[i] - arm[i] <= limit_distance
+        )
+        is_candidate = ca.logic_and(
+            ca.logic_and(is_at_limit, ca.fabs(gap) < NUMERIC_ARM_PARAMETERS.max_range_gap),
+            joints_done <= i,
+        )
+        result = ca.if_else(ca.logic_and(is_candidate, result <= 0), i + 1, result)
+    return result
 
 
 def pose_step(
     robot: RobotDescription, arm: Expr, palm: Pose, damping: Expr, p: dict[str, Expr]
-) -> Tried:
-    """One damped step of the arm (a, 1) towards a palm pose."""
-    columns, seen = list(robot.arm_actuators), _pose_at(robot)
-    bounds = Bounded(arm, p["lower"][columns], p["upper"][columns], first=0)
+) -> TrialStep:
+    """Return a damped step of the arm (a, 1) towards a palm pose."""
+    columns, pose_error = list(robot.arm_actuators), _pose_error_function(robot)
+    bounds = BoxBounds(arm, p["lower"][columns], p["upper"][columns], first=0)
     return lm_step(
-        lambda there: seen(there, palm.rotation, palm.origin),
+        lambda x: pose_error(x, palm.rotation, palm.origin),
         arm,
         damping,
         bounds,
@@ -254,59 +269,59 @@ def pose_step(
 
 
 @cache
-def _pose_at(robot: RobotDescription) -> Callable[..., Any]:
-    """(arm, rotation, origin) -> how far the palm is off, and the Jacobian of that."""
+def _pose_error_function(robot: RobotDescription) -> Callable[..., Any]:
+    """Return ``(arm, rotation, origin) -> (error, jacobian)`` of the palm pose."""
     arm = ca.SX.sym("arm", len(robot.arm_actuators))
-    wanted = Pose(ca.SX.sym("rotation", 3, 3), ca.SX.sym("origin", 3))
-    error = _error(_palm(robot, arm), wanted)
-    inputs = [arm, wanted.rotation, wanted.origin]
+    target = Pose(ca.SX.sym("rotation", 3, 3), ca.SX.sym("origin", 3))
+    error = _pose_error(_palm_of_arm(robot, arm), target)
+    inputs = [arm, target.rotation, target.origin]
     return call_function("pose_at", inputs, [error, pose_jacobian(robot, arm)])
 
 
 def newton_polish(robot: RobotDescription, model_error: float) -> ca.Function:
-    """From a nominal arm to the real one.
+    """Return the graph of Newton steps from the solution of a nominal arm to the real arm.
 
     Args:
-        robot: The description.
-        model_error: How far the nominal arm is from the real one [m and rad].
+        robot: Description of the robot.
+        model_error: Deviation of the nominal arm from the real one [m and rad].
 
     Returns:
-        ``(arm, rotation, origin, lower, upper) -> (arm, hits)``: the arm (a, 1), within bounds
-        (n, 1) of all motors, that brings the palm to a pose, and whether it does.
+        ``(arm, rotation, origin, lower, upper) -> (arm, is_exact)``: the arm (a, 1) within the
+        bounds (n, 1) of all motors, and whether it reaches the palm pose.
     """
     columns, n = list(robot.arm_actuators), len(robot.actuators)
     rotation, origin = ca.SX.sym("rotation", 3, 3), ca.SX.sym("origin", 3)
     start = ca.SX.sym("arm", len(columns))
     p = {"lower": ca.SX.sym("lower", n), "upper": ca.SX.sym("upper", n)}
-    inside = ca.fmin(ca.fmax(start, p["lower"][columns]), p["upper"][columns])
-    tried = pose_step(robot, inside, Pose(rotation, origin), ca.SX(FIT.damping_floor), p)
-    before, there = ca.sumsqr(tried.before), ca.sumsqr(tried.there)
-    reached = ca.if_else(there < before, tried.reached, inside)
-    hits = ca.fmin(before, there) < FIT.exact * FIT.exact
-    given = [rotation, origin, p["lower"], p["upper"]]
-    step = ca.Function("newton_step", [start, *given], with_cse(reached, hits))
+    clipped = ca.fmin(ca.fmax(start, p["lower"][columns]), p["upper"][columns])
+    trial = pose_step(robot, clipped, Pose(rotation, origin), ca.SX(FIT.damping_floor), p)
+    cost_before, cost_after = ca.sumsqr(trial.residual_before), ca.sumsqr(trial.residual)
+    arm_after = ca.if_else(cost_after < cost_before, trial.x, clipped)
+    is_exact = ca.fmin(cost_before, cost_after) < FIT.exact * FIT.exact
+    target = [rotation, origin, p["lower"], p["upper"]]
+    step = ca.Function("newton_step", [start, *target], with_cse(arm_after, is_exact))
     inputs: list[Expr] = [ca.MX.sym("x", x.shape) for x in step.mx_in()]
-    arm, *given = inputs
-    found: Expr = ca.MX(0)
-    for _ in range(newton_steps(model_error)):
-        arm, found = step(arm, *given)
-    return ca.Function("newton_polish", inputs, [arm, found])
+    arm, *target = inputs
+    is_reached: Expr = ca.MX(0)
+    for _ in range(newton_step_count(model_error)):
+        arm, is_reached = step(arm, *target)
+    return ca.Function("newton_polish", inputs, [arm, is_reached])
 
 
-def newton_steps(model_error: float) -> int:
-    """Newton's steps for an arm that is off by so much [m and rad]: each of them squares it.
+def newton_step_count(model_error: float) -> int:
+    """Return the number of Newton steps for a model error [m and rad], which every step squares.
 
-    One that is off by a millimetre is right to a micrometre after one, to rounding after two; one
-    that is off by a centimetre needs three.
+    An error of a millimetre is a micrometre after one step and rounding after two; an error of a
+    centimetre needs three.
     """
-    right = 1e-12
-    squarings = math.log2(math.log(right) / math.log(max(model_error, right)))
-    return max(1, math.ceil(squarings))
+    converged = 1e-12
+    steps = math.log2(math.log(converged) / math.log(max(model_error, converged)))
+    return max(1, math.ceil(steps))
 
 
 def pose_jacobian(robot: RobotDescription, arm: Expr) -> Expr:
-    """Jacobian (12, a) of position / `LENGTH` and of the columns of the palm's rotation."""
-    body = actuated(robot, _whole(robot, arm))
+    """Return the Jacobian (12, a) of position / `LENGTH` and the columns of the palm rotation."""
+    body = actuated(robot, _configuration_of_arm(robot, arm))
     linear, angular = body.palm_jacobian(robot.arm_actuators)
     rotation = body.kinematics.palm.rotation
     rows = [linear / LENGTH]
@@ -315,20 +330,20 @@ def pose_jacobian(robot: RobotDescription, arm: Expr) -> Expr:
 
 
 def _features(rotation: Expr, origin: Expr) -> Expr:
-    """A palm pose as twelve numbers: origin / `LENGTH` and the columns of its rotation."""
+    """Return origin / `LENGTH` and the columns of the rotation of a palm pose, (12, 1)."""
     return ca.vertcat(origin / LENGTH, ca.reshape(rotation, 9, 1))
 
 
-def _error(palm: Pose, wanted: Pose) -> Expr:
-    return _features(palm.rotation, palm.origin) - _features(wanted.rotation, wanted.origin)
+def _pose_error(palm: Pose, target: Pose) -> Expr:
+    return _features(palm.rotation, palm.origin) - _features(target.rotation, target.origin)
 
 
-def _palm(robot: RobotDescription, arm: Expr) -> Pose:
-    return actuated(robot, _whole(robot, arm)).kinematics.palm
+def _palm_of_arm(robot: RobotDescription, arm: Expr) -> Pose:
+    return actuated(robot, _configuration_of_arm(robot, arm)).kinematics.palm
 
 
-def _whole(robot: RobotDescription, arm: Expr) -> Expr:
-    """Q with the hand at zero: it does not move the palm."""
+def _configuration_of_arm(robot: RobotDescription, arm: Expr) -> Expr:
+    """Return q with the given arm and the hand at zero, which does not affect the palm."""
     q = ca.SX.zeros(len(robot.actuators), 1)
     for i, column in enumerate(robot.arm_actuators):
         q[column] = arm[i]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array
-from casadi_ik.kinematics.contacts import NAMES
+from casadi_ik.kinematics.contacts import EXTRA_ARRAY_NAMES
 from casadi_ik.logs.events import Happening, errors_text, listed, number, plain_name, plural
 from casadi_ik.logs.format import LogClock
 from casadi_ik.logs.reader import Log
@@ -408,7 +408,7 @@ def target_key(points: Array, normals: Array, more: Mapping[str, Array] | None =
         more: (f, 3) what they have beside; NaN where free.
     """
     free = np.full_like(points, np.nan)
-    others = [free if more is None else more.get(name, free) for name in NAMES]
+    others = [free if more is None else more.get(name, free) for name in EXTRA_ARRAY_NAMES]
     rounded = np.round(np.concatenate([points, normals, *others]).astype(float) / SAME)
     rounded[np.isnan(rounded)] = np.inf
     return (rounded + 0.0).tobytes()

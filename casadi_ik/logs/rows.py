@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.compile.layout import Field, Layout, opaque
-from casadi_ik.kinematics.contacts import NAMES
+from casadi_ik.kinematics.contacts import EXTRA_ARRAY_NAMES
 from casadi_ik.logs.events import EventKind, as_matrix, jacobian_names, measured_jacobians, words_of
 from casadi_ik.solve.recorder import SolveBlock
 from casadi_ik.solve.request import NO_PREFERENCE, PREFERENCES
@@ -119,7 +119,10 @@ def solve_layout(n: int, f: int, phases: int, kinds: int, jacobians: int, checke
         Field("seed", (), "f8", "", "of random numbers; exact below 2**53"),
         Field("target_points", (f, 3), "f8", "m", "base frame; NaN if free"),
         Field("target_normals", (f, 3), "f8", "", "base frame; NaN if free"),
-        *(Field(f"target_{name}", (f, 3), "f8", "", "base frame; NaN if free") for name in NAMES),
+        *(
+            Field(f"target_{name}", (f, 3), "f8", "", "base frame; NaN if free")
+            for name in EXTRA_ARRAY_NAMES
+        ),
         *((lowest,) if jacobians else ()),
         *(clearance if checked else ()),
         Field("solve_id", (), "u4"),
@@ -211,7 +214,7 @@ def solve_rows(block: SolveBlock, events: NDArray[np.int64], form: TraceFormat) 
 def _common(block: SolveBlock, layout: Layout) -> NDArray[Any]:
     """Rows (k,) with what all solves of a block have in common; numpy copies whole rows at once."""
     one = np.zeros(1, layout.dtype)
-    for name in NAMES:
+    for name in EXTRA_ARRAY_NAMES:
         one[f"target_{name}"] = np.nan
     one["seed"] = block.seed
     one["limits_enforced"] = block.targets.enforce_limits

@@ -15,7 +15,7 @@ from casadi_ik.compile.layout import Field, Layout
 from casadi_ik.errors import LogError, UnknownNameError
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arm_hand import ArmHand
-from casadi_ik.kinematics.contacts import NAMES
+from casadi_ik.kinematics.contacts import EXTRA_ARRAY_NAMES
 from casadi_ik.logs.events import Happening, bits_of, errors_text, measured_jacobians
 from casadi_ik.logs.reader import Log
 from casadi_ik.logs.tables import MethodRows, Table, element_name, happenings, label_of
@@ -269,7 +269,7 @@ def one_solve(
 def targets_beside(row: np.void) -> dict[str, Array]:
     """(f, 3) what the contacts of a solve's row have beside points and normals, by name."""
     names = row.dtype.names or ()
-    return {name: row[f"target_{name}"] for name in NAMES if f"target_{name}" in names}
+    return {name: row[f"target_{name}"] for name in EXTRA_ARRAY_NAMES if f"target_{name}" in names}
 
 
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?")

@@ -15,7 +15,7 @@ from casadi_ik.collision.distances import gaps
 from casadi_ik.collision.scene import Scene
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arm_hand import ArmHand
-from casadi_ik.kinematics.contacts import usual
+from casadi_ik.kinematics.contacts import point_normal_kinds
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.motion.clear import least_clearance
 from casadi_ik.motion.cycle import of_side
@@ -51,7 +51,7 @@ class Closer:
     def __init__(self, plan: FollowPlan) -> None:
         """Compile what is not compiled yet; the plan has no limits of velocity."""
         self._robot = plan.robot
-        self._asked = FollowerInputs(plan, usual(len(plan.robot.fingers)), 0)
+        self._asked = FollowerInputs(plan, point_normal_kinds(len(plan.robot.fingers)), 0)
 
     def find(
         self,

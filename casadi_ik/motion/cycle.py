@@ -45,13 +45,13 @@ import casadi as ca
 from casadi_ik.compile.graphs import FunctionGraph, recipe
 from casadi_ik.compile.layout import Field, Layout
 from casadi_ik.files.arrays import Array
-from casadi_ik.kinematics.box_qp import Bounded, damped_step
-from casadi_ik.kinematics.contact_fit import whole_jacobian, whole_residual
+from casadi_ik.kinematics.box_qp import BoxBounds, damped_step
+from casadi_ik.kinematics.contact_fit import contact_jacobian, contact_residual
 from casadi_ik.kinematics.contacts import (
     LENGTH,
     ContactRows,
     Kinds,
-    suffix,
+    kinds_suffix,
     tip_vectors,
     within_tolerance,
 )
@@ -263,7 +263,7 @@ class Cycle:
     def graph(self) -> FunctionGraph:
         """``(state, parameters) -> (state', record)``."""
         what = f"cycle_{self.obstacles}" if self.obstacles else "cycle"
-        name = ca.Function.fix_name(f"{self.robot.name}_{what}{suffix(self.kinds)}")
+        name = ca.Function.fix_name(f"{self.robot.name}_{what}{kinds_suffix(self.kinds)}")
         inputs = {"state": (self.state.size, 1), "parameters": (self.parameters.size, 1)}
         outputs = (self.state.size, 1), (self.record.size, 1)
         known = recipe(name, self.robot, self.kinds, self.obstacles)
@@ -414,14 +414,14 @@ class Cycle:
         residual = ca.vertcat(residual, pull * (here - anchor) / scales)
         jacobian = ca.vertcat(jacobian @ ca.diag(scales), pull * ca.SX.eye(n))
         at, (low, high) = here / scales, bounds
-        box = Bounded(at, low / scales, high / scales, first=0)
+        box = BoxBounds(at, low / scales, high / scales, first=0)
         damping = TUNING.residual_damping * missed
         found = damped_step(ca.sparsify(jacobian), residual, damping, box, TUNING.passes, full)
         return here + found.step * scales
 
     def _residual(self, q: Expr, p: dict[str, Expr]) -> Expr:
         """Of contacts and palms, (rows, 1)."""
-        rows = [whole_residual(self.robot, self.contacts, q, p)]
+        rows = [contact_residual(self.robot, self.contacts, q, p)]
         links = actuated(self.robot, q).kinematics.links
         for side, (link, placement) in self.palms.items():
             palm, weight = links[link].at(placement), p[of_side("palm_weight", side)]
@@ -442,7 +442,7 @@ class Cycle:
             axes = ca.horzsplit(palm.rotation)
             turned = [-weight[1] * skew(axis) @ angular for axis in axes]
             rows += [weight[0] * linear / LENGTH, *turned]
-        jacobian = whole_jacobian(self.robot, self.contacts, q, p)
+        jacobian = contact_jacobian(self.robot, self.contacts, q, p)
         return ca.vertcat(jacobian, *map(ca.sparsify, rows)) if rows else jacobian
 
     def _errors(self, q: Expr, p: dict[str, Expr]) -> tuple[Expr, Expr]:

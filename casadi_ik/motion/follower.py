@@ -13,7 +13,7 @@ from casadi_ik.errors import InputError, InvalidPoseError
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.input_checks.keypoints import lost_contacts_reason
 from casadi_ik.files.input_checks.poses import single_pose
-from casadi_ik.kinematics.contacts import Kinds, by_kinds, usual
+from casadi_ik.kinematics.contacts import Kinds, group_by_kinds, point_normal_kinds
 from casadi_ik.model.grasp import Grasp, real_array
 from casadi_ik.motion.clear import OBSTACLES, Guard, motor_units, stopping_way
 from casadi_ik.motion.inputs import FollowerInputs, FollowPlan
@@ -128,7 +128,7 @@ class Follower:
         self._change = plan.rates.steps(plan.period)[1]
         robot = plan.robot
         self._n, self._shape = len(robot.actuators), (len(robot.fingers), 3)
-        self._usual = usual(self._shape[0])
+        self._usual = point_normal_kinds(self._shape[0])
         self._tolerances = self._own = tuple(plan.request.tolerances.values())
         self._all_asked: dict[Kinds, FollowerInputs] = {}
         self._posture = plan.posture
@@ -308,7 +308,7 @@ class Follower:
         if normals is not None:
             raise InputError("normals: found beside a grasp, expected them in it")
         problem = self._plan.request.of_grasps([grasp], None)
-        ((kinds, _, _),) = by_kinds(problem)
+        ((kinds, _, _),) = group_by_kinds(problem)
         if kinds != self._asked.cycle.kinds:
             self._take_up(kinds)
         self._tolerances = problem.tolerances

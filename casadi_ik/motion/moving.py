@@ -14,7 +14,7 @@ from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.input_checks.poses import single_pose
 from casadi_ik.kinematics.arm_hand import ArmHand
-from casadi_ik.kinematics.contacts import by_kinds
+from casadi_ik.kinematics.contacts import group_by_kinds
 from casadi_ik.model.grasp import Grasp
 from casadi_ik.model.pose import inverse
 from casadi_ik.model.targets import TargetBatch
@@ -144,7 +144,7 @@ class MovingSolver:
             targets = replace(targets, fixed=self._request.held(fixed))
         engine, start = self._engine.kinds_of(targets), self._request.start(q0)
         _ = engine.finder
-        ((kinds, _, _),) = by_kinds(targets.rows(slice(0, 1)))
+        ((kinds, _, _),) = group_by_kinds(targets.rows(slice(0, 1)))
         travel = None
         if period is not None:
             travel = rates_of(self.robot, velocity, None).steps(seconds("period", period))[0]

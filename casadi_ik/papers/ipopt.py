@@ -27,8 +27,8 @@ from casadi_ik.compile.layout import Field, Layout
 from casadi_ik.compile.loop import Stepper
 from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.files.arrays import Array
-from casadi_ik.kinematics.contact_fit import whole_residual
-from casadi_ik.kinematics.contacts import LENGTH, ContactRows, Kinds, usual
+from casadi_ik.kinematics.contact_fit import contact_residual
+from casadi_ik.kinematics.contacts import LENGTH, ContactRows, Kinds, point_normal_kinds
 from casadi_ik.kinematics.couplings import joint_positions
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.targets import TargetBatch
@@ -161,7 +161,7 @@ class WholeNlp:
         )
 
         q, p = ca.SX.sym("q", n), self.parameters.symbols("p")
-        residual = whole_residual(robot, self.contacts, q, self.parameters.unpack(p))
+        residual = contact_residual(robot, self.contacts, q, self.parameters.unpack(p))
         joints = joint_positions(robot, q)[limited]
         self.residual = ca.Function("residual", [q, p], [residual], ["q", "p"], ["r"])
         self._joints = ca.Function("joints", [q], [ca.densify(joints)])
@@ -420,7 +420,7 @@ class IpoptMethod:
             kinds: Of the contacts, by finger; None: point and normal.
         """
         del compiled
-        self._kinds = kinds or usual(len(robot.fingers))
+        self._kinds = kinds or point_normal_kinds(len(robot.fingers))
         self.options = options
         self._robot = robot
 

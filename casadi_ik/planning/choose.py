@@ -20,7 +20,7 @@ from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.files.input_checks.poses import single_pose
 from casadi_ik.kinematics.arm_hand import ArmHand
-from casadi_ik.kinematics.contacts import by_kinds
+from casadi_ik.kinematics.contacts import group_by_kinds
 from casadi_ik.model.grasp import Grasp
 from casadi_ik.model.pose import inverse, transform_arrays
 from casadi_ik.model.targets import TargetBatch
@@ -251,7 +251,7 @@ def _asked(
         some = [grasps[number] for number in numbers]
         rows = np.array(numbers, dtype=np.intp)
         targets = _placed(request.of_grasps(some, fixed), some, pose)
-        for _, of_kinds, alike in by_kinds(targets):
+        for _, of_kinds, alike in group_by_kinds(targets):
             yield rows[of_kinds], alike
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arms.recognise import srs_arm
 from casadi_ik.kinematics.arms.srs import SrsArm
-from casadi_ik.kinematics.contact_fit import fresh_fit
+from casadi_ik.kinematics.contact_fit import initial_lm_state
 from casadi_ik.kinematics.contacts import LENGTH
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.diagnosis import ArmReach, HandFit
@@ -249,7 +249,7 @@ class FloatingPalmFit:
         """
         trials = self._trials
         states, parameters = fits.states[rows], fits.parameters[rows]
-        for name, value in ({"phase": Phase.HAND_FIT} | fresh_fit()).items():
+        for name, value in ({"phase": Phase.HAND_FIT} | initial_lm_state()).items():
             states[:, trials.state.slice(name)] = value
         loose = parameters[:, trials.parameters.slice("position_tolerance")].min(axis=1)
         weight = np.sqrt(np.minimum(loose / (3 * fits.outside[rows]), 1.0))

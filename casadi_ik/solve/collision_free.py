@@ -27,7 +27,7 @@ from casadi_ik.collision.clearance import ROUNDING, Clearances, CollisionQuery
 from casadi_ik.collision.distances import Table
 from casadi_ik.files.arrays import Array, spread_steps
 from casadi_ik.kinematics.arm_hand import ArmHand
-from casadi_ik.kinematics.contacts import by_kinds
+from casadi_ik.kinematics.contacts import group_by_kinds
 from casadi_ik.model.targets import TargetBatch, Tolerance
 from casadi_ik.solve.alternatives import AlternativeFinder, side_links
 from casadi_ik.solve.arm_search import Preference
@@ -625,7 +625,7 @@ def resolve_collisions(
     # A target's random numbers are its own, whichever others are looked at with it.
     asked = replace(targets.rows(rows), picked=numbers)
     robot = finder_of(asked.rows(slice(0, 1))).robot
-    for _, of_kinds, some in by_kinds(asked):
+    for _, of_kinds, some in group_by_kinds(asked):
         chosen = rows[of_kinds]
         nearby, begun = query.rows(chosen), (q[chosen], starts[chosen])
         found = free_answers(finder_of(some), some, nearby, *begun, seed, every, reasons)

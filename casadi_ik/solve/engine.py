@@ -19,7 +19,7 @@ from casadi_ik.files.arrays import Array
 from casadi_ik.files.progress import is_interactive, progress
 from casadi_ik.files.writing import BackgroundWriter
 from casadi_ik.kinematics.arm_hand import ArmHand
-from casadi_ik.kinematics.contacts import Kinds, by_kinds, usual
+from casadi_ik.kinematics.contacts import Kinds, group_by_kinds, point_normal_kinds
 from casadi_ik.model.grasp import Tolerance
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.alternatives import AlternativeFinder
@@ -134,7 +134,7 @@ class Engine:
 
     def of_kinds(self, kinds: Kinds) -> Engine:
         """The engine for targets whose contacts are of these kinds; threads may share it."""
-        if kinds == (self.kinds or usual(len(kinds))):
+        if kinds == (self.kinds or point_normal_kinds(len(kinds))):
             return self
         with self._lock:
             if kinds not in self._others:
@@ -144,7 +144,7 @@ class Engine:
 
     def parted(self, targets: TargetBatch) -> Iterator[tuple[Engine, Any, TargetBatch]]:
         """Engines for targets of any kinds, with the rows and the targets of each."""
-        for kinds, rows, some in by_kinds(targets):
+        for kinds, rows, some in group_by_kinds(targets):
             yield self.of_kinds(kinds), rows, some
 
     def kinds_of(self, targets: TargetBatch) -> Engine:
@@ -199,7 +199,7 @@ class Engine:
     @cached_property
     def sensitivity(self) -> SensitivityKernel:
         """Derivatives of answers with respect to their contacts."""
-        kinds = self.kinds or usual(len(self.robot.fingers))
+        kinds = self.kinds or point_normal_kinds(len(self.robot.fingers))
         return SensitivityKernel(self.robot.description, kinds, self.compiled)
 
     def about(self, check: SceneCheck) -> Engine:

@@ -18,7 +18,7 @@ from casadi_ik.files.arrays import Array
 from casadi_ik.files.input_checks.poses import checked_pose
 from casadi_ik.files.input_checks.units import warn_of_far_contacts, warn_of_wide_tolerance
 from casadi_ik.kinematics.arm_hand import ArmHand
-from casadi_ik.kinematics.contacts import LENGTH, more_arrays
+from casadi_ik.kinematics.contacts import LENGTH, check_extra_vectors
 from casadi_ik.model.grasp import Contact, Grasp, Tolerance
 from casadi_ik.model.pose import Free
 from casadi_ik.model.targets import DIRECTIONS_KEY, TargetBatch, fixed_array, target_arrays
@@ -236,18 +236,18 @@ class Request:
             normals: (k, f, 3).
             fixed: See `TargetBatch`.
             first_row: Number of the first target.
-            more: (k, f, 3) what contacts have beside, see `more_arrays`; and directions.
+            more: (k, f, 3) what contacts have beside, see `check_extra_vectors`; and directions.
             prefer: See `TargetBatch`.
 
         Raises:
-            InputError: See `target_arrays` and `more_arrays`.
+            InputError: See `target_arrays` and `check_extra_vectors`.
         """
         named = dict(more or {})
         directions = named.pop(DIRECTIONS_KEY, None)
         p, n = target_arrays(points, normals, len(self.robot.fingers), first_row, directions)
         warn_of_far_contacts(p, "points", self._base_travel)
         tolerances = tuple(self.tolerances.values())
-        others = more_arrays(named, p, n, first_row) if named else {}
+        others = check_extra_vectors(named, p, n, first_row) if named else {}
         return TargetBatch(
             p, n, tolerances, self.enforce_limits, first_row, fixed, others, prefer=prefer
         )

@@ -21,8 +21,8 @@ import numpy as np
 from casadi_ik.compile import FunctionGraph, FunctionKernel
 from casadi_ik.compile.graphs import recipe
 from casadi_ik.files.arrays import Array
-from casadi_ik.kinematics.contact_fit import whole_residual
-from casadi_ik.kinematics.contacts import ContactRows, Kinds, suffix
+from casadi_ik.kinematics.contact_fit import contact_residual
+from casadi_ik.kinematics.contacts import ContactRows, Kinds, kinds_suffix
 from casadi_ik.kinematics.forward import motor_scales
 from casadi_ik.kinematics.linear_algebra import solve_spd
 from casadi_ik.model.description import RobotDescription
@@ -60,7 +60,7 @@ class SensitivityKernel:
         self._inputs = {"q": (n, 1), "free": (n, 1), "gradient": (n, 1)}
         self._inputs |= {field.name: (f, field.size // f) for field in self._contacts.fields}
         size = sum(rows * columns for rows, columns in self._inputs.values())
-        self._name = name = ca.Function.fix_name(f"{robot.name}_sensitivity{suffix(kinds)}")
+        self._name = name = ca.Function.fix_name(f"{robot.name}_sensitivity{kinds_suffix(kinds)}")
         self._shapes, known = {"given": (size, 1)}, recipe(name, robot, kinds)
         self._outputs, self._recipe, self._compiled = ((6 * f, 1),), known, compiled
 
@@ -94,7 +94,7 @@ class SensitivityKernel:
         for name, (rows, columns) in self._inputs.items():
             own = column[first : first + rows * columns]
             given[name], first = ca.reshape(own, columns, rows).T, first + rows * columns
-        residual = whole_residual(robot, self._contacts, given["q"], given)
+        residual = contact_residual(robot, self._contacts, given["q"], given)
         scales = given["free"] * motor_scales(robot)
         rates = ca.jacobian(residual, given["q"]) @ ca.diag(scales)
         square = ca.densify(rates.T @ rates + DAMPING * ca.DM.eye(len(robot.actuators)))

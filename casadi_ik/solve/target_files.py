@@ -18,7 +18,7 @@ from casadi_ik.errors import InputError, UnsupportedError, os_errors
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.limits import RAISE_HINT, scaled_limit
 from casadi_ik.files.number_files import READ_ERRORS
-from casadi_ik.kinematics.contacts import NAMES
+from casadi_ik.kinematics.contacts import EXTRA_ARRAY_NAMES
 from casadi_ik.model.targets import DIRECTIONS_KEY
 
 if TYPE_CHECKING:
@@ -77,7 +77,10 @@ class TargetFile:
             there = {name.removesuffix(".npy") for name in archive.namelist()}
             members = {
                 key: opened.enter_context(self._member(archive, key))
-                for key in (*KEYS, *(key for key in (*NAMES, DIRECTIONS_KEY) if key in there))
+                for key in (
+                    *KEYS,
+                    *(key for key in (*EXTRA_ARRAY_NAMES, DIRECTIONS_KEY) if key in there),
+                )
             }
             count = members["points"].count
             for key, member in members.items():

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from casadi_ik.compile.layout import Layout
 from casadi_ik.files.arrays import Array, Rows, spread_points
 from casadi_ik.kinematics.arm_hand import ArmHand
-from casadi_ik.kinematics.contact_fit import fresh_fit
+from casadi_ik.kinematics.contact_fit import initial_lm_state
 from casadi_ik.kinematics.contacts import LENGTH
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.hand_first.method import HandFirstMethod
@@ -226,7 +226,7 @@ def refinement_rows(trials: Subproblems, targets: TargetBatch) -> tuple[Array, A
     count, hand = len(targets), len(trials.robot.description.hand_actuators)
     home = np.tile(trials.robot.home, (count, 1))
     states, parameters = trials.posture_rows(targets, home, np.zeros((count, hand)))
-    for name, value in ({"phase": Phase.REFINEMENT} | fresh_fit()).items():
+    for name, value in ({"phase": Phase.REFINEMENT} | initial_lm_state()).items():
         states[:, trials.state.slice(name)] = value
     return states, parameters
 

@@ -319,10 +319,7 @@ def test_elementary_functions_computed_together(scale):
     inner = np.ascontiguousarray(whole[:, :size])
     np.testing.assert_array_equal(inner[:, :COUNT].ravel(), sine(samples.ravel())[0])
     np.testing.assert_array_equal(whole[:, size : 2 * size].ravel(), cosine(inner.ravel() + 1)[0])
-    rows = [
-        np.ascontiguousarray(call_function).ravel()
-        for call_function in (inner[:, 1:], inner[:, :-1])
-    ]
+    rows = [np.ascontiguousarray(block).ravel() for block in (inner[:, 1:], inner[:, :-1])]
     np.testing.assert_array_equal(whole[:, 2 * size : 3 * size - 1].ravel(), angle(*rows)[0])
 
 

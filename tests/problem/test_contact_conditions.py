@@ -12,23 +12,23 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from casadi_ik.kinematics.arms.recognise import srs_arm
-from casadi_ik.kinematics.contact_fit import whole_jacobian, whole_residual
+from casadi_ik.kinematics.contact_fit import contact_jacobian, contact_residual
 from casadi_ik.kinematics.contacts import (
     CONDITIONS,
-    FACING,
     LENGTH,
-    PLACE,
+    ORIENTATION,
+    POSITION,
     ContactKind,
     ContactRows,
     chord,
-    kind_of,
-    suffix,
-    usual,
+    kind_from_vectors,
+    kinds_suffix,
+    point_normal_kinds,
     within_tolerance,
 )
 from casadi_ik.kinematics.forward import Pose
 from casadi_ik.kinematics.palm import (
-    NUMERIC_ARM,
+    NUMERIC_ARM_PARAMETERS,
     best_palm,
     hand_contacts,
     nearest_start,
@@ -47,7 +47,7 @@ RADIUS = 9.5e-3
 
 BY_ASPECT = [
     [name for name, condition in CONDITIONS.items() if condition.aspect == aspect]
-    for aspect in (PLACE, FACING)
+    for aspect in (POSITION, ORIENTATION)
 ]
 KINDS = [ContactKind(*names) for names in product(*BY_ASPECT)]
 WEIGHTS = np.array([[1.0, 1.0], [1.0, 0.0], [0.5, 2.0]])
@@ -96,9 +96,9 @@ def test_jacobian_of_the_whole_is_the_slope_of_the_residual(robot, kind, rng):
     p, rows = parameters(data_at(robot, other, rng)), ContactRows((kind,) * 3)
 
     def residual(x):
-        return number(whole_residual(robot.description, rows, ca.SX(x), p)).ravel()
+        return number(contact_residual(robot.description, rows, ca.SX(x), p)).ravel()
 
-    found = number(whole_jacobian(robot.description, rows, ca.SX(q), p))
+    found = number(contact_jacobian(robot.description, rows, ca.SX(q), p))
     assert found.shape == (rows.size, 14)
     np.testing.assert_allclose(found, differences(residual, q), atol=2e-7)
     assert np.linalg.matrix_rank(found) >= 5
@@ -135,7 +135,7 @@ def test_hand_and_whole_have_the_same_residual(robot, kind, rng):
     contacts = hand_contacts(robot.description, ca.SX(q[ARM:]), tuple(range(ARM, 14)))
     place = PalmAndHand(ca.DM(palm[:3, :3]), ca.DM(palm[:3, 3]), ca.DM(q[ARM:]))
     hand = rows.errors(ca.DM(number(fit_residual(contacts, rows, place, p))))
-    whole = rows.errors(ca.DM(number(whole_residual(robot.description, rows, ca.SX(q), p))))
+    whole = rows.errors(ca.DM(number(contact_residual(robot.description, rows, ca.SX(q), p))))
     for one, other_one in zip(hand, whole, strict=True):
         np.testing.assert_allclose(number(one), number(other_one), atol=1e-12)
 
@@ -164,12 +164,12 @@ def own_errors(kind, data, frames):
         "line": np.linalg.norm(np.cross(data["lines"], off), axis=1),
         "plane": np.abs(np.sum(data["planes"] * off, axis=1)),
         "ball": np.linalg.norm(off + RADIUS * (data["balls"] - frames[:, :3, 0]), axis=1),
-    }[kind.place]
+    }[kind.position]
     cosine = np.sum(frames[:, :3, 0] * data["normals"], axis=1)
     third = np.cross(data["normals"], data["tangents"])
     goal = np.stack([data["normals"], data["tangents"], third], axis=2)
     turned = Rotation.from_matrix(goal @ frames[:, :3, :3].transpose(0, 2, 1)).magnitude()
-    return distance, {"normal": np.arccos(cosine), "frame": turned}[kind.facing]
+    return distance, {"normal": np.arccos(cosine), "frame": turned}[kind.orientation]
 
 
 @every_kind
@@ -180,7 +180,7 @@ def test_errors_are_distances_and_angles(robot, kind, rng):
         data, rows = data_at(robot, other, rng), ContactRows((kind,) * 3)
         p, frames = parameters(data, np.ones((3, 2))), robot.contact_frames(q)
         distance, angle = own_errors(kind, data, frames)
-        residual = ca.DM(number(whole_residual(robot.description, rows, ca.SX(q), p)))
+        residual = ca.DM(number(contact_residual(robot.description, rows, ca.SX(q), p)))
         positions, chords = rows.errors(residual)
         np.testing.assert_allclose(number(positions).ravel(), distance, atol=1e-9)
         np.testing.assert_allclose(number(chords).ravel(), 2 * np.sin(angle / 2), atol=1e-9)
@@ -222,9 +222,12 @@ def test_a_frame_without_a_tangent_is_a_normal(robot, rng):
     data = data_at(robot, other, rng)
     data["tangents"] = np.zeros((3, 3))
     p = parameters(data, np.ones((3, 2)))
-    frame, normal = ContactRows((ContactKind("point", "frame"),) * 3), ContactRows(usual(3))
+    frame, normal = (
+        ContactRows((ContactKind("point", "frame"),) * 3),
+        ContactRows(point_normal_kinds(3)),
+    )
     found, expected = (
-        rows.errors(ca.DM(number(whole_residual(robot.description, rows, ca.SX(q), p))))
+        rows.errors(ca.DM(number(contact_residual(robot.description, rows, ca.SX(q), p))))
         for rows in (frame, normal)
     )
     for one, another in zip(found, expected, strict=True):
@@ -247,16 +250,22 @@ def test_best_palm_takes_tangents_into_account(robot, rng):
 
 
 def test_the_kind_follows_from_the_data():
-    assert kind_of(["point"]) == kind_of(["point", "normal"]) == ContactKind("point", "normal")
-    assert kind_of(["point", "normal", "tangent"]) == ContactKind("point", "frame")
-    assert kind_of(["point", "line"]) == ContactKind("line", "normal")
-    assert kind_of(["point", "plane", "normal", "tangent"]) == ContactKind("plane", "frame")
+    assert (
+        kind_from_vectors(["point"])
+        == kind_from_vectors(["point", "normal"])
+        == ContactKind("point", "normal")
+    )
+    assert kind_from_vectors(["point", "normal", "tangent"]) == ContactKind("point", "frame")
+    assert kind_from_vectors(["point", "line"]) == ContactKind("line", "normal")
+    assert kind_from_vectors(["point", "plane", "normal", "tangent"]) == ContactKind(
+        "plane", "frame"
+    )
 
 
 def test_graphs_of_different_kinds_have_different_names():
-    names = [suffix(kinds) for kinds in product(KINDS, repeat=2)]
+    names = [kinds_suffix(kinds) for kinds in product(KINDS, repeat=2)]
     assert len(set(names)) == len(names)
-    assert suffix(usual(3)) == ""
+    assert kinds_suffix(point_normal_kinds(3)) == ""
 
 
 def test_contact_frames_hold_the_contacts(robot, coupled_robot, rng):
@@ -281,7 +290,7 @@ def test_the_tangent_is_the_x_axis_of_the_described_contact_frame(robot, rng):
 
 
 HAND = 7
-ROWS = ContactRows(usual(3))
+ROWS = ContactRows(point_normal_kinds(3))
 
 
 def fit_parameters(robot, points, normals):
@@ -323,7 +332,7 @@ def test_residual_vanishes_at_the_generating_configuration(robot, layouts, postu
     at = PalmAndHand(ca.DM(palm[:3, :3]), ca.DM(palm[:3, 3]), ca.DM(q[ARM:]))
     contacts = hand_contacts(robot.description, ca.SX(at.hand), layouts.robot.hand_actuators)
     assert np.abs(number(fit_residual(contacts, ROWS, at, p))).max() < 1e-13
-    assert np.abs(number(whole_residual(robot.description, ROWS, ca.SX(q), p))).max() < 1e-13
+    assert np.abs(number(contact_residual(robot.description, ROWS, ca.SX(q), p))).max() < 1e-13
 
 
 def test_best_palm_finds_the_palm_of_the_right_posture(robot, layouts, rng):
@@ -361,12 +370,12 @@ def test_starts_of_the_numeric_arm_come_in_the_order_of_their_distance(robot):
     start = nearest_start(robot.description)
     palm = robot.palm(robot.home)
     passed, distances, arms = -1.0, [], []
-    for _ in range(NUMERIC_ARM.table):
+    for _ in range(NUMERIC_ARM_PARAMETERS.table_size):
         arm, passed = start(palm[:3, :3], palm[:3, 3], passed)
         distances.append(float(passed))
         arms.append(np.array(arm).ravel())
     assert np.all(np.diff(distances) > 0)
-    assert len(np.unique(np.round(arms, 9), axis=0)) == NUMERIC_ARM.table
+    assert len(np.unique(np.round(arms, 9), axis=0)) == NUMERIC_ARM_PARAMETERS.table_size
     # After the last one they begin anew.
     assert float(start(palm[:3, :3], palm[:3, 3], passed)[1]) == distances[0]
     q = np.tile(robot.home, (1, 1))
@@ -378,7 +387,10 @@ def test_starts_of_the_numeric_arm_come_in_the_order_of_their_distance(robot):
 
 def test_a_solve_tries_all_starts_of_the_numeric_arm():
     options = HandFirstParameters()
-    assert options.rounds * options.candidates * NUMERIC_ARM.starts >= NUMERIC_ARM.table
+    assert (
+        options.rounds * options.candidates * NUMERIC_ARM_PARAMETERS.starts
+        >= NUMERIC_ARM_PARAMETERS.table_size
+    )
 
 
 def test_a_step_of_the_numeric_arm_lowers_what_it_promises(robot, rng):
@@ -387,9 +399,9 @@ def test_a_step_of_the_numeric_arm_lowers_what_it_promises(robot, rng):
     p = fit_parameters(robot, *robot.contacts(other))
     target = Pose(ca.SX(palm[:3, :3]), ca.SX(palm[:3, 3]))
     tried = pose_step(robot.description, ca.SX(q[:ARM]), target, ca.SX(1e-6), p)
-    before, there = (np.sum(number(r) ** 2) for r in (tried.before, tried.there))
+    before, there = (np.sum(number(r) ** 2) for r in (tried.residual_before, tried.residual))
     assert there < 0.01 * before
-    assert before - there == pytest.approx(float(number(tried.promised)[0, 0]), rel=0.05)
+    assert before - there == pytest.approx(float(number(tried.predicted_decrease)[0, 0]), rel=0.05)
 
 
 def test_within_tolerance_compares_the_angle():

@@ -9,7 +9,7 @@ from robot_variants import thumb_of
 
 import casadi_ik as ik
 from casadi_ik.kinematics.closed_chain import VIRTUAL, closed_chain, mobility, pivoted, split
-from casadi_ik.kinematics.contacts import LENGTH, ContactRows, usual
+from casadi_ik.kinematics.contacts import LENGTH, ContactRows, point_normal_kinds
 from casadi_ik.kinematics.forward import actuated, motor_scales
 from casadi_ik.solve.thumb_first.closed_chain_step import (
     THUMB_DAMPING,
@@ -249,7 +249,7 @@ def test_rows_two_to_six_of_h_are_the_arms(robot, rng):
 
 
 WIDE = 1e3
-ROWS = ContactRows(usual(3))
+ROWS = ContactRows(point_normal_kinds(3))
 
 
 @pytest.fixture(scope="module")

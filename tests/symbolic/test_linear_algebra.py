@@ -9,7 +9,7 @@ from algebra_samples import central_difference, gradient, graph
 from scipy.optimize import lsq_linear
 
 from casadi_ik.kinematics import linear_algebra as la
-from casadi_ik.kinematics.box_qp import Bounded, damped_step
+from casadi_ik.kinematics.box_qp import BoxBounds, damped_step
 from casadi_ik.kinematics.linear_algebra import extreme_singular_values
 
 solve_spd = graph(la.solve_spd, (6, 6), (6, 4))
@@ -216,9 +216,9 @@ def step():
 
     def call(*inputs, passes=4):
         if passes not in functions:
-            found = damped_step(J, r, damping, Bounded(value, lower, upper, FIRST), passes)
+            found = damped_step(J, r, damping, BoxBounds(value, lower, upper, FIRST), passes)
             symbols = [J, r, damping, value, lower, upper]
-            functions[passes] = ca.Function("step", symbols, [found.step, found.promised])
+            functions[passes] = ca.Function("step", symbols, [found.step, found.predicted_decrease])
         s, promised = functions[passes](*inputs)
         return np.array(s).ravel(), float(promised)
 
@@ -326,10 +326,10 @@ def test_a_sparse_problem_has_the_solution_of_the_dense_one(rng, full):
     r, damping = ca.SX.sym("r", J.shape[0]), ca.SX.sym("damping")
     value, lower, upper = (ca.SX.sym(name, count - PALM) for name in ("value", "lower", "upper"))
     rows, rest = ca.SX.sym("rows", full, count), ca.SX.sym("rest", full)
-    bounded = Bounded(value, lower, upper, PALM)
+    bounded = BoxBounds(value, lower, upper, PALM)
     found = damped_step(J, r, damping, bounded, 6, (rows, rest) if full else None)
     inputs = [ca.vertcat(*J.nonzeros()), r, rows, rest, damping, value, lower, upper]
-    step = ca.Function("step", inputs, [found.step, found.promised])
+    step = ca.Function("step", inputs, [found.step, found.predicted_decrease])
     same, held = 0, 0
     for _ in range(10):
         numbers, concern_all = rng.normal(size=J.nnz()), rng.normal(size=(full, count))

@@ -46,7 +46,7 @@ from casadi_ik.integrations.datasets.postures import (
     rotations_from_rpy,
 )
 from casadi_ik.kinematics.arm_hand import ArmHand, load_robot
-from casadi_ik.kinematics.contacts import NAMES
+from casadi_ik.kinematics.contacts import EXTRA_ARRAY_NAMES
 from casadi_ik.model.grasp import Contact, Grasp
 from casadi_ik.model.load_grasp import load_grasp_files
 from casadi_ik.model.objects import GraspObject, is_mesh_name, load_object
@@ -634,5 +634,7 @@ def _contact_of_finger(vectors: dict[str, np.ndarray]) -> Contact | None:
         return None
     if DIRECTIONS_KEY in stated and "points" not in stated:
         return Contact(direction=stated[DIRECTIONS_KEY])
-    optional: dict[str, Any] = {name[:-1]: stated[name] for name in NAMES if name in stated}
+    optional: dict[str, Any] = {
+        name[:-1]: stated[name] for name in EXTRA_ARRAY_NAMES if name in stated
+    }
     return Contact(stated.get("points"), stated.get("normals"), **optional)

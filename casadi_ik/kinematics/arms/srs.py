@@ -134,7 +134,7 @@ class SrsArm(ClosedForm):
         for sphere, form in zip((self.shoulder_joints, self.wrist_joints), spheres, strict=True):
             for i, index in enumerate(sphere.indices):
                 for bound in (lower[index], upper[index]):
-                    c, a, b = (_bound_form(call_function, i, bound) for call_function in form)
+                    c, a, b = (_bound_form(item, i, bound) for item in form)
                     if i == 1:
                         c = c - ca.cos(bound + sphere.offset)
                     size = ca.fmax(ca.sqrt(a * a + b * b), MIN_LENGTH)
@@ -174,9 +174,7 @@ class SrsArm(ClosedForm):
         A_0 = rotation_between(stretched / ca.fmax(safe_norm(stretched), MIN_LENGTH), direction)
         # e(line psi) = line line' + cos (I - line line') + sin [line].
         outer = direction @ direction.T
-        rotations = [
-            call_function @ A_0 for call_function in (outer, ca.DM.eye(3) - outer, skew(direction))
-        ]
+        rotations = [matrix @ A_0 for matrix in (outer, ca.DM.eye(3) - outer, skew(direction))]
         matrices = [self.shoulder_joints.euler_matrix(A) for A in rotations]
         matrices += [self.wrist_joints.euler_matrix(B.T @ (A.T @ rotation)) for A in rotations]
         elbow = self.screws.centred(3, turn.angle)

@@ -19,7 +19,7 @@ from casadi_ik.compile import Field, Layout, StepGraph
 from casadi_ik.errors import InputError, UnknownNameError
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics import dual_quaternion as dq
-from casadi_ik.kinematics.box_qp import Bounded, damped_step
+from casadi_ik.kinematics.box_qp import BoxBounds, damped_step
 from casadi_ik.kinematics.linear_algebra import singular_values
 from casadi_ik.kinematics.screws import TipChain, TipMotion, finger_chain, relative_chain
 from casadi_ik.kinematics.se3 import normal_error, perpendicular
@@ -316,7 +316,7 @@ class ScrewControlStep:
         # z itself has to lie in the box: the problem is posed in s - z, which starts at 0.
         z = ca.fmin(ca.fmax(p["centring"] * (middle - q[moving]) / half, low), high)
         demand = p["gain"] * weights * objective.error
-        box = Bounded(z, low, high, first=0)
+        box = BoxBounds(z, low, high, first=0)
         step = z + damped_step(jacobian, jacobian @ z - demand, p["damping"] ** 2, box, PASSES).step
 
         moved = ca.SX(q)

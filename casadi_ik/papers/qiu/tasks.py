@@ -14,7 +14,7 @@ import casadi as ca
 
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.files.arrays import Array
-from casadi_ik.kinematics.contacts import USUAL, Target, tip_vectors
+from casadi_ik.kinematics.contacts import POINT_AND_NORMAL, Target, tip_vectors
 from casadi_ik.kinematics.forward import ActuatedKinematics, forward, number
 from casadi_ik.kinematics.linear_algebra import (
     damped_pinv_times,
@@ -83,7 +83,7 @@ def contact_tasks(
 ) -> tuple[Task, Task]:
     """A finger's contact point and normal, Qiu & Kermani 2021, eq. (3)."""
     tip, target = tip_vectors(body.kinematics, finger), goal.vectors
-    place, facing = USUAL.conditions
+    place, facing = POINT_AND_NORMAL.conditions
     linear, angular = body.contact_jacobian(finger, actuators)
     position = Task(linear / MILLIMETRE, place.error(tip, target) / MILLIMETRE, is_position=True)
     return position, Task(angular, facing.error(tip, target), is_position=False)

@@ -20,14 +20,14 @@ from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arms.family import ArmFamily
 from casadi_ik.kinematics.arms.recognise import arm_family
 from casadi_ik.kinematics.arms.search import ARM_SEARCH, ArmTrials, Farthest
-from casadi_ik.kinematics.box_qp import Bounded, clip, damped_step
+from casadi_ik.kinematics.box_qp import BoxBounds, clip, damped_step
 from casadi_ik.kinematics.contact_fit import (
     FIT,
-    Tried,
-    fresh_fit,
-    judge,
-    judge_beyond_tolerance,
-    judge_contacts,
+    TrialStep,
+    evaluate_contact_step,
+    evaluate_excess_step,
+    evaluate_step,
+    initial_lm_state,
     tolerance_ratio,
 )
 from casadi_ik.kinematics.contacts import LENGTH, Kinds
@@ -107,17 +107,17 @@ class BodySide:
 
     def fitted(
         self, x: PalmAndHand, damping: Expr, own: dict[str, Expr], q: Expr, tolerant: bool
-    ) -> Tried:
+    ) -> TrialStep:
         """Make one damped step of palm and hand, see `fit_step`."""
         given, around = self._own.symbols("own"), ca.SX.sym("damping")
         there = PalmAndHand(ca.SX.sym("R", 3, 3), ca.SX.sym("t", 3), ca.SX.sym("h", x.hand.numel()))
         at = ca.SX.sym("q", q.numel())
         parameters = self._own.unpack(given)
         step = fit_step(self.layouts, None, there, around, parameters, at, [given], tolerant)
-        rest = step.before, step.there, step.promised, step.size
-        whole = call_function("fitted", [*there, around, given, at], [*step.reached, *rest])
+        rest = step.residual_before, step.residual, step.predicted_decrease, step.max_change
+        whole = call_function("fitted", [*there, around, given, at], [*step.x, *rest])
         *reached, before, left, promised, size = whole(*x, damping, self._own.pack(own), q)
-        return Tried(PalmAndHand(*reached), before, left, promised, size)
+        return TrialStep(PalmAndHand(*reached), before, left, promised, size)
 
     def parameters(self, p: dict[str, Expr]) -> dict[str, Expr]:
         """The part of a body's parameters that is the side's."""
@@ -214,7 +214,7 @@ class BodyStep(HandFirstStep):
             "palm_rotation": rotation,
             "palm_origin": origin,
             "cost": 0.0,
-        } | fresh_fit()
+        } | initial_lm_state()
         record = self.layouts.row(s, p, q, Phase.CANDIDATE)
         said = {"within": ca.logic_not(side.asked(p))}
         return self._function(stage, [*inputs, hands], s, changed, said, record)
@@ -231,26 +231,26 @@ class BodyStep(HandFirstStep):
         tried = side.fitted(x, s["damping"], own, q, tolerant)
         part_of_tolerance = STAGES.before_the_arm
         if tolerant:
-            judged = judge_beyond_tolerance(s, own, tried, rows, part_of_tolerance)
+            judged = evaluate_excess_step(s, own, tried, rows, part_of_tolerance)
         else:
-            judged = judge_contacts(s, own, tried, rows, part_of_tolerance, STAGES.fit_part)
-        keep, reached = judged.accepted, tried.reached
+            judged = evaluate_contact_step(s, own, tried, rows, part_of_tolerance, STAGES.fit_part)
+        keep, reached = judged.accepted, tried.x
         changed = {
             "q": with_rows(s["q"], side.hand, ca.if_else(keep, reached.hand, x.hand)),
             "palm_rotation": ca.if_else(keep, reached.rotation, x.rotation),
             "palm_origin": ca.if_else(keep, reached.origin, x.origin),
             "fits": judged.within,
-        } | judged.fit
+        } | judged.lm_state
         said = {
             "settled": judged.settled,
             "within": judged.within,
             "miss": tolerance_ratio(judged.cost, own),
-            "cost": ca.sumsqr(tried.before),
+            "cost": ca.sumsqr(tried.residual_before),
         }
         of_side = ca.DM.zeros(len(self.robot.fingers), 2)
         of_side[side.fingers, :] = 1
         seen = p | {"weights": p["weights"] * of_side}
-        whole = replace(tried, before=self._whole(side, tried.before))
+        whole = replace(tried, residual_before=self._whole(side, tried.residual_before))
         record = self.layouts.row(s, seen, s["q"], Phase.HAND_FIT, whole, keep)
         return self._function(stage, inputs, s, changed, said, record)
 
@@ -373,17 +373,17 @@ class BodyStep(HandFirstStep):
             ca.repmat(unit, len(self.robot.trunk), 1), ca.SX.ones(len(self.layouts.arm), 1)
         )
         value, lower, upper = (x[rows] / units for x in (s["q"], p["lower"], p["upper"]))
-        bounds = Bounded(value, lower, upper, first=0)
+        bounds = BoxBounds(value, lower, upper, first=0)
         before, slopes, turned = off(s["q"])
         slopes = slopes @ ca.diag(units)
         damped = damped_step(slopes, turned, s["damping"], bounds, FIT.passes)
         q = with_rows(s["q"], rows, units * clip(value + damped.step, bounds))
         there = off(q)[0]
         size = ca.mmax(ca.fabs(q - s["q"]))
-        tried = Tried(q, before, there, damped.promised, size)
-        judged = judge(s, tried, ca.SX(0), ca.SX(0), BODY.patience, BODY.budget)
+        tried = TrialStep(q, before, there, damped.predicted_decrease, size)
+        judged = evaluate_step(s, tried, ca.SX(0), ca.SX(0), BODY.patience, BODY.budget)
         now = ca.if_else(judged.accepted, q, s["q"])
-        changed = {"q": now} | judged.fit
+        changed = {"q": now} | judged.lm_state
         said = {"settled": judged.settled, "cost": judged.cost}
         record = self.layouts.row(s, p, s["q"], Phase.TRUNK, margin=-ca.sqrt(judged.cost))
         return self._function(Stage.TRUNK, inputs, s, changed, said, record)

@@ -28,7 +28,7 @@ from casadi_ik.compile.libraries import load_library
 from casadi_ik.compile.loop import SLOTS, UNBEGUN, UNBOUNDED, SlotSource
 from casadi_ik.errors import KernelError
 from casadi_ik.files.arrays import Array, spread_steps
-from casadi_ik.kinematics.contact_fit import fresh_fit
+from casadi_ik.kinematics.contact_fit import initial_lm_state
 from casadi_ik.kinematics.contacts import LENGTH
 from casadi_ik.model.grasp import MAX_PLAIN_LENGTH, MIN_PLAIN_LENGTH, UNIT_ROUNDING
 from casadi_ik.model.targets import TargetBatch
@@ -275,7 +275,7 @@ class SearchPlan:
             "ENFORCE_LIMITS": int(self.enforce_limits),
             "HAS_ARM": int(bool(layouts.arm)),
             "N_CARRIED": len(self._carried),
-            "N_FRESH": len(fresh_fit()),
+            "N_FRESH": len(initial_lm_state()),
             "N_COUNTS": len(self.layouts.stages),
             **{f"{status.name}_STATUS": int(status) for status in Status},
             **{f"{phase.name}_PHASE": int(phase) for phase in Phase},
@@ -321,7 +321,7 @@ class SearchPlan:
         robot, seeds = self.layouts.robot, self.seeds
         hand, spreads = list(robot.hand_actuators), seeds.spreads
         lower, upper = seeds.anywhere_bounds(self.enforce_limits)
-        fresh, state = fresh_fit(), self.layouts.state
+        fresh, state = initial_lm_state(), self.layouts.state
         return {
             "HAND": np.array(hand, dtype=np.int64),
             "CARRIED": np.array(self._carried),

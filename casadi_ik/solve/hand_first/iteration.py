@@ -16,9 +16,9 @@ from casadi_ik.compile.codegen import define, define_arrays, number, row_major
 from casadi_ik.compile.function_kernel import BufferedFunction
 from casadi_ik.files.arrays import Array, spread_steps
 from casadi_ik.kinematics.arms.search import ARM_SEARCH
-from casadi_ik.kinematics.contact_fit import BALANCE, FIT, TOLERANT, fresh_fit
+from casadi_ik.kinematics.contact_fit import FIT, MINIMAX, TOLERANT_FIT, initial_lm_state
 from casadi_ik.kinematics.contacts import LENGTH
-from casadi_ik.kinematics.palm import NUMERIC_ARM, start_table
+from casadi_ik.kinematics.palm import NUMERIC_ARM_PARAMETERS, start_table
 from casadi_ik.model.description import RobotDescription, Side
 from casadi_ik.solve.hand_first.parameters import BODY, STAGES
 from casadi_ik.solve.hand_first.state import BY_SIDE, PLACES, SAID, Stage
@@ -59,7 +59,7 @@ def text(step: HandFirstStep) -> str:
         "N_HAND": len(layouts.robot.hand_actuators),
         "N_CANDIDATES": layouts.candidates,
         "N_STARTS": len(start_table(robot)[0]) if numeric else 0,
-        "MOST_STARTS": NUMERIC_ARM.starts,
+        "MOST_STARTS": NUMERIC_ARM_PARAMETERS.starts,
         "HAS_ARM": bool(layouts.arm),
         "HAS_FAMILY": step.placements is not None,
         "HAS_CHOICE": step.choices is not None,
@@ -71,10 +71,10 @@ def text(step: HandFirstStep) -> str:
         "LENGTH": LENGTH,
         "FIT_DAMPING": FIT.damping,
         "FIT_GROWTH": FIT.growth,
-        "SAME_COST": BALANCE.same,
-        "CLOSER": BALANCE.closer,
-        "PROMISING": TOLERANT.promising,
-        "NEAR_MISS": TOLERANT.near,
+        "SAME_COST": MINIMAX.same_cost_tolerance,
+        "CLOSER": MINIMAX.improvement_ratio,
+        "PROMISING": TOLERANT_FIT.max_start_ratio,
+        "NEAR_MISS": TOLERANT_FIT.near_miss_ratio,
         "OWN_HAND": STAGES.own_hand,
         "WHOLE": STAGES.whole,
         "EXACT_COST": FIT.exact * FIT.exact,
@@ -221,16 +221,16 @@ class Iteration:
             return Stage.ARM_PLACEMENT if closed else Stage.ARM_STEPS
 
         def is_new_miss(name: str) -> bool:
-            if said["miss"] > TOLERANT.near:
+            if said["miss"] > TOLERANT_FIT.near_miss_ratio:
                 return False
-            if abs(cost - x[name]) <= BALANCE.same * x[name]:
+            if abs(cost - x[name]) <= MINIMAX.same_cost_tolerance * x[name]:
                 put(returns=x["returns"] + 1)
                 return False
             put(**{name: cost})
-            return said["miss"] <= TOLERANT.promising
+            return said["miss"] <= TOLERANT_FIT.max_start_ratio
 
         def count_return(name: str, value: float) -> None:
-            put(returns=x["returns"] + (value > BALANCE.closer * x[name]))
+            put(returns=x["returns"] + (value > MINIMAX.improvement_ratio * x[name]))
             put(**{name: min(value, x[name])})
 
         def after_fitted_hand() -> Status:
@@ -261,7 +261,7 @@ class Iteration:
                 if not settled:
                     return goes_to(Stage.HAND_FIT)
                 if not within and is_new_miss("near"):
-                    put(**fresh_fit())
+                    put(**initial_lm_state())
                     return goes_to(Stage.TOLERANT_HAND_FIT)
                 return after_fitted_hand()
             case Stage.TOLERANT_HAND_FIT:
@@ -296,7 +296,7 @@ class Iteration:
                     starts=x["starts"] + (settled and not sent),
                 )
                 few = settled and near and x["earlier"] < 1
-                if not (exact or few or y["starts"][()] >= NUMERIC_ARM.starts):
+                if not (exact or few or y["starts"][()] >= NUMERIC_ARM_PARAMETERS.starts):
                     return goes_to(Stage.ARM_STEPS)
                 put(turned=0)
                 return with_arm(exact and x["fits"] > 0)
@@ -310,21 +310,21 @@ class Iteration:
                     return Status.SOLVED
                 if not is_new_miss("balanced"):
                     return to_next_candidate()
-                put(**fresh_fit())
+                put(**initial_lm_state())
                 return goes_to(Stage.TOLERANT_REFINEMENT)
             case Stage.TOLERANT_REFINEMENT:
                 if not settled:
                     return goes_to(stage)
                 if within:
                     return Status.SOLVED
-                put(**fresh_fit())
+                put(**initial_lm_state())
                 return goes_to(Stage.BALANCE)
             case Stage.BALANCE:
                 if within:
                     return Status.SOLVED
                 if not settled:
                     return goes_to(Stage.BALANCE)
-                put(**fresh_fit(), power=0)
+                put(**initial_lm_state(), power=0)
                 count_return("least", said["cost"])
                 return to_next_candidate()
         raise AssertionError(stage)

@@ -16,7 +16,7 @@ from casadi_ik.compile.loop import UNBEGUN, Stepper
 from casadi_ik.files.arrays import Array, Counts
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.arms.recognise import arm_family
-from casadi_ik.kinematics.contacts import Kinds, usual
+from casadi_ik.kinematics.contacts import Kinds, point_normal_kinds
 from casadi_ik.kinematics.robot_kernels import RobotKernels
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.targets import TargetBatch
@@ -155,7 +155,7 @@ class HandFirstMethod(LoopedMethod):
         robot = robot if compiled else robot.as_hand
         super().__init__(robot, options, compiled)
         self.options: HandFirstParameters = options
-        self._kinds = kinds or usual(len(robot.fingers))
+        self._kinds = kinds or point_normal_kinds(len(robot.fingers))
         if robot.sides:
             self.step: HandFirstStep = BodyStep(robot, options.candidates, self._kinds)
         else:

@@ -12,10 +12,10 @@ import casadi as ca
 
 from casadi_ik.compile.graphs import FunctionGraph, recipe
 from casadi_ik.compile.layout import Field, Layout
-from casadi_ik.kinematics.box_qp import Bounded
-from casadi_ik.kinematics.contact_fit import Tried, WholeContacts, fresh_fit
-from casadi_ik.kinematics.contacts import ContactRows, Kinds, suffix, usual
-from casadi_ik.kinematics.palm import SIX
+from casadi_ik.kinematics.box_qp import BoxBounds
+from casadi_ik.kinematics.contact_fit import ContactLeastSquares, TrialStep, initial_lm_state
+from casadi_ik.kinematics.contacts import ContactRows, Kinds, kinds_suffix, point_normal_kinds
+from casadi_ik.kinematics.palm import POSE_DIMENSION
 from casadi_ik.kinematics.smooth import Expr, call_function, with_cse
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.solve.limits import bits, coupling_fields, coupling_values
@@ -222,9 +222,9 @@ class HandFirstLayouts:
         )
 
     @cached_property
-    def whole(self) -> WholeContacts:
+    def whole(self) -> ContactLeastSquares:
         """The contacts as a function of all motors; the stages share its functions."""
-        return WholeContacts(self.robot, self.contacts, self.parameters)
+        return ContactLeastSquares(self.robot, self.contacts, self.parameters)
 
     @cached_property
     def record(self) -> Layout:
@@ -246,10 +246,10 @@ class HandFirstLayouts:
             STATUS.of(robot),
         )
 
-    def hand_bounds(self, q: Expr, p: dict[str, Expr], first: int) -> Bounded:
+    def hand_bounds(self, q: Expr, p: dict[str, Expr], first: int) -> BoxBounds:
         """Bounds of the hand's actuators."""
         rows = list(self.robot.hand_actuators)
-        return Bounded(q[rows], p["lower"][rows], p["upper"][rows], first)
+        return BoxBounds(q[rows], p["lower"][rows], p["upper"][rows], first)
 
     def row(
         self,
@@ -257,7 +257,7 @@ class HandFirstLayouts:
         p: dict[str, Expr],
         q: Expr,
         phase: Phase,
-        tried: Tried | None = None,
+        tried: TrialStep | None = None,
         accepted: Expr = 0.0,
         margin: Expr = NOTHING,
     ) -> Expr:
@@ -274,8 +274,8 @@ class HandFirstLayouts:
         """
         residual, cost, size = ca.SX.nan(self.contacts.size), NOTHING, NOTHING
         if tried is not None:
-            residual = tried.before[: self.contacts.size]
-            cost, size = ca.sumsqr(tried.before), tried.size
+            residual = tried.residual_before[: self.contacts.size]
+            cost, size = ca.sumsqr(tried.residual_before), tried.max_change
         restart = s["earlier"] + ca.fmax(s["candidate"], 0.0)
         numbers = cost, s["damping"], size, margin, restart, accepted, float(phase)
         return self._row(q, residual, *numbers, p["weights"], p["lower"], p["upper"])
@@ -340,7 +340,7 @@ def beginning(layouts: HandFirstLayouts) -> FunctionGraph:
     """
     robot = layouts.robot
     f, n = len(robot.fingers), len(robot.actuators)
-    name = ca.Function.fix_name(f"hand_first_beginning_{robot.name}{suffix(layouts.kinds)}")
+    name = ca.Function.fix_name(f"hand_first_beginning_{robot.name}{kinds_suffix(layouts.kinds)}")
     return FunctionGraph(
         name,
         lambda: _build(name, layouts),
@@ -400,7 +400,7 @@ def _build(name: str, layouts: HandFirstLayouts) -> ca.Function:
             "phase": ca.if_else(t["nearest"], float(Stage.START), float(Stage.CANDIDATE)),
             "candidate": -t["nearest"],
         }
-        | fresh_fit()
+        | initial_lm_state()
     )
     inputs = [*vectors.values(), here, given, postures]
     return ca.Function(name, inputs, with_cse(state, parameters))
@@ -417,17 +417,17 @@ def _is_held(layouts: HandFirstLayouts, t: dict[str, Expr]) -> Expr:
     free_hand, free_arm = (
         ca.sum1(t["lower"][rows] < t["upper"][rows]) if rows else 0 for rows in (hand, arm)
     )
-    less = ca.logic_or(free_hand < len(hand), free_arm < SIX)
+    less = ca.logic_or(free_hand < len(hand), free_arm < POSE_DIMENSION)
     return ca.logic_and(less, free_hand > 0)
 
 
 def _is_loose(layouts: HandFirstLayouts, known: Expr) -> Expr:
     """1 if contacts of which `known` (f, 2) are given leave palms of a body a freedom."""
     robot, place = layouts.robot, layouts.robot.finger_names.index
-    loose = ca.SX(float(layouts.kinds != usual(len(robot.fingers))))
+    loose = ca.SX(float(layouts.kinds != point_normal_kinds(len(robot.fingers))))
     for side, (_, hand) in zip(robot.sides, robot.side_actuators, strict=True):
         conditions = ca.sum1(known[list(map(place, side.fingers)), :] @ ca.SX([3, 2]))
-        fewer = ca.logic_and(conditions > 0, conditions < SIX + len(hand))
+        fewer = ca.logic_and(conditions > 0, conditions < POSE_DIMENSION + len(hand))
         loose = ca.logic_or(loose, fewer)
     return loose
 

@@ -32,14 +32,14 @@ from casadi_ik.kinematics.arms.family import ArmFamily
 from casadi_ik.kinematics.arms.search import ARM_SEARCH, ArmTrials, Farthest, Nearest, is_allowed
 from casadi_ik.kinematics.box_qp import clip
 from casadi_ik.kinematics.contact_fit import (
-    Tried,
-    balanced,
+    TrialStep,
     beyond_tolerance,
-    fresh_fit,
-    judge,
-    judge_beyond_tolerance,
-    judge_contacts,
+    evaluate_contact_step,
+    evaluate_excess_step,
+    evaluate_step,
+    initial_lm_state,
     lm_step,
+    minimax_step,
     tolerance_ratio,
 )
 from casadi_ik.kinematics.contacts import (
@@ -48,19 +48,19 @@ from casadi_ik.kinematics.contacts import (
     Kinds,
     Vectors,
     chord,
-    suffix,
+    kinds_suffix,
     within_tolerance,
 )
 from casadi_ik.kinematics.forward import Pose
 from casadi_ik.kinematics.palm import (
-    NUMERIC_ARM,
-    SIX,
+    NUMERIC_ARM_PARAMETERS,
+    POSE_DIMENSION,
     HandContacts,
     base_rotation,
     best_palm,
     hand_contacts,
     newton_polish,
-    next_at_end,
+    next_joint_at_limit,
     pose_step,
 )
 from casadi_ik.kinematics.se3 import compose, exp_se3, skew
@@ -95,10 +95,10 @@ def fit_jacobian(
     Seen from the palm, it is the targets that move when the palm does.
     """
     goals = _seen(rows.goals(p), x)
-    k = contacts.rates[0]["point"].shape[1]
+    k = contacts.jacobians[0]["point"].shape[1]
     tip_rates = [
         {name: ca.horzcat(ca.SX(3, 6), rate) for name, rate in rates.items()}
-        for rates in contacts.rates
+        for rates in contacts.jacobians
     ]
     goal_rates = [
         {
@@ -159,7 +159,7 @@ def fit_step(
     q: Expr,
     given: Sequence[Expr],
     tolerant: bool = False,
-) -> Tried:
+) -> TrialStep:
     """Make one damped step that turns and shifts the palm along one screw.
 
     With the palm on a screw, a palm that turns about the common axis of several joints while they
@@ -235,7 +235,7 @@ class HandFirstStep:
     def graph(self) -> StepGraph:
         """The whole iteration."""
         layouts = self.layouts
-        name = ca.Function.fix_name(f"hand_first_{self.robot.name}{suffix(layouts.kinds)}")
+        name = ca.Function.fix_name(f"hand_first_{self.robot.name}{kinds_suffix(layouts.kinds)}")
         return StepGraph(
             name,
             lambda: Stages({each: self.function(each) for each in self.stages}, text(self)),
@@ -338,10 +338,10 @@ class HandFirstStep:
         """Nothing moves."""
         inputs, s, p = self._vectors()
         contacts = self.layouts.contacts
-        residual, _ = self.layouts.whole.at(s["q"], inputs[1])
+        residual, _ = self.layouts.whole.linearised(s["q"], inputs[1])
         tolerances = p["position_tolerance"], chord(p["angle_tolerance"])
         met = within_tolerance(*contacts.errors(residual), *tolerances)
-        looked = Tried(s["q"], residual, residual, ca.SX(0), ca.SX(0))
+        looked = TrialStep(s["q"], residual, residual, ca.SX(0), ca.SX(0))
         record = self.layouts.row(s, p, s["q"], Phase.REFINEMENT, looked)
         said = {"within": met, "cost": ca.sumsqr(residual)}
         return self._function(Stage.START, inputs, s, {"spent": ca.SX(1)}, said, record)
@@ -362,7 +362,7 @@ class HandFirstStep:
             "cost": 0.0,
             "margin": ARM_SEARCH.no_margin,
             "starts": 0.0,
-        } | fresh_fit()
+        } | initial_lm_state()
         record = self.layouts.row(s, p, q, Phase.CANDIDATE)
         return self._function(Stage.CANDIDATE, [*inputs, hand], s, changed, {}, record)
 
@@ -372,19 +372,21 @@ class HandFirstStep:
         x = PalmAndHand(s["palm_rotation"], s["palm_origin"], s["q"][columns])
         tried = fit_step(self.layouts, self.arm, x, s["damping"], p, s["q"], inputs)
         fine = ca.if_else(s["earlier"] > 0, STAGES.fit_part, STAGES.before_the_arm)
-        judged = judge_contacts(s, p, tried, self.layouts.contacts, STAGES.before_the_arm, fine)
-        keep, reached = judged.accepted, tried.reached
+        judged = evaluate_contact_step(
+            s, p, tried, self.layouts.contacts, STAGES.before_the_arm, fine
+        )
+        keep, reached = judged.accepted, tried.x
         changed = {
             "q": self._with_hand(s["q"], ca.if_else(keep, reached.hand, x.hand)),
             "palm_rotation": ca.if_else(keep, reached.rotation, x.rotation),
             "palm_origin": ca.if_else(keep, reached.origin, x.origin),
             "fits": judged.within,
-        } | judged.fit
+        } | judged.lm_state
         said = {
             "settled": judged.settled,
             "within": judged.within,
             "miss": tolerance_ratio(judged.cost, p),
-            "cost": ca.sumsqr(tried.before),
+            "cost": ca.sumsqr(tried.residual_before),
         }
         record = self.layouts.row(s, p, s["q"], Phase.HAND_FIT, tried, keep)
         return self._function(Stage.HAND_FIT, inputs, s, changed, said, record)
@@ -396,14 +398,14 @@ class HandFirstStep:
         x = PalmAndHand(s["palm_rotation"], s["palm_origin"], s["q"][columns])
         tried = fit_step(self.layouts, self.arm, x, s["damping"], p, s["q"], inputs, True)
         rows = self.layouts.contacts
-        judged = judge_beyond_tolerance(s, p, tried, rows, STAGES.before_the_arm)
-        keep, reached = judged.accepted, tried.reached
+        judged = evaluate_excess_step(s, p, tried, rows, STAGES.before_the_arm)
+        keep, reached = judged.accepted, tried.x
         changed = {
             "q": self._with_hand(s["q"], ca.if_else(keep, reached.hand, x.hand)),
             "palm_rotation": ca.if_else(keep, reached.rotation, x.rotation),
             "palm_origin": ca.if_else(keep, reached.origin, x.origin),
             "fits": judged.within,
-        } | judged.fit
+        } | judged.lm_state
         said = {"settled": judged.settled, "within": judged.within}
         record = self.layouts.row(s, p, s["q"], Phase.HAND_FIT, tried, keep)
         return self._function(Stage.TOLERANT_HAND_FIT, inputs, s, changed, said, record)
@@ -468,34 +470,36 @@ class HandFirstStep:
         arm = ca.fmin(ca.fmax(s["q"][rows], p["lower"][rows]), p["upper"][rows])
         palm = Pose(s["palm_rotation"], s["palm_origin"])
         tried = pose_step(self.robot, arm, palm, s["damping"], p)
-        judged = judge(s, tried, within=ca.SX(0), exact=ca.SX(0))
-        now = ca.if_else(judged.accepted, tried.reached, arm)
+        judged = evaluate_step(s, tried, within=ca.SX(0), exact=ca.SX(0))
+        now = ca.if_else(judged.accepted, tried.x, arm)
         margin = -ca.sqrt(judged.cost)
         best_margin, q = ca.fmax(margin, s["margin"]), with_rows(s["q"], rows, now)
-        changed = judged.fit | {
+        changed = judged.lm_state | {
             "q": q,
             "cost": s["cost"],
             "margin": best_margin,
             "arm": ca.if_else(margin > s["margin"], now, s["arm"]),
         }
         # An arm of too few free motors is as near as can be asked.
-        few = ca.sum1(p["lower"][rows] < p["upper"][rows]) < SIX
+        few = ca.sum1(p["lower"][rows] < p["upper"][rows]) < POSE_DIMENSION
         position, angle = p["position_tolerance"] / LENGTH, p["angle_tolerance"]
         allowed = ca.mmax(position) ** 2 + ca.mmax(angle) ** 2
         said = {
             "settled": judged.settled,
-            "near": ca.logic_and(few, judged.cost < NUMERIC_ARM.near * allowed),
+            "near": ca.logic_and(
+                few, judged.cost < NUMERIC_ARM_PARAMETERS.good_start_cost * allowed
+            ),
             "cost": judged.cost,
-            "at_end": next_at_end(self.robot, now, s["turned"], p),
+            "at_end": next_joint_at_limit(self.robot, now, s["turned"], p),
         }
         record = self.layouts.row(s, p, q, Phase.ARM_PLACEMENT, margin=best_margin)
         return self._function(Stage.ARM_STEPS, inputs, s, changed, said, record)
 
     def _refinement(self) -> ca.Function:
         inputs, s, p = self._vectors()
-        tried = self.layouts.whole.fitted(s["q"], s["damping"], inputs[1])
-        judged = judge_contacts(s, p, tried, self.layouts.contacts)
-        changed = {"q": ca.if_else(judged.accepted, tried.reached, s["q"])} | judged.fit
+        tried = self.layouts.whole.lm_trial(s["q"], s["damping"], inputs[1])
+        judged = evaluate_contact_step(s, p, tried, self.layouts.contacts)
+        changed = {"q": ca.if_else(judged.accepted, tried.x, s["q"])} | judged.lm_state
         said = {
             "settled": judged.settled,
             "within": judged.within,
@@ -507,18 +511,18 @@ class HandFirstStep:
     def _tolerant_refinement(self) -> ca.Function:
         """Build one damped step of all motors that reduces the excess over the tolerances."""
         inputs, s, p = self._vectors()
-        tried = self.layouts.whole.fitted_beyond_tolerance(s["q"], s["damping"], inputs[1])
-        judged = judge_beyond_tolerance(s, p, tried, self.layouts.contacts)
-        changed = {"q": ca.if_else(judged.accepted, tried.reached, s["q"])} | judged.fit
+        tried = self.layouts.whole.excess_trial(s["q"], s["damping"], inputs[1])
+        judged = evaluate_excess_step(s, p, tried, self.layouts.contacts)
+        changed = {"q": ca.if_else(judged.accepted, tried.x, s["q"])} | judged.lm_state
         said = {"settled": judged.settled, "within": judged.within}
         record = self.layouts.row(s, p, s["q"], Phase.REFINEMENT, tried, judged.accepted)
         return self._function(Stage.TOLERANT_REFINEMENT, inputs, s, changed, said, record)
 
     def _balance(self) -> ca.Function:
         inputs, s, p = self._vectors()
-        tried = self.layouts.whole.balanced(s["q"], s["damping"], s["power"], inputs[1])
-        found = balanced(s["q"], tried, self.layouts.contacts, s, p)
-        said = {"settled": found.over, "within": found.within, "cost": found.largest}
+        tried = self.layouts.whole.minimax_trial(s["q"], s["damping"], s["power"], inputs[1])
+        found = minimax_step(s["q"], tried, self.layouts.contacts, s, p)
+        said = {"settled": found.is_finished, "within": found.within, "cost": found.largest}
         record = self.layouts.row(s, p, s["q"], Phase.BALANCE, tried, found.accepted)
-        changed = {"q": found.q} | found.fit
+        changed = {"q": found.q} | found.state
         return self._function(Stage.BALANCE, inputs, s, changed, said, record)

@@ -11,7 +11,7 @@ import numpy as np
 
 from casadi_ik.compile import FunctionKernel
 from casadi_ik.files.arrays import Array, Bools, Counts, Rows
-from casadi_ik.kinematics.contacts import CONDITIONS, PLACE
+from casadi_ik.kinematics.contacts import CONDITIONS, POSITION
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.proofs.box_tests import BoxTest
@@ -68,7 +68,7 @@ PROVER_EFFORT = ProverEffort()
 SLIDING_ARRAYS = {
     f"{name}s"
     for condition in CONDITIONS.values()
-    if condition.aspect == PLACE
+    if condition.aspect == POSITION
     for name in condition.data
     if name != "point"
 }

@@ -22,10 +22,10 @@ import numpy as np
 
 from casadi_ik.kinematics.contacts import (
     LENGTH,
-    PLACE,
+    POSITION,
     ContactRows,
-    resting,
-    tip_rates,
+    fixed_goal_rates,
+    tip_jacobians,
     tip_vectors,
 )
 from casadi_ik.kinematics.forward import ActuatedKinematics, actuated, motor_scales
@@ -211,19 +211,21 @@ def linearised(
         moved = body.contact_jacobian(name, range(q.numel()))
         tip, rates = (
             tip_vectors(body.kinematics, name),
-            tip_rates(body, name, range(q.numel())),
+            tip_jacobians(body, name, range(q.numel())),
         )
         mine = name == robot.thumb
         weighted = []
         for aspect, condition in enumerate(kind.conditions):
-            across = condition.across(tip, goals[i]) if condition.across else None
+            across = condition.directions(tip, goals[i]) if condition.directions else None
             slope, error = moved[aspect], left[aspect][i]
-            if condition.aspect == PLACE and condition.across is None:
-                slope = condition.jacobian(tip, rates, goals[i], resting(goals, q.numel())[i])
+            if condition.aspect == POSITION and condition.directions is None:
+                slope = condition.jacobian(
+                    tip, rates, goals[i], fixed_goal_rates(goals, q.numel())[i]
+                )
             if across is not None:
                 slope, error = across @ slope, across @ error
             slope = p["weights"][i, aspect] * slope
-            weighted.append(slope / LENGTH if condition.aspect == PLACE else slope)
+            weighted.append(slope / LENGTH if condition.aspect == POSITION else slope)
             errors[mine].append(error)
         together = ca.vertcat(*weighted)
         rows[mine].append(ca.sparsify(together) * ca.repmat(scales.T, together.shape[0], 1))

@@ -11,7 +11,7 @@ from casadi_ik.compile import StepGraph
 from casadi_ik.files.arrays import Array, Counts
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.arms.recognise import arm_family
-from casadi_ik.kinematics.contacts import Kinds, target_values, usual
+from casadi_ik.kinematics.contacts import Kinds, point_normal_kinds, target_values
 from casadi_ik.kinematics.posture_table import PostureTable
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.targets import TargetBatch
@@ -48,7 +48,7 @@ class ThumbFirstMethod(LoopedMethod):
         super().__init__(robot, options, compiled)
         robot.one_hand(self.name)
         self.options: ThumbFirstParameters = options
-        self._kinds = kinds or usual(len(robot.fingers))
+        self._kinds = kinds or point_normal_kinds(len(robot.fingers))
         self.step = ThumbFirstStep(robot, options, self._kinds, arm_family(robot))
 
     def step_graph(self) -> StepGraph:

@@ -29,15 +29,15 @@ from casadi_ik.errors import InputError
 from casadi_ik.kinematics.arms.family import ArmFamily
 from casadi_ik.kinematics.arms.search import ArmTrials, Farthest, Nearest
 from casadi_ik.kinematics.contact_fit import (
-    BALANCE,
     FIT,
-    WholeContacts,
-    balanced,
-    differs,
-    fresh_fit,
-    judge,
+    MINIMAX,
+    ContactLeastSquares,
+    evaluate_step,
+    initial_lm_state,
+    is_new_cost,
+    minimax_step,
 )
-from casadi_ik.kinematics.contacts import ContactRows, Kinds, suffix, within_tolerance
+from casadi_ik.kinematics.contacts import ContactRows, Kinds, kinds_suffix, within_tolerance
 from casadi_ik.kinematics.forward import Pose, motor_scales
 from casadi_ik.kinematics.palm import (
     base_rotation,
@@ -298,7 +298,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
 
     @property
     def _name(self) -> str:
-        return ca.Function.fix_name(f"thumb_first_{self.robot.name}{suffix(self.kinds)}")
+        return ca.Function.fix_name(f"thumb_first_{self.robot.name}{kinds_suffix(self.kinds)}")
 
     def _iteration(self) -> ca.Function:
         state = ca.MX.sym("state", self.state.size)
@@ -402,7 +402,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
         after = self.after(
             s,
             Phase.CANDIDATE,
-            fresh_fit(),
+            initial_lm_state(),
             q=q,
             palm_rotation=rotation,
             palm_origin=origin,
@@ -421,18 +421,18 @@ class ThumbFirstStep(ThumbFirstLayouts):
         columns = list(self.robot.arm_actuators)
         palm = Pose(s["palm_rotation"], s["palm_origin"])
         tried = pose_step(self.robot, s["q"][columns], palm, s["damping"], p)
-        judged = judge(s, tried, within=ca.SX(0), exact=ca.SX(0))
+        judged = evaluate_step(s, tried, within=ca.SX(0), exact=ca.SX(0))
         q = ca.SX(s["q"])
-        q[columns] = ca.if_else(judged.accepted, tried.reached, s["q"][columns])
+        q[columns] = ca.if_else(judged.accepted, tried.x, s["q"][columns])
         after = self.after(
             s,
             Phase.ARM_PLACEMENT,
-            judged.fit,
+            judged.lm_state,
             q=q,
             phase=ca.if_else(
                 judged.settled, float(Phase.HAND_ALIGNMENT), float(Phase.ARM_PLACEMENT)
             ),
-            damping=ca.if_else(judged.settled, p["first_damping"], judged.fit["damping"]),
+            damping=ca.if_else(judged.settled, p["first_damping"], judged.lm_state["damping"]),
         )
         status = ca.SX(float(Status.RUNNING))
         record = self.row(
@@ -443,7 +443,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
             status,
             merit(self.robot, self.contacts, q, p),
             damping=s["damping"],
-            step_size=tried.size,
+            step_size=tried.max_change,
             accepted=judged.accepted,
         )
         return ca.Function("placement", [state, parameters], with_cse(after, record, status))
@@ -493,7 +493,9 @@ class ThumbFirstStep(ThumbFirstLayouts):
         stuck = ca.logic_and(ca.logic_not(accepted), s["damping"] > self.options.damping_ceiling)
         over = ca.logic_or(waited >= self.options.patience, s["spent"] + 1 >= self.options.budget)
         over = ca.logic_or(ca.logic_or(over, stuck), skipped)
-        near = ca.logic_and(self._met(left, p, BALANCE.near), differs(cost, s["balanced"]))
+        near = ca.logic_and(
+            self._met(left, p, MINIMAX.max_tolerance_ratio), is_new_cost(cost, s["balanced"])
+        )
         near = ca.logic_and(ca.logic_and(near, over), ca.logic_not(solved))
         failed = ca.logic_and(over, ca.logic_not(ca.logic_or(solved, near)))
         following = ca.if_else(over, float(Phase.CANDIDATE), float(Phase.HAND_ALIGNMENT))
@@ -548,14 +550,14 @@ def balance_stage(layouts: ThumbFirstLayouts) -> ca.Function:
     """One step of all motors; it ends with a solution or with the next start."""
     state, parameters = layouts.state.symbols("state"), layouts.parameters.symbols("parameters")
     s, p = layouts.state.unpack(state), layouts.parameters.unpack(parameters)
-    whole = WholeContacts(layouts.robot, layouts.contacts, layouts.parameters)
-    tried = whole.balanced(s["q"], s["damping"], s["power"], parameters)
-    found = balanced(s["q"], tried, layouts.contacts, s, p)
-    failed = ca.logic_and(found.over, ca.logic_not(found.within))
+    whole = ContactLeastSquares(layouts.robot, layouts.contacts, layouts.parameters)
+    tried = whole.minimax_trial(s["q"], s["damping"], s["power"], parameters)
+    found = minimax_step(s["q"], tried, layouts.contacts, s, p)
+    failed = ca.logic_and(found.is_finished, ca.logic_not(found.within))
     after = layouts.after(
         s,
         Phase.BALANCE,
-        found.fit,
+        found.state,
         q=found.q,
         phase=ca.if_else(failed, float(Phase.CANDIDATE), float(Phase.BALANCE)),
         start=s["start"] + failed,
@@ -570,7 +572,7 @@ def balance_stage(layouts: ThumbFirstLayouts) -> ca.Function:
         status,
         there,
         damping=s["damping"],
-        step_size=tried.size,
+        step_size=tried.max_change,
         accepted=found.accepted,
     )
     return ca.Function("balance", [state, parameters], with_cse(after, record, status))
