@@ -11,12 +11,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from casadi_ik.kinematics.contacts import Kinds, kind_of
+from casadi_ik.kinematics.contacts import Kinds, kind_from_vectors
 from casadi_ik.model.description import Finger, RobotDescription
 from casadi_ik.model.link_shapes import NO_SHAPES
 from casadi_ik.model.targets import TargetBatch
 
-PALM_KINDS: Kinds = (kind_of(("tangent",)),)
+PALM_KINDS: Kinds = (kind_from_vectors(("tangent",)),)
 """The contact that determines a palm pose: a point with a whole frame."""
 
 
