@@ -24,7 +24,7 @@ import numpy as np
 
 import casadi_ik as ik
 from casadi_ik.app.drawing import palette
-from casadi_ik.app.drawing.drawables import close_view, looks_of, whole_view, with_object
+from casadi_ik.app.drawing.drawables import close_view, link_styles, overview, scene_with_object
 from casadi_ik.collision.solids import EXPORTED, of_object, stated
 from casadi_ik.export.project import checked_prefix, wasm_project, write_folder
 from casadi_ik.model.load_grasp import shipped_grasps
@@ -72,7 +72,7 @@ def of_grasps(robot: ik.ArmHand, name: str) -> list[dict[str, Any]]:
         if grasp.object is None or grasp.object_pose is None:
             continue
         # Where pads are and face then, which of balls is not where they touch.
-        q = ik.Solver(robot, scene=with_object(ik.Scene(), grasp)).solve(grasp).q
+        q = ik.Solver(robot, scene=scene_with_object(ik.Scene(), grasp)).solve(grasp).q
         points, normals = robot.contacts(q)
         for k, finger in enumerate(robot.fingers):
             near = np.linalg.norm(points[:k] - points[k], axis=1) < CLOSE
@@ -82,14 +82,14 @@ def of_grasps(robot: ik.ArmHand, name: str) -> list[dict[str, Any]]:
         if len(parts) >= CAPACITY or any(solid.kind not in EXPORTED for solid, _ in parts):
             continue
         # As the page answers, bit for bit: cameras look at that.
-        solver = ik.Solver(robot, scene=with_object(ik.Scene(), grasp))
+        solver = ik.Solver(robot, scene=scene_with_object(ik.Scene(), grasp))
         close = close_view(robot, solver.solve_batch(points[None], normals[None]).q[0])
         middle = np.nanmean(points, axis=0)
         found.append(
             {
                 "name": file,
                 "object": grasp.object.replace("_", " "),
-                "views": {"close": close, "whole": whole_view(middle, close)},
+                "views": {"close": close, "whole": overview(middle, close)},
                 "points": [None if np.isnan(p).any() else p.tolist() for p in points],
                 "normals": [None if np.isnan(n).any() else n.tolist() for n in normals],
                 "solids": [
@@ -101,7 +101,7 @@ def of_grasps(robot: ik.ArmHand, name: str) -> list[dict[str, Any]]:
     if not found:
         points, normals = (values.tolist() for values in robot.contacts(robot.home))
         close = close_view(robot, robot.home)
-        views = {"close": close, "whole": whole_view(np.mean(points, axis=0), close)}
+        views = {"close": close, "whole": overview(np.mean(points, axis=0), close)}
         asked = {"points": points, "normals": normals, "views": views}
         found.append({"name": "home", "object": "", "solids": [], **asked})
     return found
@@ -134,7 +134,7 @@ def about(robot: ik.ArmHand, name: str) -> dict[str, Any]:
         "name": robot.name,
         "title": ROBOTS.get(name, name),
         "armMotors": list(arms),
-        "looks": looks_of(robot.description),
+        "looks": link_styles(robot.description),
         "prismatic": [motor.unit == "m" for motor in robot.description.actuators],
         "grasps": of_grasps(robot, name),
         **reached(robot),

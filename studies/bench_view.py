@@ -172,7 +172,7 @@ def _on_view(
     robot, grasp = ik.load_robot("kuka_lwr_barrett"), ik.load_grasp("cup")
     viewer = viewing.view_grasp(robot, grasp, scene=ik.load_scene("table"))
     shown, served, solves, begun = viewer.page, [], [], [0.0]
-    put, draw = shown.work.put, shown.draw
+    put, draw = shown.work.submit, shown.draw
 
     def asked(key: str, change: Callable[[], None]) -> None:
         begun[0] = time.perf_counter()
@@ -182,14 +182,14 @@ def _on_view(
         draw(answer)
         if begun[0]:
             served.append(1e3 * (time.perf_counter() - begun[0]))
-            solves.append(1e3 * answer.seconds)
+            solves.append(1e3 * answer.solve_time)
             begun[0] = 0.0
 
     page = _opened(browser, viewer.url, COMMON + SERVED, *([] if painted else [NO_PAINTING]))
     page.wait("document.querySelector('.ik-status') !== null")
     time.sleep(4.0)  # the camera comes to rest
     client = list(viewer._server.get_clients().values())[-1]
-    box, pose = page.evaluate(BOX), shown.asked.held["thumb"].control
+    box, pose = page.evaluate(BOX), shown.request.contacts["thumb"].control
 
     def pixel(point: np.ndarray) -> np.ndarray:
         camera = client.camera
@@ -205,7 +205,7 @@ def _on_view(
     way = max((tip - here for tip in tips), key=lambda one: float(np.linalg.norm(one)))
     found: Found = {}
     found["picture painted again ms"] = _still(page, STILL.replace("DRAW", ""))
-    shown.work.put, shown.draw = asked, answered
+    shown.work.submit, shown.draw = asked, answered
     with _cpu_of(browser, steps, found, "server", "renderer", "GPU"):
         rows = _drag(page, here + 0.92 * way, 0.25 * way, steps, rest)
     viewer.stop()

@@ -35,8 +35,6 @@ def imported_modules(path: Path, modules: set[str]) -> set[str]:
 
 
 ALLOWED = {
-    "casadi_ik.app.viewer.candidates": "casadi_ik.app.viewer.grasp_page",
-    "casadi_ik.app.viewer.viser_scene": "casadi_ik.app.viewer.page",
     "casadi_ik.planning.touch.hand_table": "casadi_ik.planning.touch.candidates",
     "casadi_ik.planning.touch.strength": "casadi_ik.planning.touch.grasps",
     "casadi_ik.solve.hand_first.iteration": "casadi_ik.solve.hand_first.step",

@@ -20,18 +20,18 @@ from casadi_ik.app.drawing import palette
 from casadi_ik.app.drawing.drawables import (
     Drawable,
     View,
-    asked_marks,
+    bodies_at,
+    clearance_marks,
     close_view,
-    lowest,
-    nearest_pair,
-    object_of,
-    placed,
-    scene_of,
-    whole_view,
+    ground_height,
+    object_drawable,
+    overview,
+    scene_drawables,
+    target_marks,
 )
 from casadi_ik.app.drawing.surfaces import ball
 from casadi_ik.app.pictures.charts import new_figure, save_picture
-from casadi_ik.app.pictures.scene3d import Image, Stage, over, points_of
+from casadi_ik.app.pictures.scene3d import Image, Scene3D, composite, corner_points
 from casadi_ik.collision.clearance import closest_points
 from casadi_ik.files.arrays import Array
 
@@ -62,25 +62,25 @@ def shot(
     pair: tuple[str, str] | None = None,
 ) -> Image:
     """A robot with what it grasps and what stands about it, on white."""
-    body = placed(robot, q)
-    thing = None if grasp is None else object_of(grasp.object)
+    body = bodies_at(robot, q)
+    thing = None if grasp is None else object_drawable(grasp.object)
     pose = None if grasp is None else grasp.known_pose
-    things = [] if thing is None or pose is None else [thing.at(pose)]
-    with closing(Stage()) as stage:
+    things = [] if thing is None or pose is None else [thing.transformed(pose)]
+    with closing(Scene3D()) as stage:
         stage.add("robot", body)
         stage.add("object", things, 0.6)
         if grasp is not None:
-            marks = [one for c in grasp.contacts.values() for one in asked_marks(c, c.point)]
+            marks = [one for c in grasp.contacts.values() for one in target_marks(c, c.point)]
             stage.add("object marks", marks)
-        around = [] if scene is None else scene_of(scene, "table")
+        around = [] if scene is None else scene_drawables(scene, "table")
         stage.add("scene", around)
         if scene is not None and pair is not None:
             found = closest_points(robot, q, scene, pair)
             if found is not None:
-                stage.add("touching", nearest_pair(found, touching=True), 0.6)
-        stage.add_floor(lowest(robot, scene), body + things + around)
-        stage.aim(view, points_of(body + things + around), pixels, (0.03, 0.03))
-        return np.clip(over(1.0, stage.shoot()), 0.0, 1.0)
+                stage.add("touching", clearance_marks(found, show_shapes=True), 0.6)
+        stage.add_floor(ground_height(robot, scene), body + things + around)
+        stage.aim(view, corner_points(body + things + around), pixels, (0.03, 0.03))
+        return np.clip(composite(1.0, stage.render()), 0.0, 1.0)
 
 
 def panels(images: list[Image], titles: list[str], size: tuple[float, float]) -> Figure:
@@ -145,21 +145,21 @@ def unreachable(path: Path) -> None:
     links = robot.links(q)
     shoulder, elbow, wrist = (links[f"lwr_link_{i}"][:3, 3] for i in (2, 4, 6))
     reach = float(np.linalg.norm(elbow - shoulder) + np.linalg.norm(wrist - elbow))
-    body = placed(robot, q)
-    thing = object_of(far.object)
+    body = bodies_at(robot, q)
+    thing = object_drawable(far.object)
     assert thing is not None
-    things = [thing.at(away)]
-    marks = [one for c in far.contacts.values() for one in asked_marks(c, c.point)]
-    view, pixels = whole_view(away[:3, 3], close_view(robot, q)), (1000, 520)
+    things = [thing.transformed(away)]
+    marks = [one for c in far.contacts.values() for one in target_marks(c, c.point)]
+    view, pixels = overview(away[:3, 3], close_view(robot, q)), (1000, 520)
     shell = [Drawable("reach", ball(reach, shoulder), palette.MISSED)]
-    with closing(Stage()) as stage:
+    with closing(Scene3D()) as stage:
         stage.add("robot", body)
         stage.add("object", things, 0.6)
         stage.add("marks", marks)
         stage.add("reach", shell, 0.10)
         stage.add_floor(0.0, body + things)
-        stage.aim(view, points_of(body + things), pixels, (0.12, 0.06))
-        image = np.clip(over(1.0, stage.shoot()), 0.0, 1.0)
+        stage.aim(view, corner_points(body + things), pixels, (0.12, 0.06))
+        image = np.clip(composite(1.0, stage.render()), 0.0, 1.0)
         ends = stage.project(np.array([wrist, away[:3, 3]]))
     figure = new_figure(10.0, 6.4, dpi=100)
     axes = figure.add_axes((0.0, 0.0, 1.0, 0.82))

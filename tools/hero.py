@@ -19,10 +19,16 @@ from PIL import ImageDraw
 
 import casadi_ik as ik
 from casadi_ik.app.drawing import palette
-from casadi_ik.app.drawing.drawables import asked_marks, close_view, object_of, placed, whole_view
+from casadi_ik.app.drawing.drawables import (
+    bodies_at,
+    close_view,
+    object_drawable,
+    overview,
+    target_marks,
+)
 from casadi_ik.app.pictures.charts import save_picture
-from casadi_ik.app.pictures.pictures import animated
-from casadi_ik.app.pictures.scene3d import Image, Stage, over, points_of
+from casadi_ik.app.pictures.pictures import encode_gif
+from casadi_ik.app.pictures.scene3d import Image, Scene3D, composite, corner_points
 from casadi_ik.files.arrays import Array
 
 ROBOT, GRASP = "kuka_lwr_barrett", "cup"
@@ -59,41 +65,41 @@ def pictures(
     robot: ik.ArmHand, grasps: list[ik.Grasp], every_q: Array
 ) -> tuple[list[Image], list[Image]]:
     """Images (h, w, 3) for light and for dark pages."""
-    thing = object_of(GRASP)
+    thing = object_drawable(GRASP)
     assert thing is not None
-    bodied = [placed(robot, q) for q in every_q]
-    about = points_of([one for body in bodied[::3] for one in body])
+    bodied = [bodies_at(robot, q) for q in every_q]
+    about = corner_points([one for body in bodied[::3] for one in body])
     places = np.array([one.known_pose[:3, 3] for one in grasps if one.known_pose is not None])
     close = close_view(robot, every_q[0])
-    whole = whole_view(places.mean(axis=0), close)
+    whole = overview(places.mean(axis=0), close)
     near = 0.135 * np.vstack([np.eye(3), -np.eye(3)])
     found: tuple[list[Image], list[Image]] = ([], [])
-    with closing(Stage()) as stage:
+    with closing(Scene3D()) as stage:
         for grasp, body, place in zip(grasps, bodied, places, strict=True):
             pose = grasp.known_pose
             assert pose is not None
             far = [np.linalg.norm(one.surface.points - place, axis=1).min() > 0.3 for one in body]
             stage.replace("robot", [one for one, off in zip(body, far, strict=True) if not off])
             stage.replace("far", [one for one, off in zip(body, far, strict=True) if off])
-            stage.replace("object", [thing.at(pose)], 0.6)
+            stage.replace("object", [thing.transformed(pose)], 0.6)
             marks = [
                 one
                 for contact in grasp.contacts.values()
-                for one in asked_marks(contact, contact.point, 1.2)
+                for one in target_marks(contact, contact.point, 1.2)
             ]
             stage.replace("marks", marks)
             stage.aim(whole, about, WHOLE, (0.02, 0.04))
             layers, tip = _layers(stage, "far"), stage.project(place[None])[0]
             floors = []
             for dark in (False, True):
-                stage.add_floor(0.0, [*body, thing.at(pose)], about, dark, texels=512)
+                stage.add_floor(0.0, [*body, thing.transformed(pose)], about, dark, texels=512)
                 stage.aim(whole, about, WHOLE, (0.02, 0.04))
-                floors.append(stage.shoot("floor"))
+                floors.append(stage.render("floor"))
             stage.aim(close, near + place, CLOSE)
             inset, second = _layers(stage), stage.project(place[None])[0]
             for images, floor, color in zip(found, floors, PAPERS, strict=True):
                 paper = np.array(palette.rgb(color), np.float32) / 255
-                left = pointed(_composed(over(paper, floor), layers), tip)
+                left = pointed(_composed(composite(paper, floor), layers), tip)
                 right = pointed(_composed(paper, inset), second)
                 image = np.empty((WHOLE[1], WHOLE[0] + CLOSE[0], 3), np.float32)
                 image[:] = paper
@@ -106,13 +112,13 @@ def pictures(
 PAPERS = ("#ffffff", palette.DARK_PAPER)
 
 
-def _layers(stage: Stage, *more: str) -> tuple[Image, Image]:
-    return stage.shoot("robot", "object", "marks", *more), stage.shoot("marks")
+def _layers(stage: Scene3D, *more: str) -> tuple[Image, Image]:
+    return stage.render("robot", "object", "marks", *more), stage.render("marks")
 
 
 def _composed(below: Image, layers: tuple[Image, Image]) -> Image:
     """Marks that something hides are half seen."""
-    return over(over(below, layers[0]), layers[1], 0.5)
+    return composite(composite(below, layers[0]), layers[1], 0.5)
 
 
 def _rounded(image: Image, paper: Array) -> Image:
@@ -158,7 +164,7 @@ def main(arguments: list[str] | None = None) -> None:
     for name, images in zip(("light", "dark"), pictures(robot, grasps, every_q), strict=True):
         file = options.out / f"hero_{name}.gif"
         pause = round(1e3 * SECONDS / PICTURES / 10) * 10
-        save_picture(animated(images, [pause] * PICTURES, 128), file)
+        save_picture(encode_gif(images, [pause] * PICTURES, 128), file)
         print(file, file.stat().st_size)
 
 

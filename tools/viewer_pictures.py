@@ -85,11 +85,11 @@ def dragged(name: str, *by: float) -> Use:
 
     def use(shown: GraspPage, _: Any) -> None:
         shown.select(name)
-        start = shown.asked.places[name]
+        start = shown.request.poses[name]
         for part in np.linspace(0.25, 1.0, 4):
             pose = start.copy()
             pose[:3, 3] += part * np.array(by)
-            shown.change(name, lambda asked, pose=pose: asked.moved(name, pose))
+            shown.change(name, lambda request, pose=pose: request.with_pose(name, pose))
             shown.work.settle()
 
     return use

@@ -262,7 +262,7 @@ def _paths(lines: Iterable[tuple[str, str]]) -> list[dict[str, Any]]:
             "label": label,
             "enabled": True,
             "timestampMethod": "receiveTime",
-            "color": palette.LINES[i % len(palette.LINES)],
+            "color": palette.LINE_COLORS[i % len(palette.LINE_COLORS)],
         }
         for i, (value, label) in enumerate(lines)
     ]

@@ -41,7 +41,7 @@ def test_a_picture_has_a_panel_for_each_of_the_best(solver, found, tmp_path):
 
 
 def test_nothing_is_no_picture(solver):
-    with pytest.raises(ik.errors.InputError, match="there is no grasp to draw"):
+    with pytest.raises(ik.errors.InputError, match="found: no grasps"):
         views.draw_grasps(solver.robot, [])
 
 
@@ -56,13 +56,13 @@ def test_a_command_from_an_object_to_a_picture_and_a_page(tmp_path, capsys, view
     assert str(picture) in said
     assert Image.open(picture).width > 1000
     page = view(str(out), "--scene", "table").page
-    assert len(page.offered.shown) == 6
+    assert len(page.candidate_list.shown_names) == 6
     loads = np.load(out)["load"]
-    page.offered.filter(load=float(loads[2]))
-    assert len(page.offered.shown) == 3
-    page.offered.take(page.offered.shown[1])
+    page.candidate_list.filter(load=float(loads[2]))
+    assert len(page.candidate_list.shown_names) == 3
+    page.candidate_list.choose(page.candidate_list.shown_names[1])
     assert page.work.settle()
-    np.testing.assert_allclose(page.answer.q, np.load(out)["q"][1], atol=1e-3)
+    np.testing.assert_allclose(page.result.q, np.load(out)["q"][1], atol=1e-3)
 
 
 def test_none_found_says_why_and_writes_nothing(tmp_path, capsys):
@@ -79,15 +79,15 @@ def test_none_found_says_why_and_writes_nothing(tmp_path, capsys):
 def test_a_page_filters_by_load_and_clearance(solver, found):
     viewer = viewing.view_found(solver.robot, found, scene=solver.scene)
     try:
-        offered, page = viewer.page.offered, viewer.page
+        offered, page = viewer.page.candidate_list, viewer.page
         clear = sorted(one.clearance for one in found)[3]
         offered.filter(clearance=clear)
-        assert len(offered.shown) == 3
-        offered.filter(most=1)
-        assert len(offered.shown) == 1
-        offered.take(offered.shown[0])
+        assert len(offered.shown_names) == 3
+        offered.filter(max_count=1)
+        assert len(offered.shown_names) == 1
+        offered.choose(offered.shown_names[0])
         assert page.work.settle()
-        assert page.answer.success
-        assert page.answer.clearance >= clear - 1e-4
+        assert page.result.success
+        assert page.result.clearance >= clear - 1e-4
     finally:
         viewer.stop()

@@ -15,8 +15,7 @@ from browser import CHROMIUM, Browser, Page
 
 import casadi_ik as ik
 from casadi_ik.app import viewer as viewing
-
-pose_of = viewing.drawn.pose_of
+from casadi_ik.app.viewer.viser_scene import pose_of
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium (Debian: apt chromium)")
 
@@ -73,7 +72,7 @@ def pixel(page: Page, client: Any, point: np.ndarray) -> np.ndarray:
 
 def drag_along(page: Page, client: Any, shown: Any, name: str, far: float) -> None:
     """Drag that arrow of what is called so that is seen longest, so far [m]."""
-    pose, size = shown.asked.places[name], shown._handles._controls[name].handle.scale
+    pose, size = shown.request.poses[name], shown._handles._controls[name].handle.scale
     here = pixel(page, client, pose[:3, 3])
     tips = [pixel(page, client, pose[:3, 3] + size * pose[:3, i]) for i in range(3)]
     axis = int(np.argmax([np.linalg.norm(tip - here) for tip in tips]))
@@ -121,33 +120,33 @@ def test_object_and_contact_are_dragged_by_mouse_and_reached(
     assert said(page, ".ik-status") == "SOLVED"
     shown, robot = cup.page, cup.page.robot
     # The object is the first handle, and takes its contacts along.
-    place = shown.asked.object_pose[:3, 3]
-    before = shown.asked.grasp.contacts["thumb"].point
+    place = shown.request.object_pose[:3, 3]
+    before = shown.request.grasp.contacts["thumb"].point
     drag_along(page, client, shown, "object", 0.02)
     page.wait("document.querySelector('.ik-status') !== null")
     assert shown.work.settle()
-    gone = shown.asked.object_pose[:3, 3] - place
+    gone = shown.request.object_pose[:3, 3] - place
     assert 0.004 < np.linalg.norm(gone) < 0.06
-    assert np.allclose(shown.asked.grasp.contacts["thumb"].point - before, gone, atol=1e-9)
-    assert shown.answer.success
+    assert np.allclose(shown.request.grasp.contacts["thumb"].point - before, gone, atol=1e-9)
+    assert shown.result.success
     shown.select("thumb")
     assert shown.work.settle()
     time.sleep(0.5)
-    before = shown.asked.grasp.contacts["thumb"].point
+    before = shown.request.grasp.contacts["thumb"].point
     drag_along(page, client, shown, "thumb", 0.012)
     page.wait("document.querySelector('.ik-status') !== null")
     assert shown.work.settle()
-    wanted = shown.asked.grasp.contacts["thumb"].point
+    wanted = shown.request.grasp.contacts["thumb"].point
     assert 0.002 < np.linalg.norm(wanted - before) < 0.04
-    assert shown.answer.success
-    tip = robot.contacts(shown.answer.q)[0][robot.fingers.index("thumb")]
+    assert shown.result.success
+    tip = robot.contacts(shown.result.q)[0][robot.fingers.index("thumb")]
     assert np.linalg.norm(tip - wanted) <= 5e-3
     # And far away: why not is on the page.
     drag_along(page, client, shown, "thumb", 0.3)
     page.wait("(document.querySelector('.ik-why')?.innerText ?? '').includes('the contacts')")
     assert shown.work.settle()
-    assert not shown.answer.success
-    assert said(page, ".ik-status") == shown.answer.headline
+    assert not shown.result.success
+    assert said(page, ".ik-status") == shown.result.headline
     assert complaints(page) == []
     page.close()
 
@@ -155,12 +154,12 @@ def test_object_and_contact_are_dragged_by_mouse_and_reached(
 def test_two_browsers_see_one_drag_and_save_it(
     cup: viewing.Viewer, browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("casadi_ik.app.viewer.panel.PICTURE", (200, 320))
+    monkeypatch.setattr("casadi_ik.app.viewer.panel.PICTURE_SIZE", (200, 320))
     other, _ = opened(browser, cup)
     page, _ = opened(browser, cup, painted=True)
     shown = cup.page
     before = said(other, ".ik-finger")
-    pose = shown.asked.held["thumb"].control.copy()
+    pose = shown.request.contacts["thumb"].control.copy()
     pose[:3, 3] += [0.006, 0.0, 0.01]
     shown.drag("thumb", pose)
     told = "document.querySelector('.ik-finger').innerText"
@@ -177,7 +176,7 @@ def test_two_browsers_see_one_drag_and_save_it(
     arrived(grasp)
     arrived(picture)
     saved = ik.load_grasp(grasp)
-    assert np.allclose(saved.contacts["thumb"].point, shown.asked.grasp.contacts["thumb"].point)
+    assert np.allclose(saved.contacts["thumb"].point, shown.request.grasp.contacts["thumb"].point)
     assert ik.Solver(ik.load_robot(saved.robot)).solve(saved).success
     image = plt.imread(picture)
     assert image.shape[:2] == (200, 320)
@@ -195,7 +194,7 @@ def test_guessed_pads_are_corrected_by_mouse_and_saved(description: Path, browse
     shown = viewer.page
     # One by its arrows, which it has from the beginning, the other's normal by its own arrow.
     drag_along(page, client, shown, "first", 0.004)
-    pose = shown.asked.held["second"].control
+    pose = shown.request.contacts["second"].control
     tip = pixel(page, client, pose[:3, 3] + 0.02 * pose[:3, 0])
     aside = pixel(page, client, pose[:3, 3] + 0.02 * pose[:3, 0] + 0.012 * pose[:3, 2])
     page.drag((float(tip[0]), float(tip[1])), (float(aside[0]), float(aside[1])), steps=4)
@@ -205,7 +204,7 @@ def test_guessed_pads_are_corrected_by_mouse_and_saved(description: Path, browse
     after = ik.load_robot(description)
     moved, faced = after.contacts(after.home)
     for i, finger in enumerate(after.fingers):
-        control = shown.asked.held[finger].control
+        control = shown.request.contacts[finger].control
         assert np.allclose(moved[i], control[:3, 3], atol=1e-6)
         assert np.allclose(faced[i], control[:3, 0], atol=1e-6)
     assert 1e-3 < np.linalg.norm(moved[0] - points[0]) < 0.02
@@ -229,14 +228,14 @@ def test_two_logs_are_played_by_mouse_in_their_scene(
     page, _ = opened(browser, viewer)
     assert "iteration 1 of" in said(page, ".ik-iteration")
     press(page, "Play")
-    last = round(viewer.page.end)
-    longer = max(viewer.page.tracks, key=len)
+    last = round(viewer.page.end_time)
+    longer = max(viewer.page.playbacks, key=len)
     page.wait(
         "[...document.querySelectorAll('.ik-iteration')]"
         f".some(one => one.innerText.includes('iteration {last} of'))"
     )
     page.wait("document.body.innerText.match(/SOLVED/g)?.length >= 2")
-    for track, (drawn, _) in zip(viewer.page.tracks, viewer.page._shown, strict=True):
+    for track, (drawn, _) in zip(viewer.page.playbacks, viewer.page._views, strict=True):
         assert np.array_equal(drawn.q, track.q[-1])
     assert len(longer) == last
     assert complaints(page) == []

@@ -21,12 +21,12 @@ candidates:
 
 def test_a_grasp_and_a_robot(view) -> None:
     cup = view()
-    assert cup.page.asked.name == "cup"
-    assert cup.page.answer.success
+    assert cup.page.request.name == "cup"
+    assert cup.page.result.success
     robot = view("kuka_lwr_barrett", "--tolerance-position", "0.001")
-    assert robot.page.answer.success
-    assert robot.page.asked.settings.tolerance.position == 1e-3
-    assert np.allclose(robot.page.answer.q, robot.page.robot.home, atol=1e-6)
+    assert robot.page.result.success
+    assert robot.page.request.settings.tolerance.position == 1e-3
+    assert np.allclose(robot.page.result.q, robot.page.robot.home, atol=1e-6)
     assert cup.url != robot.url
 
 
@@ -36,7 +36,7 @@ def test_a_body_by_its_name_is_moved_part_by_part(view) -> None:
     q = robot.home + 0.3 * (np.arange(len(robot.home)) == robot.actuators.index("base_yaw"))
     page.drag_motors(q)
     assert page.work.settle()
-    assert np.array_equal(page.answer.q, q)
+    assert np.array_equal(page.result.q, q)
     named = [motor.label for motor in page._panel._motors]
     assert len(named) == len(robot.actuators)
     assert named[:2] == ["base_x [mm]", "base_y [mm]"]
@@ -52,15 +52,15 @@ def test_candidates_and_ranked_answers(view, robot: ik.ArmHand, tmp_path: Path) 
     assert len(page.candidates) == 2
     page.choose(list(page.candidates)[1])
     assert page.work.settle()
-    assert page.answer.success
-    assert page.asked.grasp.contacts["thumb"].point[0] == pytest.approx(-0.80)
+    assert page.result.success
+    assert page.request.grasp.contacts["thumb"].point[0] == pytest.approx(-0.80)
     solution = ik.Solver(robot).solve(ik.load_grasp("cup"))
     entry = {"candidate": 3, "name": "", "score": 0.5, "solution": as_json(solution)}
     ranked = tmp_path / "ranked.json"
     ranked.write_text(json.dumps({"ranked": [entry]}))
     shown = view(str(ranked)).page
-    assert shown.answer.success
-    assert np.allclose(shown.answer.q, solution.q)
+    assert shown.result.success
+    assert np.allclose(shown.result.q, solution.q)
 
 
 RANKED = (
@@ -99,26 +99,26 @@ def test_logs_play_side_by_side(view, robot: ik.ArmHand, tmp_path: Path) -> None
     page = view(*map(str, paths)).page
     page.show(10_000)
     assert page.work.settle()
-    assert page.now == page.end == max(map(len, page.tracks))
-    for track, (drawn, _) in zip(page.tracks, page._shown, strict=True):
+    assert page.time_shown == page.end_time == max(map(len, page.playbacks))
+    for track, (drawn, _) in zip(page.playbacks, page._views, strict=True):
         assert np.array_equal(drawn.q, track.q[-1])
         assert all(one.ok for one in track.verdicts(len(track) - 1).values())
     assert "smallest singular values" in page._charts.content
-    page.jump(ahead=False)
+    page.jump(forward=False)
     assert page.work.settle()
-    assert page.now in {one for track in page.tracks for one in track.eventful}
+    assert page.time_shown in {one for track in page.playbacks for one in track.event_times}
 
 
 def test_the_log_of_a_solve_plays(view, tmp_path: Path) -> None:
     """Of a body, too: one log is not taken for a motion."""
     g1, file = ik.load_robot("g1+dex3"), tmp_path / "one.mcap"
     points, normals = g1.contacts(g1.random(np.random.default_rng(0), 1))
-    answer = ik.Solver(g1).solve_batch(points, normals, log=file)
+    result = ik.Solver(g1).solve_batch(points, normals, log=file)
     page = view(str(file)).page
-    assert page.end == len(page.tracks[0]) == answer.iterations[0]
+    assert page.end_time == len(page.playbacks[0]) == result.iterations[0]
     page.show(3)
     assert page.work.settle()
-    assert page.now == 3
+    assert page.time_shown == 3
 
 
 def test_motions_play(view, robot: ik.ArmHand, tmp_path: Path) -> None:
@@ -128,9 +128,9 @@ def test_motions_play(view, robot: ik.ArmHand, tmp_path: Path) -> None:
     page = view(str(tmp_path / "way.mcap")).page
     page.show(1.23)
     assert page.work.settle()
-    ((drawn, _),) = page._shown
+    ((drawn, _),) = page._views
     assert np.allclose(drawn.q, q[24])
-    assert "1.20</b> of 2.00 s" in page._told.content
+    assert "1.20</b> of 2.00 s" in page._summary.content
     assert "lwr_joint_3" in page._charts.content
 
 
@@ -158,12 +158,12 @@ def test_bad_words_are_one_line(
 
 def test_a_robot_and_a_solution_show_themselves(robot: ik.ArmHand) -> None:
     shown = robot.view()
-    assert shown.page.answer.success
+    assert shown.page.result.success
     shown.stop()
     solution = ik.Solver(robot).solve(ik.load_grasp("cup"))
     viewer = solution.view(grasp=ik.load_grasp("cup"))
-    assert np.array_equal(viewer.page.answer.q, solution.q)
-    assert viewer.page.answer.success
+    assert np.array_equal(viewer.page.result.q, solution.q)
+    assert viewer.page.result.success
     viewer.stop()
 
 

@@ -16,13 +16,13 @@ def test_dragged_pads_are_saved_and_read_back(pads: viewing.Viewer, description:
     page = pads.page
     before = ik.load_robot(description)
     points, normals = before.contacts(before.home)
-    pose = page.asked.held["first"].control.copy()
+    pose = page.request.contacts["first"].control.copy()
     pose[:3, 3] += [0.001, 0.002, 0.003]
     page.drag("first", pose)
     page.drag_normal("second", np.array([0.1, -0.9, 0.3]))
     page.save()
     assert page.work.settle()
-    assert page.said == "saved to my_hand.yaml: first, second"
+    assert page.message == "saved to my_hand.yaml: first, second"
     after = ik.load_robot(description)
     moved, faced = after.contacts(after.home)
     assert np.allclose(moved[0], points[0] + [0.001, 0.002, 0.003], atol=1e-6)
@@ -34,25 +34,25 @@ def test_dragged_pads_are_saved_and_read_back(pads: viewing.Viewer, description:
     assert "  # corrected by hand\n  second:" in text
     for kept in ("# Made by somebody", "# a comment that stays", "fingers:  # xyz [m]"):
         assert kept in text
-    assert page.changed == []
+    assert page.changed_fingers == []
 
 
 def test_a_pad_goes_onto_the_skin(pads: viewing.Viewer) -> None:
     page = pads.page
-    page.onto_skin("first")
+    page.snap_to_surface("first")
     assert page.work.settle()
-    assert page.said == ""
-    pad = page.pads(page.asked)["first"]
+    assert page.message == ""
+    pad = page.pads(page.request)["first"]
     # The box of the last phalanx is 16 mm thick: its side is 8 mm from the middle.
     assert abs(pad.point[1]) == pytest.approx(0.008, abs=1e-6)
     assert np.allclose(np.abs(pad.normal), [0, 1, 0], atol=1e-6)
     # Where nothing moves, it is said why.
-    page.onto_skin("first")
+    page.snap_to_surface("first")
     assert page.work.settle()
-    assert page.said.startswith("first: it is on the skin")
+    assert page.message.startswith("first: ")
     page.reset()
     assert page.work.settle()
-    assert page.changed == []
+    assert page.changed_fingers == []
 
 
 def test_pads_that_are_not_stated_are_asked_for(tmp_path: Path) -> None:

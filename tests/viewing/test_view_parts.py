@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.app.drawing.drawables import bodies, item_of
-from casadi_ik.app.drawing.surfaces import arrow, sharp
+from casadi_ik.app.drawing.drawables import item_drawables, visual_bodies
+from casadi_ik.app.drawing.surfaces import arrow, split_sharp_edges
 from casadi_ik.app.viewer import request_of
-from casadi_ik.app.viewer.pad_page import LinkPad, corrected, save_pads
-from casadi_ik.app.viewer.page import REST, Newest
+from casadi_ik.app.viewer.pad_page import LinkPad, save_pads, with_corrected_pad
+from casadi_ik.app.viewer.page import IDLE_DELAY, LatestOnly
 from casadi_ik.app.viewer.panel import grasp_text
 from casadi_ik.app.viewer.viser_scene import cameras, pose_of, quaternions
 from casadi_ik.compile.cancellation import stop_if_cancelled
@@ -50,13 +50,13 @@ def test_each_hand_of_a_body_has_a_camera_that_sees_it() -> None:
 
 
 def test_a_finger_may_be_left_free_but_not_all(robot: ik.ArmHand) -> None:
-    asked = request_of(robot, ik.load_grasp("cup"), None)
+    request = request_of(robot, ik.load_grasp("cup"), None)
     for finger in robot.fingers[:-1]:
-        asked = asked.with_use(finger, used=False, normal=True)
+        request = request.with_use(finger, is_used=False, uses_normal=True)
     last = robot.fingers[-1]
-    assert set(asked.grasp.contacts) == {last}
-    assert set(asked.with_use(last, used=False, normal=True).grasp.contacts) == {last}
-    loose = asked.with_use(last, used=True, normal=False).grasp.contacts[last]
+    assert set(request.grasp.contacts) == {last}
+    assert set(request.with_use(last, is_used=False, uses_normal=True).grasp.contacts) == {last}
+    loose = request.with_use(last, is_used=True, uses_normal=False).grasp.contacts[last]
     assert loose.normal is None
 
 
@@ -65,17 +65,19 @@ def test_a_finger_may_be_left_free_but_not_all(robot: ik.ArmHand) -> None:
 )
 def test_every_kind_of_contact_is_asked_as_it_is_and_turns(robot: ik.ArmHand, more) -> None:
     (kind,), given = more, ik.Contact([0.3, 0.1, 0.5], **more)
-    asked = request_of(robot, ik.Grasp({"thumb": given}), None)
-    found = asked.grasp.contacts["thumb"]
+    request = request_of(robot, ik.Grasp({"thumb": given}), None)
+    found = request.grasp.contacts["thumb"]
     for name in ("point", "normal", "line", "plane", "ball"):
         one, other = getattr(given, name), getattr(found, name)
         assert (one is None) == (other is None)
         assert one is None or np.allclose(one, other, atol=1e-12)
     turn = turned(0.0, 0.0, 0.0)
-    moved = asked.moved("thumb", turn @ asked.places["thumb"]).grasp.contacts["thumb"]
-    assert np.allclose(getattr(moved, kind), turn[:3, :3] @ [0, 0, 1], atol=1e-12)
+    turned_contact = request.with_pose("thumb", turn @ request.poses["thumb"]).grasp.contacts[
+        "thumb"
+    ]
+    assert np.allclose(getattr(turned_contact, kind), turn[:3, :3] @ [0, 0, 1], atol=1e-12)
     if kind in ("normal", "ball"):  # they have an arrow, which is where the hand takes it
-        faced = asked.with_normal("thumb", np.array([0.6, 0.0, 0.8])).grasp.contacts["thumb"]
+        faced = request.with_normal("thumb", np.array([0.6, 0.0, 0.8])).grasp.contacts["thumb"]
         assert np.allclose(getattr(faced, kind), [0.6, 0.0, 0.8], atol=1e-12)
 
 
@@ -109,17 +111,17 @@ def test_only_the_newest_change_of_a_key_is_done() -> None:
         go_on.wait(120)
         done.append("first")
 
-    work = Newest(lambda: done.append("drawn"), ((REST, lambda: done.append("later")),))
-    work.put("thumb", first)
+    work = LatestOnly(lambda: done.append("drawn"), ((IDLE_DELAY, lambda: done.append("later")),))
+    work.submit("thumb", first)
     assert begun.wait(120)
     for i in range(5):
-        work.put("thumb", lambda i=i: done.append(f"thumb {i}"))
-    work.put("cup", lambda: done.append("cup"))
+        work.submit("thumb", lambda i=i: done.append(f"thumb {i}"))
+    work.submit("cup", lambda: done.append("cup"))
     go_on.set()
     assert work.settle(10)
     # The first was under way; of the five that waited the last is done, and drawn once with "cup".
     assert done == ["first", "drawn", "thumb 4", "cup", "drawn", "later"]
-    assert work.dropped == 4
+    assert work.dropped_count == 4
     work.stop()
 
 
@@ -133,10 +135,10 @@ def test_what_can_wait_is_given_up_when_the_hand_moves_on() -> None:
             time.sleep(0.001)
         done.append("later")
 
-    work = Newest(lambda: None, ((REST, long),))
-    work.put("thumb", lambda: None)
+    work = LatestOnly(lambda: None, ((IDLE_DELAY, long),))
+    work.submit("thumb", lambda: None)
     assert begun.wait(120)
-    work.put("thumb", lambda: done.append("thumb"))
+    work.submit("thumb", lambda: done.append("thumb"))
     assert work.settle(10)
     assert done == ["thumb", "later"]
     work.stop()
@@ -144,10 +146,10 @@ def test_what_can_wait_is_given_up_when_the_hand_moves_on() -> None:
 
 def test_a_change_that_fails_does_not_end_the_page(caplog: pytest.LogCaptureFixture) -> None:
     done = []
-    work = Newest(lambda: done.append("drawn"))
-    work.put("bad", lambda: 1 / 0)
+    work = LatestOnly(lambda: done.append("drawn"))
+    work.submit("bad", lambda: 1 / 0)
     assert work.settle(10)
-    work.put("good", lambda: done.append("good"))
+    work.submit("good", lambda: done.append("good"))
     assert work.settle(10)
     assert done == ["drawn", "good", "drawn"]
     assert "ZeroDivisionError" in caplog.text
@@ -167,10 +169,10 @@ def test_bodies_are_closed_and_wind_outwards() -> None:
             "can": {"kind": "object", "object": "mustard_bottle"},
         }
     )
-    drawn = [one for item in scene.items.values() for one in item_of(item)]
-    bodies = [one.surface for one in drawn]
-    for body in [*bodies, arrow(np.zeros(3), np.array([1.0, 0, 0]), 0.05, 0.005).surface]:
-        for surface in (body, sharp(body)):
+    drawn = [one for item in scene.items.values() for one in item_drawables(item)]
+    surfaces = [one.surface for one in drawn]
+    for body in [*surfaces, arrow(np.zeros(3), np.array([1.0, 0, 0]), 0.05, 0.005).surface]:
+        for surface in (body, split_sharp_edges(body)):
             a, b, c = (surface.points[surface.triangles[:, i]] for i in range(3))
             assert np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6 > 0
             # What is closed has no area in sum.
@@ -183,11 +185,11 @@ def test_nothing_is_written_where_pads_are_not_stated(description: Path) -> None
         save_pads(description, {"third": LinkPad(np.zeros(3), np.array([1.0, 0.0, 0.0]))})
     assert description.read_text() == text
     with pytest.raises(ik.errors.DescriptionError, match=r"fingers\.third: not in the description"):
-        corrected(text, "third", np.zeros(3), np.ones(3))
+        with_corrected_pad(text, "third", np.zeros(3), np.ones(3))
 
 
 def test_links_look_as_their_files_show_them(description: Path) -> None:
-    drawn = {one.name: one.surface for one in bodies(ik.load_robot(description))}
+    drawn = {one.name: one.surface for one in visual_bodies(ik.load_robot(description))}
     assert {"pad first", "pad second"} <= set(drawn)
     for link in ("first_2", "second_2"):
         assert np.allclose(np.ptp(drawn[link].points, axis=0), [0.02, 0.016, 0.04])

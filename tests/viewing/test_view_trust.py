@@ -63,11 +63,11 @@ def greeted(page: Connection) -> bool:
     return len(page.recv(10)) > 100
 
 
-def asked(url: str, **headers: str) -> tuple[int, bytes]:
+def fetch_page(url: str, **headers: str) -> tuple[int, bytes]:
     """Status and text of a page."""
     try:
-        with urllib.request.urlopen(urllib.request.Request(url, headers=headers)) as answer:
-            return answer.status, answer.read()
+        with urllib.request.urlopen(urllib.request.Request(url, headers=headers)) as response:
+            return response.status, response.read()
     except urllib.error.HTTPError as error:
         return error.code, error.read()
 
@@ -104,14 +104,14 @@ def test_a_foreign_page_is_refused(cup: viewing.Viewer, host: str, origin: str |
         opened(cup.url, host, origin)
     assert caught.value.response.status_code == 403
     headers = {"Host": host or urlsplit(cup.url).netloc} | ({"Origin": origin} if origin else {})
-    assert asked(cup.url, **headers)[0] == 403
+    assert fetch_page(cup.url, **headers)[0] == 403
 
 
 @pytest.mark.parametrize("name", ["127.0.0.1", "localhost"])
 def test_the_page_itself_is_answered(cup: viewing.Viewer, name: str) -> None:
     """Also through a tunnel: the port may be another one."""
     there = urlsplit(cup.url)
-    assert b"<html" in asked(cup.url, Host=f"{name}:9999")[1].lower()
+    assert b"<html" in fetch_page(cup.url, Host=f"{name}:9999")[1].lower()
     for host in (f"{name}:{there.port}", f"{name}:9999"):
         with opened(cup.url, host, f"http://{host}") as page:
             assert greeted(page)
@@ -120,30 +120,30 @@ def test_the_page_itself_is_answered(cup: viewing.Viewer, name: str) -> None:
 def test_where_can_be_written_the_address_has_a_token(pads, description: Path) -> None:
     there, before = urlsplit(pads.url), description.read_text()
     assert len(there.path) > 20
-    assert asked(pads.url)[0] == 200
+    assert fetch_page(pads.url)[0] == 200
     for path in ("", "/", "/x", there.path[:-2]):
         bare = f"http://{there.netloc}{path}"
-        assert asked(bare)[0] == 403
+        assert fetch_page(bare)[0] == 403
         with pytest.raises(InvalidStatus):
             opened(bare)
     with opened(pads.url, origin=f"http://{there.netloc}") as page:
         assert greeted(page)
-        send(page, dragged(pads), pressed(pads.page._save))
-        while not pads.page.said:
+        send(page, dragged(pads), pressed(pads.page._save_button))
+        while not pads.page.message:
             page.recv(10)
     assert pads.page.work.settle()
-    assert pads.page.said.startswith("saved to")
+    assert pads.page.message.startswith("saved to")
     assert description.read_text() != before
 
 
 def test_a_button_that_is_off_cannot_be_pressed(description: Path) -> None:
     before, viewer = description.read_text(), viewing.view_pads(description, host="0.0.0.0")
-    assert viewer.page._save.disabled
+    assert viewer.page._save_button.disabled
     with opened(viewer.url) as page:
         assert greeted(page)
         send(page, dragged(viewer))
         assert viewer.page.work.settle()
-        send(page, pressed(viewer.page._save), CAMERA | {"fov": 0.5})
+        send(page, pressed(viewer.page._save_button), CAMERA | {"fov": 0.5})
         page.ping().wait(120)
     assert viewer.page.work.settle()
     assert description.read_text() == before
@@ -178,7 +178,7 @@ def test_malformed_messages_neither_end_the_page_nor_fill_the_terminal(tmp_path:
         "print(viewer.url, panel._drag._impl.uuid, controls['thumb'].handle.name,\n"
         "      panel._motors[0]._impl.uuid, flush=True)\n"
         "sys.stdin.read(); assert viewer.page.work.settle(); viewer.stop()\n"
-        "print(viewer.page.asked.grasp.contacts['thumb'].point.tolist())\n"
+        "print(viewer.page.request.grasp.contacts['thumb'].point.tolist())\n"
     )
     process = subprocess.Popen(
         [sys.executable, "-c", code],

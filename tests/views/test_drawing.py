@@ -12,18 +12,18 @@ import casadi_ik as ik
 from casadi_ik.app.drawing import palette
 from casadi_ik.app.drawing.drawables import (
     Drawable,
-    axes_of,
-    bodies,
+    bodies_at,
     close_view,
     collision_bodies,
     contact_marks,
-    lowest,
-    placed,
-    target_place,
+    ground_height,
+    nearest_target_point,
+    view_axes,
+    visual_bodies,
 )
 from casadi_ik.app.drawing.surfaces import ball, drum, ring, rod
 from casadi_ik.app.pictures import draw_solution, show
-from casadi_ik.app.pictures.scene3d import Stage
+from casadi_ik.app.pictures.scene3d import Scene3D
 
 pytestmark = pytest.mark.opengl
 
@@ -56,7 +56,7 @@ def test_shapes_are_closed_and_of_their_size(name: str) -> None:
 def test_fingertips_of_the_body_touch_their_contacts(robot) -> None:
     for q in robot.random(np.random.default_rng(1), 5):
         points, normals = robot.contacts(q)
-        pads = [one for one in placed(robot, q) if one.role == "pad"]
+        pads = [one for one in bodies_at(robot, q) if one.role == "pad"]
         for one, point, normal in zip(pads, points, normals, strict=True):
             corners = one.surface.points
             assert np.linalg.norm(corners - point, axis=1).min() < 1.5e-3
@@ -67,7 +67,11 @@ def test_a_link_without_a_shape_is_rods_to_what_it_carries() -> None:
     body = ik.load_robot("two_pandas+allegro")
     trunk, links = body.description.trunk_link, body.links(body.home)
     assert trunk not in {one.link for one in body.description.shapes.capsules}
-    rods = [one.at(links[trunk]).surface.points for one in bodies(body) if one.frame == trunk]
+    rods = [
+        one.transformed(links[trunk]).surface.points
+        for one in visual_bodies(body)
+        if one.frame == trunk
+    ]
     for side in ("left", "right"):
         for end in (links[trunk], links[f"{side}_panda_base"]):
             away = np.linalg.norm(np.concatenate(rods) - end[:3, 3], axis=1)
@@ -83,18 +87,18 @@ def test_a_link_without_a_shape_is_rods_to_what_it_carries() -> None:
     ],
 )
 def test_links_are_of_the_arm_or_of_a_hand(name: str, arm: set[str], hand: set[str]) -> None:
-    roles = {one.frame: one.role for one in bodies(ik.load_robot(name)) if one.role != "pad"}
+    roles = {one.frame: one.role for one in visual_bodies(ik.load_robot(name)) if one.role != "pad"}
     assert {link for link in arm | hand if roles[link] == "arm"} == arm
 
 
 @pytest.mark.parametrize("name", ["kuka_lwr_barrett", "g1+dex3"])
 def test_the_ground_is_below_all_of_a_robot(name: str) -> None:
     robot = ik.load_robot(name)
-    body = [*placed(robot, robot.home), *placed(robot, robot.home, collision_bodies(robot))]
+    body = [*bodies_at(robot, robot.home), *bodies_at(robot, robot.home, collision_bodies(robot))]
     heights = [one.surface.points[:, 2].min() for one in body]
-    assert -2e-3 < lowest(robot) - min(heights) < 0
+    assert -2e-3 < ground_height(robot) - min(heights) < 0
     scene = ik.Scene({"pit": {"kind": "box", "size": [1, 1, 1], "xyz": [0, 0, -3]}})
-    assert lowest(robot, scene) == pytest.approx(-3.501)
+    assert ground_height(robot, scene) == pytest.approx(-3.501)
 
 
 @pytest.mark.parametrize(
@@ -120,24 +124,24 @@ def test_every_kind_of_contact_has_its_marks(robot, solution, changed, legend, s
     assert sum(one.role == "target" for one in marks) == solids * len(robot.fingers)
     assert {one.color for one in marks if one.role == "reached"} == {palette.MET}
     (words, *_) = draw_solution(robot, solution, asked, dpi=40).legends[0].get_texts()
-    assert words.get_text() == f"asked for: {legend}"
+    assert words.get_text() == f"target: {legend}"
 
 
 def test_the_place_asked_for_is_the_nearest_that_a_contact_allows() -> None:
     point, tip = np.array([0.1, 0.2, 0.3]), np.array([0.5, 0.7, 0.9])
-    assert (target_place(ik.Contact(point), tip) == point).all()
+    assert (nearest_target_point(ik.Contact(point), tip) == point).all()
     np.testing.assert_allclose(
-        target_place(ik.Contact(point, line=[0, 0, 2]), tip), [0.1, 0.2, 0.9]
+        nearest_target_point(ik.Contact(point, line=[0, 0, 2]), tip), [0.1, 0.2, 0.9]
     )
     np.testing.assert_allclose(
-        target_place(ik.Contact(point, plane=[0, 0, 2]), tip), [0.5, 0.7, 0.3]
+        nearest_target_point(ik.Contact(point, plane=[0, 0, 2]), tip), [0.5, 0.7, 0.3]
     )
-    assert (target_place(ik.Contact(direction=[1, 0, 0]), tip) == tip).all()
+    assert (nearest_target_point(ik.Contact(direction=[1, 0, 0]), tip) == tip).all()
 
 
 @pytest.fixture
 def stage():
-    with closing(Stage()) as made:
+    with closing(Scene3D()) as made:
         yield made
 
 
@@ -149,7 +153,7 @@ def test_the_camera_shows_all_points_within_its_margins(stage) -> None:
     assert seen[:, 0].max() <= 180 + 1e-6
     assert seen[:, 1].min() >= 6 - 1e-6
     assert seen[:, 1].max() <= 114 + 1e-6
-    right, up, towards = axes_of((0.7, 0.3))
+    right, up, towards = view_axes((0.7, 0.3))
     assert towards @ [np.cos(0.7), np.sin(0.7), 0] == pytest.approx(np.cos(0.3))
     np.testing.assert_allclose(stage.project(points + towards), seen, atol=1e-6)
     moved = stage.project(points + 0.1 * right + 0.1 * up) - seen
@@ -160,7 +164,7 @@ def test_what_is_drawn_is_where_it_is_projected_to(stage) -> None:
     points = np.array([[0.0, 0.2, 0.3], [0.1, -0.4, 0.2]])
     stage.add("ball", [Drawable("ball", ball(0.02, points[0]), "#ff0000")])
     stage.aim((0.3, 0.4), points, (121, 81), (0.2, 0.2))
-    image = stage.shoot()
+    image = stage.render()
     rows, columns = np.nonzero(image[..., 3] > 0.5)
     x, y = stage.project(points)[0]
     assert (columns.mean() + 0.5, rows.mean() + 0.5) == pytest.approx((x, y), abs=0.6)
@@ -170,7 +174,7 @@ def test_the_floor_has_the_shadow_below_the_body(stage) -> None:
     thing = [Drawable("ball", ball(0.1, (0.2, 0.3, 0.5)), "#ff0000")]
     stage.add_floor(0.0, thing)
     stage.aim((0.4, 0.8), [[-0.5, 0, 0], [0.5, 0, 0], [0, -0.5, 0], [0, 0.5, 0]], (80, 80))
-    image = stage.shoot("floor")
+    image = stage.render("floor")
     dark = 1 - image[..., 0]
     x, y = stage.project([[0.2, 0.3, 0.0]])[0]
     assert dark[int(y), int(x)] > 0.2
@@ -180,7 +184,7 @@ def test_the_floor_has_the_shadow_below_the_body(stage) -> None:
 
 def test_the_close_view_sets_the_fingertips_apart(robot, solution) -> None:
     points, _ = robot.contacts(solution.q)
-    flat = (points @ axes_of(close_view(robot, solution.q))[:2].T)[:, None]
+    flat = (points @ view_axes(close_view(robot, solution.q))[:2].T)[:, None]
     gaps = np.linalg.norm(flat - flat.swapaxes(0, 1), axis=2)[np.triu_indices(3, 1)]
     assert gaps.min() > 0.015
 
@@ -198,7 +202,7 @@ def test_show_gives_a_plotter_to_export(robot, grasp, tmp_path) -> None:
 def test_without_opengl_there_is_an_error_and_no_crash(monkeypatch) -> None:
     monkeypatch.setattr("pyvista.Plotter", NoOpenGL)
     with pytest.raises(ik.errors.PictureError, match="no OpenGL"):
-        Stage()
+        Scene3D()
 
 
 class NoOpenGL:

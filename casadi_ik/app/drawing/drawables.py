@@ -1,7 +1,7 @@
-"""What there is to draw: named shapes, made alike for pictures, for the viewer and for pages.
+"""Geometry to draw: named, coloured shapes for pictures, the viewer and web pages.
 
-Every function gives drawables in a frame that it names. Pictures put them there at once; pages make
-a node of the frame and move that. A view is where they are looked at from.
+Every function returns drawables in a frame that it documents. Pictures place them directly; pages
+create a scene node per frame and move the node. A view is a viewing direction.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from casadi_ik.app.drawing.surfaces import (
     Shape,
     arrow,
     ball,
-    coarser,
+    decimate,
     drum,
-    joined,
-    mesh_of,
+    join_surfaces,
+    mesh_shape,
     ring,
     rod,
 )
@@ -43,81 +43,85 @@ from casadi_ik.model.parts import HAND_PREFIX
 from casadi_ik.model.pose import inverse
 
 View = tuple[float, float]
-"""Azimuth about z from x, and elevation above the horizon, of the viewer [rad]."""
+"""Azimuth of the viewer about z, from x, and elevation above the horizon [rad]."""
 
 
-def axes_of(view: View) -> Array:
-    """(3, 3) unit rows: to the right, up, and towards the viewer."""
+def view_axes(view: View) -> Array:
+    """Return the (3, 3) unit axes of a view as rows: right, up, and towards the viewer."""
     (c, s), (ce, se) = ((np.cos(angle), np.sin(angle)) for angle in view)
     return np.array([[-s, c, 0.0], [-se * c, -se * s, ce], [ce * c, ce * s, se]])
 
 
-def palm_places(robot: ArmHand, q: ArrayLike, *sides: str | None) -> Array:
-    """(h, 3) where the palms of some hands are, or of all, base frame [m]."""
+def palm_positions(robot: ArmHand, q: ArrayLike, *sides: str | None) -> Array:
+    """Return the (h, 3) palm positions of the given sides, or of all, in the base frame [m]."""
     return np.array([robot.palm(q, side)[:3, 3] for side in sides or robot.hands])
 
 
 def close_view(robot: ArmHand, q: ArrayLike, *sides: str | None) -> View:
-    """Where fingertips and palm are furthest apart in the image, and pads are seen from the side.
+    """Return the view that separates fingertips and palm best and shows the pads from the side.
 
     Args:
         robot: The robot.
-        q: (n,) actuator positions [rad or m].
-        sides: The hands that are looked at; none: all.
+        q: (n,) Configuration [rad or m].
+        sides: Sides whose hands are shown; empty: all.
     """
-    fingers = [finger for side in sides or robot.hands for finger in robot.hands[side]]
+    fingers = [
+        finger for pad_visibility in sides or robot.hands for finger in robot.hands[pad_visibility]
+    ]
     points, normals = (values[fingers] for values in robot.contacts(q))
-    links, palms = robot.links(q), palm_places(robot, q, *sides)
+    links, palms = robot.links(q), palm_positions(robot, q, *sides)
     palm = palms.mean(axis=0)
     joints = [joint for joint in robot.description.joints if joint.part != "hand"]
     arm = np.mean([links[joint.parent][:3, 3] for joint in joints] or [palm], axis=0)
-    spots = np.concatenate([points, palms])
+    markers = np.concatenate([points, palms])
 
     def score(view: View) -> float:
-        axes = axes_of(view)
-        flat = spots @ axes[:2].T
-        gaps = np.linalg.norm(flat[:, None] - flat[None], axis=2)
-        gap = gaps[np.triu_indices(len(spots), 1)].min()
-        side = 1 - np.abs(normals @ axes[2]).max()
-        hidden = max(0.0, float((arm - palm) @ axes[2]))  # behind the arm
-        return float(gap + 0.03 * side - 0.05 * hidden - 0.01 * abs(view[1] - 0.35))
+        axes = view_axes(view)
+        projected = markers @ axes[:2].T
+        gaps = np.linalg.norm(projected[:, None] - projected[None], axis=2)
+        gap = gaps[np.triu_indices(len(markers), 1)].min()
+        pad_visibility = 1 - np.abs(normals @ axes[2]).max()
+        occlusion = max(0.0, float((arm - palm) @ axes[2]))  # by the arm
+        return float(gap + 0.03 * pad_visibility - 0.05 * occlusion - 0.01 * abs(view[1] - 0.35))
 
     azimuths = np.deg2rad(np.arange(0, 360, 10)).tolist()
     return max(product(azimuths, np.deg2rad([5, 15, 25, 35]).tolist()), key=score)
 
 
-def whole_view(target: Array, close: View) -> View:
-    """From the side of an arm that reaches for a target, on the side of the close-up.
+def overview(target: Array, close_up: View) -> View:
+    """Return a view from the side of an arm that reaches for a target.
+
+    Of the two sides, the one nearer to the azimuth of the close-up is chosen.
 
     Args:
-        target: (3,) what is to be grasped, in the base frame [m].
-        close: How the close-up is seen.
+        target: (3,) Position of the target in the base frame [m].
+        close_up: View of the close-up.
     """
     elevation = float(np.deg2rad(18.0))
     if np.hypot(target[0], target[1]) < 0.05:
-        return close[0], elevation
-    along = float(np.arctan2(target[1], target[0]))
-    sides = (along + np.deg2rad(65.0), along - np.deg2rad(65.0))
-    return max(sides, key=lambda side: float(np.cos(side - close[0]))), elevation
+        return close_up[0], elevation
+    azimuth = float(np.arctan2(target[1], target[0]))
+    sides = (azimuth + np.deg2rad(65.0), azimuth - np.deg2rad(65.0))
+    return max(sides, key=lambda side: float(np.cos(side - close_up[0]))), elevation
 
 
 ARM_RADIUS, FINGER_RADIUS = 0.035, 0.009
-"""Of rods that stand for links of which no shape is known [m]."""
+"""Radii of the rods that represent links without a known shape [m]."""
 
-BEYOND = 0.04
-"""How far a line is drawn past what it is given by and reached at; radius of a plane's ring [m]."""
+MARK_EXTENT = 0.04
+"""Length by which a line extends past its ends, and radius of a plane's ring [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Drawable:
-    """A shape that is drawn.
+    """A coloured shape in a frame.
 
     Attributes:
-        name: What it is.
-        shape: In its frame.
-        color: As in `casadi_ik.app.drawing.palette`.
-        frame: The frame that it moves with: a link, or "" for the base frame.
-        role: What it belongs to: "arm", "hand", "pad", "object", "scene", "target", "reached",
+        name: Name of the shape.
+        shape: Shape in the frame `frame`.
+        color: Colour as in `casadi_ik.app.drawing.palette`.
+        frame: Link that the shape moves with; "" for the base frame.
+        role: Kind of thing: "arm", "hand", "pad", "object", "scene", "target", "reached",
             "missed" or "nearest".
     """
 
@@ -129,90 +133,103 @@ class Drawable:
 
     @property
     def surface(self) -> Surface:
-        """Its triangles, in its frame."""
+        """Triangles in the frame of the drawable."""
         return self.shape.surface
 
-    def at(self, pose: Array) -> Drawable:
-        """The same in the base frame, in which its frame has a (4, 4) pose."""
-        return replace(self, shape=self.shape.moved(pose), frame="")
+    def transformed(self, pose: Array) -> Drawable:
+        """Return the drawable in the base frame, given the (4, 4) pose of its frame."""
+        return replace(self, shape=self.shape.transformed(pose), frame="")
 
 
 # Robots.
 
 
-def bodies(robot: ArmHand) -> list[Drawable]:
-    """A robot in the frames of its links, with a pad at each fingertip.
+def visual_bodies(robot: ArmHand) -> list[Drawable]:
+    """Return the visual geometry of a robot in the frames of its links, with a pad per fingertip.
 
-    An arm or a hand looks as the robot's files show it, else as the shapes that collisions are
-    checked with; a link that has none is drawn as rods to the joints that it carries.
+    Arms and hands have the meshes of the robot's files, otherwise the collision shapes. A link with
+    neither is drawn as rods to its child joints.
 
     Args:
         robot: The robot.
     """
-    description, seen = robot.description, meshes_of(robot.description)
-    looks = looks_of(description)
-    shown = {looks[link][0] for link in seen}
-    found = [_of_link(link, mesh_of(surface), looks) for link, surface in seen.items()]
-    found += [one for one in collision_bodies(robot) if one.role not in shown]
-    known, links = {one.frame for one in found}, robot.links(robot.home)
+    description, meshes = robot.description, visual_meshes(robot.description)
+    styles = link_styles(description)
+    roles_with_mesh = {styles[link][0] for link in meshes}
+    drawables = [
+        _link_drawable(link, mesh_shape(surface), styles) for link, surface in meshes.items()
+    ]
+    drawables += [
+        drawable for drawable in collision_bodies(robot) if drawable.role not in roles_with_mesh
+    ]
+    drawn_links, links = {drawable.frame for drawable in drawables}, robot.links(robot.home)
     for joint in description.joints:
-        role, end = looks[joint.parent][0], inverse(links[joint.parent]) @ links[joint.child]
-        if role not in shown and joint.parent not in known:
-            found.append(_of_link(joint.parent, _rod_to(end[:3, 3], role), looks))
+        role, end = styles[joint.parent][0], inverse(links[joint.parent]) @ links[joint.child]
+        if role not in roles_with_mesh and joint.parent not in drawn_links:
+            drawables.append(_link_drawable(joint.parent, _link_rod(end[:3, 3], role), styles))
     for finger in description.fingers:
-        if looks[finger.link][0] not in shown and finger.link not in known:
-            found.append(_of_link(finger.link, _rod_to(finger.placement[:3, 3], "hand"), looks))
-    return found + [_pad(finger) for finger in description.fingers]
+        if styles[finger.link][0] not in roles_with_mesh and finger.link not in drawn_links:
+            drawables.append(
+                _link_drawable(finger.link, _link_rod(finger.placement[:3, 3], "hand"), styles)
+            )
+    return drawables + [_pad(finger) for finger in description.fingers]
 
 
 def collision_bodies(robot: ArmHand) -> list[Drawable]:
-    """The shapes that collisions are checked with, in the frames of links."""
+    """Return the collision shapes in the frames of their links."""
     description = robot.description
-    shapes, looks = description.shapes, looks_of(description)
-    found = [
-        (one.link, rod(one.center - one.half, one.center + one.half, one.radius))
-        for one in shapes.capsules
-        if one.covers < 0
+    shapes, styles = description.shapes, link_styles(description)
+    link_shapes = [
+        (
+            capsule.link,
+            rod(capsule.center - capsule.half, capsule.center + capsule.half, capsule.radius),
+        )
+        for capsule in shapes.capsules
+        if capsule.covers < 0
     ]
-    for one, solid in zip(shapes.solids, own_solids(description), strict=True):
-        found.append((one.link, mesh_of(Surface(*solid.mesh())).moved(one.pose)))
-    return [_of_link(link, shape, looks) for link, shape in found]
+    for attached, solid in zip(shapes.solids, own_solids(description), strict=True):
+        mesh = mesh_shape(Surface(*solid.mesh()))
+        link_shapes.append((attached.link, mesh.transformed(attached.pose)))
+    return [_link_drawable(link, shape, styles) for link, shape in link_shapes]
 
 
-def placed(
+def bodies_at(
     robot: ArmHand, q: ArrayLike, drawables: Sequence[Drawable] | None = None
 ) -> list[Drawable]:
-    """Drawables of links (None: its bodies) at q (n,) [rad or m], in the base frame.
+    """Return drawables of links (None: the visual geometry) at q (n,), in the base frame.
 
     Raises:
-        InputError: Bad q.
+        InputError: q is invalid.
     """
     poses = robot.links(q)
-    return [one.at(poses[one.frame]) for one in (bodies(robot) if drawables is None else drawables)]
+    drawables = visual_bodies(robot) if drawables is None else drawables
+    return [drawable.transformed(poses[drawable.frame]) for drawable in drawables]
 
 
-def lowest(robot: ArmHand, scene: Scene | None = None) -> float:
-    """Height of the ground [m]: that of a robot's base, or below all of it at home and a scene."""
-    things = [*placed(robot, robot.home), *([] if scene is None else scene_of(scene))]
-    return min(0.0, min(float(one.surface.points[:, 2].min()) for one in things) - 1e-3)
+def ground_height(robot: ArmHand, scene: Scene | None = None) -> float:
+    """Return the height of the ground [m]: 0, or below the robot at home and the scene."""
+    drawables = [*bodies_at(robot, robot.home), *([] if scene is None else scene_drawables(scene))]
+    return min(
+        0.0, min(float(drawable.surface.points[:, 2].min()) for drawable in drawables) - 1e-3
+    )
 
 
-def merged(drawables: Sequence[Drawable]) -> list[Drawable]:
-    """Those of one frame and colour as one mesh each: fewer things to be moved."""
+def merge_by_frame(drawables: Sequence[Drawable]) -> list[Drawable]:
+    """Merge drawables of one frame and colour into one mesh each, so that fewer nodes move."""
     groups: dict[tuple[str, str], list[Drawable]] = {}
-    for one in drawables:
-        groups.setdefault((one.frame, one.color), []).append(one)
+    for drawable in drawables:
+        groups.setdefault((drawable.frame, drawable.color), []).append(drawable)
     return [
-        replace(many[0], shape=mesh_of(joined([one.surface for one in many])))
-        for many in groups.values()
+        replace(group[0], shape=mesh_shape(join_surfaces([drawable.surface for drawable in group])))
+        for group in groups.values()
     ]
 
 
-def looks_of(description: RobotDescription) -> dict[str, tuple[str, str]]:
-    """By link "arm" or "hand", and its colour, another than that of the link before it."""
+def link_styles(description: RobotDescription) -> dict[str, tuple[str, str]]:
+    """Return by link its role ("arm" or "hand") and a colour unlike that of its parent."""
     palms = {description.palm_link, *(side.palm_link for side in description.sides)}
-    alone = not (description.arm_actuators or description.sides)
-    depth, roles = {description.root: 0}, {description.root: "hand" if alone else "arm"}
+    is_hand_alone = not (description.arm_actuators or description.sides)
+    depth, roles = {description.root: 0}, {description.root: "hand" if is_hand_alone else "arm"}
     for joint in description.joints:
         depth[joint.child] = depth[joint.parent] + 1
         roles[joint.child] = "hand" if joint.part == "hand" or joint.child in palms else "arm"
@@ -220,17 +237,17 @@ def looks_of(description: RobotDescription) -> dict[str, tuple[str, str]]:
     return {link: (role, colors[role][depth[link] % 2]) for link, role in roles.items()}
 
 
-def _of_link(link: str, shape: Shape, looks: Mapping[str, tuple[str, str]]) -> Drawable:
-    role, color = looks[link]
+def _link_drawable(link: str, shape: Shape, styles: Mapping[str, tuple[str, str]]) -> Drawable:
+    role, color = styles[link]
     return Drawable(link, shape, color, link, role)
 
 
-def _rod_to(end: Array, role: str) -> Shape:
+def _link_rod(end: Array, role: str) -> Shape:
     return rod(np.zeros(3), end, ARM_RADIUS if role == "arm" else FINGER_RADIUS)
 
 
 def _pad(finger: Finger) -> Drawable:
-    """A disc; the pad's height above the axis of its link says how large it is."""
+    """Return a disc whose radius follows from the height of the pad above the axis of its link."""
     normal = finger.placement[:3, :3] @ finger.normal
     height = float(finger.placement[:3, 3] @ normal)
     radius = height if 0.004 < height < 0.02 else FINGER_RADIUS
@@ -240,24 +257,24 @@ def _pad(finger: Finger) -> Drawable:
 
 
 @lru_cache(maxsize=8)
-def meshes_of(description: RobotDescription) -> dict[str, Surface]:
-    """By link what the files show that a description points to, coarse enough to be drawn."""
+def visual_meshes(description: RobotDescription) -> dict[str, Surface]:
+    """Return by link the visual meshes of the robot's files, decimated for drawing."""
     try:
-        found = {} if description.path is None else file_meshes(description, seen=True)
-    except CasadiIKError:  # the files are gone, the kinematics are not
+        meshes = {} if description.path is None else file_meshes(description, visual=True)
+    except CasadiIKError:  # the robot can be drawn without its mesh files
         return {}
-    return {link: coarser(one) for link, one in found.items() if len(one.triangles)}
+    return {link: decimate(mesh) for link, mesh in meshes.items() if len(mesh.triangles)}
 
 
-def file_meshes(description: RobotDescription, seen: bool = False) -> dict[str, Surface]:
-    """Shapes that the files have to which a description points.
+def file_meshes(description: RobotDescription, visual: bool = False) -> dict[str, Surface]:
+    """Return the meshes of the files that a description refers to.
 
     Args:
-        description: The robot; it was read from a file.
-        seen: Whether those that are seen are wanted, else those for collisions.
+        description: Description that was read from a file.
+        visual: Read the visual meshes instead of the collision meshes.
 
     Returns:
-        By link its surface in its frame; links of which no file has a shape are left out.
+        Surface by link, in the frame of the link; links without a mesh are omitted.
 
     Raises:
         CasadiIKError: A file cannot be read.
@@ -265,26 +282,26 @@ def file_meshes(description: RobotDescription, seen: bool = False) -> dict[str, 
     path = description.path
     assert path is not None
     raw, links = read_yaml(path), set(description.links)
-    found: dict[str, Surface] = {}
+    meshes: dict[str, Surface] = {}
     for key in ("arm", "hand", "robot"):
         entry = raw.get(key)
         if not isinstance(entry, dict) or "file" not in entry:
             continue
         prefix = HAND_PREFIX if key == "hand" else ""
-        # A name that arm and hand both have is prefixed in the hand.
-        named = {link.removeprefix(prefix) if prefix else link: link for link in links}
-        named |= {link: link for link in links if f"{prefix}{link}" not in links or not prefix}
-        surfaces, _ = link_surfaces(tree_of(path, entry), list(named), seen)
+        # The hand's links are prefixed where arm and hand have a name in common.
+        link_names = {link.removeprefix(prefix) if prefix else link: link for link in links}
+        link_names |= {link: link for link in links if f"{prefix}{link}" not in links or not prefix}
+        surfaces, _ = link_surfaces(tree_of(path, entry), list(link_names), visual)
         for link, surface in surfaces.items():
-            found.setdefault(named[link], surface)
-    return found
+            meshes.setdefault(link_names[link], surface)
+    return meshes
 
 
 # Contacts.
 
 
-def target_place(contact: Contact, tip: Array) -> Array:
-    """(3,) of the places a contact allows the nearest to a fingertip (3,) [m]."""
+def nearest_target_point(contact: Contact, tip: Array) -> Array:
+    """Return the point (3,) allowed by a contact that is nearest to a fingertip (3,) [m]."""
     if np.isnan(contact.point[0]):
         return tip
     gap = tip - contact.point
@@ -295,81 +312,80 @@ def target_place(contact: Contact, tip: Array) -> Array:
     return contact.point
 
 
-def asked_marks(contact: Contact, tip: Array, size: float = 1.0) -> list[Drawable]:
-    """What a contact asks for: thick and short marks, in the contact's frame.
+def target_marks(contact: Contact, tip: Array, size: float = 1.0) -> list[Drawable]:
+    """Return thick, short marks of the constraints of a contact, in the contact's frame.
 
-    A line is a rod, a plane a ring about the place in it that is nearest to the fingertip; second
-    axes have arrows shorter than the normals'. Where the fingertip may be anywhere, what it must
-    face is drawn where it is.
+    A line is drawn as a rod, a plane as a ring about its point nearest to the fingertip. Arrows of
+    tangents are shorter than those of normals. A contact without a point is drawn at the fingertip.
 
     Args:
         contact: The contact.
-        tip: (3,) where the fingertip is [m].
-        size: Of balls and arrows, as a part of the usual.
+        tip: (3,) Position of the fingertip [m].
+        size: Scale of balls and arrows.
     """
-    place, found = target_place(contact, tip), {}
+    position, shapes = nearest_target_point(contact, tip), {}
     if contact.line is not None:
-        along = float(contact.line @ (place - contact.point))
-        low, high = min(0.0, along) - BEYOND, max(0.0, along) + BEYOND
+        offset = float(contact.line @ (position - contact.point))
+        low, high = min(0.0, offset) - MARK_EXTENT, max(0.0, offset) + MARK_EXTENT
         start, end = (contact.point + t * contact.line for t in (low, high))
-        found["line"] = rod(start, end, 0.0020)
+        shapes["line"] = rod(start, end, 0.0020)
     elif contact.plane is not None:
-        found["plane"] = ring(place, contact.plane, BEYOND, 0.0016)
+        shapes["plane"] = ring(position, contact.plane, MARK_EXTENT, 0.0016)
     elif not np.isnan(contact.point[0]):
-        found["point"] = ball(0.0036 * size, place)
-    facing = contact.ball if contact.normal is None else contact.normal
-    if facing is not None:
-        found["normal"] = arrow(place, facing, 0.030 * size, 0.0048 * size)
+        shapes["point"] = ball(0.0036 * size, position)
+    normal = contact.ball if contact.normal is None else contact.normal
+    if normal is not None:
+        shapes["normal"] = arrow(position, normal, 0.030 * size, 0.0048 * size)
     if contact.tangent is not None:
-        found["tangent"] = arrow(place, contact.tangent, 0.021 * size, 0.0048 * size)
-    return [Drawable(name, one, palette.TARGET, role="target") for name, one in found.items()]
+        shapes["tangent"] = arrow(position, contact.tangent, 0.021 * size, 0.0048 * size)
+    return [Drawable(name, shape, palette.TARGET, role="target") for name, shape in shapes.items()]
 
 
-def reached_marks(color: str, tangent: bool = False) -> list[Drawable]:
-    """What a finger reaches: thin and long arrows, in the frame of its contact (x its normal)."""
+def fingertip_marks(color: str, tangent: bool = False) -> list[Drawable]:
+    """Return long, thin arrows of a fingertip in its contact frame (x: pad normal)."""
     x, y, _ = np.eye(3)
-    parts = [ball(0.0042), arrow(np.zeros(3), x, 0.046, 0.0022)]
+    shapes = [ball(0.0042), arrow(np.zeros(3), x, 0.046, 0.0022)]
     if tangent:
-        parts.append(arrow(np.zeros(3), y, 0.034, 0.0022))
-    return [Drawable("reached", part, color, role="reached") for part in parts]
+        shapes.append(arrow(np.zeros(3), y, 0.034, 0.0022))
+    return [Drawable("reached", shape, color, role="reached") for shape in shapes]
 
 
 def contact_marks(
     robot: ArmHand, q: ArrayLike, grasp: Grasp, colors: Mapping[str, str]
 ) -> list[Drawable]:
-    """Contacts asked for and reached, and a line to those that are missed, in the base frame.
+    """Return contacts, fingertips and lines to missed contacts, in the base frame.
 
     Args:
         robot: The robot.
-        q: (n,) where it is [rad or m].
-        grasp: What is asked for.
-        colors: Of what is reached, by finger; `palette.MISSED` of what is missed.
+        q: (n,) Configuration [rad or m].
+        grasp: The grasp.
+        colors: Colour of the fingertip marks by finger; `palette.MISSED` for a missed contact.
 
     Raises:
-        InputError: The grasp has a finger that the robot has not.
+        InputError: The grasp names a finger that the robot does not have.
     """
     grasp.arrays(robot.fingers)
-    found: list[Drawable] = []
+    drawables: list[Drawable] = []
     for finger, frame in zip(robot.fingers, robot.contact_frames(q), strict=True):
         contact, tip = grasp.contacts.get(finger), frame[:3, 3]
         if contact is not None:
-            found += asked_marks(contact, tip)
-            reached = reached_marks(colors[finger], contact.tangent is not None)
-            found += [one.at(frame) for one in reached]
+            drawables += target_marks(contact, tip)
+            marks = fingertip_marks(colors[finger], contact.tangent is not None)
+            drawables += [mark.transformed(frame) for mark in marks]
             if colors[finger] == palette.MISSED:
-                gap = rod(tip, target_place(contact, tip), 0.0006)
-                found.append(Drawable("gap", gap, palette.MISSED, role="missed"))
-    return found
+                gap = rod(tip, nearest_target_point(contact, tip), 0.0006)
+                drawables.append(Drawable("gap", gap, palette.MISSED, role="missed"))
+    return drawables
 
 
-# Things.
+# Objects and scenes.
 
 
-def object_of(name: str) -> Drawable | None:
-    """The object that is grasped, in its frame; None: there is no description of it.
+def object_drawable(name: str) -> Drawable | None:
+    """Return the grasped object in its frame, or None if no description of it exists.
 
     Raises:
-        DescriptionError: Its description is malformed.
+        DescriptionError: The description of the object is malformed.
     """
     if not name:
         return None
@@ -377,57 +393,57 @@ def object_of(name: str) -> Drawable | None:
         points, triangles = load_object(name).mesh(64)
     except UnknownNameError:
         return None
-    shape = mesh_of(Surface(points, np.asarray(triangles, np.int64)))
+    shape = mesh_shape(Surface(points, np.asarray(triangles, np.int64)))
     return Drawable("object", shape, palette.OBJECT, role="object")
 
 
-def item_of(item: Item) -> list[Drawable]:
-    """Something that stands in a scene, in its frame; without end, the part near the base."""
-    near = inverse(item.pose)[:3, 3]
+def item_drawables(item: Item) -> list[Drawable]:
+    """Return an item of a scene in its frame; of an unbounded solid, the part near the base."""
+    base = inverse(item.pose)[:3, 3]
     return [
-        Drawable(f"{item.name} {i}", _placed(solid, place, near), palette.SCENE, role="scene")
-        for i, (solid, place) in enumerate(item.parts)
+        Drawable(f"{item.name} {i}", _placed_solid(solid, pose, base), palette.SCENE, role="scene")
+        for i, (solid, pose) in enumerate(item.parts)
     ]
 
 
-def _placed(solid: Solid, pose: Array, near: Array) -> Shape:
-    """A solid at a (4, 4) pose; of one that reaches without end the part near a point (3,)."""
+def _placed_solid(solid: Solid, pose: Array, point: Array) -> Shape:
+    """Return a solid at a (4, 4) pose; of an unbounded solid, the part near a point (3,)."""
     surface = Surface(*solid.mesh())
     if not np.isfinite(solid.reach):
-        x, y, _ = pose[:3, :3].T @ (near - pose[:3, 3])
+        x, y, _ = pose[:3, :3].T @ (point - pose[:3, 3])
         surface = Surface(surface.points + np.array([x, y, 0.0]), surface.triangles)
-    return mesh_of(surface).moved(pose)
+    return mesh_shape(surface).transformed(pose)
 
 
-def scene_of(scene: Scene, without: str = "") -> list[Drawable]:
-    """Everything of a scene but an object that is drawn by itself, in the base frame."""
-    drawn = {without} if object_of(without) is not None else set[str]()
-    items = [item for name, item in scene.items.items() if name not in drawn]
-    return [one.at(item.pose) for item in items for one in item_of(item)]
+def scene_drawables(scene: Scene, excluded: str = "") -> list[Drawable]:
+    """Return all items of a scene but an object that is drawn separately, in the base frame."""
+    excluded_names = {excluded} if object_drawable(excluded) is not None else set[str]()
+    items = [item for name, item in scene.items.items() if name not in excluded_names]
+    return [drawable.transformed(item.pose) for item in items for drawable in item_drawables(item)]
 
 
-def with_object(scene: Scene, grasp: Grasp | None) -> Scene:
-    """The scene with what a grasp names as its object where it has it."""
+def scene_with_object(scene: Scene, grasp: Grasp | None) -> Scene:
+    """Return the scene with the object of a grasp at its pose, if the grasp has one."""
     if grasp is not None and grasp.object and grasp.known_pose is not None:
         return scene.holding(grasp.object, grasp.known_pose)
     return scene
 
 
-def nearest_pair(closest: Closest, touching: bool = False) -> list[Drawable]:
-    """A rod between the nearest points of two shapes, a ball at each end, in the base frame.
+def clearance_marks(closest: Closest, show_shapes: bool = False) -> list[Drawable]:
+    """Return a rod between the nearest points of two shapes, in the base frame.
 
     Args:
-        closest: The pair.
-        touching: Whether the two shapes are drawn instead, a millimetre larger to be seen; not
-            what reaches without end.
+        closest: The pair of shapes.
+        show_shapes: Return the bounded ones of the two shapes instead, enlarged by a millimetre so
+            that they are visible.
     """
     start, end = closest.ends
     shapes = [rod(start, end, 0.0012), ball(0.0022, start), ball(0.0022, end)]
-    if touching:
+    if show_shapes:
         shapes = []
         for solid, pose in closest.shapes:
             if np.isfinite(solid.reach):
                 points, triangles = solid.mesh()
-                larger = Surface(points * (1 + 1e-3 / solid.reach), triangles)
-                shapes.append(mesh_of(larger).moved(pose))
-    return [Drawable("nearest", one, palette.NEAREST, role="nearest") for one in shapes]
+                enlarged = Surface(points * (1 + 1e-3 / solid.reach), triangles)
+                shapes.append(mesh_shape(enlarged).transformed(pose))
+    return [Drawable("nearest", shape, palette.NEAREST, role="nearest") for shape in shapes]

@@ -1,4 +1,4 @@
-"""The colours of every picture and page, so that the same thing looks the same everywhere."""
+"""Colours of pictures and pages; each kind of thing has the same colour everywhere."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ MET, MISSED = "#1f9d55", "#d62f3c"
 NEAREST = "#b5179e"
 
 INK, FAINT = "#2b333b", "#7a848e"
-"""Of text."""
+"""Colours of text on light pages."""
 
 DARK_PAPER, DARK_INK, DARK_FAINT = "#161b22", "#e6edf3", "#9aa5b1"
-"""Of pictures for dark pages: the ground, and text on it."""
+"""Colours of pictures for dark pages: background, text, secondary text."""
 
-LINES = ("#e08a2e", "#2f6db3", "#1f9d55", "#8e4ec6", "#c2334d", "#0f8b8d")
-"""Of the lines of a diagram."""
+LINE_COLORS = ("#e08a2e", "#2f6db3", "#1f9d55", "#8e4ec6", "#c2334d", "#0f8b8d")
+"""Colours of curves in a chart."""
 
-METHODS = {
+METHOD_COLORS = {
     "enhanced-dls": "#1f77b4",
     "enhanced-sdls": "#ff7f0e",
     "original-dls": "#2ca02c",
@@ -33,25 +33,27 @@ METHODS = {
     "thumb-first": "#9467bd",
     "hand-first": "#8c564b",
 }
-"""Of the methods, wherever several are drawn beside each other; others have none of their own."""
+"""Colours of methods in charts that compare several; other methods have no fixed colour."""
 
-PHASES = ("#f3f1ec", "#fbecd9", "#deebf7", "#e3f2e1")
-"""By the code of the phase."""
+PHASE_COLORS = ("#f3f1ec", "#fbecd9", "#deebf7", "#e3f2e1")
+"""Background colours of the phases of a solve, by phase code."""
 
 
 def method_colors(methods: Iterable[str]) -> dict[str, str]:
-    """A colour for each of some methods: its own, or one that no other of them has."""
-    free = iter([color for color in LINES[::-1] if color not in METHODS.values()] * 9)
-    return {name: METHODS[name] if name in METHODS else next(free) for name in methods}
+    """Return a colour for each method: its fixed one, or one that no other method uses."""
+    unused = iter([color for color in LINE_COLORS[::-1] if color not in METHOD_COLORS.values()] * 9)
+    return {
+        name: METHOD_COLORS[name] if name in METHOD_COLORS else next(unused) for name in methods
+    }
 
 
 def shade(value: float, stops: tuple[float, float, float] = (0.0, 0.5, 1.0)) -> str:
-    """From red at the first of some values over yellow to green at the last."""
-    channels = np.array([rgb(one) for one in (MISSED, TARGET, MET)]).T
+    """Return a colour from red through yellow to green, interpolated between three stops."""
+    channels = np.array([rgb(stop) for stop in (MISSED, TARGET, MET)]).T
     mixed = [round(float(np.interp(value, stops, channel))) for channel in channels]
     return "#{:02x}{:02x}{:02x}".format(*mixed)
 
 
 def rgb(color: str) -> tuple[int, int, int]:
-    """Red, green and blue, 0 to 255, of a colour as above."""
+    """Return red, green and blue, 0 to 255, of a colour "#rrggbb"."""
     return int(color[1:3], 16), int(color[3:5], 16), int(color[5:7], 16)

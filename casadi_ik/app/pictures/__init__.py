@@ -1,4 +1,4 @@
-"""Pictures of grasps and of convergence; needs the extra `plots`: matplotlib and PyVista."""
+"""Pictures of grasps, motions and convergence; needs the extra `plots` (matplotlib, PyVista)."""
 
 import warnings
 
@@ -8,7 +8,7 @@ from casadi_ik.errors import MissingExtraError
 try:
     import_matplotlib()
     with warnings.catch_warnings():
-        # What it downloads with has progress bars, which complain in notebooks without widgets.
+        # PyVista's download library warns in notebooks without widgets.
         warnings.filterwarnings("ignore", "IProgress not found")
         import pyvista as _pyvista  # noqa: F401
 except ImportError as error:

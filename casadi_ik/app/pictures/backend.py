@@ -9,8 +9,8 @@ import sys
 def import_matplotlib() -> None:
     """Import matplotlib even if MPLBACKEND names a backend that is not installed.
 
-    Importing matplotlib fails then. The variable is often inherited from a notebook or a desktop of
-    another environment; pictures in files do not need that backend.
+    The variable is often inherited from a notebook or desktop of another environment, and makes
+    the import fail, although files do not need that backend.
     """
     if "matplotlib" in sys.modules:
         return

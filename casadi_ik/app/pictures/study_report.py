@@ -1,4 +1,4 @@
-"""A study's log as one page that needs nothing but a browser; needs the extra `plots`."""
+"""Report of a study's log as one self-contained HTML page; needs the extra `plots`."""
 
 from __future__ import annotations
 
@@ -27,63 +27,63 @@ from casadi_ik.logs.tables import MethodRows
 
 
 def study_page(log: Log, title: str, most: int) -> str:
-    """A study's log as a page of its own: totals, failures by reason, solves to filter and sort.
+    """Return a report of a log: totals, failures by reason, and solves to filter and sort.
 
     Args:
         log: The log.
-        title: What it is called.
-        most: How many of the worst solves are listed with their stories.
+        title: Title of the page.
+        most: Maximum number of solves that are listed with details, the hardest first.
 
     Returns:
-        HTML that refers to nothing outside itself.
+        Self-contained HTML.
 
     Raises:
         LogError: The log is damaged.
     """
-    groups = groups_of(log)
-    about, count = log.info(), sum(map(len, groups))
+    groups = solve_groups(log)
+    info, count = log.info(), sum(map(len, groups))
     parts = [
-        f"<h1>{_text(title)}</h1>",
-        f'<p class="faint">{_text(about.robot)}; {count:,} solve{"s" * (count != 1)} in '
-        f"{len(about.paths)} file(s), {about.size / 1e6:.1f} MB; written "
-        f"{_text(about.metadata['created'])} by casadi-ik "
-        f"{_text(about.metadata['code_version'])}.</p>",
+        f"<h1>{_escape(title)}</h1>",
+        f'<p class="faint">{_escape(info.robot)}; {count:,} solve{"s" * (count != 1)} in '
+        f"{len(info.paths)} file(s), {info.size / 1e6:.1f} MB; written "
+        f"{_escape(info.metadata['created'])} by casadi-ik "
+        f"{_escape(info.metadata['code_version'])}.</p>",
         "<h2>Results</h2>",
         _totals(groups),
     ]
     if count:
-        chosen = list(hardest(groups, most))
+        listed = list(hardest_solves(groups, most))
         parts += [
             "<h2>Failures by reason</h2>",
             _clusters(groups),
-            f"<h2>{'Solves' if len(chosen) == count else f'The {len(chosen)} hardest solves'}</h2>",
-            "<p>What is not solved comes first, by its error, then what took the most iterations. "
-            "A number opens the story of a solve: its curve is the worst error over the "
-            "iterations, from a thousand times its tolerance (top) to a thousandth; dashed: the "
+            f"<h2>{'Solves' if len(listed) == count else f'The {len(listed)} hardest solves'}</h2>",
+            "<p>Unsolved targets come first, ordered by error, then solves ordered by iterations. "
+            "Click a number for details; the curve shows the worst error over the iterations, "
+            "from a thousand times the tolerance (top) to a thousandth; dashed: the "
             "tolerance.</p>",
-            _filter(groups, chosen),
-            _solves(log, chosen),
+            _filter(groups, listed),
+            _solves(log, listed),
             "<h2>Iterations and time</h2>",
-            effort(groups),
-            "<h2>Where</h2>",
-            "<p>The mean of a target's contact points, in the robot's base frame.</p>",
-            places(groups),
+            effort_figure(groups),
+            "<h2>Positions of targets</h2>",
+            "<p>Mean contact point of each target in the base frame.</p>",
+            contact_figure(groups),
         ]
     page = (models_folder() / "viewer" / "report.html").read_text(encoding="utf-8")
     before, after = page.split("BODY")
-    return before.replace("TITLE", _text(title)) + "\n".join(parts) + after
+    return before.replace("TITLE", _escape(title)) + "\n".join(parts) + after
 
 
-def _totals(groups: Sequence[Group]) -> str:
-    heads = (
+def _totals(groups: Sequence[SolveGroup]) -> str:
+    titles = (
         *("method", "targets", "solves", "solved %", "not solved"),
         *("iterations, median", "99 %", "restarted %", "time, median [µs]", "99 %", "singular %"),
     )
     rows = [_total(group) for group in groups]
-    return _table(heads, [[_text(cell) for cell in row] for row in rows])
+    return _table(titles, [[_escape(cell) for cell in row] for row in rows])
 
 
-def _total(group: Group) -> list[str]:
+def _total(group: SolveGroup) -> list[str]:
     count = len(group)
     if not count:
         return [group.method, group.name, "0", *[""] * 8]
@@ -104,30 +104,34 @@ def _total(group: Group) -> list[str]:
     ]
 
 
-def _clusters(groups: Sequence[Group]) -> str:
-    """The failures of all groups by reason, the most frequent first."""
-    found: dict[tuple[str, str], list[tuple[Group, int]]] = {}
+def _clusters(groups: Sequence[SolveGroup]) -> str:
+    """Return a table of failures by reason, the most frequent first."""
+    members_by_reason: dict[tuple[str, str], list[tuple[SolveGroup, int]]] = {}
     for group in groups:
         for i in np.flatnonzero(~group.success).tolist():
-            found.setdefault((str(group.status[i]), group.reason(i)), []).append((group, i))
-    failed = sum(map(len, found.values()))
-    if not failed:
+            members_by_reason.setdefault((str(group.status[i]), group.reason(i)), []).append(
+                (group, i)
+            )
+    failure_count = sum(map(len, members_by_reason.values()))
+    if not failure_count:
         return "<p>Every target is solved.</p>"
     rows = []
-    for (status, reason), members in sorted(found.items(), key=lambda item: -len(item[1])):
+    for (status, reason), members in sorted(
+        members_by_reason.items(), key=lambda item: -len(item[1])
+    ):
         error = np.median([group.worst[i] for group, i in members])
         group, i = min(members, key=lambda member: np.nan_to_num(member[0].worst[member[1]]))
-        keys = f'data-status="{_text(status)}" data-reason="{_text(reason)}"'
-        shown = f'<button type="button" {keys}>{_text(status)}: {_text(reason)}</button>'
+        keys = f'data-status="{_escape(status)}" data-reason="{_escape(reason)}"'
+        button = f'<button type="button" {keys}>{_escape(status)}: {_escape(reason)}</button>'
         example = f"{group.method}, solve {group.solve_id[i] + 1}"
-        numbers = f"{len(members):,}", f"{100 * len(members) / failed:.1f}", f"{error:.3g}"
-        rows.append([shown, *numbers, _text(example)])
-    heads = "reason", "solves", "% of failures", "error / tolerance, median", "nearest solve"
-    return _table(heads, rows)
+        numbers = f"{len(members):,}", f"{100 * len(members) / failure_count:.1f}", f"{error:.3g}"
+        rows.append([button, *numbers, _escape(example)])
+    titles = "reason", "solves", "% of failures", "error / tolerance, median", "smallest error"
+    return _table(titles, rows)
 
 
-def _filter(groups: Sequence[Group], chosen: Sequence[tuple[Group, int]]) -> str:
-    """What narrows down the list of solves."""
+def _filter(groups: Sequence[SolveGroup], chosen: Sequence[tuple[SolveGroup, int]]) -> str:
+    """Return the form that filters the list of solves."""
     values = {
         "method": [group.method for group in groups],
         "status": [str(group.status[i]) for group, i in chosen],
@@ -135,9 +139,9 @@ def _filter(groups: Sequence[Group], chosen: Sequence[tuple[Group, int]]) -> str
     }
     fields = [
         f'<label>{name} <select name="{name}"><option value="">all</option>'
-        + "".join(f"<option>{_text(value)}</option>" for value in dict.fromkeys(known))
+        + "".join(f"<option>{_escape(value)}</option>" for value in dict.fromkeys(options))
         + "</select></label>"
-        for name, known in values.items()
+        for name, options in values.items()
     ]
     return (
         '<form id="filter"><label>text <input name="words" type="search"></label>'
@@ -146,101 +150,104 @@ def _filter(groups: Sequence[Group], chosen: Sequence[tuple[Group, int]]) -> str
     )
 
 
-def _solves(log: Log, chosen: Sequence[tuple[Group, int]]) -> str:
-    """Solves as a table, each with its story behind a button."""
-    heads = ["solve", "method", "targets", "status", "reason"]
-    heads += ["iterations", "restarts", "time [µs]", "error / tolerance"]
-    head = "".join(
+def _solves(log: Log, chosen: Sequence[tuple[SolveGroup, int]]) -> str:
+    """Return a table of solves whose details open by a button."""
+    titles = ["solve", "method", "targets", "status", "reason"]
+    titles += ["iterations", "restarts", "time [µs]", "error / tolerance"]
+    header = "".join(
         f'<th scope="col" class="{"left" if 0 < i < 5 else ""}" aria-sort="none">'
         f'<button type="button">{text}</button></th>'
-        for i, text in enumerate(heads)
+        for i, text in enumerate(titles)
     )
-    bodies = []
+    table_bodies = []
     for group, i in chosen:
         number, status = int(group.solve_id[i]) + 1, str(group.status[i])
         reason, kind = ("", "good") if group.success[i] else (group.reason(i), "bad")
-        texts = _text(group.method), _text(group.name), _text(status), _text(reason)
-        left = '<td class="left">{}</td><td class="left">{}</td><td class="left {kind}">{}</td>'
-        left = f'{left}<td class="left">{{}}</td>'.format(*texts, kind=kind)
+        texts = _escape(group.method), _escape(group.name), _escape(status), _escape(reason)
+        text_cells = (
+            '<td class="left">{}</td><td class="left">{}</td><td class="left {kind}">{}</td>'
+        )
+        text_cells = f'{text_cells}<td class="left">{{}}</td>'.format(*texts, kind=kind)
         worst_error = float(np.nan_to_num(group.worst[i], nan=0.0))
         numbers = group.iterations[i], group.restarts[i], 1e6 * group.time[i], worst_error
-        right = "".join(f'<td data-value="{value:.9g}">{_digits(value)}</td>' for value in numbers)
-        keys = f'data-method="{_text(group.method)}" data-status="{_text(status)}"'
-        bodies.append(
-            f'<tbody class="solve" {keys} data-reason="{_text(reason)}">'
+        number_cells = "".join(
+            f'<td data-value="{value:.9g}">{_format_number(value)}</td>' for value in numbers
+        )
+        keys = f'data-method="{_escape(group.method)}" data-status="{_escape(status)}"'
+        table_bodies.append(
+            f'<tbody class="solve" {keys} data-reason="{_escape(reason)}">'
             f'<tr><td data-value="{number}"><button type="button" aria-expanded="false">{number}'
-            f"</button></td>{left}{right}</tr>"
-            f'<tr hidden><td class="story" colspan="{len(heads)}"><div>'
-            f"{_story(log, group, i)}</div></td></tr></tbody>"
+            f"</button></td>{text_cells}{number_cells}</tr>"
+            f'<tr hidden><td class="story" colspan="{len(titles)}"><div>'
+            f"{_details_html(log, group, i)}</div></td></tr></tbody>"
         )
     return (
-        f'<div class="wide"><table id="solves"><thead><tr>{head}</tr></thead>'
-        f"{''.join(bodies)}</table></div>"
+        f'<div class="wide"><table id="solves"><thead><tr>{header}</tr></thead>'
+        f"{''.join(table_bodies)}</table></div>"
     )
 
 
-def _digits(value: float) -> str:
-    """A number with three digits at least, and never with an exponent of ten if it is large."""
+def _format_number(value: float) -> str:
+    """Return a number with at least three digits, without an exponent if it is large."""
     return f"{value:,.0f}" if value >= 1000 else f"{value:.3g}"
 
 
-def _story(log: Log, group: Group, i: int) -> str:
-    """What `explain` tells of a solve."""
+def _details_html(log: Log, group: SolveGroup, i: int) -> str:
+    """Return the explanation of a solve."""
     solve = one_solve(log, int(group.solve_id[i]), group.method)
-    found = explain(solve)
-    parts = [f"<p>{_text(found.headline)}</p>"]
+    explanation = explain(solve)
+    parts = [f"<p>{_escape(explanation.headline)}</p>"]
     if len(solve.rows):
-        parts.append(curve(worst(solve)))
-    for title, lines in found.parts.items():
-        items = "".join(f"<li>{_text(line)}</li>" for line in lines)
+        parts.append(error_curve(worst(solve)))
+    for title, lines in explanation.parts.items():
+        items = "".join(f"<li>{_escape(line)}</li>" for line in lines)
         parts.append(f"<h4>{title}</h4><ul>{items}</ul>")
     return "".join(parts)
 
 
-def _table(heads: Iterable[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table of HTML cells; the first column is text."""
+def _table(titles: Iterable[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table of HTML cells whose first column is text."""
 
     def line(cells: Iterable[str], tag: str) -> str:
-        first, *rest = cells
+        first, *others = cells
         return f'<tr><{tag} class="left">{first}</{tag}>' + "".join(
-            f"<{tag}>{cell}</{tag}>" for cell in rest
+            f"<{tag}>{cell}</{tag}>" for cell in others
         )
 
     lines = "".join(line(row, "td") for row in rows)
-    return f'<div class="wide"><table>{line(heads, "th")}{lines}</table></div>'
+    return f'<div class="wide"><table>{line(titles, "th")}{lines}</table></div>'
 
 
-def _text(text: str) -> str:
-    """A text that may come from any file, as a page shows it."""
+def _escape(text: str) -> str:
+    """Return a text from an untrusted file as HTML."""
     return escape(printable(str(text)))
 
 
-# Solves that belong together.
+# Groups of solves.
 
-ALL = "all"
+ALL_TARGETS = "all"
 
 
 @dataclass(frozen=True, eq=False)
-class Group:
-    """Solves of one method that belong together.
+class SolveGroup:
+    """Solves of one method and one set of targets.
 
     Attributes:
         method: The method.
-        name: Of the targets: the folder of their shards, as studies lay them down; "all" if there
-            is but one.
-        solve_id: (k,) their numbers.
-        success: (k,) whether solved.
-        singular: (k,) whether a Jacobian was near singular or ill-conditioned on the way.
-        iterations: (k,).
-        restarts: (k,).
-        time: (k,) [s].
-        worst: (k,) largest error in multiples of its tolerance.
-        centre: (k, 3) mean of the contact points [m], base frame; NaN if all are free.
-        status: (k,) names.
+        name: Name of the targets: the folder of their shards; "all" if there is only one.
+        solve_id: (k,) Numbers of the solves.
+        success: (k,) The target is solved.
+        singular: (k,) A Jacobian was near singular or ill-conditioned during the solve.
+        iterations: (k,) Iterations.
+        restarts: (k,) Restarts.
+        time: (k,) Time [s].
+        worst: (k,) Largest error relative to its tolerance.
+        centre: (k, 3) Mean contact point in the base frame [m]; NaN if all points are free.
+        status: (k,) Names of the status.
         fingers: Names of the f fingers.
-        ok: (k, f) whether each contact is within tolerance.
-        limited: (k,) whether a limit was violated or an actuator came to one and stayed.
-        touching: (k,) whether shapes touch in the answer.
+        ok: (k, f) The contact is within tolerance.
+        limited: (k,) A limit was violated, or an actuator stayed at one.
+        touching: (k,) The solution is in collision.
     """
 
     method: str
@@ -263,77 +270,84 @@ class Group:
         return len(self.solve_id)
 
     def reason(self, i: int) -> str:
-        """Why a solve is none, as far as its totals tell: what is missed, and what was met."""
+        """Return the missed contacts and the difficulties of a solve, from its totals."""
         missed = [finger for finger, ok in zip(self.fingers, self.ok[i], strict=True) if not ok]
-        every = "every contact" if len(missed) == len(self.fingers) else ", ".join(missed)
-        met = {
-            f"{every} missed": bool(missed),
+        contacts = "every contact" if len(missed) == len(self.fingers) else ", ".join(missed)
+        conditions = {
+            f"{contacts} missed": bool(missed),
             "at a limit": self.limited[i],
             "near singular": self.singular[i],
             "in collision": self.touching[i],
         }
-        return ", ".join(text for text, holds in met.items() if holds) or "nothing was missed"
+        return (
+            ", ".join(text for text, is_met in conditions.items() if is_met) or "no contact missed"
+        )
 
 
-def groups_of(log: Log) -> tuple[Group, ...]:
-    """The solves of a log in groups.
+def solve_groups(log: Log) -> tuple[SolveGroup, ...]:
+    """Return the solves of a log in groups.
 
     Raises:
         LogError: The log is damaged.
     """
-    found = []
+    groups = []
     for part in log.solves().parts:
         folders = [str(PurePath(name).parent) for name in part.origins or ()]
-        known = list(dict.fromkeys(folders))
-        if len(known) <= 1:
-            found.append(_group(part, ALL))
+        names = list(dict.fromkeys(folders))
+        if len(names) <= 1:
+            groups.append(_solve_group(part, ALL_TARGETS))
             continue
-        of = np.array(folders)
-        found += [_group(part.where(of == name), ALL if name == "." else name) for name in known]
-    return tuple(found)
+        folder_of_solve = np.array(folders)
+        groups += [
+            _solve_group(part.where(folder_of_solve == name), ALL_TARGETS if name == "." else name)
+            for name in names
+        ]
+    return tuple(groups)
 
 
-def hardest(groups: tuple[Group, ...], count: int) -> Iterator[tuple[Group, int]]:
-    """The solves worth a look: what is not solved, the largest error first, then the longest.
+def hardest_solves(groups: tuple[SolveGroup, ...], count: int) -> Iterator[tuple[SolveGroup, int]]:
+    """Yield the hardest solves: failures by descending error, then solves by iterations.
 
     Args:
-        groups: Of a log.
-        count: How many at most.
+        groups: Groups of a log.
+        count: Maximum number of solves.
 
     Yields:
-        Group and place of the solve in it.
+        Group, and index of the solve in it.
     """
     keys = [
         (bool(group.success[i]), -error, -int(group.iterations[i]), g, i)
         for g, group in enumerate(groups)
-        for i, error in enumerate(_error(group).tolist())
+        for i, error in enumerate(_sort_error(group).tolist())
     ]
     for _, _, _, g, i in sorted(keys)[:count]:
         yield groups[g], i
 
 
-def _error(group: Group) -> Array:
-    """(k,) the worst error of what is not solved; of the others nothing counts but iterations."""
+def _sort_error(group: SolveGroup) -> Array:
+    """Return the (k,) worst errors of failures; 0 for solved targets."""
     return np.where(group.success, 0.0, np.nan_to_num(group.worst, nan=0.0))
 
 
-def _group(part: MethodRows, name: str) -> Group:
+def _solve_group(part: MethodRows, name: str) -> SolveGroup:
     rows = part.rows
-    known = list(part.labels["events"])
-    hits, leavings = (
-        rows["events"][:, known.index(kind.name)]
-        if kind.name in known
+    events = list(part.labels["events"])
+    limit_hits, limit_exits = (
+        rows["events"][:, events.index(kind.name)]
+        if kind.name in events
         else np.zeros(len(rows), np.int64)
         for kind in (EventKind.LIMIT_HIT, EventKind.LIMIT_LEFT)
     )
-    singular = [known.index(kind.name) for kind in SINGULAR if kind.name in known]
-    # What is free is NaN and counts for nothing.
-    shares = [rows[f"{kind}_error"] / rows[f"{kind}_tolerance"] for kind in ("position", "angle")]
+    singular = [events.index(kind.name) for kind in SINGULAR if kind.name in events]
+    # Unconstrained errors are NaN and ignored.
+    relative_errors = [
+        rows[f"{kind}_error"] / rows[f"{kind}_tolerance"] for kind in ("position", "angle")
+    ]
     points = rows["target_points"]
-    there: Bools = np.all(np.isfinite(points), axis=2)
-    total = np.where(there[:, :, None], points, 0.0).sum(axis=1)
-    counted = there.sum(axis=1)[:, None]
-    return Group(
+    is_finite: Bools = np.all(np.isfinite(points), axis=2)
+    total = np.where(is_finite[:, :, None], points, 0.0).sum(axis=1)
+    counts = is_finite.sum(axis=1)[:, None]
+    return SolveGroup(
         method=part.method,
         name=name,
         solve_id=part.solve_id,
@@ -342,120 +356,120 @@ def _group(part: MethodRows, name: str) -> Group:
         iterations=rows["iterations"].astype(np.int64),
         restarts=rows["restarts"].astype(np.int64),
         time=rows["time"].astype(float),
-        worst=np.fmax.reduce(np.concatenate(shares, axis=1), axis=1),
-        centre=np.where(counted > 0, total / np.maximum(counted, 1), np.nan),
+        worst=np.fmax.reduce(np.concatenate(relative_errors, axis=1), axis=1),
+        centre=np.where(counts > 0, total / np.maximum(counts, 1), np.nan),
         status=np.array(part.labels["status"])[rows["status"]],
         fingers=tuple(part.labels["position_error"]),
         ok=rows["ok"] > 0,
-        limited=(rows["limits_ok"] == 0) | (hits > leavings),
+        limited=(rows["limits_ok"] == 0) | (limit_hits > limit_exits),
         touching=rows["clearance"] < 0 if "clearance" in part.names else rows["success"] > 1,
     )
 
 
 # Figures.
 
-READABLE = "#7c8792"
-"""Colour of what is written in figures, which stand on a light or a dark page."""
+TEXT_COLOR = "#7c8792"
+"""Colour of text in figures, readable on light and dark pages."""
 
 
-def effort(groups: Sequence[Group]) -> str:
-    """How many iterations and how much time, as shares of the solves of each method."""
+def effort_figure(groups: Sequence[SolveGroup]) -> str:
+    """Return a figure of the distributions of iterations and time by method."""
     figure = new_figure(9.0, 3.2, 110)
     methods = list(dict.fromkeys(group.method for group in groups))
     panels = (("iterations", "iterations"), ("time", "time of a solve [µs]"))
-    for place, (name, label) in enumerate(panels, start=1):
-        axes = figure.add_subplot(1, 2, place)
+    for position, (name, label) in enumerate(panels, start=1):
+        axes = figure.add_subplot(1, 2, position)
         for method, color in palette.method_colors(methods).items():
             values = np.concatenate([getattr(g, name) for g in groups if g.method == method])
             values = np.sort(values * (1e6 if name == "time" else 1.0))
-            share = 100 * np.arange(1, len(values) + 1) / len(values)
-            axes.plot(np.maximum(values, 1e-3), share, color=color, lw=1.8, label=method)
+            percentage = 100 * np.arange(1, len(values) + 1) / len(values)
+            axes.plot(np.maximum(values, 1e-3), percentage, color=color, lw=1.8, label=method)
         axes.set_xscale("log")
         axes.set_ylim(0, 101)
         axes.set_xlabel(label)
-        axes.set_ylabel("solves with no more [%]")
-        _plain(axes)
-        if place == 1:
-            axes.legend(frameon=False, fontsize=8, loc="upper left", labelcolor=READABLE)
+        axes.set_ylabel("cumulative share of solves [%]")
+        _style_axes(axes)
+        if position == 1:
+            axes.legend(frameon=False, fontsize=8, loc="upper left", labelcolor=TEXT_COLOR)
     figure.tight_layout()
-    return _embedded(figure, "shares of the solves by iterations and by time")
+    return _embedded_image(figure, "cumulative share of solves over iterations and time")
 
 
-def places(groups: Sequence[Group]) -> str:
-    """Where the middle of the contacts is, of solved, near-singular and failed solves."""
+def contact_figure(groups: Sequence[SolveGroup]) -> str:
+    """Return a figure of the mean contact points of solved, near-singular and failed targets."""
     figure = new_figure(9.0, 4.2, 110)
     centre = np.concatenate([group.centre for group in groups])
     success = np.concatenate([group.success for group in groups])
     singular = np.concatenate([group.singular for group in groups])
     kinds = (
         ("solved", "#9fb0bf", success & ~singular, 4),
-        ("solved, singular on the way", palette.LINES[0], success & singular, 7),
-        ("not solved", palette.LINES[4], ~success, 12),
+        ("solved, passed a singularity", palette.LINE_COLORS[0], success & singular, 7),
+        ("not solved", palette.LINE_COLORS[4], ~success, 12),
     )
     panels = figure.subplots(1, 2)
-    for axes, title, second, up in zip(
+    for axes, title, axis, axis_name in zip(
         panels, ("from above", "from the side"), (1, 2), "yz", strict=True
     ):
         for label, color, rows, size in kinds:
-            chosen = centre[rows]
-            chosen = chosen[:: 1 + len(chosen) // 20_000]
+            points = centre[rows]
+            points = points[:: 1 + len(points) // 20_000]
             axes.scatter(
-                chosen[:, 0],
-                chosen[:, second],
+                points[:, 0],
+                points[:, axis],
                 s=size,
                 color=color,
                 lw=0,
                 label=f"{label} ({int(rows.sum()):,})",
             )
-        axes.plot([0], [0], marker="+", color=READABLE, ms=9, ls="none", label="base")
+        axes.plot([0], [0], marker="+", color=TEXT_COLOR, ms=9, ls="none", label="base")
         axes.set_aspect("equal", adjustable="datalim")
         axes.set_xlabel("x [m]")
-        axes.set_ylabel(f"{up} [m]")
+        axes.set_ylabel(f"{axis_name} [m]")
         axes.set_title(title, fontsize=9)
-        _plain(axes)
+        _style_axes(axes)
     lines, labels = panels[0].get_legend_handles_labels()
     figure.legend(
-        lines, labels, frameon=False, fontsize=8, loc="lower center", ncols=4, labelcolor=READABLE
+        lines, labels, frameon=False, fontsize=8, loc="lower center", ncols=4, labelcolor=TEXT_COLOR
     )
     figure.tight_layout(rect=(0, 0.06, 1, 1))
-    return _embedded(figure, "where solves fail and where they meet singularities")
+    return _embedded_image(figure, "positions of solved, near-singular and failed targets")
 
 
-def curve(errors: Array) -> str:
-    """The worst error of a solve over its iterations as a small drawing.
+def error_curve(errors: Array) -> str:
+    """Return a small chart of the worst error of a solve over its iterations.
 
     Args:
-        errors: (m,) in multiples of the tolerance; inf where not measured.
+        errors: (m,) Errors relative to the tolerance; inf where they were not measured.
     """
     width, height, low, high = 320, 70, 1e-3, 1e3
-    level = np.clip(np.nan_to_num(errors, nan=high, posinf=high), low, high)
-    y = height * np.log10(high / level) / np.log10(high / low)
+    clipped = np.clip(np.nan_to_num(errors, nan=high, posinf=high), low, high)
+    y = height * np.log10(high / clipped) / np.log10(high / low)
     x = np.linspace(0, width, len(y)) if len(y) > 1 else np.array([0.0])
-    if len(y) > width:  # the worst of the iterations that share a dot
+    if len(y) > width:  # the maximum of the iterations that share a pixel
         cuts = np.linspace(0, len(y), width, endpoint=False).astype(int)
         x, y = np.arange(width), np.minimum.reduceat(y, cuts)
-    dots = " ".join(f"{a:.0f},{b:.1f}" for a, b in zip(x, y, strict=True))
-    middle = height / 2
+    points = " ".join(f"{a:.0f},{b:.1f}" for a, b in zip(x, y, strict=True))
+    centre_y = height / 2
     return (
         f'<svg viewBox="0 0 {width} {height}" width="{width}" height="{height}" role="img">'
         f"<title>worst error in multiples of its tolerance, {low:g} to {high:g}</title>"
-        f'<line x1="0" x2="{width}" y1="{middle}" y2="{middle}" class="bound"/>'
-        f'<polyline points="{dots}"/></svg>'
+        f'<line x1="0" x2="{width}" y1="{centre_y}" y2="{centre_y}" class="bound"/>'
+        f'<polyline points="{points}"/></svg>'
     )
 
 
-def _plain(axes: Axes) -> None:
+def _style_axes(axes: Axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color(READABLE)
-    axes.tick_params(which="both", labelsize=8, colors=READABLE)
+    axes.spines[["left", "bottom"]].set_color(TEXT_COLOR)
+    axes.tick_params(which="both", labelsize=8, colors=TEXT_COLOR)
     for text in (axes.xaxis.label, axes.yaxis.label, axes.title):
-        text.set_color(READABLE)
-    axes.grid(color=READABLE, alpha=0.25, lw=0.6)
+        text.set_color(TEXT_COLOR)
+    axes.grid(color=TEXT_COLOR, alpha=0.25, lw=0.6)
     axes.set_axisbelow(True)
 
 
-def _embedded(figure: Figure, text: str) -> str:
-    drawn = io.BytesIO()
-    figure.savefig(drawn, format="png", dpi=figure.dpi, transparent=True)
-    data = base64.b64encode(drawn.getvalue()).decode("ascii")
+def _embedded_image(figure: Figure, text: str) -> str:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=figure.dpi, transparent=True)
+    data = base64.b64encode(buffer.getvalue()).decode("ascii")
     return f'<img alt="{text}" src="data:image/png;base64,{data}">'

@@ -1,4 +1,4 @@
-"""A small picture of a robot in a posture, drawn without OpenGL: for tables in notebooks."""
+"""Small picture of a robot in a configuration, drawn without OpenGL, for notebooks."""
 
 from __future__ import annotations
 
@@ -13,60 +13,62 @@ from matplotlib.figure import Figure
 from casadi_ik.app.drawing import palette
 from casadi_ik.app.drawing.drawables import (
     Drawable,
-    axes_of,
+    bodies_at,
     close_view,
-    palm_places,
-    placed,
-    whole_view,
+    overview,
+    palm_positions,
+    view_axes,
 )
-from casadi_ik.app.drawing.surfaces import coarser
+from casadi_ik.app.drawing.surfaces import decimate
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arm_hand import ArmHand
 
-LIGHT = np.array([0.3, 0.5, 0.81])
-"""Where light comes from: right, up and towards the viewer."""
+LIGHT_DIRECTION = np.array([0.3, 0.5, 0.81])
+"""Direction of the light: right, up and towards the viewer."""
 
-TRIANGLES = 300
-"""Of a body, at most."""
+MAX_TRIANGLES = 300
+"""Maximum number of triangles of a body."""
 
 
 def thumbnail(robot: ArmHand, q: Array, inches: float = 2.6) -> bytes:
-    """The whole robot and its hand from near, side by side, as a PNG.
+    """Return a PNG of the whole robot and a close-up of its hand.
 
     Args:
         robot: The robot.
-        q: (n,) where it is [rad or m].
-        inches: Of a side of each picture.
+        q: (n,) Configuration [rad or m].
+        inches: Width and height of each of the two pictures [inch].
     """
-    close = close_view(robot, q)
-    palm = palm_places(robot, q).mean(axis=0)
-    every = placed(robot, q)
-    hand = [one for one in every if one.role in ("hand", "pad")]
+    close_up = close_view(robot, q)
+    palm = palm_positions(robot, q).mean(axis=0)
+    bodies = bodies_at(robot, q)
+    hand = [body for body in bodies if body.role in ("hand", "pad")]
     figure = Figure((2 * inches, inches), dpi=100)
     FigureCanvasAgg(figure)
-    for place, shown, view in ((0.0, every, whole_view(palm, close)), (0.5, hand, close)):
-        axes = figure.add_axes((place, 0.0, 0.5, 1.0), aspect="equal")
+    for left, drawables, view in ((0.0, bodies, overview(palm, close_up)), (0.5, hand, close_up)):
+        axes = figure.add_axes((left, 0.0, 0.5, 1.0), aspect="equal")
         axes.set_axis_off()
-        _draw(axes, shown, axes_of(view))
+        _draw(axes, drawables, view_axes(view))
     stream = BytesIO()
     figure.savefig(stream, format="png", transparent=True)
     return stream.getvalue()
 
 
-def _draw(axes: Axes, shown: list[Drawable], view: Array) -> None:
-    """Triangles, the farthest first; those that face away are left out."""
+def _draw(axes: Axes, drawables: list[Drawable], view: Array) -> None:
+    """Draw triangles from back to front without those that face away."""
     corners, colors = [], []
-    for one in shown:
-        surface = coarser(one.surface, TRIANGLES)
+    for drawable in drawables:
+        surface = decimate(drawable.surface, MAX_TRIANGLES)
         triangles = (surface.points @ view.T)[surface.triangles]
         normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
         length = np.linalg.norm(normals, axis=1)
-        seen = (normals[:, 2] > 0) & (length > 0)
-        shade = 0.55 + 0.45 * np.clip(normals[seen] @ LIGHT / length[seen], 0.0, 1.0)
-        corners.append(triangles[seen])
-        colors.append(shade[:, None] * np.array(palette.rgb(one.color)) / 255)
+        is_facing = (normals[:, 2] > 0) & (length > 0)
+        shade = 0.55 + 0.45 * np.clip(
+            normals[is_facing] @ LIGHT_DIRECTION / length[is_facing], 0.0, 1.0
+        )
+        corners.append(triangles[is_facing])
+        colors.append(shade[:, None] * np.array(palette.rgb(drawable.color)) / 255)
     triangles, shades = np.concatenate(corners), np.concatenate(colors)
     order = np.argsort(triangles[:, :, 2].mean(axis=1))
-    flat, shades = triangles[order][:, :, :2], shades[order]
-    axes.add_collection(PolyCollection(list(flat), facecolors=shades, antialiaseds=False))
+    polygons, shades = triangles[order][:, :, :2], shades[order]
+    axes.add_collection(PolyCollection(list(polygons), facecolors=shades, antialiaseds=False))
     axes.autoscale_view()

@@ -1,4 +1,4 @@
-"""Pages in the browser in which contacts are dragged and logs play; needs the extra `view`."""
+"""Interactive viewer in the browser: drag contacts, play logs; needs the extra `view`."""
 
 from __future__ import annotations
 
@@ -22,8 +22,7 @@ try:
     import viser as _  # noqa: F401
 except ImportError as error:
     raise MissingExtraError(
-        f"views in the browser need {error.name}, which is not installed: "
-        "pip install 'casadi-ik[view]'"
+        f"the viewer needs {error.name}, which is not installed: pip install 'casadi-ik[view]'"
     ) from error
 
 from casadi_ik.app.viewer.access import HOST, LOOPBACK, PORT, Server, Viewer, serve
@@ -31,7 +30,7 @@ from casadi_ik.app.viewer.candidates import Candidate, Candidates
 from casadi_ik.app.viewer.grasp_page import GraspPage
 from casadi_ik.app.viewer.pad_page import PadPage
 from casadi_ik.app.viewer.page import Page
-from casadi_ik.app.viewer.play_page import PlayPage, motion_track, track_of
+from casadi_ik.app.viewer.play_page import PlayPage, motion_playback, solve_playback
 from casadi_ik.app.viewer.request import PageRequest, Settings, request_of
 
 __all__ = [
@@ -62,29 +61,29 @@ def view_grasp(
     port: int | None = None,
     dark: bool = False,
 ) -> Viewer:
-    """A page on which contacts, the object and what stands about are dragged.
+    """Open a page on which contacts, the object and obstacles can be dragged.
 
     Args:
         robot: The robot.
-        grasp: What is asked; None: the contacts that the robot has at q.
-        q: (n,) where the robot begins [rad or m]; None: at home. With a grasp it is solved from
-            there, unless q meets the contacts already.
-        scene: What stands about; None: nothing is checked.
-        settings: How it is solved.
-        candidates: Other requests to choose from, by name.
-        host: Who may see it; "0.0.0.0": everybody in the network.
-        port: Where; None: the first free one from 8080 on.
-        dark: Whether the page is dark at first.
+        grasp: The grasp; None: the contacts of the robot at q.
+        q: (n,) Initial configuration [rad or m]; None: home. A grasp is solved from q unless q
+            meets its contacts.
+        scene: Obstacles; None: collisions are not checked.
+        settings: Solver settings.
+        candidates: Candidate grasps by name, offered in a list.
+        host: Address at which the page is served; "0.0.0.0": reachable from the network.
+        port: Port; None: the first free one from 8080 on.
+        dark: Use the dark theme initially.
 
     Raises:
-        InputError: A finger that the robot has not, or a port that cannot be had.
+        InputError: The grasp names an unknown finger, or the port is in use.
         CasadiIKError: The scene does not fit the robot.
     """
     start = robot.configuration(q)
-    asked = request_of(robot, grasp, start, scene, settings)
-    return _shown(
+    request = request_of(robot, grasp, start, scene, settings)
+    return _start_page(
         serve(host, port),
-        lambda server: GraspPage(server, robot, asked, start, candidates, q is None, dark),
+        lambda server: GraspPage(server, robot, request, start, candidates, q is None, dark),
     )
 
 
@@ -97,29 +96,30 @@ def view_found(
     port: int | None = None,
     dark: bool = False,
 ) -> Viewer:
-    """A page on which grasps that `Solver.grasps_of` has found are filtered and looked at.
+    """Open a page with the grasps of `Solver.grasps_of`, with filters.
 
     Args:
-        robot: The robot that they were found for.
-        found: The grasps, best first, at least one.
-        scene: What stands about; None: nothing is checked.
-        host: As for `view_grasp`.
-        port: As for `view_grasp`.
-        dark: As for `view_grasp`.
+        robot: Robot of the grasps.
+        found: At least one grasp, the best first.
+        scene: Obstacles; None: collisions are not checked.
+        host: See `view_grasp`.
+        port: See `view_grasp`.
+        dark: See `view_grasp`.
 
     Raises:
-        InputError: There is none, or a port that cannot be had.
+        InputError: There are no grasps, or the port is in use.
     """
     if not len(found):
-        raise InputError("found: there is no grasp to show, expected at least one")
+        raise InputError("found: no grasps; expected at least one")
     candidates = {
-        f"{place}. {one.grasp.name}, load {one.load:.2f}": one for place, one in enumerate(found, 1)
+        f"{rank}. {grasp.grasp.name}, load {grasp.load:.2f}": grasp
+        for rank, grasp in enumerate(found, 1)
     }
-    first = found[0]
+    best = found[0]
     return view_grasp(
         robot,
-        first.grasp,
-        q=first.q,
+        best.grasp,
+        q=best.q,
         scene=scene,
         candidates=candidates,
         host=host,
@@ -135,23 +135,23 @@ def view_log(
     port: int | None = None,
     dark: bool = False,
 ) -> Viewer:
-    """A page on which one solve plays, or two side by side.
+    """Open a page that plays one logged solve, or two next to each other.
 
     Args:
-        solves: Each with the robot that it was solved for.
-        scene: What stood about the robot, which a log does not tell; None: nothing is drawn.
-        host: As for `view_grasp`.
-        port: As for `view_grasp`.
-        dark: As for `view_grasp`.
+        solves: Logged solves, each with its robot.
+        scene: Obstacles, which logs do not contain; None: none are drawn.
+        host: See `view_grasp`.
+        port: See `view_grasp`.
+        dark: See `view_grasp`.
 
     Raises:
-        LogError: The log has kept no iterations.
-        InputError: None or more than two, or a port that cannot be had.
+        LogError: The log has no iterations.
+        InputError: The number of solves is not one or two, or the port is in use.
     """
     if not 1 <= len(solves) <= 2:
-        raise InputError(f"found {len(solves)} solves, expected one or two")
-    tracks = [track_of(*one) for one in solves]
-    return _shown(serve(host, port), lambda server: PlayPage(server, tracks, scene, dark))
+        raise InputError(f"solves: found {len(solves)}, expected one or two")
+    playbacks = [solve_playback(*solve_and_robot) for solve_and_robot in solves]
+    return _start_page(serve(host, port), lambda server: PlayPage(server, playbacks, scene, dark))
 
 
 def view_motion(
@@ -166,53 +166,53 @@ def view_motion(
     port: int | None = None,
     dark: bool = False,
 ) -> Viewer:
-    """A page on which a motion plays, with every motor and its velocity over time.
+    """Open a page that plays a motion, with charts of positions and velocities.
 
     Args:
         robot: The robot.
-        times: (k,) increasing [s].
-        q: (k, n) [rad or m].
+        times: (k,) Increasing times [s].
+        q: (k, n) Configurations [rad or m].
         grasp: Contacts that are drawn; None: none.
-        scene: What stood about the robot; None: nothing is drawn.
-        label: What the motion is called.
-        host: As for `view_grasp`.
-        port: As for `view_grasp`.
-        dark: As for `view_grasp`.
+        scene: Obstacles; None: none are drawn.
+        label: Name of the motion.
+        host: See `view_grasp`.
+        port: See `view_grasp`.
+        dark: See `view_grasp`.
 
     Raises:
-        InputError: Times and positions do not fit, or a port that cannot be had.
+        InputError: Times and configurations do not fit, or the port is in use.
     """
-    track = motion_track(robot, np.asarray(times, float), np.asarray(q, float), label, grasp)
-    return _shown(serve(host, port), lambda server: PlayPage(server, [track], scene, dark))
+    playback = motion_playback(robot, np.asarray(times, float), np.asarray(q, float), label, grasp)
+    return _start_page(serve(host, port), lambda server: PlayPage(server, [playback], scene, dark))
 
 
 def view_pads(path: str | PathLike[str], *, host: str = HOST, port: int | None = None) -> Viewer:
-    """A page on which the pads of an imported robot are corrected.
+    """Open a page on which the pads of an imported robot are corrected.
 
     Args:
-        path: Its description, as `casadi-ik import` has written it.
-        host: As for `view_grasp`; what others may see they may not have written, and of what is
-            written from here the address has a token.
-        port: As for `view_grasp`.
+        path: Description written by `casadi-ik import`.
+        host: See `view_grasp`. Saving is possible only on a page of this machine, whose address
+            then contains a token.
+        port: See `view_grasp`.
 
     Raises:
-        DescriptionError: The description is malformed, or does not state its pads.
-        InputError: A port that cannot be had.
+        DescriptionError: The description is malformed, or does not list pads.
+        InputError: The port is in use.
     """
     file = Path(path)
     robot = load_robot(file)
     if not isinstance(read_yaml(file).get("fingers"), dict):
-        raise DescriptionError(f"{file}: fingers: expected the pads of the fingers, by name")
+        raise DescriptionError(f"{file}: fingers: expected pads by finger")
     surfaces = file_meshes(robot.description)
     writable = host in LOOPBACK
-    return _shown(
+    return _start_page(
         serve(host, port, secret=writable),
         lambda server: PadPage(server, robot, file, surfaces, writable),
     )
 
 
-def _shown(server: Server, page: Callable[[Server], Page]) -> Viewer:
-    """A page that runs; nothing is served if it cannot be made."""
+def _start_page(server: Server, page: Callable[[Server], Page]) -> Viewer:
+    """Start a page; stop its server if the page cannot be made."""
     try:
         return Viewer(server, page(server))
     except BaseException:

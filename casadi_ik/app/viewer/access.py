@@ -1,8 +1,9 @@
-"""Pages that are served, and who may open them.
+"""Servers of pages, and access control.
 
-Host, Origin and token of every request are looked at before viser is: a browser sends any web
-page's requests to this machine, websockets too, and says in `Origin` whose they are; a page that
-had its own name lead here says so in `Host`. viser looks at neither.
+Host, Origin and token of every request are checked before viser handles it. Browsers send requests
+of any web page, websockets included, to this machine and name the page in `Origin`; a page that
+resolves its own host name to this machine (DNS rebinding) reveals itself in `Host`. viser checks
+neither.
 """
 
 from __future__ import annotations
@@ -39,35 +40,35 @@ from casadi_ik.files.writing import atomic_write
 
 logger = logging.getLogger(__name__)
 
-connections = logging.getLogger(f"{__name__}.connections")
-"""Told of every connection and why it ended; goes nowhere unless somebody adds a handler."""
-connections.addHandler(logging.NullHandler())
-connections.propagate = False
+connection_logger = logging.getLogger(f"{__name__}.connections")
+"""Logger of connections and the reasons for their end; silent unless a handler is added."""
+connection_logger.addHandler(logging.NullHandler())
+connection_logger.propagate = False
 
 HOST = "127.0.0.1"
-"""Only this machine sees a page unless more is asked for."""
+"""Default host: only this machine can open a page."""
 
 PORT = 8080
-"""The first that is tried."""
+"""First port that is tried."""
 
 
 Handler = Callable[[ServerConnection], Awaitable[None]]
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-"""Where nobody else sees a page."""
+"""Hosts at which only this machine can open a page."""
 
-_HOOK = threading.Lock()
-"""Pages are made one after the other: what viser calls is exchanged meanwhile."""
+_PATCH_LOCK = threading.Lock()
+"""Lock held while viser's function to serve is patched."""
 
 
 @dataclass
 class Access:
-    """Who may open a page, and what it is called.
+    """Access control of a page.
 
     Attributes:
-        host: The address it is served at.
-        token: First part of the path of every request; "": none is expected.
-        title: On the browser's tab.
+        host: Address at which the page is served.
+        token: First component of the path of every request; "": no token is required.
+        title: Title of the browser's tab.
     """
 
     host: str
@@ -75,26 +76,31 @@ class Access:
     title: str = "casadi_ik"
 
     def refusal(self, request: Request) -> str:
-        """Why a request is refused, "" if it is not."""
+        """Return why a request is refused; "" if it is allowed."""
         hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
-        if len(hosts) != 1 or not self._is_own(hosts[0]):
+        if len(hosts) != 1 or not self._is_valid_host(hosts[0]):
             return "Host: expected the address of this machine"
-        if any(urlsplit(one).netloc.lower() != hosts[0].lower() for one in origins):
+        if any(urlsplit(origin).netloc.lower() != hosts[0].lower() for origin in origins):
             return "Origin: expected this page"
-        given = request.path.split("?")[0].split("/")[1:2]
-        if self.token and not hmac.compare_digest("".join(given).encode(), self.token.encode()):
-            return "path: expected the whole address that was printed"
+        path_token = request.path.split("?")[0].split("/")[1:2]
+        if self.token and not hmac.compare_digest(
+            "".join(path_token).encode(), self.token.encode()
+        ):
+            return "path: expected the complete address that was printed, with its token"
         return ""
 
-    def _is_own(self, host: str) -> bool:
-        """Whether a Host leads here wherever it is looked up; only names can be led elsewhere."""
+    def _is_valid_host(self, host: str) -> bool:
+        """Return True if a Host header names this machine or is an address.
+
+        An address cannot be rebound to another machine, a name can.
+        """
         name = urlsplit(f"//{host}").hostname or ""
         if name in LOOPBACK or name == self.host.lower():
             return True
         if self.host in LOOPBACK:
             return False
-        own = socket.gethostname().lower()
-        return name in (own, f"{own}.local") or _is_address(name)
+        machine = socket.gethostname().lower()
+        return name in (machine, f"{machine}.local") or _is_address(name)
 
 
 def _is_address(name: str) -> bool:
@@ -106,140 +112,144 @@ def _is_address(name: str) -> bool:
 
 
 @contextlib.contextmanager
-def asking(access: Access) -> Iterator[threading.Event]:
-    """A viser server made here asks first, and says nothing of what is no message of its pages.
+def authorised_server(access: Access) -> Iterator[threading.Event]:
+    """Patch viser to authorise every request and drop malformed messages silently.
 
     Yields:
-        Set once it does: viser has no place for it but the function by which it serves.
+        Event that is set once the access control is installed.
     """
-    asked = threading.Event()
+    installed = threading.Event()
 
-    def serve(handler: Handler, *rest: Any, **how: Any) -> Any:
-        asked.set()
-        how["process_request"] = _asking_first(access, how.get("process_request"))
-        return plain(_quiet(handler), *rest, **how, logger=connections)
+    def serve(handler: Handler, *arguments: Any, **options: Any) -> Any:
+        installed.set()
+        options["process_request"] = _authorising(access, options.get("process_request"))
+        return original_serve(
+            _drop_malformed_messages(handler), *arguments, **options, logger=connection_logger
+        )
 
-    # Of browsers that are gone before they are answered it says more than anybody needs.
+    # viser warns about every browser that disconnects early.
     warnings.filterwarnings("ignore", r"\[viser\]|Queued a ")
-    with _HOOK:
-        plain = websocket_server.serve
+    with _PATCH_LOCK:
+        original_serve = websocket_server.serve
         websocket_server.serve = serve  # type: ignore[assignment, misc]
         try:
-            yield asked
+            yield installed
         finally:
-            websocket_server.serve = plain  # type: ignore[misc]
+            websocket_server.serve = original_serve  # type: ignore[misc]
 
 
-def _asking_first(access: Access, then: Any) -> Any:
+def _authorising(access: Access, process: Any) -> Any:
     def process_request(connection: ServerConnection, request: Request) -> Response | None:
         try:
             refusal = access.refusal(request)
-        except ValueError as error:  # no address at all
+        except ValueError as error:  # the Host header is not an address
             refusal = str(error)
         if refusal:
             return connection.respond(HTTPStatus.FORBIDDEN, f"{refusal}\n")
         path = request.path.removeprefix(f"/{access.token}") if access.token else request.path
         if path.split("?")[0] not in ("", "/"):
-            return then(connection, Request(path, request.headers))
-        plain = ((k, v) for k, v in request.headers.raw_items() if k.lower() != "accept-encoding")
-        return _titled(then(connection, Request(path or "/", Headers(plain))), access.title)
+            return process(connection, Request(path, request.headers))
+        headers = ((k, v) for k, v in request.headers.raw_items() if k.lower() != "accept-encoding")
+        return _set_page_title(
+            process(connection, Request(path or "/", Headers(headers))), access.title
+        )
 
     return process_request
 
 
-WITHOUT = """<noscript>This page needs JavaScript.</noscript><script>
+BROWSER_NOTICE = """<noscript>This page needs JavaScript.</noscript><script>
 if (!document.createElement("canvas").getContext("webgl2")) document.addEventListener(
   "DOMContentLoaded", () => document.body.insertAdjacentHTML("afterbegin",
   "<p role='alert' style='position:fixed;z-index:9999;margin:1em;padding:1em;background:#fff3cd;"
-  + "color:#333;border-radius:0.4em'>This browser has no WebGL 2, so nothing can be drawn: turn on "
-  + "hardware acceleration in its settings, or use another one.</p>"));
+  + "color:#333;border-radius:0.4em'>This page needs WebGL 2: enable hardware acceleration in the "
+  + "settings of the browser, or use another browser.</p>"));
 </script></head>"""
-"""What is said where a browser cannot show the page."""
+"""Notice in browsers without JavaScript or WebGL 2."""
 
 
-def _titled(page: Response | None, title: str) -> Response | None:
-    """The page itself, with its own name on the browser's tab, and words where nothing is drawn."""
+def _set_page_title(page: Response | None, title: str) -> Response | None:
+    """Set the title of the browser's tab, and add the notice for unsupported browsers."""
     if page is not None:
-        named = f"<title>{html.escape(title)} · casadi_ik</title>"
-        page.body = page.body.replace(b"<title>Viser</title>", named.encode())
-        page.body = page.body.replace(b"</head>", WITHOUT.encode(), 1)
+        title_tag = f"<title>{html.escape(title)} · casadi_ik</title>"
+        page.body = page.body.replace(b"<title>Viser</title>", title_tag.encode())
+        page.body = page.body.replace(b"</head>", BROWSER_NOTICE.encode(), 1)
         del page.headers["Content-Length"]
         page.headers["Content-Length"] = str(len(page.body))
     return page
 
 
-def _quiet(handler: Handler) -> Handler:
-    """The same without words about clients that are not viser's, or send what it cannot use."""
+def _drop_malformed_messages(handler: Handler) -> Handler:
+    """Wrap a handler so that foreign clients and malformed messages are not reported."""
 
-    def told(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    def log_exception(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         logger.debug("%s", context.get("message"), exc_info=context.get("exception"))
 
     async def handle(connection: ServerConnection) -> None:
-        asyncio.get_running_loop().set_exception_handler(told)
-        wanted, found = f"viser-v{viser.__version__}", connection.subprotocol
-        if found != wanted:
-            await connection.close(1002, f"Version mismatch. Client: {found}, Server: {wanted}")
+        asyncio.get_running_loop().set_exception_handler(log_exception)
+        expected, actual = f"viser-v{viser.__version__}", connection.subprotocol
+        if actual != expected:
+            await connection.close(1002, f"Version mismatch. Client: {actual}, Server: {expected}")
             return
         receive = connection.recv
 
-        async def checked(*how: Any, **more: Any) -> Any:
-            message = await receive(*how, **more)
-            refuse_other_updates(message)
+        async def receive_valid(*arguments: Any, **options: Any) -> Any:
+            message = await receive(*arguments, **options)
+            reject_invalid_update(message)
             return message
 
-        connection.recv = checked  # type: ignore[method-assign]
+        connection.recv = receive_valid  # type: ignore[method-assign]
         await handler(connection)
 
     return handle
 
 
-def refuse_other_updates(message: str | bytes) -> None:
-    """Refuse what sets more of a control than its value, as no browser does: viser would.
+def reject_invalid_update(message: str | bytes) -> None:
+    """Reject messages that update any property of a control but its value; viser accepts them.
 
     Raises:
-        ValueError: It does, or it is no message.
+        ValueError: The message is malformed or updates another property.
     """
     if not isinstance(message, bytes):
-        raise ValueError("found a text")
-    found = msgspec.msgpack.decode(message)
-    if found.get("type") == "GuiUpdateMessage" and set(found["updates"]) != {"value"}:
-        raise ValueError(f"found updates of {set(found['updates'])}, expected the value")
+        raise ValueError("message: found a text, expected bytes")
+    content = msgspec.msgpack.decode(message)
+    if content.get("type") == "GuiUpdateMessage" and set(content["updates"]) != {"value"}:
+        raise ValueError(f"updates: found {set(content['updates'])}, expected the value")
 
 
 # Servers.
 
 
 class Server(viser.ViserServer):
-    """viser's server without its public tunnel, which any browser could ask for.
+    """A viser server without the public tunnel that any browser could request.
 
     Attributes:
-        access: Who may open it.
-        camera: Where a browser that opens it looks from; None: not said yet.
+        access: Access control.
+        camera: Initial camera of browsers that open the page; None: not set yet.
     """
 
     access: Access
     camera: Any = None
 
     def request_share_url(self, verbose: bool = True) -> None:
-        """Share nothing."""
+        """Do nothing: pages are not shared publicly."""
 
     def disconnect_share_url(self) -> None:
-        """Nothing is shared."""
+        """Do nothing: pages are not shared publicly."""
 
 
 class Viewer:
-    """A running page; every browser that opens it sees and moves the same robot.
+    """A running page; all browsers that open it see and move the same robot.
 
     Attributes:
-        url: Where it is.
-        page: What is on it.
+        url: Address of the page.
+        page: Content of the page.
     """
 
     def __init__(self, server: Server, page: Any) -> None:
-        """Take what runs; a page that another one takes the place of tells by `opened`."""
+        """Store server and page, and follow the page when another one replaces it."""
         self._server, self.page = server, page
-        page.opened = self._take
-        self.url = f"http://{_shown(server.get_host())}:{server.get_port()}"
+        page.on_replaced = self._replace_page
+        self.url = f"http://{_url_host(server.get_host())}:{server.get_port()}"
         if server.access.token:
             self.url += f"/{server.access.token}/"
 
@@ -247,18 +257,18 @@ class Viewer:
         return f"<Viewer {self.url}>"
 
     def _repr_html_(self) -> str:
-        """In a notebook: the page itself."""
+        """Return the page as a frame for notebooks."""
         return f'<iframe src="{self.url}" width="100%" height="600" frameborder="0"></iframe>'
 
-    def _take(self, page: Any) -> None:
-        self.page, page.opened = page, self._take
+    def _replace_page(self, page: Any) -> None:
+        self.page, page.on_replaced = page, self._replace_page
 
     def to_html(self, path: str | os.PathLike[str] | None = None, dark: bool = False) -> str:
-        """What is seen as a page that needs no server: it can be turned, not changed.
+        """Return the scene as a page that needs no server; its camera moves, its content is fixed.
 
         Args:
-            path: Where it is written as well, if anywhere.
-            dark: Whether it is dark.
+            path: File to write as well; None: none.
+            dark: Use the dark theme.
 
         Returns:
             The page, about a megabyte of text, for documents and notebooks.
@@ -268,11 +278,11 @@ class Viewer:
             >>> text = viewer.to_html()
             >>> viewer.stop()
         """
-        held = self.page.held
-        self.page.select("")  # nobody can drag there
+        selection = self.page.selection
+        self.page.select("")  # a page without a server cannot be dragged
         self.page.work.settle()
         text = self._server.scene.as_html(dark_mode=dark)
-        self.page.select(held)
+        self.page.select(selection)
         text = text.replace("<title>Viser</title>", f"<title>{self._server.access.title}</title>")
         if path is not None:
             with atomic_write(Path(path)) as part:
@@ -280,41 +290,43 @@ class Viewer:
         return text
 
     def stop(self) -> None:
-        """End the page."""
+        """Stop the page and its server."""
         self.page.stop()
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
 
     def wait(self) -> None:
-        """Go on until somebody interrupts, then end the page."""
+        """Serve until a keyboard interrupt, then stop."""
         with contextlib.suppress(KeyboardInterrupt):
             self._server.sleep_forever()
         self.stop()
 
 
 def serve(host: str = HOST, port: int | None = None, secret: bool = False) -> Server:
-    """An empty page.
+    """Start a server with an empty page.
 
     Args:
-        host: Who may see it: the address it is served at; "0.0.0.0" is everybody in the network.
-        port: Of the address; None: the first free one from 8080 on.
-        secret: Whether only who has the whole address, with its token, may open it.
+        host: Address at which the page is served; "0.0.0.0": reachable from the network.
+        port: Port; None: the first free one from 8080 on.
+        secret: Require a token in the address.
 
     Raises:
-        InputError: The port is taken, or nothing can be served there.
-        UnsupportedError: viser serves in a way in which nobody can be refused.
+        InputError: The port is in use, or the host is not an address of this machine.
+        UnsupportedError: Access control cannot be installed in this version of viser.
     """
-    wanted = range(PORT, PORT + 100) if port is None else (port,)
-    free = next((one for one in wanted if _is_free(host, one)), None)
+    ports = range(PORT, PORT + 100) if port is None else (port,)
+    free = next((candidate for candidate in ports if _is_free(host, candidate)), None)
     if free is None:
-        found = f"{port}" if port is not None else f"{PORT} to {PORT + 99}"
-        raise InputError(f"port: found {found}, which cannot be had at {host}; expected a free one")
+        ports_text = f"{port}" if port is not None else f"{PORT} to {PORT + 99}"
+        raise InputError(f"port: {ports_text} is in use on {host}; expected a free port")
     access = Access(host, secrets.token_urlsafe(16) if secret else "")
-    with asking(access) as asked, contextlib.redirect_stdout(io.StringIO()):
+    with authorised_server(access) as installed, contextlib.redirect_stdout(io.StringIO()):
         server = Server(host=host, port=free, verbose=False)
-    if not asked.is_set():
+    if not installed.is_set():
         server.stop()
-        raise UnsupportedError(f"viser {viser.__version__} cannot be told whom to refuse")
+        raise UnsupportedError(
+            f"viser {viser.__version__} is not supported: access control could not be installed"
+        )
     server.access = access
     return server
 
@@ -329,7 +341,7 @@ def _is_free(host: str, port: int) -> bool:
         raise InputError(f"host: found {host!r}, expected an address of this machine") from error
 
 
-def _shown(host: str) -> str:
+def _url_host(host: str) -> str:
     if host in ("0.0.0.0", "::", ""):
         return "127.0.0.1"
     return f"[{host}]" if ":" in host else host

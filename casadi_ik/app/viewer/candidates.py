@@ -1,16 +1,17 @@
-"""Candidates on a page: each a tripod from palm to contacts, filtered, and taken by a click."""
+"""Candidate grasps on a page: drawn as rods from palm to contacts, with filters and a list."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from casadi_ik.app.drawing import palette
 from casadi_ik.app.drawing.drawables import Drawable
-from casadi_ik.app.drawing.surfaces import Shape, ball, joined, mesh_of, rod
+from casadi_ik.app.drawing.surfaces import Shape, ball, join_surfaces, mesh_shape, rod
+from casadi_ik.app.viewer.access import Server
 from casadi_ik.app.viewer.panel import block, on_set
 from casadi_ik.app.viewer.viser_scene import add_drawable, quaternions
 from casadi_ik.files.arrays import Array
@@ -20,22 +21,19 @@ from casadi_ik.model.grasp import Grasp
 from casadi_ik.model.pose import inverse
 from casadi_ik.planning.touch.grasps import FoundGrasp
 
-if TYPE_CHECKING:
-    from casadi_ik.app.viewer.grasp_page import GraspPage
-
-AT_FIRST = 20
-"""So many are shown before somebody filters."""
+INITIAL_COUNT = 20
+"""Number of candidates that are shown initially."""
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A grasp to choose from; one that `Solver.grasps_of` has found is such as it is.
+    """A candidate grasp.
 
     Attributes:
-        grasp: What is asked; None: what q reaches.
-        q: (n,) where it is reached [rad or m]; None: it is not solved yet, and not drawn.
-        load: What it holds per newton of squeeze; None: not known.
-        clearance: Smallest distance of a pair that must not touch [m]; None: not known.
+        grasp: The grasp; None: the contacts of the robot at q.
+        q: (n,) Configuration of the grasp [rad or m]; None: not solved yet, so not drawn.
+        load: Largest weight per newton of squeeze [N/N]; None: unknown.
+        clearance: Smallest clearance [m]; None: unknown.
     """
 
     grasp: Grasp | None
@@ -45,120 +43,147 @@ class Candidate:
 
 
 Candidates = Mapping[str, Candidate | FoundGrasp]
-"""By name."""
+"""Candidates by name, the best first."""
 
 
 class CandidateList:
-    """The candidates of a page: what is drawn of them, and the controls that filter them."""
+    """The candidates of a page: marks in the scene, and controls to filter and choose."""
 
-    def __init__(self, page: GraspPage, candidates: Candidates) -> None:
-        """Draw those that are shown at first.
+    def __init__(
+        self,
+        server: Server,
+        robot: ArmHand,
+        object_pose: Array | None,
+        candidates: Candidates,
+        on_choose: Callable[[str], None],
+    ) -> None:
+        """Draw the candidates that are shown initially.
 
         Args:
-            page: Whose they are; told of the one that is taken.
-            candidates: The best first.
+            server: Server of the page.
+            robot: The robot.
+            object_pose: (4, 4) Initial pose of the object; None: there is no object.
+            candidates: Candidates by name, the best first.
+            on_choose: Callback that receives the name of the chosen candidate.
         """
-        self._page, self._all = page, dict(candidates)
-        self._bounds = {"load": -np.inf, "clearance": -np.inf, "most": AT_FIRST}
-        self._taken = next(iter(self._all))
-        server = page.server
+        self._server, self._on_choose = server, on_choose
+        self._candidates = dict(candidates)
+        self._bounds = {"load": -np.inf, "clearance": -np.inf, "max_count": INITIAL_COUNT}
+        self._chosen_name = next(iter(self._candidates))
         self._frame = server.scene.add_frame("/candidates", show_axes=False)
-        place = page.asked.object_pose
-        self._origin = np.eye(4) if place is None else place
+        self._initial_pose = np.eye(4) if object_pose is None else object_pose
         self._meshes: dict[str, Any] = {}
-        loads = [one.load for one in self._all.values() if one.load is not None]
-        for i, (name, one) in enumerate(self._all.items()):
-            tripod = _tripods(page.robot, one)
+        loads = [
+            candidate.load for candidate in self._candidates.values() if candidate.load is not None
+        ]
+        for i, (name, candidate) in enumerate(self._candidates.items()):
+            tripod = _tripods(robot, candidate)
             if not tripod:
                 continue
-            part = 0.5 if one.load is None or not loads else one.load / max(*loads, 1e-9)
-            mark = Drawable("candidate", mesh_of(joined(tripod)), palette.shade(part))
+            relative_load = (
+                0.5 if candidate.load is None or not loads else candidate.load / max(*loads, 1e-9)
+            )
+            mark = Drawable(
+                "candidate", mesh_shape(join_surfaces(tripod)), palette.shade(relative_load)
+            )
             node = f"/candidates/{i}"
             mesh = add_drawable(server, node, mark, cast_shadow=False, visible=False)
             self._meshes[name] = mesh
 
             @mesh.on_click
             async def _(_: Any, name: str = name) -> None:
-                self.take(name)
+                self.choose(name)
 
         self._add_controls()
         self.filter()
 
     @property
-    def shown(self) -> tuple[str, ...]:
-        """Names of those that pass the filter, the best first."""
-        least, most = self._bounds, int(self._bounds["most"])
-        found = [
+    def shown_names(self) -> tuple[str, ...]:
+        """Names of the candidates that pass the filter, the best first."""
+        bounds, count = self._bounds, int(self._bounds["max_count"])
+        names = [
             name
-            for name, one in self._all.items()
-            if (one.load is None or one.load >= least["load"])
-            and (one.clearance is None or one.clearance >= least["clearance"])
+            for name, candidate in self._candidates.items()
+            if (candidate.load is None or candidate.load >= bounds["load"])
+            and (candidate.clearance is None or candidate.clearance >= bounds["clearance"])
         ]
-        return tuple(found[:most])
+        return tuple(names[:count])
 
-    def place(self, pose: Array | None) -> None:
-        """Move all with the object to its (4, 4) pose."""
+    def update(self, pose: Array | None) -> None:
+        """Move all candidates with the object to its (4, 4) pose."""
         if pose is not None:
-            moved = pose @ inverse(self._origin)
-            self._frame.position, self._frame.wxyz = moved[:3, 3], quaternions(moved[:3, :3])
+            displacement = pose @ inverse(self._initial_pose)
+            self._frame.position, self._frame.wxyz = (
+                displacement[:3, 3],
+                quaternions(displacement[:3, :3]),
+            )
 
-    def take(self, name: str) -> None:
-        """Show the robot in one of them."""
-        self._taken = name
-        self._page.choose(name)
+    def choose(self, name: str) -> None:
+        """Choose a candidate by name."""
+        self._chosen_name = name
+        self._on_choose(name)
         self.filter()
 
     def filter(self, **bounds: float) -> None:
-        """Show others.
+        """Change the filter.
 
         Args:
-            bounds: The least `load` [N/N] or `clearance` [m], how many at `most`; what is not
-                given is as before.
+            bounds: Lower bounds of `load` [N/N] and `clearance` [m], and `max_count`; omitted ones
+                are unchanged.
         """
         self._bounds |= bounds
-        shown = self.shown
-        with self._page.server.atomic():
+        names = self.shown_names
+        with self._server.atomic():
             for name, mesh in self._meshes.items():
-                mesh.visible = name in shown and name != self._taken
-            options = shown or (self._taken,)
+                mesh.visible = name in names and name != self._chosen_name
+            options = names or (self._chosen_name,)
             self._list.options = options
-            if self._taken in options:
-                self._list.value = self._taken
-            one = self._all[self._taken]
-            words = [] if one.load is None else [f"load {one.load:.3f} N/N"]
-            words += [] if one.clearance is None else [f"clearance {1e3 * one.clearance:.1f} mm"]
-            about = f"<b>{len(shown)}</b> of {len(self._all)} shown"
-            self._told.content = block("<br>".join([about, *words]))
+            if self._chosen_name in options:
+                self._list.value = self._chosen_name
+            candidate = self._candidates[self._chosen_name]
+            details = [] if candidate.load is None else [f"load {candidate.load:.3f} N/N"]
+            details += (
+                []
+                if candidate.clearance is None
+                else [f"clearance {1e3 * candidate.clearance:.1f} mm"]
+            )
+            summary = f"<b>{len(names)}</b> of {len(self._candidates)} shown"
+            self._summary.content = block("<br>".join([summary, *details]))
 
     def _add_controls(self) -> None:
-        gui = self._page.server.gui
+        gui = self._server.gui
         self._list = gui.add_dropdown(
-            "Candidate", tuple(self._all), hint="or click its tripod on the object"
+            "Candidate", tuple(self._candidates), hint="or click its tripod on the object"
         )
-        on_set(self._list, lambda name: self.take(str(name)))
-        count = len(self._all)
-        most = gui.add_slider("Best", 1, max(count, 2), 1, min(AT_FIRST, count))
-        on_set(most, lambda value: self.filter(most=value))
+        on_set(self._list, lambda name: self.choose(str(name)))
+        count = len(self._candidates)
+        max_count_slider = gui.add_slider("Best", 1, max(count, 2), 1, min(INITIAL_COUNT, count))
+        on_set(max_count_slider, lambda value: self.filter(max_count=value))
         for key, label, scale in (("load", "Load ≥", 1.0), ("clearance", "Clearance ≥ [mm]", 1e3)):
-            values = [getattr(one, key) for one in self._all.values()]
-            known = [scale * value for value in values if value is not None]
-            if len(known) > 1 and max(known) > min(known):
-                low, high = np.floor(100 * min(known)) / 100, np.ceil(100 * max(known)) / 100
+            values = [getattr(candidate, key) for candidate in self._candidates.values()]
+            finite_values = [scale * value for value in values if value is not None]
+            if len(finite_values) > 1 and max(finite_values) > min(finite_values):
+                low, high = (
+                    np.floor(100 * min(finite_values)) / 100,
+                    np.ceil(100 * max(finite_values)) / 100,
+                )
                 slider = gui.add_slider(label, float(low), float(high), 0.01, float(low))
                 on_set(slider, lambda value, key=key, s=scale: self.filter(**{key: value / s}))
-        self._told = gui.add_html("")
+        self._summary = gui.add_html("")
 
 
-def _tripods(robot: ArmHand, one: Candidate | FoundGrasp) -> list[Surface]:
-    """Rods from the palm of every hand to its contacts, a ball at each; none if one is nowhere."""
-    contacts = {} if one.grasp is None else one.grasp.contacts
-    if one.q is None or not all(np.isfinite(contact.point).all() for contact in contacts.values()):
+def _tripods(robot: ArmHand, candidate: Candidate | FoundGrasp) -> list[Surface]:
+    """Return rods from each palm to its contacts, with balls at their ends."""
+    contacts = {} if candidate.grasp is None else candidate.grasp.contacts
+    if candidate.q is None or not all(
+        np.isfinite(contact.point).all() for contact in contacts.values()
+    ):
         return []
     shapes: list[Shape] = []
     for side, fingers in robot.hands.items():
         names = [robot.fingers[i] for i in fingers]
         tips = [contacts[name].point for name in names if name in contacts]
-        palm = robot.palm(one.q, side)[:3, 3]
+        palm = robot.palm(candidate.q, side)[:3, 3]
         shapes += [shape for tip in tips for shape in (rod(palm, tip, 0.0009), ball(0.003, tip))]
         shapes += [ball(0.0045, palm)] if tips else []
     return [shape.surface for shape in shapes]

@@ -1,4 +1,4 @@
-"""What all pages have: a title, a look, a thread for changes; what is dragged, and taken back."""
+"""Base classes of pages, their worker thread, and undo."""
 
 from __future__ import annotations
 
@@ -12,334 +12,335 @@ from typing import Any, Concatenate, ParamSpec
 from casadi_ik.app.viewer.access import Server
 from casadi_ik.app.viewer.panel import on_press
 from casadi_ik.app.viewer.request import PageRequest
-from casadi_ik.app.viewer.viser_scene import set_stage
+from casadi_ik.app.viewer.viser_scene import set_up_scene
 from casadi_ik.compile.cancellation import CancelledError, cancellable
 from casadi_ik.errors import shortened
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arm_hand import ArmHand
 
-KEPT = 200
-"""Steps that can be taken back."""
+UNDO_LIMIT = 200
+"""Maximum number of steps that can be undone."""
 
 
 P = ParamSpec("P")
 
 
-def in_turn(method: Callable[Concatenate[Any, P], None]) -> Callable[Concatenate[Any, P], None]:
-    """A page's method that a browser asks for: put down, done by the page's thread in its turn.
+def on_page_thread(
+    method: Callable[Concatenate[Any, P], None],
+) -> Callable[Concatenate[Any, P], None]:
+    """Run a method on the worker thread of its page instead of a thread of the server.
 
-    Of several calls that wait the newest counts.
+    Of several pending calls of one method only the latest is run.
     """
 
     @wraps(method)
-    def put(page: Page, *args: P.args, **named: P.kwargs) -> None:
-        page.work.put(method.__name__, partial(method, page, *args, **named))
+    def submit(page: Page, *args: P.args, **options: P.kwargs) -> None:
+        page.work.submit(method.__name__, partial(method, page, *args, **options))
 
-    return put
+    return submit
 
 
 class Page:
-    """What is drawn, and a panel beside it; all of it belongs to the thread of `work`.
+    """A scene and a panel; both are changed by the worker thread only.
 
     Attributes:
-        server: What serves it.
-        work: What everything is done by.
-        opened: Told of the page that takes the place of this one.
+        server: Server of the page.
+        work: Worker thread.
+        on_replaced: Callback that receives the page that replaces this one.
     """
 
-    opened: Callable[[Page], None]
+    on_replaced: Callable[[Page], None]
 
     def __init__(self, server: Server, title: str, floor: float, dark: bool) -> None:
-        """An empty page in the place of what was there.
+        """Replace the content of the server by an empty page.
 
         Args:
-            server: What serves it.
-            title: On the panel and on the browser's tab.
+            server: Server of the page.
+            title: Title of the panel and of the browser's tab.
             floor: Height of the ground [m].
-            dark: Whether it is dark.
+            dark: Use the dark theme.
         """
-        self.server, self.dark, self.ended = server, dark, False
-        self._stage = title, floor
-        set_stage(server, title, floor, dark)
+        self.server, self.dark, self.is_stopped = server, dark, False
+        self._title_and_floor = title, floor
+        set_up_scene(server, title, floor, dark)
 
-    def begin(self, *later: tuple[float, Work]) -> None:
-        """Start its thread; `later`: what is done once nothing moves, see `Newest`."""
-        self.work = Newest(lambda: None if self.ended else self.refresh(), later)
+    def start(self, *idle_tasks: tuple[float, Task]) -> None:
+        """Start the worker thread; for `idle_tasks` see `LatestOnly`."""
+        self.work = LatestOnly(lambda: None if self.is_stopped else self.refresh(), idle_tasks)
 
     def refresh(self) -> None:
-        """Draw what has changed."""
+        """Draw the current state."""
         raise NotImplementedError
 
     def stop(self) -> None:
-        """End its thread."""
-        self.ended = True
+        """Stop the worker thread."""
+        self.is_stopped = True
         self.work.stop()
 
-    held = ""
+    selection = ""
 
     def select(self, name: str) -> None:
-        """Give something its handles, on pages that have some."""
+        """Show the handles of an item, on pages that have handles."""
 
-    def add_dark(self) -> None:
-        """A switch between light and dark."""
-        title, floor = self._stage
+    def add_theme_switch(self) -> None:
+        """Add a switch between the light and the dark theme."""
+        title, floor = self._title_and_floor
         box = self.server.gui.add_checkbox("Dark", self.dark)
 
         @box.on_update
         async def _(_: Any) -> None:
             self.dark = box.value
-            set_stage(self.server, title, floor, box.value)
+            set_up_scene(self.server, title, floor, box.value)
 
 
-class DraggedPage(Page):
-    """A page whose contacts are dragged, one after the other, and taken back.
+class InteractivePage(Page):
+    """A page with draggable contacts and undo.
 
     Attributes:
         robot: The robot.
-        asked: What is asked now.
-        held: What has handles; "": nothing.
+        request: Current request.
+        selection: Item whose handles are shown; "": none.
     """
 
     def __init__(
         self,
         server: Server,
         robot: ArmHand,
-        asked: PageRequest,
+        request: PageRequest,
         title: str,
         floor: float,
         dark: bool,
     ) -> None:
-        """An empty page, see `Page`."""
+        """Make an empty page, see `Page`."""
         super().__init__(server, title, floor, dark)
-        self.robot, self.asked, self._dragged = robot, asked, ""
-        self.held = ""
-        self._past: list[Any] = []
-        self._future: list[Any] = []
+        self.robot, self.request, self._dragged = robot, request, ""
+        self.selection = ""
+        self._undo_stack: list[Any] = []
+        self._redo_stack: list[Any] = []
 
-    def begin(self, *later: tuple[float, Work]) -> None:
-        """Start its thread; where it stands is where everything can be taken back to."""
-        self._past = [self.state()]
-        super().begin(*later, (REST, self.remember))
+    def start(self, *idle_tasks: tuple[float, Task]) -> None:
+        """Start the worker thread; the current state is the first one of the undo stack."""
+        self._undo_stack = [self.state()]
+        super().start(*idle_tasks, (IDLE_DELAY, self.push_undo))
 
     def drag(self, name: str, pose: Array) -> None:
-        """A contact, the object or something in the scene dragged to a (4, 4) pose."""
-        self.change(name, lambda asked: asked.moved(name, pose), name)
+        """Move a contact, the object or a scene item to a (4, 4) pose."""
+        self.change(name, lambda request: request.with_pose(name, pose), name)
 
     def drag_point(self, finger: str, point: Array) -> None:
-        """A contact dragged by its ball to a point (3,)."""
-        self.change(finger, lambda asked: asked.with_point(finger, point))
+        """Move a contact to a point (3,) [m]."""
+        self.change(finger, lambda request: request.with_point(finger, point))
 
     def drag_normal(self, finger: str, normal: Array) -> None:
-        """A contact turned by its arrow to face a way (3,)."""
-        self.change(finger, lambda asked: asked.with_normal(finger, normal))
+        """Rotate a contact to a normal (3,)."""
+        self.change(finger, lambda request: request.with_normal(finger, normal))
 
     def change(
-        self, key: str, change: Callable[[PageRequest], PageRequest], dragged: str = ""
+        self, key: str, edit: Callable[[PageRequest], PageRequest], dragged: str = ""
     ) -> None:
-        """Another request; of several changes of a key the newest counts.
+        """Edit the request; of several pending edits of a key only the latest is applied.
 
         Args:
-            key: What is changed.
-            change: The request as it was to the request as it is.
-            dragged: What the browser has moved already.
+            key: Key of the edit.
+            edit: Function from the current request to the new one.
+            dragged: Item that the browser has moved already.
         """
 
-        def work() -> None:
-            self.changed_by_hand()
-            self.asked, self._dragged = change(self.asked), dragged
+        def apply_edit() -> None:
+            self.on_request_change()
+            self.request, self._dragged = edit(self.request), dragged
 
-        self.work.put(key, work)
+        self.work.submit(key, apply_edit)
 
-    @in_turn
+    @on_page_thread
     def select(self, name: str) -> None:
-        """Give something its handles; "" takes them all away."""
-        self.held = name
-        self.selected(name)
+        """Show the handles of an item; "" hides all handles."""
+        self.selection = name
+        self.show_selection(name)
 
-    @in_turn
+    @on_page_thread
     def undo(self) -> None:
-        """Take the last step back."""
-        self.remember()
-        if len(self._past) > 1:
-            self._future.append(self._past.pop())
-            self.restore(self._past[-1])
+        """Undo the last step."""
+        self.push_undo()
+        if len(self._undo_stack) > 1:
+            self._redo_stack.append(self._undo_stack.pop())
+            self.restore(self._undo_stack[-1])
 
-    @in_turn
+    @on_page_thread
     def redo(self) -> None:
-        """Do again what was taken back."""
-        self.remember()
-        if self._future:
-            self._past.append(self._future.pop())
-            self.restore(self._past[-1])
+        """Redo the last step that was undone."""
+        self.push_undo()
+        if self._redo_stack:
+            self._undo_stack.append(self._redo_stack.pop())
+            self.restore(self._undo_stack[-1])
 
-    @in_turn
+    @on_page_thread
     def reset(self) -> None:
-        """Back to what was asked first; that can be taken back, too."""
-        self.remember()
-        self.restore(self._past[0])
+        """Restore the initial state; this can be undone."""
+        self.push_undo()
+        self.restore(self._undo_stack[0])
 
-    def add_steps(self) -> None:
-        """Buttons that take steps back, do them again and begin anew; keys for the first two."""
-        steps = self.server.gui.add_button_group("Steps", ("Undo", "Redo", "Reset"))
-        do = {"Undo": self.undo, "Redo": self.redo, "Reset": self.reset}
-        on_press(steps, lambda _: do[str(steps.value)]())
-        add = self.server.gui.add_command
-        back = add("Undo", hotkey="Z", modifier="cmd/ctrl")
-        again = add("Redo", hotkey="Z", modifier="cmd/ctrl+shift")
-        for command, work in ((back, self.undo), (again, self.redo)):
+    def add_undo_buttons(self) -> None:
+        """Add buttons and keys for undo and redo, and a button for reset."""
+        buttons = self.server.gui.add_button_group("Steps", ("Undo", "Redo", "Reset"))
+        actions = {"Undo": self.undo, "Redo": self.redo, "Reset": self.reset}
+        on_press(buttons, lambda _: actions[str(buttons.value)]())
+        add_command = self.server.gui.add_command
+        undo_command = add_command("Undo", hotkey="Z", modifier="cmd/ctrl")
+        redo_command = add_command("Redo", hotkey="Z", modifier="cmd/ctrl+shift")
+        for command, action in ((undo_command, self.undo), (redo_command, self.redo)):
 
             @command.on_trigger
-            async def _(_: Any, work: Work = work) -> None:
-                work()
+            async def _(_: Any, action: Task = action) -> None:
+                action()
 
-    # What its kinds do each in their way.
+    # Hooks of subclasses.
 
-    def changed_by_hand(self) -> None:
-        """What is asked is about to change."""
+    def on_request_change(self) -> None:
+        """Prepare for a new request."""
 
-    def selected(self, name: str) -> None:
-        """Show what has handles."""
+    def show_selection(self, name: str) -> None:
+        """Show the handles of the selected item."""
 
     def state(self) -> tuple[PageRequest, *tuple[Any, ...]]:
-        """What can be gone back to: what is asked, which is never changed in place, and more."""
-        return (self.asked,)
+        """Return an immutable state for the undo stack; the request comes first."""
+        return (self.request,)
 
     def restore(self, state: tuple[PageRequest, *tuple[Any, ...]]) -> None:
-        """Go back to a state."""
-        self.changed_by_hand()
-        self.asked = state[0]
+        """Restore a state."""
+        self.on_request_change()
+        self.request = state[0]
 
-    def remember(self) -> None:
-        """What stands now is a step."""
+    def push_undo(self) -> None:
+        """Push the current state on the undo stack if the request has changed."""
         state = self.state()
-        if state[0] is not self._past[-1][0]:
-            self._past = [self._past[0], *self._past[1:], state][-KEPT:]
-            self._future.clear()
+        if state[0] is not self._undo_stack[-1][0]:
+            self._undo_stack = [self._undo_stack[0], *self._undo_stack[1:], state][-UNDO_LIMIT:]
+            self._redo_stack.clear()
 
 
 logger = logging.getLogger(__name__)
 
-Work = Callable[[], None]
+Task = Callable[[], None]
 
-PAUSE = 0.02
-"""What follows a drag waits so long, and so never is in the way of an answer [s]."""
+SHORT_DELAY = 0.02
+"""Delay of tasks that follow a drag without delaying its solve [s]."""
 
-REST = 0.15
-"""After so long nothing moves any more [s]; in a drag, changes are 0.05 s apart."""
+IDLE_DELAY = 0.15
+"""Time without changes after which a drag has ended [s]; during one, changes are 0.05 s apart."""
 
-LOOKS = 0.5
-"""After so long whoever drags looks, and does not go on at once [s]: time for what takes long."""
+LONG_IDLE_DELAY = 0.5
+"""Time without changes after which slow tasks start [s]."""
 
-FAULTS = 20
-"""So many different ones are told of."""
+MAX_WARNINGS = 20
+"""Maximum number of distinct errors that are logged as warnings."""
 
 
-class Newest:
-    """A thread that does the newest change of every key, then draws, then what can wait.
+class LatestOnly:
+    """A worker thread that applies the latest change of every key, refreshes, and runs idle tasks.
 
-    Whoever drags sends twenty changes a second, whatever a solve takes. Each change has a key; one
-    that was not begun when another of its key comes is dropped. What can wait is begun once nothing
-    has come for a while, and given up when something comes. The thread that talks to the browsers
-    only ever puts a change down.
+    A drag sends twenty changes a second, however long a solve takes. Each change has a key; a
+    pending change is dropped when another one with its key arrives. Idle tasks start after a time
+    without changes, and are cancelled by a new change. Threads of the server only submit changes.
     """
 
-    def __init__(self, refresh: Work, later: tuple[tuple[float, Work], ...] = ()) -> None:
-        """Start it.
+    def __init__(self, refresh: Task, idle_tasks: tuple[tuple[float, Task], ...] = ()) -> None:
+        """Start the thread.
 
         Args:
-            refresh: Called after changes, once for all that were waiting.
-            later: Each called once nothing has come for so long [s], the shortest first; all begun
-                anew after the next change if that comes in between.
+            refresh: Function called once after all pending changes.
+            idle_tasks: Pairs of a time without changes [s], in ascending order, and the task that
+                then starts. All of them are repeated after the next change.
         """
-        self._refresh, self._later = refresh, later
-        self._changes: dict[str, Work] = {}
-        self._something = threading.Condition()
+        self._refresh, self._idle_tasks = refresh, idle_tasks
+        self._changes: dict[str, Task] = {}
+        self._condition = threading.Condition()
         self._busy = self._stopped = False
-        self._awaited = 0
-        self._moved_on = threading.Event()
-        self._told: set[str] = set()
-        self.dropped = 0
+        self._waiter_count = 0
+        self._new_change = threading.Event()
+        self._logged: set[str] = set()
+        self.dropped_count = 0
         self._thread = threading.Thread(target=self._run, name="casadi-ik view", daemon=True)
         self._thread.start()
 
-    def put(self, key: str, change: Work) -> None:
-        """Ask for a change; returns at once."""
-        with self._something:
+    def submit(self, key: str, change: Task) -> None:
+        """Submit a change; returns at once."""
+        with self._condition:
             if self._changes.pop(key, None) is not None:
-                self.dropped += 1
+                self.dropped_count += 1
             self._changes[key] = change
-            self._moved_on.set()
-            self._something.notify_all()
+            self._new_change.set()
+            self._condition.notify_all()
 
     def settle(self, seconds: float = 30.0) -> bool:
-        """Wait until everything is done, what can wait as well; False if it takes longer."""
-        with self._something:
-            self._awaited += 1
-            self._something.notify_all()
+        """Wait until all changes and idle tasks are done; returns False after a timeout."""
+        with self._condition:
+            self._waiter_count += 1
+            self._condition.notify_all()
             try:
-                return self._something.wait_for(lambda: not (self._busy or self._changes), seconds)
+                return self._condition.wait_for(lambda: not (self._busy or self._changes), seconds)
             finally:
-                self._awaited -= 1
+                self._waiter_count -= 1
 
     def stop(self) -> None:
-        """End the thread after what it is doing."""
-        with self._something:
+        """Stop the thread after the current task."""
+        with self._condition:
             self._stopped = True
-            self._moved_on.set()
-            self._something.notify_all()
+            self._new_change.set()
+            self._condition.notify_all()
         if threading.current_thread() is not self._thread:
             self._thread.join(10.0)
 
     def _run(self) -> None:
-        while self._wait():
-            for change in self._take():
-                self._do(change)
-            self._do(self._refresh)
-            self._do_later(time.monotonic())
+        while self._wait_for_changes():
+            for change in self._take_changes():
+                self._run_task(change)
+            self._run_task(self._refresh)
+            self._run_idle_tasks(time.monotonic())
 
-    def _do_later(self, since: float) -> None:
+    def _run_idle_tasks(self, since: float) -> None:
         try:
-            with cancellable(self._moved_on):
-                for pause, work in self._later:
-                    if not self._rests(since + pause):
+            with cancellable(self._new_change):
+                for delay, task in self._idle_tasks:
+                    if not self._stays_idle(since + delay):
                         return
-                    self._do(work)
+                    self._run_task(task)
         except CancelledError:
-            logger.debug("given up for something newer")
+            logger.debug("idle task cancelled by a new change")
 
-    def _rests(self, until: float) -> bool:
-        """Whether nothing comes until then; at once if somebody waits for everything."""
-        with self._something:
-            self._something.wait_for(
-                lambda: self._changes or self._stopped or self._awaited,
+    def _stays_idle(self, until: float) -> bool:
+        """Wait until a time; return False if a change arrives, True early for `settle`."""
+        with self._condition:
+            self._condition.wait_for(
+                lambda: self._changes or self._stopped or self._waiter_count,
                 timeout=max(until - time.monotonic(), 0.0),
             )
             return not (self._changes or self._stopped)
 
-    def _wait(self) -> bool:
-        with self._something:
+    def _wait_for_changes(self) -> bool:
+        with self._condition:
             self._busy = False
-            self._something.notify_all()
-            self._something.wait_for(lambda: self._changes or self._stopped)
+            self._condition.notify_all()
+            self._condition.wait_for(lambda: self._changes or self._stopped)
             self._busy = True
             return not self._stopped
 
-    def _take(self) -> list[Work]:
-        with self._something:
+    def _take_changes(self) -> list[Task]:
+        with self._condition:
             changes = list(self._changes.values())
             self._changes.clear()
             if not self._stopped:
-                self._moved_on.clear()
+                self._new_change.clear()
         return changes
 
-    def _do(self, work: Work) -> None:
+    def _run_task(self, task: Task) -> None:
         try:
-            work()
+            task()
         except Exception as error:
-            # One thing that goes wrong must not end the page, nor be told at every movement.
-            text = shortened(f"{type(error).__name__}: {error}").partition("\n")[0]
-            first = text not in self._told and len(self._told) < FAULTS
-            self._told.add(text)
+            # An error must not end the page, nor be logged at every movement.
+            message = shortened(f"{type(error).__name__}: {error}").partition("\n")[0]
+            first = message not in self._logged and len(self._logged) < MAX_WARNINGS
+            self._logged.add(message)
             level = logging.WARNING if first else logging.DEBUG
             debugged = logger.isEnabledFor(logging.DEBUG)
-            logger.log(level, "the view could not do what was asked: %s", text, exc_info=debugged)
+            logger.log(level, "viewer: change failed: %s", message, exc_info=debugged)

@@ -1,4 +1,4 @@
-"""The page on which solves and motions play: one, or two side by side."""
+"""The page that plays logged solves and motions: one, or two next to each other."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from functools import cached_property
 import numpy as np
 
 from casadi_ik.app.drawing import palette
-from casadi_ik.app.drawing.drawables import lowest
+from casadi_ik.app.drawing.drawables import ground_height
 from casadi_ik.app.viewer.access import Server
-from casadi_ik.app.viewer.page import Page, in_turn
+from casadi_ik.app.viewer.page import Page, on_page_thread
 from casadi_ik.app.viewer.panel import (
     block,
     chart,
     legend,
+    motors_by_part,
     on_press,
     on_set,
-    parts_of,
     verdict_rows,
 )
 from casadi_ik.app.viewer.request import PageRequest, request_of
-from casadi_ik.app.viewer.viser_scene import DrawnRobot, Handles, Tips, cameras, light_lamp
+from casadi_ik.app.viewer.viser_scene import FingertipMarks, Handles, RobotView, add_lamp, cameras
 from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import InputError, LogError
 from casadi_ik.files.arrays import Array
@@ -34,61 +34,61 @@ from casadi_ik.logs.solve import OneSolve
 from casadi_ik.model.grasp import Contact, Grasp
 from casadi_ik.solve.verdict import ContactVerdict
 
-FRAMES = 20.0
-"""A second, while it plays."""
+FRAME_RATE = 20.0
+"""Frames per second during playback."""
 
 LEGEND = (
-    (palette.TARGET, "asked for"),
+    (palette.TARGET, "target"),
     (palette.MET, "within tolerance"),
-    (palette.MISSED, "out of it"),
+    (palette.MISSED, "out of tolerance"),
 )
 
 SPEEDS = {
-    "iteration": {"2 a second": 2.0, "10 a second": 10.0, "30 a second": 30.0},
-    "s": {"real time": 1.0, "half as fast": 0.5, "slow motion": 0.1},
+    "iteration": {"2 per second": 2.0, "10 per second": 10.0, "30 per second": 30.0},
+    "s": {"1x": 1.0, "0.5x": 0.5, "0.1x": 0.1},
 }
-"""What is played in a second, by the unit of time."""
+"""Playback speeds per second, by the unit of time."""
 
 
 @dataclass(frozen=True, eq=False)
-class Track:
-    """Where a robot is, time after time.
+class Playback:
+    """A motion of a robot.
 
     Attributes:
         robot: The robot.
-        label: What it is called.
-        times: (k,) increasing.
-        q: (k, n) [rad or m].
-        asked: Contacts that are shown.
+        label: Name of the motion.
+        times: (k,) Increasing times.
+        q: (k, n) Configurations [rad or m].
+        request: Contacts that are drawn.
     """
 
     robot: ArmHand
     label: str
     times: Array
     q: Array
-    asked: PageRequest
+    request: PageRequest
 
     unit = "s"
 
     def __len__(self) -> int:
         return len(self.q)
 
-    def at(self, time: float) -> int:
-        """The row of a time."""
+    def row_of(self, time: float) -> int:
+        """Return the row at a time."""
         return int(np.clip(np.searchsorted(self.times, time + 1e-9, "right") - 1, 0, len(self) - 1))
 
     @property
-    def eventful(self) -> list[float]:
-        """Times at which something happened."""
+    def event_times(self) -> list[float]:
+        """Times of events."""
         return []
 
     def verdicts(self, row: int) -> dict[str, ContactVerdict]:
-        """By finger how far its contact is off."""
+        """Return the verdicts of contacts by finger."""
         del row
         return {}
 
-    def told(self, row: int, time: float) -> str:
-        """What is so now, in words."""
+    def summary_html(self, row: int, time: float) -> str:
+        """Return the current state in words."""
         del time
         return block(
             f'<b>{html.escape(self.label)}</b> · <span class="ik-iteration">'
@@ -96,31 +96,31 @@ class Track:
         )
 
     def charts(self, row: int) -> str:
-        """Actuators and their velocities over time."""
+        """Return charts of actuator positions and velocities over time."""
         motors = self.robot.description.actuators
-        found = ""
-        for unit, scale, shown in (("rad", np.rad2deg(1.0), "°"), ("m", 1e3, "mm")):
-            for part, places in parts_of(self.robot.description).items():
-                chosen = [i for i in places if motors[i].unit == unit]
-                for what, values in (("", self.q), ("/s", self.velocity)):
-                    lines = {motors[i].name: scale * values[:, i] for i in chosen}
-                    title = f"{part} [{shown}{what}]"
+        content = ""
+        for unit, scale, unit_text in (("rad", np.rad2deg(1.0), "°"), ("m", 1e3, "mm")):
+            for part, indices in motors_by_part(self.robot.description).items():
+                motor_indices = [i for i in indices if motors[i].unit == unit]
+                for suffix, values in (("", self.q), ("/s", self.velocity)):
+                    lines = {motors[i].name: scale * values[:, i] for i in motor_indices}
+                    title = f"{part} [{unit_text}{suffix}]"
                     if lines and len(self) > 1:
-                        found += chart(title, self.times, lines, row, linear=True)
-        return found
+                        content += chart(title, self.times, lines, row, linear=True)
+        return content
 
     @cached_property
     def velocity(self) -> Array:
-        """(k, n) [rad/s or m/s]."""
+        """(k, n) Velocities [rad/s or m/s]."""
         return np.gradient(self.q, self.times, axis=0) if len(self) > 1 else 0 * self.q
 
 
 @dataclass(frozen=True, eq=False)
-class SolveTrack(Track):
-    """A solve, iteration by iteration.
+class SolvePlayback(Playback):
+    """A logged solve, iteration by iteration.
 
     Attributes:
-        solve: As the log has it.
+        solve: The logged solve.
     """
 
     solve: OneSolve
@@ -128,284 +128,311 @@ class SolveTrack(Track):
     unit = "iteration"
 
     @property
-    def eventful(self) -> list[float]:
-        """Iterations in which something happened."""
-        return sorted({one.iteration + 1.0 for one in self.solve.events})
+    def event_times(self) -> list[float]:
+        """Iterations with events."""
+        return sorted({event.iteration + 1.0 for event in self.solve.events})
 
     def verdicts(self, row: int) -> dict[str, ContactVerdict]:
-        """By finger how far its contact is off in an iteration."""
-        found: dict[str, ContactVerdict] = {}
-        for i, (finger, bound) in enumerate(
+        """Return the verdicts of contacts by finger in an iteration."""
+        verdicts: dict[str, ContactVerdict] = {}
+        for i, (finger, tolerance) in enumerate(
             zip(self.solve.fingers, self.solve.tolerances, strict=True)
         ):
-            p, a = (float(one[row, i]) for one in self.errors)
-            off = p > bound.position or a > bound.angle
-            found[finger] = ContactVerdict(p, a, not off, bound)
-        return found
+            p, a = (float(errors[row, i]) for errors in self.errors)
+            is_missed = p > tolerance.position or a > tolerance.angle
+            verdicts[finger] = ContactVerdict(p, a, not is_missed, tolerance)
+        return verdicts
 
     @cached_property
     def errors(self) -> tuple[Array, Array]:
-        """(k, f) distances [m] and angles [rad]; where a step has none of its own, those of q."""
+        """(k, f) Distances [m] and angles [rad]; computed from q where the log has none."""
         solve = self.solve
         targets = np.broadcast_arrays(
             solve.target_points, solve.target_normals, np.zeros((len(self), 1, 1))
         )[:2]
-        reached = self.robot.errors(self.q, *targets)
+        computed = self.robot.errors(self.q, *targets)
         recorded = solve.columns("position_error"), solve.columns("angle_error")
         position, angle = (
-            np.where(np.isfinite(ours), ours, theirs)
-            for ours, theirs in zip(recorded, reached, strict=True)
+            np.where(np.isfinite(recorded_values), recorded_values, computed_values)
+            for recorded_values, computed_values in zip(recorded, computed, strict=True)
         )
         return position, angle
 
     @property
     def singular_values(self) -> dict[str, Array]:
-        """(k,) by Jacobian; NaN where not computed."""
-        found: dict[str, Array] = {}
+        """(k,) Smallest singular values by Jacobian; NaN where they were not computed."""
+        values: dict[str, Array] = {}
         for name in self.solve.layout.names:
             if name.startswith("sigma_"):
                 columns = self.solve.columns(name)
-                short = plain_name(name.removeprefix("sigma_"))
+                label = plain_name(name.removeprefix("sigma_"))
                 for i in range(columns.shape[1]):
-                    of = f" {self.solve.name_of(name, i)}" if columns.shape[1] > 1 else ""
-                    found[f"{short}{of}"] = columns[:, i]
-        return found
+                    suffix = f" {self.solve.name_of(name, i)}" if columns.shape[1] > 1 else ""
+                    values[f"{label}{suffix}"] = columns[:, i]
+        return values
 
-    def told(self, row: int, time: float) -> str:
-        """Iteration, phase, errors and events in words."""
+    def summary_html(self, row: int, time: float) -> str:
+        """Return iteration, phase, errors and events in words."""
         solve = self.solve
-        stretch = next(one for one in solve.stretches if one.first <= row <= one.last)
-        phase = plain_name(stretch.phase) or "one phase"
+        span = next(span for span in solve.stretches if span.first <= row <= span.last)
+        phase = plain_name(span.phase) or "one phase"
         color = palette.MET if solve.success else palette.MISSED
-        last = row == len(self) - 1
-        end = f'<b style="color:{color}">{solve.status.replace("_", " ")}</b>' if last else ""
-        before = round(time - self.times[row])
-        ended = f" (ended {before} before)" if before > 0 else ""
-        head = (
+        is_last = row == len(self) - 1
+        status = f'<b style="color:{color}">{solve.status.replace("_", " ")}</b>' if is_last else ""
+        iterations_since_end = round(time - self.times[row])
+        ended_text = f" (ended {iterations_since_end} before)" if iterations_since_end > 0 else ""
+        header = (
             f'<div style="display:flex;justify-content:space-between"><b>{self.label}</b>'
-            f'{end}</div><div class="ik-iteration">iteration <b>{row + 1}</b> of {len(self)}'
-            f"{ended} · {html.escape(phase)}</div>"
+            f'{status}</div><div class="ik-iteration">iteration <b>{row + 1}</b> of {len(self)}'
+            f"{ended_text} · {html.escape(phase)}</div>"
         )
-        here = [told(one) for one in solve.events if one.iteration == row]
-        # As high as three lines, so that what is below stays where it is.
-        events = "".join(f"<li>{html.escape(line)}</li>" for line in here)
+        event_texts = [told(event) for event in solve.events if event.iteration == row]
+        # The list always has the height of three lines, so that the charts do not move.
+        events = "".join(f"<li>{html.escape(line)}</li>" for line in event_texts)
         style = "margin:0.2em 0;padding-left:1.1em;height:4.5em;overflow:auto"
-        return block(f'{head}{verdict_rows(self.verdicts(row))}<ul style="{style}">{events}</ul>')
+        return block(f'{header}{verdict_rows(self.verdicts(row))}<ul style="{style}">{events}</ul>')
 
     def charts(self, row: int) -> str:
-        """Errors and singular values over the iterations."""
+        """Return charts of errors and singular values over the iterations."""
         solve, times = self.solve, self.times
-        names = dict.fromkeys(stretch.phase for stretch in solve.stretches)
-        shades = {name: palette.PHASES[k % len(palette.PHASES)] for k, name in enumerate(names)}
-        marked = [one for one in solve.events if one.kind in EVENT_COLORS]
-        marks = [(one.first + 0.5, one.last + 1.5, shades[one.phase]) for one in solve.stretches]
-        marks += [(one.iteration + 1, one.iteration + 1, EVENT_COLORS[one.kind]) for one in marked]
-        position, angle = self.errors
-        bound, of = solve.tolerances[0], f" · {solve.method}"
-        far = {name: 1e3 * position[:, k] for k, name in enumerate(solve.fingers)}
-        turned = {name: np.rad2deg(angle[:, k]) for k, name in enumerate(solve.fingers)}
-        widest = float(np.rad2deg(bound.angle))
-        found = [
-            chart(
-                f"distance to the contact [mm]{of}", times, far, row, marks, 1e3 * bound.position
-            ),
-            chart(f"angle to the normal [°]{of}", times, turned, row, marks, widest),
-            chart(f"smallest singular values{of}", times, self.singular_values, row, marks),
+        phases = dict.fromkeys(span.phase for span in solve.stretches)
+        color_of_phase = {
+            name: palette.PHASE_COLORS[k % len(palette.PHASE_COLORS)]
+            for k, name in enumerate(phases)
+        }
+        events = [event for event in solve.events if event.kind in EVENT_COLORS]
+        bands = [
+            (span.first + 0.5, span.last + 1.5, color_of_phase[span.phase])
+            for span in solve.stretches
         ]
-        words = [(shades[name], plain_name(name)) for name in shades if name]
-        kinds = sorted({one.kind for one in marked})
-        words += [(EVENT_COLORS[kind], plain_name(kind.lower())) for kind in kinds]
-        return "".join(found) + (legend(words) if words else "")
+        bands += [
+            (event.iteration + 1, event.iteration + 1, EVENT_COLORS[event.kind]) for event in events
+        ]
+        position, angle = self.errors
+        tolerance, method_suffix = solve.tolerances[0], f" · {solve.method}"
+        distances = {name: 1e3 * position[:, k] for k, name in enumerate(solve.fingers)}
+        angles = {name: np.rad2deg(angle[:, k]) for k, name in enumerate(solve.fingers)}
+        angle_tolerance = float(np.rad2deg(tolerance.angle))
+        charts = [
+            chart(
+                f"distance to the contact [mm]{method_suffix}",
+                times,
+                distances,
+                row,
+                bands,
+                1e3 * tolerance.position,
+            ),
+            chart(
+                f"angle to the normal [°]{method_suffix}",
+                times,
+                angles,
+                row,
+                bands,
+                angle_tolerance,
+            ),
+            chart(
+                f"smallest singular values{method_suffix}", times, self.singular_values, row, bands
+            ),
+        ]
+        entries = [(color_of_phase[name], plain_name(name)) for name in color_of_phase if name]
+        kinds = sorted({event.kind for event in events})
+        entries += [(EVENT_COLORS[kind], plain_name(kind.lower())) for kind in kinds]
+        return "".join(charts) + (legend(entries) if entries else "")
 
 
-def track_of(solve: OneSolve, robot: ArmHand) -> SolveTrack:
-    """A solve, ready to be played.
+def solve_playback(solve: OneSolve, robot: ArmHand) -> SolvePlayback:
+    """Return the playback of a logged solve.
 
     Raises:
-        LogError: The log has kept no iterations of it.
+        LogError: The log has no iterations of the solve.
     """
     if len(solve.rows) == 0:
-        raise LogError(
-            f"solve {solve.solve_id + 1} of {solve.method}: the log kept no iterations of it"
-        )
+        raise LogError(f"solve {solve.solve_id + 1} of {solve.method}: the log has no iterations")
     q = solve.columns("q")
-    finite = np.asarray(np.isfinite(q).all(axis=1))
-    q = np.where(finite[:, None], q, robot.home)
+    is_finite = np.asarray(np.isfinite(q).all(axis=1))
+    q = np.where(is_finite[:, None], q, robot.home)
     contacts: dict[str, Contact] = {}
     for i, finger in enumerate(solve.fingers):
         point, normal = solve.target_points[i], solve.target_normals[i]
-        faced = np.isfinite(normal).all()
-        more = {
+        has_normal = np.isfinite(normal).all()
+        constraints = {
             name.removesuffix("s"): rows[i]
             for name, rows in solve.target_more.items()
             if np.isfinite(rows[i]).all()
         }
         if np.isfinite(point).all():
-            contacts[finger] = Contact(point, normal if faced else None, **more)
-        elif faced:
+            contacts[finger] = Contact(point, normal if has_normal else None, **constraints)
+        elif has_normal:
             contacts[finger] = Contact(direction=normal)
-    asked = request_of(robot, Grasp(contacts) if contacts else None, q[0])
+    request = request_of(robot, Grasp(contacts) if contacts else None, q[0])
     label = f"{solve.method} · solve {solve.solve_id + 1}"
-    return SolveTrack(robot, label, np.arange(1.0, len(q) + 1.0), q, asked, solve)
+    return SolvePlayback(robot, label, np.arange(1.0, len(q) + 1.0), q, request, solve)
 
 
-def motion_track(
+def motion_playback(
     robot: ArmHand, times: Array, q: Array, label: str = "", grasp: Grasp | None = None
-) -> Track:
-    """A motion, ready to be played.
+) -> Playback:
+    """Return the playback of a motion.
 
     Raises:
-        InputError: Times and positions do not fit the robot or each other.
+        InputError: Times and configurations do not fit the robot or each other.
     """
     q, times = robot.configuration(np.atleast_2d(q)), np.asarray(times, float)
     if times.shape != (len(q),) or not len(q) or not (np.diff(times) > 0).all():
-        raise InputError(f"times: found shape {times.shape}, expected ({len(q)},) that increase")
-    asked = PageRequest({}) if grasp is None else request_of(robot, grasp, q[-1])
-    return Track(robot, label or robot.name, times, q, asked)
+        raise InputError(f"times: found shape {times.shape}, expected ({len(q)},), increasing")
+    request = PageRequest({}) if grasp is None else request_of(robot, grasp, q[-1])
+    return Playback(robot, label or robot.name, times, q, request)
 
 
 class PlayPage(Page):
-    """Tracks that play.
+    """A page that plays one or two playbacks.
 
     Attributes:
-        tracks: One or two.
-        now: The time that is shown; a shorter track stays at its last.
+        playbacks: One or two playbacks.
+        time_shown: Current time; a shorter playback stays at its end.
     """
 
     def __init__(
         self,
         server: Server,
-        tracks: Sequence[Track],
+        playbacks: Sequence[Playback],
         scene: Scene | None = None,
         dark: bool = False,
     ) -> None:
-        """Draw everything.
+        """Draw everything and start the threads.
 
         Args:
-            server: What serves it.
-            tracks: One or two.
-            scene: What stood about each robot; None: nothing.
-            dark: Whether the page is dark.
+            server: Server of the page.
+            playbacks: One or two playbacks.
+            scene: Obstacles that are drawn around each robot; None: none.
+            dark: Use the dark theme.
         """
-        super().__init__(server, _title(tracks), lowest(tracks[0].robot, scene), dark)
-        self.tracks, self.now, self._scene = tuple(tracks), 0.0, scene
-        first = tracks[0]
-        self._camera = cameras(first.robot, first.q[len(first) // 2])["Robot"]
-        wider = 1.0 if len(tracks) == 1 else 1.65
-        replace(self._camera, radius=wider * self._camera.radius).show(server)
-        light_lamp(server, self._camera)
-        self._shown = [self._add(i, track) for i, track in enumerate(tracks)]
-        self.start = float(first.times[0])
-        self.end = max(float(track.times[-1]) for track in tracks)
-        self._playing, self._over = threading.Event(), threading.Event()
+        super().__init__(server, _title(playbacks), ground_height(playbacks[0].robot, scene), dark)
+        self.playbacks, self.time_shown, self._scene = tuple(playbacks), 0.0, scene
+        playback = playbacks[0]
+        self._camera = cameras(playback.robot, playback.q[len(playback) // 2])["Robot"]
+        scale = 1.0 if len(playbacks) == 1 else 1.65
+        replace(self._camera, radius=scale * self._camera.radius).show(server)
+        add_lamp(server, self._camera)
+        self._views = [self._add(i, playback) for i, playback in enumerate(playbacks)]
+        self.start_time = float(playback.times[0])
+        self.end_time = max(float(playback.times[-1]) for playback in playbacks)
+        self._play_event, self._stop_event = threading.Event(), threading.Event()
         self._add_panel()
-        self.begin()
+        self.start()
         self._player = threading.Thread(target=self._play, name="casadi-ik play", daemon=True)
         self._player.start()
-        self.show(self.start)
+        self.show(self.start_time)
 
-    @in_turn
+    @on_page_thread
     def show(self, time: float) -> None:
         """Show an iteration or a time."""
-        self.now = min(max(time, self.start), self.end)
+        self.time_shown = min(max(time, self.start_time), self.end_time)
 
-    def play(self, on: bool) -> None:
-        """Play on from here, from the beginning if this is the end; or stop."""
-        if on and self.now >= self.end:
-            self.show(self.start)
+    def play(self, is_playing: bool) -> None:
+        """Play from the current time, or from the start if this is the end; or stop."""
+        if is_playing and self.time_shown >= self.end_time:
+            self.show(self.start_time)
             self.work.settle()
-        (self._playing.set if on else self._playing.clear)()
-        self._button.label = "Stop" if on else "Play"
+        (self._play_event.set if is_playing else self._play_event.clear)()
+        self._button.label = "Stop" if is_playing else "Play"
 
-    def jump(self, ahead: bool) -> None:
-        """To the next time at which something happened, or the one before."""
-        places = sorted({one for track in self.tracks for one in track.eventful})
-        found = [one for one in places if (one > self.now if ahead else one < self.now)]
-        if found:
-            self.show(found[0] if ahead else found[-1])
+    def jump(self, forward: bool) -> None:
+        """Show the next time with an event, or the previous one."""
+        event_times = sorted({time for playback in self.playbacks for time in playback.event_times})
+        if forward:
+            event_times = [time for time in event_times if time > self.time_shown]
+        else:
+            event_times = [time for time in event_times if time < self.time_shown]
+        if event_times:
+            self.show(event_times[0] if forward else event_times[-1])
 
     def stop(self) -> None:
-        """End its threads."""
-        self._over.set()
-        self._playing.set()
+        """Stop the threads."""
+        self._stop_event.set()
+        self._play_event.set()
         self._player.join(10.0)
         super().stop()
 
     def refresh(self) -> None:
-        """Draw the time that is shown."""
-        told, charts = [], []
+        """Draw the current time."""
+        summaries, charts = [], []
         with self.server.atomic():
-            for track, (drawn, tips) in zip(self.tracks, self._shown, strict=True):
-                row = track.at(self.now)
-                drawn.place(track.q[row])
-                frames = track.robot.contact_frames(track.q[row])
-                by_finger = dict(zip(track.robot.fingers, frames, strict=True))
-                tips.place(track.asked, by_finger, track.verdicts(row))
-                told.append(track.told(row, self.now))
-                charts.append(track.charts(row))
-            self._told.content, self._charts.content = "".join(told), "".join(charts)
-            if self._slider.value != self.now:
-                self._slider.value = self.now
+            for playback, (drawn, tips) in zip(self.playbacks, self._views, strict=True):
+                row = playback.row_of(self.time_shown)
+                drawn.update(playback.q[row])
+                frames = playback.robot.contact_frames(playback.q[row])
+                by_finger = dict(zip(playback.robot.fingers, frames, strict=True))
+                tips.update(playback.request, by_finger, playback.verdicts(row))
+                summaries.append(playback.summary_html(row, self.time_shown))
+                charts.append(playback.charts(row))
+            self._summary.content, self._charts.content = "".join(summaries), "".join(charts)
+            if self._slider.value != self.time_shown:
+                self._slider.value = self.time_shown
         self.server.flush()
 
-    def _add(self, number: int, track: Track) -> tuple[DrawnRobot, Tips]:
+    def _add(self, number: int, playback: Playback) -> tuple[RobotView, FingertipMarks]:
         name = f"/track_{number}"
         frame = self.server.scene.add_frame(name, show_axes=False)
-        frame.position = self._aside(number)
-        drawn = DrawnRobot(self.server, track.robot, f"{name}/robot")
-        Handles(self.server, replace(track.asked, scene=self._scene), None, name)
-        if len(self.tracks) > 1:
+        frame.position = self._lateral_offset(number)
+        drawn = RobotView(self.server, playback.robot, f"{name}/robot")
+        Handles(self.server, replace(playback.request, scene=self._scene), None, name)
+        if len(self.playbacks) > 1:
             self.server.scene.add_label(
-                f"{name}/label", track.label, position=(0.0, 0.0, 0.02), anchor="top-center"
+                f"{name}/label", playback.label, position=(0.0, 0.0, 0.02), anchor="top-center"
             )
-        return drawn, Tips(self.server, track.asked, name)
+        return drawn, FingertipMarks(self.server, playback.request, name)
 
-    def _aside(self, number: int) -> Array:
-        """Where a robot stands."""
-        right = np.array([-self._camera.view[1], self._camera.view[0], 0.0])
-        away = 1.5 * self._camera.radius * (number - (len(self.tracks) - 1) / 2)
-        return away * right / np.linalg.norm(right)
+    def _lateral_offset(self, number: int) -> Array:
+        """Return the position of a robot next to the other one."""
+        direction = np.array([-self._camera.view[1], self._camera.view[0], 0.0])
+        offset = 1.5 * self._camera.radius * (number - (len(self.playbacks) - 1) / 2)
+        return offset * direction / np.linalg.norm(direction)
 
     def _add_panel(self) -> None:
-        gui, unit = self.server.gui, self.tracks[0].unit
-        solves = unit == "iteration"
-        label, step = ("Iteration", 1.0) if solves else ("Time [s]", 0.01)
+        gui, unit = self.server.gui, self.playbacks[0].unit
+        is_solve = unit == "iteration"
+        label, step = ("Iteration", 1.0) if is_solve else ("Time [s]", 0.01)
         self._slider = gui.add_slider(
-            label, self.start, max(self.end, self.start + step), step, self.start
+            label,
+            self.start_time,
+            max(self.end_time, self.start_time + step),
+            step,
+            self.start_time,
         )
         self._button = gui.add_button("Play", icon=None)
-        if solves:
+        if is_solve:
             jumps = gui.add_button_group("Events", ("previous", "next"))
             on_press(jumps, lambda _: self.jump(jumps.value == "next"))
         speeds: Mapping[str, float] = SPEEDS[unit]
-        self._speed = gui.add_dropdown("Speed", tuple(speeds), initial_value=list(speeds)[solves])
-        self._told, self._charts = gui.add_html(""), gui.add_html("")
-        if any(track.asked.held for track in self.tracks):
+        self._speed = gui.add_dropdown("Speed", tuple(speeds), initial_value=list(speeds)[is_solve])
+        self._summary, self._charts = gui.add_html(""), gui.add_html("")
+        if any(playback.request.contacts for playback in self.playbacks):
             gui.add_html(legend(LEGEND))
-        self.add_dark()
+        self.add_theme_switch()
         on_set(self._slider, lambda time: self.show(float(time)))
-        on_press(self._button, lambda _: self.play(not self._playing.is_set()))
+        on_press(self._button, lambda _: self.play(not self._play_event.is_set()))
 
     def _play(self) -> None:
-        speeds: Mapping[str, float] = SPEEDS[self.tracks[0].unit]
-        solves = self.tracks[0].unit == "iteration"
+        speeds: Mapping[str, float] = SPEEDS[self.playbacks[0].unit]
+        is_solve = self.playbacks[0].unit == "iteration"
         while True:
             speed = speeds.get(str(self._speed.value), 1.0)
-            rate = min(speed, FRAMES) if solves else FRAMES
-            if self._over.wait(1.0 / rate):
+            rate = min(speed, FRAME_RATE) if is_solve else FRAME_RATE
+            if self._stop_event.wait(1.0 / rate):
                 return
-            self._playing.wait()
-            if self._over.is_set():
+            self._play_event.wait()
+            if self._stop_event.is_set():
                 return
-            if self.now >= self.end:
+            if self.time_shown >= self.end_time:
                 self.play(False)
             else:
-                self.show(min(self.now + speed / rate, self.end))
+                self.show(min(self.time_shown + speed / rate, self.end_time))
                 self.work.settle()
 
 
-def _title(tracks: Sequence[Track]) -> str:
-    """Of the panel: methods alone where they tell the solves apart, else it would be cut off."""
-    methods = [track.label.partition(" · ")[0] for track in tracks]
-    apart = len(set(methods)) == len(methods) > 1
-    return " / ".join(methods if apart else [track.label for track in tracks])
+def _title(playbacks: Sequence[Playback]) -> str:
+    """Return the title: the methods alone if they differ, because long titles are cut off."""
+    methods = [playback.label.partition(" · ")[0] for playback in playbacks]
+    are_distinct = len(set(methods)) == len(methods) > 1
+    return " / ".join(methods if are_distinct else [playback.label for playback in playbacks])

@@ -1,7 +1,4 @@
-"""Requests of a page, and how they are answered: solved, and told why not where they cannot be.
-
-A request is contacts that hang on controls, an object, a scene and settings.
-"""
+"""Requests of a page (contacts with handles, object, scene, settings) and their solution."""
 
 from __future__ import annotations
 
@@ -12,8 +9,8 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from casadi_ik.api import METHODS, Solver
-from casadi_ik.app.drawing.drawables import with_object
-from casadi_ik.app.drawing.surfaces import facing
+from casadi_ik.app.drawing.drawables import scene_with_object
+from casadi_ik.app.drawing.surfaces import pose_with_x_axis
 from casadi_ik.collision.clearance import Closest, closest_points
 from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import CasadiIKError, UnsupportedError
@@ -27,25 +24,25 @@ from casadi_ik.solve.status import Status
 from casadi_ik.solve.verdict import ContactVerdict, judge
 
 OBJECT = "object"
-"""What the object is called among the things that can be moved."""
+"""Name of the object among the draggable items."""
 
 NOT_MET = "NOT MET"
-"""Said of a configuration that has not all it is asked for."""
+"""Headline when a contact or limit is violated."""
 
-TOUCHES = "Contacts and limits are met, but something collides; looking for a way out."
-MISSES = "The nearest that was found; why follows when the mouse rests."
-"""Said until it is known why nothing answers."""
+COLLISION_HINT = "Contacts and limits are met, but something collides; searching for a remedy."
+NEAREST_HINT = "Nearest configuration; the diagnosis follows when the mouse rests."
+"""Explanations that are shown until the diagnosis is available."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How it is solved.
+    """Solver settings of a page.
 
     Attributes:
         method: One of `METHODS`.
-        tolerance: When a contact counts as reached.
+        tolerance: Tolerance of contacts.
         limits: "enforce" or "ignore".
-        prefer: Which of several solutions; "q0": the one nearest to what is shown.
+        prefer: Preference among solutions; "q0": nearest to the configuration shown.
     """
 
     method: str = METHODS[0]
@@ -55,46 +52,46 @@ class Settings:
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
-    """A contact that moves with a control.
+class DraggableContact:
+    """A contact attached to a drag handle.
 
     Attributes:
-        contact: In the control's frame.
-        control: (4, 4) where the control is, base frame.
-        used: Whether the contact is asked for.
-        normal: Whether its normal is.
+        contact: Contact in the frame of the handle.
+        control: (4, 4) Pose of the handle in the base frame.
+        is_used: The contact is part of the grasp.
+        uses_normal: The normal of the contact is constrained.
     """
 
     contact: Contact
     control: Array
-    used: bool = True
-    normal: bool = True
+    is_used: bool = True
+    uses_normal: bool = True
 
     @cached_property
-    def placed(self) -> Contact:
-        """The contact in the base frame, with what is asked of it."""
-        found = self.contact.at(self.control)
-        if self.normal or not np.isfinite(found.point).all():
-            return found
-        places = {name: getattr(found, name) for name in POINT_CONSTRAINTS}
-        return Contact(found.point, tolerance=found.tolerance, **places)
+    def in_base(self) -> Contact:
+        """Contact in the base frame, without its normal unless that is constrained."""
+        contact = self.contact.at(self.control)
+        if self.uses_normal or not np.isfinite(contact.point).all():
+            return contact
+        poses = {name: getattr(contact, name) for name in POINT_CONSTRAINTS}
+        return Contact(contact.point, tolerance=contact.tolerance, **poses)
 
 
 @dataclass(frozen=True, eq=False)
 class PageRequest:
-    """A question; moved things give another one.
+    """An immutable request; a drag produces a new one.
 
     Attributes:
-        held: Contact by finger, of all fingers of the robot that may have one.
-        name: What the grasp is called.
+        contacts: Contacts by finger, for all fingers of the robot.
+        name: Name of the grasp.
         robot: Name or path of the robot.
-        object: Name of the object that is grasped; "" if there is none.
-        object_pose: (4, 4) where it is; None if there is none.
-        scene: What stands about the robot; None: nothing is checked.
-        settings: How it is solved.
+        object: Name of the grasped object; "" if there is none.
+        object_pose: (4, 4) Pose of the object; None if there is none.
+        scene: Obstacles; None: collisions are not checked.
+        settings: Solver settings.
     """
 
-    held: Mapping[str, Held]
+    contacts: Mapping[str, DraggableContact]
     name: str = ""
     robot: str = ""
     object: str = ""
@@ -104,54 +101,57 @@ class PageRequest:
 
     @cached_property
     def grasp(self) -> Grasp:
-        """The grasp; at least one finger is used."""
-        contacts = {name: one.placed for name, one in self.held.items() if one.used}
-        return Grasp(contacts, self.robot, self.name, self.object, self.object_pose)
+        """Grasp of the fingers in use, at least one."""
+        used_contacts = {
+            name: contact.in_base for name, contact in self.contacts.items() if contact.is_used
+        }
+        return Grasp(used_contacts, self.robot, self.name, self.object, self.object_pose)
 
     @property
-    def places(self) -> dict[str, Array]:
-        """(4, 4) poses of all that can be moved, by name: contacts, the object, items."""
-        found = {finger: one.control for finger, one in self.held.items()}
+    def poses(self) -> dict[str, Array]:
+        """(4, 4) Poses by name of contacts, the object and scene items."""
+        poses = {finger: contact.control for finger, contact in self.contacts.items()}
         if self.object_pose is not None:
-            found[OBJECT] = self.object_pose
+            poses[OBJECT] = self.object_pose
         items = {} if self.scene is None else self.scene.items
-        return {name: item.pose for name, item in items.items()} | found
+        return {name: item.pose for name, item in items.items()} | poses
 
-    def moved(self, name: str, pose: Array) -> PageRequest:
-        """One of them at another (4, 4) pose; the object takes all contacts along.
+    def with_pose(self, name: str, pose: Array) -> PageRequest:
+        """Return the request with one item at a (4, 4) pose; contacts move with the object.
 
         Raises:
-            CasadiIKError: There is no such thing.
+            CasadiIKError: The item does not exist.
         """
-        if name in self.held:
-            return self._held(name, replace(self.held[name], control=pose))
+        if name in self.contacts:
+            return self._with_contact(name, replace(self.contacts[name], control=pose))
         if name != OBJECT or self.object_pose is None:
             return replace(self, scene=(self.scene or Scene()).moved(name, pose))
-        step = pose @ inverse(self.object_pose)
-        held = {
-            finger: replace(one, control=_rigid(step @ one.control))
-            for finger, one in self.held.items()
+        displacement = pose @ inverse(self.object_pose)
+        contacts = {
+            finger: replace(contact, control=_orthonormalised(displacement @ contact.control))
+            for finger, contact in self.contacts.items()
         }
-        return replace(self, held=held, object_pose=pose)
+        return replace(self, contacts=contacts, object_pose=pose)
 
     def with_point(self, finger: str, point: Array) -> PageRequest:
-        """A contact moved to a point (3,) [m], facing as before."""
-        pose = self.held[finger].control.copy()
+        """Return the request with a contact translated to a point (3,) [m]."""
+        pose = self.contacts[finger].control.copy()
         pose[:3, 3] = point
-        return self.moved(finger, pose)
+        return self.with_pose(finger, pose)
 
     def with_normal(self, finger: str, normal: Array) -> PageRequest:
-        """A contact turned so that its control's x axis, its normal, faces another way (3,)."""
-        pose = self.held[finger].control
-        return self.moved(finger, facing(pose[:3, 3], normal, pose[:3, :3]))
+        """Return the request with a contact rotated to a normal (3,), the x axis of its handle."""
+        pose = self.contacts[finger].control
+        return self.with_pose(finger, pose_with_x_axis(pose[:3, 3], normal, pose[:3, :3]))
 
-    def with_use(self, finger: str, used: bool, normal: bool) -> PageRequest:
-        """A finger taken in or left free; as it is if it is the last one that is used."""
-        changed = self._held(finger, replace(self.held[finger], used=used, normal=normal))
-        return changed if any(one.used for one in changed.held.values()) else self
+    def with_use(self, finger: str, is_used: bool, uses_normal: bool) -> PageRequest:
+        """Return the request with a finger used or freed; one finger stays in use."""
+        contact = replace(self.contacts[finger], is_used=is_used, uses_normal=uses_normal)
+        request = self._with_contact(finger, contact)
+        return request if any(contact.is_used for contact in request.contacts.values()) else self
 
-    def _held(self, finger: str, one: Held) -> PageRequest:
-        return replace(self, held={**self.held, finger: one})
+    def _with_contact(self, finger: str, contact: DraggableContact) -> PageRequest:
+        return replace(self, contacts={**self.contacts, finger: contact})
 
 
 def request_of(
@@ -161,179 +161,187 @@ def request_of(
     scene: Scene | None = None,
     settings: Settings | None = None,
 ) -> PageRequest:
-    """The first question of a page.
+    """Return the initial request of a page.
 
     Args:
         robot: The robot.
-        grasp: What is asked; None: the contacts that are reached at q.
-        q: (n,) where the robot is [rad or m]; None: at home.
-        scene: What stands about.
-        settings: How it is solved.
+        grasp: The grasp; None: the contacts of the robot at q.
+        q: (n,) Configuration [rad or m]; None: home.
+        scene: Obstacles.
+        settings: Solver settings.
 
     Raises:
-        InputError: The grasp has a finger that the robot has not.
+        InputError: The grasp names a finger that the robot does not have.
     """
     frames = robot.contact_frames(robot.configuration(q))
-    given = {} if grasp is None else dict(grasp.contacts)
+    target_contacts = {} if grasp is None else dict(grasp.contacts)
     if grasp is not None:
         grasp.arrays(robot.fingers)
-    held: dict[str, Held] = {}
+    contacts: dict[str, DraggableContact] = {}
     for finger, frame in zip(robot.fingers, frames, strict=True):
-        contact = given.get(finger)
-        used = contact is not None or grasp is None
+        contact = target_contacts.get(finger)
+        is_used = contact is not None or grasp is None
         contact = contact or Contact(frame[:3, 3], frame[:3, 0])
-        place = contact.point if np.isfinite(contact.point).all() else frame[:3, 3]
-        ways = (contact.normal, contact.ball, frame[:3, 0])
-        normal = next(way for way in ways if way is not None)
-        control = facing(place, normal, frame[:3, :3])
+        position = contact.point if np.isfinite(contact.point).all() else frame[:3, 3]
+        candidate_normals = (contact.normal, contact.ball, frame[:3, 0])
+        normal = next(candidate for candidate in candidate_normals if candidate is not None)
+        control = pose_with_x_axis(position, normal, frame[:3, :3])
         if contact.normal is None and all(
             getattr(contact, name) is None for name in POINT_CONSTRAINTS
         ):
-            # Its normal is at hand if it is wanted after all.
-            whole = Contact(place, normal, contact.tolerance)
-            held[finger] = Held(whole.at(inverse(control)), control, used, normal=False)
+            # The normal is stored so that it can be switched on later.
+            full_contact = Contact(position, normal, contact.tolerance)
+            local = full_contact.at(inverse(control))
+            contacts[finger] = DraggableContact(local, control, is_used, uses_normal=False)
         else:
-            held[finger] = Held(contact.at(inverse(control)), control, used)
-    found = PageRequest(held, robot=robot.name, scene=scene, settings=settings or Settings())
+            contacts[finger] = DraggableContact(contact.at(inverse(control)), control, is_used)
+    request = PageRequest(contacts, robot=robot.name, scene=scene, settings=settings or Settings())
     if grasp is None:
-        return found
-    return replace(found, name=grasp.name, object=grasp.object, object_pose=grasp.object_pose)
+        return request
+    return replace(request, name=grasp.name, object=grasp.object, object_pose=grasp.object_pose)
 
 
-def _rigid(pose: Array) -> Array:
-    """A pose without what rounding has added to its rotation over many steps."""
+def _orthonormalised(pose: Array) -> Array:
+    """Remove from a pose the skew that rounding accumulates over many drags."""
     u, _, vt = np.linalg.svd(pose[:3, :3])
     pose[:3, :3] = u @ vt
     return pose
 
 
-# Answers.
+# Results.
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
-    """What is shown.
+class SolveResult:
+    """A configuration to show, and its verdict.
 
     Attributes:
-        q: (n,) where the robot is: the solution, or what is nearest to one [rad or m].
-        success: Whether that is one.
-        headline: How it ended, in a word or two.
-        contacts: Verdict by finger, on q.
-        lines: Why not, and what would help; empty if it is solved.
-        clearance: Of q [m]; None where nothing is checked.
-        closest: The nearest pair's names and points; None where there is none.
-        seconds: The solve took.
-        how: Method, iterations and such in a line.
-        unexplained: Whether why not has to be found out yet.
-        checked: Whether collisions are checked: there is a scene.
+        q: (n,) The solution, or the nearest configuration [rad or m].
+        success: q solves the request.
+        headline: Status in one or two words.
+        verdicts: Verdict of q by finger.
+        reasons: Reasons for a failure and remedies; empty if the request is solved.
+        clearance: Clearance of q [m]; None if it was not computed.
+        closest: Names and nearest points of the closest pair of shapes, if there is one.
+        solve_time: Duration of the solve [s].
+        summary: Method, iterations and restarts in a line.
+        needs_diagnosis: The reasons for the failure are not known yet.
+        collision_checked: The request has a scene, so collisions are checked.
     """
 
     q: Array
     success: bool
     headline: str
-    contacts: dict[str, ContactVerdict]
-    lines: tuple[str, ...] = ()
+    verdicts: dict[str, ContactVerdict]
+    reasons: tuple[str, ...] = ()
     clearance: float | None = None
     closest: tuple[tuple[str, str], Closest] | None = None
-    seconds: float = 0.0
-    how: str = ""
-    unexplained: bool = False
-    checked: bool = True
+    solve_time: float = 0.0
+    summary: str = ""
+    needs_diagnosis: bool = False
+    collision_checked: bool = True
 
     @property
     def sentence(self) -> str:
-        """All that in one sentence."""
-        if self.lines:
-            return self.lines[0]
-        missed = [name for name, one in self.contacts.items() if not one.ok]
+        """Summary of the result in one sentence."""
+        if self.reasons:
+            return self.reasons[0]
+        missed = [name for name, verdict in self.verdicts.items() if not verdict.ok]
         if missed:
-            return f"{' and '.join(missed)} missed, or a joint is beyond a limit."
+            return f"{' and '.join(missed)} missed, or a joint limit is exceeded."
         if self.clearance is None:
             return "Every contact is reached" + (
-                "." if self.checked else "; collision not checked."
+                "." if self.collision_checked else "; collision not checked."
             )
-        word = "reached" if self.clearance >= 0 else "reached, but something collides"
-        return f"Every contact is {word}; clearance {1e3 * self.clearance:.1f} mm."
+        outcome = "reached" if self.clearance >= 0 else "reached, but something collides"
+        return f"Every contact is {outcome}; clearance {1e3 * self.clearance:.1f} mm."
 
 
-class Answerer:
-    """Solves what is asked about one robot; keeps its solvers."""
+class RequestSolver:
+    """A solver of requests for one robot, with a cache of solvers by settings and scene."""
 
     def __init__(self, robot: ArmHand) -> None:
-        """Take the robot."""
+        """Store the robot."""
         self.robot = robot
-        self._solver = lru_cache(maxsize=16)(self._built)
-        self._in_scene: tuple[Settings, Scene, Solver] | None = None
+        self._solver = lru_cache(maxsize=16)(self._new_solver)
+        self._scene_solver: tuple[Settings, Scene, Solver] | None = None
 
-    def solver(self, asked: PageRequest) -> Solver:
-        """The solver for a question; one in the scene of the last is that one with things moved.
+    def solver(self, request: PageRequest) -> Solver:
+        """Return the solver of a request; moved scene items are updated in the previous solver.
 
         Raises:
             CasadiIKError: The scene or the method does not fit the robot.
         """
-        settings, scene = asked.settings, asked.scene
+        settings, scene = request.settings, request.scene
         if scene is None:
             return self._solver(settings, None)
-        if self._in_scene is None or not _alike(self._in_scene, settings, scene):
+        if self._scene_solver is None or not _only_poses_differ(
+            self._scene_solver, settings, scene
+        ):
             solver = self._solver(settings, scene)
         else:
-            _, before, solver = self._in_scene
+            _, previous_scene, solver = self._scene_solver
             for name, item in scene.items.items():
-                if item is not before.items[name]:
+                if item is not previous_scene.items[name]:
                     solver = solver.moved(name, item.pose)
-        self._in_scene = settings, scene, solver
+        self._scene_solver = settings, scene, solver
         return solver
 
-    def solve(self, asked: PageRequest, q: Array, diagnose: bool = False) -> Answer:
-        """The answer nearest to q, or the preferred one, or the nearest to one that was found.
+    def solve(self, request: PageRequest, q: Array, diagnose: bool = False) -> SolveResult:
+        """Return the solution nearest to q or preferred, or else the nearest configuration.
 
-        Why there is none takes up to a second to find out: `explain` tells.
+        A diagnosis needs up to a second; `explain` adds it later.
 
         Raises:
-            CasadiIKError: The question is malformed.
+            CasadiIKError: The request is malformed.
         """
-        solution = self._preferred(asked, q, diagnose)
-        shown = solution.q
+        solution = self._solve_with_preference(request, q, diagnose)
+        q_shown = solution.q
         if solution.diagnosis is not None and solution.status is not Status.COLLISION:
-            shown = solution.diagnosis.q
-        if not np.isfinite(shown).all():
-            shown = q
-        words = f"{solution.method} · {counted(solution.iterations, 'iteration')}"
+            q_shown = solution.diagnosis.q
+        if not np.isfinite(q_shown).all():
+            q_shown = q
+        summary = f"{solution.method} · {count_text(solution.iterations, 'iteration')}"
         if solution.restarts:
-            words += f" · {counted(solution.restarts, 'restart')}"
-        missed = not (diagnose or solution.success or solution.status is Status.COLLISION)
+            summary += f" · {count_text(solution.restarts, 'restart')}"
+        has_violation = not (diagnose or solution.success or solution.status is Status.COLLISION)
         return replace(
-            self.judged(asked, shown),
+            self.check(request, q_shown),
             success=solution.success,
-            headline=NOT_MET if missed else solution.status.name.replace("_", " "),
-            lines=why_not(solution),
-            seconds=solution.time,
-            how=words,
-            unexplained=not (diagnose or solution.success),
+            headline=NOT_MET if has_violation else solution.status.name.replace("_", " "),
+            reasons=failure_reasons(solution),
+            solve_time=solution.time,
+            summary=summary,
+            needs_diagnosis=not (diagnose or solution.success),
         )
 
-    def explain(self, asked: PageRequest, q: Array) -> Answer:
-        """The same with why a grasp is not solved and what would help.
+    def explain(self, request: PageRequest, q: Array) -> SolveResult:
+        """Return the result with the reasons for a failure and possible remedies.
 
-        What is shown stays if nothing nearer is found: of several that are equally near, the arm
-        does not go to another when the mouse rests.
+        The configuration shown is kept unless the diagnosis finds a nearer one, so that the arm
+        does not switch between equally near configurations when the mouse rests.
 
         Raises:
-            CasadiIKError: The question is malformed.
+            CasadiIKError: The request is malformed.
         """
-        found, shown = self.solve(asked, q, diagnose=True), self.judged(asked, q)
-        if found.success or _missed(shown) > 1.02 * _missed(found):
-            return found
-        kept = {name: getattr(shown, name) for name in ("contacts", "clearance", "closest")}
-        return replace(found, q=q, **kept)
+        diagnosed, current = self.solve(request, q, diagnose=True), self.check(request, q)
+        if diagnosed.success or _worst_error(current) > 1.02 * _worst_error(diagnosed):
+            return diagnosed
+        return replace(
+            diagnosed,
+            q=q,
+            verdicts=current.verdicts,
+            clearance=current.clearance,
+            closest=current.closest,
+        )
 
-    def judged(self, asked: PageRequest, q: Array) -> Answer:
-        """How a configuration meets what is asked."""
-        tolerances = tolerances_by_finger(asked.settings.tolerance, self.robot.fingers)
-        enforced = asked.settings.limits == "enforce"
-        targets = Request(self.robot, tolerances, enforced).of_grasps([asked.grasp], None)
+    def check(self, request: PageRequest, q: Array) -> SolveResult:
+        """Return the verdict of a configuration without solving."""
+        tolerances = tolerances_by_finger(request.settings.tolerance, self.robot.fingers)
+        enforced = request.settings.limits == "enforce"
+        targets = Request(self.robot, tolerances, enforced).of_grasps([request.grasp], None)
         verdict = judge(self.robot, targets, q[None])
-        contacts = {
+        verdicts = {
             finger: ContactVerdict(
                 float(verdict.position_error[0, i]),
                 float(verdict.angle_error[0, i]),
@@ -342,85 +350,91 @@ class Answerer:
             )
             for i, finger in enumerate(self.robot.fingers)
         }
-        found = Answer(q, bool(verdict.solved(enforced)[0]), "", contacts, checked=False)
-        if asked.scene is not None:
-            found = self._clear(asked, found)
-        return replace(found, headline="MET" if found.success else NOT_MET)
+        result = SolveResult(
+            q, bool(verdict.solved(enforced)[0]), "", verdicts, collision_checked=False
+        )
+        if request.scene is not None:
+            result = self._with_clearance(request, result)
+        return replace(result, headline="MET" if result.success else NOT_MET)
 
-    def every(self, asked: PageRequest, q: Array) -> tuple[Alternative, ...]:
-        """All solutions, by arm branch, swivel and hand posture; none from other methods."""
+    def solve_all(self, request: PageRequest, q: Array) -> tuple[Alternative, ...]:
+        """Return all solutions by arm branch, swivel and hand posture; empty for other methods."""
         try:
-            return self.solver(asked).solve_all(asked.grasp, 64, asked.settings.prefer, q)
+            return self.solver(request).solve_all(request.grasp, 64, request.settings.prefer, q)
         except UnsupportedError:
             return ()
 
-    def _clear(self, asked: PageRequest, found: Answer) -> Answer:
-        """What is judged, with how far it is from touching something."""
-        clear = self.solver(asked).check(found.q, asked.grasp)
-        pair = None if clear is None else clear.pair(0)
-        if asked.scene is None or clear is None or pair is None:
-            return replace(found, checked=True)
-        points = closest_points(self.robot, found.q, with_object(asked.scene, asked.grasp), pair)
+    def _with_clearance(self, request: PageRequest, result: SolveResult) -> SolveResult:
+        """Add the clearance and the closest pair of shapes to a result."""
+        clearance = self.solver(request).check(result.q, request.grasp)
+        pair = None if clearance is None else clearance.pair(0)
+        if request.scene is None or clearance is None or pair is None:
+            return replace(result, collision_checked=True)
+        points = closest_points(
+            self.robot, result.q, scene_with_object(request.scene, request.grasp), pair
+        )
         return replace(
-            found,
-            success=found.success and bool(clear.free[0]),
-            clearance=float(clear.distance[0]),
+            result,
+            success=result.success and bool(clearance.free[0]),
+            clearance=float(clearance.distance[0]),
             closest=None if points is None else (pair, points),
-            checked=True,
+            collision_checked=True,
         )
 
-    def _preferred(self, asked: PageRequest, q: Array, diagnose: bool) -> Solution:
-        solver, prefer = self.solver(asked), asked.settings.prefer
-        if prefer == CLEARANCE and asked.scene is None:
+    def _solve_with_preference(self, request: PageRequest, q: Array, diagnose: bool) -> Solution:
+        solver, prefer = self.solver(request), request.settings.prefer
+        if prefer == CLEARANCE and request.scene is None:
             prefer = "q0"
         try:
-            return solver.solve(asked.grasp, q, prefer=prefer, diagnose=diagnose)
+            return solver.solve(request.grasp, q, prefer=prefer, diagnose=diagnose)
         except UnsupportedError:
-            # A method that cannot choose takes the solution it comes to.
-            return solver.solve(asked.grasp, q, diagnose=diagnose)
+            # The method does not support preferences.
+            return solver.solve(request.grasp, q, diagnose=diagnose)
 
-    def _built(self, settings: Settings, scene: Scene | None) -> Solver:
+    def _new_solver(self, settings: Settings, scene: Scene | None) -> Solver:
         return Solver(self.robot, settings.method, settings.tolerance, settings.limits, scene=scene)
 
 
-def counted(number: int, what: str) -> str:
-    """A number of things in words."""
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+def count_text(number: int, noun: str) -> str:
+    """Return a number with its noun, in the plural unless it is 1."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
-def _missed(answer: Answer) -> float:
-    """By how much the worst contact is missed, in tolerances."""
-    parts = [0.0]
-    for one in answer.contacts.values():
-        parts += [
-            one.position_error / one.tolerance.position,
-            one.angle_error / one.tolerance.angle,
+def _worst_error(result: SolveResult) -> float:
+    """Return the largest contact error relative to its tolerance."""
+    relative_errors = [0.0]
+    for verdict in result.verdicts.values():
+        relative_errors += [
+            verdict.position_error / verdict.tolerance.position,
+            verdict.angle_error / verdict.tolerance.angle,
         ]
-    return float(np.nanmax(parts))
+    return float(np.nanmax(relative_errors))
 
 
-def why_not(solution: Solution) -> tuple[str, ...]:
-    """Why a grasp is not solved, in short lines."""
+def failure_reasons(solution: Solution) -> tuple[str, ...]:
+    """Return the reasons for a failure in short lines."""
     if solution.success:
         return ()
     if solution.collision is not None:
         return solution.collision.lines
     if solution.diagnosis is not None:
         return solution.diagnosis.lines
-    return (TOUCHES if solution.status is Status.COLLISION else MISSES,)
+    return (COLLISION_HINT if solution.status is Status.COLLISION else NEAREST_HINT,)
 
 
-def _alike(known: tuple[Settings, Scene, Solver], settings: Settings, scene: Scene) -> bool:
-    """Whether a solver differs from the one wanted in nothing but where things stand."""
-    solved_by, before, _ = known
+def _only_poses_differ(
+    entry: tuple[Settings, Scene, Solver], settings: Settings, scene: Scene
+) -> bool:
+    """Return True if a cached solver fits but for the poses of scene items and the preference."""
+    solver_settings, solver_scene, _ = entry
     return (
-        replace(solved_by, prefer=settings.prefer) == settings
-        and before.items.keys() == scene.items.keys()
-        and before.margin == scene.margin
-        and all(before.items[name].parts is one.parts for name, one in scene.items.items())
+        replace(solver_settings, prefer=settings.prefer) == settings
+        and solver_scene.items.keys() == scene.items.keys()
+        and solver_scene.margin == scene.margin
+        and all(solver_scene.items[name].parts is item.parts for name, item in scene.items.items())
     )
 
 
-def failed(error: CasadiIKError, q: Array) -> Answer:
-    """What is shown of a question that cannot be asked."""
-    return Answer(q, False, "NOT ASKED", {}, (str(error),))
+def invalid_result(error: CasadiIKError, q: Array) -> SolveResult:
+    """Return the result of a request that cannot be solved."""
+    return SolveResult(q, False, "INVALID REQUEST", {}, (str(error),))

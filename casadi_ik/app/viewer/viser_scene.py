@@ -1,11 +1,11 @@
-"""Drawables on a page by viser: robots, contacts and things that are dragged, light and camera."""
+"""Scene of a page in viser: robots, contacts, draggable items, lights and cameras."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 import viser
@@ -16,82 +16,95 @@ from casadi_ik.app.drawing import palette
 from casadi_ik.app.drawing.drawables import (
     Drawable,
     View,
-    asked_marks,
-    axes_of,
-    bodies,
+    bodies_at,
     close_view,
     collision_bodies,
-    item_of,
-    merged,
-    object_of,
-    placed,
-    reached_marks,
-    whole_view,
+    fingertip_marks,
+    item_drawables,
+    merge_by_frame,
+    object_drawable,
+    overview,
+    target_marks,
+    view_axes,
+    visual_bodies,
 )
-from casadi_ik.app.drawing.surfaces import joined, mesh_of, sharp
+from casadi_ik.app.drawing.surfaces import join_surfaces, mesh_shape, split_sharp_edges
 from casadi_ik.app.viewer.access import Server
-from casadi_ik.app.viewer.request import OBJECT, Held, PageRequest
+from casadi_ik.app.viewer.request import OBJECT, DraggableContact, PageRequest
 from casadi_ik.collision.clearance import Closest
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.input_checks.poses import rotations_from_quaternions
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.solve.verdict import ContactVerdict
 
-if TYPE_CHECKING:
-    from casadi_ik.app.viewer.page import DraggedPage
+
+class DragListener(Protocol):
+    """Callbacks for clicks and drags."""
+
+    def select(self, name: str) -> None:
+        """Give an item its arrows and rings."""
+
+    def drag(self, name: str, pose: Array) -> None:
+        """Move an item to a (4, 4) pose."""
+
+    def drag_point(self, finger: str, point: Array) -> None:
+        """Move a contact to a point (3,) [m]."""
+
+    def drag_normal(self, finger: str, normal: Array) -> None:
+        """Rotate a contact to a normal (3,)."""
 
 
-def add_drawable(server: viser.ViserServer, name: str, one: Drawable, **look: Any) -> Any:
-    """A mesh of a page; `look` as `add_mesh_simple` of viser has it."""
-    surface = sharp(one.surface)
+def add_drawable(server: viser.ViserServer, name: str, drawable: Drawable, **options: Any) -> Any:
+    """Add a drawable to the scene; `options` are those of viser's `add_mesh_simple`."""
+    surface = split_sharp_edges(drawable.surface)
     return server.scene.add_mesh_simple(
         name,
         surface.points.astype(np.float32),
         surface.triangles.astype(np.uint32),
-        color=palette.rgb(one.color),
-        **look,
+        color=palette.rgb(drawable.color),
+        **options,
     )
 
 
 def quaternions(rotations: Array) -> Array:
-    """(..., 4) unit quaternions, scalar first, of rotations (..., 3, 3)."""
+    """Return the (..., 4) unit quaternions, scalar first, of rotations (..., 3, 3)."""
     return np.asarray(SO3.from_matrix(rotations).wxyz, dtype=np.float64)
 
 
 def pose_of(position: ArrayLike, wxyz: ArrayLike) -> Array:
-    """(4, 4) of a position (3,) and a quaternion (4,) that a browser has sent.
+    """Return the (4, 4) pose of a position (3,) and a quaternion (4,) from a browser.
 
     Raises:
-        ValueError: They are not of these sizes, or not finite.
+        ValueError: The sizes are wrong, or a number is not finite.
     """
     pose = np.eye(4)
-    pose[:3, :3] = rotations_from_quaternions(usable(wxyz, 4)[None])[0]
-    pose[:3, 3] = usable(position, 3)
+    pose[:3, :3] = rotations_from_quaternions(finite_numbers(wxyz, 4)[None])[0]
+    pose[:3, 3] = finite_numbers(position, 3)
     if not np.isfinite(pose).all():
-        raise ValueError("found a quaternion of no length")
+        raise ValueError(f"wxyz: found {wxyz}, expected a quaternion of non-zero length")
     return pose
 
 
-def usable(numbers: ArrayLike, count: int) -> Array:
-    """Numbers (count,) that a browser has sent.
+def finite_numbers(numbers: ArrayLike, count: int) -> Array:
+    """Validate numbers (count,) from a browser.
 
     Raises:
-        ValueError: They are none, not so many, not finite, or too large to be drawn.
+        ValueError: They are not numeric, not finite or too large, or their count is wrong.
     """
     try:
-        found = np.asarray(numbers, dtype=float)
+        values = np.asarray(numbers, dtype=float)
     except TypeError as error:
         raise ValueError(str(error)) from error
-    if found.shape != (count,) or not (np.abs(found) <= 1e6).all():
-        raise ValueError(f"found {found}, expected {count} numbers up to 1e6")
-    return found
+    if values.shape != (count,) or not (np.abs(values) <= 1e6).all():
+        raise ValueError(f"found {values}, expected {count} finite numbers up to 1e6")
+    return values
 
 
-class DrawnRobot:
-    """The links of a robot: each hangs on the one before, so a joint's turn is all that is sent.
+class RobotView:
+    """The links of a robot as a tree of nodes, so that only joint motion is sent to browsers.
 
     Attributes:
-        q: (n,) where it is [rad or m].
+        q: (n,) Configuration shown [rad or m].
     """
 
     def __init__(
@@ -99,98 +112,102 @@ class DrawnRobot:
         server: viser.ViserServer,
         robot: ArmHand,
         name: str = "/robot",
-        skin: Sequence[Drawable] | None = None,
+        drawables: Sequence[Drawable] | None = None,
     ) -> None:
-        """Draw it at home.
+        """Draw the robot at home.
 
         Args:
-            server: The page.
+            server: Server of the page.
             robot: The robot.
-            name: Of its node.
-            skin: What it is drawn with, in the frames of links; None: its bodies.
+            name: Name of the root node.
+            drawables: Geometry in the frames of links; None: the visual geometry.
         """
         self._server, self._robot = server, robot
-        links, before = robot.description.links, _hung_on(robot)
+        links, parents = robot.description.links, _parent_indices(robot)
         nodes: list[str] = []
-        for link, on in zip(links, before, strict=True):
-            nodes.append(f"{nodes[on] if on >= 0 else name}/{link}")
+        for link, parent in zip(links, parents, strict=True):
+            nodes.append(f"{nodes[parent] if parent >= 0 else name}/{link}")
         server.scene.add_frame(name, show_axes=False)
         self._nodes = dict(zip(links, nodes, strict=True))
         self._frames = [server.scene.add_frame(node, show_axes=False) for node in nodes]
-        self._before = before
+        self._parents = parents
         self._poses = np.full((len(links), 4, 4), np.nan)
-        self._skins: dict[str, list[Any]] = {}
-        self._add_skin("bodies", bodies(robot) if skin is None else skin)
-        self.place(robot.home)
+        self._geometries: dict[str, list[Any]] = {}
+        self._add_geometry("visual", visual_bodies(robot) if drawables is None else drawables)
+        self.update(robot.home)
 
-    def skin(self, name: str) -> None:
-        """Show its bodies ("bodies"), or what collisions are checked with ("collision shapes")."""
-        if name not in self._skins:
-            self._add_skin(name, collision_bodies(self._robot))
-        for other, meshes in self._skins.items():
+    def show_geometry(self, name: str) -> None:
+        """Show the visual geometry ("visual") or the collision shapes ("collision")."""
+        if name not in self._geometries:
+            self._add_geometry(name, collision_bodies(self._robot))
+        for key, meshes in self._geometries.items():
             for mesh in meshes:
-                mesh.visible = other == name
+                mesh.visible = key == name
 
-    def _add_skin(self, name: str, skin: Sequence[Drawable]) -> None:
-        nodes = [f"{self._nodes[one.frame]}/{name}_{i}" for i, one in enumerate(merged(skin))]
-        self._skins[name] = [
-            add_drawable(self._server, node, one, side="double", receive_shadow=False)
-            for node, one in zip(nodes, merged(skin), strict=True)
+    def _add_geometry(self, name: str, drawables: Sequence[Drawable]) -> None:
+        nodes = [
+            f"{self._nodes[drawable.frame]}/{name}_{i}"
+            for i, drawable in enumerate(merge_by_frame(drawables))
+        ]
+        self._geometries[name] = [
+            add_drawable(self._server, node, drawable, side="double", receive_shadow=False)
+            for node, drawable in zip(nodes, merge_by_frame(drawables), strict=True)
         ]
 
-    def place(self, q: Array) -> None:
-        """Move it to q (n,) [rad or m]."""
+    def update(self, q: Array) -> None:
+        """Show the robot at q (n,) [rad or m]."""
         self.q = np.array(q)
-        every = np.array(list(self._robot.links(q).values()))
-        # The last stands for the base frame, which the first link hangs on.
-        on = np.concatenate([every, np.eye(4)[None]])[self._before]
-        poses = np.linalg.inv(on) @ every
-        gone = ~(np.abs(poses - self._poses) < 1e-9)
-        shifted, turned = gone[:, :3, 3].any(axis=1), gone[:, :3, :3].any(axis=(1, 2))
+        link_poses = np.array(list(self._robot.links(q).values()))
+        # Index -1 is the base frame.
+        parent_poses = np.concatenate([link_poses, np.eye(4)[None]])[self._parents]
+        poses = np.linalg.inv(parent_poses) @ link_poses
+        changed_entries = ~(np.abs(poses - self._poses) < 1e-9)
+        translated = changed_entries[:, :3, 3].any(axis=1)
+        rotated = changed_entries[:, :3, :3].any(axis=(1, 2))
         wxyz = quaternions(poses[:, :3, :3])
         with self._server.atomic():
-            for i in np.flatnonzero(shifted):
+            for i in np.flatnonzero(translated):
                 self._frames[i].position = poses[i, :3, 3]
-            for i in np.flatnonzero(turned):
+            for i in np.flatnonzero(rotated):
                 self._frames[i].wxyz = wxyz[i]
-        self._poses[shifted, :3, 3] = poses[shifted, :3, 3]
-        self._poses[turned, :3, :3] = poses[turned, :3, :3]
+        self._poses[translated, :3, 3] = poses[translated, :3, 3]
+        self._poses[rotated, :3, :3] = poses[rotated, :3, :3]
 
 
-def _hung_on(robot: ArmHand) -> list[int]:
-    """By link the number of the one that it hangs on; -1: the base frame."""
+def _parent_indices(robot: ArmHand) -> list[int]:
+    """Return the index of each link's parent link; -1 for the base frame."""
     links = robot.description.links
     parents = {joint.child: links.index(joint.parent) for joint in robot.description.joints}
     return [parents.get(link, -1) for link in links]
 
 
 class Control:
-    """A frame that drawables hang on, with arrows and rings to be dragged by while it is selected.
+    """A node with drawables; arrows and rings to drag it appear while it is selected.
 
     Attributes:
-        meshes: What hangs on it, by name.
+        meshes: Meshes below the node by name.
     """
 
     def __init__(
         self,
         server: viser.ViserServer,
         name: str,
-        what: str,
+        item: str,
         drawables: Sequence[Drawable],
-        page: DraggedPage | None,
+        listener: DragListener | None,
         size: float,
-        **look: Any,
+        **options: Any,
     ) -> None:
-        """Make it.
+        """Add the node.
 
         Args:
-            server: The page.
-            name: Of its node.
-            what: What it is called.
-            drawables: In its frame.
-            page: Told where it is dragged, and that it is clicked; None: nobody.
-            size: Of the arrows [m].
-            look: As `add_mesh_simple` of viser has it.
+            server: Server of the page.
+            name: Name of the node.
+            item: Name of the item in callbacks.
+            drawables: Drawables in the frame of the node.
+            listener: Receiver of clicks and drags; None: the node is fixed.
+            size: Length of the arrows [m].
+            options: Options of viser's `add_mesh_simple`.
         """
         self._pose: Array | None = None
         self.handle = server.scene.add_transform_controls(
@@ -198,194 +215,207 @@ class Control:
         )
         self.select(False)
         self.meshes = {
-            one.name: add_drawable(server, f"{name}/{one.name}", one, **look) for one in drawables
+            drawable.name: add_drawable(server, f"{name}/{drawable.name}", drawable, **options)
+            for drawable in drawables
         }
-        if page is None:
+        if listener is None:
             return
 
-        # Asynchronous callbacks keep their order; they only put down what is to be done. What is
-        # no place is left out: viser would tell the terminal.
+        # Asynchronous callbacks keep their order. Invalid poses are ignored here, because viser
+        # would print them to the terminal.
         @self.handle.on_update
         async def _(_: Any) -> None:
             with suppress(ValueError):
-                page.drag(what, pose_of(self.handle.position, self.handle.wxyz))
+                listener.drag(item, pose_of(self.handle.position, self.handle.wxyz))
 
         for mesh in self.meshes.values():
 
             @mesh.on_click
             async def _(_: Any) -> None:
-                page.select(what)
+                listener.select(item)
 
-    def place(self, pose: Array, held: bool) -> None:
-        """Put it at a (4, 4) pose, unless a hand holds it: then it is where the hand has it."""
+    def update(self, pose: Array, is_dragged: bool) -> None:
+        """Move the node to a (4, 4) pose, unless the browser that drags it has moved it already."""
         if pose is not self._pose:
             self._pose = pose
-            if not held:
+            if not is_dragged:
                 self.handle.position = pose[:3, 3]
                 self.handle.wxyz = quaternions(pose[:3, :3])
 
-    def select(self, on: bool) -> None:
-        """Show its arrows and rings, or hide them."""
+    def select(self, is_selected: bool) -> None:
+        """Show or hide arrows and rings."""
         handle = self.handle
-        handle.disable_axes = handle.disable_sliders = handle.disable_rotations = not on
+        handle.disable_axes = handle.disable_sliders = handle.disable_rotations = not is_selected
 
 
 class Handles:
-    """What can be dragged: contacts asked for, the object, the items of a scene."""
+    """The draggable items of a page: contacts, the object, the items of a scene."""
 
     def __init__(
         self,
         server: viser.ViserServer,
-        asked: PageRequest,
-        page: DraggedPage | None = None,
-        above: str = "",
+        request: PageRequest,
+        listener: DragListener | None = None,
+        parent: str = "",
     ) -> None:
-        """Draw them.
+        """Draw the items.
 
         Args:
-            server: The page.
-            asked: What is asked first.
-            page: Told of drags; None: nobody.
-            above: The node that they hang on; "": the base frame.
+            server: Server of the page.
+            request: Initial request.
+            listener: Receiver of clicks and drags; None: the items are fixed.
+            parent: Parent node; "": the base frame.
         """
         self._controls: dict[str, Control] = {}
-        for name, held in asked.held.items():
-            marks = asked_marks(held.contact, np.zeros(3))
-            node = f"{above}/contacts/{name}"
-            self._controls[name] = Control(server, node, name, marks, page, 0.05, cast_shadow=False)
-        if page is not None:
-            for finger in asked.held:
-                self._drag_parts(finger, page)
-        things = {} if asked.scene is None else dict(asked.scene.items)
-        things.pop(asked.object, None)
-        looks: dict[str, tuple[list[Drawable], dict[str, Any]]] = {
-            name: (item_of(item), {"opacity": 0.8, "cast_shadow": False})
-            for name, item in things.items()
-        }
-        body = object_of(asked.object)
-        if body is not None and asked.object_pose is not None:
-            looks = {OBJECT: ([body], {"opacity": 0.4, "cast_shadow": True})} | looks
-        for name, (shapes, look) in looks.items():
-            node = f"{above}/things/{name}"
+        for name, draggable in request.contacts.items():
+            marks = target_marks(draggable.contact, np.zeros(3))
+            node = f"{parent}/contacts/{name}"
             self._controls[name] = Control(
-                server, node, name, shapes, page, 0.07, receive_shadow=0.15, **look
+                server, node, name, marks, listener, 0.05, cast_shadow=False
             )
-        self.names = (*looks, *asked.held)
-        self.place(asked)
+        if listener is not None:
+            for finger in request.contacts:
+                self._add_drag_callbacks(finger, listener)
+        items = {} if request.scene is None else dict(request.scene.items)
+        items.pop(request.object, None)
+        shapes_and_options: dict[str, tuple[list[Drawable], dict[str, Any]]] = {
+            name: (item_drawables(item), {"opacity": 0.8, "cast_shadow": False})
+            for name, item in items.items()
+        }
+        object_shape = object_drawable(request.object)
+        if object_shape is not None and request.object_pose is not None:
+            shapes_and_options = {
+                OBJECT: ([object_shape], {"opacity": 0.4, "cast_shadow": True})
+            } | shapes_and_options
+        for name, (shapes, options) in shapes_and_options.items():
+            node = f"{parent}/things/{name}"
+            self._controls[name] = Control(
+                server, node, name, shapes, listener, 0.07, receive_shadow=0.15, **options
+            )
+        self.names = (*shapes_and_options, *request.contacts)
+        self.update(request)
 
-    def _drag_parts(self, finger: str, page: DraggedPage) -> None:
-        """The ball of a contact moves it, the tip of its arrow turns it."""
+    def _add_drag_callbacks(self, finger: str, listener: DragListener) -> None:
+        """Let the ball of a contact move it and the tip of its arrow rotate it."""
         control = self._controls[finger]
         for part, mesh in control.meshes.items():
 
             @mesh.on_drag("left")
             async def _(event: Any, part: str = part) -> None:
                 with suppress(ValueError):
-                    end = usable(event.end_position, 3)
+                    cursor = finite_numbers(event.end_position, 3)
                     if part != "normal":
-                        page.drag_point(finger, end)
+                        listener.drag_point(finger, cursor)
                         return
-                    way = end - usable(control.handle.position, 3)
-                    if np.linalg.norm(way) > 1e-3:
-                        page.drag_normal(finger, way)
+                    direction = cursor - finite_numbers(control.handle.position, 3)
+                    if np.linalg.norm(direction) > 1e-3:
+                        listener.drag_normal(finger, direction)
 
-    def place(self, asked: PageRequest, dragged: str = "") -> None:
-        """Put them where they are; what is being dragged is where the hand has it."""
-        for name, pose in asked.places.items():
+    def update(self, request: PageRequest, dragged: str = "") -> None:
+        """Move all items to the poses of a request, except the item that is being dragged."""
+        for name, pose in request.poses.items():
             if name in self._controls:
-                self._controls[name].place(pose, name == dragged)
-        for finger, held in asked.held.items():
+                self._controls[name].update(pose, name == dragged)
+        for finger, draggable in request.contacts.items():
             for part, mesh in self._controls[finger].meshes.items():
-                mesh.visible = held.used and (held.normal or part not in ("normal", "tangent"))
+                mesh.visible = draggable.is_used and (
+                    draggable.uses_normal or part not in ("normal", "tangent")
+                )
 
     def select(self, name: str) -> None:
-        """Give one its arrows and rings to be dragged by; "": none."""
-        for other, control in self._controls.items():
-            control.select(other == name)
+        """Show arrows and rings of one item; "": of none."""
+        for item, control in self._controls.items():
+            control.select(item == name)
 
 
-class Tips:
-    """What the fingers reach, and by how much each misses."""
+class FingertipMarks:
+    """Fingertips of a robot with the errors of missed contacts."""
 
-    def __init__(self, server: viser.ViserServer, asked: PageRequest, above: str = "") -> None:
-        """Draw them; `above`: the node that they hang on."""
-        self._tips = {finger: _Tip(server, finger, above) for finger in asked.held}
+    def __init__(self, server: viser.ViserServer, request: PageRequest, parent: str = "") -> None:
+        """Draw the fingertips below the node `parent`."""
+        self._marks = {
+            finger: _FingertipMark(server, finger, parent) for finger in request.contacts
+        }
 
-    def place(
+    def update(
         self,
-        asked: PageRequest,
+        request: PageRequest,
         frames: Mapping[str, Array],
         verdicts: Mapping[str, ContactVerdict],
     ) -> None:
-        """Put the fingertips where they are: frames (4, 4) with the normal as x axis."""
-        for finger, tip in self._tips.items():
-            held = asked.held[finger]
-            tip.place(frames[finger], held, verdicts.get(finger) if held.used else None)
+        """Move the marks to contact frames (4, 4), whose x axes are pad normals; show errors."""
+        for finger, tip in self._marks.items():
+            draggable = request.contacts[finger]
+            tip.update(
+                frames[finger], draggable, verdicts.get(finger) if draggable.is_used else None
+            )
 
 
-class _Tip:
-    """What a finger reaches."""
+class _FingertipMark:
+    """Fingertip of one finger."""
 
-    def __init__(self, server: viser.ViserServer, finger: str, above: str) -> None:
-        scene, name = server.scene, f"{above}/tips/{finger}"
+    def __init__(self, server: viser.ViserServer, finger: str, parent: str) -> None:
+        scene, name = server.scene, f"{parent}/tips/{finger}"
         self._finger, self._frame = finger, scene.add_frame(name, show_axes=False)
-        (mark,) = merged(reached_marks(palette.MET))
+        (mark,) = merge_by_frame(fingertip_marks(palette.MET))
         self._mesh = add_drawable(server, f"{name}/reached", mark, cast_shadow=False)
         self._label = scene.add_label(
             f"{name}/errors", "", anchor="bottom-center", font_screen_scale=0.85, visible=False
         )
-        self._gap = _segment(server, f"{above}/gaps/{finger}", palette.MISSED, 0.0016)
+        self._gap = _line(server, f"{parent}/gaps/{finger}", palette.MISSED, 0.0016)
 
-    def place(self, frame: Array, held: Held, verdict: ContactVerdict | None) -> None:
+    def update(
+        self, frame: Array, draggable: DraggableContact, verdict: ContactVerdict | None
+    ) -> None:
         self._frame.position, self._frame.wxyz = frame[:3, 3], quaternions(frame[:3, :3])
-        met = verdict is None or verdict.ok
-        color = palette.FAINT if verdict is None else palette.MET if met else palette.MISSED
+        is_met = verdict is None or verdict.ok
+        color = palette.FAINT if verdict is None else palette.MET if is_met else palette.MISSED
         if self._mesh.color != palette.rgb(color):
             self._mesh.color = palette.rgb(color)
-        self._gap.visible = self._label.visible = not met
-        if verdict is not None and not met:
-            ends = np.stack([frame[:3, 3], held.control[:3, 3]])[None]
+        self._gap.visible = self._label.visible = not is_met
+        if verdict is not None and not is_met:
+            ends = np.stack([frame[:3, 3], draggable.control[:3, 3]])[None]
             self._gap.points = ends.astype(np.float32)
-            self._label.text = f"{self._finger}  {'  '.join(errors_of(verdict)) or 'free'}"
+            self._label.text = f"{self._finger}  {'  '.join(error_texts(verdict)) or 'free'}"
 
 
-def errors_of(verdict: ContactVerdict) -> list[str]:
-    """Distance and angle in words; what is free is left out."""
+def error_texts(verdict: ContactVerdict) -> list[str]:
+    """Return distance and angle in words; unconstrained errors are omitted."""
     parts = [(1e3 * verdict.position_error, " mm"), (np.rad2deg(verdict.angle_error), "°")]
     return [f"{value:.2f}{unit}" for value, unit in parts if not np.isnan(value)]
 
 
-def _segment(server: viser.ViserServer, name: str, color: str, width: float) -> Any:
-    """A line between two points, not seen yet."""
+def _line(server: viser.ViserServer, name: str, color: str, width: float) -> Any:
+    """Add an invisible line segment."""
     points = np.zeros((1, 2, 3), dtype=np.float32)
     return server.scene.add_line_segments(
         name, points, palette.rgb(color), thickness=width, visible=False
     )
 
 
-class DrawnClosest:
-    """The pair that is nearest to touching: a red line between them, with its length."""
+class ClearanceLine:
+    """A line between the closest pair of shapes, labelled with the clearance."""
 
     def __init__(self, server: viser.ViserServer) -> None:
-        """Draw nothing yet."""
-        self._rod = _segment(server, "/closest/rod", palette.NEAREST, 0.003)
+        """Add the line, invisible."""
+        self._rod = _line(server, "/closest/rod", palette.NEAREST, 0.003)
         self._label = server.scene.add_label(
             "/closest/length", "", anchor="top-center", font_screen_scale=0.8, visible=False
         )
 
-    def place(
-        self, closest: Closest | None, clearance: float | None = None, told: bool = True
+    def update(
+        self, closest: Closest | None, clearance: float | None = None, show_label: bool = True
     ) -> None:
-        """Put it where two shapes are nearest, with their clearance [m]; None: nowhere.
+        """Show the line between two points, or hide it.
 
         Args:
-            closest: The two points; farther apart than 0.25 m nothing is drawn.
-            clearance: What is told of them; None: how far they are from each other.
-            told: Whether anything is: not where it would lie over what matters more.
+            closest: The nearest points; None or more than 0.25 m apart: the line is hidden.
+            clearance: Clearance in the label [m]; None: the distance between the points.
+            show_label: Show the label; False where it would cover the errors of contacts.
         """
-        shown = closest is not None and closest.distance < 0.25
-        self._rod.visible, self._label.visible = shown, shown and told
-        if closest is None or not shown:
+        is_visible = closest is not None and closest.distance < 0.25
+        self._rod.visible, self._label.visible = is_visible, is_visible and show_label
+        if closest is None or not is_visible:
             return
         self._rod.points = closest.ends[None].astype(np.float32)
         self._label.position = closest.ends.mean(axis=0)
@@ -393,45 +423,49 @@ class DrawnClosest:
         self._label.text = f"{1e3 * length:.1f} mm"
 
 
-class Ghosts:
-    """An arm, or a hand alone, several times, seen through, each in a colour of its own."""
+class GhostRobots:
+    """Translucent copies of an arm, or of a hand alone, each with its own colour."""
 
     def __init__(self, server: viser.ViserServer, robot: ArmHand) -> None:
-        """Draw nothing yet."""
+        """Store the robot; nothing is drawn."""
         self._server, self._robot, self._drawn = server, robot, []
         self._role = "arm" if robot.description.arm_actuators else "hand"
 
-    def show(self, many: Sequence[tuple[Array, str]]) -> None:
-        """Draw the robot at each q (n,) in a colour; of none nothing."""
+    def show(self, configurations: Sequence[tuple[Array, str]]) -> None:
+        """Replace the ghosts by one for each pair of q (n,) and colour."""
         with self._server.atomic():
-            for one in self._drawn:
-                one.remove()
+            for drawable in self._drawn:
+                drawable.remove()
             self._drawn = []
-            for i, (q, color) in enumerate(many):
-                seen = [one for one in bodies(self._robot) if one.role == self._role]
-                parts = [one.surface for one in placed(self._robot, q, seen)]
-                ghost = Drawable("ghost", mesh_of(joined(parts)), color)
-                look = {"opacity": 0.25, "cast_shadow": False, "receive_shadow": False}
-                self._drawn.append(add_drawable(self._server, f"/ghosts/{i}", ghost, **look))
+            for i, (q, color) in enumerate(configurations):
+                drawables = [
+                    drawable
+                    for drawable in visual_bodies(self._robot)
+                    if drawable.role == self._role
+                ]
+                parts = [drawable.surface for drawable in bodies_at(self._robot, q, drawables)]
+                ghost = Drawable("ghost", mesh_shape(join_surfaces(parts)), color)
+                options = {"opacity": 0.25, "cast_shadow": False, "receive_shadow": False}
+                self._drawn.append(add_drawable(self._server, f"/ghosts/{i}", ghost, **options))
 
 
 # Light, ground, camera.
 
-FOV = np.deg2rad(40.0)
-"""Of the camera, from below to above [rad]."""
+FIELD_OF_VIEW = np.deg2rad(40.0)
+"""Vertical field of view of the camera [rad]."""
 
-PHONE = 0.8
-"""Screens that are narrower have the panel below [width by height]."""
+NARROW_ASPECT = 0.8
+"""Aspect ratio (width / height) below which the panel is placed at the bottom of the screen."""
 
 
-def set_stage(server: Server, title: str, floor: float, dark: bool) -> None:
-    """Daylight, a ground with a grid of 0.1 m and 0.5 m, and the look of the panel.
+def set_up_scene(server: Server, title: str, floor: float, dark: bool) -> None:
+    """Add light, a ground with a grid of 0.1 m and 0.5 m, and the theme of the panel.
 
     Args:
-        server: The page.
-        title: On the panel.
+        server: Server of the page.
+        title: Title of the panel and of the browser's tab.
         floor: Height of the ground [m].
-        dark: Whether the page is dark.
+        dark: Use the dark theme.
     """
     scene, gui = server.scene, server.gui
     scene.set_up_direction("+z")
@@ -468,89 +502,95 @@ def set_stage(server: Server, title: str, floor: float, dark: bool) -> None:
 
 @dataclass(frozen=True)
 class Camera:
-    """Where from, and what.
+    """A viewpoint.
 
     Attributes:
-        target: (3,) middle of what is seen [m].
-        radius: Of a ball that holds it [m].
-        view: (3,) unit, from there towards the camera.
+        target: (3,) Centre of the view [m].
+        radius: Radius of a ball that contains everything in view [m].
+        view: (3,) Unit vector from the target towards the camera.
     """
 
     target: Array
     radius: float
     view: Array
 
-    def place(self, aspect: float = 1.0) -> Array:
-        """(3,) where the camera stands, so that all of it is seen on a screen so wide."""
-        half = min(FOV / 2, np.arctan(np.tan(FOV / 2) * aspect))
-        return self.target + self.radius / np.sin(half) * self.view
+    def position(self, aspect: float = 1.0) -> Array:
+        """Return the (3,) camera position from which the ball fits a screen of an aspect ratio."""
+        half_angle = min(FIELD_OF_VIEW / 2, np.arctan(np.tan(FIELD_OF_VIEW / 2) * aspect))
+        return self.target + self.radius / np.sin(half_angle) * self.view
 
     def show(self, server: Server) -> None:
-        """Look from there in every browser, and in those that open the page later."""
+        """Apply the viewpoint in all browsers, including those that connect later."""
         initial = server.initial_camera
-        initial.fov, initial.look_at, initial.position = FOV, self.target, self.place()
+        initial.fov, initial.look_at, initial.position = FIELD_OF_VIEW, self.target, self.position()
         if server.camera is None:
-            # Those that come later look from where the page then says.
-            server.on_client_connect(lambda client: server.camera.first_on(client))
+            # Browsers that connect later use the camera that is current then.
+            server.on_client_connect(lambda client: server.camera.apply_if_portrait(client))
         server.camera = self
         for client in server.get_clients().values():
-            self.on(client)
+            self.apply(client)
 
-    def first_on(self, client: Any) -> None:
-        """Look from there in a browser that opens the page, if its screen is upright."""
+    def apply_if_portrait(self, client: Any) -> None:
+        """Apply the viewpoint in a browser with a portrait screen."""
         if client.camera.aspect < 1.0:
-            self.on(client)
+            self.apply(client)
 
-    def on(self, client: Any) -> None:
-        """Look from there in one browser."""
-        aspect, position = client.camera.aspect, self.place(client.camera.aspect)
-        lower = np.zeros(3)
-        if aspect < PHONE:
-            # The panel covers the lower half there.
+    def apply(self, client: Any) -> None:
+        """Apply the viewpoint in one browser."""
+        aspect, position = client.camera.aspect, self.position(client.camera.aspect)
+        offset = np.zeros(3)
+        if aspect < NARROW_ASPECT:
+            # The panel covers the lower half of a narrow screen.
             up = np.array([0.0, 0.0, 1.0]) - self.view[2] * self.view
-            height = np.linalg.norm(position - self.target) * np.tan(FOV / 2)
-            lower = -0.45 * height * up / np.linalg.norm(up)
+            height = np.linalg.norm(position - self.target) * np.tan(FIELD_OF_VIEW / 2)
+            offset = -0.45 * height * up / np.linalg.norm(up)
         with client.atomic():
-            client.camera.position = position + lower
-            client.camera.look_at = self.target + lower
+            client.camera.position = position + offset
+            client.camera.look_at = self.target + offset
 
 
-def cameras(robot: ArmHand, q: Array, things: Sequence[Drawable] = ()) -> dict[str, Camera]:
-    """Where a robot at q (n,) is seen from, by name: its hand, or each, and the whole of it.
+def cameras(robot: ArmHand, q: Array, objects: Sequence[Drawable] = ()) -> dict[str, Camera]:
+    """Return viewpoints by name for a robot at q (n,): each hand, and the whole robot.
 
-    The first is where a page begins: near the only hand, else away from all of them.
+    The first one is the initial viewpoint: the only hand, or the whole robot if it has several.
 
     Args:
         robot: The robot.
-        q: (n,) [rad or m].
-        things: What is grasped, in the base frame.
+        q: (n,) Configuration [rad or m].
+        objects: Grasped objects in the base frame.
     """
-    seen, many = bodies(robot), len(robot.hands) > 1
-    body = placed(robot, q, seen)
-    whole = whole_view(robot.contacts(q)[0].mean(axis=0), close_view(robot, q))
-    found = {"Robot": _camera([*body, *things], whole)} if many else {}
+    drawables, has_several_hands = visual_bodies(robot), len(robot.hands) > 1
+    robot_drawables = bodies_at(robot, q, drawables)
+    view = overview(robot.contacts(q)[0].mean(axis=0), close_view(robot, q))
+    result = (
+        {"Robot": _fitted_camera([*robot_drawables, *objects], view)} if has_several_hands else {}
+    )
     for side in robot.hands:
         links = robot.description.side(side).links if side else robot.description.links
         hand = [
             part
-            for one, part in zip(seen, body, strict=True)
-            if one.role != "arm" and one.frame in links
+            for drawable, part in zip(drawables, robot_drawables, strict=True)
+            if drawable.role != "arm" and drawable.frame in links
         ]
-        name = side.capitalize() if side and many else "Hand"
-        found[name] = _camera([*hand, *things], close_view(robot, q, side), 1.15)
-    return found if many else found | {"Robot": _camera([*body, *things], whole)}
+        name = side.capitalize() if side and has_several_hands else "Hand"
+        result[name] = _fitted_camera([*hand, *objects], close_view(robot, q, side), 1.15)
+    return (
+        result
+        if has_several_hands
+        else result | {"Robot": _fitted_camera([*robot_drawables, *objects], view)}
+    )
 
 
-def _camera(parts: Sequence[Drawable], view: View, room: float = 1.0) -> Camera:
-    points = np.concatenate([one.surface.points for one in parts])
-    middle = (points.min(axis=0) + points.max(axis=0)) / 2
-    radius = room * float(np.linalg.norm(points - middle, axis=1).max())
-    return Camera(middle, max(radius, 0.05), axes_of(view)[2])
+def _fitted_camera(drawables: Sequence[Drawable], view: View, scale: float = 1.0) -> Camera:
+    points = np.concatenate([drawable.surface.points for drawable in drawables])
+    center = (points.min(axis=0) + points.max(axis=0)) / 2
+    radius = scale * float(np.linalg.norm(points - center, axis=1).max())
+    return Camera(center, max(radius, 0.05), view_axes(view)[2])
 
 
-def light_lamp(server: viser.ViserServer, camera: Camera) -> None:
-    """Light what a camera sees from above; its shadows cost less than those of a sun."""
-    lamp = np.array([0.55, -0.45, 1.9])
+def add_lamp(server: viser.ViserServer, camera: Camera) -> None:
+    """Add a spot light above the view; its shadows cost less than those of a sun."""
+    direction = np.array([0.55, -0.45, 1.9])
     server.scene.add_light_spot(
         "/light/lamp",
         color=(255, 250, 242),
@@ -558,7 +598,7 @@ def light_lamp(server: viser.ViserServer, camera: Camera) -> None:
         decay=0.0,
         angle=0.95,
         penumbra=0.3,
-        position=tuple((camera.target + 2 * camera.radius * lamp).tolist()),
-        direction=tuple((-lamp).tolist()),
+        position=tuple((camera.target + 2 * camera.radius * direction).tolist()),
+        direction=tuple((-direction).tolist()),
         cast_shadow=True,
     )
