@@ -1,4 +1,4 @@
-"""`Solver`: the one object that turns grasps into motor positions."""
+"""`Solver`, the main class of the package: inverse kinematics of grasps."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ from casadi_ik.planning.choose import choose
 from casadi_ik.planning.object_pose import solve_with_object
 from casadi_ik.planning.touch.grasps import grasps_of
 from casadi_ik.solve.alternatives import APART
-from casadi_ik.solve.engine import Engine, Run, SolvedBlock
+from casadi_ik.solve.engine import Engine, SolvedBlock, SolveOptions
 from casadi_ik.solve.fast import FastSolver
 from casadi_ik.solve.recorder import Recorder
 from casadi_ik.solve.registry import build_method, method_names, with_finger_step
-from casadi_ik.solve.request import Request, hand_postures, tolerances_by_finger
+from casadi_ik.solve.request import Request, broadcast_postures, tolerances_by_finger
 from casadi_ik.solve.sensitivity import Sensitivity
 from casadi_ik.solve.solution import Alternative, BatchSolution, Solution
 
 METHODS = method_names()
-"""Names of the methods that come with the package, the default first."""
+"""Names of the shipped methods, the default first."""
 
 
 class Solver(MovingSolver):
@@ -46,10 +46,10 @@ class Solver(MovingSolver):
     Attributes:
         robot: The robot.
         method: Name of the method.
-        tolerances: When a contact counts as reached, by finger.
+        tolerances: Tolerance by finger.
         limits: "enforce" or "ignore".
-        options: What was set of the method's own parameters.
-        scene: What answers must not touch; None: collisions are not checked.
+        options: Parameters of the method that differ from their defaults.
+        scene: Obstacles that solutions must not touch; None: collisions are not checked.
 
     Example:
         >>> solver = ik.Solver(robot, tolerance=ik.Tolerance(position=1e-3, angle=np.deg2rad(1)))
@@ -71,26 +71,25 @@ class Solver(MovingSolver):
         """Build the solver; its kernel is compiled at the first solve and cached on the machine.
 
         Args:
-            robot: From `load_robot`.
-            method: One of `METHODS`, or registered with `register_method`.
-            tolerance: 5 mm and 3 deg unless said; one for all fingers, or by finger name (a
-                finger left out keeps the default). A contact's own tolerance goes before.
-            limits: "enforce": being solved includes that every actuator and joint is within its
-                limits. "ignore": only the contacts decide (the paper's reading).
-            finger_step: The option of this name: "ipopt" (the default of the paper's methods) or
-                "closed-form", the same answer, much faster. Methods without a finger step take no
-                notice.
-            options: Fields of the method's parameter record (`QiuParameters`), by name. Of
-                hand-first {"max_rounds": 1} is the limit of effort: see `HandFirstParameters`.
-            compiled: False keeps to CasADi's virtual machine: the same iterates up to rounding,
-                slower.
-            scene: What stands about the robot (`load_scene`, `Scene`): being solved then includes
-                that nothing, links among themselves, is nearer than the scene's margin.
+            robot: Robot from `load_robot`.
+            method: One of `METHODS`, or a name registered with `register_method`.
+            tolerance: Tolerance of all fingers, or by finger name (other fingers keep the
+                default); default: 5 mm and 3 deg. A tolerance stated by a contact takes precedence.
+            limits: "enforce": a solution has every actuator and joint within its limits.
+                "ignore": only the contacts decide (the paper's reading).
+            finger_step: Option of this name: "ipopt" (default of the paper's methods) or
+                "closed-form" (the same result, much faster). Ignored by methods without it.
+            options: Fields of the method's parameter record (`QiuParameters`), by name. For
+                hand-first, {"max_rounds": 1} limits the effort, see `HandFirstParameters`.
+            compiled: False: use CasADi's virtual machine, which gives the same iterates up to
+                rounding and is slower.
+            scene: Obstacles around the robot (`load_scene`, `Scene`). A solution then keeps the
+                scene's margin to obstacles and between links.
 
         Raises:
-            UnknownNameError: No such method or option.
-            InputError: A value that an argument cannot have.
-            UnsupportedError: The robot is not of the kind the method needs, or has no shapes.
+            UnknownNameError: The method or an option does not exist.
+            InputError: An argument has an invalid value.
+            UnsupportedError: The method does not support the robot, or the robot has no shapes.
             DescriptionError: The scene does not fit the robot.
         """
         if not isinstance(robot, ArmHand):
@@ -103,7 +102,16 @@ class Solver(MovingSolver):
             raise InputError(
                 f"finger_step: found {finger_step!r}, expected one of {', '.join(FINGER_STEPS)}"
             )
-        self._asked = (robot, method, tolerance, limits, finger_step, options, compiled, scene)
+        self._init_args: dict[str, Any] = {
+            "robot": robot,
+            "method": method,
+            "tolerance": tolerance,
+            "limits": limits,
+            "finger_step": finger_step,
+            "options": options,
+            "compiled": compiled,
+            "scene": scene,
+        }
         self.robot = robot
         self.method = method
         self.tolerances = tolerances_by_finger(tolerance, robot.fingers)
@@ -112,28 +120,28 @@ class Solver(MovingSolver):
         self._request = Request(robot, self.tolerances, limits == "enforce")
         self.scene = scene
         check = None if scene is None else SceneCheck(robot, scene, compiled)
-        built = build_method(method, robot.description, self.options, compiled)
-        self._engine = Engine(robot, built, compiled, check=check)
+        built_method = build_method(method, robot.description, self.options, compiled)
+        self._engine = Engine(robot, built_method, compiled, check=check)
 
     @cached_property
-    def _glance(self) -> Engine:
-        """For many targets of which one is enough: a round of hand postures each."""
-        if self._engine.hand_first is None:
+    def _single_restart_engine(self) -> Engine:
+        """Engine limited to one restart, for screening many targets of which one suffices."""
+        if self._engine.hand_search is None:
             return self._engine
         method, options = self.method, {**self.options, "max_rounds": 1}
-        built = build_method(method, self.robot.description, options, self._engine.compiled)
-        return Engine(self.robot, built, self._engine.compiled, check=self._engine.check)
+        built_method = build_method(method, self.robot.description, options, self._engine.compiled)
+        return Engine(self.robot, built_method, self._engine.compiled, check=self._engine.check)
 
-    def __reduce__(self) -> tuple[type[Solver], tuple[Any, ...]]:
-        """What it was made from; a copy finds the compiled kernels on the machine it comes to."""
-        return type(self), self._asked
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the init arguments; a copy finds compiled kernels in the cache of its machine."""
+        return _build_solver, (type(self), self._init_args)
 
     def __repr__(self) -> str:
         return f"<Solver {self.method} on {self.robot.name}, limits {self.limits}>"
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """Everything that determines a solve but target, start and seed; as kept in the log.
+        """Everything except target, start and seed that determines a solve, as in the log.
 
         Example:
             >>> solver.parameters["method"], solver.parameters["limits"]
@@ -141,7 +149,9 @@ class Solver(MovingSolver):
         """
         return {
             "method": self.method,
-            "tolerance": {name: dataclasses.asdict(one) for name, one in self.tolerances.items()},
+            "tolerance": {
+                name: dataclasses.asdict(tolerance) for name, tolerance in self.tolerances.items()
+            },
             "limits": self.limits,
             "options": dict(self._engine.method.parameters),
         } | ({} if self.scene is None else {"scene": self.scene.name})
@@ -159,53 +169,56 @@ class Solver(MovingSolver):
         """Solve one grasp.
 
         Args:
-            grasp: A contact per finger; its fingers must be the robot's.
-            q0: (n,) start [rad or m]; None is `robot.home`.
-            seed: Of all random numbers, an integer >= 0.
-            log: Path of an MCAP file to write every iteration to.
-            diagnose: Whether to find out why, if it is not solved (`Solution.diagnosis`).
-            fixed: Positions of actuators that are not to move, by name [rad or m].
-            prefer: Which of several solutions: "q0" (near it, motions as parts of motors' ranges;
-                what solves is not moved), "limits" (far from them), "manipulability" (of the arm).
-                "clearance" (from what may be hit). None: "q0" if q0 is given, else "limits".
+            grasp: Contacts by finger, or palm poses with hand postures.
+            q0: (n,) start [rad or m]; None: `robot.home`.
+            seed: Seed of all random numbers, an integer >= 0.
+            log: Path of an MCAP file that records every iteration.
+            diagnose: Whether to diagnose an unsolved grasp (`Solution.diagnosis`).
+            fixed: Positions of actuators to keep fixed, by name [rad or m].
+            prefer: Order among several solutions: "q0" (near it, motors relative to their ranges;
+                a start that solves the grasp is returned unchanged), "limits" (far from them),
+                "manipulability" (of the arm), "clearance" (from obstacles). None: "q0" if q0 is
+                given, else "limits".
 
         Returns:
-            The solution; not converging is its status, never an exception.
+            The solution; failure to converge is a status, never an exception.
 
         Raises:
-            InputError: Bad q0, or a grasp the robot or the method cannot take.
-            UnknownNameError: A fixed actuator that the robot does not have.
-            UnsupportedError: The method cannot keep actuators fixed, or cannot prefer this.
+            InputError: Bad q0, or a grasp that the robot or the method does not support.
+            UnknownNameError: A fixed actuator does not exist.
+            UnsupportedError: The method does not support fixed actuators, or this preference.
             LogError: The log cannot be written.
 
         Example:
             >>> solution = solver.solve(grasp, q0=robot.home)
             >>> solution.status.name, solution.q.shape
             ('SOLVED', (14,))
-            >>> held = solver.solve(grasp, fixed={"lwr_joint_3": 0.2})
-            >>> print(round(held.q[2], 6))
+            >>> solution = solver.solve(grasp, fixed={"lwr_joint_3": 0.2})
+            >>> print(round(solution.q[2], 6))
             0.2
         """
         targets = self._request.of_grasps(
-            [grasp], fixed, self._engine.preference(prefer, q0 is not None), free=True
+            [grasp], fixed, self._engine.resolve_preference(prefer, q0 is not None), free=True
         )
         if isinstance(grasp.object_pose, Free):
             if log is not None:
-                raise InputError("log: found beside a Free object_pose, expected one of them")
+                raise InputError("log: a Free object_pose cannot be logged; expected a fixed pose")
             start = self.robot.start(q0)
             return solve_with_object(
-                lambda some, why: self._engine.solve(some, Run(start, seed, diagnose=why)),
-                lambda some: self._glance.solve(some, Run(start, seed)),
+                lambda group, why: self._engine.solve(
+                    group, SolveOptions(start, seed, diagnose=why)
+                ),
+                lambda group: self._single_restart_engine.solve(group, SolveOptions(start, seed)),
                 targets,
                 grasp.object_pose,
                 start,
                 self.robot.upper - self.robot.lower,
             )
         if log is None:
-            return self._engine.solve_one(targets, Run(q0, seed, diagnose=diagnose))
+            return self._engine.solve_one(targets, SolveOptions(q0, seed, diagnose=diagnose))
         with recorder_of(self, log, seed) as recorder:
-            run = Run(q0, seed, recorder=recorder, diagnose=diagnose)
-            return self._engine.solve(targets, run).solution(0)
+            options = SolveOptions(q0, seed, recorder=recorder, diagnose=diagnose)
+            return self._engine.solve(targets, options).solution(0)
 
     def solve_batch(
         self,
@@ -229,21 +242,21 @@ class Solver(MovingSolver):
             points: (k, f, 3) contact points [m], base frame, fingers in `robot.fingers` order;
                 NaN marks a free finger.
             normals: (k, f, 3) outward pad normals, base frame; NaN marks a free normal.
-            q0: (n,) or (k, n) start; None is `robot.home`.
-            seed: As for `solve`.
-            jobs: Threads, at least 1.
-            log: Path of an MCAP file to write every iteration to; or an open recorder, which
-                stays open, for several batches in one log.
-            diagnose: Whether to find out why, for every target that is not solved.
-            fixed: As for `solve`.
+            q0: (n,) or (k, n) start; None: `robot.home`.
+            seed: See `solve`.
+            jobs: Number of threads, at least 1.
+            log: Path of an MCAP file that records every iteration; or an open recorder, which
+                stays open, to record several batches in one log.
+            diagnose: Whether to diagnose every unsolved target.
+            fixed: See `solve`.
             keep: Which solves keep their iterations in the log; None: all.
-            compression: Of the log: "zstd" (level 1), "lz4" or "none".
-            prefer: As for `solve`.
-            object_pose: (4, 4) or (k, 4, 4) where what the scene calls grasped is, base frame.
-            more: (k, f, 3) by name, NaN where free: "tangents" (second axes of
-                `ArmHand.contact_frames`), "lines", "planes" (anywhere on that through the point),
-                "balls" (outward normals of the pads' balls where they touch the points),
-                "directions" (a fingertip without a point faces this way).
+            compression: Compression of the log: "zstd" (level 1), "lz4" or "none".
+            prefer: See `solve`.
+            object_pose: (4, 4) or (k, 4, 4) pose of the grasped item of the scene, base frame.
+            more: (k, f, 3) further vectors by name, NaN where free: "tangents" (second axes of
+                `ArmHand.contact_frames`), "lines" and "planes" (the point may lie anywhere on
+                them), "balls" (outward normals of ball pads that touch the points), "directions"
+                (directions of fingertips without a point).
 
         Returns:
             The fields of a `Solution`, as arrays.
@@ -257,13 +270,14 @@ class Solver(MovingSolver):
             >>> batch.q.shape, bool(batch.success.all())
             ((1000, 14), True)
         """
-        held = self._request.held(fixed)
-        preferred = self._engine.preference(prefer, q0 is not None)
-        targets = self._request.of_arrays(points, normals, held, more=more, prefer=preferred)
+        fixed_q = self._request.fixed_vector(fixed)
+        preference = self._engine.resolve_preference(prefer, q0 is not None)
+        targets = self._request.of_arrays(points, normals, fixed_q, more=more, prefer=preference)
         if object_pose is not None:
             targets = targets.holding(grasped_in(self.scene), object_pose)
         with recorder_of(self, log, seed, keep, compression) as recorder:
-            return self._engine.solve(targets, Run(q0, seed, jobs, recorder, diagnose, shown=True))
+            options = SolveOptions(q0, seed, jobs, recorder, diagnose, show_progress=True)
+            return self._engine.solve(targets, options)
 
     def solve_blocks(
         self,
@@ -277,26 +291,26 @@ class Solver(MovingSolver):
         prefer: str | None = None,
         first_row: int = 0,
     ) -> Generator[SolvedBlock, None, None]:
-        """Solve targets that come block by block, in the memory that one block takes.
+        """Solve a stream of targets block by block, in the memory of one block.
 
-        A target's answer does not depend on how the targets are cut into blocks. A malformed
-        target does not stop the others: it is among the faults of its block.
+        Results do not depend on the division into blocks. A malformed target does not affect the
+        others: it is listed in the faults of its block.
 
         Args:
-            blocks: Points and normals of some targets each, as for `solve_batch`; or all of its
-                arrays by name.
-            q0: (n,) start of all; as `seed`, `diagnose`, `fixed` and `prefer` for `solve_batch`.
-            seed: See there.
-            jobs: Threads, at least 1; a few thousand targets a block keep them busy.
-            log: Path of an MCAP file to write every iteration to; complete after the last block,
-                and given up if the iterator is closed before.
-            diagnose: See there.
-            fixed: See there.
-            prefer: See there.
-            first_row: Number of the first target, where these are a part of more.
+            blocks: Points and normals of each block, as for `solve_batch`; or all of its arrays
+                by name.
+            q0: (n,) start of all targets; None: `robot.home`.
+            seed: See `solve_batch`.
+            jobs: Number of threads, at least 1; blocks of a few thousand targets keep them busy.
+            log: Path of an MCAP file that records every iteration; complete after the last block,
+                and abandoned if the iterator is closed before.
+            diagnose: See `solve_batch`.
+            fixed: See `solve_batch`.
+            prefer: See `solve_batch`.
+            first_row: Number of the first target, if the stream is part of a larger one.
 
         Yields:
-            The blocks, solved.
+            The solved blocks.
 
         Raises:
             InputError: Bad q0, seed or jobs, or a block of the wrong shape; else as `solve_batch`.
@@ -307,23 +321,23 @@ class Solver(MovingSolver):
             >>> [int(block.solution.success.sum()) for block in solver.solve_blocks(blocks)]
             [500, 500, 500]
         """
-        held = self._request.held(fixed)
-        preferred = self._engine.preference(prefer, q0 is not None)
+        fixed_q = self._request.fixed_vector(fixed)
+        preference = self._engine.resolve_preference(prefer, q0 is not None)
 
-        def ask(block: Mapping[str, ArrayLike], first_row: int) -> TargetBatch:
-            return self._request.of_named(block, held, first_row, preferred)
+        def parse(block: Mapping[str, ArrayLike], first_row: int) -> TargetBatch:
+            return self._request.of_named(block, fixed_q, first_row, preference)
 
         with recorder_of(self, log, seed) as recorder:
             tolerances = tuple(self.tolerances.values())
-            run = Run(q0, seed, jobs, recorder, diagnose)
-            yield from self._engine.solve_blocks(blocks, ask, tolerances, run, first_row)
+            options = SolveOptions(q0, seed, jobs, recorder, diagnose)
+            yield from self._engine.solve_blocks(blocks, parse, tolerances, options, first_row)
 
     def stepper(self, grasp: Grasp, q0: ArrayLike | None = None) -> Stepper:
-        """Solve one grasp by hand, one iteration at a time.
+        """Return a stepper that solves one grasp iteration by iteration.
 
         Args:
-            grasp: As for `solve`.
-            q0: As for `solve`.
+            grasp: See `solve`.
+            q0: See `solve`.
 
         Raises:
             InputError: As for `solve`.
@@ -334,12 +348,12 @@ class Solver(MovingSolver):
             >>> type(stepper).__name__
             'Stepper'
         """
-        preferred = self._engine.preference(None, q0 is not None)
-        targets = self._request.of_grasps([grasp], None, preferred)
-        return self._engine.kinds_of(targets).method.stepper(targets, self._request.start(q0))
+        preference = self._engine.resolve_preference(None, q0 is not None)
+        targets = self._request.of_grasps([grasp], None, preference)
+        return self._engine.engine_for(targets).method.stepper(targets, self._request.start(q0))
 
     def fast(self) -> FastSolver:
-        """Solve for loops that cannot wait: see `FastSolver`.
+        """Return a solver of single targets for control loops, see `FastSolver`.
 
         Raises:
             UnsupportedError: The method is not hand-first, or the solver has a scene.
@@ -365,27 +379,27 @@ class Solver(MovingSolver):
     ) -> tuple[Alternative, ...]:
         """Find different solutions of one grasp, best first.
 
-        For every hand posture that meets the contacts: of an arm in closed form every branch
-        (signs of shoulder, elbow and wrist) with the intervals of its freedom, see `ArmBranch`,
-        and the preferred arm of each; of another arm the different configurations that many
-        starts lead to. Of two alike, one.
+        For every hand posture that meets the contacts: each branch of an arm with a closed form
+        (signs of shoulder, elbow and wrist) with the intervals of its redundancy, see `ArmBranch`,
+        at its preferred configuration; for other arms the configurations to which several starts
+        converge. Duplicates are removed.
 
         Args:
-            grasp: A contact per finger; its fingers must be the robot's.
-            limit: How many at most.
-            prefer: What comes first: "limits" (far from its limits), "manipulability" (of the
-                arm), "clearance", or "q0" (close to it).
-            q0: (n,) where the robot is [rad or m]; None is `robot.home`.
-            seed: As for `solve`.
-            fixed: As for `solve`.
-            apart: How different they are: of any two, at least one actuator differs by this part
-                of its range, 0 to 1. 0: all that are found.
+            grasp: Contacts by finger; the fingers must be the robot's.
+            limit: Maximum number of solutions.
+            prefer: Order of the solutions: "limits" (far from its limits), "manipulability" (of
+                the arm), "clearance", or "q0" (close to it).
+            q0: (n,) current configuration [rad or m]; None: `robot.home`.
+            seed: See `solve`.
+            fixed: See `solve`.
+            apart: Minimum difference of two solutions: one actuator at least differs by this
+                fraction of its range, 0 to 1. 0: all solutions.
 
         Returns:
-            The solutions; none if the grasp cannot be solved (`solve` says why).
+            The solutions; empty if the grasp cannot be solved (`solve` says why).
 
         Raises:
-            InputError: Bad limit, preference, distance or q0, or a grasp the robot cannot take.
+            InputError: Bad limit, preference, difference or q0, or an unsupported grasp.
 
         Example:
             >>> several = solver.solve_all(grasp, limit=4, prefer="manipulability")
@@ -393,7 +407,7 @@ class Solver(MovingSolver):
             (4, True)
         """
         targets = self._request.of_grasps([grasp], fixed)
-        finder = self._engine.kinds_of(targets).finder
+        finder = self._engine.engine_for(targets).finder
         start, query = self._request.start(q0), self._engine.collision_query(targets)
         return finder.find(targets, start, seed, limit, prefer, apart, query)
 
@@ -408,26 +422,26 @@ class Solver(MovingSolver):
         fixed: Mapping[str, float] | None = None,
         prefer: str | None = None,
     ) -> BatchSolution:
-        """Solve k palms that are given, with hands as they are said: only arms are unknown.
+        """Solve k palm poses with known hand postures: only the arm is unknown.
 
         Args:
             palms: (k, 4, 4) poses of `robot.palm` in the base frame.
             postures: Positions (k,), or one for all, of every motor that moves a finger, by name
-                [rad or m]; or configurations (k, n) or (n,) of which these motors are taken.
-            q0: (n,) or (k, n) start; None is `robot.home`.
-            seed: As for `solve`.
-            jobs: Threads, at least 1.
-            diagnose: As for `solve_batch`.
-            fixed: As for `solve`, for other actuators.
-            prefer: As for `solve`.
+                [rad or m]; or configurations (k, n) or (n,) from which these motors are taken.
+            q0: (n,) or (k, n) start; None: `robot.home`.
+            seed: See `solve`.
+            jobs: Number of threads, at least 1.
+            diagnose: See `solve_batch`.
+            fixed: See `solve`; for actuators of the arm.
+            prefer: See `solve`.
 
         Returns:
             As `solve_batch`, with `palm_position_error`, `palm_angle_error` and `palm_ok`.
 
         Raises:
-            InputError: No rigid poses, or postures that are not all there or beyond limits.
-            UnknownNameError: No such actuator.
-            UnsupportedError: The method is not hand-first, or the robot is a body.
+            InputError: The poses are not rigid, or postures are incomplete or beyond limits.
+            UnknownNameError: An actuator does not exist.
+            UnsupportedError: The method is not hand-first, or the robot has several arms.
 
         Example:
             >>> q = robot.random(np.random.default_rng(4), 50)
@@ -440,10 +454,11 @@ class Solver(MovingSolver):
         poses = checked_pose(palms, "palms")
         if poses.ndim != 3:
             raise InputError(f"palms: found shape {poses.shape}, expected (k, 4, 4)")
-        hands = hand_postures(self._request.robot, postures, len(poses))
-        preferred = self._engine.preference(prefer, q0 is not None)
-        targets = self._request.of_palms(poses, hands, fixed, preferred)
-        return self._engine.solve(targets, Run(q0, seed, jobs, None, diagnose, shown=True))
+        hands = broadcast_postures(self._request.robot, postures, len(poses))
+        preference = self._engine.resolve_preference(prefer, q0 is not None)
+        targets = self._request.of_palms(poses, hands, fixed, preference)
+        options = SolveOptions(q0, seed, jobs, None, diagnose, show_progress=True)
+        return self._engine.solve(targets, options)
 
     choose = choose
     grasps_of = grasps_of
@@ -456,25 +471,25 @@ class Solver(MovingSolver):
         gradient: ArrayLike | None = None,
         **more: ArrayLike | None,
     ) -> Sensitivity:
-        """How answers move with their targets, by the implicit function theorem.
+        """Return the derivatives of solutions by their targets (implicit function theorem).
 
-        What an answer leaves of its contacts' errors stays, in the sense of least squares; motors
-        at a limit stay there; of motions that contacts leave free none is made.
+        Remaining contact errors stay constant in the least-squares sense, motors at a limit stay
+        there, and motions that the contacts leave free are zero.
 
         Args:
-            q: (k, n) answers [rad or m].
+            q: (k, n) solutions [rad or m].
             points: (k, f, 3) contact points [m], as for `solve_batch`.
-            normals: (k, f, 3), likewise.
-            gradient: (k, n) of a number by q [1/rad or 1/m]: its derivatives by the contacts are
-                found, which takes a part of the time. None: those of q.
-            more: As for `solve_batch`.
+            normals: (k, f, 3) pad normals.
+            gradient: (k, n) gradient of a scalar by q [1/rad or 1/m]: the result is its gradient
+                by the contacts, which is cheaper. None: the derivatives of q.
+            more: See `solve_batch`.
 
         Returns:
             Derivatives (k, n, f, 3) of q by points [rad/m or 1] and by normals [rad or m]; with a
             gradient (k, f, 3).
 
         Raises:
-            InputError: Bad shapes or values, or targets of several kinds.
+            InputError: Bad shapes or values, or targets of several contact kinds.
 
         Example:
             >>> points, normals = robot.contacts(solution.q[None])
@@ -482,75 +497,80 @@ class Solver(MovingSolver):
             >>> rates.points.shape
             (1, 14, 3, 3)
         """
-        every = self.robot.configuration(q)
+        configurations = self.robot.configuration(q)
         targets = self._request.of_arrays(points, normals, None, more=more)
         k, n = len(targets), len(self.robot.actuators)
-        if every.shape != (k, n):
-            raise InputError(f"q: found shape {every.shape}, expected {(k, n)}")
-        kernel = self._engine.kinds_of(targets).sensitivity
+        if configurations.shape != (k, n):
+            raise InputError(f"q: found shape {configurations.shape}, expected {(k, n)}")
+        kernel = self._engine.engine_for(targets).sensitivity
         if gradient is not None:
-            given = np.asarray(gradient, dtype=float)
-            if given.shape != every.shape:
-                raise InputError(f"gradient: found shape {given.shape}, expected {every.shape}")
-            return kernel(targets, every, given)
+            gradients = np.asarray(gradient, dtype=float)
+            if gradients.shape != (k, n):
+                raise InputError(f"gradient: found shape {gradients.shape}, expected {(k, n)}")
+            return kernel(targets, configurations, gradients)
         rows = np.repeat(np.arange(k), n)
-        found = kernel(targets.rows(rows), every[rows], np.tile(np.eye(n), (k, 1)))
+        rates = kernel(targets.rows(rows), configurations[rows], np.tile(np.eye(n), (k, 1)))
         f = len(self.robot.fingers)
-        return Sensitivity(found.points.reshape(k, n, f, 3), found.normals.reshape(k, n, f, 3))
+        return Sensitivity(rates.points.reshape(k, n, f, 3), rates.normals.reshape(k, n, f, 3))
 
     def moved(self, name: str, pose: ArrayLike) -> Self:
-        """The same solver with something in its scene elsewhere, in less than a millisecond.
+        """Return the solver with an item of its scene at another pose, within a millisecond.
 
         Args:
-            name: Of an item of the scene.
-            pose: (4, 4) of it in the base frame.
+            name: Name of the item.
+            pose: (4, 4) pose of the item in the base frame.
 
         Raises:
-            InputError: The solver has no scene, or this is no pose.
+            InputError: The solver has no scene, or the pose is not rigid.
             UnknownNameError: The scene has no such item.
-            DescriptionError: It would stand in the robot's base.
+            DescriptionError: The item would penetrate the robot's base.
 
         Example:
             >>> lower = np.eye(4)
             >>> lower[2, 3] = -0.3
-            >>> among = ik.Solver(robot, scene=ik.load_scene("table"))
-            >>> among.moved("table", lower).solve(grasp).status.name
+            >>> at_table = ik.Solver(robot, scene=ik.load_scene("table"))
+            >>> at_table.moved("table", lower).solve(grasp).status.name
             'SOLVED'
         """
         check = self._engine.check
         if check is None:
-            raise InputError(f"{name!r} cannot be moved: the solver has no scene")
-        # Not `copy`, which builds what is unpickled anew.
-        other = object.__new__(type(self))
-        other.__dict__.update(self.__dict__)
-        moved = check.moved(name, single_pose(pose))
-        other.scene, other._engine = moved.scene, self._engine.about(moved)
-        other._asked = (*self._asked[:-1], moved.scene)
-        return other
+            raise InputError(f"{name}: the solver has no scene; expected one with this item")
+        moved_check = check.moved(name, single_pose(pose))
+        # `copy` would call `__reduce__`, which builds a new engine.
+        solver = object.__new__(type(self))
+        solver.__dict__.update(self.__dict__)
+        solver.scene, solver._engine = moved_check.scene, self._engine.with_scene(moved_check)
+        solver._init_args = {**self._init_args, "scene": moved_check.scene}
+        return solver
 
     @property
     def scene_check(self) -> SceneCheck | None:
-        """What tells whether configurations touch anything; None without a scene."""
+        """Collision check of the scene; None without a scene."""
         return self._engine.check
 
     def check(self, q: ArrayLike, grasp: Grasp) -> Clearances | None:
-        """How far configurations are from touching anything they must not touch.
+        """Return the clearances of configurations.
 
         Args:
             q: (n,) or (k, n) actuator positions [rad or m].
-            grasp: Its fingers may touch what is grasped.
+            grasp: Grasp whose fingers may touch the grasped item.
 
         Returns:
             Clearances of the k configurations (one for a single q); None without a scene.
 
         Raises:
-            InputError: Bad q, or a grasp that the robot cannot take.
+            InputError: Bad q, or an unsupported grasp.
 
         Example:
-            >>> among = ik.Solver(robot, scene=ik.load_scene("table"))
-            >>> bool(among.check(solution.q, grasp).distance[0] > 0)
+            >>> at_table = ik.Solver(robot, scene=ik.load_scene("table"))
+            >>> bool(at_table.check(solution.q, grasp).distance[0] > 0)
             True
         """
         targets = self._request.of_grasps([grasp], None)
         query = self._engine.collision_query(targets)
         return query and query.check(np.atleast_2d(self.robot.configuration(q)))
+
+
+def _build_solver(kind: type[Solver], init_args: Mapping[str, Any]) -> Solver:
+    """Build a solver from named init arguments, for unpickling."""
+    return kind(**init_args)

@@ -29,7 +29,7 @@ from casadi_ik.solve.collision_free import PARAMETERS as FREE
 from casadi_ik.solve.free_hands import PARAMETERS as FINGERS
 from casadi_ik.solve.hand_first.body import BodyStep
 from casadi_ik.solve.hand_first.method import HandFirstMethod
-from casadi_ik.solve.trials import AT_ENDS, CARRYING, PALMS
+from casadi_ik.solve.trials import CARRY_ONLY, PALM_SCALES, TRUNK_STRETCH
 
 MOST = 1000
 """The largest capacity: each solid costs kilobytes."""
@@ -355,7 +355,11 @@ class SceneSources:
         sizes = {"LOOK_ROUNDS": self._rounds, "HAS_CLOSED_ARM": closed}
         sizes |= {"N_HAND_PARTS": self._hand_parts}
         sizes |= {"STATE_TURN": self.method.step.layouts.state.slice("turn").start}
-        reals = {"LOOK_ALIKE": FREE.alike, "PALM_TURN": PALMS[0], "PALM_SHIFT": PALMS[3]}
+        reals = {
+            "LOOK_ALIKE": FREE.alike,
+            "PALM_TURN": PALM_SCALES[0],
+            "PALM_SHIFT": PALM_SCALES[3],
+        }
         return (
             define(sizes)
             + "".join(f"#define {name} {number(float(value))}\n" for name, value in reals.items())
@@ -510,7 +514,7 @@ class BodySceneSources(SceneSources):
         state = self.step.layouts.state
         motors = [*self.robot.description.trunk_actuators, *self.step.layouts.arm]
         carry: dict[int, float] = {}
-        for name, value in (CARRYING | {"side": float(len(self.step.sides))}).items():
+        for name, value in (CARRY_ONLY | {"side": float(len(self.step.sides))}).items():
             place = state.slice(name)
             carry |= dict.fromkeys(range(place.start, place.stop), value)
         places = {
@@ -530,7 +534,7 @@ class BodySceneSources(SceneSources):
         return (
             super().look_constants()
             + define(places)
-            + f"#define TRUNK_AT_ENDS {number(AT_ENDS)}\n"
+            + f"#define TRUNK_AT_ENDS {number(TRUNK_STRETCH)}\n"
             + define_arrays(arrays)
         )
 

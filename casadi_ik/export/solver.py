@@ -49,7 +49,7 @@ from casadi_ik.solve.hand_first.driver import SearchPlan, source_text
 from casadi_ik.solve.hand_first.method import HandFirstMethod
 from casadi_ik.solve.hand_first.parameters import HandFirstParameters
 from casadi_ik.solve.hand_first.state import terms
-from casadi_ik.solve.request import BEYOND, touched
+from casadi_ik.solve.request import POSTURE_LIMIT_SLACK, contacts_from_palms
 from casadi_ik.solve.verdict import LIMIT_SLACK, TOLERANCE_SLACK
 
 
@@ -63,10 +63,10 @@ def palm_marks(robot: ArmHand, prefix: str, real: str) -> dict[str, str]:
     motors = robot.description.finger_motors
     own = np.where(np.isin(robot.actuators, motors), robot.home, np.nan)
     home = robot.palm(robot.home)
-    if touched(robot, home[None], own[None])[2]:  # contacts leave it free
+    if contacts_from_palms(robot, home[None], own[None])[2]:  # contacts leave it free
         return {}
     pose = np.concatenate([home[:3, :3].ravel(), home[:3, 3]])
-    constants = f"#define POSTURE_ROUNDING {number(BEYOND)}\n" + define_arrays(
+    constants = f"#define POSTURE_ROUNDING {number(POSTURE_LIMIT_SLACK)}\n" + define_arrays(
         {"HOME_PALM": pose, "OF_HAND": np.isin(robot.actuators, motors).astype(int)}
     )
     marks = {"PREFIX": prefix, "GUARD": prefix.upper()}

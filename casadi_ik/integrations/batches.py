@@ -33,7 +33,7 @@ from casadi_ik.model.pose import transform_arrays
 from casadi_ik.solve.diagnosis import Diagnosis
 from casadi_ik.solve.solution import BatchSolution
 from casadi_ik.solve.status import Status
-from casadi_ik.solve.target_files import Part, Source
+from casadi_ik.solve.target_files import BatchPart, TargetSource
 
 if TYPE_CHECKING:
     from dask.distributed import Client
@@ -184,7 +184,7 @@ class SolvedPart:
 
 
 def solve_part(
-    solver: bytes, asked: Mapping[str, Any], part: Part, logged: bool, place: str | None = None
+    solver: bytes, asked: Mapping[str, Any], part: BatchPart, logged: bool, place: str | None = None
 ) -> SolvedPart:
     """Solve a part.
 
@@ -340,7 +340,7 @@ def _brief(value: Any) -> str:
 
 def solve_parts(
     solver: Solver,
-    source: Source,
+    source: TargetSource,
     asked: Mapping[str, Any],
     folder: BatchFolder,
     jobs: int = 1,

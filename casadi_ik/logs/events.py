@@ -48,7 +48,7 @@ from casadi_ik.solve.trace import (
     POSITION_ERROR,
     RESTART,
     SIGMA,
-    WORD,
+    WORD_BITS,
     Q,
     RecordedJacobian,
     TraceFormat,
@@ -302,7 +302,7 @@ def measured_jacobians(form: TraceFormat, item: Field) -> tuple[str, ...]:
 def mask_words(form: TraceFormat) -> int:
     """Number of 32-bit words of a mask of all actuators."""
     sizes = {item.name: item.size for item in form.layout}
-    coordinates = -(-sizes.get(Q.name, 1) // WORD)
+    coordinates = -(-sizes.get(Q.name, 1) // WORD_BITS)
     masks = (sizes.get(mask.name, 1) for mask in (LIMIT_MASK, ACTIVE_MASK))
     return max(coordinates, *masks)
 

@@ -48,7 +48,7 @@ from casadi_ik.logs.format import (
 )
 from casadi_ik.logs.rows import solve_layout
 from casadi_ik.logs.tables import Labels, MethodRows
-from casadi_ik.solve.trace import CONDITION, SIGMA, STANDARD, Elements
+from casadi_ik.solve.trace import CONDITION, SIGMA, STANDARD_FIELDS, Elements
 
 logger = logging.getLogger(__name__)
 
@@ -431,7 +431,7 @@ def _layout(kind: str, text: str) -> Layout:
             Elements.FINGERS: (f,),
         }
         expected = [
-            Field(each.name, shapes.get(each.elements, ()), each.dtype) for each in STANDARD
+            Field(each.name, shapes.get(each.elements, ()), each.dtype) for each in STANDARD_FIELDS
         ]
         measured = [item for item in layout if item.name.startswith((SIGMA, CONDITION))]
         expected += [

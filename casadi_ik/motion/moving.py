@@ -24,7 +24,7 @@ from casadi_ik.motion.inputs import FollowPlan
 from casadi_ik.motion.motion import a_direction, length, rates_of, seconds, unbounded
 from casadi_ik.motion.reach import Carried, Pace, Reach, WayPlan, move, place, reach
 from casadi_ik.motion.track import PathTracker, Track, track
-from casadi_ik.solve.engine import Engine, Run
+from casadi_ik.solve.engine import Engine, SolveOptions
 from casadi_ik.solve.request import Request
 from casadi_ik.solve.solution import Chosen
 from casadi_ik.solve.verdict import LIMIT_SLACK, judge
@@ -141,8 +141,8 @@ class MovingSolver:
         # A palm that is given counts as the contacts that it leads to.
         targets = replace(self._request.of_grasps(grasps, fixed), palms=None)
         if targets.fixed is not None and targets.fixed.ndim > 1:
-            targets = replace(targets, fixed=self._request.held(fixed))
-        engine, start = self._engine.kinds_of(targets), self._request.start(q0)
+            targets = replace(targets, fixed=self._request.fixed_vector(fixed))
+        engine, start = self._engine.engine_for(targets), self._request.start(q0)
         _ = engine.finder
         ((kinds, _, _),) = group_by_kinds(targets.rows(slice(0, 1)))
         travel = None
@@ -428,12 +428,12 @@ class MovingSolver:
                 return [q], ""
             off = f"{1e3 * np.nanmax(verdict.position_error):.3g} mm"
             return [], f"the posture that was chosen does not take its grasp ({off} off, or limits)"
-        engine = self._engine.kinds_of(problem)
+        engine = self._engine.engine_for(problem)
         found = engine.finder.find(
             problem, start, seed, limit, "q0", apart=0.05, query=engine.collision_query(problem)
         )
         # A solve looks further for an answer that is free than a list of all does.
-        best = engine.solve(replace(problem, prefer="q0"), Run(start, seed))
+        best = engine.solve(replace(problem, prefer="q0"), SolveOptions(start, seed))
         every = [*best.q[best.success], *(one.q for one in found)][:limit]
         return every, "" if every else "the grasp has no solution"
 

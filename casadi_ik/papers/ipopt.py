@@ -32,7 +32,7 @@ from casadi_ik.kinematics.contacts import LENGTH, ContactRows, Kinds, point_norm
 from casadi_ik.kinematics.couplings import joint_positions
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.targets import TargetBatch
-from casadi_ik.solve.method import Outcome
+from casadi_ik.solve.method import Method, Outcome
 from casadi_ik.solve.status import Phase, Status
 from casadi_ik.solve.trace import (
     ANGLE_ERROR,
@@ -46,7 +46,7 @@ from casadi_ik.solve.trace import (
     JacobianMeasures,
     Q,
     TraceFormat,
-    packed,
+    pack_mask,
     trace_format,
 )
 
@@ -390,7 +390,7 @@ AT_LIMIT = 1e-6
 """A motor this close to its limit [rad or m] counts as standing there; Ipopt stays inside."""
 
 
-class IpoptMethod:
+class IpoptMethod(Method):
     """`ipopt`: one start from q0, then random ones until the contacts are met.
 
     An iteration is a row of the trace: every start counts its first point and every step of
@@ -556,7 +556,7 @@ class IpoptMethod:
         for name in ("barrier", "infeasibility", "regularization"):
             rows[name] = np.concatenate([getattr(run, name) for run in runs])
         rows["step_size"] = np.concatenate([_step_sizes(run.path) for run in runs])
-        rows["limit_mask"] = packed(at_limit)
+        rows["limit_mask"] = pack_mask(at_limit)
         rows["restart"] = np.repeat(np.arange(len(runs)), [len(run.path) for run in runs])
         rows["phase"] = Phase.WHOLE_SYSTEM
         rows["status"][-1:] = max(status, 0)

@@ -26,14 +26,14 @@ from casadi_ik.model.pose import inverse, transform_arrays
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.alternatives import APART, SEEKING, AlternativeFinder, checked_distance
 from casadi_ik.solve.arm_search import Preference
-from casadi_ik.solve.batches import judged
+from casadi_ik.solve.batches import judge_outcome
 from casadi_ik.solve.collision_free import free_answers
 from casadi_ik.solve.engine import Engine
 from casadi_ik.solve.method import Outcome
 from casadi_ik.solve.request import CLEARANCE, Request
 from casadi_ik.solve.solution import Choice, Ranking, Solution
 from casadi_ik.solve.status import Status
-from casadi_ik.solve.trials import Deduplicator, largest_of_each
+from casadi_ik.solve.trials import Deduplicator, largest_per_owner
 from casadi_ik.solve.turns import in_nearest_turns, nearest_turns, search_start
 
 Judgement: TypeAlias = str | Callable[[ArmHand, Array], ArrayLike]
@@ -158,7 +158,7 @@ def choose(
     limit = _count(limit, "limit")
     most = None if per_candidate is None else _count(per_candidate, "per_candidate")
     apart, start = checked_distance(apart), request.start(q0)
-    word = "own" if callable(prefer) else engine.preference(prefer, q0 is not None)
+    word = "own" if callable(prefer) else engine.resolve_preference(prefer, q0 is not None)
     pose = None if object_pose is None else single_pose(object_pose, "object_pose")
     wanted: Preference = _own(prefer, engine.robot) if callable(prefer) else word
     asked = list(_asked(request, grasps, pose, fixed))
@@ -314,7 +314,7 @@ class _Search:
                 continue
             some = targets.rows(np.searchsorted(numbers, left))
             some = replace(some, picked=left, prefer="limits")
-            engine, query = self.engine.kinds_of(some), self.engine.collision_query(some)
+            engine, query = self.engine.engine_for(some), self.engine.collision_query(some)
             for first in range(0, len(left), PARAMETERS.together):
                 rows = np.arange(first, min(first + PARAMETERS.together, len(left)))
                 nearby = None if query is None else query.rows(rows)
@@ -358,7 +358,7 @@ class _Search:
             q = in_nearest_turns(robot, near, answers.q[mine], self.start)
             outcome = Outcome(q, status, none, none, np.zeros(len(mine)), {})
             query, method = self.engine.collision_query(some), self.engine.method.name
-            batch = judged(self.engine.robot, method, some, outcome, query)
+            batch = judge_outcome(self.engine.robot, method, some, outcome, query)
             found |= {int(row): batch.solution(i) for i, row in enumerate(mine.tolist())}
         return found
 
@@ -462,7 +462,7 @@ class _Part:
             return found, whose, {}
         left = np.flatnonzero(~np.isin(owner, whose))
         # The last word has the hand with most room.
-        left = left[largest_of_each(owner[left], surplus[left], 1)]
+        left = left[largest_per_owner(owner[left], surplus[left], 1)]
         clear = query.rows(owner[left]).check(q[left])
         named = ((row, clear.pair(i)) for i, row in enumerate(owner[left].tolist()))
         return found, whose, {row: pair for row, pair in named if pair is not None}

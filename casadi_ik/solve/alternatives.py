@@ -25,17 +25,17 @@ from casadi_ik.model.grasp import Tolerance
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.arm_search import ArmSearch, Preference
 from casadi_ik.solve.hand_first.body import BodyStep
-from casadi_ik.solve.hand_first.method import HandFirstMethod
-from casadi_ik.solve.request import CLEARANCE, preference
+from casadi_ik.solve.method import HandSearch
+from casadi_ik.solve.request import CLEARANCE, resolve_preference
 from casadi_ik.solve.solution import Alternative, ArmBranch
 from casadi_ik.solve.trials import (
     Bounds,
     LocalRefinement,
     Subproblems,
-    distinct,
-    other_trunks,
-    palm_parts,
-    palms_of,
+    distinct_rows,
+    palm_coordinates,
+    sample_trunks,
+    side_palms,
 )
 from casadi_ik.solve.turns import nearest_turns, search_start
 from casadi_ik.solve.verdict import contact_verdicts, judge
@@ -99,7 +99,7 @@ class AlternativeFinder:
         hand: Positions in q of the hand's actuators.
     """
 
-    def __init__(self, robot: ArmHand, method: HandFirstMethod, compiled: bool = True) -> None:
+    def __init__(self, robot: ArmHand, method: HandSearch, compiled: bool = True) -> None:
         """Take the robot and hand-first on it."""
         self.robot = robot
         self.trials = Subproblems(robot, method)
@@ -183,7 +183,7 @@ class AlternativeFinder:
         """
         if not isinstance(limit, (int, np.integer)) or limit < 1:
             raise InputError(f"limit: found {limit!r}, expected an integer >= 1")
-        preference(prefer, started=True)
+        resolve_preference(prefer, has_start=True)
         apart = checked_distance(apart)
         limits = self.trials.limits(targets).first
         robot, bounds, start = self.robot.description, (limits.lower, limits.upper), q0
@@ -201,7 +201,7 @@ class AlternativeFinder:
         keys = np.stack([self._valued(q, q0, prefer, query), self._margins(q, self._arm)])
         order = [int(i) for i in np.lexsort(-keys[::-1]) if solved[i]]
         parts = self._parts(q[order], list(range(q.shape[1])))
-        kept = distinct(parts, apart)[:limit]
+        kept = distinct_rows(parts, apart)[:limit]
         q = nearest_turns(robot, q, start, bounds, prefer == "q0")
         chosen = [replace(found[order[i]], q=q[order[i]]) for i in kept]
         return tuple(self._described(targets, alternative, start) for alternative in chosen)
@@ -243,7 +243,7 @@ class AlternativeFinder:
             # The restarts of the whole search find what the rounds from tables miss.
             q = method.run(targets, q0[None], 0, trace=False).q
             kept = q[trials.solved(targets, q, targets.enforce_limits)]
-        return [kept[i] for i in distinct(self.hand_parts(kept), SEEKING.distinct)]
+        return [kept[i] for i in distinct_rows(self.hand_parts(kept), SEEKING.distinct)]
 
     def hand_parts(self, q: Array) -> Array:
         """Return the numbers that distinguish hand poses: motors, and the palm that an arm moves.
@@ -253,13 +253,13 @@ class AlternativeFinder:
 
         Returns:
             (m, h) motors of the hand divided by their ranges; with an arm (m, h + 12), followed by
-            the pose of the palm (`palm_parts`). Contacts such as those of two opposed fingers leave
-            the palm free, so that equal postures of the hand are different hand poses.
+            the pose of the palm (`palm_coordinates`). Contacts such as those of two opposed fingers
+            leave the palm free, so that equal postures of the hand are different hand poses.
         """
         parts = self._parts(q, self.hand)
         if not self._arm:
             return parts
-        return np.concatenate([parts, palm_parts(self.robot.palm(q))], axis=1)
+        return np.concatenate([parts, palm_coordinates(self.robot.palm(q))], axis=1)
 
     def _arms(
         self,
@@ -301,7 +301,7 @@ class AlternativeFinder:
             # A stretch may be shorter than the positions are apart.
             found += [_Found(arm, posture) for arm in self._searched(targets, q, seed, q0, prefer)]
             parts = self._parts(np.stack([item.q for item in found]), self._arm)
-            return [found[i] for i in distinct(parts, SEEKING.distinct)]
+            return [found[i] for i in distinct_rows(parts, SEEKING.distinct)]
         return self._exact(targets, found) or [_Found(q, posture)]
 
     def _seen_by_form(self, end: Array, limits: Bounds) -> Array:
@@ -322,12 +322,12 @@ class AlternativeFinder:
 
     def _other_trunks(self, targets: TargetBatch, q: Array) -> list[Array]:
         """Different trunks and arms of a body, its hands as in q."""
-        palms, first = palms_of(self.robot, q[None]), np.zeros(1, np.intp)
-        ends, _ = other_trunks(self.trials, targets, q[None], palms, first, 0, SEEKING.trunks)
+        palms, first = side_palms(self.robot, q[None]), np.zeros(1, np.intp)
+        ends, _ = sample_trunks(self.trials, targets, q[None], palms, first, 0, SEEKING.trunks)
         ends = np.concatenate([q[None], ends])
         kept = ends[self.trials.solved(targets, ends, targets.enforce_limits)]
         moving = [i for i in range(kept.shape[1]) if i not in self.hand]
-        return [kept[i] for i in distinct(self._parts(kept, moving), SEEKING.distinct)]
+        return [kept[i] for i in distinct_rows(self._parts(kept, moving), SEEKING.distinct)]
 
     def _searched(
         self, targets: TargetBatch, q: Array, seed: int, q0: Array, prefer: str
@@ -345,7 +345,7 @@ class AlternativeFinder:
         ends = np.concatenate([q[None], ends])
         same = (np.abs(self._parts(ends - q, self.hand)) < SEEKING.distinct).all(axis=1)
         kept = ends[same & self.trials.solved(targets, ends, targets.enforce_limits)]
-        return [kept[i] for i in distinct(self._parts(kept, self._arm), SEEKING.distinct)]
+        return [kept[i] for i in distinct_rows(self._parts(kept, self._arm), SEEKING.distinct)]
 
     def _parts(self, q: Array, columns: list[int]) -> Array:
         """Some columns of configurations as parts of their ranges."""

@@ -1,4 +1,4 @@
-"""How a batch is cut into parts, and a part solved: judged, and as it is recorded."""
+"""Division of a batch into parts, and the check, recording and concurrency of parts."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from casadi_ik.solve.verdict import judge
 
 @dataclass(frozen=True, eq=False)
 class SolvedPart:
-    """A part of a batch, solved.
+    """A solved part of a batch.
 
     Attributes:
-        targets: Its targets.
-        starts: (k, n) where they were begun.
-        started: When it was begun, since the Unix epoch [ns].
-        outcome: What the method came to.
-        batch: The same, judged.
-        query: What the answers were checked against; None: nothing.
+        targets: Targets of the part.
+        starts: (k, n) start configurations [rad or m].
+        started: Start time [ns since the Unix epoch].
+        outcome: Result of the method.
+        batch: Solutions after the verdict.
+        query: Collision query of the targets; None: collisions were not checked.
     """
 
     targets: TargetBatch
@@ -44,14 +44,14 @@ class SolvedPart:
     batch: BatchSolution
     query: CollisionQuery | None = None
 
-    def record(self, recorder: Recorder, form: TraceFormat, seed: int) -> None:
-        """Hand it on with its iterations, if they were kept."""
+    def record(self, recorder: Recorder, trace_format: TraceFormat, seed: int) -> None:
+        """Pass the part to a recorder if its iterations were traced."""
         if self.outcome.rows is None:
             return
         batch = self.batch
         before = np.concatenate([[0.0], np.cumsum(batch.time)[:-1]])[: len(batch)]
         block = SolveBlock(
-            format=form,
+            format=trace_format,
             first=self.targets.first_row,
             targets=self.targets,
             starts=self.starts,
@@ -64,35 +64,35 @@ class SolvedPart:
         recorder.record(block)
 
 
-def judged(
+def judge_outcome(
     robot: ArmHand,
     method: str,
     targets: TargetBatch,
     outcome: Outcome,
     query: CollisionQuery | None = None,
 ) -> BatchSolution:
-    """An outcome with the verdict on it, which has the last word on what is solved.
+    """Check an outcome against its targets; the verdict decides what is solved.
 
     Args:
         robot: The robot.
         method: Name of the method.
         targets: The targets.
-        outcome: What the method came to.
-        query: What the answers must not touch; None: nothing is checked.
+        outcome: Result of the method.
+        query: Collision query of the targets; None: collisions are not checked.
     """
     verdict = judge(robot, targets, outcome.q)
     success, palm = verdict.solved(targets.enforce_limits), verdict.palm
-    clear = None if query is None else query.check(outcome.q)
-    touching = None if clear is None else success & ~clear.free
-    if clear is not None:
-        success = success & clear.free
-    status, content = outcome.status, outcome.status == Status.SOLVED
-    if (content != success).any():
-        # A method that is content with what the verdict refuses has come to a standstill.
-        status = np.where(content, int(Status.STALLED), status)
+    clearances = None if query is None else query.check(outcome.q)
+    in_collision = None if clearances is None else success & ~clearances.free
+    if clearances is not None:
+        success = success & clearances.free
+    status, claimed = outcome.status, outcome.status == Status.SOLVED
+    if (claimed != success).any():
+        # A method's SOLVED that fails the check becomes STALLED.
+        status = np.where(claimed, int(Status.STALLED), status)
         status[success] = Status.SOLVED
-        if touching is not None:
-            status[touching] = Status.COLLISION
+        if in_collision is not None:
+            status[in_collision] = Status.COLLISION
     return BatchSolution(
         success=success,
         status=status,
@@ -110,9 +110,9 @@ def judged(
         method=method,
         robot=robot.name,
         actuators=robot.actuators,
-        clearance=None if clear is None else clear.distance,
-        closest=() if clear is None else tuple(map(clear.pair, range(len(outcome.q)))),
-        collisions=() if clear is None else (None,) * len(outcome.q),
+        clearance=None if clearances is None else clearances.distance,
+        closest=() if clearances is None else tuple(map(clearances.pair, range(len(outcome.q)))),
+        collisions=() if clearances is None else (None,) * len(outcome.q),
         palm_position_error=None if palm is None else palm.position_error,
         palm_angle_error=None if palm is None else palm.angle_error,
         palm_ok=None if palm is None else palm.ok,
@@ -120,91 +120,116 @@ def judged(
     )
 
 
-PART_BYTES = 2**24
-"""About how many bytes of iterations a part may have if they are to be kept; what it has made is
-lost if the process is killed before it goes to the log."""
+MAX_PART_BYTES = 2**24
+"""Approximate maximum size of the trace of a part [bytes]. A killed process loses the parts that it
+has not recorded."""
 
-CACHED_BYTES = 2**22
-"""A part of `ENOUGH` solves has no more than this: what the next one needs is then at hand, in the
-caches and in the process. Parts of 16 MiB make a study of hand-first with a log a tenth slower."""
+MAX_CACHED_BYTES = 2**22
+"""Maximum size of the trace of a part of at least `MIN_PART_SOLVES` solves [bytes].
 
-ENOUGH = 256
-"""Solves of a part that keep the vectors busy: its last ones have them to themselves."""
+The next part then finds its data in the caches. Source: a logged study of hand-first takes 10 %
+longer with parts of 16 MiB."""
 
-FIRST_PART = 64
-"""Solves of the first parts of a traced batch, from which the others' size is learned."""
+MIN_PART_SOLVES = 256
+"""Number of solves that keep the vector lanes busy; the last solves of a part run alone."""
+
+FIRST_PART_SOLVES = 64
+"""Number of solves of the first parts of a traced batch, from which the part size is adapted."""
 
 
 class BatchParts:
-    """The parts of a batch in order; iterating may go on while finished parts are learned from."""
+    """The parts of a batch in order; the part size adapts while the parts are solved."""
 
-    def __init__(self, count: int, jobs: int, trace: bool, watched: bool = False) -> None:
-        """Cut.
+    def __init__(self, count: int, jobs: int, trace: bool, show_progress: bool = False) -> None:
+        """Divide a batch.
 
         Args:
-            count: Targets.
-            jobs: Threads.
-            trace: Whether all iterations are kept.
-            watched: Whether someone wants to see how far it is.
+            count: Number of targets.
+            jobs: Number of threads.
+            trace: Whether all iterations are recorded.
+            show_progress: Whether a progress bar is shown.
         """
         self._count = count
-        self._trace, self._watched = trace, watched
-        self._largest = max(1, -(-count // jobs))
-        self._size = min(FIRST_PART, self._largest) if trace or watched else self._largest
+        self._trace, self._show_progress = trace, show_progress
+        self._max_size = max(1, -(-count // jobs))
+        is_adaptive = trace or show_progress
+        self._size = min(FIRST_PART_SOLVES, self._max_size) if is_adaptive else self._max_size
 
     def __iter__(self) -> Iterator[slice]:
-        """The parts; a single empty one if there are no targets.
+        """Yield the rows of each part; a single empty part if there are no targets.
 
-        A part is recorded while the next is solved. The last parts of a traced batch grow smaller,
-        so that little is left to record when all are solved.
+        A part is recorded while the next one is solved. The last parts of a traced batch shrink,
+        so that little remains to be recorded after the last solve.
         """
         start = 0
         while True:
-            left = self._count - start
-            size = min(self._size, max(left // 2, ENOUGH)) if self._trace else self._size
-            stop = min(start + size, self._count)
+            remaining = self._count - start
+            size = min(self._size, max(remaining // 2, MIN_PART_SOLVES))
+            stop = min(start + (size if self._trace else self._size), self._count)
             yield slice(start, stop)
             start = stop
             if start == self._count:
                 return
 
-    def pace(self, seconds: float) -> None:
-        """Take note of how long a part took: those that someone watches take a quarter second."""
-        if self._watched and not self._trace and seconds < 0.25:
-            self._size = min(4 * self._size, self._largest)
+    def adapt_to_time(self, seconds: float) -> None:
+        """Enlarge the parts of a batch with a progress bar to about a quarter of a second.
 
-    def learn(self, solves: int, size: int) -> None:
-        """Take note of how many bytes of iterations so many solves had."""
-        cached, fitting = (bound * solves // max(size, 1) for bound in (CACHED_BYTES, PART_BYTES))
-        self._size = max(1, min(max(cached, min(ENOUGH, fitting)), self._largest))
+        Args:
+            seconds: Duration of a part [s].
+        """
+        if self._show_progress and not self._trace and seconds < 0.25:
+            self._size = min(4 * self._size, self._max_size)
+
+    def adapt_to_memory(self, solves: int, size: int) -> None:
+        """Adapt the part size to the size of the trace.
+
+        Args:
+            solves: Number of solves of a part.
+            size: Size of their trace [bytes].
+        """
+        cached, fitting = (
+            bound * solves // max(size, 1) for bound in (MAX_CACHED_BYTES, MAX_PART_BYTES)
+        )
+        self._size = max(1, min(max(cached, min(MIN_PART_SOLVES, fitting)), self._max_size))
 
 
 Item = TypeVar("Item")
-Done = TypeVar("Done")
+Result = TypeVar("Result")
 
 
-def in_order(task: Callable[[Item], Done], items: Iterable[Item], jobs: int) -> Iterator[Done]:
-    """What becomes of items, in order, done by so many threads.
+def map_ordered(
+    task: Callable[[Item], Result], items: Iterable[Item], jobs: int
+) -> Iterator[Result]:
+    """Yield the results of a task on items, in order, computed by several threads.
 
-    If what takes the results ends by an exception (Ctrl-C), the threads are told to stop.
+    If the consumer ends by an exception (Ctrl-C), the threads are cancelled.
+
+    Args:
+        task: Function of an item.
+        items: The items; at most `jobs` + 1 are taken ahead of the results.
+        jobs: Number of threads.
+
+    Yields:
+        The result of each item.
     """
     if jobs == 1:
         yield from map(task, items)
         return
-    cancelled, pool, ahead = threading.Event(), ThreadPoolExecutor(jobs), deque[Future[Done]]()
+    cancelled, pool = threading.Event(), ThreadPoolExecutor(jobs)
+    pending = deque[Future[Result]]()
 
-    def work(item: Item) -> Done:
+    def run(item: Item) -> Result:
         with cancellable(cancelled):
             stop_if_cancelled()
             return task(item)
 
     try:
         for item in items:
-            ahead.append(pool.submit(work, item))
-            if len(ahead) > jobs:
-                yield ahead.popleft().result()
-        while ahead:
-            yield ahead.popleft().result()
+            pending.append(pool.submit(run, item))
+            if len(pending) > jobs:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
     except BaseException:
         cancelled.set()
         raise

@@ -23,12 +23,19 @@ from casadi_ik.kinematics.contacts import LENGTH
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.diagnosis import ArmReach, HandFit
 from casadi_ik.solve.status import Phase
-from casadi_ik.solve.trials import NEVER, LocalRefinement, Rows, Subproblems, allowed, smallest
+from casadi_ik.solve.trials import (
+    UNREACHABLE_TOLERANCE,
+    LocalRefinement,
+    Rows,
+    Subproblems,
+    residual_tolerances,
+    smallest_per_target,
+)
 from casadi_ik.solve.verdict import contact_verdicts, judge
 
 
 @dataclass(frozen=True)
-class ClosestTuning:
+class ClosestSettings:
     """Numbers of the search for the nearest contacts, chosen with ``studies/diagnosis.py``.
 
     Attributes:
@@ -49,11 +56,11 @@ class ClosestTuning:
     slid: int = 2
 
 
-TUNING = ClosestTuning()
+CLOSEST_TUNING = ClosestSettings()
 
 
 @dataclass(frozen=True, eq=False)
-class Closest:
+class ClosestConfigurations:
     """What came closest to k targets.
 
     Attributes:
@@ -67,16 +74,18 @@ class Closest:
     fair: Array
     ratio: Array
 
-    def rows(self, rows: Rows) -> Closest:
+    def rows(self, rows: Rows) -> ClosestConfigurations:
         """What came closest to some of the targets."""
-        return Closest(self.q[rows], self.fair[rows], self.ratio[rows])
+        return ClosestConfigurations(self.q[rows], self.fair[rows], self.ratio[rows])
 
-    def put(self, rows: Rows, found: Closest) -> None:
+    def put(self, rows: Rows, found: ClosestConfigurations) -> None:
         """Take what came closer to some of the targets."""
         self.q[rows], self.fair[rows], self.ratio[rows] = found.q, found.fair, found.ratio
 
 
-def closest(descent: LocalRefinement, owner: Rows, q: Array, followed: int) -> Closest:
+def find_closest(
+    descent: LocalRefinement, owner: Rows, q: Array, followed: int
+) -> ClosestConfigurations:
     """Follow the best of some configurations to the end.
 
     Args:
@@ -86,10 +95,10 @@ def closest(descent: LocalRefinement, owner: Rows, q: Array, followed: int) -> C
         followed: How many of a target at most.
     """
     cost = (descent.misses(owner, q) ** 2).sum(axis=(1, 2))
-    kept = smallest(owner, cost, followed)
+    kept = smallest_per_target(owner, cost, followed)
     owner, q = owner[kept], q[kept]
     count, first = len(q), np.searchsorted(owner, np.arange(len(descent.targets)))
-    tolerated = allowed(descent.targets)[owner]
+    tolerated = residual_tolerances(descent.targets)[owner]
     counted = tolerated > 0
     total = (tolerated**2).sum(axis=(1, 2))
     weights = counted.astype(float)
@@ -98,7 +107,7 @@ def closest(descent: LocalRefinement, owner: Rows, q: Array, followed: int) -> C
     done = np.zeros(len(first), dtype=bool)
     fair, plain, cost = q.copy(), q, np.zeros(count)
     rows = np.arange(count)
-    for number in range(TUNING.rounds):
+    for number in range(CLOSEST_TUNING.rounds):
         here = owner[rows]
         q[rows] = descent.run(here, q[rows], weights=np.sqrt(weights[rows]))
         misses = descent.misses(here, q[rows])
@@ -113,20 +122,28 @@ def closest(descent: LocalRefinement, owner: Rows, q: Array, followed: int) -> C
         bound[rows] = np.maximum(bound[rows], np.sqrt(squares / total[rows]))
         before, best = best, np.minimum.reduceat(worst, first)
         least = np.minimum.reduceat(bound, first)
-        stuck = best > (1 - TUNING.settled) * before
+        stuck = best > (1 - CLOSEST_TUNING.settled) * before
         done |= (
-            (best <= 1) | ((least > TUNING.margin) & stuck) | (least > (1 - TUNING.settled) * best)
+            (best <= 1)
+            | ((least > CLOSEST_TUNING.margin) & stuck)
+            | (least > (1 - CLOSEST_TUNING.settled) * best)
         )
         # A minimum that cannot come closer than another one already has is followed no further.
         going = ~done[here] & (bound[rows] < best[here])
         if not going.any():
             break
-        new = np.where(counted[rows], np.maximum(weights[rows] * parts, TUNING.lightest), 0.0)
+        new = np.where(
+            counted[rows], np.maximum(weights[rows] * parts, CLOSEST_TUNING.lightest), 0.0
+        )
         scale = total[rows] / (new * tolerated[rows] ** 2).sum(axis=(1, 2))
         weights[rows] = new * scale[:, None, None]
         rows = rows[going]
     ratio = np.minimum.reduceat(bound, first)
-    return Closest(plain[smallest(owner, cost, 1)], fair[smallest(owner, worst, 1)], ratio)
+    return ClosestConfigurations(
+        plain[smallest_per_target(owner, cost, 1)],
+        fair[smallest_per_target(owner, worst, 1)],
+        ratio,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,12 +183,12 @@ class HandFits:
 
     def ratio(self, targets: TargetBatch) -> Array:
         """(k,) by which factor the tolerances would have to grow at least, near any of the fits."""
-        cost = self.cost[smallest(self.owner, self.cost, 1)]
-        return np.sqrt(cost / (allowed(targets) ** 2).sum(axis=(1, 2)))
+        cost = self.cost[smallest_per_target(self.owner, self.cost, 1)]
+        return np.sqrt(cost / (residual_tolerances(targets) ** 2).sum(axis=(1, 2)))
 
     def best(self, most: int) -> Rows:
         """Rows of each target that fit best with regard to the arm's reach."""
-        return smallest(self.owner, self.cost + (self.outside / LENGTH) ** 2, most)
+        return smallest_per_target(self.owner, self.cost + (self.outside / LENGTH) ** 2, most)
 
     @classmethod
     def joined(cls, parts: Sequence[HandFits]) -> HandFits:
@@ -201,8 +218,8 @@ class FloatingPalmFit:
 
         Nothing is said of the reach where no hand fits, or of an arm without a closed form.
         """
-        best = smallest(fits.owner, np.where(fits.ok, 0.0, 1.0 + fits.cost), 1)
-        nearest = smallest(fits.owner, np.where(fits.ok, fits.outside, np.inf), 1)
+        best = smallest_per_target(fits.owner, np.where(fits.ok, 0.0, 1.0 + fits.cost), 1)
+        nearest = smallest_per_target(fits.owner, np.where(fits.ok, fits.outside, np.inf), 1)
         errors = (each[best] for each in (fits.position_error, fits.angle_error, fits.met))
         verdicts = contact_verdicts(self._trials.robot.fingers, targets.tolerances, *errors)
         found = []
@@ -222,14 +239,14 @@ class FloatingPalmFit:
         """
         method, every = self._trials.method, np.arange(len(targets))
         nearest = method.postures(targets, 0)
-        fits = self._fitted(targets, q0, every, nearest[:, : TUNING.first])
+        fits = self._fitted(targets, q0, every, nearest[:, : CLOSEST_TUNING.first])
         without = fits.without()
         if len(without):
             wide = method.postures(targets.rows(without), 1)
-            more = np.concatenate([nearest[without, TUNING.first :], wide], axis=1)
+            more = np.concatenate([nearest[without, CLOSEST_TUNING.first :], wide], axis=1)
             fits = HandFits.joined([fits, self._fitted(targets, q0, without, more)])
         rows = np.flatnonzero(fits.ok & np.isin(fits.owner, fits.without()))
-        rows = rows[smallest(fits.owner[rows], fits.outside[rows], TUNING.slid)]
+        rows = rows[smallest_per_target(fits.owner[rows], fits.outside[rows], CLOSEST_TUNING.slid)]
         if len(rows):
             fits = HandFits.joined([fits, self._slid(targets, fits, rows)])
         return fits
@@ -254,7 +271,7 @@ class FloatingPalmFit:
         loose = parameters[:, trials.parameters.slice("position_tolerance")].min(axis=1)
         weight = np.sqrt(np.minimum(loose / (3 * fits.outside[rows]), 1.0))
         parameters[:, trials.parameters.slice("reach")] = weight[:, None]
-        trials.set_tolerance(parameters, NEVER)
+        trials.set_tolerance(parameters, UNREACHABLE_TOLERANCE)
         slid = self._run(targets, fits.owner[rows], states, parameters)
         return replace(slid, parameters=fits.parameters[rows])
 

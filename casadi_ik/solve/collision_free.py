@@ -31,7 +31,7 @@ from casadi_ik.kinematics.contacts import group_by_kinds
 from casadi_ik.model.targets import TargetBatch, Tolerance
 from casadi_ik.solve.alternatives import AlternativeFinder, side_links
 from casadi_ik.solve.arm_search import Preference
-from casadi_ik.solve.batches import judged
+from casadi_ik.solve.batches import judge_outcome
 from casadi_ik.solve.free_hands import SideHands, UnconstrainedFingers
 from casadi_ik.solve.method import Outcome
 from casadi_ik.solve.request import CLEARANCE
@@ -40,13 +40,13 @@ from casadi_ik.solve.status import Phase, Status
 from casadi_ik.solve.trials import (
     Deduplicator,
     LocalRefinement,
-    best_of_each,
-    carried,
-    largest_of_each,
-    other_trunks,
-    palms_of,
+    carry_palms,
+    improving_rows,
+    largest_per_owner,
+    sample_trunks,
+    side_palms,
 )
-from casadi_ik.solve.verdict import SolvedVerdict, judge_one
+from casadi_ik.solve.verdict import SolvedVerdict, judge_single
 
 USUAL = "limits"
 """What is preferred where nothing is said."""
@@ -294,13 +294,13 @@ class FreeSearch:
         if not len(q):
             return np.zeros(0)
         surplus = self.query.rows(owner).check(q).surplus
-        rows = best_of_each(owner, surplus, self.surplus)
+        rows = improving_rows(owner, surplus, self.surplus)
         self.nearest[owner[rows]], self.surplus[owner[rows]] = q[rows], surplus[rows]
         if self._sides is not None:
             every, of, room = self._near
             every, of = np.concatenate([every, q]), np.concatenate([of, owner])
             room = np.concatenate([room, surplus])
-            some = largest_of_each(of, room, PARAMETERS.near)
+            some = largest_per_owner(of, room, PARAMETERS.near)
             self._near = every[some], of[some], room[some]
         kept = np.flatnonzero(surplus >= -ROUNDING)
         if len(kept):
@@ -308,7 +308,7 @@ class FreeSearch:
             score = self.finder.score(
                 some, self.starts[mine], self.targets.prefer, surplus=surplus[kept]
             )
-            rows = best_of_each(mine, score, self.score)
+            rows = improving_rows(mine, score, self.score)
             self.best[mine[rows]], self.score[mine[rows]] = some[rows], score[rows]
             self.free[mine[rows]] = True
         return surplus
@@ -390,7 +390,7 @@ class FreeSearch:
             return
         first = sum(trunks for trunks, _ in PARAMETERS.trunks if trunks < count)
         each = max(count // int(np.bincount(owner).max()), 1)
-        ends, of = other_trunks(self.trials, self.targets, q, palms, owner, first, each)
+        ends, of = sample_trunks(self.trials, self.targets, q, palms, owner, first, each)
         good = self.trials.solved(self.targets.rows(owner[of]), ends, self.targets.enforce_limits)
         ends, of = ends[good], of[good]
         self.take(ends, owner[of])
@@ -441,7 +441,7 @@ class FreeSearch:
         if self.arm_search is None:
             return
         q, owner, surplus = self._hands_of(rows)
-        kept = largest_of_each(owner, surplus, 1)
+        kept = largest_per_owner(owner, surplus, 1)
         found, mine, _ = self._arms(q[kept], owner[kept], surplus[kept], self.query, CLEARANCE)
         self.take(np.concatenate([found, q[kept]]), np.concatenate([mine, owner[kept]]))
 
@@ -481,8 +481,8 @@ class FreeSearch:
             begun, random = q.copy(), np.random.default_rng([self.seed, number])
             steps = random.standard_normal((PARAMETERS.near, self._tries, len(moving)))
             begun[:, moving] += part * self._ranges[moving] * steps[rank].reshape(-1, len(moving))
-            begun, palms = self.limits.of(owner).clip(begun), palms_of(robot, q)
-            ends = carried(trials, self.targets, begun, palms, owner, float(Phase.TRUNK))
+            begun, palms = self.limits.of(owner).clip(begun), side_palms(robot, q)
+            ends = carry_palms(trials, self.targets, begun, palms, owner, float(Phase.TRUNK))
             self.take(*self._solved(ends, owner))
 
     def _free_hands(self, sides: SideHands) -> None:
@@ -573,7 +573,7 @@ class FreeSearch:
             possible[owner[query.rows(owner).free(q)]] = True
             return possible
         kept = np.flatnonzero(query.rows(owner).held.free(q))
-        kept = kept[largest_of_each(owner[kept], surplus[kept], PARAMETERS.hopeful)]
+        kept = kept[largest_per_owner(owner[kept], surplus[kept], PARAMETERS.hopeful)]
         any_room = np.full(len(kept), np.inf)
         _, mine, _ = self._arms(q[kept], owner[kept], any_room, query, "limits")
         possible[mine] = True
@@ -636,7 +636,7 @@ def resolve_collisions(
     status = np.where(touching, int(Status.SOLVED), outcome.status)
     ended = replace(outcome, q=q, time=seconds, status=status)
     return replace(
-        judged(robot, batch.method, targets, ended, query),
+        judge_outcome(robot, batch.method, targets, ended, query),
         collisions=tuple(reports.tolist()),
     )
 
@@ -669,7 +669,7 @@ def resolve_at_once(
     if not search.free[0]:
         return None
     found = search.best[0]
-    verdict = judge_one(finder.robot, targets, found)
+    verdict = judge_single(finder.robot, targets, found)
     if verdict is None:
         return None
     clear = query.check(found[None])

@@ -136,7 +136,7 @@ class Remedies:
     freed: tuple[Freed, ...] = ()
 
 
-class Lazy:
+class LazyRemedies:
     """Remedies that are looked for when first asked for; pickled as what was found."""
 
     def __init__(self, find: Callable[[], Remedies]) -> None:
@@ -194,7 +194,7 @@ class Diagnosis(ReprMixin):
     nearest: Mapping[str, NearContact]
     q: Array
     time: float
-    lazy: Lazy = field(default_factory=lambda: Lazy(Remedies), repr=False)
+    lazy: LazyRemedies = field(default_factory=lambda: LazyRemedies(Remedies), repr=False)
     palm: PalmVerdict | None = None
     sides: Mapping[str, ContactVerdict] = field(default_factory=dict[str, ContactVerdict])
 

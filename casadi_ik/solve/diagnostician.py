@@ -13,9 +13,16 @@ from casadi_ik.files.arrays import Array, Counts
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.grasp import Tolerance
 from casadi_ik.model.targets import TargetBatch
-from casadi_ik.solve.closest import Closest, FloatingPalmFit, HandFits, closest
-from casadi_ik.solve.diagnosis import ArmReach, Diagnosis, HandFit, Lazy, NearContact, Reason
-from casadi_ik.solve.hand_first.method import HandFirstMethod
+from casadi_ik.solve.closest import ClosestConfigurations, FloatingPalmFit, HandFits, find_closest
+from casadi_ik.solve.diagnosis import (
+    ArmReach,
+    Diagnosis,
+    HandFit,
+    LazyRemedies,
+    NearContact,
+    Reason,
+)
+from casadi_ik.solve.method import HandSearch
 from casadi_ik.solve.proofs.proof import Proof, ProofKind
 from casadi_ik.solve.proofs.prove import PROVER_EFFORT, Prover
 from casadi_ik.solve.remedies import RemedyFinder
@@ -67,7 +74,7 @@ class DiagnosisEffort:
     missed_reach: float = 1e-3
 
 
-DIAGNOSIS = DiagnosisEffort()
+DIAGNOSIS_EFFORT = DiagnosisEffort()
 
 
 class Diagnostician:
@@ -78,7 +85,7 @@ class Diagnostician:
         method: Hand-first on that robot.
     """
 
-    def __init__(self, robot: ArmHand, method: HandFirstMethod, compiled: bool = True) -> None:
+    def __init__(self, robot: ArmHand, method: HandSearch, compiled: bool = True) -> None:
         """Keep robot and method; nothing is built before the first diagnosis."""
         self.robot = robot
         self.method = method
@@ -119,8 +126,8 @@ class Diagnostician:
             (near,) = self._nearest(one, nearest[row : row + 1])
             found[row] = _reachable(one, nearest[row], near, clock.seconds[row])
         rest = np.flatnonzero(~known)
-        for start in range(0, len(rest), DIAGNOSIS.together):
-            rows = rest[start : start + DIAGNOSIS.together]
+        for start in range(0, len(rest), DIAGNOSIS_EFFORT.together):
+            rows = rest[start : start + DIAGNOSIS_EFFORT.together]
             some, spent = targets.rows(rows), clock.seconds[rows]
             whys = self._together(some, q0[rows], nearest[rows], _Clock(spent))
             found |= zip(rows.tolist(), whys, strict=True)
@@ -138,7 +145,7 @@ class Diagnostician:
         searches = np.bincount(owner, minlength=len(every))
         if fits is not None:
             searches += np.bincount(fits.owner, minlength=len(every))
-        best = closest(descent, owner, ends, DIAGNOSIS.placed + 1)
+        best = find_closest(descent, owner, ends, DIAGNOSIS_EFFORT.placed + 1)
         clock.lap(every)
         proofs: list[Proof | None] = [None] * len(every)
         rows = np.flatnonzero(~self._solved(targets, best.fair))
@@ -152,7 +159,7 @@ class Diagnostician:
         unsure = np.array([reason is None for reason in refused])
         certain = self._certain(targets, fits, best)
         certain |= np.array([proof is not None for proof in proofs])
-        for below, count, followed in DIAGNOSIS.searches:
+        for below, count, followed in DIAGNOSIS_EFFORT.searches:
             rows = np.flatnonzero(unsure | ((best.ratio < below) & ~certain))
             rows = rows[~self._solved(targets.rows(rows), best.fair[rows])]
             if len(rows):
@@ -165,7 +172,9 @@ class Diagnostician:
         solved, enough = fair.solved(targets.enforce_limits), _enough(targets, fair)
         near = self._nearest(targets, np.where(solved[:, None], best.fair, best.q))
         held = self._at_limit(best.q)
-        pressed = held | self._at_limit(best.fair) | (best.ratio <= DIAGNOSIS.barely)[:, None]
+        pressed = (
+            held | self._at_limit(best.fair) | (best.ratio <= DIAGNOSIS_EFFORT.barely)[:, None]
+        )
         sides = self._one_at_a_time(targets, best)
         clock.lap(every)
         for i in every.tolist():
@@ -191,12 +200,12 @@ class Diagnostician:
                 nearest=near[i],
                 q=best.q[i],
                 time=float(clock.seconds[i]),
-                lazy=Lazy(remedies.find),
+                lazy=LazyRemedies(remedies.find),
                 sides=sides[i],
             )
 
     def _one_at_a_time(
-        self, targets: TargetBatch, best: Closest
+        self, targets: TargetBatch, best: ClosestConfigurations
     ) -> list[dict[str, ContactVerdict]]:
         """By target the worst contact of every side of a body that it asks for, the others free."""
         found: list[dict[str, ContactVerdict]] = [{} for _ in range(len(targets))]
@@ -208,7 +217,7 @@ class Diagnostician:
                 continue
             others = [i for i in range(len(robot.fingers)) if i not in fingers]
             alone = _free_of(targets.rows(rows), others)
-            search = self._search(alone, best.rows(rows), *DIAGNOSIS.alone)
+            search = self._search(alone, best.rows(rows), *DIAGNOSIS_EFFORT.alone)
             position, angle, met = (
                 getattr(judge(robot, alone, search.fair), one)
                 for one in ("position_error", "angle_error", "ok")
@@ -248,21 +257,23 @@ class Diagnostician:
         return self._palm_free.evidence(targets, fits), fits
 
     def _certain(
-        self, targets: TargetBatch, fits: HandFits | None, best: Closest
+        self, targets: TargetBatch, fits: HandFits | None, best: ClosestConfigurations
     ) -> NDArray[np.bool_]:
         """(k,) whether the hand alone already says no, however the arm holds it."""
         if fits is None:
             return np.zeros(len(targets), dtype=bool)
-        return np.minimum(fits.ratio(targets), best.ratio) >= DIAGNOSIS.certain
+        return np.minimum(fits.ratio(targets), best.ratio) >= DIAGNOSIS_EFFORT.certain
 
     def _placed(self, fits: HandFits | None) -> tuple[Rows, Array]:
         """Configurations (m, n) that the best fits of each target lead to, and their targets."""
         if fits is None:
             return np.zeros(0, np.intp), np.zeros((0, len(self.robot.actuators)))
-        rows = fits.best(DIAGNOSIS.placed)
+        rows = fits.best(DIAGNOSIS_EFFORT.placed)
         return fits.owner[rows], self._trials.run(fits.states[rows], fits.parameters[rows])
 
-    def _search(self, targets: TargetBatch, best: Closest, count: int, followed: int) -> Closest:
+    def _search(
+        self, targets: TargetBatch, best: ClosestConfigurations, count: int, followed: int
+    ) -> ClosestConfigurations:
         """The closest to each target from random arms, with hands of all kinds.
 
         The hands are those that came closest so far, and some that look like the grasp. A hand
@@ -275,11 +286,13 @@ class Diagnostician:
             hand = list(self.robot.description.hand_actuators)
             starts[:, ::2, hand] = best.fair[:, None, hand]
             starts[:, 1::2, hand] = best.q[:, None, hand]
-            starts[:, :: DIAGNOSIS.alike, hand] = self._alike(targets, -(-count // DIAGNOSIS.alike))
+            starts[:, :: DIAGNOSIS_EFFORT.alike, hand] = self._alike(
+                targets, -(-count // DIAGNOSIS_EFFORT.alike)
+            )
         starts = np.concatenate([best.q[:, None], best.fair[:, None], starts], axis=1)
         descent = LocalRefinement(self._trials, targets)
         ends = descent.run(owner, starts.reshape(len(owner), -1))
-        return closest(descent, owner, ends, followed)
+        return find_closest(descent, owner, ends, followed)
 
     def _alike(self, targets: TargetBatch, count: int) -> Array:
         """(k, count, hand) postures that look like the grasps, in turns."""
@@ -311,8 +324,8 @@ class Diagnostician:
         ]
 
     def _at_limit(self, q: Array) -> NDArray[np.bool_]:
-        return (q - self.robot.lower <= DIAGNOSIS.at_limit) | (
-            self.robot.upper - q <= DIAGNOSIS.at_limit
+        return (q - self.robot.lower <= DIAGNOSIS_EFFORT.at_limit) | (
+            self.robot.upper - q <= DIAGNOSIS_EFFORT.at_limit
         )
 
 
@@ -335,15 +348,15 @@ def _refused(hand: HandFit | None, reach: ArmReach | None, proof: Proof | None) 
         return Reason.HAND
     if proof is not None:
         return Reason.REACH
-    if reach is not None and abs(reach.excess) > DIAGNOSIS.missed_reach:
+    if reach is not None and abs(reach.excess) > DIAGNOSIS_EFFORT.missed_reach:
         return Reason.REACH
     return None
 
 
 def _worth(ratio: Array) -> Counts:
     """(k,) boxes a proof may take of targets that are missed by a factor (k,)."""
-    share = np.clip((ratio - 1) / (DIAGNOSIS.clearly - 1), 0.0, 1.0)
-    return np.maximum(PROVER_EFFORT.max_boxes * share, DIAGNOSIS.least).astype(np.int64)
+    share = np.clip((ratio - 1) / (DIAGNOSIS_EFFORT.clearly - 1), 0.0, 1.0)
+    return np.maximum(PROVER_EFFORT.max_boxes * share, DIAGNOSIS_EFFORT.least).astype(np.int64)
 
 
 def _enough(targets: TargetBatch, fair: Verdict) -> list[Tolerance]:

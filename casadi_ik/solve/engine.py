@@ -1,4 +1,4 @@
-"""The one way a batch is solved: checked, run (in parallel if asked), judged, recorded."""
+"""The engine: runs a method on targets, checks the results, and records the iterations."""
 
 from __future__ import annotations
 
@@ -23,38 +23,38 @@ from casadi_ik.kinematics.contacts import Kinds, group_by_kinds, point_normal_ki
 from casadi_ik.model.grasp import Tolerance
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.alternatives import AlternativeFinder
-from casadi_ik.solve.batches import BatchParts, SolvedPart, in_order, judged
+from casadi_ik.solve.batches import BatchParts, SolvedPart, judge_outcome, map_ordered
 from casadi_ik.solve.collision_free import RANKED, resolve_at_once, resolve_collisions
 from casadi_ik.solve.diagnosis import Diagnosis, Reason
 from casadi_ik.solve.diagnostician import Diagnostician
-from casadi_ik.solve.first_answer import FirstAnswers
+from casadi_ik.solve.first_answer import InterimSolver
 from casadi_ik.solve.hand_first.method import HandFirstMethod
 from casadi_ik.solve.hand_first.parameters import HandFirstParameters
-from casadi_ik.solve.method import Method, Outcome, Quick
+from casadi_ik.solve.method import HandSearch, Method, Outcome, SingleOutcome
 from casadi_ik.solve.recorder import Recorder
 from casadi_ik.solve.remedies import with_way_out
-from casadi_ik.solve.request import CLEARANCE, NO_PREFERENCE, preference
+from casadi_ik.solve.request import CLEARANCE, NO_PREFERENCE, resolve_preference
 from casadi_ik.solve.sensitivity import SensitivityKernel
 from casadi_ik.solve.solution import BatchSolution, Solution
 from casadi_ik.solve.status import Status
 from casadi_ik.solve.turns import in_nearest_turns, search_start
-from casadi_ik.solve.verdict import judge_errors, judge_one, made
+from casadi_ik.solve.verdict import construct_unchecked, judge_errors, judge_single
 
 MANIPULABILITY = "manipulability"
-"""The preference that is seen to after the solve."""
+"""Preference that is applied by ranking alternatives after the solve."""
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
-    """How targets are solved.
+class SolveOptions:
+    """Options of a solve that do not belong to its targets.
 
     Attributes:
-        q0: (n,) start, or (k, n) for k targets; None is the robot's home.
-        seed: Of all random numbers, >= 0.
-        jobs: Threads, at least 1; compiled loops run side by side.
-        recorder: Keeps the iterations; None: they are not kept.
-        diagnose: Whether to find the reason where a target is not solved.
-        shown: Whether to show how far it is, where someone looks on.
+        q0: (n,) start, or (k, n) for k targets [rad or m]; None: the robot's home.
+        seed: Seed of all random numbers, >= 0.
+        jobs: Number of threads, at least 1; compiled loops run concurrently.
+        recorder: Recorder of the iterations; None: they are not recorded.
+        diagnose: Whether to diagnose targets that are not solved.
+        show_progress: Whether to show a progress bar on an interactive terminal.
     """
 
     q0: ArrayLike | None = None
@@ -62,48 +62,48 @@ class Run:
     jobs: int = 1
     recorder: Recorder | None = None
     diagnose: bool = False
-    shown: bool = False
+    show_progress: bool = False
 
     def __post_init__(self) -> None:
-        for name, least in (("jobs", 1), ("seed", 0)):
+        for name, minimum in (("jobs", 1), ("seed", 0)):
             value = getattr(self, name)
-            if type(value) is int and value >= least:
+            if type(value) is int and value >= minimum:
                 continue
-            if not isinstance(value, (int, np.integer)) or value < least:
-                raise InputError(f"{name}: found {value!r}, expected an integer >= {least}")
+            if not isinstance(value, (int, np.integer)) or value < minimum:
+                raise InputError(f"{name}: found {value!r}, expected an integer >= {minimum}")
             object.__setattr__(self, name, int(value))
 
     def starts(self, robot: ArmHand, count: int) -> Array:
-        """(count, n) where each solve begins.
+        """Return (count, n) start configurations.
 
         Raises:
-            InputError: Wrong shape or numbers, or not as many as targets.
+            InputError: Wrong shape or numbers, or another number of rows than targets.
         """
         start = robot.start(self.q0)
         if start.ndim == 1:
             return np.repeat(start[None], count, axis=0)
         if len(start) != count:
             raise InputError(
-                f"q0: found {len(start)} rows for {count} targets, expected as many, or one (n,)"
+                f"q0: found {len(start)} rows for {count} targets, expected {count}, or one (n,)"
             )
         return start
 
 
-REQUIRED = ("points", "normals")
-"""What every target is told by."""
+REQUIRED_ARRAYS = ("points", "normals")
+"""Arrays that every block of targets has."""
 
-Block = tuple[ArrayLike, ArrayLike] | Mapping[str, ArrayLike]
-"""Points and normals (k, f, 3) of some targets; or these and more by name."""
+TargetArrays = tuple[ArrayLike, ArrayLike] | Mapping[str, ArrayLike]
+"""Points and normals (k, f, 3) of a block of targets; or all of its arrays by name."""
 
 
 @dataclass(frozen=True, eq=False)
 class SolvedBlock:
-    """The answers to a block.
+    """The solutions of a block of targets.
 
     Attributes:
-        first_row: Number of its first target among all.
-        solution: A row per target; those with a fault are INVALID, with NaN for q and errors.
-        faults: What is wrong with a target, by its number among all.
+        first_row: Number of the first target of the block among all targets.
+        solution: A row per target; malformed targets are INVALID, with NaN for q and errors.
+        faults: Error messages of malformed targets, by target number.
     """
 
     first_row: int
@@ -113,14 +113,14 @@ class SolvedBlock:
 
 @dataclass(frozen=True, eq=False)
 class Engine:
-    """A method on a robot.
+    """A method on a robot, with an optional scene.
 
     Attributes:
         robot: The robot.
         method: The method, built for this robot.
-        compiled: Whether the additional graphs of a diagnosis run in compiled code.
-        kinds: Of the contacts, by finger; None: point and normal.
-        check: The scene about the robot; None: collisions are not checked.
+        compiled: Whether the additional graphs of a diagnosis are compiled.
+        kinds: Contact kinds by finger; None: point and normal.
+        check: Collision check of the scene; None: collisions are not checked.
     """
 
     robot: ArmHand
@@ -129,59 +129,64 @@ class Engine:
     kinds: Kinds | None = None
     check: SceneCheck | None = None
 
-    _others: dict[Kinds, Engine] = field(default_factory=dict, init=False, repr=False)
+    _engines: dict[Kinds, Engine] = field(default_factory=dict, init=False, repr=False)
     _lock: Lock = field(default_factory=Lock, init=False, repr=False)
 
-    def of_kinds(self, kinds: Kinds) -> Engine:
-        """The engine for targets whose contacts are of these kinds; threads may share it."""
+    def for_kinds(self, kinds: Kinds) -> Engine:
+        """Return the engine for these contact kinds; threads may share it."""
         if kinds == (self.kinds or point_normal_kinds(len(kinds))):
             return self
         with self._lock:
-            if kinds not in self._others:
+            if kinds not in self._engines:
                 method = self.method.for_kinds(kinds)
-                self._others[kinds] = replace(self, method=method, kinds=kinds)
-            return self._others[kinds]
+                self._engines[kinds] = replace(self, method=method, kinds=kinds)
+            return self._engines[kinds]
 
-    def parted(self, targets: TargetBatch) -> Iterator[tuple[Engine, Any, TargetBatch]]:
-        """Engines for targets of any kinds, with the rows and the targets of each."""
-        for kinds, rows, some in group_by_kinds(targets):
-            yield self.of_kinds(kinds), rows, some
+    def group_by_contact_kind(
+        self, targets: TargetBatch
+    ) -> Iterator[tuple[Engine, Any, TargetBatch]]:
+        """Yield an engine, row indices and targets for each combination of contact kinds."""
+        for kinds, rows, group in group_by_kinds(targets):
+            yield self.for_kinds(kinds), rows, group
 
-    def kinds_of(self, targets: TargetBatch) -> Engine:
-        """The engine for targets that are all of the same kinds.
+    def engine_for(self, targets: TargetBatch) -> Engine:
+        """Return the engine for targets that share their contact kinds.
 
         Raises:
-            InputError: They are of several.
+            InputError: The targets have several combinations of contact kinds.
         """
-        first, *others = (engine for engine, _, _ in self.parted(targets))
+        first, *others = (engine for engine, _, _ in self.group_by_contact_kind(targets))
         if others:
             raise InputError("grasps: found contacts of several kinds, expected the same in all")
         return first
 
-    @cached_property
-    def hand_first(self) -> HandFirstMethod | None:
-        """The method, if its hands and arms can be tried one by one."""
-        method: Any = self.method
-        return method if hasattr(method, "postures") else None
+    @property
+    def hand_search(self) -> HandSearch | None:
+        """The method as a search over hand postures; None if it is a black box."""
+        return self.method.hand_search
 
     @cached_property
-    def _first(self) -> FirstAnswers:
-        return FirstAnswers(self.hand_first if self.compiled else None)
+    def _interim_solver(self) -> InterimSolver:
+        return InterimSolver(self.hand_search if self.compiled else None)
 
     @cached_property
     def diagnostician(self) -> Diagnostician:
-        """Finds why a target was not solved, with hand-first where the method cannot."""
-        method = self.hand_first or HandFirstMethod(
+        """Diagnostician of unsolved targets; it uses hand-first if the method is a black box."""
+        method = self.hand_search or HandFirstMethod(
             self.robot.description, HandFirstParameters(), self.compiled, self.kinds
         )
         return Diagnostician(self.robot, method, self.compiled)
 
-    @property
-    def _several(self) -> HandFirstMethod:
-        method = self.hand_first
+    def _require_hand_search(self) -> HandSearch:
+        """Return the method as a hand search, ready to run.
+
+        Raises:
+            UnsupportedError: The method is a black box.
+        """
+        method = self.hand_search
         if method is None:
             raise UnsupportedError(
-                f"method {self.method.name!r} gives one solution; several need "
+                f"method: {self.method.name!r} finds a single solution; expected "
                 f"{HandFirstMethod.name!r}"
             )
         method.prepare()
@@ -189,305 +194,337 @@ class Engine:
 
     @cached_property
     def finder(self) -> AlternativeFinder:
-        """Finds several solutions.
+        """Finder of alternative solutions.
 
         Raises:
-            UnsupportedError: The method gives one.
+            UnsupportedError: The method finds a single solution.
         """
-        return AlternativeFinder(self.robot, self._several, self.compiled)
+        return AlternativeFinder(self.robot, self._require_hand_search(), self.compiled)
 
     @cached_property
     def sensitivity(self) -> SensitivityKernel:
-        """Derivatives of answers with respect to their contacts."""
+        """Derivatives of solutions with respect to their contacts."""
         kinds = self.kinds or point_normal_kinds(len(self.robot.fingers))
         return SensitivityKernel(self.robot.description, kinds, self.compiled)
 
-    def about(self, check: SceneCheck) -> Engine:
-        """The engine with another scene; all that was worked out for the robot stays."""
-        other = copy(self)
+    def with_scene(self, check: SceneCheck) -> Engine:
+        """Return the engine with another scene; it shares everything cached for the robot."""
+        engine = copy(self)
         with self._lock:
-            others = {kinds: one.about(check) for kinds, one in self._others.items()}
-        vars(other).update(check=check, _others=others, _lock=Lock())
-        return other
+            engines = {kinds: member.with_scene(check) for kinds, member in self._engines.items()}
+        vars(engine).update(check=check, _engines=engines, _lock=Lock())
+        return engine
 
     def collision_query(self, targets: TargetBatch) -> CollisionQuery | None:
-        """What targets are checked against; None: nothing."""
+        """Return the collision query of targets; None without a scene."""
         return None if self.check is None else self.check.collision_query(targets)
 
-    def preference(self, prefer: str | None, started: bool) -> str:
-        """What is preferred, see `preference`.
+    def resolve_preference(self, prefer: str | None, has_start: bool) -> str:
+        """Return the preference of a solve, see `request.resolve_preference`.
 
         Raises:
-            InputError: No such preference.
-            UnsupportedError: The method does not know it.
+            InputError: The preference is unknown.
+            UnsupportedError: The method does not support it.
         """
-        asked, method = preference(prefer, started), self.method
-        if asked == CLEARANCE and self.check is None:
-            raise InputError(f"prefer: found {asked!r}, which needs a solver with a scene")
-        if known := getattr(method, "preferences", ()):
-            if asked in known:
-                return asked
+        preference, method = resolve_preference(prefer, has_start), self.method
+        if preference == CLEARANCE and self.check is None:
+            raise InputError(f"prefer: {preference!r} needs a solver with a scene")
+        if method.preferences:
+            if preference in method.preferences:
+                return preference
             raise UnsupportedError(
-                f"prefer: method {method.name!r} knows {', '.join(known)}, found {asked!r}"
+                f"prefer: {preference!r} is not supported by method {method.name!r}; expected one "
+                f"of {', '.join(method.preferences)}"
             )
         if prefer is None:
             return NO_PREFERENCE
         raise UnsupportedError(
-            f"prefer: method {method.name!r} cannot choose, it takes the solution it comes to from "
-            f"q0; found {prefer!r}"
+            f"prefer: {prefer!r} is not supported by method {method.name!r}, which returns the "
+            "first solution it finds; expected None"
         )
 
-    def solve_one(self, targets: TargetBatch, run: Run) -> Solution:
-        """Solve one target, by the shortest way that the method has.
+    def solve_one(self, targets: TargetBatch, options: SolveOptions) -> Solution:
+        """Solve one target with as little overhead as the method allows.
 
         Args:
             targets: One target.
-            run: How to solve it.
+            options: Options of the solve.
 
         Raises:
-            InputError: Bad q0, or a target the method cannot take.
+            InputError: Bad q0, or a target that the method does not support.
         """
-        if targets.more and (other := self.kinds_of(targets)) is not self:
-            return other.solve_one(targets, run)
-        method, start, known = self.hand_first, self.robot.start(run.q0), None
-        plain = targets.palms is None and targets.prefer not in RANKED and start.ndim == 1
-        if method is not None and plain and run.recorder is None:
-            if (early := self._first.answer(targets, start, self.check)) is not None:
-                return early
+        if targets.more and (engine := self.engine_for(targets)) is not self:
+            return engine.solve_one(targets, options)
+        method, start, outcome = self.hand_search, self.robot.start(options.q0), None
+        is_plain = targets.palms is None and targets.prefer not in RANKED and start.ndim == 1
+        if method is not None and is_plain and options.recorder is None:
+            interim = self._interim_solver.solve(targets, start, self.check)
+            if interim is not None:
+                return interim
             method.prepare()
-            begin = time.perf_counter()
-            found = method.quick(targets, start)
-            if found is not None:
-                solution = self._solved(targets, found, start, begin)
+            started = time.perf_counter()
+            single = method.quick(targets, start)
+            if single is not None:
+                solution = self._single_solution(targets, single, start, started)
                 if solution is not None:
                     return solution
-                known = found.outcome(time.perf_counter() - begin)
-        return self.solve(targets, run, known).solution(0)
+                outcome = single.outcome(time.perf_counter() - started)
+        return self.solve(targets, options, outcome).solution(0)
 
-    def _solved(
-        self, targets: TargetBatch, found: Quick, start: Array, begin: float
+    def _single_solution(
+        self, targets: TargetBatch, outcome: SingleOutcome, start: Array, started: float
     ) -> Solution | None:
-        """A single answer with its verdict, begun at a time of the clock, if it is a solution."""
-        if found.status != Status.SOLVED:
+        """Return the solution of one target if its outcome passes the verdict and is free.
+
+        Args:
+            targets: One target.
+            outcome: Result of the method.
+            start: (n,) start configuration [rad or m].
+            started: Start of the solve [s], as `time.perf_counter` counts.
+        """
+        if outcome.status != Status.SOLVED:
             return None
-        robot, seconds = self.robot, time.perf_counter() - begin
-        if found.errors is None:
-            verdict = judge_one(robot, targets, found.q)
+        robot, seconds = self.robot, time.perf_counter() - started
+        if outcome.errors is None:
+            verdict = judge_single(robot, targets, outcome.q)
         else:
-            verdict = judge_errors(targets, *found.errors)
+            verdict = judge_errors(targets, *outcome.errors)
         if verdict is None:
             return None
-        q, distance, closest = found.q, None, None
+        q, distance, pair = outcome.q, None, None
         if (query := self.collision_query(targets)) is not None:
-            clear = query.check(q[None])
-            if not clear.free[0]:
+            clearances = query.check(q[None])
+            if not clearances.free[0]:
                 near = search_start(robot.description, start)
-                if (other := resolve_at_once(self.finder, targets, query, q, near)) is None:
+                free = resolve_at_once(self.finder, targets, query, q, near)
+                if free is None:
                     return None
-                q, verdict, clear = other
+                q, verdict, clearances = free
                 q = in_nearest_turns(robot.description, targets, q, start)
-                seconds = time.perf_counter() - begin
-            distance, closest = float(clear.distance[0]), clear.pair(0)
-        return made(
+                seconds = time.perf_counter() - started
+            distance, pair = float(clearances.distance[0]), clearances.pair(0)
+        return construct_unchecked(
             Solution,
             success=True,
             status=Status.SOLVED,
             q=q,
-            iterations=found.iterations,
-            restarts=found.restarts,
+            iterations=outcome.iterations,
+            restarts=outcome.restarts,
             time=seconds,
             contacts=dict(zip(robot.fingers, verdict.contacts, strict=True)),
-            phases=found.phases,
+            phases=outcome.phases,
             limits_ok=verdict.limits_ok,
             method=self.method.name,
             robot=robot.name,
             actuators=robot.actuators,
             clearance=distance,
-            closest=closest,
+            closest=pair,
             arm_hand=robot,
         )
 
-    def solve(self, targets: TargetBatch, run: Run, known: Outcome | None = None) -> BatchSolution:
+    def solve(
+        self, targets: TargetBatch, options: SolveOptions, outcome: Outcome | None = None
+    ) -> BatchSolution:
         """Solve a batch of k targets.
 
         Args:
             targets: The targets.
-            run: How to solve them.
-            known: What the method came to, if it was asked before.
+            options: Options of the solve.
+            outcome: Result of the method, if it has run already.
 
         Raises:
-            InputError: Bad q0, or targets the method cannot take.
+            InputError: Bad q0, or targets that the method does not support.
         """
         if targets.palms is not None:
-            _ = self._several  # no other method keeps every target's hand where it is
-        starts, recorder = run.starts(self.robot, len(targets)), run.recorder
-        # Built before the clock and the threads start: no work of a solve, nor for several at once.
-        ranked = targets.prefer == MANIPULABILITY or self.check is not None
-        for engine, _, _ in self.parted(targets):
+            self._require_hand_search()  # no other method keeps the hand of each target
+        starts, recorder = options.starts(self.robot, len(targets)), options.recorder
+        # Build before clock and threads start, so that no solve is charged for it.
+        needs_finder = targets.prefer == MANIPULABILITY or self.check is not None
+        for engine, _, _ in self.group_by_contact_kind(targets):
             engine.method.prepare()
-            if run.diagnose:
+            if options.diagnose:
                 _ = engine.diagnostician
-            if ranked and engine.hand_first is not None:
+            if needs_finder and engine.hand_search is not None:
                 _ = engine.finder
-        form = self.method.trace_format
-        if recorder is not None and form.measures is not None:
-            form.measures.prepare()
+        trace_format = self.method.trace_format
+        if recorder is not None and trace_format.measures is not None:
+            trace_format.measures.prepare()
         batches = []
-        with BackgroundWriter() as background, progress(len(targets), run.shown) as show:
-            for part in self._parts(targets, starts, run, known):
-                show(len(part.batch))
+        with (
+            BackgroundWriter() as background,
+            progress(len(targets), options.show_progress) as report_progress,
+        ):
+            for part in self._parts(targets, starts, options, outcome):
+                report_progress(len(part.batch))
                 if recorder is not None:
-                    background.do(partial(part.record, recorder, form, run.seed))
+                    background.do(partial(part.record, recorder, trace_format, options.seed))
                 batches.append(part.batch)
         return BatchSolution.joined(batches)
 
     def solve_blocks(
         self,
-        blocks: Iterable[Block],
-        ask: Callable[[Mapping[str, np.ndarray], int], TargetBatch],
+        blocks: Iterable[TargetArrays],
+        parse: Callable[[Mapping[str, np.ndarray], int], TargetBatch],
         tolerances: tuple[Tolerance, ...],
-        run: Run,
+        options: SolveOptions,
         first_row: int = 0,
     ) -> Iterator[SolvedBlock]:
-        """Solve one block after the other; a target's numbers do not depend on the blocks.
+        """Solve one block after the other; results do not depend on the division into blocks.
 
         Args:
             blocks: Arrays of targets.
-            ask: Arrays by name and the number of the first target as a checked question.
-            tolerances: When a contact counts as reached, by finger.
-            run: How targets are solved; one start (n,) for all of them.
+            parse: Function of arrays by name and the number of the first target that returns
+                checked targets.
+            tolerances: Tolerance by finger.
+            options: Options of the solve, with a single start (n,).
             first_row: Number of the first target.
+
+        Yields:
+            The solved blocks.
 
         Raises:
             InputError: Bad q0, or a block of the wrong shape.
         """
-        if self.robot.start(run.q0).ndim != 1:
+        if self.robot.start(options.q0).ndim != 1:
             raise InputError("q0: found several, expected one start for all targets")
-        none = self.method.name, self.robot, tolerances, run.diagnose, self.check is not None
-        for given in blocks:
-            named = given if isinstance(given, Mapping) else dict(zip(REQUIRED, given, strict=True))
-            arrays = {name: np.asanyarray(array) for name, array in named.items()}
-            count = len(arrays[REQUIRED[0]])
+        template = (
+            self.method.name,
+            self.robot,
+            tolerances,
+            options.diagnose,
+            self.check is not None,
+        )
+        for block in blocks:
+            if not isinstance(block, Mapping):
+                block = dict(zip(REQUIRED_ARRAYS, block, strict=True))
+            arrays = {name: np.asanyarray(array) for name, array in block.items()}
+            count = len(arrays[REQUIRED_ARRAYS[0]])
             for name, array in arrays.items():
                 if len(array) != count:
                     raise InputError(
-                        f"{REQUIRED[0]} and {name}: found {count} and {len(array)} rows, expected "
-                        "as many"
+                        f"{REQUIRED_ARRAYS[0]} and {name}: found {count} and {len(array)} rows, "
+                        "expected the same number"
                     )
-            parts: dict[int, BatchSolution] = {}
+            solutions: dict[int, BatchSolution] = {}
             faults: dict[int, str] = {}
-            waiting = [(0, count)]
-            while waiting:
-                start, stop = waiting.pop()
-                some = {name: array[start:stop] for name, array in arrays.items()}
+            pending = [(0, count)]
+            while pending:
+                start, stop = pending.pop()
+                piece = {name: array[start:stop] for name, array in arrays.items()}
                 try:
-                    parts[start] = self.solve(ask(some, first_row + start), run)
+                    solutions[start] = self.solve(parse(piece, first_row + start), options)
                 except RowError as error:
-                    # A row with a fault parts those before it from those after it.
+                    # A malformed target separates the targets before it from those after it.
                     row = error.row - first_row
                     faults[error.row] = str(error)
-                    parts[row] = BatchSolution.invalid(1, *none)
-                    both = (row + 1, stop), (start, row)
-                    waiting += [part for part in both if part[0] < part[1]]
-            solution = BatchSolution.joined([parts[start] for start in sorted(parts)])
+                    solutions[row] = BatchSolution.invalid(1, *template)
+                    ranges = (row + 1, stop), (start, row)
+                    pending += [(first, last) for first, last in ranges if first < last]
+            solution = BatchSolution.joined([solutions[start] for start in sorted(solutions)])
             yield SolvedBlock(first_row, solution, dict(sorted(faults.items())))
             first_row += count
 
     def _parts(
-        self, targets: TargetBatch, starts: Array, run: Run, known: Outcome | None
+        self, targets: TargetBatch, starts: Array, options: SolveOptions, known: Outcome | None
     ) -> Iterator[SolvedPart]:
-        """Parts of the batch in order, solved, judged and diagnosed side by side."""
-        trace = run.recorder is not None
-        parts = BatchParts(len(targets), run.jobs, trace, run.shown and is_interactive())
+        """Yield the parts of the batch in order: solved concurrently, checked and diagnosed."""
+        trace, seed = options.recorder is not None, options.seed
+        show_progress = options.show_progress and is_interactive()
+        parts = BatchParts(len(targets), options.jobs, trace, show_progress)
 
         def solve(rows: slice) -> SolvedPart:
-            started, asked, q0 = time.time_ns(), targets.rows(rows), starts[rows]
+            started, part, q0 = time.time_ns(), targets.rows(rows), starts[rows]
             near = search_start(self.robot.description, q0)
-            outcome = known or self._run(asked, near, run.seed, trace)
+            outcome = known or self._run(part, near, seed, trace)
             if outcome.rows is not None:
-                parts.learn(len(outcome.q), outcome.rows.nbytes)
-            query = self.collision_query(asked)
+                parts.adapt_to_memory(len(outcome.q), outcome.rows.nbytes)
+            query = self.collision_query(part)
             if query is None and targets.prefer == MANIPULABILITY:
-                outcome = self._most_manipulable(asked, near, run.seed, outcome)
-            batch = judged(self.robot, self.method.name, asked, outcome, query)
-            if query is not None and self.hand_first is not None:
+                outcome = self._maximise_manipulability(part, near, seed, outcome)
+            batch = judge_outcome(self.robot, self.method.name, part, outcome, query)
+            if query is not None and self.hand_search is not None:
                 batch = resolve_collisions(
-                    lambda some: self.kinds_of(some).finder,
-                    asked,
+                    lambda group: self.engine_for(group).finder,
+                    part,
                     query,
                     near,
-                    run.seed,
+                    seed,
                     outcome,
                     batch,
-                    run.diagnose,
+                    options.diagnose,
                 )
                 outcome = replace(outcome, q=batch.q, time=batch.time)
-            if run.diagnose:
-                batch = self._diagnosed(asked, near, outcome, batch)
+            if options.diagnose:
+                batch = self._diagnose(part, near, outcome, batch)
                 if self.check is not None and len(targets) == 1:
-                    again = Run(starts[0], run.seed)
+                    retry = SolveOptions(starts[0], seed)
                     batch = with_way_out(
-                        lambda some: self.solve(some, again).success, self.check, asked, batch
+                        lambda changed: self.solve(changed, retry).success, self.check, part, batch
                     )
-            q = in_nearest_turns(self.robot.description, asked, batch.q, q0)
+            q = in_nearest_turns(self.robot.description, part, batch.q, q0)
             batch = replace(batch, q=q)
-            parts.pace(1e-9 * (time.time_ns() - started))
-            return SolvedPart(asked, q0, started, outcome, batch, query)
+            parts.adapt_to_time(1e-9 * (time.time_ns() - started))
+            return SolvedPart(part, q0, started, outcome, batch, query)
 
-        return in_order(solve, parts, run.jobs)
+        return map_ordered(solve, parts, options.jobs)
 
     def _run(self, targets: TargetBatch, starts: Array, seed: int, trace: bool) -> Outcome:
-        """Solve targets of any kinds, each by the method for its kinds."""
-        groups, outcomes = [], []
-        for engine, rows, some in self.parted(targets):
-            groups.append(rows)
-            outcomes.append(engine.method.run(some, starts[rows], seed, trace))
-        return outcomes[0] if len(outcomes) == 1 else Outcome.interleaved(groups, outcomes)
+        """Run the method on targets of any contact kinds."""
+        indices, outcomes = [], []
+        for engine, rows, group in self.group_by_contact_kind(targets):
+            indices.append(rows)
+            outcomes.append(engine.method.run(group, starts[rows], seed, trace))
+        return outcomes[0] if len(outcomes) == 1 else Outcome.interleaved(indices, outcomes)
 
-    def _most_manipulable(
+    def _maximise_manipulability(
         self, targets: TargetBatch, starts: Array, seed: int, outcome: Outcome
     ) -> Outcome:
-        """Every hand where it is, held by the arm of the best measure."""
-        begin, q = time.perf_counter(), outcome.q.copy()
+        """Replace the arm of each solution by the most manipulable one; the hands stay."""
+        started, q = time.perf_counter(), outcome.q.copy()
         rows = np.flatnonzero(outcome.status == Status.SOLVED)
         for row in rows:
-            one = targets.rows(slice(row, row + 1))
-            finder = self.kinds_of(one).finder
-            q[row] = finder.best_arm(one, q[row], starts[row], seed, MANIPULABILITY)
+            target = targets.rows(slice(row, row + 1))
+            finder = self.engine_for(target).finder
+            q[row] = finder.best_arm(target, q[row], starts[row], seed, MANIPULABILITY)
         seconds = outcome.time.copy()
-        seconds[rows] += (time.perf_counter() - begin) / max(len(rows), 1)
+        seconds[rows] += (time.perf_counter() - started) / max(len(rows), 1)
         return replace(outcome, q=q, time=seconds)
 
-    def _diagnosed(
+    def _diagnose(
         self, targets: TargetBatch, starts: Array, outcome: Outcome, batch: BatchSolution
     ) -> BatchSolution:
-        """Find the reasons; a solution found by hand-first's own diagnosis is the answer."""
-        own = self.hand_first is not None
+        """Add diagnoses of unsolved targets to a batch.
+
+        A solution found by the diagnosis becomes the result if the method is a hand search.
+        """
+        is_hand_search = self.hand_search is not None
         q, seconds = outcome.q.copy(), outcome.time.copy()
         rows = np.flatnonzero(~batch.success & (batch.status != Status.COLLISION))
         if not len(rows):
             return replace(batch, diagnoses=(None,) * len(batch))
-        found: dict[int, Diagnosis] = {}
-        # Why there is no solution does not depend on which is preferred.
-        for engine, of_kinds, some in self.parted(replace(targets.rows(rows), prefer="limits")):
-            chosen = rows[of_kinds]
-            ends = q[chosen] if own else None
-            diagnoses = engine.diagnostician.diagnose(some, starts[chosen], ends)
-            found |= zip(chosen.tolist(), diagnoses, strict=True)
-        for row, why in found.items():
-            if own and why.reason is Reason.REACHABLE:
-                q[row] = why.q
-                seconds[row] += why.time
+        by_row: dict[int, Diagnosis] = {}
+        # The cause does not depend on the preference.
+        unsolved = replace(targets.rows(rows), prefer="limits")
+        for engine, members, group in self.group_by_contact_kind(unsolved):
+            group_rows = rows[members]
+            nearest = q[group_rows] if is_hand_search else None
+            diagnoses = engine.diagnostician.diagnose(group, starts[group_rows], nearest)
+            by_row |= zip(group_rows.tolist(), diagnoses, strict=True)
+        for row, diagnosis in by_row.items():
+            if is_hand_search and diagnosis.reason is Reason.REACHABLE:
+                q[row] = diagnosis.q
+                seconds[row] += diagnosis.time
         reports, query = batch.collisions, self.collision_query(targets)
-        ended = replace(outcome, q=q, time=seconds)
+        outcome = replace(outcome, q=q, time=seconds)
         batch = replace(
-            judged(self.robot, self.method.name, targets, ended, query), collisions=reports
+            judge_outcome(self.robot, self.method.name, targets, outcome, query),
+            collisions=reports,
         )
         diagnoses = tuple(
-            None if solved else found.get(row) for row, solved in enumerate(batch.success)
+            None if solved else by_row.get(row) for row, solved in enumerate(batch.success)
         )
         status = batch.status.copy()
-        for row, why in enumerate(diagnoses):
-            if why is not None and why.reason is not Reason.REACHABLE:
-                status[row] = Status.UNREACHABLE if why.established else Status.NOT_FOUND
+        for row, diagnosis in enumerate(diagnoses):
+            if diagnosis is not None and diagnosis.reason is not Reason.REACHABLE:
+                status[row] = Status.UNREACHABLE if diagnosis.established else Status.NOT_FOUND
         return replace(batch, status=status, diagnoses=diagnoses)

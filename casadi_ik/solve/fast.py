@@ -1,4 +1,4 @@
-"""One target a call, arrays in and arrays out: for loops that cannot wait."""
+"""A solver of single targets with arrays in and out, for control loops."""
 
 from __future__ import annotations
 
@@ -10,54 +10,60 @@ from numpy.typing import ArrayLike
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.files.arrays import Array
 from casadi_ik.model.grasp import real_array
-from casadi_ik.solve.engine import Engine, Run
-from casadi_ik.solve.request import Request, preference
+from casadi_ik.solve.engine import Engine, SolveOptions
+from casadi_ik.solve.request import Request, resolve_preference
 from casadi_ik.solve.status import Status
 
-STATUSES = {int(status): status for status in Status}
+STATUS_BY_CODE = {int(status): status for status in Status}
 
 
 class FastSolver:
-    """Solves one target a call, in memory made once.
+    """Solves one target per call in preallocated memory.
 
-    The answers are bit for bit those of `Solver.solve(..., diagnose=False)`, all restarts and the
-    verdict included. What it does without: a diagnosis, a log, a `Solution` (errors are in two
-    arrays), grasps and what contacts may have beside point and normal, actuators held where they
-    are, and interruption of a call by Ctrl-C before its kernel comes back (0.2 s at most).
+    The results equal those of `Solver.solve(..., diagnose=False)` bit for bit, with all restarts
+    and the verdict. It has no diagnosis, log, `Solution` (errors are in two arrays), grasps,
+    contact vectors beyond point and normal, or fixed actuators, and Ctrl-C takes effect when the
+    kernel returns (0.2 s at most).
 
-    An instance has one answer at a time: threads need one each.
+    An instance stores one result: each thread needs its own.
 
     Attributes:
-        position_error: (f,) [m] of the last answer, NaN where free; the next call overwrites it.
-        angle_error: (f,) [rad], likewise.
+        position_error: (f,) distances of the last result [m], NaN where free; the next call
+            overwrites them.
+        angle_error: (f,) angles of the last result [rad], NaN where free.
     """
 
     def __init__(self, engine: Engine, request: Request) -> None:
-        """Compile what is not compiled yet, and lay the arrays out.
+        """Compile the method if necessary, and allocate its memory.
+
+        Args:
+            engine: Engine without a scene.
+            request: Defaults of the targets.
 
         Raises:
-            UnsupportedError: The method has no such memory, or there is a scene.
+            UnsupportedError: The method is not hand-first, or there is a scene.
         """
         if engine.check is not None:
-            raise UnsupportedError("fast: checks no collisions, expected a solver without a scene")
-        method = engine.hand_first
+            raise UnsupportedError("fast: a scene is not supported; expected a solver without one")
+        method = engine.hand_search
         if method is None:
-            found = engine.method.name
-            raise UnsupportedError(f"fast: expected method 'hand-first', found {found!r}")
+            name = engine.method.name
+            raise UnsupportedError(f"fast: expected method 'hand-first', found {name!r}")
         self._engine, self._request = engine, request
         robot = engine.robot
         f, n = len(robot.fingers), len(robot.actuators)
         self._home, self._shapes = robot.home, ((f, 3), (f, 3), (n,))
         self.position_error, self.angle_error = np.full(f, np.nan), np.full(f, np.nan)
-        self._one = one = method.alone(request.enforce_limits)
-        if one is None:
+        self._search = search = method.alone(request.enforce_limits)
+        if search is None:
             return
-        self._points, self._normals, self._here = one.points, one.normals, one.here
-        self._terms, self._q, self._rounds = one.terms, one.q, one.plan.rounds
-        self.position_error, self.angle_error = one.position_error, one.angle_error
+        self._points, self._normals, self._start = search.points, search.normals, search.here
+        self._parameters, self._q = search.terms, search.q
+        self._max_restarts = method.rounds
+        self.position_error, self.angle_error = search.position_error, search.angle_error
         # Tolerances and limits are the same for all targets.
         any_contact = np.zeros((1, *self._shapes[0])), np.ones((1, *self._shapes[0]))
-        self._terms[...] = method.terms(request.of_arrays(*any_contact, None))
+        self._parameters[...] = method.terms(request.of_arrays(*any_contact, None))
 
     def __call__(
         self, points: ArrayLike, normals: ArrayLike, q0: ArrayLike | None = None
@@ -68,8 +74,8 @@ class FastSolver:
             points: (f, 3) contact points [m], base frame, in `robot.fingers` order; NaN marks a
                 free finger.
             normals: (f, 3) outward pad normals; NaN marks a free normal.
-            q0: (n,) where the robot is: of several solutions one near it is wanted. None: it is
-                at home, and one far from limits is wanted.
+            q0: (n,) start configuration [rad or m]; a solution near it is preferred. None: start
+                at home, and prefer a solution far from the limits.
 
         Returns:
             q (n,) [rad or m] and the status.
@@ -77,49 +83,49 @@ class FastSolver:
         Raises:
             InputError: Wrong shapes or numbers.
         """
-        one = self._one
-        if one is None:
-            return self._slowly(points, normals, q0)
+        search = self._search
+        if search is None:
+            return self._solve_as_batch(points, normals, q0)
         try:
-            p, n = _numbers(points), _numbers(normals)
-            here = self._home if q0 is None else _numbers(q0)
+            p, n = _as_array(points), _as_array(normals)
+            start = self._home if q0 is None else _as_array(q0)
         except (TypeError, ValueError):
-            return self._slowly(points, normals, q0)
-        if (p.shape, n.shape, here.shape) != self._shapes:
-            return self._slowly(points, normals, q0)
-        self._points[...], self._normals[...], self._here[...] = p, n, here
-        self._terms[-1] = q0 is not None
-        status = one(self._rounds)
+            return self._solve_as_batch(points, normals, q0)
+        if (p.shape, n.shape, start.shape) != self._shapes:
+            return self._solve_as_batch(points, normals, q0)
+        self._points[...], self._normals[...], self._start[...] = p, n, start
+        self._parameters[-1] = q0 is not None
+        status = search(self._max_restarts)
         if status is None:
-            return self._slowly(points, normals, q0)
-        return self._q.copy(), STATUSES[status]
+            return self._solve_as_batch(points, normals, q0)
+        return self._q.copy(), STATUS_BY_CODE[status]
 
-    def _slowly(
+    def _solve_as_batch(
         self, points: ArrayLike, normals: ArrayLike, q0: ArrayLike | None
     ) -> tuple[Array, Status]:
-        """The way of a batch: without a compiler, and for what has to be refused in words.
+        """Solve as a batch of one: without a compiler, and to report malformed input.
 
         Raises:
             InputError: Wrong shapes or numbers.
         """
         request = self._request
-        prefer = preference(None, q0 is not None)
-        one: Any = [points], [normals]
-        targets = request.of_arrays(one[0], one[1], None, prefer=prefer)
+        prefer = resolve_preference(None, q0 is not None)
+        arrays: Any = [points], [normals]
+        targets = request.of_arrays(arrays[0], arrays[1], None, prefer=prefer)
         start = request.start(q0)
-        solution = self._engine.solve(targets, Run(start)).solution(0)
+        solution = self._engine.solve(targets, SolveOptions(start)).solution(0)
         verdicts = solution.contacts.values()
         self.position_error[...] = [verdict.position_error for verdict in verdicts]
         self.angle_error[...] = [verdict.angle_error for verdict in verdicts]
         return solution.q, solution.status
 
 
-def _numbers(value: ArrayLike) -> Array:
-    """Real numbers as an array.
+def _as_array(value: ArrayLike) -> Array:
+    """Return real numbers as an array.
 
     Raises:
-        TypeError: Something else.
-        ValueError: The same.
+        TypeError: The value is not numeric.
+        ValueError: The value is ragged or not real.
     """
     if type(value) is np.ndarray and value.dtype == np.float64:
         return value

@@ -1,10 +1,10 @@
-"""A robot's first answers, from CasADi's virtual machine while its C is compiled in the background.
+"""Interim solutions from CasADi's virtual machine while the C code is compiled in the background.
 
-A process of its own compiles into the cache, so that the next program finds what this one asked
-for. It ends by itself; where it is killed, nothing is left that looks like a library. The virtual
-machine answers what the first round of compiled code would answer, the same up to the last places
-of sines and arcs. What that round does not solve waits for the compiler, so an answer does not
-depend on when it was asked for.
+A separate process compiles into the cache, so that later programs find the library as well. It ends
+by itself, and leaves no incomplete library if it is killed. The virtual machine computes the
+solution of the first restart of the compiled code, up to the last digits of sines and arctangents.
+A target that this restart does not solve waits for the compiler, so a solution does not depend on
+the time of the call.
 """
 
 from __future__ import annotations
@@ -26,29 +26,29 @@ from casadi_ik.compile.libraries import NotCachedError
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.targets import TargetBatch
-from casadi_ik.solve.batches import judged
-from casadi_ik.solve.hand_first.method import HandFirstMethod
+from casadi_ik.solve.batches import judge_outcome
+from casadi_ik.solve.method import HandSearch
 from casadi_ik.solve.solution import Solution
 from casadi_ik.solve.turns import in_nearest_turns, search_start
 
 
 @dataclass(frozen=True)
-class Waiting:
-    """How long is waited for compiled code.
+class BackgroundCompilation:
+    """Settings of the compilation in the background.
 
     Attributes:
-        look_again: From one look for it to the next [s].
-        lifetime: After which the process in the background ends in any case [s].
-        motor: What a motor adds to the compiler's work, about [s] (gcc 12, one core of a server of
-            2023).
+        poll_interval: Time between two looks for the library [s].
+        lifetime: Maximum lifetime of the process [s].
+        seconds_per_motor: Approximate compile time per motor [s]. Source: gcc 12, one core of a
+            server of 2023.
     """
 
-    look_again: float = 0.25
+    poll_interval: float = 0.25
     lifetime: float = 900.0
-    motor: float = 0.4
+    seconds_per_motor: float = 0.4
 
 
-WAITING = Waiting()
+BACKGROUND_COMPILATION = BackgroundCompilation()
 
 CHILD = """\
 import sys
@@ -58,39 +58,46 @@ compile_in_background()
 """
 
 
-class FirstAnswers:
-    """Answers of a method until its compiled code is there; threads may share it."""
+class InterimSolver:
+    """Solves single targets until the compiled code of a method is available.
 
-    def __init__(self, method: HandFirstMethod | None) -> None:
-        """Nothing is done before the first answer; without a method there is none."""
+    Threads may share an instance.
+    """
+
+    def __init__(self, method: HandSearch | None) -> None:
+        """Store the method; nothing is built before the first call.
+
+        Args:
+            method: The method; None: there are no interim solutions.
+        """
         self._method = method
-        self._early: tuple[HandFirstMethod, ArmHand] | None = None
+        self._virtual: tuple[HandSearch, ArmHand] | None = None
         self._process: subprocess.Popen[bytes] | None = None
-        self._looked = 0.0
+        self._last_poll = 0.0
         self._lock = threading.Lock()
 
-    def answer(
+    def solve(
         self, targets: TargetBatch, start: Array, check: SceneCheck | None
     ) -> Solution | None:
-        """The answer of the virtual machine.
+        """Solve a target in the virtual machine.
 
         Args:
             targets: One target.
-            start: (n,) where the robot is.
-            check: What answers must not touch; None: nothing is checked.
+            start: (n,) start configuration [rad or m].
+            check: Collision check of the scene; None: collisions are not checked.
 
         Returns:
-            The answer, or None where compiled code is there, or has to be waited for.
+            The solution; None if compiled code is available, or is needed for this target.
         """
         method = self._method
         if method is None or self._is_ready(method):
             return None
         with virtual_machine():
-            if self._early is None:
+            if self._virtual is None:
                 virtual = method.in_virtual_machine()
-                # A robot of its own: its functions are not those of the compiled method.
-                self._early = virtual, ArmHand(virtual.robot)
-            virtual, robot = self._early
+                # The compiled method and the virtual one must not share functions of the robot.
+                self._virtual = virtual, ArmHand(virtual.robot)
+            virtual, robot = self._virtual
             near = search_start(virtual.robot, start)[None]
             outcome = virtual.run(targets, near, 0, False, rounds=1)
             q = in_nearest_turns(virtual.robot, targets, outcome.q, start)
@@ -98,37 +105,39 @@ class FirstAnswers:
             query = None
             if check is not None:
                 query = SceneCheck(robot, check.scene, compiled=False).collision_query(targets)
-            batch = judged(robot, virtual.name, targets, outcome, query)
+            batch = judge_outcome(robot, virtual.name, targets, outcome, query)
         return batch.solution(0) if batch.success[0] else None
 
-    def _is_ready(self, method: HandFirstMethod) -> bool:
-        """Whether the method is compiled, or is to be waited for."""
+    def _is_ready(self, method: HandSearch) -> bool:
+        """Return whether to use the compiled method, waiting for the compiler if necessary."""
         with self._lock:
             process, now = self._process, time.monotonic()
-            if process is not None and now - self._looked < WAITING.look_again:
+            interval = BACKGROUND_COMPILATION.poll_interval
+            if process is not None and now - self._last_poll < interval:
                 return False
-            self._looked = now
+            self._last_poll = now
             try:
                 with cached_only():
                     method.prepare()
             except NotCachedError:
-                ready = waits_for_compiler() or (process is not None and process.poll() is not None)
-                if not ready and process is None:
-                    self._process = started(method)
-                    ready = self._process is None
+                has_ended = process is not None and process.poll() is not None
+                is_ready = waits_for_compiler() or has_ended
+                if not is_ready and process is None:
+                    self._process = start_compilation(method)
+                    is_ready = self._process is None
             else:
-                ready = True
-            if ready:
+                is_ready = True
+            if is_ready:
                 self._method = None
-            return ready
+            return is_ready
 
 
-def started(method: HandFirstMethod) -> subprocess.Popen[bytes] | None:
-    """A process that compiles a method, or None where none can be started."""
+def start_compilation(method: HandSearch) -> subprocess.Popen[bytes] | None:
+    """Start a process that compiles a method; None if no process can be started."""
     if not Path(sys.executable or "").name.startswith("python") or find_compiler() is None:
         return None
     package = Path(__file__).parents[2]
-    # A process group of its own: Ctrl-C is not meant for it.
+    # Its own process group, so that Ctrl-C does not end the compilation.
     flags = subprocess.CREATE_NO_WINDOW if sys.platform == "win32" else 0
     try:
         process = subprocess.Popen(
@@ -144,17 +153,17 @@ def started(method: HandFirstMethod) -> subprocess.Popen[bytes] | None:
             pickle.dump(method, stream)
     except OSError:
         return None
-    seconds = WAITING.motor * len(method.robot.actuators)
+    seconds = BACKGROUND_COMPILATION.seconds_per_motor * len(method.robot.actuators)
     print_note(
-        f"{method.robot.name}: compiled in the background (about {seconds:.0f} s, once per "
-        "machine); until then CasADi's virtual machine answers"
+        f"{method.robot.name}: compiling in the background (about {seconds:.0f} s, once per "
+        "machine); CasADi's virtual machine solves until then"
     )
     return process
 
 
 def compile_in_background() -> None:
-    """What that process does: for one target first, then for batches."""
-    threading.Thread(target=_end_later, daemon=True).start()
+    """Compile the method that standard input holds, first for one target, then for batches."""
+    threading.Thread(target=_exit_after_lifetime, daemon=True).start()
     method = pickle.load(sys.stdin.buffer)
     with contextlib.suppress(OSError, AttributeError):
         os.nice(5)
@@ -162,6 +171,6 @@ def compile_in_background() -> None:
     method.prepare(batches=True)
 
 
-def _end_later() -> None:
-    time.sleep(WAITING.lifetime)
+def _exit_after_lifetime() -> None:
+    time.sleep(BACKGROUND_COMPILATION.lifetime)
     os._exit(1)

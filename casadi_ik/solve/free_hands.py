@@ -18,10 +18,10 @@ from casadi_ik.solve.status import Phase
 from casadi_ik.solve.trials import (
     Deduplicator,
     Subproblems,
-    best_of_each,
-    carried,
-    palm_parts,
-    palms_of,
+    carry_palms,
+    improving_rows,
+    palm_coordinates,
+    side_palms,
 )
 
 
@@ -77,14 +77,14 @@ class SideHands:
             best: Whether to take one of each target at most, that with most room.
         """
         surplus = self._own[side].rows(owner).check(q).surplus
-        rows = best_of_each(owner, surplus, self.surplus[side])
+        rows = improving_rows(owner, surplus, self.surplus[side])
         self.nearest[side, owner[rows]] = q[rows]
         self.surplus[side, owner[rows]] = surplus[rows]
         rows = rows if best else np.arange(len(q))
         kept = rows[surplus[rows] >= -ROUNDING]
         q, owner = q[kept], owner[kept]
-        palms, ranges = palms_of(self._trials.robot, q), self._robot.upper - self._robot.lower
-        parts = [(q / ranges)[:, self.hands[side]], palm_parts(palms[:, side])]
+        palms, ranges = side_palms(self._trials.robot, q), self._robot.upper - self._robot.lower
+        parts = [(q / ranges)[:, self.hands[side]], palm_coordinates(palms[:, side])]
         fresh = self._known[side].add(np.concatenate(parts, axis=1), owner)
         qs, poses, owners = self._found[side]
         self._found[side] = (
@@ -155,7 +155,9 @@ class SideHands:
             )
             q, of = found.q, of[found.owner]
         if len(q) and not all(search.exact for search in searches):
-            q = carried(self._trials, self._targets, q, palms[of], owner[of], float(Phase.TRUNK))
+            q = carry_palms(
+                self._trials, self._targets, q, palms[of], owner[of], float(Phase.TRUNK)
+            )
         return q, owner[of]
 
 

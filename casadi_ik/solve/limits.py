@@ -11,16 +11,16 @@ from casadi_ik.kinematics.couplings import has_toggle, toggle_margins
 from casadi_ik.kinematics.smooth import Expr
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.targets import TargetBatch
-from casadi_ik.solve.trace import WORD, RecordedJacobian
+from casadi_ik.solve.trace import WORD_BITS, RecordedJacobian
 
 
-def kept_within(robot: RobotDescription, q: Expr, enforce: Expr) -> Expr:
+def clamp_to_limits(robot: RobotDescription, q: Expr, enforce: Expr) -> Expr:
     """Move q (n, 1) into the limits where `enforce` is 1; leave it as it is where it is 0."""
     lower, upper = ca.DM(robot.lower.tolist()), ca.DM(robot.upper.tolist())
     return ca.if_else(enforce > 0, ca.fmin(ca.fmax(q, lower), upper), q)
 
 
-def starts_within(robot: RobotDescription, targets: TargetBatch, q0: Array) -> Array:
+def clip_starts(robot: RobotDescription, targets: TargetBatch, q0: Array) -> Array:
     """Starts (k, n), moved into the limits where the targets enforce them."""
     return np.clip(q0, robot.lower, robot.upper) if targets.enforce_limits else q0
 
@@ -28,19 +28,19 @@ def starts_within(robot: RobotDescription, targets: TargetBatch, q0: Array) -> A
 def limit_mask(robot: RobotDescription, q: Expr) -> Expr:
     """Bit i is set where actuator i stands at or beyond a limit."""
     lower, upper = ca.DM(robot.lower.tolist()), ca.DM(robot.upper.tolist())
-    return bits(ca.logic_or(q <= lower, q >= upper))
+    return pack_bits(ca.logic_or(q <= lower, q >= upper))
 
 
-def bits(flags: Expr) -> Expr:
-    """Bit i is set where flag i (n, 1) is; a word (1, 1) for every `WORD` of them."""
+def pack_bits(flags: Expr) -> Expr:
+    """Bit i is set where flag i (n, 1) is; a word (1, 1) for every `WORD_BITS` of them."""
     n = flags.numel()
-    words = [flags[first : min(first + WORD, n)] for first in range(0, n, WORD)]
+    words = [flags[first : min(first + WORD_BITS, n)] for first in range(0, n, WORD_BITS)]
     return ca.vertcat(
         *(ca.dot(word, ca.DM([2.0**i for i in range(word.numel())])) for word in words)
     )
 
 
-NEAR_TOGGLE = 0.03
+TOGGLE_THRESHOLD = 0.03
 """Squared sine of a transmission angle (10 deg) below which a mechanism counts as near toggle."""
 
 
@@ -62,7 +62,7 @@ def coupling_values(robot: RobotDescription, q: ca.SX) -> dict[str, Expr]:
 def coupling_jacobian(robot: RobotDescription) -> dict[str, RecordedJacobian]:
     """When the coupling Jacobian counts as near singular, for the events of a log."""
     motors = _motors(robot)
-    return {"coupling": RecordedJacobian(motors, singular=NEAR_TOGGLE)} if motors else {}
+    return {"coupling": RecordedJacobian(motors, singular=TOGGLE_THRESHOLD)} if motors else {}
 
 
 def _motors(robot: RobotDescription) -> tuple[str, ...]:

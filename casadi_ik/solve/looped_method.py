@@ -1,4 +1,4 @@
-"""A method that is one step graph: started, run to its end in compiled code, stepped by hand."""
+"""Base class of methods that iterate a single step graph."""
 
 from __future__ import annotations
 
@@ -18,55 +18,58 @@ from casadi_ik.files.arrays import Array, Counts
 from casadi_ik.kinematics.contacts import Kinds
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.targets import TargetBatch
-from casadi_ik.solve.method import Method, Outcome
+from casadi_ik.solve.method import HandSearch, Method, Outcome
 from casadi_ik.solve.status import Phase, Status
 from casadi_ik.solve.trace import JacobianMeasures, RecordedJacobian, TraceFormat, trace_format
 
 Start = tuple[Array, Array]
-"""First states (k, ns) and parameters (k, np) of a step graph."""
+"""Initial states (k, ns) and parameters (k, np) of a step graph."""
 
 
 class LoopedMethod(ABC):
-    """A method that is one step graph run to its end.
+    """Base class of methods that iterate a single step graph.
 
-    What a method of this kind has to say of itself are `step_graph` (the iteration, with the
-    layouts of its state, parameters and record), `begin` (where solves start) and `phase_counts`
-    (what the iterations were spent on). Batches, steps by hand and traces follow from these.
+    A subclass defines `step_graph` (the iteration, with the layouts of its state, parameters and
+    record), `begin` (initial states) and `phase_counts` (iterations by phase). Batches, steppers
+    and traces follow from these.
 
     The state has a field "q" (n,), the configuration to return; the record has the fields that
     `trace_format` names. The step ends a solve with a code of `Status`.
 
     Attributes:
         name: Name of the method.
-        robot: The robot.
-        options: Its parameter record, a dataclass.
+        robot: Robot that the method is built for.
+        options: Parameter record, a dataclass.
     """
 
     name: str
 
+    preferences: tuple[str, ...] = ()
+    """Preferences that the method supports, see `Method.preferences`."""
+
     phases_without_arm: tuple[Phase, ...] = ()
-    """Phases in which the arm's part of q means nothing yet: its Jacobian is not measured there."""
+    """Phases in which the arm's part of q is undefined; the arm Jacobian is not measured there."""
 
     follows_closed_chain: bool = False
-    """Whether a log measures the closed chain of arm and thumb, since the method moves along it."""
+    """Whether a log measures the closed chain of arm and thumb, along which the method moves."""
 
     max_iterations: int = 100_000
-    """Budget of a start. This one is far above what steps allow themselves that end by a status of
-    their own."""
+    """Maximum number of iterations of a start. The default exceeds what any step with its own
+    stopping rule uses."""
 
     takes_free_contacts: bool = False
-    """Whether a finger or its normal may be left free."""
+    """Whether a finger or its normal may be free."""
 
     takes_fixed_actuators: bool = False
     """Whether actuators may be fixed."""
 
     def __init__(self, robot: RobotDescription, options: Any, compiled: bool = True) -> None:
-        """Remember what the method is made of; its loop is built when first needed.
+        """Store the arguments; the loop is built when first needed.
 
         Args:
             robot: The robot.
-            options: The parameter record, a dataclass.
-            compiled: False keeps to CasADi's virtual machine.
+            options: Parameter record, a dataclass.
+            compiled: False: use CasADi's virtual machine.
         """
         self.robot = robot
         self.options = options
@@ -74,43 +77,48 @@ class LoopedMethod(ABC):
 
     @abstractmethod
     def step_graph(self) -> StepGraph:
-        """The whole iteration."""
+        """Build the graph of an iteration."""
 
     @abstractmethod
     def begin(self, targets: TargetBatch, q0: Array) -> Start:
-        """Where the solves of a batch begin; `Layout.pack_rows` lays it out.
+        """Return the initial states and parameters of a batch, see `Layout.pack_rows`.
 
         Args:
             targets: k targets.
-            q0: (k, n) configurations to start from.
+            q0: (k, n) start configurations.
         """
 
     @abstractmethod
     def phase_counts(self, states: Array, iterations: Counts) -> Mapping[Phase, Counts]:
-        """Iterations by phase.
+        """Return the number of iterations by phase.
 
         Args:
-            states: (k, ns) last states.
+            states: (k, ns) final states.
             iterations: (k,) iterations.
         """
 
     def restarts(self, states: Array) -> Counts:
-        """(k,) how often the solves began anew, from their last states (k, ns)."""
+        """Return the number of restarts (k,) of solves with these final states (k, ns)."""
         return np.zeros(len(states), dtype=np.int64)
 
     @property
+    def hand_search(self) -> HandSearch | None:
+        """None: the method is a black box, see `Method.hand_search`."""
+        return None
+
+    @property
     def jacobians(self) -> Mapping[str, RecordedJacobian]:
-        """The Jacobians in the record, as in `TraceFormat`."""
+        """Jacobians in the record, as in `TraceFormat`."""
         return {}
 
     @cached_property
     def graph(self) -> StepGraph:
-        """The step graph, made once."""
+        """Step graph, built once."""
         return self.step_graph()
 
     @cached_property
     def kernel(self) -> LoopKernel:
-        """The compiled loop; the virtual machine for a step that has no C code."""
+        """Compiled loop; CasADi's virtual machine for a step that cannot be compiled."""
         return LoopKernel(self.graph, self._compiled)
 
     @cached_property
@@ -124,12 +132,12 @@ class LoopedMethod(ABC):
 
     @property
     def trace_format(self) -> TraceFormat:
-        """How its traces are to be read."""
+        """Layout and labels of the rows of a trace."""
         return trace_format(self.graph.record, self.robot, self.jacobians, self._measures)
 
     @property
     def parameters(self) -> Mapping[str, Any]:
-        """The parameter record as a plain mapping."""
+        """Fields of the parameter record by name."""
         return dataclasses.asdict(self.options)
 
     def prepare(self) -> None:
@@ -137,57 +145,63 @@ class LoopedMethod(ABC):
         _ = self.kernel
 
     def for_kinds(self, kinds: Kinds) -> Method:
-        """Itself: a method that knows points with normals only refuses all else in `run`."""
+        """Return the method itself; `run` refuses contacts other than points with normals."""
         del kinds
         return self
 
     def stepper(self, targets: TargetBatch, q0: Array) -> Stepper:
-        """One target, one iteration at a time; see `Method.stepper`."""
+        """Return a stepper of one target, see `Method.stepper`."""
         self._check(targets)
         states, parameters = self.begin(targets, q0[None])
         return Stepper(self.kernel, states[0], parameters[0])
 
     def run(self, targets: TargetBatch, q0: Array, seed: int, trace: bool) -> Outcome:
-        """Solve a batch; see `Method.run`. No random numbers are drawn."""
+        """Solve a batch, see `Method.run`; no random numbers are drawn."""
         del seed
         self._check(targets)
-        begun = time.perf_counter()
+        started = time.perf_counter()
         states, parameters = self.begin(targets, q0)
         result = self.kernel.run(states, parameters, self.max_iterations, trace)
-        # What is done for all solves at once counts for each of them alike.
-        outside = max(time.perf_counter() - begun - result.time.sum(), 0.0)
+        # Time spent on the batch as a whole is divided equally among its solves.
+        overhead = max(time.perf_counter() - started - result.time.sum(), 0.0)
         counts = self.phase_counts(result.states, result.iterations)
         return Outcome(
-            # A copy: the states are much larger and need not stay.
+            # A copy releases the states, which are much larger.
             q=result.states[:, self.graph.state.slice("q")].copy(),
             status=Status.from_loop(result.status),
             iterations=result.iterations,
             restarts=self.restarts(result.states),
-            time=result.time + outside / max(len(targets), 1),
-            phases={phase.label: spent for phase, spent in counts.items()},
+            time=result.time + overhead / max(len(targets), 1),
+            phases={phase.label: count for phase, count in counts.items()},
             rows=result.rows,
         )
 
     def _check(self, targets: TargetBatch) -> None:
+        """Check that the method supports the targets.
+
+        Raises:
+            UnsupportedError: Actuators are fixed.
+            RowError: A contact has a vector that the method does not support, or lacks one.
+        """
         if targets.fixed is not None and not self.takes_fixed_actuators:
-            raise UnsupportedError(f"method {self.name!r} cannot keep actuators fixed")
+            raise UnsupportedError(f"fixed: method {self.name!r} cannot keep actuators fixed")
         if self.takes_free_contacts:
             return
         for name, array in targets.more.items():
-            given = np.argwhere(~np.isnan(array[..., 0]))
-            if len(given):
-                row, finger = targets.number(int(given[0, 0])), given[0, 1]
+            present = np.argwhere(~np.isnan(array[..., 0]))
+            if len(present):
+                row, finger = targets.number(int(present[0, 0])), present[0, 1]
                 raise RowError(
-                    f"method {self.name!r} needs point and normal of every finger and knows no "
-                    f"{name}; row {row} has one for {self.robot.finger_names[finger]!r}",
+                    f"{name}: row {row} has a value for {self.robot.finger_names[finger]!r}, which "
+                    f"method {self.name!r} does not support; expected point and normal only",
                     row,
                 )
-        for name, array in (("contact", targets.points), ("normal", targets.normals)):
+        for name, array in (("points", targets.points), ("normals", targets.normals)):
             free = np.argwhere(np.isnan(array[..., 0]))
             if len(free):
                 row, finger = targets.number(int(free[0, 0])), free[0, 1]
                 raise RowError(
-                    f"method {self.name!r} needs a {name} for every finger; row {row} has none for "
-                    f"{self.robot.finger_names[finger]!r}",
+                    f"{name}: row {row} has no value for {self.robot.finger_names[finger]!r}; "
+                    f"method {self.name!r} expects a point and a normal for every finger",
                     row,
                 )

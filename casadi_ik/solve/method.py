@@ -1,35 +1,38 @@
-"""What a method has to offer, and what it gives back."""
+"""The interface between the engine and the methods: `Method`, `HandSearch`, and their outcomes."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.compile.layout import split_rows
-from casadi_ik.compile.loop import Stepper
+from casadi_ik.compile.layout import Layout, split_rows
+from casadi_ik.compile.loop import LoopResult, Stepper
 from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.arms.family import ArmFamily
 from casadi_ik.kinematics.contacts import Kinds
+from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.trace import TraceFormat
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What a method made of a batch of k targets.
+    """Result of a method for a batch of k targets, before the verdict.
 
     Attributes:
-        q: (k, n) configurations reached.
+        q: (k, n) final configurations [rad or m].
         status: (k,) codes of `Status`.
         iterations: (k,) iterations over all phases and restarts.
-        restarts: (k,) how often it began anew.
+        restarts: (k,) number of restarts.
         time: (k,) seconds per solve.
         phases: (k,) iterations by phase name, in the order of the phases.
-        rows: The records of all iterations, one solve after the other, (sum of iterations,); None
-            if no trace was asked for.
+        rows: (sum of iterations,) records of all iterations, ordered by solve; None without a
+            trace.
     """
 
     q: Array
@@ -42,7 +45,7 @@ class Outcome:
 
     @property
     def trace(self) -> tuple[NDArray[Any], ...]:
-        """The rows of each solve, views into `rows`; empty if no trace was asked for."""
+        """Rows of each solve as views into `rows`; empty without a trace."""
         return () if self.rows is None else split_rows(self.rows, self.iterations)
 
     def continued(
@@ -92,32 +95,37 @@ class Outcome:
 
     @classmethod
     def interleaved(
-        cls, places: Sequence[NDArray[np.intp]], outcomes: Sequence[Outcome]
+        cls, indices: Sequence[NDArray[np.intp]], outcomes: Sequence[Outcome]
     ) -> Outcome:
-        """Put the outcomes of some targets each together.
+        """Merge the outcomes of disjoint subsets of a batch.
 
         Args:
-            places: Which rows of the whole the targets of an outcome are; together all of them.
-            outcomes: At least one.
+            indices: For each outcome the rows of the batch that it belongs to; together all rows.
+            outcomes: At least one outcome.
         """
-        order = np.argsort(np.concatenate(list(places)))
+        order = np.argsort(np.concatenate(list(indices)))
 
-        def whole(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
-            return np.concatenate(list(parts))[order]
+        def merge(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
+            return np.concatenate(list(arrays))[order]
 
-        names = dict.fromkeys(name for one in outcomes for name in one.phases)
+        names = dict.fromkeys(name for outcome in outcomes for name in outcome.phases)
         rows = None
-        if all(one.rows is not None for one in outcomes):
-            traces = [trace for one in outcomes for trace in one.trace]
+        if all(outcome.rows is not None for outcome in outcomes):
+            traces = [trace for outcome in outcomes for trace in outcome.trace]
             rows = np.concatenate([traces[i] for i in order])
         return cls(
-            q=whole([one.q for one in outcomes]),
-            status=whole([one.status for one in outcomes]),
-            iterations=whole([one.iterations for one in outcomes]),
-            restarts=whole([one.restarts for one in outcomes]),
-            time=whole([one.time for one in outcomes]),
+            q=merge([outcome.q for outcome in outcomes]),
+            status=merge([outcome.status for outcome in outcomes]),
+            iterations=merge([outcome.iterations for outcome in outcomes]),
+            restarts=merge([outcome.restarts for outcome in outcomes]),
+            time=merge([outcome.time for outcome in outcomes]),
             phases={
-                name: whole([one.phases.get(name, np.zeros_like(one.status)) for one in outcomes])
+                name: merge(
+                    [
+                        outcome.phases.get(name, np.zeros_like(outcome.status))
+                        for outcome in outcomes
+                    ]
+                )
                 for name in names
             },
             rows=rows,
@@ -125,12 +133,12 @@ class Outcome:
 
 
 @dataclass(frozen=True, eq=False)
-class Quick:
-    """What a method made of one target; fields as in `Outcome`.
+class SingleOutcome:
+    """Result of a method for one target; fields as in `Outcome`.
 
     Attributes:
-        errors: As the verdict measures them, if it was asked: distances [m] and angles [rad] by
-            finger, NaN where free; by how much the worst actuator or joint is beyond its limits.
+        errors: Distances [m] and angles [rad] by finger as the verdict measures them, NaN where
+            free, and the largest limit violation [rad or m]; None: not measured.
     """
 
     q: Array
@@ -141,7 +149,7 @@ class Quick:
     errors: tuple[list[float], list[float], float] | None = None
 
     def outcome(self, seconds: float) -> Outcome:
-        """The same as a batch of one that took some seconds."""
+        """Return the outcome as a batch of one target that took this many seconds."""
         return Outcome(
             q=self.q[None],
             status=np.array([self.status]),
@@ -153,58 +161,223 @@ class Quick:
 
 
 class Method(Protocol):
-    """A named way to solve, built for one robot and kinds of contact.
+    """A named solver, built for one robot and one combination of contact kinds.
 
-    One that can prefer one of several solutions has `preferences`, too: those of `PREFERENCES` it
-    knows. "q0" it follows itself where a `TargetBatch` says so, "limits" is what it does else.
+    A class that subclasses this protocol explicitly inherits the defaults of `preferences` and
+    `hand_search`.
+
+    Attributes:
+        name: Name of the method, as in the registry.
     """
 
     name: str
 
     @property
+    def preferences(self) -> tuple[str, ...]:
+        """Values of `PREFERENCES` that the method supports.
+
+        Empty if the method returns the first solution it finds. A method reads "q0" from
+        `TargetBatch.prefer`; "limits" is its default order.
+        """
+        return ()
+
+    @property
+    def hand_search(self) -> HandSearch | None:
+        """The method as a search over hand postures, or None if it is a black box.
+
+        The engine needs it for alternatives, collision-free search, palm targets, `fast` and
+        interim solutions. Diagnoses of other methods build a hand-first search of their own.
+        """
+        return None
+
+    @property
     def trace_format(self) -> TraceFormat:
-        """How its traces are to be read."""
+        """Layout and labels of the rows of a trace."""
         ...
 
     @property
     def parameters(self) -> Mapping[str, Any]:
-        """Every number and choice it works with, for the log."""
+        """All parameters of the method, for the log."""
         ...
 
     def prepare(self) -> None:
-        """Build and compile what `run` needs; afterwards `run` may be called by several threads."""
+        """Build and compile what `run` needs; afterwards threads may call `run` concurrently."""
         ...
 
     def for_kinds(self, kinds: Kinds) -> Method:
-        """The same method for contacts of other kinds; itself for its own, and if it has only one.
+        """Return the method for other contact kinds.
 
-        What it cannot take, it refuses in `run`, target by target.
+        A method that supports a single combination of kinds returns itself, and refuses other
+        targets in `run`.
         """
         ...
 
     def stepper(self, targets: TargetBatch, q0: Array) -> Stepper:
-        """Solve one target by hand, one iteration at a time.
+        """Return a stepper that solves one target iteration by iteration.
 
         Args:
             targets: One target.
-            q0: (n,) configuration to start from.
+            q0: (n,) start configuration.
 
         Raises:
-            RowError: The method cannot take the target (for example a free finger).
+            RowError: The method does not support the target (for example a free finger).
             UnsupportedError: The method cannot be stepped; the message says why.
         """
         ...
 
     def run(self, targets: TargetBatch, q0: Array, seed: int, trace: bool) -> Outcome:
-        """Solve a batch of targets of its kinds.
+        """Solve a batch of targets of the method's contact kinds.
 
         Args:
             targets: The targets.
-            q0: (k, n) configurations to start from.
-            seed: Of all random numbers; row i of a batch gets the same numbers in any batch.
-            trace: Whether to keep every iteration.
+            q0: (k, n) start configurations.
+            seed: Seed of all random numbers; a target gets the same numbers in any batch.
+            trace: Whether to record every iteration.
 
         Raises:
-            RowError: The method cannot take a target (for example a free finger).
+            RowError: The method does not support a target (for example a free finger).
         """
+        ...
+
+
+class SearchLayouts(Protocol):
+    """Layouts of the compiled loop of a `HandSearch`."""
+
+    @cached_property
+    def state(self) -> Layout:
+        """Layout of the state."""
+        ...
+
+    @cached_property
+    def parameters(self) -> Layout:
+        """Layout of the parameters."""
+        ...
+
+
+class SearchStep(Protocol):
+    """The iteration of a `HandSearch`."""
+
+    @property
+    def layouts(self) -> SearchLayouts:
+        """Layouts of state and parameters."""
+        ...
+
+    @property
+    def arm(self) -> ArmFamily | None:
+        """Closed form of the arm; None for an arm without one, and without an arm."""
+        ...
+
+
+class SearchSettings(Protocol):
+    """Parameters of a `HandSearch` that its callers read."""
+
+    @property
+    def candidates(self) -> int:
+        """Number of seeds of a restart."""
+        ...
+
+    @property
+    def rounds(self) -> int:
+        """Number of restarts whose seeds resemble the target."""
+        ...
+
+
+class SingleSearch(Protocol):
+    """Preallocated memory of one search; used by one thread at a time.
+
+    Attributes:
+        points: (f, 3) contact points [m], NaN where free; an input.
+        normals: (f, 3) pad normals, NaN where free; an input.
+        here: (n,) start configuration [rad or m]; an input.
+        terms: Parameters that targets share, as `HandSearch.terms` returns them; an input.
+        q: (n,) result [rad or m]; overwritten by each call, like the errors.
+        position_error: (f,) distances [m].
+        angle_error: (f,) angles [rad].
+    """
+
+    points: Array
+    normals: Array
+    here: Array
+    terms: Array
+    q: Array
+    position_error: Array
+    angle_error: Array
+
+    def __call__(self, rounds: int) -> int | None:
+        """Solve with at most this many restarts; return the status, None for malformed input."""
+        ...
+
+
+class HandSearch(Method, Protocol):
+    """A method whose seeds, loop states and runs are accessible one by one.
+
+    Hand-first implements it. Alternatives, the collision-free search, diagnoses, `fast` and
+    interim solutions are built on these members.
+    """
+
+    @property
+    def robot(self) -> RobotDescription:
+        """Robot that the method is built for."""
+        ...
+
+    @property
+    def options(self) -> SearchSettings:
+        """Parameters of the method."""
+        ...
+
+    @property
+    def step(self) -> SearchStep:
+        """Iteration of the method."""
+        ...
+
+    @property
+    def rounds(self) -> int:
+        """Maximum number of restarts."""
+        ...
+
+    def prepare(self, batches: bool = False) -> None:
+        """Build and compile what a single target needs, and with `batches` what a batch needs."""
+        ...
+
+    def in_virtual_machine(self) -> HandSearch:
+        """Return the method evaluated by CasADi's virtual machine."""
+        ...
+
+    def run(
+        self, targets: TargetBatch, q0: Array, seed: int, trace: bool, rounds: int | None = None
+    ) -> Outcome:
+        """Solve a batch with at most `rounds` restarts; see `Method.run`."""
+        ...
+
+    def quick(self, targets: TargetBatch, q0: Array) -> SingleOutcome | None:
+        """Solve one target from q0 (n,) with less overhead than `run`; None if it cannot."""
+        ...
+
+    def alone(self, enforce_limits: bool) -> SingleSearch | None:
+        """Return memory for one search after the other; None without a compiler."""
+        ...
+
+    def terms(self, targets: TargetBatch) -> Array:
+        """Return the parameters that targets share: tolerances, bounds, preference."""
+        ...
+
+    def postures(self, targets: TargetBatch, number: int) -> Array:
+        """Return the seeds of a restart, (k, candidates, hand) hand postures."""
+        ...
+
+    def rows(
+        self, targets: TargetBatch, q0: Array, postures: Array, begun: bool = False
+    ) -> tuple[Array, Array]:
+        """Return initial states and parameters of the loop for `run_rows`.
+
+        Args:
+            targets: k targets.
+            q0: (k, n) start configurations.
+            postures: (k, candidates, hand) seeds, or (k, 1, hand).
+            begun: Whether to skip the search for a solution near q0.
+        """
+        ...
+
+    def run_rows(self, states: Array, parameters: Array) -> LoopResult:
+        """Run the loop from states and parameters made by `rows`."""
         ...

@@ -20,7 +20,7 @@ from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.diagnosis import Freed, Relief, Remedies
 from casadi_ik.solve.solution import BatchSolution, SuggestedFix
-from casadi_ik.solve.trials import Bounds, LocalRefinement, Subproblems, repeated
+from casadi_ik.solve.trials import Bounds, LocalRefinement, Subproblems, repeat_target
 
 HALVINGS = 8
 """How often what a limit has to give is halved, while a solution remains."""
@@ -149,7 +149,7 @@ class RemedyFinder:
         tried = self._lifts()
         if not tried:
             return False
-        asked, bounds = repeated(self.targets, len(tried)), self._lifted(tried)
+        asked, bounds = repeat_target(self.targets, len(tried)), self._lifted(tried)
         if self._solves(asked, self._descended(asked, bounds), bounds).any():
             return True
         # Lifted all together they help if any of them does.
@@ -159,7 +159,7 @@ class RemedyFinder:
 
     def _reliefs(self) -> Iterator[Relief]:
         tried = self._lifts()
-        asked = repeated(self.targets, len(tried))
+        asked = repeat_target(self.targets, len(tried))
         solutions = self._solutions(asked, self._lifted(tried))
         solved = [(tried[i], q) for i, q in solutions.items()]
         return relax_limits(self.trials, self.targets, self._limits, solved, self.q)

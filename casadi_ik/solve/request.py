@@ -1,7 +1,7 @@
-"""How a solver's questions become problems: grasps, palms, arrays; tolerances, limits, preferences.
+"""Conversion of grasps, palm poses and arrays into targets; tolerances, limits and preferences.
 
-A palm that is given with the posture of its hand says where every fingertip is; what it leaves free
-the contacts say.
+A palm pose with a hand posture determines all contacts; pose components that the contacts leave
+free are constrained by tangents.
 """
 
 from __future__ import annotations
@@ -24,196 +24,210 @@ from casadi_ik.model.pose import Free
 from casadi_ik.model.targets import DIRECTIONS_KEY, TargetBatch, fixed_array, target_arrays
 
 CLEARANCE = "clearance"
-"""The preference for what is far from everything; for solvers with a scene."""
+"""Preference for solutions far from obstacles; requires a solver with a scene."""
 
 PREFERENCES = ("limits", "manipulability", "q0", CLEARANCE)
-"""What may be preferred: distance from the limits, manipulability of the arm, closeness to q0,
+"""Orders among solutions: distance from the limits, manipulability of the arm, distance to q0,
 clearance."""
 
 NO_PREFERENCE = "none"
-"""That of methods that cannot choose: they take the solution they come to."""
+"""Preference of methods that return the first solution they find."""
 
 
-def preference(prefer: str | None, started: bool) -> str:
-    """The preference that was asked for.
+def resolve_preference(prefer: str | None, has_start: bool) -> str:
+    """Return the preference of a solve.
 
     Args:
-        prefer: One of `PREFERENCES`, or None: "q0" if a start was given, else "limits".
-        started: Whether one was.
+        prefer: One of `PREFERENCES`, or None: "q0" with a start, else "limits".
+        has_start: Whether the caller passed a start.
 
     Raises:
-        InputError: No such preference.
+        InputError: The preference is unknown.
     """
     if prefer is None:
-        return "q0" if started else "limits"
+        return "q0" if has_start else "limits"
     if prefer not in PREFERENCES:
         raise InputError(f"prefer: found {prefer!r}, expected one of {', '.join(PREFERENCES)}")
     return prefer
 
 
-DETERMINED = 0.15
-"""Contacts that move by less than this when their palm moves by 1 (turned [rad], or shifted by
-`LENGTH`) do not say where it is. Those of all shipped hands with three fingers or more move by 0.17
-at least."""
+MIN_CONTACT_MOTION = 0.15
+"""Singular value of the map from palm motions (rotation [rad], translation by `LENGTH`) to contacts
+below which the contacts leave the palm free. Source: hands with three fingers or more in the
+catalogue have 0.17 or more."""
 
-BEYOND = 1e-6
-"""A posture may be so far beyond a limit [rad or m]; it is then at the limit."""
+POSTURE_LIMIT_SLACK = 1e-6
+"""Limit violation of a posture that is clipped instead of refused [rad or m]."""
 
 
 def hand_posture(robot: ArmHand, posture: Mapping[str, float], name: str = "posture") -> Array:
-    """(n,) positions of all motors that move fingers; NaN for the others.
+    """Return the posture as (n,) motor positions; NaN for motors that move no finger.
 
     Args:
         robot: The robot.
         posture: Position by actuator [rad or m].
-        name: What to call it in an error.
+        name: Name of the posture in errors.
 
     Raises:
-        UnknownNameError: No such actuator.
-        InputError: One that is missing or moves no finger, or not a number within limits.
+        UnknownNameError: An actuator does not exist.
+        InputError: A motor is missing or moves no finger, or a position is not a number within
+            the limits.
     """
     motors = robot.description.finger_motors
-    values = np.full(len(robot.actuators), np.nan)
+    positions = np.full(len(robot.actuators), np.nan)
     for key, value in posture.items():
         if key not in motors:
-            error = InputError if key in robot.actuators else UnknownNameError
-            found = "moves no finger" if key in robot.actuators else "no such actuator"
-            raise error(f"{name}.{key}: {found}, expected {', '.join(motors)}")
+            exists = key in robot.actuators
+            error = InputError if exists else UnknownNameError
+            problem = "moves no finger" if exists else "no such actuator"
+            raise error(f"{name}.{key}: {problem}, expected {', '.join(motors)}")
         i = robot.actuators.index(key)
         low, high = robot.lower[i], robot.upper[i]
-        number = isinstance(value, (int, float, np.integer, np.floating))
-        if not (number and low - BEYOND <= value <= high + BEYOND):
+        is_number = isinstance(value, (int, float, np.integer, np.floating))
+        if not (is_number and low - POSTURE_LIMIT_SLACK <= value <= high + POSTURE_LIMIT_SLACK):
             raise InputError(
                 f"{name}.{key}: found {value!r}, expected a number from {low:g} to {high:g}"
             )
-        values[i] = min(max(float(value), low), high)
+        positions[i] = min(max(float(value), low), high)
     missing = [key for key in motors if key not in posture]
     if missing:
         raise InputError(f"{name}.{missing[0]}: missing, expected a number for every finger motor")
-    return values
+    return positions
 
 
-def postures_of(
+def stack_postures(
     robot: ArmHand, postures: Sequence[Mapping[str, float]], name: str = "posture"
 ) -> Array:
-    """(k, n) as `hand_posture` gives them, of many that name the same motors."""
+    """Return k postures that name the same motors as (k, n), see `hand_posture`."""
     motors = robot.description.finger_motors
-    columns = [robot.actuators.index(name) for name in motors]
-    found = np.full((len(postures), len(robot.actuators)), np.nan)
+    columns = [robot.actuators.index(motor) for motor in motors]
+    q = np.full((len(postures), len(robot.actuators)), np.nan)
     try:
-        given = np.array([[posture[name] for name in motors] for posture in postures], dtype=float)
+        values = np.array([[posture[motor] for motor in motors] for posture in postures], float)
     except (KeyError, TypeError, ValueError):
-        given = np.full((len(postures), len(motors)), np.nan)
+        values = np.full((len(postures), len(motors)), np.nan)
     low, high = robot.lower[columns], robot.upper[columns]
-    within = np.asarray(((given >= low - BEYOND) & (given <= high + BEYOND)).all(axis=1))
-    found[:, columns] = np.clip(given, low, high)
+    is_within = (values >= low - POSTURE_LIMIT_SLACK) & (values <= high + POSTURE_LIMIT_SLACK)
+    is_valid = np.logical_and.reduce(is_within, axis=1)
+    q[:, columns] = np.clip(values, low, high)
     for row, posture in enumerate(postures):
-        if not within[row] or len(posture) != len(motors):
-            # Which says best what is wrong.
-            found[row] = hand_posture(robot, posture, name.format(row))
-    return found
+        if not is_valid[row] or len(posture) != len(motors):
+            q[row] = hand_posture(robot, posture, name.format(row))  # raises a specific error
+    return q
 
 
-def hand_postures(
+def broadcast_postures(
     robot: ArmHand, postures: Mapping[str, ArrayLike] | ArrayLike, count: int
 ) -> Array:
-    """(k, n) positions of all motors that move fingers; NaN for the others.
+    """Return k postures as (k, n) motor positions; NaN for motors that move no finger.
 
     Args:
         robot: The robot.
         postures: Positions (k,), or one for all, by actuator [rad or m]; or configurations (k, n)
-            or (n,), of which the motors that move fingers count.
-        count: k.
+            or (n,), from which the finger motors are taken.
+        count: Number of postures k.
 
     Raises:
-        UnknownNameError: No such actuator.
+        UnknownNameError: An actuator does not exist.
         InputError: As for `hand_posture`, or another number of positions; the message names the
             row.
     """
     if not isinstance(postures, Mapping):
-        given = robot.configuration(postures, "postures")
+        q = robot.configuration(postures, "postures")
         motors = [robot.actuators.index(name) for name in robot.description.finger_motors]
-        postures = {robot.actuators[i]: given[..., i] for i in motors}
+        postures = {robot.actuators[i]: q[..., i] for i in motors}
     columns: dict[str, Array] = {}
     for name, value in postures.items():
         try:
             columns[name] = np.broadcast_to(np.asarray(value, dtype=float), (count,))
         except (TypeError, ValueError) as error:
             raise InputError(f"postures.{name}: expected {count} numbers, or one") from error
-    rows = range(count)
-    every = [{name: float(column[row]) for name, column in columns.items()} for row in rows]
-    return postures_of(robot, every, "postures: row {}")
+    by_row = [
+        {name: float(column[row]) for name, column in columns.items()} for row in range(count)
+    ]
+    return stack_postures(robot, by_row, "postures: row {}")
 
 
-def touched(robot: ArmHand, palms: Array, postures: Array) -> tuple[Array, Array, dict[str, Array]]:
-    """Where fingertips are if hands of given postures have their palms at poses.
+def contacts_from_palms(
+    robot: ArmHand, palms: Array, postures: Array
+) -> tuple[Array, Array, dict[str, Array]]:
+    """Return the contacts of hands with these palm poses and postures.
 
     Args:
         robot: The robot.
-        palms: (k, 4, 4) poses of its palm frame in the base frame.
-        postures: (k, n) as `hand_posture` gives them.
+        palms: (k, 4, 4) poses of the palm frame in the base frame.
+        postures: (k, n) postures as `hand_posture` returns them.
 
     Returns:
         Contact points (k, f, 3) [m] and normals (k, f, 3), base frame; and "tangents" (k, f, 3)
-        where points and normals leave the palm free, as those of two opposed fingers do: NaN where
-        they do not, no entry if they never do.
+        where points and normals leave the palm free, as with two opposed fingers: NaN for other
+        rows, missing if there is no such row.
     """
     q = np.where(np.isnan(postures), robot.home, postures)
     points, normals = robot.contacts(q)
-    here = robot.palm(q)
-    turn = palms[:, :3, :3] @ np.swapaxes(here[:, :3, :3], 1, 2)
-    back = np.swapaxes(turn, 1, 2)
-    points = (points - here[:, None, :3, 3]) @ back + palms[:, None, :3, 3]
-    normals = normals @ back
-    free = _leave_free(points, normals)
-    if not free.any():
+    home_palm = robot.palm(q)
+    rotation = palms[:, :3, :3] @ np.swapaxes(home_palm[:, :3, :3], 1, 2)
+    rotation_T = np.swapaxes(rotation, 1, 2)
+    points = (points - home_palm[:, None, :3, 3]) @ rotation_T + palms[:, None, :3, 3]
+    normals = normals @ rotation_T
+    is_free = _palm_is_free(points, normals)
+    if not is_free.any():
         return points, normals, {}
-    tangents = robot.contact_frames(q)[..., :3, 1] @ back
-    return points, normals, {"tangents": np.where(free[:, None, None], tangents, np.nan)}
+    tangents = robot.contact_frames(q)[..., :3, 1] @ rotation_T
+    return points, normals, {"tangents": np.where(is_free[:, None, None], tangents, np.nan)}
 
 
-TURNS = np.cross(np.eye(3)[:, None], np.eye(3)[None])
-"""`v @ TURNS[i]` is the cross product of axis i with v."""
+CROSS_PRODUCTS = np.cross(np.eye(3)[:, None], np.eye(3)[None])
+"""`v @ CROSS_PRODUCTS[i]` is the cross product of axis i with v."""
 
 
-def _leave_free(points: Array, facing: Array) -> NDArray[np.bool_]:
-    """(k,) whether points (k, f, 3) [m] and directions (k, m, 3) leave the palm free; NaN: none."""
-    placed, known = (~np.isnan(vectors[..., :1]) for vectors in (points, facing))
-    count = np.maximum(placed.sum(axis=1, keepdims=True), 1)
-    off = (points - np.nansum(points, axis=1, keepdims=True) / count) / LENGTH
+def _palm_is_free(points: Array, directions: Array) -> NDArray[np.bool_]:
+    """Return (k,) whether contacts leave the palm free.
+
+    Args:
+        points: (k, f, 3) contact points [m]; NaN: none.
+        directions: (k, m, 3) contact directions; NaN: none.
+    """
+    has_point, has_direction = (~np.isnan(vectors[..., :1]) for vectors in (points, directions))
+    count = np.maximum(has_point.sum(axis=1, keepdims=True), 1)
+    offsets = (points - np.nansum(points, axis=1, keepdims=True) / count) / LENGTH
     f = points.shape[1]
-    moved = np.zeros((len(points), 6, f + facing.shape[1], 3))
-    turned = np.where(np.concatenate([placed, known], axis=1), np.hstack([off, facing]), 0.0)
+    jacobian = np.zeros((len(points), 6, f + directions.shape[1], 3))
+    is_present = np.concatenate([has_point, has_direction], axis=1)
+    vectors = np.where(is_present, np.hstack([offsets, directions]), 0.0)
     for i, axis in enumerate(np.eye(3)):
-        moved[:, i, :f] = axis * placed
-        moved[:, 3 + i] = turned @ TURNS[i]
-    rows = moved.reshape(len(points), 6, -1)
-    return np.asarray(np.linalg.eigvalsh(rows @ np.swapaxes(rows, 1, 2))[:, 0] < DETERMINED**2)
+        jacobian[:, i, :f] = axis * has_point
+        jacobian[:, 3 + i] = vectors @ CROSS_PRODUCTS[i]
+    rows = jacobian.reshape(len(points), 6, -1)
+    smallest = np.linalg.eigvalsh(rows @ np.swapaxes(rows, 1, 2))[:, 0]
+    return np.asarray(smallest < MIN_CONTACT_MOTION**2)
 
 
-def held_too(postures: Array, fixed: Array | None, actuators: Sequence[str]) -> Array:
-    """(k, n) what is held by postures and by the caller.
+def merge_fixed(postures: Array, fixed: Array | None, actuators: Sequence[str]) -> Array:
+    """Return (k, n) motor positions fixed by postures or by the caller; NaN for other motors.
 
     Raises:
-        InputError: The caller holds a motor of the hand.
+        InputError: The caller fixes a motor of the hand.
     """
     if fixed is None:
         return postures
     both = ~np.isnan(fixed) & ~np.isnan(postures).all(axis=0)
     if both.any():
         name = actuators[int(np.flatnonzero(both)[0])]
-        raise InputError(f"fixed.{name}: the grasp's posture holds it already")
+        raise InputError(
+            f"fixed.{name}: the motor is fixed by the grasp's posture; expected other motors"
+        )
     return np.where(np.isnan(postures), fixed, postures)
 
 
 @dataclass(frozen=True, eq=False)
 class Request:
-    """What all questions of a solver share.
+    """Converter of grasps and arrays into targets, with the defaults of a solver.
 
     Attributes:
         robot: The robot.
-        tolerances: By finger, in the robot's order.
-        enforce_limits: Whether limits are part of being solved.
+        tolerances: Tolerance by finger, in the robot's order.
+        enforce_limits: Whether a solution has to be within the limits.
     """
 
     robot: ArmHand
@@ -229,15 +243,15 @@ class Request:
         more: Mapping[str, ArrayLike | None] | None = None,
         prefer: str = "limits",
     ) -> TargetBatch:
-        """Targets as arrays.
+        """Return targets given as arrays.
 
         Args:
-            points: (k, f, 3) [m].
-            normals: (k, f, 3).
-            fixed: See `TargetBatch`.
+            points: (k, f, 3) contact points [m].
+            normals: (k, f, 3) pad normals.
+            fixed: Positions of fixed actuators, see `TargetBatch`.
             first_row: Number of the first target.
-            more: (k, f, 3) what contacts have beside, see `check_extra_vectors`; and directions.
-            prefer: See `TargetBatch`.
+            more: (k, f, 3) further vectors by name, see `check_extra_vectors`, and directions.
+            prefer: Preference, see `TargetBatch`.
 
         Raises:
             InputError: See `target_arrays` and `check_extra_vectors`.
@@ -247,9 +261,9 @@ class Request:
         p, n = target_arrays(points, normals, len(self.robot.fingers), first_row, directions)
         warn_of_far_contacts(p, "points", self._base_travel)
         tolerances = tuple(self.tolerances.values())
-        others = check_extra_vectors(named, p, n, first_row) if named else {}
+        vectors = check_extra_vectors(named, p, n, first_row) if named else {}
         return TargetBatch(
-            p, n, tolerances, self.enforce_limits, first_row, fixed, others, prefer=prefer
+            p, n, tolerances, self.enforce_limits, first_row, fixed, vectors, prefer=prefer
         )
 
     def of_named(
@@ -259,7 +273,7 @@ class Request:
         first_row: int = 0,
         prefer: str = "limits",
     ) -> TargetBatch:
-        """Targets as arrays by name, see `of_arrays`: points, normals, and what else there is.
+        """Return targets given as arrays by name, see `of_arrays`.
 
         Raises:
             InputError: See `of_arrays`.
@@ -275,24 +289,24 @@ class Request:
         prefer: str = "limits",
         free: bool = False,
     ) -> TargetBatch:
-        """Grasps, at least one, that share the tolerances of the first.
+        """Return the targets of grasps, which share the tolerances of the first one.
 
         Args:
-            grasps: The grasps.
-            fixed: Held actuators by name.
-            prefer: See `TargetBatch`.
-            free: Whether their object may have a `Free` pose.
+            grasps: At least one grasp.
+            fixed: Positions of fixed actuators by name.
+            prefer: Preference, see `TargetBatch`.
+            free: Whether object poses may be `Free`.
 
         Raises:
-            InputError: Something else than a grasp, one with a finger that the robot has not, one
-                whose palms are of other sides, or see `held`.
+            InputError: An element is not a grasp, names a finger or a side that the robot does
+                not have, or see `fixed_vector`.
         """
         fingers = self.robot.fingers
         for grasp in grasps:
             if not isinstance(grasp, Grasp):
                 raise InputError(f"grasp: found {type(grasp).__name__}, expected a Grasp")
         if not free and any(isinstance(grasp.object_pose, Free) for grasp in grasps):
-            raise InputError("object_pose: found a Free pose, which only Solver.solve looks for")
+            raise InputError("object_pose: a Free pose is only supported by Solver.solve")
         if len(self.robot.sides) == 1:
             (side,) = self.robot.sides
             grasps = [
@@ -300,26 +314,26 @@ class Request:
                 for grasp in grasps
             ]
         if any(isinstance(grasp.palm, Mapping) for grasp in grasps):
-            grasps, held = self._with_palms_met(grasps)
+            grasps, postures = self._replace_palms_by_contacts(grasps)
             targets = self.of_grasps(grasps, None, prefer, free)
-            given = self.held(fixed) if fixed else None
-            return replace(targets, fixed=held_too(held, given, self.robot.actuators))
+            fixed_q = self.fixed_vector(fixed) if fixed else None
+            return replace(targets, fixed=merge_fixed(postures, fixed_q, self.robot.actuators))
         if any(grasp.palm is not None for grasp in grasps):
             return self._of_palm_grasps(grasps, fixed, prefer)
-        # Contacts are checked when they are made.
+        # The constructor of a contact has checked it.
         arrays = [grasp.arrays(fingers) for grasp in grasps]
         more = [grasp.more(fingers) for grasp in grasps]
-        own, tolerances = grasps[0].contacts, self._usual
-        if any(contact.tolerance for contact in own.values()):
-            usual = self.tolerances
+        contacts, tolerances = grasps[0].contacts, self._default_tolerances
+        if any(contact.tolerance for contact in contacts.values()):
             tolerances = tuple(
-                (own[name].tolerance if name in own else None) or usual[name] for name in fingers
+                (contacts[name].tolerance if name in contacts else None) or self.tolerances[name]
+                for name in fingers
             )
-        # A new dimension costs nothing; one grasp is solved in the time that joining some takes.
+        # Adding a dimension is free; stacking takes as long as solving one grasp.
         points, normals = (
             (arrays[0][0][None], arrays[0][1][None])
             if len(arrays) == 1
-            else (np.array(both) for both in zip(*arrays, strict=True))
+            else (np.array(vectors) for vectors in zip(*arrays, strict=True))
         )
         warn_of_far_contacts(points, grasps[0].name or "contacts", self._base_travel)
         return TargetBatch(
@@ -327,8 +341,8 @@ class Request:
             normals,
             tolerances,
             self.enforce_limits,
-            fixed=self.held(fixed) if fixed else None,
-            more=_stacked(more, len(fingers)) if any(more) else {},
+            fixed=self.fixed_vector(fixed) if fixed else None,
+            more=_stack_vectors(more, len(fingers)) if any(more) else {},
             prefer=prefer,
             object=grasps[0].object,
             object_pose=_object_poses(grasps),
@@ -345,53 +359,58 @@ class Request:
             raise InputError(
                 f"palm: found one pose, expected one by side (palms in a file): {names}"
             )
-        postures = postures_of(self.robot, [grasp.posture for grasp in grasps])
+        postures = stack_postures(self.robot, [grasp.posture for grasp in grasps])
         targets = self.of_palms(np.stack(palms), postures, fixed, prefer)
-        named, poses = grasps[0].object, _object_poses(grasps)
-        return replace(targets, object=named, object_pose=poses)
+        return replace(targets, object=grasps[0].object, object_pose=_object_poses(grasps))
 
-    def _with_palms_met(self, grasps: Sequence[Grasp]) -> tuple[list[Grasp], Array]:
-        """Contacts instead of palms by side, and (k, n) what hands take, NaN for other motors."""
-        robot, made = self.robot, list[Grasp]()
-        held = np.full((len(grasps), len(robot.actuators)), np.nan)
+    def _replace_palms_by_contacts(self, grasps: Sequence[Grasp]) -> tuple[list[Grasp], Array]:
+        """Return grasps with contacts instead of palms by side, and their postures.
+
+        Returns:
+            The grasps, and (k, n) positions of the motors of their hands, NaN for other motors.
+        """
+        robot, converted = self.robot, list[Grasp]()
+        postures = np.full((len(grasps), len(robot.actuators)), np.nan)
         for row, grasp in enumerate(grasps):
             if not isinstance(grasp.palm, Mapping):
-                raise InputError("grasps: found palms by side and others, expected the same in all")
+                raise InputError(
+                    "grasps: found grasps with and without palms by side, expected the same in all"
+                )
             contacts = dict[str, Contact]()
-            motors = {name: i for i, name in enumerate(robot.actuators)}
-            wanted = set[str]()
+            columns = {name: i for i, name in enumerate(robot.actuators)}
+            used_motors = set[str]()
             for name, pose in grasp.palm.items():
                 if name not in self._sides:
                     known = ", ".join(self._sides) or "none"
                     raise InputError(f"palm.{name}: no such side; the robot's sides: {known}")
-                hand = self._sides[name]
-                own = {
+                side = self._sides[name]
+                positions = {
                     motor: grasp.posture[motor]
-                    for motor in hand.actuators
+                    for motor in side.actuators
                     if motor in grasp.posture
                 }
-                posture = hand_posture(hand, own)
-                points, normals, more = touched(hand, pose[None], posture[None])
-                tangents = more.get("tangents", [[None] * len(hand.fingers)])[0]
+                posture = hand_posture(side, positions)
+                points, normals, more = contacts_from_palms(side, pose[None], posture[None])
+                tangents = more.get("tangents", [[None] * len(side.fingers)])[0]
                 contacts |= {
                     finger: Contact(points[0, i], normals[0, i], tangent=tangents[i])
-                    for i, finger in enumerate(hand.fingers)
+                    for i, finger in enumerate(side.fingers)
                 }
-                wanted |= set(own)
-                for motor, value in zip(hand.actuators, posture, strict=True):
-                    held[row, motors[motor]] = value
-            extra = sorted(set(grasp.posture) - wanted)
+                used_motors |= set(positions)
+                for motor, value in zip(side.actuators, posture, strict=True):
+                    postures[row, columns[motor]] = value
+            extra = sorted(set(grasp.posture) - used_motors)
             if extra:
                 raise InputError(
-                    f"posture.{extra[0]}: found it, expected motors of hands with palms"
+                    f"posture.{extra[0]}: not a motor of a hand with a palm; expected such motors"
                 )
-            made.append(replace(grasp, palm=None, posture={}, contacts=contacts))
-        return made, held
+            converted.append(replace(grasp, palm=None, posture={}, contacts=contacts))
+        return converted, postures
 
     @cached_property
     def _sides(self) -> dict[str, ArmHand]:
-        body = self.robot.description
-        return {side.name: ArmHand(body.side(side.name)) for side in body.sides}
+        robot = self.robot.description
+        return {side.name: ArmHand(robot.side(side.name)) for side in robot.sides}
 
     def of_palms(
         self,
@@ -400,26 +419,27 @@ class Request:
         fixed: Mapping[str, float] | None,
         prefer: str = "limits",
     ) -> TargetBatch:
-        """Palms that are given with the postures of their hands: only the arm is unknown.
+        """Return targets given as palm poses with hand postures: only the arm is unknown.
 
         Args:
-            palms: (k, 4, 4) poses of the robot's palm frame in the base frame.
-            postures: (k, n) as `hand_posture` gives them.
-            fixed: Other held actuators by name.
-            prefer: See `TargetBatch`.
+            palms: (k, 4, 4) poses of the palm frame in the base frame.
+            postures: (k, n) postures as `hand_posture` returns them.
+            fixed: Positions of other fixed actuators by name.
+            prefer: Preference, see `TargetBatch`.
 
         Raises:
-            InputError: No rigid motions, or a motor of the hand among the held ones.
+            InputError: The poses are not rigid, or a motor of the hand is fixed.
         """
         poses = checked_pose(palms, "palms")
-        points, normals, more = touched(self.robot, poses, postures)
-        held = held_too(postures, self.held(fixed) if fixed else None, self.robot.actuators)
+        points, normals, more = contacts_from_palms(self.robot, poses, postures)
+        fixed_q = self.fixed_vector(fixed) if fixed else None
+        fixed_q = merge_fixed(postures, fixed_q, self.robot.actuators)
         return TargetBatch(
             points,
             normals,
-            self._usual,
+            self._default_tolerances,
             self.enforce_limits,
-            fixed=held,
+            fixed=fixed_q,
             more=more,
             prefer=prefer,
             palms=poses,
@@ -427,25 +447,24 @@ class Request:
 
     @cached_property
     def _base_travel(self) -> float:
-        """Distance that the robot's sliding motors go together [m]."""
-        motors = self.robot.description.actuators
-        ends = [max(abs(one.lower), abs(one.upper)) for one in motors if one.unit == "m"]
-        return float(sum(ends))
+        """Total travel of the robot's linear motors [m]."""
+        motors = [motor for motor in self.robot.description.actuators if motor.unit == "m"]
+        return float(sum(max(abs(motor.lower), abs(motor.upper)) for motor in motors))
 
     @cached_property
-    def _usual(self) -> tuple[Tolerance, ...]:
+    def _default_tolerances(self) -> tuple[Tolerance, ...]:
         return tuple(self.tolerances.values())
 
-    def held(self, fixed: Mapping[str, float] | None) -> Array | None:
-        """Return held actuators as an array; see `fixed_array`."""
+    def fixed_vector(self, fixed: Mapping[str, float] | None) -> Array | None:
+        """Return the positions of fixed actuators as an array, see `fixed_array`."""
         robot = self.robot
         return fixed_array(fixed or {}, robot.actuators, *robot.description.stops)
 
     def start(self, q0: ArrayLike | None, name: str = "q0") -> Array:
-        """One configuration (n,) to start from; None is the robot's home.
+        """Return a start configuration (n,); None: the robot's home.
 
         Raises:
-            InputError: Not one configuration; the message has its name.
+            InputError: The start is not a single configuration.
         """
         start = self.robot.start(q0, name)
         if start.ndim != 1:
@@ -454,7 +473,7 @@ class Request:
 
 
 def _object_poses(grasps: Sequence[Grasp]) -> Array | None:
-    """(k, 4, 4) where grasps have their object; None unless all say it, of the same object."""
+    """Return (k, 4, 4) object poses; None unless all grasps state the pose of the same object."""
     if len(grasps) == 1:
         pose = grasps[0].known_pose
         return None if pose is None else pose[None]
@@ -464,20 +483,20 @@ def _object_poses(grasps: Sequence[Grasp]) -> Array | None:
     return np.stack(poses) if poses and len(poses) == len(grasps) else None
 
 
-def _stacked(parts: Sequence[Mapping[str, Array]], f: int) -> dict[str, Array]:
-    """(k, f, 3) arrays of what grasps have beside points and normals; NaN where they have none."""
-    none = np.full((f, 3), np.nan)
-    names = dict.fromkeys(name for part in parts for name in part)
-    return {name: np.array([part.get(name, none) for part in parts]) for name in names}
+def _stack_vectors(vectors: Sequence[Mapping[str, Array]], f: int) -> dict[str, Array]:
+    """Return (k, f, 3) arrays of the further contact vectors of k grasps; NaN where missing."""
+    missing = np.full((f, 3), np.nan)
+    names = dict.fromkeys(name for by_name in vectors for name in by_name)
+    return {name: np.array([by_name.get(name, missing) for by_name in vectors]) for name in names}
 
 
 def tolerances_by_finger(
     tolerance: Tolerance | Mapping[str, Tolerance] | None, fingers: Sequence[str]
 ) -> dict[str, Tolerance]:
-    """The tolerance of every finger; what is not said is the default.
+    """Return the tolerance of every finger; a missing one is the default.
 
     Raises:
-        InputError: No tolerance, or one for a finger that is not among them.
+        InputError: A value is not a tolerance, or a finger does not exist.
     """
     if tolerance is None or isinstance(tolerance, Tolerance):
         if tolerance is not None:
@@ -485,12 +504,12 @@ def tolerances_by_finger(
         return dict.fromkeys(fingers, tolerance or Tolerance())
     if not isinstance(tolerance, Mapping):
         raise InputError(f"tolerance: found {tolerance!r}, expected a Tolerance, or one by finger")
-    for name, one in tolerance.items():
+    for name, value in tolerance.items():
         if name not in fingers:
             raise InputError(
                 f"tolerance.{name}: no such finger; the robot's fingers: {', '.join(fingers)}"
             )
-        if not isinstance(one, Tolerance):
-            raise InputError(f"tolerance.{name}: found {one!r}, expected a Tolerance")
-        warn_of_wide_tolerance(one.position, one.angle, f"tolerance.{name}")
+        if not isinstance(value, Tolerance):
+            raise InputError(f"tolerance.{name}: found {value!r}, expected a Tolerance")
+        warn_of_wide_tolerance(value.position, value.angle, f"tolerance.{name}")
     return {name: tolerance.get(name, Tolerance()) for name in fingers}

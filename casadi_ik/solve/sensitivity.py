@@ -28,10 +28,10 @@ from casadi_ik.kinematics.linear_algebra import solve_spd
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.targets import TargetBatch
 
-AT_LIMIT = 1e-9
+LIMIT_DISTANCE = 1e-9
 """A motor that is nearer to a limit [rad or m] is at it."""
 
-DAMPING, PASSES = 1e-7, 5
+PSEUDO_INVERSE_DAMPING, PSEUDO_INVERSE_PASSES = 1e-7, 5
 """Added to the squares of the singular values; further passes take its effect away again, to 1e-5
 of a value of 1e-3. What is below 3e-4 counts as a motion that contacts leave free. With less, the
 rounding of these motions is seen in the others: 3e-7 with 1e-8."""
@@ -76,7 +76,7 @@ class SensitivityKernel:
             return Sensitivity(none, none)
         low, high = targets.bounds(self._robot, np.inf)
         values: dict[str, Any] = {"q": q, "gradient": gradients}
-        values["free"] = (q - low >= AT_LIMIT) & (high - q >= AT_LIMIT)
+        values["free"] = (q - low >= LIMIT_DISTANCE) & (high - q >= LIMIT_DISTANCE)
         known = [~np.isnan(array[..., 0]) for array in (targets.points, targets.normals)]
         values["weights"] = np.stack(known, axis=2)
         for name in self._inputs.keys() - values.keys():
@@ -97,11 +97,13 @@ class SensitivityKernel:
         residual = contact_residual(robot, self._contacts, given["q"], given)
         scales = given["free"] * motor_scales(robot)
         rates = ca.jacobian(residual, given["q"]) @ ca.diag(scales)
-        square = ca.densify(rates.T @ rates + DAMPING * ca.DM.eye(len(robot.actuators)))
+        square = ca.densify(
+            rates.T @ rates + PSEUDO_INVERSE_DAMPING * ca.DM.eye(len(robot.actuators))
+        )
         step = solve_spd(square, scales * given["gradient"])
         total = step
-        for _ in range(PASSES - 1):
-            step = DAMPING * solve_spd(square, step)
+        for _ in range(PSEUDO_INVERSE_PASSES - 1):
+            step = PSEUDO_INVERSE_DAMPING * solve_spd(square, step)
             total = total + step
         by_points, by_normals = (
             -ca.jtimes(residual, given[name], rates @ total, True) for name in ("points", "normals")

@@ -24,10 +24,10 @@ from casadi_ik.model.targets import DIRECTIONS_KEY
 if TYPE_CHECKING:
     import polars
 
-KEYS = ("points", "normals")
+REQUIRED_KEYS = ("points", "normals")
 """What has to be there; the others may be."""
 
-ENDINGS = {"points": ("x", "y", "z"), "normals": ("nx", "ny", "nz")}
+COLUMN_SUFFIXES = {"points": ("x", "y", "z"), "normals": ("nx", "ny", "nz")}
 """Of the columns of a finger in a table: ``thumb_x``, ..., ``thumb_nz``."""
 
 
@@ -61,7 +61,7 @@ class TargetFile:
         Raises:
             InputError: As `check`, as far as the heads tell.
         """
-        with self._opened() as archive, self._member(archive, KEYS[0]) as points:
+        with self._opened() as archive, self._member(archive, REQUIRED_KEYS[0]) as points:
             return points.count
 
     def blocks(self, size: Callable[[], int]) -> Iterator[dict[str, Array]]:
@@ -74,13 +74,11 @@ class TargetFile:
             InputError: As `check`.
         """
         with self._opened() as archive, ExitStack() as opened:
-            there = {name.removesuffix(".npy") for name in archive.namelist()}
+            names = {name.removesuffix(".npy") for name in archive.namelist()}
+            optional = [key for key in (*EXTRA_ARRAY_NAMES, DIRECTIONS_KEY) if key in names]
             members = {
                 key: opened.enter_context(self._member(archive, key))
-                for key in (
-                    *KEYS,
-                    *(key for key in (*EXTRA_ARRAY_NAMES, DIRECTIONS_KEY) if key in there),
-                )
+                for key in (*REQUIRED_KEYS, *optional)
             }
             count = members["points"].count
             for key, member in members.items():
@@ -118,7 +116,9 @@ class TargetFile:
         where, names = f"{self.path}: {key}", archive.namelist()
         if f"{key}.npy" not in names:
             found = ", ".join(name.removesuffix(".npy") for name in names) or "nothing"
-            raise InputError(f"{where}: missing, expected {' and '.join(KEYS)}; found {found}")
+            raise InputError(
+                f"{where}: missing, expected {' and '.join(REQUIRED_KEYS)}; found {found}"
+            )
         try:
             stream = archive.open(f"{key}.npy")
             format_version = np.lib.format.read_magic(stream)
@@ -143,11 +143,11 @@ class TargetFile:
             if not size <= info.file_size <= size + 10_064:
                 problem = "fewer" if info.file_size < size else "more"
                 raise InputError(f"{where}: damaged: {problem} bytes than its shape says")
-            refuse_bombs(where, info.file_size, info.compress_size)
+            refuse_zip_bomb(where, info.file_size, info.compress_size)
             yield _Member(where, stream, shape[0], self.fingers, dtype, column_major)
 
 
-def refuse_bombs(where: str, unpacked: int, packed: int) -> None:
+def refuse_zip_bomb(where: str, unpacked: int, packed: int) -> None:
     """Refuse what unpacks to more than 256 MiB and to more than 200 times its own size.
 
     Raises:
@@ -223,7 +223,7 @@ class TargetTable:
             InputError: No Parquet file, columns missing or not of numbers, or no rows.
             UnsupportedError: polars is not installed.
         """
-        pl, frame = polars_module(), self._scanned()
+        pl, frame = import_polars(), self._scanned()
         try:
             schema = frame.collect_schema()
             count = int(frame.select(pl.len()).collect().item())
@@ -244,12 +244,12 @@ class TargetTable:
         if not count:
             raise InputError(f"{self.path}: found no rows, expected at least one")
         width = sum(len(names) for names in self._columns().values())
-        refuse_bombs(str(self.path), 8 * width * count, self.path.stat().st_size)
+        refuse_zip_bomb(str(self.path), 8 * width * count, self.path.stat().st_size)
         return count
 
     def blocks(self, size: Callable[[], int]) -> Iterator[dict[str, Array]]:
         """Arrays (up to size, f, 3) by name, one block after the other; as `TargetFile.blocks`."""
-        pl, frame, count = polars_module(), self._scanned(), self.rows()
+        pl, frame, count = import_polars(), self._scanned(), self.rows()
         start = 0
         while start < count:
             rows = min(size(), count - start)
@@ -267,14 +267,14 @@ class TargetTable:
     def _columns(self) -> dict[str, list[str]]:
         return {
             key: [f"{finger}_{ending}" for finger in self.fingers for ending in endings]
-            for key, endings in ENDINGS.items()
+            for key, endings in COLUMN_SUFFIXES.items()
         }
 
     def _scanned(self) -> polars.LazyFrame:
-        return polars_module().scan_parquet(self.path)
+        return import_polars().scan_parquet(self.path)
 
 
-def polars_module() -> Any:
+def import_polars() -> Any:
     """The library that reads Parquet.
 
     Raises:
@@ -290,7 +290,7 @@ def polars_module() -> Any:
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class BatchPart:
     """Targets that are solved together.
 
     Attributes:
@@ -305,7 +305,7 @@ class Part:
 
 
 @dataclass(frozen=True, eq=False)
-class Source:
+class TargetSource:
     """Targets in files, in parts of at most `size`; no part reaches over two files.
 
     Attributes:
@@ -344,7 +344,7 @@ class Source:
         """Number of each part's first target among all."""
         return (0, *accumulate(self.sizes))[:-1]
 
-    def without(self, done: Container[int]) -> Iterator[Part]:
+    def without(self, done: Container[int]) -> Iterator[BatchPart]:
         """The parts that are not done yet, read as they are asked for.
 
         Raises:
@@ -358,7 +358,7 @@ class Source:
                 continue
             for arrays in file.blocks(lambda: self.size):
                 if number not in done:
-                    yield Part(number, first_row, arrays)
+                    yield BatchPart(number, first_row, arrays)
                 number, first_row = number + 1, first_row + len(arrays["points"])
 
     @cached_property
@@ -371,7 +371,7 @@ class Source:
         return [_fingerprint(file.path) for file in self.files]
 
 
-def source_of(path: Path, fingers: tuple[str, ...], size: int) -> Source:
+def open_targets(path: Path, fingers: tuple[str, ...], size: int) -> TargetSource:
     """The targets at a path.
 
     Args:
@@ -393,7 +393,7 @@ def source_of(path: Path, fingers: tuple[str, ...], size: int) -> Source:
         else TargetFile(each, len(fingers))
         for each in paths
     )
-    return Source(tuple(found), size)
+    return TargetSource(tuple(found), size)
 
 
 def _fingerprint(path: Path) -> str:

@@ -48,7 +48,7 @@ from casadi_ik.kinematics.smooth import Expr
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.solve.status import Phase, Status
 
-WORD = 32
+WORD_BITS = 32
 """Bits of a word of a mask: viewers show wider ones badly."""
 
 
@@ -92,7 +92,7 @@ class StandardField:
             doc: What it is in this method, where more can be said than `StandardField.doc`.
         """
         n, f = len(robot.actuators), len(robot.fingers)
-        words = -(-n // WORD)
+        words = -(-n // WORD_BITS)
         shape = {
             Elements.ACTUATORS: (n,),
             Elements.ACTUATOR_BITS: () if words <= 1 else (words,),
@@ -168,7 +168,7 @@ STATUS = StandardField(
     "status", Elements.CODE, "u1", "", "0 running, else the final status", codes=Status.labels()
 )
 
-STANDARD = (
+STANDARD_FIELDS = (
     *(Q, POSITION_ERROR, ANGLE_ERROR, COST, STEP_SIZE, DAMPING),
     *(LIMIT_MASK, ACTIVE_MASK, RESTART, ACCEPTED, PHASE, STATUS),
 )
@@ -182,9 +182,9 @@ CLEARANCE = "clearance"
 """Name of the field that a log adds where there is a scene."""
 
 
-def packed(flags: NDArray[np.bool_]) -> NDArray[np.uint32]:
+def pack_mask(flags: NDArray[np.bool_]) -> NDArray[np.uint32]:
     """Flags of all actuators (k, n) as the words of a mask, (k,) or (k, words)."""
-    padded = np.pad(flags, ((0, 0), (0, -flags.shape[1] % WORD)))
+    padded = np.pad(flags, ((0, 0), (0, -flags.shape[1] % WORD_BITS)))
     words = np.packbits(padded, axis=1, bitorder="little").view("<u4")
     return words[:, 0] if words.shape[1] == 1 else words
 
@@ -268,7 +268,7 @@ def trace_format(
     """
     found = {item.name: item for item in layout}
     labels: dict[str, tuple[str, ...]] = {}
-    for standard in STANDARD:
+    for standard in STANDARD_FIELDS:
         expected, item = standard.of(robot), found.get(standard.name)
         if item is None:
             if standard.required:
@@ -286,12 +286,12 @@ def trace_format(
     return TraceFormat(layout, labels, jacobians or {}, measures)
 
 
-LARGEST_CONDITION = 1e7
+MAX_CONDITION = 1e7
 """Beyond it the smallest singular value is not resolved."""
 
 ARM, HAND, CLOSED_CHAIN = "arm", "hand", "closed_chain"
 
-THRESHOLDS = {ARM: (0.05, 500.0), HAND: (0.02, 200.0), CLOSED_CHAIN: (0.1, 150.0)}
+SINGULARITY_THRESHOLDS = {ARM: (0.05, 500.0), HAND: (0.02, 200.0), CLOSED_CHAIN: (0.1, 150.0)}
 """Smallest singular value and condition number at which each counts as near singular."""
 
 
@@ -427,7 +427,9 @@ class JacobianMeasures:
         inputs = {"q": (n, 1)}
         graph = FunctionGraph(full, build, inputs, ((2, 1),), recipe(full, robot))
         places = tuple(motors[column] for column in columns)
-        return _Measured(name, places, graph, self._compiled, kind == HAND, THRESHOLDS[kind])
+        return _Measured(
+            name, places, graph, self._compiled, kind == HAND, SINGULARITY_THRESHOLDS[kind]
+        )
 
 
 def _arm(robot: RobotDescription, body: ActuatedKinematics) -> tuple[Expr, Expr]:
@@ -463,4 +465,4 @@ def _scales(robot: RobotDescription, columns: Sequence[int]) -> ca.DM:
 def _judged(jacobian: Expr, scales: ca.DM) -> tuple[Expr, Expr]:
     """Smallest singular value and condition number of a Jacobian, columns by their scales."""
     smallest, largest = extreme_singular_values(jacobian @ ca.diag(scales))
-    return smallest, largest / ca.fmax(smallest, largest / LARGEST_CONDITION + 1e-300)
+    return smallest, largest / ca.fmax(smallest, largest / MAX_CONDITION + 1e-300)

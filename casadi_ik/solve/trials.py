@@ -14,33 +14,33 @@ from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contact_fit import initial_lm_state
 from casadi_ik.kinematics.contacts import LENGTH
 from casadi_ik.model.targets import TargetBatch
-from casadi_ik.solve.hand_first.method import HandFirstMethod
+from casadi_ik.solve.method import HandSearch
 from casadi_ik.solve.status import Phase
 from casadi_ik.solve.verdict import deviations, judge
 
-NEVER = 1e-12
+UNREACHABLE_TOLERANCE = 1e-12
 """A tolerance that nothing meets: the loop then goes on to the minimum."""
 
-LAST = 1e6
+EXHAUSTED = 1e6
 """Trunks tried: none follows the one that a row begins from."""
 
-CARRYING = {
-    "first": LAST,
-    "farthest": LAST,
+CARRY_ONLY = {
+    "first": EXHAUSTED,
+    "farthest": EXHAUSTED,
     "fits": 1.0,
     "fitted": 1.0,
-    "tried": LAST,
+    "tried": EXHAUSTED,
     "again": 1.0,
 }
 """What a row says that is to end where trunk and arms carry the palms, or nowhere."""
 
-AT_ENDS = 2.0
+TRUNK_STRETCH = 2.0
 """Of every second trunk the even spread is stretched by this about its middle, up to the ends."""
 
-ALIKE = 1.001
+DUPLICATE_FACTOR = 1.001
 """Two values of a row that differ by less than this factor count as the same."""
 
-PALMS = np.array([0.1, 0.1, 0.1, 2.0])
+PALM_SCALES = np.array([0.1, 0.1, 0.1, 2.0])
 """What turns [rad] and shifts [m] of a palm that is free count as, beside parts of ranges."""
 
 
@@ -83,7 +83,7 @@ class Subproblems:
     """
 
     robot: ArmHand
-    method: HandFirstMethod
+    method: HandSearch
 
     @cached_property
     def state(self) -> Layout:
@@ -212,7 +212,7 @@ class LocalRefinement:
         trials.set_bounds(parameters, bounds)
         if weights is not None:
             parameters[:, trials.parameters.slice("weights")] *= weights.reshape(len(q), -1)
-            trials.set_tolerance(parameters, NEVER)
+            trials.set_tolerance(parameters, UNREACHABLE_TOLERANCE)
         return trials.run(states, parameters)
 
     def misses(self, owner: Rows, q: Array) -> Array:
@@ -231,7 +231,7 @@ def refinement_rows(trials: Subproblems, targets: TargetBatch) -> tuple[Array, A
     return states, parameters
 
 
-def other_trunks(
+def sample_trunks(
     trials: Subproblems,
     targets: TargetBatch,
     q: Array,
@@ -260,7 +260,7 @@ def other_trunks(
     of = np.repeat(np.arange(len(q)), count)
     moving = [*body.trunk_actuators, *(place for arm, _ in body.side_actuators for place in arm)]
     spread = spread_points(first + count, len(moving))[first:]
-    spread[1::2] = np.clip((spread[1::2] - 0.5) * AT_ENDS + 0.5, 0.0, 1.0)
+    spread[1::2] = np.clip((spread[1::2] - 0.5) * TRUNK_STRETCH + 0.5, 0.0, 1.0)
     limits = trials.limits(targets).of(owner[of])
     begun = q[of]
     lower, upper = (np.broadcast_to(ends, begun.shape) for ends in (limits.lower, limits.upper))
@@ -268,10 +268,10 @@ def other_trunks(
     begun[:, moving] = lower[:, moving] + steps * (upper - lower)[:, moving]
     placed = np.tile(np.arange(first, first + count) % 4 != 3, len(q))
     phase = np.where(placed, float(Phase.ARM_PLACEMENT), float(Phase.TRUNK))
-    return carried(trials, targets, begun, palms[of], owner[of], phase), of
+    return carry_palms(trials, targets, begun, palms[of], owner[of], phase), of
 
 
-def carried(
+def carry_palms(
     trials: Subproblems,
     targets: TargetBatch,
     q: Array,
@@ -288,7 +288,7 @@ def carried(
         "best_q": q,
         "phase": phase,
         "side": len(robot.sides),
-        **CARRYING,
+        **CARRY_ONLY,
     }
     for place in range(len(robot.sides)):
         wanted[f"palm_rotation_{place}"] = palms[:, place, :3, :3].reshape(-1, 9)
@@ -299,24 +299,24 @@ def carried(
     return trials.run(states, parameters)
 
 
-def palms_of(robot: ArmHand, q: Array) -> Array:
+def side_palms(robot: ArmHand, q: Array) -> Array:
     """(k, s, 4, 4) poses of the palms of a body."""
     return np.stack([robot.palm(q, side.name) for side in robot.description.sides], axis=1)
 
 
-def repeated(targets: TargetBatch, count: int) -> TargetBatch:
+def repeat_target(targets: TargetBatch, count: int) -> TargetBatch:
     """One target, several times."""
     return targets.rows(np.zeros(count, dtype=np.intp))
 
 
-def allowed(targets: TargetBatch) -> Array:
+def residual_tolerances(targets: TargetBatch) -> Array:
     """(k, f, 2) the residuals that the tolerances allow, see `LocalRefinement.misses`; 0: free."""
     known = [~np.isnan(targets.points[..., 0]), ~np.isnan(targets.normals[..., 0])]
     tolerated = [targets.position_tolerance / LENGTH, 2 * np.sin(targets.angle_tolerance / 2)]
     return np.stack(known, axis=2) * np.stack(tolerated, axis=1)
 
 
-def smallest(owner: Rows, values: Array, most: int) -> Rows:
+def smallest_per_target(owner: Rows, values: Array, most: int) -> Rows:
     """Rows with the smallest values of each target that differ, target by target, best first.
 
     Args:
@@ -327,23 +327,25 @@ def smallest(owner: Rows, values: Array, most: int) -> Rows:
     order = np.lexsort((values, owner))
     mine, value = owner[order], values[order]
     fresh = np.ones(len(order), dtype=bool)
-    fresh[1:] = (mine[1:] != mine[:-1]) | (value[1:] > value[:-1] * ALIKE)
-    return first_of_each(owner, order[fresh], most)
+    fresh[1:] = (mine[1:] != mine[:-1]) | (value[1:] > value[:-1] * DUPLICATE_FACTOR)
+    return first_per_owner(owner, order[fresh], most)
 
 
-def best_of_each(owner: NDArray[np.intp], value: Array, than: Array) -> NDArray[np.intp]:
+def improving_rows(owner: NDArray[np.intp], value: Array, than: Array) -> NDArray[np.intp]:
     """The row of the largest value (m,) of each owner (m,), where it exceeds what that has (k,)."""
     order = np.lexsort((value, owner))
     last = order[np.diff(owner[order], append=-1) != 0]
     return last[value[last] > than[owner[last]]]
 
 
-def largest_of_each(owner: NDArray[np.intp], value: Array, count: int) -> NDArray[np.intp]:
+def largest_per_owner(owner: NDArray[np.intp], value: Array, count: int) -> NDArray[np.intp]:
     """The rows of so many of the largest values (m,) of each owner (m,), owner by owner."""
-    return first_of_each(owner, np.lexsort((-value, owner)), count)
+    return first_per_owner(owner, np.lexsort((-value, owner)), count)
 
 
-def first_of_each(owner: NDArray[np.intp], order: NDArray[np.intp], count: int) -> NDArray[np.intp]:
+def first_per_owner(
+    owner: NDArray[np.intp], order: NDArray[np.intp], count: int
+) -> NDArray[np.intp]:
     """So many rows of each owner, the first in an order that goes owner by owner."""
     sorted_owner = owner[order]
     rank = np.arange(len(order)) - np.searchsorted(sorted_owner, sorted_owner)
@@ -394,12 +396,12 @@ class Deduplicator:
         return found
 
 
-def palm_parts(palms: Array) -> Array:
+def palm_coordinates(palms: Array) -> Array:
     """(k, 12) what tells poses (k, 4, 4) of palms apart, beside motors as parts of ranges."""
-    return (palms[:, :3] * PALMS).reshape(-1, 12)
+    return (palms[:, :3] * PALM_SCALES).reshape(-1, 12)
 
 
-def distinct(parts: Array, apart: float) -> list[int]:
+def distinct_rows(parts: Array, apart: float) -> list[int]:
     """Rows of parts (k, n) that differ from all chosen before them, in their order."""
     nobody = np.zeros(len(parts), dtype=np.intp)
     return np.flatnonzero(Deduplicator(1, parts.shape[1], apart).add(parts, nobody)).tolist()

@@ -1,7 +1,7 @@
-"""The verdict: is it solved? Recomputed from q alone, whatever a method believes.
+"""The verdict: whether a configuration solves its target, computed from q alone.
 
-Its errors are formulas of their own on purpose, not those of `kinematics.contacts` that the methods
-minimise: a fault there must not be judged by itself.
+The errors are computed by formulas independent of those in `kinematics.contacts`, which the methods
+minimise, so that a fault there is detected.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from casadi_ik.model.grasp import Tolerance
 from casadi_ik.model.targets import TargetBatch
 
 LIMIT_SLACK = 1e-9
-"""Rounding allowed at a limit [rad or m]: a coupling's arithmetic may end a hair beyond it."""
+"""Limit violation that counts as rounding [rad or m]: couplings may end slightly beyond a limit."""
 
 TOLERANCE_SLACK = 1e-9
-"""Relative rounding allowed at a tolerance, so that graph and verdict agree on its edge."""
+"""Relative excess over a tolerance that counts as rounding, so that graphs and verdict agree."""
 
 
 @dataclass(frozen=True)
@@ -30,10 +30,10 @@ class ContactVerdict:
     """Errors of one finger's contact.
 
     Attributes:
-        position_error: Distance from the contact point [m]; NaN if the finger is free.
-        angle_error: Angle from the normal [rad]; NaN if it is free.
-        ok: Within tolerance (what is free is).
-        tolerance: What it was compared with.
+        position_error: Distance from the contact point [m]; NaN if the point is free.
+        angle_error: Angle from the normal [rad]; NaN if the normal is free.
+        ok: Whether the errors are within tolerance; True for free errors.
+        tolerance: Tolerance of the contact.
 
     Example:
         >>> verdict = solution.contacts["thumb"]
@@ -50,11 +50,11 @@ class ContactVerdict:
 def contact_verdicts(
     fingers: Sequence[str], tolerances: Sequence[Tolerance], *errors: NDArray[Any]
 ) -> list[dict[str, ContactVerdict]]:
-    """Of k configurations the verdicts by finger.
+    """Return the verdicts of k configurations by finger.
 
     Args:
-        fingers: Names.
-        tolerances: By finger.
+        fingers: Names of the fingers.
+        tolerances: Tolerance by finger.
         errors: (k, f) distances [m], angles [rad], and whether they are within tolerance.
     """
     return [
@@ -65,12 +65,12 @@ def contact_verdicts(
 
 @dataclass(frozen=True)
 class PalmVerdict:
-    """Errors of the palm's pose.
+    """Errors of a palm pose.
 
     Attributes:
-        position_error: Distance of its origin [m].
-        angle_error: Angle between its frame and the wanted one [rad].
-        ok: Within the largest tolerance of the fingers.
+        position_error: Distance of the origin from the target pose [m].
+        angle_error: Rotation angle to the target pose [rad].
+        ok: Whether the errors are within the largest tolerance of the fingers.
 
     Example:
         >>> motors = [name for name in robot.actuators if name.startswith("bh_")]
@@ -87,21 +87,27 @@ class PalmVerdict:
 
 @dataclass(frozen=True, eq=False)
 class PalmVerdicts:
-    """How far k palms are from where they have to be: (k,) [m], (k,) [rad], (k,) near enough."""
+    """Errors of k palm poses.
+
+    Attributes:
+        position_error: (k,) distances of the origins [m].
+        angle_error: (k,) rotation angles [rad].
+        ok: (k,) whether the errors are within the largest tolerance of the fingers.
+    """
 
     position_error: Array
     angle_error: Array
     ok: NDArray[np.bool_]
 
     def of(self, row: int) -> PalmVerdict:
-        """One of them."""
+        """Return the verdict of a row."""
         errors = float(self.position_error[row]), float(self.angle_error[row])
         return PalmVerdict(*errors, bool(self.ok[row]))
 
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """How k configurations meet their targets; arrays as in `BatchSolution`."""
+    """Errors of k configurations against their targets; arrays as in `BatchSolution`."""
 
     position_error: Array
     angle_error: Array
@@ -111,24 +117,24 @@ class Verdict:
 
     @property
     def all_ok(self) -> NDArray[np.bool_]:
-        """(k,) True where every contact is met; of palm targets, where the palm pose is.
+        """(k,) whether every contact is within tolerance; for palm targets, the palm pose.
 
         The contacts of a palm target are derived from its palm pose and the hand posture. Their
         errors are reported, but only the palm pose is required.
         """
         if self.palm is not None:
             return self.palm.ok
-        met: NDArray[np.bool_] = np.logical_and.reduce(self.ok, axis=1)
-        return met
+        contacts_ok: NDArray[np.bool_] = np.logical_and.reduce(self.ok, axis=1)
+        return contacts_ok
 
     def solved(self, limits: bool) -> NDArray[np.bool_]:
-        """(k,) True where the target is met and, if `limits`, the robot's limits are kept."""
+        """Return (k,) whether the target is solved, and q within limits if `limits`."""
         return self.all_ok & self.limits_ok if limits else self.all_ok
 
 
 @dataclass(frozen=True, eq=False)
 class SolvedVerdict:
-    """How one configuration meets all contacts of its target."""
+    """Errors of a configuration that meets all contacts of its target."""
 
     contacts: Sequence[ContactVerdict]
     limits_ok: bool
@@ -139,83 +145,88 @@ def judge(robot: ArmHand, targets: TargetBatch, q: Array) -> Verdict:
 
     Args:
         robot: The robot.
-        targets: k targets, or one that all configurations are compared with.
-        q: (k, n) configurations.
+        targets: k targets, or one target for all configurations.
+        q: (k, n) configurations [rad or m].
     """
     points, normals = targets.points, targets.normals
     if len(targets) == 1:
         points, normals = points[0], normals[0]
-    position, angle, beyond = deviations(robot, targets, q)
+    position, angle, excess = deviations(robot, targets, q)
     slack = 1 + TOLERANCE_SLACK
-    placed = position <= targets.position_tolerance * slack
-    faced = angle <= targets.angle_tolerance * slack
-    ok = placed & faced
+    position_ok = position <= targets.position_tolerance * slack
+    angle_ok = angle <= targets.angle_tolerance * slack
+    ok = position_ok & angle_ok
     if not ok.all():
-        # Free is what the target leaves out; an error that is NaN for another reason is no success.
-        ok = (placed | np.isnan(points[..., 0])) & (faced | np.isnan(normals[..., 0]))
-    return Verdict(position, angle, ok, beyond <= LIMIT_SLACK, judge_palms(robot, targets, q))
+        # NaN is accepted only where the target is free; other NaN errors are failures.
+        ok = (position_ok | np.isnan(points[..., 0])) & (angle_ok | np.isnan(normals[..., 0]))
+    return Verdict(position, angle, ok, excess <= LIMIT_SLACK, judge_palms(robot, targets, q))
 
 
 def judge_palms(robot: ArmHand, targets: TargetBatch, q: Array) -> PalmVerdicts | None:
-    """Compare palms with where they have to be; None where contacts alone decide.
+    """Compare palm poses with their targets; None for targets without palm poses.
 
     Args:
         robot: The robot.
-        targets: k targets, or one that all configurations are compared with. A palm counts as
-            reached within the largest tolerance of the fingers.
-        q: (k, n) configurations; NaN gives NaN.
+        targets: k targets, or one target for all configurations. The tolerance of a palm is the
+            largest tolerance of the fingers.
+        q: (k, n) configurations [rad or m]; NaN gives NaN.
     """
     if targets.palms is None:
         return None
-    found = np.full((len(q), 4, 4), np.nan)
+    palms = np.full((len(q), 4, 4), np.nan)
     finite = np.isfinite(q).all(axis=1)
     if finite.any():
-        found[finite] = robot.palm(q[finite])
-    wanted = targets.palms
-    position = np.linalg.norm(found[:, :3, 3] - wanted[:, :3, 3], axis=1)
-    angle = _turn(found[:, :3, :3], np.broadcast_to(wanted[:, :3, :3], (len(q), 3, 3)))
-    most, slack = targets.largest_tolerance, 1 + TOLERANCE_SLACK
-    ok = (position <= most.position * slack) & (angle <= most.angle * slack)
+        palms[finite] = robot.palm(q[finite])
+    position = np.linalg.norm(palms[:, :3, 3] - targets.palms[:, :3, 3], axis=1)
+    target_rotations = np.broadcast_to(targets.palms[:, :3, :3], (len(q), 3, 3))
+    angle = _rotation_angle(palms[:, :3, :3], target_rotations)
+    tolerance, slack = targets.largest_tolerance, 1 + TOLERANCE_SLACK
+    ok = (position <= tolerance.position * slack) & (angle <= tolerance.angle * slack)
     return PalmVerdicts(position, angle, ok)
 
 
-def judge_one(robot: ArmHand, targets: TargetBatch, q: Array) -> SolvedVerdict | None:
-    """The verdict on one configuration if everything asked is there and met; None: ask `judge`.
+def judge_single(robot: ArmHand, targets: TargetBatch, q: Array) -> SolvedVerdict | None:
+    """Return the verdict of a configuration that solves its target, else None.
+
+    None also stands for a target with free parts; `judge` handles every case.
 
     Args:
         robot: The robot.
         targets: One target.
-        q: (n,).
+        q: (n,) configuration [rad or m].
     """
-    position, angle, beyond = deviations(robot, targets, q)
-    return judge_errors(targets, position.tolist(), angle.tolist(), float(beyond))
+    position, angle, excess = deviations(robot, targets, q)
+    return judge_errors(targets, position.tolist(), angle.tolist(), float(excess))
 
 
 def judge_errors(
-    targets: TargetBatch, position: list[float], angle: list[float], beyond: float
+    targets: TargetBatch, position: list[float], angle: list[float], excess: float
 ) -> SolvedVerdict | None:
-    """`judge_one` from what was measured.
+    """Return the verdict of measured errors if they solve the target, see `judge_single`.
 
     Args:
         targets: One target.
         position: Distances by finger [m].
         angle: Angles by finger [rad].
-        beyond: By how much the worst actuator or joint is beyond its limits [rad or m].
+        excess: Largest limit violation of an actuator or joint [rad or m].
     """
-    limits_ok = beyond <= LIMIT_SLACK
+    limits_ok = excess <= LIMIT_SLACK
     if targets.enforce_limits and not limits_ok:
         return None
     contacts = []
     slack = 1 + TOLERANCE_SLACK
-    errors = zip(position, angle, targets.tolerances, strict=True)
-    for distance, turn, tolerance in errors:
-        if not (distance <= tolerance.position * slack and turn <= tolerance.angle * slack):
+    for position_error, angle_error, tolerance in zip(
+        position, angle, targets.tolerances, strict=True
+    ):
+        if not (
+            position_error <= tolerance.position * slack and angle_error <= tolerance.angle * slack
+        ):
             return None
         contacts.append(
-            made(
+            construct_unchecked(
                 ContactVerdict,
-                position_error=distance,
-                angle_error=turn,
+                position_error=position_error,
+                angle_error=angle_error,
                 ok=True,
                 tolerance=tolerance,
             )
@@ -224,66 +235,71 @@ def judge_errors(
 
 
 def deviations(robot: ArmHand, targets: TargetBatch, q: Array) -> tuple[Array, Array, Array]:
-    """How far configurations are from their targets and beyond their limits.
+    """Return contact errors and limit violations of configurations.
 
     Args:
         robot: The robot.
         targets: k targets, or one for all.
-        q: (k, n) or (n,); NaN gives NaN.
+        q: (k, n) or (n,) configurations [rad or m]; NaN gives NaN.
 
     Returns:
-        (k, f) or (f,) distances [m] from the point, line or plane (of the pad's ball, from touching
-        the point as it should); as many angles [rad] between
-        the normals, or between the whole frames where there is a tangent; NaN where free; (k,) or
-        () by how much the worst actuator or joint is beyond its limits [rad or m].
+        (k, f) or (f,) distances [m] from the point, line or plane (for a ball pad, from touching
+        the point along its normal); angles [rad] of the same shape between the normals, or between
+        the contact frames if there is a tangent; NaN where free; (k,) or () largest limit
+        violation of an actuator or joint [rad or m].
     """
     points, normals = targets.points, targets.normals
     if len(targets) == 1:
         points, normals = points[0], normals[0]
-    position, angle, beyond = robot.deviations(q, points, normals)
+    position, angle, excess = robot.deviations(q, points, normals)
     if not targets.more:
-        return position, angle, beyond
+        return position, angle, excess
     frames = robot.frames_at(q)
-    off = frames[..., :3, 3] - points
+    offset = frames[..., :3, 3] - points
     for name, array in targets.more.items():
         vectors = array[0] if len(targets) == 1 else array
-        given = np.broadcast_to(~np.isnan(vectors[..., 0]), position.shape)
+        is_present = np.broadcast_to(~np.isnan(vectors[..., 0]), position.shape)
         if name == "lines":
-            position = np.where(given, np.linalg.norm(np.cross(vectors, off), axis=-1), position)
+            distance = np.linalg.norm(np.cross(vectors, offset), axis=-1)
+            position = np.where(is_present, distance, position)
         elif name == "planes":
-            position = np.where(given, np.abs(np.sum(vectors * off, axis=-1)), position)
+            distance = np.abs(np.sum(vectors * offset, axis=-1))
+            position = np.where(is_present, distance, position)
         elif name == "balls":
             radii = np.array([[finger.radius] for finger in robot.description.fingers])
-            rolled = radii * (vectors - frames[..., :3, 0])
-            position = np.where(given, np.linalg.norm(off + rolled, axis=-1), position)
+            rolling = radii * (vectors - frames[..., :3, 0])
+            distance = np.linalg.norm(offset + rolling, axis=-1)
+            position = np.where(is_present, distance, position)
         elif name == "tangents":
-            wanted = np.stack([normals, vectors, np.cross(normals, vectors)], axis=-1)
-            angle = np.where(given, _turn(frames[..., :3, :3], wanted), angle)
+            target = np.stack([normals, vectors, np.cross(normals, vectors)], axis=-1)
+            rotation_angle = _rotation_angle(frames[..., :3, :3], target)
+            angle = np.where(is_present, rotation_angle, angle)
         else:
-            raise ValueError(f"there is no verdict on {name}")
-    return position, angle, beyond
+            raise ValueError(f"deviations: contact vector {name!r} is not implemented")
+    return position, angle, excess
 
 
-def _turn(one: Array, other: Array) -> Array:
-    """Angle [rad] between frames (..., 3, 3), exact where they nearly agree."""
-    turned = np.swapaxes(one, -1, -2) @ other
-    axis = [turned[..., i, j] - turned[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))]
-    cosine = turned[..., 0, 0] + turned[..., 1, 1] + turned[..., 2, 2] - 1
+def _rotation_angle(rotations: Array, targets: Array) -> Array:
+    """Return the angle [rad] between rotations (..., 3, 3), accurate for small angles."""
+    relative = np.swapaxes(rotations, -1, -2) @ targets
+    axis = [relative[..., i, j] - relative[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))]
+    cosine = relative[..., 0, 0] + relative[..., 1, 1] + relative[..., 2, 2] - 1
     return np.arctan2(np.linalg.norm(np.stack(axis, axis=-1), axis=-1), cosine)
 
 
 T = TypeVar("T")
 
 
-def made(kind: type[T], **fields: Any) -> T:
-    """An object of a frozen dataclass as its `__init__` makes it, from fields that are sound.
+def construct_unchecked(kind: type[T], **fields: Any) -> T:
+    """Construct a frozen dataclass without calling its `__init__`.
 
-    That sets every field by a call, which for the 17 of a solution takes as long as a hand's fit.
+    `__init__` calls `object.__setattr__` for every field, which for the 17 fields of a solution
+    takes as long as a hand fit. Fields are not validated.
 
     Args:
         kind: A dataclass without `__post_init__` and slots.
-        fields: By name; those with a plain default may be left out.
+        fields: Values by field name; fields with a plain default may be omitted.
     """
-    found = object.__new__(kind)
-    vars(found).update(fields)
-    return found
+    instance = object.__new__(kind)
+    vars(instance).update(fields)
+    return instance

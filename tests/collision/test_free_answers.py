@@ -66,9 +66,7 @@ def test_no_scene_checks_nothing(robot):
     solution = ik.Solver(robot).solve(ik.load_grasp("cup"))
     assert solution.clearance is None
     assert solution.closest is None
-    with pytest.raises(
-        ik.errors.InputError, match="'clearance', which needs a solver with a scene"
-    ):
+    with pytest.raises(ik.errors.InputError, match=r"prefer: 'clearance'.*scene"):
         ik.Solver(robot).solve(ik.load_grasp("cup"), prefer="clearance")
 
 
@@ -131,7 +129,7 @@ def test_all_solutions_are_free(solver):
 
 
 def test_what_knows_no_scene_says_so(solver):
-    with pytest.raises(ik.errors.UnsupportedError, match="fast: checks no collisions"):
+    with pytest.raises(ik.errors.UnsupportedError, match=r"fast: .*scene"):
         solver.fast()
 
 

@@ -21,9 +21,21 @@ from casadi_ik.model.targets import TargetBatch, Tolerance
 from casadi_ik.solve.recorder import SolveBlock
 from casadi_ik.solve.solution import BatchSolution
 from casadi_ik.solve.status import Status
-from casadi_ik.solve.trace import THRESHOLDS, JacobianMeasures, RecordedJacobian, TraceFormat
+from casadi_ik.solve.trace import (
+    SINGULARITY_THRESHOLDS,
+    JacobianMeasures,
+    RecordedJacobian,
+    TraceFormat,
+)
 
-__all__ = ["STORAGE", "THRESHOLDS", "Field", "JacobianMeasures", "Layout", "RecordedJacobian"]
+__all__ = [
+    "SINGULARITY_THRESHOLDS",
+    "STORAGE",
+    "Field",
+    "JacobianMeasures",
+    "Layout",
+    "RecordedJacobian",
+]
 __all__ += ["SolveBlock", "TargetBatch", "TraceFormat", "changed", "chunks_of", "event_format"]
 __all__ += ["main", "make_block", "make_rows", "parse_layout", "rewritten", "schema_name"]
 __all__ += ["schema_text"]

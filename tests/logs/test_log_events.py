@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from made_up_solves import (
     FORMAT,
     LABELS,
-    THRESHOLDS,
+    SINGULARITY_THRESHOLDS,
     Field,
     JacobianMeasures,
     Layout,
@@ -485,11 +485,11 @@ def test_singular_arms_are_events_in_every_method(robot, log):
     solves = log.solves()
     lowest = solves.rows["lowest_sigma"][:, solves.labels["lowest_sigma"].index("arm")]
     events = [r for r in log.events(event="NEAR_SINGULAR").records() if r["jacobian"] == "arm"]
-    near = set(np.flatnonzero(lowest < THRESHOLDS["arm"][0]).tolist())
+    near = set(np.flatnonzero(lowest < SINGULARITY_THRESHOLDS["arm"][0]).tolist())
     assert {event["solve_id"] for event in events} == near
     assert near, "the answers are singular: someone has to come there"
     for event in events:
-        assert event["value"] < event["threshold"] == THRESHOLDS["arm"][0]
+        assert event["value"] < event["threshold"] == SINGULARITY_THRESHOLDS["arm"][0]
         assert set(event["joint_mask"]) == set(robot.actuators[:7])
 
 

@@ -173,11 +173,9 @@ def test_whole_poses_of_all_fingers(robot, oracle, solvers, method):
 def test_the_papers_methods_say_what_they_need(robot, method):
     points, normals, tangents = (frames(robot)[None, :, :3, i] for i in (3, 0, 1))
     solver = ik.Solver(robot, method, finger_step="closed-form", compiled=False)
-    with pytest.raises(
-        ik.errors.RowError, match=r"needs point and normal of every finger.*row 0.*'thumb'"
-    ):
+    with pytest.raises(ik.errors.RowError, match=r"row 0 .*'thumb'"):
         solver.solve_batch(points, normals, tangents=tangents)
-    with pytest.raises(ik.errors.RowError, match="needs a contact for every finger"):
+    with pytest.raises(ik.errors.RowError, match="points: row 0 "):
         solver.solve(ik.Grasp({"thumb": ik.Contact(direction=UP)}))
 
 

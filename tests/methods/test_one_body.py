@@ -292,9 +292,7 @@ def test_palms_that_cannot_be_are_refused():
         match=r"one pose, expected one by side \(palms in a file\): left, right",
     ):
         solver.solve(ik.Grasp(palm=np.eye(4), posture=one.posture))
-    with pytest.raises(
-        ik.errors.InputError, match=r"posture\..*: found it, expected motors of hands"
-    ):
+    with pytest.raises(ik.errors.InputError, match=r"posture\..*: "):
         solver.solve(ik.Grasp(palm=one.palm, posture={**one.posture, "waist_yaw_joint": 0.0}))
     with pytest.raises(ik.errors.InputError, match=r"palm\.left: "):
         ik.Grasp(palm={"left": 2 * np.eye(4)}, posture=one.posture)
@@ -341,9 +339,9 @@ def test_bounds_of_an_object_that_cannot_be_are_refused():
     with pytest.raises(ik.errors.InputError, match="expected none above"):
         ik.Free([1, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0])
     free = ik.Grasp(box.contacts, object_pose=ik.Free([0] * 6, [0] * 6))
-    with pytest.raises(ik.errors.InputError, match="Free pose, which only"):
+    with pytest.raises(ik.errors.InputError, match="object_pose: a Free pose"):
         ik.Solver(robot).choose([free])
-    with pytest.raises(ik.errors.InputError, match="log: found beside a Free"):
+    with pytest.raises(ik.errors.InputError, match=r"log: .* Free"):
         ik.Solver(robot).solve(free, log="nothing.mcap")
 
 

@@ -12,7 +12,7 @@ from trace_checks import Kept
 
 import casadi_ik as ik
 from casadi_ik.model.targets import TargetBatch
-from casadi_ik.solve.engine import Engine, Run
+from casadi_ik.solve.engine import Engine, SolveOptions
 from casadi_ik.solve.method import Outcome
 from casadi_ik.solve.verdict import judge
 
@@ -21,6 +21,7 @@ class Answering:
     """Gives for every target the q0 it was given, and the status it was made with."""
 
     name, trace_format = "answering", None
+    preferences, hand_search = (), None
 
     def __init__(self, status=ik.Status.SOLVED):
         self.status = status
@@ -50,7 +51,7 @@ def test_limits_are_part_of_success_where_enforced(robot, enforce):
     """The method is sure of itself, the contacts are met, but a motor is beyond its limit."""
     q = np.tile(robot.home, (2, 1))
     q[1, 6] = robot.upper[6] + 0.01
-    batch = Engine(robot, Answering()).solve(targets(robot, q, enforce), Run(q))
+    batch = Engine(robot, Answering()).solve(targets(robot, q, enforce), SolveOptions(q))
     np.testing.assert_array_equal(batch.limits_ok, [True, False])
     np.testing.assert_array_equal(batch.success, [True, not enforce])
     assert list(batch.status_names) == ["SOLVED", "STALLED" if enforce else "SOLVED"]
@@ -64,7 +65,7 @@ def test_the_verdict_outvotes_the_method(robot, status):
     q = np.tile(robot.home, (2, 1))
     goals = q.copy()
     goals[1, 0] += 0.5
-    batch = Engine(robot, Answering(status)).solve(targets(robot, goals), Run(q))
+    batch = Engine(robot, Answering(status)).solve(targets(robot, goals), SolveOptions(q))
     assert list(batch.status_names) == ["SOLVED", status.name]
     np.testing.assert_array_equal(batch.success, [True, False])
 

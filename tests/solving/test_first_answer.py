@@ -61,8 +61,8 @@ def test_the_virtual_machine_answers_until_there_is_compiled_code(
     tmp_path: Path, scene: str
 ) -> None:
     early, said = run(tmp_path, "background", scene)
-    about = "kuka_lwr_barrett: compiled in the background (about 6 s, once per machine)"
-    assert said.startswith(about)
+    assert said.startswith("kuka_lwr_barrett: ")
+    assert "background (about 6 s" in said
     assert said.count("\n") == 1
     if not Path("/proc/self/environ").exists():
         pytest.skip("how processes are found is Linux's")

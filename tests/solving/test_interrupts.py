@@ -13,7 +13,7 @@ from processes import python
 
 import casadi_ik as ik
 from casadi_ik.compile.cancellation import CancelledError, stop_if_cancelled
-from casadi_ik.solve.batches import in_order
+from casadi_ik.solve.batches import map_ordered
 
 pytestmark = pytest.mark.usefixtures("usual_flags")
 
@@ -99,6 +99,6 @@ def test_an_error_stops_the_others() -> None:
         raise ValueError("of one")
 
     with pytest.raises(ValueError, match="of one"):
-        list(in_order(lambda task: task(), [fail, until_told], 2))
+        list(map_ordered(lambda task: task(), [fail, until_told], 2))
     assert stopped.is_set()
     stop_if_cancelled()  # this thread was never told

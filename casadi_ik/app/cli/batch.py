@@ -45,7 +45,7 @@ from casadi_ik.integrations.batches import (
 )
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.pose import transform_arrays
-from casadi_ik.solve.target_files import Source, TargetFile, polars_module, source_of
+from casadi_ik.solve.target_files import TargetFile, TargetSource, import_polars, open_targets
 
 BLOCK = 4096
 """Targets in memory at once, at most."""
@@ -135,7 +135,7 @@ def batch(said: Said) -> Answer:
     path, file = Path(said.targets), said.out
     if file.suffix.lower() == ".parquet" and not file.is_dir():
         with located("--out", (UnsupportedError,)):
-            polars_module()
+            import_polars()
     in_parts = said.dask is not None or said.resume or said.part_size is not None
     in_parts = in_parts or file.is_dir() or not file.suffix
     in_parts = in_parts or path.is_dir() or path.suffix.lower() == ".parquet"
@@ -254,7 +254,7 @@ def _solve_parts(
     """
     file = said.out
     check_installed(said.dask)
-    source = source_of(path, robot.fingers, said.part_size or PART_SIZE)
+    source = open_targets(path, robot.fingers, said.part_size or PART_SIZE)
     count = source.count  # read before anything is written
     one_file = bool(file.suffix) and not file.is_dir()
     if one_file:
@@ -293,12 +293,12 @@ def _solve_parts(
     return solver
 
 
-def _answers(folder: BatchFolder, source: Source, number: int) -> dict[str, Any]:
+def _answers(folder: BatchFolder, source: TargetSource, number: int) -> dict[str, Any]:
     return folder.answers(number, source.first_rows[number], source.sizes[number])
 
 
 def _question(
-    said: Said, solver: Solver, source: Source, asked: Mapping[str, Any]
+    said: Said, solver: Solver, source: TargetSource, asked: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Everything that decides the answers, so that no part of another batch is taken for ours."""
     scene = None
@@ -384,7 +384,7 @@ class _GrowingFile:
         for name, array in arrays.items():
             columns = array.T if array.ndim == 2 else [array]
             frame |= dict(zip(names.get(name, [name]), map(np.asarray, columns), strict=True))
-        polars_module().DataFrame(frame).write_parquet(part)
+        import_polars().DataFrame(frame).write_parquet(part)
 
 
 @contextmanager

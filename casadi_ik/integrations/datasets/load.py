@@ -51,7 +51,7 @@ from casadi_ik.model.grasp import Contact, Grasp
 from casadi_ik.model.load_grasp import load_grasp_files
 from casadi_ik.model.objects import GraspObject, is_mesh_name, load_object
 from casadi_ik.model.targets import DIRECTIONS_KEY
-from casadi_ik.solve.target_files import TargetFile, polars_module
+from casadi_ik.solve.target_files import TargetFile, import_polars
 
 Invalid = Literal["error", "drop", "clip"]
 """Treatment of rows that the hand cannot take."""
@@ -293,7 +293,7 @@ def _read_npz_table(path: Path) -> dict[str, Array]:
 
 
 def _read_parquet(path: Path) -> Mapping[str, Array]:
-    pl = polars_module()
+    pl = import_polars()
     try:
         scanned = pl.scan_parquet(path)
         names = [name for name in scanned.collect_schema().names() if not _is_ignored(name)]

@@ -25,7 +25,7 @@ from casadi_ik.kinematics.screws import TipChain, TipMotion, finger_chain, relat
 from casadi_ik.kinematics.se3 import normal_error, perpendicular
 from casadi_ik.kinematics.smooth import Expr, safe_norm, with_cse
 from casadi_ik.model.description import RobotDescription
-from casadi_ik.solve.limits import coupling_fields, coupling_values, kept_within, limit_mask
+from casadi_ik.solve.limits import clamp_to_limits, coupling_fields, coupling_values, limit_mask
 from casadi_ik.solve.status import Status
 from casadi_ik.solve.trace import LIMIT_MASK, STATUS, STEP_SIZE, Q
 
@@ -325,7 +325,7 @@ class ScrewControlStep:
         spacing = ca.if_else(grid > 0, grid, 1.0)
         start = ca.DM(self.robot.lower.tolist())
         rounded = start + spacing * ca.floor((moved - start) / spacing + 0.5)
-        q_next = kept_within(self.robot, ca.if_else(grid > 0, rounded, moved), 1.0)
+        q_next = clamp_to_limits(self.robot, ca.if_else(grid > 0, rounded, moved), 1.0)
 
         error_norm = safe_norm(objective.error)
         reached = error_norm <= p["tolerance"]

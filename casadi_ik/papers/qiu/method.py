@@ -40,7 +40,7 @@ from casadi_ik.papers.qiu.tasks import (
     weighted,
     weighted_damped,
 )
-from casadi_ik.solve.limits import kept_within, limit_mask, starts_within
+from casadi_ik.solve.limits import clamp_to_limits, clip_starts, limit_mask
 from casadi_ik.solve.looped_method import LoopedMethod, Start
 from casadi_ik.solve.status import Phase, Status
 from casadi_ik.solve.trace import STEP_SIZE, RecordedJacobian
@@ -315,7 +315,7 @@ class EnhancedStep(QiuStep[QiuParameters]):
     def _moved(self, q: ca.SX, step: ca.SX, p: dict[str, ca.SX]) -> ca.SX:
         """Take a step from q: capped, and kept within limits if they are enforced."""
         q_next = q + step * ca.fmin(1.0, p["step_cap"] / ca.fmax(_largest(step), 1e-12))
-        return kept_within(self.robot, q_next, p["enforce_limits"])
+        return clamp_to_limits(self.robot, q_next, p["enforce_limits"])
 
 
 def _smallest(jacobian: ca.SX) -> ca.SX:
@@ -456,7 +456,7 @@ class OriginalStep(QiuStep[OriginalParameters]):
         step = ca.SX.sym("step", len(self.robot.actuators))
         robot, q, positions, angles = self.robot, s["q"], errors[:, 0], errors[:, 1]
         solved = within_tolerance(positions, angles, p["position_tolerance"], p["angle_tolerance"])
-        q_next = kept_within(robot, q + step, p["enforce_limits"])
+        q_next = clamp_to_limits(robot, q + step, p["enforce_limits"])
         status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
         after = self.state.pack({"q": ca.if_else(solved, q, q_next)})
         record = self.record.pack(
@@ -501,7 +501,7 @@ class _QiuMethod(LoopedMethod, Generic[Step]):
     def begin(self, targets: TargetBatch, q0: Array) -> Start:
         """Start at q0, moved into limits that are enforced."""
         step, count = self.step, len(targets)
-        first = step.first_state(starts_within(self.robot, targets, q0))
+        first = step.first_state(clip_starts(self.robot, targets, q0))
         states = step.state.pack_rows(first, count)
         return states, step.parameters.pack_rows(step.parameter_values(targets), count)
 

@@ -35,10 +35,10 @@ from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.hand_first.parameters import HandFirstParameters
 from casadi_ik.solve.hand_first.seeds import FEATURES, Seeds
 from casadi_ik.solve.hand_first.state import HandFirstLayouts, terms
-from casadi_ik.solve.method import Outcome, Quick
+from casadi_ik.solve.method import Outcome, SingleOutcome
 from casadi_ik.solve.status import Phase, Status
 from casadi_ik.solve.turns import TURN
-from casadi_ik.solve.verdict import LIMIT_SLACK, TOLERANCE_SLACK, made
+from casadi_ik.solve.verdict import LIMIT_SLACK, TOLERANCE_SLACK, construct_unchecked
 
 MALFORMED = -9
 """What a search returns for a question that is none."""
@@ -497,7 +497,7 @@ class Searches:
             self._paused.value = 0
         return self._status.value
 
-    def answer(self, status: int) -> Quick:
+    def answer(self, status: int) -> SingleOutcome:
         """The last answer, copied.
 
         Args:
@@ -506,8 +506,8 @@ class Searches:
         errors = None
         if not self.more:
             errors = self.position_error.tolist(), self.angle_error.tolist(), self._beyond.value
-        return made(
-            Quick,
+        return construct_unchecked(
+            SingleOutcome,
             q=self.q.copy(),
             status=status,
             iterations=self._iterations.value,

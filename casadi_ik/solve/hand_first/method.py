@@ -29,11 +29,11 @@ from casadi_ik.solve.hand_first.state import CARRIED, beginning
 from casadi_ik.solve.hand_first.step import HandFirstStep
 from casadi_ik.solve.limits import coupling_jacobian
 from casadi_ik.solve.looped_method import LoopedMethod, Start
-from casadi_ik.solve.method import Outcome, Quick
+from casadi_ik.solve.method import HandSearch, Outcome, SingleOutcome
 from casadi_ik.solve.proofs.premises import ArmSpan, arm_span, palms_in_span
 from casadi_ik.solve.request import PREFERENCES
 from casadi_ik.solve.status import Phase, Status
-from casadi_ik.solve.trace import RecordedJacobian, packed
+from casadi_ik.solve.trace import RecordedJacobian, pack_mask
 from casadi_ik.solve.verdict import judge
 
 SideRun = Callable[[TargetBatch, Array], Outcome]
@@ -118,7 +118,7 @@ def _of_body(
         elif name != "limit_mask" and name in (rows.dtype.names or ()):
             found[name] = rows[name]
     at_limits = (found["q"] <= robot.lower) | (found["q"] >= robot.upper)
-    found["limit_mask"] = packed(at_limits).reshape(found["limit_mask"].shape)
+    found["limit_mask"] = pack_mask(at_limits).reshape(found["limit_mask"].shape)
     return found
 
 
@@ -139,7 +139,7 @@ class HandFirstMethod(LoopedMethod):
     """
 
     name = "hand-first"
-    preferences = PREFERENCES
+    preferences: tuple[str, ...] = PREFERENCES
     phases_without_arm = (Phase.CANDIDATE, Phase.HAND_FIT)
     takes_free_contacts = True
     takes_fixed_actuators = True
@@ -189,6 +189,11 @@ class HandFirstMethod(LoopedMethod):
     def _is_apart(self) -> bool:
         """Whether the robot is a body whose sides know nothing of each other."""
         return bool(self.robot.sides) and not self.robot.trunk
+
+    @property
+    def hand_search(self) -> HandSearch:
+        """The method itself."""
+        return self
 
     def in_virtual_machine(self) -> HandFirstMethod:
         """The same, never compiled; a body is one hand with all motors there."""
@@ -369,7 +374,7 @@ class HandFirstMethod(LoopedMethod):
             self.graph.record.dtype if trace else None,
         )
 
-    def quick(self, targets: TargetBatch, q0: Array) -> Quick | None:
+    def quick(self, targets: TargetBatch, q0: Array) -> SingleOutcome | None:
         """What `run` would find for one target from q0 (n,), sooner; None: ask `run`."""
         if not self.is_compiled or self._is_apart:
             return None

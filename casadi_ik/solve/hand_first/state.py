@@ -18,7 +18,7 @@ from casadi_ik.kinematics.contacts import ContactRows, Kinds, kinds_suffix, poin
 from casadi_ik.kinematics.palm import POSE_DIMENSION
 from casadi_ik.kinematics.smooth import Expr, call_function, with_cse
 from casadi_ik.model.description import RobotDescription
-from casadi_ik.solve.limits import bits, coupling_fields, coupling_values
+from casadi_ik.solve.limits import coupling_fields, coupling_values, pack_bits
 from casadi_ik.solve.status import Phase
 from casadi_ik.solve.trace import (
     ACCEPTED,
@@ -300,7 +300,7 @@ class HandFirstLayouts:
                 "position_error": ca.if_else(weights[:, 0] > 0, positions, NOTHING),
                 "angle_error": ca.if_else(known, angles, NOTHING),
                 **coupling_values(robot, q),
-                "limit_mask": bits(ca.logic_or(q <= lower, q >= upper)),
+                "limit_mask": pack_bits(ca.logic_or(q <= lower, q >= upper)),
                 "status": 0.0,  # filled in by the iteration
             }
         )

@@ -32,7 +32,7 @@ class ThumbFirstMethod(LoopedMethod):
     """
 
     name = "thumb-first"
-    preferences = ("limits", NEAREST)
+    preferences: tuple[str, ...] = ("limits", NEAREST)
     follows_closed_chain = True
     takes_free_contacts = True
     takes_fixed_actuators = True

@@ -48,7 +48,7 @@ from casadi_ik.kinematics.palm import (
 )
 from casadi_ik.kinematics.smooth import Expr, with_cse
 from casadi_ik.model.description import RobotDescription
-from casadi_ik.solve.limits import bits
+from casadi_ik.solve.limits import pack_bits
 from casadi_ik.solve.status import Phase, Status
 from casadi_ik.solve.thumb_first.closed_chain_step import (
     STEP_SOLVERS,
@@ -262,7 +262,7 @@ class ThumbFirstLayouts:
             "damping": NOTHING,
             "step_size": NOTHING,
             "active_mask": ca.DM.zeros(LIMIT_MASK.of(self.robot).size, 1),
-            "limit_mask": bits(ca.logic_or(q <= p["lower"], q >= p["upper"])),
+            "limit_mask": pack_bits(ca.logic_or(q <= p["lower"], q >= p["upper"])),
             "restart": ca.fmax(s["start"], 0.0),
             "accepted": 0.0,
             "phase": float(phase),
@@ -527,7 +527,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
             left,
             damping=s["damping"],
             step_size=ca.mmax(ca.fabs(tried - s["q"])),
-            active_mask=bits(held),
+            active_mask=pack_bits(held),
             accepted=accepted,
         )
         inputs = [state, parameters, step, held]
