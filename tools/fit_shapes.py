@@ -16,7 +16,7 @@ from shape_fitting.writing import write
 
 from casadi_ik.files.reading import read
 from casadi_ik.files.shipped import resolve_description
-from casadi_ik.integrations.importing.capsules import FIT, fitted, worst
+from casadi_ik.integrations.importing.capsules import SHAPE_FIT, fit_links, largest_excess
 from casadi_ik.integrations.importing.robot_shapes import may_touch
 from casadi_ik.integrations.importing.surfaces import Surface, together
 from casadi_ik.model.linkage import link_poses
@@ -31,8 +31,8 @@ def main() -> None:
     parser.add_argument("name")
     parser.add_argument("file", type=Path)
     parser.add_argument("--names", default="")
-    parser.add_argument("--most", type=int, default=FIT.most)
-    parser.add_argument("--saving", type=float, default=FIT.saving)
+    parser.add_argument("--most", type=int, default=SHAPE_FIT.max_capsules)
+    parser.add_argument("--saving", type=float, default=SHAPE_FIT.min_saving)
     parser.add_argument(
         "--apart", nargs="*", default=[], help="our links that hold several of the file: each alone"
     )
@@ -54,18 +54,19 @@ def main() -> None:
             parts.setdefault(link, []).extend(some)
     surfaces = {link: whole for link, some in parts.items() if (whole := together(some))}
     flat = {part.root} if given.kind == "hands" else set()
-    shapes = fitted(surfaces, flat, most=given.most, saving=given.saving)
+    shapes = fit_links(surfaces, flat, max_capsules=given.most, min_saving=given.saving)
     for link in given.apart:
         named = {str(i): one for i, one in enumerate(parts[link])}
-        each = fitted(named, named)
+        each = fit_links(named, named)
         shapes[link] = [shape for found in each.values() for shape in found]
     touching = may_touch(part, shapes, surfaces)
     write(path, shapes, touching, given.names or given.file.name)
     count = sum(map(len, shapes.values()))
     for link, found in shapes.items():
-        print(f"  {link}: {len(found)}, {1e3 * worst({link: found}):.0f} mm")
+        print(f"  {link}: {len(found)}, {1e3 * largest_excess({link: found}):.0f} mm")
     print(
-        f"{given.name}: {len(shapes)} links, {count} shapes, at most {1e3 * worst(shapes):.0f} mm"
+        f"{given.name}: {len(shapes)} links, {count} shapes, "
+        f"at most {1e3 * largest_excess(shapes):.0f} mm"
     )
     print("  without:", [x for x in link_poses(part.root, part.joints, {}) if x not in shapes])
     for one in touching:

@@ -128,7 +128,7 @@ def test_without_shapes_the_pad_is_guessed_from_the_joints(run: Command, tmp_pat
     data = yaml.safe_load((tmp_path / "mine.yaml").read_text())
     np.testing.assert_allclose(data["fingers"]["index"]["normal"], [0, 1, 0], atol=1e-6)
     np.testing.assert_allclose(data["fingers"]["index"]["xyz"], [0, 0, 0.032], atol=1e-6)
-    assert "the file has no shapes" in (tmp_path / "mine.yaml").read_text()
+    assert "without shapes" in (tmp_path / "mine.yaml").read_text()
 
 
 def test_missing_meshes_are_named(run: Command, tmp_path: Path) -> None:

@@ -316,10 +316,10 @@ def test_how_far_capsules_stand_out_is_found_by_looking_at_few_points():
     triangles = corners[np.array([*faces, (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)])]
     found, beyond = capsules.fit(triangles, 3)
     points, numbers = capsules.cut(triangles)
-    held = np.min([one.beyond(points) for one in found], axis=0)
+    held = np.min([one.distances_to(points) for one in found], axis=0)
     assert held.max() <= 1e-12
-    skin = np.concatenate([one.skin() for one in found])
-    skin = skin[np.min([one.beyond(skin) for one in found], axis=0) >= -1e-6]
+    skin = np.concatenate([one.surface_points() for one in found])
+    skin = skin[np.min([one.distances_to(skin) for one in found], axis=0) >= -1e-6]
     every = np.concatenate([points, points[numbers].mean(axis=1)])
     nearest = np.linalg.norm(skin[:, None] - every, axis=2).min(axis=1)
     assert beyond == pytest.approx(nearest.max(), abs=1e-9)
@@ -335,7 +335,7 @@ def test_a_fine_mesh_is_simplified_by_less_than_a_cell_and_enclosed_as_a_whole()
     distances, _ = KDTree(coarse.points).query(mesh.points)
     assert distances.max() <= np.sqrt(3) * 0.08 / 40
     found, beyond = capsules.fit(mesh.points[mesh.triangles], 1)
-    assert found[0].beyond(mesh.points).max() <= 0
+    assert found[0].distances_to(mesh.points).max() <= 0
     assert found[0].radius < 0.0215
     assert beyond < 0.006
 

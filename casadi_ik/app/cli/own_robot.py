@@ -31,7 +31,7 @@ from casadi_ik.export.project import (
     write_folder,
 )
 from casadi_ik.integrations.importing import imported
-from casadi_ik.integrations.importing.capsules import worst
+from casadi_ik.integrations.importing.capsules import largest_excess
 from casadi_ik.integrations.importing.imported import Imported, largest_difference, no_palm
 from casadi_ik.kinematics.arm_hand import ArmHand, load_robot
 from casadi_ik.kinematics.arms.recognise import describe_arm, is_searched
@@ -211,8 +211,9 @@ def _import_report(
     if lines.shapes:
         shapes = sum(map(len, lines.shapes.values()))
         pairs["shapes"] = (
-            f"{shapes} on {len(lines.shapes)} links, at most {1e3 * worst(lines.shapes):.0f} mm "
-            f"beyond their meshes; {len(lines.touching)} pairs may touch"
+            f"{shapes} on {len(lines.shapes)} links, "
+            f"at most {1e3 * largest_excess(lines.shapes):.0f} mm beyond their meshes; "
+            f"{len(lines.touching)} pairs may touch"
         )
     rows = table("finger", "pad on link", "joints", "point [mm]", "normal", right=("joints",))
     fingers = [(h.side, *finger) for h in lines.hands for finger in h.fingers.items()]

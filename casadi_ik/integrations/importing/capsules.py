@@ -1,7 +1,4 @@
-"""Meshes as few simple shapes that hold them: capsules, and boxes for what is flat.
-
-Shapes of links come out as a description has them.
-"""
+"""Fits of capsules and boxes that enclose the meshes of links, as entries of a description."""
 
 from __future__ import annotations
 
@@ -24,67 +21,66 @@ Rows = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
-class ShapeFit:
-    """How links become capsules and boxes.
+class ShapeFitSettings:
+    """Settings of the fit of capsules and boxes to links.
 
     Attributes:
-        saving: Part of the volume that another capsule has to save, unless told.
-        inside: Points that volumes are counted by.
-        rounds: Rounds of random turns by which a capsule's axis is bettered.
-        last_rounds: Rounds of the last fit, of the capsules that a link gets.
-        turns: Turns of a round.
-        corners: Number of directions whose outermost corners determine a capsule; in the end it
-            encloses all corners.
-        cells: Cells of a grid along the longest edge of a mesh, of each of which one corner is
-            among those that determine a capsule.
+        min_saving: Default fraction of the volume that another capsule has to save.
+        samples: Number of points by which volumes are estimated.
+        rounds: Rounds of the random search for a better axis.
+        last_rounds: Rounds of the search in the final fit.
+        axes_per_round: Random axes per round.
+        corner_directions: Number of directions whose outermost corners determine a capsule; in the
+            end it encloses all corners.
+        cells: Grid cells along the longest edge of a mesh; one corner of each cell may determine a
+            capsule.
         triangles: Number of triangles above which splits are decided on a simplified mesh.
-        refined: Number of splits, the best by a rough fit, that are fitted again with a search for
-            better axes.
-        added: Number of corners outside a capsule that take part in its last fit.
-        pieces: Triangles are cut until no edge is longer than this part of the mesh.
-        box_saving: Part of the volume that another box has to save.
-        box_points: Points along an edge of a box's skin.
-        grid: What is fitted is rounded up to a tenth of a millimetre.
-        large: Links longer than this [m] may have more capsules than `most_of_small`.
-        most: Capsules of a large link, unless more are asked for.
-        most_of_small: Capsules of a small link, at the most.
-        least: What is smaller than this [m] is no shape.
+        refined_splits: Number of best splits by a rough fit that are refined.
+        extra_corners: Number of corners outside a capsule that take part in its last fit.
+        pieces_per_length: Number of pieces into which the longest edge of a mesh is subdivided.
+        box_saving: Fraction of the volume that another box has to save.
+        box_points: Number of sample points along an edge of a box.
+        grid: Resolution to which results are rounded up [1/m].
+        large_link: Length above which a link may have `max_capsules` capsules [m].
+        max_capsules: Default maximum number of capsules of a large link.
+        max_capsules_of_small: Maximum number of capsules of a small link.
+        min_size: Extent below which a mesh is ignored [m].
     """
 
-    saving: float = 0.04
-    inside: int = 1500
+    min_saving: float = 0.04
+    samples: int = 1500
     rounds: int = 4
     last_rounds: int = 10
-    turns: int = 12
-    corners: int = 160
+    axes_per_round: int = 12
+    corner_directions: int = 160
     cells: int = 36
     triangles: int = 2000
-    refined: int = 3
-    added: int = 60
-    pieces: int = 12
+    refined_splits: int = 3
+    extra_corners: int = 60
+    pieces_per_length: int = 12
     box_saving: float = 0.12
     box_points: int = 24
     grid: float = 1e4
-    large: float = 0.13
-    most: int = 4
-    most_of_small: int = 2
-    least: float = 1e-4
+    large_link: float = 0.13
+    max_capsules: int = 4
+    max_capsules_of_small: int = 2
+    min_size: float = 1e-4
 
 
-FIT = ShapeFit()
+SHAPE_FIT = ShapeFitSettings()
 
-WIDER = np.array([1.0, 1.02, 1.05, 1.1, 1.2, 1.35, 1.5])
-"""Radii that are tried, as parts of the least."""
+RADIUS_FACTORS = np.array([1.0, 1.02, 1.05, 1.1, 1.2, 1.35, 1.5])
+"""Radii that are tried, relative to the smallest one."""
 
 
 @dataclass(frozen=True, eq=False)
 class FittedCapsule:
-    """A capsule.
+    """A capsule around a segment.
 
     Attributes:
-        first: (3,) end of its segment [m].
-        last: (3,) the other.
-        radius: [m].
+        first: (3,) first end of the segment [m].
+        last: (3,) other end of the segment [m].
+        radius: Radius [m].
     """
 
     first: Array
@@ -93,19 +89,19 @@ class FittedCapsule:
 
     @property
     def volume(self) -> float:
-        """[m^3]."""
+        """Volume [m^3]."""
         length = float(np.linalg.norm(self.last - self.first))
         return float(np.pi * self.radius**2 * (length + 4 / 3 * self.radius))
 
-    def beyond(self, points: Array) -> Array:
-        """(k,) distances of points from the capsule [m], negative inside."""
+    def distances_to(self, points: Array) -> Array:
+        """Return the distances (k,) of points from the capsule [m], negative inside."""
         along = self.last - self.first
         t = (points - self.first) @ along / max(float(along @ along), 1e-30)
         foot = self.first + np.clip(t, 0, 1)[:, None] * along
         return np.linalg.norm(points - foot, axis=1) - self.radius
 
-    def skin(self) -> Array:
-        """(k, 3) points of its surface."""
+    def surface_points(self) -> Array:
+        """Return sample points (k, 3) of the surface [m]."""
         along = self.last - self.first
         length = float(np.linalg.norm(along))
         axis = along / length if length > 1e-12 else np.array([0, 0, 1.0])
@@ -119,7 +115,7 @@ class FittedCapsule:
 
 
 def fit(
-    triangles: Array, most: int = 4, saving: float = FIT.saving
+    triangles: Array, max_capsules: int = 4, min_saving: float = SHAPE_FIT.min_saving
 ) -> tuple[list[FittedCapsule], float]:
     """Fit capsules that enclose a mesh.
 
@@ -128,43 +124,45 @@ def fit(
 
     Args:
         triangles: (t, 3, 3) corners [m].
-        most: Maximum number of capsules.
-        saving: Fraction of the volume that another capsule has to save.
+        max_capsules: Maximum number of capsules.
+        min_saving: Fraction of the volume that another capsule has to save.
 
     Returns:
         The capsules, and the largest distance by which samples of their surface stand out beyond
         the mesh [m].
     """
     mesh = Surface(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3))
-    coarse = mesh.simplified(FIT.triangles, FIT.cells)
+    coarse = mesh.simplified(SHAPE_FIT.triangles, SHAPE_FIT.cells)
     pieces = _Pieces(cut(coarse.points[coarse.triangles]))
-    parts, capsules = _split(pieces, most, saving)
+    parts, capsules = _split(pieces, max_capsules, min_saving)
     if coarse is not mesh:
         pieces = _Pieces(cut(triangles))
         outside = [
-            capsule.beyond(pieces.corners)[pieces.numbers].max(axis=1) for capsule in capsules
+            capsule.distances_to(pieces.corners)[pieces.numbers].max(axis=1) for capsule in capsules
         ]
         nearest = np.argmin(outside, axis=0)
         parts = [rows for i in range(len(capsules)) if len(rows := np.flatnonzero(nearest == i))]
-    capsules = [pieces.enclosing(part, FIT.last_rounds) for part in parts]
+    capsules = [pieces.enclosing(part, SHAPE_FIT.last_rounds) for part in parts]
     return capsules, excess(capsules, np.concatenate([pieces.corners, pieces.centroids]))
 
 
-def _split(pieces: _Pieces, most: int, saving: float) -> tuple[list[Rows], list[FittedCapsule]]:
+def _split(
+    pieces: _Pieces, max_capsules: int, min_saving: float
+) -> tuple[list[Rows], list[FittedCapsule]]:
     """Split a mesh into parts, and enclose each in a capsule, as long as that saves volume."""
     parts = [np.arange(len(pieces.numbers))]
-    capsules = [pieces.enclosing(parts[0], FIT.rounds)]
-    samples = _inside(capsules[0])
+    capsules = [pieces.enclosing(parts[0], SHAPE_FIT.rounds)]
+    samples = _points_inside(capsules[0])
     volume = 1.0
     splits: list[list[_Split] | None] = [None]
 
     def enclosed(i: int, pair: Sequence[FittedCapsule]) -> float:
         """Return the fraction of the samples inside if a pair replaces capsule i."""
         others = [capsule for j, capsule in enumerate(capsules) if j != i]
-        distances = np.min([capsule.beyond(samples) for capsule in (*others, *pair)], axis=0)
+        distances = np.min([capsule.distances_to(samples) for capsule in (*others, *pair)], axis=0)
         return float((distances <= 0).mean())
 
-    while len(parts) < most:
+    while len(parts) < max_capsules:
         drafts: list[tuple[float, int, _Split]] = []
         for i, part in enumerate(parts):
             known = splits[i] = splits[i] or pieces.splits(part)
@@ -172,14 +170,15 @@ def _split(pieces: _Pieces, most: int, saving: float) -> tuple[list[Rows], list[
         # The capsules of a draft tell which splits are worth the search for better ones.
         drafts.sort(key=lambda draft: draft[0])
         options = [
-            (enclosed(i, split.refined(pieces)), i, split) for _, i, split in drafts[: FIT.refined]
+            (enclosed(i, split.refined(pieces)), i, split)
+            for _, i, split in drafts[: SHAPE_FIT.refined_splits]
         ]
         if not options:
             break
-        least, i, split = min(options, key=lambda option: option[0])
-        if least > volume - saving:
+        min_size, i, split = min(options, key=lambda option: option[0])
+        if min_size > volume - min_saving:
             break
-        volume = least
+        volume = min_size
         parts[i : i + 1], capsules[i : i + 1] = split.parts, split.refined(pieces)
         splits[i : i + 1] = [None, None]
     return parts, capsules
@@ -200,7 +199,7 @@ class _Pieces:
         self.corners, self.numbers = mesh
         self.centroids = self.corners[self.numbers].mean(axis=1)
         self.outermost = np.zeros(len(self.corners), bool)
-        self.outermost[clusters(self.corners, FIT.cells)[0]] = True
+        self.outermost[clusters(self.corners, SHAPE_FIT.cells)[0]] = True
 
     def enclosing(self, rows: Rows, rounds: int) -> FittedCapsule:
         """Return a small capsule that encloses the triangles of some rows.
@@ -242,12 +241,12 @@ class _Split:
 
     def refined(self, pieces: _Pieces) -> list[FittedCapsule]:
         """Return a small capsule for each part."""
-        self.best = self.best or [pieces.enclosing(part, FIT.rounds) for part in self.parts]
+        self.best = self.best or [pieces.enclosing(part, SHAPE_FIT.rounds) for part in self.parts]
         return self.best
 
 
 def around(
-    points: Array, candidates: Array, enclosed: Array, rounds: int = FIT.rounds
+    points: Array, candidates: Array, enclosed: Array, rounds: int = SHAPE_FIT.rounds
 ) -> FittedCapsule:
     """Return a small capsule that encloses points.
 
@@ -260,35 +259,39 @@ def around(
     offsets = points - points.mean(axis=0)
     axes = np.linalg.eigh(offsets.T @ offsets)[1].T[::-1]
     rng = np.random.default_rng(0)
-    directions = rng.normal(size=(FIT.corners, 3))
+    directions = rng.normal(size=(SHAPE_FIT.corner_directions, 3))
     extreme = (directions @ np.ascontiguousarray(candidates.T)).argmax(axis=1)
     picked = candidates[np.unique(extreme)]
-    best, axis = _along(picked, axes)
+    best, axis = _smallest_along(picked, axes)
     spread = 0.3
     for _ in range(rounds):
-        tried = axis + spread * rng.normal(size=(FIT.turns, 3))
-        capsule, direction = _along(picked, tried / np.linalg.norm(tried, axis=1, keepdims=True))
+        tried = axis + spread * rng.normal(size=(SHAPE_FIT.axes_per_round, 3))
+        capsule, direction = _smallest_along(
+            picked, tried / np.linalg.norm(tried, axis=1, keepdims=True)
+        )
         if capsule.volume < best.volume:
             best, axis = capsule, direction
         spread *= 0.5
-    distance = best.beyond(enclosed)
+    distance = best.distances_to(enclosed)
     if rounds:  # the corners that are outside take part, so that the radius need not cover them
-        outside = np.argpartition(-distance, min(FIT.added, len(distance)) - 1)[: FIT.added]
-        capsule, _ = _along(np.concatenate([picked, enclosed[outside]]), axis[None])
-        widened = capsule.beyond(enclosed)
-        if _widened(capsule, widened).volume < _widened(best, distance).volume:
+        outside = np.argpartition(-distance, min(SHAPE_FIT.extra_corners, len(distance)) - 1)[
+            : SHAPE_FIT.extra_corners
+        ]
+        capsule, _ = _smallest_along(np.concatenate([picked, enclosed[outside]]), axis[None])
+        widened = capsule.distances_to(enclosed)
+        if _with_radius_for(capsule, widened).volume < _with_radius_for(best, distance).volume:
             best, distance = capsule, widened
-    return _widened(best, distance)
+    return _with_radius_for(best, distance)
 
 
-def _widened(capsule: FittedCapsule, distances: Array) -> FittedCapsule:
+def _with_radius_for(capsule: FittedCapsule, distances: Array) -> FittedCapsule:
     """Return the capsule with a radius that encloses points at some distances (k,) from it."""
     radius = capsule.radius + float(np.maximum(distances, 0).max()) + 1e-9
     return FittedCapsule(capsule.first, capsule.last, radius)
 
 
-def _along(points: Array, axes: Array) -> tuple[FittedCapsule, Array]:
-    """The smallest of some capsules along some axes (a, 3) that hold points, and its axis."""
+def _smallest_along(points: Array, axes: Array) -> tuple[FittedCapsule, Array]:
+    """Return the smallest enclosing capsule along given axes (a, 3), and its axis."""
     side = np.cross(axes, np.eye(3)[np.abs(axes).argmin(axis=1)])
     side /= np.linalg.norm(side, axis=1, keepdims=True)
     frames = np.stack([side, np.cross(axes, side), axes], axis=2)
@@ -301,7 +304,7 @@ def _along(points: Array, axes: Array) -> tuple[FittedCapsule, Array]:
         far = (off**2).sum(axis=2).argmax(axis=1)
         center = center + off[rows, far] / (i + 2)
     distance = np.linalg.norm(across - center[:, None], axis=2)
-    radii = distance.max(axis=1)[:, None] * WIDER
+    radii = distance.max(axis=1)[:, None] * RADIUS_FACTORS
     room = np.sqrt(np.maximum(radii[:, :, None] ** 2 - distance[:, None] ** 2, 0))
     low, high = (z[:, None] + room).min(axis=2), (z[:, None] - room).max(axis=2)
     middle = (z.min(axis=1) + z.max(axis=1))[:, None] / 2
@@ -315,13 +318,13 @@ def _along(points: Array, axes: Array) -> tuple[FittedCapsule, Array]:
     return FittedCapsule(ends[0], ends[1], float(radii[a, r])), axes[a]
 
 
-def _inside(capsule: FittedCapsule) -> Array:
-    """Points (k, 3) spread evenly in a capsule."""
+def _points_inside(capsule: FittedCapsule) -> Array:
+    """Return uniform sample points (k, 3) inside a capsule."""
     rng = np.random.default_rng(0)
     ends = np.stack([capsule.first, capsule.last])
     low, high = ends.min(axis=0) - capsule.radius, ends.max(axis=0) + capsule.radius
-    points = rng.uniform(low, high, (3 * FIT.inside, 3))
-    return points[capsule.beyond(points) <= 0][: FIT.inside]
+    points = rng.uniform(low, high, (3 * SHAPE_FIT.samples, 3))
+    return points[capsule.distances_to(points) <= 0][: SHAPE_FIT.samples]
 
 
 def halves(centroids: Array) -> list[NDArray[np.bool_]]:
@@ -341,7 +344,7 @@ def halves(centroids: Array) -> list[NDArray[np.bool_]]:
 def cut(triangles: Array) -> tuple[Array, Rows]:
     """Subdivide triangles (t, 3, 3) with long edges; return corners (c, 3) and triangles (t, 3)."""
     corners = triangles.reshape(-1, 3)
-    reach = float(np.ptp(corners, axis=0).max()) / FIT.pieces
+    reach = float(np.ptp(corners, axis=0).max()) / SHAPE_FIT.pieces_per_length
     rows = np.arange(len(corners)).reshape(-1, 3)
     finer = subdivide_to_size(corners, rows, reach, max_iter=50)
     corners, numbers = np.unique(np.asarray(finer[0], dtype=float), axis=0, return_inverse=True)
@@ -349,20 +352,20 @@ def cut(triangles: Array) -> tuple[Array, Rows]:
 
 
 def excess(shapes: Sequence[FittedCapsule | FittedBox], points: Array) -> float:
-    """By how much shapes stand out beyond a mesh of points [m], as far as samples show."""
-    skin = np.concatenate([one.skin() for one in shapes])
-    inside = np.min([one.beyond(skin) for one in shapes], axis=0) < -1e-6
-    return float(KDTree(points).query(skin[~inside])[0].max(initial=0.0))
+    """Return the largest distance of shape surfaces from the points of a mesh [m], by samples."""
+    surface_points = np.concatenate([one.surface_points() for one in shapes])
+    samples = np.min([one.distances_to(surface_points) for one in shapes], axis=0) < -1e-6
+    return float(KDTree(points).query(surface_points[~samples])[0].max(initial=0.0))
 
 
 @dataclass(frozen=True, eq=False)
 class FittedBox:
-    """A box.
+    """An oriented box.
 
     Attributes:
-        rotation: (3, 3) its axes, columns.
-        center: (3,) [m].
-        size: (3,) its edges [m].
+        rotation: (3, 3) axes of the box in columns.
+        center: (3,) centre [m].
+        size: (3,) edge lengths [m].
     """
 
     rotation: Array
@@ -371,17 +374,17 @@ class FittedBox:
 
     @property
     def volume(self) -> float:
-        """[m^3]."""
+        """Volume [m^3]."""
         return float(np.prod(self.size))
 
-    def beyond(self, points: Array) -> Array:
-        """(k,) how far points are outside, negative inside [m]."""
+    def distances_to(self, points: Array) -> Array:
+        """Return the distances (k,) of points from the faces [m], negative inside."""
         local = np.abs((points - self.center) @ self.rotation) - self.size / 2
         return local.max(axis=1)
 
-    def skin(self) -> Array:
-        """(k, 3) points of its surface."""
-        line = np.linspace(-0.5, 0.5, FIT.box_points)
+    def surface_points(self) -> Array:
+        """Return sample points (k, 3) of the surface [m]."""
+        line = np.linspace(-0.5, 0.5, SHAPE_FIT.box_points)
         u, v = (one.ravel() for one in np.meshgrid(line, line))
         faces = []
         for axis in range(3):
@@ -392,12 +395,12 @@ class FittedBox:
         return self.center + (np.concatenate(faces) * self.size) @ self.rotation.T
 
 
-def fit_boxes(triangles: Array, most: int = 3) -> list[FittedBox]:
-    """Boxes that hold a mesh of triangles (t, 3, 3) [m], no more than `most`."""
+def fit_boxes(triangles: Array, max_capsules: int = 3) -> list[FittedBox]:
+    """Fit at most `max_capsules` boxes that enclose triangles (t, 3, 3) [m]."""
     corners, numbers = cut(triangles)
     parts = [corners[numbers]]
     found = [box_around(parts[0].reshape(-1, 3))]
-    while len(parts) < most:
+    while len(parts) < max_capsules:
         options = []
         for i, part in enumerate(parts):
             for below in halves(part.mean(axis=1)):
@@ -408,14 +411,14 @@ def fit_boxes(triangles: Array, most: int = 3) -> list[FittedBox]:
         if not options:
             break
         saved, i, two, pair = max(options, key=lambda option: option[0])
-        if saved < FIT.box_saving * sum(one.volume for one in found):
+        if saved < SHAPE_FIT.box_saving * sum(one.volume for one in found):
             break
         parts[i : i + 1], found[i : i + 1] = two, pair
     return found
 
 
 def box_around(points: Array) -> FittedBox:
-    """A small box that holds points (k, 3) [m], along the frame's axes or the points' own."""
+    """Return a small box around points (k, 3) [m], along the frame or the principal axes."""
     _, _, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
     if np.linalg.det(axes) < 0:
         axes[2] *= -1
@@ -424,16 +427,16 @@ def box_around(points: Array) -> FittedBox:
         local = points @ rotation
         low, high = local.min(axis=0), local.max(axis=0)
         found.append(FittedBox(rotation, rotation @ ((low + high) / 2), high - low))
-    # Its own axes only where they save something: plain numbers are better to read.
+    # Principal axes only if they save volume: axes of the frame give simpler numbers.
     return found[1] if found[1].volume < 0.9 * found[0].volume else found[0]
 
 
-def fitted(
+def fit_links(
     surfaces: Mapping[str, Surface],
     flat: Collection[str],
     known: Mapping[str, Sequence[ShapeEntry]] | None = None,
-    most: int = FIT.most,
-    saving: float = FIT.saving,
+    max_capsules: int = SHAPE_FIT.max_capsules,
+    min_saving: float = SHAPE_FIT.min_saving,
     report: Callable[[int], object] | None = None,
 ) -> dict[str, list[ShapeEntry]]:
     """Return the shapes that enclose links, by link.
@@ -442,8 +445,8 @@ def fitted(
         surfaces: Surfaces by link, in the link's frame.
         flat: Links that boxes may enclose: a palm, which fingers come near.
         known: Shapes by link that are simple already, and are not changed.
-        most: Maximum number of capsules of a large link.
-        saving: Fraction of the volume that another capsule has to save.
+        max_capsules: Maximum number of capsules of a large link.
+        min_saving: Fraction of the volume that another capsule has to save.
         report: Function called with the number of links that have been enclosed since.
     """
     shapes: dict[str, list[ShapeEntry]] = {}
@@ -451,53 +454,59 @@ def fitted(
         extent = float(np.ptp(surface.points, axis=0).max())
         if known and link in known:
             shapes[link] = list(known[link])
-        elif len(surface.triangles) and extent > FIT.least:
-            count = most if extent > FIT.large else FIT.most_of_small
+        elif len(surface.triangles) and extent > SHAPE_FIT.min_size:
+            count = (
+                max_capsules if extent > SHAPE_FIT.large_link else SHAPE_FIT.max_capsules_of_small
+            )
             triangles = surface.points[surface.triangles]
-            shapes[link] = _held(triangles, count, link in flat, saving)
+            shapes[link] = _enclosing_shapes(triangles, count, link in flat, min_saving)
         if report is not None:
             report(1)
     return shapes
 
 
-def _held(triangles: Array, most: int, flat: bool, saving: float) -> list[ShapeEntry]:
-    """Capsules that hold a mesh, or boxes where it may be flat and they hold it closer."""
-    capsules, beyond = fit(triangles, most, saving)
+def _enclosing_shapes(
+    triangles: Array, max_capsules: int, flat: bool, min_saving: float
+) -> list[ShapeEntry]:
+    """Return enclosing capsules of a mesh, or boxes if they are allowed and closer."""
+    capsules, distances_to = fit(triangles, max_capsules, min_saving)
     boxes = fit_boxes(triangles) if flat else []
     if boxes:
         closer = excess(boxes, cut(triangles)[0])
-        if closer < beyond:
-            return [_box(one, _up(closer, 1e3)) for one in boxes]
-    return [_capsule(one, _up(beyond, 1e3)) for one in capsules]
+        if closer < distances_to:
+            return [_box(one, _ceil(closer, 1e3)) for one in boxes]
+    return [_capsule(one, _ceil(distances_to, 1e3)) for one in capsules]
 
 
-def _capsule(one: FittedCapsule, beyond: float) -> ShapeEntry:
+def _capsule(one: FittedCapsule, distances_to: float) -> ShapeEntry:
     first, last = (_rounded(end) for end in (one.first, one.last))
-    radius = math.ceil(one.radius * FIT.grid + 0.9) / FIT.grid
+    radius = math.ceil(one.radius * SHAPE_FIT.grid + 0.9) / SHAPE_FIT.grid
     if first == last:
-        return SphereEntry(radius=radius, center=first, excess=beyond)
-    return CapsuleEntry(ends=(first, last), radius=radius, excess=beyond)
+        return SphereEntry(radius=radius, center=first, excess=distances_to)
+    return CapsuleEntry(ends=(first, last), radius=radius, excess=distances_to)
 
 
-def _box(one: FittedBox, beyond: float) -> ShapeEntry:
-    size = np.ceil(one.size * FIT.grid + 1.1) / FIT.grid
+def _box(one: FittedBox, distances_to: float) -> ShapeEntry:
+    size = np.ceil(one.size * SHAPE_FIT.grid + 1.1) / SHAPE_FIT.grid
     rpy = np.round(roll_pitch_yaw(one.rotation), 4)
-    if np.any(rpy):  # what rounding may turn it by
-        size = np.ceil((size + 1e-4 * np.linalg.norm(size)) * FIT.grid) / FIT.grid
+    if np.any(rpy):  # the largest effect of rounding the angles
+        size = np.ceil((size + 1e-4 * np.linalg.norm(size)) * SHAPE_FIT.grid) / SHAPE_FIT.grid
     x, y, z = size.tolist()
     roll, pitch, yaw = (rpy + 0.0).tolist()
-    return BoxEntry(size=(x, y, z), xyz=_rounded(one.center), rpy=(roll, pitch, yaw), excess=beyond)
+    return BoxEntry(
+        size=(x, y, z), xyz=_rounded(one.center), rpy=(roll, pitch, yaw), excess=distances_to
+    )
 
 
 def _rounded(point: Array) -> tuple[float, float, float]:
-    x, y, z = (np.round(point * FIT.grid) / FIT.grid + 0.0).tolist()
+    x, y, z = (np.round(point * SHAPE_FIT.grid) / SHAPE_FIT.grid + 0.0).tolist()
     return x, y, z
 
 
-def _up(value: float, grid: float) -> float:
+def _ceil(value: float, grid: float) -> float:
     return math.ceil(grid * value) / grid
 
 
-def worst(shapes: Mapping[str, Sequence[ShapeEntry]]) -> float:
-    """By how much shapes stand out beyond what they hold, at most [m]."""
+def largest_excess(shapes: Mapping[str, Sequence[ShapeEntry]]) -> float:
+    """Return the largest excess of shapes beyond the meshes that they enclose [m]."""
     return max((one.excess for found in shapes.values() for one in found), default=0.0)

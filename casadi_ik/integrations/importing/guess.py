@@ -1,4 +1,4 @@
-"""What is guessed of a hand: its fingers, the thumb, the pads of the fingertips, a home posture."""
+"""Guesses about an imported hand: fingers, thumb, pads of the fingertips, home posture."""
 
 from __future__ import annotations
 
@@ -24,33 +24,33 @@ from casadi_ik.model.linkage import (
 from casadi_ik.model.parts import RobotPart
 from casadi_ik.model.xml_tree import RobotTree, TreeJoint
 
-WORDS = {
+FINGER_PATTERNS = {
     "thumb": r"thumb|(?<![a-z])th(?=[jb_]|dist|prox|mid|tip|hub|base|$)",
     "index": r"index|fore_?finger|(?<![a-z])ff(?=j|dist|prox|mid|knuck|tip|_|$)",
     "ring": r"(?<![a-z])ring|(?<![a-z])rf(?=j|dist|prox|mid|knuck|tip|_|$)",
     "little": r"little|pinky|(?<![a-z])lf(?=j|dist|prox|mid|knuck|meta|tip|_|$)",
     "middle": r"middle_?finger|(?<![a-z])mf(?=j|dist|prox|mid|knuck|tip|_|$)|middle",
 }
-"""What the fingers' names look like; a middle phalanx must not make a finger the middle one."""
+"""Patterns of finger names; a middle phalanx must not turn a finger into the middle finger."""
 
 
 @dataclass(frozen=True)
 class GuessParameters:
-    """How fingers, thumb, pads and home are guessed.
+    """Parameters of the guesses.
 
     Attributes:
-        arm_joints: Least number of motors in a row of an arm beside other chains.
-        arm_length: Least length of the path along such an arm [m]; fingers are shorter.
-        lone_arm_joints: Least number of motors of an arm that is the only chain of its file.
-        palm_chains: Least number of chains of a palm that another palm is beside.
-        postures: At random, over which opposition is averaged.
-        clear: By how much the thumb has to be more opposed than the next finger, of 2, to be called
-            clear.
-        parallel: Cosine above which two joints of a finger bend it the same way.
-        sure: Relative difference of distances above which they say which way a finger closes.
-        home_samples: Postures of the arm that are compared, if it has at most `usual_joints`.
-        usual_joints: Joints of an arm.
-        step: Of the differences that a Jacobian is made of [rad or m].
+        arm_joints: Minimum number of consecutive motors of an arm beside other chains.
+        arm_length: Minimum length of such an arm [m]; fingers are shorter.
+        lone_arm_joints: Minimum number of motors of an arm that is the only chain of its file.
+        palm_chains: Minimum number of chains of a palm if there are several palms.
+        postures: Number of random postures over which opposition is averaged.
+        min_opposition_gap: Minimum lead of the thumb's opposition (0 to 2) over the next finger.
+        parallel: Cosine above which two joints bend a finger in the same direction.
+        min_relative_difference: Minimum relative difference of distances that decides the closing
+            direction of a finger.
+        home_samples: Number of arm postures that are compared for an arm of `usual_arm_joints`.
+        usual_arm_joints: Number of joints up to which all samples are compared.
+        difference_step: Step of numerical Jacobians [rad or m].
     """
 
     arm_joints: int = 6
@@ -58,34 +58,34 @@ class GuessParameters:
     lone_arm_joints: int = 5
     palm_chains: int = 3
     postures: int = 64
-    clear: float = 0.15
+    min_opposition_gap: float = 0.15
     parallel: float = 0.7
-    sure: float = 0.05
+    min_relative_difference: float = 0.05
     home_samples: int = 300
-    usual_joints: int = 12
-    step: float = 1e-6
+    usual_arm_joints: int = 12
+    difference_step: float = 1e-6
 
 
-GUESS = GuessParameters()
+GUESS_PARAMETERS = GuessParameters()
 
 
 @dataclass(frozen=True)
 class Branch:
-    """A finger as found in a tree.
+    """A finger in a tree of links.
 
     Attributes:
-        name: What it is called.
-        chain: Its joints that move, from the palm to the tip.
-        link: The link that carries the pad.
-        links: All links of the branch.
-        named: Whether the file's names say which finger it is.
+        name: Name of the finger.
+        chain: Movable joints from the palm to the tip.
+        link: Link that carries the pad.
+        links: All links of the finger.
+        is_named: True if names in the file identify the finger.
     """
 
     name: str
     chain: tuple[Joint, ...]
     link: str
     links: tuple[str, ...]
-    named: bool
+    is_named: bool
 
 
 JAW = r"jaw|finger|claw|knuckle|thumb"
@@ -102,22 +102,22 @@ def palms(tree: RobotTree) -> list[str]:
 
 def motors_in_a_row(tree: RobotTree, joint: TreeJoint) -> int:
     """Return the most joints without coupling in a row, from a joint outwards."""
-    further = (motors_in_a_row(tree, next_) for next_ in moving_below(tree, joint.child))
-    return (joint.coupling is None) + max(further, default=0)
+    counts = (motors_in_a_row(tree, next_) for next_ in moving_below(tree, joint.child))
+    return (joint.coupling is None) + max(counts, default=0)
 
 
 def is_limb(tree: RobotTree, joint: TreeJoint) -> bool:
     """Return whether what a joint moves has as many motors as an arm, and is as long as one."""
     return (
-        motors_in_a_row(tree, joint) >= GUESS.arm_joints
-        and _length(tree, joint.child) >= GUESS.arm_length
+        motors_in_a_row(tree, joint) >= GUESS_PARAMETERS.arm_joints
+        and _longest_path(tree, joint.child) >= GUESS_PARAMETERS.arm_length
     )
 
 
-def _length(tree: RobotTree, link: str) -> float:
+def _longest_path(tree: RobotTree, link: str) -> float:
     """Return the length of the longest path of joints below a link [m]."""
     steps = (
-        float(np.linalg.norm(joint.placement[:3, 3])) + _length(tree, joint.child)
+        float(np.linalg.norm(joint.placement[:3, 3])) + _longest_path(tree, joint.child)
         for joint in tree.joints
         if joint.parent == link
     )
@@ -174,7 +174,7 @@ def _ends_below(tree: RobotTree, link: str, last: TreeJoint | None) -> list[Limb
     if len(chains) == 1:
         return _ends_below(tree, chains[0].child, chains[0])
     limbs = [joint for joint in chains if is_limb(tree, joint)]
-    if not limbs:  # several whole hands, each on a wrist
+    if not limbs:  # several complete hands, each on a wrist
         limbs = [joint for joint in chains if _carries_a_palm(tree, joint)]
         limbs = limbs if len(limbs) > 1 else []
     if not limbs:
@@ -185,7 +185,7 @@ def _ends_below(tree: RobotTree, link: str, last: TreeJoint | None) -> list[Limb
 def _carries_a_palm(tree: RobotTree, joint: TreeJoint) -> bool:
     """Return whether a link from which three or more chains go out is moved by a joint."""
     links = (joint.child, *(further.child for further in joints_below(tree, joint.child)))
-    return any(len(moving_below(tree, link)) >= GUESS.palm_chains for link in links)
+    return any(len(moving_below(tree, link)) >= GUESS_PARAMETERS.palm_chains for link in links)
 
 
 def _is_wheel(tree: RobotTree, joint: TreeJoint) -> bool:
@@ -202,48 +202,59 @@ def _is_leg(tree: RobotTree, link: str) -> bool:
 
 
 def find_fingers(part: RobotPart, palm: str) -> list[Branch]:
-    """The fingers below a palm, in the file's order."""
-    found: list[Branch] = []
+    """Return the fingers below a palm, in the order of the file."""
+    fingers: list[Branch] = []
     for joint in moving_below(part, palm):
-        for start, end in _ends(part, joint):
-            links = [start.child, *(one.child for one in joints_below(part, start.child))]
-            names = [*links, *(one.name for one in part.joints if one.child in links)]
+        for start, end in _finger_ends(part, joint):
+            links = [
+                start.child,
+                *(chain_joint.child for chain_joint in joints_below(part, start.child)),
+            ]
+            names = [
+                *links,
+                *(chain_joint.name for chain_joint in part.joints if chain_joint.child in links),
+            ]
             to_end = chain_to(part, end.child, palm)
-            word, chain = _word(names), tuple(one for one in to_end if one.type != "fixed")
+            word, chain = (
+                _finger_word(names),
+                tuple(chain_joint for chain_joint in to_end if chain_joint.type != "fixed"),
+            )
             link = _tip(part, end.child)
-            found.append(Branch(word or "", chain, link, tuple(links), bool(word)))
-    return _called(found)
+            fingers.append(Branch(word or "", chain, link, tuple(links), bool(word)))
+    return _with_names(fingers)
 
 
-def _ends(part: RobotPart, joint: Joint) -> list[tuple[Joint, Joint]]:
-    """The fingers that a joint carries: the first joint that is one's own, and its last.
+def _finger_ends(part: RobotPart, joint: Joint) -> list[tuple[Joint, Joint]]:
+    """Return the first and last joint of each finger that a joint carries.
 
-    Two chains of two joints or more that hang on one joint are two fingers; of shorter ones
-    (linkages) the longest counts.
+    Two chains of two or more joints on one joint are two fingers; of shorter chains (linkages) the
+    longest counts.
     """
-    next_ = moving_below(part, joint.child)
-    long = [one for one in next_ if joint_depth(part, one.child) >= 1]
-    if len(long) >= 2:
-        return [pair for one in long for pair in _ends(part, one)]
-    if not next_:
+    next_joints = moving_below(part, joint.child)
+    chains = [next_joint for next_joint in next_joints if joint_depth(part, next_joint.child) >= 1]
+    if len(chains) >= 2:
+        return [pair for next_joint in chains for pair in _finger_ends(part, next_joint)]
+    if not next_joints:
         return [(joint, joint)]
-    longest = max(next_, key=lambda one: joint_depth(part, one.child))
-    further = _ends(part, longest)
-    return further if len(further) > 1 else [(joint, further[0][1])]
+    longest = max(next_joints, key=lambda next_joint: joint_depth(part, next_joint.child))
+    ends = _finger_ends(part, longest)
+    return ends if len(ends) > 1 else [(joint, ends[0][1])]
 
 
 def _tip(part: RobotPart, link: str) -> str:
-    """The last link, or the frame of a tip that is fixed to it."""
-    ends = [one for one in rigid_links(part, link)[1:] if "tip" in one.lower()]
-    return ends[0] if len(ends) == 1 else link
+    """Return the last link, or the tip frame that is fixed to it."""
+    candidates = [
+        candidate for candidate in rigid_links(part, link)[1:] if "tip" in candidate.lower()
+    ]
+    return candidates[0] if len(candidates) == 1 else link
 
 
-def _word(names: list[str]) -> str | None:
-    """The finger that most of some names speak of."""
+def _finger_word(names: list[str]) -> str | None:
+    """Return the finger that most names mention; None if there is none."""
     lower = [name.lower() for name in names]
     counts = {
         word: sum(bool(re.search(pattern, name)) for name in lower)
-        for word, pattern in WORDS.items()
+        for word, pattern in FINGER_PATTERNS.items()
     }
     best = max(counts, key=lambda word: counts[word])  # the first of equals: middle is the last
     if counts["middle"] and best != "middle" and counts[best] < len(lower) / 2 < counts["middle"]:
@@ -251,44 +262,48 @@ def _word(names: list[str]) -> str | None:
     return best if counts[best] else None
 
 
-def _called(branches: list[Branch]) -> list[Branch]:
-    """Names for all: those of fingers, what a branch's links begin with, or numbers."""
+def _with_names(branches: list[Branch]) -> list[Branch]:
+    """Return the branches with unique names: finger names, common prefixes of links, or numbers."""
     stems = [_stem(branch.links) for branch in branches]
-    called: list[Branch] = []
+    named: list[Branch] = []
     for i, (branch, stem) in enumerate(zip(branches, stems, strict=True)):
-        same = [one for one in branches if one.name == branch.name]
-        name = branch.name if branch.named and len(same) == 1 else ""
+        namesakes = [other for other in branches if other.name == branch.name]
+        name = branch.name if branch.is_named and len(namesakes) == 1 else ""
         if not name and len(stem) >= 3 and stems.count(stem) == 1:
             name = stem
-        if not name or any(one.name == name for one in called):
+        if not name or any(other.name == name for other in named):
             name = f"finger_{i + 1}"
-        called.append(Branch(name, branch.chain, branch.link, branch.links, branch.named))
-    return called
+        named.append(Branch(name, branch.chain, branch.link, branch.links, branch.is_named))
+    return named
 
 
 def _stem(links: tuple[str, ...]) -> str:
     if len(links) < 2:
         return ""
-    first, *others = (link.lower() for link in links)
-    same = [all(one[: i + 1] == first[: i + 1] for one in others) for i in range(len(first))]
-    common = first[: sum(same)]
+    first, *other_links = (link.lower() for link in links)
+    is_common = [
+        all(link[: i + 1] == first[: i + 1] for link in other_links) for i in range(len(first))
+    ]
+    common = first[: sum(is_common)]
     common = re.sub(r"(link|phalanx|body|joint)_*$", "", common.rstrip("_-. "))
     return re.sub(r"[^a-z0-9_]+", "_", common).strip("_")
 
 
 def guess_thumb(part: RobotPart, branches: list[Branch], pads: list[Pad]) -> tuple[int, str]:
-    """The thumb's place among the fingers, and how it was found."""
-    named = [i for i, branch in enumerate(branches) if branch.named and branch.name == "thumb"]
-    if len(named) == 1:
-        return named[0], "the file calls it so"
+    """Return the index of the thumb among the fingers, and the reason."""
+    is_named = [
+        i for i, branch in enumerate(branches) if branch.is_named and branch.name == "thumb"
+    ]
+    if len(is_named) == 1:
+        return is_named[0], "named in the file"
     if len(branches) == 1:
         return 0, "the only finger"
     rng = np.random.default_rng(0)
-    opposed = np.zeros(len(branches))
-    for _ in range(GUESS.postures):
+    opposition = np.zeros(len(branches))
+    for _ in range(GUESS_PARAMETERS.postures):
         poses = _poses(part, _random(part, rng))
         normals = np.array([poses[pad.link][:3, :3] @ pad.normal for pad in pads])
-        # Bent fingers all face the palm: what counts is how they face each other across it.
+        # Bent fingers all face the palm, so only the components across the palm count.
         reaches = [
             _apply(poses[pad.link], pad.point) - poses[branch.chain[0].child][:3, 3]
             for branch, pad in zip(branches, pads, strict=True)
@@ -297,23 +312,25 @@ def guess_thumb(part: RobotPart, branches: list[Branch], pads: list[Pad]) -> tup
         normals -= np.outer(normals @ z, z)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
         cosines = normals @ normals.T
-        opposed -= (cosines.sum(axis=1) - 1) / (len(branches) - 1) / GUESS.postures
-    best, second = np.argsort(-opposed)[:2]
-    if opposed[best] - opposed[second] < GUESS.clear:
+        opposition -= (cosines.sum(axis=1) - 1) / (len(branches) - 1) / GUESS_PARAMETERS.postures
+    best, second = np.argsort(-opposition)[:2]
+    if opposition[best] - opposition[second] < GUESS_PARAMETERS.min_opposition_gap:
         lengths = [len(branch.chain) for branch in branches]
-        if lengths.count(min(lengths)) == 1:  # the one that does not spread
-            return lengths.index(min(lengths)), "none opposes the others most: the simplest finger"
-        return 0, "none opposes the others most: the first finger"
-    return int(best), "its pad is the one most opposed to the others"
+        if lengths.count(min(lengths)) == 1:  # the finger without a spread joint
+            return lengths.index(
+                min(lengths)
+            ), "no clear opposition: the finger with the fewest joints"
+        return 0, "no clear opposition: the first finger"
+    return int(best), "its pad opposes the others most"
 
 
 def guess_palm_frame(
     part: RobotPart, palm: str, branches: list[Branch], pads: list[Pad], thumb: int
 ) -> Array:
-    """(4, 4) in the palm's link: origin amid the fingers' bases, z outwards, y to the thumb."""
-    poses = _poses(part, _middle(part))
+    """Return the palm frame (4, 4) in the palm link: z along the fingers, y towards the thumb."""
+    poses = _poses(part, _mid_range(part))
     inverse = np.linalg.inv(poses[palm])
-    bases = np.array([(inverse @ poses[one.chain[0].child])[:3, 3] for one in branches])
+    bases = np.array([(inverse @ poses[branch.chain[0].child])[:3, 3] for branch in branches])
     tips = (
         np.array([_apply(poses[pad.link], pad.point) for pad in pads]) @ inverse[:3, :3].T
         + inverse[:3, 3]
@@ -324,21 +341,21 @@ def guess_palm_frame(
     to_thumb = bases[thumb] - (others.mean(axis=0) if len(others) else 0 * bases[thumb])
     if np.linalg.norm(to_thumb - (to_thumb @ z) * z) < 5e-3:
         to_thumb = tips[thumb] - (np.delete(tips, thumb, axis=0).mean(axis=0) if len(others) else 0)
-    y = _unit(_across(to_thumb, z), _any_across(z))
+    y = _unit(_perpendicular_part(to_thumb, z), _any_perpendicular(z))
     frame = np.eye(4)
     frame[:3, :3] = np.column_stack([np.cross(y, z), y, z])
     frame[:3, 3] = bases.mean(axis=0)
     return frame
 
 
-def _unit(vector: Array, otherwise: Array) -> Array:
+def _unit(vector: Array, fallback: Array) -> Array:
     length = float(np.linalg.norm(vector))
-    chosen = vector if length > 1e-9 else otherwise
-    return chosen / np.linalg.norm(chosen)
+    direction = vector if length > 1e-9 else fallback
+    return direction / np.linalg.norm(direction)
 
 
-TILT = np.cos(np.deg2rad(45.0))
-"""The skin may be tilted so far from where the finger bends to."""
+MIN_COS_TILT = np.cos(np.deg2rad(45.0))
+"""Cosine of the largest angle between the skin and the closing direction."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -347,36 +364,36 @@ class Pad:
 
     Attributes:
         link: The link.
-        point: (3,) in the link's frame [m].
-        normal: (3,) outward, unit, in the link's frame.
-        how: How it was found, for a comment.
+        point: (3,) origin in the link frame [m].
+        normal: (3,) outward unit normal in the link frame.
+        reason: Description of the guess, for a comment.
     """
 
     link: str
     point: Array
     normal: Array
-    how: str
+    reason: str
 
 
 def guess_pads(
     part: RobotPart, palm: str, branches: list[Branch], surfaces: dict[str, Surface]
 ) -> list[Pad]:
-    """A pad for every finger."""
-    middle = _middle(part)
+    """Return a pad for every finger."""
+    middle = _mid_range(part)
     poses = _poses(part, middle)
-    bodies = [_body(part, branch, surfaces) for branch in branches]
+    bodies = [_last_phalanx(part, branch, surfaces) for branch in branches]
     tips = [
         _apply(poses[branch.chain[index].child], tip)
         for branch, (_, tip, index) in zip(branches, bodies, strict=True)
     ]
     pads: list[Pad] = []
     for i, branch in enumerate(branches):
-        others = [tip for j, tip in enumerate(tips) if j != i]
-        meeting = np.mean(others, axis=0) if others else poses[palm][:3, 3]
-        if not others and palm in surfaces:  # a jaw closes towards the nearest part of the palm
+        other_tips = [tip for j, tip in enumerate(tips) if j != i]
+        closing_target = np.mean(other_tips, axis=0) if other_tips else poses[palm][:3, 3]
+        if not other_tips and palm in surfaces:  # a jaw closes towards the nearest part of the palm
             points = surfaces[palm].moved(poses[palm]).points
-            meeting = points[np.argmin(np.linalg.norm(points - tips[i], axis=1))]
-        pads.append(_pad(part, branch, bodies[i], meeting))
+            closing_target = points[np.argmin(np.linalg.norm(points - tips[i], axis=1))]
+        pads.append(_pad(part, branch, bodies[i], closing_target))
     return pads
 
 
@@ -389,18 +406,20 @@ def guess_fixed_jaw(part: RobotPart, palm: str, pad: Pad, surface: Surface | Non
         pad: The pad of the jaw that moves.
         surface: The shape of the palm's link; None if it is not known.
     """
-    poses = _poses(part, _middle(part))
+    poses = _poses(part, _mid_range(part))
     pose = np.linalg.inv(poses[palm]) @ poses[pad.link]
     point, normal = _apply(pose, pad.point), pose[:3, :3] @ pad.normal
     hit = None if surface is None else surface.hit(point, normal)
     if hit is not None:
         return Pad(palm, hit, -normal, "where a ray from the jaw that moves meets the palm's link")
-    ends = []
+    positions = []
     for joint in part.joints:
         for value in (joint.lower, joint.upper) if joint.type != "fixed" else ():
-            moved = _poses(part, _middle(part) | {joint.name: value})
-            ends.append(_apply(np.linalg.inv(moved[palm]) @ moved[pad.link], pad.point))
-    closed = max(ends, key=lambda end: float((end - point) @ normal))
+            poses_at_limit = _poses(part, _mid_range(part) | {joint.name: value})
+            positions.append(
+                _apply(np.linalg.inv(poses_at_limit[palm]) @ poses_at_limit[pad.link], pad.point)
+            )
+    closed = max(positions, key=lambda end: float((end - point) @ normal))
     return Pad(palm, closed, -normal, "where the jaw that moves is when it is closed")
 
 
@@ -410,160 +429,171 @@ def tool_pad(link: str) -> Pad:
 
 
 Body = tuple[Surface | None, Array, int]
-"""The shape of the last phalanx in its moving link's frame, a point at its end, and which of the
-chain's joints moves it."""
+"""Surface of the last phalanx in the frame of its moving link, its tip, and the index of the joint
+that moves it."""
 
 
-def _body(part: RobotPart, branch: Branch, surfaces: dict[str, Surface]) -> Body:
-    rest = _poses(part, {})
+def _last_phalanx(part: RobotPart, branch: Branch, surfaces: dict[str, Surface]) -> Body:
+    zero_poses = _poses(part, {})
     for index in reversed(range(len(branch.chain))):
         joint = branch.chain[index]
-        inverse = np.linalg.inv(rest[joint.child])
+        inverse = np.linalg.inv(zero_poses[joint.child])
         parts = [
-            surfaces[link].moved(inverse @ rest[link])
+            surfaces[link].moved(inverse @ zero_poses[link])
             for link in rigid_links(part, joint.child)
             if link in surfaces
         ]
-        whole = together(parts)
-        if whole is not None and len(whole.points):
-            return whole, _end(whole, joint), index
+        surface = together(parts)
+        if surface is not None and len(surface.points):
+            return surface, _tip_point(surface, joint), index
     joint = branch.chain[-1]
-    place = (np.linalg.inv(rest[joint.child]) @ rest[branch.link])[:3, 3]
-    if np.linalg.norm(place) < 3e-3:  # no frame of a tip: as long as most of the phalanx before
-        before = rest[branch.chain[-2].child] if len(branch.chain) > 1 else np.eye(4)
-        step = rest[joint.child][:3, 3] - before[:3, 3]
-        place = 0.8 * rest[joint.child][:3, :3].T @ step
-    return None, place, len(branch.chain) - 1
+    tip = (np.linalg.inv(zero_poses[joint.child]) @ zero_poses[branch.link])[:3, 3]
+    if np.linalg.norm(tip) < 3e-3:  # without a tip frame: 0.8 times the previous phalanx
+        previous = zero_poses[branch.chain[-2].child] if len(branch.chain) > 1 else np.eye(4)
+        difference_step = zero_poses[joint.child][:3, 3] - previous[:3, 3]
+        tip = 0.8 * zero_poses[joint.child][:3, :3].T @ difference_step
+    return None, tip, len(branch.chain) - 1
 
 
-def _end(body: Surface, joint: Joint) -> Array:
-    """The end of the last phalanx: as far from its joint as the shape goes, in its middle."""
-    u = _long_way(body, joint)
-    along = body.points @ u
-    far = body.points[along > 0.6 * along.max()] if along.max() > 0 else body.points
-    middle = (far.min(axis=0) + far.max(axis=0)) / 2
-    return middle + (along.max() - middle @ u) * u
+def _tip_point(body: Surface, joint: Joint) -> Array:
+    """Return the tip of the last phalanx: its farthest cross-section's centre."""
+    u = _phalanx_direction(body, joint)
+    heights = body.points @ u
+    outer = body.points[heights > 0.6 * heights.max()] if heights.max() > 0 else body.points
+    middle = (outer.min(axis=0) + outer.max(axis=0)) / 2
+    return middle + (heights.max() - middle @ u) * u
 
 
-def _long_way(body: Surface, joint: Joint) -> Array:
-    """Unit direction from the joint to the middle of the phalanx, across the joint's axis."""
-    way = _across(body.centroid(), joint.axis)
-    if np.linalg.norm(way) < 3e-3:
+def _phalanx_direction(body: Surface, joint: Joint) -> Array:
+    """Return the unit direction from joint to phalanx, perpendicular to the joint axis."""
+    direction = _perpendicular_part(body.centroid(), joint.axis)
+    if np.linalg.norm(direction) < 3e-3:
         flat = body.points - np.outer(body.points @ joint.axis, joint.axis)
-        way = flat[np.argmax(np.linalg.norm(flat, axis=1))]
-    return _unit(way, np.array([0.0, 0.0, 1.0]))
+        direction = flat[np.argmax(np.linalg.norm(flat, axis=1))]
+    return _unit(direction, np.array([0.0, 0.0, 1.0]))
 
 
-def _pad(part: RobotPart, branch: Branch, body: Body, meeting: Array) -> Pad:
+def _pad(part: RobotPart, branch: Branch, body: Body, closing_target: Array) -> Pad:
     shape, end, index = body
     joint = branch.chain[index]
-    sign, why = _closing(part, branch, index, end, meeting)
+    sign, why = _closing_direction(part, branch, index, end, closing_target)
     if joint.type == "prismatic":
-        normal, u = sign * joint.axis, _unit(_across(end, joint.axis), _any_across(joint.axis))
+        normal, u = (
+            sign * joint.axis,
+            _unit(_perpendicular_part(end, joint.axis), _any_perpendicular(joint.axis)),
+        )
     else:
-        u = _long_way(shape, joint) if shape is not None else _across(end, joint.axis)
-        u = _unit(u, _any_across(joint.axis))
+        u = (
+            _phalanx_direction(shape, joint)
+            if shape is not None
+            else _perpendicular_part(end, joint.axis)
+        )
+        u = _unit(u, _any_perpendicular(joint.axis))
         normal = sign * np.cross(joint.axis, u)
     if shape is None:
-        point, how = end, "the file has no shapes: the point is the tip's frame or a guess of it"
+        point, reason = end, "without shapes: the point is the tip frame or a guess of it"
     else:
-        point, how, radius = _skin(shape, u, normal)
-        faced = shape.facing(point, radius, normal)
+        point, reason, radius = _skin(shape, u, normal)
+        mean_normal = shape.facing(point, radius, normal)
         if joint.type != "prismatic":
-            faced = _unit(_across(faced, joint.axis), normal)
-        if faced @ normal > TILT:
-            normal = faced
-    rest = _poses(part, {})
-    pose = np.linalg.inv(rest[branch.link]) @ rest[joint.child]
+            mean_normal = _unit(_perpendicular_part(mean_normal, joint.axis), normal)
+        if mean_normal @ normal > MIN_COS_TILT:
+            normal = mean_normal
+    zero_poses = _poses(part, {})
+    pose = np.linalg.inv(zero_poses[branch.link]) @ zero_poses[joint.child]
     link = branch.link
-    if not np.isfinite(pose).all() or _moving_link(part, link) != joint.child:
+    if not np.isfinite(pose).all() or _last_moving_link(part, link) != joint.child:
         link, pose = joint.child, np.eye(4)
-    return Pad(link, _apply(pose, point), pose[:3, :3] @ normal, f"{how}; {why}")
+    return Pad(link, _apply(pose, point), pose[:3, :3] @ normal, f"{reason}; {why}")
 
 
 def _skin(shape: Surface, u: Array, normal: Array) -> tuple[Array, str, float]:
-    """The point of the shape over the middle of the fingertip, on the side the normal shows.
+    """Return the point of the fingertip's surface in the direction of the normal.
 
-    Also how it was found, and within what distance the skin counts as the pad.
+    The second value describes how it was found, the third is the radius of the pad [m].
     """
     side = np.cross(u, normal)
-    along = shape.points @ u
-    length = float(along.max())
-    far = shape.points[along >= length - 0.4 * max(length, float(np.ptp(along)))]
-    height = float(np.ptp(far @ normal))
-    back = min(max(height / 2, 0.1 * length), 0.5 * max(length, 1e-3))
-    there = (far @ side).min(), (far @ side).max()
-    start = (length - back) * u + float(np.mean(there)) * side
-    reach = float(np.abs(shape.points).max()) * 4 + 0.1
-    hit = shape.hit(start + reach * normal, -normal)
+    heights = shape.points @ u
+    length = float(heights.max())
+    outer = shape.points[heights >= length - 0.4 * max(length, float(np.ptp(heights)))]
+    height = float(np.ptp(outer @ normal))
+    inset = min(max(height / 2, 0.1 * length), 0.5 * max(length, 1e-3))
+    side_range = (outer @ side).min(), (outer @ side).max()
+    start = (length - inset) * u + float(np.mean(side_range)) * side
+    ray_start = float(np.abs(shape.points).max()) * 4 + 0.1
+    hit = shape.hit(start + ray_start * normal, -normal)
     if hit is not None:
-        how = f"where a ray meets the shape {1e3 * back:.1f} mm before the tip's end"
-        return hit, how, back / 2
+        reason = f"hit of a ray on the shape {1e3 * inset:.1f} mm before the tip's end"
+        return hit, reason, inset / 2
     flat = start - (start @ normal) * normal
-    there = flat + float((far @ normal).max()) * normal
-    return there, "no ray meets the shape: its farthest point", 0.0
+    side_range = flat + float((outer @ normal).max()) * normal
+    return side_range, "no ray hits the shape: its farthest point", 0.0
 
 
-def _closing(
-    part: RobotPart, branch: Branch, index: int, end: Array, meeting: Array
+def _closing_direction(
+    part: RobotPart, branch: Branch, index: int, end: Array, closing_target: Array
 ) -> tuple[float, str]:
-    """Which way the last joint turns when the finger closes, and how that was decided."""
+    """Return the direction (1 or -1) in which the last joint closes the finger, and the reason."""
     joint = branch.chain[index]
-    middle = _middle(part)
+    middle = _mid_range(part)
     poses = _poses(part, middle)
     axis = poses[joint.child][:3, :3] @ joint.axis
     bending: dict[str, float] = {}
-    for one in branch.chain[: index + 1]:
-        if one.type == joint.type:
-            cosine = float(poses[one.child][:3, :3] @ one.axis @ axis)
-            if abs(cosine) > GUESS.parallel:
-                bending[one.name] = np.sign(cosine)
-    base = next(one for one in branch.chain if one.name in bending)
+    for chain_joint in branch.chain[: index + 1]:
+        if chain_joint.type == joint.type:
+            cosine = float(poses[chain_joint.child][:3, :3] @ chain_joint.axis @ axis)
+            if abs(cosine) > GUESS_PARAMETERS.parallel:
+                bending[chain_joint.name] = np.sign(cosine)
+    base = next(chain_joint for chain_joint in branch.chain if chain_joint.name in bending)
 
-    joints = {one.name: one for one in part.joints}
+    joints = {chain_joint.name: chain_joint for chain_joint in part.joints}
 
     def tip(sign: float) -> tuple[Array, Array]:
         values = dict(middle)
-        for name, way in bending.items():
-            one = joints[name]
-            values[name] = one.upper if way * sign > 0 else one.lower
-        found = _poses(part, values)
-        return _apply(found[joint.child], end), found[base.child][:3, 3]
+        for name, direction in bending.items():
+            chain_joint = joints[name]
+            values[name] = chain_joint.upper if direction * sign > 0 else chain_joint.lower
+        closed_poses = _poses(part, values)
+        return _apply(closed_poses[joint.child], end), closed_poses[base.child][:3, 3]
 
     (plus, root), (minus, _) = tip(1.0), tip(-1.0)
     if len(bending) > 1:
         lengths = float(np.linalg.norm(plus - root)), float(np.linalg.norm(minus - root))
-        if abs(lengths[0] - lengths[1]) > GUESS.sure * max(lengths):
-            return (1.0 if lengths[0] < lengths[1] else -1.0), "faces the way the finger bends"
-    here = poses[joint.child]
-    place = _apply(here, end)
-    way = axis if joint.type == "prismatic" else np.cross(axis, place - here[:3, 3])
-    sign = 1.0 if way @ (meeting - place) >= 0 else -1.0
+        if abs(lengths[0] - lengths[1]) > GUESS_PARAMETERS.min_relative_difference * max(lengths):
+            return (1.0 if lengths[0] < lengths[1] else -1.0), "faces the bending direction"
+    pose = poses[joint.child]
+    tip_position = _apply(pose, end)
+    direction = axis if joint.type == "prismatic" else np.cross(axis, tip_position - pose[:3, 3])
+    sign = 1.0 if direction @ (closing_target - tip_position) >= 0 else -1.0
     return sign, "faces the other fingers"
 
 
-def _middle(part: RobotPart) -> dict[str, float]:
-    """Every joint in the middle of its range [rad or m]."""
-    return {one.name: (one.lower + one.upper) / 2 for one in part.joints if one.type != "fixed"}
+def _mid_range(part: RobotPart) -> dict[str, float]:
+    """Return the middle of the range of every joint [rad or m]."""
+    return {
+        joint.name: (joint.lower + joint.upper) / 2
+        for joint in part.joints
+        if joint.type != "fixed"
+    }
 
 
 def _random(part: RobotPart, rng: np.random.Generator) -> dict[str, float]:
-    """Every joint anywhere in the middle half of its range, couplings left out."""
+    """Return random positions in the middle half of the range of every joint."""
     return {
-        one.name: one.lower + (0.25 + 0.5 * rng.random()) * (one.upper - one.lower)
-        for one in part.joints
-        if one.type != "fixed"
+        joint.name: joint.lower + (0.25 + 0.5 * rng.random()) * (joint.upper - joint.lower)
+        for joint in part.joints
+        if joint.type != "fixed"
     }
 
 
 def _poses(part: RobotPart, values: Mapping[str, float]) -> dict[str, Array]:
-    """(4, 4) pose of every link in the root's frame."""
+    """Return the pose (4, 4) of every link in the root frame."""
     return link_poses(part.root, part.joints, values)
 
 
-def _moving_link(part: RobotPart, link: str) -> str:
-    """The link itself, or the next one above that a joint moves."""
-    moving = [one.child for one in chain_to(part, link) if one.type != "fixed"]
+def _last_moving_link(part: RobotPart, link: str) -> str:
+    """Return the link, or its nearest ancestor that a joint moves."""
+    moving = [joint.child for joint in chain_to(part, link) if joint.type != "fixed"]
     return moving[-1] if moving else part.root
 
 
@@ -571,23 +601,25 @@ def _apply(pose: Array, point: Array) -> Array:
     return pose[:3, :3] @ point + pose[:3, 3]
 
 
-def _across(vector: Array, axis: Array) -> Array:
+def _perpendicular_part(vector: Array, axis: Array) -> Array:
     return vector - (vector @ axis) * axis
 
 
-def _any_across(axis: Array) -> Array:
-    across: Array = np.asarray(np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))]), dtype=float)
-    return _unit(across, axis)
+def _any_perpendicular(axis: Array) -> Array:
+    perpendicular: Array = np.asarray(
+        np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))]), dtype=float
+    )
+    return _unit(perpendicular, axis)
 
 
-TURN = np.pi / 2
-"""A joint is not turned further than this from the middle of its range, however wide it is."""
+MAX_TURN = np.pi / 2
+"""Largest distance of a home position from the middle of the joint range [rad]."""
 
 
 def guess_home(robot: RobotDescription) -> Array:
-    """(n,) the hand half closed, the arm well within its limits and able to move every way.
+    """Return a home configuration (n,): the hand half closed, the arm far from singularities.
 
-    Of a body side by side, with its trunk at zero.
+    The sides of a multi-arm robot are treated separately, with the trunk at zero.
     """
     middle = (robot.lower + robot.upper) / 2
     if robot.sides:
@@ -597,32 +629,44 @@ def guess_home(robot: RobotDescription) -> Array:
         return home
     arm = list(robot.arm_actuators)
     if not arm:
-        return _round(middle, robot)
+        return _rounded(middle, robot)
     chain = robot.chain(robot.palm_link)
     rng = np.random.default_rng(0)
-    half = np.minimum((robot.upper - robot.lower)[arm] / 4, TURN)
-    best, found = -1.0, middle
-    # What a posture takes grows with the square of the joints.
+    spread = np.minimum((robot.upper - robot.lower)[arm] / 4, MAX_TURN)
+    best_value, best_q = -1.0, middle
+    # The cost of a posture grows with the square of the number of joints.
     for i in range(
-        max(1, int(GUESS.home_samples * min(1.0, (GUESS.usual_joints / len(arm)) ** 2)))
+        max(
+            1,
+            int(
+                GUESS_PARAMETERS.home_samples
+                * min(1.0, (GUESS_PARAMETERS.usual_arm_joints / len(arm)) ** 2)
+            ),
+        )
     ):
         q = middle.copy()
         if i:
-            q[arm] += half * rng.uniform(-1, 1, len(arm))
-        value = _freedom(robot, chain, q, arm)
-        if value > best:
-            best, found = value, q
-    return _round(found, robot)
+            q[arm] += spread * rng.uniform(-1, 1, len(arm))
+        value = _smallest_singular_value(robot, chain, q, arm)
+        if value > best_value:
+            best_value, best_q = value, q
+    return _rounded(best_q, robot)
 
 
-def _freedom(robot: RobotDescription, chain: tuple[Joint, ...], q: Array, arm: list[int]) -> float:
-    """The least that the palm moves for a motion of the arm's motors, a metre as a radian."""
+def _smallest_singular_value(
+    robot: RobotDescription, chain: tuple[Joint, ...], q: Array, arm: list[int]
+) -> float:
+    """Return the smallest singular value of the palm Jacobian, metres and radians alike."""
     pose = _palm(robot, chain, q)
     columns = []
     for i in arm:
-        other = q.copy()
-        other[i] += GUESS.step
-        change = (_palm(robot, chain, other) - pose) @ np.linalg.inv(pose) / GUESS.step
+        q_step = q.copy()
+        q_step[i] += GUESS_PARAMETERS.difference_step
+        change = (
+            (_palm(robot, chain, q_step) - pose)
+            @ np.linalg.inv(pose)
+            / GUESS_PARAMETERS.difference_step
+        )
         columns.append([*change[:3, 3], change[2, 1], change[0, 2], change[1, 0]])
     values = np.linalg.svd(np.array(columns).T, compute_uv=False)
     return float(values[: min(6, len(arm))].min())
@@ -634,8 +678,8 @@ def _palm(robot: RobotDescription, chain: tuple[Joint, ...], q: Array) -> Array:
     return link_poses(robot.root, chain, positions)[robot.palm_link]
 
 
-def _round(q: Array, robot: RobotDescription) -> Array:
-    """Two digits where they are within the limits."""
-    short = np.where(robot.upper - robot.lower > 0.5, np.round(q, 2), np.round(q, 4))
-    inside = (short > robot.lower) & (short < robot.upper)
-    return np.where(inside, short, q)
+def _rounded(q: Array, robot: RobotDescription) -> Array:
+    """Round to two digits (four for small ranges) where that stays within the limits."""
+    rounded = np.where(robot.upper - robot.lower > 0.5, np.round(q, 2), np.round(q, 4))
+    is_inside = (rounded > robot.lower) & (rounded < robot.upper)
+    return np.where(is_inside, rounded, q)

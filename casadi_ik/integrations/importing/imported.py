@@ -17,7 +17,7 @@ import numpy as np
 from casadi_ik.errors import DescriptionError, InputError, MissingExtraError
 from casadi_ik.files.arrays import Array
 from casadi_ik.integrations.importing.guess import (
-    GUESS,
+    GUESS_PARAMETERS,
     Branch,
     ends_of_arms,
     find_fingers,
@@ -145,7 +145,7 @@ def guessed_palms(tree: RobotTree) -> list[tuple[str, str]]:
             for joint in tree.chain(tree.root, end.link, str(tree.path))
             if joint.type != "fixed" and joint.coupling is None
         ]
-        if not palms(tree) and len(motors) + end.has_fingers < GUESS.lone_arm_joints:
+        if not palms(tree) and len(motors) + end.has_fingers < GUESS_PARAMETERS.lone_arm_joints:
             return [(tree.root, "there is a single chain of joints: the base")]
         if end.has_fingers and len(moving_below(tree, end.link)) > 1:
             return [(end.link, "the first link from which several chains of joints go out")]
@@ -382,7 +382,7 @@ def _found_hand(
     branches = find_fingers(part, palm)
     if not branches:
         motors = [joint for joint in chain_to(part, palm) if joint.type != "fixed"]
-        if len(motors) < GUESS.lone_arm_joints:
+        if len(motors) < GUESS_PARAMETERS.lone_arm_joints:
             raise DescriptionError(
                 f"{tree.path}: no joint moves below the palm {palm!r}; try --palm"
             )

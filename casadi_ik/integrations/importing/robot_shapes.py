@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from casadi_ik.collision.distances import between_segments
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.progress import progress
-from casadi_ik.integrations.importing.capsules import FIT, fitted
+from casadi_ik.integrations.importing.capsules import SHAPE_FIT, fit_links
 from casadi_ik.integrations.importing.surfaces import Surface, link_surfaces
 from casadi_ik.integrations.importing.triangle_tree import TriangleTree
 from casadi_ik.model.description import RobotDescription
@@ -197,7 +197,10 @@ def _allowed_overlap(
     reason += f"their meshes in {intersecting.sum()} of {len(examined)}"
     # The allowed overlap is less than where the meshes intersect, if that tells the two apart.
     depths = -clearance[examined]
-    depth = math.floor(SAMPLING.depth * float(depths[intersecting].min()) * FIT.grid) / FIT.grid
+    depth = (
+        math.floor(SAMPLING.depth * float(depths[intersecting].min()) * SHAPE_FIT.grid)
+        / SHAPE_FIT.grid
+    )
     if (
         intersecting.mean() > SAMPLING.nested
         or (depths[~intersecting] < depth).mean() < SAMPLING.told_apart
@@ -256,7 +259,7 @@ def robot_shapes(
     ordered = {link: surfaces[link] for link in robot.links if link in surfaces}
     palms = {side.palm_link for side in robot.sides} or {robot.palm_link}
     with progress(2 * len(ordered)) as report:
-        shapes = fitted(ordered, palms, simple, report=report)
+        shapes = fit_links(ordered, palms, simple, report=report)
         touching = may_touch(robot, shapes, surfaces, report)
     return shapes, touching, notes
 

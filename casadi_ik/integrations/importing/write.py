@@ -159,7 +159,7 @@ class HandLines:
             lines.append(f"thumb: {scalar(self.thumb[0])}  # {_guess(self.thumb[1])}")
         lines.append("fingers:  # xyz [m] and outward normal of the pad, in the link's frame")
         for name, pad in self.fingers.items():
-            lines.append(f"  # GUESS: {one_line(pad.how)}")
+            lines.append(f"  # GUESS: {one_line(pad.reason)}")
             lines.append(
                 f"  {scalar(name)}: {{link: {scalar(pad.link)}, xyz: {vector(pad.point)}, "
                 f"normal: {vector(pad.normal)}}}"
