@@ -1,8 +1,7 @@
-"""The exceptions casadi_ik raises on bad input.
+"""Exceptions that casadi_ik raises on bad input.
 
-Not converging is never an exception: it is a `Status` of the solution. An exception means that
-the question itself was malformed, and its message says in one line where, what was found and
-what was expected.
+Failure to converge is a `Status` of the solution, never an exception. An exception means that an
+input is malformed; its message is one line: `<where>: <noun> is <problem>; expected <x>`.
 """
 
 from __future__ import annotations
@@ -14,15 +13,15 @@ from contextlib import contextmanager
 
 
 def printable(text: str, most: int = 0) -> str:
-    r"""A text that may come from anybody, made fit for a terminal.
+    r"""Return untrusted text in a form that is safe to print on a terminal.
 
     Args:
         text: The text.
-        most: Characters of it that are kept, at the most; 0: all.
+        most: Maximum number of characters; 0: unlimited.
 
     Returns:
-        The text with what would move the cursor, change colours or turn the direction of writing
-        as visible escapes (``\x1b``); line breaks stay.
+        The text with control and direction characters as visible escapes (``\x1b``); line breaks
+        stay.
     """
     if most and len(text) > most:
         text = f"{text[:most]}... ({len(text)} characters)"
@@ -32,35 +31,37 @@ def printable(text: str, most: int = 0) -> str:
 
 
 def _escaped(character: str) -> str:
-    # Cc: control characters; Cf: marks without a shape, among them those of direction; Cs: halves.
+    # Cc: control characters; Cf: invisible marks, such as writing direction; Cs: lone surrogates.
     if character == "\n" or unicodedata.category(character) not in ("Cc", "Cf", "Cs"):
         return character
     return character.encode("unicode_escape", "surrogatepass").decode("ascii")
 
 
-LONGEST = 600
-"""Characters of a message; of a longer one the beginning and the end are kept."""
+MAX_MESSAGE_LENGTH = 600
+"""Maximum number of characters of a message; longer ones are shortened in the middle."""
 
 
 def shortened(text: str) -> str:
-    """A text of any length as one of a few hundred characters, fit for a terminal."""
+    """Return text in at most `MAX_MESSAGE_LENGTH` characters, safe to print on a terminal."""
     text = printable(text)
-    return text if len(text) <= LONGEST else f"{text[: LONGEST - 200]} [...] {text[-180:]}"
+    if len(text) <= MAX_MESSAGE_LENGTH:
+        return text
+    return f"{text[: MAX_MESSAGE_LENGTH - 200]} [...] {text[-180:]}"
 
 
 def did_you_mean(word: str, known: Iterable[str], otherwise: str | None = None) -> str:
-    """The known word that is nearest to one that is not; else `otherwise`, or all of them."""
+    """Return a hint with the most similar known word, else `otherwise` or all known words."""
     known = list(known)
-    near = difflib.get_close_matches(word, known, 1)
-    if near:
-        return f"did you mean {near[0]!r}?"
+    matches = difflib.get_close_matches(word, known, 1)
+    if matches:
+        return f"did you mean {matches[0]!r}?"
     return f"expected one of {', '.join(known)}" if otherwise is None else otherwise
 
 
 class CasadiIKError(Exception):
-    """Base of every error that casadi_ik raises on purpose.
+    """Base class of all errors that casadi_ik raises.
 
-    Its text is printable and short, whatever the file holds that it speaks of.
+    The message is printable and short, whatever the file contains that it quotes.
 
     Example:
         >>> try:
@@ -76,11 +77,11 @@ class CasadiIKError(Exception):
 
 @contextmanager
 def os_errors(what: str, kind: type[CasadiIKError]) -> Iterator[None]:
-    """Turn what the system refuses into an error of the package.
+    """Convert errors of the operating system into an error of the package.
 
     Args:
-        what: File and what was tried: "cup.yaml: cannot be read".
-        kind: The error.
+        what: File and failed operation, as in "cup.yaml: cannot be read".
+        kind: Class of the error.
     """
     try:
         yield
@@ -89,22 +90,22 @@ def os_errors(what: str, kind: type[CasadiIKError]) -> Iterator[None]:
 
 
 class DescriptionError(CasadiIKError):
-    """A robot, object or grasp file (or the data in it) is malformed."""
+    """Error of a malformed robot, object or grasp file, or of its data."""
 
 
 class UnknownNameError(CasadiIKError):
-    """A robot, grasp, method, finger, joint or option of that name does not exist."""
+    """Error of a robot, grasp, method, finger, joint or option name that does not exist."""
 
 
 class InputError(CasadiIKError):
-    """An argument has the wrong shape, type or value (non-finite, zero normal, ...)."""
+    """Error of an argument with the wrong shape, type or value (non-finite, zero normal, ...)."""
 
 
 class RowError(InputError):
-    """One target of many is malformed or not for the method; the message says which.
+    """Error of a target in a batch that is malformed, or that the method does not support.
 
     Attributes:
-        row: Number of the target.
+        row: Number of the target, also named in the message.
     """
 
     def __init__(self, message: str, row: int) -> None:
@@ -113,15 +114,15 @@ class RowError(InputError):
 
 
 class InvalidPoseError(InputError, DescriptionError):
-    """A pose, rotation or quaternion is not rigid, by more than rounding.
+    """Error of a pose, rotation or quaternion that is not rigid within rounding.
 
-    Arguments and files raise the same class: those who catch `InputError` or `DescriptionError`
-    catch it, too.
+    Arguments and files raise this class; handlers of `InputError` and of `DescriptionError` catch
+    it.
     """
 
 
 class InputWarning(UserWarning):
-    """An input is accepted, but probably not meant: its units or the order of its keypoints.
+    """Warning of an accepted input whose units or keypoint order are probably wrong.
 
     The message names the value, the limit and the likely mistake (millimetres given as metres,
     degrees given as radians). Silence it with ``warnings.simplefilter("ignore", InputWarning)``.
@@ -129,20 +130,20 @@ class InputWarning(UserWarning):
 
 
 class UnsupportedError(CasadiIKError):
-    """The method cannot be used with this robot; the message says which property is missing."""
+    """Error of a method, robot or environment that lacks a required property."""
 
 
 class KernelError(CasadiIKError):
-    """Generated code could not be compiled or loaded."""
+    """Error of generated code that cannot be compiled or loaded."""
 
 
 class LogError(CasadiIKError):
-    """A log cannot be written or read."""
+    """Error of a log that cannot be written or read."""
 
 
 class PictureError(CasadiIKError):
-    """A picture cannot be written."""
+    """Error of a picture that cannot be written."""
 
 
 class MissingExtraError(CasadiIKError, ImportError):
-    """An optional part of the package is not installed; the message says how to install it."""
+    """Error of an optional dependency that is not installed; the message says how to install it."""

@@ -1,6 +1,6 @@
-"""What a solver hands over to a recorder of its solves: plain arrays and one protocol.
+"""The interface between solvers and recorders: `SolveBlock` and `Recorder`.
 
-The solvers own this contract and know nothing of files; the logs implement it.
+Solvers know this interface but no files; `casadi_ik.logs` implements it.
 """
 
 from __future__ import annotations
@@ -21,19 +21,18 @@ from casadi_ik.solve.trace import TraceFormat
 
 @dataclass(frozen=True, eq=False)
 class SolveBlock:
-    """k solves of one method, numbered one after the other, with everything that is kept of them.
+    """Records of k consecutive solves of one method.
 
     Attributes:
-        format: How the rows are to be read.
-        first: Number of the first solve; solves are unique per method in one log.
+        format: Layout and labels of the rows.
+        first: Number of the first solve; numbers are unique per method in a log.
         targets: The targets.
-        starts: Where each solve began, (k, n).
-        seed: Of the random numbers.
-        batch: The answers; it names method, robot and fingers.
-        rows: The iterations of all solves, one solve after the other, (sum of
-            `BatchSolution.iterations`,) of the format's layout.
-        started: When each solve began, (k,) [ns since the Unix epoch].
-        query: What they were checked against; None: nothing.
+        starts: (k, n) start configurations [rad or m].
+        seed: Seed of the random numbers.
+        batch: The solutions, which name method, robot and fingers.
+        rows: (sum of `BatchSolution.iterations`,) iterations of all solves, ordered by solve.
+        started: (k,) start times [ns since the Unix epoch].
+        query: Collision query of the targets; None: collisions were not checked.
     """
 
     format: TraceFormat
@@ -66,14 +65,14 @@ class SolveBlock:
 
 
 class Recorder(Protocol):
-    """Keeps the iterations of solves."""
+    """A context manager that records the iterations of solves."""
 
     def record(self, block: SolveBlock) -> None:
-        """Take finished solves; the caller leaves the arrays alone from then on."""
+        """Record finished solves; the caller must not modify the arrays afterwards."""
         ...
 
     def close(self) -> None:
-        """Nothing more will come; what was taken is now kept for good."""
+        """Finish the record and make it durable."""
         ...
 
     def __enter__(self) -> Self: ...

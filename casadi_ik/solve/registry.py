@@ -1,4 +1,4 @@
-"""The methods by name."""
+"""Registry of the methods by name."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from casadi_ik.solve.thumb_first.method import ThumbFirstMethod
 from casadi_ik.solve.thumb_first.step import ThumbFirstParameters
 
 Build = Callable[[RobotDescription, Any, bool], Method]
-"""Makes a method from robot, parameter record and whether to compile; often a class."""
+"""Function of robot, parameter record and whether to compile that builds a method."""
 
 
 @dataclass(frozen=True)
 class _Entry:
-    """How a method is built.
+    """A registered method.
 
     Attributes:
-        summary: What it does, in one line.
-        record: Its parameter record, a dataclass.
-        build: Makes it.
-        fixed: Fields of the record that make the method what its name says.
+        summary: One-line description.
+        record: Parameter record, a dataclass.
+        build: Function that builds the method.
+        fixed: Values of fields of the record that define the method and cannot be set.
     """
 
     summary: str
@@ -36,7 +36,7 @@ class _Entry:
 
     @property
     def options(self) -> tuple[str, ...]:
-        """Fields of the record that can be chosen."""
+        """Fields of the record that users can set."""
         return tuple(entry.name for entry in fields(self.record) if entry.name not in self.fixed)
 
 
@@ -52,10 +52,10 @@ _ENTRIES: dict[str, _Entry] = {
         ThumbFirstMethod,
     ),
 }
-"""Methods by name. `casadi_ik.papers` adds its methods, `register_method` those of users."""
+"""Methods by name; `casadi_ik.papers` and `register_method` add more."""
 
 _SHIPPED = set(_ENTRIES)
-"""Names that come with the package and cannot be replaced."""
+"""Names of shipped methods, which cannot be replaced."""
 
 
 def add_shipped_method(
@@ -65,7 +65,7 @@ def add_shipped_method(
     build: Build,
     fixed: Mapping[str, Any] | None = None,
 ) -> None:
-    """Add a method that comes with the package; the arguments are those of `register_method`."""
+    """Register a shipped method; for the arguments see `register_method`."""
     _ENTRIES[name] = _Entry(summary, parameters, build, dict(fixed or {}))
     _SHIPPED.add(name)
 
@@ -81,17 +81,17 @@ def register_method(
     """Register a method for `Solver` under a name, in this process.
 
     Args:
-        name: What it is called; also `Method.name` of what `build` makes.
-        summary: What it does, in one line.
-        parameters: Its parameter record, a dataclass whose fields have defaults; `Solver(options=)`
-            sets them.
-        build: Makes it from robot, parameter record and whether to compile; a subclass of
-            `LoopedMethod` does.
-        fixed: Fields of the record that cannot be chosen.
-        replace: Whether it may take the place of a method registered before.
+        name: Name of the method; also `Method.name` of what `build` returns.
+        summary: One-line description.
+        parameters: Parameter record, a dataclass whose fields have defaults;
+            `Solver(options=)` sets them.
+        build: Function of robot, parameter record and whether to compile that returns the method,
+            for example a subclass of `LoopedMethod`.
+        fixed: Values of fields of the record that users cannot set.
+        replace: Whether to replace a method registered before.
 
     Raises:
-        InputError: The name is taken, or an argument is not what it has to be.
+        InputError: The name is taken, or an argument has the wrong type.
 
     Example:
         >>> from dataclasses import dataclass
@@ -105,11 +105,11 @@ def register_method(
     if not (isinstance(name, str) and name):
         raise InputError(f"name: found {name!r}, expected the name of a method")
     if name in _SHIPPED or (name in _ENTRIES and not replace):
-        raise InputError(f"name: there is a method {name!r} already, expected another name")
+        raise InputError(f"name: method {name!r} exists already; expected another name")
     if not (isinstance(parameters, type) and is_dataclass(parameters)):
         raise InputError(f"parameters: found {parameters!r}, expected a dataclass")
     if not callable(build):
-        raise InputError(f"build: found {build!r}, expected what makes a method")
+        raise InputError(f"build: found {build!r}, expected a function that builds a method")
     _ENTRIES[name] = _Entry(summary, parameters, build, dict(fixed or {}))
 
 
@@ -119,19 +119,19 @@ def method_names() -> tuple[str, ...]:
 
 
 def method_summary(name: str) -> str:
-    """What a method does, in one line.
+    """Return the one-line description of a method.
 
     Raises:
-        UnknownNameError: No such method.
+        UnknownNameError: The method does not exist.
     """
     return _entry(name).summary
 
 
 def option_names(name: str) -> tuple[str, ...]:
-    """Names of the parameters that `Solver`'s options can set.
+    """Return the names of the parameters that `Solver(options=)` can set.
 
     Raises:
-        UnknownNameError: No such method.
+        UnknownNameError: The method does not exist.
     """
     return _entry(name).options
 
@@ -139,18 +139,18 @@ def option_names(name: str) -> tuple[str, ...]:
 def with_finger_step(
     method: str, options: Mapping[str, Any], finger_step: str | None
 ) -> dict[str, Any]:
-    """Return the options with the finger step, if it is given and the method has one.
+    """Return the options with the finger step added, for methods that have one.
 
     Raises:
-        UnknownNameError: No such method.
-        InputError: The finger step is among the options as well.
+        UnknownNameError: The method does not exist.
+        InputError: The options contain a finger step already.
     """
     if finger_step is None:
         return dict(options)
     if "finger_step" in options:
-        raise InputError("finger_step: found twice, expected it as argument or among the options")
-    has_one = "finger_step" in option_names(method)
-    return {**options, "finger_step": finger_step} if has_one else dict(options)
+        raise InputError("finger_step: given twice; expected an argument or an option")
+    has_finger_step = "finger_step" in option_names(method)
+    return {**options, "finger_step": finger_step} if has_finger_step else dict(options)
 
 
 def build_method(
@@ -160,14 +160,14 @@ def build_method(
 
     Args:
         name: One of `method_names`.
-        robot: The description.
+        robot: Description of the robot.
         options: Fields of the method's parameter record that differ from their defaults.
-        compiled: False keeps to CasADi's virtual machine.
+        compiled: False: use CasADi's virtual machine.
 
     Raises:
-        UnknownNameError: No such method, or no such option.
-        InputError: An option has a value it cannot have.
-        UnsupportedError: The robot is not of the kind the method needs.
+        UnknownNameError: The method or an option does not exist.
+        InputError: An option has an invalid value.
+        UnsupportedError: The method does not support the robot.
     """
     entry = _entry(name)
     for option in options:
@@ -182,7 +182,7 @@ def build_method(
         raise InputError(f"options: {error}") from error
     method = entry.build(robot, record, compiled)
     if method.name != name:
-        raise InputError(f"method {name!r} calls itself {method.name!r}, expected one name")
+        raise InputError(f"method: `name` is {method.name!r}; expected {name!r}")
     return method
 
 

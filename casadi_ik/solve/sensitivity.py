@@ -1,12 +1,13 @@
-"""How answers move with their targets: derivatives by the implicit function theorem.
+"""Derivatives of solutions by their targets, from the implicit function theorem.
 
-With the contacts' residual r(q, t) an answer q of a target t follows the target by keeping what is
-left, r(q + dq, t + dt) = r(q, t), in the sense of least squares where not all rows can be kept:
+With the contact residual r(q, t), a solution q follows its target t such that the remaining
+residual stays constant, r(q + dq, t + dt) = r(q, t), in the least-squares sense if the rows
+conflict:
 
     dq = -(dr/dq)^+ dr/dt dt
 
-over the motors that are free to move. A motor at a limit stays there. Of motions that contacts
-leave free none is made: the pseudo-inverse takes the smallest (motors as `motor_scales` counts).
+over the motors that are free to move. A motor at a limit stays there. Motions that the contacts
+leave free are zero: the pseudo-inverse returns the smallest motion (scaled by `motor_scales`).
 """
 
 from __future__ import annotations
@@ -29,21 +30,22 @@ from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.targets import TargetBatch
 
 LIMIT_DISTANCE = 1e-9
-"""A motor that is nearer to a limit [rad or m] is at it."""
+"""Distance below which a motor counts as being at its limit [rad or m]."""
 
 PSEUDO_INVERSE_DAMPING, PSEUDO_INVERSE_PASSES = 1e-7, 5
-"""Added to the squares of the singular values; further passes take its effect away again, to 1e-5
-of a value of 1e-3. What is below 3e-4 counts as a motion that contacts leave free. With less, the
-rounding of these motions is seen in the others: 3e-7 with 1e-8."""
+"""Damping of the squared singular values, and number of refinements that remove its effect.
+
+The remaining effect is 1e-5 of a singular value of 1e-3. Singular values below 3e-4 count as free
+motions. With a damping of 1e-8 the rounding of free motions appears in the others (3e-7)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """Derivatives of configurations, or of a number that depends on them, by contacts.
+    """Derivatives of configurations, or of a scalar of them, by the contacts.
 
     Attributes:
-        points: (..., f, 3) by coordinates of contact points [1/m]; 0 where free.
-        normals: (..., f, 3) by those of normals, which count as scaled to length 1; likewise.
+        points: (..., f, 3) derivatives by contact points [1/m]; 0 where free.
+        normals: (..., f, 3) derivatives by normals, which are normalised to length 1; 0 where free.
     """
 
     points: Array
@@ -51,10 +53,10 @@ class Sensitivity:
 
 
 class SensitivityKernel:
-    """Derivatives of a robot's answers, for contacts of some kinds."""
+    """Compiled derivatives of a robot's solutions, for one combination of contact kinds."""
 
     def __init__(self, robot: RobotDescription, kinds: Kinds, compiled: bool = True) -> None:
-        """Lay the inputs out; the function is compiled when first needed."""
+        """Define the inputs; the function is compiled when first needed."""
         self._robot, self._contacts = robot, ContactRows(kinds)
         n, f = len(robot.actuators), len(kinds)
         self._inputs = {"q": (n, 1), "free": (n, 1), "gradient": (n, 1)}
@@ -70,10 +72,10 @@ class SensitivityKernel:
         return FunctionKernel(graph, self._compiled, in_lanes=True)
 
     def __call__(self, targets: TargetBatch, q: Array, gradients: Array) -> Sensitivity:
-        """Return derivatives of ``gradients @ q`` for answers q (k, n), gradients (k, n)."""
+        """Return derivatives of ``gradients @ q`` for solutions q (k, n), gradients (k, n)."""
         if not len(q):
-            none = np.zeros((0, len(self._robot.fingers), 3))
-            return Sensitivity(none, none)
+            empty = np.zeros((0, len(self._robot.fingers), 3))
+            return Sensitivity(empty, empty)
         low, high = targets.bounds(self._robot, np.inf)
         values: dict[str, Any] = {"q": q, "gradient": gradients}
         values["free"] = (q - low >= LIMIT_DISTANCE) & (high - q >= LIMIT_DISTANCE)
@@ -81,34 +83,35 @@ class SensitivityKernel:
         values["weights"] = np.stack(known, axis=2)
         for name in self._inputs.keys() - values.keys():
             values[name] = np.nan_to_num(targets.vectors(name))
-        given = [values[name].reshape(len(q), -1) for name in self._inputs]
-        (found,) = self._kernel(np.concatenate(given, axis=1, dtype=float))
-        points, normals = np.split(found.reshape(len(q), -1, 3), 2, axis=1)
+        columns = [values[name].reshape(len(q), -1) for name in self._inputs]
+        (rates,) = self._kernel(np.concatenate(columns, axis=1, dtype=float))
+        points, normals = np.split(rates.reshape(len(q), -1, 3), 2, axis=1)
         return Sensitivity(points, normals)
 
     def _graph(self) -> ca.Function:
-        """All inputs below each other, row by row -> derivatives by points, then by normals."""
-        given, first, robot = dict[str, ca.SX](), 0, self._robot
+        """Build the graph of all inputs, stacked -> derivatives by points, then by normals."""
+        inputs, first, robot = dict[str, ca.SX](), 0, self._robot
         ((_, shape),) = self._shapes.items()
         column = ca.SX.sym("given", *shape)
         for name, (rows, columns) in self._inputs.items():
-            own = column[first : first + rows * columns]
-            given[name], first = ca.reshape(own, columns, rows).T, first + rows * columns
-        residual = contact_residual(robot, self._contacts, given["q"], given)
-        scales = given["free"] * motor_scales(robot)
-        rates = ca.jacobian(residual, given["q"]) @ ca.diag(scales)
+            values = column[first : first + rows * columns]
+            inputs[name], first = ca.reshape(values, columns, rows).T, first + rows * columns
+        residual = contact_residual(robot, self._contacts, inputs["q"], inputs)
+        scales = inputs["free"] * motor_scales(robot)
+        rates = ca.jacobian(residual, inputs["q"]) @ ca.diag(scales)
         square = ca.densify(
             rates.T @ rates + PSEUDO_INVERSE_DAMPING * ca.DM.eye(len(robot.actuators))
         )
-        step = solve_spd(square, scales * given["gradient"])
+        step = solve_spd(square, scales * inputs["gradient"])
         total = step
         for _ in range(PSEUDO_INVERSE_PASSES - 1):
             step = PSEUDO_INVERSE_DAMPING * solve_spd(square, step)
             total = total + step
         by_points, by_normals = (
-            -ca.jtimes(residual, given[name], rates @ total, True) for name in ("points", "normals")
+            -ca.jtimes(residual, inputs[name], rates @ total, True)
+            for name in ("points", "normals")
         )
-        along = ca.sum2(by_normals * given["normals"])
-        by_normals = by_normals - ca.repmat(along, 1, 3) * given["normals"]
-        found = ca.vertcat(ca.vec(by_points.T), ca.vec(by_normals.T))
-        return ca.Function(self._name, [column], [ca.densify(ca.cse(found))])
+        along = ca.sum2(by_normals * inputs["normals"])
+        by_normals = by_normals - ca.repmat(along, 1, 3) * inputs["normals"]
+        result = ca.vertcat(ca.vec(by_points.T), ca.vec(by_normals.T))
+        return ca.Function(self._name, [column], [ca.densify(ca.cse(result))])

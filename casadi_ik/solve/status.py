@@ -1,4 +1,4 @@
-"""How an iteration, and with it a solve, can end; and the phases it goes through."""
+"""Status of a solve and phase of an iteration."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from casadi_ik.compile import REPEATED, RUNNING
 
 
 class Status(IntEnum):
-    """How a solve ended. Not converging is a status, never an exception.
+    """Status of a solve; failure to converge is a status, never an exception.
 
     Example:
         >>> ik.Status.SOLVED.name, int(ik.Status.SOLVED)
@@ -19,39 +19,39 @@ class Status(IntEnum):
     """
 
     INVALID = -1
-    """A number was no longer finite; the last finite configuration is returned."""
+    """A value became non-finite, or the target is malformed; q is the last finite configuration."""
     RUNNING = 0
-    """Not ended yet (a step's status only)."""
+    """The solve continues (only as the status of a step)."""
     SOLVED = 1
-    """Every contact within tolerance, every actuator and joint within limits if enforced."""
+    """Every contact is within tolerance, and q within limits if they are enforced."""
     STALLED = 2
-    """The iteration stands still away from the contacts."""
+    """The cost no longer decreases, and a contact is not within tolerance."""
     ITERATION_LIMIT = 3
-    """The budget of iterations is used up."""
+    """The maximum number of iterations is reached."""
     UNREACHABLE = 4
-    """The contacts cannot be reached: there is a proof, see `Diagnosis.proof`."""
+    """It is proved that the contacts cannot be reached, see `Diagnosis.proof`."""
     NOT_FOUND = 5
-    """A diagnosis found neither a solution nor a proof that there is none."""
+    """The diagnosis found neither a solution nor a proof that there is none."""
     COLLISION = 6
-    """Contacts and limits are met, but something touches, see `Solution.collision`."""
+    """Contacts and limits are met, but the robot is in collision, see `Solution.collision`."""
 
     @classmethod
     def from_loop(cls, codes: NDArray[np.int32]) -> NDArray[np.int64]:
-        """How solves ended, from the codes (k,) of `LoopResult.status`.
+        """Return the statuses of solves from the codes (k,) of `LoopResult.status`.
 
-        A step ends with a status of its own; what the loop itself ends is out of iterations, back
-        at an earlier state (and would be there again and again), or no longer finite.
+        A step ends a solve with a status. The loop ends a solve that has reached the maximum
+        number of iterations, has returned to an earlier state, or is no longer finite.
         """
-        found = codes.astype(np.int64)
+        status = codes.astype(np.int64)
         return np.select(
-            [found == RUNNING, found == REPEATED, found < 0],
+            [status == RUNNING, status == REPEATED, status < 0],
             [int(cls.ITERATION_LIMIT), int(cls.STALLED), int(cls.INVALID)],
-            found,
+            status,
         )
 
     @classmethod
     def labels(cls) -> tuple[str, ...]:
-        """Names by code from 0 on, for the log."""
+        """Return the names of the codes 0, 1, ..., for the log."""
         return tuple(cls(code).name for code in range(max(cls) + 1))
 
 
@@ -77,11 +77,11 @@ class Phase(IntEnum):
 
     @property
     def label(self) -> str:
-        """The name as it is shown."""
+        """Name in logs and tables."""
         return self.name.lower().replace("_", "-")
 
     @classmethod
     def labels(cls) -> tuple[str, ...]:
-        """Names by code from 0 on ("" where there is no such phase), for the log."""
+        """Return the names of the codes 0, 1, ..., "" for unused codes, for the log."""
         known = {phase.value: phase.label for phase in cls}
         return tuple(known.get(code, "") for code in range(max(cls) + 1))

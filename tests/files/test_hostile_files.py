@@ -47,7 +47,7 @@ def test_hostile_yaml(tmp_path: Path, case: str) -> None:
         with pytest.raises(ik.errors.DescriptionError) as caught:
             load(path)
         assert says in str(caught.value)
-        assert len(str(caught.value)) <= ik.errors.LONGEST
+        assert len(str(caught.value)) <= ik.errors.MAX_MESSAGE_LENGTH
         assert str(caught.value).isprintable()
 
 
@@ -111,7 +111,7 @@ def test_numbers_that_would_lose_something(robot, kind: str) -> None:
 def test_a_name_that_commands_a_terminal_or_fills_it() -> None:
     text = str(ik.errors.InputError("\x1b[2J" + "x" * 5000))
     assert text.isprintable()
-    assert len(text) <= ik.errors.LONGEST
+    assert len(text) <= ik.errors.MAX_MESSAGE_LENGTH
     assert text.endswith("xxx")
 
 
@@ -175,7 +175,7 @@ def refused(load: Callable[[], object]) -> None:
         said = str(error)
     else:
         return
-    assert len(said) <= ik.errors.LONGEST
+    assert len(said) <= ik.errors.MAX_MESSAGE_LENGTH
     assert said.isprintable()
 
 
