@@ -39,7 +39,7 @@ from casadi_ik.kinematics.se3 import compose, exp_se3
 from casadi_ik.solve.hand_first.parameters import HandFirstParameters
 from casadi_ik.solve.hand_first.state import HandFirstLayouts
 from casadi_ik.solve.hand_first.step import PalmAndHand, fit_jacobian, fit_residual, reach_row
-from casadi_ik.solve.thumb_first.closed_chain_step import contact_errors, linearised
+from casadi_ik.solve.thumb_first.closed_chain_step import contact_errors, linearise_contacts
 
 ARM = 7
 RADIUS = 9.5e-3
@@ -150,7 +150,7 @@ def test_rows_of_newton_are_the_slopes_of_the_error_at_the_target(robot, kind, r
         return number(ca.vertcat(*map(ca.vertcat, *both))).ravel()
 
     assert np.abs(errors(q)).max() < 1e-7
-    linear = linearised(robot.description, rows, ca.SX(q), p)
+    linear = linearise_contacts(robot.description, rows, ca.SX(q), p)
     found = np.vstack([number(linear.thumb), number(linear.others)])
     slopes = -differences(errors, q)
     np.testing.assert_allclose(found.T @ found, slopes.T @ slopes, atol=1e-5, rtol=1e-5)
@@ -232,7 +232,9 @@ def test_a_frame_without_a_tangent_is_a_normal(robot, rng):
     )
     for one, another in zip(found, expected, strict=True):
         np.testing.assert_allclose(number(one), number(another), atol=1e-14)
-    one, another = (linearised(robot.description, rows, ca.SX(q), p) for rows in (frame, normal))
+    one, another = (
+        linearise_contacts(robot.description, rows, ca.SX(q), p) for rows in (frame, normal)
+    )
     gram = [np.vstack([number(x.thumb), number(x.others)]) for x in (one, another)]
     np.testing.assert_allclose(gram[0].T @ gram[0], gram[1].T @ gram[1], atol=1e-9)
 

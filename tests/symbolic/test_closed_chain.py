@@ -13,11 +13,11 @@ from casadi_ik.kinematics.contacts import LENGTH, ContactRows, point_normal_kind
 from casadi_ik.kinematics.forward import actuated, motor_scales
 from casadi_ik.solve.thumb_first.closed_chain_step import (
     THUMB_DAMPING,
-    Linear,
-    Room,
-    freezing,
-    linearised,
-    quadratic_program,
+    LinearisedContacts,
+    StepLimits,
+    linearise_contacts,
+    solve_by_fixing,
+    solve_by_proxqp,
 )
 
 SPREAD, THUMB_1, THUMB_2 = 7, 8, 9
@@ -258,7 +258,7 @@ def problem(robot):
     q, points = ca.SX.sym("q", 14), ca.SX.sym("points", 3, 3)
     normals, weights = ca.SX.sym("normals", 3, 3), ca.SX.sym("weights", 3, 2)
     p = {"points": points, "normals": normals, "weights": weights}
-    linear = linearised(robot.description, ROWS, q, p)
+    linear = linearise_contacts(robot.description, ROWS, q, p)
     outputs = [linear.thumb, linear.thumb_error, linear.others, linear.others_error]
     return ca.Function("problem", [q, points, normals, weights], outputs)
 
@@ -269,8 +269,10 @@ def steps(problem):
     shapes = [problem.size_out(i) for i in range(4)] + [(14, 1), (14, 1), (1, 1)]
     symbols = [ca.MX.sym("x", *shape) for shape in shapes]
     return [
-        ca.Function("step", symbols, list(solve(Linear(*symbols[:4]), Room(*symbols[4:]))))
-        for solve in (freezing, quadratic_program)
+        ca.Function(
+            "step", symbols, list(solve(LinearisedContacts(*symbols[:4]), StepLimits(*symbols[4:])))
+        )
+        for solve in (solve_by_fixing, solve_by_proxqp)
     ]
 
 

@@ -1,4 +1,4 @@
-"""The thumb-first method: palm estimates from a table of postures, then one compiled loop."""
+"""The method `thumb-first`: palm estimates from a table of postures, then one compiled loop."""
 
 from __future__ import annotations
 
@@ -17,22 +17,26 @@ from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.looped_method import LoopedMethod, Start
 from casadi_ik.solve.status import Phase
-from casadi_ik.solve.thumb_first.step import STAGES, ThumbFirstParameters, ThumbFirstStep
+from casadi_ik.solve.thumb_first.step import (
+    THUMB_FIRST_STAGES,
+    ThumbFirstParameters,
+    ThumbFirstStep,
+)
 
-NEAREST = "q0"
-"""The preference for what is near the start."""
+PREFER_Q0 = "q0"
+"""Name of the preference for solutions near `q0`."""
 
 
 class ThumbFirstMethod(LoopedMethod):
-    """`thumb-first`: the arm starts at the estimated palm, then the closed chain does the rest.
+    """`thumb-first`: the arm starts at the estimated palm pose and moves along the closed chain.
 
     Attributes:
-        step: Its step for this robot; in the virtual machine if it is ProxQP's.
-        preferences: What it can prefer.
+        step: Step of this robot; runs in the virtual machine if it uses ProxQP.
+        preferences: Names of the supported preferences.
     """
 
     name = "thumb-first"
-    preferences: tuple[str, ...] = ("limits", NEAREST)
+    preferences: tuple[str, ...] = ("limits", PREFER_Q0)
     follows_closed_chain = True
     takes_free_contacts = True
     takes_fixed_actuators = True
@@ -44,7 +48,14 @@ class ThumbFirstMethod(LoopedMethod):
         compiled: bool = True,
         kinds: Kinds | None = None,
     ) -> None:
-        """Recognise the arm and lay out the step; point and normal if no kinds are given."""
+        """Recognise the family of the arm and lay out the step.
+
+        Args:
+            robot: Description of the robot.
+            options: Parameters of the method.
+            compiled: False to run the step in CasADi's virtual machine.
+            kinds: Kind of contact of each finger (default: point and normal).
+        """
         super().__init__(robot, options, compiled)
         robot.one_hand(self.name)
         self.options: ThumbFirstParameters = options
@@ -52,12 +63,12 @@ class ThumbFirstMethod(LoopedMethod):
         self.step = ThumbFirstStep(robot, options, self._kinds, arm_family(robot))
 
     def step_graph(self) -> StepGraph:
-        """The whole iteration."""
+        """Return the graph of an iteration."""
         return self.step.graph()
 
     @cached_property
     def table(self) -> PostureTable:
-        """The hand postures that targets are compared with."""
+        """Table of hand postures for palm estimates."""
         robot, options = ArmHand(self.robot), self.options
         return PostureTable(
             robot,
@@ -68,87 +79,87 @@ class ThumbFirstMethod(LoopedMethod):
         )
 
     def for_kinds(self, kinds: Kinds) -> ThumbFirstMethod:
-        """The same for contacts of other kinds."""
+        """Return this method for contacts of other kinds."""
         if kinds == self._kinds:
             return self
         return ThumbFirstMethod(self.robot, self.options, self._compiled, kinds)
 
     def prepare(self) -> None:
-        """Build and compile the loop, and fill the table."""
+        """Build and compile the loop, and compute the table."""
         _ = self.kernel, self.table
 
     def begin(self, targets: TargetBatch, q0: Array) -> Start:
-        """Start where the robot is, if its nearest is wanted, and from estimates of the palm."""
-        count, step, most = len(targets), self.step, self.options.starts
+        """Return initial states: q0 if it is preferred, then palm estimates."""
+        count, step, max_starts = len(targets), self.step, self.options.starts
         lower, upper = targets.bounds(self.robot)
         hand = list(self.robot.hand_actuators)
-        here = np.clip(q0, lower, upper)
-        nearest = targets.prefer == NEAREST
-        found = self._hands(targets, here[:, hand], nearest, most)[:, :most]
-        postures = np.zeros((count, most, len(hand)))
-        postures[:, : found.shape[1]] = found
-        known = [~np.isnan(array[..., 0]) for array in (targets.points, targets.normals)]
+        current = np.clip(q0, lower, upper)
+        prefers_q0 = targets.prefer == PREFER_Q0
+        hands = self._hands(targets, current[:, hand], prefers_q0, max_starts)[:, :max_starts]
+        postures = np.zeros((count, max_starts, len(hand)))
+        postures[:, : hands.shape[1]] = hands
+        is_constrained = [~np.isnan(array[..., 0]) for array in (targets.points, targets.normals)]
         values = {
             **target_values(targets),
             **{
                 f"{name}s": np.nan_to_num(targets.vectors(f"{name}s"))
                 for name in self.step.contacts.data
             },
-            "weights": np.stack(known, axis=2),
+            "weights": np.stack(is_constrained, axis=2),
             "lower": lower,
             "upper": upper,
             "postures": np.clip(postures, lower[hand], upper[hand]),
-            "given": found.shape[1],
-            "here": here,
-            "nearest": float(nearest),
+            "given": hands.shape[1],
+            "here": current,
+            "nearest": float(prefers_q0),
             "first_damping": self.options.damping,
             "step_cap": self.options.step_cap,
         }
         parameters = step.parameters.pack_rows(values, count)
-        first = {item.name: np.zeros(item.shape) for item in step.state} | {
-            "q": here if nearest else q0,
+        initial_state = {item.name: np.zeros(item.shape) for item in step.state} | {
+            "q": current if prefers_q0 else q0,
             "passed": -1.0,
-            "phase": Phase.HAND_ALIGNMENT if nearest else Phase.CANDIDATE,
-            "start": -float(nearest),
+            "phase": Phase.HAND_ALIGNMENT if prefers_q0 else Phase.CANDIDATE,
+            "start": -float(prefers_q0),
             "damping": self.options.damping,
             "best_q": q0,
             "best_cost": np.finfo(float).max,
         }
-        return step.state.pack_rows(first, count), parameters
+        return step.state.pack_rows(initial_state, count), parameters
 
-    def _hands(self, targets: TargetBatch, own: Array, nearest: bool, count: int) -> Array:
-        """Hands (k, c, hand) to begin with: of those that look alike, the nearest is first.
+    def _hands(self, targets: TargetBatch, current: Array, prefers_q0: bool, count: int) -> Array:
+        """Return hand postures (k, c, hand) to start from, nearest first among similar shapes.
 
         Args:
             targets: k targets.
-            own: (k, hand) the robot's own.
-            nearest: Whether what is near to that is wanted, not what is near to its home.
-            count: How many of the table.
+            current: (k, hand) hand posture of q0.
+            prefers_q0: True to prefer postures near q0, False for postures near home.
+            count: Number of postures from the table.
         """
-        wanted = targets.points, targets.normals
-        home = np.tile(self._home, (len(own), 1))
-        if not nearest:
-            return self.table.nearest(*wanted, count, home)
-        found = self.table.nearest(*wanted, 1, own)
+        contacts = targets.points, targets.normals
+        home = np.tile(self._home, (len(current), 1))
+        if not prefers_q0:
+            return self.table.nearest(*contacts, count, home)
+        hands = self.table.nearest(*contacts, 1, current)
         if count > 1:
-            # What is near was a dead end: from here on as if nothing was preferred.
-            found = np.concatenate([found, self.table.nearest(*wanted, count, home)], axis=1)
-        # A hand without an arm has begun there already.
+            # If the posture near q0 fails, continue without the preference.
+            hands = np.concatenate([hands, self.table.nearest(*contacts, count, home)], axis=1)
+        # A hand without an arm has already started at the current posture.
         if not self.robot.arm_actuators:
-            return found
-        return np.concatenate([own[:, None], found], axis=1)
+            return hands
+        return np.concatenate([current[:, None], hands], axis=1)
 
     @cached_property
     def _home(self) -> Array:
         return ArmHand(self.robot).home[list(self.robot.hand_actuators)]
 
     def phase_counts(self, states: Array, iterations: Counts) -> Mapping[Phase, Counts]:
-        """The step counts them."""
+        """Return the iterations by phase, which the step counts."""
         del iterations
         counts = states[:, self.step.state.slice("counts")].astype(np.int64)
-        return {stage: counts[:, i] for i, stage in enumerate(STAGES)}
+        return {stage: counts[:, i] for i, stage in enumerate(THUMB_FIRST_STAGES)}
 
     def restarts(self, states: Array) -> Counts:
-        """Palm estimates begun from but the first."""
+        """Return the number of palm estimates after the first."""
         start = states[:, self.step.state.slice("start").start].astype(np.int64)
         return np.clip(start, 0, self.options.starts - 1)

@@ -1,19 +1,19 @@
-"""The thumb-first method as one step graph: arm start, then along the closed chain.
+"""Step graph of the thumb-first method: arm start, then motion along the closed chain.
 
-The idea of Qiu & Kermani 2021 without its two flaws. Not the palm's pose is demanded, averaged
-over the fingers, but every finger's own contact; and the closed chain is the null space of the
-thumb's five rows, not a choice of active joints whose complement may be singular. One iteration:
+The method follows Qiu & Kermani 2021 with two changes: the constraints are the contacts of all
+fingers instead of a palm pose averaged over the fingers, and the closed chain is the null space of
+the five rows of the thumb instead of a choice of active joints whose complement may be singular. An
+iteration is one of:
 
-candidate  take the next hand posture, the palm pose that brings it closest to the contacts and
-           the arm for that palm (in closed form, or the nearest of a table);
-placement  arms without a closed form only: a damped step towards that palm pose;
-alignment  one Gauss-Newton step of the other fingers along the closed chain, limits kept; taken
-           if it lowers the summed squares of all contacts, else tried again with more damping;
-balance    one step of all motors towards the smallest largest error, where the contacts are
-           missed by little.
+candidate  select the next hand posture, the palm pose that best fits it to the contacts, and an arm
+           configuration for that palm (closed form, or the nearest of a table);
+placement  only for arms without a closed form: a damped step towards that palm pose;
+alignment  a Gauss-Newton step of the other fingers along the closed chain within limits; accepted
+           if it decreases the cost of all contacts, else repeated with more damping;
+balance    a minimax step of all motors, for near misses.
 
-If a solution near to where the robot is is wanted, the first start is the robot as it is, the
-second its hand with the arm nearest to its own.
+If solutions near q0 are preferred, the first start is q0 and the second is the hand of q0 with the
+arm configuration nearest to that of q0.
 """
 
 from __future__ import annotations
@@ -52,11 +52,11 @@ from casadi_ik.solve.limits import pack_bits
 from casadi_ik.solve.status import Phase, Status
 from casadi_ik.solve.thumb_first.closed_chain_step import (
     STEP_SOLVERS,
-    Linear,
-    Merit,
-    Room,
-    linearised,
-    merit,
+    ContactErrors,
+    LinearisedContacts,
+    StepLimits,
+    evaluate_contacts,
+    linearise_contacts,
 )
 from casadi_ik.solve.trace import (
     ACCEPTED,
@@ -73,31 +73,32 @@ from casadi_ik.solve.trace import (
     Q,
 )
 
-STEPS = ("freeze", "proxqp")
-"""How a step keeps to the limits."""
+STEP_METHODS = ("freeze", "proxqp")
+"""Methods by which a step satisfies the limits."""
 
 
 @dataclass(frozen=True)
 class ThumbFirstParameters:
-    """Parameters of the method.
+    """Parameters of the method `thumb-first`.
 
     Attributes:
-        starts: Palm estimates a solve may begin from, each from another hand posture.
-        table: Hand postures that the target's shape is compared with to find them.
-        pull: How much a posture's distance from the start's hand counts along with the shape.
-        step: "freeze": the joint that violates its limits most is fixed there and the step is
-            solved again. "proxqp": the same problem as a quadratic program (ProxQP, Bambade et
-            al. 2022), in CasADi's virtual machine; slower.
-        damping: Damping [-] of the first step of a start; residuals are in 0.1 m and rad.
-        step_cap: Longest change of any motor in one iteration [rad, or part of a slider's range].
-        eased: Factor of the damping after a step that lowered the cost.
-        tightened: The same after one that did not.
+        starts: Maximum number of palm estimates per solve, each from a different hand posture.
+        table: Number of hand postures in the table of palm estimates.
+        pull: Weight of the distance from the hand of q0 relative to the match of the contacts.
+        step: "freeze" fixes the joint with the largest limit violation and solves the step again.
+            "proxqp" solves the same problem as a quadratic program (ProxQP, Bambade et al. 2022)
+            in CasADi's virtual machine, which is slower.
+        damping: Damping of the first step of a start [-]; residuals are in 0.1 m and rad.
+        step_cap: Largest change of a motor per iteration [rad, or fraction of the range of a
+            slider].
+        eased: Factor of the damping after an accepted step.
+        tightened: Factor of the damping after a rejected step.
         damping_floor: Smallest damping.
-        damping_ceiling: Damping at which a step leads nowhere.
-        gain: A step that leaves more than this part of the cost gained little.
-        patience: Iterations in a row with little gain after which a start is given up.
-        budget: Iterations after which it is in any case.
-        as_it_is: Summed squares up to which the robot as it is, or its hand, is worth a start.
+        damping_ceiling: Damping at which a rejected step ends a start.
+        gain: Ratio of costs after and before a step above which progress is slow.
+        patience: Number of consecutive iterations with slow progress that ends a start.
+        budget: Maximum number of iterations per start.
+        as_it_is: Largest cost at which q0, or the hand posture of q0, is used as a start.
     """
 
     starts: int = 32
@@ -116,9 +117,9 @@ class ThumbFirstParameters:
     as_it_is: float = 0.5
 
     def __post_init__(self) -> None:
-        if self.step not in STEPS:
-            known = ", ".join(STEPS)
-            raise InputError(f"step: found {self.step!r}, expected one of {known}")
+        if self.step not in STEP_METHODS:
+            names = ", ".join(STEP_METHODS)
+            raise InputError(f"step: found {self.step!r}, expected one of {names}")
         for entry in fields(self):
             value = getattr(self, entry.name)
             if entry.type == "int" and not (type(value) is int and value >= 1):
@@ -129,20 +130,20 @@ class ThumbFirstParameters:
             raise InputError(f"table: found {self.table}, expected at least starts = {self.starts}")
 
 
-STAGES = (Phase.HAND_ALIGNMENT, Phase.CANDIDATE, Phase.ARM_PLACEMENT, Phase.BALANCE)
-"""What an iteration may be, the most frequent first."""
+THUMB_FIRST_STAGES = (Phase.HAND_ALIGNMENT, Phase.CANDIDATE, Phase.ARM_PLACEMENT, Phase.BALANCE)
+"""Phases of an iteration, the most frequent first."""
 
-NOTHING = float("nan")
+ABSENT = float("nan")
 
 
 @dataclass(frozen=True, eq=False)
 class ThumbFirstLayouts:
-    """The three layouts for one robot.
+    """Layouts of state, parameters and record for one robot.
 
     Attributes:
-        robot: The description.
-        options: Numbers and choices.
-        kinds: Of the contacts, by finger.
+        robot: Description of the robot.
+        options: Parameters of the method.
+        kinds: Kind of contact of each finger.
     """
 
     robot: RobotDescription
@@ -151,37 +152,41 @@ class ThumbFirstLayouts:
 
     @cached_property
     def contacts(self) -> ContactRows:
-        """The contacts' rows."""
+        """Rows of the contacts."""
         return ContactRows(self.kinds)
 
     @cached_property
     def state(self) -> Layout:
-        """What an iteration hands to the next."""
+        """State that an iteration passes to the next."""
         n = len(self.robot.actuators)
         return Layout(
             (
                 Field("q", (n,)),
                 Field("palm_rotation", (3, 3), doc="estimated palm pose of this start"),
                 Field("palm_origin", (3,), unit="m"),
-                Field("passed", doc="how far the last arm of the table was from the palm wanted"),
+                Field("passed", doc="distance of the last arm of the table from the palm pose"),
                 Field("phase"),
-                Field("start", doc="number of the palm estimate begun from; -1: as the robot is"),
+                Field("start", doc="index of the palm estimate; -1 for q0"),
                 Field("damping"),
-                Field("growth", doc="placement: factor of the damping if the next step is vain"),
+                Field("growth", doc="placement: factor of the damping after a rejected step"),
                 Field("cost", doc="placement: squared distance from the palm pose"),
-                Field("waited", doc="iterations in a row that gained little"),
+                Field("waited", doc="consecutive iterations with slow progress"),
                 Field("spent", doc="iterations in this phase"),
-                Field("power", doc="powers done while the contacts are balanced"),
-                Field("balanced", doc="cost at which contacts were last balanced, 0: never"),
-                Field("best_cost", doc="smallest summed squares of the contacts so far"),
-                Field("best_q", (n,), doc="the configuration it belongs to"),
-                Field("counts", (len(STAGES),), doc="iterations by stage, in the order of STAGES"),
+                Field("power", doc="completed powers of the minimax stage"),
+                Field("balanced", doc="cost at the last start of the minimax stage; 0 if none"),
+                Field("best_cost", doc="smallest cost so far"),
+                Field("best_q", (n,), doc="configuration of the smallest cost"),
+                Field(
+                    "counts",
+                    (len(THUMB_FIRST_STAGES),),
+                    doc="iterations by stage, in the order of STAGES",
+                ),
             )
         )
 
     @cached_property
     def parameters(self) -> Layout:
-        """The problem and the numbers of the method."""
+        """Target and parameters of a solve."""
         n, f = len(self.robot.actuators), len(self.robot.fingers)
         hand = len(self.robot.hand_actuators)
         return Layout(
@@ -191,10 +196,10 @@ class ThumbFirstLayouts:
                 Field("angle_tolerance", (f,), unit="rad"),
                 Field("lower", (n,), doc="lower bounds of q"),
                 Field("upper", (n,), doc="upper bounds of q"),
-                Field("postures", (self.options.starts, hand), doc="hands to begin with"),
-                Field("given", doc="how many of them are there"),
-                Field("here", (n,), doc="where the robot is, within bounds"),
-                Field("nearest", doc="1 if a solution near to that is wanted"),
+                Field("postures", (self.options.starts, hand), doc="hand postures to start from"),
+                Field("given", doc="number of postures"),
+                Field("here", (n,), doc="q0 clipped to the bounds"),
+                Field("nearest", doc="1 if solutions near q0 are preferred"),
                 Field("first_damping"),
                 Field("step_cap"),
             )
@@ -202,7 +207,7 @@ class ThumbFirstLayouts:
 
     @cached_property
     def record(self) -> Layout:
-        """What is logged of an iteration: where it led, and the step that led there."""
+        """Log record of an iteration: the configuration after it, and the step."""
         robot = self.robot
         return Layout.record(
             Q.of(robot, "actuator positions after the iteration"),
@@ -220,18 +225,18 @@ class ThumbFirstLayouts:
         )
 
     def after(
-        self, s: dict[str, Expr], stage: Phase, fit: dict[str, Expr], **changed: Expr
+        self, s: dict[str, Expr], stage: Phase, fit_state: dict[str, Expr], **changed: Expr
     ) -> Expr:
-        """The state (size, 1) with one more iteration spent in a stage, and with what it changed.
+        """Return the state (size, 1) after an iteration.
 
         Args:
-            s: State before it.
-            stage: What it was.
-            fit: Counters and damping.
-            changed: Other fields, and those of `fit` that are otherwise.
+            s: State before the iteration.
+            stage: Phase of the iteration.
+            fit_state: Counters and damping.
+            changed: Other changed fields; they override `fit_state`.
         """
-        one = ca.DM([float(stage == other) for other in STAGES])
-        return self.state.pack(s | {"counts": s["counts"] + one} | fit | changed)
+        increment = ca.DM([float(stage == phase) for phase in THUMB_FIRST_STAGES])
+        return self.state.pack(s | {"counts": s["counts"] + increment} | fit_state | changed)
 
     def row(
         self,
@@ -240,27 +245,27 @@ class ThumbFirstLayouts:
         q: Expr,
         phase: Phase,
         status: Expr,
-        there: Merit,
+        errors: ContactErrors,
         **measured: Expr,
     ) -> Expr:
-        """What is logged of an iteration.
+        """Return the log record of an iteration.
 
         Args:
-            s: State before it.
+            s: State before the iteration.
             p: Parameters.
-            q: (n, 1) where it led.
-            phase: What it was.
-            status: Whether the solve goes on.
-            there: The contacts at q.
-            measured: The other fields; those that the phase does not have are left out.
+            q: (n, 1) configuration after the iteration.
+            phase: Phase of the iteration.
+            status: Status after the iteration.
+            errors: Contact errors at q.
+            measured: Further fields that the phase defines.
         """
         values: dict[str, Expr] = {
             "q": q,
-            "cost": there.cost,
-            "position_error": ca.if_else(p["weights"][:, 0] > 0, there.positions, NOTHING),
-            "angle_error": ca.if_else(p["weights"][:, 1] > 0, there.angles, NOTHING),
-            "damping": NOTHING,
-            "step_size": NOTHING,
+            "cost": errors.cost,
+            "position_error": ca.if_else(p["weights"][:, 0] > 0, errors.positions, ABSENT),
+            "angle_error": ca.if_else(p["weights"][:, 1] > 0, errors.angles, ABSENT),
+            "damping": ABSENT,
+            "step_size": ABSENT,
             "active_mask": ca.DM.zeros(LIMIT_MASK.of(self.robot).size, 1),
             "limit_mask": pack_bits(ca.logic_or(q <= p["lower"], q >= p["upper"])),
             "restart": ca.fmax(s["start"], 0.0),
@@ -273,18 +278,18 @@ class ThumbFirstLayouts:
 
 @dataclass(frozen=True, eq=False)
 class ThumbFirstStep(ThumbFirstLayouts):
-    """Builds the step graph for one robot.
+    """Step graph for one robot.
 
-    Without an arm the palm is fixed: the same step then moves the fingers alone.
+    Without an arm the palm is fixed and the step moves the fingers only.
 
     Attributes:
-        arm: The family of the arm, or None: then its start is found numerically.
+        arm: Family of the arm; None if its start is computed iteratively.
     """
 
     arm: ArmFamily | None
 
     def graph(self) -> StepGraph:
-        """The whole iteration; compilable unless the step is ProxQP's."""
+        """Return the graph of an iteration; it is compilable unless the step uses ProxQP."""
         return StepGraph(
             self._name,
             self._iteration,
@@ -304,20 +309,20 @@ class ThumbFirstStep(ThumbFirstLayouts):
         state = ca.MX.sym("state", self.state.size)
         parameters = ca.MX.sym("parameters", self.parameters.size)
         stages = {Phase.CANDIDATE: self._candidate(), Phase.HAND_ALIGNMENT: self._alignment()}
-        # Only arms without a closed form are placed step by step; nobody else gets there.
+        # Arms with a closed form never enter the placement phase.
         numeric = self.arm is None and self.robot.arm_actuators
         stages[Phase.ARM_PLACEMENT] = self._placement() if numeric else stages[Phase.CANDIDATE]
-        stages[Phase.BALANCE] = balance_stage(self)
-        cases = [stages[phase] for phase in STAGES]
+        stages[Phase.BALANCE] = minimax_stage(self)
+        cases = [stages[phase] for phase in THUMB_FIRST_STAGES]
         stage = sum(
             (
                 i * (state[self.state.slice("phase")] == float(phase))
-                for i, phase in enumerate(STAGES)
+                for i, phase in enumerate(THUMB_FIRST_STAGES)
             ),
             ca.MX(0),
         )
-        choose = ca.Function.conditional("stage", cases[:-1], cases[-1])
-        outputs = choose(stage, state, parameters)
+        selected_stage = ca.Function.conditional("stage", cases[:-1], cases[-1])
+        outputs = selected_stage(stage, state, parameters)
         return ca.Function(self._name, [state, parameters], list(outputs))
 
     def _vectors(self, kind: type[ca.SX] | type[ca.MX]) -> tuple[Expr, Expr, dict, dict]:
@@ -326,49 +331,57 @@ class ThumbFirstStep(ThumbFirstLayouts):
         return state, parameters, self.state.unpack(state), self.parameters.unpack(parameters)
 
     def _candidate(self) -> ca.Function:
-        """The next start: hand, palm and arm."""
+        """Return the graph of the next start: hand, palm and arm."""
         state, parameters, s, p = self._vectors(ca.MX)
-        hand, rotation, origin = self._guess()(state, parameters)
+        hand, rotation, origin = self._palm_estimate()(state, parameters)
         columns = list(self.robot.arm_actuators)
-        arm, passed = s["q"][columns], s["passed"]
+        arm, table_distance = s["q"][columns], s["passed"]
         if self.arm is not None:
-            given = (p[name][columns] for name in ("here", "lower", "upper"))
-            arm = self._arm_start(self.arm)(p["nearest"], rotation, origin, *given)
+            bounds = (p[name][columns] for name in ("here", "lower", "upper"))
+            arm = self._arm_start(self.arm)(p["nearest"], rotation, origin, *bounds)
         elif columns:
-            # Another start gets another arm as well: the next nearest of the table.
-            arm, passed = nearest_start(self.robot)(rotation, origin, passed)
-        outputs = self._begin()(state, parameters, hand, rotation, origin, arm, passed)
+            # Every start uses another arm configuration: the next nearest of the table.
+            arm, table_distance = nearest_start(self.robot)(rotation, origin, table_distance)
+        outputs = self._begin_start()(
+            state, parameters, hand, rotation, origin, arm, table_distance
+        )
         return ca.Function("candidate", [state, parameters], list(outputs))
 
     def _arm_start(self, family: ArmFamily) -> ca.Function:
-        """The arm farthest from its limits, or the one nearest to where the robot is.
+        """Return the graph of the arm farthest from its limits, or nearest to q0.
 
-        The steps that follow move it anyway: the first arms looked at are close enough.
+        The first trials suffice, because the following steps move the arm.
 
         Returns:
-            ``(nearest, rotation, origin, here, lower, upper) -> arm``, (n, 1) each but the palm's
-            pose and whether it is to be the nearest.
+            ``(nearest, rotation, origin, here, lower, upper) -> arm``: 1 for the arm nearest to
+            `here`, palm pose, arm of q0, bounds (a, 1), arm configuration (a, 1).
         """
-        # A pose is of either kind of symbols, which its annotations do not say.
+        # The annotations of `Pose` do not express that it holds SX or MX.
         rotation: Expr = ca.MX.sym("rotation", 3, 3)
         origin: Expr = ca.MX.sym("origin", 3)
-        columns, first = list(self.robot.arm_actuators), ca.MX(0)
-        here, lower, upper = (ca.MX.sym(name, len(columns)) for name in ("here", "lower", "upper"))
+        columns, first_trial = list(self.robot.arm_actuators), ca.MX(0)
+        current, lower, upper = (
+            ca.MX.sym(name, len(columns)) for name in ("here", "lower", "upper")
+        )
         palm, bounds = Pose(rotation, origin), (lower, upper)
         ranges = (self.robot.upper - self.robot.lower)[columns]
-        inputs, cases = [rotation, origin, here, lower, upper], []
+        inputs, cases = [rotation, origin, current, lower, upper], []
         for score in (Nearest.by_ranges(ranges), Farthest()):
             search = ArmTrials(family, score)
-            arm, value, swivel = search.trial(palm, bounds, first, (here, first), first, here)
+            arm, value, swivel = search.trial(
+                palm, bounds, first_trial, (current, first_trial), first_trial, current
+            )
             if search.is_nearest and search.first_local_trial is not None:
-                around = ca.MX(search.first_local_trial)
-                other, better, _ = search.trial(palm, bounds, around, (arm, swivel), first, here)
-                arm = ca.if_else(better > value, other, arm)
+                second_trial = ca.MX(search.first_local_trial)
+                second_arm, second_value, _ = search.trial(
+                    palm, bounds, second_trial, (arm, swivel), first_trial, current
+                )
+                arm = ca.if_else(second_value > value, second_arm, arm)
             cases.append(ca.Function("near_or_far", inputs, [arm]))
         return ca.Function.if_else("arm_start", *cases)
 
-    def _guess(self) -> ca.Function:
-        """Hand posture of this start and the palm pose that brings it closest to the contacts."""
+    def _palm_estimate(self) -> ca.Function:
+        """Return the graph of the hand posture of this start and its best palm pose."""
         state, parameters, s, p = self._vectors(ca.SX)
         hand = sum(
             (
@@ -381,24 +394,24 @@ class ThumbFirstStep(ThumbFirstLayouts):
         rotation, origin = best_palm(contacts, self.contacts, p, base=base_rotation(self.robot))
         return ca.Function("guess", [state, parameters], with_cse(hand, rotation, origin))
 
-    def _begin(self) -> ca.Function:
+    def _begin_start(self) -> ca.Function:
         state, parameters, s, p = self._vectors(ca.SX)
         hand, arm = (
             ca.SX.sym("hand", len(self.robot.hand_actuators)),
             ca.SX.sym("arm", len(self.robot.arm_actuators)),
         )
         rotation, origin = ca.SX.sym("rotation", 3, 3), ca.SX.sym("origin", 3)
-        passed = ca.SX.sym("passed")
+        table_distance = ca.SX.sym("passed")
         numeric = self.arm is None and self.robot.arm_actuators
         columns = list(self.robot.arm_actuators)
-        # An arm that is found step by step begins as it is, for the first hand and for another.
-        as_it_is = ca.logic_and(p["nearest"], s["start"] <= 1) if numeric else ca.SX(0)
-        started = ca.SX.zeros(s["q"].numel(), 1)
-        started[list(self.robot.hand_actuators)] = hand
-        started[columns] = ca.if_else(as_it_is, p["here"][columns], arm)
-        started = ca.fmin(ca.fmax(started, p["lower"]), p["upper"])
+        # An iteratively placed arm starts at q0 for the first two hand postures.
+        keeps_arm = ca.logic_and(p["nearest"], s["start"] <= 1) if numeric else ca.SX(0)
+        start_q = ca.SX.zeros(s["q"].numel(), 1)
+        start_q[list(self.robot.hand_actuators)] = hand
+        start_q[columns] = ca.if_else(keeps_arm, p["here"][columns], arm)
+        start_q = ca.fmin(ca.fmax(start_q, p["lower"]), p["upper"])
         exhausted = s["start"] >= p["given"]
-        q = ca.if_else(exhausted, s["best_q"], started)
+        q = ca.if_else(exhausted, s["best_q"], start_q)
         after = self.after(
             s,
             Phase.CANDIDATE,
@@ -406,33 +419,35 @@ class ThumbFirstStep(ThumbFirstLayouts):
             q=q,
             palm_rotation=rotation,
             palm_origin=origin,
-            passed=ca.if_else(as_it_is, s["passed"], passed),
+            passed=ca.if_else(keeps_arm, s["passed"], table_distance),
             phase=float(Phase.ARM_PLACEMENT if numeric else Phase.HAND_ALIGNMENT),
             damping=FIT.damping if numeric else p["first_damping"],
         )
         status = ca.if_else(exhausted, float(Status.STALLED), float(Status.RUNNING))
-        record = self.row(s, p, q, Phase.CANDIDATE, status, merit(self.robot, self.contacts, q, p))
-        inputs = [state, parameters, hand, rotation, origin, arm, passed]
+        record = self.row(
+            s, p, q, Phase.CANDIDATE, status, evaluate_contacts(self.robot, self.contacts, q, p)
+        )
+        inputs = [state, parameters, hand, rotation, origin, arm, table_distance]
         return ca.Function("begin", inputs, with_cse(after, record, status))
 
     def _placement(self) -> ca.Function:
-        """A step of the arm alone towards the estimated palm pose."""
+        """Return the graph of a step of the arm towards the estimated palm pose."""
         state, parameters, s, p = self._vectors(ca.SX)
         columns = list(self.robot.arm_actuators)
         palm = Pose(s["palm_rotation"], s["palm_origin"])
-        tried = pose_step(self.robot, s["q"][columns], palm, s["damping"], p)
-        judged = evaluate_step(s, tried, within=ca.SX(0), exact=ca.SX(0))
+        trial = pose_step(self.robot, s["q"][columns], palm, s["damping"], p)
+        outcome = evaluate_step(s, trial, within=ca.SX(0), exact=ca.SX(0))
         q = ca.SX(s["q"])
-        q[columns] = ca.if_else(judged.accepted, tried.x, s["q"][columns])
+        q[columns] = ca.if_else(outcome.accepted, trial.x, s["q"][columns])
         after = self.after(
             s,
             Phase.ARM_PLACEMENT,
-            judged.lm_state,
+            outcome.lm_state,
             q=q,
             phase=ca.if_else(
-                judged.settled, float(Phase.HAND_ALIGNMENT), float(Phase.ARM_PLACEMENT)
+                outcome.settled, float(Phase.HAND_ALIGNMENT), float(Phase.ARM_PLACEMENT)
             ),
-            damping=ca.if_else(judged.settled, p["first_damping"], judged.lm_state["damping"]),
+            damping=ca.if_else(outcome.settled, p["first_damping"], outcome.lm_state["damping"]),
         )
         status = ca.SX(float(Status.RUNNING))
         record = self.row(
@@ -441,10 +456,10 @@ class ThumbFirstStep(ThumbFirstLayouts):
             q,
             Phase.ARM_PLACEMENT,
             status,
-            merit(self.robot, self.contacts, q, p),
+            evaluate_contacts(self.robot, self.contacts, q, p),
             damping=s["damping"],
-            step_size=tried.max_change,
-            accepted=judged.accepted,
+            step_size=trial.max_change,
+            accepted=outcome.accepted,
         )
         return ca.Function("placement", [state, parameters], with_cse(after, record, status))
 
@@ -452,68 +467,78 @@ class ThumbFirstStep(ThumbFirstLayouts):
         state, parameters, _, _ = self._vectors(ca.MX)
         *problem, lower, upper, damping = self._problem()(state, parameters)
         solve = STEP_SOLVERS[self.options.step]
-        step, held = solve(Linear(*problem), Room(lower, upper, damping))
-        outputs = self._take()(state, parameters, step, held)
+        step, held = solve(LinearisedContacts(*problem), StepLimits(lower, upper, damping))
+        outputs = self._accept_step()(state, parameters, step, held)
         return ca.Function("alignment", [state, parameters], list(outputs))
 
     def _problem(self) -> ca.Function:
-        """The Gauss-Newton problem at q, in units of `motor_scales`."""
+        """Return the graph of the Gauss-Newton problem at q, in units of `motor_scales`."""
         state, parameters, s, p = self._vectors(ca.SX)
-        linear = linearised(self.robot, self.contacts, s["q"], p)
+        linear = linearise_contacts(self.robot, self.contacts, s["q"], p)
         scales = motor_scales(self.robot)
         lower, upper = (p["lower"] - s["q"]) / scales, (p["upper"] - s["q"]) / scales
         outputs = [linear.thumb, linear.thumb_error, linear.others, linear.others_error]
         outputs += [lower, upper, s["damping"]]
         return ca.Function("problem", [state, parameters], with_cse(*outputs))
 
-    def _take(self) -> ca.Function:
-        """Take the step if it lowers the cost; decide whether the solve is at its end."""
+    def _accept_step(self) -> ca.Function:
+        """Return the graph that accepts or rejects a step and selects the next phase."""
         state, parameters, s, p = self._vectors(ca.SX)
         n = s["q"].numel()
-        step, held = ca.SX.sym("step", n), ca.SX.sym("held", n)
-        size = ca.mmax(ca.fabs(step))
+        step, is_fixed = ca.SX.sym("step", n), ca.SX.sym("held", n)
+        largest = ca.mmax(ca.fabs(step))
         capped = (
-            motor_scales(self.robot) * step * ca.fmin(1.0, p["step_cap"] / ca.fmax(size, 1e-12))
+            motor_scales(self.robot) * step * ca.fmin(1.0, p["step_cap"] / ca.fmax(largest, 1e-12))
         )
-        tried = ca.fmin(ca.fmax(s["q"] + capped, p["lower"]), p["upper"])
-        before, there = (merit(self.robot, self.contacts, q, p) for q in (s["q"], tried))
-        # What meets the contacts stays; what begins too far away is not worth a start.
-        met, skipped = self._met(before, p), self._skipped(before, s, p)
-        stays = ca.logic_or(met, skipped)
-        accepted = ca.logic_and(there.cost < before.cost, ca.logic_not(stays))
-        q = ca.if_else(accepted, tried, s["q"])
-        left = Merit(
-            ca.if_else(accepted, there.positions, before.positions),
-            ca.if_else(accepted, there.angles, before.angles),
-            ca.if_else(accepted, there.cost, before.cost),
+        trial_q = ca.fmin(ca.fmax(s["q"] + capped, p["lower"]), p["upper"])
+        errors_before, errors_after = (
+            evaluate_contacts(self.robot, self.contacts, q, p) for q in (s["q"], trial_q)
         )
-        cost = left.cost
-        solved = self._met(left, p)
-        waited = ca.if_else(cost > self.options.gain * before.cost, s["waited"] + 1, 0.0)
-        stuck = ca.logic_and(ca.logic_not(accepted), s["damping"] > self.options.damping_ceiling)
-        over = ca.logic_or(waited >= self.options.patience, s["spent"] + 1 >= self.options.budget)
-        over = ca.logic_or(ca.logic_or(over, stuck), skipped)
-        near = ca.logic_and(
-            self._met(left, p, MINIMAX.max_tolerance_ratio), is_new_cost(cost, s["balanced"])
+        # A configuration that meets the contacts remains; a distant q0 is skipped as a start.
+        is_met, is_skipped = (
+            self._is_within(errors_before, p),
+            self._is_skipped(errors_before, s, p),
         )
-        near = ca.logic_and(ca.logic_and(near, over), ca.logic_not(solved))
-        failed = ca.logic_and(over, ca.logic_not(ca.logic_or(solved, near)))
-        following = ca.if_else(over, float(Phase.CANDIDATE), float(Phase.HAND_ALIGNMENT))
+        keeps_q = ca.logic_or(is_met, is_skipped)
+        accepted = ca.logic_and(errors_after.cost < errors_before.cost, ca.logic_not(keeps_q))
+        q = ca.if_else(accepted, trial_q, s["q"])
+        errors = ContactErrors(
+            ca.if_else(accepted, errors_after.positions, errors_before.positions),
+            ca.if_else(accepted, errors_after.angles, errors_before.angles),
+            ca.if_else(accepted, errors_after.cost, errors_before.cost),
+        )
+        cost = errors.cost
+        solved = self._is_within(errors, p)
+        slow_steps = ca.if_else(cost > self.options.gain * errors_before.cost, s["waited"] + 1, 0.0)
+        is_stuck = ca.logic_and(ca.logic_not(accepted), s["damping"] > self.options.damping_ceiling)
+        is_finished = ca.logic_or(
+            slow_steps >= self.options.patience, s["spent"] + 1 >= self.options.budget
+        )
+        is_finished = ca.logic_or(ca.logic_or(is_finished, is_stuck), is_skipped)
+        starts_minimax = ca.logic_and(
+            self._is_within(errors, p, MINIMAX.max_tolerance_ratio),
+            is_new_cost(cost, s["balanced"]),
+        )
+        starts_minimax = ca.logic_and(
+            ca.logic_and(starts_minimax, is_finished), ca.logic_not(solved)
+        )
+        has_failed = ca.logic_and(is_finished, ca.logic_not(ca.logic_or(solved, starts_minimax)))
+        next_phase = ca.if_else(is_finished, float(Phase.CANDIDATE), float(Phase.HAND_ALIGNMENT))
         factor = ca.if_else(accepted, self.options.eased, self.options.tightened)
-        eased = ca.fmax(s["damping"] * factor, self.options.damping_floor)
+        damping = ca.fmax(s["damping"] * factor, self.options.damping_floor)
         better = cost < s["best_cost"]
         after = self.after(
             s,
             Phase.HAND_ALIGNMENT,
             {},
             q=q,
-            phase=ca.if_else(near, float(Phase.BALANCE), following),
-            start=s["start"] + failed,
-            damping=ca.if_else(near, FIT.damping, eased),
-            waited=waited,
-            spent=ca.if_else(near, 0.0, s["spent"] + 1),
+            phase=ca.if_else(starts_minimax, float(Phase.BALANCE), next_phase),
+            start=s["start"] + has_failed,
+            damping=ca.if_else(starts_minimax, FIT.damping, damping),
+            waited=slow_steps,
+            spent=ca.if_else(starts_minimax, 0.0, s["spent"] + 1),
             power=0.0,
-            balanced=ca.if_else(near, cost, s["balanced"]),
+            balanced=ca.if_else(starts_minimax, cost, s["balanced"]),
             best_cost=ca.if_else(better, cost, s["best_cost"]),
             best_q=ca.if_else(better, q, s["best_q"]),
         )
@@ -524,55 +549,57 @@ class ThumbFirstStep(ThumbFirstLayouts):
             q,
             Phase.HAND_ALIGNMENT,
             status,
-            left,
+            errors,
             damping=s["damping"],
-            step_size=ca.mmax(ca.fabs(tried - s["q"])),
-            active_mask=pack_bits(held),
+            step_size=ca.mmax(ca.fabs(trial_q - s["q"])),
+            active_mask=pack_bits(is_fixed),
             accepted=accepted,
         )
-        inputs = [state, parameters, step, held]
+        inputs = [state, parameters, step, is_fixed]
         return ca.Function("take", inputs, with_cse(after, record, status))
 
-    def _met(self, there: Merit, p: dict[str, Expr], times: float = 1.0) -> Expr:
-        """Whether every contact is within so many times its tolerance."""
+    def _is_within(self, errors: ContactErrors, p: dict[str, Expr], factor: float = 1.0) -> Expr:
+        """Return whether every contact is within `factor` times its tolerance."""
         tolerances = p["position_tolerance"], p["angle_tolerance"]
-        return within_tolerance(there.positions / times, there.angles / times, *tolerances)
+        return within_tolerance(errors.positions / factor, errors.angles / factor, *tolerances)
 
-    def _skipped(self, before: Merit, s: dict[str, Expr], p: dict[str, Expr]) -> Expr:
-        """Whether the robot or its hand, as it is, is too far away to begin with."""
+    def _is_skipped(self, errors: ContactErrors, s: dict[str, Expr], p: dict[str, Expr]) -> Expr:
+        """Return whether q0 or its hand posture is too far from the target for a start."""
         if not self.robot.arm_actuators:
             return ca.SX(0)
-        begins = ca.logic_and(s["spent"] < 1, s["start"] <= 0)
-        return ca.logic_and(ca.logic_and(p["nearest"], begins), before.cost > self.options.as_it_is)
+        is_first = ca.logic_and(s["spent"] < 1, s["start"] <= 0)
+        return ca.logic_and(
+            ca.logic_and(p["nearest"], is_first), errors.cost > self.options.as_it_is
+        )
 
 
-def balance_stage(layouts: ThumbFirstLayouts) -> ca.Function:
-    """One step of all motors; it ends with a solution or with the next start."""
+def minimax_stage(layouts: ThumbFirstLayouts) -> ca.Function:
+    """Return the graph of a minimax step of all motors; it ends solved or with the next start."""
     state, parameters = layouts.state.symbols("state"), layouts.parameters.symbols("parameters")
     s, p = layouts.state.unpack(state), layouts.parameters.unpack(parameters)
-    whole = ContactLeastSquares(layouts.robot, layouts.contacts, layouts.parameters)
-    tried = whole.minimax_trial(s["q"], s["damping"], s["power"], parameters)
-    found = minimax_step(s["q"], tried, layouts.contacts, s, p)
-    failed = ca.logic_and(found.is_finished, ca.logic_not(found.within))
+    problem = ContactLeastSquares(layouts.robot, layouts.contacts, layouts.parameters)
+    trial = problem.minimax_trial(s["q"], s["damping"], s["power"], parameters)
+    outcome = minimax_step(s["q"], trial, layouts.contacts, s, p)
+    has_failed = ca.logic_and(outcome.is_finished, ca.logic_not(outcome.within))
     after = layouts.after(
         s,
         Phase.BALANCE,
-        found.state,
-        q=found.q,
-        phase=ca.if_else(failed, float(Phase.CANDIDATE), float(Phase.BALANCE)),
-        start=s["start"] + failed,
+        outcome.state,
+        q=outcome.q,
+        phase=ca.if_else(has_failed, float(Phase.CANDIDATE), float(Phase.BALANCE)),
+        start=s["start"] + has_failed,
     )
-    status = ca.if_else(found.within, float(Status.SOLVED), float(Status.RUNNING))
-    there = merit(layouts.robot, layouts.contacts, found.q, p)
+    status = ca.if_else(outcome.within, float(Status.SOLVED), float(Status.RUNNING))
+    errors = evaluate_contacts(layouts.robot, layouts.contacts, outcome.q, p)
     record = layouts.row(
         s,
         p,
-        found.q,
+        outcome.q,
         Phase.BALANCE,
         status,
-        there,
+        errors,
         damping=s["damping"],
-        step_size=tried.max_change,
-        accepted=found.accepted,
+        step_size=trial.max_change,
+        accepted=outcome.accepted,
     )
     return ca.Function("balance", [state, parameters], with_cse(after, record, status))
