@@ -574,7 +574,7 @@ def group_by_kinds(
             return
         rows = np.flatnonzero(group == i)
         row_numbers = np.array([targets.number(row) for row in rows.tolist()])
-        yield kinds, rows, replace(targets.rows(rows), row_numbers=row_numbers)
+        yield kinds, rows, replace(targets.rows(rows), picked=row_numbers)
 
 
 def target_fields(robot: RobotDescription) -> tuple[Field, ...]:
