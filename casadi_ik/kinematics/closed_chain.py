@@ -27,12 +27,12 @@ from casadi_ik.kinematics.linear_algebra import solve
 from casadi_ik.model.description import RobotDescription
 
 VIRTUAL = -1
-"""Stands for the virtual joint where actuators are given by their position in q."""
+"""Index of the virtual joint among the indices of actuators in q."""
 
 
 @dataclass(frozen=True)
 class ChainSplit:
-    """Who is who in the closed chain; actuators by their position in q.
+    """Active and passive coordinates of the closed chain, by index of the actuator in q.
 
     Attributes:
         reversed_leg: `VIRTUAL`, the thumb's actuators from tip to palm, the borrowed arm
@@ -54,7 +54,7 @@ class ChainSplit:
 
 
 def split(robot: RobotDescription, borrowed: int = 1) -> ChainSplit:
-    """The paper's choice of legs and active joints, for any arm and thumb.
+    """Return the paper's choice of legs and active joints, for any arm and thumb.
 
     The mobility is the number of coordinates less six (Gruebler). Active are the virtual joint,
     the thumb's joints but the first, and as many of the arm's last joints as are missing; for the
@@ -90,7 +90,7 @@ def split(robot: RobotDescription, borrowed: int = 1) -> ChainSplit:
 
 @dataclass(frozen=True, eq=False)
 class ClosedChain:
-    """The chain's graphs at one configuration; twists are [v; w] in the palm frame.
+    """Graphs of the chain at one configuration; twists are [v; w] in the palm frame.
 
     Attributes:
         split: Legs and active coordinates.
@@ -108,7 +108,7 @@ class ClosedChain:
     J_cc: ca.SX
 
     def motor_steps(self, active_step: ca.SX, n: int) -> ca.SX:
-        """Change of every motor for a step of the active coordinates.
+        """Return the change of every motor for a step of the active coordinates.
 
         Args:
             active_step: (mobility, 1).
@@ -133,7 +133,7 @@ def closed_chain(
     length: float = 1.0,
     platform: str = "arm-leg",
 ) -> ClosedChain:
-    """Eqs. (6) to (8) at the symbolic configuration.
+    """Return the graphs of eqs. (6) to (8) at the symbolic configuration.
 
     Args:
         robot_kinematics: Kinematics over q.
@@ -166,7 +166,7 @@ def closed_chain(
 
 
 def _column(robot_kinematics: ActuatedKinematics, index: int, length: float) -> ca.SX:
-    """Twist [v; w] of the palm, in the palm frame, for a unit rate of one coordinate (6, 1).
+    """Return twist [v; w] of the palm, in the palm frame, for a unit rate of one coordinate (6, 1).
 
     In the reversed leg the palm moves against the tip as the tip moves against the palm in the
     motor's own sense, so the same column serves both.
@@ -186,7 +186,7 @@ def _column(robot_kinematics: ActuatedKinematics, index: int, length: float) -> 
 
 
 def pivoted(constraint: Array) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Active and passive coordinates at one configuration.
+    """Return the active and passive coordinates at one configuration.
 
     QR with column pivoting (Businger & Golub 1965) takes as passive the columns that are farthest
     from one another; one counts as dependent if less than 1e-9 of the largest is left of it.
@@ -216,5 +216,5 @@ def pivoted(constraint: Array) -> tuple[tuple[int, ...], tuple[int, ...]]:
 
 
 def mobility(constraint: Array) -> int:
-    """In how many ways a chain moves at one configuration: its coordinates less the rank of C."""
+    """Return the mobility of a chain: its number of coordinates minus the rank of C."""
     return len(pivoted(constraint)[0])

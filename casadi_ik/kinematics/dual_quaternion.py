@@ -29,7 +29,7 @@ PITCH_REMAINDER = (-1 / 24, 1 / 960, -1 / 107520)
 
 
 def quaternion_multiply(a: Expr, b: Expr) -> Expr:
-    """Hamilton product of two quaternions (4, 1)."""
+    """Return the Hamilton product of two quaternions (4, 1)."""
     return ca.vertcat(
         a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
         a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
@@ -39,56 +39,56 @@ def quaternion_multiply(a: Expr, b: Expr) -> Expr:
 
 
 def multiply(a: Expr, b: Expr) -> Expr:
-    """Product of two dual quaternions (8, 1); as poses, b acts on a point first."""
+    """Return the product of two dual quaternions (8, 1); as poses, b acts on a point first."""
     real = quaternion_multiply(a[:4], b[:4])
     dual = quaternion_multiply(a[:4], b[4:]) + quaternion_multiply(a[4:], b[:4])
     return ca.vertcat(real, dual)
 
 
 def conjugate(x: Expr) -> Expr:
-    """Classical conjugate (8, 1): both quaternions conjugated; the inverse of a unit x."""
+    """Return the classical conjugate (8, 1), both quaternions conjugated: inverse of a unit x."""
     return ca.vertcat(x[0], -x[1:4], x[4], -x[5:])
 
 
 def identity() -> ca.DM:
-    """The pose that moves nothing (8, 1)."""
+    """Return the identity pose (8, 1)."""
     return ca.DM([1.0, 0, 0, 0, 0, 0, 0, 0])
 
 
 def norm(x: Expr) -> Expr:
-    """Dual-number norm (2, 1) of x (8, 1): (|r|, r . d / |r|); (1, 0) for a unit x."""
+    """Return the dual-number norm (2, 1) of x (8, 1): (|r|, r . d / |r|); (1, 0) for a unit x."""
     length = ca.sqrt(ca.dot(x[:4], x[:4]))
     return ca.vertcat(length, ca.dot(x[:4], x[4:]) / length)
 
 
 def from_pose(R: Expr, p: Expr) -> Expr:
-    """Unit dual quaternion (8, 1) of R (3, 3) and p (3, 1) [m]; its sign is not fixed."""
+    """Return unit dual quaternion (8, 1) of R (3, 3) and p (3, 1) [m]; its sign is not fixed."""
     return from_quaternion(quaternion_from_matrix(R), p)
 
 
 def from_quaternion(r: Expr, p: Expr) -> Expr:
-    """Unit dual quaternion (8, 1) of a unit quaternion r (4, 1) and a translation p (3, 1) [m]."""
+    """Return the dual quaternion (8, 1) of unit quaternion r (4, 1) and translation p (3, 1) [m]."""
     return ca.vertcat(r, quaternion_multiply(ca.vertcat(0.0, 0.5 * p), r))
 
 
 def from_translation(p: Expr) -> Expr:
-    """Unit dual quaternion (8, 1) of a translation p (3, 1) [m]."""
+    """Return the unit dual quaternion (8, 1) of a translation p (3, 1) [m]."""
     return ca.vertcat(1.0, 0.0, 0.0, 0.0, 0.0, 0.5 * p)
 
 
 def to_pose(x: Expr) -> tuple[Expr, Expr]:
-    """Rotation matrix (3, 3) and translation (3, 1) [m] of a unit dual quaternion x (8, 1)."""
+    """Return R (3, 3) and translation (3, 1) [m] of a unit dual quaternion x (8, 1)."""
     return quaternion_to_matrix(x[:4]), translation(x)
 
 
 def translation(x: Expr) -> Expr:
-    """Translation p = 2 d r* (3, 1) [m] of a unit dual quaternion x (8, 1)."""
+    """Return the translation p = 2 d r* (3, 1) [m] of a unit dual quaternion x (8, 1)."""
     r, d = x[1:4], x[5:]
     return 2 * (x[0] * d - x[4] * r + ca.cross(r, d))
 
 
 def directed_line(direction: Expr, point: Expr) -> tuple[Expr, Expr]:
-    """Unit dual vector l + eps m of a line: Chandra eq. (2), where m = point x direction.
+    """Return unit dual vector l + eps m of a line: Chandra eq. (2), where m = point x direction.
 
     Args:
         direction: l (3, 1), unit.
@@ -101,7 +101,7 @@ def directed_line(direction: Expr, point: Expr) -> tuple[Expr, Expr]:
 
 
 def exp_screw(angle: Expr, distance: Expr, direction: Expr, moment: Expr) -> Expr:
-    """Displacement along a screw, exp((theta + eps d)/2 (l + eps m)): Chandra eq. (1).
+    """Return the displacement along a screw, exp((theta + eps d)/2 (l + eps m)): Chandra eq. (1).
 
     No division, so no singularity; a revolute joint has d = 0, a prismatic one theta = 0.
 
@@ -120,7 +120,7 @@ def exp_screw(angle: Expr, distance: Expr, direction: Expr, moment: Expr) -> Exp
 
 
 def exp(w: Expr, v: Expr) -> Expr:
-    """Unit dual quaternion (8, 1) of a twist: the inverse of `log`, smooth at w = 0.
+    """Return the unit dual quaternion (8, 1) of a twist: the inverse of `log`, smooth at w = 0.
 
     Args:
         w: theta l (3, 1) [rad].
@@ -139,7 +139,7 @@ def exp(w: Expr, v: Expr) -> Expr:
 
 
 def log(x: Expr) -> tuple[Expr, Expr]:
-    """Twist (w, v) = (theta l, theta m + d l) of a unit dual quaternion: Chandra eq. (14).
+    """Return twist (w, v) = (theta l, theta m + d l) of a unit dual quaternion: Chandra eq. (14).
 
     Of x and -x the one with theta in [0, pi] is meant. Robust at theta = 0, where v is the
     translation.
@@ -164,19 +164,19 @@ def log(x: Expr) -> tuple[Expr, Expr]:
 
 
 def act_on_point(x: Expr, point: Expr) -> Expr:
-    """Coordinates R point + p (3, 1) [m] of a point (3, 1) [m] moved by the pose x (8, 1)."""
+    """Return R point + p (3, 1) [m] for a point (3, 1) [m] and a pose x (8, 1)."""
     return rotate(x, point) + translation(x)
 
 
 def rotate(x: Expr, vector: Expr) -> Expr:
-    """R vector (3, 1) for the rotation of the unit (dual) quaternion x (4, 1) or (8, 1)."""
+    """Return R vector (3, 1) for the rotation of the unit (dual) quaternion x (4, 1) or (8, 1)."""
     r = x[1:4]
     t = 2 * ca.cross(r, vector)
     return vector + x[0] * t + ca.cross(r, t)
 
 
 def act_on_line(x: Expr, direction: Expr, moment: Expr) -> tuple[Expr, Expr]:
-    """The line moved by the pose x: x s x* with the classical conjugate, Chandra eq. (6).
+    """Return the line moved by the pose x: x s x* with the classical conjugate, Chandra eq. (6).
 
     Args:
         x: unit dual quaternion (8, 1).
@@ -191,7 +191,7 @@ def act_on_line(x: Expr, direction: Expr, moment: Expr) -> tuple[Expr, Expr]:
 
 
 def error(current: Expr, desired: Expr) -> Expr:
-    """Displacement e = x_c x_d* (8, 1) from the desired to the current pose: Chandra eq. (13).
+    """Return e = x_c x_d* (8, 1) from the desired to the current pose: Chandra eq. (13).
 
     In the base frame: current = e desired. The control law (14) is the twist -gain log(e).
     """
@@ -199,7 +199,7 @@ def error(current: Expr, desired: Expr) -> Expr:
 
 
 def twist(x: Expr, rate: Expr) -> tuple[Expr, Expr]:
-    """Twist w + eps v = 2 x' x* of a moving pose, in the base frame: Chandra eq. (4).
+    """Return the twist w + eps v = 2 x' x* of a moving pose, in the base frame: Chandra eq. (4).
 
     Args:
         x: unit dual quaternion (8, 1).
@@ -214,7 +214,7 @@ def twist(x: Expr, rate: Expr) -> tuple[Expr, Expr]:
 
 
 def control_twist(e: Expr, gain: Expr) -> tuple[Expr, Expr]:
-    """Twist -gain log(e) of the screw control law: Chandra eq. (14).
+    """Return the twist -gain log(e) of the screw control law: Chandra eq. (14).
 
     Args:
         e: unit dual quaternion (8, 1) of the error, see `error`.
@@ -228,6 +228,6 @@ def control_twist(e: Expr, gain: Expr) -> tuple[Expr, Expr]:
 
 
 def screw_error_norm(e: Expr) -> Expr:
-    """Norm sqrt(|w|^2 + |v|^2) of log(e), Chandra eq. (17); it adds rad^2 to m^2 as they do."""
+    """Return sqrt(|w|^2 + |v|^2) of log(e), which adds rad^2 and m^2: Chandra eq. (17)."""
     w, v = log(e)
     return safe_sqrt(ca.dot(w, w) + ca.dot(v, v))

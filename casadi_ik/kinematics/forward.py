@@ -16,7 +16,7 @@ from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.joints import Joint
 
 ROUNDING = 1e-15
-"""Constants below this are rounding errors of a description's angles and become exact zeros."""
+"""Threshold below which constants of a description are rounding errors, treated as zero."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,22 +27,22 @@ class Pose:
     origin: ca.SX
 
     def at(self, placement: Array) -> Pose:
-        """The frame that has the constant (4, 4) pose `placement` in this one."""
+        """Return the frame with the constant pose `placement` (4, 4) relative to this frame."""
         rotation, origin = _constants(placement)
         return Pose(self.rotation @ rotation, self.origin + self.rotation @ origin)
 
     def rotate(self, vector: Array) -> ca.SX:
-        """A constant (3,) direction of this frame in the base frame, (3, 1)."""
+        """Return a constant (3,) direction of this frame in the base frame, (3, 1)."""
         return self.rotation @ sparse(np.asarray(vector, dtype=float).reshape(3, 1))
 
     def inverse_apply(self, point: ca.SX) -> ca.SX:
-        """A point of the base frame in this frame, (3, 1) [m]."""
+        """Return a point of the base frame in this frame, (3, 1) [m]."""
         return self.rotation.T @ (point - self.origin)
 
 
 @dataclass(frozen=True, eq=False)
 class Kinematics:
-    """Every link, axis and contact of a robot as a function of theta.
+    """Poses of links, joint axes and contacts as functions of theta.
 
     Attributes:
         robot: The description.
@@ -62,21 +62,21 @@ class Kinematics:
         return self.links[self.robot.palm_link].at(self.robot.palm_placement)
 
     def contact_frame(self, finger: str) -> Pose:
-        """Pose of a finger's contact frame."""
+        """Return the pose of a finger's contact frame."""
         entry = self.robot.finger(finger)
         return self.links[entry.link].at(entry.placement)
 
     def contact(self, finger: str) -> tuple[ca.SX, ca.SX]:
-        """A finger's contact point (3, 1) [m] and outward pad normal (3, 1), base frame."""
+        """Return a finger's contact point (3, 1) [m] and outward pad normal (3, 1), base frame."""
         frame = self.contact_frame(finger)
         return frame.origin, frame.rotate(self.robot.finger(finger).normal)
 
     def tangent(self, finger: str) -> ca.SX:
-        """The second axis (3, 1) of a finger's pad, unit, orthogonal to the normal, base frame."""
+        """Return the unit tangent (3, 1) of the pad of a finger, base frame."""
         return self.contact_frame(finger).rotate(self.robot.finger(finger).tangent)
 
     def twist_columns(self, joints: Sequence[str], link: str, point: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Geometric Jacobian of a point fixed to a link with respect to some joints.
+        """Return the geometric Jacobian of a point fixed to a link with respect to some joints.
 
         Args:
             joints: Names of movable joints; a joint that does not carry the link gets zeros.
@@ -104,7 +104,7 @@ class Kinematics:
 
 
 def forward(robot: RobotDescription, theta: ca.SX) -> Kinematics:
-    """Forward kinematics.
+    """Return all link poses as functions of theta.
 
     Args:
         robot: The description.
@@ -132,7 +132,7 @@ def _moved(frame: Pose, joint: Joint, value: ca.SX) -> Pose:
 
 
 def axis_rotation(axis: Array, angle: ca.SX) -> ca.SX:
-    """Rotation about a constant unit axis, (3, 3), with as few operations as the axis allows."""
+    """Return the rotation (3, 3) about a constant unit axis, exploiting zeros of the axis."""
     a = np.asarray(axis, dtype=float)
     outer = np.outer(a, a)
     cross = np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
@@ -142,7 +142,7 @@ def axis_rotation(axis: Array, angle: ca.SX) -> ca.SX:
 
 
 def number(value: ca.SX) -> Array:
-    """The entries of a constant graph, row by row (rows * columns,)."""
+    """Return the entries of a constant graph, row by row (rows * columns,)."""
     return np.array(ca.evalf(ca.densify(value))).ravel()
 
 
@@ -151,7 +151,7 @@ def _constants(placement: Array) -> tuple[ca.DM, ca.DM]:
 
 
 def sparse(array: Array) -> ca.DM:
-    """A constant without what is zero but for rounding."""
+    """Return a constant with entries below rounding replaced by structural zeros."""
     exact = np.where(np.abs(array) < ROUNDING, 0.0, array)
     # Rotations by quarter turns come out of cosines as 1 - 1e-16; make them exact as well.
     near = np.round(exact)
@@ -182,7 +182,7 @@ class ActuatedKinematics:
         return ca.Function("coupling", [symbols], [jacobian])(self.q)
 
     def twist(self, link: str, point: ca.SX, actuators: Sequence[int]) -> tuple[ca.SX, ca.SX]:
-        """Geometric Jacobian of a point fixed to a link.
+        """Return the geometric Jacobian of a point fixed to a link.
 
         Args:
             link: The link.
@@ -199,30 +199,30 @@ class ActuatedKinematics:
         return ca.densify(linear @ chain_rule), ca.densify(angular @ chain_rule)
 
     def contact_jacobian(self, finger: str, actuators: Sequence[int]) -> tuple[ca.SX, ca.SX]:
-        """Geometric Jacobian of a finger's contact frame, as `twist`."""
+        """Return the geometric Jacobian of a finger's contact frame, as `twist`."""
         point, _ = self.kinematics.contact(finger)
         return self.twist(self.robot.finger(finger).link, point, actuators)
 
     def palm_jacobian(self, actuators: Sequence[int]) -> tuple[ca.SX, ca.SX]:
-        """Geometric Jacobian of the palm frame, as `twist`."""
+        """Return the geometric Jacobian of the palm frame, as `twist`."""
         return self.twist(self.robot.palm_link, self.kinematics.palm.origin, actuators)
 
     def palm_euler_jacobian(self, actuators: Sequence[int]) -> ca.SX:
-        """Analytic Jacobian (3, k) of the palm's ZYX Euler angles; rates per unit of q."""
+        """Return analytic Jacobian (3, k) of the palm's ZYX Euler angles; rates per unit of q."""
         _, angular = self.palm_jacobian(actuators)
         angles = euler_zyx(self.kinematics.palm.rotation)
         return angular_velocity_to_euler_zyx(angles) @ angular
 
 
 def motor_scales(robot: RobotDescription) -> ca.DM:
-    """(n, 1) what counts as a unit of each motor: 1 rad, or the range of a slider."""
+    """Return the unit of each motor (n, 1): 1 rad, or the range of a slider."""
     ranges = (robot.upper - robot.lower).tolist()
     units = [actuator.unit for actuator in robot.actuators]
     return ca.DM([1.0 if u == "rad" else r for u, r in zip(units, ranges, strict=True)])
 
 
 def actuated(robot: RobotDescription, q: ca.SX) -> ActuatedKinematics:
-    """Kinematics over the actuated coordinates.
+    """Return the kinematics as a function of the motor positions.
 
     Args:
         robot: The description.

@@ -49,7 +49,7 @@ def solve_spd(A: Expr, b: Expr) -> Expr:
 
 
 def det_spd(A: Expr) -> Expr:
-    """Determinant of a symmetric positive semidefinite A (n, n): the product of LDL' pivots.
+    """Return determinant of a symmetric positive semidefinite A (n, n): the product of LDL' pivots.
 
     Rounding may leave it slightly negative where it should be 0. 81 instructions for n = 6,
     where CasADi's expansion by minors takes 2000.
@@ -75,7 +75,7 @@ def solve(A: Expr, b: Expr) -> Expr:
 
 
 def damped_pinv_times(J: Expr, e: Expr, lam: Expr) -> Expr:
-    """Damped least squares J' (J J' + lam^2 I)^-1 e (Wampler 1986).
+    """Return the damped least-squares solution J' (J J' + lam^2 I)^-1 e (Wampler 1986).
 
     Solved on the smaller side of J; both forms are equal.
 
@@ -94,7 +94,7 @@ def damped_pinv_times(J: Expr, e: Expr, lam: Expr) -> Expr:
 
 
 def weighted_damped_pinv_times(J: Expr, e: Expr, lam: Expr, weights: Expr) -> Expr:
-    """Weighted damped least squares (Chan & Dubey 1995).
+    """Return the weighted damped least-squares solution (Chan & Dubey 1995).
 
     W^-1 J' (J W^-1 J' + lam^2 I)^-1 e with W = diag(weights): a heavy coordinate moves little.
 
@@ -115,7 +115,7 @@ def weighted_damped_pinv_times(J: Expr, e: Expr, lam: Expr, weights: Expr) -> Ex
 
 
 def pinv_times(J: Expr, e: Expr, eps: float = 1e-6) -> Expr:
-    """Pseudoinverse of J times e, regularised: `damped_pinv_times` with a tiny damping.
+    """Return the pseudoinverse of J times e, regularised: `damped_pinv_times` with a tiny damping.
 
     Args:
         J: (m, n).
@@ -146,7 +146,7 @@ def project_to_null_space(J: Expr, x: Expr, eps: float = 1e-6) -> Expr:
 
 
 def _add_to_diagonal(A: Expr, value: Expr) -> Expr:
-    """A + diag(value) for a scalar or (n, 1) value."""
+    """Return A + diag(value) for a scalar or (n, 1) value."""
     n = A.shape[0]
     return ca.densify(A + ca.diag(value * ca.DM.ones(n, 1)))
 
@@ -176,7 +176,7 @@ def _det_spd_function(n: int) -> ca.Function:
 
 
 def _ldl(A: Expr) -> tuple[list[list[Expr]], list[Expr], list[Expr]]:
-    """Rows of the strict lower factor L the pivots of A = L D L' and their inverses."""
+    """Return rows of the strict lower factor L, pivots of A = L D L', and their inverses."""
     L: list[list[Expr]] = []
     pivots, inverses = [], []
     for j in range(A.shape[0]):
@@ -216,7 +216,7 @@ def _solve_function(n: int, k: int) -> ca.Function:
 
 
 def reflector(x: Expr, row: int) -> tuple[Expr, Expr, Expr]:
-    """Householder reflection I - v w' that clears a vector below a row.
+    """Return the Householder reflection I - v w' that clears a vector below a row.
 
     Args:
         x: (n, 1).
@@ -240,13 +240,13 @@ def reflect(v: Expr, w: Expr, y: Expr) -> Expr:
 
 
 SWEEPS = {1: 0, 2: 1, 3: 4, 4: 5, 5: 5, 6: 5}
-"""Default sweeps by the smaller dimension of J."""
+"""Default number of sweeps by the smaller dimension of J."""
 
 TINY = 1e-300
 
 
 def svd(J: Expr, sweeps: int | None = None) -> tuple[Expr, Expr, Expr]:
-    """Thin singular value decomposition J = U diag(s) V'.
+    """Return the thin singular value decomposition J = U diag(s) V'.
 
     Args:
         J: (m, n); k = min(m, n).
@@ -265,18 +265,18 @@ def svd(J: Expr, sweeps: int | None = None) -> tuple[Expr, Expr, Expr]:
 
 
 def singular_values(J: Expr, sweeps: int | None = None) -> Expr:
-    """Singular values (k, 1) of J (m, n), k = min(m, n), descending; see `svd`."""
+    """Return the singular values (k, 1) of J (m, n), k = min(m, n), descending; see `svd`."""
     return svd(J, sweeps)[1]
 
 
 def condition_number(s: Expr, cap: float = 1e12) -> Expr:
-    """Largest over smallest of the singular values s (k, 1), at most `cap`, never NaN."""
+    """Return the ratio of largest to smallest singular value s (k, 1), at most `cap`, never NaN."""
     ratio = ca.mmin(s) / (ca.mmax(s) + TINY)
     return 1 / ca.fmax(ratio, 1 / cap)
 
 
 def manipulability(J: Expr) -> Expr:
-    """Yoshikawa's measure sqrt(det(J J')) of J (m, n), or sqrt(det(J' J)) if m > n.
+    """Return Yoshikawa's measure sqrt(det(J J')) of J (m, n), or sqrt(det(J' J)) if m > n.
 
     Differentiable; at a singularity 0 (1e-150) with derivative 0. Its square is resolved to
     rounding only, so where the singular values are at hand, their product is more accurate.
@@ -288,7 +288,7 @@ def manipulability(J: Expr) -> Expr:
 
 @cache
 def _sweep_function(k: int) -> ca.Function:
-    """One sweep over all pairs of columns of A (k, k), the same rotations applied to V (k, k)."""
+    """Return A and V (k, k) after one sweep of rotations of all pairs of columns of A."""
     A, V = ca.SX.sym("A", k, k), ca.SX.sym("V", k, k)
     a, v = ca.horzsplit(A), ca.horzsplit(V)
     for i in range(k - 1):
@@ -300,7 +300,7 @@ def _sweep_function(k: int) -> ca.Function:
 
 
 def _rotation(x: Expr, y: Expr) -> tuple[Expr, Expr]:
-    """Cosine and sine of the rotation that makes x, y orthogonal and the first the longer one."""
+    """Return cosine and sine of the rotation that makes x, y orthogonal, the longer first."""
     difference = ca.dot(x, x) - ca.dot(y, y)
     twice = 2 * ca.dot(x, y)
     root = ca.sqrt(difference * difference + twice * twice)
@@ -313,7 +313,7 @@ def _rotation(x: Expr, y: Expr) -> tuple[Expr, Expr]:
 
 @cache
 def _svd_function(n: int, k: int, sweeps: int) -> ca.Function:
-    """SVD of a tall A (n, k): QR first where it is not square, then Jacobi on the triangle."""
+    """Return the SVD of a tall A (n, k): QR unless A is square, then Jacobi rotations."""
     A = ca.SX.sym("A", n, k)
     columns, reflections = ca.horzsplit(A), []
     if n > k:
@@ -342,7 +342,7 @@ TINY = 1e-300
 
 
 def extreme_singular_values(J: Expr) -> tuple[Expr, Expr]:
-    """Smallest and largest singular value of J (m, n), of min(m, n).
+    """Return the smallest and largest singular value of J (m, n), of min(m, n).
 
     Not meant to be differentiated.
     """
@@ -359,7 +359,7 @@ def extreme_singular_values(J: Expr) -> tuple[Expr, Expr]:
 
 
 def _tridiagonal(A: list[list[Expr]]) -> tuple[list[Expr], list[Expr]]:
-    """Diagonal and squares of the subdiagonal of a symmetric matrix in tridiagonal form."""
+    """Return diagonal and squares of the subdiagonal of a symmetric matrix in tridiagonal form."""
     n = len(A)
     diagonal, squares = [], []
     for k in range(n - 2):
@@ -387,7 +387,7 @@ def _tridiagonal(A: list[list[Expr]]) -> tuple[list[Expr], list[Expr]]:
 
 
 def _laguerre(diagonal: list[Expr], squares: list[Expr], x: Expr, direction: float) -> Expr:
-    """The root next to x in a direction, of the characteristic polynomial (2 rows at least)."""
+    """Return the root of the characteristic polynomial nearest to x in a direction (>= 2 rows)."""
     n = len(diagonal)
     for _ in range(ITERATIONS.get(n, 5)):
         # The leading minors p with their first and second derivatives q and r.

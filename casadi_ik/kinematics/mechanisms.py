@@ -1,4 +1,4 @@
-"""The mechanisms that bend fingers: the slider triangle and the four-bar of Chandra et al. 2019.
+"""Mechanisms that bend fingers: the slider triangle and the four-bar of Chandra et al. 2019.
 
 *Lead screw*, eq. (8): a screw of length s between two arms b and c of a joint, s^2 = b^2 + c^2 -
 2 b c cos(theta). All lengths share one unit (m); theta in (0, pi) is the angle between the arms,
@@ -40,7 +40,7 @@ class Linkage(NamedTuple):
 
 
 def coefficients(phi: Expr, bar: Linkage) -> tuple[Expr, Expr, Expr]:
-    """A, B, C [length^2] of A cos(psi) + B sin(psi) = C, as printed below eq. (9)."""
+    """Return A, B, C [length^2] of A cos(psi) + B sin(psi) = C, as printed below eq. (9)."""
     p, q, g, h = bar[:4]
     c, s = ca.cos(phi), ca.sin(phi)
     pq2 = 2 * p * q
@@ -48,7 +48,7 @@ def coefficients(phi: Expr, bar: Linkage) -> tuple[Expr, Expr, Expr]:
 
 
 def linkage_toggle(phi: Expr, bar: Linkage) -> Expr:
-    """Distance from the singular position: sin^2 of the angle between rod and coupler.
+    """Return the distance from the singular position: sin^2 of the angle between rod and coupler.
 
     (A^2 + B^2 - C^2) / (2 q h)^2: 1 where rod and coupler stand at right angles, 0 where they
     align and the rates blow up, negative where the linkage cannot be assembled. Smooth.
@@ -58,13 +58,13 @@ def linkage_toggle(phi: Expr, bar: Linkage) -> Expr:
 
 
 def psi(phi: Expr, bar: Linkage) -> Expr:
-    """Rod angle psi [rad] in (-pi, pi]: atan2(B, A) + sigma acos(C / sqrt(A^2 + B^2))."""
+    """Return rod angle psi [rad] in (-pi, pi]: atan2(B, A) + sigma acos(C / sqrt(A^2 + B^2))."""
     rod, _ = _rod(phi, bar)
     return ca.atan2(rod[1], rod[0])
 
 
 def theta3(phi: Expr, bar: Linkage, reference: Expr = 0.0) -> Expr:
-    """Angle theta3 [rad] of the distal phalanx against the middle one: eq. (9).
+    """Return the angle theta3 [rad] of the distal phalanx against the middle one: eq. (9).
 
     Args:
         phi: crank angle [rad].
@@ -81,7 +81,7 @@ def theta3(phi: Expr, bar: Linkage, reference: Expr = 0.0) -> Expr:
 
 
 def theta3_rate(phi: Expr, bar: Linkage) -> Expr:
-    """Coupling f = d theta3 / d phi of both branches: eq. (11) with a = p. Dimensionless.
+    """Return coupling f = d theta3 / d phi of both branches: eq. (11) with a = p. Dimensionless.
 
     Its numerator p sin(psi - phi) - h sin(phi + theta3 - psi) is g sin(psi), the lever of O about
     the rod, so f = g sin(psi) / [h sin(phi + theta3 - psi)], where h sin(phi + theta3 - psi) =
@@ -92,7 +92,7 @@ def theta3_rate(phi: Expr, bar: Linkage) -> Expr:
 
 
 def branch_from_pose(bar: Linkage, phi: float, theta: float) -> int:
-    """Branch (+1 or -1) of a numeric linkage in a known pose.
+    """Return the branch (+1 or -1) of a numeric linkage in a known pose.
 
     Args:
         bar: the linkage, numbers; its branch is ignored.
@@ -112,7 +112,7 @@ def branch_from_pose(bar: Linkage, phi: float, theta: float) -> int:
 
 
 def _rod(phi: Expr, bar: Linkage) -> tuple[tuple[Expr, Expr], Expr]:
-    """(cos psi, sin psi) and the root sqrt(A^2 + B^2 - C^2), kept from vanishing."""
+    """Return (cos psi, sin psi) and the root sqrt(A^2 + B^2 - C^2), kept from vanishing."""
     A, B, C = coefficients(phi, bar)
     floor = 2 * bar.q * bar.h * MIN_SINE
     root = ca.sqrt(ca.fmax(A * A + B * B - C * C, floor * floor))
@@ -123,11 +123,11 @@ def _rod(phi: Expr, bar: Linkage) -> tuple[tuple[Expr, Expr], Expr]:
 
 
 FLAT = 1e-16
-"""The triangle's two slacks are kept above FLAT b c [m^2]."""
+"""Lower bound of the two slacks of the triangle, relative to b c."""
 
 
 def angle_from_slider(s: Expr, b: Expr, c: Expr) -> Expr:
-    """Angle theta [rad] of a slider length s [m]: Chandra eq. (8).
+    """Return the angle theta [rad] of a slider length s [m]: Chandra eq. (8).
 
     As 2 atan sqrt((s^2 - (b - c)^2) / ((b + c)^2 - s^2)), which unlike acos keeps all digits
     near the flat triangles.
@@ -142,13 +142,13 @@ def angle_from_slider(s: Expr, b: Expr, c: Expr) -> Expr:
 
 
 def angle_rate(s: Expr, b: Expr, c: Expr) -> Expr:
-    """Rate d theta / d s = s / (b c sin theta) [rad/m] at the slider length s [m]."""
+    """Return the rate d theta / d s = s / (b c sin theta) [rad/m] at the slider length s [m]."""
     low, high = _slacks(s, b, c)
     return 2 * s / ca.sqrt(low * high)
 
 
 def slider_toggle(s: Expr, b: Expr, c: Expr) -> Expr:
-    """Distance from the flat triangle: sin^2(theta).
+    """Return the distance from the flat triangle: sin^2(theta).
 
     1 where the slider pushes at right angles to the crank, 0 where the triangle is flat and the
     rate blows up, negative where there is no triangle. Smooth.
@@ -157,7 +157,7 @@ def slider_toggle(s: Expr, b: Expr, c: Expr) -> Expr:
 
 
 def _slacks(s: Expr, b: Expr, c: Expr) -> tuple[Expr, Expr]:
-    """s^2 - (b - c)^2 = 4 b c sin^2(theta/2) and (b + c)^2 - s^2 = 4 b c cos^2(theta/2)."""
+    """Return s^2 - (b - c)^2 = 4 b c sin^2(theta/2) and (b + c)^2 - s^2 = 4 b c cos^2(theta/2)."""
     short, long, flat = b - c, b + c, FLAT * b * c
     return (
         ca.fmax((s - short) * (s + short), flat),

@@ -1,4 +1,4 @@
-"""Which hand postures look like a grasp: a table of them, ranked by the shape of their contacts.
+"""Table of hand postures, ranked by the similarity of the shape of their contacts to a target.
 
 Distances between contact points and angles of the normals do not change when the hand is moved as
 a whole. These invariants of a target are compared with those of many postures, so that the hand
@@ -22,7 +22,7 @@ from casadi_ik.kinematics.contacts import LENGTH
 
 
 def contact_shape(f: int, scales: Sequence[float] | NDArray = ()) -> FunctionGraph:
-    """Invariants of contacts under rigid motions, NaN where something is free (and for f = 1).
+    """Return invariants of contacts under rigid motions, NaN where free (and for f = 1).
 
     Distances of the points, cosines between the normals, slopes of the normals against the lines
     between the points, and the side of the plane of three points that the normals are on.
@@ -67,7 +67,7 @@ def _build(name: str, f: int, factors: tuple[float, ...]) -> ca.Function:
 
 
 class PostureTable:
-    """Hand postures spread evenly over the limits.
+    """Hand postures of a low-discrepancy sequence within the limits.
 
     Attributes:
         postures: (t, k) positions of the hand's actuators.
@@ -85,7 +85,7 @@ class PostureTable:
         compiled: bool = True,
         bounds: tuple[Array, Array] | None = None,
     ) -> None:
-        """Spread the postures and note the shape of their contacts.
+        """Compute the postures and the invariants of their contacts.
 
         Args:
             robot: The robot.
@@ -113,14 +113,14 @@ class PostureTable:
         self.lookup = LookupKernel(key, rows, compiled)
 
     def spread(self, first: int, count: int) -> Array:
-        """(count, k) postures spread like those of the table, from one on: it may be beyond it."""
+        """Return postures (count, k) of the sequence of the table, from any index on."""
         spread = (spread_points(count, len(self.ranges), first) - 0.5) / self._squeeze + 0.5
         return self._lower + np.clip(spread, 0.0, 1.0) * self.ranges
 
     def nearest(
         self, points: Array, normals: Array, count: int, near: Array | None = None
     ) -> Array:
-        """The postures whose contacts are shaped most like the targets, best first.
+        """Return the postures whose contacts are shaped most like the targets, best first.
 
         Args:
             points: (k, f, 3) [m], NaN where free.

@@ -1,4 +1,4 @@
-"""Everything that is asked of a robot's kinematics in numbers, compiled when first used."""
+"""Numeric kinematics of a robot, compiled at the first use."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from casadi_ik.model.description import CONTINUOUS_LIMIT, RobotDescription
 
 
 class RobotKernels:
-    """Functions of q (n,) [rad or m], base frame, lengths in m, angles in rad."""
+    """Kernels of q (n,) [rad or m]; results in the base frame, in m and rad."""
 
     def __init__(self, robot: RobotDescription) -> None:
-        """Keep the description."""
+        """Store the description; kernels are built at the first use."""
         self._robot = robot
 
     @cached_property
@@ -33,7 +33,7 @@ class RobotKernels:
 
     @cached_property
     def toggle_margins(self) -> tuple[tuple[str, ...], FunctionKernel]:
-        """Names of the joints with mechanisms, and how far these are from their toggle."""
+        """Names of the joints with mechanisms, and the kernel of their toggle margins."""
         q = ca.SX.sym("q", len(self._robot.actuators))
         margins = toggle_margins(self._robot, q)
         values = ca.densify(ca.vertcat(ca.SX(0, 1), *margins.values()))
@@ -56,7 +56,7 @@ class RobotKernels:
 
     @cached_property
     def contact_frames(self) -> FunctionKernel:
-        """Contact frames (4, 4), one below the other: axes normal, tangent, normal x tangent."""
+        """Contact frames (4, 4), stacked: axes normal, tangent, normal x tangent."""
 
         def build(q: ca.SX) -> list[ca.SX]:
             kinematics = actuated(self._robot, q).kinematics
@@ -128,7 +128,7 @@ class RobotKernels:
 
     @cached_property
     def links(self) -> FunctionKernel:
-        """Poses of all links, one below the other."""
+        """Poses of all links, stacked."""
 
         def build(q: ca.SX) -> list[ca.SX]:
             links = actuated(self._robot, q).kinematics.links
@@ -143,7 +143,7 @@ class RobotKernels:
         others: Mapping[str, Shape],
         outputs: Sequence[Shape],
     ) -> FunctionKernel:
-        """The kernel of a function of q and other inputs."""
+        """Return the kernel of a function of q and other inputs."""
         # A robot's name may be anything; a function's may not.
         full = ca.Function.fix_name(f"{self._robot.name}_{name}")
         inputs = {"q": (len(self._robot.actuators), 1), **others}

@@ -50,7 +50,7 @@ class Screw:
     revolute: bool
 
     def displacement(self, theta: Expr) -> Expr:
-        """Unit dual quaternion (8, 1) of moving by theta [rad or m]: delta_j of eq. (3)."""
+        """Return unit dual quaternion (8, 1) of moving by theta [rad or m]: delta_j of eq. (3)."""
         angle, distance = (theta, 0.0) if self.revolute else (0.0, theta)
         return dq.exp_screw(angle, distance, ca.DM(self.direction), ca.DM(self.moment))
 
@@ -70,7 +70,7 @@ class ScrewChain:
     reference: Array
 
     def at(self, theta: Expr) -> Screws:
-        """The chain with its joints at theta (len(joints), 1) [rad or m]."""
+        """Return the chain with its joints at theta (len(joints), 1) [rad or m]."""
         return Screws(self, theta)
 
 
@@ -122,7 +122,7 @@ class Screws:
 
 
 def screw_chain_to_contact(robot: RobotDescription, finger: str) -> ScrewChain:
-    """The chain to a finger's contact frame.
+    """Return the chain to a finger's contact frame.
 
     Raises:
         UnknownNameError: There is no such finger.
@@ -166,35 +166,35 @@ class TipChain:
     signs: tuple[int, ...]
 
     def at(self, q: Expr) -> TipMotion:
-        """The chain with the actuators at q (n, 1) [rad or m]."""
+        """Return the chain with the actuators at q (n, 1) [rad or m]."""
         return TipMotion(self, q)
 
     @cached_property
     def drivers(self) -> tuple[str, ...]:
-        """The joints that follow no other joint, in the order in which they are met."""
+        """Joints without a coupling, in the order of the chain."""
         return tuple(dict.fromkeys(self.driver(name) for name in self.chain.joints))
 
     @cached_property
     def actuators(self) -> tuple[int, ...]:
-        """Positions in q of the actuators that move the tip, in order."""
+        """Indices in q of the actuators that move the tip, in order."""
         return tuple(
             sorted({self.robot.actuator_index(self.source(name)) for name in self.drivers})
         )
 
     def driver(self, name: str) -> str:
-        """The joint at the beginning of what a joint follows; itself if it follows no joint."""
+        """Return the joint that drives a joint through its couplings; itself if uncoupled."""
         joint = self.joint(name)
         while joint.coupling is not None and joint.coupling.of in self.robot.joint_names:
             joint = self.joint(joint.coupling.of)
         return joint.name
 
     def source(self, driver: str) -> str:
-        """The actuator that moves a driving joint."""
+        """Return the actuator that moves a driving joint."""
         coupling = self.joint(driver).coupling
         return driver if coupling is None else coupling.of
 
     def joint(self, name: str) -> Joint:
-        """The movable joint of that name."""
+        """Return the movable joint of that name."""
         return self.robot.movable[self.robot.joint_names.index(name)]
 
 
@@ -246,7 +246,7 @@ class TipMotion:
         return ca.densify(ca.horzcat(*columns.values()))
 
     def displacement(self, rates: Expr) -> Expr:
-        """Joint displacements (d, 1) that `joint_jacobian` multiplies: eq. (16).
+        """Return the joint displacements (d, 1) that `joint_jacobian` multiplies: eq. (16).
 
         Args:
             rates: (d, 1) of the driving joints themselves [rad or m].
@@ -265,7 +265,7 @@ class TipMotion:
         return ca.densify(self.joint_jacobian @ drive)
 
     def _rate(self, name: str) -> Expr:
-        """How fast a joint moves per unit of its driving joint, down its couplings."""
+        """Return the rate of a joint per unit of its driving joint, through its couplings."""
         joint, rate = self.tip.joint(name), ca.DM(1)
         while joint.coupling is not None and joint.coupling.of in self.joints:
             rate = rate * coupling_rate(joint, self.joints[joint.coupling.of])
@@ -273,13 +273,13 @@ class TipMotion:
         return rate
 
     def _sign(self, driver: str) -> int:
-        """Sense in which a driving joint counts; a joint beside the chain counts as it is."""
+        """Return the sign of a driving joint in the chain; 1 for a joint outside the chain."""
         joints = self.tip.chain.joints
         return self.tip.signs[joints.index(driver)] if driver in joints else 1
 
 
 def finger_chain(robot: RobotDescription, finger: str) -> TipChain:
-    """A finger's contact frame seen from the base: the chain of eq. (12).
+    """Return the contact frame of a finger relative to the base: the chain of eq. (12).
 
     Raises:
         UnknownNameError: There is no such finger.
@@ -289,7 +289,7 @@ def finger_chain(robot: RobotDescription, finger: str) -> TipChain:
 
 
 def relative_chain(robot: RobotDescription, reference: str, finger: str) -> TipChain:
-    """A finger's contact frame seen from another finger's: the chain of eqs. (15) and (16).
+    """Return the chain between the contact frames of two fingers: eqs. (15) and (16).
 
     Joints that carry both (an arm, above all) move neither against the other and are left out.
 

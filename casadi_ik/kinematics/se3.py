@@ -24,7 +24,7 @@ import numpy as np
 from casadi_ik.kinematics.smooth import Expr, call_function, even_function, safe_norm, safe_sqrt
 
 TINY_SQUARED = 1e-8
-"""Two Taylor terms are exact to rounding below; the closed forms here never cancel above."""
+"""Switching point: two Taylor terms are exact below it; the closed forms do not cancel above."""
 
 HALF_SINC = (1.0, -1 / 24)
 HALF_COSINE = (1.0, -1 / 8)
@@ -37,12 +37,12 @@ def skew(w: Expr) -> Expr:
 
 
 def exp_so3(w: Expr) -> Expr:
-    """Rotation matrix (3, 3) of the rotation vector w (3, 1) [rad]."""
+    """Return the rotation matrix (3, 3) of the rotation vector w (3, 1) [rad]."""
     return quaternion_to_matrix(quaternion_exp(w))
 
 
 def log_so3(R: Expr) -> Expr:
-    """Rotation vector w (3, 1) [rad] of R (3, 3), with |w| <= pi.
+    """Return the rotation vector w (3, 1) [rad] of R (3, 3), with |w| <= pi.
 
     Goes through the quaternion, so it is accurate to rounding both near 0 and near pi. At exactly
     pi the sign of w is a free choice.
@@ -51,34 +51,34 @@ def log_so3(R: Expr) -> Expr:
 
 
 def quaternion_exp(w: Expr) -> Expr:
-    """Unit quaternion (4, 1) of the rotation vector w (3, 1) [rad]."""
+    """Return the unit quaternion (4, 1) of the rotation vector w (3, 1) [rad]."""
     s = ca.dot(w, w)
     cosine = even_function(s, lambda x: ca.cos(0.5 * ca.sqrt(x)), HALF_COSINE, TINY_SQUARED)
     return ca.vertcat(cosine, (0.5 * half_sinc(s)) * w)
 
 
 def half_sinc(s: Expr) -> Expr:
-    """sin(theta/2) / (theta/2) as a function of s = theta^2 [rad^2]."""
+    """Return sin(theta/2) / (theta/2) as a function of s = theta^2 [rad^2]."""
     return even_function(
         s, lambda x: ca.sin(0.5 * ca.sqrt(x)) / (0.5 * ca.sqrt(x)), HALF_SINC, TINY_SQUARED
     )
 
 
 def quaternion_log(q: Expr) -> Expr:
-    """Rotation vector (3, 1) [rad], |w| <= pi, of the unit quaternion q (4, 1) of either sign."""
+    """Return the rotation vector (3, 1) [rad], |w| <= pi, of a unit quaternion q of either sign."""
     sign = ca.if_else(q[0] < 0, -1.0, 1.0)
     return (sign * angle_over_half_sine(sign * q[0], ca.dot(q[1:], q[1:]))) * q[1:]
 
 
 def angle_over_half_sine(cosine: Expr, s: Expr) -> Expr:
-    """Ratio theta / sin(theta/2), 2 at 0, of cos(theta/2) >= 0 and s = sin(theta/2)^2."""
+    """Return ratio theta / sin(theta/2), 2 at 0, of cos(theta/2) >= 0 and s = sin(theta/2)^2."""
     return even_function(
         s, lambda x: 2 * ca.atan2(ca.sqrt(x), cosine) / ca.sqrt(x), ARC_OVER_SINE, TINY_SQUARED
     )
 
 
 def quaternion_from_matrix(R: Expr) -> Expr:
-    """Unit quaternion (4, 1) of R (3, 3); its sign is not fixed.
+    """Return the unit quaternion (4, 1) of R (3, 3); its sign is not fixed.
 
     Takes the row of 4 q q' (linear in R) with the largest diagonal entry, so nothing small is
     ever divided by (Shepperd 1978).
@@ -95,7 +95,7 @@ def quaternion_from_matrix(R: Expr) -> Expr:
 
 
 def quaternion_to_matrix(q: Expr) -> Expr:
-    """Rotation matrix (3, 3) of the unit quaternion q (4, 1)."""
+    """Return the rotation matrix (3, 3) of the unit quaternion q (4, 1)."""
     w, x, y, z = q[0], q[1], q[2], q[3]
     x2, y2, z2 = 2 * x, 2 * y, 2 * z
     xx, yy, zz = x * x2, y * y2, z * z2
@@ -109,7 +109,7 @@ def quaternion_to_matrix(q: Expr) -> Expr:
 
 
 def matrix_to_rpy(R: Expr) -> Expr:
-    """Roll, pitch, yaw (3, 1) [rad] of R (3, 3), pitch in [-pi/2, pi/2].
+    """Return the roll, pitch, yaw (3, 1) [rad] of R (3, 3), pitch in [-pi/2, pi/2].
 
     In gimbal lock (pitch = +-pi/2) roll is set to 0 and yaw carries the whole rotation.
     """
@@ -123,7 +123,7 @@ def matrix_to_rpy(R: Expr) -> Expr:
 
 
 def euler_zyx(R: Expr) -> Expr:
-    """Euler angles (alpha, beta, gamma) (3, 1) [rad] with R = Rz(alpha) Ry(beta) Rx(gamma).
+    """Return Euler angles (alpha, beta, gamma) (3, 1) [rad] with R = Rz(alpha) Ry(beta) Rx(gamma).
 
     The angles of `matrix_to_rpy` in reverse order; one reading of the palm's Euler angles of Qiu
     & Kermani 2021, section II-B2, which leaves the convention open.
@@ -133,7 +133,7 @@ def euler_zyx(R: Expr) -> Expr:
 
 
 def angular_velocity_to_euler_zyx(angles: Expr, min_cosine: float = 1e-6) -> Expr:
-    """Matrix E^-1 (3, 3): d(angles)/dt = E^-1 omega; times J_omega it is the analytic Jacobian.
+    """Return E^-1 (3, 3) of d(angles)/dt = E^-1 omega; E^-1 J_omega is the analytic Jacobian.
 
     Args:
         angles: (alpha, beta, gamma) (3, 1) [rad] as in `euler_zyx`.
@@ -152,7 +152,7 @@ def angular_velocity_to_euler_zyx(angles: Expr, min_cosine: float = 1e-6) -> Exp
 
 
 def mean_rotation(Ra: Expr, Rb: Expr) -> Expr:
-    """Rotation closest to both Ra and Rb: the SVD projection of Qiu & Kermani 2021, eq. (12).
+    """Return the rotation closest to Ra and Rb: SVD projection, Qiu & Kermani 2021, eq. (12).
 
     The least-squares solution of (12) is (Ra + Rb)/2 and its projection to SO(3) the chordal
     mean. For two rotations that equals the normalised sum of their sign-aligned quaternions, which
@@ -171,7 +171,7 @@ def mean_rotation(Ra: Expr, Rb: Expr) -> Expr:
 
 
 def project_to_rotation(M: Expr, iterations: int = 8) -> Expr:
-    """Rotation closest to M in the Frobenius norm: the polar factor, U V' of the SVD.
+    """Return the rotation closest to M in the Frobenius norm: the polar factor, U V' of the SVD.
 
     Newton's iteration X <- (g X + X^-T / g) / 2 with g = |det X|^(-1/3) (Higham 1986). Eight
     steps reach rounding up to condition number 1e4.
@@ -197,26 +197,26 @@ Transform: TypeAlias = tuple[Expr, Expr]
 """(R (3, 3), p (3, 1) [m])."""
 
 SMALL_ANGLE_SQUARED = 1e-4
-"""Below it three Taylor terms are exact to rounding, above it the closed forms still are."""
+"""Switching point: three Taylor terms are exact below it, the closed forms above it."""
 
 SINE_REMAINDER = (1 / 6, -1 / 120, 1 / 5040)
 COTANGENT_REMAINDER = (1 / 12, 1 / 720, 1 / 30240)
 
 
 def compose(first: Transform, second: Transform) -> Transform:
-    """Product of two transforms: (Ra Rb, Ra pb + pa); `second` acts on a point first."""
+    """Return the product of two transforms: (Ra Rb, Ra pb + pa); `second` acts on a point first."""
     (Ra, pa), (Rb, pb) = first, second
     return ca.mtimes(Ra, Rb), ca.mtimes(Ra, pb) + pa
 
 
 def inverse(transform: Transform) -> Transform:
-    """Inverse transform: (R', -R' p)."""
+    """Return the inverse transform: (R', -R' p)."""
     R, p = transform
     return R.T, -ca.mtimes(R.T, p)
 
 
 def exp_se3(twist: Expr) -> Transform:
-    """Transform reached by following a constant twist for unit time.
+    """Return the transform reached by following a constant twist for unit time.
 
     Args:
         twist: [v; w] (6, 1) [m, rad].
@@ -238,7 +238,7 @@ def exp_se3(twist: Expr) -> Transform:
 
 
 def log_se3(transform: Transform) -> Expr:
-    """Twist [v; w] (6, 1) [m, rad] with |w| <= pi whose exponential is the transform.
+    """Return the twist [v; w] (6, 1) [m, rad] with |w| <= pi whose exponential is the transform.
 
     Qiu & Kermani 2021, eq. (14), and the control law of Chandra et al. 2019, eq. (14).
     """
@@ -250,7 +250,7 @@ def log_se3(transform: Transform) -> Expr:
 
 
 def cotangent_remainder(s: Expr) -> Expr:
-    """(1 - (theta/2) cot(theta/2)) / theta^2 as a function of s = theta^2 [rad^2]; 1/12 at 0."""
+    """Return (1 - (theta/2) cot(theta/2)) / theta^2 for s = theta^2 [rad^2]; 1/12 at 0."""
 
     def closed(x: Expr) -> Expr:
         half = 0.5 * ca.sqrt(x)
@@ -267,14 +267,14 @@ ANGLE_OVER_SINE = (0.5, 1 / 12)
 
 
 def perpendicular(n: Expr) -> Expr:
-    """A unit vector (3, 1) perpendicular to the unit vector n (3, 1) (Duff et al. 2017)."""
+    """Return a unit vector (3, 1) perpendicular to the unit vector n (3, 1) (Duff et al. 2017)."""
     sign = ca.if_else(n[2] < 0, -1.0, 1.0)
     y = n[1] / (sign + n[2])
     return ca.vertcat(-n[0] * y, sign - n[1] * y, -n[1])
 
 
 def angle_between(a: Expr, b: Expr) -> Expr:
-    """Angle in [0, pi] between two vectors (3, 1) of any nonzero length.
+    """Return the angle in [0, pi] between two vectors (3, 1) of any nonzero length.
 
     Kahan's 2 atan2(|U|, |V|) with U = |b| a - |a| b, V = |b| a + |a| b, as below eq. (3) of Qiu &
     Kermani 2021: accurate to rounding at 0 and at pi, where acos loses half the digits.
@@ -284,7 +284,7 @@ def angle_between(a: Expr, b: Expr) -> Expr:
 
 
 def normal_error(current: Expr, desired: Expr) -> Expr:
-    """Rotation vector (3, 1) [rad] that turns one unit normal into another, Qiu eq. (3).
+    """Return the rotation vector (3, 1) [rad] that turns one unit normal into another, Qiu eq. (3).
 
     phi (n_c x n_d) / |n_c x n_d| with Kahan's angle phi, written with U = n_c - n_d and
     V = n_c + n_d as phi (U x V) / (|U| |V|): the cross product of nearly opposite normals
@@ -311,7 +311,7 @@ def normal_error(current: Expr, desired: Expr) -> Expr:
 
 
 def rotation_between(a: Expr, b: Expr) -> Expr:
-    """Shortest rotation R (3, 3) with R a = b for unit vectors a, b (3, 1): Qiu eq. (11).
+    """Return shortest rotation R (3, 3) with R a = b for unit vectors a, b (3, 1): Qiu eq. (11).
 
     Equal to I + [w] sin + [w]^2 (1 - cos), but written as the product of the reflections in the
     planes perpendicular to a and to a + b: two outer products, no angle, no normalised axis.
@@ -332,7 +332,7 @@ def rotation_between(a: Expr, b: Expr) -> Expr:
 
 
 def align(correlation: Expr, free: Expr | None = None) -> Expr:
-    """Rotation R (3, 3) that maximises trace(R B') for B = sum of weighted outer products b a'.
+    """Return the rotation R (3, 3) that maximises trace(R B') for B = sum of weighted b a'.
 
     The best R takes the vectors a to the vectors b in the least-squares sense. The dominant
     eigenvector of Davenport's matrix is its quaternion; it is found by squaring, so that two
@@ -366,7 +366,7 @@ def align(correlation: Expr, free: Expr | None = None) -> Expr:
 
 @cache
 def _squared() -> ca.Function:
-    """Upper triangle of a symmetric (4, 4) -> that of its square, by the trace."""
+    """Return ``upper triangle of S (4, 4) -> upper triangle of S^2 / trace(S^2)``."""
     upper = ca.SX.sym("upper", ca.Sparsity.upper(4))
     matrix = ca.triu2symm(upper)
     square = matrix @ matrix

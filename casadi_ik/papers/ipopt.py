@@ -1,6 +1,6 @@
-"""The method `ipopt`: the whole arm-hand as one nonlinear program, the slow, trusted reference.
+"""The method `ipopt`: the arm-hand as one nonlinear program, a slow reference.
 
-Ipopt solves it from q0 and then from random starts.
+Ipopt solves the program from q0 and then from random starts.
 """
 
 from __future__ import annotations
@@ -53,15 +53,15 @@ from casadi_ik.solve.trace import (
 
 @dataclass(frozen=True)
 class IpoptParameters:
-    """Parameters of the method.
+    """Parameters of the method `ipopt`.
 
     Attributes:
-        restarts: Starts drawn at random within the limits after the one from q0; 0 for none. Of
-            150 targets with every joint within 1 deg of a limit, 10 restarts missed 11 (local
-            minima), 30 one, 46 none; of 750 others 9 were enough.
-        max_iterations: Budget of Ipopt's iterations, each start anew.
-        optimality: Ipopt's own tolerance (``tol``) on its scaled optimality error. The contacts
-            end up off by about its root where a coordinate stands at a bound.
+        restarts: Maximum number of random starts within the limits after the start from q0.
+            Source: of 150 targets with every joint within 1 deg of a limit, 10 restarts missed 11
+            (local minima), 30 missed one, 46 none; 9 sufficed for 750 other targets.
+        max_iterations: Maximum number of Ipopt iterations per start.
+        optimality: Tolerance ``tol`` of Ipopt on its scaled optimality error. The error of the
+            contacts is about its square root if a coordinate is at a bound.
     """
 
     restarts: int = 50
@@ -80,7 +80,7 @@ class IpoptParameters:
 
 
 def contact_errors(contacts: ContactRows, residuals: Array) -> tuple[Array, Array]:
-    """Distances [m] and angles [rad], (k, f) each and zero where free, of residuals (k, r)."""
+    """Return distances [m] and angles [rad] (k, f) of residuals (k, r); zero where free."""
     parts = [residuals[:, own] for own in contacts.slices]
     lengths = np.stack([np.linalg.norm(part, axis=1) for part in parts], axis=1)
     f = len(contacts.kinds)
@@ -88,34 +88,34 @@ def contact_errors(contacts: ContactRows, residuals: Array) -> tuple[Array, Arra
 
 
 NEAR = 0.1
-"""Cost below which a start is taken for a solution nearly there, and Ipopt started warm."""
+"""Cost below which a start is near a solution, so that Ipopt is warm-started."""
 
 COLD, WARM = 0.1, 1e-11
-"""Barrier parameter mu to begin with."""
+"""Initial barrier parameters mu of cold and warm starts."""
 
 PULL = 1e-8
-"""Weight of the distance from a warm start: decides only along the arm's self-motion, where the
-barrier alone would draw the arm to the middle of its range."""
+"""Weight of the distance from a warm start: it acts only along the self-motion of the arm, where
+the barrier would otherwise draw the arm to the centre of its range."""
 
 INSIDE = 1e-8
-"""A start at a bound is moved inside by this part of the range (or of its size)."""
+"""Distance by which a start at a bound is moved inside, relative to the range (or the value)."""
 
 
 @dataclass(frozen=True, eq=False)
 class NlpRun:
-    """The run from one start; a row per iteration, the start itself first.
+    """Run from one start; one row per iteration, the start first.
 
     Attributes:
-        q: (n,) configuration reached, within its bounds.
-        residual: (r,) residual there.
-        inside: Whether the coupled joints are within their limits there.
-        status: How Ipopt ended: STALLED (at a minimum, whether it meets the contacts or not),
-            ITERATION_LIMIT or INVALID.
+        q: (n,) final configuration, within its bounds.
+        residual: (r,) residual at q.
+        inside: True if the coupled joints are within their limits at q.
+        status: Result of Ipopt: STALLED (at a minimum, feasible or not), ITERATION_LIMIT or
+            INVALID.
         path: (rows, n) configurations.
-        residuals: (rows, r) residuals there.
-        barrier: (rows,) Ipopt's mu; NaN if Ipopt was not needed.
+        residuals: (rows, r) residuals of these configurations.
+        barrier: (rows,) barrier parameter mu; NaN if Ipopt was not needed.
         infeasibility: (rows,) largest violation of a constraint, Ipopt's ``inf_pr``.
-        regularization: (rows,) what Ipopt added to the diagonal of the Hessian.
+        regularization: (rows,) regularisation that Ipopt added to the diagonal of the Hessian.
     """
 
     q: Array
@@ -130,17 +130,17 @@ class NlpRun:
 
     @property
     def cost(self) -> float:
-        """Squared residual at the end."""
+        """Squared norm of the final residual."""
         return float(self.residual @ self.residual)
 
 
 class WholeNlp:
-    """The program for one robot; targets, weights and bounds are numbers of a solve.
+    """Nonlinear program of one robot; targets, weights and bounds are its parameters.
 
     Attributes:
-        contacts: The contacts' rows.
-        parameters: Layout of the targets: points (f, 3) [m], normals (f, 3), what their kinds have
-            beside, weights (f, 2), 1 where a point (a normal) counts, 0 where it is free.
+        contacts: Rows of the contacts.
+        parameters: Layout of the targets: points (f, 3) [m], normals (f, 3), extra vectors of the
+            kinds, weights (f, 2), 1 where a point or normal is constrained, 0 where it is free.
         residual: ``(q, parameters) -> r`` (rows, 1).
     """
 
@@ -151,7 +151,7 @@ class WholeNlp:
         self.parameters = Layout(self.contacts.fields)
         self._n, self._rows = n, self.contacts.size
         self._lower = robot.lower
-        # Sliders of millimetres and joints of radians move the contacts alike once scaled.
+        # Scaling gives sliders [m] and joints [rad] similar effects on the contacts.
         metres = np.array([actuator.unit == "m" for actuator in robot.actuators])
         self._scale = np.where(metres, robot.upper - robot.lower, 1.0)
         limited = limited_joints(robot)
@@ -178,7 +178,7 @@ class WholeNlp:
         }
         self._watch = Watch(n + self._rows, rows.numel(), self.program["p"].numel())
         self._solvers = {mu: self._solver(mu, options) for mu in (COLD, WARM)}
-        # Ipopt's callback hands its rows to this object, so one solve at a time.
+        # The callback of Ipopt writes to this object, so that solves must not overlap.
         self._lock = ForkSafeLock()
 
     def _solver(self, barrier: float, options: IpoptParameters) -> ca.Function:
@@ -271,7 +271,7 @@ class WholeNlp:
         return within(np.array(self._joints(q)).ravel(), limits)
 
     def _unmoved(self, q: Array, residual: Array, status: Status) -> NlpRun:
-        """A run without Ipopt: one row."""
+        """Return a run without Ipopt: one row."""
         nothing = np.full(1, np.nan)
         return NlpRun(q, residual, True, status, q[None], residual[None], nothing, nothing, nothing)
 
@@ -280,11 +280,11 @@ _ENDINGS = {
     "Maximum_Iterations_Exceeded": Status.ITERATION_LIMIT,
     "Invalid_Number_Detected": Status.INVALID,
 }
-"""What Ipopt's endings mean; all others leave it standing at a point."""
+"""Status by result of Ipopt; all other results count as STALLED."""
 
 
 def limited_joints(robot: RobotDescription) -> list[int]:
-    """Joints whose limits the bounds of q do not imply: positions in `robot.joint_names`.
+    """Return the joints whose limits the bounds of q do not imply: indices in `robot.joint_names`.
 
     Every joint depends on one actuator, and where all couplings on the way are monotone, the
     ends of the actuator's range tell.
@@ -308,7 +308,7 @@ def limited_joints(robot: RobotDescription) -> list[int]:
 
 
 def _column(stats: dict[str, Any], name: str, rows: int) -> Array:
-    """A quantity Ipopt keeps by iteration; NaN where it kept none (a restoration phase)."""
+    """Return a statistic of Ipopt by iteration; NaN in restoration phases."""
     kept = np.asarray(stats.get("iterations", {}).get(name, []), dtype=float)
     column = np.full(rows, np.nan)
     if len(kept) == rows:
@@ -317,21 +317,21 @@ def _column(stats: dict[str, Any], name: str, rows: int) -> Array:
 
 
 EXACT = 1e-8
-"""Root of the cost at which the contacts count as met exactly: no iteration is spent beyond."""
+"""Square root of the cost below which contacts are met exactly and Ipopt stops."""
 
 JOINT_SLACK = 1e-9
-"""Rounding allowed at the limit of a coupled joint [rad or m]."""
+"""Tolerance of the limits of coupled joints [rad or m]."""
 
 
 class Watch(ca.Callback):
-    """Keeps every iterate, and stops Ipopt once the contacts are met exactly or nobody waits.
+    """Callback that stores every iterate and stops Ipopt at exact contacts or on cancellation.
 
     For a program over x = (motors, slacks s) whose constraints are (r - s, joints). One solve at
     a time: `begin`, then Ipopt, then `end`.
     """
 
     def __init__(self, nx: int, ng: int, parameters: int) -> None:
-        """Remember the sizes of the program."""
+        """Store the sizes of the program."""
         ca.Callback.__init__(self)
         sizes = {"x": nx, "f": 1, "g": ng, "lam_x": nx, "lam_g": ng, "lam_p": parameters}
         self._sizes = [sizes[name] for name in ca.nlpsol_out()]
@@ -343,32 +343,32 @@ class Watch(ca.Callback):
         self.construct("watch", {})
 
     def begin(self, contacts: int, joints: tuple[Array, Array]) -> None:
-        """A new solve: how many rows of the constraints are r - s, and the limits of the others."""
+        """Reset for a new solve with the number of rows r - s and the limits of the other rows."""
         self._path, self._rows = [], []
         self._contacts, self._joints = contacts, joints
 
     def end(self) -> tuple[Array, Array]:
-        """(rows, nx) iterates x, and of each r and the joints (rows, ng)."""
+        """Return the iterates x (rows, nx), with their residuals and joints (rows, ng)."""
         return np.array(self._path), np.array(self._rows)
 
     def get_n_in(self) -> int:
-        """Everything a solver returns."""
+        """Return the number of inputs: all outputs of a solver."""
         return len(self._sizes)
 
     def get_n_out(self) -> int:
-        """Whether to stop."""
+        """Return the number of outputs: the stop flag."""
         return 1
 
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        """Dense columns."""
+        """Return dense columns."""
         return ca.Sparsity.dense(self._sizes[i], 1)
 
     def has_eval_buffer(self) -> bool:
-        """Numbers are taken where they are, without matrices around them."""
+        """Read the raw buffers, without wrapping them in matrices."""
         return True
 
     def eval_buffer(self, arg: Any, res: Any) -> int:
-        """Called by Ipopt at the start and after every iteration."""
+        """Store an iterate; Ipopt calls this at the start and after every iteration."""
         x, rows = (np.frombuffer(arg[i], dtype=float).copy() for i in self._wanted)
         rows[: self._contacts] += x[len(x) - self._contacts :]
         self._path.append(x)
@@ -380,18 +380,18 @@ class Watch(ca.Callback):
 
 
 def within(joints: Array, limits: tuple[Array, Array]) -> bool:
-    """Whether coupled joints are within their lower and upper limits."""
+    """Return whether coupled joints are within their lower and upper limits."""
     return bool(
         np.all(joints >= limits[0] - JOINT_SLACK) and np.all(joints <= limits[1] + JOINT_SLACK)
     )
 
 
 AT_LIMIT = 1e-6
-"""A motor this close to its limit [rad or m] counts as standing there; Ipopt stays inside."""
+"""Distance at which a motor is at its limit [rad or m]; Ipopt remains inside the bounds."""
 
 
 class IpoptMethod(Method):
-    """`ipopt`: one start from q0, then random ones until the contacts are met.
+    """`ipopt`: a start from q0, then random starts until the contacts are met.
 
     An iteration is a row of the trace: every start counts its first point and every step of
     Ipopt. Of several starts in vain the one with the smallest cost is returned. Threads take
@@ -411,7 +411,7 @@ class IpoptMethod(Method):
         compiled: bool = True,
         kinds: Kinds | None = None,
     ) -> None:
-        """Remember the robot; the program is built when first needed.
+        """Store the robot; the program is built at the first use.
 
         Args:
             robot: The robot.
@@ -426,11 +426,11 @@ class IpoptMethod(Method):
 
     @cached_property
     def program(self) -> WholeNlp:
-        """The program; it serves every target."""
+        """Nonlinear program, shared by all targets."""
         return WholeNlp(self._robot, self.options, self._kinds)
 
     def for_kinds(self, kinds: Kinds) -> IpoptMethod:
-        """The same for contacts of other kinds."""
+        """Return this method for contacts of other kinds."""
         return self if kinds == self._kinds else IpoptMethod(self._robot, self.options, kinds=kinds)
 
     def prepare(self) -> None:
@@ -439,7 +439,7 @@ class IpoptMethod(Method):
 
     @cached_property
     def record(self) -> Layout:
-        """What is logged of an iteration."""
+        """Layout of the log record of an iteration."""
         robot = self._robot
         return Layout.record(
             Q.of(robot, "actuator positions before the step"),
@@ -458,7 +458,7 @@ class IpoptMethod(Method):
 
     @property
     def trace_format(self) -> TraceFormat:
-        """How its traces are to be read."""
+        """Format of the traces."""
         return trace_format(self.record, self._robot, measures=self._measures)
 
     @cached_property
@@ -467,11 +467,11 @@ class IpoptMethod(Method):
 
     @property
     def parameters(self) -> Mapping[str, Any]:
-        """The parameter record as a plain mapping."""
+        """Parameter record as a mapping."""
         return dataclasses.asdict(self.options)
 
     def stepper(self, targets: TargetBatch, q0: Array) -> Stepper:
-        """Not to be had.
+        """Raise, because this method has no step graph.
 
         Raises:
             UnsupportedError: Always.
@@ -520,7 +520,7 @@ class IpoptMethod(Method):
     def _runs(
         self, start: Array, goals: Array, targets: TargetBatch, rng: np.random.Generator
     ) -> list[NlpRun]:
-        """One run after the other, until the contacts are met or the starts are used up."""
+        """Run Ipopt from successive starts until the contacts are met or no start remains."""
         robot, runs = self._robot, []
         lower, upper = targets.bounds(robot, np.inf)
         for _ in range(self.options.restarts + 1):
@@ -531,7 +531,7 @@ class IpoptMethod(Method):
         return runs
 
     def _goals(self, targets: TargetBatch) -> Array:
-        """(k, ...) parameters of the program; what is free is zero."""
+        """Return the parameters (k, ...) of the program; free vectors are zero."""
         layout, count = self.program.parameters, len(targets)
         counts = [~np.isnan(array[..., 0]) for array in (targets.points, targets.normals)]
         values = {
@@ -564,12 +564,12 @@ class IpoptMethod(Method):
 
 
 def _step_sizes(path: Array) -> Array:
-    """(rows,) largest motor change of the step from every row; none from the last."""
+    """Return the largest motor change (rows,) of the step after every row; NaN for the last."""
     return np.append(np.abs(np.diff(path, axis=0)).max(axis=1), np.nan)
 
 
 def _ending(run: NlpRun, targets: TargetBatch, contacts: ContactRows) -> Status:
-    """How a run ended: solved if every contact is within tolerance, whatever Ipopt thinks."""
+    """Return the status of a run: SOLVED if all contacts are within tolerance, else Ipopt's."""
     distances, angles = contact_errors(contacts, run.residual[None])
     met = np.all(distances <= targets.position_tolerance)
     met = met and np.all(angles <= targets.angle_tolerance)

@@ -79,7 +79,8 @@ def test_a_kind_is_added_in_two_files(tmp_path):
     replace(package / "model" / "couplings.py", union, f"{data}\n\n{union} | Quadratic")
     graphs = package / "kinematics" / "couplings.py"
     replace(graphs, "Linear, Polynomial\n", "Linear, Polynomial, Quadratic\n")
-    replace(graphs, '}\n"""Formulas by kind of coupling."""', f'{row}}}\n"""Formulas by kind of coupling."""')
+    end = '}\n"""Formulas by kind of coupling."""'
+    replace(graphs, end, row + end)
     run_with(package, SCRIPT, path)
 
 

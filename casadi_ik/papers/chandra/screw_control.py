@@ -1,4 +1,4 @@
-"""`ScrewControl`: a fingertip led to where it shall be, step by step, as a real hand would be."""
+"""`ScrewControl`: iterative control of a fingertip towards a target, as on a real hand."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from casadi_ik.solve.status import Status
 from casadi_ik.solve.trace import TraceFormat
 
 UNLIMITED = 1e9
-"""A step that no actuator reaches [rad or m]."""
+"""Step length that no actuator reaches [rad or m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class Trajectory:
     status: Status
 
     def rate(self, floor: float = 1e-9) -> float:
-        """Exponential rate [1/s] fitted to the error norm: -slope of its logarithm over time.
+        """Return the exponential rate [1/s] of the error norm: minus the slope of its logarithm.
 
         Args:
             floor: Norms at or below it are rounding and left out.
@@ -80,7 +80,7 @@ class Trajectory:
 
 
 class ScrewControl:
-    """The screw control law of Chandra et al. 2019 (14), for whole poses and parts of them.
+    """Screw control law of Chandra et al. 2019, eq. (14), for full poses and parts of them.
 
     Attributes:
         robot: The robot.
@@ -111,7 +111,7 @@ class ScrewControl:
         resolution: ArrayLike | None = None,
         compiled: bool = True,
     ) -> None:
-        """Build the law; its step is compiled at the first run and cached on the machine.
+        """Build the control law; its step is compiled at the first run and cached on the machine.
 
         Args:
             robot: From `load_robot`.
@@ -158,19 +158,19 @@ class ScrewControl:
 
     @property
     def kernel(self) -> LoopKernel:
-        """The compiled loop, one for all gains."""
+        """Compiled loop, shared by all gains."""
         return _kernel(self._step, self._compiled)
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """Everything that determines a run but target and start; as kept in the log."""
+        """Settings of a run except target and start, as stored in the log."""
         task = {"kind": self.task.kind, "finger": self.task.finger}
         task |= {"relative_to": self.task.relative_to, "axis": self.task.axis}
         numbers = {name: np.asarray(value).tolist() for name, value in self._numbers.items()}
         return {"method": "screw-control", "task": task, "period": self.period, **numbers}
 
     def target(self, q: ArrayLike) -> dict[str, Array]:
-        """The target that a posture fulfils.
+        """Return the target that a posture meets.
 
         Args:
             q: (n,) actuator positions [rad or m].
@@ -197,7 +197,7 @@ class ScrewControl:
         tolerance: float = 0.0,
         log: str | PathLike[str] | None = None,
     ) -> Trajectory:
-        """Follow the law.
+        """Run the control law.
 
         Args:
             q0: (n,) start [rad or m], moved into the limits; None is `robot.home`.
@@ -248,7 +248,7 @@ class ScrewControl:
         return trajectory
 
     def stepper(self, q0: ArrayLike | None, target: Mapping[str, ArrayLike]) -> Stepper:
-        """The same law by hand, one step at a time; arguments and errors as in `run`."""
+        """Return an iterator over single steps of the law; arguments and errors as in `run`."""
         start = np.clip(self._posture(q0, "q0"), self.robot.lower, self.robot.upper)
         numbers = {**self._numbers, "tolerance": 0.0}
         vector = self._step.parameter_vector(self._checked(target), numbers)
@@ -294,7 +294,7 @@ class ScrewControl:
         trajectory: Trajectory,
         rows: NDArray[Any],
     ) -> None:
-        """One run as one solve of a log; its contacts are left free, its rows tell the rest."""
+        """Return a run as one solve of a log, with free contacts."""
         n, count = len(self.robot.fingers), np.array([len(rows)])
         free = np.full((1, n, 3), np.nan)
         batch = BatchSolution(
@@ -371,7 +371,7 @@ def _number(
 
 
 def _each(name: str, value: ArrayLike, n: int) -> Array:
-    """One number per actuator, not negative."""
+    """Return a checked non-negative value per actuator."""
     array = np.asarray(value, dtype=float)
     if array.shape not in ((), (n,)) or np.isnan(array).any() or (array < 0).any():
         raise InputError(f"{name}: found {value!r}, expected () or ({n},) numbers >= 0")

@@ -1,8 +1,8 @@
-"""What a fingertip is to do, as rows that go to zero: a whole pose, or only what matters.
+"""Tasks of a fingertip as residual rows: a full pose, or selected components.
 
-Chandra et al. 2019 control the whole pose, six rows for the two to four coordinates of a hand, and
-name task-specific Jacobians as future work. Here every objective reads the same tip motion, seen
-from the base or from another fingertip, and takes from it the rows that the task asks for.
+Chandra et al. 2019 control the full pose, six rows for the two to four coordinates of a finger, and
+name task-specific Jacobians as future work. Here every task selects its rows from the motion of the
+tip relative to the base or to another fingertip.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class ScrewTask:
     Attributes:
         kind: "pose", "position", "planar-pose" (position in a plane and angle about its normal),
             "distance" (of the two tips) or "contact" (point and outward pad normal).
-        finger: The finger that is controlled.
-        relative_to: The finger whose contact frame the target is given in, and which moves as
-            well; None is the robot's base.
+        finger: Name of the controlled finger.
+        relative_to: Name of the finger whose contact frame expresses the target and which moves
+            too (default: the base frame).
         axis: Normal of the plane of "planar-pose", in the frame of the target; None is the axis of
             the finger's last joint, with all joints at zero.
 
@@ -64,11 +64,11 @@ class ScrewTask:
             raise InputError(f"task {self.kind!r}: axis: found {self.axis}, expected a direction")
 
     def chain(self, robot: RobotDescription) -> TipChain:
-        """The screws between the frame of the target and the tip.
+        """Return the screws between the frame of the target and the tip.
 
         Raises:
-            UnknownNameError: There is no such finger.
-            InputError: The finger is to be controlled relative to itself.
+            UnknownNameError: The finger does not exist.
+            InputError: The finger is relative to itself.
         """
         if self.relative_to is None:
             return finger_chain(robot, self.finger)
@@ -76,18 +76,18 @@ class ScrewTask:
 
     @property
     def target_fields(self) -> tuple[Field, ...]:
-        """What a target consists of."""
+        """Fields of a target."""
         return OBJECTIVES[self.kind].target
 
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """An objective at a configuration.
+    """Rows of a task at a configuration.
 
     Attributes:
-        error: (m, 1) what is left, desired minus current [m, rad].
-        jacobian: (m, k) over the tip's actuators.
-        linear: How many of the rows, the first ones, are lengths [m]; the rest are angles [rad].
+        error: (m, 1) desired minus current [m, rad].
+        jacobian: (m, k) by the actuators of the tip.
+        linear: Number of leading rows that are lengths [m]; the others are angles [rad].
     """
 
     error: Expr
@@ -97,10 +97,10 @@ class Rows:
 
 @dataclass(frozen=True, eq=False)
 class Tip:
-    """What the objectives read of a tip.
+    """A fingertip as the tasks use it.
 
     Attributes:
-        motion: The tip's screws.
+        motion: Screws of the tip.
         normal: (3,) outward pad normal in the contact frame.
         axis: (3,) unit normal of the plane, in the frame of the target.
     """
@@ -132,12 +132,12 @@ class Tip:
 
 
 def rows(task: ScrewTask, robot: RobotDescription, q: Expr, target: dict[str, Expr]) -> Rows:
-    """A task's rows at q (n, 1) for a target given as the task's target fields."""
+    """Return a task's rows at q (n, 1) for a target given as the task's target fields."""
     return OBJECTIVES[task.kind].rows(tip(task, robot, q), target)
 
 
 def values(task: ScrewTask, robot: RobotDescription, q: Expr) -> dict[str, Expr]:
-    """The target that q (n, 1) fulfils, as the task's target fields."""
+    """Return the target that q (n, 1) meets, as the task's target fields."""
     seen = tip(task, robot, q)
     every = {
         "pose": seen.motion.pose,
@@ -149,7 +149,7 @@ def values(task: ScrewTask, robot: RobotDescription, q: Expr) -> dict[str, Expr]
 
 
 def tip(task: ScrewTask, robot: RobotDescription, q: Expr) -> Tip:
-    """What the objectives read of the task's fingertip, the actuators at q (n, 1)."""
+    """Return the fingertip of a task with the actuators at q (n, 1)."""
     chain = task.chain(robot)
     axis = chain.chain.screws[-1].direction if task.axis is None else np.asarray(task.axis, float)
     normal = robot.finger(task.finger).normal
@@ -157,7 +157,7 @@ def tip(task: ScrewTask, robot: RobotDescription, q: Expr) -> Tip:
 
 
 def _pose(tip: Tip, target: dict[str, Expr]) -> Rows:
-    """All six, the paper's: -log of the error, the twist that eq. (14) asks for."""
+    """Return all six rows of the paper: -log of the error, the twist of eq. (14)."""
     w, v = dq.control_twist(dq.error(tip.motion.pose, target["pose"]), 1.0)
     return Rows(ca.vertcat(v, w), tip.motion.jacobian, 3)
 
@@ -167,7 +167,7 @@ def _position(tip: Tip, target: dict[str, Expr]) -> Rows:
 
 
 def _planar_pose(tip: Tip, target: dict[str, Expr]) -> Rows:
-    """Two coordinates in the plane, and the turn about its normal.
+    """Return the two coordinates in the plane and the angle about its normal.
 
     The turn's row is exact where the tip turns about that normal alone, as a finger with parallel
     axes does; elsewhere it is an approximation that still vanishes at the target.
@@ -188,7 +188,7 @@ def _distance(tip: Tip, target: dict[str, Expr]) -> Rows:
 
 
 def _contact(tip: Tip, target: dict[str, Expr]) -> Rows:
-    """Point and normal; turning about the normal is free."""
+    """Return point and normal; the rotation about the normal is free."""
     normal = tip.normal_now
     turning = tip.angular - normal @ (normal.T @ tip.angular)
     return Rows(
@@ -297,7 +297,7 @@ class ScrewControlStep:
         return ca.Function(name, [q], [ca.densify(value) for value in fulfilled.values()])
 
     def graph(self) -> StepGraph:
-        """The whole step."""
+        """Return the step graph."""
         state, parameters = self.state.symbols("state"), self.parameters.symbols("parameters")
         q, p = self.state.unpack(state)["q"], self.parameters.unpack(parameters)
         seen = tip(self.task, self.robot, q)
@@ -350,5 +350,5 @@ class ScrewControlStep:
         return StepGraph(name, function, self.state, self.parameters, self.record)
 
     def parameter_vector(self, target: dict[str, Any], numbers: dict[str, Any]) -> Array:
-        """Parameters (np,) of a target and the law's numbers."""
+        """Return the parameters (np,) of a target and the law's numbers."""
         return self.parameters.pack({**target, **numbers})

@@ -1,4 +1,4 @@
-"""The other fingers' inverse kinematics in the palm frame (Qiu & Kermani 2021, eqs. 4 and 5).
+"""Inverse kinematics of the other fingers in the palm frame (Qiu & Kermani 2021, eqs. 4 and 5).
 
 Eq. (4): the desired normal gives the spread and the sum of the flexions. Eq. (5): with both held,
 the flexions that bring the contact point closest to its place, within limits. Two solvers of
@@ -42,7 +42,7 @@ ALIGNED = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class PlanarFinger:
-    """The constants of a planar finger.
+    """Constants of a planar finger.
 
     Attributes:
         name: The finger.
@@ -151,7 +151,7 @@ def _spread(
 def _reference(
     robot: RobotDescription, name: str, chain: list[Joint]
 ) -> tuple[list[Array], list[Array], Array, Array]:
-    """Origins and axes of the chain, contact and normal at theta = 0, in the palm frame."""
+    """Return origins and axes of the chain, contact and normal at theta = 0, in the palm frame."""
     kinematics = forward(robot, ca.SX.zeros(len(robot.movable), 1))
     palm = kinematics.palm
     point, normal = kinematics.contact(name)
@@ -163,13 +163,13 @@ def _reference(
 
 
 def _across(normal: Array, y: Array) -> Array:
-    """A direction perpendicular to the flexion axis, for a finger without spread."""
+    """Return a direction perpendicular to the flexion axis, for a finger without spread."""
     z = normal - (normal @ y) * y
     return z / np.linalg.norm(z)
 
 
 UNDECIDED = 1e-12
-"""Weight of the present spread: decides only where no normal demands one."""
+"""Weight of the current spread; it matters only if no normal determines the spread."""
 
 IPOPT_OPTIONS = {
     "ipopt.print_level": 0,
@@ -190,7 +190,7 @@ IPOPT_OPTIONS = {
 
 @dataclass(frozen=True, eq=False)
 class Demand:
-    """What eq. (4) asks of one finger, and what eq. (5) has to reach.
+    """Result of eq. (4) for one finger: the target of eq. (5).
 
     Attributes:
         finger: The finger's constants.
@@ -214,7 +214,7 @@ def demands(
     q: Expr,
     goals: dict[str, Target],
 ) -> list[Demand]:
-    """Eq. (4) for every finger.
+    """Return the results of eq. (4) for every finger.
 
     Args:
         robot: The description.
@@ -231,7 +231,7 @@ def demands(
 
 
 def closed_form(demand: Demand) -> tuple[Expr, Expr]:
-    """Eq. (5) in closed form: the two flexions [rad].
+    """Return the two flexions [rad] that solve eq. (5) in closed form.
 
     The second axis runs on a circle about the first; its nearest point to `reach` is in the same
     direction, and the distance grows with the angle from there, so the limits simply clamp.
@@ -247,7 +247,7 @@ def closed_form(demand: Demand) -> tuple[Expr, Expr]:
 
 
 class IpoptFinger:
-    """Eq. (5) by Ipopt on a CasADi graph, for one finger; exact Hessian, lengths in millimetres.
+    """Solver of eq. (5) for one finger by Ipopt; exact Hessian, lengths in millimetres.
 
     The far side of the circle is a local minimum as well where it lies within the limits, so Ipopt
     starts from whichever of the ends and the middle of the range is best.
@@ -282,7 +282,7 @@ class IpoptFinger:
 
 
 def _squared_distance(finger: PlanarFinger, first: Expr, reach: Expr) -> Expr:
-    """What eq. (5) minimises [mm^2], over the first flexion [rad]."""
+    """Return the objective of eq. (5) [mm^2] as a function of the first flexion [rad]."""
     z, x = float(finger.middle[2]), float(finger.middle[0])
     c, s = ca.cos(first), ca.sin(first)
     place = ca.vertcat(c * z - s * x, s * z + c * x)
@@ -290,7 +290,7 @@ def _squared_distance(finger: PlanarFinger, first: Expr, reach: Expr) -> Expr:
 
 
 def _best_start(demand: Demand) -> Expr:
-    """The best pair of flexions (2, 1) among the ends and the middle of the first one's range."""
+    """Return the best flexions (2, 1) among ends and centre of the range of the first."""
     lower, upper = demand.first_limits[0], demand.first_limits[1]
     best, least = lower, _squared_distance(demand.finger, lower, demand.reach)
     for first in ((lower + upper) / 2, upper):
@@ -301,7 +301,7 @@ def _best_start(demand: Demand) -> Expr:
 
 
 def planar_fingers(robot: RobotDescription) -> list[PlanarFinger]:
-    """The fingers that the step closes: all but the thumb.
+    """Return the fingers that the step closes: all but the thumb.
 
     Raises:
         UnsupportedError: One of them is not planar; the message says how.
@@ -310,7 +310,7 @@ def planar_fingers(robot: RobotDescription) -> list[PlanarFinger]:
 
 
 def finger_step_function(robot: RobotDescription, solver: str) -> ca.Function:
-    """The whole finger step as a Function, to be called inside a step graph.
+    """Return the finger step as a Function that step graphs call.
 
     Args:
         robot: The description; its fingers but the thumb must be planar.
@@ -349,12 +349,12 @@ def finger_step_function(robot: RobotDescription, solver: str) -> ca.Function:
 
 
 def clamp(value: Expr, lower: Expr, upper: Expr) -> Expr:
-    """Value moved into [lower, upper]."""
+    """Return a value clipped to [lower, upper]."""
     return ca.fmin(ca.fmax(value, lower), upper)
 
 
 def wrap(angle: Expr) -> Expr:
-    """Angle moved by full turns into [-pi, pi] [rad]."""
+    """Return an angle wrapped to [-pi, pi] [rad]."""
     return ca.atan2(ca.sin(angle), ca.cos(angle))
 
 
@@ -370,7 +370,7 @@ def _spreads(
     q: Expr,
     local: Sequence[Target],
 ) -> list[Expr]:
-    """Spread joint angle of every finger; fingers on one motor agree on one."""
+    """Return the spread angle of every finger; fingers on one motor share one angle."""
     agreed: dict[int, Expr] = {}
     for motor in {finger.spread for finger in fingers if finger.spread is not None}:
         total, weights = UNDECIDED * q[motor], UNDECIDED
@@ -393,7 +393,7 @@ def _spreads(
 def _spread_range(
     robot: RobotDescription, fingers: Sequence[PlanarFinger], motor: int
 ) -> tuple[float, float]:
-    """Limits of a spread motor that keep it and every joint on it within theirs."""
+    """Return the limits of a spread motor that keep it and every joint on it within theirs."""
     lower, upper = float(robot.lower[motor]), float(robot.upper[motor])
     for finger in fingers:
         if finger.spread == motor:
@@ -403,7 +403,7 @@ def _spread_range(
 
 
 def _demand(finger: PlanarFinger, goal: Target, spread: Expr) -> Demand:
-    """The attainable flexion sum closest to the normal, and the reach it leaves to eq. (5)."""
+    """Return attainable flexion sum closest to the normal, and the reach it leaves to eq. (5)."""
     c, s = ca.cos(spread), ca.sin(spread)
     (low_1, high_1), (low_2, high_2) = finger.flexion_limits
     across = c * goal.normal[0] + s * goal.normal[1]

@@ -1,4 +1,4 @@
-"""The methods of Qiu & Kermani 2021, each one compiled loop.
+"""The methods of Qiu & Kermani 2021, each as one compiled loop.
 
 *Enhanced:* thumb reaching, then hand alignment. *Original*, of the paper's comparison: all contacts
 in one hierarchy.
@@ -49,7 +49,7 @@ NOT_MEASURED = float("nan")
 
 
 class EnhancedStep(QiuStep[QiuParameters]):
-    """Builds the step graph of an enhanced method for one robot.
+    """Step graph of an enhanced method for one robot.
 
     Attributes:
         chain: Active and passive joints of the closed chain.
@@ -61,11 +61,11 @@ class EnhancedStep(QiuStep[QiuParameters]):
         """Lay out state, parameters and record.
 
         Raises:
-            UnsupportedError: The robot is not of the kind the method needs.
+            UnsupportedError: The robot does not have the structure that the method requires.
         """
         self.chain = split(robot, options.borrowed)
         self.compilable = options.finger_step != "ipopt"
-        planar_fingers(robot)  # refused now rather than when the graph is built
+        planar_fingers(robot)  # raises here rather than when the graph is built
         state = (
             Field("phase"),
             Field("best", doc="smallest summed error of thumb reaching so far"),
@@ -98,7 +98,7 @@ class EnhancedStep(QiuStep[QiuParameters]):
 
     @property
     def jacobians(self) -> dict[str, RecordedJacobian]:
-        """The Jacobians in the record.
+        """Jacobians in the record.
 
         The paper names no thresholds; these are ours. A metre of the thumb's tip asks for more
         than 20 rad of some joint, a rad of the palm for more than 2 rad, the platform for passive
@@ -116,7 +116,7 @@ class EnhancedStep(QiuStep[QiuParameters]):
         }
 
     def parameter_values(self, targets: TargetBatch) -> dict[str, float | list[float] | Array]:
-        """Values of all parameter fields for a batch."""
+        """Return the values of all parameter fields for a batch."""
         options = self.options
         weights = [
             options.virtual_weight if column == VIRTUAL else options.joint_weight
@@ -125,7 +125,7 @@ class EnhancedStep(QiuStep[QiuParameters]):
         return super().parameter_values(targets) | {"weights": weights}
 
     def first_state(self, starts: Array) -> dict[str, float | Array]:
-        """Values of all state fields for starts (k, n)."""
+        """Return the values of all state fields for starts (k, n)."""
         most = float(np.finfo(float).max)
         begun = {"phase": float(Phase.THUMB_REACHING), "best": most, "waited": 0.0, "reached": 0.0}
         return super().first_state(starts) | begun
@@ -133,14 +133,14 @@ class EnhancedStep(QiuStep[QiuParameters]):
     def row(
         self, q: Expr, positions: Expr, angles: Expr, *, phase: Phase, **measured: Expr
     ) -> ca.SX:
-        """What is logged of an iteration.
+        """Return the log record of an iteration.
 
         Args:
-            q: (n, 1) the configuration the row describes.
-            positions: (f, 1) its errors [m].
-            angles: (f, 1) [rad].
-            phase: The phase.
-            measured: The other fields; those that the phase does not have are left out.
+            q: (n, 1) configuration that the record describes.
+            positions: (f, 1) position errors [m].
+            angles: (f, 1) angle errors [rad].
+            phase: Phase of the iteration.
+            measured: Further fields that the phase defines.
         """
         values: dict[str, Expr] = {
             "q": q,
@@ -171,7 +171,7 @@ class EnhancedStep(QiuStep[QiuParameters]):
         return ca.Function(self._name, [state, parameters], list(outputs))
 
     def _palm_view(self) -> ca.Function:
-        """Targets of the fingers but the thumb, seen from the palm: what eq. (5) works with."""
+        """Return the graph of the targets of the other fingers in the palm frame, for eq. (5)."""
         state, parameters, s, p = self._inputs()
         palm = actuated(self.robot, s["q"]).kinematics.palm
         goals = [
@@ -182,7 +182,7 @@ class EnhancedStep(QiuStep[QiuParameters]):
         return ca.Function("palm_view", [state, parameters], [points, normals])
 
     def _reach(self) -> ca.Function:
-        """One iteration of thumb reaching (section II-B)."""
+        """Return the graph of thumb reaching (section II-B)."""
         state, parameters, s, p = self._inputs()
         robot, body, goals = self.robot, actuated(self.robot, s["q"]), goal_contacts(self.robot, p)
         columns = robot.arm_actuators + robot.finger_actuators(robot.thumb)
@@ -234,7 +234,7 @@ class EnhancedStep(QiuStep[QiuParameters]):
         return ca.Function("reach", [state, parameters], with_cse(after, record, status))
 
     def _align(self) -> ca.Function:
-        """One iteration of hand alignment (section II-C), after the fingers' own step."""
+        """Return the graph of hand alignment (section II-C), after the finger step."""
         state, parameters, s, p = self._inputs()
         closed = ca.SX.sym("closed", len(self.robot.actuators))
         robot, body, goals = self.robot, actuated(self.robot, closed), goal_contacts(self.robot, p)
@@ -278,7 +278,7 @@ class EnhancedStep(QiuStep[QiuParameters]):
     def _palm_tasks(
         self, J_cc: ca.SX, translation: ca.SX, rotation: ca.SX, p: dict[str, ca.SX]
     ) -> list[Task]:
-        """What the closed chain is to do: position, then orientation, or both as one."""
+        """Return the tasks of the closed chain: position and orientation, or both as one."""
         if self.options.chain_tasks == "successive":
             return [
                 Task(J_cc[:3, :], translation, is_position=True),
@@ -289,31 +289,31 @@ class EnhancedStep(QiuStep[QiuParameters]):
         return [Task(stacked, ca.vertcat(translation, lever * rotation), is_position=True)]
 
     def _combined(self, tasks: Sequence[Task], solve: TaskSolver) -> ca.SX:
-        """One step for all tasks, the highest first, as in the paper by successive projection."""
+        """Return one step for all tasks by successive projection, as in the paper."""
         return combine(tasks, [solve(task) for task in tasks], "successive")
 
     def _reaching(self, p: dict[str, ca.SX]) -> TaskSolver:
-        """Solves the tasks of the serial chain."""
+        """Return the solver of the tasks of the serial chain."""
         if self.options.steps == "dls":
             return damped(p["reaching_damping"])
         return selective(p["reaching_gamma"], p["longest_error"], p["widest_error"])
 
     def _chain_solver(self, p: dict[str, ca.SX]) -> TaskSolver:
-        """Solves the tasks of the closed chain, weighted."""
+        """Return the weighted solver of the tasks of the closed chain."""
         if self.options.steps == "dls":
             return weighted_damped(p["chain_damping"], p["weights"])
         solver = selective(p["chain_gamma"], p["longest_error"], p["widest_error"])
         return weighted(solver, p["weights"])
 
     def _spread(self, step: ca.SX, columns: tuple[int, ...]) -> ca.SX:
-        """A step of some actuators as a step of all (n, 1)."""
+        """Return a step of some actuators as a step of all (n, 1)."""
         full = ca.SX.zeros(len(self.robot.actuators), 1)
         for i, column in enumerate(columns):
             full[column] = step[i]
         return full
 
     def _moved(self, q: ca.SX, step: ca.SX, p: dict[str, ca.SX]) -> ca.SX:
-        """Take a step from q: capped, and kept within limits if they are enforced."""
+        """Return q after a step, capped and clipped to enforced limits."""
         q_next = q + step * ca.fmin(1.0, p["step_cap"] / ca.fmax(_largest(step), 1e-12))
         return clamp_to_limits(self.robot, q_next, p["enforce_limits"])
 
@@ -323,15 +323,15 @@ def _smallest(jacobian: ca.SX) -> ca.SX:
 
 
 def _largest(step: ca.SX) -> ca.SX:
-    """Largest change of any motor."""
+    """Return the largest change of any motor."""
     return ca.mmax(ca.fabs(step))
 
 
 class OriginalStep(QiuStep[OriginalParameters]):
-    """Builds the step graph of an original method for one robot.
+    """Step graph of an original method for one robot.
 
-    What repeats, the solving of a task, is a function that is called: written out once per task it
-    made the C compiler slow. Only the columns of the actuators that move a task are worked on.
+    The solution of a task is a called function, because inlined copies slow the C compiler down. It
+    operates only on the columns of the actuators that move the task.
     """
 
     family = "original"
@@ -369,7 +369,7 @@ class OriginalStep(QiuStep[OriginalParameters]):
 
     @cached_property
     def _kinds(self) -> list[tuple[bool, tuple[int, ...]]]:
-        """Of every task by priority, whether it is a position, and the actuators that move it."""
+        """By priority of tasks: True for a position, and the actuators that move the task."""
         robot, arm = self.robot, self.robot.arm_actuators
         movers = [(*arm, *robot.finger_actuators(name)) for name in thumb_first(robot)]
         if self.options.order == "per-finger":
@@ -383,7 +383,7 @@ class OriginalStep(QiuStep[OriginalParameters]):
         return self.options.palm_task and bool(self.robot.arm_actuators)
 
     def _view(self) -> ca.Function:
-        """Errors (f, 2) of all fingers in point and normal, then all tasks by priority.
+        """Return the errors (f, 2) of all fingers in point and normal, then all tasks by priority.
 
         A task is its Jacobian over the actuators that move it, and its error, [J, e] (3, k + 1).
         """
@@ -407,9 +407,9 @@ class OriginalStep(QiuStep[OriginalParameters]):
         return ca.Function("view", [state, parameters], with_cse(errors, *seen))
 
     def _solve(self, count: int) -> ca.Function:
-        """The step of one task alone over the actuators that move it, errors not above `longest`.
+        """Return the graph of the step of one task by the actuators that move it.
 
-        SDLS needs that, DLS does not look at it.
+        SDLS limits errors to `longest`; DLS ignores it.
         """
         _, parameters, _, p = self._inputs()
         longest, pair = ca.SX.sym("longest"), ca.SX.sym("pair", 3, count + 1)
@@ -421,7 +421,7 @@ class OriginalStep(QiuStep[OriginalParameters]):
         return ca.Function(f"solve_{count}", [parameters, longest, pair], with_cse(step))
 
     def _pairs(self) -> tuple[list[ca.SX], list[Task]]:
-        """Symbols of all [J, e], and the tasks over all actuators that they stand for."""
+        """Return symbols of all [J, e], and the tasks over all actuators that they stand for."""
         n, pairs, tasks = len(self.robot.actuators), [], []
         for i, (is_position, columns) in enumerate(self._kinds):
             pair = ca.SX.sym(f"pair_{i}", 3, len(columns) + 1)
@@ -430,7 +430,7 @@ class OriginalStep(QiuStep[OriginalParameters]):
         return pairs, tasks
 
     def _stacked(self) -> ca.Function:
-        """One step for all tasks as one, without priorities."""
+        """Return the graph of one step for all tasks without priorities."""
         _, parameters, _, p = self._inputs()
         pairs, tasks = self._pairs()
         J = ca.vertcat(*(task.jacobian for task in tasks))
@@ -439,7 +439,7 @@ class OriginalStep(QiuStep[OriginalParameters]):
         return ca.Function("stacked", [parameters, *pairs], with_cse(step))
 
     def _combined(self) -> ca.Function:
-        """One step from those of all tasks."""
+        """Return the graph that combines the steps of all tasks."""
         n, (pairs, tasks) = len(self.robot.actuators), self._pairs()
         given, steps = [], []
         for i, (_, columns) in enumerate(self._kinds):
@@ -450,7 +450,7 @@ class OriginalStep(QiuStep[OriginalParameters]):
         return ca.Function("combined", [*pairs, *given], with_cse(step))
 
     def _ending(self) -> ca.Function:
-        """Take the step, or end."""
+        """Return the graph that takes the step or ends the solve."""
         state, parameters, s, p = self._inputs()
         errors = ca.SX.sym("errors", len(self.robot.fingers), 2)
         step = ca.SX.sym("step", len(self.robot.actuators))
@@ -476,7 +476,7 @@ class OriginalStep(QiuStep[OriginalParameters]):
 
 
 def _spread(matrix: ca.SX, columns: tuple[int, ...], n: int) -> ca.SX:
-    """A matrix (r, k) as the given columns of one with n, the others structurally zero."""
+    """Return a matrix (r, k) as the given columns of one with n, the others structurally zero."""
     wide = ca.SX(matrix.shape[0], n)
     wide[:, list(columns)] = matrix
     return wide
@@ -486,20 +486,20 @@ Step = TypeVar("Step", EnhancedStep, OriginalStep)
 
 
 class _QiuMethod(LoopedMethod, Generic[Step]):
-    """What the methods of the paper share: one step graph, begun at q0, within the paper's budget.
+    """Base class of the methods of the paper: one step graph, started at q0.
 
     Attributes:
-        step: Its step for this robot.
+        step: Step of this robot.
     """
 
     step: Step
 
     def step_graph(self) -> StepGraph:
-        """The whole iteration."""
+        """Return the step graph."""
         return self.step.graph()
 
     def begin(self, targets: TargetBatch, q0: Array) -> Start:
-        """Start at q0, moved into limits that are enforced."""
+        """Return initial states at q0, clipped to enforced limits."""
         step, count = self.step, len(targets)
         first = step.first_state(clip_starts(self.robot, targets, q0))
         states = step.state.pack_rows(first, count)
@@ -509,7 +509,7 @@ class _QiuMethod(LoopedMethod, Generic[Step]):
 class EnhancedMethod(_QiuMethod[EnhancedStep]):
     """`enhanced-*`: thumb reaching, then hand alignment along the arm-thumb closed chain.
 
-    Its step runs in the virtual machine if the finger step is Ipopt's.
+    The step runs in the virtual machine if the finger step uses Ipopt.
     """
 
     def __init__(
@@ -523,18 +523,18 @@ class EnhancedMethod(_QiuMethod[EnhancedStep]):
         self.max_iterations = options.max_iterations
 
     def phase_counts(self, states: Array, iterations: Counts) -> Mapping[Phase, Counts]:
-        """What is not thumb reaching is hand alignment."""
+        """Return the iterations by phase; those after thumb reaching are hand alignment."""
         reached = states[:, self.step.state.slice("reached").start].astype(iterations.dtype)
         return {Phase.THUMB_REACHING: reached, Phase.HAND_ALIGNMENT: iterations - reached}
 
     @property
     def jacobians(self) -> Mapping[str, RecordedJacobian]:
-        """Those of thumb, palm and closed chain."""
+        """Jacobians of thumb, palm and closed chain."""
         return self.step.jacobians
 
 
 class OriginalMethod(_QiuMethod[OriginalStep]):
-    """`original-*`: all contacts in one hierarchy, what the paper compares with."""
+    """`original-*`: all contacts in one hierarchy, the baseline of the paper."""
 
     def __init__(
         self, robot: RobotDescription, options: OriginalParameters, compiled: bool = True
@@ -547,6 +547,6 @@ class OriginalMethod(_QiuMethod[OriginalStep]):
         self.max_iterations = options.max_iterations
 
     def phase_counts(self, states: Array, iterations: Counts) -> Mapping[Phase, Counts]:
-        """There is but one phase."""
+        """Return the iterations of the single phase."""
         del states
         return {Phase.HIERARCHY: iterations.copy()}

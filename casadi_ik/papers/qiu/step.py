@@ -1,4 +1,4 @@
-"""Every number and every open choice of Qiu & Kermani 2021, and what their steps share."""
+"""Parameters and open choices of Qiu & Kermani 2021, and the base class of the steps."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ ORDERS = ("per-finger", "points-first")
 """Order of the tasks of the original methods: finger by finger, or all points, then all normals."""
 
 PROJECTIONS = (*HIERARCHIES, "stacked")
-"""How the tasks of the original methods share the motors: a hierarchy, or one damped least squares
-problem of all of them (DLS only: selective damping is per task here)."""
+"""Combination of the tasks of the original methods: a hierarchy, or one damped least-squares
+problem (only with DLS, because selective damping is per task)."""
 
 PROJECTORS = ("exact", "damped")
 
@@ -48,14 +48,13 @@ MAY_BE_ZERO = ("borrowed",)
 
 @dataclass(frozen=True)
 class QiuParameters:
-    """Parameters of the paper's methods; the defaults are the paper's where it gives them.
+    """Parameters of the enhanced methods; defaults are those of the paper where it states them.
 
-    Lengths inside the solver are millimetres, angles radians: the paper gives its damping
-    factors as bare numbers, and only in these units do they do what it describes (lambda = 150
-    "considerably large").
+    The solver uses millimetres and radians: the paper states damping factors without units, and
+    only these units reproduce its description (lambda = 150 is "considerably large").
 
     Attributes:
-        steps: How a task is solved: "dls" (Wampler 1986) or "sdls" (Buss & Kim 2005).
+        steps: Solver of a task: "dls" (Wampler 1986) or "sdls" (Buss & Kim 2005).
         reaching_damping: lambda of thumb reaching (paper: 1), squared in the normal matrix.
             [mm] in the position task, [rad/rad] in the orientation tasks.
         chain_damping: lambda of the closed chain (paper: 150), squared in the normal matrix.
@@ -63,7 +62,8 @@ class QiuParameters:
             97 % to 82 % (12 shipped grasps x 40 random arms, limits ignored).
         reaching_gamma: SDLS: largest joint change in one step of thumb reaching (paper: pi/9)
             [rad].
-        chain_gamma: SDLS: the same for the closed chain (paper: pi/500) [rad].
+        chain_gamma: SDLS: largest joint change in one step of the closed chain (paper: pi/500)
+            [rad].
         longest_error: SDLS: position errors are shortened to this (paper: 200) [mm].
         widest_error: SDLS: orientation errors are shortened to this (paper: pi/6) [rad].
         virtual_weight: Weight of the virtual joint in the closed chain (paper: 10).
@@ -71,24 +71,24 @@ class QiuParameters:
         palm_error: "euler": differences of Euler angles as the paper writes; it names no
             convention, taken is ZYX, each difference wrapped to (-pi, pi]. "rotation-vector":
             rotation logarithm and geometric Jacobian, free of the Euler singularity.
-        palm_task: Whether thumb reaching has the palm's estimated orientation as its first task
+        palm_task: True if the estimated palm orientation is the first task of thumb reaching
             (paper: yes).
-        closed_chain: Whether the closed chain moves the palm (paper: yes); without it only the
+        closed_chain: True if the closed chain moves the palm (paper: yes); otherwise only the
             fingers close.
         chain_tasks: "successive": the palm's position, its orientation in the null space of that
             (paper). "stacked": both as one task, its rotations times `chain_lever`.
-        chain_lever: How much palm motion a turn of the palm counts as [mm/rad].
-        platform: Whose twist J_cc of eq. (8) is: "arm-leg" as printed (the arm's last joint is
-            left out), "palm" with it.
+        chain_lever: Length that converts palm rotation to translation [mm/rad].
+        platform: Body whose twist J_cc of eq. (8) describes: "arm-leg" as printed (without the
+            last joint of the arm), or "palm" with it.
         borrowed: Arm joints counted to the reversed thumb (paper: 1, the 7th).
         finger_step: Solver of eq. (5): "ipopt" (the paper: fmincon) or "closed-form" (the same
             answer, much faster).
         reaching_patience: Thumb reaching ends when palm and thumb are within tolerance. The
             paper does not say what happens when the tasks conflict and they never are: here it
             also ends after this many iterations without a gain of 1 % in the summed errors.
-        reaching_iterations: ... and after this many iterations in any case.
-        step_cap: Longest change of any motor in one iteration [rad or m]. Not in the paper: none.
-        max_iterations: Budget of a solve, both phases together (paper: 10,000).
+        reaching_iterations: Maximum number of iterations of thumb reaching.
+        step_cap: Largest change of a motor per iteration [rad or m]; the paper has no cap.
+        max_iterations: Maximum number of iterations of both phases together (paper: 10,000).
     """
 
     steps: str = "dls"
@@ -118,7 +118,7 @@ class QiuParameters:
 
 
 def _check_fields(record: QiuParameters | OriginalParameters) -> None:
-    """Raise unless every field has a value it can have."""
+    """Raise InputError unless every field has an admissible value."""
     for entry in fields(record):
         value = getattr(record, entry.name)
         if entry.name in CHOICES:
@@ -143,7 +143,7 @@ def _check_number(name: str, value: object, whole: bool) -> None:
 
 @dataclass(frozen=True)
 class OriginalParameters:
-    """Parameters of the methods the paper compares with: one hierarchy over all motors.
+    """Parameters of the original methods, the baseline of the paper: one hierarchy of all motors.
 
     The paper says only "the methods without the enhancement of the proposed approach". The
     defaults carry the hierarchy of its thumb reaching on to the other fingers: the palm's
@@ -155,15 +155,15 @@ class OriginalParameters:
         steps: How a task is solved: "dls" or "sdls".
         palm_task: Whether the palm's estimated orientation is the first task.
         order: Order of the contact tasks, see `ORDERS`; the thumb is the first finger.
-        projection: How a lower task is kept from disturbing the higher ones, see `hierarchy`;
-            "stacked": all tasks are one, without priorities.
+        projection: Projection that keeps lower tasks from disturbing higher ones, see `combine`;
+            "stacked": one problem of all tasks without priorities.
         projectors: Their pseudoinverse: "exact", or "damped" by `damping` like a task's own.
         damping: lambda (paper: 1) [mm; rad/rad].
         gamma: SDLS: largest joint change in one step (paper: pi/9) [rad].
         longest_error: SDLS: position errors are shortened to this (paper: 200) [mm].
         widest_error: SDLS: orientation errors are shortened to this (paper: pi/6) [rad].
         palm_error: See `QiuParameters`.
-        max_iterations: Budget of a solve (paper: 10,000).
+        max_iterations: Maximum number of iterations (paper: 10,000).
     """
 
     steps: str = "dls"
@@ -188,14 +188,14 @@ Options = TypeVar("Options", QiuParameters, OriginalParameters)
 
 
 class QiuStep(Generic[Options]):
-    """What the steps of the paper's methods share: layouts, and the numbers that go in.
+    """Base class of the steps of the paper: layouts and parameter values.
 
     Attributes:
-        robot: The description.
-        options: The structural choices; their numbers are parameters of the graph.
-        state: What an iteration hands to the next.
-        parameters: The problem and the numbers of the method.
-        record: What is logged of an iteration.
+        robot: Description of the robot.
+        options: Parameters of the method; numeric ones are parameters of the graph.
+        state: Layout of the state that an iteration passes to the next.
+        parameters: Layout of the target and the numeric parameters.
+        record: Layout of the log record of an iteration.
     """
 
     family: str
@@ -213,10 +213,10 @@ class QiuStep(Generic[Options]):
         """Lay out state, parameters and record.
 
         Args:
-            robot: The description.
-            options: The structural choices.
-            state: Fields of the state beside q.
-            numbers: Fields of the parameters beside the targets and limits.
+            robot: Description of the robot.
+            options: Parameters of the method.
+            state: Fields of the state in addition to q.
+            numbers: Fields of the parameters in addition to targets and limits.
             measured: Fields of the record between the errors and the limits.
         """
         limits = Field("enforce_limits", doc="1: q is kept within its limits, 0: it is not")
@@ -228,7 +228,7 @@ class QiuStep(Generic[Options]):
         self.record = Layout.record(*ends[0], *measured, *ends[1])
 
     def graph(self) -> StepGraph:
-        """The whole iteration."""
+        """Return the step graph."""
         return StepGraph(
             self._name,
             self._iteration,
@@ -245,15 +245,15 @@ class QiuStep(Generic[Options]):
         return ca.Function.fix_name(f"{self.family}_{self.options.steps}_{self.robot.name}")
 
     def _iteration(self) -> ca.Function:
-        """``(state, parameters) -> (state', record, status)``."""
+        """Return ``(state, parameters) -> (state', record, status)``."""
         raise NotImplementedError
 
     def first_state(self, starts: Array) -> dict[str, float | Array]:
-        """Values of all state fields for starts (k, n)."""
+        """Return the values of all state fields for starts (k, n)."""
         return {"q": starts}
 
     def parameter_values(self, targets: TargetBatch) -> dict[str, float | list[float] | Array]:
-        """Values of all parameter fields for a batch."""
+        """Return the values of all parameter fields for a batch."""
         named = (name for name in self.parameters.names if hasattr(self.options, name))
         return {
             **target_values(targets),

@@ -1,4 +1,4 @@
-"""The tasks of Qiu & Kermani 2021 and how they are combined.
+"""Tasks of Qiu & Kermani 2021 and their combination.
 
 Rows of contacts and of the palm's orientation, the estimate of that orientation from contacts
 (1), (2), steps by damped and selectively damped least squares, a task in the null space of those
@@ -35,12 +35,12 @@ from casadi_ik.kinematics.smooth import Expr, safe_norm
 from casadi_ik.model.description import RobotDescription
 
 MILLIMETRE = 1e-3
-"""The paper's solvers work in millimetres and radians: their damping factors say so."""
+"""Millimetres per metre: the damping factors of the paper refer to millimetres and radians."""
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """One end effector's position or orientation.
+    """Position or orientation task of one end effector.
 
     Attributes:
         jacobian: (3, k) over some actuators [mm or rad per rad or m].
@@ -54,13 +54,13 @@ class Task:
 
 
 TaskSolver = Callable[[Task], Expr]
-"""Turns a task into a step (k, 1) of its actuators."""
+"""Solver that returns the step (k, 1) of the actuators of a task."""
 
 
 def palm_orientation_task(
     body: ActuatedKinematics, desired: Expr, actuators: Sequence[int], euler: bool
 ) -> Task:
-    """The palm's orientation; error by Euler angles as in the paper, or by rotation vector.
+    """Return the task of the palm orientation, by Euler angles as in the paper or rotation vector.
 
     Args:
         body: Kinematics over q.
@@ -81,7 +81,7 @@ def palm_orientation_task(
 def contact_tasks(
     body: ActuatedKinematics, finger: str, goal: Target, actuators: Sequence[int]
 ) -> tuple[Task, Task]:
-    """A finger's contact point and normal, Qiu & Kermani 2021, eq. (3)."""
+    """Return the tasks of contact point and normal of a finger, Qiu & Kermani 2021, eq. (3)."""
     tip, target = tip_vectors(body.kinematics, finger), goal.vectors
     place, facing = POINT_AND_NORMAL.conditions
     linear, angular = body.contact_jacobian(finger, actuators)
@@ -90,12 +90,12 @@ def contact_tasks(
 
 
 def damped(damping: Expr) -> TaskSolver:
-    """Damped least squares (Wampler 1986) with one damping factor [mm; rad/rad]."""
+    """Return the damped least-squares solver (Wampler 1986) for a damping factor [mm; rad/rad]."""
     return lambda task: damped_pinv_times(task.jacobian, task.error, damping)
 
 
 def selective(gamma_max: Expr, longest: Expr, widest: Expr) -> TaskSolver:
-    """Selectively damped least squares (Buss & Kim 2005).
+    """Return the selectively damped least-squares solver (Buss & Kim 2005).
 
     Args:
         gamma_max: Largest change of any actuator [rad or m].
@@ -111,12 +111,12 @@ def selective(gamma_max: Expr, longest: Expr, widest: Expr) -> TaskSolver:
 
 
 def weighted_damped(damping: Expr, weights: Expr) -> TaskSolver:
-    """Weighted damped least squares (Chan & Dubey 1995); a heavy actuator (k, 1) moves little."""
+    """Return the weighted damped least-squares solver (Chan & Dubey 1995) for weights (k, 1)."""
     return lambda task: weighted_damped_pinv_times(task.jacobian, task.error, damping, weights)
 
 
 def weighted(solver: TaskSolver, weights: Expr) -> TaskSolver:
-    """Any solver in the weighted coordinates sqrt(w_i) q_i, as weighted damping does it."""
+    """Return a solver in the weighted coordinates sqrt(w_i) q_i."""
     scale = 1 / ca.sqrt(weights)
 
     def solve(task: Task) -> Expr:
@@ -127,15 +127,15 @@ def weighted(solver: TaskSolver, weights: Expr) -> TaskSolver:
 
 
 def clamped(error: Expr, longest: Expr) -> Expr:
-    """An error shortened to a length, its direction kept."""
+    """Return an error scaled down to at most a length."""
     return error * ca.fmin(1.0, longest / ca.fmax(safe_norm(error), 1e-12))
 
 
 PROJECTIONS = ("successive", "augmented", "none")
-"""Which null space a lower task has to stay in."""
+"""Null spaces to which lower tasks are projected."""
 
 EXACT = 1e-6
-"""Damping of a projector that is meant to be exact [unit of the task's Jacobian]."""
+"""Damping of an `exact` projector [unit of the task's Jacobian]."""
 
 RANK_FLOOR = 1e-3
 """Damping of the augmented projector [rad/rad, and m/rad]: below it a row left over
@@ -148,7 +148,7 @@ def combine(
     projection: str,
     damping: float | None = None,
 ) -> Expr:
-    """One step for all tasks (k, 1), the highest first.
+    """Return one step (k, 1) for all tasks, in order of priority.
 
     Args:
         tasks: From the highest priority to the lowest, over the same actuators.
@@ -180,7 +180,7 @@ def combine(
 
 @dataclass(frozen=True, eq=False)
 class Projector:
-    """N = I - Y' Z with Z = (Y Y' + damping^2 I)^-1 Y, kept as its factors, both (3, k).
+    """Projector N = I - Y' Z with Z = (Y Y' + damping^2 I)^-1 Y, stored as factors (3, k).
 
     Multiplied with vectors one after the other they take a third of the instructions of a product
     of the matrices.
@@ -190,16 +190,16 @@ class Projector:
     Z: Expr
 
     def of_column(self, column: Expr) -> Expr:
-        """N v for v (k, 1)."""
+        """Return N v for v (k, 1)."""
         return column - self.Y.T @ (self.Z @ column)
 
     def of_rows(self, rows: Expr) -> Expr:
-        """R N for R (r, k)."""
+        """Return R N for R (r, k)."""
         return rows - (rows @ self.Y.T) @ self.Z
 
 
 def _projector(task: Task, higher: Sequence[Projector], damping: float | None) -> Projector:
-    """What the tasks so far and one more leave free is N_1 N_2 ... N_k: this is N_k.
+    """Return the factor N_k of the projector N_1 N_2 ... N_k onto the null space of k tasks.
 
     Y = J N_1 ... N_k-1 is the part of the task that the higher ones left to it.
     """
@@ -217,11 +217,11 @@ def _projector(task: Task, higher: Sequence[Projector], damping: float | None) -
 
 
 NEGLIGIBLE = 1e-9
-"""Singular values below this part of the largest count as zero, their directions as unreachable."""
+"""Singular values below this fraction of the largest are zero; their directions unreachable."""
 
 
 def selectively_damped(jacobian: Expr, error: Expr, gamma_max: Expr) -> Expr:
-    """One SDLS step for one end effector.
+    """Return an SDLS step for one end effector.
 
     With J = sum sigma_i u_i v_i', alpha_i = u_i' e, N_i = |u_i| = 1 and
     M_i = sum_j |v_ji| |J_j| / sigma_i:  gamma_i = min(1, N_i / M_i) gamma_max and
@@ -253,12 +253,12 @@ def selectively_damped(jacobian: Expr, error: Expr, gamma_max: Expr) -> Expr:
 
 
 def shorten(step: Expr, largest: Expr) -> Expr:
-    """A vector scaled down so that no entry exceeds `largest` in magnitude."""
+    """Return a vector scaled down so that no entry exceeds `largest` in magnitude."""
     return step * ca.fmin(1.0, largest / ca.fmax(ca.mmax(ca.fabs(step)), 1e-300))
 
 
 def axes_through(points: list[ca.SX]) -> ca.SX:
-    """The frame of eqs. (1) and (2) through three or more points.
+    """Return the frame of eqs. (1) and (2) through three or more points.
 
     X runs from the last point to the second, Y from the middle of those towards the first (the
     thumb), Z = X x Y, and X = Y x Z makes them orthogonal.
@@ -279,7 +279,7 @@ def axes_through(points: list[ca.SX]) -> ca.SX:
 
 
 def base_axes(robot: RobotDescription) -> Array:
-    """The same frame through the fingers' base points, in the palm frame (3, 3).
+    """Return the frame of eqs. (1), (2) through the finger bases, palm frame (3, 3).
 
     The paper's palm frame has it as the identity; another hand's palm frame may be turned.
 
@@ -301,7 +301,7 @@ def base_axes(robot: RobotDescription) -> Array:
 
 
 def palm_orientation(robot: RobotDescription, goal: dict[str, Target]) -> ca.SX:
-    """Estimated palm orientation (3, 3) in the frame of the targets.
+    """Return the estimated palm orientation (3, 3) in the frame of the targets.
 
     The contact points stand in for the fingers' base points.
     """
@@ -310,13 +310,13 @@ def palm_orientation(robot: RobotDescription, goal: dict[str, Target]) -> ca.SX:
 
 
 def thumb_first(robot: RobotDescription) -> tuple[str, ...]:
-    """Finger names with the thumb in front."""
+    """Return the finger names with the thumb in front."""
     others = tuple(name for name in robot.finger_names if name != robot.thumb)
     return (robot.thumb, *others)
 
 
 def palm_motion(body: ActuatedKinematics, goals: dict[str, Target]) -> tuple[ca.SX, ca.SX]:
-    """Mean translation and rotation demanded by the fingers, in the palm frame.
+    """Return the mean translation and rotation demanded by the fingers, in the palm frame.
 
     Args:
         body: Kinematics over q.

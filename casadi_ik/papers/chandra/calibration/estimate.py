@@ -1,10 +1,10 @@
-"""The estimate, maximum a posteriori and robust to outliers, and the description made of it.
+"""Robust maximum-a-posteriori estimate of parameters, and the calibrated description.
 
-Gauss-Newton on whitened misfits and priors, reweighted for a robust loss (iteratively reweighted
-least squares), the parameters within bounds. The noise is estimated from the data, so the standard
-deviations given are only where that begins. Everything is computed in units of the priors: a
-singular value s of the whitened Jacobian says how much more (s > 1) or less (s < 1) the data know
-about a direction than the prior does.
+The estimate uses Gauss-Newton steps on whitened residuals and priors within bounds, reweighted for
+a robust loss (iteratively reweighted least squares). The noise is estimated from the data; the
+given standard deviations are initial values. Units are those of the priors: a singular value s of
+the whitened Jacobian compares the information of the data about a direction with that of the prior
+(s > 1: data dominate, s < 1: prior dominates).
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ CAUCHY, HUBER = 2.385, 1.345
 
 @dataclass(frozen=True)
 class Loss:
-    """A loss.
+    """A robust loss function.
 
     Attributes:
-        cost: What a component of a measurement costs.
+        cost: Cost of a component of a measurement.
         weight: Weight of a measurement in the normal equations, cost' / rho.
-        slope: Its share in the mean curvature, weight + rho weight' / m over m components, from
+        slope: Contribution to the mean curvature, weight + rho weight' / m over m components, from
             weight, rho and m.
     """
 
@@ -64,23 +64,23 @@ LOSSES = {
     ),
     "squares": Loss(lambda rho: 0.5 * rho**2, np.ones_like, lambda weight, *_: weight),
 }
-"""The losses by name."""
+"""Loss functions by name."""
 
 
 NORMAL_95 = 1.959964
-"""95 % of a normal variable lie within so many standard deviations."""
+"""Half width of the central 95 % interval of a normal variable [standard deviations]."""
 
 
 @dataclass(frozen=True)
 class EstimateSettings:
-    """How the estimate is found.
+    """Settings of the estimate.
 
     Attributes:
-        unknown: Singular value, relative to the largest, below which the data say nothing at all.
-        fewest: Measured numbers beyond those that the parameters can explain, so that noise can be
-            seen.
-        max_iterations: Steps at most.
-        smallest_step: Step at which the iteration ends, in prior standard deviations.
+        unknown: Singular value, relative to the largest, below which the data contain no
+            information.
+        fewest: Smallest number of redundant measured values from which noise is estimated.
+        max_iterations: Maximum number of steps.
+        smallest_step: Step length at which the iteration ends [prior standard deviations].
     """
 
     unknown: float = 1e-6
@@ -94,22 +94,23 @@ SETTINGS = EstimateSettings()
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What the data say about the parameters; m measurements, k parameters.
+    """Result of a calibration with m measurements and k parameters.
 
     Attributes:
-        parameters: The parameters.
+        parameters: Estimated parameters.
         values: (k,) estimates.
         covariance: (k, k) of the estimates.
         singular_values: (k,) of the whitened Jacobian in units of the priors, descending.
         directions: (k, k) their directions in units of the priors, one per row.
-        weights: (m,) weight of each measurement, 1 where it is taken in full.
+        weights: (m,) weight of each measurement, 1 for an inlier.
         noise: Standard deviations of a measured coordinate [m] and angle [rad]; NaN if no
             orientation was measured.
-        noise_estimated: Whether the noise is from the data; with too few it is what was assumed.
-        before: (m, 2) misfit of the description: distance [m] and angle [rad, NaN].
-        after: (m, 2) the same of the estimate.
-        iterations: Gauss-Newton steps.
-        converged: Whether the last step was small enough.
+        noise_estimated: True if the noise is estimated, False if it is the assumed noise because of
+            too few data.
+        before: (m, 2) errors of the description: distance [m] and angle [rad, NaN].
+        after: (m, 2) errors of the estimate.
+        iterations: Number of Gauss-Newton steps.
+        converged: True if the last step was small enough.
     """
 
     parameters: tuple[Parameter, ...]
@@ -137,17 +138,17 @@ class Calibration:
 
     @property
     def learned(self) -> Array:
-        """(k,) part of the prior's variance that the data took away: 0 nothing, 1 all."""
+        """Fraction of the variance of the prior that the data remove (k,): 0 none, 1 all."""
         prior = np.array([parameter.prior for parameter in self.parameters])
         return np.clip(1 - (self.deviation / prior) ** 2, 0.0, 1.0)
 
     @property
     def outliers(self) -> NDArray[np.intp]:
-        """Rows that count less than a quarter."""
+        """Rows with a weight below 0.25."""
         return np.flatnonzero(self.weights < 0.25)
 
     def unidentified(self, below: float = 1.0) -> list[tuple[float, dict[str, float]]]:
-        """Directions about which the data say less than the priors.
+        """Return the directions about which the data contain less information than the priors.
 
         Args:
             below: Singular value up to which a direction counts.
@@ -166,7 +167,7 @@ class Calibration:
 
     @property
     def unknown_directions(self) -> int:
-        """How many directions the data say nothing at all about."""
+        """Number of directions about which the data contain no information."""
         return int(np.sum(self.singular_values < SETTINGS.unknown * self.singular_values[0]))
 
 
@@ -193,8 +194,8 @@ def calibrate(
         sigma_angle: The same of a measured angle [rad].
 
     Raises:
-        UnknownNameError: No such loss.
-        InputError: A noise that is not positive.
+        UnknownNameError: The loss does not exist.
+        InputError: A noise is not positive.
     """
     if loss not in LOSSES:
         raise UnknownNameError(f"loss: found {loss!r}, expected one of {', '.join(LOSSES)}")
@@ -219,14 +220,14 @@ def calibrate(
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """The least-squares problem; x are the parameters' deviations in units of the priors."""
+    """Least-squares problem; x are deviations of the parameters in units of the priors."""
 
     model: HandModel
     measurements: Measurements
     loss: Loss
 
     def misfit(self, x: Array) -> tuple[Array, Array]:
-        """Errors (m, 6) [m, rad], 0 where not measured, and their Jacobian (m, 6, k) over x."""
+        """Return errors (m, 6) [m, rad], 0 if not measured, and their Jacobian by x (m, 6, k)."""
         seen, model = self.measurements, self.model
         values = model.nominal + model.prior * x
         errors = np.zeros((len(seen), 6))
@@ -240,7 +241,7 @@ class _Fit:
         return errors, jacobians
 
     def step(self, x: Array, noise: Array) -> Array:
-        """A Gauss-Newton step within the bounds, halved until the cost does not rise."""
+        """Return a Gauss-Newton step within the bounds, halved until the cost does not rise."""
         errors, jacobians = self.misfit(x)
         white, rho, _ = self.whitened(errors, noise)
         roots = np.sqrt(self.loss.weight(rho))
@@ -257,13 +258,13 @@ class _Fit:
         return step
 
     def whitened(self, errors: Array, noise: Array) -> tuple[Array, Array, Array]:
-        """Errors over the noise (m, 6), their root mean squares (m,) and numbers (m,)."""
+        """Return errors over the noise (m, 6), their root mean squares (m,) and numbers (m,)."""
         white = errors / _each(noise)
         numbers = np.where(self.measurements.turned, 6.0, 3.0)
         return white, np.sqrt((white**2).sum(axis=1) / numbers), numbers
 
     def enough(self) -> bool:
-        """Whether there are rows enough beyond what the parameters can explain."""
+        """Return whether there are enough redundant rows to estimate the noise."""
         _, jacobians = self.misfit(np.zeros(len(self.model.parameters)))
         rows = jacobians.reshape(-1, jacobians.shape[2])
         return (
@@ -272,7 +273,7 @@ class _Fit:
         )
 
     def noise(self, x: Array, noise: Array) -> Array:
-        """Standard deviations from the medians of the misfits, which outliers hardly move."""
+        """Return standard deviations from medians of the errors, which are robust to outliers."""
         errors, jacobians = self.misfit(x)
         _, rho, _ = self.whitened(errors, noise)
         known, _ = self._known(jacobians, noise, self.loss.weight(rho))
@@ -283,15 +284,15 @@ class _Fit:
         if turned.any():
             angle = np.median((errors[turned, 3:] ** 2).sum(axis=1))
             estimate[1] = math.sqrt(angle / CHI_SQUARE_MEDIAN / free)
-        # Exact data have no noise; what is left of them is rounding.
+        # Exact data have no noise but rounding errors.
         return np.maximum(np.array(estimate), 1e-8)
 
     def _rows(self) -> int:
-        """How many numbers were measured."""
+        """Return the number of measured values."""
         return int(np.where(self.measurements.turned, 6, 3).sum())
 
     def _known(self, jacobians: Array, noise: Array, weights: Array) -> tuple[Array, Array]:
-        """Singular values (k,) and directions (k, k) of the whitened, weighted Jacobian."""
+        """Return singular values (k,) and directions (k, k) of the whitened, weighted Jacobian."""
         rows = _stacked(jacobians, noise, np.sqrt(weights))
         few = len(rows) < rows.shape[1]  # else the directions are complete without the rest of U
         _, known, directions = np.linalg.svd(rows, full_matrices=few)
@@ -300,7 +301,7 @@ class _Fit:
     def result(
         self, x: Array, noise: Array, estimated: bool, before: Array, steps: int, converged: bool
     ) -> Calibration:
-        """The estimate with all that is said about it; `estimated`: the noise is from the data."""
+        """Return the calibration; `estimated` is True if the noise is estimated."""
         errors, jacobians = self.misfit(x)
         _, rho, numbers = self.whitened(errors, noise)
         weights = self.loss.weight(rho)
@@ -315,7 +316,7 @@ class _Fit:
         _, sizes, turns = np.linalg.svd(np.vstack([curved, eye]), full_matrices=False)
         outer = (turns.T / sizes**2) @ turns
         known, directions = self._known(jacobians, noise, weights)
-        # Where there are too few data to see the scatter, the noise that was assumed stands for it.
+        # With too few data the assumed noise replaces the estimated scatter.
         scatter = (weights * rho) ** 2 / (1 - _used(known) / self._rows())
         share = scatter if estimated else self.loss.slope(weights, rho, numbers)
         inner = information(share) + eye
@@ -349,13 +350,13 @@ class _Fit:
 
 
 def _stacked(jacobians: Array, noise: Array, roots: Array) -> Array:
-    """Whitened Jacobians (m, 6, k) as rows (6 m, k), each measurement times its root weight."""
+    """Return whitened Jacobians (m, 6, k), times root weights, as rows (6 m, k)."""
     scaled = jacobians * (roots[:, None] / _each(noise))[:, :, None]
     return scaled.reshape(-1, jacobians.shape[2])
 
 
 def _used(known: Array) -> float:
-    """How many of the measured numbers the estimate follows, by its singular values."""
+    """Return the effective number of parameters from the singular values."""
     return float((known**2 / (known**2 + 1)).sum())
 
 
@@ -369,31 +370,31 @@ def _sizes(errors: Array, turned: NDArray[np.bool_]) -> Array:
 
 
 TAG = "calibration"
-"""Source of the numbers that were estimated."""
+"""Source tag of estimated values."""
 
 GRID = 201
-"""Positions per stroke at which a coupled joint's range is looked for."""
+"""Number of samples per stroke for the range of a coupled joint."""
 
 MARGIN = 1e-3
-"""By which a widened joint limit lies beyond what the strokes allow [rad]."""
+"""Margin of widened joint limits beyond the range of the strokes [rad]."""
 
 
 def write_description(
     calibration: Calibration, robot: str | Path, path: Path, origin: str = ""
 ) -> None:
-    """Write the robot with its estimated numbers; the hand stands in the same file.
+    """Write the robot with its estimated parameters, with the hand in the same file.
 
-    A joint limit that the calibrated couplings pass within their actuator's stroke is widened to
-    it, since such limits follow from the stroke.
+    Joint limits that the calibrated couplings exceed within the stroke of their actuator are
+    widened, because such limits follow from the stroke.
 
     Args:
-        calibration: The estimate.
-        robot: The robot it was made for, a shipped name or a path.
-        path: The file to write.
-        origin: Where the data are from, for the list of sources.
+        calibration: Result of `calibrate`.
+        robot: Calibrated robot, a shipped name or a path.
+        path: Output file.
+        origin: Origin of the data, for the list of sources.
 
     Raises:
-        InputError: The robot's joints are not described in our own files.
+        InputError: The joints of the robot are not described in YAML.
         OSError: The file cannot be written.
     """
     top_path = resolve_description(robot, "arm_hands")
@@ -455,11 +456,11 @@ _PARTS = {"coupling": _coupling, "origin": _origin, "axis": _axis, "tip": _tip, 
 
 
 def _widen(joints: dict[str, dict[str, Any]], names: set[str], path: Path) -> None:
-    """Let the limits of some coupled joints include what their actuators' strokes allow."""
+    """Widen the limits of coupled joints to the range of their actuators' strokes."""
     robot = load_description(path)
     q = ca.SX.sym("q", len(robot.actuators))
     positions = ca.Function("joints", [q], [joint_positions(robot, q)])
-    # A triangle or a four-bar hangs on one actuator, so all strokes can be gone through at once.
+    # Every mechanism depends on one actuator, so that all strokes are sampled simultaneously.
     strokes = np.linspace(*robot.strokes, GRID)
     ranges = np.array(positions(strokes.T))
     for joint, values in zip(robot.movable, ranges, strict=True):

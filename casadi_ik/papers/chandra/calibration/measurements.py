@@ -26,12 +26,12 @@ POINT = ("x", "y", "z")
 TURN = ("qw", "qx", "qy", "qz")
 
 STROKE_SLACK = 1e-3
-"""Part of its range by which a reading may lie beyond an actuator's limits."""
+"""Largest violation of the limits by a reading, relative to the range of the actuator."""
 
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
-    """Fingertips seen at known actuator positions.
+    """Measured fingertip poses at known actuator positions.
 
     Attributes:
         fingers: (m,) name of the finger of each row.
@@ -50,11 +50,11 @@ class Measurements:
 
     @property
     def measured_fingers(self) -> tuple[str, ...]:
-        """The fingers that were measured, each once."""
+        """Names of the measured fingers, without duplicates."""
         return tuple(dict.fromkeys(self.fingers))
 
     def rows(self, finger: str) -> NDArray[np.intp]:
-        """Which rows are of a finger."""
+        """Return the rows of a finger."""
         return np.flatnonzero([name == finger for name in self.fingers])
 
 
@@ -181,7 +181,7 @@ def _row(
 
 
 def true_values(model: HandModel, rng: np.random.Generator) -> Array:
-    """(k,) parameters of a hand that the description's priors could mean.
+    """Return parameters (k,) of a hand, drawn from the priors of a description.
 
     Args:
         model: The model; deviations are normal with its priors, cut at 2.5 of them.
@@ -202,7 +202,7 @@ def simulate(
     outliers: float = 0.0,
     factor: float = 20.0,
 ) -> Measurements:
-    """Poses of a fingertip at random actuator positions, with noise.
+    """Return the poses of a fingertip at random actuator positions, with noise.
 
     Args:
         model: The model.
@@ -227,7 +227,7 @@ def simulate(
 
 @cache
 def _displaced() -> FunctionKernel:
-    """A pose turned about its own point and shifted, both in the base frame."""
+    """Return a pose rotated about its origin and translated, both in the base frame."""
     pose, turn, shift = ca.SX.sym("pose", 8), ca.SX.sym("turn", 3), ca.SX.sym("shift", 3)
     turned = dq.quaternion_multiply(dq.exp(turn, ca.DM.zeros(3, 1))[:4], pose[:4])
     moved = dq.from_quaternion(turned, dq.translation(pose) + shift)

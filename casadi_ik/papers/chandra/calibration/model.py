@@ -1,4 +1,4 @@
-"""A hand whose dimensions are symbols: numbers with priors, and fingertip poses over them.
+"""Parametric hand model: parameters with priors, and fingertip poses as functions of them.
 
 The same graphs as everywhere: eq. (8) for the triangles, eq. (9) for the four-bars, eq. (3) for the
 chain (Chandra et al. 2019), with the description's numbers as inputs. A four-bar keeps the branch
@@ -29,12 +29,12 @@ GROUPS = ("linkage", "axes", "tips")
 """Numbers of the couplings; origins and directions of the joint axes; contact frames."""
 
 BOUND = 3.0
-"""Estimates stay within so many prior standard deviations of the description."""
+"""Bound of estimates around the description [prior standard deviations]."""
 
 
 @dataclass(frozen=True)
 class Priors:
-    """How far the description may be off: standard deviations.
+    """Standard deviations of the errors of a description.
 
     Attributes:
         length: Sides of triangles and four-bars [m].
@@ -60,7 +60,7 @@ class Priors:
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number that is estimated.
+    """An estimated parameter.
 
     Attributes:
         owner: The joint or finger it belongs to.
@@ -80,14 +80,14 @@ class Parameter:
 
     @property
     def name(self) -> str:
-        """What it is called."""
+        """Name of the parameter."""
         if self.part == "coupling":
             return f"{self.owner}.{self.key}"
         return f"{self.owner}.{self.part}.{self.key}"
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """Least and largest value."""
+        """Smallest and largest value."""
         return self.nominal - BOUND * self.prior, self.nominal + BOUND * self.prior
 
 
@@ -97,7 +97,7 @@ def hand_parameters(
     groups: Sequence[str] = GROUPS,
     priors: Priors | None = None,
 ) -> tuple[Parameter, ...]:
-    """The numbers of some fingers, from the palm to the tips, each once.
+    """Return the parameters of fingers, from the palm to the tips, without duplicates.
 
     Args:
         robot: The description.
@@ -142,7 +142,7 @@ def hand_parameters(
 
 @dataclass(frozen=True, eq=False)
 class HandModel:
-    """A description with some of its numbers free.
+    """A description with free parameters.
 
     Attributes:
         robot: The description.
@@ -156,7 +156,7 @@ class HandModel:
 
     @cached_property
     def nominal(self) -> Array:
-        """(k,) what the description says."""
+        """Parameter values of the description (k,)."""
         return np.array([parameter.nominal for parameter in self.parameters])
 
     @cached_property
@@ -165,7 +165,7 @@ class HandModel:
         return np.array([parameter.prior for parameter in self.parameters])
 
     def poses(self, finger: str, q: Array, values: Array) -> Array:
-        """Fingertip poses.
+        """Return the fingertip poses.
 
         Args:
             finger: The finger.
@@ -179,7 +179,7 @@ class HandModel:
         return poses
 
     def misfit(self, finger: str, q: Array, values: Array, measured: Array) -> tuple[Array, Array]:
-        """What the model misses of measured poses, and how the parameters move it.
+        """Return the errors of the model at measured poses, and their Jacobian by the parameters.
 
         Args:
             finger: The finger.
@@ -217,7 +217,7 @@ class HandModel:
         return {}
 
     def _pose(self, finger: str, q: ca.SX, p: ca.SX) -> Expr:
-        """The product of the joints' screws, each joint's frame placed in its parent's."""
+        """Return the tip pose as the product of the joint screws in their parent frames."""
         symbols = {parameter.name: p[i] for i, parameter in enumerate(self.parameters)}
         positions = {name: q[i] for i, name in enumerate(self.robot.actuator_names)}
         joints = {joint.name: joint for joint in self.robot.movable}
@@ -248,14 +248,14 @@ class HandModel:
 
 
 def tilted(axis: Array, tilts: Expr) -> Expr:
-    """A unit axis (3,) turned by the rotation vector of two tilts (2, 1) [rad] across it."""
+    """Return a unit axis (3,) rotated by two perpendicular tilts (2, 1) [rad]."""
     first = perpendicular(ca.DM(axis.tolist()))
     across = ca.horzcat(first, ca.cross(ca.DM(axis.tolist()), first))
     return exp_so3(across @ tilts) @ ca.DM(axis.tolist())
 
 
 class _Numbers:
-    """The numbers of a joint's coupling, symbols where they are free."""
+    """Return the parameters of the coupling of a joint, symbols where they are free."""
 
     def __init__(self, joint: Joint, symbols: dict[str, Expr]) -> None:
         self._joint, self._symbols = joint, symbols
@@ -265,7 +265,7 @@ class _Numbers:
 
 
 def _vector(symbols: dict[str, Expr], owner: str, part: str, nominal: Array) -> Expr:
-    """A vector whose entries are symbols where they are free."""
+    """Return a vector whose entries are symbols where they are free."""
     keys: Sequence[str] = "12" if part == "axis" else "xyz"
     pairs = zip(keys, nominal, strict=True)
     return ca.vertcat(*(symbols.get(f"{owner}.{part}.{key}", float(value)) for key, value in pairs))
