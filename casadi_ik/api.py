@@ -27,7 +27,7 @@ from casadi_ik.papers.qiu.step import FINGER_STEPS
 from casadi_ik.planning.choose import choose
 from casadi_ik.planning.object_pose import solve_with_object
 from casadi_ik.planning.touch.grasps import grasps_of
-from casadi_ik.solve.alternatives import APART
+from casadi_ik.solve.alternatives import DEFAULT_SEPARATION
 from casadi_ik.solve.engine import Engine, SolvedBlock, SolveOptions
 from casadi_ik.solve.fast import FastSolver
 from casadi_ik.solve.recorder import Recorder
@@ -375,7 +375,7 @@ class Solver(MovingSolver):
         q0: ArrayLike | None = None,
         seed: int = 0,
         fixed: Mapping[str, float] | None = None,
-        apart: float = APART,
+        apart: float = DEFAULT_SEPARATION,
     ) -> tuple[Alternative, ...]:
         """Find different solutions of one grasp, best first.
 

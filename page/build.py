@@ -25,7 +25,7 @@ import numpy as np
 import casadi_ik as ik
 from casadi_ik.app.drawing import palette
 from casadi_ik.app.drawing.drawables import close_view, link_styles, overview, scene_with_object
-from casadi_ik.collision.solids import EXPORTED, of_object, stated
+from casadi_ik.collision.solids import EXPORTED_KINDS, primitive_solids, solid_to_dict
 from casadi_ik.export.project import checked_prefix, wasm_project, write_folder
 from casadi_ik.model.load_grasp import shipped_grasps
 from casadi_ik.model.objects import load_object
@@ -78,8 +78,8 @@ def of_grasps(robot: ik.ArmHand, name: str) -> list[dict[str, Any]]:
             near = np.linalg.norm(points[:k] - points[k], axis=1) < CLOSE
             if finger not in grasp.contacts or near.any():
                 points[k] = normals[k] = np.nan
-        parts = of_object(load_object(grasp.object).shape)
-        if len(parts) >= CAPACITY or any(solid.kind not in EXPORTED for solid, _ in parts):
+        parts = primitive_solids(load_object(grasp.object).shape)
+        if len(parts) >= CAPACITY or any(solid.kind not in EXPORTED_KINDS for solid, _ in parts):
             continue
         # As the page answers, bit for bit: cameras look at that.
         solver = ik.Solver(robot, scene=scene_with_object(ik.Scene(), grasp))
@@ -93,7 +93,7 @@ def of_grasps(robot: ik.ArmHand, name: str) -> list[dict[str, Any]]:
                 "points": [None if np.isnan(p).any() else p.tolist() for p in points],
                 "normals": [None if np.isnan(n).any() else n.tolist() for n in normals],
                 "solids": [
-                    stated(solid, grasp.object_pose @ place) | {"shape": solid.kind.name}
+                    solid_to_dict(solid, grasp.object_pose @ place) | {"shape": solid.kind.name}
                     for solid, place in parts
                 ],
             }

@@ -1,4 +1,4 @@
-"""Least distances of a robot's shapes for batches of configurations, some at a time."""
+"""Kernel for the smallest distances of a robot's shapes in batches of configurations."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.collision.distances import Table, nearest
-from casadi_ik.collision.model import placed, size_of
+from casadi_ik.collision.distances import PairTable, pair_distances
+from casadi_ik.collision.model import shape_pose_size, shape_poses
 from casadi_ik.collision.solids import C_NAMES
 from casadi_ik.compile.cancellation import SLICE, check, run_cancellable
 from casadi_ik.compile.codegen import c_struct, define, driver_text
@@ -26,20 +26,20 @@ from casadi_ik.model.description import RobotDescription
 SYMBOL = "casadi_ik_clearance"
 
 RECENT = 8
-"""Pairs that the driver looks at first: those that were in the way last."""
+"""Number of recently critical pairs, which the driver checks first."""
 
-BLOCK = 1024
-"""Configurations that numpy works on at a time where there is no compiled driver."""
+NUMPY_CHUNK_SIZE = 1024
+"""Number of configurations per chunk without a compiled driver."""
 
 
 ClearanceJob = c_struct("clearance_job", {"RECENT": RECENT})
 
 
 OBSTACLES = 4
-"""Clearances that a goal minds at once."""
+"""Maximum number of clearances that a goal configuration takes into account."""
 
 SPARE = 0.1
-"""How far [m] motors may move things, at most, until a guard looks at all pairs again."""
+"""Largest displacement of a shape [m] until a guard checks all pairs again."""
 
 Surroundings = c_struct("surroundings", driver="guard_job")
 GuardJob = c_struct("guard_job")
@@ -65,7 +65,7 @@ class Guarding:
         self,
         kernel: ClearanceKernel,
         poses: Array,
-        table: Table,
+        table: PairTable,
         levers: Array,
         hand: Array,
         side: Array,
@@ -148,31 +148,31 @@ class Guarding:
 
 
 class ClearanceKernel:
-    """Distances of one robot's capsules; tables and poses are parameters, threads may share it.
+    """The distance kernel of a robot; threads may share it.
 
     Attributes:
-        name: What it is called.
-        size: Numbers that say where the shapes are.
-        entry: The compiled driver; None: numpy works distances out.
-        guards: Those of `Guarding`, compiled with it.
+        name: Name of the kernel.
+        size: Number of values of `shape_poses`.
+        entry: The compiled driver; None: distances are computed in numpy.
+        guards: The functions of `Guarding`, compiled in the same library.
     """
 
     def __init__(self, robot: RobotDescription, compiled: bool = True) -> None:
-        """Compile the placing of the capsules with the driver, or load them from the cache.
+        """Compile the poses of the shapes with the driver, or load them from the cache.
 
         Args:
-            robot: With shapes.
-            compiled: False keeps to the virtual machine and numpy.
+            robot: A robot with collision shapes.
+            compiled: Use the compiled driver; False: the virtual machine and numpy.
         """
-        n, size = len(robot.actuators), size_of(robot)
+        n, size = len(robot.actuators), shape_pose_size(robot)
         name = ca.Function.fix_name(f"{robot.name}_shapes")
 
         def build() -> ca.Function:
             q = ca.SX.sym("q", n)
-            return ca.Function(name, [q], [placed(robot, q)], ["q"], ["shapes"])
+            return ca.Function(name, [q], [shape_poses(robot, q)], ["q"], ["shapes"])
 
-        known = recipe(name, robot)
-        self._graph = FunctionGraph(name, build, {"q": (n, 1)}, ((size, 1),), known)
+        key = recipe(name, robot)
+        self._graph = FunctionGraph(name, build, {"q": (n, 1)}, ((size, 1),), key)
         self.name, self.size, self._n = name, size, n
         self._robot = robot
         self._compiled = compiled
@@ -201,57 +201,61 @@ class ClearanceKernel:
         return library[SYMBOL]
 
     @cached_property
-    def placed(self) -> FunctionKernel:
-        """Where the shapes are for q, see `collision.model.placed`."""
+    def shape_poses(self) -> FunctionKernel:
+        """Function from q to the poses of the shapes, see `collision.model.shape_poses`."""
         return FunctionKernel(self._graph, self._compiled)
 
-    def least(
+    def min_distances(
         self,
         q: Array,
         poses: Array,
-        table: Table,
-        most: float = math.inf,
-        enough: float = -math.inf,
+        table: PairTable,
+        max_distance: float = math.inf,
+        stop_below: float = -math.inf,
     ) -> tuple[Array, NDArray[np.int64]]:
-        """The smallest distance of each configuration.
+        """Compute the smallest distance of each configuration.
 
         Args:
-            q: (k, n).
-            poses: (m, 12) of the scene's solids, or (k, m, 12).
+            q: (k, n) configurations.
+            poses: (m, 12) poses of the scene's solids, or (k, m, 12).
             table: The pairs.
-            most: Distances above it are not told apart: they are `most`.
-            enough: Distances below it are not told apart either: they are anything below it.
+            max_distance: Upper bound of the reported distances; larger ones are not computed.
+            stop_below: Distances below this are reported as any value below it.
 
         Returns:
-            (k,) [m], offsets taken off, and (k,) the pair; -1 where none is below `most`.
+            (k,) distances minus the offsets of the pairs [m], and (k,) indices of the pairs; -1 if
+            no distance is below `max_distance`.
         """
-        return self._distances(q, poses, table, most, None, enough)
+        return self._distances(q, poses, table, max_distance, None, stop_below)
 
-    def every(self, q: Array, poses: Array, table: Table) -> Array:
-        """(k, p) distances of all pairs [m], see `least`."""
-        found = np.empty((len(q), len(table.pairs)))
-        self._distances(q, poses, table, math.inf, found)
-        return found
+    def all_distances(self, q: Array, poses: Array, table: PairTable) -> Array:
+        """Compute the distances (k, p) of all pairs [m], see `min_distances`."""
+        distances = np.empty((len(q), len(table.pairs)))
+        self._distances(q, poses, table, math.inf, distances)
+        return distances
 
     def job(
-        self, q: Array, poses: Array, table: Table, most: float, enough: float
+        self, q: Array, poses: Array, table: PairTable, max_distance: float, stop_below: float
     ) -> tuple[Any, tuple[Any, ...]]:
-        """What the driver works on, without memory for results; and what has to be kept meanwhile.
+        """Return the arguments of the driver without memory for results.
 
         Args:
             q: (k, n), aligned doubles.
-            poses: As for `least`.
-            table: As for `least`.
-            most: As for `least`.
-            enough: As for `least`.
+            poses: As for `min_distances`.
+            table: As for `min_distances`.
+            max_distance: As for `min_distances`.
+            stop_below: As for `min_distances`.
+
+        Returns:
+            The job, and the objects that must outlive it.
         """
-        solids, planes = table.for_driver
-        places = doubles(poses)
+        solids, planes = table.driver_arrays
+        solid_poses = doubles(poses)
         radii, halves, offsets = map(doubles, (table.radii, table.halves, table.offsets))
         job = ClearanceJob(
             q=memory(q),
-            poses=places.ctypes.data,
-            pose_step=places[0].size if places.ndim == 3 else 0,
+            poses=solid_poses.ctypes.data,
+            pose_step=solid_poses[0].size if solid_poses.ndim == 3 else 0,
             n_solids=len(solids) - table.own,
             solids=solids.ctypes.data,
             planes=planes.ctypes.data,
@@ -261,57 +265,57 @@ class ClearanceKernel:
             offsets=memory(offsets),
             n_pairs=len(table.pairs),
             recent=(ctypes.c_int64 * RECENT)(*[-1] * RECENT),
-            most=most,
-            enough=enough,
+            max_distance=max_distance,
+            stop_below=stop_below,
             count=len(q),
             slice=SLICE,
         )
-        return job, (q, places, radii, halves, offsets, table)
+        return job, (q, solid_poses, radii, halves, offsets, table)
 
     def _distances(
         self,
         q: Array,
         poses: Array,
-        table: Table,
-        most: float,
-        every: Array | None,
-        enough: float = -math.inf,
+        table: PairTable,
+        max_distance: float,
+        all_distances: Array | None,
+        stop_below: float = -math.inf,
     ) -> tuple[Array, NDArray[np.int64]]:
-        given = doubles(q)
+        q = doubles(q)
         if poses.ndim == 3 and len(poses) == 1:
             poses = poses[0]
-        if poses.ndim == 3 and len(poses) != len(given):
-            raise InputError(f"{self.name}: {len(poses)} poses for {len(given)} configurations")
-        least, closest = np.full(len(given), most), np.full(len(given), -1, dtype=np.int64)
-        if not len(given) or not len(table.pairs):
-            return least, closest
+        if poses.ndim == 3 and len(poses) != len(q):
+            raise InputError(f"{self.name}: {len(poses)} poses for {len(q)} configurations")
+        distances, pairs = np.full(len(q), max_distance), np.full(len(q), -1, dtype=np.int64)
+        if not len(q) or not len(table.pairs):
+            return distances, pairs
         if self.entry is None:
-            self._by_numpy(given, poses, table, least, closest, every)
-            return least, closest
-        job, _kept = self.job(given, poses, table, most, enough)
-        job.least, job.closest = memory(least), memory(closest)
-        job.every = None if every is None else memory(every)
+            self._compute_in_numpy(q, poses, table, distances, pairs, all_distances)
+            return distances, pairs
+        job, _buffers = self.job(q, poses, table, max_distance, stop_below)
+        job.distances, job.closest_pairs = memory(distances), memory(pairs)
+        job.all_distances = None if all_distances is None else memory(all_distances)
         run_cancellable(self.name, self.entry, job)
-        return least, closest
+        return distances, pairs
 
-    def _by_numpy(
+    def _compute_in_numpy(
         self,
         q: Array,
         poses: Array,
-        table: Table,
-        least: Array,
-        closest: NDArray[np.int64],
-        every: Array | None,
+        table: PairTable,
+        distances: Array,
+        pairs: NDArray[np.int64],
+        all_distances: Array | None,
     ) -> None:
-        for first in range(0, len(q), BLOCK):
-            rows = slice(first, first + BLOCK)
-            (where,) = self.placed(q[rows])
-            places = poses[rows] if poses.ndim == 3 else poses
-            distance, _ = nearest(where, places, table)
-            if every is not None:
-                every[rows] = distance
-            which = distance.argmin(axis=1)
-            found = distance[np.arange(len(which)), which]
-            below = found < least[rows]
-            least[rows] = np.where(below, found, least[rows])
-            closest[rows] = np.where(below, which, -1)
+        for first in range(0, len(q), NUMPY_CHUNK_SIZE):
+            rows = slice(first, first + NUMPY_CHUNK_SIZE)
+            (shapes,) = self.shape_poses(q[rows])
+            solid_poses = poses[rows] if poses.ndim == 3 else poses
+            distance, _ = pair_distances(shapes, solid_poses, table)
+            if all_distances is not None:
+                all_distances[rows] = distance
+            closest = distance.argmin(axis=1)
+            smallest = distance[np.arange(len(closest)), closest]
+            is_below = smallest < distances[rows]
+            distances[rows] = np.where(is_below, smallest, distances[rows])
+            pairs[rows] = np.where(is_below, closest, -1)

@@ -1,4 +1,4 @@
-"""The shapes of a robot, and which of them are checked against each other and against a scene."""
+"""The collision model of a robot: its shapes, and the pairs that are checked."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.collision.distances import Table, from_solid, pose_row
+from casadi_ik.collision.distances import PairTable, from_solid, pose_row
 from casadi_ik.collision.scene import Scene
 from casadi_ik.collision.solids import Solid, box, cylinder
 from casadi_ik.errors import DescriptionError, UnsupportedError
@@ -24,16 +24,16 @@ from casadi_ik.model.linkage import rigid_bodies
 
 @dataclass(frozen=True, eq=False)
 class CollisionModel:
-    """A robot's capsules.
+    """The capsules of a robot and their collision pairs.
 
     Attributes:
         robot: The description.
-        capsules: Its capsules.
-        bodies: By link the link it is fixed to that moves, or the root.
-        pairs: (p, 2) what is checked against each other: a capsule; another, or a solid of the
-            robot, counted on behind the capsules.
-        excluded: Links that are not, and why.
-        allowed: Links that are, but may overlap a little, and why.
+        capsules: The capsules.
+        bodies: For each link the movable link that it is fixed to, or the root.
+        pairs: (p, 2) pairs to check: index of a capsule; index of a second one, or number of
+            capsules + index of a solid of the robot.
+        excluded: Links that are not checked, and why.
+        allowed: Links that may overlap by a given depth, and why.
     """
 
     robot: RobotDescription
@@ -45,30 +45,30 @@ class CollisionModel:
 
     @property
     def radii(self) -> Array:
-        """(s,) radii [m]."""
-        return np.array([one.radius for one in self.capsules])
+        """Radii of the capsules [m], (s,)."""
+        return np.array([capsule.radius for capsule in self.capsules])
 
     @property
     def halves(self) -> Array:
-        """(s,) half lengths of the segments [m]."""
-        return np.array([float(np.linalg.norm(one.half)) for one in self.capsules])
+        """Half lengths of the capsules' segments [m], (s,)."""
+        return np.array([float(np.linalg.norm(capsule.half)) for capsule in self.capsules])
 
     @property
     def links(self) -> tuple[str, ...]:
-        """(s,) the link of each capsule."""
-        return tuple(one.link for one in self.capsules)
+        """Link of each capsule, (s,)."""
+        return tuple(capsule.link for capsule in self.capsules)
 
     def names(self, i: int, j: int) -> tuple[str, str]:
-        """The links of a pair."""
+        """Return the links of a pair of shapes."""
         return self.capsules[i].link, _link(self.robot.shapes, j)
 
     def is_fixed(self, link: str) -> bool:
-        """Whether a link cannot move."""
+        """Return whether no joint moves a link."""
         return self.bodies[link] == self.bodies[self.robot.root]
 
     @property
     def moving(self) -> frozenset[str]:
-        """Links that the arm may move while the palm stays: between the base and the palm."""
+        """Links between the base and the palm, which the arm may move while the palm stays."""
         palm = self.bodies[self.robot.palm_link]
         carried = {self.robot.root} if palm == self.bodies[self.robot.root] else set[str]()
         for joint in self.robot.joints:
@@ -78,36 +78,38 @@ class CollisionModel:
             link for link in self.bodies if link not in carried and not self.is_fixed(link)
         )
 
-    def without(self, more: Iterable[Touching]) -> CollisionModel:
-        """The same with more links that may touch."""
-        added = tuple(more)
-        names = {frozenset(one.links) for one in added}
-        kept = [frozenset(self.names(i, j)) not in names for i, j in self.pairs.tolist()]
+    def without(self, touching: Iterable[Touching]) -> CollisionModel:
+        """Return the model with further links that may touch."""
+        added = tuple(touching)
+        names = {frozenset(entry.links) for entry in added}
+        is_checked = [frozenset(self.names(i, j)) not in names for i, j in self.pairs.tolist()]
         return CollisionModel(
             self.robot,
             self.capsules,
             self.bodies,
-            self.pairs[np.array(kept, dtype=bool)],
+            self.pairs[np.array(is_checked, dtype=bool)],
             self.excluded + added,
             self.allowed,
         )
 
     @property
     def offsets(self) -> Array:
-        """(p,) what is added to what a pair has to be apart: minus what it may overlap [m]."""
-        depths = {frozenset(one.links): one.depth for one in self.allowed}
+        """Offset of the margin of each pair: minus the allowed overlap [m], (p,)."""
+        depths = {frozenset(entry.links): entry.depth for entry in self.allowed}
         return np.array([-depths.get(frozenset(self.names(i, j)), 0.0) for i, j in self.pairs])
 
 
 def collision_model(robot: RobotDescription) -> CollisionModel:
-    """The model of a robot: all pairs but those of one body, of neighbours, and that may touch.
+    """Return the collision model of a robot.
+
+    Pairs of one body, of neighbouring bodies and of links that may touch are not checked.
 
     Raises:
         UnsupportedError: The arm or the hand has no shapes.
     """
     capsules = robot.shapes.capsules
-    part = {joint.child: joint.part for joint in robot.joints}
-    described = {part.get(one.link, "base") for one in capsules}
+    part_of = {joint.child: joint.part for joint in robot.joints}
+    described = {part_of.get(capsule.link, "base") for capsule in capsules}
     for name in sorted({joint.part for joint in robot.movable}):
         if name not in described:
             raise UnsupportedError(
@@ -116,108 +118,113 @@ def collision_model(robot: RobotDescription) -> CollisionModel:
             )
     bodies, neighbours = rigid_bodies(robot)
     excluded: dict[frozenset[str], Touching] = {
-        frozenset(one.links): one for one in robot.shapes.touching if math.isinf(one.depth)
+        frozenset(entry.links): entry for entry in robot.shapes.touching if math.isinf(entry.depth)
     }
 
-    def checked(one: str, other: str) -> bool:
-        names = frozenset((one, other))
-        if bodies[one] == bodies[other]:
+    def is_checked(first: str, second: str) -> bool:
+        names = frozenset((first, second))
+        if bodies[first] == bodies[second]:
             return False
-        if names not in excluded and frozenset((bodies[one], bodies[other])) in neighbours:
-            excluded[names] = Touching((one, other), "a joint holds them together")
+        if names not in excluded and frozenset((bodies[first], bodies[second])) in neighbours:
+            excluded[names] = Touching((first, second), "a joint holds them together")
         return names not in excluded
 
-    found = [
+    checked_pairs = [
         pair
         for pair in _pairs(robot.shapes)
-        if checked(capsules[pair[0]].link, _link(robot.shapes, pair[1]))
+        if is_checked(capsules[pair[0]].link, _link(robot.shapes, pair[1]))
     ]
-    pairs = np.array(found, dtype=np.int32).reshape(-1, 2)
-    allowed = tuple(one for one in robot.shapes.touching if not math.isinf(one.depth))
+    pairs = np.array(checked_pairs, dtype=np.int32).reshape(-1, 2)
+    allowed = tuple(entry for entry in robot.shapes.touching if not math.isinf(entry.depth))
     return CollisionModel(robot, capsules, bodies, pairs, tuple(excluded.values()), allowed)
 
 
 def _pairs(shapes: Shapes) -> Iterator[tuple[int, int]]:
-    """All pairs of shapes: capsule and capsule, capsule and solid; of two solids one's capsules."""
+    """Yield all pairs of shapes.
+
+    These are pairs of capsules, and of a capsule and a solid. Of two solids one is represented by
+    the capsules that cover it.
+    """
     count = len(shapes.capsules)
-    itself = [i for i, one in enumerate(shapes.capsules) if one.covers < 0]
-    yield from combinations(itself, 2)
+    plain = [i for i, capsule in enumerate(shapes.capsules) if capsule.covers < 0]
+    yield from combinations(plain, 2)
     for k in range(len(shapes.solids)):
-        for i in itself:
+        for i in plain:
             yield i, count + k
-        for i, one in enumerate(shapes.capsules):
-            if one.covers > k:
+        for i, capsule in enumerate(shapes.capsules):
+            if capsule.covers > k:
                 yield i, count + k
 
 
 def _link(shapes: Shapes, number: int) -> str:
-    """The link of a capsule, or of a solid behind them."""
+    """Return the link of a shape; capsules are numbered before solids."""
     count = len(shapes.capsules)
     return shapes.capsules[number].link if number < count else shapes.solids[number - count].link
 
 
-def placed(robot: RobotDescription, q: ca.SX) -> ca.SX:
-    """Where the shapes are, base frame [m], one below the other.
+def shape_poses(robot: RobotDescription, q: ca.SX) -> ca.SX:
+    """Return the poses of the shapes in the base frame [m] as a column.
 
-    Six numbers for each capsule: middle and half of its segment; then twelve for each solid: its
-    rotation row by row and its origin.
+    There are six numbers for each capsule, center and half-axis of its segment; then twelve for
+    each solid, rotation (row-major) and origin.
     """
     links = actuated(robot, q).kinematics.links
-    holders = {joint.child: joint for joint in robot.joints if joint.type == "fixed"}
+    fixed_joints = {joint.child: joint for joint in robot.joints if joint.type == "fixed"}
 
-    def held(link: str) -> tuple[Pose, Array]:
-        place = np.eye(4)
-        while link in holders:  # constants fold before the graph is made
-            place = holders[link].placement @ place
-            link = holders[link].parent
-        return links[link], place
+    def movable_link(link: str) -> tuple[Pose, Array]:
+        placement = np.eye(4)
+        while link in fixed_joints:  # Fold constants before the graph is built.
+            placement = fixed_joints[link].placement @ placement
+            link = fixed_joints[link].parent
+        return links[link], placement
 
     rows = []
-    for one in robot.shapes.capsules:
-        pose, place = held(one.link)
-        center = place[:3, :3] @ one.center + place[:3, 3]
-        rows += [pose.origin + pose.rotate(center), pose.rotate(place[:3, :3] @ one.half)]
+    for capsule in robot.shapes.capsules:
+        pose, placement = movable_link(capsule.link)
+        center = placement[:3, :3] @ capsule.center + placement[:3, 3]
+        rows += [pose.origin + pose.rotate(center), pose.rotate(placement[:3, :3] @ capsule.half)]
     for solid in robot.shapes.solids:
-        pose, place = held(solid.link)
-        whole = pose.at(place @ solid.pose)
-        rows += [ca.vec(whole.rotation.T), whole.origin]
+        pose, placement = movable_link(solid.link)
+        solid_pose = pose.at(placement @ solid.pose)
+        rows += [ca.vec(solid_pose.rotation.T), solid_pose.origin]
     return ca.densify(ca.vertcat(ca.SX(0, 1), *rows))
 
 
-def size_of(robot: RobotDescription) -> int:
-    """How many numbers `placed` gives."""
+def shape_pose_size(robot: RobotDescription) -> int:
+    """Return the length of the column of `shape_poses`."""
     return 6 * len(robot.shapes.capsules) + 12 * len(robot.shapes.solids)
 
 
 def own_solids(robot: RobotDescription) -> tuple[Solid, ...]:
-    """The robot's boxes and cylinders."""
-    found = []
-    for one in robot.shapes.solids:
-        x, y, z = one.size.tolist()
-        found.append(box((x, y, z)) if one.kind == "box" else cylinder(x, y))
-    return tuple(found)
+    """Return the boxes and cylinders of a robot."""
+    solids = []
+    for shape in robot.shapes.solids:
+        x, y, z = shape.size.tolist()
+        solids.append(box((x, y, z)) if shape.kind == "box" else cylinder(x, y))
+    return tuple(solids)
 
 
 def pair_table(
     model: CollisionModel, scene: Scene, touched_by: Sequence[str], carried: bool = False
-) -> Table:
-    """The pairs of a robot and a scene.
+) -> PairTable:
+    """Return the collision pairs of a robot and a scene.
 
     Args:
-        model: The robot's shapes.
-        scene: What stands about it.
-        touched_by: Links that may touch what is grasped.
-        carried: Whether what is grasped moves with the hand: then links that cannot move count.
+        model: Collision model of the robot.
+        scene: The scene.
+        touched_by: Links that may touch the grasped object.
+        carried: True if the grasped object moves with the hand, so that it is checked against
+            fixed links as well.
 
     Raises:
-        DescriptionError: The scene speaks of a link or a solid that is not there, or of one that
-            stands in the robot's base.
+        DescriptionError: The scene names an unknown link or solid, or a solid penetrates the
+            robot's base.
     """
     links, known = model.links, set(model.robot.links) | set(scene.items)
-    stated = {frozenset(one.links) for one in scene.touching}
-    named = [("touching", i, one.links) for i, one in enumerate(scene.touching)]
-    named += [("margins", i, tuple(pair)) for i, pair in enumerate(scene.margins)]
-    for key, i, pair in named:
+    may_touch = {frozenset(entry.links) for entry in scene.touching}
+    entries = [("touching", i, entry.links) for i, entry in enumerate(scene.touching)]
+    entries += [("margins", i, tuple(pair)) for i, pair in enumerate(scene.margins)]
+    for key, i, pair in entries:
         for name in sorted(set(pair) - known):
             raise DescriptionError(
                 f"{scene.name}: {key}[{i}].links: unknown {name!r}; known: "
@@ -228,24 +235,24 @@ def pair_table(
     parts = [(item, *part) for item in scene.items.values() for part in item.parts]
     rows: list[tuple[tuple[int, int], float, float, tuple[str, str]]] = []
 
-    def add(pair: tuple[int, int], names: tuple[str, str], usual: float, overlap: float) -> None:
-        if frozenset(names) not in stated:
-            margin = scene.margins.get(frozenset(names), usual)
-            rows.append((pair, overlap + (margin - scene.margin), margin, names))
+    def add(pair: tuple[int, int], names: tuple[str, str], margin: float, offset: float) -> None:
+        if frozenset(names) not in may_touch:
+            margin = scene.margins.get(frozenset(names), margin)
+            rows.append((pair, offset + (margin - scene.margin), margin, names))
 
     for k, (item, _, _) in enumerate(parts, start=count + len(own)):
-        grasped = item.name == scene.grasped
+        is_grasped = item.name == scene.grasped
         for i, link in enumerate(links):
-            # What cannot move is where it was put: no answer could change that.
-            fixed = model.is_fixed(link) and not (carried and grasped)
-            if not fixed and not (grasped and link in touched_by):
-                usual = scene.margin if item.margin is None else item.margin
-                deep = grasped and link in fingers
-                usual, overlap = (0.0, -scene.enveloping) if deep else (usual, 0.0)
-                add((i, k), (link, item.name), usual, overlap)
-    for (i, j), overlap in zip(model.pairs.tolist(), model.offsets.tolist(), strict=True):
-        add((i, j), model.names(i, j), scene.margin, overlap)
-    return Table(
+            # No solution could change the distance of two fixed shapes.
+            is_fixed = model.is_fixed(link) and not (carried and is_grasped)
+            if not is_fixed and not (is_grasped and link in touched_by):
+                margin = scene.margin if item.margin is None else item.margin
+                may_penetrate = is_grasped and link in fingers
+                margin, offset = (0.0, -scene.enveloping) if may_penetrate else (margin, 0.0)
+                add((i, k), (link, item.name), margin, offset)
+    for (i, j), offset in zip(model.pairs.tolist(), model.offsets.tolist(), strict=True):
+        add((i, j), model.names(i, j), scene.margin, offset)
+    return PairTable(
         radii=model.radii,
         halves=model.halves,
         pairs=np.array([pair for pair, _, _, _ in rows], dtype=np.int32).reshape(-1, 2),
@@ -261,41 +268,43 @@ def pair_table(
 
 
 def _finger_links(robot: RobotDescription) -> frozenset[str]:
-    """Links that joints of fingers move."""
+    """Return the links that joints of fingers move."""
     joints = {name for finger in robot.fingers for name in finger.joints}
-    return frozenset(k for k in robot.links if any(one.name in joints for one in robot.chain(k)))
+    return frozenset(
+        k for k in robot.links if any(joint.name in joints for joint in robot.chain(k))
+    )
 
 
-def check_base(model: CollisionModel, scene: Scene, where: Array, names: Collection[str]) -> None:
-    """Refuse a scene with something in the robot's base: all would be in collision.
+def check_base(model: CollisionModel, scene: Scene, shapes: Array, names: Collection[str]) -> None:
+    """Refuse a scene with an item inside the robot's base, where every target would collide.
 
-    A base's shapes are larger than the base, so that a table under it may touch them; what is
-    deeper than a shape's radius is meant by nobody.
+    Shapes are larger than the base, so that a table below it may touch them. A penetration by more
+    than a shape's radius is an error of the scene.
 
     Args:
-        model: The robot's shapes.
+        model: Collision model of the robot.
         scene: The scene.
-        where: Where the shapes are, as `placed` gives it.
-        names: The items that are looked at.
+        shapes: Poses of the shapes, as `shape_poses` returns them.
+        names: Names of the items to check.
 
     Raises:
-        DescriptionError: The middle line of a shape of the base is inside a solid.
+        DescriptionError: The axis of a capsule of the base is inside a solid.
     """
-    stated = {frozenset(one.links) for one in scene.touching}
+    may_touch = {frozenset(entry.links) for entry in scene.touching}
     for name in names:
         item = scene.items[name]
         for i, link in enumerate(model.links):
-            if not model.is_fixed(link) or frozenset((link, name)) in stated:
+            if not model.is_fixed(link) or frozenset((link, name)) in may_touch:
                 continue
-            segment = where[6 * i : 6 * i + 6].reshape(1, 1, 6)
+            segment = shapes[6 * i : 6 * i + 6].reshape(1, 1, 6)
             depths = [
                 -float(from_solid(solid, segment, pose_row(item.pose @ place)[None])[0].item())
                 for solid, place in item.parts
             ]
             if max(depths) > 0:
-                deep = f"stands {1e3 * max(depths):.1f} mm inside"
-                how = deep if max(depths) >= 0.05e-3 else "touches"
+                depth = f"is {1e3 * max(depths):.1f} mm inside"
+                problem = depth if max(depths) >= 0.05e-3 else "touches"
                 raise DescriptionError(
-                    f"{scene.name}: solids.{name}: {how} {link!r}, which cannot move; "
-                    "expected it beside the robot's base (or the two under 'touching')"
+                    f"{scene.name}: solids.{name}: {problem} {link!r}, which cannot move; expected "
+                    "a pose outside of the robot's base (or the two names under 'touching')"
                 )

@@ -17,13 +17,13 @@ from casadi_ik.collision.solids import (
     Solid,
     box,
     capsule,
-    cloud,
+    cloud_solids,
     cylinder,
+    grid_centers,
     half_space,
     hull,
-    hulls,
+    mesh_hulls,
     object_solids,
-    thinned,
 )
 from casadi_ik.errors import DescriptionError, InputError, UnknownNameError
 from casadi_ik.files.arrays import Array
@@ -202,7 +202,7 @@ class MeshEntry(Entry, frozen=True, tag="mesh", kw_only=True):
         if not files:
             raise DescriptionError(f"{where}.file: found none, expected at least one")
         if self.parts:
-            return hulls(load_mesh_shape(files, self.scale, f"{where}.file"), f"{where}.file")
+            return mesh_hulls(load_mesh_shape(files, self.scale, f"{where}.file"), f"{where}.file")
         meshes = [self.scale * read_body(file, f"{where}.file")[0] for file in files]
         return [_centred(points, f"{where}.file") for points in meshes]
 
@@ -260,13 +260,13 @@ class PointCloudEntry(Entry, frozen=True, tag="point-cloud", kw_only=True):
             found = self.scale * read_points(path, f"{where}.file")
         else:
             found = finite_points(np.asarray(self.points), f"{where}.points")
-        found, wider = thinned(found, self.voxel) if self.voxel > 0 else (found, 0.0)
+        found, wider = grid_centers(found, self.voxel) if self.voxel > 0 else (found, 0.0)
         if len(found) > LIMITS.cloud_balls:
             raise DescriptionError(
                 f"{where}: found {len(found)} points, expected at most {LIMITS.cloud_balls} "
                 "(see 'voxel')"
             )
-        return cloud(found, self.radius + wider)
+        return cloud_solids(found, self.radius + wider)
 
 
 class ObjectEntry(Entry, frozen=True, tag="object", kw_only=True):

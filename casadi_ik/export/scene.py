@@ -12,7 +12,7 @@ import numpy as np
 from casadi_ik.collision.clearance import ROUNDING, SceneCheck
 from casadi_ik.collision.model import CollisionModel, own_solids
 from casadi_ik.collision.scene import Scene
-from casadi_ik.collision.solids import C_NAMES, EXPORTED
+from casadi_ik.collision.solids import C_NAMES, EXPORTED_KINDS
 from casadi_ik.compile.codegen import define, define_arrays, driver_text, number
 from casadi_ik.compile.function_kernel import FunctionKernel
 from casadi_ik.compile.graphs import FunctionGraph
@@ -24,9 +24,9 @@ from casadi_ik.kinematics.arms.family import ArmFamily
 from casadi_ik.kinematics.arms.search import ARM_SEARCH, arms_graph
 from casadi_ik.kinematics.robot_kernels import RobotKernels
 from casadi_ik.solve.alternatives import side_links
-from casadi_ik.solve.arm_search import SearchValues
-from casadi_ik.solve.collision_free import PARAMETERS as FREE
-from casadi_ik.solve.free_hands import PARAMETERS as FINGERS
+from casadi_ik.solve.arm_search import RedundancySamples
+from casadi_ik.solve.collision_free import COLLISION_FREE_PARAMETERS
+from casadi_ik.solve.free_hands import UNCONSTRAINED_FINGER_PARAMETERS
 from casadi_ik.solve.hand_first.body import BodyStep
 from casadi_ik.solve.hand_first.method import HandFirstMethod
 from casadi_ik.solve.trials import CARRY_ONLY, PALM_SCALES, TRUNK_STRETCH
@@ -44,36 +44,36 @@ class ClosedArm:
         columns: Positions in q of its motors.
         lower: (a,) its limits.
         upper: (a,).
-        values: Values of the redundancy at which it is looked at.
+        samples: Values of the redundancy at which arms are computed.
     """
 
     family: ArmFamily
     columns: tuple[int, ...]
     lower: Array
     upper: Array
-    values: SearchValues
+    samples: RedundancySamples
 
     @property
     def sizes(self) -> dict[str, int]:
         """Macros that its arrays are made of."""
-        grid, between = self.values.levels
+        grid, between = self.samples.levels
         return {
             "N_ARM": len(self.lower),
             "N_REDUNDANCY": self.family.size,
             "N_ROWS": self.family.rows,
-            "N_PLACES": len(grid),
-            "N_MORE_PLACES": len(between),
-            "N_CLOSER": len(self.values.closer),
+            "N_SAMPLES": len(grid),
+            "N_MORE_SAMPLES": len(between),
+            "N_SAMPLE_OFFSETS": len(self.samples.offsets),
         }
 
     @property
     def arrays(self) -> dict[str, Array]:
         """Its arrays; none is empty."""
-        (grid, between), closer = self.values.levels, self.values.closer
+        (grid, between), offsets = self.samples.levels, self.samples.offsets
         return {
-            "PLACES": grid.ravel(),
-            "MORE_PLACES": between.ravel(),
-            "CLOSER": closer,
+            "SAMPLES": grid.ravel(),
+            "MORE_SAMPLES": between.ravel(),
+            "SAMPLE_OFFSETS": offsets,
             "ARM_LOW": self.lower,
             "ARM_RANGE": self.upper - self.lower,
         }
@@ -130,7 +130,7 @@ class SceneSources:
             if family is None:
                 return []
             limits = self.robot.lower[list(columns)], self.robot.upper[list(columns)]
-            found.append(ClosedArm(family, columns, *limits, SearchValues.of(family, *limits)))
+            found.append(ClosedArm(family, columns, *limits, RedundancySamples.of(family, *limits)))
         return found
 
     @property
@@ -144,7 +144,7 @@ class SceneSources:
         n, capsules, own = len(self.robot.actuators), len(self.model.capsules), self._own
         constants = define({"N_Q": n, "N_CAPSULES": capsules, "N_OWN": own, **C_NAMES})
         room = n + 6 * capsules + 12 * (own + self.capacity)
-        return self.check.kernel.placed, constants, room
+        return self.check.kernel.shape_poses, constants, room
 
     @property
     def maps(self) -> dict[str, FunctionKernel | FunctionGraph]:
@@ -164,11 +164,11 @@ class SceneSources:
 
     @property
     def room(self) -> int:
-        """Eights of bytes that the search among arms works with, `room` of runtime/arm_search.c."""
+        """Memory of the arm search in units of 8 bytes, see `scratch_size` of arm_search.c."""
         n, sizes = len(self.robot.actuators), [1]
         for arm in self.closed_arms:
-            values, rows, free = arm.values, arm.family.rows, arm.family.size
-            most = max(*map(len, values.levels), len(values.closer)) * rows + 1
+            samples, rows, free = arm.samples, arm.family.rows, arm.family.size
+            most = max(*map(len, samples.levels), len(samples.offsets)) * rows + 1
             whole = 6 * most + 2
             numbers = 2 * most * (len(arm.lower) + 2) + most * (12 + free) + (most + 1) * n + 1
             size = 8 if self.single is None else 4
@@ -215,7 +215,7 @@ class SceneSources:
             "OWN_SOLIDS": str(self._own),
             "LINKS": str(len(self.links)),
             "ROUNDING": number(self.rounding),
-            "N_HAND_PARTS": str(self._hand_parts),
+            "N_HAND_PARTS": str(self._hand_coordinates),
             "N_CANDIDATES": str(candidates),
             "TRIED": str(self._rounds * candidates),
             "N_LOOKED": str(self._rounds * candidates + 1),
@@ -223,12 +223,12 @@ class SceneSources:
             "MOST_PAIRS": str(max(self._most_pairs, 1)),
             "KINDS_C": "\n".join(
                 f"  {self.prefix.upper()}_{kind.name} = {int(kind)}, /* {row.size} */"
-                for kind, row in EXPORTED.items()
+                for kind, row in EXPORTED_KINDS.items()
             ),
-            "KINDS_JS": ", ".join(f"{kind.name}: {int(kind)}" for kind in EXPORTED),
+            "KINDS_JS": ", ".join(f"{kind.name}: {int(kind)}" for kind in EXPORTED_KINDS),
             "KINDS_DTS": "\n".join(
                 f"  /** {row.size} */\n  readonly {kind.name}: {int(kind)};"
-                for kind, row in EXPORTED.items()
+                for kind, row in EXPORTED_KINDS.items()
             ),
             "LINK_NAMES": ", ".join(json.dumps(link, ensure_ascii=False) for link in self.links),
             "SHAPES_JSON": json.dumps(self.shapes()),
@@ -311,7 +311,7 @@ class SceneSources:
     @property
     def _rounds(self) -> int:
         """Rounds of other hands that are looked at."""
-        return min(FREE.rounds, self.method.options.rounds)
+        return min(COLLISION_FREE_PARAMETERS.restarts, self.method.options.rounds)
 
     begun = "  solver->scene.looking = solver->scene.again = 0;\n"
     """What happens to the scene where a target is taken up."""
@@ -344,19 +344,21 @@ class SceneSources:
         return arm.sizes, f"#define ARM_COLUMNS {{{columns}}}\n", arm.arrays
 
     @property
-    def _hand_parts(self) -> int:
-        """Number of values that distinguish hand poses, as `AlternativeFinder.hand_parts`."""
+    def _hand_coordinates(self) -> int:
+        """Number of values that distinguish hand poses, as `AlternativeFinder.hand_coordinates`."""
         return len(self.robot.description.hand_actuators) + 12
 
     def look_constants(self) -> str:
         """What the search for hands that are free knows."""
         closed = int(bool(self.closed_arms))
-        ranges = np.maximum(self.robot.upper - self.robot.lower, FREE.least_range)
+        ranges = np.maximum(
+            self.robot.upper - self.robot.lower, COLLISION_FREE_PARAMETERS.min_range
+        )
         sizes = {"LOOK_ROUNDS": self._rounds, "HAS_CLOSED_ARM": closed}
-        sizes |= {"N_HAND_PARTS": self._hand_parts}
+        sizes |= {"N_HAND_PARTS": self._hand_coordinates}
         sizes |= {"STATE_TURN": self.method.step.layouts.state.slice("turn").start}
         reals = {
-            "LOOK_ALIKE": FREE.alike,
+            "LOOK_ALIKE": COLLISION_FREE_PARAMETERS.min_hand_difference,
             "PALM_TURN": PALM_SCALES[0],
             "PALM_SHIFT": PALM_SCALES[3],
         }
@@ -372,18 +374,24 @@ class SceneSources:
         hand = list(about.hand_actuators)
         fingers = [about.finger_actuators(name) for name in robot.fingers]
         moved = [about.links_moved([motor]) for motor in hand]
-        whole = {"N_HAND": len(hand), "N_PARTS": len(FINGERS.parts)}
-        whole |= {"N_IDLE": FINGERS.postures, "N_IDLE_CLOSER": FINGERS.closer}
+        whole = {
+            "N_HAND": len(hand),
+            "N_IDLE_RADII": len(UNCONSTRAINED_FINGER_PARAMETERS.local_radii),
+        }
+        whole |= {
+            "N_IDLE": UNCONSTRAINED_FINGER_PARAMETERS.postures,
+            "N_IDLE_LOCAL": UNCONSTRAINED_FINGER_PARAMETERS.local_postures,
+        }
         return (
             define(whole)
-            + f"#define IDLE_NEAR {number(FINGERS.near)}\n"
+            + f"#define IDLE_MAX_GAIN {number(UNCONSTRAINED_FINGER_PARAMETERS.max_gain)}\n"
             + define_arrays(
                 {
                     "HAND": np.array(hand, dtype=int),
                     "HAND_LOWER": robot.lower[hand],
                     "HAND_RANGE": (robot.upper - robot.lower)[hand],
                     "HAND_SPREAD": spread_steps(len(robot.lower))[hand],
-                    "IDLE_PARTS": np.array(FINGERS.parts),
+                    "IDLE_RADII": np.array(UNCONSTRAINED_FINGER_PARAMETERS.local_radii),
                     "FINGER_MOVED": np.array(
                         [[m in some for m in hand] for some in fingers], dtype=int
                     ),
@@ -398,7 +406,7 @@ class SceneSources:
         model, robot = self.model, self.robot
         links = {name: i for i, name in enumerate(self.links)}
         own, shapes = own_solids(robot.description), robot.description.shapes.solids
-        touching = self.check.bodies_of_fingers
+        touching = self.check.finger_bodies
         pairs, capsules = model.pairs, model.capsules
         crossing = [self.decided_by(*model.names(i, j)) for i, j in pairs.tolist()]
         arrays: dict[str, np.ndarray] = {
@@ -413,7 +421,7 @@ class SceneSources:
             "PAIRS": pairs,
             "PAIR_MOVING": np.array(crossing, dtype=int),
             "OFFSETS": model.offsets,
-            "SIZE_FACTORS": np.array([row.factors for row in EXPORTED.values()]),
+            "SIZE_FACTORS": np.array([row.factors for row in EXPORTED_KINDS.values()]),
             "OWN_KIND": np.array([int(one.kind) for one in own], dtype=int),
             "OWN_SIZE": np.array([one.size for one in own]).reshape(-1, 3),
             "OWN_REACH": np.array([one.reach for one in own]),
@@ -422,13 +430,13 @@ class SceneSources:
         whole = {
             "N_CAPSULES": len(capsules),
             "N_OWN": len(own),
-            "N_KINDS": len(EXPORTED),
+            "N_KINDS": len(EXPORTED_KINDS),
             "N_PAIRS": len(pairs),
             "HAS_CLOSED_ARM": int(bool(self.closed_arms)),
         }
         text = f"#define ROUNDING {number(self.rounding)}\n"
         if self.closed_arms:
-            text += f"#define ALLOWED {number(self.allowed)}\n"
+            text += f"#define MIN_LIMIT_MARGIN {number(self.allowed)}\n"
             sizes, columns, tables = self.arm_constants()
             whole, text, arrays = whole | sizes, text + columns, arrays | tables
         return define(whole) + text + define_arrays(arrays) + self._idle_constants()
@@ -476,7 +484,7 @@ class BodySceneSources(SceneSources):
             "ARMS_OF_SIDES": self._arms_of_sides(),
             "SIDES": str(count),
             "PARTS_OF_PAIRS": str(3 * count + 1),
-            "MOST_TRUNKS": str(sum(trunks for trunks, _ in FREE.trunks)),
+            "MOST_TRUNKS": str(sum(trunks for trunks, _ in COLLISION_FREE_PARAMETERS.trunk_stages)),
         }
 
     @property
@@ -522,10 +530,10 @@ class BodySceneSources(SceneSources):
             "STATE_PALMS": state.slice("palm_rotation_0").start,
             "N_CARRY": len(carry),
             "N_CARRYING": len(motors),
-            "N_LOTS": len(FREE.trunks),
+            "N_LOTS": len(COLLISION_FREE_PARAMETERS.trunk_stages),
         }
         arrays = {
-            "LOTS": np.array(FREE.trunks),
+            "LOTS": np.array(COLLISION_FREE_PARAMETERS.trunk_stages),
             "CARRY_PLACES": np.array(list(carry)),
             "CARRY_VALUES": np.array(list(carry.values())),
             "CARRYING": np.array(motors),
@@ -543,13 +551,14 @@ class BodySceneSources(SceneSources):
         text = rows = ""
         for i, arm in enumerate(self.closed_arms):
             n = arm.sizes
-            arrays = {f"{k}_{i}": array for k, array in arm.arrays.items() if k != "CLOSER"}
+            arrays = {f"{k}_{i}": array for k, array in arm.arrays.items() if k != "SAMPLE_OFFSETS"}
             columns = ", ".join(map(str, arm.columns))
             text += define_arrays(arrays) + f"static const int64_t COLUMNS_{i}[] = {{{columns}}};\n"
             rows += (
                 f"  {{{self.prefix}_arms_{i}_kernel, {n['N_ARM']}, {n['N_REDUNDANCY']}, "
-                f"{n['N_ROWS']}, {{{n['N_PLACES']}, {n['N_MORE_PLACES']}}},\n"
-                f"   {{PLACES_{i}, MORE_PLACES_{i}}}, ARM_LOW_{i}, ARM_RANGE_{i}, COLUMNS_{i}}},\n"
+                f"{n['N_ROWS']}, {{{n['N_SAMPLES']}, {n['N_MORE_SAMPLES']}}},\n"
+                f"   {{SAMPLES_{i}, MORE_SAMPLES_{i}}}, ARM_LOW_{i}, ARM_RANGE_{i}, "
+                f"COLUMNS_{i}}},\n"
             )
         if not rows:
             return ""

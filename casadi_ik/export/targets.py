@@ -13,13 +13,13 @@ import numpy as np
 from casadi_ik.api import Solver
 from casadi_ik.collision.clearance import SceneCheck
 from casadi_ik.collision.scene import Scene
-from casadi_ik.collision.solids import stated
+from casadi_ik.collision.solids import solid_to_dict
 from casadi_ik.compile.codegen import digits, numbers
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.load_grasp import load_grasp, shipped_grasps
-from casadi_ik.solve.collision_free import resolve_at_once
+from casadi_ik.solve.collision_free import resolve_single
 from casadi_ik.solve.engine import Engine
 from casadi_ik.solve.hand_first.method import HandFirstMethod
 from casadi_ik.solve.hand_first.parameters import HandFirstParameters
@@ -305,8 +305,8 @@ class SceneTargets:
         assert query is not None
         clear = query.check(q[None])
         if not clear.free[0]:
-            found = resolve_at_once(
-                engine.finder, targets, query, q, request.start(q0), others=True
+            found = resolve_single(
+                engine.finder, targets, query, q, request.start(q0), try_other_hands=True
             )
             if found is None:
                 return None
@@ -318,7 +318,9 @@ class SceneTargets:
         found = []
         for name, item in self.scene.items.items():
             (solid, place) = item.parts[0]
-            found.append(stated(solid, item.pose @ place) | {"grasped": name == self.scene.grasped})
+            found.append(
+                solid_to_dict(solid, item.pose @ place) | {"grasped": name == self.scene.grasped}
+            )
         return found
 
     def header(self, real: str = "double") -> str:

@@ -138,7 +138,7 @@ class _Looking:
             here = CollisionQuery(query.kernel, query.table, poses[part], query.margin)
             seen = here.check(q[part])
             found.append(np.stack([seen.surplus, seen.distance, seen.pairs.astype(float)], axis=1))
-            places.append(query.kernel.placed(q[part])[0])
+            places.append(query.kernel.shape_poses(q[part])[0])
         return _Postures(q, poses, np.concatenate(places), np.concatenate(found))
 
     def motion(self, one: _Postures, other: _Postures) -> Array:
@@ -483,7 +483,7 @@ class Guard:
         while True:
             step = braked + shares[tried] * (wanted - braked)
             path = stopping_path(q, step, self._change)
-            here, *every = self._query.kernel.every(
+            here, *every = self._query.kernel.all_distances(
                 np.concatenate([q[None], path]), self._query.poses, self._query.table
             )
             touching = ~(every >= np.minimum(here, self._enough)).all(axis=0)
@@ -507,7 +507,7 @@ class Guard:
             return guarding.rooms, guarding.slopes
         rooms, slopes = np.zeros(OBSTACLES), np.zeros((OBSTACLES, self._n))
         nudged = goal + np.concatenate([np.zeros((1, self._n)), self.nudge * np.eye(self._n)])
-        every = self._query.kernel.every(nudged, self._query.poses, self._query.table)
+        every = self._query.kernel.all_distances(nudged, self._query.poses, self._query.table)
         order = np.argsort(every[0], kind="stable")
         nearest, omitted = order[:OBSTACLES], order[OBSTACLES : OBSTACLES + 1]
         count, minded = len(nearest), every[0, omitted].min(initial=self._minded)

@@ -1,7 +1,6 @@
-"""Which of many grasps to take: candidates of all kinds, ranked together.
+"""Ranking of many candidate grasps by their best collision-free solutions.
 
-For candidates of which one answer is enough every hand, branch and value of the redundancy is
-looked at, for many at once.
+Hands, arm branches and redundancies of all candidates are searched in batches.
 """
 
 from __future__ import annotations
@@ -24,10 +23,15 @@ from casadi_ik.kinematics.contacts import group_by_kinds
 from casadi_ik.model.grasp import Grasp
 from casadi_ik.model.pose import inverse, transform_arrays
 from casadi_ik.model.targets import TargetBatch
-from casadi_ik.solve.alternatives import APART, SEEKING, AlternativeFinder, checked_distance
+from casadi_ik.solve.alternatives import (
+    ALTERNATIVES,
+    DEFAULT_SEPARATION,
+    AlternativeFinder,
+    check_separation,
+)
 from casadi_ik.solve.arm_search import Preference
 from casadi_ik.solve.batches import judge_outcome
-from casadi_ik.solve.collision_free import free_answers
+from casadi_ik.solve.collision_free import find_collision_free
 from casadi_ik.solve.engine import Engine
 from casadi_ik.solve.method import Outcome
 from casadi_ik.solve.request import CLEARANCE, Request
@@ -36,66 +40,69 @@ from casadi_ik.solve.status import Status
 from casadi_ik.solve.trials import Deduplicator, largest_per_owner
 from casadi_ik.solve.turns import in_nearest_turns, nearest_turns, search_start
 
-Judgement: TypeAlias = str | Callable[[ArmHand, Array], ArrayLike]
-"""One of `PREFERENCES`, or what gives configurations (m, n) of a robot their scores (m,)."""
+RankingPreference: TypeAlias = str | Callable[[ArmHand, Array], ArrayLike]
+"""One of `PREFERENCES`, or a function from a robot and configurations (m, n) to scores (m,)."""
 
 
 @dataclass(frozen=True)
 class ChooseParameters:
-    """How many candidates are looked at, and how far.
+    """Effort of the ranking of candidates.
 
     Attributes:
-        together: Candidates that are worked on at once.
-        rounds: Of hands that a candidate gets at most: hands of many motors go on much longer for a
-            single grasp, and most of many candidates are out of reach.
-        closer: So many times as many answers as are wanted are looked at closer.
+        chunk_size: Number of candidates that are searched together.
+        max_restarts: Maximum number of restarts per candidate. A single grasp of a hand with many
+            motors gets many more, but most of many candidates are out of reach.
+        refined_factor: Number of arms that are refined, as a multiple of the number of solutions
+            to return.
     """
 
-    together: int = 1024
-    rounds: int = 51
-    closer: int = 8
+    chunk_size: int = 1024
+    max_restarts: int = 51
+    refined_factor: int = 8
 
 
-PARAMETERS = ChooseParameters()
+CHOOSE_PARAMETERS = ChooseParameters()
 
 
 @dataclass(frozen=True, eq=False)
-class Answers:
-    """Answers to some of k candidates.
+class CandidateSolutions:
+    """Solutions of k candidates.
 
     Attributes:
-        q: (m, n) configurations, free of collision where that was asked for.
-        owner: (m,) candidate of each.
-        score: (m,) what they are ranked by, higher is better.
-        margin: (m,) smallest distance of the arm from its limits: where scores are equal.
-        reasons: Why there is none, by candidate; "" where there is one.
+        q: (m, n) configurations; collision-free if the solver has a scene.
+        candidate: (m,) index of the candidate of each.
+        score: (m,) score by which they are ranked; higher is better.
+        margin: (m,) limit margin of the arm, which ranks equal scores.
+        reasons: (k,) reason why a candidate has no solution; "" if it has one.
     """
 
     q: Array
-    owner: NDArray[np.intp]
+    candidate: NDArray[np.intp]
     score: Array
     margin: Array
     reasons: NDArray[np.object_]
 
     @property
-    def answered(self) -> Bools:
-        """(k,) which candidates have one."""
+    def is_solved(self) -> Bools:
+        """True for the candidates with a solution, (k,)."""
         return np.asarray(self.reasons == "", dtype=bool)
 
     @classmethod
-    def joined(cls, parts: list[tuple[NDArray[np.intp], Answers]], count: int) -> Answers:
-        """Those of all candidates; of one that is there twice the last reason holds.
+    def concatenate(
+        cls, parts: list[tuple[NDArray[np.intp], CandidateSolutions]], count: int
+    ) -> CandidateSolutions:
+        """Concatenate the solutions of parts of the candidates.
 
         Args:
-            parts: Numbers of some candidates, and their answers.
-            count: How many candidates there are.
+            parts: Indices of candidates, and their solutions. The last reason of a candidate holds.
+            count: Number of all candidates.
         """
         reasons = np.full(count, "", dtype=object)
-        for numbers, part in parts:
-            reasons[numbers] = part.reasons
+        for indices, part in parts:
+            reasons[indices] = part.reasons
         return cls(
             np.concatenate([part.q for _, part in parts]),
-            np.concatenate([numbers[part.owner] for numbers, part in parts]),
+            np.concatenate([indices[part.candidate] for indices, part in parts]),
             np.concatenate([part.score for _, part in parts]),
             np.concatenate([part.margin for _, part in parts]),
             reasons,
@@ -108,42 +115,42 @@ def choose(
     object_pose: ArrayLike | None = None,
     q0: ArrayLike | None = None,
     limit: int = 10,
-    prefer: Judgement | None = None,
+    prefer: RankingPreference | None = None,
     seed: int = 0,
     fixed: Mapping[str, float] | None = None,
-    apart: float = APART,
+    apart: float = DEFAULT_SEPARATION,
     per_candidate: int | None = 1,
 ) -> Ranking:
-    """Of many grasps find those that are best to take, and how.
+    """Rank candidate grasps and return the best feasible solutions.
 
-    Of every candidate the different hands that meet its contacts are looked at, with every
-    branch of the arm all around its swivel; free of collision where the solver has a scene.
-    Which candidates have an answer depends neither on `q0` nor on `prefer`: they order.
+    For every candidate all hands that meet its contacts are searched, with every branch of the arm
+    over its whole redundancy, free of collision if the solver has a scene. Whether a candidate has
+    a solution depends neither on `q0` nor on `prefer`, which only rank.
 
     Args:
         solver: A `Solver`.
         grasps: The candidates.
-        object_pose: (4, 4) where the object is in the base frame; candidates that do not say
-            where theirs is are in its frame. None: they are in the base frame.
-        q0: (n,) where the robot is [rad or m]; None is `robot.home`.
-        limit: How many answers at most.
-        prefer: What comes first: "q0", "limits", "manipulability", "clearance" as for `solve`,
-            or a function of the robot and configurations (m, n) that gives their scores (m,),
-            higher is better, -inf for never. None: "q0" if q0 is given, else "limits". What is
-            given (a palm's hand, `fixed`) is no part of "limits".
+        object_pose: (4, 4) pose of the object in the base frame. Candidates without a pose of
+            their object are in its frame. None: candidates are in the base frame.
+        q0: (n,) initial configuration [rad or m]; None: `robot.home`.
+        limit: Maximum number of solutions.
+        prefer: Ranking: "q0", "limits", "manipulability", "clearance" as for `solve`, or a
+            function from the robot and configurations (m, n) to scores (m,), where higher is
+            better and -inf excludes. None: "q0" if q0 is given, else "limits". Fixed motors and
+            given hand postures do not count for "limits".
         seed: As for `solve`.
         fixed: As for `solve`.
-        apart: How different answers are, of one candidate or several: of any two at least one
-            actuator differs by this part of its range, 0 to 1. 0: all that are not the same.
-        per_candidate: How many answers of one candidate at most; None: any number, and once there
-            are `limit` of them no candidate is looked at further.
+        apart: Minimum difference of solutions: in any two at least one actuator differs by this
+            fraction of its range, 0 to 1. 0: all that are not equal.
+        per_candidate: Maximum number of solutions per candidate. None: unlimited, and the search
+            ends when there are `limit` solutions.
 
     Returns:
-        The answers, best first, and why candidates have none.
+        The solutions, best first, and the reasons why candidates have none.
 
     Raises:
-        InputError: No candidates, no rigid object_pose, bad q0, limit, preference or distance,
-            or a grasp the robot cannot take.
+        InputError: There are no candidates, object_pose is not rigid, q0, limit, preference or
+            difference is invalid, or the robot has no fingers for a grasp.
         UnsupportedError: The method is not hand-first.
 
     Example:
@@ -155,37 +162,42 @@ def choose(
     engine: Engine = solver._engine
     request: Request = solver._request
     grasps = _candidates(grasps)
-    limit = _count(limit, "limit")
-    most = None if per_candidate is None else _count(per_candidate, "per_candidate")
-    apart, start = checked_distance(apart), request.start(q0)
-    word = "own" if callable(prefer) else engine.resolve_preference(prefer, q0 is not None)
+    limit = _positive_count(limit, "limit")
+    max_per_candidate = limit
+    if per_candidate is not None:
+        max_per_candidate = _positive_count(per_candidate, "per_candidate")
+    apart, start = check_separation(apart), request.start(q0)
+    name = "own" if callable(prefer) else engine.resolve_preference(prefer, q0 is not None)
     pose = None if object_pose is None else single_pose(object_pose, "object_pose")
-    wanted: Preference = _own(prefer, engine.robot) if callable(prefer) else word
-    asked = list(_asked(request, grasps, pose, fixed))
-    search = _Search(engine, asked, start, wanted, limit, seed)
-    parts = list(search.look(np.ones(len(grasps), dtype=bool), thorough=False))
-    answers = Answers.joined(parts, len(grasps))
-    found = search.best(answers, apart, most)
-    # Where several answers of one candidate will do, they may be enough.
-    enough = limit if most is None and len(found) >= limit else answers.answered.sum()
-    if enough < min(limit, len(grasps)):
-        parts += search.look(~answers.answered, thorough=True)
-        answers = Answers.joined(parts, len(grasps))
-        found = search.best(answers, apart, most)
+    preference: Preference = _checked_scores(prefer, engine.robot) if callable(prefer) else name
+    groups = list(_target_groups(request, grasps, pose, fixed))
+    search = _Search(engine, groups, start, preference, limit, seed)
+    parts = list(search.solve(np.ones(len(grasps), dtype=bool), thorough=False))
+    solutions = CandidateSolutions.concatenate(parts, len(grasps))
+    best = search.best(solutions, apart, max_per_candidate)
+    # Without a limit per candidate, `limit` solutions of the candidates so far are enough.
+    is_complete = per_candidate is None and len(best) >= limit
+    solved_count = limit if is_complete else solutions.is_solved.sum()
+    if solved_count < min(limit, len(grasps)):
+        parts += search.solve(~solutions.is_solved, thorough=True)
+        solutions = CandidateSolutions.concatenate(parts, len(grasps))
+        best = search.best(solutions, apart, max_per_candidate)
     seconds = (time.perf_counter() - begin) / len(grasps)
     entries = []
-    for row, solution in found:
-        owner = int(answers.owner[row])
-        grasp = grasps[owner] if pose is None else grasps[owner].in_object_frame().at(pose)
+    for row, solution in best:
+        candidate = int(solutions.candidate[row])
+        grasp = grasps[candidate]
+        if pose is not None:
+            grasp = grasp.in_object_frame().at(pose)
         timed = replace(solution, time=seconds)
-        entries.append(Choice(owner, timed, float(answers.score[row]), grasp))
-    reasons = [reason for reason in answers.reasons.tolist() if reason]
+        entries.append(Choice(candidate, timed, float(solutions.score[row]), grasp))
+    reasons = [reason for reason in solutions.reasons.tolist() if reason]
     return Ranking(
         entries=tuple(entries),
         candidates=len(grasps),
         answered=len(grasps) - len(reasons),
         failures=dict(Counter(reasons).most_common()),
-        prefer=word,
+        prefer=name,
     )
 
 
@@ -193,26 +205,28 @@ def _candidates(grasps: Iterable[Grasp]) -> Sequence[Grasp]:
     """Return the candidates as a sequence.
 
     Raises:
-        InputError: They are not several grasps.
+        InputError: They are not a sequence of grasps.
     """
     if isinstance(grasps, (Grasp, str, Mapping)) or not isinstance(grasps, Iterable):
         raise InputError(f"grasps: found {type(grasps).__name__}, expected a sequence of grasps")
     return grasps if isinstance(grasps, Sequence) else list(grasps)
 
 
-def _count(value: int, name: str) -> int:
-    """A number of answers.
+def _positive_count(value: int, name: str) -> int:
+    """Return a count as an integer.
 
     Raises:
-        InputError: It is none.
+        InputError: It is not an integer >= 1.
     """
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
         raise InputError(f"{name}: found {value!r}, expected an integer >= 1")
     return int(value)
 
 
-def _own(prefer: Callable[[ArmHand, Array], ArrayLike], robot: ArmHand) -> Callable[[Array], Array]:
-    """Return a caller's preference with its scores checked."""
+def _checked_scores(
+    prefer: Callable[[ArmHand, Array], ArrayLike], robot: ArmHand
+) -> Callable[[Array], Array]:
+    """Return a user-defined preference with a check of its scores."""
 
     def score(q: Array) -> Array:
         try:
@@ -223,148 +237,178 @@ def _own(prefer: Callable[[ArmHand, Array], ArrayLike], robot: ArmHand) -> Calla
                 f"prefer: the function raised {problem}; expected scores ({len(q)},)"
             ) from error
         if scores.shape != (len(q),):
-            raise InputError(f"prefer: gave shape {scores.shape}, expected ({len(q)},)")
+            raise InputError(f"prefer: scores have shape {scores.shape}; expected ({len(q)},)")
         if np.isnan(scores).any():
-            raise InputError("prefer: gave NaN, expected numbers")
+            raise InputError("prefer: scores are NaN; expected numbers")
         return scores
 
     return score
 
 
-def _asked(
+def _target_groups(
     request: Request,
     grasps: Sequence[Grasp],
     pose: Array | None,
     fixed: Mapping[str, float] | None,
 ) -> Iterator[tuple[NDArray[np.intp], TargetBatch]]:
-    """Candidates with the same fingers, tolerances, kinds and object, in the base frame."""
+    """Yield groups of candidates with equal fingers, tolerances, contact kinds and object.
+
+    Yields:
+        Indices of candidates, and their targets in the base frame.
+
+    Raises:
+        InputError: There are no candidates, or one is not a `Grasp`.
+    """
     if not len(grasps):
         raise InputError("grasps: found none, expected at least one")
     groups: dict[object, list[int]] = {}
     for number, grasp in enumerate(grasps):
         if not isinstance(grasp, Grasp):
             raise InputError(f"grasps[{number}]: found {type(grasp).__name__}, expected a Grasp")
-        own = tuple((name, one.tolerance) for name, one in grasp.contacts.items())
-        key = own, grasp.object, grasp.known_pose is None, grasp.palm is None
+        fingers = tuple((name, contact.tolerance) for name, contact in grasp.contacts.items())
+        key = fingers, grasp.object, grasp.known_pose is None, grasp.palm is None
         groups.setdefault(key, []).append(number)
     for numbers in groups.values():
-        some = [grasps[number] for number in numbers]
-        rows = np.array(numbers, dtype=np.intp)
-        targets = _placed(request.of_grasps(some, fixed), some, pose)
-        for _, of_kinds, alike in group_by_kinds(targets):
-            yield rows[of_kinds], alike
+        group = [grasps[number] for number in numbers]
+        indices = np.array(numbers, dtype=np.intp)
+        targets = _with_object_pose(request.of_grasps(group, fixed), group, pose)
+        for _, kind_rows, kind_targets in group_by_kinds(targets):
+            yield indices[kind_rows], kind_targets
 
 
-def _placed(targets: TargetBatch, grasps: Sequence[Grasp], pose: Array | None) -> TargetBatch:
-    """Targets moved as a whole with the object they are on, see `Grasp.at`."""
+def _with_object_pose(
+    targets: TargetBatch, grasps: Sequence[Grasp], pose: Array | None
+) -> TargetBatch:
+    """Move targets rigidly with their object, see `Grasp.at`."""
     if pose is None:
         return targets
-    places = [grasp.known_pose for grasp in grasps if grasp.known_pose is not None]
-    arrays = {"points": targets.points, "normals": targets.normals, **targets.more}
-    for name, array in arrays.items() if places else ():
-        # Seen from the object first.
-        stack = np.stack(places)
+    known_poses = [grasp.known_pose for grasp in grasps if grasp.known_pose is not None]
+    vectors = {"points": targets.points, "normals": targets.normals, **targets.more}
+    for name, array in vectors.items() if known_poses else ():
+        # Into the object frame first.
+        stack = np.stack(known_poses)
         shift = stack[:, None, :3, 3] if name == "points" else 0.0
-        arrays[name] = (array - shift) @ stack[:, :3, :3]
-    arrays = transform_arrays(arrays, pose)
-    points, normals = arrays.pop("points"), arrays.pop("normals")
-    named = grasps[0].object
-    at = np.broadcast_to(pose, (len(grasps), 4, 4)) if named or places else None
+        vectors[name] = (array - shift) @ stack[:, :3, :3]
+    vectors = transform_arrays(vectors, pose)
+    points, normals = vectors.pop("points"), vectors.pop("normals")
+    has_object = bool(grasps[0].object or known_poses)
+    object_poses = np.broadcast_to(pose, (len(grasps), 4, 4)) if has_object else None
     palms = targets.palms
     if palms is not None:
-        palms = pose @ (np.stack([inverse(place) for place in places]) @ palms if places else palms)
+        if known_poses:
+            palms = np.stack([inverse(known_pose) for known_pose in known_poses]) @ palms
+        palms = pose @ palms
     return replace(
-        targets, points=points, normals=normals, more=arrays, object_pose=at, palms=palms
+        targets,
+        points=points,
+        normals=normals,
+        more=vectors,
+        object_pose=object_poses,
+        palms=palms,
     )
 
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """The search for answers to all candidates.
+    """The search for solutions of all candidates.
 
     Attributes:
-        engine: Solves.
-        asked: Candidates that are alike, as numbers and targets.
-        start: (n,) where the robot is; with `prefer` it says which arms are better.
-        prefer: What is preferred.
-        limit: How many answers are wanted.
-        seed: Of random arms.
+        engine: The engine.
+        groups: Indices and targets of candidates with equal fingers and contact kinds.
+        start: (n,) initial configuration, which `prefer` may refer to.
+        prefer: The preference.
+        limit: Number of solutions to return.
+        seed: Seed of random arms.
     """
 
     engine: Engine
-    asked: Sequence[tuple[NDArray[np.intp], TargetBatch]]
+    groups: Sequence[tuple[NDArray[np.intp], TargetBatch]]
     start: Array
     prefer: Preference
     limit: int
     seed: int
 
-    def look(self, candidates: Bools, thorough: bool) -> Iterator[tuple[NDArray[np.intp], Answers]]:
-        """Answers to some candidates (k,), part by part, with the numbers of these.
+    def solve(
+        self, is_selected: Bools, thorough: bool
+    ) -> Iterator[tuple[NDArray[np.intp], CandidateSolutions]]:
+        """Yield the solutions of selected candidates in chunks, with their indices.
 
-        Neither what is preferred nor where the robot is decides which candidates have one.
+        Neither the preference nor the start decides whether a candidate has a solution.
 
         Args:
-            candidates: (k,) which.
-            thorough: Whether to look at all hands that a single grasp would get, after
-                `ChooseParameters.rounds` of rounds, instead of those that one round leads to.
+            is_selected: (k,) True for the candidates to solve.
+            thorough: Try all hands that a single grasp would get, with up to
+                `ChooseParameters.max_restarts` restarts, instead of the hands of one restart.
         """
-        for numbers, targets in self.asked:
-            left = numbers[candidates[numbers]]
-            if not len(left):
+        for indices, targets in self.groups:
+            selected = indices[is_selected[indices]]
+            if not len(selected):
                 continue
-            some = targets.rows(np.searchsorted(numbers, left))
-            some = replace(some, picked=left, prefer="limits")
-            engine, query = self.engine.engine_for(some), self.engine.collision_query(some)
-            for first in range(0, len(left), PARAMETERS.together):
-                rows = np.arange(first, min(first + PARAMETERS.together, len(left)))
-                nearby = None if query is None else query.rows(rows)
-                part = _Part(self, engine.finder, some.rows(rows), nearby)
-                yield left[rows], part.run(thorough)
+            group = targets.rows(np.searchsorted(indices, selected))
+            group = replace(group, picked=selected, prefer="limits")
+            engine, query = self.engine.engine_for(group), self.engine.collision_query(group)
+            for first in range(0, len(selected), CHOOSE_PARAMETERS.chunk_size):
+                last = min(first + CHOOSE_PARAMETERS.chunk_size, len(selected))
+                rows = np.arange(first, last)
+                chunk_query = None if query is None else query.rows(rows)
+                chunk = _Chunk(self, engine.finder, group.rows(rows), chunk_query)
+                yield selected[rows], chunk.solve(thorough)
 
-    def best(self, answers: Answers, apart: float, most: int | None) -> list[tuple[int, Solution]]:
-        """Rows of the best that differ from each other, at most so many of a candidate."""
+    def best(
+        self, solutions: CandidateSolutions, apart: float, max_per_candidate: int
+    ) -> list[tuple[int, Solution]]:
+        """Return the best solutions that differ from each other, and their rows.
+
+        Args:
+            solutions: The solutions.
+            apart: Minimum difference, see `choose`.
+            max_per_candidate: Maximum number of solutions per candidate.
+        """
         robot, limit = self.engine.robot, self.limit
-        # Of equals that whose arm is farther from its limits, then the first candidate.
-        left = np.lexsort((answers.owner, -answers.margin, -answers.score))
-        parts = answers.q / (robot.upper - robot.lower)
-        solutions: dict[int, Solution] = {}
+        # Equal scores are ranked by the limit margin of the arm, then by the candidate.
+        order = np.lexsort((solutions.candidate, -solutions.margin, -solutions.score))
+        fractions = solutions.q / (robot.upper - robot.lower)
+        verified: dict[int, Solution] = {}
         while True:
-            chosen, rest = list[int](), left
-            places = np.full(len(answers.reasons), limit if most is None else most)
-            while len(rest) and len(chosen) < limit:
-                row = int(rest[0])
+            chosen, remaining = list[int](), order
+            quota = np.full(len(solutions.reasons), max_per_candidate)
+            while len(remaining) and len(chosen) < limit:
+                row = int(remaining[0])
                 chosen.append(row)
-                places[answers.owner[row]] -= 1
-                off = np.abs(parts[rest] - parts[row]).max(axis=1)
-                rest = rest[(off >= apart) & (off > 0) & (places[answers.owner[rest]] > 0)]
-            solutions |= self._judged(answers, np.setdiff1d(chosen, [*solutions]).astype(np.intp))
-            failed = [row for row in chosen if not solutions[row].success]
+                quota[solutions.candidate[row]] -= 1
+                difference = np.abs(fractions[remaining] - fractions[row]).max(axis=1)
+                is_distinct = (difference >= apart) & (difference > 0)
+                remaining = remaining[is_distinct & (quota[solutions.candidate[remaining]] > 0)]
+            new_rows = np.setdiff1d(chosen, [*verified]).astype(np.intp)
+            verified |= self._verify(solutions, new_rows)
+            failed = [row for row in chosen if not verified[row].success]
             if not failed:
-                return [(row, solutions[row]) for row in chosen]
-            left = left[~np.isin(left, failed)]
+                return [(row, verified[row]) for row in chosen]
+            order = order[~np.isin(order, failed)]
 
-    def _judged(self, answers: Answers, rows: NDArray[np.intp]) -> dict[int, Solution]:
-        """Answers with the verdict on them, which has the last word."""
-        found: dict[int, Solution] = {}
-        for numbers, targets in self.asked:
-            mine = rows[np.isin(answers.owner[rows], numbers)]
-            if not len(mine):
+    def _verify(self, solutions: CandidateSolutions, rows: NDArray[np.intp]) -> dict[int, Solution]:
+        """Return the verdicts on solutions by their row."""
+        verified: dict[int, Solution] = {}
+        for indices, targets in self.groups:
+            group_rows = rows[np.isin(solutions.candidate[rows], indices)]
+            if not len(group_rows):
                 continue
-            some = targets.rows(np.searchsorted(numbers, answers.owner[mine]))
-            none = np.zeros(len(mine), dtype=np.int64)
-            status = np.full(len(mine), int(Status.SOLVED), dtype=np.int64)
+            candidates = solutions.candidate[group_rows]
+            group = targets.rows(np.searchsorted(indices, candidates))
+            zeros = np.zeros(len(group_rows), dtype=np.int64)
+            status = np.full(len(group_rows), int(Status.SOLVED), dtype=np.int64)
             robot = self.engine.robot.description
-            near = replace(some, prefer="q0" if self.prefer == "q0" else "limits")
-            q = in_nearest_turns(robot, near, answers.q[mine], self.start)
-            outcome = Outcome(q, status, none, none, np.zeros(len(mine)), {})
-            query, method = self.engine.collision_query(some), self.engine.method.name
-            batch = judge_outcome(self.engine.robot, method, some, outcome, query)
-            found |= {int(row): batch.solution(i) for i, row in enumerate(mine.tolist())}
-        return found
+            with_preference = replace(group, prefer="q0" if self.prefer == "q0" else "limits")
+            q = in_nearest_turns(robot, with_preference, solutions.q[group_rows], self.start)
+            outcome = Outcome(q, status, zeros, zeros, np.zeros(len(group_rows)), {})
+            query, method = self.engine.collision_query(group), self.engine.method.name
+            batch = judge_outcome(self.engine.robot, method, group, outcome, query)
+            verified |= {int(row): batch.solution(i) for i, row in enumerate(group_rows.tolist())}
+        return verified
 
 
-class _Part:
-    """Some candidates that are alike."""
+class _Chunk:
+    """Candidates with equal fingers and contact kinds that are solved together."""
 
     def __init__(
         self,
@@ -375,129 +419,157 @@ class _Part:
     ) -> None:
         self.search, self.finder, self.targets, self.query = search, finder, targets, query
         self.prefer, self.trials = search.prefer, finder.trials
-        ends = finder.robot.home, search_start(finder.robot.description, search.start)
-        self.home, self.starts = (np.tile(q, (len(targets), 1)) for q in ends)
+        starts = finder.robot.home, search_start(finder.robot.description, search.start)
+        self.home, self.starts = (np.tile(q, (len(targets), 1)) for q in starts)
         self.limits = self.trials.limits(targets)
         fixed = np.full(len(search.start), np.nan) if targets.fixed is None else targets.fixed
-        # What is given has no part in what is better.
+        # Motors that are fixed in all targets do not rank solutions.
         self.columns = np.flatnonzero(np.isnan(np.atleast_2d(fixed)).any(axis=0)).tolist()
 
-    def run(self, thorough: bool) -> Answers:
-        """Their answers."""
+    def solve(self, thorough: bool) -> CandidateSolutions:
+        """Return the solutions, see `_Search.solve`."""
         method = self.trials.method
-        rounds = PARAMETERS.rounds if thorough else 1
-        outcome = method.run(self.targets, self.home, self.search.seed, False, rounds)
-        good = self.trials.solved(self.targets, outcome.q, self.targets.enforce_limits)
+        restarts = CHOOSE_PARAMETERS.max_restarts if thorough else 1
+        outcome = method.run(self.targets, self.home, self.search.seed, False, restarts)
+        solved = self.trials.solved(self.targets, outcome.q, self.targets.enforce_limits)
         reasons = np.array([Status(int(code)).name for code in outcome.status], dtype=object)
-        # A method that is content with what the verdict refuses has come to a standstill.
-        reasons[~good & (outcome.status == Status.SOLVED)] = Status.STALLED.name
-        rows = np.flatnonzero(good)
+        # A method's SOLVED that fails the check becomes STALLED.
+        reasons[~solved & (outcome.status == Status.SOLVED)] = Status.STALLED.name
+        rows = np.flatnonzero(solved)
         q, pairs = outcome.q[rows], dict[int, tuple[str, str]]()
         if thorough and self.query is not None:
-            q, rows, pairs = self._freed(q, rows, self.query)
-        q, owner, more = self._answers(*self._hands(q, rows))
-        for row, pair in (pairs | more).items():
+            q, rows, pairs = self._resolve_collisions(q, rows, self.query)
+        q, candidate, further_pairs = self._solutions(*self._hands(q, rows))
+        for row, pair in (pairs | further_pairs).items():
             reasons[row] = f"{Status.COLLISION.name}: {pair[0]} and {pair[1]}"
-        reasons[owner] = ""
-        q = self._in_nearest_turns(q, owner)
-        return Answers(q, owner, self._score(q, owner), self.finder.arm_margins(q), reasons)
+        reasons[candidate] = ""
+        q = self._in_nearest_turns(q, candidate)
+        score, margin = self._score(q, candidate), self.finder.arm_margins(q)
+        return CandidateSolutions(q, candidate, score, margin, reasons)
 
-    def _in_nearest_turns(self, q: Array, owner: NDArray[np.intp]) -> Array:
-        """Return answers in the turns nearest to the start, see `nearest_turns`."""
+    def _in_nearest_turns(self, q: Array, candidate: NDArray[np.intp]) -> Array:
+        """Return solutions in the turns nearest to the start, see `nearest_turns`."""
         bounds = self.limits.first.lower, self.limits.first.upper
-        near = self.prefer == "q0"
-        return nearest_turns(self.finder.robot.description, q, self.starts[owner], bounds, near)
+        prefers_start = self.prefer == "q0"
+        robot, starts = self.finder.robot.description, self.starts[candidate]
+        return nearest_turns(robot, q, starts, bounds, prefers_start)
 
-    def _freed(
+    def _resolve_collisions(
         self, q: Array, rows: NDArray[np.intp], query: CollisionQuery
     ) -> tuple[Array, NDArray[np.intp], dict[int, tuple[str, str]]]:
-        """What a single grasp would get: free answers; and what is in the way of the others."""
-        some, nearby, home = self.targets.rows(rows), query.rows(rows), self.home[rows]
-        seed = self.search.seed
-        found = free_answers(self.finder, some, nearby, q, home, seed, reasons=False)
-        reports = zip(rows.tolist(), found.reports, strict=True)
+        """Search collision-free solutions as for a single grasp.
+
+        Returns:
+            Collision-free solutions, their candidates, and the colliding pairs of the others.
+        """
+        result = find_collision_free(
+            self.finder,
+            self.targets.rows(rows),
+            query.rows(rows),
+            q,
+            self.home[rows],
+            self.search.seed,
+            diagnose=False,
+        )
+        reports = zip(rows.tolist(), result.reports, strict=True)
         pairs = {row: report.pair for row, report in reports if report is not None}
-        return found.q[found.free], rows[found.free], pairs
+        return result.q[result.free], rows[result.free], pairs
 
     def _hands(self, q: Array, rows: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
-        """Different hands that meet the contacts of candidates, with an arm for each.
+        """Return different hands that meet the contacts, with an arm for each.
 
         Args:
-            q: (m, n) first answers.
-            rows: (m,) the candidates that have them.
+            q: (m, n) first solutions.
+            rows: (m,) indices of their candidates.
+
+        Returns:
+            (p, n) configurations and (p,) indices of their candidates.
         """
         if not len(rows) or self.targets.palms is not None:
-            return q, rows  # a hand that is given has no other posture
-        some = self.targets.rows(rows)
-        postures = self.trials.method.postures(some, 0)
+            return q, rows  # A target with a palm pose has a single hand posture.
+        postures = self.trials.method.postures(self.targets.rows(rows), 0)
         starts = self.limits.clip(self.home)
-        owner, *begun = self.trials.hand_rows(self.targets, rows, starts, postures)
-        ends, asked = self.trials.run(*begun), self.targets.rows(owner)
-        ends[~self.trials.solved(asked, ends, asked.enforce_limits)] = np.nan
-        every = np.concatenate([q[:, None], ends.reshape(len(rows), -1, q.shape[1])], axis=1)
-        kept: Bools = np.all(np.isfinite(every), axis=2)
-        place, which = np.nonzero(kept)
-        found, owner = every[place, which], rows[place]
-        parts = self.finder.hand_parts(found)
-        fresh = Deduplicator(len(rows), parts.shape[1], SEEKING.distinct).add(parts, place)
-        return found[fresh], owner[fresh]
+        candidate, *initial = self.trials.hand_rows(self.targets, rows, starts, postures)
+        ends, targets = self.trials.run(*initial), self.targets.rows(candidate)
+        ends[~self.trials.solved(targets, ends, targets.enforce_limits)] = np.nan
+        solutions = np.concatenate([q[:, None], ends.reshape(len(rows), -1, q.shape[1])], axis=1)
+        is_solved: Bools = np.all(np.isfinite(solutions), axis=2)
+        row, posture = np.nonzero(is_solved)
+        hands, candidate = solutions[row, posture], rows[row]
+        coordinates = self.finder.hand_coordinates(hands)
+        known = Deduplicator(len(rows), coordinates.shape[1], ALTERNATIVES.min_difference)
+        is_new = known.add(coordinates, row)
+        return hands[is_new], candidate[is_new]
 
-    def _answers(
-        self, q: Array, owner: NDArray[np.intp]
+    def _solutions(
+        self, q: Array, candidate: NDArray[np.intp]
     ) -> tuple[Array, NDArray[np.intp], dict[int, tuple[str, str]]]:
-        """The preferred free arm of every branch of hands; and what is in the way of the others."""
+        """Return the preferred collision-free arm of every branch of hands.
+
+        Returns:
+            Configurations, their candidates, and the colliding pairs of candidates without one.
+        """
         arms, query = self.finder.arm_search, self.query
         surplus = np.full(len(q), np.inf)
         if not len(q):
-            return q, owner, {}
+            return q, candidate, {}
         if query is not None:
-            nearby = query.rows(owner)
-            surplus = (nearby if arms is None else nearby.held).check(q).surplus
-        kept = np.flatnonzero(surplus >= -ROUNDING)
-        found, whose = q[kept], owner[kept]
+            hand_query = query.rows(candidate)
+            if arms is not None:
+                hand_query = hand_query.hand_pairs
+            surplus = hand_query.check(q).surplus
+        free_rows = np.flatnonzero(surplus >= -ROUNDING)
+        solutions, solution_candidate = q[free_rows], candidate[free_rows]
         if arms is not None:
-            found, hand = self._arms(found, whose, surplus[kept])
-            whose = whose[hand]
+            solutions, hand = self._arms(solutions, solution_candidate, surplus[free_rows])
+            solution_candidate = solution_candidate[hand]
         if query is None:
-            return found, whose, {}
-        left = np.flatnonzero(~np.isin(owner, whose))
-        # The last word has the hand with most room.
-        left = left[largest_per_owner(owner[left], surplus[left], 1)]
-        clear = query.rows(owner[left]).check(q[left])
-        named = ((row, clear.pair(i)) for i, row in enumerate(owner[left].tolist()))
-        return found, whose, {row: pair for row, pair in named if pair is not None}
+            return solutions, solution_candidate, {}
+        failed = np.flatnonzero(~np.isin(candidate, solution_candidate))
+        # The hand with the largest clearance names the colliding pair.
+        failed = failed[largest_per_owner(candidate[failed], surplus[failed], 1)]
+        clearances = query.rows(candidate[failed]).check(q[failed])
+        pairs = ((row, clearances.pair(i)) for i, row in enumerate(candidate[failed].tolist()))
+        return solutions, solution_candidate, {row: p for row, p in pairs if p is not None}
 
     def _arms(
-        self, q: Array, owner: NDArray[np.intp], surplus: Array
+        self, q: Array, candidate: NDArray[np.intp], surplus: Array
     ) -> tuple[Array, NDArray[np.intp]]:
-        """Free arms of hands, and whose hand it is; closer where the best of them are."""
-        found, hand = self._preferred(q, owner, surplus, False)
-        score = self._score(found, owner[hand])
-        best = np.argsort(-score, kind="stable")[: PARAMETERS.closer * self.search.limit]
-        again = np.unique(hand[best])
-        more, mine = self._preferred(q[again], owner[again], surplus[again], True)
-        others = ~np.isin(hand, again)
-        return np.concatenate([found[others], more]), np.concatenate([hand[others], again[mine]])
+        """Return collision-free arms and their hands; the best hands are refined."""
+        arms, hand = self._search_arms(q, candidate, surplus, False)
+        score = self._score(arms, candidate[hand])
+        count = CHOOSE_PARAMETERS.refined_factor * self.search.limit
+        best = np.argsort(-score, kind="stable")[:count]
+        best_hands = np.unique(hand[best])
+        refined, refined_hand = self._search_arms(
+            q[best_hands], candidate[best_hands], surplus[best_hands], True
+        )
+        is_other = ~np.isin(hand, best_hands)
+        return (
+            np.concatenate([arms[is_other], refined]),
+            np.concatenate([hand[is_other], best_hands[refined_hand]]),
+        )
 
-    def _preferred(
-        self, q: Array, owner: NDArray[np.intp], surplus: Array, closer: bool
+    def _search_arms(
+        self, q: Array, candidate: NDArray[np.intp], surplus: Array, refine: bool
     ) -> tuple[Array, NDArray[np.intp]]:
-        arms = self.finder.arm_search
-        assert arms is not None
-        query = None if self.query is None else self.query.swung.rows(owner)
+        """Return the preferred collision-free arm of every branch of hands, and its hand."""
+        search = self.finder.arm_search
+        assert search is not None
+        query = None if self.query is None else self.query.arm_pairs.rows(candidate)
         bounds = self.limits.first.lower, self.limits.first.upper
-        starts = self.starts[owner]
-        found = arms.choose(q, starts, bounds, self.prefer, query, surplus, True, closer)
+        starts = self.starts[candidate]
+        arms = search.choose(q, starts, bounds, self.prefer, query, surplus, True, refine)
         if query is None or self.prefer != CLEARANCE:
-            return found.q, found.owner
+            return arms.q, arms.hand_index
         assert self.query is not None
-        free = self.query.rows(owner[found.owner]).free(found.q)
-        return found.q[free], found.owner[free]
+        is_free = self.query.rows(candidate[arms.hand_index]).free(arms.q)
+        return arms.q[is_free], arms.hand_index[is_free]
 
-    def _score(self, q: Array, owner: NDArray[np.intp]) -> Array:
+    def _score(self, q: Array, candidate: NDArray[np.intp]) -> Array:
         if not len(q):
             return np.zeros(0)
         surplus = np.zeros(len(q))
         if self.prefer == CLEARANCE and self.query is not None:
-            surplus = self.query.rows(owner).check(q).surplus
-        return self.finder.score(q, self.starts[owner], self.prefer, self.columns, surplus)
+            surplus = self.query.rows(candidate).check(q).surplus
+        return self.finder.score(q, self.starts[candidate], self.prefer, self.columns, surplus)

@@ -1,7 +1,7 @@
-"""The preferred arms that hold hands where they are and touch nothing, for many hands at once.
+"""Batched search for the preferred collision-free arms at given palm poses.
 
-All branches at some values of the redundancy are put in the asked order and checked until one is
-free; see runtime/arm_search.c.
+All branches at sampled values of the redundancy are sorted by the preference and checked until one
+is collision-free; see compile/runtime/arm_search.c.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from casadi_ik.solve.request import CLEARANCE
 
 SYMBOL = "casadi_ik_arm_search"
 
-TURN = 2 * np.pi
+FULL_TURN = 2 * np.pi
 
 Preference: TypeAlias = str | Callable[[Array], Array]
-"""One of `PREFERENCES`, or what gives configurations (m, n) their scores (m,)."""
+"""One of `PREFERENCES`, or a function from configurations (m, n) to scores (m,)."""
 
 
-class Order(IntEnum):
-    """What is preferred, as drivers/arm_search.c has it."""
+class ArmOrder(IntEnum):
+    """The order of arms, with the values of compile/runtime/arm_search.c."""
 
     LIMITS = 0
     NEAREST = 1
@@ -46,84 +46,87 @@ class Order(IntEnum):
     CLEAREST = 3
 
 
-ORDERS = {
-    "limits": Order.LIMITS,
-    "q0": Order.NEAREST,
-    "manipulability": Order.MEASURED,
-    CLEARANCE: Order.CLEAREST,
+ARM_ORDERS = {
+    "limits": ArmOrder.LIMITS,
+    "q0": ArmOrder.NEAREST,
+    "manipulability": ArmOrder.MEASURED,
+    CLEARANCE: ArmOrder.CLEAREST,
 }
 
 
 @dataclass(frozen=True)
 class FreeArmParameters:
-    """Where arms that touch nothing are looked for.
+    """Sampling of the redundancy in the search for collision-free arms.
 
     Attributes:
-        values: Of the last number of a redundancy, all around.
-        locked: Angles of each locked joint: where these are all the redundancy, where not.
-        closer: Values around the one that was taken.
-        at_once: Hands of one call, after which Python gets a look at its signals.
+        samples: Number of values of the last redundancy parameter.
+        locked_samples: Number of angles of each locked joint: if locked joints are the whole
+            redundancy, and otherwise.
+        local_samples: Number of values around the best one in the refinement.
+        chunk_size: Number of hands per call, between which Python handles its signals.
     """
 
-    values: int = 12
-    locked: tuple[int, int] = (5, 3)
-    closer: int = 13
-    at_once: int = 512
+    samples: int = 12
+    locked_samples: tuple[int, int] = (5, 3)
+    local_samples: int = 13
+    chunk_size: int = 512
 
 
-SEARCH = FreeArmParameters()
+FREE_ARM_PARAMETERS = FreeArmParameters()
 
 
 @dataclass(frozen=True, eq=False)
-class SearchValues:
-    """The values of its redundancy at which the arms of a robot are looked at.
+class RedundancySamples:
+    """The values of the redundancy at which the arms of a robot are computed.
 
     Attributes:
-        levels: Values (s, r) to look at, and those where nothing is found; the last of the r
-            numbers may be varied.
-        closer: (c,) by how much, about a value where something was found.
+        levels: (s, r) values that are tried first, and further ones for hands without a
+            collision-free arm among the first. A refinement varies the last of the r parameters.
+        offsets: (c,) offsets of that parameter in the refinement.
     """
 
     levels: tuple[Array, Array]
-    closer: Array
+    offsets: Array
 
     @classmethod
-    def of(cls, family: ArmFamily, lower: Array, upper: Array) -> SearchValues:
-        """A grid over the bounds (a,) of an arm; where nothing is found, what is between."""
+    def of(cls, family: ArmFamily, lower: Array, upper: Array) -> RedundancySamples:
+        """Return a grid over the bounds (a,) of an arm, and values between its points."""
         locked, size = len(family.locked), len(family.redundancy)
         if not size:
             return cls((np.zeros((1, 1)), np.zeros((0, 1))), np.zeros(0))
-        counts = [SEARCH.locked[size > locked]] * locked + [SEARCH.values] * (size - locked)
-        ends = [one.bounds(lower, upper) for one in family.redundancy]
-        low, high = (np.array([float(end[i]) for end in ends]) for i in (0, 1))
+        parameters = FREE_ARM_PARAMETERS
+        counts = [parameters.locked_samples[size > locked]] * locked
+        counts += [parameters.samples] * (size - locked)
+        bounds = [parameter.bounds(lower, upper) for parameter in family.redundancy]
+        low, high = (np.array([float(bound[i]) for bound in bounds]) for i in (0, 1))
         axes = np.meshgrid(*((np.arange(c) + 0.5) / c for c in counts), indexing="ij")
         grid = np.stack([axis.ravel() for axis in axes], axis=1)
-        between = spread_points(2 * len(grid), size) if locked else grid + 0.5 / SEARCH.values
+        between = spread_points(2 * len(grid), size) if locked else grid + 0.5 / parameters.samples
         levels = low + (high - low) * grid, low + (high - low) * between
         step = (high[-1] - low[-1]) / counts[-1]
-        return cls(levels, step * np.linspace(-1, 1, SEARCH.closer + 2)[1:-1])
+        return cls(levels, step * np.linspace(-1, 1, parameters.local_samples + 2)[1:-1])
 
 
 @dataclass(frozen=True, eq=False)
 class ArmCandidates:
-    """Arms of k hands.
+    """The arms of k hands.
 
     Attributes:
         q: (m, n) configurations within the bounds.
-        owner: (m,) number of the hand.
-        tried: (k,) arms of each hand that were within bounds.
+        hand_index: (m,) index of the hand of each configuration.
+        arms_tried: (k,) number of arms of each hand within the bounds.
     """
 
     q: Array
-    owner: NDArray[np.intp]
-    tried: NDArray[np.int64]
+    hand_index: NDArray[np.intp]
+    arms_tried: NDArray[np.int64]
 
 
 ArmSearchJob = c_struct("arm_search_job", {"LEVELS": 2}, "arm_search")
 
 
 class ArmSearch:
-    """The search for one robot; threads may share it."""
+    """The search for the arms of one robot; threads may share it."""
 
     def __init__(
         self,
@@ -134,16 +137,17 @@ class ArmSearch:
         compiled: bool = True,
         side: int | None = None,
     ) -> None:
-        """Compile the function of the arm and the driver, or load them from the cache.
+        """Compile the closed form of the arm and the driver, or load them from the cache.
 
         Args:
             robot: The robot.
-            family: The arm's.
-            scores: Of configurations (m, n), starts (m, n) and what is preferred: the order (m,)
-                of arms of the same hand, higher is better.
-            manipulability: Gives that of the arm as a function of q.
-            compiled: False keeps to the virtual machine and numpy.
-            side: Number of the side of a body whose arm it is; the trunk stays.
+            family: Family of the arm.
+            scores: Function from configurations (m, n), initial configurations (m, n) and a
+                preference to scores (m,) of arms of the same hand; higher is better.
+            manipulability: Returns the manipulability of the arm as a function of q.
+            compiled: Use compiled kernels; False: the virtual machine and numpy.
+            side: Number of the side of a multi-arm robot whose arm is searched at a fixed trunk;
+                None: the arm of a robot with one arm.
         """
         self._robot, self._family = robot, family
         self.scores, self._manipulability = scores, manipulability
@@ -152,19 +156,19 @@ class ArmSearch:
         self._columns = np.array(arm, dtype=np.int64)
         lower, upper = robot.lower[self._columns], robot.upper[self._columns]
         self._low, self._range = doubles(lower), doubles(upper - lower)
-        # Of the very limits, as exports have them: the sum of low and range may differ from high.
-        self.values = SearchValues.of(family, lower, upper)
-        alone = body if side is None else body.side(body.sides[side].name)
-        name = ca.Function.fix_name(f"{alone.name}_all_arms")
-        arms = arms_graph(family, name, recipe(name, alone))
+        # From the limits themselves, as in exports: low + range may differ from high by rounding.
+        self.samples = RedundancySamples.of(family, lower, upper)
+        description = body if side is None else body.side(body.sides[side].name)
+        name = ca.Function.fix_name(f"{description.name}_all_arms")
+        arms = arms_graph(family, name, recipe(name, description))
         self._arms = FunctionKernel(arms, compiled, in_lanes=True)
         self._lanes = machine_lanes() if compiled else 0
         self._run: Any = self._load() if self._lanes else None
-        self._tables = tuple(map(doubles, (*self.values.levels, self.values.closer)))
+        self._tables = tuple(map(doubles, (*self.samples.levels, self.samples.offsets)))
 
     @property
-    def exact(self) -> bool:
-        """Whether the arms that are found carry their palms exactly."""
+    def is_exact(self) -> bool:
+        """True if the closed form carries the palm exactly."""
         return self._family.is_exact
 
     def _load(self) -> Any:
@@ -181,47 +185,51 @@ class ArmSearch:
         prefer: Preference,
         query: CollisionQuery | None,
         surplus: Array,
-        branches: bool = False,
-        closer: bool = True,
-        of_one: NDArray[np.intp] | None = None,
+        all_branches: bool = False,
+        refine: bool = True,
+        target_index: NDArray[np.intp] | None = None,
     ) -> ArmCandidates:
-        """The preferred arm that touches nothing, of every hand that has one.
+        """Return the preferred collision-free arm of every hand that has one.
 
         Args:
-            q: (k, n) configurations of hands that touch nothing themselves, with an arm for each.
-            starts: (k, n) where the robot is.
-            bounds: (n,) and (n,).
-            prefer: What is preferred.
-            query: Pairs that this arm decides, none of which may touch; None: nothing is checked.
-            surplus: (k,) of what the hand alone decides [m], which no arm can exceed.
-            branches: Whether to give the preferred arm of every branch, and the given one, instead
-                of one.
-            closer: Whether to look about the values at which they were found.
-            of_one: (k,) whose each hand is, one's hands together: those behind the first that has
-                an arm are left out. None: none is.
+            q: (k, n) configurations whose hands are collision-free, each with an arm.
+            starts: (k, n) initial configurations.
+            bounds: (n,) and (n,) lower and upper bounds.
+            prefer: Preference among arms.
+            query: Pairs whose distances this arm decides and that must not collide; None: nothing
+                is checked.
+            surplus: (k,) clearance of the hand alone beyond the margin [m], which bounds that of
+                every arm.
+            all_branches: Return the preferred arm of every branch, and the given arm, instead of
+                a single arm.
+            refine: Sample the redundancy more finely around the best arm.
+            target_index: (k,) index of the target of each hand, with the hands of a target next
+                to each other: hands after the first one with an arm are skipped. None: no hand is
+                skipped.
 
         Returns:
-            The arms; with "clearance" those with most room, free or not.
+            The arms; with the preference "clearance" those with the largest clearance, which may
+            be in collision.
         """
         if not len(q):
             return ArmCandidates(q, np.zeros(0, np.intp), np.zeros(0, np.int64))
-        inside = bounds[0][self._columns], bounds[1][self._columns]
-        asked = _Asked(q, self._palm(q), starts, inside, prefer, query, surplus)
-        groups = self._family.rows + 1 if branches else 1
+        arm_bounds = bounds[0][self._columns], bounds[1][self._columns]
+        problem = _ArmProblem(q, self._palm(q), starts, arm_bounds, prefer, query, surplus)
+        groups = self._family.rows + 1 if all_branches else 1
         measure = _Measure(self, prefer)
         entries = [self._run, self._arms.entry]
         entries += [] if query is None else [query.kernel.entry]
-        entries += [measure.address] if asked.order is Order.MEASURED else []
+        entries += [measure.address] if problem.order is ArmOrder.MEASURED else []
         if any(entry is None for entry in entries):
-            return self._plain(asked, groups, of_one)
-        arms, score, tried = self._compiled(asked, measure, groups, closer, of_one)
-        owner, group = np.nonzero(score > -np.inf)
-        found = q[owner]
-        found[:, self._columns] = arms[owner, group]
-        return ArmCandidates(found, owner, tried)
+            return self._choose_numpy(problem, groups, target_index)
+        arms, score, tried = self._choose_compiled(problem, measure, groups, refine, target_index)
+        hand_index, group = np.nonzero(score > -np.inf)
+        chosen = q[hand_index]
+        chosen[:, self._columns] = arms[hand_index, group]
+        return ArmCandidates(chosen, hand_index, tried)
 
     def _palm(self, q: Array) -> Array:
-        """(k, 4, 4) the palm as the arm's base sees it."""
+        """Return the (k, 4, 4) palm poses in the base frame of the arm."""
         if self._side is None:
             return self._robot.palm(q)
         body = self._robot.description
@@ -229,36 +237,42 @@ class ArmSearch:
         palm = self._robot.palm(q, body.sides[self._side].name)
         return np.asarray(np.linalg.solve(base, palm), dtype=float)
 
-    def _compiled(
+    def _choose_compiled(
         self,
-        asked: _Asked,
+        problem: _ArmProblem,
         measure: _Measure,
         groups: int,
-        closer: bool,
-        of_one: NDArray[np.intp] | None,
+        refine: bool,
+        target_index: NDArray[np.intp] | None,
     ) -> tuple[Array, Array, NDArray[np.int64]]:
-        """(k, g, a) arms, (k, g) their scores or -inf for none, (k,) how many were tried."""
-        count, n_arm = len(asked.q), len(self._columns)
+        """Run the driver.
+
+        Returns:
+            (k, g, a) arms, (k, g) their scores or -inf for no arm, (k,) number of arms tried.
+        """
+        count, n_arm = len(problem.q), len(self._columns)
         chosen, score = np.zeros((count, groups, n_arm)), np.empty((count, groups))
         tried = np.zeros(count, dtype=np.int64)
-        given = (asked.q, asked.palms, asked.starts, *asked.bounds, asked.surplus)
-        q, palms, starts, lower, upper, surplus = map(doubles, given)
-        whose = None if of_one is None else np.ascontiguousarray(of_one, dtype=np.int64)
-        for rows in _slices(count, whose):
+        inputs = (problem.q, problem.palms, problem.starts, *problem.bounds, problem.surplus)
+        q, palms, starts, lower, upper, surplus = map(doubles, inputs)
+        owner = None
+        if target_index is not None:
+            owner = np.ascontiguousarray(target_index, dtype=np.int64)
+        for rows in _slices(count, owner):
             job = ArmSearchJob(
                 arms=_address(self._arms.entry),
                 measure=measure.address,
                 lanes=self._lanes,
-                order=int(asked.order),
+                order=int(problem.order),
                 n_q=q.shape[1],
                 n_arm=n_arm,
                 n_redundancy=self._tables[0].shape[1],
                 n_rows=self._family.rows,
                 n_groups=groups,
-                n_places=(ctypes.c_int64 * 2)(*map(len, self._tables[:2])),
-                n_closer=len(self._tables[2]) if closer else 0,
-                places=(ctypes.c_void_p * 2)(*(t.ctypes.data for t in self._tables[:2])),
-                closer=self._tables[2].ctypes.data,
+                n_samples=(ctypes.c_int64 * 2)(*map(len, self._tables[:2])),
+                n_offsets=len(self._tables[2]) if refine else 0,
+                samples=(ctypes.c_void_p * 2)(*(t.ctypes.data for t in self._tables[:2])),
+                offsets=self._tables[2].ctypes.data,
                 columns=self._columns.ctypes.data,
                 lower=lower.ctypes.data,
                 upper=upper.ctypes.data,
@@ -267,77 +281,86 @@ class ArmSearch:
                 q=q[rows].ctypes.data,
                 palms=palms[rows].ctypes.data,
                 starts=starts[rows].ctypes.data,
-                owner=None if whose is None else whose[rows].ctypes.data,
-                allowed=ARM_SEARCH.tolerance,
+                owner=None if owner is None else owner[rows].ctypes.data,
+                min_limit_margin=ARM_SEARCH.tolerance,
                 count=rows.stop - rows.start,
                 chosen=memory(chosen[rows]),
                 score=memory(score[rows]),
                 tried=memory(tried[rows]),
             )
-            query, kept = asked.query, None
+            query, buffers = problem.query, None
             if query is not None and len(query.table.pairs):
                 poses = query.poses[rows] if query.poses.ndim == 3 else query.poses
                 kernel, table = query.kernel, query.table
-                clear, *kept = kernel.job(np.zeros((1, 1)), poses, table, 0.0, 0.0)
-                job.check, job.clear = _address(kernel.entry), ctypes.addressof(clear)
-                job.poses, job.pose_step = clear.poses, clear.pose_step
+                clearance_job, *buffers = kernel.job(np.zeros((1, 1)), poses, table, 0.0, 0.0)
+                job.check = _address(kernel.entry)
+                job.clearance = ctypes.addressof(clearance_job)
+                job.poses, job.pose_step = clearance_job.poses, clearance_job.pose_step
                 job.margin, job.rounding = query.margin, ROUNDING
-                job.caps = surplus[rows].ctypes.data
+                job.clearance_bounds = surplus[rows].ctypes.data
             code = self._run(ctypes.byref(job))
-            del kept
+            del buffers  # The driver has used their memory until now.
             measure.reraise()
             if code != DriverCode.DONE:
                 check("arm_search", code)
         return chosen, score, tried
 
-    def _plain(self, asked: _Asked, groups: int, of_one: NDArray[np.intp] | None) -> ArmCandidates:
-        """The same in numpy, without a closer look: where something is not compiled."""
-        values = np.concatenate(self.values.levels)
-        kept, owners, tried = [], [], np.zeros(len(asked.q), dtype=np.int64)
-        answered: set[int] = set()
-        for hand, own in enumerate(asked.q):
-            if of_one is not None and int(of_one[hand]) in answered:
+    def _choose_numpy(
+        self, problem: _ArmProblem, groups: int, target_index: NDArray[np.intp] | None
+    ) -> ArmCandidates:
+        """Search in numpy, without refinement, where a kernel is not compiled."""
+        samples = np.concatenate(self.samples.levels)
+        parts, hand_index, tried = [], [], np.zeros(len(problem.q), dtype=np.int64)
+        solved_targets: set[int] = set()
+        for hand, configuration in enumerate(problem.q):
+            if target_index is not None and int(target_index[hand]) in solved_targets:
                 continue
-            q, group = self._within(asked, hand, own, values)
+            q, group = self._arms_within_bounds(problem, hand, configuration, samples)
             tried[hand] = len(q)
-            score = asked.scores(self, q, np.full(len(q), hand))
-            # The first of those with the highest score of each group.
+            score = problem.scores(self, q, np.full(len(q), hand))
+            # Of the arms with the highest score of each group take the first.
             order = np.lexsort((-np.arange(len(q)), score, group * (groups > 1)))
             group = (group * (groups > 1))[order]
             last = order[np.append(group[1:] != group[:-1], True)] if len(q) else order
-            found = q[last[score[last] > -np.inf]]
-            if len(found) and of_one is not None:
-                answered.add(int(of_one[hand]))
-            kept.append(found)
-            owners.append(np.full(len(found), hand))
-        return ArmCandidates(np.concatenate(kept), np.concatenate(owners), tried)
+            chosen = q[last[score[last] > -np.inf]]
+            if len(chosen) and target_index is not None:
+                solved_targets.add(int(target_index[hand]))
+            parts.append(chosen)
+            hand_index.append(np.full(len(chosen), hand))
+        return ArmCandidates(np.concatenate(parts), np.concatenate(hand_index), tried)
 
-    def _within(
-        self, asked: _Asked, hand: int, own: Array, values: Array
+    def _arms_within_bounds(
+        self, problem: _ArmProblem, hand: int, configuration: Array, samples: Array
     ) -> tuple[Array, NDArray[np.intp]]:
-        """All arms (m, n) of a hand within bounds, the given one last, and their branches."""
+        """Return all arms (m, n) of a hand within the bounds, and their branches (m,).
+
+        The arm of the given configuration comes last, as a branch of its own.
+        """
         rows, n = self._family.rows, len(self._columns)
-        palm, (lower, upper) = asked.palms[hand], asked.bounds
-        pose = np.tile(np.append(palm[:3, :3], palm[:3, 3]), (len(values), 1))
-        (found,) = self._arms(np.hstack([pose, values]))
-        reached = np.append(found[:, rows * n :].ravel() >= 0, True)
-        arms = np.concatenate([found[:, : rows * n].reshape(-1, n), own[None, self._columns]])
-        held = arms + TURN * np.floor((lower - arms) / TURN + 0.5)
-        arms = np.where(lower < upper, arms, held)
-        if asked.prefer == "q0":
-            start = asked.starts[hand, self._columns]
-            turned = arms + TURN * np.floor((start - arms) / TURN + 0.5)
-            arms = np.where((turned >= lower) & (turned <= upper), turned, arms)
+        palm, (lower, upper) = problem.palms[hand], problem.bounds
+        pose = np.tile(np.append(palm[:3, :3], palm[:3, 3]), (len(samples), 1))
+        (outputs,) = self._arms(np.hstack([pose, samples]))
+        reaches = np.append(outputs[:, rows * n :].ravel() >= 0, True)
+        arms = np.concatenate(
+            [outputs[:, : rows * n].reshape(-1, n), configuration[None, self._columns]]
+        )
+        # A joint with equal bounds is fixed, possibly in another turn.
+        at_bound = arms + FULL_TURN * np.floor((lower - arms) / FULL_TURN + 0.5)
+        arms = np.where(lower < upper, arms, at_bound)
+        if problem.prefer == "q0":
+            start = problem.starts[hand, self._columns]
+            nearest = arms + FULL_TURN * np.floor((start - arms) / FULL_TURN + 0.5)
+            arms = np.where((nearest >= lower) & (nearest <= upper), nearest, arms)
         margin = np.minimum(arms - lower, upper - arms).min(axis=1)
-        inside = np.flatnonzero(reached & (margin >= ARM_SEARCH.tolerance))
-        q = np.tile(own, (len(inside), 1))
+        inside = np.flatnonzero(reaches & (margin >= ARM_SEARCH.tolerance))
+        q = np.tile(configuration, (len(inside), 1))
         q[:, self._columns] = np.clip(arms[inside], lower, upper)
-        return q, np.append(np.tile(np.arange(rows), len(values)), rows)[inside]
+        return q, np.append(np.tile(np.arange(rows), len(samples)), rows)[inside]
 
 
 @dataclass(frozen=True, eq=False)
-class _Asked:
-    """What arms are asked for; k hands."""
+class _ArmProblem:
+    """Inputs of a search for the arms of k hands, see `ArmSearch.choose`."""
 
     q: Array
     palms: Array
@@ -348,11 +371,12 @@ class _Asked:
     surplus: Array
 
     @property
-    def order(self) -> Order:
-        return Order.MEASURED if callable(self.prefer) else ORDERS[self.prefer]
+    def order(self) -> ArmOrder:
+        """The order of arms in the driver."""
+        return ArmOrder.MEASURED if callable(self.prefer) else ARM_ORDERS[self.prefer]
 
     def scores(self, search: ArmSearch, q: Array, hand: NDArray[np.intp]) -> Array:
-        """(m,) of configurations of hands (m,); -inf where they touch something."""
+        """Return the scores (m,) of configurations of hands (m,); -inf for a collision."""
         if not len(q):
             return np.zeros(0)
         if self.query is None:
@@ -364,13 +388,13 @@ class _Asked:
 
 
 class _Measure:
-    """A score of q for the driver, which calls it like a compiled map of many rows."""
+    """A score of q that the driver calls like a compiled map of many rows."""
 
     def __init__(self, search: ArmSearch, prefer: Preference) -> None:
         self.address: int | None = None
         self._error: BaseException | None = None
         if callable(prefer):
-            self._call = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.POINTER(MapJob))(self._scored)
+            self._call = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.POINTER(MapJob))(self._run_map)
             self._prefer, self.address = prefer, _address(self._call)
             self._size = len(search._robot.lower)
         elif prefer == "manipulability":
@@ -378,20 +402,20 @@ class _Measure:
             self.address = None if kernel.entry is None else _address(kernel.entry)
 
     def reraise(self) -> None:
-        """Raise what a preference of one's own raised."""
+        """Raise the exception of a user-defined preference, if there was one."""
         if self._error is not None:
             raise self._error
 
-    def _scored(self, job: Any) -> int:
-        """Like a map kernel: `count` rows of its only input to its only output."""
+    def _run_map(self, job: Any) -> int:
+        """Map the `count` rows of the only input to the only output, like a map kernel."""
         map_job = job.contents
         try:
-            given, wanted = (
-                ctypes.cast(each, ctypes.POINTER(ctypes.POINTER(ctypes.c_double)))[0]
-                for each in (map_job.inputs, map_job.outputs)
+            source, destination = (
+                ctypes.cast(pointers, ctypes.POINTER(ctypes.POINTER(ctypes.c_double)))[0]
+                for pointers in (map_job.inputs, map_job.outputs)
             )
-            q = np.ctypeslib.as_array(given, (map_job.count, self._size))
-            np.ctypeslib.as_array(wanted, (map_job.count,))[:] = self._prefer(q.copy())
+            q = np.ctypeslib.as_array(source, (map_job.count, self._size))
+            np.ctypeslib.as_array(destination, (map_job.count,))[:] = self._prefer(q.copy())
         except BaseException as error:
             self._error = error
             return int(DriverCode.NO_MEMORY)
@@ -399,10 +423,10 @@ class _Measure:
 
 
 def _slices(count: int, owner: NDArray[np.int64] | None) -> Iterator[slice]:
-    """Hands of one call each, those of an owner together."""
+    """Yield the hands of each call; hands with the same owner stay together."""
     first = 0
     while first < count:
-        last = min(first + SEARCH.at_once, count)
+        last = min(first + FREE_ARM_PARAMETERS.chunk_size, count)
         while owner is not None and last < count and owner[last] == owner[last - 1]:
             last += 1
         yield slice(first, last)

@@ -1,15 +1,20 @@
-"""Answers that touch nothing: other arms for the same hand, other hands, and steps away.
+"""Search for collision-free solutions of targets whose first solution is in collision.
 
-What is looked at, until one is free: all branches of the arm over all of its redundancy with the
-hand as it is; the hand postures of every round, each with all its arms; of an arm of no family
-descents from random arms; and steps about what is nearest, each brought back to the contacts. A
-hand that touches something by itself, wherever its unconstrained fingers are put, is discarded
-before any of its arms is looked at.
+The search order is:
 
-Of a body hands that touch something by themselves are moved by such steps first, side by side, then
-by steps of what they touch within its tolerances; then come other trunks for the hands that are
-left, other arms there, and so on with the hands of the next round (free_hands.py). At last trunk
-and arms move about the nearest of what was found, palms kept.
+1. all branches of the arm at all sampled values of its redundancy, with the given hand;
+2. the hand postures of each restart, each with all arms; for an arm without a closed form,
+   descents from random arms;
+3. random steps around the least-penetrating solutions, each projected back onto the contacts.
+
+A hand in self-collision for every posture of its unconstrained fingers is discarded before any arm
+is checked.
+
+For a multi-arm robot, hands in self-collision are first moved by such steps, independently for
+each side, and then by steps of their contacts within the tolerances. The remaining hands are
+combined with other trunks and other arms, and each stage of trunks is followed by the hands of the
+next restart (free_hands.py). Finally trunk and arms move around the least-penetrating solutions
+while the palms stay in place.
 """
 
 from __future__ import annotations
@@ -24,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.collision.clearance import ROUNDING, Clearances, CollisionQuery
-from casadi_ik.collision.distances import Table
+from casadi_ik.collision.distances import PairTable
 from casadi_ik.files.arrays import Array, spread_steps
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import group_by_kinds
@@ -48,64 +53,78 @@ from casadi_ik.solve.trials import (
 )
 from casadi_ik.solve.verdict import SolvedVerdict, judge_single
 
-USUAL = "limits"
-"""What is preferred where nothing is said."""
+DEFAULT_PREFERENCE = "limits"
+"""Preference of targets that name none."""
 
-RANKED = ("manipulability", CLEARANCE)
-"""Preferences for which an answer that is free already has to compete with all others."""
+RANKING_PREFERENCES = ("manipulability", CLEARANCE)
+"""Preferences for which a collision-free solution still competes with all other solutions."""
 
 
 @dataclass(frozen=True)
-class FreeSearchParameters:
-    """How far answers that touch nothing are looked for.
+class CollisionFreeParameters:
+    """Effort of the search for collision-free solutions.
 
     Attributes:
-        together: Targets that are worked on at once.
-        rounds: Of hand postures.
-        alike: Hands all of whose motors differ by less [of their ranges] have the same arms.
-        trunks: Trunks of a body that are tried, one lot after the other, and how many ways to
-            combine hands of its sides share them. After each lot there is a round of hands.
-        starts: Random arms that a target is solved from, where the arm is of no family.
-        steps: About what is nearest to being free, one after the other [of motors' ranges].
-        tries: Of such a step, in random directions; the best is taken. Of a robot with one hand and
-            of a body. Source: `studies/bench.py --part clutter`, a KUKA LWR with a Barrett hand by
-            turns with commit 508e6b5, which solves 472 of 650 targets: with 4, 8 and 12 it is 473,
-            481 and 490, in 0.95, 1.04 and 1.11 times the time.
-        aside: Steps of the motors of a body's hands. Source: of two Pandas with Allegro hands those
-            of `steps` leave more to `within`: 1.9 to 2.5 ms a target instead of 1.5 to 1.6.
-        within: Steps of contacts [of their tolerances], where those of motors do not help.
-        kept: What a contact may be off such a place [of its tolerance].
-        near: Answers of a body that are nearest, about which others are looked for at last.
-        about: Steps of trunk and arms about these [of motors' ranges], and how far inside something
-            they may be [m]. Source: of 300 targets of a G1 with Dex3 that are given hands touching
-            nothing 211 got a free answer without these steps, 248 with them; a search of 6,000
-            found 16 of those 37 and no other. Of 100 targets with any hands 7 got one, with steps
-            of contacts as well 38.
-        deep: What is farther inside something [m] is not got out of by such steps.
-        left: As much for each of the steps, of an arm in closed form: for all, and for the hand
-            inside itself, unless a hand is nearer to the scene. A target all of whose hands are
-            farther inside themselves than at first is given up after a round of them. Source: of a
-            KUKA LWR with a Barrett hand steps free 48 among 1,778 targets of
-            `studies/collision.py` and 41 among 2,000 of `studies/bench.py`. A first step of 0.3
-            (a seventh of whose ends meet the contacts) and one of 0.2, with an eighth in all and
+        chunk_size: Number of targets that are searched together.
+        restarts: Maximum number of restarts whose hand postures are tried.
+        min_hand_difference: Hands are duplicates if every motor differs by less than this
+            [fraction of its range]; duplicates have the same arms.
+        trunk_stages: For a multi-arm robot, the number of trunks per target in each stage, and the
+            maximum number of combinations of its hands that share them. Each stage is followed by
+            the hands of one restart.
+        random_arms: Number of random starts per target for an arm without a closed form.
+        escape_steps: Standard deviations of successive random steps around the least-penetrating
+            solution [fraction of the motors' ranges].
+        step_samples: Number of random directions per step, of which the best is kept: for a robot
+            with one arm and for a multi-arm robot.
+            Source: `studies/bench.py --part clutter`, a KUKA LWR with a Barrett hand, alternating
+            with commit 508e6b5, which solves 472 of 650 targets: with 4, 8 and 12 directions it is
+            473, 481 and 490, in 0.95, 1.04 and 1.11 times the time.
+        hand_steps: Steps of the hand motors of a multi-arm robot [fraction of their ranges].
+            Source: for two Pandas with Allegro hands, `escape_steps` here leave more work to
+            `contact_steps`: 1.9 to 2.5 ms a target instead of 1.5 to 1.6.
+        contact_steps: Steps of contacts [fraction of their tolerances], tried where steps of the
+            motors do not help.
+        contact_tolerance: Tolerance of the displaced contacts [fraction of the original one].
+        pool_size: For a multi-arm robot, number of least-penetrating solutions of a target around
+            which trunk and arms move at the end.
+        carry_steps: Steps of trunk and arms around these solutions [fraction of the motors'
+            ranges], each with the maximum penetration for which it is tried [m].
+            Source: of 300 targets of a G1 with Dex3 hands that are given hands without
+            self-collision, 211 got a collision-free solution without these steps and 248 with
+            them; a search of 6,000 solutions found 16 of those 37 and no other. Of 100 targets
+            with arbitrary hands 7 got one, and 38 with `contact_steps` as well.
+        max_penetration: Maximum penetration [m] for which steps of hands, and of arms without a
+            closed form, are tried.
+        escape_depths: For an arm with a closed form, the maximum penetration [m] for which each of
+            `escape_steps` is tried: of the robot, and of the hand in self-collision unless a hand
+            is limited by the scene. A target all of whose hands exceed the first self-penetration
+            is given up after one restart.
+            Source: of a KUKA LWR with a Barrett hand these steps free 48 of 1,778 targets of
+            `studies/collision.py` and 41 of 2,000 of `studies/bench.py`. A first step of 0.3 (of
+            whose results one in seven meets the contacts), and one of 0.2 with eight steps and
             depths of 20, 18, 15, 12, 9, 6, 4 and 2 mm, free 50 and 43 in 1.9 and 1.1 times the
             time.
-        hopeful: Hands with most room that are looked at for why there is no answer.
-        least_range: What stands for the range of a motor that has none [rad or m].
+        diagnosed_hands: Number of hands with the largest clearance that are checked for the reason
+            of a collision.
+        min_range: Substitute for the range of a motor without a range [rad or m].
     """
 
-    together: int = 256
-    rounds: int = 3
-    alike: float = 0.02
-    trunks: tuple[tuple[int, int], ...] = ((4, 1), (12, 2), (48, 4), (192, 8), (768, 16))
-    starts: int = 24
-    steps: tuple[float, ...] = (0.15, 0.1, 0.1, 0.1, 0.1, 0.05, 0.05)
-    tries: tuple[int, int] = (12, 24)
-    aside: tuple[float, ...] = (0.3, 0.2, 0.1, 0.1, 0.1, 0.1, 0.05, 0.05)
-    within: tuple[float, ...] = (1, 0.7, 0.5, 0.5, 0.35, 0.35, 0.25, 0.25, 0.18, 0.18, 0.12, 0.12)
-    kept: float = 0.5
-    near: int = 16
-    about: tuple[tuple[float, float], ...] = (
+    chunk_size: int = 256
+    restarts: int = 3
+    min_hand_difference: float = 0.02
+    trunk_stages: tuple[tuple[int, int], ...] = ((4, 1), (12, 2), (48, 4), (192, 8), (768, 16))
+    random_arms: int = 24
+    escape_steps: tuple[float, ...] = (0.15, 0.1, 0.1, 0.1, 0.1, 0.05, 0.05)
+    step_samples: tuple[int, int] = (12, 24)
+    hand_steps: tuple[float, ...] = (0.3, 0.2, 0.1, 0.1, 0.1, 0.1, 0.05, 0.05)
+    contact_steps: tuple[float, ...] = (
+        *(1, 0.7, 0.5, 0.5, 0.35, 0.35),
+        *(0.25, 0.25, 0.18, 0.18, 0.12, 0.12),
+    )
+    contact_tolerance: float = 0.5
+    pool_size: int = 16
+    carry_steps: tuple[tuple[float, float], ...] = (
         (0.2, 0.08),
         (0.2, 0.04),
         (0.1, 0.03),
@@ -115,8 +134,8 @@ class FreeSearchParameters:
         (0.05, 0.006),
         (0.05, 0.004),
     )
-    deep: float = 0.02
-    left: tuple[tuple[float, float], ...] = (
+    max_penetration: float = 0.02
+    escape_depths: tuple[tuple[float, float], ...] = (
         (0.020, 0.006),
         (0.010, 0.003),
         (0.008, 0.002),
@@ -125,21 +144,22 @@ class FreeSearchParameters:
         (0.003, 0.001),
         (0.002, 0.001),
     )
-    hopeful: int = 4
-    least_range: float = 1e-9
+    diagnosed_hands: int = 4
+    min_range: float = 1e-9
 
 
-PARAMETERS = FreeSearchParameters()
+COLLISION_FREE_PARAMETERS = CollisionFreeParameters()
 
 
 @dataclass(frozen=True, eq=False)
-class FreeAnswers:
-    """What was found for k targets.
+class CollisionFreeResult:
+    """Results of the search for k targets.
 
     Attributes:
-        q: (k, n) a free answer; where there is none, the one that is nearest to it.
-        free: (k,) whether it is.
-        reports: Why there is none; None where there is.
+        q: (k, n) collision-free solutions; the least-penetrating solution where there is none.
+        free: (k,) True where the solution is collision-free.
+        reports: (k,) `CollisionReport` of each target without a collision-free solution, else
+            None.
     """
 
     q: Array
@@ -147,84 +167,88 @@ class FreeAnswers:
     reports: NDArray[np.object_]
 
 
-def free_answers(
+def find_collision_free(
     finder: AlternativeFinder,
     targets: TargetBatch,
     query: CollisionQuery,
     q: Array,
     starts: Array,
     seed: int,
-    every: bool = False,
-    reasons: bool = True,
-) -> FreeAnswers:
-    """Free answers of k targets.
+    rank_all: bool = False,
+    diagnose: bool = True,
+) -> CollisionFreeResult:
+    """Search collision-free solutions of k targets.
 
     Args:
-        finder: Of the robot.
-        targets: The targets.
-        query: What they are checked against.
-        q: (k, n) answers, whether or not they are free.
-        starts: (k, n) where the robot is.
-        seed: Of random arms.
-        every: Whether an answer that is free already competes with the others for being preferred,
-            instead of being kept.
-        reasons: Whether to find out if those without one would have one without the scene, or if
-            the robot could pass through itself.
+        finder: Source of arms and hands of the robot.
+        targets: k targets.
+        query: Pairs that must not collide.
+        q: (k, n) solutions, which may collide.
+        starts: (k, n) initial configurations.
+        seed: Seed of the random steps and arms.
+        rank_all: Compare a solution that is collision-free already with all others under the
+            preference, instead of keeping it.
+        diagnose: Check whether targets without a result would have one without the scene, or
+            without self-collision.
     """
     home = np.tile(finder.robot.home, (len(q), 1))
-    biased = targets.prefer != USUAL or not np.array_equal(starts, home)
-    found = _searched(finder, targets, query, q, starts, seed, every, reasons, steps=not biased)
-    left = np.flatnonzero(~found.free)
-    if not biased or not len(left):
-        return found
-    # A preference orders answers; whether there is one it does not decide. So steps out of a
-    # collision, which lead to any answer, are left to the search without one.
-    some, trials = replace(targets.rows(left), prefer=USUAL), finder.trials
-    ends = trials.method.run(some, home[left], seed, False).q
-    met = trials.solved(some, ends, some.enforce_limits)
-    left, some, ends = left[met], some.rows(np.flatnonzero(met)), ends[met]
-    asked = query.rows(left), ends, home[left]
-    again = _searched(finder, some, *asked, seed, every=False, reasons=False, steps=True)
-    taken = left[again.free]
-    found.q[taken], found.free[taken], found.reports[taken] = again.q[again.free], True, None
-    return found
+    is_biased = targets.prefer != DEFAULT_PREFERENCE or not np.array_equal(starts, home)
+    result = _search_in_chunks(
+        finder, targets, query, q, starts, seed, rank_all, diagnose, escape=not is_biased
+    )
+    blocked = np.flatnonzero(~result.free)
+    if not is_biased or not len(blocked):
+        return result
+    # A preference ranks solutions and must not decide whether there is one. Escape steps lead to
+    # arbitrary solutions, so they are taken by a second search without preference from home.
+    retry, trials = replace(targets.rows(blocked), prefer=DEFAULT_PREFERENCE), finder.trials
+    ends = trials.method.run(retry, home[blocked], seed, False).q
+    solved = trials.solved(retry, ends, retry.enforce_limits)
+    blocked, retry, ends = blocked[solved], retry.rows(np.flatnonzero(solved)), ends[solved]
+    arguments = query.rows(blocked), ends, home[blocked]
+    second = _search_in_chunks(
+        finder, retry, *arguments, seed, rank_all=False, diagnose=False, escape=True
+    )
+    freed = blocked[second.free]
+    result.q[freed], result.free[freed], result.reports[freed] = second.q[second.free], True, None
+    return result
 
 
-def _searched(
+def _search_in_chunks(
     finder: AlternativeFinder,
     targets: TargetBatch,
     query: CollisionQuery,
     q: Array,
     starts: Array,
     seed: int,
-    every: bool,
-    reasons: bool,
-    steps: bool,
-) -> FreeAnswers:
-    """One search, see `free_answers`; with steps out of a collision if asked."""
+    rank_all: bool,
+    diagnose: bool,
+    escape: bool,
+) -> CollisionFreeResult:
+    """Search chunk by chunk, see `find_collision_free`; take escape steps if `escape`."""
     if not len(q):
-        return FreeAnswers(q, np.zeros(0, dtype=bool), np.zeros(0, dtype=object))
+        return CollisionFreeResult(q, np.zeros(0, dtype=bool), np.zeros(0, dtype=object))
     parts = []
-    for first in range(0, len(q), PARAMETERS.together):
-        rows = np.arange(first, min(first + PARAMETERS.together, len(q)))
-        some = targets.rows(rows), query.rows(rows), starts[rows]
-        search = FreeSearch(finder, *some, seed)
-        if every:
-            search.take(q[rows], np.arange(len(rows)))
-        search.run(q[rows], every, steps)
-        found = search.found(reasons)
-        parts.append((found.q, found.free, found.reports))
-    return FreeAnswers(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+    for first in range(0, len(q), COLLISION_FREE_PARAMETERS.chunk_size):
+        rows = np.arange(first, min(first + COLLISION_FREE_PARAMETERS.chunk_size, len(q)))
+        chunk = targets.rows(rows), query.rows(rows), starts[rows]
+        search = CollisionFreeSearch(finder, *chunk, seed)
+        if rank_all:
+            search.record_candidates(q[rows], np.arange(len(rows)))
+        search.run(q[rows], rank_all, escape)
+        result = search.result(diagnose)
+        parts.append((result.q, result.free, result.reports))
+    return CollisionFreeResult(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
-class FreeSearch:
-    """The search for some targets.
+class CollisionFreeSearch:
+    """The state of a search for k targets.
 
     Attributes:
-        best: (k, n) the preferred of what is free so far.
-        free: (k,) whether there is any.
-        room: (k,) most that one of the hands has among its own links [m]; infinite if something
-            of the scene is nearer.
+        best: (k, n) preferred collision-free configurations so far.
+        free: (k,) True where `best` holds a configuration.
+        self_clearance: (k,) largest clearance of a hand from its own links [m]; infinite if a hand
+            is limited by the scene.
     """
 
     def __init__(
@@ -244,362 +268,479 @@ class FreeSearch:
         self.best, self.score = np.full((count, n), np.nan), np.full(count, -np.inf)
         self.nearest, self.surplus = np.full((count, n), np.nan), np.full(count, -np.inf)
         self.free = np.zeros(count, dtype=bool)
-        self.room = np.full(count, np.inf if self.arm_search is None else -np.inf)
-        self.tried = np.zeros(count, dtype=np.int64)
+        self.self_clearance = np.full(count, np.inf if self.arm_search is None else -np.inf)
+        self.arms_tried = np.zeros(count, dtype=np.int64)
         self.hands: list[tuple[Array, NDArray[np.intp], Array]] = []
         robot = finder.robot
-        self._idle = UnconstrainedFingers(robot, targets)
-        self._ranges = np.maximum(robot.upper - robot.lower, PARAMETERS.least_range)
+        self._unconstrained = UnconstrainedFingers(robot, targets)
+        self._ranges = np.maximum(robot.upper - robot.lower, COLLISION_FREE_PARAMETERS.min_range)
         size = len(finder.hand) + 12 * bool(robot.description.arm_actuators)
-        self._known, self._searched = (
-            Deduplicator(count, size, PARAMETERS.alike) for _ in range(2)
+        self._known_hands, self._searched_hands = (
+            Deduplicator(count, size, COLLISION_FREE_PARAMETERS.min_hand_difference)
+            for _ in range(2)
         )
-        self._fresh = np.ones(count, dtype=bool)
-        self._near = np.zeros((0, n)), np.zeros(0, dtype=np.intp), np.zeros(0)
+        self._has_new_hands = np.ones(count, dtype=bool)
+        # Configurations, target indices and clearances of the least-penetrating solutions.
+        self._pool = np.zeros((0, n)), np.zeros(0, dtype=np.intp), np.zeros(0)
         self._sides: SideHands | None = None
-        self._tries = PARAMETERS.tries[bool(robot.description.sides)]
-        if robot.description.sides:
-            own = side_links(robot.description), targets, query
-            self._sides = SideHands(self.trials, *own, PARAMETERS.alike)
+        is_multi_arm = bool(robot.description.sides)
+        self._step_samples = COLLISION_FREE_PARAMETERS.step_samples[is_multi_arm]
+        if is_multi_arm:
+            self._sides = SideHands(
+                self.trials,
+                side_links(robot.description),
+                targets,
+                query,
+                COLLISION_FREE_PARAMETERS.min_hand_difference,
+            )
 
     @cached_property
     def _descent(self) -> LocalRefinement:
         return LocalRefinement(self.trials, self.targets)
 
-    def run(self, q: Array, every: bool, steps: bool) -> None:
-        """Look until all are free; or first, if asked, at the hands of a round whether or not."""
+    def run(self, q: Array, rank_all: bool, escape: bool) -> None:
+        """Search until all targets have a collision-free configuration.
+
+        Args:
+            q: (k, n) solutions whose hands are tried first.
+            rank_all: Try the hands of the first restart for all targets.
+            escape: Take random steps around the least-penetrating solutions at the end.
+        """
         self.try_hands(q, np.arange(len(q)))
-        hands, sides = self.other_hands(every), self._sides
-        for count, ways in PARAMETERS.trunks:
+        hands, sides = self.restart_hands(rank_all), self._sides
+        for trunk_count, max_combinations in COLLISION_FREE_PARAMETERS.trunk_stages:
             if sides is None:
                 break
-            self._free_hands(sides)
-            self._try_trunks(sides, count, ways)
+            self._resolve_hand_collisions(sides)
+            self._try_trunks(sides, trunk_count, max_combinations)
             self.try_hands(*next(hands, (q[:0], np.zeros(0, np.intp))))
-        for found, owner in chain(hands, self._from_anywhere()):
-            self.try_hands(found, owner)
-            # Of these a hand touches none of its own links, or hardly.
-            self._fresh &= self.room > -PARAMETERS.left[0][1]
+        for candidates, target_index in chain(hands, self._solve_from_random_arms()):
+            self.try_hands(candidates, target_index)
+            # Without a hand that is (almost) free of self-collision further hands rarely help.
+            min_clearance = -COLLISION_FREE_PARAMETERS.escape_depths[0][1]
+            self._has_new_hands &= self.self_clearance > min_clearance
         if sides is not None:
-            self._carry_about(sides)
+            self._move_trunk_and_arms(sides)
         blocked = np.flatnonzero(~self.free)
         if len(blocked):
-            self._find_nearest(blocked)
-            if steps:
+            self._record_clearest_arms(blocked)
+            if escape:
                 self._escape()
 
-    def take(self, q: Array, owner: NDArray[np.intp]) -> Array:
-        """Keep the preferred free ones of configurations (m, n), and the nearest; their room."""
+    def record_candidates(self, q: Array, target_index: NDArray[np.intp]) -> Array:
+        """Update the best collision-free and the least-penetrating configuration of each target.
+
+        Args:
+            q: (m, n) candidate configurations.
+            target_index: (m,) index of the target that each candidate solves.
+
+        Returns:
+            (m,) clearance beyond the required margin [m]; negative where a candidate collides.
+        """
         if not len(q):
             return np.zeros(0)
-        surplus = self.query.rows(owner).check(q).surplus
-        rows = improving_rows(owner, surplus, self.surplus)
-        self.nearest[owner[rows]], self.surplus[owner[rows]] = q[rows], surplus[rows]
+        surplus = self.query.rows(target_index).check(q).surplus
+        rows = improving_rows(target_index, surplus, self.surplus)
+        self.nearest[target_index[rows]], self.surplus[target_index[rows]] = q[rows], surplus[rows]
         if self._sides is not None:
-            every, of, room = self._near
-            every, of = np.concatenate([every, q]), np.concatenate([of, owner])
-            room = np.concatenate([room, surplus])
-            some = largest_per_owner(of, room, PARAMETERS.near)
-            self._near = every[some], of[some], room[some]
-        kept = np.flatnonzero(surplus >= -ROUNDING)
-        if len(kept):
-            some, mine = q[kept], owner[kept]
-            score = self.finder.score(
-                some, self.starts[mine], self.targets.prefer, surplus=surplus[kept]
+            pool_q = np.concatenate([self._pool[0], q])
+            pool_targets = np.concatenate([self._pool[1], target_index])
+            pool_surplus = np.concatenate([self._pool[2], surplus])
+            kept = largest_per_owner(
+                pool_targets, pool_surplus, COLLISION_FREE_PARAMETERS.pool_size
             )
-            rows = improving_rows(mine, score, self.score)
-            self.best[mine[rows]], self.score[mine[rows]] = some[rows], score[rows]
-            self.free[mine[rows]] = True
+            self._pool = pool_q[kept], pool_targets[kept], pool_surplus[kept]
+        free_rows = np.flatnonzero(surplus >= -ROUNDING)
+        if len(free_rows):
+            free_q, free_targets = q[free_rows], target_index[free_rows]
+            score = self.finder.score(
+                free_q, self.starts[free_targets], self.targets.prefer, surplus=surplus[free_rows]
+            )
+            rows = improving_rows(free_targets, score, self.score)
+            self.best[free_targets[rows]] = free_q[rows]
+            self.score[free_targets[rows]] = score[rows]
+            self.free[free_targets[rows]] = True
         return surplus
 
-    def try_hands(self, q: Array, owner: NDArray[np.intp]) -> None:
-        """The preferred free arms of hands (m, n) of targets."""
+    def try_hands(self, q: Array, target_index: NDArray[np.intp]) -> None:
+        """Record the preferred collision-free arm of each hand.
+
+        Args:
+            q: (m, n) solutions whose hands and palm poses are used.
+            target_index: (m,) index of the target of each solution.
+        """
         if not len(q):
             return
-        q = self._idle.aside(q, owner, self.query.held)
+        q = self._unconstrained.move_aside(q, target_index, self.query.hand_pairs)
         if self.arm_search is None:
-            self.take(q, owner)
+            self.record_candidates(q, target_index)
             if self._sides is not None:
-                for side in range(len(self._sides.hands)):
-                    self._sides.add(q, owner, side)
-            self.hands.append((q, owner, np.zeros(len(q))))
-            np.add.at(self.tried, owner, 1)
-            self._fresh[owner] = True
+                for side in range(len(self._sides.hand_motors)):
+                    self._sides.add_hands(q, target_index, side)
+            self.hands.append((q, target_index, np.zeros(len(q))))
+            np.add.at(self.arms_tried, target_index, 1)
+            self._has_new_hands[target_index] = True
             return
-        held = self.query.rows(owner).held
-        clear = held.check(q)
-        surplus = clear.surplus
-        # What stands about another hand may avoid.
-        itself = np.append(held.table.within, False)[clear.pairs]
-        np.maximum.at(self.room, owner, np.where(itself, surplus, np.inf))
-        parts = self.finder.hand_parts(q)
-        fresh = self._known.add(parts, owner)
-        self._fresh[owner[fresh]] = True
-        self.hands.append((q[fresh], owner[fresh], surplus[fresh]))
-        kept = np.flatnonzero(surplus >= -ROUNDING)
-        np.add.at(self.tried, owner[surplus < -ROUNDING], 1)
-        kept = kept[self._searched.add(parts[kept], owner[kept])]
-        kept = kept[self._in_order(q[kept], owner[kept])]
-        found, mine, tried = self._arms(q[kept], owner[kept], surplus[kept], self.query)
-        np.add.at(self.tried, owner[kept], tried)
-        self.take(found, mine)
+        hand_query = self.query.rows(target_index).hand_pairs
+        clearances = hand_query.check(q)
+        surplus = clearances.surplus
+        # A hand limited by the scene is no reason to give up: another hand may avoid the scene.
+        is_self_pair = np.append(hand_query.table.is_self_pair, False)[clearances.pairs]
+        np.maximum.at(self.self_clearance, target_index, np.where(is_self_pair, surplus, np.inf))
+        coordinates = self.finder.hand_coordinates(q)
+        is_new = self._known_hands.add(coordinates, target_index)
+        self._has_new_hands[target_index[is_new]] = True
+        self.hands.append((q[is_new], target_index[is_new], surplus[is_new]))
+        free_rows = np.flatnonzero(surplus >= -ROUNDING)
+        np.add.at(self.arms_tried, target_index[surplus < -ROUNDING], 1)
+        is_new = self._searched_hands.add(coordinates[free_rows], target_index[free_rows])
+        rows = free_rows[is_new]
+        rows = rows[self._preference_order(q[rows], target_index[rows])]
+        arms, arm_targets, tried = self._search_arms(
+            q[rows], target_index[rows], surplus[rows], self.query
+        )
+        np.add.at(self.arms_tried, target_index[rows], tried)
+        self.record_candidates(arms, arm_targets)
 
-    def _in_order(self, q: Array, owner: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Hands target by target, the preferred ones first as far as the hand goes."""
+    def _preference_order(self, q: Array, target_index: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Sort hands by target, then by the preference as far as it depends on the hand."""
         hand = self.finder.hand
         if self.targets.prefer == "q0":
-            off = ((q - self.starts[owner]) / self._ranges)[:, hand]
-            return np.lexsort((np.square(off).sum(axis=1), owner))
-        return np.lexsort((-self.finder.score(q, q, "limits", hand), owner))
+            offset = ((q - self.starts[target_index]) / self._ranges)[:, hand]
+            return np.lexsort((np.square(offset).sum(axis=1), target_index))
+        return np.lexsort((-self.finder.score(q, q, "limits", hand), target_index))
 
-    def _arms(
+    def _search_arms(
         self,
         q: Array,
-        owner: NDArray[np.intp],
+        target_index: NDArray[np.intp],
         surplus: Array,
         query: CollisionQuery,
         prefer: Preference | None = None,
     ) -> tuple[Array, NDArray[np.intp], NDArray[np.int64]]:
-        """Preferred arms of hands, their targets, and how many were tried for each hand."""
-        arms = self.arm_search
-        assert arms is not None
-        asked = prefer or self.targets.prefer
-        found = arms.choose(
-            q,
-            self.starts[owner],
-            (self.limits.first.lower, self.limits.first.upper),
-            asked,
-            query.swung.rows(owner),
-            surplus,
-            of_one=owner if asked in ("limits", "q0") else None,
-        )
-        return *self._solved(found.q, owner[found.owner]), found.tried
-
-    def _try_trunks(self, sides: SideHands, count: int, ways: int) -> None:
-        """Look at other trunks of a body, and then at other arms there.
+        """Return the preferred arms of hands.
 
         Args:
-            sides: The hands of its sides.
-            count: Trunks of every target.
-            ways: Of its hands, at most, which share them.
+            q: (m, n) hands.
+            target_index: (m,) index of the target of each hand.
+            surplus: (m,) clearance of each hand beyond the margin [m].
+            query: Pairs that must not collide.
+            prefer: Preference; None: that of the targets.
+
+        Returns:
+            (p, n) configurations, (p,) indices of their targets, (m,) number of arms tried.
+        """
+        arms = self.arm_search
+        assert arms is not None
+        preference = prefer or self.targets.prefer
+        candidates = arms.choose(
+            q,
+            self.starts[target_index],
+            (self.limits.first.lower, self.limits.first.upper),
+            preference,
+            query.arm_pairs.rows(target_index),
+            surplus,
+            target_index=target_index if preference in ("limits", "q0") else None,
+        )
+        solved = self._solved(candidates.q, target_index[candidates.hand_index])
+        return *solved, candidates.arms_tried
+
+    def _try_trunks(self, sides: SideHands, trunk_count: int, max_combinations: int) -> None:
+        """Try other trunks of a multi-arm robot, and then other arms at these trunks.
+
+        Args:
+            sides: Hands of its sides.
+            trunk_count: Number of trunks per target.
+            max_combinations: Maximum number of combinations of hands, which share the trunks.
         """
         searches = self.finder.side_searches
-        q, palms, owner = sides.mixed(np.flatnonzero(~self.free), ways)
+        q, palms, target_index = sides.combine(np.flatnonzero(~self.free), max_combinations)
         if not len(q):
             return
-        first = sum(trunks for trunks, _ in PARAMETERS.trunks if trunks < count)
-        each = max(count // int(np.bincount(owner).max()), 1)
-        ends, of = sample_trunks(self.trials, self.targets, q, palms, owner, first, each)
-        good = self.trials.solved(self.targets.rows(owner[of]), ends, self.targets.enforce_limits)
-        ends, of = ends[good], of[good]
-        self.take(ends, owner[of])
-        left = np.flatnonzero(~self.free[owner[of]])
-        if searches and len(left):
-            some = ends[left], palms[of[left]], owner[of[left]]
-            found = sides.arms(searches, *some, self.starts, self.targets.prefer)
-            self.take(*self._solved(*found))
+        stages = COLLISION_FREE_PARAMETERS.trunk_stages
+        first = sum(trunks for trunks, _ in stages if trunks < trunk_count)
+        per_hand = max(trunk_count // int(np.bincount(target_index).max()), 1)
+        ends, rows = sample_trunks(
+            self.trials, self.targets, q, palms, target_index, first, per_hand
+        )
+        solved = self.trials.solved(
+            self.targets.rows(target_index[rows]), ends, self.targets.enforce_limits
+        )
+        ends, rows = ends[solved], rows[solved]
+        self.record_candidates(ends, target_index[rows])
+        blocked = np.flatnonzero(~self.free[target_index[rows]])
+        if searches and len(blocked):
+            rows = rows[blocked]
+            hands = ends[blocked], palms[rows], target_index[rows]
+            arms = sides.search_arms(searches, *hands, self.starts, self.targets.prefer)
+            self.record_candidates(*self._solved(*arms))
 
-    def other_hands(self, every: bool = False) -> Iterator[tuple[Array, NDArray[np.intp]]]:
-        """Answers with other hands, of the targets that are not free, round by round."""
+    def restart_hands(self, rank_all: bool = False) -> Iterator[tuple[Array, NDArray[np.intp]]]:
+        """Yield solutions with other hands, restart by restart, for targets that are not free.
+
+        Args:
+            rank_all: Include all targets in the first restart.
+        """
         method = self.trials.method
-        for number in range(min(PARAMETERS.rounds, method.options.rounds, method.rounds)):
-            # Where a round has brought no other hand, the next will not either.
-            rows = np.flatnonzero((~self.free | (every and not number)) & self._fresh)
+        restarts = min(COLLISION_FREE_PARAMETERS.restarts, method.options.rounds, method.rounds)
+        for restart in range(restarts):
+            # A target whose last restart brought no new hand is unlikely to get one from the next.
+            rows = np.flatnonzero((~self.free | (rank_all and not restart)) & self._has_new_hands)
             if not len(rows):
                 break
-            self._fresh[:] = False
-            postures = method.postures(self.targets.rows(rows), number)
-            first, starts = number * postures.shape[1], self.limits.clip(self.starts)
-            owner, *begun = self.trials.hand_rows(self.targets, rows, starts, postures, first)
-            ends = self.trials.run(*begun)
-            yield self._solved(ends, owner)
+            self._has_new_hands[:] = False
+            postures = method.postures(self.targets.rows(rows), restart)
+            first, starts = restart * postures.shape[1], self.limits.clip(self.starts)
+            target_index, *initial = self.trials.hand_rows(
+                self.targets, rows, starts, postures, first
+            )
+            yield self._solved(self.trials.run(*initial), target_index)
 
-    def _from_anywhere(self) -> Iterator[tuple[Array, NDArray[np.intp]]]:
-        """Answers with arms that are of no family, of the targets that are not free."""
+    def _solve_from_random_arms(self) -> Iterator[tuple[Array, NDArray[np.intp]]]:
+        """Yield solutions from random arms for targets that are not free; no closed form."""
         rows, robot, hand = np.flatnonzero(~self.free), self.finder.robot, self.finder.hand
         if not len(rows) or self.arm_search is not None:
             return
-        count = PARAMETERS.starts
-        owner = np.repeat(rows, count)
+        count = COLLISION_FREE_PARAMETERS.random_arms
+        target_index = np.repeat(rows, count)
         numbers = np.array([self.targets.number(int(row)) for row in rows])
-        starts = np.concatenate(_shifted(robot, self.seed, numbers, count))
-        last = self.hands[0][0]
-        starts[::2, hand] = last[owner[::2]][:, hand]
-        ends = self._descent.run(owner, self.limits.of(owner).clip(starts))
-        yield self._solved(ends, owner)
+        starts = np.concatenate(_shifted_samples(robot, self.seed, numbers, count))
+        given = self.hands[0][0]
+        starts[::2, hand] = given[target_index[::2]][:, hand]
+        ends = self._descent.run(target_index, self.limits.of(target_index).clip(starts))
+        yield self._solved(ends, target_index)
 
-    def _solved(self, q: Array, owner: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
+    def _solved(self, q: Array, target_index: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
+        """Select the configurations that meet their targets."""
         if not len(q):
-            return q, owner
-        asked = self.targets.rows(owner)
-        good = self.trials.solved(asked, q, asked.enforce_limits)
-        return q[good], owner[good]
+            return q, target_index
+        targets = self.targets.rows(target_index)
+        solved = self.trials.solved(targets, q, targets.enforce_limits)
+        return q[solved], target_index[solved]
 
-    def _find_nearest(self, rows: NDArray[np.intp]) -> None:
-        """The answers with most room, of the hands with most."""
+    def _record_clearest_arms(self, rows: NDArray[np.intp]) -> None:
+        """Record the arms with the largest clearance, for the clearest hand of each target."""
         if self.arm_search is None:
             return
-        q, owner, surplus = self._hands_of(rows)
-        kept = largest_per_owner(owner, surplus, 1)
-        found, mine, _ = self._arms(q[kept], owner[kept], surplus[kept], self.query, CLEARANCE)
-        self.take(np.concatenate([found, q[kept]]), np.concatenate([mine, owner[kept]]))
+        q, target_index, surplus = self._hands_of(rows)
+        clearest = largest_per_owner(target_index, surplus, 1)
+        q, target_index, surplus = q[clearest], target_index[clearest], surplus[clearest]
+        arms, arm_targets, _ = self._search_arms(q, target_index, surplus, self.query, CLEARANCE)
+        self.record_candidates(
+            np.concatenate([arms, q]), np.concatenate([arm_targets, target_index])
+        )
 
     def _hands_of(self, rows: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp], Array]:
-        """All hands of some targets, their owners and their room."""
-        q, owner, surplus = (np.concatenate(each) for each in zip(*self.hands, strict=True))
-        mine = np.isin(owner, rows)
-        return q[mine], owner[mine], surplus[mine]
+        """Return all hands of some targets, the indices of their targets and their clearances."""
+        q, target_index, surplus = (
+            np.concatenate(arrays) for arrays in zip(*self.hands, strict=True)
+        )
+        selected = np.isin(target_index, rows)
+        return q[selected], target_index[selected], surplus[selected]
 
     def _escape(self) -> None:
-        """Move the configurations nearest to being free: random steps of motors and of contacts.
+        """Take random steps around the least-penetrating solution of each target.
 
-        Steps of motors are brought back to the contacts; steps of contacts stay within their
-        tolerances. Source: of 1,000 targets each that free configurations meet at the edge of 5 mm
-        and 3 deg among eight posts, without steps of contacts 29 (Panda with Allegro), 20 (KUKA LWR
-        with Barrett) and 55 (UR5e with Shadow) got no free answer; with them 13, 5 and 17, in 1.3
-        to 1.7 times the time.
+        Steps of motors are projected back onto the contacts; steps of contacts stay within their
+        tolerances. Source: of 1,000 targets each that collision-free configurations meet at the
+        edge of 5 mm and 3 deg among eight posts, without steps of contacts 29 (Panda with Allegro),
+        20 (KUKA LWR with Barrett) and 55 (UR5e with Shadow) got no collision-free solution; with
+        them 13, 5 and 17, in 1.3 to 1.7 times the time.
         """
-        steps = zip(PARAMETERS.steps, PARAMETERS.left, strict=True)
-        for number, (part, (deep, of_hand)) in enumerate(steps):
-            most = PARAMETERS.deep if self.arm_search is None else deep
-            rows = np.flatnonzero(~self.free & (self.surplus > -most))
+        steps = zip(
+            COLLISION_FREE_PARAMETERS.escape_steps,
+            COLLISION_FREE_PARAMETERS.escape_depths,
+            strict=True,
+        )
+        for number, (size, (max_depth, max_self_depth)) in enumerate(steps):
+            if self.arm_search is None:
+                max_depth = COLLISION_FREE_PARAMETERS.max_penetration
+            rows = np.flatnonzero(~self.free & (self.surplus > -max_depth))
             if len(rows) and self.arm_search is not None:
-                itself = self.query.among(self.query.table.of_robot).held.rows(rows)
-                alone = itself.check(self.nearest[rows]).surplus
-                rows = rows[(alone > -of_hand) | np.isinf(self.room[rows])]
+                hand_query = self.query.with_table(self.query.table.self_pairs).hand_pairs
+                self_surplus = hand_query.rows(rows).check(self.nearest[rows]).surplus
+                is_scene_limited = np.isinf(self.self_clearance[rows])
+                rows = rows[(self_surplus > -max_self_depth) | is_scene_limited]
             if not len(rows):
                 return
-            self.take(*self._steps_about(self.nearest[rows], rows, slice(None), number, part))
-            for step in range(2 * number, min(2 * number + 2, len(PARAMETERS.within))):
+            ends = self._step_motors(self.nearest[rows], rows, slice(None), number, size)
+            self.record_candidates(*ends)
+            contact_steps = len(COLLISION_FREE_PARAMETERS.contact_steps)
+            for step in range(2 * number, min(2 * number + 2, contact_steps)):
                 rows = rows[~self.free[rows]]
                 if len(rows):
-                    self.take(*self._within_tolerances(self.nearest[rows], rows, step))
+                    self.record_candidates(*self._step_contacts(self.nearest[rows], rows, step))
 
-    def _carry_about(self, sides: SideHands) -> None:
-        """Trunk and arms of a body about what is nearest to being free, its palms kept."""
+    def _move_trunk_and_arms(self, sides: SideHands) -> None:
+        """Move trunk and arms around the least-penetrating solutions; the palms stay in place."""
         robot, trials = self.finder.robot, self.trials
         moving = np.setdiff1d(np.arange(len(robot.lower)), self.finder.hand)
-        hopeless = (sides.surplus < -ROUNDING).any(axis=0)
-        for number, (part, deep) in enumerate(PARAMETERS.about):
-            q, owner, room = self._near
-            left = np.flatnonzero(~(self.free | hopeless)[owner] & (room > -deep))
-            if not len(left):
+        has_hand_collision = (sides.surplus < -ROUNDING).any(axis=0)
+        for number, (size, max_depth) in enumerate(COLLISION_FREE_PARAMETERS.carry_steps):
+            q, target_index, surplus = self._pool
+            is_open = ~(self.free | has_hand_collision)[target_index]
+            rows = np.flatnonzero(is_open & (surplus > -max_depth))
+            if not len(rows):
                 return
-            rank = left - np.searchsorted(owner, owner[left])
-            of = np.repeat(left, self._tries)
-            q, owner = q[of], owner[of]
-            begun, random = q.copy(), np.random.default_rng([self.seed, number])
-            steps = random.standard_normal((PARAMETERS.near, self._tries, len(moving)))
-            begun[:, moving] += part * self._ranges[moving] * steps[rank].reshape(-1, len(moving))
-            begun, palms = self.limits.of(owner).clip(begun), side_palms(robot, q)
-            ends = carry_palms(trials, self.targets, begun, palms, owner, float(Phase.TRUNK))
-            self.take(*self._solved(ends, owner))
+            rank = rows - np.searchsorted(target_index, target_index[rows])
+            repeated_rows = np.repeat(rows, self._step_samples)
+            q, target_index = q[repeated_rows], target_index[repeated_rows]
+            starts, random = q.copy(), np.random.default_rng([self.seed, number])
+            steps = random.standard_normal(
+                (COLLISION_FREE_PARAMETERS.pool_size, self._step_samples, len(moving))
+            )
+            starts[:, moving] += size * self._ranges[moving] * steps[rank].reshape(-1, len(moving))
+            starts, palms = self.limits.of(target_index).clip(starts), side_palms(robot, q)
+            ends = carry_palms(
+                trials, self.targets, starts, palms, target_index, float(Phase.TRUNK)
+            )
+            self.record_candidates(*self._solved(ends, target_index))
 
-    def _free_hands(self, sides: SideHands) -> None:
-        """Hands of a body's sides that touch something by themselves moved aside."""
-        first = len(PARAMETERS.aside)
-        for side, motors in enumerate(sides.hands):
-            for number in range(first + len(PARAMETERS.within)):
+    def _resolve_hand_collisions(self, sides: SideHands) -> None:
+        """Move hands in self-collision aside, side by side of a multi-arm robot."""
+        motor_steps = COLLISION_FREE_PARAMETERS.hand_steps
+        contact_steps = COLLISION_FREE_PARAMETERS.contact_steps
+        for side, motors in enumerate(sides.hand_motors):
+            for number in range(len(motor_steps) + len(contact_steps)):
                 surplus = np.where(self.free, 0.0, sides.surplus[side])
-                rows = np.flatnonzero((surplus < -ROUNDING) & (surplus > -PARAMETERS.deep))
+                is_shallow = surplus > -COLLISION_FREE_PARAMETERS.max_penetration
+                rows = np.flatnonzero((surplus < -ROUNDING) & is_shallow)
                 if not len(rows):
                     break
                 nearest = sides.nearest[side][rows]
-                if number < first:
-                    part = PARAMETERS.aside[number]
-                    found = self._steps_about(nearest, rows, motors, number, part)
+                if number < len(motor_steps):
+                    ends = self._step_motors(nearest, rows, motors, number, motor_steps[number])
                 else:
-                    found = self._within_tolerances(nearest, rows, number - first)
-                sides.add(*found, side, best=True)
+                    ends = self._step_contacts(nearest, rows, number - len(motor_steps))
+                sides.add_hands(*ends, side, best_only=True)
 
-    def _within_tolerances(
+    def _step_contacts(
         self, q: Array, rows: NDArray[np.intp], number: int
     ) -> tuple[Array, NDArray[np.intp]]:
-        """Answers about answers (k, n) to some targets: steps of contacts, within tolerances."""
-        tries, part = self._tries, PARAMETERS.within[number]
-        owner, starts = np.repeat(rows, tries), np.repeat(q, tries, axis=0)
-        targets, begun = self.targets.rows(owner), self.finder.robot.contacts(starts)
-        random, moved = np.random.default_rng([self.seed, number]), []
-        asked = (
+        """Displace the contacts of solutions at random within their tolerances, and solve again.
+
+        Args:
+            q: (k, n) solutions.
+            rows: (k,) indices of their targets.
+            number: Index into `contact_steps`.
+        """
+        samples, size = self._step_samples, COLLISION_FREE_PARAMETERS.contact_steps[number]
+        target_index, starts = np.repeat(rows, samples), np.repeat(q, samples, axis=0)
+        targets, contacts = self.targets.rows(target_index), self.finder.robot.contacts(starts)
+        random, displaced = np.random.default_rng([self.seed, number]), []
+        goals = (
             (targets.points, targets.position_tolerance),
             (targets.normals, targets.angle_tolerance),
         )
-        for at, (wanted, most) in zip(begun, asked, strict=True):
-            steps = np.tile(random.standard_normal((tries, *at.shape[1:])), (len(rows), 1, 1))
-            off = (at - wanted) / most[:, None] + part * steps
-            off /= np.maximum(1.0, np.linalg.norm(off, axis=2, keepdims=True))
-            moved.append(wanted + off * most[:, None])
-        points, normals = moved[0], moved[1] / np.linalg.norm(moved[1], axis=2, keepdims=True)
-        closer = tuple(
-            Tolerance(PARAMETERS.kept * each.position, PARAMETERS.kept * each.angle)
-            for each in targets.tolerances
+        for actual, (goal, tolerance) in zip(contacts, goals, strict=True):
+            steps = np.tile(random.standard_normal((samples, *actual.shape[1:])), (len(rows), 1, 1))
+            offset = (actual - goal) / tolerance[:, None] + size * steps
+            offset /= np.maximum(1.0, np.linalg.norm(offset, axis=2, keepdims=True))
+            displaced.append(goal + offset * tolerance[:, None])
+        points = displaced[0]
+        normals = displaced[1] / np.linalg.norm(displaced[1], axis=2, keepdims=True)
+        factor = COLLISION_FREE_PARAMETERS.contact_tolerance
+        tolerances = tuple(
+            Tolerance(factor * tolerance.position, factor * tolerance.angle)
+            for tolerance in targets.tolerances
         )
-        shifted = replace(targets, points=points, normals=normals, tolerance=closer)
-        ends = LocalRefinement(self.trials, shifted).run(np.arange(len(owner)), starts)
-        return self._solved(ends, owner)
+        shifted = replace(targets, points=points, normals=normals, tolerance=tolerances)
+        ends = LocalRefinement(self.trials, shifted).run(np.arange(len(target_index)), starts)
+        return self._solved(ends, target_index)
 
-    def _steps_about(
-        self, q: Array, rows: NDArray[np.intp], motors: list[int] | slice, number: int, part: float
+    def _step_motors(
+        self, q: Array, rows: NDArray[np.intp], motors: list[int] | slice, number: int, size: float
     ) -> tuple[Array, NDArray[np.intp]]:
-        """Answers about answers (k, n) to some targets: steps of some motors, brought back."""
-        owner = np.repeat(rows, self._tries)
+        """Displace motors of solutions at random, and project back onto the contacts.
+
+        Args:
+            q: (k, n) solutions.
+            rows: (k,) indices of their targets.
+            motors: Motors that are displaced.
+            number: Number of the step, which selects its random directions.
+            size: Standard deviation [fraction of the motors' ranges].
+        """
+        target_index = np.repeat(rows, self._step_samples)
         ranges = self._ranges[motors]
         random = np.random.default_rng([self.seed, number])
-        steps = random.standard_normal((self._tries, len(ranges)))
-        starts = np.repeat(q, self._tries, axis=0)
-        starts[:, motors] += part * ranges * np.tile(steps, (len(rows), 1))
-        ends = self._descent.run(owner, self.limits.of(owner).clip(starts))
-        return self._solved(ends, owner)
+        steps = random.standard_normal((self._step_samples, len(ranges)))
+        starts = np.repeat(q, self._step_samples, axis=0)
+        starts[:, motors] += size * ranges * np.tile(steps, (len(rows), 1))
+        ends = self._descent.run(target_index, self.limits.of(target_index).clip(starts))
+        return self._solved(ends, target_index)
 
-    def found(self, reasons: bool) -> FreeAnswers:
-        """What it came to; whether it would work without the scene or the robot, if asked."""
+    def result(self, diagnose: bool) -> CollisionFreeResult:
+        """Return the result, and the reason of each remaining collision.
+
+        Args:
+            diagnose: Check whether there is a solution without the scene or without
+                self-collision.
+        """
         q = np.where(self.free[:, None], self.best, self.nearest)
         reports = np.full(len(q), None, dtype=object)
         blocked = np.flatnonzero(~self.free)
         if not len(blocked):
-            return FreeAnswers(q, self.free, reports)
-        clear = self.query.rows(blocked).check(q[blocked])
+            return CollisionFreeResult(q, self.free, reports)
+        clearances = self.query.rows(blocked).check(q[blocked])
         table = self.query.table
-        alone = self._possible(blocked, table.of_robot) if reasons else None
-        passing = self._possible(blocked, table.of_scene) if reasons else None
+        without_scene = self._is_possible(blocked, table.self_pairs) if diagnose else None
+        without_self = self._is_possible(blocked, table.scene_pairs) if diagnose else None
         for i, row in enumerate(blocked.tolist()):
-            pair = clear.pair(i)
+            pair = clearances.pair(i)
             assert pair is not None
             reports[row] = CollisionReport(
                 pair,
-                -float(clear.surplus[i]),
-                int(self.tried[row]),
-                None if alone is None else bool(alone[row]),
-                None if passing is None else bool(passing[row]),
+                -float(clearances.surplus[i]),
+                int(self.arms_tried[row]),
+                None if without_scene is None else bool(without_scene[row]),
+                None if without_self is None else bool(without_self[row]),
             )
-        return FreeAnswers(q, self.free, reports)
+        return CollisionFreeResult(q, self.free, reports)
 
-    def _possible(self, rows: NDArray[np.intp], table: Table) -> NDArray[np.bool_]:
-        """(all targets,) whether one of the hands is free of some of the pairs alone."""
-        query = self.query.among(table)
-        q, owner, surplus = self._hands_of(rows)
+    def _is_possible(self, rows: NDArray[np.intp], table: PairTable) -> NDArray[np.bool_]:
+        """Return for all targets whether a hand is free of the pairs of `table` alone.
+
+        Args:
+            rows: Indices of the targets that are checked.
+            table: Pairs that must not collide.
+        """
+        query = self.query.with_table(table)
+        q, target_index, surplus = self._hands_of(rows)
         possible = np.zeros(len(self.free), dtype=bool)
         if self.arm_search is None:
-            possible[owner[query.rows(owner).free(q)]] = True
+            possible[target_index[query.rows(target_index).free(q)]] = True
             return possible
-        kept = np.flatnonzero(query.rows(owner).held.free(q))
-        kept = kept[largest_per_owner(owner[kept], surplus[kept], PARAMETERS.hopeful)]
-        any_room = np.full(len(kept), np.inf)
-        _, mine, _ = self._arms(q[kept], owner[kept], any_room, query, "limits")
-        possible[mine] = True
+        free_rows = np.flatnonzero(query.rows(target_index).hand_pairs.free(q))
+        clearest = largest_per_owner(
+            target_index[free_rows], surplus[free_rows], COLLISION_FREE_PARAMETERS.diagnosed_hands
+        )
+        rows = free_rows[clearest]
+        no_bound = np.full(len(rows), np.inf)
+        _, arm_targets, _ = self._search_arms(
+            q[rows], target_index[rows], no_bound, query, "limits"
+        )
+        possible[arm_targets] = True
         return possible
 
 
-def _shifted(robot: ArmHand, seed: int, numbers: NDArray[np.intp], count: int) -> Array:
-    """(k, count, n) configurations, spread over the limits for each target in its own way.
+def _shifted_samples(robot: ArmHand, seed: int, numbers: NDArray[np.intp], count: int) -> Array:
+    """Sample configurations within the limits, independently of the other targets of a batch.
 
-    A random cloud, for each target shifted around in the limits, by its number alone: whichever
-    others are looked at with it.
+    One random set of samples is shifted cyclically within the limits by the number of the target.
+
+    Args:
+        robot: The robot.
+        seed: Seed of the samples.
+        numbers: (k,) numbers of the targets.
+        count: Number of samples per target.
+
+    Returns:
+        (k, count, n) configurations.
     """
-    cloud = np.random.default_rng(seed).random((count, len(robot.lower)))
+    samples = np.random.default_rng(seed).random((count, len(robot.lower)))
     shift = numbers[:, None] * spread_steps(len(robot.lower))
-    part = (cloud + shift[:, None]) % 1.0
-    return robot.lower + part * (robot.upper - robot.lower)
+    fraction = (samples + shift[:, None]) % 1.0
+    return robot.lower + fraction * (robot.upper - robot.lower)
 
 
 def resolve_collisions(
@@ -610,77 +751,91 @@ def resolve_collisions(
     seed: int,
     outcome: Outcome,
     batch: BatchSolution,
-    reasons: bool = True,
+    diagnose: bool = True,
 ) -> BatchSolution:
-    """The verdicts on a batch after other answers were looked for where they touch something.
+    """Replace solutions in collision by collision-free ones where possible.
 
     Args:
-        finder_of: By targets of one kind the finder for them.
+        finder_of: Returns the finder for targets of one combination of contact kinds.
         targets: k targets.
-        query: What they are checked against.
-        starts: (k, n) where the robot is.
-        seed: Of all random numbers.
-        outcome: What the method came to.
-        batch: The verdicts on it.
-        reasons: Whether the reports say what else would do, see `free_answers`.
+        query: Pairs that must not collide.
+        starts: (k, n) initial configurations.
+        seed: Seed of all random numbers.
+        outcome: Outcome of the method.
+        batch: Verdicts on the outcome.
+        diagnose: Determine the reasons of collisions, see `find_collision_free`.
+
+    Returns:
+        The verdicts after the search.
     """
-    every = targets.prefer in RANKED
-    touching = batch.status == Status.COLLISION
-    rows = np.flatnonzero(touching | batch.success if every else touching)
+    rank_all = targets.prefer in RANKING_PREFERENCES
+    collides = batch.status == Status.COLLISION
+    rows = np.flatnonzero(collides | batch.success if rank_all else collides)
     if not len(rows):
         return batch
     begin, q = time.perf_counter(), batch.q.copy()
     reports = np.array(batch.collisions, dtype=object)
     numbers = np.array([targets.number(row) for row in rows.tolist()], dtype=np.intp)
-    # A target's random numbers are its own, whichever others are looked at with it.
-    asked = replace(targets.rows(rows), picked=numbers)
-    robot = finder_of(asked.rows(slice(0, 1))).robot
-    for _, of_kinds, some in group_by_kinds(asked):
-        chosen = rows[of_kinds]
-        nearby, begun = query.rows(chosen), (q[chosen], starts[chosen])
-        found = free_answers(finder_of(some), some, nearby, *begun, seed, every, reasons)
-        q[chosen] = found.q
-        reports[chosen] = found.reports
+    # The number of a target seeds its random numbers: a result does not depend on the batch.
+    selected = replace(targets.rows(rows), picked=numbers)
+    robot = finder_of(selected.rows(slice(0, 1))).robot
+    for _, kind_rows, kind_targets in group_by_kinds(selected):
+        chosen = rows[kind_rows]
+        result = find_collision_free(
+            finder_of(kind_targets),
+            kind_targets,
+            query.rows(chosen),
+            q[chosen],
+            starts[chosen],
+            seed,
+            rank_all,
+            diagnose,
+        )
+        q[chosen] = result.q
+        reports[chosen] = result.reports
     seconds = batch.time.copy()
     seconds[rows] += (time.perf_counter() - begin) / len(rows)
-    status = np.where(touching, int(Status.SOLVED), outcome.status)
-    ended = replace(outcome, q=q, time=seconds, status=status)
+    status = np.where(collides, int(Status.SOLVED), outcome.status)
+    updated = replace(outcome, q=q, time=seconds, status=status)
     return replace(
-        judge_outcome(robot, batch.method, targets, ended, query),
+        judge_outcome(robot, batch.method, targets, updated, query),
         collisions=tuple(reports.tolist()),
     )
 
 
-def resolve_at_once(
+def resolve_single(
     finder: AlternativeFinder,
     targets: TargetBatch,
     query: CollisionQuery,
     q: Array,
     start: Array,
-    others: bool = False,
+    try_other_hands: bool = False,
 ) -> tuple[Array, SolvedVerdict, Clearances] | None:
-    """Another arm for the hand of one answer that touches something, judged; None: look further.
+    """Find a collision-free arm for the hand of a single solution.
 
-    What it gives is what `resolve_collisions` gives, which looks there first.
+    The result equals that of `resolve_collisions`, which tries the given hand first.
 
     Args:
-        finder: For the target's kinds.
+        finder: Finder for the target's contact kinds.
         targets: One target.
-        query: What it is checked against.
-        q: (n,) the answer.
-        start: (n,) where the robot is.
-        others: Whether to look at the hands of further rounds, too, as an exported solver does.
+        query: Pairs that must not collide.
+        q: (n,) solution in collision.
+        start: (n,) initial configuration.
+        try_other_hands: Try the hands of restarts as well, as an exported solver does.
+
+    Returns:
+        The configuration, its verdict and its clearance; None if a full search is needed.
     """
-    search = FreeSearch(finder, targets, query, start[None], 0)
+    search = CollisionFreeSearch(finder, targets, query, start[None], 0)
     search.try_hands(q[None], np.zeros(1, dtype=np.intp))
-    if others:
-        for hands, owner in search.other_hands():
-            search.try_hands(hands, owner)
+    if try_other_hands:
+        for hands, target_index in search.restart_hands():
+            search.try_hands(hands, target_index)
     if not search.free[0]:
         return None
-    found = search.best[0]
-    verdict = judge_single(finder.robot, targets, found)
+    solution = search.best[0]
+    verdict = judge_single(finder.robot, targets, solution)
     if verdict is None:
         return None
-    clear = query.check(found[None])
-    return (found, verdict, clear) if clear.free[0] else None
+    clearances = query.check(solution[None])
+    return (solution, verdict, clearances) if clearances.free[0] else None

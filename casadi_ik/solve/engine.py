@@ -24,7 +24,7 @@ from casadi_ik.model.grasp import Tolerance
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.alternatives import AlternativeFinder
 from casadi_ik.solve.batches import BatchParts, SolvedPart, judge_outcome, map_ordered
-from casadi_ik.solve.collision_free import RANKED, resolve_at_once, resolve_collisions
+from casadi_ik.solve.collision_free import RANKING_PREFERENCES, resolve_collisions, resolve_single
 from casadi_ik.solve.diagnosis import Diagnosis, Reason
 from casadi_ik.solve.diagnostician import Diagnostician
 from casadi_ik.solve.first_answer import InterimSolver
@@ -256,7 +256,9 @@ class Engine:
         if targets.more and (engine := self.engine_for(targets)) is not self:
             return engine.solve_one(targets, options)
         method, start, outcome = self.hand_search, self.robot.start(options.q0), None
-        is_plain = targets.palms is None and targets.prefer not in RANKED and start.ndim == 1
+        is_plain = (
+            targets.palms is None and targets.prefer not in RANKING_PREFERENCES and start.ndim == 1
+        )
         if method is not None and is_plain and options.recorder is None:
             interim = self._interim_solver.solve(targets, start, self.check)
             if interim is not None:
@@ -296,7 +298,7 @@ class Engine:
             clearances = query.check(q[None])
             if not clearances.free[0]:
                 near = search_start(robot.description, start)
-                free = resolve_at_once(self.finder, targets, query, q, near)
+                free = resolve_single(self.finder, targets, query, q, near)
                 if free is None:
                     return None
                 q, verdict, clearances = free

@@ -1,4 +1,4 @@
-"""Hands moved out of the way: those of a body's sides by themselves, fingers without a contact."""
+"""Collision-free hands: independent hands of a multi-arm robot, and unconstrained fingers."""
 
 from __future__ import annotations
 
@@ -26,14 +26,15 @@ from casadi_ik.solve.trials import (
 
 
 class SideHands:
-    """Hands of the sides of a body that touch nothing by themselves, and arms for them.
+    """The hands of a multi-arm robot without self-collision, by side.
 
-    Which hand a side has and where its palm is the others do not care: hands are kept by side.
+    The posture and palm pose of a side's hand do not depend on the other sides, so hands are
+    collected by side and combined afterwards.
 
     Attributes:
-        hands: By side positions in q of the motors of its hand.
-        nearest: (s, k, n) answers whose hand of a side is nearest to touching nothing.
-        surplus: (s, k) their room.
+        hand_motors: Positions in q of the hand motors, by side.
+        nearest: (s, k, n) solutions with the least-penetrating hand of each side and target.
+        surplus: (s, k) clearances of these hands beyond the margin [m].
     """
 
     def __init__(
@@ -42,217 +43,249 @@ class SideHands:
         links: Sequence[tuple[frozenset[str], frozenset[str]]],
         targets: TargetBatch,
         query: CollisionQuery,
-        alike: float,
+        min_difference: float,
     ) -> None:
-        """Find the pairs that each hand decides by itself, and those that each arm does.
+        """Split the collision pairs by the hand or arm that decides their distance.
 
         Args:
             trials: The loop.
-            links: By side those of its arm, and those that stay with its palm.
+            links: By side, the links of its arm and those that move with its palm.
             targets: k targets.
-            query: What they are checked against.
-            alike: Hands that differ by less [of their motors' ranges] are taken once.
+            query: Pairs that must not collide.
+            min_difference: Hands that differ by less are duplicates [fraction of motor ranges].
         """
         self._trials, self._targets, self._query = trials, targets, query
         self._robot = body = trials.robot.description
-        self._arms = [arm for arm, _ in links]
-        every = body.links_moved(range(len(body.actuators)))
-        # Neither trunk, arms nor other hands: a hand among itself, and with what stands still.
-        self._own = [query.parted(every - hand)[1] for _, hand in links]
-        self.hands = [list(hand) for _, hand in body.side_actuators]
-        count = len(targets)
-        self.nearest = np.full((len(links), count, len(body.actuators)), np.nan)
-        self.surplus = np.full((len(links), count), -np.inf)
-        none, n, s = np.zeros(0, np.intp), len(body.actuators), len(links)
-        self._found = [(np.zeros((0, n)), np.zeros((0, s, 4, 4)), none) for _ in links]
-        self._known = [Deduplicator(len(targets), len(h) + 12, alike) for h in self.hands]
+        self._arm_links = [arm for arm, _ in links]
+        moved_links = body.links_moved(range(len(body.actuators)))
+        # Pairs without trunk, arms and other hands: a hand with itself and with fixed objects.
+        self._hand_queries = [query.split_by_links(moved_links - hand)[1] for _, hand in links]
+        self.hand_motors = [list(hand) for _, hand in body.side_actuators]
+        count, n, sides = len(targets), len(body.actuators), len(links)
+        self.nearest = np.full((sides, count, n), np.nan)
+        self.surplus = np.full((sides, count), -np.inf)
+        empty = np.zeros((0, n)), np.zeros((0, sides, 4, 4)), np.zeros(0, np.intp)
+        # By side: configurations, poses of all palms, target indices.
+        self._free_hands = [empty for _ in links]
+        self._known_hands = [
+            Deduplicator(count, len(motors) + 12, min_difference) for motors in self.hand_motors
+        ]
 
-    def add(self, q: Array, owner: NDArray[np.intp], side: int, best: bool = False) -> None:
-        """Take the hands of a side in that touch nothing by themselves, of answers (m, n).
+    def add_hands(
+        self, q: Array, target_index: NDArray[np.intp], side: int, best_only: bool = False
+    ) -> None:
+        """Add the hands of a side that are free of self-collision.
 
         Args:
-            q: (m, n).
-            owner: (m,) the target of each.
+            q: (m, n) solutions.
+            target_index: (m,) index of the target of each solution.
             side: Number of the side.
-            best: Whether to take one of each target at most, that with most room.
+            best_only: Add at most one hand per target, the one with the largest clearance, and
+                only if it improves on all hands before it.
         """
-        surplus = self._own[side].rows(owner).check(q).surplus
-        rows = improving_rows(owner, surplus, self.surplus[side])
-        self.nearest[side, owner[rows]] = q[rows]
-        self.surplus[side, owner[rows]] = surplus[rows]
-        rows = rows if best else np.arange(len(q))
-        kept = rows[surplus[rows] >= -ROUNDING]
-        q, owner = q[kept], owner[kept]
+        surplus = self._hand_queries[side].rows(target_index).check(q).surplus
+        rows = improving_rows(target_index, surplus, self.surplus[side])
+        self.nearest[side, target_index[rows]] = q[rows]
+        self.surplus[side, target_index[rows]] = surplus[rows]
+        rows = rows if best_only else np.arange(len(q))
+        rows = rows[surplus[rows] >= -ROUNDING]
+        q, target_index = q[rows], target_index[rows]
         palms, ranges = side_palms(self._trials.robot, q), self._robot.upper - self._robot.lower
-        parts = [(q / ranges)[:, self.hands[side]], palm_coordinates(palms[:, side])]
-        fresh = self._known[side].add(np.concatenate(parts, axis=1), owner)
-        qs, poses, owners = self._found[side]
-        self._found[side] = (
-            np.concatenate([qs, q[fresh]]),
-            np.concatenate([poses, palms[fresh]]),
-            np.concatenate([owners, owner[fresh]]),
+        coordinates = [(q / ranges)[:, self.hand_motors[side]], palm_coordinates(palms[:, side])]
+        is_new = self._known_hands[side].add(np.concatenate(coordinates, axis=1), target_index)
+        added = q[is_new], palms[is_new], target_index[is_new]
+        known_q, known_palms, known_targets = self._free_hands[side]
+        self._free_hands[side] = (
+            np.concatenate([known_q, added[0]]),
+            np.concatenate([known_palms, added[1]]),
+            np.concatenate([known_targets, added[2]]),
         )
 
-    def mixed(self, rows: NDArray[np.intp], most: int) -> tuple[Array, Array, NDArray[np.intp]]:
-        """Hands of all sides for some targets, as many ways as hands were found, and at most.
+    def combine(
+        self, rows: NDArray[np.intp], max_combinations: int
+    ) -> tuple[Array, Array, NDArray[np.intp]]:
+        """Combine the hands of all sides.
+
+        Args:
+            rows: Indices of the targets.
+            max_combinations: Maximum number of combinations per target. There are as many as the
+                side with most hands has; sides with fewer hands repeat theirs.
 
         Returns:
-            (m, n) configurations, (m, s, 4, 4) poses of the palms, (m,) the target of each.
+            (m, n) configurations, (m, s, 4, 4) palm poses, (m,) index of the target of each.
         """
-        every = []
-        for qs, poses, owner in self._found:
-            order = np.argsort(owner, kind="stable")
-            first = np.searchsorted(owner[order], rows)
-            count = np.searchsorted(owner[order], rows, side="right") - first
-            every.append((qs[order], poses[order], first, count))
-        counts = np.stack([each[3] for each in every])
-        ways = np.where(counts.min(axis=0) > 0, np.minimum(counts.max(axis=0), most), 0)
-        at = np.repeat(np.arange(len(rows)), ways)
-        number = np.arange(len(at)) - np.repeat(np.cumsum(ways) - ways, ways)
-        q, palms = None, []
-        for side, (qs, poses, first, count) in enumerate(every):
-            picked = first[at] + number % np.maximum(count[at], 1)
-            q = qs[picked] if q is None else q
-            motors = self.hands[side]
-            q[:, motors] = qs[picked][:, motors]
-            palms.append(poses[picked, side])
-        assert q is not None
-        return q, np.stack(palms, axis=1), rows[at]
+        sorted_hands = []
+        for q, palms, target_index in self._free_hands:
+            order = np.argsort(target_index, kind="stable")
+            first = np.searchsorted(target_index[order], rows)
+            count = np.searchsorted(target_index[order], rows, side="right") - first
+            sorted_hands.append((q[order], palms[order], first, count))
+        counts = np.stack([count for *_, count in sorted_hands])
+        max_counts = np.minimum(counts.max(axis=0), max_combinations)
+        combinations = np.where(counts.min(axis=0) > 0, max_counts, 0)
+        row = np.repeat(np.arange(len(rows)), combinations)
+        first_of_row = np.repeat(np.cumsum(combinations) - combinations, combinations)
+        number = np.arange(len(row)) - first_of_row
+        combined_q, combined_palms = None, []
+        for side, (q, palms, first, count) in enumerate(sorted_hands):
+            hand = first[row] + number % np.maximum(count[row], 1)
+            combined_q = q[hand] if combined_q is None else combined_q
+            motors = self.hand_motors[side]
+            combined_q[:, motors] = q[hand][:, motors]
+            combined_palms.append(palms[hand, side])
+        assert combined_q is not None
+        return combined_q, np.stack(combined_palms, axis=1), rows[row]
 
-    def arms(
+    def search_arms(
         self,
         searches: Sequence[ArmSearch],
         q: Array,
         palms: Array,
-        owner: NDArray[np.intp],
+        target_index: NDArray[np.intp],
         starts: Array,
         prefer: Preference,
     ) -> tuple[Array, NDArray[np.intp]]:
-        """Other arms for configurations (m, n) whose palms are right, one arm after the other.
+        """Search collision-free arms for given palm poses, one side after the other.
 
-        Of every arm but the last the preferred one of each branch that touches nothing is kept.
+        All sides but the last keep the preferred collision-free arm of every branch.
+
+        Args:
+            searches: Arm search of each side.
+            q: (m, n) configurations.
+            palms: (m, s, 4, 4) palm poses.
+            target_index: (m,) index of the target of each configuration.
+            starts: (k, n) initial configurations of all targets.
+            prefer: Preference among arms.
+
+        Returns:
+            (p, n) configurations and (p,) indices of their targets.
         """
-        asked = prefer if prefer in ("limits", "q0") else "limits"
+        preference = prefer if prefer in ("limits", "q0") else "limits"
         limits, query = self._trials.limits(self._targets).first, self._query
-        arms = frozenset[str]().union(*self._arms)
-        free = query.parted(arms)[1].rows(owner).free(q)
-        of = np.flatnonzero(free)
-        q = q[of]
+        all_arms = frozenset[str]().union(*self._arm_links)
+        is_free = query.split_by_links(all_arms)[1].rows(target_index).free(q)
+        rows = np.flatnonzero(is_free)
+        q = q[rows]
         for side, search in enumerate(searches):
-            later = frozenset[str]().union(*self._arms[side + 1 :])
-            pairs = query.parted(later)[1].parted(self._arms[side])[0]
-            last = side + 1 == len(searches)
-            found = search.choose(
+            later_arms = frozenset[str]().union(*self._arm_links[side + 1 :])
+            earlier_pairs = query.split_by_links(later_arms)[1]
+            pairs, _ = earlier_pairs.split_by_links(self._arm_links[side])
+            is_last = side + 1 == len(searches)
+            candidates = search.choose(
                 q,
-                starts[owner[of]],
+                starts[target_index[rows]],
                 (limits.lower, limits.upper),
-                asked,
-                pairs.rows(owner[of]),
+                preference,
+                pairs.rows(target_index[rows]),
                 np.full(len(q), np.inf),
-                branches=not last,
-                closer=False,
-                of_one=owner[of] if last else None,
+                all_branches=not is_last,
+                refine=False,
+                target_index=target_index[rows] if is_last else None,
             )
-            q, of = found.q, of[found.owner]
-        if len(q) and not all(search.exact for search in searches):
-            q = carry_palms(
-                self._trials, self._targets, q, palms[of], owner[of], float(Phase.TRUNK)
-            )
-        return q, owner[of]
+            q, rows = candidates.q, rows[candidates.hand_index]
+        if len(q) and not all(search.is_exact for search in searches):
+            phase = float(Phase.TRUNK)
+            q = carry_palms(self._trials, self._targets, q, palms[rows], target_index[rows], phase)
+        return q, target_index[rows]
 
 
 @dataclass(frozen=True)
 class UnconstrainedFingerParameters:
-    """Which postures of unconstrained fingers are looked at.
+    """Sampling of the postures of fingers without a contact.
 
     Attributes:
-        postures: Evenly spread over their limits.
-        closer: As many about the best of them, where they have too little clearance, ever closer.
-        parts: How far about [of the motors' ranges].
-        near: Clearance [m] that can be gained about a posture.
+        postures: Number of postures, evenly spread over the limits.
+        local_postures: Number of postures around the best one in each refinement.
+        local_radii: Radii of the refinements [fraction of the motors' ranges].
+        max_gain: Clearance [m] that a refinement can gain; hands with a larger penetration are not
+            refined.
     """
 
     postures: int = 48
-    closer: int = 24
-    parts: tuple[float, ...] = (0.5, 0.25, 0.12)
-    near: float = 0.02
+    local_postures: int = 24
+    local_radii: tuple[float, ...] = (0.5, 0.25, 0.12)
+    max_gain: float = 0.02
 
 
-PARAMETERS = UnconstrainedFingerParameters()
+UNCONSTRAINED_FINGER_PARAMETERS = UnconstrainedFingerParameters()
 
 
 class UnconstrainedFingers:
-    """The motors of k targets' hands that move no finger with a contact."""
+    """The hand motors of k targets that move no finger with a contact."""
 
     def __init__(self, robot: ArmHand, targets: TargetBatch) -> None:
+        """Find the free motors of each target and sample their postures."""
+        parameters = UNCONSTRAINED_FINGER_PARAMETERS
         self._description = description = robot.description
-        free = np.isnan(targets.points[..., 0]) & np.isnan(targets.normals[..., 0])
-        for more in targets.more.values():
-            free &= np.isnan(more[..., 0])
-        busy = np.zeros((len(description.finger_names), len(robot.lower)), dtype=bool)
+        is_unconstrained = np.isnan(targets.points[..., 0]) & np.isnan(targets.normals[..., 0])
+        for vectors in targets.more.values():
+            is_unconstrained &= np.isnan(vectors[..., 0])
+        moves_finger = np.zeros((len(description.finger_names), len(robot.lower)), dtype=bool)
         for finger, name in enumerate(description.finger_names):
-            busy[finger, list(description.finger_actuators(name))] = True
+            moves_finger[finger, list(description.finger_actuators(name))] = True
         hand = np.zeros(len(robot.lower), dtype=bool)
         hand[list(description.hand_actuators)] = True
-        self._motors: Bools = hand & ~(~free[:, :, None] & busy).any(axis=1)
+        is_constrained = (~is_unconstrained[:, :, None] & moves_finger).any(axis=1)
+        self._free_motors: Bools = hand & ~is_constrained
         if targets.fixed is not None:
-            self._motors &= np.isnan(targets.fixed)
-        parts = (
-            0.5 + np.arange(PARAMETERS.postures)[:, None] * spread_steps(len(robot.lower))
-        ) % 1.0
+            self._free_motors &= np.isnan(targets.fixed)
+        steps = np.arange(parameters.postures)[:, None] * spread_steps(len(robot.lower))
+        fractions = (0.5 + steps) % 1.0
         ranges = robot.upper - robot.lower
         self._limits = robot.lower, robot.upper
-        self._places = robot.lower + parts * ranges
-        about = (parts[: PARAMETERS.closer] - 0.5) * ranges
-        self._spread = (None, *(part * about for part in PARAMETERS.parts))
+        self._postures = robot.lower + fractions * ranges
+        offsets = (fractions[: parameters.local_postures] - 0.5) * ranges
+        # None: postures over the whole range; then offsets around the best one.
+        self._levels = (None, *(radius * offsets for radius in parameters.local_radii))
 
-    def aside(self, q: Array, owner: NDArray[np.intp], query: CollisionQuery) -> Array:
-        """Hands, those that touch something by themselves with their idle fingers elsewhere.
+    def move_aside(self, q: Array, target_index: NDArray[np.intp], query: CollisionQuery) -> Array:
+        """Move unconstrained fingers to the posture with the largest clearance, if in collision.
 
         Args:
             q: (m, n) configurations.
-            owner: (m,) their targets.
-            query: What hands by themselves are checked against.
+            target_index: (m,) indices of their targets.
+            query: Pairs whose distances the hand decides.
 
         Returns:
-            (m, n) each as it is, or with the idle fingers where they have most room.
+            (m, n) configurations; only those in self-collision are changed.
         """
-        some = np.flatnonzero(self._motors[owner].any(axis=1))
-        if not len(some):
+        rows = np.flatnonzero(self._free_motors[target_index].any(axis=1))
+        if not len(rows):
             return q
-        of_idle, others = query.parted(self._links)
-        # What the idle fingers have no part in they do not help.
-        some = some[others.rows(owner[some]).free(q[some])]
-        before = of_idle.rows(owner[some]).check(q[some]).surplus
-        touching = before < -ROUNDING
-        some, before = some[touching], before[touching]
-        if not len(some):
+        free_finger_pairs, other_pairs = query.split_by_links(self._free_links)
+        # Unconstrained fingers cannot resolve a collision of other links.
+        rows = rows[other_pairs.rows(target_index[rows]).free(q[rows])]
+        surplus = free_finger_pairs.rows(target_index[rows]).check(q[rows]).surplus
+        collides = surplus < -ROUNDING
+        rows, surplus = rows[collides], surplus[collides]
+        if not len(rows):
             return q
         moved = q.copy()
-        for places in self._spread:
-            motors = self._motors[owner[some]]
-            about = moved[some][:, None]
-            there = self._places if places is None else about + places
-            tried = np.where(motors[:, None], np.clip(there, *self._limits), about)
-            count = tried.shape[1]
-            rows = np.repeat(owner[some], count)
-            surplus = (
-                of_idle.rows(rows).check(tried.reshape(-1, q.shape[1])).surplus.reshape(-1, count)
+        for offsets in self._levels:
+            is_free = self._free_motors[target_index[rows]]
+            center = moved[rows][:, None]
+            samples = self._postures if offsets is None else center + offsets
+            candidates = np.where(is_free[:, None], np.clip(samples, *self._limits), center)
+            count = candidates.shape[1]
+            candidate_query = free_finger_pairs.rows(np.repeat(target_index[rows], count))
+            clearances = candidate_query.check(candidates.reshape(-1, q.shape[1])).surplus
+            clearances = clearances.reshape(-1, count)
+            best = clearances.argmax(axis=1)
+            numbers = np.arange(len(rows))
+            best_surplus = clearances[numbers, best]
+            is_better = best_surplus > surplus
+            moved[rows[is_better]] = candidates[numbers, best][is_better]
+            surplus = np.maximum(surplus, best_surplus)
+            can_improve = (surplus < -ROUNDING) & (
+                surplus > -UNCONSTRAINED_FINGER_PARAMETERS.max_gain
             )
-            best = surplus.argmax(axis=1)
-            each = np.arange(len(some))
-            most = surplus[each, best]
-            better = most > before
-            moved[some[better]] = tried[each, best][better]
-            before = np.maximum(before, most)
-            near = (before < -ROUNDING) & (before > -PARAMETERS.near)
-            some, before = some[near], before[near]
-            if not len(some):
+            rows, surplus = rows[can_improve], surplus[can_improve]
+            if not len(rows):
                 break
         return moved
 
     @cached_property
-    def _links(self) -> frozenset[str]:
-        """Links that a motor moves which is idle in one of the targets."""
-        idle = np.flatnonzero(self._motors.any(axis=0)).tolist()
-        return self._description.links_moved(idle)
+    def _free_links(self) -> frozenset[str]:
+        """Links moved by a motor that is free in at least one target."""
+        motors = np.flatnonzero(self._free_motors.any(axis=0)).tolist()
+        return self._description.links_moved(motors)

@@ -225,8 +225,8 @@ def _grasps(robot: ik.ArmHand) -> list[tuple[ik.Grasp, dict[str, Any]]]:
     request = Request(robot, tolerances_by_finger(None, robot.fingers), True)
     around = check.collision_query(request.of_arrays(points, normals, None).holding(BALL, poses))
     of_ball = np.array([BALL in names for names in around.table.names])
-    clear = around.among(around.table.only(~of_ball)).free(q) & (radii > SMALLEST)
-    clear &= around.among(around.table.only(of_ball)).check(q).distance + SAFE > radii
+    clear = around.with_table(around.table.select(~of_ball)).free(q) & (radii > SMALLEST)
+    clear &= around.with_table(around.table.select(of_ball)).check(q).distance + SAFE > radii
     found = []
     for row in np.flatnonzero(clear)[:POSTURES].tolist():
         named = zip(robot.fingers, points[row], normals[row], strict=True)

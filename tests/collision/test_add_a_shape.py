@@ -40,12 +40,12 @@ def test_a_kind_is_added_in_three_files(tmp_path: Path) -> None:
     distance, call = blocks("add_a_shape.md", "c")
     solids = package / "collision" / "solids.py"
     replace(solids, "    CLOUD = 5\n", f"    CLOUD = 5\n{name}")
-    replace(solids, '}\n"""The kinds:', f'{row}}}\n"""The kinds:')
+    replace(solids, '}\n"""Properties of all kinds', f'{row}}}\n"""Properties of all kinds')
     replace(solids, "def half_space()", f"{make}\n\ndef half_space()")
     driver = package / "compile" / "runtime" / "clearance.c"
-    before = "static LANES_TARGET along from_solid("
+    before = "static LANES_TARGET along distance_along("
     replace(driver, before, f"{distance}\n{before}")
-    first = "  if (one->kind == BOX)"
+    first = "  if (shape->kind == BOX)"
     replace(driver, first, f"{call}{first}")
     scene = package / "collision" / "scene.py"
     replace(

@@ -25,7 +25,7 @@ def hands(robot, solver):
     rng = np.random.default_rng(5)
     q = robot.random(rng, 60)
     around = solver._engine.collision_query(solver._request.of_arrays(*robot.contacts(q), None))
-    room = around.held.check(q).surplus
+    room = around.hand_pairs.check(q).surplus
     kept = np.flatnonzero(room >= 0)
     return q[kept], robot.random(rng, len(kept)), around.rows(kept), room[kept]
 
@@ -53,8 +53,10 @@ def chosen(search, robot, hands, prefer, branches=False, **words):
 
 def scores(search, hands, found, prefer):
     if prefer == "clearance":
-        return np.minimum(hands[2].rows(found.owner).check(found.q).surplus, hands[3][found.owner])
-    return search.scores(found.q, hands[1][found.owner], prefer)
+        return np.minimum(
+            hands[2].rows(found.hand_index).check(found.q).surplus, hands[3][found.hand_index]
+        )
+    return search.scores(found.q, hands[1][found.hand_index], prefer)
 
 
 @pytest.mark.parametrize("branches", [False, True])
@@ -65,15 +67,17 @@ def test_without_a_compiler_the_same_hands_have_arms_no_better(
     """It looks at the same values and those between, and no closer."""
     compiled, simple = (chosen(one, robot, hands, prefer, branches) for one in (search, plain))
     assert len(compiled.q) > 20
-    assert set(compiled.owner) == set(simple.owner)
+    assert set(compiled.hand_index) == set(simple.hand_index)
     for one in (compiled, simple):
-        np.testing.assert_allclose(robot.palm(one.q), robot.palm(hands[0][one.owner]), atol=1e-9)
+        np.testing.assert_allclose(
+            robot.palm(one.q), robot.palm(hands[0][one.hand_index]), atol=1e-9
+        )
         assert (one.q >= robot.lower).all()
         assert (one.q <= robot.upper).all()
         if prefer != "clearance":
-            assert hands[2].rows(one.owner).free(one.q).all()
+            assert hands[2].rows(one.hand_index).free(one.q).all()
     if not branches:
-        np.testing.assert_array_equal(compiled.owner, simple.owner)
+        np.testing.assert_array_equal(compiled.hand_index, simple.hand_index)
         better = scores(search, hands, compiled, prefer) - scores(search, hands, simple, prefer)
         # What is between the values may be better than what is about the best of them.
         assert np.mean(better >= -1e-9) > 0.7
@@ -87,7 +91,7 @@ def test_a_preference_of_ones_own_is_asked_by_the_compiled_search(search, robot,
 
     found = chosen(search, robot, hands, high)
     other = chosen(search, robot, hands, "limits")
-    np.testing.assert_array_equal(found.owner, other.owner)
+    np.testing.assert_array_equal(found.hand_index, other.hand_index)
     assert (high(found.q) >= high(other.q) - 1e-9).mean() > 0.9
     assert (high(found.q) > high(other.q)).any()
 
@@ -102,9 +106,9 @@ def test_what_is_chosen_is_the_best_free_arm(search, robot, hands):
     """Any free arm of the same hand found by other means is no farther from its limits."""
     q, _, around, _ = hands
     found = chosen(search, robot, hands, "limits")
-    given = around.free(q)[found.owner]
+    given = around.free(q)[found.hand_index]
     best, own = (
-        search.scores(each[given], each[given], "limits") for each in (found.q, q[found.owner])
+        search.scores(each[given], each[given], "limits") for each in (found.q, q[found.hand_index])
     )
     assert (best >= own - 1e-12).all()
     assert given.sum() > 5
@@ -115,18 +119,20 @@ def test_each_hand_is_looked_at_alone(search, robot, hands):
     q, starts, around, room = hands
     alone = chosen(search, robot, (q[some], starts[some], around.rows(some), room[some]), "limits")
     for i, hand in enumerate(some.tolist()):
-        np.testing.assert_array_equal(alone.q[alone.owner == i], together.q[together.owner == hand])
+        np.testing.assert_array_equal(
+            alone.q[alone.hand_index == i], together.q[together.hand_index == hand]
+        )
 
 
 def test_the_first_hand_of_a_target_with_an_arm_is_enough(search, plain, robot, hands):
     whose = np.arange(len(hands[0])) // 3
     every = chosen(search, robot, hands, "limits")
-    targets = whose[every.owner]
-    firsts = every.owner[np.append(True, targets[1:] != targets[:-1])]
+    targets = whose[every.hand_index]
+    firsts = every.hand_index[np.append(True, targets[1:] != targets[:-1])]
     for one in (search, plain):
-        found = chosen(one, robot, hands, "limits", of_one=whose)
-        np.testing.assert_array_equal(found.owner, firsts)
-        assert (found.tried[firsts] > 0).all()
+        found = chosen(one, robot, hands, "limits", target_index=whose)
+        np.testing.assert_array_equal(found.hand_index, firsts)
+        assert (found.arms_tried[firsts] > 0).all()
 
 
 def test_only_motors_of_unconstrained_fingers_move_and_only_for_more_room():
@@ -140,8 +146,8 @@ def test_only_motors_of_unconstrained_fingers_move_and_only_for_more_room():
     for given in (None, fixed):
         fixed[motor] = 0.0
         problems = TargetBatch(points, normals, ik.Tolerance(), True, fixed=given)
-        around = SceneCheck(robot, ik.Scene({})).collision_query(problems).held
-        moved = UnconstrainedFingers(robot, problems).aside(q, np.arange(120), around)
+        around = SceneCheck(robot, ik.Scene({})).collision_query(problems).hand_pairs
+        moved = UnconstrainedFingers(robot, problems).move_aside(q, np.arange(120), around)
         before, after = around.check(q).surplus, around.check(moved).surplus
         changed = (moved != q).any(axis=1)
         assert changed[:90].sum() > 5

@@ -50,7 +50,7 @@ def test_distances_are_those_of_coal_and_never_larger(robot, rng):
     around = surroundings(robot, ik.Scene(SCENE))
     q = robot.random(rng, 300)
     names = [frozenset(pair) for pair in around.table.names]
-    every = around.kernel.every(q, around.poses, around.table)
+    every = around.kernel.all_distances(q, around.poses, around.table)
     theirs = by_coal(robot, q, set(names))
     solids = {"palm", "l2", "base"}  # described as boxes and a cylinder
     for name in set(names):
@@ -71,7 +71,7 @@ def test_planes_round_a_hull_off_by_little(robot, rng):
     around = surroundings(robot, ik.Scene({"block": SCENE["block"]}))
     q = robot.random(rng, 200)
     rows = np.array([{"l3", "block"} == set(pair) for pair in around.table.names])
-    ours = around.kernel.every(q, around.poses, around.table)[:, rows].min(axis=1)
+    ours = around.kernel.all_distances(q, around.poses, around.table)[:, rows].min(axis=1)
     coals = by_coal(robot, q, {frozenset(("l3", "block"))})[frozenset(("l3", "block"))]
     near = (coals > 0) & (coals < 0.2)
     assert near.sum() > 15
@@ -84,9 +84,9 @@ def test_the_virtual_machine_gives_the_same(robot, rng):
     q = robot.random(rng, 100)
     tables = compiled.table, plain.table
     assert tables[0].names == tables[1].names
-    every = [one.kernel.every(q, one.poses, one.table) for one in (compiled, plain)]
+    every = [one.kernel.all_distances(q, one.poses, one.table) for one in (compiled, plain)]
     np.testing.assert_allclose(every[0], every[1], atol=3e-7)
-    least, which = compiled.kernel.least(q, compiled.poses, compiled.table)
+    least, which = compiled.kernel.min_distances(q, compiled.poses, compiled.table)
     np.testing.assert_array_equal(least, every[0].min(axis=1))
     np.testing.assert_array_equal(which, every[0].argmin(axis=1))
 
@@ -106,7 +106,9 @@ def test_shapes_come_no_nearer_than_by_steps_times_levers(robot, rng, name):
             robot.lower,
             robot.upper,
         )
-        before, after = (around.kernel.every(x, around.poses, around.table) for x in (q, other))
+        before, after = (
+            around.kernel.all_distances(x, around.poses, around.table) for x in (q, other)
+        )
         bound = np.abs(other - q) @ longest.T
         assert (np.abs(after - before) <= bound + MICROMETRE).all()
         moved = bound > 1e-5

@@ -62,7 +62,7 @@ def test_margins_of_single_pairs(robot) -> None:
             solver._request.of_grasps([ik.load_grasp("cup")], None)
         )
         of_pair = np.array([set(names) == {"lwr_link_6", "post"} for names in around.table.names])
-        found = around.among(around.table.only(of_pair)).check(robot.home[None])
+        found = around.with_table(around.table.select(of_pair)).check(robot.home[None])
         clearances.append(float(found.distance[0]))
         assert found.surplus[0] == pytest.approx(found.distance[0] - kept)
     assert clearances[0] == pytest.approx(clearances[1])

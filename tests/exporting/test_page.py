@@ -85,7 +85,7 @@ def the_page_follows(page: Page, robot: ik.ArmHand) -> None:
     drawn = page.evaluate(
         "casadiIk.now.body.parts.map(({ kind, at, mesh }) => [kind, at, mesh.position.toArray()])"
     )
-    (placed,) = ClearanceKernel(robot.description).placed(q[None])
+    (placed,) = ClearanceKernel(robot.description).shape_poses(q[None])
     told = page.evaluate("[...casadiIk.now.solving.solver.shapes(casadiIk.now.shown)]")
     assert np.abs(np.array(told) - placed.ravel()).max() < 1e-12
     assert len(drawn) > 20

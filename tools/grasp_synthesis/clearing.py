@@ -51,7 +51,7 @@ def cleared(
         rng: Source of places for the other fingers, behind where they are and home.
     """
     robot, named = check.robot, list(touching)
-    around = surroundings(check, item, named, pinch, pinch.q).held
+    around = surroundings(check, item, named, pinch, pinch.q).hand_pairs
     hand = set(robot.description.hand_actuators)
     busy = {i for name in named for i in robot.description.finger_actuators(name)}
     idle = sorted(hand - busy)

@@ -125,7 +125,7 @@ def _penetration(robot: ArmHand, grasp: Grasp, solution: Solution) -> list[str]:
     except CasadiIKError:  # a robot or an object without shapes
         return []
     mine = np.array([grasp.object in names for names in query.table.names], dtype=bool)
-    clear = query.among(query.table.only(mine)).check(solution.q[None])
+    clear = query.with_table(query.table.select(mine)).check(solution.q[None])
     pair = clear.pair(0)
     if clear.free[0] or pair is None:
         return []

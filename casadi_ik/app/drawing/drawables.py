@@ -26,7 +26,7 @@ from casadi_ik.app.drawing.surfaces import (
     ring,
     rod,
 )
-from casadi_ik.collision.clearance import Closest
+from casadi_ik.collision.clearance import ClosestPoints
 from casadi_ik.collision.model import own_solids
 from casadi_ik.collision.scene import Item, Scene
 from casadi_ik.collision.solids import Solid
@@ -429,7 +429,7 @@ def scene_with_object(scene: Scene, grasp: Grasp | None) -> Scene:
     return scene
 
 
-def clearance_marks(closest: Closest, show_shapes: bool = False) -> list[Drawable]:
+def clearance_marks(closest: ClosestPoints, show_shapes: bool = False) -> list[Drawable]:
     """Return a rod between the nearest points of two shapes, in the base frame.
 
     Args:

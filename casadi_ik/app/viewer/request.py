@@ -11,7 +11,7 @@ import numpy as np
 from casadi_ik.api import METHODS, Solver
 from casadi_ik.app.drawing.drawables import scene_with_object
 from casadi_ik.app.drawing.surfaces import pose_with_x_axis
-from casadi_ik.collision.clearance import Closest, closest_points
+from casadi_ik.collision.clearance import ClosestPoints, closest_points
 from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import CasadiIKError, UnsupportedError
 from casadi_ik.files.arrays import Array
@@ -235,7 +235,7 @@ class SolveResult:
     verdicts: dict[str, ContactVerdict]
     reasons: tuple[str, ...] = ()
     clearance: float | None = None
-    closest: tuple[tuple[str, str], Closest] | None = None
+    closest: tuple[tuple[str, str], ClosestPoints] | None = None
     solve_time: float = 0.0
     summary: str = ""
     needs_diagnosis: bool = False

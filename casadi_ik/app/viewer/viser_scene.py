@@ -31,7 +31,7 @@ from casadi_ik.app.drawing.drawables import (
 from casadi_ik.app.drawing.surfaces import join_surfaces, mesh_shape, split_sharp_edges
 from casadi_ik.app.viewer.access import Server
 from casadi_ik.app.viewer.request import OBJECT, DraggableContact, PageRequest
-from casadi_ik.collision.clearance import Closest
+from casadi_ik.collision.clearance import ClosestPoints
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.input_checks.poses import rotations_from_quaternions
 from casadi_ik.kinematics.arm_hand import ArmHand
@@ -404,7 +404,7 @@ class ClearanceLine:
         )
 
     def update(
-        self, closest: Closest | None, clearance: float | None = None, show_label: bool = True
+        self, closest: ClosestPoints | None, clearance: float | None = None, show_label: bool = True
     ) -> None:
         """Show the line between two points, or hide it.
 

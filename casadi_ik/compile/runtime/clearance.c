@@ -1,24 +1,24 @@
-/* Distances of capsules that a step places, from each other and from solids, LANES configurations
- * side by side. The step maps q to the middles and halves of the capsules' segments, and to the
+/* Distances of the robot's capsules from each other and from solids, for LANES configurations at a
+ * time. The step graph maps q to the centers and half-axes of the capsules' segments, and to the
  * poses of the robot's own solids.
  *
- * Of two capsules the distance is exact. Of a capsule and a solid it is that of its segment's point
- * nearest to the solid (deepest inside it), never more than the true one: the signed distance from
- * a convex solid is convex along the segment, and what is given is where two of its tangents meet.
- * From the balls of a cloud it is exact.
+ * The distance of two capsules is exact. The distance of a capsule and a convex solid is a lower
+ * bound: the signed distance is convex along the capsule's segment, and its minimum is bounded by
+ * the intersection of two tangents. The distance from a point cloud is exact.
  *
- * Expects the macros N_Q, N_CAPSULES, N_OWN (solids of the robot), and the kinds of solids.
+ * Requires the macros N_Q, N_CAPSULES, N_OWN (number of the robot's solids), and the kinds of
+ * solids.
  */
-enum { MOST_CUTS = 40 };
+enum { MAX_CUTS = 40 };
 
-/* So many planes of a convex solid, which are spread all around, tell whether it is far away. */
-enum { FEW = 64 };
+/* Number of planes, spread over all directions, by which a distant convex solid is skipped. */
+enum { FIRST_PLANES = 64 };
 
-/* So many points of a cloud have a ball that holds them, in the row before theirs. */
+/* Number of points of a cloud per bounding ball; the ball is the row before its points. */
 enum { GROUP = 32 };
 
-/* Where tangents and function agree to this [m], the least is found. */
-#define CLOSE (scalar) 1e-7
+/* Tolerance between the tangents' bound and the function's value [m]. */
+#define CONVERGED (scalar) 1e-7
 #define TINY (scalar) 1e-30
 
 typedef struct { lanes x, y, z; } vector;
@@ -36,8 +36,9 @@ LANES_INLINE vector at(vector c, vector h, lanes t) {
 }
 LANES_INLINE vector load(const lanes *from) { return (vector) {from[0], from[1], from[2]}; }
 
-/* Least distance of two segments whose middles are apart by r; a, b: squares of the half lengths. */
-LANES_INLINE lanes between(vector r, vector g, vector h, scalar a, scalar b) {
+/* Distance of two segments with half-axes g and h, whose centers differ by r; a and b are the
+ * squared half lengths. */
+LANES_INLINE lanes segment_distance(vector r, vector g, vector h, scalar a, scalar b) {
   const lanes both = dot(g, h), d = dot(g, r), f = dot(h, r);
   const lanes det = SPREAD(a * b) - both * both;
   const scalar over_a = a > 0 ? 1 / a : 0, over_b = b > 0 ? 1 / b : 0;
@@ -48,10 +49,10 @@ LANES_INLINE lanes between(vector r, vector g, vector h, scalar a, scalar b) {
   return lanes_sqrt(dot(r, r));
 }
 
-LANES_INLINE along of_box(const solid *one, vector p, vector h) {
+LANES_INLINE along box_distance(const solid *shape, vector p, vector h) {
   const lanes zero = SPREAD(0.0);
-  const lanes x = lanes_fabs(p.x) - one->size[0], y = lanes_fabs(p.y) - one->size[1];
-  const lanes z = lanes_fabs(p.z) - one->size[2];
+  const lanes x = lanes_fabs(p.x) - shape->size[0], y = lanes_fabs(p.y) - shape->size[1];
+  const lanes z = lanes_fabs(p.z) - shape->size[2];
   const lanes gx = lanes_select(p.x < zero, -h.x, h.x), gy = lanes_select(p.y < zero, -h.y, h.y);
   const lanes gz = lanes_select(p.z < zero, -h.z, h.z);
   const lanes ox = larger(x, zero), oy = larger(y, zero), oz = larger(z, zero);
@@ -63,12 +64,12 @@ LANES_INLINE along of_box(const solid *one, vector p, vector h) {
   return (along) {lanes_select(outside, out, deep), lanes_select(outside, outer, inner)};
 }
 
-LANES_INLINE along of_cylinder(const solid *one, vector p, vector h) {
+LANES_INLINE along cylinder_distance(const solid *shape, vector p, vector h) {
   const lanes zero = SPREAD(0.0);
   const lanes from_axis = lanes_sqrt(p.x * p.x + p.y * p.y);
   const lanes around = (p.x * h.x + p.y * h.y) / larger(from_axis, SPREAD(TINY));
   const lanes up = lanes_select(p.z < zero, -h.z, h.z);
-  const lanes a = from_axis - one->size[0], b = lanes_fabs(p.z) - one->size[1];
+  const lanes a = from_axis - shape->size[0], b = lanes_fabs(p.z) - shape->size[1];
   const lanes oa = larger(a, zero), ob = larger(b, zero);
   const lanes out = lanes_sqrt(oa * oa + ob * ob);
   const lane_mask outside = out > zero;
@@ -77,7 +78,7 @@ LANES_INLINE along of_cylinder(const solid *one, vector p, vector h) {
   return (along) {lanes_select(outside, out, larger(a, b)), lanes_select(outside, outer, inner)};
 }
 
-/* A convex solid's planes along a segment: a straight line each, of which the highest counts. */
+/* The planes of a convex solid along a segment: linear functions, whose maximum is the distance. */
 typedef struct { lanes *line; int64_t count; } envelope;
 
 LANES_INLINE along higher_of(along a, along b) {
@@ -92,7 +93,7 @@ LANES_INLINE along at_line(const lanes *line, lanes t) {
 LANES_INLINE along highest(envelope planes, lanes t) {
   const along none = {SPREAD(-INFINITY), SPREAD(0.0)};
   const lanes *line = planes.line, *end = line + 2 * planes.count;
-  /* Four at a time: each comparison waits for the one before. */
+  /* Four independent chains hide the latency of the comparisons. */
   along a = none, b = none, c = none, d = none;
   for (; line + 8 <= end; line += 8) {
     a = higher_of(a, at_line(line, t));
@@ -104,8 +105,8 @@ LANES_INLINE along highest(envelope planes, lanes t) {
   return higher_of(higher_of(a, b), higher_of(c, d));
 }
 
-/* The lines of some planes; their highest in the middle is what is given. */
-static LANES_TARGET lanes of_planes(const scalar *plane, vector c, vector h, lanes *line,
+/* Compute the lines of planes first..last; returns their maximum at the segment's center. */
+static LANES_TARGET lanes plane_lines(const scalar *plane, vector c, vector h, lanes *line,
                                     int64_t first, int64_t last) {
   lanes most[4];
   int64_t i, k;
@@ -120,35 +121,37 @@ static LANES_TARGET lanes of_planes(const scalar *plane, vector c, vector h, lan
   return larger(larger(most[0], most[1]), larger(most[2], most[3]));
 }
 
-/* Without the lines that in no lane still looked at come up to a bound between two places. */
-static LANES_TARGET int64_t thinned(envelope planes, lanes low, lanes high, lanes bound,
-                                    lane_mask over) {
-  int64_t i, kept = 0;
+/* Remove the lines that stay below a bound between `low` and `high` in every unfinished lane;
+ * returns the number of remaining lines. */
+static LANES_TARGET int64_t remove_low_lines(envelope planes, lanes low, lanes high, lanes bound,
+                                    lane_mask finished) {
+  int64_t i, count = 0;
   for (i = 0; i < planes.count; ++i) {
     const lanes value = planes.line[2 * i], slope = planes.line[2 * i + 1];
     const lanes most = larger(value + low * slope, value + high * slope);
-    if (lanes_all((most < bound) | over)) continue;
-    planes.line[2 * kept] = value;
-    planes.line[2 * kept + 1] = slope;
-    ++kept;
+    if (lanes_all((most < bound) | finished)) continue;
+    planes.line[2 * count] = value;
+    planes.line[2 * count + 1] = slope;
+    ++count;
   }
-  return kept;
+  return count;
 }
 
-static LANES_TARGET along from_solid(const solid *one, vector c, vector h, envelope planes,
+static LANES_TARGET along distance_along(const solid *shape, vector c, vector h, envelope planes,
                                      lanes t) {
   const vector p = at(c, h, t);
-  if (one->kind == BOX) return of_box(one, p, h);
-  if (one->kind == CYLINDER) return of_cylinder(one, p, h);
+  if (shape->kind == BOX) return box_distance(shape, p, h);
+  if (shape->kind == CYLINDER) return cylinder_distance(shape, p, h);
   return highest(planes, t);
 }
 
-/* Lower bound of the least of the convex distance along a segment in the solid's frame. */
-static LANES_TARGET lanes lowest(const solid *one, vector c, vector h, envelope planes) {
+/* Lower bound of the minimum of the convex distance along a segment, in the frame of the solid. */
+static LANES_TARGET lanes min_along(const solid *shape, vector c, vector h, envelope planes) {
   const lanes zero = SPREAD(0.0);
-  lanes low = SPREAD(-1.0), high = SPREAD(1.0), best, bound, found = zero;
-  lane_mask over = (lane_mask) zero;
-  along left = from_solid(one, c, h, planes, low), right = from_solid(one, c, h, planes, high);
+  lanes low = SPREAD(-1.0), high = SPREAD(1.0), best, bound, result = zero;
+  lane_mask finished = (lane_mask) zero;
+  along left = distance_along(shape, c, h, planes, low);
+  along right = distance_along(shape, c, h, planes, high);
   const lane_mask falls = left.slope < zero, rises = right.slope > zero;
   const lanes ends = lanes_select(falls, right.value, left.value);
   const lane_mask inner = falls & rises;
@@ -160,108 +163,117 @@ static LANES_TARGET lanes lowest(const solid *one, vector c, vector h, envelope 
         (right.value - left.value + left.slope * low - right.slope * high) / steep;
     lanes t;
     lane_mask left_side;
-    along here;
+    along sample;
     bound = left.value + left.slope * (meet - low);
-    /* What a lane comes to does not depend on how long the others take. */
-    found = lanes_select(over, found, smaller(bound, best));
-    over |= lanes_not(inner) | (best - bound < SPREAD(CLOSE));
-    if (cut == MOST_CUTS || lanes_all(over)) break;
-    /* Where the tangents meet; every third time the middle, since flat ends creep. */
+    /* The result of a lane must not depend on the number of cuts of the others. */
+    result = lanes_select(finished, result, smaller(bound, best));
+    finished |= lanes_not(inner) | (best - bound < SPREAD(CONVERGED));
+    if (cut == MAX_CUTS || lanes_all(finished)) break;
+    /* Cut where the tangents meet; bisect every third time: cuts converge slowly at flat ends. */
     t = cut % 3 == 2 ? (low + high) * (scalar) 0.5 : smaller(larger(meet, low), high);
-    here = from_solid(one, c, h, planes, t);
-    best = smaller(best, here.value);
-    left_side = here.slope < zero;
+    sample = distance_along(shape, c, h, planes, t);
+    best = smaller(best, sample.value);
+    left_side = sample.slope < zero;
     low = lanes_select(left_side, t, low);
-    left.value = lanes_select(left_side, here.value, left.value);
-    left.slope = lanes_select(left_side, here.slope, left.slope);
+    left.value = lanes_select(left_side, sample.value, left.value);
+    left.slope = lanes_select(left_side, sample.slope, left.slope);
     high = lanes_select(left_side, high, t);
-    right.value = lanes_select(left_side, right.value, here.value);
-    right.slope = lanes_select(left_side, right.slope, here.slope);
-    if (planes.count > 1) planes.count = thinned(planes, low, high, bound - CLOSE, over);
+    right.value = lanes_select(left_side, right.value, sample.value);
+    right.slope = lanes_select(left_side, right.slope, sample.slope);
+    if (planes.count > 1) {
+      planes.count = remove_low_lines(planes, low, high, bound - CONVERGED, finished);
+    }
   }
-  return lanes_select(inner, found, ends);
+  return lanes_select(inner, result, ends);
 }
 
-/* Square of the distance of a point from a segment about c; over: one by the square of its half. */
-LANES_INLINE lanes off_point(const scalar *point, vector c, vector h, scalar over) {
+/* Squared distance of a point from a segment centered at c; `inverse_square` is
+ * 1 / half length^2, or 0. */
+LANES_INLINE lanes point_distance_squared(const scalar *point, vector c, vector h,
+                                          scalar inverse_square) {
   const vector r = {point[0] - c.x, point[1] - c.y, point[2] - c.z};
-  const lanes t = within(dot(r, h) * over);
-  const vector off = minus(r, (vector) {t * h.x, t * h.y, t * h.z});
-  return dot(off, off);
+  const lanes t = within(dot(r, h) * inverse_square);
+  const vector offset = minus(r, (vector) {t * h.x, t * h.y, t * h.z});
+  return dot(offset, offset);
 }
 
-/* Distance of a segment from the points of a cloud that are nearer than `near`; else anything above
- * it. What lies in groups that are farther in every lane is not looked at. */
-static LANES_TARGET lanes off_cloud(const scalar *row, int64_t count, vector c, vector h,
+/* Distance of a segment from a cloud if it is below `near`, else any value above `near`. Groups
+ * that are farther in every lane are skipped. */
+static LANES_TARGET lanes cloud_distance(const scalar *row, int64_t count, vector c, vector h,
                                     scalar half, lanes near) {
-  const scalar *end = row + 4 * count, over = half > 0 ? 1 / (half * half) : 0;
+  const scalar *end = row + 4 * count, inverse_square = half > 0 ? 1 / (half * half) : 0;
   lanes best = SPREAD(INFINITY);
   int k;
   for (; row < end; row += 4 * (GROUP + 1)) {
-    const lanes far = near + row[3];
-    if (lanes_all((off_point(row, c, h, over) >= far * far) | (far < SPREAD(0.0)))) continue;
-    for (k = 1; k <= GROUP; ++k) best = smaller(best, off_point(row + 4 * k, c, h, over));
+    const lanes cutoff = near + row[3];
+    const lanes ball = point_distance_squared(row, c, h, inverse_square);
+    if (lanes_all((ball >= cutoff * cutoff) | (cutoff < SPREAD(0.0)))) continue;
+    for (k = 1; k <= GROUP; ++k) {
+      best = smaller(best, point_distance_squared(row + 4 * k, c, h, inverse_square));
+    }
     near = smaller(near, lanes_sqrt(best));
   }
   return lanes_sqrt(best);
 }
 
-/* Distance of a capsule's segment from a solid, less `radius`; where the least distances are below
- * what this can be at all, anything above them. */
-static LANES_TARGET lanes off_solid(const clearance_job *job, const solid *one, const lanes *pose,
-                                    vector c, vector h, scalar half, scalar radius, lanes least,
-                                    lanes *lines) {
-  const envelope planes = {lines, one->kind == CONVEX ? one->planes : 0};
+/* Distance of a segment from a solid, minus `radius`; any value above `least` if the distance
+ * cannot be below `least` in any lane. */
+static LANES_TARGET lanes solid_distance(const clearance_job *job, const solid *shape,
+                                         const lanes *pose, vector c, vector h, scalar half,
+                                         scalar radius, lanes least, lanes *lines) {
+  const envelope planes = {lines, shape->kind == CONVEX ? shape->planes : 0};
   const vector x = load(pose), y = load(pose + 3), z = load(pose + 6);
   const vector r = minus(c, load(pose + 9));
-  vector place, way;
-  lanes sure;
-  if (one->kind == HALF_SPACE) {
+  vector center, half_axis;
+  lanes bound;
+  if (shape->kind == HALF_SPACE) {
     const vector up = {x.z, y.z, z.z};
     return dot(up, r) - lanes_fabs(dot(up, h)) - radius;
   }
-  sure = least + (one->reach + half + radius);
-  if (lanes_all((dot(r, r) >= sure * sure) | (sure < SPREAD(0.0)))) return SPREAD(INFINITY);
-  if (one->kind == CAPSULE) {
-    const scalar other = one->size[1];
+  bound = least + (shape->reach + half + radius);
+  if (lanes_all((dot(r, r) >= bound * bound) | (bound < SPREAD(0.0)))) return SPREAD(INFINITY);
+  if (shape->kind == CAPSULE) {
+    const scalar other = shape->size[1];
     const vector axis = {x.z * other, y.z * other, z.z * other};
-    return between(r, h, axis, half * half, other * other) - (radius + one->size[0]);
+    return segment_distance(r, h, axis, half * half, other * other) - (radius + shape->size[0]);
   }
-  /* The rotation's columns are the solid's axes. */
-  place.x = x.x * r.x + y.x * r.y + z.x * r.z;
-  place.y = x.y * r.x + y.y * r.y + z.y * r.z;
-  place.z = x.z * r.x + y.z * r.y + z.z * r.z;
-  way.x = x.x * h.x + y.x * h.y + z.x * h.z;
-  way.y = x.y * h.x + y.y * h.y + z.y * h.z;
-  way.z = x.z * h.x + y.z * h.y + z.z * h.z;
-  if (one->kind == CLOUD) {
-    const scalar wide = radius + one->size[0];
-    return off_cloud(job->planes + 4 * one->first, one->planes, place, way, half, least + wide)
-           - wide;
+  /* Columns of the rotation are the axes of the solid. */
+  center.x = x.x * r.x + y.x * r.y + z.x * r.z;
+  center.y = x.y * r.x + y.y * r.y + z.y * r.z;
+  center.z = x.z * r.x + y.z * r.y + z.z * r.z;
+  half_axis.x = x.x * h.x + y.x * h.y + z.x * h.z;
+  half_axis.y = x.y * h.x + y.y * h.y + z.y * h.z;
+  half_axis.z = x.z * h.x + y.z * h.y + z.z * h.z;
+  if (shape->kind == CLOUD) {
+    const scalar thickness = radius + shape->size[0];
+    const scalar *points = job->planes + 4 * shape->first;
+    return cloud_distance(points, shape->planes, center, half_axis, half, least + thickness)
+           - thickness;
   }
-  if (one->kind == CONVEX) {
-    const scalar *plane = job->planes + 4 * one->first;
-    const int64_t some = planes.count < FEW ? planes.count : FEW;
-    sure = of_planes(plane, place, way, lines, 0, some);
-    if (lanes_all(sure - (half + radius) >= least)) return sure - (half + radius);
-    sure = larger(sure, of_planes(plane, place, way, lines, some, planes.count));
+  if (shape->kind == CONVEX) {
+    const scalar *plane = job->planes + 4 * shape->first;
+    const int64_t count = planes.count < FIRST_PLANES ? planes.count : FIRST_PLANES;
+    bound = plane_lines(plane, center, half_axis, lines, 0, count);
+    if (lanes_all(bound - (half + radius) >= least)) return bound - (half + radius);
+    bound = larger(bound, plane_lines(plane, center, half_axis, lines, count, planes.count));
   } else {
-    sure = from_solid(one, place, way, planes, SPREAD(0.0)).value;
+    bound = distance_along(shape, center, half_axis, planes, SPREAD(0.0)).value;
   }
-  sure -= half + radius;
-  if (lanes_all(sure >= least) || half == 0) return sure;
-  return lowest(one, place, way, planes) - radius;
+  bound -= half + radius;
+  if (lanes_all(bound >= least) || half == 0) return bound;
+  return min_along(shape, center, half_axis, planes) - radius;
 }
 
-/* Puts a pair to the end of the recent ones, which is looked at last of them; the first goes. */
-static void blocked_by(clearance_job *job, int64_t pair) {
+/* Append a pair to the recently critical ones, and evict the oldest. */
+static void mark_critical(clearance_job *job, int64_t pair) {
   int k = RECENT - 1, i;
   while (k > 0 && job->recent[k] != pair) --k;
   for (i = k; i < RECENT - 1; ++i) job->recent[i] = job->recent[i + 1];
   job->recent[RECENT - 1] = pair;
 }
 
-/* Distance of a pair; 0: in all lanes it is at least `enough`, and not worked out. */
+/* Compute the distance of a pair; returns 0 without a distance if it is at least `enough` in all
+ * lanes. */
 LANES_INLINE int apart(const clearance_job *job, int64_t pair, const lanes *placed, lanes enough,
                        lanes *lines, lanes *distance) {
   const int i = job->pairs[2 * pair], j = job->pairs[2 * pair + 1];
@@ -272,23 +284,24 @@ LANES_INLINE int apart(const clearance_job *job, int64_t pair, const lanes *plac
     const vector r = minus(c, load(placed + 6 * j));
     const lanes sure = enough + (reach + half + other);
     if (lanes_all((dot(r, r) >= sure * sure) | (sure < SPREAD(0.0)))) return 0;
-    *distance = between(r, h, load(placed + 6 * j + 3), half * half, other * other) - reach;
+    *distance =
+        segment_distance(r, h, load(placed + 6 * j + 3), half * half, other * other) - reach;
   } else {
     const int64_t number = j - N_CAPSULES;
-    *distance = off_solid(job, job->solids + number, placed + 6 * N_CAPSULES + 12 * number, c, h,
-                          half, radius, enough, lines);
+    *distance = solid_distance(job, job->solids + number, placed + 6 * N_CAPSULES + 12 * number,
+                               c, h, half, radius, enough, lines);
   }
   return 1;
 }
 
-/* What distances of LANES configurations are worked out on. */
+/* Memory for the distances of LANES configurations. */
 typedef struct {
   workspace space;
-  lanes *q, *placed;           /* N_Q; the numbers of the step, then the poses of the scene */
-  lanes *lines;                /* of a convex solid's planes */
+  lanes *q, *placed;           /* N_Q; outputs of the step graph, then the poses of the scene */
+  lanes *lines;                /* values and slopes of a convex solid's planes */
 } placing;
 
-/* How many numbers these are. */
+/* Number of values in this memory. */
 static size_t room(const clearance_job *job) {
   int64_t most = 0, k;
   for (k = 0; k < N_OWN + job->n_solids; ++k) {
@@ -299,65 +312,67 @@ static size_t room(const clearance_job *job) {
   return (size_t) (N_Q + 6 * N_CAPSULES + 12 * (N_OWN + job->n_solids) + 2 * most);
 }
 
-static LANES_TARGET void lay_out(placing *here, const clearance_job *job) {
+static LANES_TARGET void lay_out(placing *buffers, const clearance_job *job) {
   int64_t k;
-  here->q = here->space.extra;
-  here->placed = here->q + N_Q;
-  here->lines = here->placed + 6 * N_CAPSULES + 12 * N_OWN;
-  for (k = 0; k < 12 * job->n_solids; ++k) *here->lines++ = SPREAD(job->poses[k]);
+  buffers->q = buffers->space.extra;
+  buffers->placed = buffers->q + N_Q;
+  buffers->lines = buffers->placed + 6 * N_CAPSULES + 12 * N_OWN;
+  for (k = 0; k < 12 * job->n_solids; ++k) *buffers->lines++ = SPREAD(job->poses[k]);
 }
 
 LANES_TARGET DRIVER(clearance, clearance_job) {
-  placing here;
+  placing buffers;
   int64_t ticks = 0, k;
-  scalar *poses, limit;
-  int lane, outcome = set_up(&here.space, room(job));
+  scalar *poses, deadline;
+  int lane, outcome = set_up(&buffers.space, room(job));
   if (outcome != DONE) return outcome;
-  lay_out(&here, job);
-  poses = (scalar *) (here.placed + 6 * N_CAPSULES + 12 * N_OWN);
-  limit = monotonic() + job->slice;
+  lay_out(&buffers, job);
+  poses = (scalar *) (buffers.placed + 6 * N_CAPSULES + 12 * N_OWN);
+  deadline = monotonic() + job->slice;
   for (; job->next < job->count; job->next += LANES) {
-    lanes least = SPREAD(job->most), who = SPREAD(-1.0);
-    if (++ticks % CLOCK_INTERVAL == 0 && monotonic() > limit) {
+    lanes minimum = SPREAD(job->max_distance), closest = SPREAD(-1.0);
+    if (++ticks % CLOCK_INTERVAL == 0 && monotonic() > deadline) {
       outcome = SLICE_OVER;
       break;
     }
     for (lane = 0; lane < LANES; ++lane) {
       const int64_t row = job->next + lane < job->count ? job->next + lane : job->count - 1;
-      for (k = 0; k < N_Q; ++k) ((scalar *) here.q)[k * LANES + lane] = job->q[row * N_Q + k];
+      for (k = 0; k < N_Q; ++k) ((scalar *) buffers.q)[k * LANES + lane] = job->q[row * N_Q + k];
       if (!job->pose_step) continue;
       for (k = 0; k < 12 * job->n_solids; ++k) {
         poses[k * LANES + lane] = job->poses[row * job->pose_step + k];
       }
     }
-    here.space.arg[0] = here.q;
-    here.space.res[0] = here.placed;
-    STEP(here.space.arg, here.space.res, (1 << LANES) - 1);
-    /* What was in the way last may be in the way again. */
+    buffers.space.arg[0] = buffers.q;
+    buffers.space.res[0] = buffers.placed;
+    STEP(buffers.space.arg, buffers.space.res, (1 << LANES) - 1);
+    /* Recently critical pairs are likely to be critical again. */
     for (k = -RECENT; k < job->n_pairs; ++k) {
       const int64_t pair = k < 0 ? job->recent[RECENT + k] : k;
-      const lanes enough = job->every ? SPREAD(INFINITY) : least;
+      const lanes cutoff = job->all_distances ? SPREAD(INFINITY) : minimum;
       lanes distance;
       lane_mask nearer;
-      if (pair < 0 || !apart(job, pair, here.placed, enough, here.lines, &distance)) continue;
-      if (job->every) {
+      if (pair < 0 || !apart(job, pair, buffers.placed, cutoff, buffers.lines, &distance)) continue;
+      if (job->all_distances) {
         for (lane = 0; lane < LANES && job->next + lane < job->count; ++lane) {
-          job->every[(job->next + lane) * job->n_pairs + pair] = lanes_at(distance, lane);
+          job->all_distances[(job->next + lane) * job->n_pairs + pair] = lanes_at(distance, lane);
         }
       }
-      nearer = distance < least;
-      least = lanes_select(nearer, distance, least);
-      who = lanes_select(nearer, SPREAD((scalar) pair), who);
-      if (lanes_all(least < SPREAD(job->enough))) break;
+      nearer = distance < minimum;
+      minimum = lanes_select(nearer, distance, minimum);
+      closest = lanes_select(nearer, SPREAD((scalar) pair), closest);
+      if (lanes_all(minimum < SPREAD(job->stop_below))) break;
     }
     for (lane = 0; lane < LANES; ++lane) {
-      if (lanes_at(least, lane) < job->enough) blocked_by(job, (int64_t) lanes_at(who, lane));
+      if (lanes_at(minimum, lane) < job->stop_below) {
+        mark_critical(job, (int64_t) lanes_at(closest, lane));
+      }
     }
     for (lane = 0; lane < LANES && job->next + lane < job->count; ++lane) {
-      job->least[job->next + lane] = lanes_at(least, lane);
-      job->closest[job->next + lane] = (int64_t) lanes_at(who, lane);
+      job->distances[job->next + lane] = lanes_at(minimum, lane);
+      job->closest_pairs[job->next + lane] = (int64_t) lanes_at(closest, lane);
     }
   }
-  give_back(&here.space);
+  give_back(&buffers.space);
   return outcome;
 }

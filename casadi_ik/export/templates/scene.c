@@ -19,8 +19,8 @@ enum { N_SIDES = @SIDES@ };
 #if HAS_CLOSED_ARM
 typedef struct {
   KERNEL(arms, map_job);
-  int64_t n_arm, n_redundancy, n_rows, n_places[LEVELS];
-  const scalar *places[LEVELS], *low, *range;
+  int64_t n_arm, n_redundancy, n_rows, n_samples[LEVELS];
+  const scalar *samples[LEVELS], *low, *range;
   const int64_t *columns;
 } arm_of_side;
 
@@ -168,8 +168,8 @@ static clearance_job about(@PREFIX@_solver *solver, const int *idle) {
   job.offsets = solver->scene.offsets;
   job.n_pairs = solver->scene.n_pairs;
   for (i = 0; i < RECENT; ++i) job.recent[i] = -1;
-  job.most = INFINITY;
-  job.enough = -INFINITY;
+  job.max_distance = INFINITY;
+  job.stop_below = -INFINITY;
   job.count = 1;
   return job;
 }
@@ -178,8 +178,8 @@ static scalar room_at(@PREFIX@_solver *solver, clearance_job *job, const scalar 
                       int64_t *closest) {
   scalar least = INFINITY;
   job->q = q;
-  job->least = &least;
-  job->closest = closest;
+  job->distances = &least;
+  job->closest_pairs = closest;
   job->next = 0;
   *closest = -1;
   (void) @PREFIX@_near_kernel(job, &solver->memory);
@@ -228,7 +228,7 @@ static int choose_arm(@PREFIX@_solver *solver, const scalar *lower, const scalar
   clear.n_pairs -= solver->scene.n_held;
   job.arms = @PREFIX@_arms_kernel;
   job.check = @PREFIX@_near_kernel;
-  job.clear = &clear;
+  job.clearance = &clear;
   job.lanes = 1;
   job.order = near ? NEAR_START : FAR_FROM_LIMITS;
   job.n_q = @GUARD@_MOTORS;
@@ -236,12 +236,12 @@ static int choose_arm(@PREFIX@_solver *solver, const scalar *lower, const scalar
   job.n_redundancy = N_REDUNDANCY;
   job.n_rows = N_ROWS;
   job.n_groups = 1;
-  job.n_places[0] = N_PLACES;
-  job.n_places[1] = N_MORE_PLACES;
-  job.n_closer = N_CLOSER;
-  job.places[0] = PLACES;
-  job.places[1] = MORE_PLACES;
-  job.closer = CLOSER;
+  job.n_samples[0] = N_SAMPLES;
+  job.n_samples[1] = N_MORE_SAMPLES;
+  job.n_offsets = N_SAMPLE_OFFSETS;
+  job.samples[0] = SAMPLES;
+  job.samples[1] = MORE_SAMPLES;
+  job.offsets = SAMPLE_OFFSETS;
   job.columns = columns;
   job.lower = low;
   job.upper = high;
@@ -253,7 +253,7 @@ static int choose_arm(@PREFIX@_solver *solver, const scalar *lower, const scalar
   job.poses = solver->scene.poses;
   job.margin = solver->scene.margin;
   job.rounding = ROUNDING;
-  job.allowed = ALLOWED;
+  job.min_limit_margin = MIN_LIMIT_MARGIN;
   job.count = 1;
   job.chosen = arm;
   job.score = &score;
@@ -279,8 +279,8 @@ static clearance_job of_parts(@PREFIX@_solver *solver, int first, int last) {
 static int part_is_free(@PREFIX@_solver *solver, int first, int last, const scalar *q) {
   clearance_job job = of_parts(solver, first, last);
   int64_t closest;
-  job.most = solver->scene.margin;
-  job.enough = solver->scene.margin - ROUNDING;
+  job.max_distance = solver->scene.margin;
+  job.stop_below = solver->scene.margin - ROUNDING;
   return room_at(solver, &job, q, &closest) >= -ROUNDING;
 }
 
@@ -302,7 +302,7 @@ static int choose_arms(@PREFIX@_solver *solver, const scalar *lower, const scala
   }
   job.arms = own->arms;
   job.check = @PREFIX@_near_kernel;
-  job.clear = &clear;
+  job.clearance = &clear;
   job.lanes = 1;
   job.order = near ? NEAR_START : FAR_FROM_LIMITS;
   job.n_q = @GUARD@_MOTORS;
@@ -311,8 +311,8 @@ static int choose_arms(@PREFIX@_solver *solver, const scalar *lower, const scala
   job.n_rows = own->n_rows;
   job.n_groups = last ? 1 : own->n_rows + 1;
   for (i = 0; i < LEVELS; ++i) {
-    job.n_places[i] = own->n_places[i];
-    job.places[i] = own->places[i];
+    job.n_samples[i] = own->n_samples[i];
+    job.samples[i] = own->samples[i];
   }
   job.columns = own->columns;
   job.lower = low;
@@ -325,7 +325,7 @@ static int choose_arms(@PREFIX@_solver *solver, const scalar *lower, const scala
   job.poses = solver->scene.poses;
   job.margin = solver->scene.margin;
   job.rounding = ROUNDING;
-  job.allowed = ALLOWED;
+  job.min_limit_margin = MIN_LIMIT_MARGIN;
   job.count = 1;
   job.chosen = arms;
   job.score = score;
@@ -365,10 +365,10 @@ static scalar put_aside(@PREFIX@_solver *solver, const scalar *lower, const scal
   most = room_at(solver, &job, q, &closest);
   memcpy(best, q, sizeof best);
   /* All over their range first, then ever closer about the best. */
-  for (closer = 0; closer <= N_PARTS && most < -ROUNDING; ++closer) {
-    if (closer && !(most > -IDLE_NEAR)) break;
-    if (closer) part = IDLE_PARTS[closer - 1];
-    for (place = 0; place < (closer ? N_IDLE_CLOSER : N_IDLE); ++place) {
+  for (closer = 0; closer <= N_IDLE_RADII && most < -ROUNDING; ++closer) {
+    if (closer && !(most > -IDLE_MAX_GAIN)) break;
+    if (closer) part = IDLE_RADII[closer - 1];
+    for (place = 0; place < (closer ? N_IDLE_LOCAL : N_IDLE); ++place) {
       scalar room;
       memcpy(tried, q, sizeof tried);
       for (k = 0; k < N_HAND; ++k) {

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from trimesh.remesh import subdivide_to_size
 
-from casadi_ik.collision.solids import spread
+from casadi_ik.collision.solids import sphere_directions
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.reading import roll_pitch_yaw
 from casadi_ik.integrations.importing.surfaces import Surface, clusters
@@ -105,7 +105,7 @@ class FittedCapsule:
         along = self.last - self.first
         length = float(np.linalg.norm(along))
         axis = along / length if length > 1e-12 else np.array([0, 0, 1.0])
-        ball = spread(400)
+        ball = sphere_directions(400)
         up = ball @ axis
         ends = np.where((up > 0)[:, None], self.last, self.first) + self.radius * ball
         flat = ball - up[:, None] * axis

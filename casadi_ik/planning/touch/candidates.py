@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.collision.clearance import CollisionQuery, SceneCheck
-from casadi_ik.collision.distances import Table, pose_row
+from casadi_ik.collision.distances import PairTable, pose_row
 from casadi_ik.compile.cancellation import SLICE, run_cancellable
 from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.model.pose import inverse
@@ -500,7 +500,7 @@ class HandCheck:
             tables: Cache of the same hand and object, shared between poses of the object.
         """
         self.table, self.check, self.pose, self._tables = table, check, pose, tables
-        self._all_pairs = check.table(check.scene, frozenset()).held
+        self._all_pairs = check.table(check.scene, frozenset()).hand_pairs
         rows = self._all_pairs.poses(check.scene.items)
         self._items = rigid(rows[:, :9].reshape(-1, 3, 3), rows[:, 9:])
         self.shapes = table.shape(check)
@@ -566,24 +566,24 @@ class HandCheck:
     def arm_is_free(self, q: Array) -> Bools:
         """Return (k,) True for configurations (k, n) whose arm is free of collision."""
         check = self.check
-        table = check.table(check.scene, frozenset()).swung
+        table = check.table(check.scene, frozenset()).arm_pairs
         query = CollisionQuery(
             check.kernel, table, table.poses(check.scene.items), check.scene.margin
         )
         return query.free(q)
 
-    def _pairs_for(self, used: Bools) -> Table:
+    def _pairs_for(self, used: Bools) -> PairTable:
         """Return the pairs to check: fingertips that are used may touch the object."""
         key = used.tobytes()
         if key not in self._tables:
             names = zip(self.table.robot.fingers, used, strict=True)
-            pads = [self.check.bodies_of_fingers[name] for name, is_used in names if is_used]
+            pads = [self.check.finger_bodies[name] for name, is_used in names if is_used]
             touching_links, grasped = frozenset[str]().union(*pads), self.check.scene.grasped
             checked = [
                 not (pair[1] == grasped and pair[0] in touching_links)
                 for pair in self._all_pairs.names
             ]
-            self._tables[key] = self._all_pairs.only(np.array(checked, dtype=bool))
+            self._tables[key] = self._all_pairs.select(np.array(checked, dtype=bool))
         return self._tables[key]
 
 

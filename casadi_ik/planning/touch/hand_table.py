@@ -283,7 +283,7 @@ class HandShapes:
         numbers = np.concatenate([*own, rest]).astype(np.intp)
         count = len(numbers) - len(rest)
         q = table.configuration(table.q.reshape(s * n, -1))
-        (where,) = check.kernel.placed(q)
+        (where,) = check.kernel.shape_poses(q)
         segments = where.reshape(s * n, -1)[:, : 6 * len(owner)].reshape(s * n, -1, 6)[:, numbers]
         turn, middle, half = table.palm[:3, :3], segments[..., :3], segments[..., 3:]
         start = (middle - half - table.palm[:3, 3]) @ turn
@@ -292,7 +292,7 @@ class HandShapes:
         first = np.cumsum([0, *map(len, own)])
         within = pair_table(model, Scene(), ())
         pads = [
-            links[i] in check.bodies_of_fingers[robot.fingers[k]]
+            links[i] in check.finger_bodies[robot.fingers[k]]
             for k in range(f)
             for i in range(first[k], first[k + 1])
         ]
@@ -301,8 +301,8 @@ class HandShapes:
         pairs, known = fingers[within.pairs], np.isin(within.pairs[:, 0], numbers)
         known &= np.isin(within.pairs[:, 1], numbers) | (within.pairs[:, 1] >= len(owner))
         two = known & (pairs >= 0).all(axis=1) & (pairs[:, 0] != pairs[:, 1])
-        one = within.only(known & ~two)
-        clear = check.kernel.every(q, np.zeros((0, 12)), one) >= 0
+        one = within.select(known & ~two)
+        clear = check.kernel.all_distances(q, np.zeros((0, 12)), one) >= 0
         alone = np.stack(
             [clear[:, (fingers[one.pairs] == k).any(axis=1)].all(axis=1) for k in range(f)], 1
         ).reshape(s, n, f)
