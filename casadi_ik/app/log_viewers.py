@@ -1,4 +1,4 @@
-"""One solve as a file that Foxglove and Lichtblick play: robot, frames, contacts, phases, events.
+"""Export of one solve for Foxglove and Lichtblick: robot, frames, contacts, phases, events.
 
 ======================  ==========================  ================================================
 topic                   schema                      message
@@ -6,13 +6,13 @@ topic                   schema                      message
 ``/robot_description``  std_msgs/msg/String         the robot as URDF, once
 ``/tf``                 foxglove.FrameTransforms    every link under its parent, each iteration
 ``/joint_states``       sensor_msgs/msg/JointState  joints after the couplings, each iteration
-``/ik/targets``         foxglove.SceneUpdate        the contacts asked for, once
-``/ik/contacts``        foxglove.SceneUpdate        where the fingertips are, each iteration
-``/ik/iteration``       as in the log               all that the log holds of each iteration
-``/ik/messages``        foxglove.Log                how it began, phases, events, how it ended
+``/ik/targets``         foxglove.SceneUpdate        the target contacts, once
+``/ik/contacts``        foxglove.SceneUpdate        the fingertips, each iteration
+``/ik/iteration``       as in the log               all fields of the log, each iteration
+``/ik/messages``        foxglove.Log                start, phases, events, final status
 ======================  ==========================  ================================================
 
-An iteration takes 10 ms, and the first is at the time when the solve began.
+Iterations are 10 ms apart; the first one has the time at which the solve began.
 """
 
 from __future__ import annotations
@@ -47,33 +47,31 @@ except ImportError as error:
         "viewer files need foxglove-sdk, which is not installed: pip install 'casadi-ik[viewer]'"
     ) from error
 
-ITERATION = 10_000_000
-"""Time between two iterations in the viewer [ns]."""
+ITERATION_PERIOD = 10_000_000
+"""Time between two iterations [ns]."""
 
-FREE = "#999999"
-"""Of the contact of a free finger."""
+FREE_COLOR = "#999999"
+"""Colour of the contact of a free finger."""
 
-ARROW = 0.05
-"""Length of a contact's normal [m]."""
+ARROW_LENGTH = 0.05
+"""Length of the arrow of a normal [m]."""
 
 
 def write_view(path: str | os.PathLike[str], solve: OneSolve, robot: ArmHand) -> None:
     """Write a viewer file.
 
     Args:
-        path: The MCAP file; it is there when it is complete.
+        path: MCAP file, written atomically.
         solve: The solve.
-        robot: The robot that it was solved for.
+        robot: Robot of the solve.
 
     Raises:
         LogError: The log has no iterations of the solve, or the file cannot be written.
     """
     if len(solve.rows) == 0:
-        raise LogError(
-            f"solve {solve.solve_id + 1} of {solve.method}: the log kept no iterations of it"
-        )
-    refused = os_errors(f"{path}: cannot write the viewer file", LogError)
-    with refused, atomic_write(Path(path)) as part, part.open("xb") as stream:
+        raise LogError(f"solve {solve.solve_id + 1} of {solve.method}: the log has no iterations")
+    on_error = os_errors(f"{path}: cannot write the viewer file", LogError)
+    with on_error, atomic_write(Path(path)) as temporary, temporary.open("xb") as stream:
         writer = Writer(stream)
         writer.start(profile="ros2", library="casadi_ik")
         _View(writer, solve, robot).write()
@@ -81,7 +79,7 @@ def write_view(path: str | os.PathLike[str], solve: OneSolve, robot: ArmHand) ->
 
 
 class _View:
-    """The topics of one solve."""
+    """Writer of the topics of one solve."""
 
     def __init__(self, writer: Writer, solve: OneSolve, robot: ArmHand) -> None:
         self.writer = writer
@@ -89,10 +87,10 @@ class _View:
         self.robot = robot
         self.root = robot.description.root
         self.q = solve.rows["q"].astype(float)
-        self.times = solve.started + ITERATION * np.arange(len(solve.rows))
+        self.times = solve.started + ITERATION_PERIOD * np.arange(len(solve.rows))
 
     def write(self) -> None:
-        """All topics, each in its order; a reader sorts by time."""
+        """Write all topics one after another; readers sort messages by time."""
         write_postures(self.writer, self.robot, self.q, self.times.tolist())
         self._targets()
         self._transforms()
@@ -100,8 +98,8 @@ class _View:
         self._iterations()
         self._messages()
 
-    def _protobuf(self, topic: str, found: Schema) -> int:
-        number = self.writer.register_schema(found.name, found.encoding, found.data)
+    def _protobuf(self, topic: str, schema: Schema) -> int:
+        number = self.writer.register_schema(schema.name, schema.encoding, schema.data)
         return self.writer.register_channel(topic, "protobuf", number)
 
     def _add(self, channel: int, i: int, data: bytes) -> None:
@@ -124,14 +122,14 @@ class _View:
         ]
         channel = self._protobuf("/tf", fox.FrameTransforms.get_schema())
         for i, time in enumerate(self.times.tolist()):
-            stamp = stamp_of(time)
+            stamp = timestamp(time)
             transforms = [
                 fox.FrameTransform(
                     timestamp=stamp,
                     parent_frame_id=parent,
                     child_frame_id=child,
-                    translation=vector_of(positions[i]),
-                    rotation=quaternion_of(rotations[i]),
+                    translation=vector(positions[i]),
+                    rotation=quaternion(rotations[i]),
                 )
                 for parent, child, positions, rotations in frames
             ]
@@ -139,9 +137,9 @@ class _View:
 
     def _targets(self) -> None:
         solve = self.solve
-        turned = along(solve.target_normals)
+        rotations = quaternions_to(solve.target_normals)
         contacts = [
-            (f"{finger} target", solve.target_points[j], turned[j], palette.TARGET)
+            (f"{finger} target", solve.target_points[j], rotations[j], palette.TARGET)
             for j, finger in enumerate(solve.fingers)
             if not np.isnan(solve.target_points[j]).any()
         ]
@@ -151,7 +149,7 @@ class _View:
     def _contacts(self) -> None:
         solve = self.solve
         points, normals = self.robot.contacts(self.q)
-        turned = along(normals.reshape(-1, 3)).reshape(*normals.shape[:2], 4)
+        rotations = quaternions_to(normals.reshape(-1, 3)).reshape(*normals.shape[:2], 4)
         missed = (solve.rows["position_error"] > solve.position_tolerance) | (
             solve.rows["angle_error"] > solve.angle_tolerance
         )
@@ -159,26 +157,28 @@ class _View:
         free = [bool(np.isnan(point).any()) for point in solve.target_points]
         for i in range(len(self.q)):
             colors = [
-                FREE if free[j] else palette.MISSED if missed[i, j] else palette.MET
+                FREE_COLOR if free[j] else palette.MISSED if missed[i, j] else palette.MET
                 for j in range(len(free))
             ]
-            contacts = list(zip(solve.fingers, points[i], turned[i], colors, strict=True))
+            contacts = list(zip(solve.fingers, points[i], rotations[i], colors, strict=True))
             self._add(channel, i, self._scene(i, contacts, thickness=0.004))
 
     def _scene(
         self, i: int, contacts: list[tuple[str, Array, Array, str]], thickness: float
     ) -> bytes:
-        """Contacts as points with arrows along their normals: name, point, rotation, colour."""
-        stamp = stamp_of(int(self.times[i]))
+        """Return contacts (name, point, rotation, colour) as balls with arrows."""
+        stamp = timestamp(int(self.times[i]))
         entities = [
             fox.SceneEntity(
                 timestamp=stamp,
                 frame_id=self.root,
                 id=name,
                 spheres=[sphere(point, 2.5 * thickness, color)],
-                arrows=[] if np.isnan(turned).any() else [arrow(point, turned, thickness, color)],
+                arrows=[]
+                if np.isnan(rotation).any()
+                else [arrow(point, rotation, thickness, color)],
             )
-            for name, point, turned, color in contacts
+            for name, point, rotation, color in contacts
         ]
         return fox.SceneUpdate(entities=entities).encode()
 
@@ -195,7 +195,7 @@ class _View:
         lines = [
             (0, fox.LogLevel.Info, f"{solve.method} on {solve.robot}, solve {solve.solve_id + 1}")
         ]
-        lines += [(each.first, fox.LogLevel.Info, each.phase) for each in solve.stretches]
+        lines += [(span.first, fox.LogLevel.Info, span.phase) for span in solve.stretches]
         lines += [
             (
                 event.iteration,
@@ -212,39 +212,41 @@ class _View:
             lines.append((last, level, f"{finger} off by {solve.errors_of(i)}"))
         channel = self._protobuf("/ik/messages", fox.Log.get_schema())
         for i, level, text in sorted(lines, key=lambda line: line[0]):
-            stamp = stamp_of(int(self.times[i]))
+            stamp = timestamp(int(self.times[i]))
             log = fox.Log(timestamp=stamp, level=level, message=text, name=f"iteration {i + 1}")
             self._add(channel, i, log.encode())
 
 
 def shipped_layout() -> Path:
-    """The layout file that comes with the package."""
+    """Return the path of the shipped layout file."""
     return models_folder() / "viewer" / "layout.json"
 
 
 def layout_of(solve: OneSolve, robot: ArmHand) -> dict[str, Any]:
-    """The shipped layout, its plots and its frame filled in for a solve.
+    """Return the shipped layout with the plots and the fixed frame of a solve.
 
     Args:
-        solve: The solve; its fields are what is plotted.
-        robot: The robot that it was solved for.
+        solve: The solve, whose fields are plotted.
+        robot: Robot of the solve.
     """
     layout = json.loads(shipped_layout().read_text(encoding="utf-8"))
     panels = layout["configById"]
     panels["3D!robot"]["followTf"] = robot.description.root
     for name in ("position_error", "angle_error"):
-        panels[f"Plot!{name}"]["paths"] = _paths(_lines(solve, name))
+        panels[f"Plot!{name}"]["paths"] = _plot_paths(_plot_lines(solve, name))
     sigmas = [name for name in solve.layout.names if name.startswith("sigma_")]
-    panels["Plot!sigma"]["paths"] = _paths(line for name in sigmas for line in _lines(solve, name))
-    panels["Plot!joints"]["paths"] = _paths(
+    panels["Plot!sigma"]["paths"] = _plot_paths(
+        line for name in sigmas for line in _plot_lines(solve, name)
+    )
+    panels["Plot!joints"]["paths"] = _plot_paths(
         (f"/joint_states.position[{i}]", joint)
         for i, joint in enumerate(robot.description.joint_names)
     )
     return layout
 
 
-def _lines(solve: OneSolve, name: str) -> list[tuple[str, str]]:
-    """A line per element of a field of the log."""
+def _plot_lines(solve: OneSolve, name: str) -> list[tuple[str, str]]:
+    """Return path and label of a plot line per element of a field."""
     fields = {item.name: item for item in solve.layout}
     if name not in fields:
         return []
@@ -255,7 +257,7 @@ def _lines(solve: OneSolve, name: str) -> list[tuple[str, str]]:
     ]
 
 
-def _paths(lines: Iterable[tuple[str, str]]) -> list[dict[str, Any]]:
+def _plot_paths(lines: Iterable[tuple[str, str]]) -> list[dict[str, Any]]:
     return [
         {
             "value": value,
@@ -268,52 +270,52 @@ def _paths(lines: Iterable[tuple[str, str]]) -> list[dict[str, Any]]:
     ]
 
 
-def stamp_of(time: int) -> fox.Timestamp:
-    """A time [ns since the Unix epoch]."""
+def timestamp(time: int) -> fox.Timestamp:
+    """Return a time stamp from nanoseconds since the Unix epoch."""
     return fox.Timestamp(*divmod(time, 1_000_000_000))
 
 
-def vector_of(values: Array) -> fox.Vector3:
-    """A vector (3,)."""
+def vector(values: Array) -> fox.Vector3:
+    """Return a vector (3,) as a message."""
     x, y, z = values.tolist()
     return fox.Vector3(x=x, y=y, z=z)
 
 
-def quaternion_of(values: Array) -> fox.Quaternion:
-    """A quaternion (4,), scalar last."""
+def quaternion(values: Array) -> fox.Quaternion:
+    """Return a quaternion (4,), scalar last, as a message."""
     x, y, z, w = values.tolist()
     return fox.Quaternion(x=x, y=y, z=z, w=w)
 
 
-def along(normals: Array) -> Array:
-    """Quaternions (k, 4), scalar last, that turn x axes to unit vectors (k, 3); NaN of NaN."""
+def quaternions_to(normals: Array) -> Array:
+    """Return quaternions (k, 4), scalar last, that rotate x to unit vectors (k, 3); NaN for NaN."""
     x, y, z = normals.T
-    turned = np.stack([0 * x, -z, y, 1 + x], axis=1)
-    turned[~turned.any(axis=1)] = 0, 0, 1, 0
-    return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True), np.float64)
+    quaternions = np.stack([0 * x, -z, y, 1 + x], axis=1)
+    quaternions[~quaternions.any(axis=1)] = 0, 0, 1, 0
+    return np.asarray(quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True), np.float64)
 
 
-def color_of(color: str) -> fox.Color:
-    """An opaque colour."""
+def opaque_color(color: str) -> fox.Color:
+    """Return an opaque colour as a message."""
     red, green, blue = (part / 255 for part in palette.rgb(color))
     return fox.Color(r=red, g=green, b=blue, a=1.0)
 
 
 def sphere(point: Array, size: float, color: str) -> fox.SpherePrimitive:
-    """A sphere at a point, its diameter [m]."""
-    pose = fox.Pose(position=vector_of(point), orientation=fox.Quaternion(w=1.0))
+    """Return a sphere at a point, given its diameter [m]."""
+    pose = fox.Pose(position=vector(point), orientation=fox.Quaternion(w=1.0))
     return fox.SpherePrimitive(
-        pose=pose, size=fox.Vector3(x=size, y=size, z=size), color=color_of(color)
+        pose=pose, size=fox.Vector3(x=size, y=size, z=size), color=opaque_color(color)
     )
 
 
-def arrow(point: Array, turned: Array, thickness: float, color: str) -> fox.ArrowPrimitive:
-    """An arrow from a point; in its own frame it points along x."""
+def arrow(point: Array, rotation: Array, thickness: float, color: str) -> fox.ArrowPrimitive:
+    """Return an arrow along the x axis of its frame."""
     return fox.ArrowPrimitive(
-        pose=fox.Pose(position=vector_of(point), orientation=quaternion_of(turned)),
-        shaft_length=0.7 * ARROW,
+        pose=fox.Pose(position=vector(point), orientation=quaternion(rotation)),
+        shaft_length=0.7 * ARROW_LENGTH,
         shaft_diameter=thickness,
-        head_length=0.3 * ARROW,
+        head_length=0.3 * ARROW_LENGTH,
         head_diameter=2.2 * thickness,
-        color=color_of(color),
+        color=opaque_color(color),
     )

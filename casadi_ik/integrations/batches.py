@@ -1,7 +1,7 @@
-"""Batches in parts: each solved by a worker, stored whole, and gone on with after a kill.
+"""Batches in parts: workers solve parts, which are stored atomically, so a killed batch can resume.
 
-Workers are processes of this machine, or of a Dask cluster, both through joblib. Those of a
-cluster need the installed package and its extra `cluster`, and no folder in common with who asks.
+Workers are processes of this machine or of a Dask cluster, both through joblib. Workers of a
+cluster need the package with its extra `cluster`, but no shared folder.
 """
 
 from __future__ import annotations
@@ -39,30 +39,30 @@ if TYPE_CHECKING:
     from dask.distributed import Client
 
 
-PATIENCE = 30
-"""Seconds to wait for a scheduler to answer, and for a first worker to be there."""
+CLUSTER_TIMEOUT = 30
+"""Time to wait for a scheduler, and for its first worker [s]."""
 
-PACKAGES = ("casadi-ik", "casadi", "numpy", "joblib")
-"""What answers depend on, or what is needed to come to any."""
+REQUIRED_PACKAGES = ("casadi-ik", "casadi", "numpy", "joblib")
+"""Packages whose versions must match on workers, because results depend on them."""
 
 
 @contextmanager
 def backend(
-    jobs: int, dask: str | None, packages: tuple[str, ...] = PACKAGES
+    jobs: int, dask: str | None, packages: tuple[str, ...] = REQUIRED_PACKAGES
 ) -> Iterator[Client | None]:
-    """Where joblib's calls go meanwhile.
+    """Select where joblib runs calls in this context.
 
     Args:
         jobs: Processes on this machine.
-        dask: Address of a Dask scheduler whose workers solve instead.
-        packages: Which packages they have to have in the versions that are here.
+        dask: Address of a Dask scheduler whose workers are used instead.
+        packages: Packages whose versions must match on the workers.
 
     Yields:
-        The client of the cluster; None: it is this machine.
+        The client of the cluster; None: this machine.
 
     Raises:
-        InputError: No scheduler answers, it has no worker, or a worker has not what is needed.
-        UnsupportedError: joblib or Dask is not installed here.
+        InputError: The scheduler does not answer, has no worker, or a worker lacks a package.
+        UnsupportedError: joblib or Dask is not installed on this machine.
     """
     check_installed(dask)
     import joblib
@@ -73,43 +73,43 @@ def backend(
             try:
                 yield None
             except (KeyboardInterrupt, GeneratorExit):
-                # By themselves they would finish what they have and wait for more.
+                # Workers would otherwise finish their calls and wait for more.
                 get_reusable_executor().shutdown(wait=False, kill_workers=True)
                 raise
         return
-    with _quiet(), _client(dask) as client:
-        _check(client, dask, packages)
+    with _dask_loggers_disabled(), _client(dask) as client:
+        _check_workers(client, dask, packages)
         with joblib.parallel_config(backend="dask"):
             yield client
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep Dask from printing tracebacks of lost connections; what matters is raised."""
-    # They have levels of their own, so that it does not help to set one above them.
+def _dask_loggers_disabled() -> Iterator[None]:
+    """Disable the tracebacks that Dask logs for lost connections; relevant errors are raised."""
+    # These loggers have their own levels, so a level on a parent has no effect.
     loggers = [
         logging.getLogger(name)
         for name in list(logging.root.manager.loggerDict)
         if name.partition(".")[0] in ("asyncio", "distributed", "tornado")
     ]
-    before = [logger.disabled for logger in loggers]
+    were_disabled = [logger.disabled for logger in loggers]
     for logger in loggers:
         logger.disabled = True
     try:
         yield
     finally:
-        for logger, disabled in zip(loggers, before, strict=True):
+        for logger, disabled in zip(loggers, were_disabled, strict=True):
             logger.disabled = disabled
 
 
 def check_installed(cluster: str | None) -> None:
-    """See to it that there is what parts need.
+    """Check that joblib, and Dask for a cluster, are installed.
 
     Args:
         cluster: Address of a Dask scheduler; None: this machine.
 
     Raises:
-        UnsupportedError: joblib or Dask is not installed here.
+        UnsupportedError: joblib or Dask is not installed on this machine.
     """
     try:
         import joblib  # noqa: F401
@@ -123,57 +123,60 @@ def check_installed(cluster: str | None) -> None:
     try:
         import dask.distributed  # noqa: F401 - makes its loggers
     except ImportError as error:
-        raise UnsupportedError("--dask: needs Dask: pip install 'casadi-ik[cluster]'") from error
+        raise UnsupportedError("--dask needs Dask: pip install 'casadi-ik[cluster]'") from error
 
 
 def _client(address: str) -> Client:
     from dask.distributed import Client
 
     try:
-        return Client(address, timeout=PATIENCE)
+        return Client(address, timeout=CLUSTER_TIMEOUT)
     except (OSError, ValueError, TypeError) as error:
         raise InputError(
-            f"--dask {address}: found no scheduler ({error}), expected the address that "
+            f"--dask {address}: found no scheduler ({error}); expected the address that "
             "`dask scheduler` prints, such as tcp://HOST:8786"
         ) from error
 
 
-def _check(client: Client, address: str, packages: tuple[str, ...]) -> None:
+def _check_workers(client: Client, address: str, packages: tuple[str, ...]) -> None:
     try:
-        client.wait_for_workers(1, timeout=PATIENCE)
+        client.wait_for_workers(1, timeout=CLUSTER_TIMEOUT)
     except TimeoutError as error:
         raise InputError(
-            f"--dask {address}: found no worker within {PATIENCE} s, expected at least one: "
+            f"--dask {address}: found no worker within {CLUSTER_TIMEOUT} s; expected at least one: "
             f"`dask worker {address}`"
         ) from error
-    found: Any = client.get_versions(packages=list(packages))
-    mine = _installed(found["client"], packages)
-    for place, state in {**found["workers"], "the scheduler": found["scheduler"]}.items():
-        if (theirs := _installed(state, packages)) != mine:
-            raise InputError(f"--dask {address}: {place} has {theirs}, expected {mine} as here")
+    versions: Any = client.get_versions(packages=list(packages))
+    expected = _version_text(versions["client"], packages)
+    for machine, state in {**versions["workers"], "the scheduler": versions["scheduler"]}.items():
+        if (actual := _version_text(state, packages)) != expected:
+            raise InputError(f"--dask {address}: {machine} has {actual}; expected {expected}")
 
 
-def _installed(state: Mapping[str, Any], packages: tuple[str, ...]) -> str:
-    """Python and packages with their versions as Dask tells them; "none" of what is not there."""
-    found = state["packages"]
-    python = ".".join(found["python"].split(".")[:2])
-    return ", ".join([f"python {python}", *(f"{one} {found[one] or 'none'}" for one in packages)])
+def _version_text(state: Mapping[str, Any], packages: tuple[str, ...]) -> str:
+    """Return the versions of Python and packages as reported by Dask; "none" if one is missing."""
+    packages_of_state = state["packages"]
+    python = ".".join(packages_of_state["python"].split(".")[:2])
+    return ", ".join(
+        [f"python {python}", *(f"{name} {packages_of_state[name] or 'none'}" for name in packages)]
+    )
 
 
-MANIFEST = "batch.json"
-"""Name of the file that says what a folder's parts are answers to."""
+MANIFEST_NAME = "batch.json"
+"""Name of the file that describes the batch of a folder."""
 
 
 @dataclass(frozen=True)
-class SolvedPart:
-    """A part, solved; bytes, so that a worker needs no folder in common with who asked.
+class EncodedPart:
+    """A solved part as bytes, which need no folder shared with the worker.
 
     Attributes:
-        number: Of the part.
-        count: Targets of it.
-        answers: An npz of the arrays of `columns`, and `row`, each target's number among all.
-        log: An MCAP log, if one was asked for; solves are numbered as among all targets.
-        faults: What is wrong with a target, by its number among all.
+        number: Number of the part.
+        count: Number of its targets.
+        answers: An npz of the arrays of `columns`, with `row`, the number of each target in the
+            batch.
+        log: An MCAP log, if requested; solves are numbered as in the batch.
+        faults: Problem of a target by its number in the batch.
     """
 
     number: int
@@ -184,28 +187,32 @@ class SolvedPart:
 
 
 def solve_part(
-    solver: bytes, asked: Mapping[str, Any], part: BatchPart, logged: bool, place: str | None = None
-) -> SolvedPart:
+    solver: bytes,
+    options: Mapping[str, Any],
+    part: BatchPart,
+    with_log: bool,
+    temporary_folder: str | None = None,
+) -> EncodedPart:
     """Solve a part.
 
     Args:
-        solver: A pickled `Solver`; what it is made to is kept for the next part.
-        asked: What is asked of all parts alike, as `Solver.solve_blocks` takes it.
-        part: Its targets.
-        logged: Whether every iteration is logged.
-        place: Folder for what is there meanwhile; None: that of the system.
+        solver: Pickled `Solver`; the unpickled one is cached for the next part.
+        options: Options of `Solver.solve_blocks`, the same for all parts.
+        part: The targets.
+        with_log: Log every iteration.
+        temporary_folder: Folder for temporary files; None: that of the system.
     """
-    with tempfile.TemporaryDirectory(prefix="casadi_ik-part-", dir=place) as folder:
-        path = Path(folder) / "part.mcap" if logged else None
+    with tempfile.TemporaryDirectory(prefix="casadi_ik-part-", dir=temporary_folder) as folder:
+        path = Path(folder) / "part.mcap" if with_log else None
         (block,) = _solver(solver).solve_blocks(
-            [part.arrays], log=path, first_row=part.first_row, **asked
+            [part.arrays], log=path, first_row=part.first_row, **options
         )
         log = None if path is None else path.read_bytes()
     answers = io.BytesIO()
     count = len(block.solution)
-    numbers = part.first_row + np.arange(count)
-    np.savez(answers, allow_pickle=False, row=numbers, **columns(block.solution))
-    return SolvedPart(part.number, count, answers.getvalue(), log, dict(block.faults))
+    rows = part.first_row + np.arange(count)
+    np.savez(answers, allow_pickle=False, row=rows, **columns(block.solution))
+    return EncodedPart(part.number, count, answers.getvalue(), log, dict(block.faults))
 
 
 @lru_cache(maxsize=2)
@@ -216,80 +223,82 @@ def _solver(pickled: bytes) -> Solver:
 
 
 class BatchFolder:
-    """Parts of one batch.
+    """Folder with the parts of one batch.
 
-    A part is there whole or not at all: whoever is killed loses what was being solved.
+    A part is stored completely or not at all; a kill loses only the parts that are being solved.
 
     Attributes:
-        path: The folder.
-        logs: The folder of the logs, one per part; None: there are none.
+        path: Path of the folder.
+        logs: Folder of the logs, one per part; None: no logs.
     """
 
     def __init__(self, path: Path, logs: Path | None = None) -> None:
         self.path, self.logs = path, logs
 
     def part(self, number: int) -> Path:
-        """Where the answers of a part stand."""
+        """Return the path of the results of a part."""
         return self.path / f"part-{number:06d}.npz"
 
     def log(self, number: int) -> Path:
-        """Where its log stands."""
+        """Return the path of the log of a part."""
         assert self.logs is not None
         return self.logs / f"part-{number:06d}.mcap"
 
-    def claim(self, question: Mapping[str, Any], resume: bool) -> None:
-        """Take the folder for a batch, or go on with it.
+    def claim(self, batch: Mapping[str, Any], resume: bool) -> None:
+        """Start a batch in the folder, or resume it.
 
         Args:
-            question: Everything that decides the answers, as JSON holds it.
-            resume: Whether parts may be there already.
+            batch: Everything that determines the results, as JSON values.
+            resume: Accept parts that are stored already.
 
         Raises:
-            InputError: It holds something else, or parts though `resume` is false.
-            OSError: It cannot be written.
+            InputError: The folder holds something else, or parts although `resume` is false.
+            OSError: The folder cannot be written.
         """
-        mine = json.loads(json.dumps({"format": 1, **question}))
-        path = self.path / MANIFEST
+        manifest = json.loads(json.dumps({"format": 1, **batch}))
+        path = self.path / MANIFEST_NAME
         if path.exists():
             try:
-                kept = json.loads(path.read_text(encoding="utf-8"))
+                stored = json.loads(path.read_text(encoding="utf-8"))
             except (OSError, ValueError) as error:
                 raise InputError(f"{path}: cannot be read: {error}") from error
-            if not isinstance(kept, dict):
-                raise InputError(f"{path}: found {type(kept).__name__}, expected an object")
-            for key, value in mine.items():
-                if kept.get(key) != value:
+            if not isinstance(stored, dict):
+                raise InputError(f"{path}: found {type(stored).__name__}, expected an object")
+            for key, value in manifest.items():
+                if stored.get(key) != value:
                     raise InputError(
-                        f"{path}: {key}: these parts were made with {_brief(kept.get(key))}, this "
-                        f"batch has {_brief(value)}; expected the same, or another --out"
+                        f"{path}: {key}: parts have {_shortened_json(stored.get(key))}, this "
+                        f"batch has {_shortened_json(value)}; expected the same, or another --out"
                     )
             if not resume:
                 raise InputError(
-                    f"{self.path}: holds parts of this batch, expected --resume to go on with "
-                    "them, or another --out"
+                    f"{self.path}: holds parts of this batch; expected --resume to continue, or "
+                    "another --out"
                 )
         elif self.path.is_dir() and any(self.path.iterdir()):
-            raise InputError(f"{self.path}: holds files but no {MANIFEST}, expected a new folder")
+            raise InputError(
+                f"{self.path}: holds files but no {MANIFEST_NAME}; expected a new folder"
+            )
         for folder in filter(None, (self.path, self.logs)):
             folder.mkdir(parents=True, exist_ok=True)
             remove_stale(folder, ".part-*")
         if not path.exists():
-            with atomic_write(path) as part:
-                part.write_text(json.dumps(mine, indent=1) + "\n", encoding="utf-8")
+            with atomic_write(path) as temporary:
+                temporary.write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
 
     def done(self) -> set[int]:
-        """Numbers of the parts that are there."""
+        """Return the numbers of the stored parts."""
         return {
             int(path.stem.removeprefix("part-"))
             for path in self.path.glob("part-*.npz")
             if path.stem.removeprefix("part-").isdigit()
         }
 
-    def store(self, solved: SolvedPart) -> None:
-        """Put what came of a part into its place: the log first, so that what is there is whole.
+    def store(self, solved: EncodedPart) -> None:
+        """Store a part; its log is written first, so that a stored part is complete.
 
         Raises:
-            OSError: It cannot be written.
+            OSError: A file cannot be written.
         """
         if solved.log is not None:
             with atomic_write(self.log(solved.number)) as part:
@@ -298,42 +307,42 @@ class BatchFolder:
             part.write_bytes(solved.answers)
 
     def answers(self, number: int, first_row: int, count: int) -> dict[str, np.ndarray]:
-        """The arrays of a part.
+        """Return the arrays of a part.
 
         Args:
-            number: Of the part.
-            first_row: Number of its first target among all.
-            count: Targets of it.
+            number: Number of the part.
+            first_row: Number of its first target in the batch.
+            count: Number of its targets.
 
         Raises:
-            InputError: Its file is damaged, or has the answers to other targets.
+            InputError: The file is damaged, or belongs to other targets.
         """
         path = self.part(number)
         try:
             with np.load(path, allow_pickle=False) as stored:
                 arrays = {name: stored[name] for name in stored.files}
         except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-            raise InputError(f"{path}: damaged ({error}); remove it and go on") from error
+            raise InputError(f"{path}: damaged ({error}); remove it and resume") from error
         rows = arrays.pop("row", np.zeros(0))
         if not np.array_equal(rows, first_row + np.arange(count)):
             found = f"{len(rows)} targets from {rows[0]} on" if len(rows) else "no row"
             raise InputError(
                 f"{path}: row: found {found}, expected {count} targets from "
-                f"{first_row} on; remove it and go on"
+                f"{first_row} on; remove it and resume"
             )
         return arrays
 
     def remove(self) -> None:
-        """Remove the parts, and the folders if there is nothing else in them."""
+        """Remove the parts, and the folders unless they hold other files."""
         for number in self.done():
             self.part(number).unlink()
-        (self.path / MANIFEST).unlink()
+        (self.path / MANIFEST_NAME).unlink()
         for folder in filter(None, (self.path, self.logs)):
             if not any(folder.iterdir()):
                 folder.rmdir()
 
 
-def _brief(value: Any) -> str:
+def _shortened_json(value: Any) -> str:
     text = json.dumps(value)
     return text if len(text) <= 80 else f"{text[:70]}..."
 
@@ -341,56 +350,59 @@ def _brief(value: Any) -> str:
 def solve_parts(
     solver: Solver,
     source: TargetSource,
-    asked: Mapping[str, Any],
+    options: Mapping[str, Any],
     folder: BatchFolder,
     jobs: int = 1,
     dask: str | None = None,
     object_pose: Array | None = None,
-) -> Iterator[SolvedPart]:
-    """Solve what is missing and put it into its place; in the order in which parts are finished.
+) -> Iterator[EncodedPart]:
+    """Solve and store the missing parts; yield them in the order in which they finish.
 
     Args:
-        solver: The solver; it travels to the workers.
+        solver: The solver; it is sent to the workers.
         source: The targets.
-        asked: What is asked of all parts alike, as `Solver.solve_blocks` takes it.
-        folder: Where parts are and go, with their logs if it has a place for them; claimed already.
+        options: Options of `Solver.solve_blocks`, the same for all parts.
+        folder: Folder of the parts and logs, claimed already.
         jobs: Processes on this machine.
-        dask: Address of a Dask scheduler whose workers solve instead. A worker that dies costs
-            what it was solving, which others do again.
-        object_pose: (4, 4) where the object is in whose frame the targets are; None: they are in
-            the base frame.
+        dask: Address of a Dask scheduler whose workers are used instead. If a worker dies, its part
+            is solved again by another one.
+        object_pose: (4, 4) Pose of the object in whose frame the targets are given; None: targets
+            are in the base frame.
 
     Yields:
-        The parts, stored.
+        The stored parts.
 
     Raises:
-        InputError: A file of targets is damaged, or the cluster cannot be used or went away; what
-            is finished by then is in the folder.
+        InputError: A file of targets is damaged, or the cluster cannot be used or was lost;
+            finished parts remain in the folder.
         OSError: A part cannot be stored.
     """
     done = folder.done()
     if len(done.intersection(range(len(source.sizes)))) == len(source.sizes):
         return
     pickled = pickle.dumps(solver)
-    # Removed with all in it, also if workers of this machine are killed in the middle of a part.
-    with tempfile.TemporaryDirectory(prefix="casadi_ik-parts-") as own, backend(jobs, dask):
+    # The folder is removed even if local workers are killed in the middle of a part.
+    with (
+        tempfile.TemporaryDirectory(prefix="casadi_ik-parts-") as worker_folder,
+        backend(jobs, dask),
+    ):
         import joblib
 
-        # A batch of calls would come back, and be lost, as a whole; joblib's annotation of this
-        # argument knows the word "auto" only.
-        one: Any = 1
-        parallel = joblib.Parallel(return_as="generator_unordered", batch_size=one)
+        # A batch of several calls would return, or be lost, as a whole. joblib annotates this
+        # argument as the literal "auto".
+        batch_size: Any = 1
+        parallel = joblib.Parallel(return_as="generator_unordered", batch_size=batch_size)
         parts = source.without(done)
         if object_pose is not None:
             parts = (
                 replace(part, arrays=transform_arrays(part.arrays, object_pose)) for part in parts
             )
-        how = folder.logs is not None, own if dask is None else None
-        calls = (joblib.delayed(solve_part)(pickled, asked, part, *how) for part in parts)
+        log_options = folder.logs is not None, worker_folder if dask is None else None
+        calls = (joblib.delayed(solve_part)(pickled, options, part, *log_options) for part in parts)
         solved = iter(parallel(calls))
         while True:
             try:
-                ended = next(solved)
+                encoded = next(solved)
             except StopIteration:
                 return
             except CasadiIKError:
@@ -399,65 +411,70 @@ def solve_parts(
                 if dask is None:
                     raise
                 raise InputError(
-                    f"--dask {dask}: the cluster went away ({type(error).__name__}: {error}); "
+                    f"--dask {dask}: the cluster was lost ({type(error).__name__}: {error}); "
                     f"{folder.path} has {len(folder.done())} of {len(source.sizes)} parts, "
-                    "--resume goes on with them"
+                    "--resume continues with them"
                 ) from error
-            assert isinstance(ended, SolvedPart)
-            folder.store(ended)
-            yield ended
+            assert isinstance(encoded, EncodedPart)
+            folder.store(encoded)
+            yield encoded
 
 
-STATUS = np.dtype(f"<U{max(len(status.name) for status in Status)}")
-"""Names of statuses, as wide as the longest."""
+STATUS_DTYPE = np.dtype(f"<U{max(len(status.name) for status in Status)}")
+"""Data type of status names, as wide as the longest."""
 
-REASON = np.dtype("<U9")
-"""Names of reasons, "" where there is no diagnosis."""
+REASON_DTYPE = np.dtype("<U9")
+"""Data type of reasons; "" without a diagnosis."""
 
 
-def columns(solved: BatchSolution) -> dict[str, np.ndarray]:
-    """The arrays of a block as they are written, a row per target."""
-    found: dict[str, np.ndarray] = {
-        "q": solved.q,
-        "success": solved.success,
-        "status": solved.status_names.astype(STATUS),
-        "position_error": solved.position_error,
-        "angle_error": solved.angle_error,
-        "iterations": solved.iterations,
-        "restarts": solved.restarts,
-        "time": solved.time,
+def columns(solution: BatchSolution) -> dict[str, np.ndarray]:
+    """Return the arrays of a block as they are stored, one row per target."""
+    arrays: dict[str, np.ndarray] = {
+        "q": solution.q,
+        "success": solution.success,
+        "status": solution.status_names.astype(STATUS_DTYPE),
+        "position_error": solution.position_error,
+        "angle_error": solution.angle_error,
+        "iterations": solution.iterations,
+        "restarts": solution.restarts,
+        "time": solution.time,
     }
-    if solved.clearance is not None:
-        found["clearance"] = solved.clearance
-    if solved.diagnoses:
-        found |= _diagnoses(solved.diagnoses, solved.q.shape[1])
-    return found
+    if solution.clearance is not None:
+        arrays["clearance"] = solution.clearance
+    if solution.diagnoses:
+        arrays |= _diagnoses(solution.diagnoses, solution.q.shape[1])
+    return arrays
 
 
 def _diagnoses(diagnoses: tuple[Diagnosis | None, ...], n: int) -> dict[str, np.ndarray]:
     count = len(diagnoses)
-    found = {
-        "reason": np.zeros(count, dtype=REASON),
+    arrays = {
+        "reason": np.zeros(count, dtype=REASON_DTYPE),
         "nearest_q": np.full((count, n), np.nan),
         "enough_position": np.full(count, np.nan),
         "enough_angle": np.full(count, np.nan),
     }
-    for row, each in enumerate(diagnoses):
-        if each is not None:
-            values = each.reason.name, each.q, each.enough.position, each.enough.angle
-            for array, value in zip(found.values(), values, strict=True):
+    for row, diagnosis in enumerate(diagnoses):
+        if diagnosis is not None:
+            values = (
+                diagnosis.reason.name,
+                diagnosis.q,
+                diagnosis.enough.position,
+                diagnosis.enough.angle,
+            )
+            for array, value in zip(arrays.values(), values, strict=True):
                 array[row] = value
-    return found
+    return arrays
 
 
 @cache
 def code_version() -> str:
-    """Version of the package and a digest of the sources that decide a result."""
-    without_influence = ("app", "export", "integrations", "logs")
+    """Return the version of the package with a digest of the sources that determine results."""
+    excluded_folders = ("app", "export", "integrations", "logs")
     digest = hashlib.sha256()
     root = Path(str(files("casadi_ik")))
     for path in sorted(path for pattern in ("*.py", "*.c") for path in root.rglob(pattern)):
         name = path.relative_to(root)
-        if name.parts[0] not in without_influence:
+        if name.parts[0] not in excluded_folders:
             digest.update(name.as_posix().encode() + b"\0" + path.read_bytes())
     return f"{version('casadi-ik')}+{digest.hexdigest()[:12]}"

@@ -1,11 +1,11 @@
-"""Solvers as layers of PyTorch and of JAX: answers forward, `Solver.sensitivity` backward.
+"""Solvers as layers of PyTorch and JAX: solutions forward, `Solver.sensitivity` backward.
 
     layer = torch_layer(solver)
     q, solved = layer(points, normals)
     loss(q[solved]).backward()
 
-Points and normals have the shape (..., f, 3), fingers in `robot.fingers` order, NaN where free;
-q (..., n) and whether it is solved (...). Of what is not solved the derivative is zero.
+Points and normals have the shape (..., f, 3), fingers in the order of `robot.fingers`, NaN where
+free; q has the shape (..., n), solved (...). Derivatives of unsolved targets are zero.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from casadi_ik.files.arrays import Array
 
 
 def torch_layer(solver: Solver, **options: Any) -> Callable[[Any, Any], tuple[Any, Any]]:
-    """``layer(points, normals) -> (q, solved)`` on tensors, by a `torch.autograd.Function`.
+    """Return ``layer(points, normals) -> (q, solved)`` on tensors, a `torch.autograd.Function`.
 
     Args:
-        solver: Solves in double precision on the CPU, whatever the tensors are.
-        options: Of `Solver.solve_batch`: `q0`, `seed`, `jobs`, `prefer`.
+        solver: The solver; it works in double precision on the CPU for all tensors.
+        options: Options of `Solver.solve_batch`: `q0`, `seed`, `jobs`, `prefer`.
 
     Raises:
         MissingExtraError: PyTorch is not installed.
     """
-    torch = _extra("torch")
+    torch = _import_extra("torch")
 
     class Solve(torch.autograd.Function):
         @staticmethod
@@ -46,8 +46,10 @@ def torch_layer(solver: Solver, **options: Any) -> Callable[[Any, Any], tuple[An
 
         @staticmethod
         def backward(ctx: Any, *gradients: Any) -> tuple[Any, ...]:
-            given = (each.numpy(force=True) for each in (*ctx.saved_tensors, gradients[0]))
-            return tuple(torch.from_numpy(one).to(gradients[0]) for one in _rates(solver, *given))
+            arrays = (tensor.numpy(force=True) for tensor in (*ctx.saved_tensors, gradients[0]))
+            return tuple(
+                torch.from_numpy(rates).to(gradients[0]) for rates in _rates(solver, *arrays)
+            )
 
     return Solve.apply
 
@@ -55,45 +57,45 @@ def torch_layer(solver: Solver, **options: Any) -> Callable[[Any, Any], tuple[An
 def jax_layer(
     solver: Solver, reverse_only: bool = False, **options: Any
 ) -> Callable[[Any, Any], tuple[Any, Any]]:
-    """``layer(points, normals) -> (q, solved)`` on arrays of JAX, by a `jax.custom_jvp`.
+    """Return ``layer(points, normals) -> (q, solved)`` on JAX arrays, a `jax.custom_jvp`.
 
-    It can be compiled, mapped (`jax.vmap`) and differentiated in both directions; either takes all
-    derivatives of q, as many calls of `Solver.sensitivity` with a gradient as there are motors.
+    The layer can be compiled, mapped (`jax.vmap`) and differentiated in both modes; each computes
+    the full Jacobian of q, which costs one call of `Solver.sensitivity` with a gradient per motor.
     JAX computes in single precision unless `jax_enable_x64` is set.
 
     Args:
-        solver: As for `torch_layer`.
-        reverse_only: Whether to make a `jax.custom_vjp`: `jax.grad` then asks for the gradient
-            alone, a few per cent of the solve, and there is no forward mode.
-        options: As for `torch_layer`.
+        solver: See `torch_layer`.
+        reverse_only: Return a `jax.custom_vjp`: `jax.grad` computes only the gradient, which costs
+            a few per cent of the solve; forward mode is not available.
+        options: See `torch_layer`.
 
     Raises:
         MissingExtraError: JAX is not installed.
     """
-    jax = _extra("jax")
+    jax = _import_extra("jax")
     n = len(solver.robot.actuators)
 
-    def outside(compute: Callable[..., Any], shapes: Any, *arrays: Any) -> Any:
-        def called(*given: Any) -> Any:
-            found = compute(*map(np.asarray, given))
-            return tuple(each.astype(s.dtype) for each, s in zip(found, shapes, strict=True))
+    def host_call(compute: Callable[..., Any], shapes: Any, *arrays: Any) -> Any:
+        def compute_arrays(*arrays: Any) -> Any:
+            results = compute(*map(np.asarray, arrays))
+            return tuple(result.astype(s.dtype) for result, s in zip(results, shapes, strict=True))
 
-        return jax.pure_callback(called, shapes, *arrays, vmap_method="broadcast_all")
+        return jax.pure_callback(compute_arrays, shapes, *arrays, vmap_method="broadcast_all")
 
-    def shape(like: Any, *size: int, dtype: Any = None) -> Any:
-        return jax.ShapeDtypeStruct((*like.shape[:-2], *size), dtype or like.dtype)
+    def shape(reference: Any, *size: int, dtype: Any = None) -> Any:
+        return jax.ShapeDtypeStruct((*reference.shape[:-2], *size), dtype or reference.dtype)
 
     def solve(points: Any, normals: Any) -> Any:
         shapes = shape(points, n), shape(points, dtype=bool)
-        return outside(lambda *given: _solve(solver, options, *given), shapes, points, normals)
+        return host_call(lambda *arrays: _solve(solver, options, *arrays), shapes, points, normals)
 
     def forward(points: Any, normals: Any) -> Any:
-        found = solve(points, normals)
-        return found, (points, normals, *found)
+        results = solve(points, normals)
+        return results, (points, normals, *results)
 
-    def backward(saved: Any, gradients: Any) -> Any:
-        shapes = (shape(saved[0], *saved[0].shape[-2:]),) * 2
-        return outside(lambda *given: _rates(solver, *given), shapes, *saved, gradients[0])
+    def backward(residuals: Any, gradients: Any) -> Any:
+        shapes = (shape(residuals[0], *residuals[0].shape[-2:]),) * 2
+        return host_call(lambda *arrays: _rates(solver, *arrays), shapes, *residuals, gradients[0])
 
     if reverse_only:
         reverse = jax.custom_vjp(solve)
@@ -105,17 +107,17 @@ def jax_layer(
     def _(primals: Any, tangents: Any) -> Any:
         q, solved = layer(*primals)
         shapes = (shape(primals[0], n, *primals[0].shape[-2:]),) * 2
-        rates = outside(lambda *given: _rates(solver, *given), shapes, *primals, q, solved)
-        moved = (
+        rates = host_call(lambda *arrays: _rates(solver, *arrays), shapes, *primals, q, solved)
+        tangent_parts = (
             jax.numpy.einsum("...nfi,...fi->...n", *pair)
             for pair in zip(rates, tangents, strict=True)
         )
-        return (q, solved), (sum(moved), np.zeros(solved.shape, jax.dtypes.float0))
+        return (q, solved), (sum(tangent_parts), np.zeros(solved.shape, jax.dtypes.float0))
 
     return layer
 
 
-def _extra(name: str) -> Any:
+def _import_extra(name: str) -> Any:
     try:
         return import_module(name)
     except ImportError as error:
@@ -123,11 +125,11 @@ def _extra(name: str) -> Any:
 
 
 def _solve(solver: Solver, options: Any, points: Array, normals: Array) -> tuple[Any, Any]:
-    """Answers (..., n) and whether they are solved (...)."""
-    lead, size = points.shape[:-2], (-1, *points.shape[-2:])
-    flat = points.reshape(size).astype(float), normals.reshape(size).astype(float)
-    found = solver.solve_batch(*flat, **options)
-    return found.q.reshape(*lead, -1), found.success.reshape(lead)
+    """Return solutions (..., n), and whether each target is solved (...)."""
+    batch_shape, size = points.shape[:-2], (-1, *points.shape[-2:])
+    flat_targets = points.reshape(size).astype(float), normals.reshape(size).astype(float)
+    solution = solver.solve_batch(*flat_targets, **options)
+    return solution.q.reshape(*batch_shape, -1), solution.success.reshape(batch_shape)
 
 
 def _rates(
@@ -138,12 +140,18 @@ def _rates(
     solved: Array,
     gradient: Array | None = None,
 ) -> list[Array]:
-    """Derivatives by points and by normals, see `Solver.sensitivity`; 0 where it is not solved."""
-    given = (q, points, normals) if gradient is None else (q, points, normals, gradient)
-    rows, lead = np.flatnonzero(solved), solved.ndim
-    some = (each.reshape(-1, *each.shape[lead:])[rows].astype(float) for each in given)
-    found = solver.sensitivity(*some)
-    size = (*q.shape[lead:], *points.shape[lead:]) if gradient is None else points.shape[lead:]
-    every = [np.zeros((solved.size, *size)) for _ in range(2)]
-    every[0][rows], every[1][rows] = found.points, found.normals
-    return [each.reshape(*solved.shape, *size) for each in every]
+    """Return derivatives by points and normals; 0 for unsolved targets."""
+    arguments = (q, points, normals) if gradient is None else (q, points, normals, gradient)
+    rows, batch_ndim = np.flatnonzero(solved), solved.ndim
+    solved_arguments = (
+        array.reshape(-1, *array.shape[batch_ndim:])[rows].astype(float) for array in arguments
+    )
+    sensitivity = solver.sensitivity(*solved_arguments)
+    size = (
+        (*q.shape[batch_ndim:], *points.shape[batch_ndim:])
+        if gradient is None
+        else points.shape[batch_ndim:]
+    )
+    rates = [np.zeros((solved.size, *size)) for _ in range(2)]
+    rates[0][rows], rates[1][rows] = sensitivity.points, sensitivity.normals
+    return [array.reshape(*solved.shape, *size) for array in rates]

@@ -1,4 +1,4 @@
-"""A retargeter for Isaac Teleop: a tracked hand moves arm and hand of the robot.
+"""Retargeter for Isaac Teleop: a tracked hand moves the arm and hand of a robot.
 
 Written against `isaacteleop.retargeting_engine.interface` of isaacteleop 1.5 (NVIDIA/IsaacTeleop):
 a `BaseRetargeter` with `input_spec`, `output_spec` and `_compute_fn`.
@@ -31,10 +31,10 @@ except ImportError as error:
 
 
 class ArmHandRetargeter(BaseRetargeter):
-    """Input "hand_left" or "hand_right" (a `HandInput`), output "joints": a number per motor.
+    """Retargeter from "hand_left" or "hand_right" (a `HandInput`) to "joints", a number per motor.
 
-    A hand that is not tracked, or partly, lets the motors come to rest; a reset of the session
-    starts again from where they are.
+    If the hand is not tracked, or only in part, the motors decelerate to rest; a reset of the
+    session restarts from their current positions.
 
     Example:
         >>> follower = solver.follow(q0=robot.home, period=1 / 90)
@@ -51,13 +51,13 @@ class ArmHandRetargeter(BaseRetargeter):
         follower: Follower,
         side: str = "right",
     ) -> None:
-        """Take a robot and its follower.
+        """Store a robot and its follower.
 
         Args:
-            name: Of the node, unique in its pipeline.
+            name: Name of the node, unique in its pipeline.
             robot: The robot.
-            config: How keypoints become fingertips and palm.
-            follower: Called once a step; its period is the pipeline's.
+            config: Retargeting settings.
+            follower: Follower that is called once per step; its period is the pipeline's.
             side: "right" or "left", the tracked hand.
         """
         self._robot, self._config, self._follower = robot, config, follower
@@ -67,11 +67,11 @@ class ArmHandRetargeter(BaseRetargeter):
         super().__init__(name)
 
     def input_spec(self) -> dict[str, Any]:
-        """The tracked hand, which may be absent."""
+        """Return the tracked hand, which is optional."""
         return {self._key: OptionalType(HandInput())}
 
     def output_spec(self) -> dict[str, Any]:
-        """A float per motor [rad or m], by name."""
+        """Return a float per motor [rad or m], by name."""
         motors = [FloatType(name) for name in self._robot.actuators]
         return {"joints": TensorGroupType("joints", motors)}
 
@@ -79,16 +79,16 @@ class ArmHandRetargeter(BaseRetargeter):
         if context.execution_events.reset:
             self._follower.reset(self._q)
             self._retargeter = Retargeter(self._config, self._robot, self._q)
-        wanted = self._retargeter(_keypoints(inputs[self._key]), elapsed=self._follower.period)
-        self._q = self._follower(wanted.points, palm=wanted.palm, palm_weight=self._weight)
+        goal = self._retargeter(_keypoints(inputs[self._key]), elapsed=self._follower.period)
+        self._q = self._follower(goal.points, palm=goal.palm, palm_weight=self._weight)
         for i, value in enumerate(self._q.tolist()):
             outputs["joints"][i] = value
 
 
 def _keypoints(hand: Any) -> np.ndarray:
-    """(26, 3) joints of OpenXR [m]; NaN where the hand is not tracked."""
-    found = np.full((26, 3), np.nan)
+    """Return the (26, 3) OpenXR joints [m]; NaN where the hand is not tracked."""
+    keypoints = np.full((26, 3), np.nan)
     if not hand.is_none:
         valid = np.from_dlpack(hand[HandInputIndex.JOINT_VALID]).astype(bool)
-        found[valid] = np.from_dlpack(hand[HandInputIndex.JOINT_POSITIONS])[valid]
-    return found
+        keypoints[valid] = np.from_dlpack(hand[HandInputIndex.JOINT_POSITIONS])[valid]
+    return keypoints

@@ -1,4 +1,4 @@
-"""Kinematics for LeRobot: in place of its `RobotKinematics`, and a step for contacts.
+"""LeRobot adapter: a replacement of `RobotKinematics`, and a processor step for contacts.
 
 Written against lerobot 0.4 (`lerobot.model.kinematics`, `lerobot.processor`).
 """
@@ -28,24 +28,25 @@ except ImportError as error:
         "the adapter needs lerobot, which is not installed: pip install 'casadi-ik[lerobot]'"
     ) from error
 
-PLACE, NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
+POINT_KEYS, NORMAL_KEYS = ("x", "y", "z"), ("nx", "ny", "nz")
+"""Suffixes of the keys of a contact in an action."""
 
 
 class ArmKinematics:
-    """What the steps of LeRobot call `kinematics`, exact and global, for a palm's or a tool's pose.
+    """Exact, global kinematics of a palm or tool with the interface of LeRobot's `kinematics`.
 
-    Takes the place of `lerobot.model.kinematics.RobotKinematics` in `InverseKinematicsEEToJoints`,
-    `EEReferenceAndDelta` and the other steps: positions in degrees, poses (4, 4) [m]. Values after
-    those of the arm (a gripper's) stay as they are. A pose that cannot be reached leaves the arm
-    where it is, see `status`.
+    Replaces `lerobot.model.kinematics.RobotKinematics` in `InverseKinematicsEEToJoints`,
+    `EEReferenceAndDelta` and other steps: positions in degrees, poses (4, 4) [m]. Values after
+    those of the arm (such as a gripper's) are unchanged. If a pose is out of reach, the arm does
+    not move, see `status`.
 
     Attributes:
-        joint_names: The arm's motors, in the order of all arrays.
-        status: Of the last inverse kinematics; INVALID if the pose was not rigid or not finite.
+        joint_names: Motors of the arm, in the order of all arrays.
+        status: Status of the last inverse kinematics; INVALID if the pose was not rigid or finite.
     """
 
     def __init__(self, solver: Solver) -> None:
-        """Take a solver; its robot is an arm alone or with a hand, whose palm is posed."""
+        """Store a solver; its robot is an arm alone, or with a hand whose palm is posed."""
         self._solver, self._robot = solver, solver.robot
         self._arm = list(solver.robot.description.arm_actuators)
         self.joint_names = [solver.robot.actuators[i] for i in self._arm]
@@ -57,7 +58,7 @@ class ArmKinematics:
         return q
 
     def forward_kinematics(self, joint_pos_deg: ArrayLike) -> Array:
-        """(4, 4) pose of the palm from positions [deg]."""
+        """Return the (4, 4) pose of the palm at positions [deg]."""
         return self._robot.palm(self._configuration(joint_pos_deg))
 
     def inverse_kinematics(
@@ -67,70 +68,73 @@ class ArmKinematics:
         position_weight: float = 1.0,
         orientation_weight: float = 0.01,
     ) -> Array:
-        """Positions [deg] at which the palm has a pose, near the current ones.
+        """Return positions [deg] near the current ones at which the palm has the desired pose.
 
         Args:
-            current_joint_pos: The arm's [deg], and what stays as it is.
-            desired_ee_pose: (4, 4) in the base frame.
-            position_weight: Not used: the pose is met within the solver's tolerance.
-            orientation_weight: 0: the position alone counts (of an arm without a hand).
+            current_joint_pos: Positions of the arm [deg], followed by values that are unchanged.
+            desired_ee_pose: (4, 4) Pose in the base frame.
+            position_weight: Unused: the pose is met within the solver's tolerance.
+            orientation_weight: 0: only the position is constrained (arms without a hand).
         """
         del position_weight
-        found = np.array(current_joint_pos, dtype=float)
-        q0 = self._configuration(found)
+        positions = np.array(current_joint_pos, dtype=float)
+        q0 = self._configuration(positions)
         try:
             pose = single_pose(desired_ee_pose, "desired_ee_pose")
-        except InvalidPoseError:  # of a tracker that has lost the hand: the arm is held
+        except InvalidPoseError:  # the tracker has lost the hand: the arm does not move
             self.status = Status.INVALID
-            return found
+            return positions
         grasp = self._grasp(pose, orientation_weight != 0)
         solution = self._solver.solve(grasp, q0=q0, prefer="q0", diagnose=False)
         self.status = solution.status
         if solution.success:
-            found[: len(self._arm)] = np.rad2deg(solution.q[self._arm])
-        return found
+            positions[: len(self._arm)] = np.rad2deg(solution.q[self._arm])
+        return positions
 
-    def _grasp(self, pose: Array, turned: bool) -> Grasp:
+    def _grasp(self, pose: Array, with_orientation: bool) -> Grasp:
         robot = self._robot
         if robot.description.hand_actuators:
-            if not turned:
+            if not with_orientation:
                 raise InputError("orientation_weight: found 0, expected an arm without a hand")
             posture = {
                 robot.actuators[i]: float(robot.home[i]) for i in robot.description.hand_actuators
             }
             return Grasp(palm=pose, posture=posture)
         tip = pose @ np.linalg.inv(robot.palm(robot.home)) @ robot.contact_frames(robot.home)[0]
-        return Grasp({robot.fingers[0]: Contact.at(tip) if turned else Contact(tip[:3, 3])})
+        return Grasp(
+            {robot.fingers[0]: Contact.at(tip) if with_orientation else Contact(tip[:3, 3])}
+        )
 
 
-def _contacts_of(places: dict[str, list[float]], normals: dict[str, list[float]]) -> Grasp | None:
+def _contacts_of(points: dict[str, list[float]], normals: dict[str, list[float]]) -> Grasp | None:
     """Return the contacts of an action; None if they are those of a tracker without a hand."""
-    if lost_contacts_reason(np.array(list(places.values()), dtype=float)):
+    if lost_contacts_reason(np.array(list(points.values()), dtype=float)):
         return None
     try:
         return Grasp(
             {
                 name: Contact(point, None if np.isnan(normals[name]).any() else normals[name])
-                for name, point in places.items()
+                for name, point in points.items()
                 if np.isfinite(point).all()
             }
         )
-    except InputError:  # no contact is left, or a normal is zero or infinite
+    except InputError:  # all contacts are free, or a normal is zero or infinite
         return None
 
 
 @ProcessorStepRegistry.register("casadi_ik_contacts_to_joints")
 @dataclass
 class ContactsToJoints(RobotActionProcessorStep):
-    """Turns contacts of an action into targets of all motors of arm and hand.
+    """Processor step from contacts in an action to targets of all motors of arm and hand.
 
-    `FINGER.x`, `.y`, `.z` [m] and `.nx`, `.ny`, `.nz` (the pad's outward normal, may be left out)
-    become `MOTOR.pos` [rad or m]. Contacts that cannot be met leave the motors where they are.
+    `FINGER.x`, `.y`, `.z` [m] and `.nx`, `.ny`, `.nz` (outward normal of the pad, optional) are
+    replaced by `MOTOR.pos` [rad or m]. If the contacts are out of reach, the motors keep their
+    targets.
 
     Attributes:
-        solver: Of the robot.
-        q: (n,) the last targets; None: the robot's home.
-        status: Of the last contacts; INVALID if they were those of a tracker without a hand.
+        solver: Solver of the robot.
+        q: (n,) Last targets; None: home.
+        status: Status of the last contacts; INVALID if the tracker had lost the hand.
     """
 
     solver: Solver
@@ -138,33 +142,33 @@ class ContactsToJoints(RobotActionProcessorStep):
     status: Status = field(default=Status.SOLVED, init=False)
 
     def action(self, action: dict[str, Any]) -> dict[str, Any]:
-        """Replace the contacts of an action."""
+        """Replace the contacts of an action by motor targets."""
         robot = self.solver.robot
-        here = robot.home if self.q is None else self.q
-        places, normals = (
+        q0 = robot.home if self.q is None else self.q
+        points, normals = (
             {name: [action.pop(f"{name}.{key}", np.nan) for key in keys] for name in robot.fingers}
-            for keys in (PLACE, NORMAL)
+            for keys in (POINT_KEYS, NORMAL_KEYS)
         )
-        grasp = _contacts_of(places, normals)
+        grasp = _contacts_of(points, normals)
         if grasp is None:
-            self.status, self.q = Status.INVALID, here
+            self.status, self.q = Status.INVALID, q0
         else:
-            solution = self.solver.solve(grasp, q0=here, prefer="q0", diagnose=False)
+            solution = self.solver.solve(grasp, q0=q0, prefer="q0", diagnose=False)
             self.status = solution.status
-            self.q = solution.q if solution.success else here
+            self.q = solution.q if solution.success else q0
         return action | {
             f"{name}.pos": float(value) for name, value in zip(robot.actuators, self.q, strict=True)
         }
 
     def transform_features(self, features: dict[Any, dict[str, Any]]) -> dict[Any, dict[str, Any]]:
-        """The same of the features: numbers per motor instead of numbers per contact."""
-        known, robot = features[PipelineFeatureType.ACTION], self.solver.robot
-        for name in (f"{x}.{key}" for x in robot.fingers for key in (*PLACE, *NORMAL)):
-            known.pop(name, None)
+        """Replace the features of contacts by features of motors."""
+        action_features, robot = features[PipelineFeatureType.ACTION], self.solver.robot
+        for name in (f"{x}.{key}" for x in robot.fingers for key in (*POINT_KEYS, *NORMAL_KEYS)):
+            action_features.pop(name, None)
         for name in robot.actuators:
-            known[f"{name}.pos"] = PolicyFeature(type=FeatureType.ACTION, shape=(1,))
+            action_features[f"{name}.pos"] = PolicyFeature(type=FeatureType.ACTION, shape=(1,))
         return features
 
     def reset(self) -> None:
-        """Begin again from the robot's home."""
+        """Restart from home."""
         self.q = None

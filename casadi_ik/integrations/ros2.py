@@ -1,8 +1,9 @@
-"""A ROS 2 node without a ROS installation: contacts in and joint states out, in cdr over zenoh.
+"""ROS 2 node without a ROS installation: contacts in, joint states out, in CDR over zenoh.
 
-Messages are `geometry_msgs/PoseArray` (a pose per finger, in the order of `robot.fingers`: its
-position is the contact, its x axis the outward normal of the pad) and `sensor_msgs/JointState`.
-Keys of zenoh are names of topics without the first slash, as zenoh-bridge-ros2dds has them.
+Messages are `geometry_msgs/PoseArray` (a pose per finger in the order of `robot.fingers`; the
+position is the contact point, the x axis the outward normal of the pad) and
+`sensor_msgs/JointState`. Zenoh keys are topic names without the leading slash, as in
+zenoh-bridge-ros2dds.
 """
 
 # pyright: reportMissingImports=false
@@ -35,29 +36,29 @@ except ImportError as error:
         "the ROS 2 node needs eclipse-zenoh, which is not installed: pip install 'casadi-ik[ros2]'"
     ) from error
 
-POSE = 7
+POSE_SIZE = 7
 """Numbers of a pose: x y z [m] and a quaternion x y z w."""
 
 
 def encode_contacts(points: ArrayLike, normals: ArrayLike, frame: str = "base") -> bytes:
-    """Points (f, 3) [m] and normals (f, 3) as a PoseArray; NaN marks what is free."""
+    """Encode points (f, 3) [m] and normals (f, 3) as a PoseArray; NaN marks free components."""
     points, normals = np.asarray(points, dtype=float), np.asarray(normals, dtype=float)
-    poses = np.empty((len(points), POSE))
+    poses = np.empty((len(points), POSE_SIZE))
     poses[:, :3] = points
-    # The half-way rotation that takes x to the normal; opposite to x, half a turn about z.
+    # Shortest rotation from x to the normal; for -x, a rotation by pi about z.
     x = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    turn = np.column_stack([np.zeros(len(x)), -x[:, 2], x[:, 1], 1 + x[:, 0]])
-    turn[x[:, 0] < -1 + 1e-12] = 0, 0, 1, 0
-    poses[:, 3:] = turn / np.linalg.norm(turn, axis=1, keepdims=True)
-    head = cdr((_now(), frame, len(poses)))
-    return CDR_HEADER + head + bytes(-len(head) % 8) + poses.astype("<f8").tobytes()
+    quaternions = np.column_stack([np.zeros(len(x)), -x[:, 2], x[:, 1], 1 + x[:, 0]])
+    quaternions[x[:, 0] < -1 + 1e-12] = 0, 0, 1, 0
+    poses[:, 3:] = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
+    header = cdr((_now(), frame, len(poses)))
+    return CDR_HEADER + header + bytes(-len(header) % 8) + poses.astype("<f8").tobytes()
 
 
 def decode_contacts(data: bytes) -> tuple[Array, Array]:
-    """Points (f, 3) [m] and normals (f, 3) of a PoseArray.
+    """Decode points (f, 3) [m] and normals (f, 3) from a PoseArray.
 
     Raises:
-        InputError: The bytes are no such message.
+        InputError: The bytes are not a PoseArray.
         InvalidPoseError: The orientation of a pose is not a unit quaternion.
     """
     try:
@@ -66,14 +67,14 @@ def decode_contacts(data: bytes) -> tuple[Array, Array]:
         reader.text()
         count = reader.number("<I")
         reader.place += -reader.place % 8
-        values = np.frombuffer(reader.data, "<f8", count * POSE, reader.place)
+        values = np.frombuffer(reader.data, "<f8", count * POSE_SIZE, reader.place)
     except (struct.error, ValueError) as error:
         raise InputError(f"contacts: no geometry_msgs/PoseArray in cdr: {error}") from error
-    poses = values.reshape(count, POSE)
+    poses = values.reshape(count, POSE_SIZE)
     unit, invalid = unit_quaternions(poses[:, 3:])
-    wrong = invalid & np.isfinite(poses[:, 3:]).all(axis=1)  # NaN marks a free normal
-    if wrong.any():
-        i = int(np.argmax(wrong))
+    malformed = invalid & np.isfinite(poses[:, 3:]).all(axis=1)  # NaN marks a free normal
+    if malformed.any():
+        i = int(np.argmax(malformed))
         raise InvalidPoseError(
             f"contacts: poses[{i}].orientation: found {poses[i, 3:].tolist()}; expected a "
             "quaternion of length 1"
@@ -84,14 +85,14 @@ def decode_contacts(data: bytes) -> tuple[Array, Array]:
 
 
 class ContactNode:
-    """Answers each PoseArray with a JointState of the motors, in microseconds.
+    """Node that replies to each PoseArray with a JointState of the motors, in microseconds.
 
-    Where contacts cannot be met, or a message is malformed, nothing is sent: the last command
-    holds.
+    If the contacts are out of reach or a message is malformed, nothing is published, so the last
+    command stays valid.
 
     Attributes:
-        status: Of the last target.
-        refused: Why the last malformed message was refused, or "".
+        status: Status of the last target.
+        refused: Why the last message was refused, or "".
 
     Example:
         >>> with ContactNode(ik.Solver(robot)) as node:
@@ -106,40 +107,44 @@ class ContactNode:
         q0: ArrayLike | None = None,
         config: Any = None,
     ) -> None:
-        """Open a session of zenoh and subscribe.
+        """Open a zenoh session and subscribe.
 
         Args:
-            solver: Of the robot; without a scene.
-            contacts: Key of what is asked.
-            joints: Key of the answers.
-            q0: (n,) where the robot is [rad or m]; answers stay near the last one. None: at home.
-            config: Of zenoh; None: what the environment's ZENOH_CONFIG says, else the default.
+            solver: Solver of the robot, without a scene.
+            contacts: Key of the contacts.
+            joints: Key of the joint states.
+            q0: (n,) Initial configuration [rad or m]; solutions stay near the previous one. None:
+                home.
+            config: Zenoh configuration; None: that of ZENOH_CONFIG in the environment, or the
+                default.
         """
         self.status, self.refused = Status.SOLVED, ""
-        self._fast, self._names = solver.fast(), list(solver.robot.actuators)
+        self._fast_solver, self._names = solver.fast(), list(solver.robot.actuators)
         self._q = solver.robot.configuration(q0, "q0")
-        self._none = np.empty(0)
+        self._empty = np.empty(0)
         self._session = zenoh.open(_config() if config is None else config)
-        self._out = self._session.declare_publisher(joints)
-        self._in = self._session.declare_subscriber(contacts, self._answer)
+        self._publisher = self._session.declare_publisher(joints)
+        self._subscriber = self._session.declare_subscriber(contacts, self._on_contacts)
 
-    def _answer(self, sample: Any) -> None:
+    def _on_contacts(self, sample: Any) -> None:
         try:
             points, normals = decode_contacts(bytes(sample.payload))
             self.refused = lost_contacts_reason(points)
             if self.refused:
                 return
-            q, self.status = self._fast(points, normals, self._q)
+            q, self.status = self._fast_solver(points, normals, self._q)
         except CasadiIKError as error:
             self.refused = str(error)
             return
         self.refused = ""
         if self.status is Status.SOLVED:
             self._q = q.copy()
-            self._out.put(cdr_message(_now(), "", self._names, self._q, self._none, self._none))
+            self._publisher.put(
+                cdr_message(_now(), "", self._names, self._q, self._empty, self._empty)
+            )
 
     def wait(self) -> None:
-        """Answer until the process is interrupted."""
+        """Serve until the process is interrupted."""
         threading.Event().wait()
 
     def __enter__(self) -> ContactNode:

@@ -21,7 +21,7 @@ from casadi_ik.app.cli.inputs import located, robot_of_log
 from casadi_ik.app.cli.options import Option
 from casadi_ik.app.cli.outputs import check_outputs, output, write_json
 from casadi_ik.app.cli.table import Answer, Said, command
-from casadi_ik.app.report import counted, duration, fields, files, headline, indented, table
+from casadi_ik.app.report import count_text, duration, fields, files, headline, indented, table
 from casadi_ik.errors import InputError, MissingExtraError, UnknownNameError, printable
 from casadi_ik.logs.container import ForeignLogError, NothingWrittenError
 from casadi_ik.logs.events import SERIOUS, plain_name, quantity, told
@@ -121,7 +121,7 @@ def why(said: Said) -> Answer:
         parts.append(Text(f"  solve {solve.number + 1} of {solve.shard}"))
     for title, lines in found.parts.items():
         parts.append(Text(f"  {title}", "bold"))
-        parts += [indented(line, by=4) for line in lines]
+        parts += [indented(line, width=4) for line in lines]
     return Answer(Group(*parts))
 
 
@@ -210,7 +210,7 @@ def report(said: Said) -> Answer:
     page = study_page(log, title, said.most)
     with output(said.out) as part:
         part.write_text(page, encoding="utf-8")
-    count = counted(sum(len(part) for part in log.solves().parts), "solve")
+    count = count_text(sum(len(part) for part in log.solves().parts), "solve")
     return Answer(Group(Text(f"  {count}"), *files({"page": said.out})))
 
 
@@ -273,7 +273,8 @@ def finish(said: Said) -> Answer:
             cut = f"{_size(done.cut)} of a torn tail cut" if done.cut else "a summary was written"
             about = {
                 "done": f"finished, {cut}" if done.changed else "whole already",
-                "holds": f"{counted(done.chunks, 'chunk')}, {counted(done.messages, 'message')}",
+                "holds": f"{count_text(done.chunks, 'chunk')}, "
+                f"{count_text(done.messages, 'message')}",
             }
         parts += [_title(str(path)), fields(about)]
     return Answer(Group(*parts))
@@ -341,8 +342,8 @@ def _only_last_wraps(rows: Table) -> Table:
 
 def _count(count: int, most: int, thing: str) -> RenderableType:
     if count <= most:
-        return Text(f"  {counted(count, thing)}")
-    return Text(f"  the first {most} of {counted(count, thing)} (--most shows more)")
+        return Text(f"  {count_text(count, thing)}")
+    return Text(f"  the first {most} of {count_text(count, thing)} (--most shows more)")
 
 
 def _named(items: Sequence[Any], why_named: str = "") -> str:

@@ -17,7 +17,7 @@ from casadi_ik.app.cli.inputs import located, the_robot, the_units
 from casadi_ik.app.cli.options import Option
 from casadi_ik.app.cli.outputs import check_outputs, output, say
 from casadi_ik.app.cli.table import Answer, Said, command
-from casadi_ik.app.report import Units, counted, fields, files, headline, table
+from casadi_ik.app.report import Units, count_text, fields, files, headline, table
 from casadi_ik.compile import cache_directory
 from casadi_ik.compile.compiler import find_compiler
 from casadi_ik.errors import InputError, MissingExtraError, UnsupportedError
@@ -429,5 +429,5 @@ def compile_ahead(said: Said) -> Answer:
             spent = time.perf_counter() - began
             say("compiled", f"{robot.name} {i}/{len(parts)}: {what} ({spent:.1f} s)")
         lines.append(Text(f"  {robot.name}: {time.perf_counter() - whole_time:.1f} s"))
-    what = f"{counted(len(robots), 'robot')} in {cache_directory()}"
+    what = f"{count_text(len(robots), 'robot')} in {cache_directory()}"
     return Answer(Group(headline(True, "COMPILED", what), *lines))

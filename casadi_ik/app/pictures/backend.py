@@ -12,7 +12,7 @@ def import_matplotlib() -> None:
     The variable is often inherited from a notebook or desktop of another environment, and makes
     the import fail, although files do not need that backend.
     """
-    if "matplotlib" in sys.modules:
+    if sys.modules.get("matplotlib") is not None:
         return
     inherited = os.environ.pop("MPLBACKEND", None)
     try:
