@@ -186,7 +186,7 @@ class Diagnostician:
             remedies = RemedyFinder(self._trials, one, q0[i], best.q[i], pressed[i], hand_only)
             reason = refused[i]
             if reason is None:
-                reason = Reason.LIMITS if remedies.lifting_helps() else Reason.NOT_FOUND
+                reason = Reason.LIMITS if remedies.limits_help() else Reason.NOT_FOUND
             names = zip(self.robot.actuators, held[i].tolist(), strict=True)
             clock.lap(every[i : i + 1])
             yield Diagnosis(

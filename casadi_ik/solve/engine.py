@@ -32,7 +32,7 @@ from casadi_ik.solve.hand_first.method import HandFirstMethod
 from casadi_ik.solve.hand_first.parameters import HandFirstParameters
 from casadi_ik.solve.method import HandSearch, Method, Outcome, SingleOutcome
 from casadi_ik.solve.recorder import Recorder
-from casadi_ik.solve.remedies import with_way_out
+from casadi_ik.solve.remedies import add_collision_remedies
 from casadi_ik.solve.request import CLEARANCE, NO_PREFERENCE, resolve_preference
 from casadi_ik.solve.sensitivity import SensitivityKernel
 from casadi_ik.solve.solution import BatchSolution, Solution
@@ -460,7 +460,7 @@ class Engine:
                 batch = self._diagnose(part, near, outcome, batch)
                 if self.check is not None and len(targets) == 1:
                     retry = SolveOptions(starts[0], seed)
-                    batch = with_way_out(
+                    batch = add_collision_remedies(
                         lambda changed: self.solve(changed, retry).success, self.check, part, batch
                     )
             q = in_nearest_turns(self.robot.description, part, batch.q, q0)

@@ -1,7 +1,7 @@
-"""What would make a grasp solvable: limits lifted, fingers or normals left free.
+"""Remedies that make a grasp solvable: relaxed limits, and fingers or normals left free.
 
-Where every answer touches something: the object elsewhere, a finger fewer. Whatever is said to help
-was solved.
+For targets whose solutions all collide: a shift of the object, or a finger without contact. Every
+remedy is verified by a solution.
 """
 
 from __future__ import annotations
@@ -22,115 +22,116 @@ from casadi_ik.solve.diagnosis import Freed, Relief, Remedies
 from casadi_ik.solve.solution import BatchSolution, SuggestedFix
 from casadi_ik.solve.trials import Bounds, LocalRefinement, Subproblems, repeat_target
 
-HALVINGS = 8
-"""How often what a limit has to give is halved, while a solution remains."""
+RELAXATION_HALVINGS = 8
+"""Number of bisection steps that minimize the relaxation of limits."""
 
-NOTHING = 1e-9
-"""What counts as not beyond a limit [rad or m]."""
+LIMIT_TOLERANCE = 1e-9
+"""Largest excess over a limit that is ignored [rad or m]."""
 
 
 @dataclass(frozen=True)
-class Lift:
-    """Limits that are lifted together.
+class RelaxedLimits:
+    """Actuators whose limits are relaxed together.
 
     Attributes:
-        name: An actuator, or "arm", "hand" or "all".
-        columns: Positions in q.
+        name: Name of an actuator, or "arm", "hand" or "all".
+        columns: Positions of the actuators in q.
     """
 
     name: str
     columns: tuple[int, ...]
 
     def widen(self, robot: ArmHand, bounds: Bounds, row: int) -> None:
-        """Move the bounds of a row outwards: by half a turn, or by the range of a slider."""
+        """Widen the bounds of a row by half a turn, or by the range of a prismatic actuator."""
         for i in self.columns:
-            turning = robot.description.actuators[i].unit == "rad"
-            far = np.pi if turning else float(robot.upper[i] - robot.lower[i])
-            bounds.lower[row, i] -= far
-            bounds.upper[row, i] += far
+            is_angle = robot.description.actuators[i].unit == "rad"
+            extension = np.pi if is_angle else float(robot.upper[i] - robot.lower[i])
+            bounds.lower[row, i] -= extension
+            bounds.upper[row, i] += extension
 
 
-def lifts(
+def relaxation_candidates(
     robot: ArmHand, movable: NDArray[np.bool_], pressed: NDArray[np.bool_], hand_only: bool
-) -> list[Lift]:
-    """All lifts worth trying.
+) -> list[RelaxedLimits]:
+    """Return the relaxations that may help.
 
     Args:
         robot: The robot.
-        movable: (n,) whether an actuator may move at all.
-        pressed: (n,) whether its limit alone may be what blocks.
-        hand_only: Whether the arm cannot help, because the hand does not fit.
+        movable: (n,) True for actuators with a range.
+        pressed: (n,) True for actuators whose limit alone may block the target.
+        hand_only: True if the hand does not fit, so that the arm cannot help.
     """
-    every = tuple(map(int, np.flatnonzero(movable)))
-    arm = tuple(i for i in every if i in robot.description.arm_actuators)
-    hand = tuple(i for i in every if i in robot.description.hand_actuators)
-    asked = [i for i in (hand if hand_only else every) if pressed[i]]
-    single = [Lift(robot.actuators[i], (i,)) for i in asked]
-    groups = {"hand": hand} if hand_only else {"arm": arm, "hand": hand, "all": every}
-    return single + [Lift(name, columns) for name, columns in groups.items() if columns]
+    columns = tuple(map(int, np.flatnonzero(movable)))
+    arm = tuple(i for i in columns if i in robot.description.arm_actuators)
+    hand = tuple(i for i in columns if i in robot.description.hand_actuators)
+    blocking = [i for i in (hand if hand_only else columns) if pressed[i]]
+    single = [RelaxedLimits(robot.actuators[i], (i,)) for i in blocking]
+    groups = {"hand": hand} if hand_only else {"arm": arm, "hand": hand, "all": columns}
+    return single + [RelaxedLimits(name, group) for name, group in groups.items() if group]
 
 
 def relax_limits(
     trials: Subproblems,
     targets: TargetBatch,
     limits: Bounds,
-    solved: list[tuple[Lift, Array]],
+    solved: list[tuple[RelaxedLimits, Array]],
     q: Array,
 ) -> Iterator[Relief]:
-    """Draw lifted limits back towards where they are, as long as there is a solution.
+    """Yield the smallest relaxations for which a solution is found.
 
     Args:
         trials: The loop.
         targets: One target.
-        limits: The true limits.
-        solved: Lifts with a solution (n,) each.
-        q: (n,) the nearest configuration within the true limits, a second start.
+        limits: The original limits.
+        solved: Relaxations with a solution (n,) each.
+        q: (n,) nearest configuration within the limits, a second start.
     """
     if not solved:
         return
     count, robot = len(solved), trials.robot
     best = np.stack([solution for _, solution in solved])
     descent, rows = LocalRefinement(trials, targets), np.zeros(2 * count, dtype=np.intp)
-    # What is given lies between two configurations: one within the limits, one that solves it.
-    least, most = np.zeros((count, 1)), np.ones((count, 1))
+    # The relaxation lies between none and that of a solution.
+    lower, upper = np.zeros((count, 1)), np.ones((count, 1))
     beyond = limits.beyond(best)
-    for _ in range(HALVINGS):
-        share = (least + most) / 2
+    for _ in range(RELAXATION_HALVINGS):
+        fraction = (lower + upper) / 2
         bounds = Bounds(
-            limits.lower + np.minimum(beyond, 0) * share,
-            limits.upper + np.maximum(beyond, 0) * share,
+            limits.lower + np.minimum(beyond, 0) * fraction,
+            limits.upper + np.maximum(beyond, 0) * fraction,
         )
         twice = Bounds(np.tile(bounds.lower, (2, 1)), np.tile(bounds.upper, (2, 1)))
         starts = np.concatenate([best, np.tile(q, (count, 1))])
         reached = descent.run(rows, starts, twice)
-        ok = trials.solved(targets, reached, limits=False).reshape(2, count)
+        solved_rows = trials.solved(targets, reached, limits=False).reshape(2, count)
         reached = reached.reshape(2, count, -1)
-        new = np.where(ok[0][:, None], reached[0], reached[1])
-        either = np.logical_or(ok[0], ok[1])[:, None]
+        new = np.where(solved_rows[0][:, None], reached[0], reached[1])
+        either = np.logical_or(solved_rows[0], solved_rows[1])[:, None]
         best = np.where(either, new, best)
-        most, least = np.where(either, share, most), np.where(either, least, share)
+        upper = np.where(either, fraction, upper)
+        lower = np.where(either, lower, fraction)
     units = {actuator.name: actuator.unit for actuator in robot.description.actuators}
-    for (lift, _), solution in zip(solved, best, strict=True):
+    for (relaxation, _), solution in zip(solved, best, strict=True):
         over = limits.beyond(solution)
-        far = {
+        excess = {
             name: float(value)
             for name, value in zip(robot.actuators, over, strict=True)
-            if abs(value) > NOTHING
+            if abs(value) > LIMIT_TOLERANCE
         }
-        yield Relief(lift.name, far, units, solution)
+        yield Relief(relaxation.name, excess, units, solution)
 
 
 @dataclass(frozen=True, eq=False)
 class RemedyFinder:
-    """Solves a grasp again with less asked, and proves what helps by a solution.
+    """A search for remedies that solves relaxed versions of a grasp.
 
     Attributes:
         trials: The loop.
         targets: One target.
-        q0: (n,) start.
-        q: (n,) the nearest configuration that was found.
-        pressed: (n,) actuators whose limit alone may be what blocks.
-        hand_only: Whether the arm cannot help, because the hand does not fit.
+        q0: (n,) initial configuration.
+        q: (n,) nearest configuration of the failed solve.
+        pressed: (n,) True for actuators whose limit alone may block the target.
+        hand_only: True if the hand does not fit, so that the arm cannot help.
     """
 
     trials: Subproblems
@@ -141,33 +142,36 @@ class RemedyFinder:
     hand_only: bool
 
     def find(self) -> Remedies:
-        """Everything that helps."""
-        return Remedies(tuple(self._reliefs()), tuple(self._freed()))
+        """Return all remedies."""
+        return Remedies(tuple(self._reliefs()), tuple(self._with_free_contacts()))
 
-    def lifting_helps(self) -> bool:
-        """Whether lifting limits helps at all: there are reliefs."""
-        tried = self._lifts()
-        if not tried:
+    def limits_help(self) -> bool:
+        """Return whether relaxed limits make the target solvable."""
+        relaxations = self._relaxations()
+        if not relaxations:
             return False
-        asked, bounds = repeat_target(self.targets, len(tried)), self._lifted(tried)
-        if self._solves(asked, self._descended(asked, bounds), bounds).any():
+        candidates, bounds = (
+            repeat_target(self.targets, len(relaxations)),
+            self._relaxed_bounds(relaxations),
+        )
+        if self._solves(candidates, self._refine(candidates, bounds), bounds).any():
             return True
-        # Lifted all together they help if any of them does.
+        # All limits relaxed together help if any of them does.
         last = Bounds(bounds.lower[-1:], bounds.upper[-1:])
-        found = self.trials.search(self.targets, self.q0, last)
-        return bool(self._solves(self.targets, found, last)[0])
+        q = self.trials.search(self.targets, self.q0, last)
+        return bool(self._solves(self.targets, q, last)[0])
 
     def _reliefs(self) -> Iterator[Relief]:
-        tried = self._lifts()
-        asked = repeat_target(self.targets, len(tried))
-        solutions = self._solutions(asked, self._lifted(tried))
-        solved = [(tried[i], q) for i, q in solutions.items()]
+        relaxations = self._relaxations()
+        candidates = repeat_target(self.targets, len(relaxations))
+        solutions = self._solutions(candidates, self._relaxed_bounds(relaxations))
+        solved = [(relaxations[i], q) for i, q in solutions.items()]
         return relax_limits(self.trials, self.targets, self._limits, solved, self.q)
 
-    def _freed(self) -> Iterator[Freed]:
-        freeings = self._freeings()
+    def _with_free_contacts(self) -> Iterator[Freed]:
+        freeings = self._relaxed_targets()
         if freeings:
-            asked = replace(
+            candidates = replace(
                 self.targets,
                 points=np.concatenate([targets.points for _, _, targets in freeings]),
                 normals=np.concatenate([targets.normals for _, _, targets in freeings]),
@@ -176,9 +180,9 @@ class RemedyFinder:
                     for name in self.targets.more
                 },
                 picked=None,
-                object_pose=None,  # contacts alone are looked at here
+                object_pose=None,  # Only contacts matter.
             )
-            for i, q in self._solutions(asked, self._limits.tiled(len(asked))).items():
+            for i, q in self._solutions(candidates, self._limits.tiled(len(candidates))).items():
                 part, finger, _ = freeings[i]
                 yield Freed(part, finger, q)
 
@@ -186,98 +190,103 @@ class RemedyFinder:
     def _limits(self) -> Bounds:
         return self.trials.limits(self.targets)
 
-    def _lifts(self) -> list[Lift]:
+    def _relaxations(self) -> list[RelaxedLimits]:
         if not self.targets.enforce_limits:
             return []
         movable = self._limits.lower < self._limits.upper
-        return lifts(self.trials.robot, movable, movable & self.pressed, self.hand_only)
+        return relaxation_candidates(
+            self.trials.robot, movable, movable & self.pressed, self.hand_only
+        )
 
-    def _lifted(self, tried: list[Lift]) -> Bounds:
-        bounds = self._limits.tiled(len(tried))
-        for i, lift in enumerate(tried):
-            lift.widen(self.trials.robot, bounds, i)
+    def _relaxed_bounds(self, relaxations: list[RelaxedLimits]) -> Bounds:
+        bounds = self._limits.tiled(len(relaxations))
+        for i, relaxation in enumerate(relaxations):
+            relaxation.widen(self.trials.robot, bounds, i)
         return bounds
 
-    def _freeings(self) -> list[tuple[str, str, TargetBatch]]:
-        """The target with a finger, a normal or all normals left free."""
-        targets, found = self.targets, []
-        known = ~np.isnan(targets.points[0, :, 0])
-        faced = ~np.isnan(targets.normals[0, :, 0])
+    def _relaxed_targets(self) -> list[tuple[str, str, TargetBatch]]:
+        """Return the target with a finger, a normal or all normals left free."""
+        targets, relaxed = self.targets, []
+        is_known = ~np.isnan(targets.points[0, :, 0])
+        has_normal = ~np.isnan(targets.normals[0, :, 0])
         for i, name in enumerate(self.trials.robot.fingers):
             points, normals = targets.points.copy(), targets.normals.copy()
             normals[0, i] = np.nan
-            if faced[i]:
-                found.append(("normal", name, _freed(targets, points, normals)))
-            if known[i] and known.sum() > 1:
+            if has_normal[i]:
+                relaxed.append(("normal", name, _with_free_contacts(targets, points, normals)))
+            if is_known[i] and is_known.sum() > 1:
                 points[0, i] = np.nan
-                found.append(("finger", name, _freed(targets, points, normals)))
-        if faced.sum() > 1:
+                relaxed.append(("finger", name, _with_free_contacts(targets, points, normals)))
+        if has_normal.sum() > 1:
             none = np.full_like(targets.normals, np.nan)
-            found.append(("normal", "all", _freed(targets, targets.points, none)))
-        return found
+            relaxed.append(("normal", "all", _with_free_contacts(targets, targets.points, none)))
+        return relaxed
 
-    def _solutions(self, asked: TargetBatch, bounds: Bounds) -> dict[int, Array]:
-        """Solutions by row: from the nearest configuration, else by a search."""
-        q = self._descended(asked, bounds)
-        ok = self._solves(asked, q, bounds)
-        rest = np.flatnonzero(~ok)
-        if len(rest):
-            left = Bounds(bounds.lower[rest], bounds.upper[rest])
-            some = asked.rows(rest)
-            q[rest] = self.trials.search(some, self.q0, left)
-            ok[rest] = self._solves(some, q[rest], left)
-        return {int(i): q[i] for i in np.flatnonzero(ok)}
+    def _solutions(self, candidates: TargetBatch, bounds: Bounds) -> dict[int, Array]:
+        """Return solutions by row, from the nearest configuration or else by a search."""
+        q = self._refine(candidates, bounds)
+        solved_rows = self._solves(candidates, q, bounds)
+        failed = np.flatnonzero(~solved_rows)
+        if len(failed):
+            remaining_bounds = Bounds(bounds.lower[failed], bounds.upper[failed])
+            remaining = candidates.rows(failed)
+            q[failed] = self.trials.search(remaining, self.q0, remaining_bounds)
+            solved_rows[failed] = self._solves(remaining, q[failed], remaining_bounds)
+        return {int(i): q[i] for i in np.flatnonzero(solved_rows)}
 
-    def _descended(self, asked: TargetBatch, bounds: Bounds) -> Array:
-        rows = np.arange(len(asked))
+    def _refine(self, candidates: TargetBatch, bounds: Bounds) -> Array:
+        rows = np.arange(len(candidates))
         starts = np.tile(self.q, (len(rows), 1))
-        return LocalRefinement(self.trials, asked).run(rows, starts, bounds)
+        return LocalRefinement(self.trials, candidates).run(rows, starts, bounds)
 
-    def _solves(self, asked: TargetBatch, q: Array, bounds: Bounds) -> NDArray[np.bool_]:
+    def _solves(self, candidates: TargetBatch, q: Array, bounds: Bounds) -> NDArray[np.bool_]:
         inside = (bounds.beyond(q) == 0).all(axis=1)
-        return np.logical_and(inside, self.trials.solved(asked, q, limits=False))
+        return np.logical_and(inside, self.trials.solved(candidates, q, limits=False))
 
 
-def _freed(targets: TargetBatch, points: Array, normals: Array) -> TargetBatch:
-    """A target without what goes with the points and normals that are now free."""
-    placed, faced = ~np.isnan(points), ~np.isnan(normals)
+def _with_free_contacts(targets: TargetBatch, points: Array, normals: Array) -> TargetBatch:
+    """Return a target with given points and normals, without vectors of the free ones."""
+    has_point, has_normal = ~np.isnan(points), ~np.isnan(normals)
     more = {
-        name: np.where(placed & faced if name == "tangents" else placed, array, np.nan)
+        name: np.where(has_point & has_normal if name == "tangents" else has_point, array, np.nan)
         for name, array in targets.more.items()
     }
     return replace(targets, points=points.copy(), normals=normals, more=more)
 
 
 SHIFTS = (0.01, 0.02, 0.04, 0.08, 0.16)
-"""How far the object is moved [m], until it helps."""
+"""Distances by which the object is shifted [m], until one helps."""
 
 SHIFT_HALVINGS = 4
-"""By which the shortest way is found once one helps."""
+"""Number of bisection steps that minimize a shift."""
 
-WAYS = np.array(
+SHIFT_DIRECTIONS = np.array(
     [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z],
     dtype=float,
 )
-WAYS /= np.linalg.norm(WAYS, axis=1, keepdims=True)
+SHIFT_DIRECTIONS /= np.linalg.norm(SHIFT_DIRECTIONS, axis=1, keepdims=True)
 """(26, 3) unit vectors to the faces, edges and corners of a cube."""
 
-ROUNDING = 1e-9
-"""By which a moved object may be nearer to something than it stands [m]."""
+DISTANCE_ROUNDING = 1e-9
+"""Rounding error of distances of a shifted object [m]."""
 
-Free = Callable[[TargetBatch], NDArray[np.bool_]]
-"""Of k targets, which have a free answer."""
+SolveFree = Callable[[TargetBatch], NDArray[np.bool_]]
+"""Function from k targets to whether each has a collision-free solution, (k,)."""
 
 
-def with_way_out(
-    free: Free, check: SceneCheck, targets: TargetBatch, batch: BatchSolution
+def add_collision_remedies(
+    solve_free: SolveFree, check: SceneCheck, targets: TargetBatch, batch: BatchSolution
 ) -> BatchSolution:
-    """The answer to one target that touches something, with what else would do in its report.
+    """Add remedies to the collision report of a target.
 
     Args:
-        free: Solves targets.
-        check: The scene about the robot.
-        targets: The target.
-        batch: The answer.
+        solve_free: Solves targets.
+        check: Collision check of the robot in its scene.
+        targets: One target.
+        batch: Its solution.
+
+    Returns:
+        The solution; unchanged if it does not collide.
     """
     (report,) = batch.collisions
     if report is None:
@@ -285,88 +294,100 @@ def with_way_out(
     scene, known = check.scene, targets
     if targets.object_pose is None and scene.grasped in scene.items:
         known = targets.holding(scene.grasped or "", scene.items[scene.grasped or ""].pose)
-    moved = _moved(known, _standing(check, known), free)
-    found = SuggestedFix(moved, SHIFTS[-1], _fewer(known, check.robot.fingers, free))
-    return replace(batch, collisions=(replace(report, way_out=found),))
+    shift = _shortest_shift(known, _keeps_object_clearance(check, known), solve_free)
+    fix = SuggestedFix(
+        shift, SHIFTS[-1], _removable_fingers(known, check.robot.fingers, solve_free)
+    )
+    return replace(batch, collisions=(replace(report, way_out=fix),))
 
 
-def _standing(check: SceneCheck, targets: TargetBatch) -> Callable[[Array], NDArray[np.bool_]]:
-    """Which shifts (k, 3) let what is grasped stand as free as it stands now."""
+def _keeps_object_clearance(
+    check: SceneCheck, targets: TargetBatch
+) -> Callable[[Array], NDArray[np.bool_]]:
+    """Return a function of shifts (k, 3): whether the object is as free of others as before."""
     scene: Scene = check.scene
     name, pose = targets.object or scene.grasped or "", targets.object_pose
     if name and pose is not None:
         scene = scene.holding(name, pose[0])
     item = scene.items.get(name)
-    others: list[Item] = [one for key, one in scene.items.items() if key != name]
+    others: list[Item] = [other for key, other in scene.items.items() if key != name]
 
-    def stands(shifts: Array) -> NDArray[np.bool_]:
+    def keeps_clearance(shifts: Array) -> NDArray[np.bool_]:
         if item is None or not others:
             return np.ones(len(shifts), dtype=bool)
         poses = np.repeat(item.pose[None], 1 + len(shifts), axis=0)
         poses[1:, :3, 3] += shifts
-        every = gaps(item, others, poses)
-        return every[1:] >= min(float(every[0]), 0.0) - ROUNDING
+        distances = gaps(item, others, poses)
+        return distances[1:] >= min(float(distances[0]), 0.0) - DISTANCE_ROUNDING
 
-    return stands
+    return keeps_clearance
 
 
-def _moved(
-    targets: TargetBatch, stands: Callable[[Array], NDArray[np.bool_]], free: Free
+def _shortest_shift(
+    targets: TargetBatch,
+    keeps_clearance: Callable[[Array], NDArray[np.bool_]],
+    solve_free: SolveFree,
 ) -> tuple[float, float, float] | None:
-    """The shortest shift that helps."""
+    """Return the shortest shift for which there is a collision-free solution."""
 
     def helps(shifts: Array) -> NDArray[np.bool_]:
-        good = stands(shifts)
+        good = keeps_clearance(shifts)
         if good.any():
-            good[good] = free(_shifted(targets, shifts[good]))
+            good[good] = solve_free(_shifted(targets, shifts[good]))
         return good
 
     before = 0.0
     for step in SHIFTS:
-        ways = WAYS[helps(step * WAYS)]
-        if len(ways):
-            low, high = np.full(len(ways), before), np.full(len(ways), step)
+        directions = SHIFT_DIRECTIONS[helps(step * SHIFT_DIRECTIONS)]
+        if len(directions):
+            low, high = np.full(len(directions), before), np.full(len(directions), step)
             for _ in range(SHIFT_HALVINGS):
                 middle = (low + high) / 2
-                good = helps(middle[:, None] * ways)
+                good = helps(middle[:, None] * directions)
                 low, high = np.where(good, low, middle), np.where(good, middle, high)
-                # The shortest is wanted: what is longer than another way already is left out.
-                some = low < high.min()
-                low, high, ways = low[some], high[some], ways[some]
-            x, y, z = (high[:, None] * ways)[int(high.argmin())].tolist()
+                # Directions that are longer than another one already are dropped.
+                is_shorter = low < high.min()
+                low, high, directions = low[is_shorter], high[is_shorter], directions[is_shorter]
+            x, y, z = (high[:, None] * directions)[int(high.argmin())].tolist()
             return x, y, z
         before = step
     return None
 
 
 def _shifted(targets: TargetBatch, shifts: Array) -> TargetBatch:
-    """One target at as many places."""
-    asked = targets.rows(np.zeros(len(shifts), dtype=np.intp))
-    pose = asked.object_pose
+    """Return one target at k shifts (k, 3)."""
+    candidates = targets.rows(np.zeros(len(shifts), dtype=np.intp))
+    pose = candidates.object_pose
     if pose is not None:
         pose = pose.copy()
         pose[:, :3, 3] += shifts
     return replace(
-        asked, points=asked.points + shifts[:, None], object_pose=pose, picked=None, first_row=0
+        candidates,
+        points=candidates.points + shifts[:, None],
+        object_pose=pose,
+        picked=None,
+        first_row=0,
     )
 
 
-def _fewer(targets: TargetBatch, fingers: Sequence[str], free: Free) -> tuple[str, ...]:
-    """Fingers without whose contact there is a free answer."""
-    placed = ~np.isnan(targets.points[0]).all(axis=1)
+def _removable_fingers(
+    targets: TargetBatch, fingers: Sequence[str], solve_free: SolveFree
+) -> tuple[str, ...]:
+    """Return the fingers without whose contact there is a collision-free solution."""
+    has_point = ~np.isnan(targets.points[0]).all(axis=1)
     facing = ~np.isnan(targets.normals[0]).all(axis=1)
-    named = np.flatnonzero(placed | facing)
-    # A finger with more than a point and a normal would make it a target of other kinds.
+    named = np.flatnonzero(has_point | facing)
+    # Without a finger of another contact kind the target would need another solver.
     plain = [
         i for i in named.tolist() if all(np.isnan(v[0, i]).all() for v in targets.more.values())
     ]
     if len(named) < 2:
         return ()
-    return tuple(fingers[i] for i in plain if free(_without(targets, i))[0])
+    return tuple(fingers[i] for i in plain if solve_free(_without(targets, i))[0])
 
 
 def _without(targets: TargetBatch, finger: int) -> TargetBatch:
-    """One target with a finger free."""
+    """Return a target with a free finger."""
     points, normals = targets.points.copy(), targets.normals.copy()
     points[:, finger], normals[:, finger] = np.nan, np.nan
     return replace(targets, points=points, normals=normals)

@@ -1,33 +1,33 @@
-/* The rows of a table whose keys are nearest to that of each sample, in order.
+/* Lookup of the rows of a table with the nearest keys, in the order of their distance.
  *
- * Expects the macros N_IN, N_KEY, TILE, STEPS, LARGEST and REGISTER_BYTES (of the machine's vectors,
- * 0: not known); the step is the function that makes a key.
+ * Requires the macros N_IN, N_KEY, TILE, STEPS, LARGEST and REGISTER_BYTES (size of the machine's
+ * vector registers; 0: unknown). The step graph computes a key.
  */
 #include <math.h>
 
-/* Twice a key of whole steps, for two entries of all rows of a tile. Entries that are not known
- * count nothing: `kept` is zero there, else all its bits are set. */
+/* Two entries of a quantized key, doubled. `mask` is zero for unknown entries, which do not count,
+ * and has all bits set otherwise. */
 typedef struct {
-  int16_t twice[2], kept[2];
-} asked;
+  int16_t twice[2], mask[2];
+} key_pair;
 
 #define PAIRS ((N_KEY + 1) / 2)
 #define FAR INT32_MAX
 
 #define UNROLLED LOOPS static inline __attribute__((always_inline, unused))
 
-static void ask(const scalar *key, asked *pairs) {
+static void quantize_key(const scalar *key, key_pair *pairs) {
   int i;
   memset(pairs, 0, PAIRS * sizeof *pairs);
   for (i = 0; i < N_KEY; ++i) {
     if (key[i] != key[i]) continue;
     pairs[i / 2].twice[i % 2] = (int16_t) (2 * fmax(fmin(rint(key[i] * STEPS), LARGEST), -LARGEST));
-    pairs[i / 2].kept[i % 2] = -1;
+    pairs[i / 2].mask[i % 2] = -1;
   }
 }
 
-/* |row - key|^2 over the known entries, without the part that all rows share. */
-UNROLLED void measure(const lookup_job *job, const asked *pairs, int32_t *distance) {
+/* |row - key|^2 over the known entries, without the term that all rows share. */
+UNROLLED void measure(const lookup_job *job, const key_pair *pairs, int32_t *distance) {
   int64_t tile, tiles = (job->rows + TILE - 1) / TILE;
   int i, j;
   for (tile = 0; tile < tiles; ++tile, distance += TILE) {
@@ -35,35 +35,36 @@ UNROLLED void measure(const lookup_job *job, const asked *pairs, int32_t *distan
     for (j = 0; j < TILE; ++j) distance[j] = 0;
     for (i = 0; i < PAIRS; ++i, row += TILE * 2) {
       for (j = 0; j < TILE; ++j) {
-        distance[j] += row[2 * j] * ((row[2 * j] - pairs[i].twice[0]) & pairs[i].kept[0])
-                     + row[2 * j + 1] * ((row[2 * j + 1] - pairs[i].twice[1]) & pairs[i].kept[1]);
+        distance[j] += row[2 * j] * ((row[2 * j] - pairs[i].twice[0]) & pairs[i].mask[0])
+                     + row[2 * j + 1] * ((row[2 * j + 1] - pairs[i].twice[1]) & pairs[i].mask[1]);
       }
     }
   }
 }
 
-UNROLLED int32_t least(const int32_t *values, int64_t count) {
-  int32_t found = FAR;
+UNROLLED int32_t min_of(const int32_t *values, int64_t count) {
+  int32_t minimum = FAR;
   int64_t j;
-  for (j = 0; j < count; ++j) found = values[j] < found ? values[j] : found;
-  return found;
+  for (j = 0; j < count; ++j) minimum = values[j] < minimum ? values[j] : minimum;
+  return minimum;
 }
 
-/* The nearest one after the other, of equals the first: the tile it is in, then the row. */
-UNROLLED void choose(const lookup_job *job, int32_t *distance, int32_t *nearest, int64_t *found) {
+/* Select the nearest rows in order, the first among equals: first the tile, then the row. */
+UNROLLED void select_nearest(const lookup_job *job, int32_t *distance, int32_t *nearest,
+                             int64_t *found) {
   const int64_t tiles = (job->rows + TILE - 1) / TILE;
   int64_t i, j, place;
   for (j = job->rows; j < tiles * TILE; ++j) distance[j] = FAR;
-  for (i = 0; i < tiles; ++i) nearest[i] = least(distance + i * TILE, TILE);
+  for (i = 0; i < tiles; ++i) nearest[i] = min_of(distance + i * TILE, TILE);
   for (place = 0; place < job->wanted; ++place) {
-    const int32_t best = least(nearest, tiles);
+    const int32_t best = min_of(nearest, tiles);
     int32_t *tile;
     for (i = 0; nearest[i] != best; ++i) {}
     tile = distance + i * TILE;
     for (j = 0; tile[j] != best; ++j) {}
     found[place] = i * TILE + j;
     tile[j] = FAR;
-    nearest[i] = least(tile, TILE);
+    nearest[i] = min_of(tile, TILE);
   }
 }
 
@@ -71,7 +72,7 @@ UNROLLED void choose(const lookup_job *job, int32_t *distance, int32_t *nearest,
 #define PAIR_OF(numbers) \
   ((int32_t) ((uint32_t) (uint16_t) (numbers)[0] | (uint32_t) (uint16_t) (numbers)[1] << 16))
 
-/* The instruction is named: the header of all of them takes longer to read than this file to
+/* Inline assembly, since the header of the intrinsics takes longer to parse than this file takes to
  * compile. */
 #if REGISTER_BYTES == 64
 #define TARGET "avx512f,avx512bw"
@@ -85,24 +86,24 @@ typedef int32_t wide __attribute__((vector_size(REGISTER_BYTES)));
 typedef int16_t halves __attribute__((vector_size(REGISTER_BYTES)));
 
 LOOPS __attribute__((target(TARGET)))
-static void measure_wide(const lookup_job *job, const asked *pairs, int32_t *distance) {
-  wide twice[PAIRS], kept[PAIRS];
+static void measure_wide(const lookup_job *job, const key_pair *pairs, int32_t *distance) {
+  wide twice[PAIRS], mask[PAIRS];
   const int64_t parts = TILE * 4 / REGISTER_BYTES;
   int64_t part, count = (job->rows + TILE - 1) / TILE * parts;
   int i;
   for (i = 0; i < PAIRS; ++i) {
     twice[i] = PAIR_OF(pairs[i].twice) + (wide) {0};
-    kept[i] = PAIR_OF(pairs[i].kept) + (wide) {0};
+    mask[i] = PAIR_OF(pairs[i].mask) + (wide) {0};
   }
   for (part = 0; part < count; ++part) {
     const char *from = (const char *) job->tiles
                      + (part / parts * PAIRS * parts + part % parts) * REGISTER_BYTES;
     wide sum = {0};
     for (i = 0; i < PAIRS; ++i) {
-      wide a, rest, both;
+      wide a, difference, both;
       memcpy(&a, from + i * parts * REGISTER_BYTES, REGISTER_BYTES);
-      rest = (wide) ((halves) a - (halves) twice[i]) & kept[i];
-      __asm__("vpmaddwd %2, %1, %0" : "=" REGISTER(both) : REGISTER(a), REGISTER(rest));
+      difference = (wide) ((halves) a - (halves) twice[i]) & mask[i];
+      __asm__("vpmaddwd %2, %1, %0" : "=" REGISTER(both) : REGISTER(a), REGISTER(difference));
       sum += both;
     }
     memcpy(distance + part * (REGISTER_BYTES / 4), &sum, REGISTER_BYTES);
@@ -110,10 +111,10 @@ static void measure_wide(const lookup_job *job, const asked *pairs, int32_t *dis
 }
 
 LOOPS __attribute__((target(TARGET)))
-static void find(const lookup_job *job, const asked *pairs, int32_t *distance, int32_t *nearest,
+static void find(const lookup_job *job, const key_pair *pairs, int32_t *distance, int32_t *nearest,
                  int64_t *found) {
   measure_wide(job, pairs, distance);
-  choose(job, distance, nearest, found);
+  select_nearest(job, distance, nearest, found);
 }
 #else
 #if defined(FREESTANDING) && (defined(__SSE2__) || defined(__wasm_simd128__))
@@ -123,29 +124,29 @@ typedef __m128i eight;
 #define LOADED(from) _mm_loadu_si128((const __m128i *) (const void *) (from))
 #define STORED(to, x) _mm_storeu_si128((__m128i *) (void *) (to), x)
 #define TWICE(x) _mm_set1_epi32(x)
-#define REST(a, twice, kept) _mm_and_si128(_mm_sub_epi16(a, twice), kept)
-#define SUM(sum, a, rest) _mm_add_epi32(sum, _mm_madd_epi16(a, rest))
+#define DIFFERENCE(a, twice, mask) _mm_and_si128(_mm_sub_epi16(a, twice), mask)
+#define SUM(sum, a, difference) _mm_add_epi32(sum, _mm_madd_epi16(a, difference))
 #else
 #include <wasm_simd128.h>
 typedef v128_t eight;
 #define LOADED(from) wasm_v128_load(from)
 #define STORED(to, x) wasm_v128_store(to, x)
 #define TWICE(x) wasm_i32x4_splat(x)
-#define REST(a, twice, kept) wasm_v128_and(wasm_i16x8_sub(a, twice), kept)
-#define SUM(sum, a, rest) wasm_i32x4_add(sum, wasm_i32x4_dot_i16x8(a, rest))
+#define DIFFERENCE(a, twice, mask) wasm_v128_and(wasm_i16x8_sub(a, twice), mask)
+#define SUM(sum, a, difference) wasm_i32x4_add(sum, wasm_i32x4_dot_i16x8(a, difference))
 #endif
 
 #define PAIR_OF(numbers) \
   ((int32_t) ((uint32_t) (uint16_t) (numbers)[0] | (uint32_t) (uint16_t) (numbers)[1] << 16))
 
-/* What every machine of the kind has. */
-static void measure_eight(const lookup_job *job, const asked *pairs, int32_t *distance) {
-  eight twice[PAIRS], kept[PAIRS];
+/* Baseline vectors of 16 bytes, which every machine of the architecture has. */
+static void measure_eight(const lookup_job *job, const key_pair *pairs, int32_t *distance) {
+  eight twice[PAIRS], mask[PAIRS];
   int64_t tile, tiles = (job->rows + TILE - 1) / TILE;
   int i, part;
   for (i = 0; i < PAIRS; ++i) {
     twice[i] = TWICE(PAIR_OF(pairs[i].twice));
-    kept[i] = TWICE(PAIR_OF(pairs[i].kept));
+    mask[i] = TWICE(PAIR_OF(pairs[i].mask));
   }
   for (tile = 0; tile < tiles; ++tile) {
     const int16_t *row = job->tiles + tile * PAIRS * TILE * 2;
@@ -153,7 +154,7 @@ static void measure_eight(const lookup_job *job, const asked *pairs, int32_t *di
       eight sum = TWICE(0);
       for (i = 0; i < PAIRS; ++i) {
         const eight a = LOADED(row + (i * TILE + part * 4) * 2);
-        sum = SUM(sum, a, REST(a, twice[i], kept[i]));
+        sum = SUM(sum, a, DIFFERENCE(a, twice[i], mask[i]));
       }
       STORED(distance + tile * TILE + part * 4, sum);
     }
@@ -163,10 +164,10 @@ static void measure_eight(const lookup_job *job, const asked *pairs, int32_t *di
 #define measure measure_eight
 #endif
 
-LOOPS static void find(const lookup_job *job, const asked *pairs, int32_t *distance,
+LOOPS static void find(const lookup_job *job, const key_pair *pairs, int32_t *distance,
                        int32_t *nearest, int64_t *found) {
   measure(job, pairs, distance);
-  choose(job, distance, nearest, found);
+  select_nearest(job, distance, nearest, found);
 }
 #endif
 
@@ -174,23 +175,23 @@ DRIVER(lookup, lookup_job) {
   workspace space;
   int outcome = set_up(&space, N_KEY + 2 * (job->rows + TILE));
   int64_t ticks = 0;
-  scalar limit = 0;
+  scalar deadline = 0;
   int i;
-  asked pairs[PAIRS];
+  key_pair pairs[PAIRS];
   int32_t *distance, *nearest;
   if (outcome != DONE) return outcome;
   distance = (int32_t *) (space.extra + N_KEY);
   nearest = distance + job->rows + TILE;
-  if (job->count - job->next > CLOCK_INTERVAL) limit = monotonic() + job->slice;
+  if (job->count - job->next > CLOCK_INTERVAL) deadline = monotonic() + job->slice;
   for (; job->next < job->count; ++job->next) {
-    if (++ticks % CLOCK_INTERVAL == 0 && monotonic() > limit) {
+    if (++ticks % CLOCK_INTERVAL == 0 && monotonic() > deadline) {
       outcome = SLICE_OVER;
       break;
     }
     for (i = 0; i < N_IN; ++i) space.arg[i] = job->inputs[i] + job->next * job->input_steps[i];
     space.res[0] = space.extra;
     STEP(space.arg, space.res, 0);
-    ask(space.extra, pairs);
+    quantize_key(space.extra, pairs);
     find(job, pairs, distance, nearest, job->found + job->next * job->wanted);
   }
   give_back(&space);
