@@ -1,9 +1,8 @@
 """Build the page that solves in the browser: drag a contact, and arm and hand follow.
 
-Every robot's solver is exported as WebAssembly and written into a script of its own, which the page
-loads when the robot is chosen; three.js comes from the npm registry (`npm ci`, versions in
-package-lock.json) and is bundled. What comes out are plain files: they work from any file host, and
-from disk::
+Each robot's solver is exported as WebAssembly and bundled into a script that the page loads when
+the robot is selected. three.js comes from the npm registry (`npm ci`, versions in
+package-lock.json). The result are plain files for any file host, which also work from disk::
 
     python page/build.py --out out/page
 """
@@ -30,7 +29,7 @@ from casadi_ik.export.project import checked_prefix, wasm_project, write_folder
 from casadi_ik.model.load_grasp import shipped_grasps
 from casadi_ik.model.objects import load_object
 
-HERE = Path(__file__).parent
+PAGE_FOLDER = Path(__file__).parent
 
 ROBOTS = {
     "kuka_lwr_barrett": "LWR 4+ · Barrett",
@@ -40,7 +39,7 @@ ROBOTS = {
     "two_ur10e+barrett_bh8_280": "Two UR10e · Barretts",
     "g1+dex3": "G1 · two Dex3",
 }
-"""What can be chosen, and what it is called there."""
+"""Robots of the page, and their titles."""
 
 COLORS = {
     "object": palette.OBJECT,
@@ -48,81 +47,86 @@ COLORS = {
     "touching": palette.NEAREST,
     "pad": palette.PAD,
 }
-"""Of what the page draws beside robots."""
+"""Colours of items other than robots."""
 
-CAPACITY = 8
-"""Solids of a scene: an object of several parts, and the obstacle."""
+SOLID_CAPACITY = 8
+"""Maximum number of solids: the parts of an object, and the obstacle."""
 
-LARGEST = 4e6
-"""A robot's script is at most as large [bytes]."""
+MAX_SCRIPT_SIZE = 4e6
+"""Maximum size of a robot's script [bytes]."""
 
-CLOSE = 0.015
-"""Of two contacts of a shipped grasp that are nearer to each other [m] one is left out: the shapes
-of two fingers would overlap."""
+MIN_CONTACT_DISTANCE = 0.015
+"""Minimum distance of contacts of a shipped grasp [m]; of closer ones, one is left out, since the
+shapes of the fingers would overlap.
+"""
 
-SPANS = 20_000
-"""Random configurations, from which it is known how far fingertips reach, and apart."""
+SAMPLE_COUNT = 20_000
+"""Number of random configurations from which the ranges of fingertip distances are estimated."""
 
 
-def of_grasps(robot: ik.ArmHand, name: str) -> list[dict[str, Any]]:
-    """The robot's shipped grasps with objects as an export has them; else its contacts at home."""
-    found: list[dict[str, Any]] = []
-    for file in shipped_grasps(name):
-        grasp = ik.load_grasp(file)
+def grasp_entries(robot: ik.ArmHand, name: str) -> list[dict[str, Any]]:
+    """Return the robot's shipped grasps whose objects can be exported, or its contacts at home."""
+    grasps: list[dict[str, Any]] = []
+    for grasp_name in shipped_grasps(name):
+        grasp = ik.load_grasp(grasp_name)
         if grasp.object is None or grasp.object_pose is None:
             continue
-        # Where pads are and face then, which of balls is not where they touch.
+        # Points and normals of the pads; for a ball condition they differ from the target.
         q = ik.Solver(robot, scene=scene_with_object(ik.Scene(), grasp)).solve(grasp).q
         points, normals = robot.contacts(q)
         for k, finger in enumerate(robot.fingers):
-            near = np.linalg.norm(points[:k] - points[k], axis=1) < CLOSE
-            if finger not in grasp.contacts or near.any():
+            is_close = np.linalg.norm(points[:k] - points[k], axis=1) < MIN_CONTACT_DISTANCE
+            if finger not in grasp.contacts or is_close.any():
                 points[k] = normals[k] = np.nan
         parts = primitive_solids(load_object(grasp.object).shape)
-        if len(parts) >= CAPACITY or any(solid.kind not in EXPORTED_KINDS for solid, _ in parts):
+        if len(parts) >= SOLID_CAPACITY or any(
+            solid.kind not in EXPORTED_KINDS for solid, _ in parts
+        ):
             continue
-        # As the page answers, bit for bit: cameras look at that.
+        # Cameras show the solution of the page, which equals this one bit for bit.
         solver = ik.Solver(robot, scene=scene_with_object(ik.Scene(), grasp))
-        close = close_view(robot, solver.solve_batch(points[None], normals[None]).q[0])
-        middle = np.nanmean(points, axis=0)
-        found.append(
+        close_up = close_view(robot, solver.solve_batch(points[None], normals[None]).q[0])
+        center = np.nanmean(points, axis=0)
+        grasps.append(
             {
-                "name": file,
+                "name": grasp_name,
                 "object": grasp.object.replace("_", " "),
-                "views": {"close": close, "whole": overview(middle, close)},
+                "views": {"close": close_up, "whole": overview(center, close_up)},
                 "points": [None if np.isnan(p).any() else p.tolist() for p in points],
                 "normals": [None if np.isnan(n).any() else n.tolist() for n in normals],
                 "solids": [
-                    solid_to_dict(solid, grasp.object_pose @ place) | {"shape": solid.kind.name}
-                    for solid, place in parts
+                    solid_to_dict(solid, grasp.object_pose @ pose) | {"shape": solid.kind.name}
+                    for solid, pose in parts
                 ],
             }
         )
-    if not found:
+    if not grasps:
         points, normals = (values.tolist() for values in robot.contacts(robot.home))
-        close = close_view(robot, robot.home)
-        views = {"close": close, "whole": overview(np.mean(points, axis=0), close)}
-        asked = {"points": points, "normals": normals, "views": views}
-        found.append({"name": "home", "object": "", "solids": [], **asked})
-    return found
+        close_up = close_view(robot, robot.home)
+        views = {"close": close_up, "whole": overview(np.mean(points, axis=0), close_up)}
+        contacts_and_views = {"points": points, "normals": normals, "views": views}
+        grasps.append({"name": "home", "object": "", "solids": [], **contacts_and_views})
+    return grasps
 
 
-def reached(robot: ik.ArmHand) -> dict[str, Any]:
-    """How far apart two fingertips, and each from the base, were in random configurations [m]."""
-    points, _ = robot.contacts(robot.random(np.random.default_rng(0), SPANS))
+def reach_statistics(robot: ik.ArmHand) -> dict[str, Any]:
+    """Return the ranges of distances between fingertips and from the base."""
+    points, _ = robot.contacts(robot.random(np.random.default_rng(0), SAMPLE_COUNT))
     pairs = itertools.combinations(range(len(robot.fingers)), 2)
-    away = {pair: np.linalg.norm(points[:, pair[0]] - points[:, pair[1]], axis=1) for pair in pairs}
+    distances = {
+        pair: np.linalg.norm(points[:, pair[0]] - points[:, pair[1]], axis=1) for pair in pairs
+    }
     return {
         "spans": [
             {"fingers": pair, "least": float(d.min()), "most": float(d.max())}
-            for pair, d in away.items()
+            for pair, d in distances.items()
         ],
         "reach": np.linalg.norm(points, axis=2).max(axis=0).tolist(),
     }
 
 
-def about(robot: ik.ArmHand, name: str) -> dict[str, Any]:
-    """What the page has to know of a robot beside its solver."""
+def robot_data(robot: ik.ArmHand, name: str) -> dict[str, Any]:
+    """Return the data of a robot that the page needs besides its solver."""
     description = robot.description
     arms = description.arm_actuators
     if description.sides:
@@ -136,42 +140,42 @@ def about(robot: ik.ArmHand, name: str) -> dict[str, Any]:
         "armMotors": list(arms),
         "looks": link_styles(robot.description),
         "prismatic": [motor.unit == "m" for motor in robot.description.actuators],
-        "grasps": of_grasps(robot, name),
-        **reached(robot),
+        "grasps": grasp_entries(robot, name),
+        **reach_statistics(robot),
     }
 
 
 def run(*command: str) -> None:
-    """Run a command in this folder."""
-    done = subprocess.run(command, cwd=HERE, capture_output=True, text=True)
+    """Run a command in the folder of the page."""
+    done = subprocess.run(command, cwd=PAGE_FOLDER, capture_output=True, text=True)
     if done.returncode:
         raise SystemExit(f"{' '.join(command)}:\n{done.stdout[-2000:]}{done.stderr[-2000:]}")
 
 
-def bundle(entry: Path, out: Path, *more: str) -> None:
-    """A script that needs nothing and is no module: from disk, browsers load no others."""
+def bundle(entry: Path, out: Path, *options: str) -> None:
+    """Bundle a script as an IIFE, because browsers do not load modules from disk."""
     run(
         *("npx", "--no-install", "esbuild", str(entry), "--bundle", "--minify", "--format=iife"),
-        *("--target=es2022", "--charset=utf8", "--log-level=error", f"--outfile={out}", *more),
+        *("--target=es2022", "--charset=utf8", "--log-level=error", f"--outfile={out}", *options),
     )
 
 
-def build_robot(name: str, out: Path, keep: Path | None) -> dict[str, Any]:
-    """A robot's script; what the page says of it before it is loaded.
+def build_robot(name: str, out: Path, keep_folder: Path | None) -> dict[str, Any]:
+    """Build the script of a robot, and return its entry in the page.
 
     Args:
-        name: Of the robot.
+        name: Name of the robot.
         out: Folder of the page.
-        keep: Where the exported module stays, if it shall.
+        keep_folder: Folder in which the exported module is kept; None: it is not kept.
     """
     robot = ik.load_robot(name)
     prefix = checked_prefix(None, name)
-    data = about(robot, name)
+    data = robot_data(robot, name)
     with tempfile.TemporaryDirectory() as folder:
-        place = (keep or Path(folder)) / prefix
-        write_folder(place, wasm_project(robot, prefix, CAPACITY))
-        (place / "about.json").write_text(json.dumps(data), encoding="utf-8")
-        entry = place / "entry.js"
+        folder_of_robot = (keep_folder or Path(folder)) / prefix
+        write_folder(folder_of_robot, wasm_project(robot, prefix, SOLID_CAPACITY))
+        (folder_of_robot / "about.json").write_text(json.dumps(data), encoding="utf-8")
+        entry = folder_of_robot / "entry.js"
         entry.write_text(
             f'import * as solver from "./{prefix}.js";\n'
             f'import wasm from "./{prefix}.wasm";\n'
@@ -184,8 +188,10 @@ def build_robot(name: str, out: Path, keep: Path | None) -> dict[str, Any]:
         loaders = ("--loader:.wasm=binary", "--external:node:fs/promises")
         bundle(entry, script, *loaders, "--define:import.meta.url=''")
     size = script.stat().st_size
-    if size > LARGEST:
-        raise SystemExit(f"{name}: {size / 1e6:.1f} MB, expected at most {LARGEST / 1e6:.0f} MB")
+    if size > MAX_SCRIPT_SIZE:
+        raise SystemExit(
+            f"{name}: {size / 1e6:.1f} MB, expected at most {MAX_SCRIPT_SIZE / 1e6:.0f} MB"
+        )
     print(f"{name}: {size / 1e6:.2f} MB", flush=True)
     motors, fingers = len(robot.actuators), len(robot.fingers)
     return {
@@ -198,23 +204,23 @@ def build_robot(name: str, out: Path, keep: Path | None) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Build it."""
+    """Build the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--robots", nargs="+", default=list(ROBOTS), metavar="ROBOT")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="keep the exported modules here")
     arguments = parser.parse_args()
     if shutil.which("npm") is None:
-        raise SystemExit("the page needs node and npm, to bundle three.js")
+        raise SystemExit("npm is not installed; the page needs node and npm to bundle three.js")
     out = arguments.out.resolve()
     (out / "robots").mkdir(parents=True, exist_ok=True)
     run("npm", "ci", "--no-audit", "--no-fund", "--silent")
     robots = [build_robot(name, out, arguments.keep) for name in arguments.robots]
-    defined = {"ROBOTS": robots, "PALETTE": COLORS}
-    words = [f"--define:{name}={json.dumps(value)}" for name, value in defined.items()]
-    bundle(HERE / "src" / "main.js", out / "page.js", *words)
+    definitions = {"ROBOTS": robots, "PALETTE": COLORS}
+    options = [f"--define:{name}={json.dumps(value)}" for name, value in definitions.items()]
+    bundle(PAGE_FOLDER / "src" / "main.js", out / "page.js", *options)
     for name in ("index.html", "page.css"):
-        shutil.copy(HERE / "src" / name, out / name)
+        shutil.copy(PAGE_FOLDER / "src" / name, out / name)
     print(f"open {out / 'index.html'}", file=sys.stderr)
 
 

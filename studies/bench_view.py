@@ -221,17 +221,17 @@ def _on_page(
     """A drag on the page without a server."""
     url, scripts = Path(path).resolve().as_uri(), [] if painted else [NO_PAINTING]
     page = _opened(browser, url, *scripts)
-    page.wait("globalThis.casadiIk?.now.answer && !casadiIk.stage.asked", 60.0)
+    page.wait("globalThis.casadiIk?.now.answer && !casadiIk.viewport.framePending", 60.0)
     time.sleep(1.0)
     page.evaluate(COMMON + ALONE)
     still = STILL.replace("DRAW; next()", "next()")
-    still = still.replace("took.push(", "casadiIk.stage.draw(); took.push(")
+    still = still.replace("took.push(", "casadiIk.viewport.draw(); took.push(")
     found: Found = {}
     found["picture painted again ms"] = _still(page, still)
     start = np.array(page.evaluate("casadiIk.pixel('point 0')"))
     with _cpu_of(browser, steps, found, "renderer", "GPU"):
         rows = _drag(page, start, np.array([9.0, -9.0]), steps, rest)
-    page.wait("!casadiIk.stage.asked")
+    page.wait("!casadiIk.viewport.framePending")
     return rows, found
 
 

@@ -145,10 +145,10 @@ def imported(urdf: Path, folder: Path) -> list[str]:
 def alone(browser: Any, path: Path, picture: Path) -> None:
     """The page without a server, once it has answered often enough to be warm."""
     page = browser.open(path.resolve().as_uri(), *WINDOW)
-    page.wait("globalThis.casadiIk?.now.answer && !casadiIk.stage.asked", 60.0)
+    page.wait("globalThis.casadiIk?.now.answer && !casadiIk.viewport.framePending", 60.0)
     x, y = page.evaluate("casadiIk.pixel('object')")
     page.drag((x, y), (x + 6.0, y - 4.0), steps=12)
-    page.wait("!casadiIk.stage.asked")
+    page.wait("!casadiIk.viewport.framePending")
     seen(page, picture)
 
 

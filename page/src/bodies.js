@@ -1,8 +1,8 @@
-// What is drawn: the robot's shapes, solids, contacts.
+// Meshes of the robot, of solids and of contacts.
 import * as THREE from "three";
 
 /* global PALETTE */
-// By the solver's names of kinds: what a solid looks like, along z where it is along anything.
+// Geometries by the solver's names of kinds; axes of revolution are z.
 const UPRIGHT = Math.PI / 2;
 const GEOMETRY = {
   BOX: (size) => new THREE.BoxGeometry(...size),
@@ -17,7 +17,7 @@ const UP = new THREE.Vector3(0, 1, 0);
 const ALONG = new THREE.Vector3(0, 0, 1);
 const PAD = [0.0056, 0.003]; // radius and thickness [m]
 
-// Of fingers: as many as two hands have.
+// Colours of fingers, for two hands.
 export const COLORS = [
   "#f0a400", "#2f7fd6", "#16a39a", "#b04fc9", "#e0528a", "#8fae1b", "#7a5a3c", "#5b4fcf", "#d8492a", "#6f8796",
 ];
@@ -31,7 +31,7 @@ function meshOf(shape, size, material) {
   return mesh;
 }
 
-// A pose as the solver has it: rotation row by row, then the origin.
+// Returns the matrix of a pose: the rotation by rows, then the origin.
 export function matrixOf(pose) {
   const [a, b, c, d, e, f, g, h, i, x, y, z] = pose;
   return new THREE.Matrix4().set(a, b, c, x, d, e, f, y, g, h, i, z, 0, 0, 0, 1);
@@ -42,7 +42,7 @@ export function poseOf(matrix) {
   return [m[0], m[4], m[8], m[1], m[5], m[9], m[2], m[6], m[10], m[12], m[13], m[14]];
 }
 
-// A robot as the shapes that collisions are checked with, a pad at each fingertip.
+// Collision shapes of a robot, with a pad at each fingertip.
 export class RobotBody extends THREE.Group {
   constructor({ about, shapes, fingers }) {
     super();
@@ -60,7 +60,7 @@ export class RobotBody extends THREE.Group {
     this.touching = solid(PALETTE.touching);
   }
 
-  // As the solver has it: where its shapes are, and what its fingertips reach.
+  // Moves the shapes and pads to the configuration q.
   place(q, solver) {
     const places = solver.shapes(q), { points, normals } = solver.contacts(q);
     const way = new THREE.Vector3();
@@ -84,14 +84,14 @@ export class RobotBody extends THREE.Group {
     }
   }
 
-  // Links that touch something have a colour of their own.
+  // Highlights colliding links.
   mark(links) {
     for (const part of this.parts) {
       part.mesh.material = links.includes(part.link) ? this.touching : part.usual;
     }
   }
 
-  // Corners of what is drawn, of all or of the hand: a camera is to see them.
+  // Returns the corners of the bounding boxes of all shapes, or of the hand's.
   corners(handOnly) {
     const found = [], box = new THREE.Box3();
     for (const { mesh, role } of this.parts) {
@@ -107,8 +107,8 @@ export class RobotBody extends THREE.Group {
   }
 }
 
-export class Things extends THREE.Group {
-  // Solids in one: the object (seen through) or the obstacle.
+export class SolidGroup extends THREE.Group {
+  // Solids of the object (translucent) or of the obstacle.
   constructor(solids, isObject) {
     super();
     this.material = solid(isObject ? PALETTE.object : PALETTE.scene);
@@ -129,7 +129,7 @@ export class Things extends THREE.Group {
   }
 }
 
-// By what the object is taken: a disc with a rim at its middle, seen through everything.
+// Handle of the object: a disc at its centre, drawn over everything.
 export class Knob extends THREE.Group {
   constructor() {
     super();
@@ -156,8 +156,8 @@ export class Knob extends THREE.Group {
   }
 }
 
-// A contact: a ball where the fingertip must be, an arrow the way it must face, a line from where
-// the fingertip is. Seen through everything.
+// A contact: a ball at the point, an arrow along the normal, a line to the fingertip. Drawn over
+// everything.
 export class ContactMark extends THREE.Group {
   constructor(color) {
     super();

@@ -1,9 +1,9 @@
-// What is said beside the picture.
+// The panel beside the 3D view.
 import { COLORS } from "./bodies.js";
-import { clear, degrees, millimetres, plain, reason } from "./words.js";
+import { clearanceText, degrees, failureReason, millimetres, plain } from "./messages.js";
 
 const MET = { position: 5e-3, angle: (3 * Math.PI) / 180 };
-const by = (id) => document.getElementById(id);
+const element = (id) => document.getElementById(id);
 
 export class Panel {
   constructor(robots, choose) {
@@ -18,7 +18,7 @@ export class Panel {
       chip.addEventListener("click", () => choose(robot));
       return chip;
     });
-    by("robots").replaceChildren(...this.chips);
+    element("robots").replaceChildren(...this.chips);
   }
 
   chosen(name) {
@@ -26,10 +26,10 @@ export class Panel {
   }
 
   robot({ about, fingers, motors }) {
-    by("grasp").replaceChildren(
+    element("grasp").replaceChildren(
       ...about.grasps.map((grasp, i) => new Option(grasp.object || "at home", String(i))),
     );
-    by("fingers").replaceChildren(
+    element("fingers").replaceChildren(
       ...fingers.map((name, i) => {
         const row = document.createElement("tr");
         row.innerHTML = `<td><i style="background:${COLORS[i % COLORS.length]}"></i></td><td></td><td></td><td></td>`;
@@ -37,7 +37,7 @@ export class Panel {
         return row;
       }),
     );
-    by("motors").replaceChildren(
+    element("motors").replaceChildren(
       ...motors.map((name, i) => {
         const row = document.createElement("div");
         row.className = "motor";
@@ -48,24 +48,26 @@ export class Panel {
     );
   }
 
-  // What keys may move, by name and in words.
+  // Lists the items that keys can move, by name and label.
   selectable(names, words) {
-    by("selected").replaceChildren(...names.map((name, i) => new Option(words[i], name)));
+    element("selected").replaceChildren(...names.map((name, i) => new Option(words[i], name)));
   }
 
   answer(solving, question, answer) {
     const { robot } = solving, { Status, about, lower, upper } = robot;
     const solved = answer.status === Status.SOLVED, touches = answer.status === Status.COLLISION;
-    const badge = by("status");
-    badge.textContent = solved ? "solved" : touches ? "touches" : "not reached";
+    const badge = element("status");
+    badge.textContent = solved ? "solved" : touches ? "in collision" : "not reached";
     badge.className = `badge ${solved ? "good" : touches ? "warn" : "bad"}`;
     this.time(answer);
-    const why = by("reason");
+    const why = element("reason");
     why.className = solved ? "good" : "bad";
-    why.textContent = solved ? clear(question, answer) : reason(robot, question, answer, solving.atEnds(answer.q));
-    [...by("fingers").rows].forEach((row, i) => {
+    why.textContent = solved
+      ? clearanceText(question, answer)
+      : failureReason(robot, question, answer, solving.motorsAtLimits(answer.q));
+    [...element("fingers").rows].forEach((row, i) => {
       const off = answer.positionError[i], turned = answer.angleError[i];
-      // What is free is NaN.
+      // Unconstrained errors are NaN.
       const good = !(off > MET.position * 1.000001) && !(turned > MET.angle * 1.000001);
       row.cells[1].textContent = Number.isNaN(off) ? "free" : millimetres(off);
       row.cells[2].textContent = Number.isNaN(turned) ? "free" : degrees(turned);
@@ -74,10 +76,10 @@ export class Panel {
     });
     const judged = (solved || touches) && answer.closest;
     const names = judged ? judged.map((name) => plain(question.called(name))) : null;
-    by("clearance").textContent = names ? `${millimetres(answer.clearance)}, ${names.join(" – ")}` : "collision not checked";
+    element("clearance").textContent = names ? `${millimetres(answer.clearance)}, ${names.join(" – ")}` : "collision not checked";
     const { iterations, restarts } = answer;
-    by("iterations").textContent = `${iterations}, ${restarts} ${restarts === 1 ? "restart" : "restarts"}`;
-    [...by("motors").children].forEach((row, i) => {
+    element("iterations").textContent = `${iterations}, ${restarts} ${restarts === 1 ? "restart" : "restarts"}`;
+    [...element("motors").children].forEach((row, i) => {
       const part = (answer.q[i] - lower[i]) / (upper[i] - lower[i]);
       row.children[1].firstChild.style.left = `${100 * Math.min(Math.max(part, 0), 1)}%`;
       row.children[1].classList.toggle("end", Math.min(part, 1 - part) < 1e-3);
@@ -85,23 +87,23 @@ export class Panel {
     });
   }
 
-  time({ time, counted }) {
+  time({ time, solveCount }) {
     const digits = time < 100 ? 1 : 0;
-    by("time").textContent = time < 1000 ? `${time.toFixed(digits)} µs` : `${(time / 1000).toFixed(1)} ms`;
-    by("share").title = counted > 1 ? `Median over lots of ${counted} solves of this target in all` : "One solve";
+    element("time").textContent = time < 1000 ? `${time.toFixed(digits)} µs` : `${(time / 1000).toFixed(1)} ms`;
+    element("share").title = solveCount > 1 ? `Median over ${solveCount} solves of this target` : "One solve";
   }
 }
 
-// Something that happened, said below the verdict, where there is always room for it.
+// Shows a message below the verdict for some seconds.
 let silence = 0;
 export function note(text, seconds = 6) {
-  by("note").textContent = text;
+  element("note").textContent = text;
   clearTimeout(silence);
-  silence = setTimeout(() => (by("note").textContent = ""), 1e3 * seconds);
+  silence = setTimeout(() => (element("note").textContent = ""), 1e3 * seconds);
 }
 
-// Text to the clipboard; where the browser does not let a page do that, the old way.
-export async function copied(text, what) {
+// Copies a text to the clipboard; falls back to execCommand if the browser refuses.
+export async function copyText(text, what) {
   try {
     await navigator.clipboard.writeText(text);
   } catch {

@@ -66,7 +66,7 @@ def asked(page: Page) -> np.ndarray:
 
 def settled(page: Page) -> None:
     """Everything is done that was asked for, and the robot stands."""
-    page.wait(f"{ANSWERED} && !casadiIk.stage.asked")
+    page.wait(f"{ANSWERED} && !casadiIk.viewport.framePending")
 
 
 def the_page_follows(page: Page, robot: ik.ArmHand) -> None:

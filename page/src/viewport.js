@@ -1,20 +1,20 @@
-// Camera, light, floor: what everything else stands in. Drawn when something has changed.
+// Cameras, lights and floor; rendered on demand.
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
 const FLOOR = { light: [0xaab4be, 0xd3dae1, 0.18], dark: [0x4b5a69, 0x28323c, 0.4] };
-const AROUND = 1.2; // of what has to be seen, left free about it
-const INSET = { part: 0.3, most: 230, edge: 12 }; // of the width; [pixels]
+const MARGIN = 1.2; // size of the view relative to its content
+const INSET = { fraction: 0.3, maxSize: 230, edge: 12 }; // of the width; [pixels]
 
-const TIP = 0.02; // how far what touches a point may be from it [m]
+const TIP = 0.02; // distance within which a body does not occlude a contact [m]
 
-// To where a picture is taken from: by azimuth and elevation [rad].
-function outOf([azimuth, elevation]) {
+// Returns the unit vector towards the camera for azimuth and elevation [rad].
+function viewDirection([azimuth, elevation]) {
   const flat = Math.cos(elevation);
   return new THREE.Vector3(flat * Math.cos(azimuth), flat * Math.sin(azimuth), Math.sin(elevation));
 }
 
-export class Stage {
+export class Viewport {
   constructor(canvas) {
     this.canvas = canvas;
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
@@ -24,9 +24,9 @@ export class Stage {
     this.renderer.autoClear = false;
     this.scene = new THREE.Scene();
     this.camera = new THREE.PerspectiveCamera(32, 1, 0.02, 30);
-    this.far = new THREE.PerspectiveCamera(32, 1, 0.02, 30);
+    this.insetCamera = new THREE.PerspectiveCamera(32, 1, 0.02, 30);
     this.camera.up.set(0, 0, 1);
-    this.far.up.set(0, 0, 1);
+    this.insetCamera.up.set(0, 0, 1);
     this.controls = new OrbitControls(this.camera, canvas);
     this.scene.add(new THREE.HemisphereLight(0xffffff, 0xb9c2ca, 2.3));
     this.sun = new THREE.DirectionalLight(0xffffff, 1.7);
@@ -61,36 +61,36 @@ export class Stage {
     this.renderer.setSize(width, height, false);
     this.camera.aspect = width / height;
     this.camera.updateProjectionMatrix();
-    const side = Math.round(Math.min(INSET.part * width, 0.42 * height, INSET.most));
+    const side = Math.round(Math.min(INSET.fraction * width, 0.42 * height, INSET.maxSize));
     this.inset = { side, x: INSET.edge, y: height - side - INSET.edge };
     this.canvas.parentElement.style.setProperty("--inset", `${side}px`);
     this.draw();
   }
 
-  // Puts a camera where it sees all points from a side, and nothing else fits.
+  // Moves a camera so that all points, seen from a side, fill its view.
   aim(camera, side, points) {
-    const out = outOf(side), [azimuth] = side;
+    const out = viewDirection(side), [azimuth] = side;
     const right = new THREE.Vector3(-Math.sin(azimuth), Math.cos(azimuth), 0);
     const up = out.clone().cross(right);
-    const tall = Math.tan((camera.fov * Math.PI) / 360) / AROUND, wide = tall * camera.aspect;
+    const tall = Math.tan((camera.fov * Math.PI) / 360) / MARGIN, wide = tall * camera.aspect;
     const center = new THREE.Box3().setFromPoints(points).getCenter(new THREE.Vector3());
     let away = 0;
-    for (let round = 0; round < 4; ++round) {
-      // As far as the sides of the picture allow; then the middle of what is seen, and again.
-      const least = { x: Infinity, y: Infinity }, most = { x: -Infinity, y: -Infinity };
+    for (let pass = 0; pass < 4; ++pass) {
+      // Alternate between the smallest distance that shows all points and centring them.
+      const minimum = { x: Infinity, y: Infinity }, maximum = { x: -Infinity, y: -Infinity };
       away = 0;
-      const seen = points.map((point) => point.clone().sub(center));
-      for (const one of seen) {
-        away = Math.max(away, one.dot(out) + Math.abs(one.dot(right)) / wide, one.dot(out) + Math.abs(one.dot(up)) / tall);
+      const offsets = points.map((point) => point.clone().sub(center));
+      for (const offset of offsets) {
+        away = Math.max(away, offset.dot(out) + Math.abs(offset.dot(right)) / wide, offset.dot(out) + Math.abs(offset.dot(up)) / tall);
       }
-      for (const one of seen) {
-        const depth = away - one.dot(out), x = one.dot(right) / depth, y = one.dot(up) / depth;
-        Object.assign(least, { x: Math.min(least.x, x), y: Math.min(least.y, y) });
-        Object.assign(most, { x: Math.max(most.x, x), y: Math.max(most.y, y) });
+      for (const offset of offsets) {
+        const depth = away - offset.dot(out), x = offset.dot(right) / depth, y = offset.dot(up) / depth;
+        Object.assign(minimum, { x: Math.min(minimum.x, x), y: Math.min(minimum.y, y) });
+        Object.assign(maximum, { x: Math.max(maximum.x, x), y: Math.max(maximum.y, y) });
       }
-      if (round === 3) break;
-      center.addScaledVector(right, (away * (least.x + most.x)) / 2);
-      center.addScaledVector(up, (away * (least.y + most.y)) / 2);
+      if (pass === 3) break;
+      center.addScaledVector(right, (away * (minimum.x + maximum.x)) / 2);
+      center.addScaledVector(up, (away * (minimum.y + maximum.y)) / 2);
     }
     camera.position.copy(center).addScaledVector(out, away);
     camera.lookAt(center);
@@ -98,27 +98,27 @@ export class Stage {
     return { center, away };
   }
 
-  // The side near a preferred one from which most of some points are seen past bodies.
+  // Returns the view near a preferred one from which most points are not occluded by bodies.
   side(preferred, points, bodies) {
-    const caster = new THREE.Raycaster(), way = outOf(preferred);
+    const caster = new THREE.Raycaster(), way = viewDirection(preferred);
     const seen = (out) =>
       points.filter((point) => {
-        // Fingertips that touch a point do not hide it.
+        // Fingertips that touch a point do not occlude it.
         caster.set(point.clone().addScaledVector(out, TIP), out);
         return !caster.intersectObjects(bodies, false).length;
       }).length;
-    let best = preferred, most = -Infinity;
+    let best = preferred, maximum = -Infinity;
     for (let i = 0; i < 16; ++i) {
       for (const elevation of [0.15, 0.35, 0.6]) {
-        const side = i ? [preferred[0] + (i * Math.PI) / 8, elevation] : preferred, out = outOf(side);
+        const side = i ? [preferred[0] + (i * Math.PI) / 8, elevation] : preferred, out = viewDirection(side);
         const score = seen(out) / points.length + 0.1 * out.dot(way);
-        if (score > most + 1e-9) [best, most] = [side, score];
+        if (score > maximum + 1e-9) [best, maximum] = [side, score];
       }
     }
     return best;
   }
 
-  // Looks at points from a side.
+  // Points the main camera at points from a side.
   look(side, points) {
     const { center, away } = this.aim(this.camera, side, points);
     this.controls.target.copy(center);
@@ -129,9 +129,9 @@ export class Stage {
     this.draw();
   }
 
-  // The picture in the corner, and the light of everything in it.
-  lookWhole(side, points) {
-    this.aim(this.far, side, points);
+  // Sets the camera of the inset, and fits floor and lights to the points.
+  setInset(side, points) {
+    this.aim(this.insetCamera, side, points);
     const box = new THREE.Box3().setFromPoints(points), floor = Math.min(box.min.z, 0);
     const { center, radius } = box.getBoundingSphere(new THREE.Sphere());
     this.floor.position.z = floor;
@@ -147,46 +147,46 @@ export class Stage {
     this.draw();
   }
 
-  // Calls are gathered: one picture a frame. `before` is done first, the last one asked for.
+  // Renders once per frame, after the latest `before`.
   draw(before) {
     if (before) this.before = before;
-    if (this.asked) return;
-    this.asked = requestAnimationFrame(() => {
-      const begun = performance.now(), work = this.before;
+    if (this.framePending) return;
+    this.framePending = requestAnimationFrame(() => {
+      const start = performance.now(), work = this.before;
       this.before = null;
       work?.();
-      this.asked = 0;
+      this.framePending = 0;
       this.render();
-      if (work) this.frames.push(performance.now() - begun);
+      if (work) this.frames.push(performance.now() - start);
       if (this.frames.length > 100) this.frames.shift();
     });
   }
 
-  // The large picture; where it shows the hand, the whole robot in a corner of it.
+  // Renders the main view, and the whole robot as an inset while the main view shows the hand.
   render() {
     const { renderer, scene, canvas } = this, { x, y, side } = this.inset;
     renderer.setScissorTest(false);
     renderer.setViewport(0, 0, canvas.clientWidth, canvas.clientHeight);
     renderer.clear();
     renderer.render(scene, this.camera);
-    if (!this.near) return;
+    if (!this.showsHand) return;
     renderer.shadowMap.autoUpdate = false;
     renderer.setViewport(x, y, side, side);
     renderer.setScissor(x, y, side, side);
     renderer.setScissorTest(true);
     renderer.clear();
-    renderer.render(scene, this.far);
+    renderer.render(scene, this.insetCamera);
     renderer.shadowMap.autoUpdate = true;
   }
 
-  // How many metres so many pixels are, where a point is.
+  // Returns the length [m] of a number of pixels at the depth of a point.
   metres(pixels, point) {
     const away = this.camera.position.distanceTo(point);
-    const whole = 2 * away * Math.tan((this.camera.fov * Math.PI) / 360);
-    return (pixels * whole) / this.canvas.clientHeight;
+    const viewHeight = 2 * away * Math.tan((this.camera.fov * Math.PI) / 360);
+    return (pixels * viewHeight) / this.canvas.clientHeight;
   }
 
-  // Where a point is seen [pixels of the page].
+  // Returns the position of a point on the page [pixels].
   pixel(point) {
     const seen = point.clone().project(this.camera), box = this.canvas.getBoundingClientRect();
     return [
@@ -195,14 +195,14 @@ export class Stage {
     ];
   }
 
-  // The ray through a place of the page.
+  // Returns the ray through a position on the page.
   ray(x, y) {
     const box = this.canvas.getBoundingClientRect(), caster = new THREE.Raycaster();
-    const at = new THREE.Vector2(
+    const position = new THREE.Vector2(
       (2 * (x - box.left)) / box.width - 1,
       1 - (2 * (y - box.top)) / box.height,
     );
-    caster.setFromCamera(at, this.camera);
+    caster.setFromCamera(position, this.camera);
     return caster;
   }
 }

@@ -1,46 +1,46 @@
-// What is asked: remembered step by step, and as the address of the page has it.
+// Undo history, and questions in the address of the page.
 
-const AT_ONCE = 900; // [ms] in which steps of one kind are one step: keys that are held
-const ROUND = 1e-4; // [m], and of normals and positions of motors
+const JOIN_MS = 900; // time within which steps of one kind are joined, for repeated keys [ms]
+const RESOLUTION = 1e-4; // of points [m], normals and motor positions in addresses
 
-// Steps that can be taken back. A step is whatever was asked, as JSON has it.
-export class Past {
+// Steps that can be undone; a step is a question as JSON.
+export class UndoHistory {
   constructor(changed) {
     Object.assign(this, { steps: [], at: -1, kind: "", when: 0, changed });
   }
 
-  keep(step, kind = "") {
+  record(step, kind = "") {
     const text = JSON.stringify(step), time = performance.now();
     if (text === this.steps[this.at]) return;
-    const joins = kind && kind === this.kind && time - this.when < AT_ONCE;
+    const joins = kind && kind === this.kind && time - this.when < JOIN_MS;
     this.steps.splice(joins ? this.at : this.at + 1, Infinity, text);
     this.at = this.steps.length - 1;
     Object.assign(this, { kind, when: time });
     this.changed();
   }
 
-  go(by) {
-    if (!this.steps[this.at + by]) return null;
-    this.at += by;
+  step(count) {
+    if (!this.steps[this.at + count]) return null;
+    this.at += count;
     this.kind = "";
     this.changed();
     return JSON.parse(this.steps[this.at]);
   }
 
-  get back() {
+  get canUndo() {
     return this.at > 0;
   }
 
-  get again() {
+  get canRedo() {
     return this.at < this.steps.length - 1;
   }
 }
 
-const rounded = (value) => String(Math.round(value / ROUND) / Math.round(1 / ROUND));
+const rounded = (value) => String(Math.round(value / RESOLUTION) / Math.round(1 / RESOLUTION));
 const list = (values) => values.map(rounded).join(",");
 const rows = (all) => all.map((row) => (row ? list(row) : "free")).join(";");
 
-// A question as the part of an address behind "#".
+// Returns a question as the fragment of an address.
 export function address({ robot, grasp, points, normals, object, obstacle, q0 }) {
   const words = { robot, grasp, points: rows(points), normals: rows(normals), object: list(object) };
   if (obstacle) words.obstacle = list(obstacle);
@@ -63,19 +63,19 @@ function contacts(text, count, key) {
   return found.map((row) => (row === "free" ? null : numbers(row, 3, key)));
 }
 
-// The name of the robot of an address; "": it has none.
+// Returns the name of the robot in an address, or "".
 export function robotOf(hash) {
   const text = hash.slice(1);
   return text.includes("=") ? new URLSearchParams(text).get("robot") ?? "" : decodeURIComponent(text);
 }
 
-// The question of an address, of a robot that is loaded; null: it has only a robot.
-export function asked(hash, { about, fingers, motors }) {
+// Returns the question in an address for a loaded robot; null if it names only a robot.
+export function questionFromAddress(hash, { about, fingers, motors }) {
   const words = new URLSearchParams(hash.slice(1));
   const of = (key, read, otherwise) => (words.has(key) ? read(words.get(key), key) : otherwise);
   const grasp = about.grasps.find(({ name }) => name === words.get("grasp"));
   if (!words.has("grasp")) return null;
-  if (!grasp) throw new Error(`grasp: found "${words.get("grasp").slice(0, 60)}", which is not here`);
+  if (!grasp) throw new Error(`grasp: found "${words.get("grasp").slice(0, 60)}": no such grasp`);
   const f = fingers.length;
   const points = of("points", (text, key) => contacts(text, f, key), grasp.points);
   const normals = of("normals", (text, key) => contacts(text, f, key), grasp.normals);
