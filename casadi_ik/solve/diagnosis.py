@@ -1,4 +1,4 @@
-"""What can be said about a grasp that was not solved: why, by how much, and what would help."""
+"""Diagnosis of an unsolved grasp: cause, distance to a solution, and remedies."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Point = tuple[float, float, float]
 
 
 class Reason(StrEnum):
-    """Cause of an unsolved grasp: proved, or likely.
+    """Cause of an unsolved grasp, proved or likely.
 
     Example:
         >>> far.diagnosis.reason is ik.solve.Reason.REACH
@@ -32,21 +32,21 @@ class Reason(StrEnum):
     REACHABLE = "the contacts can be reached; the method did not find the way"
 
 
-OF_PALMS = {
-    Reason.HAND: "the hand cannot be as it is asked",
-    Reason.REACH: "the arm does not reach where the palm is asked",
-    Reason.REACHABLE: "the palm can be reached; the method did not find the way",
+PALM_REASONS = {
+    Reason.HAND: "the hand cannot take the required posture",
+    Reason.REACH: "the arm does not reach the palm pose",
+    Reason.REACHABLE: "the palm pose can be reached, but the method did not find a solution",
 }
-"""What the reasons are where a palm was asked for, not contacts; the others are the same."""
+"""Texts of reasons for palm targets, where they differ from those for contacts."""
 
 
 @dataclass(frozen=True)
 class HandFit:
-    """How well the hand alone, with its palm free to move, fits the contacts.
+    """Fit of the hand alone, with a floating palm, to the contacts.
 
     Attributes:
         fits: Whether every contact is within tolerance.
-        contacts: Residual errors by finger.
+        contacts: Errors by finger.
     """
 
     fits: bool
@@ -55,12 +55,13 @@ class HandFit:
 
 @dataclass(frozen=True)
 class ArmReach:
-    """Where the wrist would have to be, against what the arm can span.
+    """Required distance of the wrist from the shoulder, and the range of the arm.
 
     Attributes:
-        distance: Of the wrist from the shoulder [m], of the hand fit nearest to the range.
+        distance: Distance of the wrist from the shoulder [m], for the hand fit nearest to the
+            range.
         nearest: Smallest distance within the limits of the elbow [m].
-        farthest: Largest distance [m].
+        farthest: Largest distance within the limits of the elbow [m].
     """
 
     distance: float
@@ -69,20 +70,20 @@ class ArmReach:
 
     @property
     def excess(self) -> float:
-        """By how much it is too far (> 0) or too near (< 0) [m]; 0 within the range."""
+        """Distance beyond the range: too far (> 0) or too near (< 0) [m]; 0 within the range."""
         return max(self.distance - self.farthest, 0.0) - max(self.nearest - self.distance, 0.0)
 
 
 @dataclass(frozen=True)
 class Relief:
-    """Limits that make the grasp solvable if they alone are lifted; proved by a solution.
+    """Limits whose removal makes the grasp solvable, with a solution as evidence.
 
     Attributes:
-        lifted: An actuator's name, or "arm", "hand" or "all" for all limits of these.
-        beyond: By how much the solution found is beyond the limits, by actuator [rad or m];
-            above the upper one if > 0, below the lower one if < 0. No more was found necessary.
+        lifted: Name of an actuator, or "arm", "hand" or "all" for all limits of these.
+        beyond: Limit violation of the solution by actuator [rad or m]: > 0 above the upper limit,
+            < 0 below the lower one. No smaller violation was found.
         units: Unit by actuator.
-        q: (n,) the solution.
+        q: (n,) solution [rad or m].
     """
 
     lifted: str
@@ -93,12 +94,12 @@ class Relief:
 
 @dataclass(frozen=True)
 class Freed:
-    """Something that makes the rest solvable if it is left free; proved by a solution.
+    """A contact or normal whose release makes the grasp solvable, with a solution as evidence.
 
     Attributes:
         part: "finger" or "normal".
         finger: Name of the finger; "all" for the normals of all fingers.
-        q: (n,) the solution.
+        q: (n,) solution [rad or m].
     """
 
     part: str
@@ -108,13 +109,13 @@ class Freed:
 
 @dataclass(frozen=True)
 class NearContact:
-    """The contact a finger makes in the nearest configuration.
+    """Contact of a finger in the nearest configuration.
 
     Attributes:
-        point: Where it touches [m], base frame.
-        normal: Which way it faces, base frame.
-        position_error: Distance from the contact asked for [m]; NaN if free.
-        angle_error: Angle from the normal asked for [rad]; NaN if free.
+        point: Contact point [m], base frame.
+        normal: Pad normal, base frame.
+        position_error: Distance from the target point [m]; NaN if free.
+        angle_error: Angle from the target normal [rad]; NaN if free.
     """
 
     point: Point
@@ -125,11 +126,11 @@ class NearContact:
 
 @dataclass(frozen=True)
 class Remedies:
-    """What makes a grasp solvable.
+    """Changes that make a grasp solvable.
 
     Attributes:
-        reliefs: Limits whose lifting does.
-        freed: Fingers and normals whose freeing makes the rest solvable.
+        reliefs: Limits whose removal makes it solvable.
+        freed: Fingers and normals whose release makes it solvable.
     """
 
     reliefs: tuple[Relief, ...] = ()
@@ -137,15 +138,15 @@ class Remedies:
 
 
 class LazyRemedies:
-    """Remedies that are looked for when first asked for; pickled as what was found."""
+    """Remedies that are computed on first access, and before pickling."""
 
     def __init__(self, find: Callable[[], Remedies]) -> None:
-        """Take what finds them."""
+        """Store the function that computes the remedies."""
         self._find = find
 
     @cached_property
     def found(self) -> Remedies:
-        """The remedies, looked for once."""
+        """The remedies, computed once."""
         return self._find()
 
     def __getstate__(self) -> dict[str, Remedies]:
@@ -156,26 +157,25 @@ class LazyRemedies:
 class Diagnosis(ReprMixin):
     """Cause of an unsolved grasp, with evidence.
 
-    What would help (`reliefs`, `freed`, and `lines`, which tells of them) is looked for when first
-    asked for, which takes some milliseconds; everything else is there at once.
+    The remedies (`reliefs`, `freed`, and their part of `lines`) are computed on first access, which
+    takes some milliseconds.
 
     Attributes:
-        reason: The one that is proved; without a proof the likely one, that fits what was found.
-        proof: That the grasp is impossible; None where there is none, which says nothing.
-        searches: Starts from which a solution was looked for.
-        hand: The hand alone against the contacts; None for a hand without an arm.
-        reach: The arm against the wrist's place; None unless the arm has a closed form and the
-            hand fits.
+        reason: The proved cause; without a proof the likely one.
+        proof: Proof that the grasp is impossible; None if none was found.
+        searches: Number of starts of the search for a solution.
+        hand: Fit of the hand alone; None for a hand without an arm.
+        reach: Reach of the arm; None unless the arm has a closed form and the hand fits.
         active: Actuators at a limit in the nearest configuration.
-        enough: Tolerance with which the grasp would be solved.
-        nearest: The contacts of the nearest configuration, by finger.
-        q: (n,) that configuration; a solution if the reason is `REACHABLE`.
-        time: Seconds the diagnosis took; in a batch its share. Without the search for remedies.
-        lazy: Where the remedies come from.
-        palm: How far the palm is off in the nearest configuration; None where contacts were asked
-            for.
-        sides: By side of a body its worst contact where it comes closest by itself, the trunk
-            moving for it alone; of sides with contacts. {} of an arm with one hand.
+        enough: Tolerance with which the grasp is solvable.
+        nearest: Contacts of the nearest configuration, by finger.
+        q: (n,) nearest configuration [rad or m]; a solution if the reason is `REACHABLE`.
+        time: Duration of the diagnosis without the remedies [s]; in a batch its share.
+        lazy: Source of the remedies.
+        palm: Errors of the palm in the nearest configuration; None for targets without palm
+            poses.
+        sides: Worst contact of each side of a multi-arm robot that has contacts, solved by itself
+            with the trunk; empty for a single arm.
 
     Example:
         >>> far.status.name, far.diagnosis.reason.name, far.diagnosis.hand.fits
@@ -199,7 +199,7 @@ class Diagnosis(ReprMixin):
     sides: Mapping[str, ContactVerdict] = field(default_factory=dict[str, ContactVerdict])
 
     def __repr__(self) -> str:
-        return f"<Diagnosis {self.reason.name}>"  # no search for remedies
+        return f"<Diagnosis {self.reason.name}>"  # does not compute the remedies
 
     @property
     def established(self) -> bool:
@@ -208,40 +208,40 @@ class Diagnosis(ReprMixin):
 
     @property
     def reliefs(self) -> tuple[Relief, ...]:
-        """Limits whose lifting makes it solvable."""
+        """Limits whose removal makes the grasp solvable."""
         return self.lazy.found.reliefs
 
     @property
     def freed(self) -> tuple[Freed, ...]:
-        """Fingers and normals whose freeing makes the rest solvable."""
+        """Fingers and normals whose release makes the grasp solvable."""
         return self.lazy.found.freed
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """What, by how much, and what would help: short lines in mm and degrees."""
-        reason = self.reason if self.palm is None else OF_PALMS.get(self.reason, self.reason)
+        """Cause, distance to a solution and remedies in short lines, in mm and degrees."""
+        reason = self.reason if self.palm is None else PALM_REASONS.get(self.reason, self.reason)
         if self.reason is Reason.REACHABLE:
-            return (str(reason), "reachable: hand-first solves it")
+            return (str(reason), "hand-first solves the grasp")
         likely = "" if self.established or self.reason is Reason.NOT_FOUND else "likely: "
-        lines = [f"{likely}{reason}", *self._why(), *self._grounds()]
-        for relief in self._shown:
-            far = ", ".join(
+        lines = [f"{likely}{reason}", *self._evidence_lines(), *self._proof_lines()]
+        for relief in self._smallest_reliefs:
+            violations = ", ".join(
                 f"{name} {_length(value, relief.units[name])} {_side(value)}"
                 for name, value in relief.beyond.items()
             )
-            lines.append(f"solvable with limits lifted: {far}")
+            lines.append(f"solvable with limits lifted: {violations}")
         if self.palm is not None:
-            off = _missed(self.palm.position_error, self.palm.angle_error)
-            return (*lines, f"nearest: the palm is {off}")
+            error = _format_error(self.palm.position_error, self.palm.angle_error)
+            return (*lines, f"nearest: the palm is {error} off")
         fingers = [item.finger for item in self.freed if item.part == "finger"]
         normals = [item.finger for item in self.freed if item.part == "normal"]
-        every = normals == ["all"]
+        all_normals = normals == ["all"]
         normals = [name for name in normals if name != "all"]
         if fingers:
             lines.append(f"solvable with a finger left free: {' or '.join(fingers)}")
         if normals:
             lines.append(f"solvable with a normal left free: {' or '.join(normals)}")
-        if every:
+        if all_normals:
             lines.append("solvable with all normals left free")
         lines.append(
             f"solvable within {_length(self.enough.position, 'm')} "
@@ -249,34 +249,34 @@ class Diagnosis(ReprMixin):
         )
         return tuple(lines)
 
-    def _grounds(self) -> tuple[str, ...]:
-        """On what the reason rests."""
+    def _proof_lines(self) -> tuple[str, ...]:
+        """Return the lines of the proof, or of the search without one."""
         if self.proof is not None:
             return self.proof.lines if self.palm is None else self.proof.lines_of_palm
         return (f"not proved; no solution from {self.searches} starts",)
 
     @property
-    def _shown(self) -> list[Relief]:
-        """Single limits; only where there is none, groups of them, the smallest first."""
+    def _smallest_reliefs(self) -> list[Relief]:
+        """Reliefs of single actuators, else the smallest group of limits."""
         single = [item for item in self.reliefs if item.lifted in item.units]
         return single or list(self.reliefs[:1])
 
-    def _why(self) -> list[str]:
+    def _evidence_lines(self) -> list[str]:
         lines = [
             f"{name} by itself: nothing found closer than "
-            f"{_apart(worst.position_error, worst.angle_error)}"
+            f"{_format_error(worst.position_error, worst.angle_error)}"
             for name, worst in self.sides.items()
             if not worst.ok
         ]
         if len(self.sides) > 1 and not lines:
-            lines.append(f"{' and '.join(self.sides)} get there one at a time, not at once")
+            lines.append(f"{' and '.join(self.sides)} are solvable separately, but not together")
         if self.hand is not None and not self.hand.fits:
-            off = [
-                f"{name} {_missed(verdict.position_error, verdict.angle_error)}"
+            errors = [
+                f"{name} {_format_error(verdict.position_error, verdict.angle_error)} off"
                 for name, verdict in self.hand.contacts.items()
                 if not math.isnan(verdict.position_error)
             ]
-            lines.append(f"best fit of the hand alone: {', '.join(off)}")
+            lines.append(f"best fit of the hand alone: {', '.join(errors)}")
         if self.reach is not None and self.reach.excess != 0:
             side = "too far" if self.reach.excess > 0 else "too near"
             lines.append(
@@ -297,10 +297,6 @@ def _side(value: float) -> str:
     return "above" if value > 0 else "below"
 
 
-def _missed(position: float, angle: float) -> str:
-    return f"{_apart(position, angle)} off"
-
-
-def _apart(position: float, angle: float) -> str:
-    turned = "" if math.isnan(angle) else f" {_length(angle, 'rad')}"
-    return f"{_length(position, 'm')}{turned}"
+def _format_error(position: float, angle: float) -> str:
+    rotation = "" if math.isnan(angle) else f" {_length(angle, 'rad')}"
+    return f"{_length(position, 'm')}{rotation}"

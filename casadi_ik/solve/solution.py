@@ -1,4 +1,4 @@
-"""The answer: configuration, status, a verdict on every contact; of many grasps which to take."""
+"""Results of solves: solutions, batches, rankings of grasps, and alternatives."""
 
 from __future__ import annotations
 
@@ -25,14 +25,13 @@ Pair = tuple[str, str]
 
 @dataclass(frozen=True)
 class SuggestedFix:
-    """What else would do where all answers touch something, as far as it was tried.
+    """Changes of a target under which a grasp in collision becomes solvable, among those tried.
 
     Attributes:
-        moved: Translation of what is grasped, with its contacts, for which there is a free answer,
-            base frame [m]: the shortest of those tried, at which the object itself stands free;
-            None: none of them has one.
-        farthest: How far it was moved at the most [m].
-        fewer: Fingers without whose contact there is a free answer.
+        moved: Shortest translation of the object and its contacts that gives a collision-free
+            solution with the object itself free, base frame [m]; None: no translation does.
+        farthest: Longest translation that was tried [m].
+        fewer: Fingers whose contact can be dropped to obtain a collision-free solution.
     """
 
     moved: tuple[float, float, float] | None
@@ -41,29 +40,29 @@ class SuggestedFix:
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """The same in short lines."""
+        """Summary in short lines."""
         lines = [f"solvable without the contact of {name}" for name in self.fewer]
         if self.moved is None:
             far = f"{1e3 * self.farthest:.0f} mm"
             return (*lines, f"the object moved by up to {far} in 26 directions does not help")
-        way = ", ".join(f"{1e3 * value + 0.0:.0f}" for value in self.moved)
+        vector = ", ".join(f"{1e3 * value + 0.0:.0f}" for value in self.moved)
         length = 1e3 * math.hypot(*self.moved)
-        return (*lines, f"solvable with the object moved by {length:.0f} mm: ({way}) mm")
+        return (*lines, f"solvable with the object moved by {length:.0f} mm: ({vector}) mm")
 
 
 @dataclass(frozen=True)
 class CollisionReport:
-    """Why every answer of a grasp collides.
+    """Report of a grasp whose solutions are all in collision.
 
     Attributes:
-        pair: The pair that is in the way in the best answer: two links, or a link and a solid.
-        short: By how much they are nearer than they have to be [m].
-        tried: Answers (hands, arms, elbows) that were looked at.
-        without_scene: Whether one of them is free of the robot itself, the scene left out; None if
-            that was not looked at: it is where a diagnosis is asked for.
-        without_self: Whether one of them is free of the scene, the robot itself left out, or None.
-        way_out: What else would do; None if that was not looked for: it is where one grasp is
-            solved and a diagnosis asked for.
+        pair: Pair in collision in the best solution: two links, or a link and a solid.
+        short: Clearance that the pair lacks [m].
+        tried: Number of solutions (hands, arms, elbows) that were checked.
+        without_scene: Whether a solution is free of self-collision, ignoring the scene; None
+            without a diagnosis.
+        without_self: Whether a solution is free of the scene, ignoring self-collision; None
+            without a diagnosis.
+        way_out: Changes that make the grasp solvable; None unless a single grasp is diagnosed.
 
     Example:
         >>> wall = {"kind": "box", "size": [3, 3, 3], "xyz": [-1.8, 0, 1.0]}  # the cup is inside
@@ -81,7 +80,7 @@ class CollisionReport:
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """The same in short lines."""
+        """Summary in short lines."""
         answers = "the answer touches" if self.tried == 1 else f"all {self.tried} answers touch"
         lines = [
             f"contacts and limits are met, but {answers} something",
@@ -96,31 +95,30 @@ class CollisionReport:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Solution(ReprMixin):
-    """The answer to one grasp.
+    """The result of solving one grasp.
 
     Attributes:
-        success: Every contact within tolerance, and every actuator and joint within its limits
-            unless limits are ignored. Recomputed from q, whatever the method says.
+        success: Whether every contact is within tolerance, and q within limits unless limits are
+            ignored; computed from q, independently of the method.
         status: How the solve ended.
-        q: (n,) actuator positions reached [rad or m].
-        iterations: Iterations over all phases and restarts.
-        restarts: How often the method began anew.
-        time: Seconds the solve took; in a batch its share of the time.
+        q: (n,) actuator positions [rad or m].
+        iterations: Number of iterations over all phases and restarts.
+        restarts: Number of restarts.
+        time: Duration of the solve [s]; in a batch its share of the time.
         contacts: Verdict by finger.
         phases: Iterations by phase name, in the order of the phases.
         limits_ok: Whether every actuator and joint is within its limits.
         method: Name of the method.
         robot: Name of the robot.
         actuators: Names of the entries of q.
-        diagnosis: Why it is not solved; None if it is, or if no diagnosis was asked for.
-        clearance: Distance of the pair of shapes that is nearest to being too near [m], negative:
-            penetration; None if no scene was given: collisions were not checked.
-        closest: That pair: two links, or a link and a solid of the scene.
-        collision: Why all answers touch something, if that is the status and a diagnosis was asked
-            for.
-        palm: How far the palm is from where it was asked; None where contacts were asked for.
-        arm_hand: The robot; None: not known.
-        object_pose: (4, 4) where the object is, if that was looked for.
+        diagnosis: Diagnosis of an unsolved grasp; None if it is solved or not diagnosed.
+        clearance: Signed distance of the critical pair of shapes [m], negative in penetration;
+            None without a scene.
+        closest: The critical pair: two links, or a link and a solid of the scene.
+        collision: Report of a grasp with status COLLISION; None without a diagnosis.
+        palm: Errors of the palm pose; None for targets without palm poses.
+        arm_hand: The robot; None if it is unknown.
+        object_pose: (4, 4) object pose found for a `Free` object pose.
 
     Example:
         >>> solution = solver.solve(grasp)
@@ -156,19 +154,19 @@ class Solution(ReprMixin):
         path: str | PathLike[str] | None = None,
         **options: Any,
     ) -> Any:
-        """Draw it; needs the extra `plots`.
+        """Draw the solution; requires the extra `plots`.
 
         Args:
-            grasp: What was asked for; None: the contacts that are reached are shown.
+            grasp: The target; None: the contacts that q reaches.
             path: PNG file to write, if any.
-            options: As `casadi_ik.app.pictures.draw_solution` has them: scene, view, dpi, dark.
+            options: Options of `casadi_ik.app.pictures.draw_solution`: scene, view, dpi, dark.
 
         Returns:
             The matplotlib figure, which notebooks show.
 
         Raises:
             MissingExtraError: matplotlib or PyVista is not installed.
-            PictureError: The file cannot be written, or there is no OpenGL to draw with.
+            PictureError: The file cannot be written, or OpenGL is not available.
         """
         robot = self.arm_hand or load_robot(self.robot)
         if grasp is None:
@@ -179,19 +177,19 @@ class Solution(ReprMixin):
         )
 
     def view(self, robot: ArmHand | None = None, **options: Any) -> Any:
-        """Show it in the browser, and in a notebook; needs the extra `view`.
+        """Show the solution in the browser, and in a notebook; requires the extra `view`.
 
         Args:
-            robot: The robot that was solved for; None: the one that the answer knows.
-            options: As `casadi_ik.app.viewer.view_grasp` has them; `grasp` is what was asked for
-                (without it the contacts that are reached are shown), `scene` what stands about.
+            robot: The robot that was solved for; None: `arm_hand`.
+            options: Options of `casadi_ik.app.viewer.view_grasp`: `grasp`, the target (default:
+                the contacts that q reaches), `scene`, the obstacles.
 
         Returns:
             The running `casadi_ik.app.viewer.Viewer`.
 
         Raises:
             MissingExtraError: viser is not installed.
-            UnknownNameError: No shipped robot has that name: give the robot.
+            UnknownNameError: No shipped robot has this name; pass the robot.
         """
         robot = robot or self.arm_hand or load_robot(self.robot)
         return robot.view(self.q, **options)
@@ -199,34 +197,33 @@ class Solution(ReprMixin):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class BatchSolution(ReprMixin):
-    """The answers to a batch of k targets; the fields of `Solution` as arrays.
+    """The results of solving a batch of k targets: the fields of `Solution` as arrays.
 
     Attributes:
         success: (k,) bool.
         status: (k,) codes of `Status`.
         q: (k, n) actuator positions [rad or m].
-        iterations: (k,).
-        restarts: (k,).
-        time: (k,) seconds per solve; solves made side by side share the time.
-        position_error: (k, f) [m], NaN where free.
-        angle_error: (k, f) [rad], NaN where free.
+        iterations: (k,) numbers of iterations.
+        restarts: (k,) numbers of restarts.
+        time: (k,) seconds per solve; concurrent solves share the time.
+        position_error: (k, f) distances [m], NaN where free.
+        angle_error: (k, f) angles [rad], NaN where free.
         ok: (k, f) bool.
         limits_ok: (k,) bool.
         phases: (k,) iterations by phase name.
-        tolerances: When a contact counted as reached, by finger.
-        fingers: Names of the fingers, the order of every (k, f) array.
+        tolerances: Tolerance by finger.
+        fingers: Names of the fingers, in the order of (k, f) arrays.
         method: Name of the method.
         robot: Name of the robot.
         actuators: Names of the columns of q.
-        diagnoses: Why each target is not solved (None if it is); empty if not asked for.
-        clearance: (k,) as for `Solution` [m], NaN where there is no finite q; None if no scene was
-            given: collisions were not checked.
-        closest: The pair of each target; empty if no scene was given.
-        collisions: Why all answers touch something, by target; empty if no scene was given.
-        palm_position_error: (k,) [m]; None where contacts were asked for, not palms.
-        palm_angle_error: (k,) [rad], likewise.
-        palm_ok: (k,) bool, likewise.
-        arm_hand: The robot; None: not known.
+        diagnoses: Diagnosis of each target (None if it is solved); empty without diagnoses.
+        clearance: (k,) clearances [m], NaN where q is not finite; None without a scene.
+        closest: Critical pair of each target; empty without a scene.
+        collisions: Collision report of each target; empty without a scene.
+        palm_position_error: (k,) distances of palms [m]; None for targets without palm poses.
+        palm_angle_error: (k,) rotation angles of palms [rad]; None likewise.
+        palm_ok: (k,) bool; None likewise.
+        arm_hand: The robot; None if it is unknown.
 
     Example:
         >>> points, normals = robot.contacts(robot.random(np.random.default_rng(1), 200))
@@ -270,7 +267,7 @@ class BatchSolution(ReprMixin):
         diagnosed: bool,
         checked: bool = False,
     ) -> BatchSolution:
-        """Rows for targets that are malformed: status INVALID, NaN for every number."""
+        """Return rows of malformed targets: status INVALID, NaN for all numbers."""
         n, f = len(robot.actuators), len(robot.fingers)
         none = np.zeros(count, dtype=np.int64)
         return cls(
@@ -302,9 +299,9 @@ class BatchSolution(ReprMixin):
 
     @classmethod
     def joined(cls, parts: Sequence[BatchSolution]) -> BatchSolution:
-        """One batch after the other, at least one.
+        """Concatenate batches, at least one.
 
-        A phase that a part does not know counts 0 iterations there.
+        A phase that is missing in a batch has 0 iterations there.
         """
         first = parts[0]
         if len(parts) == 1:
@@ -314,19 +311,19 @@ class BatchSolution(ReprMixin):
             for item in fields(cls)
             if isinstance(getattr(first, item.name), np.ndarray)
         }
-        none = [np.zeros(len(part), dtype=np.int64) for part in parts]
+        zeros = [np.zeros(len(part), dtype=np.int64) for part in parts]
         names = dict.fromkeys(chain.from_iterable(part.phases for part in parts))
         phases = {
             name: np.concatenate(
-                [part.phases.get(name, no) for part, no in zip(parts, none, strict=True)]
+                [part.phases.get(name, zero) for part, zero in zip(parts, zeros, strict=True)]
             )
             for name in names
         }
-        each = {
+        tuples = {
             name: tuple(chain.from_iterable(getattr(part, name) for part in parts))
             for name in ("diagnoses", "closest", "collisions")
         }
-        return replace(first, **arrays, phases=phases, **each)
+        return replace(first, **arrays, phases=phases, **tuples)
 
     @property
     def status_names(self) -> NDArray[np.str_]:
@@ -334,7 +331,7 @@ class BatchSolution(ReprMixin):
         return np.array([status.name for status in sorted(Status)])[self.status - min(Status)]
 
     def solution(self, row: int) -> Solution:
-        """One row as a `Solution`.
+        """Return a row as a `Solution`.
 
         Example:
             >>> points, normals = robot.contacts(robot.home[None])
@@ -372,32 +369,32 @@ class BatchSolution(ReprMixin):
 
 
 class Chosen(Protocol):
-    """A posture that takes a grasp."""
+    """A configuration that solves a grasp."""
 
     @property
     def grasp(self) -> Grasp:
-        """In the base frame."""
+        """Grasp in the base frame."""
         ...
 
     @property
     def q(self) -> Array:
-        """(n,) the posture [rad or m]."""
+        """(n,) configuration [rad or m]."""
         ...
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Choice(ReprMixin):
-    """One of the answers of a `Ranking`.
+    """An entry of a `Ranking`.
 
     Attributes:
-        candidate: Number of the grasp among those that were given, from 0.
-        solution: How to take it.
-        score: What it was ranked by, higher is better: smallest distance of an actuator that is
-            not given from its limits as a part of half its range ("limits"); minus the distance
-            from q0, every actuator as a part of its range ("q0"); of the arm [m^3]
-            ("manipulability"); room beyond the margins of the scene [m] ("clearance"); or what the
-            given function says.
-        grasp: The grasp, where the object is (base frame).
+        candidate: Index of the grasp among the candidates.
+        solution: Solution of the grasp.
+        score: Score of the ranking, higher is better: smallest limit margin of the actuators that
+            are not fixed, relative to half their range ("limits"); negative distance from q0,
+            actuators relative to their ranges ("q0"); manipulability of the arm [m^3]
+            ("manipulability"); clearance beyond the margins of the scene [m] ("clearance"); or
+            the value of a score function.
+        grasp: The grasp in the base frame.
 
     Example:
         >>> best = solver.choose([grasp], prefer="limits")[0]
@@ -412,21 +409,21 @@ class Choice(ReprMixin):
 
     @property
     def q(self) -> Array:
-        """(n,) the posture: what `Solver.reach` goes to."""
+        """(n,) configuration [rad or m], the goal of `Solver.reach`."""
         return self.solution.q
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Ranking(ReprMixin, Sequence[Choice]):
-    """Ranked answers to many candidate grasps, best first.
+    """Candidate grasps with solutions, best first.
 
     Attributes:
-        entries: The answers; itself a sequence of them.
-        candidates: How many grasps there were.
-        answered: How many of them have an answer, in `entries` or not.
-        failures: How many have none, by reason: the name of a `Status`, and of a COLLISION the pair
-            that is in the way. Most frequent first.
-        prefer: What they were ranked by.
+        entries: The entries; the ranking is a sequence of them.
+        candidates: Number of candidates.
+        answered: Number of candidates with a solution, in `entries` or not.
+        failures: Number of candidates without a solution by reason, most frequent first: the name
+            of a `Status`, for COLLISION with the pair.
+        prefer: Preference or score of the ranking.
 
     Example:
         >>> ranked = solver.choose([grasp, ik.load_grasp("apple")], limit=2, prefer="limits")
@@ -449,43 +446,44 @@ class Ranking(ReprMixin, Sequence[Choice]):
         return iter(self.entries)
 
     @overload
-    def __getitem__(self, place: int) -> Choice: ...
+    def __getitem__(self, index: int) -> Choice: ...
 
     @overload
-    def __getitem__(self, place: slice) -> tuple[Choice, ...]: ...
+    def __getitem__(self, index: slice) -> tuple[Choice, ...]: ...
 
-    def __getitem__(self, place: int | slice) -> Choice | tuple[Choice, ...]:
-        return self.entries[place]
+    def __getitem__(self, index: int | slice) -> Choice | tuple[Choice, ...]:
+        return self.entries[index]
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """The same in short lines."""
+        """Summary in short lines."""
         lines = [f"{self.answered} of {self.candidates} candidates have an answer"]
         lines += [f"  {count} have none: {reason}" for reason, count in self.failures.items()]
         if self.entries:
             lines.append(f"best {len(self)} by {self.prefer}:")
-        for place, one in enumerate(self.entries, 1):
-            clear = one.solution.clearance
-            room = "" if clear is None else f", clearance {1e3 * clear:.1f} mm"
-            lines.append(f"  {place}. candidate {one.candidate}: {one.score:.4g}{room}")
+        for rank, entry in enumerate(self.entries, 1):
+            clearance = entry.solution.clearance
+            text = "" if clearance is None else f", clearance {1e3 * clearance:.1f} mm"
+            lines.append(f"  {rank}. candidate {entry.candidate}: {entry.score:.4g}{text}")
         return tuple(lines)
 
 
 @dataclass(frozen=True)
 class ArmBranch:
-    """One branch of an arm, and the range of its redundancy.
+    """A branch of an arm, and the interval of its redundancy parameter.
 
     Attributes:
-        shoulder: +1 or -1. Of an arm with a spherical shoulder, elbow and spherical wrist (S-R-S):
-            sign of joint 2 from where axes 1 and 3 are aligned.
-        elbow: +1 or -1; S-R-S: sign of joint 4 from the stretched arm.
-        wrist: +1 or -1; S-R-S: sign of joint 6 from where axes 5 and 7 are aligned.
-        swivel: (start, end) [rad] of an interval of the arm's freedom within limits, start <= end;
-            None for an arm without one. S-R-S: the angle of the elbow about the line from shoulder
-            to wrist, a whole turn if none is out. Other arms of seven joints: the position of the
-            joint that is swept, see `casadi_ik.kinematics.arms.six_joints`.
-        root: Number of the arm among those of the same signs, at each position of a swept joint:
-            a wrist whose last axis passes by it may have several. 0 of other arms.
+        shoulder: +1 or -1. For an arm with spherical shoulder, elbow and spherical wrist (S-R-S):
+            sign of joint 2 relative to the alignment of axes 1 and 3.
+        elbow: +1 or -1. S-R-S: sign of joint 4 relative to the stretched arm.
+        wrist: +1 or -1. S-R-S: sign of joint 6 relative to the alignment of axes 5 and 7.
+        swivel: (start, end) [rad] of an interval of the redundancy parameter within limits,
+            start <= end; None for an arm without redundancy. S-R-S: the swivel angle of the elbow
+            about the line from shoulder to wrist, a full revolution if all values are within
+            limits. Other arms of seven joints: the position of the swept joint, see
+            `casadi_ik.kinematics.arms.six_joints`.
+        root: Index among the solutions with the same signs at a position of a swept joint; a
+            wrist with an offset last axis may have several. 0 for other arms.
 
     Example:
         >>> branch = solver.solve_all(grasp, limit=1)[0].branch
@@ -502,19 +500,19 @@ class ArmBranch:
 
 @dataclass(frozen=True, eq=False)
 class Alternative:
-    """One of several solutions of a grasp.
+    """A solution of a grasp that has several.
 
     Attributes:
         q: (n,) actuator positions [rad or m], within limits unless they are ignored.
-        contacts: Verdict by finger; all are met.
-        posture: Number of the hand posture, the same for all solutions that share it.
-        branch: How the arm is bent and how far it may be varied; None for an arm without a
-            closed form, and for a hand without an arm.
-        swivel: The swivel [rad] of q within `branch.swivel`, or None.
-        margin: Smallest distance of any actuator from its limits as a part of half its range: 1
-            in the middle of the range, 0 at a limit.
-        manipulability: Yoshikawa's measure of the arm [m^3]; 0 for a hand without an arm.
-        distance: Euclidean distance from q0, every actuator as a part of its range.
+        contacts: Verdict by finger; all are within tolerance.
+        posture: Index of the hand posture; solutions may share it.
+        branch: Branch of the arm with its redundancy interval; None for an arm without a closed
+            form, and for a hand without an arm.
+        swivel: Redundancy parameter of q [rad] within `branch.swivel`, or None.
+        margin: Smallest limit margin of the actuators relative to half their range: 1 in the
+            middle of the range, 0 at a limit.
+        manipulability: Manipulability of the arm (Yoshikawa) [m^3]; 0 for a hand without an arm.
+        distance: Euclidean distance from q0, actuators relative to their ranges.
 
     Example:
         >>> first, second = solver.solve_all(grasp, limit=2)

@@ -1,11 +1,11 @@
-"""How a trace is to be read: the fields that mean the same in every method, and its Jacobians.
+"""Format of traces: the standard fields of all methods, and the measures of their Jacobians.
 
-A method's record is made of the standard fields below and of fields of its own. What looks at
-traces (events, explanations, pictures) goes by the standard fields alone: a method that has such a
-number under another name, or of another kind, is refused by `trace_format`.
+The record of a method has the standard fields below and fields of its own. Readers of traces
+(events, explanations, pictures) use the standard fields alone; `trace_format` refuses a record
+whose standard fields have another shape, type or unit.
 
-How near the Jacobians of a robot are to a singularity is measured of finished traces, all rows at
-once: solvers have no use for these numbers, and a solve that nobody logs costs nothing more.
+The conditioning of Jacobians is measured on finished traces, all rows at once, because solvers do
+not need it and solves without a log should not pay for it.
 
 ============  ==================================================================================
 Jacobian      maps
@@ -18,9 +18,9 @@ closed_chain  motors of arm and thumb to the five rows of the thumb's contact: v
               closed chain of arm and thumb is singular
 ============  ==================================================================================
 
-Of a body arm and hand of every side are measured, named ``left_arm`` and so on; the arm by itself,
-without the trunk. A revolute motor counts by the radian, a linear one by its range. Of an r x c
-Jacobian the smallest of its min(r, c) singular values is meant.
+Arm and hand of each side of a multi-arm robot are measured separately, named ``left_arm`` and so
+on, without the trunk. Revolute motors are scaled by the radian, linear ones by their range. The
+singular value of an r x c Jacobian is the smallest of its min(r, c) singular values.
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ from casadi_ik.model.description import RobotDescription
 from casadi_ik.solve.status import Phase, Status
 
 WORD_BITS = 32
-"""Bits of a word of a mask: viewers show wider ones badly."""
+"""Bits per word of a mask; viewers support no wider words."""
 
 
 class Elements(Enum):
-    """What the numbers of a standard field belong to."""
+    """Kind of the elements of a standard field."""
 
     SOLVE = "the solve: one number"
     CODE = "the solve: one code with a name"
@@ -64,16 +64,16 @@ class Elements(Enum):
 
 @dataclass(frozen=True)
 class StandardField:
-    """A field that means the same in the record of every method that has it.
+    """A field with the same meaning in the records of all methods.
 
     Attributes:
-        name: Its name.
-        elements: What its numbers belong to; sets shape and labels.
-        dtype: Storage, as in `Field.dtype`.
+        name: Name of the field.
+        elements: Kind of its elements, which determines shape and labels.
+        dtype: Storage type, see `Field.dtype`.
         unit: SI unit, "" if dimensionless.
-        doc: What it is, one line.
-        codes: Names of the codes 0, 1, ... of a code; "" for one that is not used.
-        required: Whether every method has to record it.
+        doc: One-line description.
+        codes: Names of the codes 0, 1, ...; "" for unused codes.
+        required: Whether every method has to record the field.
     """
 
     name: str
@@ -85,11 +85,11 @@ class StandardField:
     required: bool = True
 
     def of(self, robot: RobotDescription, doc: str = "") -> Field:
-        """The field in the record of a robot.
+        """Return the field of the record of a robot.
 
         Args:
             robot: The robot.
-            doc: What it is in this method, where more can be said than `StandardField.doc`.
+            doc: Description specific to a method; "": `StandardField.doc`.
         """
         n, f = len(robot.actuators), len(robot.fingers)
         words = -(-n // WORD_BITS)
@@ -101,7 +101,7 @@ class StandardField:
         return Field(self.name, shape, self.dtype, self.unit, doc or self.doc)
 
     def labels(self, robot: RobotDescription) -> tuple[str, ...]:
-        """Names of its elements, bits or codes; none if it is a plain number."""
+        """Return the names of the elements, bits or codes; empty for a plain number."""
         if self.elements in (Elements.ACTUATORS, Elements.ACTUATOR_BITS):
             return robot.actuator_names
         return robot.finger_names if self.elements is Elements.FINGERS else self.codes
@@ -172,18 +172,18 @@ STANDARD_FIELDS = (
     *(Q, POSITION_ERROR, ANGLE_ERROR, COST, STEP_SIZE, DAMPING),
     *(LIMIT_MASK, ACTIVE_MASK, RESTART, ACCEPTED, PHASE, STATUS),
 )
-"""All of them."""
+"""All standard fields."""
 
 SIGMA, CONDITION = "sigma_", "condition_"
-"""What stands before the name of a Jacobian in the fields of its smallest singular value and of its
-condition number; NaN where it is not measured."""
+"""Prefixes of the fields of the smallest singular value and of the condition number of a Jacobian;
+NaN where it is not measured."""
 
 CLEARANCE = "clearance"
-"""Name of the field that a log adds where there is a scene."""
+"""Name of the field that a log adds for solvers with a scene."""
 
 
 def pack_mask(flags: NDArray[np.bool_]) -> NDArray[np.uint32]:
-    """Flags of all actuators (k, n) as the words of a mask, (k,) or (k, words)."""
+    """Return flags of all actuators (k, n) as words of a mask, (k,) or (k, words)."""
     padded = np.pad(flags, ((0, 0), (0, -flags.shape[1] % WORD_BITS)))
     words = np.packbits(padded, axis=1, bitorder="little").view("<u4")
     return words[:, 0] if words.shape[1] == 1 else words
@@ -191,14 +191,14 @@ def pack_mask(flags: NDArray[np.bool_]) -> NDArray[np.uint32]:
 
 @dataclass(frozen=True)
 class RecordedJacobian:
-    """A Jacobian, and when its measures call it singular.
+    """A Jacobian of a trace, with thresholds of its measures.
 
     Attributes:
         joints: Actuators whose motion it maps.
-        singular: Smallest singular value below which it counts as near singular, in the unit of
-            its field ``sigma_<name>``.
-        condition: Condition number above which it counts as ill-conditioned, for its field
-            ``condition_<name>``.
+        singular: Threshold of the smallest singular value below which the Jacobian is near
+            singular, in the unit of its field ``sigma_<name>``.
+        condition: Threshold of the condition number above which the Jacobian is ill-conditioned,
+            for its field ``condition_<name>``.
     """
 
     joints: tuple[str, ...] = ()
@@ -207,40 +207,40 @@ class RecordedJacobian:
 
 
 class Measures(Protocol):
-    """Numbers that follow from the rows of a trace, and are measured when it goes to a log."""
+    """Quantities that are computed from the rows of a trace when it is written to a log."""
 
     @property
     def fields(self) -> tuple[Field, ...]:
-        """What they add to a row, all of dtype "f4"."""
+        """Fields that the measures add to a row, all of dtype "f4"."""
         ...
 
     @property
     def jacobians(self) -> Mapping[str, RecordedJacobian]:
-        """The Jacobians among them, as in `TraceFormat`."""
+        """Jacobians among the measures, as in `TraceFormat`."""
         ...
 
     def prepare(self) -> None:
-        """Build and compile what is needed."""
+        """Build and compile the graphs."""
         ...
 
     def __call__(self, rows: NDArray[Any]) -> NDArray[np.float32]:
-        """The values (m, fields) of rows (m,); NaN where there is nothing to measure."""
+        """Return the values (m, fields) of rows (m,); NaN where nothing is measured."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class TraceFormat:
-    """How to read a trace.
+    """Layout and labels of a trace.
 
     Attributes:
         layout: Fields of a row.
         labels: Names that make a field readable: of the codes 0, 1, ... of an integer scalar
-            ("phase"; "" for a code not used), of the bits of a field ending in "_mask", of the
+            ("phase"; "" for unused codes), of the bits of a field ending in "_mask", of the
             elements along the first axis of any other field ("q": actuator names); "q_unit":
-            what actuators are measured in.
-        jacobians: What there is to know of the Jacobians in fields ``sigma_<name>`` and
-            ``condition_<name>``, by name. One that is not named here is never near singular.
-        measures: What a log adds to the rows; None: nothing.
+            units of the actuators.
+        jacobians: Actuators and thresholds of the Jacobians in fields ``sigma_<name>`` and
+            ``condition_<name>``, by name. Other Jacobians are never near singular.
+        measures: Quantities that a log adds to the rows; None: none.
     """
 
     layout: Layout
@@ -255,30 +255,33 @@ def trace_format(
     jacobians: Mapping[str, RecordedJacobian] | None = None,
     measures: Measures | None = None,
 ) -> TraceFormat:
-    """How to read the traces of a method.
+    """Return the format of the traces of a method.
 
     Args:
-        layout: Fields of a row: the standard ones, and the method's own.
+        layout: Fields of a row: the standard fields and those of the method.
         robot: The robot.
-        jacobians: As in `TraceFormat`.
-        measures: As in `TraceFormat`.
+        jacobians: Jacobians of the record, see `TraceFormat`.
+        measures: Measures of the trace, see `TraceFormat`.
 
     Raises:
-        InputError: A standard field is not what it is elsewhere, or a required one is missing.
+        InputError: A standard field differs from its definition, or a required one is missing.
     """
-    found = {item.name: item for item in layout}
+    fields = {item.name: item for item in layout}
     labels: dict[str, tuple[str, ...]] = {}
     for standard in STANDARD_FIELDS:
-        expected, item = standard.of(robot), found.get(standard.name)
+        expected, item = standard.of(robot), fields.get(standard.name)
         if item is None:
             if standard.required:
-                raise InputError(f"trace: no field {standard.name!r}, which every method records")
+                raise InputError(
+                    f"trace: field {standard.name!r} is missing; every method records it"
+                )
             continue
         for name in ("shape", "dtype", "unit"):
-            ours, theirs = getattr(item, name), getattr(expected, name)
-            if ours != theirs:
+            value, expected_value = getattr(item, name), getattr(expected, name)
+            if value != expected_value:
                 raise InputError(
-                    f"trace: field {standard.name!r} has {name} {ours!r}, expected {theirs!r}"
+                    f"trace: field {standard.name!r} has {name} {value!r}, expected "
+                    f"{expected_value!r}"
                 )
         if names := standard.labels(robot):
             labels[standard.name] = names
@@ -287,25 +290,25 @@ def trace_format(
 
 
 MAX_CONDITION = 1e7
-"""Beyond it the smallest singular value is not resolved."""
+"""Condition number beyond which the smallest singular value is not resolved."""
 
 ARM, HAND, CLOSED_CHAIN = "arm", "hand", "closed_chain"
 
 SINGULARITY_THRESHOLDS = {ARM: (0.05, 500.0), HAND: (0.02, 200.0), CLOSED_CHAIN: (0.1, 150.0)}
-"""Smallest singular value and condition number at which each counts as near singular."""
+"""Thresholds of the smallest singular value and of the condition number by Jacobian."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Measured:
+class _MeasuredJacobian:
     """A Jacobian of the robot.
 
     Attributes:
-        name: Its name in the fields of the trace.
-        columns: Positions in q of what it depends on and maps.
-        graph: Smallest singular value and condition number for values of these.
-        compiled: False keeps to the virtual machine.
-        everywhere: Whether it is measured where the arm is not yet placed, too.
-        thresholds: Smallest singular value and condition number at which it is near singular.
+        name: Name in the fields of the trace.
+        columns: Columns of q that the Jacobian depends on and maps.
+        graph: Graph of smallest singular value and condition number.
+        compiled: False: use CasADi's virtual machine.
+        everywhere: Whether to measure it in phases without an arm, too.
+        thresholds: Thresholds of smallest singular value and condition number.
     """
 
     name: str
@@ -317,12 +320,12 @@ class _Measured:
 
     @cached_property
     def kernel(self) -> FunctionKernel:
-        """Made when first needed."""
+        """Kernel of the graph, built when first needed."""
         return FunctionKernel(self.graph, self.compiled, in_lanes=True)
 
 
 class JacobianMeasures:
-    """Measures arm and hand, and the closed chain of arm and thumb where a method follows it."""
+    """Measures of the Jacobians of arm, hand, and the closed chain of arm and thumb."""
 
     def __init__(
         self,
@@ -332,21 +335,21 @@ class JacobianMeasures:
         closed_chain: bool = False,
         compiled: bool = True,
     ) -> None:
-        """Choose what is measured; nothing is built yet.
+        """Select the Jacobians; graphs are built when first needed.
 
         Args:
             robot: The robot.
-            without_arm: Phases in which the arm of q is not yet placed: there only the hand is
-                measured.
-            closed_chain: Whether the closed chain is.
-            compiled: False keeps to the virtual machine.
+            without_arm: Phases in which the arm's part of q is undefined, so that only the hand
+                is measured.
+            closed_chain: Whether to measure the closed chain.
+            compiled: False: use CasADi's virtual machine.
         """
         self._robot = robot
         self._without_arm = tuple(map(int, without_arm))
         self._compiled = compiled
         names = list(robot.actuator_names)
-        parts: list[_Measured] = []
-        by_side = {f"{one.name}_": robot.side(one.name) for one in robot.sides}
+        parts: list[_MeasuredJacobian] = []
+        by_side = {f"{side.name}_": robot.side(side.name) for side in robot.sides}
         for label, side in (by_side or {"": robot}).items():
             motors = [names.index(name) for name in side.actuator_names]
             arm, hand = side.arm_actuators, side.hand_actuators
@@ -362,7 +365,7 @@ class JacobianMeasures:
 
     @property
     def fields(self) -> tuple[Field, ...]:
-        """What it adds to a row: per Jacobian its smallest singular value and condition number."""
+        """Fields of the smallest singular value and condition number of each Jacobian."""
         return tuple(
             Field(kind + part.name, (), "f4", "", doc)
             for part in self._parts
@@ -374,7 +377,7 @@ class JacobianMeasures:
 
     @property
     def jacobians(self) -> dict[str, RecordedJacobian]:
-        """The Jacobians by name: their motors and thresholds."""
+        """Actuators and thresholds of the Jacobians by name."""
         names = self._robot.actuator_names
         return {
             part.name: RecordedJacobian(tuple(names[i] for i in part.columns), *part.thresholds)
@@ -382,24 +385,24 @@ class JacobianMeasures:
         }
 
     def prepare(self) -> None:
-        """Compile what it needs."""
+        """Build and compile the graphs."""
         for part in self._parts:
             _ = part.kernel
 
     def __call__(self, rows: NDArray[Any]) -> NDArray[np.float32]:
-        """The values (m, fields) of rows (m,) that have the standard fields q and phase."""
+        """Return the values (m, fields) of rows (m,) with the standard fields q and phase."""
         values = np.full((len(rows), 2 * len(self._parts)), np.nan, np.float32)
-        q, placed = np.ascontiguousarray(rows[Q.name]), None
+        q, rows_with_arm = np.ascontiguousarray(rows[Q.name]), None
         if self._without_arm:
             phase = np.ascontiguousarray(rows[PHASE.name])
-            placed = np.logical_and.reduce([phase != code for code in self._without_arm])
-            placed = np.flatnonzero(placed)
+            has_arm = np.logical_and.reduce([phase != code for code in self._without_arm])
+            rows_with_arm = np.flatnonzero(has_arm)
         for i, part in enumerate(self._parts):
             columns = slice(2 * i, 2 * i + 2)
-            if part.everywhere or placed is None:
+            if part.everywhere or rows_with_arm is None:
                 (values[:, columns],) = part.kernel(q)
             else:
-                (values[placed, columns],) = part.kernel(np.take(q, placed, axis=0))
+                (values[rows_with_arm, columns],) = part.kernel(np.take(q, rows_with_arm, axis=0))
         return values
 
     def _measured(
@@ -410,41 +413,41 @@ class JacobianMeasures:
         motors: Sequence[int],
         columns: tuple[int, ...],
         extremes: Callable[[RobotDescription, ActuatedKinematics], tuple[Expr, Expr]],
-    ) -> _Measured:
-        """A Jacobian of a side, or of the robot, whose motors have places in the robot's q."""
+    ) -> _MeasuredJacobian:
+        """Return a Jacobian of a side, whose motors are columns `motors` of the robot's q."""
         robot, name, n = self._robot, f"{label}{kind}", len(self._robot.actuators)
         full = ca.Function.fix_name(f"{robot.name}_singular_{name}")
 
         def build() -> ca.Function:
             q = ca.SX.sym("q", n)
-            # What does not matter is at zero and folds away.
-            matters = ca.SX.zeros(len(motors), 1)
+            # Other motors are constant zeros, so that CasADi folds their expressions.
+            side_q = ca.SX.zeros(len(motors), 1)
             for column in columns:
-                matters[column] = q[motors[column]]
-            smallest, condition = extremes(side, actuated(side, matters))
+                side_q[column] = q[motors[column]]
+            smallest, condition = extremes(side, actuated(side, side_q))
             return ca.Function(full, [q], [ca.vertcat(smallest, condition)], ["q"], ["out"])
 
         inputs = {"q": (n, 1)}
         graph = FunctionGraph(full, build, inputs, ((2, 1),), recipe(full, robot))
-        places = tuple(motors[column] for column in columns)
-        return _Measured(
-            name, places, graph, self._compiled, kind == HAND, SINGULARITY_THRESHOLDS[kind]
+        robot_columns = tuple(motors[column] for column in columns)
+        return _MeasuredJacobian(
+            name, robot_columns, graph, self._compiled, kind == HAND, SINGULARITY_THRESHOLDS[kind]
         )
 
 
 def _arm(robot: RobotDescription, body: ActuatedKinematics) -> tuple[Expr, Expr]:
     columns = robot.arm_actuators
     linear, angular = body.palm_jacobian(columns)
-    return _judged(ca.vertcat(linear * (1 / LENGTH), angular), _scales(robot, columns))
+    return _conditioning(ca.vertcat(linear * (1 / LENGTH), angular), _scales(robot, columns))
 
 
 def _hand(robot: RobotDescription, body: ActuatedKinematics) -> tuple[Expr, Expr]:
-    found = []
+    measures = []
     for finger in robot.finger_names:
         columns = robot.finger_actuators(finger)
         linear, _ = body.contact_jacobian(finger, columns)
-        found.append(_judged(linear * (1 / LENGTH), _scales(robot, columns)))
-    smallest, condition = (ca.vertcat(*values) for values in zip(*found, strict=True))
+        measures.append(_conditioning(linear * (1 / LENGTH), _scales(robot, columns)))
+    smallest, condition = (ca.vertcat(*values) for values in zip(*measures, strict=True))
     return ca.mmin(smallest), ca.mmax(condition)
 
 
@@ -455,14 +458,16 @@ def _thumb_contact(robot: RobotDescription, body: ActuatedKinematics) -> tuple[E
     _, normal = body.kinematics.contact(thumb)
     first = perpendicular(normal)
     across = ca.horzcat(first, ca.cross(normal, first)).T
-    return _judged(ca.vertcat(linear * (1 / LENGTH), across @ angular), _scales(robot, columns))
+    return _conditioning(
+        ca.vertcat(linear * (1 / LENGTH), across @ angular), _scales(robot, columns)
+    )
 
 
 def _scales(robot: RobotDescription, columns: Sequence[int]) -> ca.DM:
     return motor_scales(robot)[list(columns)]
 
 
-def _judged(jacobian: Expr, scales: ca.DM) -> tuple[Expr, Expr]:
-    """Smallest singular value and condition number of a Jacobian, columns by their scales."""
+def _conditioning(jacobian: Expr, scales: ca.DM) -> tuple[Expr, Expr]:
+    """Return smallest singular value and condition number of a Jacobian with scaled columns."""
     smallest, largest = extreme_singular_values(jacobian @ ca.diag(scales))
     return smallest, largest / ca.fmax(smallest, largest / MAX_CONDITION + 1e-300)

@@ -1,4 +1,4 @@
-"""Runs of the hand-first loop with other bounds, weights and starts: what a diagnosis asks."""
+"""Runs of the hand-first loop with modified bounds, weights and starts, and helpers for them."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from casadi_ik.solve.status import Phase
 from casadi_ik.solve.verdict import deviations, judge
 
 UNREACHABLE_TOLERANCE = 1e-12
-"""A tolerance that nothing meets: the loop then goes on to the minimum."""
+"""Tolerance that no configuration meets, so that the loop continues to the minimum."""
 
 EXHAUSTED = 1e6
-"""Trunks tried: none follows the one that a row begins from."""
+"""Trial number after the last one, so that no further trial follows."""
 
 CARRY_ONLY = {
     "first": EXHAUSTED,
@@ -32,16 +32,16 @@ CARRY_ONLY = {
     "tried": EXHAUSTED,
     "again": 1.0,
 }
-"""What a row says that is to end where trunk and arms carry the palms, or nowhere."""
+"""State fields of a row that only moves trunk and arms to given palm poses."""
 
 TRUNK_STRETCH = 2.0
-"""Of every second trunk the even spread is stretched by this about its middle, up to the ends."""
+"""Factor by which every second trunk sample is stretched about the middle of the range, clamped."""
 
 DUPLICATE_FACTOR = 1.001
-"""Two values of a row that differ by less than this factor count as the same."""
+"""Ratio below which two values of a target count as duplicates."""
 
 PALM_SCALES = np.array([0.1, 0.1, 0.1, 2.0])
-"""What turns [rad] and shifts [m] of a palm that is free count as, beside parts of ranges."""
+"""Scales of rotations [1/rad] and translations [1/m] of a free palm, relative to motor ranges."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,34 +52,34 @@ class Bounds:
     upper: Array
 
     def clip(self, q: Array) -> Array:
-        """Configurations moved into the bounds."""
+        """Return configurations clipped to the bounds."""
         return np.clip(q, self.lower, self.upper)
 
     def of(self, rows: Rows) -> Bounds:
-        """Those of some targets; those that all share are of each."""
+        """Return the bounds of some targets."""
         return self if self.lower.ndim == 1 else Bounds(self.lower[rows], self.upper[rows])
 
     @property
     def first(self) -> Bounds:
-        """(n,) of the first target; the arm has the same in all."""
+        """(n,) bounds of the first target; the bounds of the arm are the same for all targets."""
         return self if self.lower.ndim == 1 else Bounds(self.lower[0], self.upper[0])
 
     def tiled(self, count: int) -> Bounds:
-        """The same bounds for k configurations."""
+        """Return shared bounds as (k, n)."""
         return Bounds(np.tile(self.lower, (count, 1)), np.tile(self.upper, (count, 1)))
 
     def beyond(self, q: Array) -> Array:
-        """Signed distance from the bounds: > 0 above, < 0 below, 0 within."""
+        """Return signed violations of the bounds: > 0 above, < 0 below, 0 within."""
         return np.maximum(q - self.upper, 0.0) - np.maximum(self.lower - q, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Subproblems:
-    """The loop of the hand-first method, asked in other ways.
+    """Runs of the loop of the hand-first method from modified states and parameters.
 
     Attributes:
         robot: The robot.
-        method: The method on that robot.
+        method: The method, built for this robot.
     """
 
     robot: ArmHand
@@ -87,28 +87,28 @@ class Subproblems:
 
     @cached_property
     def state(self) -> Layout:
-        """Layout of the loop's state."""
+        """Layout of the state of the loop."""
         return self.method.step.layouts.state
 
     @cached_property
     def parameters(self) -> Layout:
-        """Layout of the loop's parameters."""
+        """Layout of the parameters of the loop."""
         return self.method.step.layouts.parameters
 
     def limits(self, targets: TargetBatch) -> Bounds:
-        """The bounds that solutions have to keep, (n,) or (k, n), see `TargetBatch.bounds`."""
+        """Return the bounds of solutions, (n,) or (k, n), see `TargetBatch.bounds`."""
         return Bounds(*targets.bounds(self.robot.description))
 
     def search(self, targets: TargetBatch, start: Array, bounds: Bounds) -> Array:
-        """The first round of hand-first for each of k targets.
+        """Run the first restart of hand-first for each of k targets.
 
         Args:
             targets: The targets.
-            start: (n,).
-            bounds: (k, n).
+            start: (n,) start configuration [rad or m].
+            bounds: (k, n) bounds [rad or m].
 
         Returns:
-            (k, n) configurations.
+            (k, n) configurations [rad or m].
         """
         starts = bounds.clip(start)
         postures = self.method.postures(targets, 0)
@@ -119,18 +119,18 @@ class Subproblems:
     def posture_rows(
         self, targets: TargetBatch, start: Array, postures: Array, turns: ArrayLike = 0.0
     ) -> tuple[Array, Array]:
-        """Rows of the loop that know a single hand posture each.
+        """Return states and parameters with a single seed each.
 
         Args:
             targets: k targets.
-            start: (k, n).
-            postures: (k, hand).
-            turns: (k,) numbers, another palm for each where contacts leave the palm free.
+            start: (k, n) start configurations [rad or m].
+            postures: (k, hand) seeds [rad or m].
+            turns: (k,) numbers that select the palm pose where contacts leave the palm free.
         """
         states, parameters = self.method.rows(targets, start, postures[:, None], begun=True)
         states[:, self.state.slice("candidate")] = self.method.options.candidates - 1
         if self.robot.description.sides:
-            # Every side begins from its part of the posture, and none follows.
+            # Each side has a single seed, its part of the posture.
             states[:, self.state.slice("first")] = self.method.options.candidates - 1
         states[:, self.state.slice("turn").start] = turns
         return states, parameters
@@ -138,17 +138,17 @@ class Subproblems:
     def hand_rows(
         self, targets: TargetBatch, rows: Rows, starts: Array, postures: Array, first: int = 0
     ) -> tuple[Rows, Array, Array]:
-        """Rows of the loop for several hand postures of each of some targets.
+        """Return states and parameters for several seeds of some targets.
 
         Args:
             targets: k targets.
-            rows: (c,) those of them.
-            starts: (k, n) of each target.
-            postures: (c, p, hand) of those.
-            first: Turn of the first posture, see `posture_rows`.
+            rows: (c,) indices of the targets.
+            starts: (k, n) start configurations of all targets [rad or m].
+            postures: (c, p, hand) seeds of the selected targets [rad or m].
+            first: Palm number of the first seed, see `posture_rows`.
 
         Returns:
-            The target of each row, (c p,), states and parameters.
+            Target index of each row, (c p,), states and parameters.
         """
         count = postures.shape[1]
         owner, turns = np.repeat(rows, count), first + np.tile(np.arange(count), len(rows))
@@ -156,34 +156,34 @@ class Subproblems:
         return owner, *self.posture_rows(targets.rows(owner), starts[owner], flat, turns)
 
     def solved(self, targets: TargetBatch, q: Array, limits: bool) -> NDArray[np.bool_]:
-        """(k,) whether configurations meet their targets, and if asked the robot's limits."""
+        """Return (k,) whether q solves its targets, within limits if `limits`."""
         return judge(self.robot, targets, q).solved(limits)
 
     def set_bounds(self, parameters: Array, bounds: Bounds) -> None:
-        """Put bounds into rows of parameters."""
+        """Set the bounds in rows of parameters."""
         parameters[:, self.parameters.slice("lower")] = bounds.lower
         parameters[:, self.parameters.slice("upper")] = bounds.upper
 
     def set_tolerance(self, parameters: Array, tolerance: float) -> None:
-        """Put one tolerance [m, rad] of all contacts into rows of parameters."""
+        """Set one tolerance [m, rad] of all contacts in rows of parameters."""
         parameters[:, self.parameters.slice("position_tolerance")] = tolerance
         parameters[:, self.parameters.slice("angle_tolerance")] = tolerance
 
     def run(self, states: Array, parameters: Array) -> Array:
-        """(k, n) configurations that rows lead to."""
+        """Return the final configurations (k, n) of rows."""
         return self.method.run_rows(states, parameters).states[:, self.state.slice("q")]
 
 
 class LocalRefinement:
-    """Refinement of the whole arm-hand from given configurations.
+    """Refinement of all joints of the robot from given configurations.
 
     Attributes:
-        trials: The loop.
+        trials: Runs of the loop.
         targets: k targets.
     """
 
     def __init__(self, trials: Subproblems, targets: TargetBatch) -> None:
-        """Lay out a row per target, for any number of runs."""
+        """Prepare states and parameters of every target, for any number of runs."""
         self.trials = trials
         self.targets = targets
         self._states, self._parameters = refinement_rows(trials, targets)
@@ -191,17 +191,17 @@ class LocalRefinement:
     def run(
         self, owner: Rows, q: Array, bounds: Bounds | None = None, weights: Array | None = None
     ) -> Array:
-        """Refine.
+        """Refine configurations.
 
         Args:
-            owner: (m,) number of the target of each row.
-            q: (m, n) starts.
-            bounds: (n,) or (m, n); None keeps to the limits.
-            weights: (m, f, 2) of points and normals; None counts all alike. With weights the loop
-                does not stop at the tolerance.
+            owner: (m,) target index of each row.
+            q: (m, n) start configurations [rad or m].
+            bounds: (n,) or (m, n) bounds [rad or m]; None: the limits.
+            weights: (m, f, 2) weights of points and normals; None: all 1. With weights the loop
+                continues beyond the tolerance to the minimum.
 
         Returns:
-            (m, n) configurations.
+            (m, n) configurations [rad or m].
         """
         trials = self.trials
         states, parameters = self._states[owner], self._parameters[owner]
@@ -216,13 +216,13 @@ class LocalRefinement:
         return trials.run(states, parameters)
 
     def misses(self, owner: Rows, q: Array) -> Array:
-        """(m, f, 2) lengths of the residuals of points [0.1 m] and normals; 0 where free."""
+        """Return (m, f, 2) residual norms of points [0.1 m] and normals; 0 where free."""
         position, angle, _ = deviations(self.trials.robot, self.targets.rows(owner), q)
         return np.nan_to_num(np.stack([position / LENGTH, 2 * np.sin(angle / 2)], axis=2))
 
 
 def refinement_rows(trials: Subproblems, targets: TargetBatch) -> tuple[Array, Array]:
-    """States and parameters of the loop that begin with the refinement of the whole arm-hand."""
+    """Return states and parameters of the loop that start with the refinement of all joints."""
     count, hand = len(targets), len(trials.robot.description.hand_actuators)
     home = np.tile(trials.robot.home, (count, 1))
     states, parameters = trials.posture_rows(targets, home, np.zeros((count, hand)))
@@ -240,21 +240,22 @@ def sample_trunks(
     first: int,
     count: int,
 ) -> tuple[Array, NDArray[np.intp]]:
-    """Configurations with the same hands and palms, from several trunks each.
+    """Return configurations with given hands and palm poses, from several trunk postures each.
 
-    By turns the arms are placed at the trunk in closed form, or trunk and arms move from anywhere.
+    Three of four samples place the arms in closed form at the sampled trunk; the fourth moves trunk
+    and arms numerically from a sampled posture.
 
     Args:
-        trials: The loop.
+        trials: Runs of the loop.
         targets: k targets.
-        q: (m, n) configurations whose hands are kept.
-        palms: (m, s, 4, 4) poses of the palms.
-        owner: (m,) the target of each.
-        first: Number of the first trunk.
-        count: How many.
+        q: (m, n) configurations that contain the hand postures [rad or m].
+        palms: (m, s, 4, 4) palm poses.
+        owner: (m,) target index of each configuration.
+        first: Number of the first sample.
+        count: Number of samples.
 
     Returns:
-        (m count, n) where the loop ended, and the place in q of each.
+        (m count, n) final configurations [rad or m], and the row of q of each.
     """
     body = trials.robot.description
     of = np.repeat(np.arange(len(q)), count)
@@ -279,7 +280,7 @@ def carry_palms(
     owner: NDArray[np.intp],
     phase: float | Array,
 ) -> Array:
-    """Configurations (m, n) in which trunk and arms, from q on, carry palms (m, s, 4, 4)."""
+    """Return configurations (m, n) whose trunk and arms move from q to palm poses (m, s, 4, 4)."""
     robot = trials.robot.description
     hands = q[:, list(robot.hand_actuators)]
     states, parameters = trials.posture_rows(targets.rows(owner), q, hands)
@@ -300,108 +301,119 @@ def carry_palms(
 
 
 def side_palms(robot: ArmHand, q: Array) -> Array:
-    """(k, s, 4, 4) poses of the palms of a body."""
+    """Return the palm poses (k, s, 4, 4) of a multi-arm robot."""
     return np.stack([robot.palm(q, side.name) for side in robot.description.sides], axis=1)
 
 
 def repeat_target(targets: TargetBatch, count: int) -> TargetBatch:
-    """One target, several times."""
+    """Return one target repeated."""
     return targets.rows(np.zeros(count, dtype=np.intp))
 
 
 def residual_tolerances(targets: TargetBatch) -> Array:
-    """(k, f, 2) the residuals that the tolerances allow, see `LocalRefinement.misses`; 0: free."""
+    """Return (k, f, 2) residuals at tolerance, see `LocalRefinement.misses`; 0 where free."""
     known = [~np.isnan(targets.points[..., 0]), ~np.isnan(targets.normals[..., 0])]
     tolerated = [targets.position_tolerance / LENGTH, 2 * np.sin(targets.angle_tolerance / 2)]
     return np.stack(known, axis=2) * np.stack(tolerated, axis=1)
 
 
 def smallest_per_target(owner: Rows, values: Array, most: int) -> Rows:
-    """Rows with the smallest values of each target that differ, target by target, best first.
+    """Return the rows with the smallest distinct values of each target, ordered by target.
 
     Args:
-        owner: (m,) number of the target of each row.
-        values: (m,) >= 0.
-        most: How many rows of a target at most.
+        owner: (m,) target index of each row.
+        values: (m,) values >= 0.
+        most: Maximum number of rows per target.
     """
     order = np.lexsort((values, owner))
-    mine, value = owner[order], values[order]
-    fresh = np.ones(len(order), dtype=bool)
-    fresh[1:] = (mine[1:] != mine[:-1]) | (value[1:] > value[:-1] * DUPLICATE_FACTOR)
-    return first_per_owner(owner, order[fresh], most)
+    sorted_owner, value = owner[order], values[order]
+    is_distinct = np.ones(len(order), dtype=bool)
+    is_distinct[1:] = (sorted_owner[1:] != sorted_owner[:-1]) | (
+        value[1:] > value[:-1] * DUPLICATE_FACTOR
+    )
+    return first_per_owner(owner, order[is_distinct], most)
 
 
 def improving_rows(owner: NDArray[np.intp], value: Array, than: Array) -> NDArray[np.intp]:
-    """The row of the largest value (m,) of each owner (m,), where it exceeds what that has (k,)."""
+    """Return the row with the largest value of each owner, if it exceeds a threshold.
+
+    Args:
+        owner: (m,) owner of each row.
+        value: (m,) values.
+        than: (k,) threshold of each owner.
+    """
     order = np.lexsort((value, owner))
     last = order[np.diff(owner[order], append=-1) != 0]
     return last[value[last] > than[owner[last]]]
 
 
 def largest_per_owner(owner: NDArray[np.intp], value: Array, count: int) -> NDArray[np.intp]:
-    """The rows of so many of the largest values (m,) of each owner (m,), owner by owner."""
+    """Return the rows of the `count` largest values (m,) of each owner (m,), ordered by owner."""
     return first_per_owner(owner, np.lexsort((-value, owner)), count)
 
 
 def first_per_owner(
     owner: NDArray[np.intp], order: NDArray[np.intp], count: int
 ) -> NDArray[np.intp]:
-    """So many rows of each owner, the first in an order that goes owner by owner."""
+    """Return the first `count` rows of each owner, from an order that is sorted by owner."""
     sorted_owner = owner[order]
     rank = np.arange(len(order)) - np.searchsorted(sorted_owner, sorted_owner)
     return order[rank < count]
 
 
 class Deduplicator:
-    """The rows that each of k owners has had so far, none like another."""
+    """Filter of duplicate rows for each of k owners."""
 
     def __init__(self, count: int, size: int, apart: float) -> None:
-        """Begin with none.
+        """Start without rows.
 
         Args:
-            count: Owners.
-            size: Numbers of a row.
-            apart: Rows all of whose numbers differ by less are alike.
+            count: Number of owners.
+            size: Numbers per row.
+            apart: Rows are duplicates if all of their numbers differ by less than this.
         """
         self._rows = np.full((count, 0, size), np.nan)
         self._apart = apart
 
     def add(self, rows: Array, owner: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Take rows (m, size) in; (m,) whether each is unlike all before it."""
+        """Add rows (m, size), and return (m,) whether each differs from all rows before it."""
         order = np.argsort(owner, kind="stable")
-        mine = owner[order]
-        rank = np.arange(len(order)) - np.searchsorted(mine, mine)
-        whose, place = np.unique(mine, return_inverse=True)
-        most, before = int(rank.max(initial=-1)) + 1, self._rows.shape[1]
-        if not before and most <= 1:
-            self._rows = np.full((len(self._rows), most, rows.shape[1]), np.nan)
-            self._rows[whose, :1] = rows[order][:, None]
+        sorted_owner = owner[order]
+        rank = np.arange(len(order)) - np.searchsorted(sorted_owner, sorted_owner)
+        owners, position = np.unique(sorted_owner, return_inverse=True)
+        largest, before = int(rank.max(initial=-1)) + 1, self._rows.shape[1]
+        if not before and largest <= 1:
+            self._rows = np.full((len(self._rows), largest, rows.shape[1]), np.nan)
+            self._rows[owners, :1] = rows[order][:, None]
             return np.ones(len(rows), dtype=bool)
-        new = np.full((len(whose), most, rows.shape[1]), np.nan)
-        new[place, rank] = rows[order]
-        every = np.concatenate([self._rows[whose], new], axis=1)
-        # Of rows that are not there the distance is NaN, which is not near. Number by number: the
-        # largest along a short last axis costs several times as much.
-        near = np.ones((len(whose), most, before + most), dtype=bool)
-        for one, known in zip(np.moveaxis(new, 2, 0), np.moveaxis(every, 2, 0), strict=True):
-            near &= np.abs(one[:, :, None] - known[:, None]) < self._apart
-        fresh = np.asarray(~near[:, :, :before].any(axis=2))
-        for i in range(1, most):
-            fresh[:, i] &= ~(near[:, i, before : before + i] & fresh[:, :i]).any(axis=1)
-        added = np.full((len(self._rows), most, rows.shape[1]), np.nan)
-        added[whose] = np.where(fresh[:, :, None], new, np.nan)
+        new = np.full((len(owners), largest, rows.shape[1]), np.nan)
+        new[position, rank] = rows[order]
+        known = np.concatenate([self._rows[owners], new], axis=1)
+        # The distance to a missing row is NaN, which does not count as near. The loop over numbers
+        # is several times faster than a maximum along a short last axis.
+        is_near = np.ones((len(owners), largest, before + largest), dtype=bool)
+        for new_column, known_column in zip(
+            np.moveaxis(new, 2, 0), np.moveaxis(known, 2, 0), strict=True
+        ):
+            is_near &= np.abs(new_column[:, :, None] - known_column[:, None]) < self._apart
+        is_new = np.asarray(~is_near[:, :, :before].any(axis=2))
+        for i in range(1, largest):
+            is_new[:, i] &= ~(is_near[:, i, before : before + i] & is_new[:, :i]).any(axis=1)
+        added = np.full((len(self._rows), largest, rows.shape[1]), np.nan)
+        added[owners] = np.where(is_new[:, :, None], new, np.nan)
         self._rows = np.concatenate([self._rows, added], axis=1)
-        found = np.zeros(len(rows), dtype=bool)
-        found[order] = fresh[place, rank]
-        return found
+        result = np.zeros(len(rows), dtype=bool)
+        result[order] = is_new[position, rank]
+        return result
 
 
 def palm_coordinates(palms: Array) -> Array:
-    """(k, 12) what tells poses (k, 4, 4) of palms apart, beside motors as parts of ranges."""
+    """Return (k, 12) scaled coordinates of palm poses (k, 4, 4), comparable to motor ranges."""
     return (palms[:, :3] * PALM_SCALES).reshape(-1, 12)
 
 
 def distinct_rows(parts: Array, apart: float) -> list[int]:
-    """Rows of parts (k, n) that differ from all chosen before them, in their order."""
-    nobody = np.zeros(len(parts), dtype=np.intp)
-    return np.flatnonzero(Deduplicator(1, parts.shape[1], apart).add(parts, nobody)).tolist()
+    """Return the indices of rows (k, n) that differ from all returned rows before them."""
+    single_owner = np.zeros(len(parts), dtype=np.intp)
+    duplicates = Deduplicator(1, parts.shape[1], apart)
+    return np.flatnonzero(duplicates.add(parts, single_owner)).tolist()

@@ -108,7 +108,7 @@ def test_a_palm_is_where_it_is_asked(tmp_path: Path) -> None:
     assert missed.diagnosis.palm is not None
     assert missed.diagnosis.palm.position_error > 1
     said = reasons(missed)
-    assert "the arm does not reach where the palm is asked" in said
+    assert "the arm does not reach the palm pose" in said
     assert "proved: the palm has the wrist where the arm does not reach" in said
     assert not any(finger in line for line in said for finger in (*robot.fingers, "contact"))
     assert far.palm is not None
