@@ -1,9 +1,9 @@
-"""How near a hand comes to contacts: with the arm at its fairest, and alone, its palm floating.
+"""Configurations closest to contacts: of the whole robot, and of the hand with a floating palm.
 
-With weights w_i >= 0 the smallest ``sum w_i e_i^2`` of the errors e_i bounds what is possible: if
-it exceeds ``sum w_i t_i^2`` the tolerances t_i cannot all be kept. Weights that grow where the
-tolerance is exceeded most tighten that bound (Lawson's algorithm), and lead to the configuration
-whose largest error, as a part of its tolerance, is smallest (minimax).
+For weights w_i >= 0 the minimum of ``sum w_i e_i^2`` over the errors e_i is a bound: if it exceeds
+``sum w_i t_i^2``, the tolerances t_i cannot all be met. Weights that grow where the tolerance is
+exceeded most tighten the bound (Lawson's algorithm), and lead to the configuration whose largest
+error relative to its tolerance is smallest (minimax).
 """
 
 from __future__ import annotations
@@ -36,130 +36,138 @@ from casadi_ik.solve.verdict import contact_verdicts, judge
 
 @dataclass(frozen=True)
 class ClosestSettings:
-    """Numbers of the search for the nearest contacts, chosen with ``studies/diagnosis.py``.
+    """Settings of the search for the closest configurations. Source: ``studies/diagnosis.py``.
 
     Attributes:
-        rounds: Adaptations of the minimax weights, at most.
-        settled: The weights are adapted no further when the bound is this close to what was
-            reached, or when it says no and a round gains less than this.
-        margin: By which factor the contacts have to be missed for a grasp to count as unreachable.
-        lightest: Smallest weight.
-        first: Hand postures tried for every target; where none of them fits, two rounds of them.
-        slid: Hands that fit but are out of the arm's reach, and are slid towards it.
+        max_weight_updates: Maximum number of updates of the minimax weights.
+        convergence: Relative gap between bound and best error, and relative gain of an update,
+            below which the weights are final.
+        unreachable_factor: Factor of the tolerances that has to be exceeded for a target to count
+            as unreachable.
+        min_weight: Smallest weight of a contact.
+        first_seeds: Number of hand seeds of every target; if none fits, the seeds of two restarts
+            are used.
+        max_slid_fits: Number of fits per target beyond the arm's reach that are moved towards it.
     """
 
-    rounds: int = 16
-    settled: float = 0.01
-    margin: float = 1.02
-    lightest: float = 1e-4
-    first: int = 4
-    slid: int = 2
+    max_weight_updates: int = 16
+    convergence: float = 0.01
+    unreachable_factor: float = 1.02
+    min_weight: float = 1e-4
+    first_seeds: int = 4
+    max_slid_fits: int = 2
 
 
-CLOSEST_TUNING = ClosestSettings()
+CLOSEST_SETTINGS = ClosestSettings()
 
 
 @dataclass(frozen=True, eq=False)
 class ClosestConfigurations:
-    """What came closest to k targets.
+    """Configurations closest to k targets.
 
     Attributes:
-        q: (k, n) configurations with the smallest squared error.
-        fair: (k, n) configurations with the smallest largest error.
-        ratio: (k,) by which factor the tolerances would have to grow at least, near any of the
-            minima.
+        q: (k, n) configurations with the smallest squared error [rad or m].
+        minimax_q: (k, n) configurations with the smallest largest error [rad or m].
+        factor: (k,) lower bound of the factor by which the tolerances have to grow, near any of
+            the minima.
     """
 
     q: Array
-    fair: Array
-    ratio: Array
+    minimax_q: Array
+    factor: Array
 
     def rows(self, rows: Rows) -> ClosestConfigurations:
-        """What came closest to some of the targets."""
-        return ClosestConfigurations(self.q[rows], self.fair[rows], self.ratio[rows])
+        """Return the configurations of some targets."""
+        return ClosestConfigurations(self.q[rows], self.minimax_q[rows], self.factor[rows])
 
-    def put(self, rows: Rows, found: ClosestConfigurations) -> None:
-        """Take what came closer to some of the targets."""
-        self.q[rows], self.fair[rows], self.ratio[rows] = found.q, found.fair, found.ratio
+    def update(self, rows: Rows, closer: ClosestConfigurations) -> None:
+        """Replace the configurations of some targets."""
+        self.q[rows], self.minimax_q[rows] = closer.q, closer.minimax_q
+        self.factor[rows] = closer.factor
 
 
 def find_closest(
-    descent: LocalRefinement, owner: Rows, q: Array, followed: int
+    refinement: LocalRefinement, owner: Rows, q: Array, max_starts: int
 ) -> ClosestConfigurations:
-    """Follow the best of some configurations to the end.
+    """Refine the best of some configurations to their minimax minimum.
 
     Args:
-        descent: Of k targets.
-        owner: (m,) which target a configuration is for; every target has one at least.
-        q: (m, n).
-        followed: How many of a target at most.
+        refinement: Refinement of k targets.
+        owner: (m,) target index of each configuration; every target has one at least.
+        q: (m, n) start configurations [rad or m].
+        max_starts: Maximum number of configurations per target that are refined.
     """
-    cost = (descent.misses(owner, q) ** 2).sum(axis=(1, 2))
-    kept = smallest_per_target(owner, cost, followed)
-    owner, q = owner[kept], q[kept]
-    count, first = len(q), np.searchsorted(owner, np.arange(len(descent.targets)))
-    tolerated = residual_tolerances(descent.targets)[owner]
-    counted = tolerated > 0
-    total = (tolerated**2).sum(axis=(1, 2))
-    weights = counted.astype(float)
+    settings = CLOSEST_SETTINGS
+    cost = (refinement.misses(owner, q) ** 2).sum(axis=(1, 2))
+    selected = smallest_per_target(owner, cost, max_starts)
+    owner, q = owner[selected], q[selected]
+    count, first = len(q), np.searchsorted(owner, np.arange(len(refinement.targets)))
+    tolerance = residual_tolerances(refinement.targets)[owner]
+    is_constrained = tolerance > 0
+    total = (tolerance**2).sum(axis=(1, 2))
+    weights = is_constrained.astype(float)
     worst, bound = np.full(count, np.inf), np.zeros(count)
     best = np.full(len(first), np.inf)
-    done = np.zeros(len(first), dtype=bool)
-    fair, plain, cost = q.copy(), q, np.zeros(count)
+    is_done = np.zeros(len(first), dtype=bool)
+    minimax_q, least_squares_q, cost = q.copy(), q, np.zeros(count)
     rows = np.arange(count)
-    for number in range(CLOSEST_TUNING.rounds):
-        here = owner[rows]
-        q[rows] = descent.run(here, q[rows], weights=np.sqrt(weights[rows]))
-        misses = descent.misses(here, q[rows])
-        if number == 0:
-            plain, cost = q.copy(), (misses**2).sum(axis=(1, 2))
-        parts = np.divide(misses, tolerated[rows], where=counted[rows], out=np.zeros_like(misses))
-        largest = parts.max(axis=(1, 2))
-        better = rows[largest < worst[rows]]
-        fair[better] = q[better]
+    for update in range(settings.max_weight_updates):
+        target = owner[rows]
+        q[rows] = refinement.run(target, q[rows], weights=np.sqrt(weights[rows]))
+        misses = refinement.misses(target, q[rows])
+        if update == 0:
+            least_squares_q, cost = q.copy(), (misses**2).sum(axis=(1, 2))
+        relative = np.divide(
+            misses, tolerance[rows], where=is_constrained[rows], out=np.zeros_like(misses)
+        )
+        largest = relative.max(axis=(1, 2))
+        improved = rows[largest < worst[rows]]
+        minimax_q[improved] = q[improved]
         worst[rows] = np.minimum(worst[rows], largest)
         squares = (weights[rows] * misses**2).sum(axis=(1, 2))
         bound[rows] = np.maximum(bound[rows], np.sqrt(squares / total[rows]))
-        before, best = best, np.minimum.reduceat(worst, first)
-        least = np.minimum.reduceat(bound, first)
-        stuck = best > (1 - CLOSEST_TUNING.settled) * before
-        done |= (
+        previous, best = best, np.minimum.reduceat(worst, first)
+        lowest_bound = np.minimum.reduceat(bound, first)
+        is_stalled = best > (1 - settings.convergence) * previous
+        is_done |= (
             (best <= 1)
-            | ((least > CLOSEST_TUNING.margin) & stuck)
-            | (least > (1 - CLOSEST_TUNING.settled) * best)
+            | ((lowest_bound > settings.unreachable_factor) & is_stalled)
+            | (lowest_bound > (1 - settings.convergence) * best)
         )
-        # A minimum that cannot come closer than another one already has is followed no further.
-        going = ~done[here] & (bound[rows] < best[here])
-        if not going.any():
+        # Drop minima whose bound exceeds the best error of the target.
+        is_active = ~is_done[target] & (bound[rows] < best[target])
+        if not is_active.any():
             break
-        new = np.where(
-            counted[rows], np.maximum(weights[rows] * parts, CLOSEST_TUNING.lightest), 0.0
+        updated = np.where(
+            is_constrained[rows],
+            np.maximum(weights[rows] * relative, settings.min_weight),
+            0.0,
         )
-        scale = total[rows] / (new * tolerated[rows] ** 2).sum(axis=(1, 2))
-        weights[rows] = new * scale[:, None, None]
-        rows = rows[going]
-    ratio = np.minimum.reduceat(bound, first)
+        scale = total[rows] / (updated * tolerance[rows] ** 2).sum(axis=(1, 2))
+        weights[rows] = updated * scale[:, None, None]
+        rows = rows[is_active]
     return ClosestConfigurations(
-        plain[smallest_per_target(owner, cost, 1)],
-        fair[smallest_per_target(owner, worst, 1)],
-        ratio,
+        least_squares_q[smallest_per_target(owner, cost, 1)],
+        minimax_q[smallest_per_target(owner, worst, 1)],
+        np.minimum.reduceat(bound, first),
     )
 
 
 @dataclass(frozen=True, eq=False)
 class HandFits:
-    """Hand postures that were fitted to targets without the arm, each with a palm pose.
+    """Fits of the hand alone to targets, each with a palm pose.
 
     Attributes:
-        owner: (m,) number of the target.
-        states: (m, ...) of the loop, where the arm would be placed next.
-        parameters: (m, ...) of the loop.
-        position_error: (m, f) [m], NaN where free.
-        angle_error: (m, f) [rad], NaN where free.
-        met: (m, f) within tolerance, or free.
-        cost: (m,) squared residual, as in the hand stage.
-        distance: (m,) of the wrist from the shoulder [m]; NaN for an arm without a closed form.
-        outside: (m,) how far the wrist is from what the arm can span [m], 0 within.
+        owner: (m,) target index.
+        states: (m, ...) states of the loop, before the arm is placed.
+        parameters: (m, ...) parameters of the loop.
+        position_error: (m, f) distances [m], NaN where free.
+        angle_error: (m, f) angles [rad], NaN where free.
+        met: (m, f) whether the errors are within tolerance, or free.
+        cost: (m,) squared residual of the hand stage.
+        distance: (m,) distance of the wrist from the shoulder [m]; NaN for an arm without a
+            closed form.
+        outside: (m,) distance of the wrist from the range of the arm [m], 0 within.
     """
 
     owner: Rows
@@ -174,95 +182,104 @@ class HandFits:
 
     @property
     def ok(self) -> NDArray[np.bool_]:
-        """(m,) every contact within tolerance."""
+        """(m,) whether every contact is within tolerance."""
         return np.all(self.met, axis=1)
 
-    def without(self) -> Rows:
-        """Targets without a fit that the arm reaches."""
+    def unreached_targets(self) -> Rows:
+        """Return the targets without a fit that the arm reaches."""
         return np.setdiff1d(self.owner, self.owner[self.ok & (self.outside == 0)])
 
-    def ratio(self, targets: TargetBatch) -> Array:
-        """(k,) by which factor the tolerances would have to grow at least, near any of the fits."""
+    def tolerance_factor(self, targets: TargetBatch) -> Array:
+        """Return (k,) lower bounds of the factor by which the tolerances have to grow."""
         cost = self.cost[smallest_per_target(self.owner, self.cost, 1)]
         return np.sqrt(cost / (residual_tolerances(targets) ** 2).sum(axis=(1, 2)))
 
     def best(self, most: int) -> Rows:
-        """Rows of each target that fit best with regard to the arm's reach."""
+        """Return the best fits of each target, `most` at the most, weighing cost and reach."""
         return smallest_per_target(self.owner, self.cost + (self.outside / LENGTH) ** 2, most)
 
     @classmethod
     def joined(cls, parts: Sequence[HandFits]) -> HandFits:
-        """One after the other."""
+        """Concatenate fits."""
         names = [item.name for item in fields(cls)]
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 class FloatingPalmFit:
-    """Fits the hand alone to targets, whatever the arm could do."""
+    """Fits the hand alone to targets, with a floating palm."""
 
     def __init__(self, trials: Subproblems) -> None:
-        """Ask the loop's hand stage."""
+        """Store the runs of the loop."""
         self._trials = trials
         self._arm = srs_arm(trials.robot.description)
 
     @cached_property
     def _palm(self) -> Array:
-        """(4, 4) where the palm is with the arm at zero."""
+        """(4, 4) palm pose with the arm at zero."""
         robot = self._trials.robot
         return robot.palm(np.zeros(len(robot.actuators)))
 
     def evidence(
         self, targets: TargetBatch, fits: HandFits
     ) -> list[tuple[HandFit, ArmReach | None]]:
-        """What the fits say of each target: the best one, and the one nearest to the arm's range.
+        """Return the best hand fit of each target, and the reach of the arm for the nearest fit.
 
-        Nothing is said of the reach where no hand fits, or of an arm without a closed form.
+        The reach is None if no hand fits, and for an arm without a closed form.
         """
         best = smallest_per_target(fits.owner, np.where(fits.ok, 0.0, 1.0 + fits.cost), 1)
         nearest = smallest_per_target(fits.owner, np.where(fits.ok, fits.outside, np.inf), 1)
-        errors = (each[best] for each in (fits.position_error, fits.angle_error, fits.met))
+        errors = (array[best] for array in (fits.position_error, fits.angle_error, fits.met))
         verdicts = contact_verdicts(self._trials.robot.fingers, targets.tolerances, *errors)
-        found = []
+        evidence = []
         for row, near, contacts in zip(best.tolist(), nearest.tolist(), verdicts, strict=True):
             hand, arm = HandFit(bool(fits.ok[row]), contacts), None
             if hand.fits and self._arm is not None:
                 arm = ArmReach(float(fits.distance[near]), *self._span(targets, self._arm))
-            found.append((hand, arm))
-        return found
+            evidence.append((hand, arm))
+        return evidence
 
     def fits(self, targets: TargetBatch, q0: Array) -> HandFits:
-        """Fit some postures to each of k targets, more where none of them fits.
+        """Fit a few seeds to each of k targets, and more seeds if none of them fits.
 
         Args:
             targets: The targets.
-            q0: (k, n) where what is free stays.
+            q0: (k, n) positions of unconstrained motors [rad or m].
         """
-        method, every = self._trials.method, np.arange(len(targets))
+        method, all_targets = self._trials.method, np.arange(len(targets))
         nearest = method.postures(targets, 0)
-        fits = self._fitted(targets, q0, every, nearest[:, : CLOSEST_TUNING.first])
-        without = fits.without()
-        if len(without):
-            wide = method.postures(targets.rows(without), 1)
-            more = np.concatenate([nearest[without, CLOSEST_TUNING.first :], wide], axis=1)
-            fits = HandFits.joined([fits, self._fitted(targets, q0, without, more)])
-        rows = np.flatnonzero(fits.ok & np.isin(fits.owner, fits.without()))
-        rows = rows[smallest_per_target(fits.owner[rows], fits.outside[rows], CLOSEST_TUNING.slid)]
+        fits = self._fit_seeds(targets, q0, all_targets, nearest[:, : CLOSEST_SETTINGS.first_seeds])
+        unreached = fits.unreached_targets()
+        if len(unreached):
+            further = method.postures(targets.rows(unreached), 1)
+            seeds = np.concatenate(
+                [nearest[unreached, CLOSEST_SETTINGS.first_seeds :], further], axis=1
+            )
+            fits = HandFits.joined([fits, self._fit_seeds(targets, q0, unreached, seeds)])
+        rows = np.flatnonzero(fits.ok & np.isin(fits.owner, fits.unreached_targets()))
+        rows = rows[
+            smallest_per_target(
+                fits.owner[rows], fits.outside[rows], CLOSEST_SETTINGS.max_slid_fits
+            )
+        ]
         if len(rows):
-            fits = HandFits.joined([fits, self._slid(targets, fits, rows)])
+            fits = HandFits.joined([fits, self._slide_towards_arm(targets, fits, rows)])
         return fits
 
-    def _fitted(self, targets: TargetBatch, q0: Array, chosen: Rows, postures: Array) -> HandFits:
-        """Fit postures (c, p, hand) to c of the targets."""
+    def _fit_seeds(
+        self, targets: TargetBatch, q0: Array, chosen: Rows, postures: Array
+    ) -> HandFits:
+        """Fit seeds (c, p, hand) to c of the targets."""
         trials = self._trials
         owner, states, parameters = trials.hand_rows(targets, chosen, q0, postures)
         parameters[:, trials.parameters.slice("alone")] = 1.0
         parameters[:, trials.parameters.slice("reach")] = 0.0
         return self._run(targets, owner, states, parameters)
 
-    def _slid(self, targets: TargetBatch, fits: HandFits, rows: Rows) -> HandFits:
-        """Spend what freedom the contacts leave on the arm's reach.
+    def _slide_towards_arm(self, targets: TargetBatch, fits: HandFits, rows: Rows) -> HandFits:
+        """Move fits towards the range of the arm along motions that the contacts leave free.
 
-        The reach weighs so little that a hand without a freedom stays within the tolerance.
+        The weight of the reach is small, so that a hand without free motions stays within
+        tolerance.
         """
         trials = self._trials
         states, parameters = fits.states[rows], fits.parameters[rows]
@@ -276,17 +293,17 @@ class FloatingPalmFit:
         return replace(slid, parameters=fits.parameters[rows])
 
     def _run(self, targets: TargetBatch, owner: Rows, states: Array, parameters: Array) -> HandFits:
-        """Run the hand stage of some rows to its end and judge what it came to."""
+        """Run the hand stage of some rows, and measure the resulting fits."""
         trials = self._trials
         states = trials.method.run_rows(states, parameters).states
-        # From here on the rows may go on to the arm.
+        # Runs from these states may continue with the arm.
         parameters[:, trials.parameters.slice("alone")] = 0.0
         rotation = states[:, trials.state.slice("palm_rotation")].reshape(-1, 3, 3)
         origin = states[:, trials.state.slice("palm_origin")]
         hand = states[:, trials.state.slice("q")].copy()
         hand[:, list(trials.robot.description.arm_actuators)] = 0.0
-        seen = self._seen(targets.rows(owner), rotation, origin)
-        verdict = judge(trials.robot, seen, hand)
+        moved_targets = self._in_zero_palm(targets.rows(owner), rotation, origin)
+        verdict = judge(trials.robot, moved_targets, hand)
         position, angle, met = verdict.position_error, verdict.angle_error, verdict.ok
         squares = (position / LENGTH) ** 2, (2 * np.sin(angle / 2)) ** 2
         distance, outside = self._wrist(targets, rotation, origin)
@@ -302,17 +319,22 @@ class FloatingPalmFit:
             outside=outside,
         )
 
-    def _seen(self, asked: TargetBatch, rotation: Array, origin: Array) -> TargetBatch:
-        """Targets moved with their palm poses to where the palm is with the arm at zero."""
+    def _in_zero_palm(self, targets: TargetBatch, rotation: Array, origin: Array) -> TargetBatch:
+        """Return targets moved with their palm poses to the palm pose with the arm at zero."""
         palm = self._palm
-        turn = np.einsum("ij,kmj->kim", palm[:3, :3], rotation)
-        points = np.einsum("kij,kfj->kfi", turn, asked.points - origin[:, None]) + palm[:3, 3]
-        normals = np.einsum("kij,kfj->kfi", turn, asked.normals)
-        more = {key: np.einsum("kij,kfj->kfi", turn, v) for key, v in asked.more.items()}
-        return replace(asked, points=points, normals=normals, more=more)
+        rotation_to_zero = np.einsum("ij,kmj->kim", palm[:3, :3], rotation)
+        points = (
+            np.einsum("kij,kfj->kfi", rotation_to_zero, targets.points - origin[:, None])
+            + palm[:3, 3]
+        )
+        normals = np.einsum("kij,kfj->kfi", rotation_to_zero, targets.normals)
+        more = {
+            key: np.einsum("kij,kfj->kfi", rotation_to_zero, v) for key, v in targets.more.items()
+        }
+        return replace(targets, points=points, normals=normals, more=more)
 
     def _wrist(self, targets: TargetBatch, rotation: Array, origin: Array) -> tuple[Array, Array]:
-        """(m,) distance of the wrist from the shoulder, and from what the arm can span [m]."""
+        """Return (m,) distances of the wrist from the shoulder and from the arm's range [m]."""
         if self._arm is None:
             return np.full(len(origin), np.nan), np.zeros(len(origin))
         wrist = origin + rotation @ self._arm.wrist_in_palm
@@ -321,7 +343,7 @@ class FloatingPalmFit:
         return distance, np.maximum(np.maximum(distance - far, near - distance), 0.0)
 
     def _span(self, targets: TargetBatch, arm: SrsArm) -> tuple[float, float]:
-        """Smallest and largest distance of the wrist from the shoulder [m]."""
+        """Return the smallest and largest distance of the wrist from the shoulder [m]."""
         limits = self._trials.limits(targets)
         elbow = self._trials.robot.description.arm_actuators[3]
         near, far = arm.reach(limits.lower[elbow], limits.upper[elbow])

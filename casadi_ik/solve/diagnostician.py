@@ -1,4 +1,4 @@
-"""Finds out why grasps cannot be solved: by solving them again with less asked."""
+"""Diagnosis of unsolved targets by solving relaxed problems."""
 
 from __future__ import annotations
 
@@ -39,26 +39,24 @@ from casadi_ik.solve.verdict import (
 
 @dataclass(frozen=True)
 class DiagnosisEffort:
-    """How long a diagnosis goes on; chosen with ``studies/diagnosis.py``.
+    """Limits of the effort of a diagnosis. Source: ``studies/diagnosis.py``.
 
     Attributes:
-        together: Targets that are diagnosed in the same runs of the compiled loop.
-        placed: Fitted hands that the arm follows, in addition to the one of hand-first.
-        searches: If the contacts are missed by less than a factor, so many further starts are
-            tried, whatever hand and reach say, and so many of the minima they lead to are followed.
-        alike: Every third of these starts has a hand that looks like the grasp, the others the
-            nearest.
-        certain: If hand and arm-hand both miss the contacts by this factor where they come
-            closest, no arm is looked for that would help a hand that does not fit.
-        barely: If they are missed by less than this, limits are lifted that nothing presses
-            against, too.
-        alone: Random arms for every side of a body by itself, and how many of them are followed.
-        clearly: A proof may take all its boxes where the tolerances would have to be so many times
-            as large. What is missed by little is hardly ever proved: no box is excluded before it
-            is small.
-        least: Boxes it may take in any case.
-        at_limit: How near to a limit counts as at it [rad or m].
-        missed_reach: How far an arm's reach has to be missed to be the reason [m].
+        together: Number of targets diagnosed in the same runs of the compiled loop.
+        placed: Number of hand fits that the arm follows, beyond that of hand-first.
+        searches: Stages of the search for the closest configuration: (upper bound of the tolerance
+            factor, number of starts, number of minima that are refined).
+        alone: Number of starts and of refined minima for each side of a multi-arm robot.
+        alike: Every start whose index is a multiple of this has a hand seed that resembles the
+            grasp; the others have the closest hands.
+        certain: Tolerance factor of hand and robot above which a hand that does not fit is not
+            searched further.
+        barely: Tolerance factor below which limits are relaxed even if no motor is at them.
+        clearly: Tolerance factor from which a proof may use the maximum number of boxes. Slight
+            misses are rarely proved: no box is excluded before it is small.
+        least: Minimum of the maximum number of boxes of a proof.
+        at_limit: Distance below which a motor counts as being at its limit [rad or m].
+        missed_reach: Excess of the reach from which it counts as the cause [m].
     """
 
     together: int = 64
@@ -78,15 +76,15 @@ DIAGNOSIS_EFFORT = DiagnosisEffort()
 
 
 class Diagnostician:
-    """Diagnoses grasps on one robot, whichever method failed.
+    """Diagnoses the unsolved targets of any method on one robot.
 
     Attributes:
         robot: The robot.
-        method: Hand-first on that robot.
+        method: Hand-first, built for this robot.
     """
 
     def __init__(self, robot: ArmHand, method: HandSearch, compiled: bool = True) -> None:
-        """Keep robot and method; nothing is built before the first diagnosis."""
+        """Store robot and method; graphs are built at the first diagnosis."""
         self.robot = robot
         self.method = method
         self._trials = Subproblems(robot, method)
@@ -98,146 +96,158 @@ class Diagnostician:
         ]
 
     def diagnose(self, targets: TargetBatch, q0: Array, nearest: Array | None) -> list[Diagnosis]:
-        """Diagnose k targets; each as if it were alone.
+        """Diagnose k targets independently of each other.
 
         Args:
             targets: The targets.
-            q0: (k, n) starts.
-            nearest: (k, n) what hand-first came to; None if another method was asked.
+            q0: (k, n) start configurations [rad or m].
+            nearest: (k, n) configurations that hand-first returned [rad or m]; None: run it.
         """
         self.method.prepare()
         if targets.fixed is not None and targets.fixed.ndim > 1:
-            # Hands that are held differently have nothing in common.
-            found_alone = [
-                self.diagnose(_held_alone(targets, row), q0[row : row + 1], near)[0]
+            # Targets with different fixed positions are diagnosed one by one.
+            diagnoses = [
+                self.diagnose(_single_fixed(targets, row), q0[row : row + 1], near)[0]
                 for row in range(len(targets))
                 for near in [None if nearest is None else nearest[row : row + 1]]
             ]
-            return _of_palms(self.robot, targets, found_alone)
-        known = np.zeros(len(targets), dtype=bool)
+            return _add_palm_errors(self.robot, targets, diagnoses)
+        is_solved = np.zeros(len(targets), dtype=bool)
         clock = _Clock(np.zeros(len(targets)))
         if nearest is None:
             nearest = self.method.run(targets, q0, 0, trace=False).q
-            known = judge(self.robot, targets, nearest).solved(targets.enforce_limits)
+            is_solved = judge(self.robot, targets, nearest).solved(targets.enforce_limits)
             clock.lap(np.arange(len(targets)))
-        found: dict[int, Diagnosis] = {}
-        for row in np.flatnonzero(known).tolist():
-            one = targets.rows(slice(row, row + 1))
-            (near,) = self._nearest(one, nearest[row : row + 1])
-            found[row] = _reachable(one, nearest[row], near, clock.seconds[row])
-        rest = np.flatnonzero(~known)
-        for start in range(0, len(rest), DIAGNOSIS_EFFORT.together):
-            rows = rest[start : start + DIAGNOSIS_EFFORT.together]
-            some, spent = targets.rows(rows), clock.seconds[rows]
-            whys = self._together(some, q0[rows], nearest[rows], _Clock(spent))
-            found |= zip(rows.tolist(), whys, strict=True)
-        return [found[row] for row in range(len(targets))]
+        by_row: dict[int, Diagnosis] = {}
+        for row in np.flatnonzero(is_solved).tolist():
+            target = targets.rows(slice(row, row + 1))
+            (contacts,) = self._nearest_contacts(target, nearest[row : row + 1])
+            by_row[row] = _reachable(target, nearest[row], contacts, clock.seconds[row])
+        unsolved = np.flatnonzero(~is_solved)
+        for start in range(0, len(unsolved), DIAGNOSIS_EFFORT.together):
+            rows = unsolved[start : start + DIAGNOSIS_EFFORT.together]
+            clock_of_rows = _Clock(clock.seconds[rows])
+            diagnoses = self._diagnose_unsolved(
+                targets.rows(rows), q0[rows], nearest[rows], clock_of_rows
+            )
+            by_row |= zip(rows.tolist(), diagnoses, strict=True)
+        return [by_row[row] for row in range(len(targets))]
 
-    def _together(
+    def _diagnose_unsolved(
         self, targets: TargetBatch, q0: Array, nearest: Array, clock: _Clock
     ) -> Iterator[Diagnosis]:
-        """Diagnose targets that hand-first did not solve."""
-        every = np.arange(len(targets))
-        descent = LocalRefinement(self._trials, targets)
-        evidence, fits = self._hands(targets, q0)
-        owner, ends = self._placed(fits)
-        owner, ends = np.concatenate([every, owner]), np.concatenate([nearest, ends])
-        searches = np.bincount(owner, minlength=len(every))
+        """Yield the diagnoses of targets that hand-first did not solve."""
+        all_rows = np.arange(len(targets))
+        refinement = LocalRefinement(self._trials, targets)
+        evidence, fits = self._fit_hands(targets, q0)
+        owner, ends = self._place_arms(fits)
+        owner, ends = np.concatenate([all_rows, owner]), np.concatenate([nearest, ends])
+        searches = np.bincount(owner, minlength=len(all_rows))
         if fits is not None:
-            searches += np.bincount(fits.owner, minlength=len(every))
-        best = find_closest(descent, owner, ends, DIAGNOSIS_EFFORT.placed + 1)
-        clock.lap(every)
-        proofs: list[Proof | None] = [None] * len(every)
-        rows = np.flatnonzero(~self._solved(targets, best.fair))
+            searches += np.bincount(fits.owner, minlength=len(all_rows))
+        best = find_closest(refinement, owner, ends, DIAGNOSIS_EFFORT.placed + 1)
+        clock.lap(all_rows)
+        proofs: list[Proof | None] = [None] * len(all_rows)
+        rows = np.flatnonzero(~self._solved(targets, best.minimax_q))
         if len(rows):
-            found = self._proofs(targets.rows(rows), _worth(best.ratio[rows]))
-            for row, proof in zip(rows.tolist(), found, strict=True):
+            new_proofs = self._prove(targets.rows(rows), _max_boxes(best.factor[rows]))
+            for row, proof in zip(rows.tolist(), new_proofs, strict=True):
                 proofs[row] = proof
             clock.lap(rows)
-        refused = [_refused(*item, proof) for item, proof in zip(evidence, proofs, strict=True)]
-        # Where neither the hand nor the reach says no, only searching can.
-        unsure = np.array([reason is None for reason in refused])
-        certain = self._certain(targets, fits, best)
-        certain |= np.array([proof is not None for proof in proofs])
-        for below, count, followed in DIAGNOSIS_EFFORT.searches:
-            rows = np.flatnonzero(unsure | ((best.ratio < below) & ~certain))
-            rows = rows[~self._solved(targets.rows(rows), best.fair[rows])]
+        causes = [_cause_of(*item, proof) for item, proof in zip(evidence, proofs, strict=True)]
+        # A longer search decides where neither hand nor reach rules a solution out.
+        is_open = np.array([reason is None for reason in causes])
+        is_certain = self._is_certain(targets, fits, best)
+        is_certain |= np.array([proof is not None for proof in proofs])
+        for max_factor, count, followed in DIAGNOSIS_EFFORT.searches:
+            rows = np.flatnonzero(is_open | ((best.factor < max_factor) & ~is_certain))
+            rows = rows[~self._solved(targets.rows(rows), best.minimax_q[rows])]
             if len(rows):
-                some, found = targets.rows(rows), best.rows(rows)
-                best.put(rows, self._search(some, found, count, followed))
+                subset, closest = targets.rows(rows), best.rows(rows)
+                best.update(rows, self._search(subset, closest, count, followed))
                 searches[rows] += count + 2
                 clock.lap(rows)
-            unsure[:] = False
-        fair = judge(self.robot, targets, best.fair)
-        solved, enough = fair.solved(targets.enforce_limits), _enough(targets, fair)
-        near = self._nearest(targets, np.where(solved[:, None], best.fair, best.q))
-        held = self._at_limit(best.q)
-        pressed = (
-            held | self._at_limit(best.fair) | (best.ratio <= DIAGNOSIS_EFFORT.barely)[:, None]
+            is_open[:] = False
+        verdict = judge(self.robot, targets, best.minimax_q)
+        solved, enough = verdict.solved(targets.enforce_limits), _enough(targets, verdict)
+        contacts = self._nearest_contacts(
+            targets, np.where(solved[:, None], best.minimax_q, best.q)
         )
-        sides = self._one_at_a_time(targets, best)
-        clock.lap(every)
-        for i in every.tolist():
+        at_limit = self._at_limit(best.q)
+        is_pressed = (
+            at_limit
+            | self._at_limit(best.minimax_q)
+            | (best.factor <= DIAGNOSIS_EFFORT.barely)[:, None]
+        )
+        sides = self._diagnose_sides(targets, best)
+        clock.lap(all_rows)
+        for i in all_rows.tolist():
             if solved[i]:
-                yield _reachable(targets, best.fair[i], near[i], clock.seconds[i])
+                yield _reachable(targets, best.minimax_q[i], contacts[i], clock.seconds[i])
                 continue
             hand, reach = evidence[i]
-            one, hand_only = targets.rows(slice(i, i + 1)), refused[i] is Reason.HAND
-            remedies = RemedyFinder(self._trials, one, q0[i], best.q[i], pressed[i], hand_only)
-            reason = refused[i]
+            target, hand_only = targets.rows(slice(i, i + 1)), causes[i] is Reason.HAND
+            remedies = RemedyFinder(
+                self._trials, target, q0[i], best.q[i], is_pressed[i], hand_only
+            )
+            reason = causes[i]
             if reason is None:
                 reason = Reason.LIMITS if remedies.limits_help() else Reason.NOT_FOUND
-            names = zip(self.robot.actuators, held[i].tolist(), strict=True)
-            clock.lap(every[i : i + 1])
+            names = zip(self.robot.actuators, at_limit[i].tolist(), strict=True)
+            clock.lap(all_rows[i : i + 1])
             yield Diagnosis(
                 reason=reason,
                 proof=proofs[i],
                 searches=int(searches[i]),
                 hand=hand,
                 reach=reach,
-                active=tuple(name for name, at in names if at and targets.enforce_limits),
+                active=tuple(
+                    name for name, is_at_limit in names if is_at_limit and targets.enforce_limits
+                ),
                 enough=enough[i],
-                nearest=near[i],
+                nearest=contacts[i],
                 q=best.q[i],
                 time=float(clock.seconds[i]),
                 lazy=LazyRemedies(remedies.find),
                 sides=sides[i],
             )
 
-    def _one_at_a_time(
+    def _diagnose_sides(
         self, targets: TargetBatch, best: ClosestConfigurations
     ) -> list[dict[str, ContactVerdict]]:
-        """By target the worst contact of every side of a body that it asks for, the others free."""
-        found: list[dict[str, ContactVerdict]] = [{} for _ in range(len(targets))]
+        """Return by target the worst contact of each side, solved with the other sides free."""
+        by_target: list[dict[str, ContactVerdict]] = [{} for _ in range(len(targets))]
         robot = self.robot
         for name, fingers in robot.hands.items():
-            asked = ~np.isnan(targets.points[:, fingers, 0]).all(axis=1)
-            rows = np.flatnonzero(asked)
+            has_contacts = ~np.isnan(targets.points[:, fingers, 0]).all(axis=1)
+            rows = np.flatnonzero(has_contacts)
             if name is None or not len(rows):
                 continue
             others = [i for i in range(len(robot.fingers)) if i not in fingers]
-            alone = _free_of(targets.rows(rows), others)
+            alone = _with_free_fingers(targets.rows(rows), others)
             search = self._search(alone, best.rows(rows), *DIAGNOSIS_EFFORT.alone)
             position, angle, met = (
-                getattr(judge(robot, alone, search.fair), one)
-                for one in ("position_error", "angle_error", "ok")
+                getattr(judge(robot, alone, search.minimax_q), array)
+                for array in ("position_error", "angle_error", "ok")
             )
             verdicts = contact_verdicts(robot.fingers, alone.tolerances, position, angle, met)
             for row, of_fingers in zip(rows.tolist(), verdicts, strict=True):
-                own = [of_fingers[robot.fingers[i]] for i in fingers]
-                found[row][name] = max(own, key=lambda one: (not one.ok, one.position_error))
-        return found
+                by_target[row][name] = max(
+                    (of_fingers[robot.fingers[i]] for i in fingers),
+                    key=lambda verdict: (not verdict.ok, verdict.position_error),
+                )
+        return by_target
 
-    def _proofs(self, targets: TargetBatch, most: Counts) -> list[Proof | None]:
-        """Proofs of targets; of a body that one side cannot, wherever the trunk takes it."""
+    def _prove(self, targets: TargetBatch, most: Counts) -> list[Proof | None]:
+        """Return proofs for targets; for a multi-arm robot, that one side is unsolvable."""
         if not self._sides:
             return self._prover.prove(_with_contact_bounds(targets), max_boxes=most)
         robot = self.robot.description
         proofs: list[Proof | None] = [None] * len(targets)
         for prover, side in zip(self._sides, robot.sides, strict=True):
             fingers = [robot.finger_names.index(name) for name in side.fingers]
-            asked = ~np.isnan(targets.points[:, fingers, 0]).all(axis=1)
-            rows = np.flatnonzero(asked & np.array([proof is None for proof in proofs]))
+            has_contacts = ~np.isnan(targets.points[:, fingers, 0]).all(axis=1)
+            rows = np.flatnonzero(has_contacts & np.array([proof is None for proof in proofs]))
             if not len(rows) or targets.fixed is not None:
                 continue
             part = targets.rows(rows).of_fingers(fingers)
@@ -247,25 +257,25 @@ class Diagnostician:
                 proofs[row] = proof
         return proofs
 
-    def _hands(
+    def _fit_hands(
         self, targets: TargetBatch, q0: Array
     ) -> tuple[Sequence[tuple[HandFit | None, ArmReach | None]], HandFits | None]:
-        """What the hand alone says of each target; nothing if there is no arm."""
+        """Return hand fit and arm reach of each target, and all fits; None without an arm."""
         if not self.robot.description.arm_actuators:
             return [(None, None)] * len(targets), None
         fits = self._palm_free.fits(targets, q0)
         return self._palm_free.evidence(targets, fits), fits
 
-    def _certain(
+    def _is_certain(
         self, targets: TargetBatch, fits: HandFits | None, best: ClosestConfigurations
     ) -> NDArray[np.bool_]:
-        """(k,) whether the hand alone already says no, however the arm holds it."""
+        """Return (k,) whether the hand alone clearly misses the contacts."""
         if fits is None:
             return np.zeros(len(targets), dtype=bool)
-        return np.minimum(fits.ratio(targets), best.ratio) >= DIAGNOSIS_EFFORT.certain
+        return np.minimum(fits.tolerance_factor(targets), best.factor) >= DIAGNOSIS_EFFORT.certain
 
-    def _placed(self, fits: HandFits | None) -> tuple[Rows, Array]:
-        """Configurations (m, n) that the best fits of each target lead to, and their targets."""
+    def _place_arms(self, fits: HandFits | None) -> tuple[Rows, Array]:
+        """Return target indices (m,) and configurations (m, n) of the best fits and their arms."""
         if fits is None:
             return np.zeros(0, np.intp), np.zeros((0, len(self.robot.actuators)))
         rows = fits.best(DIAGNOSIS_EFFORT.placed)
@@ -274,32 +284,32 @@ class Diagnostician:
     def _search(
         self, targets: TargetBatch, best: ClosestConfigurations, count: int, followed: int
     ) -> ClosestConfigurations:
-        """The closest to each target from random arms, with hands of all kinds.
+        """Return the configurations closest to each target from random starts.
 
-        The hands are those that came closest so far, and some that look like the grasp. A hand
-        without an arm is started at random itself.
+        The arms are random; the hands are the closest ones so far and seeds that resemble the
+        grasp. A hand without an arm starts at random.
         """
         owner = np.repeat(np.arange(len(targets)), count + 2)
         random = self.robot.random(np.random.default_rng(count), count)
         starts = np.tile(random, (len(targets), 1, 1))
         if self.robot.description.arm_actuators:
             hand = list(self.robot.description.hand_actuators)
-            starts[:, ::2, hand] = best.fair[:, None, hand]
+            starts[:, ::2, hand] = best.minimax_q[:, None, hand]
             starts[:, 1::2, hand] = best.q[:, None, hand]
-            starts[:, :: DIAGNOSIS_EFFORT.alike, hand] = self._alike(
+            starts[:, :: DIAGNOSIS_EFFORT.alike, hand] = self._resembling_seeds(
                 targets, -(-count // DIAGNOSIS_EFFORT.alike)
             )
-        starts = np.concatenate([best.q[:, None], best.fair[:, None], starts], axis=1)
+        starts = np.concatenate([best.q[:, None], best.minimax_q[:, None], starts], axis=1)
         descent = LocalRefinement(self._trials, targets)
         ends = descent.run(owner, starts.reshape(len(owner), -1))
         return find_closest(descent, owner, ends, followed)
 
-    def _alike(self, targets: TargetBatch, count: int) -> Array:
-        """(k, count, hand) postures that look like the grasps, in turns."""
+    def _resembling_seeds(self, targets: TargetBatch, count: int) -> Array:
+        """Return (k, count, hand) hand seeds that resemble the grasps, repeated if necessary."""
         options = self.method.options
         rounds = range(min(options.rounds, -(-count // options.candidates)))
-        found = [self.method.postures(targets, number) for number in rounds]
-        postures = np.concatenate(found, axis=1)
+        seeds = [self.method.postures(targets, number) for number in rounds]
+        postures = np.concatenate(seeds, axis=1)
         return postures[:, np.arange(count) % postures.shape[1]]
 
     def _solved(self, targets: TargetBatch, q: Array) -> NDArray[np.bool_]:
@@ -307,8 +317,8 @@ class Diagnostician:
             return np.zeros(0, dtype=bool)
         return judge(self.robot, targets, q).solved(targets.enforce_limits)
 
-    def _nearest(self, targets: TargetBatch, q: Array) -> list[dict[str, NearContact]]:
-        """The contacts of configurations (k, n), beside those asked for."""
+    def _nearest_contacts(self, targets: TargetBatch, q: Array) -> list[dict[str, NearContact]]:
+        """Return the contacts of configurations (k, n) with their errors."""
         points, normals = self.robot.contacts(q)
         position_error, angle_error, _ = deviations(self.robot, targets, q)
         columns = points, normals, position_error, angle_error
@@ -330,20 +340,20 @@ class Diagnostician:
 
 
 class _Clock:
-    """Seconds (k,) spent on each of the targets that are worked on together."""
+    """Stopwatch that divides time among targets, (k,) seconds."""
 
     def __init__(self, seconds: Array) -> None:
         self.seconds = seconds
         self._now = time.perf_counter()
 
     def lap(self, owner: Rows) -> None:
-        """Share the time since the last lap among some targets."""
+        """Divide the time since the last lap among targets."""
         before, self._now = self._now, time.perf_counter()
         self.seconds[owner] += (self._now - before) / len(owner)
 
 
-def _refused(hand: HandFit | None, reach: ArmReach | None, proof: Proof | None) -> Reason | None:
-    # A proof by the reach may owe much to the hand: it shows only that no posture does both.
+def _cause_of(hand: HandFit | None, reach: ArmReach | None, proof: Proof | None) -> Reason | None:
+    # A proof by reach shows that no posture satisfies hand and arm, not that the arm is the cause.
     if (proof is not None and proof.kind is not ProofKind.REACH) or (hand and not hand.fits):
         return Reason.HAND
     if proof is not None:
@@ -353,21 +363,21 @@ def _refused(hand: HandFit | None, reach: ArmReach | None, proof: Proof | None) 
     return None
 
 
-def _worth(ratio: Array) -> Counts:
-    """(k,) boxes a proof may take of targets that are missed by a factor (k,)."""
+def _max_boxes(ratio: Array) -> Counts:
+    """Return (k,) maximum numbers of boxes of proofs for tolerance factors (k,)."""
     share = np.clip((ratio - 1) / (DIAGNOSIS_EFFORT.clearly - 1), 0.0, 1.0)
     return np.maximum(PROVER_EFFORT.max_boxes * share, DIAGNOSIS_EFFORT.least).astype(np.int64)
 
 
-def _enough(targets: TargetBatch, fair: Verdict) -> list[Tolerance]:
-    """Tolerances that were kept to, no smaller than those asked for."""
-    least = targets.largest_tolerance
-    position = np.nanmax(fair.position_error, axis=1, initial=least.position)
-    angle = np.nanmax(fair.angle_error, axis=1, initial=least.angle)
+def _enough(targets: TargetBatch, verdict: Verdict) -> list[Tolerance]:
+    """Return the tolerances that the configurations meet, at least those of the targets."""
+    minimum = targets.largest_tolerance
+    position = np.nanmax(verdict.position_error, axis=1, initial=minimum.position)
+    angle = np.nanmax(verdict.angle_error, axis=1, initial=minimum.angle)
     return [Tolerance(*pair) for pair in zip(position.tolist(), angle.tolist(), strict=True)]
 
 
-def _held_alone(targets: TargetBatch, row: int) -> TargetBatch:
+def _single_fixed(targets: TargetBatch, row: int) -> TargetBatch:
     """Return one of several targets whose hands are held differently."""
     one = targets.rows(slice(row, row + 1))
     assert one.fixed is not None
@@ -392,7 +402,9 @@ def _with_contact_bounds(targets: TargetBatch) -> TargetBatch:
     return replace(targets, tolerance=tolerance)
 
 
-def _of_palms(robot: ArmHand, targets: TargetBatch, found: list[Diagnosis]) -> list[Diagnosis]:
+def _add_palm_errors(
+    robot: ArmHand, targets: TargetBatch, found: list[Diagnosis]
+) -> list[Diagnosis]:
     """Return the diagnoses with the errors of the palms, if the targets have palm poses."""
     palms = judge_palms(robot, targets, np.stack([one.q for one in found]))
     if palms is None:
@@ -400,8 +412,8 @@ def _of_palms(robot: ArmHand, targets: TargetBatch, found: list[Diagnosis]) -> l
     return [replace(one, palm=palms.of(row)) for row, one in enumerate(found)]
 
 
-def _free_of(targets: TargetBatch, fingers: list[int]) -> TargetBatch:
-    """Targets that some fingers have no part in."""
+def _with_free_fingers(targets: TargetBatch, fingers: list[int]) -> TargetBatch:
+    """Return targets with some fingers free."""
 
     def free(array: Array) -> Array:
         array = array.copy()

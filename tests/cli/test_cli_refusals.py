@@ -89,7 +89,7 @@ solve unit.yaml => unknown unit 'inch'
 solve pinky.yaml => pinky.yaml: contacts.pinky: no such finger; the robot's fingers: thumb, finger_2
 solve no_robot.yaml => no_robot.yaml: robot: missing, expected it in the file or --robot
 solve other.yaml => other.yaml: robot: no shipped arm-hand is called 'no_such'
-solve two.yaml --method enhanced-dls => two.yaml: method 'enhanced-dls'
+solve two.yaml --method enhanced-dls => two.yaml: points: row 0
 solve good.yaml --method enhanced-dls --robot hand_only.yaml => --method enhanced-dls:
 
 solve good.yaml --robot pandas => no shipped arm-hand is called 'pandas'; did you mean 'panda'?

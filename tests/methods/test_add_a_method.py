@@ -74,12 +74,12 @@ def test_a_free_finger_is_refused_by_name(page, targets):
 
 def test_names_are_taken_once(page):
     method, known = page.DampedLeastSquares, page.DampedParameters
-    with pytest.raises(errors.InputError, match="there is a method 'damped-least-squares' already"):
+    with pytest.raises(errors.InputError, match="name: method 'damped-least-squares'"):
         ik.register_method(method.name, "again", known, method)
     ik.register_method(method.name, "again", known, method, replace=True)
     assert registry.method_summary(method.name) == "again"
     assert registry.method_names() == (*ik.METHODS, method.name)
-    with pytest.raises(errors.InputError, match="there is a method 'ipopt' already"):
+    with pytest.raises(errors.InputError, match="name: method 'ipopt'"):
         ik.register_method("ipopt", "mine", known, method, replace=True)
     with pytest.raises(errors.InputError, match="expected a dataclass"):
         ik.register_method("other", "mine", dict, method)
