@@ -1,4 +1,4 @@
-"""Answers as JSON: what `casadi-ik solve` and `choose` write, and what is read back of it."""
+"""Solutions and rankings as JSON, as `casadi-ik solve` and `choose` write them."""
 
 from __future__ import annotations
 
@@ -22,56 +22,56 @@ from casadi_ik.solve.solution import Ranking, Solution
 
 
 def solution_data(solution: Solution) -> dict[str, Any]:
-    """A solution as JSON holds it; null stands for what is not a finite number (a free finger)."""
+    """Return a solution as JSON data; null stands for non-finite numbers (a free finger)."""
     names = ["success", "status", "method", "robot", "actuators", "q", "iterations", "restarts"]
     names += ["time", "contacts", "diagnosis"]
     names += ["palm"] if solution.palm is not None else []
     names += ["clearance", "closest", "collision"] if solution.clearance is not None else []
-    found = to_json({name: getattr(solution, name) for name in names}, infinite=lambda _: None)
+    data = to_json({name: getattr(solution, name) for name in names}, infinite=lambda _: None)
     if solution.diagnosis is not None:
-        told = ("established", "reliefs", "freed", "lines")
-        more = {name: getattr(solution.diagnosis, name) for name in told}
-        found["diagnosis"] |= to_json(more, infinite=lambda _: None)
-    for contact in found["contacts"].values():
+        properties = ("established", "reliefs", "freed", "lines")
+        evidence = {name: getattr(solution.diagnosis, name) for name in properties}
+        data["diagnosis"] |= to_json(evidence, infinite=lambda _: None)
+    for contact in data["contacts"].values():
         del contact["tolerance"]
-    return found
+    return data
 
 
 def ranking_data(ranking: Ranking, names: Sequence[str]) -> dict[str, Any]:
-    """A ranking as JSON holds it.
+    """Return a ranking as JSON data.
 
     Args:
-        ranking: The answers.
-        names: Of the candidates.
+        ranking: The ranking.
+        names: Names of the candidates.
     """
     ranked = []
-    for one in ranking:
-        before = one.grasp.pregrasp
+    for entry in ranking:
+        pregrasp = entry.grasp.pregrasp
         ranked.append(
             {
-                "candidate": one.candidate,
-                "name": names[one.candidate],
-                "score": one.score,
-                "grasp": grasp_to_dict(one.grasp),
-                **({} if before is None else {"pregrasp": grasp_to_dict(before)}),
-                "solution": solution_data(one.solution),
+                "candidate": entry.candidate,
+                "name": names[entry.candidate],
+                "score": entry.score,
+                "grasp": grasp_to_dict(entry.grasp),
+                **({} if pregrasp is None else {"pregrasp": grasp_to_dict(pregrasp)}),
+                "solution": solution_data(entry.solution),
             }
         )
-    about = {name: getattr(ranking, name) for name in ("candidates", "answered", "prefer")}
-    return about | {"failures": dict(ranking.failures), "ranked": ranked}
+    summary = {name: getattr(ranking, name) for name in ("candidates", "answered", "prefer")}
+    return summary | {"failures": dict(ranking.failures), "ranked": ranked}
 
 
 RANKED_MEMBER = "ranked"
-"""Name of the array that holds the ranked answers of an npz file, as bytes of JSON."""
+"""Name of the array of an npz file that contains the ranking as bytes of JSON."""
 
 
 class RankedSolution(msgspec.Struct, frozen=True):
-    """What is needed of an answer.
+    """The solution of a ranked entry, as far as it is read.
 
     Attributes:
-        robot: Whose it is.
-        q: A number per actuator [rad or m].
-        clearance: Smallest distance of a pair that must not touch [m]; None: not checked.
+        robot: Name of the robot.
+        q: Actuator positions [rad or m].
+        clearance: Clearance [m]; None: not checked.
     """
 
     robot: str
@@ -80,16 +80,16 @@ class RankedSolution(msgspec.Struct, frozen=True):
 
 
 class RankedEntry(msgspec.Struct, frozen=True):
-    """One of the answers of a file.
+    """An entry of a ranking in a file.
 
     Attributes:
-        candidate: Number of its grasp among the candidates.
-        score: What it was ranked by.
-        solution: How to take it.
-        name: Of its grasp.
-        grasp: The grasp, where the object is; None in older files.
-        pregrasp: The same hand before it, if the candidate said it.
-        load: What it holds per newton of squeeze, of answers of ``casadi-ik grasp``.
+        candidate: Index of the grasp among the candidates.
+        score: Score of the ranking.
+        solution: Solution of the grasp.
+        name: Name of the grasp.
+        grasp: Grasp in the base frame; None in older files.
+        pregrasp: Pregrasp of the candidate, if it has one.
+        load: Load per newton of squeeze, for files of ``casadi-ik grasp``.
     """
 
     candidate: int
@@ -102,18 +102,18 @@ class RankedEntry(msgspec.Struct, frozen=True):
 
     @property
     def label(self) -> str:
-        """It in a few words."""
+        """Short description of the entry."""
         return f"{self.name or 'candidate'} ({self.candidate}), score {self.score:.4g}"
 
     def placed(self, path: Path, place: int) -> Grasp:
-        """The grasp, with the hand before it if that is known.
+        """Return the grasp with its pregrasp.
 
         Args:
-            path: Its file.
-            place: Its place there, from 1.
+            path: File of the entry.
+            place: Rank of the entry, from 1.
 
         Raises:
-            DescriptionError: It is missing or malformed.
+            DescriptionError: The grasp is missing or malformed.
         """
         where = f"ranked[{place - 1}]."
         if self.grasp is None:
@@ -124,8 +124,8 @@ class RankedEntry(msgspec.Struct, frozen=True):
         )
         if self.pregrasp is None:
             return grasp
-        before = grasp_from_entry(self.pregrasp, path, grasp.name, f"{where}pregrasp.")
-        return replace(grasp, pregrasp=before)
+        pregrasp = grasp_from_entry(self.pregrasp, path, grasp.name, f"{where}pregrasp.")
+        return replace(grasp, pregrasp=pregrasp)
 
 
 class _RankedFile(msgspec.Struct, frozen=True):
@@ -134,11 +134,11 @@ class _RankedFile(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, eq=False)
 class ChosenPosture:
-    """One of the answers, to be reached.
+    """The configuration of a ranked entry, as the goal of `Solver.reach`.
 
     Attributes:
-        grasp: The grasp, base frame.
-        q: (n,) the posture [rad or m].
+        grasp: Grasp in the base frame.
+        q: (n,) configuration [rad or m].
         robot: Name of the robot.
     """
 
@@ -148,36 +148,37 @@ class ChosenPosture:
 
 
 def chosen_posture(path: Path, rank: int) -> ChosenPosture:
-    """One of the answers of a file.
+    """Return the configuration of an entry of a file.
 
     Args:
-        path: What ``casadi-ik choose --out`` wrote.
-        rank: Which, from 1.
+        path: File that ``casadi-ik choose --out`` wrote.
+        rank: Rank of the entry, from 1.
 
     Raises:
-        InputError: As for `read_ranked`, or there are fewer.
-        DescriptionError: Its grasp is missing or malformed.
+        InputError: See `read_ranked`, or there are fewer entries.
+        DescriptionError: The grasp of the entry is missing or malformed.
     """
-    found = read_ranked(path)
-    if rank > len(found):
-        raise InputError(f"--rank: found {rank}, but {path} has {len(found)} answers")
-    one = found[rank - 1]
-    return ChosenPosture(one.placed(path, rank), np.array(one.solution.q), one.solution.robot)
+    entries = read_ranked(path)
+    if rank > len(entries):
+        raise InputError(f"--rank: found {rank}, but {path} has {len(entries)} answers")
+    entry = entries[rank - 1]
+    q = np.array(entry.solution.q)
+    return ChosenPosture(entry.placed(path, rank), q, entry.solution.robot)
 
 
 def is_ranked(path: Path) -> bool:
-    """Whether a file holds ranked answers: of ``casadi-ik choose``, or of ``casadi-ik grasp``."""
+    """Return whether a file contains a ranking of ``casadi-ik choose`` or ``casadi-ik grasp``."""
     if path.suffix.lower() != ".npz":
         return path.suffix.lower() == ".json"
     try:
         with zipfile.ZipFile(path) as members:
             return f"{RANKED_MEMBER}.npy" in members.namelist()
     except (OSError, zipfile.BadZipFile):
-        return False  # whoever reads it says best what is wrong
+        return False  # the reader reports the error
 
 
 def _member(path: Path) -> bytes:
-    """The ranked answers that ``casadi-ik grasp`` has written beside its arrays."""
+    """Return the ranking that ``casadi-ik grasp`` has written beside its arrays."""
     try:
         arrays = read_npz(path, LIMITS.ranked_bytes)
     except DescriptionError as error:
@@ -190,26 +191,28 @@ def _member(path: Path) -> bytes:
 
 
 def read_ranked(path: Path) -> list[RankedEntry]:
-    """The answers of a file, best first, at least one.
+    """Return the entries of a file, at least one, best first.
 
     Args:
-        path: What ``casadi-ik choose --out`` wrote.
+        path: File that ``casadi-ik choose --out`` wrote.
 
     Raises:
-        InputError: It cannot be read, is too large, is none of that kind, or has no answers; the
-            message names file and key.
+        InputError: The file cannot be read, is too large, is not a ranking, or has no entries;
+            the message names file and key.
     """
     try:
-        size, most = path.stat().st_size, scaled_limit(LIMITS.ranked_bytes)
-        if size > most:
-            raise InputError(f"{path}: found {size} bytes, expected at most {most} {RAISE_HINT}")
-        held = path.read_bytes() if path.suffix.lower() != ".npz" else _member(path)
-        found = msgspec.json.decode(held, type=_RankedFile).ranked
+        size, max_size = path.stat().st_size, scaled_limit(LIMITS.ranked_bytes)
+        if size > max_size:
+            raise InputError(
+                f"{path}: found {size} bytes, expected at most {max_size} {RAISE_HINT}"
+            )
+        content = path.read_bytes() if path.suffix.lower() != ".npz" else _member(path)
+        entries = msgspec.json.decode(content, type=_RankedFile).ranked
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         text = str(error).replace("`$.", "`")
         raise InputError(f"{path}: expected what `casadi-ik choose` writes: {text}") from error
-    if not found:
+    if not entries:
         raise InputError(f"{path}: ranked: found none, expected at least one answer")
-    return found
+    return entries

@@ -1,4 +1,4 @@
-"""Targets in files: npz and Parquet, checked before they are used, and cut into parts."""
+"""Readers of targets in npz and Parquet files, and their division into parts."""
 
 from __future__ import annotations
 
@@ -25,55 +25,55 @@ if TYPE_CHECKING:
     import polars
 
 REQUIRED_KEYS = ("points", "normals")
-"""What has to be there; the others may be."""
+"""Names of the required arrays."""
 
 COLUMN_SUFFIXES = {"points": ("x", "y", "z"), "normals": ("nx", "ny", "nz")}
-"""Of the columns of a finger in a table: ``thumb_x``, ..., ``thumb_nz``."""
+"""Suffixes of the columns of a finger in a table: ``thumb_x``, ..., ``thumb_nz``."""
 
 
 @dataclass(frozen=True)
 class TargetFile:
-    """Points, normals and more of k targets in an npz file; nothing in it is ever executed.
+    """Targets in an npz file, read without unpickling.
 
     Attributes:
-        path: The file.
-        fingers: How many contacts a target has.
+        path: Path of the file.
+        fingers: Number of fingers of the robot.
     """
 
     path: Path
     fingers: int
 
     def check(self, size: int) -> int:
-        """Read all of it once, `size` targets at a time.
+        """Read the whole file, `size` targets at a time.
 
         Returns:
-            How many targets there are.
+            Number of targets.
 
         Raises:
-            InputError: Missing, no npz, damaged, or other arrays than expected; the message names
-                file and key.
+            InputError: The file is missing, not an npz file or damaged, or an array is unexpected;
+                the message names file and key.
         """
         return sum(len(block["points"]) for block in self.blocks(lambda: size))
 
     def rows(self) -> int:
-        """How many targets there are, by the heads of its arrays alone.
+        """Return the number of targets from the headers of the arrays.
 
         Raises:
-            InputError: As `check`, as far as the heads tell.
+            InputError: See `check`; the data are not read.
         """
-        with self._opened() as archive, self._member(archive, REQUIRED_KEYS[0]) as points:
+        with self._open() as archive, self._member(archive, REQUIRED_KEYS[0]) as points:
             return points.count
 
     def blocks(self, size: Callable[[], int]) -> Iterator[dict[str, Array]]:
-        """Arrays (up to size, f, 3) by name, one block after the other.
+        """Yield arrays (up to size, f, 3) by name, block by block.
 
         Args:
-            size: Says before every block how large it may be.
+            size: Function that returns the maximum size of the next block.
 
         Raises:
-            InputError: As `check`.
+            InputError: See `check`.
         """
-        with self._opened() as archive, ExitStack() as opened:
+        with self._open() as archive, ExitStack() as opened:
             names = {name.removesuffix(".npy") for name in archive.namelist()}
             optional = [key for key in (*EXTRA_ARRAY_NAMES, DIRECTIONS_KEY) if key in names]
             members = {
@@ -85,7 +85,7 @@ class TargetFile:
                 if member.count != count:
                     raise InputError(
                         f"{self.path}: points and {key}: found {count} and {member.count} rows, "
-                        "expected as many"
+                        "expected the same number"
                     )
             start = 0
             while start < count:
@@ -95,10 +95,10 @@ class TargetFile:
                 yield {key: member.read(rows, last) for key, member in members.items()}
 
     @contextmanager
-    def _opened(self) -> Iterator[zipfile.ZipFile]:
+    def _open(self) -> Iterator[zipfile.ZipFile]:
         try:
             if self.path.exists() and not (self.path.is_file() or self.path.is_dir()):
-                raise InputError(f"{self.path}: no plain file, expected an npz file")
+                raise InputError(f"{self.path}: not a regular file, expected an npz file")
             if self.path.is_file() and not zipfile.is_zipfile(self.path):
                 raise InputError(
                     f"{self.path}: not an npz file, expected one with points and normals"
@@ -127,7 +127,7 @@ class TargetFile:
             elif format_version == (2, 0):
                 shape, column_major, dtype = np.lib.format.read_array_header_2_0(stream)
             else:
-                raise ValueError("a version of the npy format that is not for numbers")
+                raise ValueError("unsupported version of the npy format")
         except (*READ_ERRORS, OSError) as error:
             raise InputError(f"{where}: cannot be read: {error}") from error
         with stream:
@@ -141,17 +141,17 @@ class TargetFile:
             info, size = archive.getinfo(f"{key}.npy"), shape[0] * self.fingers * 3 * dtype.itemsize
             # The longest header that numpy reads has 10,064 bytes, magic and padding included.
             if not size <= info.file_size <= size + 10_064:
-                problem = "fewer" if info.file_size < size else "more"
-                raise InputError(f"{where}: damaged: {problem} bytes than its shape says")
+                comparison = "fewer" if info.file_size < size else "more"
+                raise InputError(f"{where}: damaged: {comparison} bytes than its shape requires")
             refuse_zip_bomb(where, info.file_size, info.compress_size)
             yield _Member(where, stream, shape[0], self.fingers, dtype, column_major)
 
 
 def refuse_zip_bomb(where: str, unpacked: int, packed: int) -> None:
-    """Refuse what unpacks to more than 256 MiB and to more than 200 times its own size.
+    """Refuse data that unpack to more than 256 MiB and to more than 200 times their size.
 
     Raises:
-        InputError: It does.
+        InputError: The data do.
     """
     if unpacked > scaled_limit(max(2**28, 200 * packed)):
         raise InputError(
@@ -162,7 +162,7 @@ def refuse_zip_bomb(where: str, unpacked: int, packed: int) -> None:
 
 @dataclass
 class _Member:
-    """An array (k, f, 3) inside a zip file, read from its first row to its last."""
+    """An array (k, f, 3) inside a zip file, read sequentially."""
 
     where: str
     stream: IO[bytes]
@@ -170,29 +170,29 @@ class _Member:
     fingers: int
     dtype: np.dtype[np.generic]
     column_major: bool
-    place: int = 0
+    position: int = 0
 
     @cached_property
-    def _whole(self) -> Array:
-        """All rows of a column-major array: its first row is known only when its last is read."""
+    def _all_rows(self) -> Array:
+        """All rows of a column-major array, whose rows are not contiguous in the file."""
         return self._rows(self.count, "F")
 
     def read(self, rows: int, last: bool) -> Array:
-        """The next rows; at the last, the member has to end and its checksum to be right."""
+        """Return the next rows; after the last ones, check the end and the checksum."""
         if self.column_major:
-            block = self._whole[self.place : self.place + rows]
+            block = self._all_rows[self.position : self.position + rows]
         else:
             block = self._rows(rows, "C")
-        self.place += rows
+        self.position += rows
         if last and self._bytes(1):
-            raise InputError(f"{self.where}: damaged: more bytes than its shape says")
+            raise InputError(f"{self.where}: damaged: more bytes than its shape requires")
         return block
 
     def _rows(self, rows: int, order: Literal["C", "F"]) -> Array:
         size = rows * self.fingers * 3
         data = self._bytes(size * self.dtype.itemsize)
         if len(data) < size * self.dtype.itemsize:
-            raise InputError(f"{self.where}: damaged: fewer bytes than its shape says")
+            raise InputError(f"{self.where}: damaged: fewer bytes than its shape requires")
         shape = (rows, self.fingers, 3)
         values = np.frombuffer(data, self.dtype).reshape(shape, order=order)
         return values.astype(np.float64)
@@ -206,29 +206,30 @@ class _Member:
 
 @dataclass(frozen=True)
 class TargetTable:
-    """Points and normals of k targets in a Parquet file; null and NaN mark what is free.
+    """Targets in a Parquet file; null and NaN mark free values.
 
     Attributes:
-        path: The file.
-        fingers: The robot's, by whose names columns are called.
+        path: Path of the file.
+        fingers: Names of the robot's fingers, the prefixes of the columns.
     """
 
     path: Path
     fingers: tuple[str, ...]
 
     def rows(self) -> int:
-        """How many targets there are.
+        """Return the number of targets.
 
         Raises:
-            InputError: No Parquet file, columns missing or not of numbers, or no rows.
+            InputError: The file is not a Parquet file, columns are missing or not numeric, or
+                there are no rows.
             UnsupportedError: polars is not installed.
         """
-        pl, frame = import_polars(), self._scanned()
+        pl, frame = import_polars(), self._scan()
         try:
             schema = frame.collect_schema()
             count = int(frame.select(pl.len()).collect().item())
         except (pl.exceptions.PolarsError, OSError) as error:
-            raise InputError(f"{self.path}: no Parquet file: {error}") from error
+            raise InputError(f"{self.path}: not a Parquet file: {error}") from error
         for names in self._columns().values():
             for name in names:
                 if name not in schema:
@@ -248,19 +249,19 @@ class TargetTable:
         return count
 
     def blocks(self, size: Callable[[], int]) -> Iterator[dict[str, Array]]:
-        """Arrays (up to size, f, 3) by name, one block after the other; as `TargetFile.blocks`."""
-        pl, frame, count = import_polars(), self._scanned(), self.rows()
+        """Yield arrays (up to size, f, 3) by name, see `TargetFile.blocks`."""
+        pl, frame, count = import_polars(), self._scan(), self.rows()
         start = 0
         while start < count:
             rows = min(size(), count - start)
             block = {}
             for key, names in self._columns().items():
-                wanted = [pl.col(name).cast(pl.Float64).fill_null(np.nan) for name in names]
+                columns = [pl.col(name).cast(pl.Float64).fill_null(np.nan) for name in names]
                 try:
-                    part = frame.slice(start, rows).select(wanted).collect()
+                    table = frame.slice(start, rows).select(columns).collect()
                 except (pl.exceptions.PolarsError, OSError) as error:
                     raise InputError(f"{self.path}: damaged: {error}") from error
-                block[key] = part.to_numpy().reshape(rows, len(self.fingers), 3)
+                block[key] = table.to_numpy().reshape(rows, len(self.fingers), 3)
             yield block
             start += rows
 
@@ -270,15 +271,15 @@ class TargetTable:
             for key, endings in COLUMN_SUFFIXES.items()
         }
 
-    def _scanned(self) -> polars.LazyFrame:
+    def _scan(self) -> polars.LazyFrame:
         return import_polars().scan_parquet(self.path)
 
 
 def import_polars() -> Any:
-    """The library that reads Parquet.
+    """Import polars, which reads Parquet files.
 
     Raises:
-        UnsupportedError: It is not installed.
+        UnsupportedError: polars is not installed.
     """
     try:
         import polars as pl
@@ -294,9 +295,9 @@ class BatchPart:
     """Targets that are solved together.
 
     Attributes:
-        number: Of the part, from 0.
-        first_row: Number of its first target among all.
-        arrays: Points, normals and more, (k, f, 3) by name.
+        number: Number of the part, from 0.
+        first_row: Number of the first target of the part among all targets.
+        arrays: (k, f, 3) arrays by name: points, normals, further vectors.
     """
 
     number: int
@@ -306,11 +307,11 @@ class BatchPart:
 
 @dataclass(frozen=True, eq=False)
 class TargetSource:
-    """Targets in files, in parts of at most `size`; no part reaches over two files.
+    """Targets in files, divided into parts; a part lies within one file.
 
     Attributes:
         files: The files in order.
-        size: Targets of a part, at most.
+        size: Maximum number of targets of a part.
     """
 
     files: tuple[TargetFile | TargetTable, ...]
@@ -318,21 +319,21 @@ class TargetSource:
 
     @cached_property
     def counts(self) -> tuple[int, ...]:
-        """Targets of each file.
+        """Number of targets of each file.
 
         Raises:
-            InputError: One is no file of targets of this robot.
+            InputError: A file does not contain targets of this robot.
         """
         return tuple(file.rows() for file in self.files)
 
     @property
     def count(self) -> int:
-        """Targets of all."""
+        """Number of all targets."""
         return sum(self.counts)
 
     @cached_property
     def sizes(self) -> tuple[int, ...]:
-        """Targets of each part."""
+        """Number of targets of each part."""
         return tuple(
             min(self.size, count - start)
             for count in self.counts
@@ -341,11 +342,11 @@ class TargetSource:
 
     @cached_property
     def first_rows(self) -> tuple[int, ...]:
-        """Number of each part's first target among all."""
+        """Number of the first target of each part among all targets."""
         return (0, *accumulate(self.sizes))[:-1]
 
     def without(self, done: Container[int]) -> Iterator[BatchPart]:
-        """The parts that are not done yet, read as they are asked for.
+        """Yield the parts whose numbers are not in `done`, read on demand.
 
         Raises:
             InputError: A file is damaged.
@@ -363,37 +364,37 @@ class TargetSource:
 
     @cached_property
     def fingerprint(self) -> list[str]:
-        """Name, size and a digest of the end of each file, which tell these from others.
+        """Name, size and digest of the end of each file, which identify its content.
 
-        At its end a zip file keeps the checksums of its members and a Parquet file the places and
-        statistics of its columns.
+        The end of a zip file contains the checksums of its members, that of a Parquet file the
+        positions and statistics of its columns.
         """
         return [_fingerprint(file.path) for file in self.files]
 
 
 def open_targets(path: Path, fingers: tuple[str, ...], size: int) -> TargetSource:
-    """The targets at a path.
+    """Return the targets at a path.
 
     Args:
-        path: An npz or Parquet file, or a folder that holds such files; they are taken by name.
-        fingers: The robot's.
-        size: Targets of a part, at most.
+        path: An npz or Parquet file, or a folder of such files, which are sorted by name.
+        fingers: Names of the robot's fingers.
+        size: Maximum number of targets of a part.
 
     Raises:
-        InputError: There is nothing of the kind.
+        InputError: The path contains no such file.
     """
     endings, paths = (".npz", ".parquet"), [path]
     if path.is_dir():
-        paths = sorted(each for each in path.iterdir() if each.suffix.lower() in endings)
+        paths = sorted(file for file in path.iterdir() if file.suffix.lower() in endings)
     if not paths:
-        raise InputError(f"{path}: found no .npz or .parquet file in it, expected at least one")
-    found = (
-        TargetTable(each, fingers)
-        if each.suffix.lower() == ".parquet"
-        else TargetFile(each, len(fingers))
-        for each in paths
+        raise InputError(f"{path}: contains no .npz or .parquet file, expected at least one")
+    files = (
+        TargetTable(file, fingers)
+        if file.suffix.lower() == ".parquet"
+        else TargetFile(file, len(fingers))
+        for file in paths
     )
-    return TargetSource(tuple(found), size)
+    return TargetSource(tuple(files), size)
 
 
 def _fingerprint(path: Path) -> str:

@@ -233,8 +233,8 @@ def _copy(out: Path) -> list[str]:
 @pytest.mark.parametrize(
     ("name", "says"),
     [
-        ("missing.parquet", "missing.parquet: no Parquet file"),
-        ("empty", "found no .npz or .parquet file in it"),
+        ("missing.parquet", "missing.parquet: not a Parquet file"),
+        ("empty", "contains no .npz or .parquet file"),
         ("other.parquet", "thumb_x: missing, expected columns thumb_x"),
     ],
 )
