@@ -450,7 +450,7 @@ class Solver(MovingSolver):
             >>> bool(batch.success.all()), bool(batch.palm_position_error.max() < 1e-3)
             (True, True)
         """
-        self.robot.description.one_hand("solve_palms")
+        self.robot.description.require_single_hand("solve_palms")
         poses = checked_pose(palms, "palms")
         if poses.ndim != 3:
             raise InputError(f"palms: found shape {poses.shape}, expected (k, 4, 4)")

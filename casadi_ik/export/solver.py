@@ -153,8 +153,8 @@ class FollowSources:
             "TRAIL_PROGRESS": recovery.PROGRESS,
         }
         arrays = {
-            "LOWER": robot.description.stops[0],
-            "UPPER": robot.description.stops[1],
+            "LOWER": robot.description.motion_limits[0],
+            "UPPER": robot.description.motion_limits[1],
             "HOME": robot.home,
             "VELOCITY": own_velocities(robot),
             "UNITS": motor_units(robot),

@@ -1,1 +1,1 @@
-"""Reading and writing of files, and limits on what is read."""
+"""Reading and writing of files, and limits on the size of input files."""

@@ -1,4 +1,4 @@
-"""The arrays that pass between the parts of the package: their names, and points spread evenly."""
+"""Array types of the package, read-only arrays, and low-discrepancy points."""
 
 from __future__ import annotations
 
@@ -6,37 +6,41 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
-"""Numbers: coordinates, vectors, matrices."""
+"""Real numbers: coordinates, vectors, matrices."""
 
 Counts = NDArray[np.int64]
-"""Whole numbers that count: iterations, restarts, solves."""
+"""Integer counts: iterations, restarts, solves."""
 
 Bools = NDArray[np.bool_]
-"""What holds and what does not."""
+"""Truth values."""
 
 Rows = NDArray[np.intp]
-"""Positions in another array."""
+"""Row numbers of another array."""
 
 
 def read_only(values: ArrayLike) -> Array:
-    """Numbers as an array that cannot be changed."""
+    """Return numbers as an array that cannot be changed."""
     array = np.asarray(values, dtype=float)
     array.flags.writeable = False
     return array
 
 
 def spread_points(count: int, dimensions: int, first: int = 0) -> Array:
-    """(count, dimensions) points of an additive recurrence, evenly spread over the unit cube.
+    """Return points of a low-discrepancy sequence in the unit cube, (count, dimensions).
 
-    From one on, counted from 0: with all before they are spread evenly as well.
+    The sequence is the additive recurrence of Roberts' generalised golden ratio: the root of
+    x^(d+1) = x + 1 gives the increments.
 
-    Roberts' generalised golden ratio: the root of x^(d+1) = x + 1 gives the increments.
+    Args:
+        count: Number of points.
+        dimensions: Dimension of the cube.
+        first: Index of the first point; consecutive calls continue the sequence.
     """
     return (0.5 + np.arange(first + 1, first + count + 1)[:, None] * spread_steps(dimensions)) % 1.0
 
 
 def spread_steps(dimensions: int) -> Array:
-    """(dimensions,) from one point of an even spread to the next."""
+    """Return the increments (dimensions,) between consecutive points of `spread_points`."""
     ratio = 2.0
     for _ in range(64):
         ratio = (1 + ratio) ** (1 / (dimensions + 1))

@@ -1,4 +1,4 @@
-"""What needs more than the package installs is looked up when it is asked for."""
+"""Lazy imports of optional dependencies and of code that draws results."""
 
 from __future__ import annotations
 
@@ -8,20 +8,21 @@ from typing import Any
 
 
 def import_lazily(name: str) -> ModuleType:
-    """A part of the package that an extra brings to life, by its name.
+    """Import a module by name when it is needed.
 
-    What is shown knows what shows it by this name alone: pictures stand on everything else.
+    Results import the code that draws them by name only, so that they do not depend on it.
 
     Raises:
-        MissingExtraError: The extra is not installed; the message says how to install it.
+        MissingExtraError: An optional dependency is not installed; the message says how to install
+            it.
     """
     return importlib.import_module(name)
 
 
 class ReprMixin:
-    """What prints as the command line reports it, and shows itself in notebooks.
+    """Base class of results: text as the command line reports it, and HTML in notebooks.
 
-    `casadi_ik.app.report` knows what there is to say about each kind.
+    `casadi_ik.app.report` formats the report of each type.
     """
 
     def __repr__(self) -> str:

@@ -1,4 +1,4 @@
-"""How large a file of somebody else may be: each reader has its limits, one factor raises all."""
+"""Limits on the size of input files, and the factor that raises all of them."""
 
 from __future__ import annotations
 
@@ -9,56 +9,56 @@ from dataclasses import dataclass
 from casadi_ik.errors import InputError
 
 LIMITS_VARIABLE = "CASADI_IK_LIMITS"
-"""Factor in the environment by which all limits are multiplied."""
+"""Environment variable with a factor for all limits."""
 
 RAISE_HINT = (
     f"(--size-limits 4, or {LIMITS_VARIABLE}=4 in the environment, allows four times as much)"
 )
-"""Said where a limit is met."""
+"""Hint at the end of messages about a limit."""
 
 
 @dataclass(frozen=True)
 class FileLimits:
-    """How much of somebody else's file is read; SECURITY.md promises these numbers.
+    """Limits on untrusted input files; SECURITY.md states these numbers.
 
     `scaled_limit` multiplies sizes, counts, time and memory by `CASADI_IK_LIMITS`.
 
     Attributes:
-        yaml_bytes: Bytes of a YAML file.
+        yaml_bytes: Size of a YAML file [bytes].
         yaml_text: Characters of one text or number.
-        yaml_depth: Lists and mappings inside one another.
-        yaml_values: Values in a file, those counted again that an alias repeats.
+        yaml_depth: Depth of nested lists and mappings.
+        yaml_values: Values in a file; a value that an alias repeats counts again.
         quantity_text: Characters of a number with a unit.
         name_text: Characters of a name in a description.
-        mesh_bytes: Bytes of a mesh file.
+        mesh_bytes: Size of a mesh file [bytes].
         mesh_faces: Triangles of a mesh.
-        mesh_coordinate: Largest coordinate of a corner [m, or what the file counts in].
-        link_triangles: Triangles of one link; of a finer mesh only the points are kept.
-        object_pieces: Pieces of a grasped object.
-        cloud_bytes: Bytes of a file of points.
+        mesh_coordinate: Largest coordinate of a vertex [m, or the unit of the file].
+        link_triangles: Triangles of one link; of a finer mesh only the points are used.
+        object_pieces: Connected pieces of a grasped object.
+        cloud_bytes: Size of a point file [bytes].
         cloud_points: Points of a file.
-        cloud_head: Lines of the head of a PLY or PCD file.
+        cloud_head: Header lines of a PLY or PCD file.
         cloud_balls: Balls of a point cloud in a scene.
-        robot_bytes: Bytes of a URDF, xacro or MJCF file.
+        robot_bytes: Size of a URDF, xacro or MJCF file [bytes].
         robot_number: Largest length or angle of a robot [m or rad].
-        joint_limit: Largest limit of a joint [rad or m]; beyond it there is none, since some
-            programs write 1e16 for a joint without limits.
-        xml_depth: Elements inside one another.
-        links: Links of a robot's file.
-        moving_joints: Joints of a robot's file that move.
-        reader_seconds: Computing time of the process that reads macros and MJCF [s].
-        reader_patience: Times as long by the clock, since the machine may be busy.
+        joint_limit: Largest limit of a joint [rad or m]. A joint with a larger limit has none,
+            because some programs write 1e16 for a joint without limits.
+        xml_depth: Depth of nested XML elements.
+        links: Links of a robot file.
+        moving_joints: Movable joints of a robot file.
+        reader_seconds: CPU time of the process that expands macros and reads MJCF [s].
+        reader_patience: Wall time of that process, as a multiple of `reader_seconds`.
         reader_memory: Memory of that process [bytes].
-        reader_output: What it may hand back [bytes].
+        reader_output: Output of that process [bytes].
         grasp_numbers: Numbers of a grasp of a data set.
-        dataset_bytes: Bytes of a file of a data set, unpacked.
-        table_bytes: Bytes of a table of grasps, unpacked.
+        dataset_bytes: Size of a data set file, uncompressed [bytes].
+        table_bytes: Size of a table of grasps, uncompressed [bytes].
         candidates: Grasps of a file.
-        ranked_bytes: Bytes of a file of ranked answers, of which ten thousand take a third.
-        stream_bytes: Bytes of a stream of frames to be followed, unpacked: hours of keypoints.
-        stream_cycles: Cycles in which a stream is followed: an hour at a kilohertz.
-        stream_reach: Farthest contact from the base, or keypoint from the middle of the hand, in a
-            stream [m]; beyond it the numbers are in other units.
+        ranked_bytes: Size of a file of ranked results [bytes]; ten thousand results fill a third.
+        stream_bytes: Size of a stream of frames, uncompressed [bytes]: hours of keypoints.
+        stream_cycles: Cycles in which a stream is followed: an hour at 1 kHz.
+        stream_reach: Largest distance of a contact from the base, or of a keypoint from the middle
+            of the hand, in a stream [m]; larger numbers are in another unit.
     """
 
     yaml_bytes: int = 4 * 2**20
@@ -97,13 +97,14 @@ class FileLimits:
 
 
 LIMITS = FileLimits()
+"""Default limits."""
 
 
 def scaled_limit(value: float) -> int:
-    """A limit of size, time or memory, times the factor of the environment.
+    """Return a limit of size, time or memory times the factor of the environment.
 
     Raises:
-        InputError: The factor is no positive number.
+        InputError: The factor is not a positive number.
     """
     text = os.environ.get(LIMITS_VARIABLE, "1")
     try:
@@ -118,7 +119,11 @@ def scaled_limit(value: float) -> int:
 
 
 def raise_hint(needed: float, value: float) -> str:
-    """Return how to raise a limit, whose default is `value`, to what is needed.
+    """Return a hint how to raise a limit.
+
+    Args:
+        needed: Required value.
+        value: Default value of the limit.
 
     Example:
         >>> from casadi_ik.files.limits import raise_hint

@@ -1,4 +1,4 @@
-"""Numbers in files of somebody: arrays, triangles, points. What they unpack to is known first."""
+"""Readers for untrusted arrays, meshes and point clouds; sizes are checked before decompression."""
 
 from __future__ import annotations
 
@@ -39,45 +39,47 @@ READ_ERRORS = (
     zlib.error,
     lzma.LZMAError,
 )
-"""What numpy and zipfile were seen to raise on a damaged or encrypted member."""
+"""Exceptions that numpy and zipfile raise for damaged or encrypted files."""
 
 
-def check_unpacked_size(where: str, size: int, most: int) -> None:
-    """Refuse what takes more memory than it should.
+def check_unpacked_size(where: str, size: int, max_size: int) -> None:
+    """Refuse data that need more memory than allowed.
 
     Args:
         where: File and key, for the message.
-        size: Bytes that it unpacks to.
-        most: How many it may have.
+        size: Uncompressed size [bytes].
+        max_size: Largest allowed size [bytes].
 
     Raises:
-        DescriptionError: It has more.
+        DescriptionError: The data are larger.
     """
-    if size > scaled_limit(most):
+    allowed = scaled_limit(max_size)
+    if size > allowed:
         raise DescriptionError(
-            f"{where}: unpacks to {size} bytes, expected at most {scaled_limit(most)} {RAISE_HINT}"
+            f"{where}: unpacks to {size} bytes; expected at most {allowed} {RAISE_HINT}"
         )
 
 
-def read_npz(path: Path, most: int) -> dict[str, Array]:
-    """All arrays of a file; nothing in it is ever executed.
+def read_npz(path: Path, max_size: int) -> dict[str, Array]:
+    """Read all arrays of a file without executing anything in it.
 
     Args:
         path: The file.
-        most: Bytes that it may unpack to, eight for every number.
+        max_size: Largest uncompressed size [bytes], 8 per number.
 
     Raises:
-        DescriptionError: It cannot be read, is no npz file or damaged, unpacks to more, or holds
-            anything else than arrays of numbers.
+        DescriptionError: The file cannot be read, is damaged or is not an npz file, is too large,
+            or contains anything but arrays of numbers.
     """
-    found: dict[str, Array] = {}
+    arrays: dict[str, Array] = {}
     size = 0
     try:
         path.open("rb").close()
         if not zipfile.is_zipfile(path):
             raise DescriptionError(f"{path}: not an npz file")
         with zipfile.ZipFile(path) as members:
-            check_unpacked_size(str(path), sum(one.file_size for one in members.infolist()), most)
+            unpacked = sum(member.file_size for member in members.infolist())
+            check_unpacked_size(str(path), unpacked, max_size)
         with np.load(path, allow_pickle=False) as archive:
             for name in archive.files:
                 array = archive[name]
@@ -87,31 +89,33 @@ def read_npz(path: Path, most: int) -> dict[str, Array]:
                         f"{path}: {name}: found values of type {kind}, expected numbers"
                     )
                 size += 8 * array.size
-                check_unpacked_size(str(path), size, most)
-                found[name] = array.astype(np.float64)
+                check_unpacked_size(str(path), size, max_size)
+                arrays[name] = array.astype(np.float64)
     except OSError as error:
         raise DescriptionError(f"{path}: cannot be read: {error.strerror or error}") from error
     except (*READ_ERRORS, KeyError) as error:
         raise DescriptionError(f"{path}: damaged: {error}") from error
-    return found
+    return arrays
 
 
 MESH_FORMATS = (".stl", ".obj", ".ply", ".dae", ".off", ".glb")
-"""Names' ends of what is read."""
+"""File name extensions of supported meshes."""
 
-LOOKS = ("library_images", "library_effects", "library_materials", "bind_material")
-"""Elements of COLLADA that say what colour a mesh has."""
+APPEARANCE_TAGS = ("library_images", "library_effects", "library_materials", "bind_material")
+"""COLLADA elements that describe the appearance of a mesh."""
 
 
 def read_mesh(path: Path, where: str) -> tuple[Array, NDArray[np.int64]]:
-    """Corners (k, 3) and triangles (t, 3) of a mesh's file, its parts together; without triangles.
+    """Return the vertices (k, 3) and triangles (t, 3) of a mesh file, its parts combined.
+
+    Vertices that no triangle uses are dropped.
 
     Args:
         path: STL, OBJ, PLY, DAE, OFF or GLB.
-        where: File and key that name it, for the message.
+        where: File and key that name the mesh, for the message.
 
     Raises:
-        DescriptionError: There is no such file, no mesh in it, or it is larger than any robot's.
+        DescriptionError: The file does not exist, has no triangles, or is too large.
     """
     if not path.is_file():
         raise DescriptionError(f"{where}: no such file {str(path)!r}")
@@ -123,77 +127,80 @@ def read_mesh(path: Path, where: str) -> tuple[Array, NDArray[np.int64]]:
         )
     data = read_bytes(path, where, scaled_limit(LIMITS.mesh_bytes), RAISE_HINT)
     try:
-        points, triangles = _parsed(data, kind[1:])
-    except Exception as error:  # whatever a broken file leads a reader into
+        points, triangles = _parse_mesh(data, kind[1:])
+    except Exception as error:  # libraries raise exceptions of any type for damaged files
         reason = " ".join(str(error).split()) or type(error).__name__
         raise DescriptionError(f"{where}: cannot be read: {reason}") from error
     if len(triangles) > scaled_limit(LIMITS.mesh_faces):
         hint = raise_hint(len(triangles), LIMITS.mesh_faces)
-        most = f"at most {scaled_limit(LIMITS.mesh_faces)} {hint}"
-        raise DescriptionError(f"{where}: found {len(triangles)} triangles, expected {most}")
+        expected = f"at most {scaled_limit(LIMITS.mesh_faces)} {hint}"
+        raise DescriptionError(f"{where}: found {len(triangles)} triangles, expected {expected}")
     if not len(points):
-        raise DescriptionError(f"{where}: is an empty mesh, expected triangles")
-    most = LIMITS.mesh_coordinate
-    if not (np.abs(points) <= most).all():
-        raise DescriptionError(f"{where}: has corners that are not finite, or beyond {most:g}")
+        raise DescriptionError(f"{where}: the mesh is empty; expected triangles")
+    bound = LIMITS.mesh_coordinate
+    if not (np.abs(points) <= bound).all():
+        raise DescriptionError(
+            f"{where}: a vertex is not finite or beyond {bound:g}; expected finite coordinates"
+        )
     return points, triangles
 
 
-def _parsed(data: bytes, kind: str) -> tuple[Array, NDArray[np.int64]]:
+def _parse_mesh(data: bytes, kind: str) -> tuple[Array, NDArray[np.int64]]:
     with warnings.catch_warnings(), np.errstate(all="ignore"), _silent("trimesh.util"):
         warnings.simplefilter("ignore")
-        parts = _of_collada(data) if kind == "dae" else _of_others(data, kind)
+        parts = _read_collada(data) if kind == "dae" else _read_trimesh(data, kind)
     points, triangles, count = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
-    for corners, faces in parts:
-        # What no triangle has is no part of the mesh: files keep what was once there.
-        kept, numbers = np.unique(np.asarray(faces, dtype=np.int64), return_inverse=True)
-        if len(kept) and not 0 <= kept[0] <= kept[-1] < len(corners):
-            raise ValueError("triangles of corners that are not there")
-        points.append(np.asarray(corners, dtype=np.float64)[kept])
+    for vertices, faces in parts:
+        # Files may keep vertices of triangles that were deleted.
+        used, numbers = np.unique(np.asarray(faces, dtype=np.int64), return_inverse=True)
+        if len(used) and not 0 <= used[0] <= used[-1] < len(vertices):
+            raise ValueError("a triangle refers to a vertex that does not exist")
+        points.append(np.asarray(vertices, dtype=np.float64)[used])
         triangles.append(numbers.reshape(-1, 3) + count)
-        count += len(kept)
+        count += len(used)
     return np.concatenate(points), np.concatenate(triangles)
 
 
 @contextlib.contextmanager
 def _silent(logger: str) -> Iterator[None]:
-    """Keep what a library logs of broken files: what is said of them is ours."""
+    """Suppress a library's log messages about damaged files; errors of the package replace them."""
     log = logging.getLogger(logger)
-    before, log.disabled = log.disabled, True
+    previous, log.disabled = log.disabled, True
     try:
         yield
     finally:
-        log.disabled = before
+        log.disabled = previous
 
 
-def _of_others(data: bytes, kind: str) -> list[tuple[Any, Any]]:
+def _read_trimesh(data: bytes, kind: str) -> list[tuple[Any, Any]]:
     import trimesh
 
     library: Any = trimesh
-    found = library.load_scene(io.BytesIO(data), file_type=kind, process=False, skip_materials=True)
-    return [(one.vertices, one.faces) for one in found.dump() if hasattr(one, "faces")]
+    scene = library.load_scene(io.BytesIO(data), file_type=kind, process=False, skip_materials=True)
+    return [(mesh.vertices, mesh.faces) for mesh in scene.dump() if hasattr(mesh, "faces")]
 
 
-def _of_collada(data: bytes) -> list[tuple[Any, Any]]:
-    """Its geometries as its scene places them, in metres, whichever way it calls up."""
+def _read_collada(data: bytes) -> list[tuple[Any, Any]]:
+    """Return the geometries of a COLLADA scene in metres, with the poses of the scene applied."""
     import collada
 
     library: Any = collada
     root = ElementTree.fromstring(data)
     for parent in list(root.iter()):
         for child in list(parent):
-            if child.tag.rpartition("}")[2] in LOOKS:  # of which a fault would cost the mesh
+            # An error in the appearance must not make the geometry unreadable.
+            if child.tag.rpartition("}")[2] in APPEARANCE_TAGS:
                 parent.remove(child)
-    plain = io.BytesIO(ElementTree.tostring(root))
-    document = library.Collada(plain, ignore=[library.common.DaeError])
+    geometry_only = io.BytesIO(ElementTree.tostring(root))
+    document = library.Collada(geometry_only, ignore=[library.common.DaeError])
     unit = document.assetInfo.unitmeter or 1.0
-    found: list[tuple[Any, Any]] = []
+    meshes: list[tuple[Any, Any]] = []
     for geometry in document.scene.objects("geometry") if document.scene else ():
-        for one in geometry.primitives():
-            some = one.triangleset() if hasattr(one, "triangleset") else one
-            if isinstance(some, library.triangleset.BoundTriangleSet) and some.vertex is not None:
-                found.append((unit * some.vertex, some.vertex_index))
-    return found
+        for primitive in geometry.primitives():
+            faces = primitive.triangleset() if hasattr(primitive, "triangleset") else primitive
+            if isinstance(faces, library.triangleset.BoundTriangleSet) and faces.vertex is not None:
+                meshes.append((unit * faces.vertex, faces.vertex_index))
+    return meshes
 
 
 PLY_TYPES = {
@@ -213,13 +220,13 @@ COMPRESSED = "binary_compressed"
 
 
 @dataclass
-class _Head:
-    """What the head of a PLY or PCD file says.
+class _Header:
+    """The header of a PLY or PCD file.
 
     Attributes:
         fields: Name, type and number of values of each field of a point.
-        count: How many points there are.
-        form: "ascii", the order of bytes ("<" or ">"), or `COMPRESSED`.
+        count: Number of points.
+        form: "ascii", a byte order ("<" or ">"), or `COMPRESSED`.
     """
 
     fields: list[tuple[str, str, int]]
@@ -228,29 +235,31 @@ class _Head:
 
 
 def read_points(path: Path, where: str) -> Array:
-    """(k, 3) points of a file [as it has them]; those of no distance (NaN) are left out.
+    """Read the finite points (k, 3) of a file, in the unit of the file.
 
     Args:
-        path: ``.npy``, ``.npz`` (an array alone, or called ``points``): (k, 3), (H, W, 3) as a
-            depth camera has it, or more columns, of which the first three are taken; ``.ply`` and
-            ``.pcd`` (text, binary or compressed); ``.xyz``, ``.txt``, ``.csv``: x, y and z in the
-            first three columns, or where a header line has these names.
+        path: ``.npy``, ``.npz`` (a single array, or one called ``points``): (k, 3), (H, W, 3) of a
+            depth camera, or more columns, whose first three are used; ``.ply`` and ``.pcd``
+            (text, binary or compressed); ``.xyz``, ``.txt``, ``.csv``: x, y and z in the first
+            three columns, or in the columns that a header line names.
         where: File and key, for the message.
 
     Raises:
-        DescriptionError: There is no such file, it is damaged, or no file of points.
+        DescriptionError: The file does not exist, is damaged, or holds no points.
     """
     readers: dict[str, Callable[[Path], Array]] = {
         ".npy": _npy,
         ".npz": _npz,
-        ".ply": lambda file: _headed(file, _ply_head),
-        ".pcd": lambda file: _headed(file, _pcd_head),
+        ".ply": lambda file: _read_with_header(file, _read_ply_header),
+        ".pcd": lambda file: _read_with_header(file, _read_pcd_header),
         **dict.fromkeys((".xyz", ".txt", ".csv"), _table),
     }
     reader = readers.get(path.suffix.lower())
     if reader is None:
-        known = ", ".join(readers)
-        raise DescriptionError(f"{where}: found {path.name!r}, expected a name ending in {known}")
+        suffixes = ", ".join(readers)
+        raise DescriptionError(
+            f"{where}: found {path.name!r}, expected a name that ends in {suffixes}"
+        )
     if not path.is_file():
         raise DescriptionError(f"{where}: no such file {str(path)!r}")
     try:
@@ -258,7 +267,7 @@ def read_points(path: Path, where: str) -> Array:
             raise ValueError(
                 f"found more than {scaled_limit(LIMITS.cloud_bytes)} bytes {RAISE_HINT}"
             )
-        found = reader(path)
+        points = reader(path)
     except DescriptionError as error:
         raise DescriptionError(f"{where}: {error}") from error
     except OSError as error:
@@ -266,37 +275,38 @@ def read_points(path: Path, where: str) -> Array:
     except (*READ_ERRORS, TypeError, LookupError, StopIteration) as error:
         reason = " ".join(str(error).split())
         raise DescriptionError(f"{where}: {path.name} cannot be read: {reason}") from error
-    return finite_points(found, f"{where}: {path.name}")
+    return finite_points(points, f"{where}: {path.name}")
 
 
 def finite_points(points: np.ndarray, where: str) -> Array:
-    """Points (k, 3) that are numbers; a camera's rows without a distance are left out.
+    """Return the finite rows of points (k, 3); depth cameras mark rows without a distance by NaN.
 
     Raises:
-        DescriptionError: Another shape, no numbers, or none is left.
+        DescriptionError: The array has another shape or type, or no finite row.
     """
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
-        found = f"{points.dtype} of shape {points.shape}"
-        raise DescriptionError(f"{where}: found {found}, expected numbers (k, 3)")
-    kept = np.asarray(points[np.isfinite(points).all(axis=1)], dtype=np.float64)
-    if not len(kept):
+        description = f"{points.dtype} of shape {points.shape}"
+        raise DescriptionError(f"{where}: found {description}, expected numbers (k, 3)")
+    finite = np.asarray(points[np.isfinite(points).all(axis=1)], dtype=np.float64)
+    if not len(finite):
         raise DescriptionError(f"{where}: found no points, expected at least one")
-    return kept
+    return finite
 
 
-def _at_most(count: int) -> int:
+def _checked_count(count: int) -> int:
     max_count = scaled_limit(LIMITS.cloud_points)
     if not 0 <= count <= max_count:
         raise ValueError(f"found {count} points, expected at most {max_count} {RAISE_HINT}")
     return count
 
 
-MOST_COLUMNS = 16
-"""Most numbers of a point in an array: x, y, z, then colours, normals, intensities and the like."""
+MAX_COLUMNS = 16
+"""Largest number of columns of a point array: x, y, z, then colours, normals, intensities."""
 
 
 def _npy(path: Path) -> Array:
-    array = np.lib.format.open_memmap(path, mode="r")  # reserves nothing, unpickles nothing
+    # A memory map neither allocates memory nor unpickles objects.
+    array = np.lib.format.open_memmap(path, mode="r")
     return _coordinates(array)
 
 
@@ -304,8 +314,8 @@ def _coordinates(array: np.ndarray) -> Array:
     """Return the points (k, 3) of an array of points or of an image of points."""
     if array.dtype.names is not None and set("xyz") <= set(array.dtype.names):
         array = np.stack([array[axis] for axis in "xyz"], axis=-1)
-    if array.ndim in (2, 3) and 3 <= array.shape[-1] <= MOST_COLUMNS:
-        _at_most(array.size // array.shape[-1])
+    if array.ndim in (2, 3) and 3 <= array.shape[-1] <= MAX_COLUMNS:
+        _checked_count(array.size // array.shape[-1])
         array = array[..., :3].reshape(-1, 3)
     return np.asarray(array)
 
@@ -319,11 +329,11 @@ def _npz(path: Path) -> Array:
 
 def _table(path: Path) -> Array:
     with path.open("rb") as stream:
-        return _numbers(stream, _columns_of_header(stream), None)
+        return _read_columns(stream, _columns_of_header(stream), None)
 
 
 def _columns_of_header(stream: IO[bytes]) -> list[int]:
-    """Pass over the header line of a table, if it has one, and return the columns of x, y and z."""
+    """Skip the header line of a table, if there is one, and return the columns of x, y and z."""
     start = stream.tell()
     line = stream.readline(10_000).removeprefix(b"\xef\xbb\xbf")
     words = line.decode("latin-1").replace(",", " ").replace(";", " ").split()
@@ -334,7 +344,7 @@ def _columns_of_header(stream: IO[bytes]) -> list[int]:
         numbers = [float(word) for word in words]
     except ValueError:
         numbers = []
-    # A header, or the number of points alone; comments are passed over with the table.
+    # The line is a header or the number of points. Comments are skipped with the table.
     is_comment = line.lstrip().startswith((b"#", b"//"))
     if (words and not numbers and not is_comment) or len(numbers) == 1:
         return [0, 1, 2]
@@ -342,144 +352,147 @@ def _columns_of_header(stream: IO[bytes]) -> list[int]:
     return [0, 1, 2]
 
 
-def _numbers(stream: IO[bytes], columns: list[int], count: int | None) -> Array:
-    """Return columns of a table with blanks, commas or semicolons between its numbers."""
+def _read_columns(stream: IO[bytes], columns: list[int], count: int | None) -> Array:
+    """Return columns of a table whose numbers are separated by spaces, commas or semicolons."""
     blanks = bytes.maketrans(b",;", b"  ")
-    rows, most = (line.translate(blanks) for line in stream), scaled_limit(LIMITS.cloud_points) + 1
+    rows = (line.translate(blanks) for line in stream)
+    max_rows = scaled_limit(LIMITS.cloud_points) + 1
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # nothing in it: told by the caller
-        found = np.loadtxt(rows, comments=["#", "//"], usecols=columns, max_rows=most, ndmin=2)
-    _at_most(len(found))
-    if count is not None and len(found) < count:
-        raise ValueError(f"found {len(found)} points, expected {count}")
-    return found[:count].reshape(-1, 3)
+        warnings.simplefilter("ignore", UserWarning)  # the caller reports empty files
+        points = np.loadtxt(rows, comments=["#", "//"], usecols=columns, max_rows=max_rows, ndmin=2)
+    _checked_count(len(points))
+    if count is not None and len(points) < count:
+        raise ValueError(f"found {len(points)} points, expected {count}")
+    return points[:count].reshape(-1, 3)
 
 
-def _headed(path: Path, read_head: Callable[[IO[bytes]], _Head]) -> Array:
+def _read_with_header(path: Path, read_header: Callable[[IO[bytes]], _Header]) -> Array:
     with path.open("rb") as stream:
-        head = read_head(stream)
-        names = [name for name, _, _ in head.fields]
-        places = [names.index(axis) if axis in names else -1 for axis in "xyz"]
-        if min(places) < 0:
+        header = read_header(stream)
+        names = [name for name, _, _ in header.fields]
+        columns = [names.index(axis) if axis in names else -1 for axis in "xyz"]
+        if min(columns) < 0:
             raise ValueError(f"found {' '.join(names)}, expected x, y and z")
-        if head.form == "ascii":
-            before = np.cumsum([0, *(count for _, _, count in head.fields)])
-            return _numbers(stream, before[places].tolist(), head.count)
-        if head.form == COMPRESSED:
-            return _by_field(stream, head, places)
+        if header.form == "ascii":
+            starts = np.cumsum([0, *(count for _, _, count in header.fields)])
+            return _read_columns(stream, starts[columns].tolist(), header.count)
+        if header.form == COMPRESSED:
+            return _read_compressed(stream, header, columns)
         row = np.dtype(
             [
-                (f"f{i}", f"{head.form}{kind}", count)
-                for i, (_, kind, count) in enumerate(head.fields)
+                (f"f{i}", f"{header.form}{kind}", count)
+                for i, (_, kind, count) in enumerate(header.fields)
             ]
         )
-        data = stream.read(row.itemsize * head.count)
-        if len(data) < row.itemsize * head.count:
-            raise ValueError(f"ends after {len(data) // row.itemsize} of {head.count} points")
+        data = stream.read(row.itemsize * header.count)
+        if len(data) < row.itemsize * header.count:
+            raise ValueError(f"ends after {len(data) // row.itemsize} of {header.count} points")
         rows = np.frombuffer(data, row)
-        return np.stack([rows[f"f{i}"].reshape(-1).astype(np.float64) for i in places], axis=1)
+        return np.stack([rows[f"f{i}"].reshape(-1).astype(np.float64) for i in columns], axis=1)
 
 
-def _by_field(stream: IO[bytes], head: _Head, places: list[int]) -> Array:
-    """Return the points of compressed data: all values of a field follow one another.
+def _read_compressed(stream: IO[bytes], header: _Header, columns: list[int]) -> Array:
+    """Return the points of compressed data, which store all values of a field contiguously.
 
     Raises:
-        ValueError: The data are damaged, or unpack to another size than the head announces.
+        ValueError: The data are damaged, or their size differs from the header.
     """
     packed_size, size = struct.unpack("<II", stream.read(8))
-    kinds = [np.dtype((f"<{kind}", (count,))) for _, kind, count in head.fields]
-    if size != head.count * sum(kind.itemsize for kind in kinds):
-        raise ValueError(f"unpacks to {size} bytes, not to {head.count} points")
-    check_unpacked_size("its data", size, LIMITS.cloud_bytes)
+    kinds = [np.dtype((f"<{kind}", (count,))) for _, kind, count in header.fields]
+    if size != header.count * sum(kind.itemsize for kind in kinds):
+        raise ValueError(f"unpacks to {size} bytes, not to {header.count} points")
+    check_unpacked_size("compressed data", size, LIMITS.cloud_bytes)
     data = unpack_lzf(stream.read(packed_size), size)
-    starts = np.cumsum([0, *(head.count * kind.itemsize for kind in kinds)])
-    columns = [np.frombuffer(data, kinds[i], head.count, int(starts[i])) for i in places]
-    return np.stack([column.reshape(-1).astype(np.float64) for column in columns], axis=1)
+    starts = np.cumsum([0, *(header.count * kind.itemsize for kind in kinds)])
+    values = [np.frombuffer(data, kinds[i], header.count, int(starts[i])) for i in columns]
+    return np.stack([column.reshape(-1).astype(np.float64) for column in values], axis=1)
 
 
 def unpack_lzf(packed: bytes, size: int) -> bytes:
-    """Unpack data of the LZF compression, which PCD files use.
+    """Decompress LZF data, as in PCD files.
 
-    A byte below 32 announces that many bytes plus one as they are. Any other byte and the next
-    ones are the length and the distance of bytes that are copied from what is already unpacked.
+    A control byte below 32 is followed by that many bytes plus one, which are copied. Any other
+    control byte and the following ones encode the length and the distance of a copy from the
+    output.
 
     Raises:
-        ValueError: The data are damaged, or unpack to another size.
+        ValueError: The data are damaged, or decompress to another size.
     """
-    data, place = bytearray(), 0
+    data, position = bytearray(), 0
     try:
-        while place < len(packed):
-            control = packed[place]
-            place += 1
+        while position < len(packed):
+            control = packed[position]
+            position += 1
             if control < 32:
-                data += packed[place : place + control + 1]
-                place += control + 1
+                data += packed[position : position + control + 1]
+                position += control + 1
                 continue
             length = control >> 5
             if length == 7:
-                length += packed[place]
-                place += 1
-            start = len(data) - ((control & 31) << 8) - packed[place] - 1
-            place, length = place + 1, length + 2
+                length += packed[position]
+                position += 1
+            start = len(data) - ((control & 31) << 8) - packed[position] - 1
+            position, length = position + 1, length + 2
             if start < 0 or len(data) + length > size:
-                raise ValueError("its compressed data are damaged")
-            # A copy may overlap its own source: then the source repeats.
+                raise ValueError("the compressed data are damaged")
+            # The copy may overlap its source, which then repeats.
             source = bytes(data[start : start + length])
             data += (source * (length // len(source) + 1))[:length]
     except IndexError as error:
-        raise ValueError("its compressed data end too early") from error
+        raise ValueError("the compressed data end too early") from error
     if len(data) != size:
         raise ValueError(f"unpacks to {len(data)} bytes, expected {size}")
     return bytes(data)
 
 
-def _lines(stream: IO[bytes]) -> list[str]:
+def _read_words(stream: IO[bytes]) -> list[str]:
     return stream.readline(1000).decode("ascii").split()
 
 
-def _ply_head(stream: IO[bytes]) -> _Head:
-    if _lines(stream) != ["ply"]:
-        raise ValueError("no PLY file")
+def _read_ply_header(stream: IO[bytes]) -> _Header:
+    if _read_words(stream) != ["ply"]:
+        raise ValueError("is not a PLY file")
     forms = {"ascii": "ascii", "binary_little_endian": "<", "binary_big_endian": ">"}
-    head, elements = _Head([], 0, ""), 0
+    header, elements = _Header([], 0, ""), 0
     for _ in range(LIMITS.cloud_head):
-        match _lines(stream):
+        match _read_words(stream):
             case ["format", form, _]:
-                head.form = forms[form]
+                header.form = forms[form]
             case ["element", name, count]:
                 elements += 1
                 if elements == 1 and name != "vertex":
                     raise ValueError(f"begins with {name}, expected vertex first")
-                head.count = _at_most(int(count)) if elements == 1 else head.count
+                header.count = _checked_count(int(count)) if elements == 1 else header.count
             case ["property", "list", *_] if elements == 1:
                 raise ValueError("a vertex has lists, expected numbers")
             case ["property", kind, name] if elements == 1:
-                head.fields.append((name, PLY_TYPES[kind], 1))
+                header.fields.append((name, PLY_TYPES[kind], 1))
             case ["end_header"]:
-                return head
+                return header
             case _:
                 pass
-    raise ValueError("its head has no end")
+    raise ValueError("the header has no end")
 
 
-def _pcd_head(stream: IO[bytes]) -> _Head:
-    said: dict[str, list[str]] = {}
+def _read_pcd_header(stream: IO[bytes]) -> _Header:
+    entries: dict[str, list[str]] = {}
     for _ in range(LIMITS.cloud_head):
-        words = _lines(stream)
+        words = _read_words(stream)
         if words and not words[0].startswith("#"):
-            said[words[0].upper()] = words[1:]
-        if "DATA" in said:
+            entries[words[0].upper()] = words[1:]
+        if "DATA" in entries:
             break
     else:
-        raise ValueError("no PCD file")
-    form = said["DATA"][0]
+        raise ValueError("is not a PCD file")
+    form = entries["DATA"][0]
     if form not in ("ascii", "binary", COMPRESSED):
-        raise ValueError(f"its data are {form}, expected ascii, binary or {COMPRESSED}")
-    names = said["FIELDS"]
-    counts = [int(one) for one in said.get("COUNT", ["1"] * len(names))]
-    if not all(0 < one <= 1000 for one in counts):
-        raise ValueError(f"COUNT: found {counts}")
-    kinds = [f"{kind.lower()}{size}" for kind, size in zip(said["TYPE"], said["SIZE"], strict=True)]
-    count = int(said["POINTS"][0]) if "POINTS" in said else int(said["WIDTH"][0])
+        raise ValueError(f"DATA: found {form}, expected ascii, binary or {COMPRESSED}")
+    names = entries["FIELDS"]
+    counts = [int(count) for count in entries.get("COUNT", ["1"] * len(names))]
+    if not all(0 < count <= 1000 for count in counts):
+        raise ValueError(f"COUNT: found {counts}, expected 1 to 1000")
+    types = zip(entries["TYPE"], entries["SIZE"], strict=True)
+    kinds = [f"{kind.lower()}{size}" for kind, size in types]
+    count = int(entries["POINTS"][0] if "POINTS" in entries else entries["WIDTH"][0])
     fields = list(zip(names, kinds, counts, strict=True))
-    return _Head(fields, _at_most(count), "<" if form == "binary" else form)
+    return _Header(fields, _checked_count(count), "<" if form == "binary" else form)

@@ -1,4 +1,4 @@
-"""How far something is, shown where a person looks on: on a terminal, or in a notebook."""
+"""Progress bars for terminals and notebooks, and progress lines for other streams."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from contextlib import contextmanager
 from typing import Any
 
 PATIENCE = 1.0
-"""Seconds after which it is shown."""
+"""Time after which a bar appears [s]."""
 
-SAID_EVERY = 10.0
-"""Seconds between two lines where there is nothing to draw a bar on."""
+LINE_INTERVAL = 10.0
+"""Time between two progress lines where no bar can be drawn [s]."""
 
 
 @contextmanager
@@ -22,43 +22,44 @@ def progress(
     done: int = 0,
     say: Callable[[str], object] | None = None,
 ) -> Iterator[Callable[[int], None]]:
-    """Show how far it is, as soon as that takes longer than a second.
+    """Show the progress of work that takes longer than a second.
 
     Args:
-        count: Targets in all.
-        shown: Whether it may be shown.
-        done: Of those, done before.
-        say: What is called with a line where there is neither a terminal nor a notebook, every ten
-            seconds; None: nothing is said there.
+        count: Total number of targets.
+        shown: False to draw no bar.
+        done: Number of targets that are done already.
+        say: Function that is called with a progress line every ten seconds where there is neither a
+            terminal nor a notebook; None for no lines.
 
     Yields:
-        Moves it on by so many targets.
+        A function that advances the progress by a number of targets.
     """
-    began = last = time.monotonic()
-    total, drawn = done, None
+    began = last_line = time.monotonic()
+    total, visible_bar = done, None
     draw = _bar(count) if shown else None
 
-    def move(more: int) -> None:
-        nonlocal total, last, drawn
-        total += more
+    def advance(targets: int) -> None:
+        nonlocal total, last_line, visible_bar
+        total += targets
         now = time.monotonic()
         rate = (total - done) / max(now - began, 1e-9)
         if draw is not None and now - began > PATIENCE:
-            drawn = draw
+            visible_bar = draw
             draw(total, rate)
-        elif draw is None and say is not None and now - last > SAID_EVERY:
-            last = now
-            say(f"{total:,} of {count:,} targets, {rate:,.0f} a second{_left(count - total, rate)}")
+        elif draw is None and say is not None and now - last_line > LINE_INTERVAL:
+            last_line = now
+            time_left = _time_left(count - total, rate)
+            say(f"{total:,} of {count:,} targets, {rate:,.0f} a second{time_left}")
 
     try:
-        yield move
+        yield advance
     finally:
-        if drawn is not None:
-            drawn(None, 0.0)
+        if visible_bar is not None:
+            visible_bar(None, 0.0)
 
 
-def _left(targets: int, rate: float) -> str:
-    """How long the rest takes, in words."""
+def _time_left(targets: int, rate: float) -> str:
+    """Return the remaining time as text, "" if it is unknown."""
     if rate <= 0:
         return ""
     minutes, seconds = divmod(round(targets / rate), 60)
@@ -69,21 +70,21 @@ def _left(targets: int, rate: float) -> str:
 
 
 def _bar(count: int) -> Callable[[int | None, float], None] | None:
-    """What draws a bar, and takes it away for None; None: there is nothing to draw on."""
+    """Return a function that draws a bar, or removes it for None; None if no bar can be drawn."""
     if _in_notebook():
         return _notebook(count)
     return _terminal(count) if is_interactive() else None
 
 
 def is_interactive() -> bool:
-    """Return whether there is a notebook or a terminal to show progress on."""
+    """Return True in a notebook, or if stderr is a terminal."""
     return _in_notebook() or is_terminal(sys.stderr)
 
 
 def is_terminal(stream: Any) -> bool:
-    """Return whether a stream is a terminal.
+    """Return True if a stream is a terminal.
 
-    A program may have put any object with a `write` method in place of `sys.stderr`, or None.
+    Programs may replace `sys.stderr` by any object with a `write` method, or by None.
     """
     return hasattr(stream, "isatty") and not getattr(stream, "closed", False) and stream.isatty()
 
@@ -101,11 +102,11 @@ def _notebook(count: int) -> Callable[[int | None, float], None]:
     def draw(total: int | None, rate: float) -> None:
         nonlocal handle
         bar = f"<progress value={total} max={count}></progress>"
-        shown = HTML("" if total is None else f"{bar} {total:,} of {count:,}, {rate:,.0f}/s")
+        html = HTML("" if total is None else f"{bar} {total:,} of {count:,}, {rate:,.0f}/s")
         if handle is None:
-            handle = display(shown, display_id=True)
+            handle = display(html, display_id=True)
         else:
-            handle.update(shown)
+            handle.update(html)
 
     return draw
 

@@ -1,6 +1,6 @@
-"""Reading description files: YAML with units in, checked data out.
+"""Reading of description files: YAML with units in, validated records out.
 
-Nothing in a file is run, and none takes for ever, whoever wrote it.
+Files are untrusted: nothing in them is executed, and size and depth are limited.
 """
 
 from __future__ import annotations
@@ -33,66 +33,66 @@ from casadi_ik.files.units import (
 
 MERGE = "tag:yaml.org,2002:merge"
 
-# libyaml where PyYAML has it: a tenth of the time.
+# libyaml, if PyYAML includes it, takes a tenth of the time.
 _SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class _UniqueKeyLoader(_SafeLoader):
-    """YAML's own loader keeps the last of two equal keys without a word; this one objects.
+    """YAML loader that refuses duplicate keys, which YAML's own loader accepts silently.
 
-    Merge keys (``<<``) are refused: they are no part of YAML 1.2, and what they override is easily
-    overlooked.
+    It refuses merge keys (``<<``), too: they are not part of YAML 1.2, and what they override is
+    easily overlooked.
     """
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen: set[Any] = set()
+        keys: set[Any] = set()
         for key_node, _ in node.value:
             if key_node.tag == MERGE:
                 raise yaml.constructor.ConstructorError(
-                    None, None, "merge keys (<<) are not taken", key_node.start_mark
+                    None, None, "merge keys (<<) are not supported", key_node.start_mark
                 )
             key = self.construct_object(key_node, deep=True)
-            if isinstance(key, (str, int, float)) and key in seen:
+            if isinstance(key, (str, int, float)) and key in keys:
                 raise yaml.constructor.ConstructorError(
                     None, None, f"key {key!r} appears twice", key_node.start_mark
                 )
             if isinstance(key, (str, int, float)):
-                seen.add(key)
+                keys.add(key)
         return super().construct_mapping(node, deep)
 
 
-def read_bytes(path: Path, where: str, most: int, note: str = "") -> bytes:
-    """All of a file.
+def read_bytes(path: Path, where: str, max_size: int, note: str = "") -> bytes:
+    """Read a file.
 
     Args:
         path: The file.
-        where: What to call it in a message.
-        most: Bytes that it may have.
-        note: How that is raised, for the message.
+        where: Name of the file in messages.
+        max_size: Largest size [bytes].
+        note: Hint how to raise the limit, for the message.
 
     Raises:
-        DescriptionError: It cannot be read, or is larger.
+        DescriptionError: The file cannot be read, or is larger.
     """
     try:
         with path.open("rb") as stream:
-            data = stream.read(most + 1)
+            data = stream.read(max_size + 1)
     except (OSError, ValueError) as error:
         reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
         raise DescriptionError(f"{where}: cannot be read: {reason}") from error
-    if len(data) > most:
-        size = f"{most / 2**20:.3g} MiB {note}".rstrip()
+    if len(data) > max_size:
+        size = f"{max_size / 2**20:.3g} MiB {note}".rstrip()
         raise DescriptionError(f"{where}: cannot be read: is larger than {size}")
     return data
 
 
-def read_text(path: Path, most: int, note: str = "", encoding: str = "utf-8") -> str:
-    """The text of a file; see `read_bytes`.
+def read_text(path: Path, max_size: int, note: str = "", encoding: str = "utf-8") -> str:
+    """Read a text file; see `read_bytes`.
 
     Raises:
-        DescriptionError: As there, or it is no text.
+        DescriptionError: The file cannot be read, is larger, or is not text.
     """
     try:
-        return read_bytes(path, str(path), most, note).decode(encoding)
+        return read_bytes(path, str(path), max_size, note).decode(encoding)
     except UnicodeDecodeError as error:
         raise DescriptionError(f"{path}: cannot be read: not UTF-8 text") from error
 
@@ -106,7 +106,7 @@ def parse_yaml(path: Path) -> Any:
     text = read_text(path, LIMITS.yaml_bytes)
     try:
         _check_events(text)
-        found = yaml.load(text, Loader=_UniqueKeyLoader)
+        data = yaml.load(text, Loader=_UniqueKeyLoader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f":{mark.line + 1}:{mark.column + 1}" if mark is not None else ""
@@ -115,17 +115,17 @@ def parse_yaml(path: Path) -> Any:
     except (ValueError, OverflowError, RecursionError) as error:  # an impossible date
         raise DescriptionError(f"{path}: not valid YAML: {error}") from error
     try:
-        _count(found, 0, 0)
+        _count_values(data, 0, 0)
     except ValueError as error:
         raise DescriptionError(f"{path}: {error}") from error
-    return found
+    return data
 
 
 def _check_events(text: str) -> None:
-    """Look at a text one event at a time: building nested data from it could end the process.
+    """Check the events of a text before nested data, which could crash the process, are built.
 
     Raises:
-        yaml.YAMLError: Not YAML, or beyond a limit.
+        yaml.YAMLError: The text is not YAML, or beyond a limit.
     """
     depth = 0
     for event in yaml.parse(text, Loader=_SafeLoader):
@@ -137,34 +137,36 @@ def _check_events(text: str) -> None:
         if depth > LIMITS.yaml_depth:
             problem = f"nested more than {LIMITS.yaml_depth} deep"
         elif isinstance(event, yaml.ScalarEvent) and len(event.value) > LIMITS.yaml_text:
-            problem = f"a text of more than {LIMITS.yaml_text} characters"
-        elif isinstance(event, yaml.ScalarEvent) and not _readable(event.value):
-            problem = "a text with control characters"
+            problem = f"text is longer than {LIMITS.yaml_text} characters"
+        elif isinstance(event, yaml.ScalarEvent) and not _is_printable(event.value):
+            problem = "text contains control characters"
         if problem:
             raise ComposerError(None, None, problem, event.start_mark)
 
 
-def _readable(text: str) -> bool:
+def _is_printable(text: str) -> bool:
     return text.isprintable() or all(c.isprintable() or c in "\n\t" for c in text)
 
 
-def _count(value: Any, count: int, depth: int) -> int:
-    """How many values there are, aliases followed.
+def _count_values(value: Any, count: int, depth: int) -> int:
+    """Return `count` plus the number of values of nested data.
+
+    A value that is used twice counts twice.
 
     Raises:
-        ValueError: Too many, or too deep.
+        ValueError: There are too many values, or they are nested too deeply.
     """
     count += 1
     if count > LIMITS.yaml_values:
         raise ValueError(f"holds more than {LIMITS.yaml_values} values")
     if depth > LIMITS.yaml_depth:
-        raise ValueError("nested too deeply, or holds itself")
+        raise ValueError("nested too deeply, or contains itself")
     if isinstance(value, dict):
         for item in value.values():
-            count = _count(item, count, depth + 1)
+            count = _count_values(item, count, depth + 1)
     elif isinstance(value, (list, tuple, set)):
         for item in value:
-            count = _count(item, count, depth + 1)
+            count = _count_values(item, count, depth + 1)
     return count
 
 
@@ -179,7 +181,7 @@ class Struct(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Frame(Struct, frozen=True):
-    """A pose relative to the parent: xyz, then rpy about the fixed axes (as URDF).
+    """A pose relative to the parent: xyz, then rpy about the fixed axes (as in URDF).
 
     Attributes:
         xyz: Origin in the parent's frame [m].
@@ -191,7 +193,7 @@ class Frame(Struct, frozen=True):
 
 
 def frame_matrix(frame: Frame) -> Array:
-    """(4, 4) pose of a frame: translation xyz after rotation rpy about the fixed axes (URDF)."""
+    """Return the pose (4, 4) of a frame: rotation rpy about fixed axes, then translation xyz."""
     roll, pitch, yaw = frame.rpy
     cr, sr = math.cos(roll), math.sin(roll)
     cp, sp = math.cos(pitch), math.sin(pitch)
@@ -207,7 +209,7 @@ def frame_matrix(frame: Frame) -> Array:
 
 
 def roll_pitch_yaw(rotation: Array) -> Array:
-    """(3,) angles about the fixed axes [rad] of a rotation (3, 3): `frame_matrix` turned round."""
+    """Return the angles (3,) about the fixed axes [rad] of a rotation (3, 3)."""
     flat = math.hypot(rotation[0, 0], rotation[1, 0])
     pitch = math.atan2(-rotation[2, 0], flat)
     if flat > 1e-9:
@@ -229,16 +231,16 @@ def read(path: Path, type_: type[T]) -> tuple[T, dict[str, str]]:
     """Read a YAML file of a type; see `validated`.
 
     Raises:
-        DescriptionError: With file, key, what was found and what was expected.
+        DescriptionError: The file is malformed; the message names file, key and expected value.
     """
     return validated(parse_yaml(path), type_, path)
 
 
 def validated(raw: Any, type_: type[T], path: Path) -> tuple[T, dict[str, str]]:
-    """Parsed YAML as a type: all numbers finite, every unit of the dimension that its place has.
+    """Return parsed YAML as a type, with finite numbers and units of the declared dimensions.
 
     Args:
-        raw: As it was parsed, units and all.
+        raw: Parsed YAML, with units.
         type_: The type.
         path: The file.
 
@@ -246,7 +248,7 @@ def validated(raw: Any, type_: type[T], path: Path) -> tuple[T, dict[str, str]]:
         The entry, and the units in the file by key ("home.spread": "deg").
 
     Raises:
-        DescriptionError: With file, key, what was found and what was expected.
+        DescriptionError: The data do not fit; the message names file, key, and the expected value.
     """
     data = to_si(raw)
     for key, value in leaf_values(data):
@@ -258,20 +260,22 @@ def validated(raw: Any, type_: type[T], path: Path) -> tuple[T, dict[str, str]]:
 
 
 def convert_entry(data: Any, type_: type[T], path: Path) -> T:
-    """Check parsed YAML against a type.
+    """Convert parsed YAML to a type.
 
     Raises:
-        DescriptionError: With file, key, what was found and what was expected.
+        DescriptionError: The data do not fit; the message names file, key, and the expected value.
     """
     try:
         return msgspec.convert(data, type_)
     except msgspec.ValidationError as error:
-        text, _, place = str(error).partition(" - at `")
-        in_key = place.startswith("key` in `")
-        key, value = _culprit(data, type_, place.removeprefix("key` in `")[1:-1], str(error))
+        text, _, location = str(error).partition(" - at `")
+        in_key = location.startswith("key` in `")
+        key, value = _invalid_item(
+            data, type_, location.removeprefix("key` in `")[1:-1], str(error)
+        )
         text = f"{text[0].lower()}{text[1:]}"
         if in_key:
-            text = f"one of its keys is no text: {text}"
+            text = f"one of its keys is not text: {text}"
         elif isinstance(value, str):
             match = QUANTITY.match(value)
             if match and "float" in text:
@@ -282,23 +286,23 @@ def convert_entry(data: Any, type_: type[T], path: Path) -> T:
         raise DescriptionError(f"{path}: {key or '(top level)'}: {text}") from error
 
 
-def _culprit(data: Any, type_: type[Any], place: str, message: str) -> tuple[str, Any]:
-    """Key and value that a validation error is about.
+def _invalid_item(data: Any, type_: type[Any], location: str, message: str) -> tuple[str, Any]:
+    """Return key and value that a validation error is about.
 
-    msgspec writes ``[...]`` for the keys of a mapping of the user's own names; which one it was
-    comes out by leaving out all the others.
+    msgspec writes ``[...]`` for the keys of a mapping with free names; which of them is invalid is
+    found by validating each one without the others.
     """
     key, value, trimmed = "", data, data
     steps: list[Any] = []
-    for part in re.findall(r"\[\.\.\.\]|\[\d+\]|\.[^.\[]+", place):
+    for part in re.findall(r"\[\.\.\.\]|\[\d+\]|\.[^.\[]+", location):
         if part == "[...]" and isinstance(value, dict):
             for name in value:
-                alone = _replaced(trimmed, steps, {name: value[name]})
-                if _complains(alone, type_, message):
+                single = _replace_item(trimmed, steps, {name: value[name]})
+                if _raises(single, type_, message):
                     break
             else:
                 return f"{key}[...]", None
-            trimmed, step = alone, name
+            trimmed, step = single, name
             key += f".{name}"
         else:
             step = int(part[1:-1]) if part.startswith("[") else part[1:]
@@ -308,7 +312,7 @@ def _culprit(data: Any, type_: type[Any], place: str, message: str) -> tuple[str
     return key.lstrip("."), value
 
 
-def _complains(data: Any, type_: type[Any], message: str) -> bool:
+def _raises(data: Any, type_: type[Any], message: str) -> bool:
     try:
         msgspec.convert(data, type_)
     except msgspec.ValidationError as error:
@@ -316,10 +320,10 @@ def _complains(data: Any, type_: type[Any], message: str) -> bool:
     return False
 
 
-def _replaced(data: Any, steps: list[Any], value: Any) -> Any:
-    """A copy of nested data with another value at a place."""
+def _replace_item(data: Any, steps: list[Any], value: Any) -> Any:
+    """Return a copy of nested data with another value at the end of a path of keys."""
     if not steps:
         return value
     copy = data.copy()
-    copy[steps[0]] = _replaced(data[steps[0]], steps[1:], value)
+    copy[steps[0]] = _replace_item(data[steps[0]], steps[1:], value)
     return copy

@@ -1,4 +1,4 @@
-"""Where the shipped descriptions are: inside the wheel, or beside the package in a checkout."""
+"""Names and paths of the shipped descriptions, in the wheel or in a checkout."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from pathlib import Path
 from casadi_ik.errors import DescriptionError, UnknownNameError, did_you_mean
 
 ROBOT_FILE_FORMATS = (".urdf", ".xacro", ".xml", ".mjcf")
-"""Names' ends of robots' files that are imported."""
+"""File name extensions of robot files that have to be imported."""
 
 
 BODIES_FOLDER = "bodies"
-"""The folder of robots with several arms, or with a trunk."""
+"""Folder of multi-arm robots."""
 
 
 ROBOT_FOLDERS = ("arm_hands", BODIES_FOLDER, "arms", "hands")
-"""The folders of robots and of what they are put together from."""
+"""Folders of robots and of their parts."""
 
 
 def models_folder() -> Path:
-    """The folder ``models``.
+    """Return the folder ``models``.
 
     Raises:
         DescriptionError: The installation is incomplete.
@@ -32,7 +32,7 @@ def models_folder() -> Path:
 
 
 def shipped_names(kind: str) -> tuple[str, ...]:
-    """Names of the shipped descriptions of a kind ("arms", "hands", "arm_hands", ...).
+    """Return the names of the shipped descriptions of a kind ("arms", "hands", "arm_hands", ...).
 
     Example:
         >>> ik.shipped_names("scenes")
@@ -46,13 +46,13 @@ def shipped_names(kind: str) -> tuple[str, ...]:
 def resolve_description(
     name_or_path: str | Path, kind: str, relative_to: Path | None = None
 ) -> Path:
-    """The file behind a shipped name or a path.
+    """Return the file of a shipped name or a path.
 
     Args:
-        name_or_path: A shipped name, or the path of a YAML file (anything with a path separator
-            or ending in .yaml or .yml).
+        name_or_path: Shipped name, or path of a YAML file (anything with a path separator or ending
+            in .yaml or .yml).
         kind: Folder under ``models``.
-        relative_to: A file relative to whose folder a relative path is looked up first.
+        relative_to: File whose folder relative paths refer to; None for the working directory.
 
     Raises:
         UnknownNameError: No shipped description has that name.
@@ -69,10 +69,10 @@ def resolve_description(
         return path
     path = models_folder() / kind / f"{text}.yaml"
     if text not in shipped_names(kind):
-        noun, known = kind.replace("_", "-").removesuffix("s"), shipped_names(kind)
-        rest = did_you_mean(text, known, f"shipped: {', '.join(known)}")
+        noun, names = kind.replace("_", "-").removesuffix("s"), shipped_names(kind)
+        hint = did_you_mean(text, names, f"shipped: {', '.join(names)}")
         raise UnknownNameError(
-            f"no shipped {noun} is called {text!r}; {rest} (or give the path of a YAML file)"
+            f"no shipped {noun} is called {text!r}; {hint} (or give the path of a YAML file)"
         )
     return path
 
@@ -80,23 +80,23 @@ def resolve_description(
 def resolve_robot(
     name_or_path: str | Path, relative_to: Path | None = None
 ) -> Path | tuple[Path | None, Path | None]:
-    """The file of a robot, or those of an arm and a hand, of which one may stand alone.
+    """Return the file of a robot, or the files of an arm and a hand, one of which may be None.
 
     Args:
-        name_or_path: A shipped arm-hand, body, arm or hand, "ARM+HAND" or "BODY+HAND" of shipped
-            names, or the path of a YAML file.
+        name_or_path: Shipped arm-hand, multi-arm robot, arm or hand, "ARM+HAND" or "BODY+HAND" of
+            shipped names, or path of a YAML file.
         relative_to: See `resolve_description`.
 
     Raises:
         UnknownNameError: No shipped description has that name.
-        DescriptionError: The path does not exist, or is of a file that has to be imported.
+        DescriptionError: The path does not exist, or is a robot file that has to be imported.
     """
     text = str(name_or_path)
     path_like = isinstance(name_or_path, Path) or "/" in text or text.endswith((".yaml", ".yml"))
     if text.endswith(ROBOT_FILE_FORMATS):
         raise DescriptionError(
-            f"{text}: is a robot's file, expected a description, which says where its fingertips "
-            f"are: casadi-ik import {text} --out {Path(text).stem}.yaml makes one"
+            f"{text}: is a robot file; expected a description with fingertips, which casadi-ik "
+            f"import {text} --out {Path(text).stem}.yaml writes"
         )
     arm, plus, hand = text.partition("+")
     if not path_like and text in shipped_names(BODIES_FOLDER):
@@ -120,9 +120,9 @@ def resolve_robot(
     try:
         return resolve_description(name_or_path, "arm_hands", relative_to)
     except UnknownNameError:
-        known = [name for kind in ROBOT_FOLDERS for name in shipped_names(kind)]
+        names = [name for kind in ROBOT_FOLDERS for name in shipped_names(kind)]
         listed = f"shipped: {', '.join(shipped_names('arm_hands'))}; {bodies}"
         raise UnknownNameError(
-            f"no shipped arm-hand is called {text!r}; {did_you_mean(text, known, listed)} (or give "
+            f"no shipped arm-hand is called {text!r}; {did_you_mean(text, names, listed)} (or give "
             "the path of a YAML file, or ARM+HAND of the catalogue, see casadi-ik robots)"
         ) from None

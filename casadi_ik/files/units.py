@@ -1,13 +1,12 @@
-"""Units in files: what they are in SI, and whether they fit where they stand.
+"""Units in files: conversion to SI, checks of dimensions, and JSON Schemas.
 
-Numbers may carry a unit (``90 deg``, ``50 mm``, ``110 deg/s``); without one they are SI. A field
-declares its dimension and what it has to be above by its type (`Length`, `Size`, `Angle`, ...); a
-plain `float` takes any.
+Numbers may carry a unit (``90 deg``, ``50 mm``, ``110 deg/s``); without one they are in SI. A field
+declares its dimension and its lower bound by its type (`Length`, `Size`, `Angle`, ...); a plain
+`float` accepts any unit.
 
-JSON Schemas come from the very types that check files, so that editors complete keys: draft 7, the
-one that editors' language servers know. Keys, defaults and alternatives are those of
-the type; what a key means is its line under ``Attributes:`` in the type's docstring; a number may
-carry a unit of the dimension that its type declares.
+JSON Schemas are built from the types that check the files, so that editors complete keys. They are
+draft 7, which the language servers of editors support. Descriptions of keys are the lines under
+``Attributes:`` in the docstrings of the types.
 """
 
 from __future__ import annotations
@@ -38,17 +37,19 @@ UNITS = {
     "mm/s": 1e-3,
     "kg": 1.0,
 }
+"""Factor to SI by unit."""
 
 QUANTITY = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-z/]*)\s*$")
+"""Pattern of a number with an optional unit."""
 
-DIMENSIONS = {"deg": "rad", "cm": "m", "mm": "m", "deg/s": "rad/s", "mm/s": "m/s"}
-"""The SI unit of a unit, where that is another."""
+SI_UNITS = {"deg": "rad", "cm": "m", "mm": "m", "deg/s": "rad/s", "mm/s": "m/s"}
+"""SI unit by unit, where they differ."""
 
 
 class Dimension(str):
-    """The SI units that a number may be in, parted by blanks; "" for a pure number.
+    """SI units that a number may have, separated by spaces; "" for a pure number.
 
-    "joint" stands for those of the position of what is described: by its ``type`` or ``unit``.
+    "joint" denotes the unit of the described joint, which depends on its ``type`` or ``unit``.
     """
 
     __slots__ = ()
@@ -67,7 +68,7 @@ AnyValue = Annotated[float, Dimension("rad m")]
 
 
 def quantity(text: Any) -> tuple[float, str] | None:
-    """The number in SI of a text with a known unit, and the unit; None if it is something else."""
+    """Return the SI value and the unit of a text with a known unit; None for anything else."""
     if not isinstance(text, str) or len(text) > LIMITS.quantity_text:
         return None
     match = QUANTITY.match(text)
@@ -77,30 +78,30 @@ def quantity(text: Any) -> tuple[float, str] | None:
 
 
 def to_si(value: Any) -> Any:
-    """Nested data with every quantity as a float."""
+    """Return nested data with every quantity as a float in SI."""
     if isinstance(value, dict):
         return {key: to_si(item) for key, item in value.items()}
     if isinstance(value, list):
         return [to_si(item) for item in value]
-    found = quantity(value)
-    return value if found is None else found[0]
+    parsed = quantity(value)
+    return value if parsed is None else parsed[0]
 
 
-def item_name(items: Any, place: int) -> str:
-    """What to call an item of a list: by its name, if it has one, else by its number."""
-    item = items[place] if isinstance(items, list) and place < len(items) else None
+def item_name(items: Any, index: int) -> str:
+    """Return the name of an item of a list, or its index if it has no name."""
+    item = items[index] if isinstance(items, list) and index < len(items) else None
     name = item.get("name") if isinstance(item, dict) else None
-    return name if isinstance(name, str) else str(place)
+    return name if isinstance(name, str) else str(index)
 
 
 def units_in(value: Any) -> dict[str, str]:
-    """The SI unit of every quantity that has one, by key."""
-    found = ((key, quantity(text)) for key, text in leaf_values(value))
-    return {key: DIMENSIONS.get(one[1], one[1]) for key, one in found if one and one[1]}
+    """Return the SI unit of every quantity that has a unit, by key."""
+    quantities = ((key, quantity(text)) for key, text in leaf_values(value))
+    return {key: SI_UNITS.get(pair[1], pair[1]) for key, pair in quantities if pair and pair[1]}
 
 
 def leaf_values(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """What nested data consist of, each with its key ("sides.left.at.xyz[0]")."""
+    """Yield the scalar values of nested data, each with its key ("sides.left.at.xyz[0]")."""
     if isinstance(value, dict):
         for name, item in value.items():
             yield from leaf_values(item, f"{key}.{name}" if key else str(name))
@@ -112,17 +113,17 @@ def leaf_values(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def check_units(value: Any, type_: Any, path: Path, key: str = "", owner: Any = None) -> None:
-    """Whether every unit in parsed YAML is of the dimension that its type declares.
+    """Check that every unit in parsed YAML has the dimension that its type declares.
 
     Args:
-        value: As it was parsed, units and all; it fits the type.
-        type_: Its type.
+        value: Parsed YAML with units, which fits the type.
+        type_: The type.
         path: The file.
-        key: Where it stands.
-        owner: The mapping it stands in.
+        key: Key of the value.
+        owner: Mapping that contains the value.
 
     Raises:
-        DescriptionError: With file, key, what was found and what was expected.
+        DescriptionError: A unit does not fit; the message names file, key, and the expected unit.
     """
     origin = get_origin(type_)
     if origin is Annotated:
@@ -133,15 +134,15 @@ def check_units(value: Any, type_: Any, path: Path, key: str = "", owner: Any = 
                 return
         check_units(value, inner, path, key, owner)
     elif origin in (Union, UnionType):
-        for one in get_args(type_):
-            if _fits(value, one):
-                check_units(value, one, path, key, owner)
+        for member in get_args(type_):
+            if _fits(value, member):
+                check_units(value, member, path, key, owner)
                 return
     elif isinstance(value, dict):
         hints = _hints(type_)
-        named = get_args(type_)[1] if origin is dict else Any
+        value_type = get_args(type_)[1] if origin is dict else Any
         for name, item in value.items():
-            inner = hints.get(name, named)
+            inner = hints.get(name, value_type)
             check_units(item, inner, path, f"{key}.{name}" if key else str(name), value)
     elif isinstance(value, list) and origin in (list, tuple):
         types = get_args(type_)
@@ -151,12 +152,12 @@ def check_units(value: Any, type_: Any, path: Path, key: str = "", owner: Any = 
 
 
 def _hints(type_: Any) -> dict[str, Any]:
-    structure = isinstance(type_, type) and issubclass(type_, msgspec.Struct)
-    return get_type_hints(type_, include_extras=True) if structure else {}
+    is_struct = isinstance(type_, type) and issubclass(type_, msgspec.Struct)
+    return get_type_hints(type_, include_extras=True) if is_struct else {}
 
 
 def _fits(value: Any, type_: Any) -> bool:
-    """Whether a member of a union is meant, of a value that fits one of them."""
+    """Return True if a value fits one type of a union."""
     try:
         msgspec.convert(to_si(value), type_)
     except msgspec.ValidationError:
@@ -165,23 +166,23 @@ def _fits(value: Any, type_: Any) -> bool:
 
 
 def _check_unit(value: Any, allowed: Dimension, path: Path, key: str, owner: Any) -> None:
-    found = quantity(value)
-    if found is None or not found[1]:
+    parsed = quantity(value)
+    if parsed is None or not parsed[1]:
         return
     words = str(allowed).split()
     if words[:1] == ["joint"]:
         words = [f"{unit}{''.join(words[1:])}" for unit in _joint_units(owner)]
-    if DIMENSIONS.get(found[1], found[1]) not in words:
+    if SI_UNITS.get(parsed[1], parsed[1]) not in words:
         expected = " or ".join(words) or "a number without a unit"
         raise DescriptionError(f"{path}: {key}: found {value!r}, expected {expected}")
 
 
 def _joint_units(owner: Any) -> tuple[str, ...]:
-    """The units of a joint or an actuator as it is described; both if that does not say."""
-    described = owner if isinstance(owner, dict) else {}
-    if "type" in described or "axis" in described:
-        return ("m",) if described.get("type") == "prismatic" else ("rad",)
-    unit = described.get("unit")
+    """Return the units of a described joint or actuator; both if the description leaves it open."""
+    entry = owner if isinstance(owner, dict) else {}
+    if "type" in entry or "axis" in entry:
+        return ("m",) if entry.get("type") == "prismatic" else ("rad",)
+    unit = entry.get("unit")
     return (unit,) if unit in ("rad", "m") else ("rad", "m")
 
 
@@ -195,14 +196,14 @@ ABOVE_ZERO = rf"(?=[^eE]*[1-9]){NOT_BELOW_ZERO}"
 
 NO_BOUND = msgspec.Meta()
 
-PLAIN = {int: "integer", bool: "boolean"}
-"""JSON's names of types."""
+JSON_TYPES = {int: "integer", bool: "boolean"}
+"""JSON Schema type by Python type."""
 
 TEXT = {
     "type": "string",
     "not": {"pattern": rf"^\s*{NUMBER}\s*({'|'.join(filter(None, UNITS))})?\s*$"},
 }
-"""What reads as a number with a unit is a number, wherever it stands."""
+"""Schema of text: text that reads as a number with a unit is a number."""
 
 QUANTITIES = {
     "": "pure number",
@@ -213,27 +214,27 @@ QUANTITIES = {
     "joint": "position",
     "joint /s": "velocity",
 }
-"""What a dimension is called."""
+"""Name of each dimension."""
 
 
 def json_schema(type_: Any, title: str) -> dict[str, Any]:
-    """The schema of a file of a type.
+    """Return the JSON Schema of a file type.
 
     Args:
-        type_: Of the file.
-        title: What the file is.
+        type_: Type of the file.
+        title: Description of the file.
     """
     definitions: dict[str, Any] = {}
     root = _schema(type_, definitions)
-    whole = root if "$ref" not in root else {"allOf": [root]}
-    return {"$schema": DRAFT, "title": title, **whole, "definitions": definitions}
+    schema = root if "$ref" not in root else {"allOf": [root]}
+    return {"$schema": DRAFT, "title": title, **schema, "definitions": definitions}
 
 
 def key_texts(struct: type[Any]) -> dict[str, str]:
-    """What the docstrings of a struct and of those it is made from say of each key."""
+    """Return the description of each key from the docstrings of a struct and its base classes."""
     texts: dict[str, str] = {}
-    for one in reversed(struct.__mro__):
-        section = (inspect.cleandoc(one.__doc__ or "")).partition("Attributes:\n")[2]
+    for base in reversed(struct.__mro__):
+        section = (inspect.cleandoc(base.__doc__ or "")).partition("Attributes:\n")[2]
         for entry in re.split(r"\n    (?=\S)", "\n" + section.split("\n\n")[0]):
             name, colon, text = entry.strip().partition(":")
             if colon:
@@ -244,55 +245,61 @@ def key_texts(struct: type[Any]) -> dict[str, str]:
 def _schema(type_: Any, definitions: dict[str, Any]) -> dict[str, Any]:
     origin, args = get_origin(type_), get_args(type_)
     if origin is Annotated:
-        mark = next((one for one in args[1:] if isinstance(one, Dimension)), None)
-        bound = next((one for one in args[1:] if isinstance(one, msgspec.Meta)), None)
+        mark = next((arg for arg in args[1:] if isinstance(arg, Dimension)), None)
+        bound = next((arg for arg in args[1:] if isinstance(arg, msgspec.Meta)), None)
         return _quantity(mark, definitions, bound or msgspec.Meta())
     if type_ is float:
         return _quantity(None, definitions)
     if origin in (Union, UnionType):
-        some = [_schema(one, definitions) for one in args if one is not NoneType]
-        some += [{"type": "null"}] if NoneType in args else []
-        return {"anyOf": some}
+        members = [_schema(arg, definitions) for arg in args if arg is not NoneType]
+        members += [{"type": "null"}] if NoneType in args else []
+        return {"anyOf": members}
     if origin is dict:
         return {"type": "object", "additionalProperties": _schema(args[1], definitions)}
     if origin is list or (origin is tuple and args[-1] is Ellipsis):
         return {"type": "array", "items": _schema(args[0], definitions)}
     if origin is tuple:
-        items: Any = [_schema(one, definitions) for one in args]
-        items = items[0] if all(one == items[0] for one in items) else items
+        items: Any = [_schema(arg, definitions) for arg in args]
+        items = items[0] if all(item == items[0] for item in items) else items
         return {"type": "array", "items": items, "minItems": len(args), "maxItems": len(args)}
     if isinstance(type_, type) and issubclass(type_, msgspec.Struct):
         return _reference(type_, definitions)
     if type_ is str:
         definitions.setdefault("text", TEXT)
         return {"$ref": "#/definitions/text"}
-    return {"type": PLAIN[type_]}
+    return {"type": JSON_TYPES[type_]}
 
 
 def _quantity(
     mark: Dimension | None, definitions: dict[str, Any], bound: msgspec.Meta = NO_BOUND
 ) -> dict[str, Any]:
-    """A reference to a number that may have a unit behind; any unit, if nothing is declared."""
+    """Return a reference to the schema of a number with an optional unit.
+
+    Args:
+        mark: Dimension; None for any unit.
+        definitions: Definitions of the schema, to which the number is added.
+        bound: Lower bound.
+    """
     name = "number" if mark is None else QUANTITIES[mark]
-    limit, before = {}, NUMBER
+    minimum, number = {}, NUMBER
     if bound.gt is not None:
-        name, limit, before = f"{name} above zero", {"exclusiveMinimum": 0}, ABOVE_ZERO
+        name, minimum, number = f"{name} above zero", {"exclusiveMinimum": 0}, ABOVE_ZERO
     elif bound.ge is not None:
-        name, limit, before = f"{name} not below zero", {"minimum": 0}, NOT_BELOW_ZERO
+        name, minimum, number = f"{name} not below zero", {"minimum": 0}, NOT_BELOW_ZERO
     if name not in definitions:
         words = str(mark or "").replace("joint", "rad m").split()
         words = [f"{word}/s" for word in words[:-1]] if words[-1:] == ["/s"] else words
-        fits = [unit for unit in UNITS if unit and DIMENSIONS.get(unit, unit) in words]
-        units = [unit for unit in UNITS if unit] if mark is None else fits
-        behind = rf"\s*({'|'.join(units)})?" if units else ""
-        text = {"type": "string", "pattern": rf"^\s*{before}{behind}\s*$"}
-        said = f"A number, or one with its unit: {', '.join(units)}." if units else "A number."
-        definitions[name] = {"description": said, "anyOf": [{"type": "number"} | limit, text]}
+        matching = [unit for unit in UNITS if unit and SI_UNITS.get(unit, unit) in words]
+        units = [unit for unit in UNITS if unit] if mark is None else matching
+        suffix = rf"\s*({'|'.join(units)})?" if units else ""
+        text = {"type": "string", "pattern": rf"^\s*{number}{suffix}\s*$"}
+        summary = f"A number, or one with its unit: {', '.join(units)}." if units else "A number."
+        definitions[name] = {"description": summary, "anyOf": [{"type": "number"} | minimum, text]}
     return {"$ref": f"#/definitions/{name}"}
 
 
 def _reference(struct: type[msgspec.Struct], definitions: dict[str, Any]) -> dict[str, Any]:
-    """A reference to a struct's schema, which is made when it is first met."""
+    """Return a reference to the schema of a struct, which is built at the first use."""
     name = f"{struct.__module__.rpartition('.')[2]}.{struct.__name__}"
     if name not in definitions:
         definitions[name] = {}
@@ -314,7 +321,7 @@ def _object(struct: type[msgspec.Struct], definitions: dict[str, Any]) -> dict[s
             required.append(field.encode_name)
         elif field.default is not msgspec.NODEFAULT and field.default is not None:
             entry = entry | {"default": msgspec.to_builtins(field.default)}
-        if reference := entry.pop("$ref", None):  # what stands beside a reference is not read
+        if reference := entry.pop("$ref", None):  # draft 7 ignores keys next to $ref
             entry = {"allOf": [{"$ref": reference}], **entry}
         text = texts.get(field.name, "")
         properties[field.encode_name] = ({"description": text} if text else {}) | entry

@@ -1,8 +1,7 @@
-"""Files that are there whole or not at all.
+"""Atomic writes, removal of stale temporary files, JSON values, and writing in the background.
 
-What killed processes left behind is told by the number of a process in its name and by its age.
-
-What takes long to write is written in the background, in order, while the next is made.
+Names of temporary files contain the id of the process, so that files of killed processes can be
+recognised and removed.
 """
 
 from __future__ import annotations
@@ -28,22 +27,23 @@ HOUR, DAY = 3600.0, 86400.0
 
 
 def remove_stale(folder: Path, pattern: str, word: int | None = None) -> None:
-    """Remove files and folders that a process made and cannot have use for any more.
+    """Remove temporary files and folders of processes that have ended.
 
-    That is so if the process is gone and nothing was written for an hour: it could run on another
-    machine that shares the folder, so its number alone does not count. Without a number it takes
-    a day. What cannot be removed stays.
+    A file is stale if its process is gone and nothing was written for an hour: the process could
+    run on another machine that shares the folder, so its id alone is not enough. A file without a
+    process id is stale after a day. Files that cannot be removed stay.
 
     Args:
-        folder: Where to look.
-        pattern: Names (`Path.glob`).
-        word: Which word of the name, parted by "-" and ".", is the number of the process.
+        folder: Folder to search.
+        pattern: Pattern of the names (`Path.glob`).
+        word: Index of the word of the name, separated by "-" and ".", that is the process id; None
+            for names without one.
     """
     for path in folder.glob(pattern):
         with contextlib.suppress(OSError, IndexError):
             number = "" if word is None else path.name.replace(".", "-").split("-")[word]
             patience = HOUR if number.isdigit() else DAY
-            if (number.isdigit() and _alive(int(number))) or _age(path) < patience:
+            if (number.isdigit() and _is_alive(int(number))) or _age(path) < patience:
                 continue
             if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path, ignore_errors=True)
@@ -52,13 +52,13 @@ def remove_stale(folder: Path, pattern: str, word: int | None = None) -> None:
 
 
 def _age(path: Path) -> float:
-    """Seconds since something in it was last written."""
-    inside = path.iterdir() if path.is_dir() and not path.is_symlink() else ()
-    return time.time() - max(item.lstat().st_mtime for item in (path, *inside))
+    """Return the time since the last write to a file or folder [s]."""
+    entries = path.iterdir() if path.is_dir() and not path.is_symlink() else ()
+    return time.time() - max(item.lstat().st_mtime for item in (path, *entries))
 
 
-def _alive(process: int) -> bool:
-    """Whether a process of that number runs here; so it is said where that cannot be found out."""
+def _is_alive(process: int) -> bool:
+    """Return False if no process with this id runs on this machine; True if that is unknown."""
     if os.name != "posix":
         return True
     try:
@@ -71,52 +71,53 @@ def _alive(process: int) -> bool:
 
 
 def resolve_links(path: Path) -> Path:
-    """Where a file really stands, links followed."""
+    """Return the path of a file with symbolic links resolved."""
     return Path(os.path.realpath(path))
 
 
 def temporary_path(target: Path) -> Path:
-    """A hidden neighbour of the same suffix, to be written before it is put in place."""
+    """Return a hidden path in the same folder and with the same suffix."""
     return target.with_name(f".{target.stem}.{secrets.token_hex(4)}.part{target.suffix}")
 
 
 @contextlib.contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """Gives a path to write to, and puts what was written in its place once it is complete.
+    """Yield a temporary path, and move the file from there to `path` once it is complete.
 
-    An error of the package about what is written meanwhile names the path that was asked for.
+    Errors of the package in the block name `path` instead of the temporary path.
 
     Raises:
-        OSError: It cannot be written; nothing is left behind, and what stood there stays.
+        OSError: The file cannot be written; an existing file stays unchanged and no temporary file
+            remains.
     """
     target = resolve_links(path)
-    part = temporary_path(target)
+    temporary = temporary_path(target)
     remove_stale(target.parent, f".{glob.escape(target.stem)}.*.part{glob.escape(target.suffix)}")
     try:
-        yield part
-        part.replace(target)
+        yield temporary
+        temporary.replace(target)
     except CasadiIKError as error:
-        error.args = tuple(str(one).replace(str(part), str(path)) for one in error.args)
+        error.args = tuple(str(arg).replace(str(temporary), str(path)) for arg in error.args)
         raise
     finally:
         with contextlib.suppress(OSError):
-            part.unlink()
+            temporary.unlink()
 
 
 def to_json(value: Any, infinite: Callable[[float], Any] = str) -> Any:
-    """A value as standard JSON holds it: arrays as lists, enums by name, records by their fields.
+    """Return a value as JSON types: arrays as lists, enums by name, records as mappings.
 
     Args:
-        value: The value; of records what `repr` shows of them.
-        infinite: What stands for NaN and infinity.
+        value: The value; of records, the fields that `repr` shows.
+        infinite: Function that converts NaN and infinity.
     """
     if isinstance(value, Enum):
         return value.name
     if is_dataclass(value):
-        value = {one.name: getattr(value, one.name) for one in fields(value) if one.repr}
+        value = {field.name: getattr(value, field.name) for field in fields(value) if field.repr}
     if isinstance(value, Mapping):
         return {str(key): to_json(item, infinite) for key, item in value.items()}
-    if hasattr(value, "tolist"):  # of numpy, which is not imported to say what the program can do
+    if hasattr(value, "tolist"):  # a NumPy value; importing NumPy would slow down `--help`
         value = value.tolist()
     if isinstance(value, list | tuple | set | frozenset):
         return [to_json(item, infinite) for item in value]
@@ -126,11 +127,11 @@ def to_json(value: Any, infinite: Callable[[float], Any] = str) -> Any:
 
 
 class BackgroundWriter:
-    """One thread that does jobs in their order, at most one behind.
+    """A thread that runs jobs in order, at most one of them pending.
 
-    To check, compress and write a log takes as long as to solve what it holds; all of it runs in
-    compiled code that holds no lock of the interpreter. The thread is made with the second job, so
-    that a single solve, or a log of one chunk, does without.
+    Checking, compressing and writing a log takes as long as solving, and runs in compiled code that
+    releases the interpreter's lock. The first job runs in the calling thread, so that a single
+    solve, or a log of one chunk, needs no thread.
     """
 
     def __init__(self) -> None:
@@ -139,7 +140,7 @@ class BackgroundWriter:
         self._pending: Future[None] | None = None
 
     def do(self, job: Callable[[], None]) -> None:
-        """Have a job done; raises what the one before has raised."""
+        """Run a job in the background; raises the error of the previous job."""
         if self._first:
             self._first = False
             job()
@@ -150,7 +151,7 @@ class BackgroundWriter:
         self._pending = self._pool.submit(job)
 
     def wait(self) -> None:
-        """Wait until nothing is left to do; raises what the last job has raised."""
+        """Wait for the pending job; raises its error."""
         pending, self._pending = self._pending, None
         if pending is not None:
             pending.result()
@@ -164,7 +165,7 @@ class BackgroundWriter:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Wait for the last job; what it raises counts unless something else has been raised."""
+        """Wait for the pending job; raises its error unless the block has raised one."""
         try:
             if error is None:
                 self.wait()
@@ -172,7 +173,7 @@ class BackgroundWriter:
             self.end()
 
     def end(self) -> None:
-        """Wait for the last job, whatever becomes of it, and end the thread."""
+        """Wait for the pending job, ignore its error, and end the thread."""
         self._pending = None
         if self._pool is not None:
             self._pool.shutdown()

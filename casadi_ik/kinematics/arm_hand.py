@@ -94,7 +94,7 @@ class ArmHand(ReprMixin):
             >>> ik.load_robot("g1+dex3").side("left").actuators[:2]
             ('waist_yaw_joint', 'waist_roll_joint')
         """
-        return type(self)(self.description.side(name, carried=True))
+        return type(self)(self.description.side(name, with_trunk=True))
 
     @property
     def lower(self) -> Array:
@@ -333,7 +333,7 @@ class ArmHand(ReprMixin):
         if side is None and len(self.sides) == 1:
             (side,) = self.sides
         if side is not None:
-            selected = self.description.side_named(side)
+            selected = self.description.get_side(side)
             return self.links(q)[selected.palm_link] @ selected.palm_placement
         if self.sides:
             raise InputError(f"side: found None, expected one of {', '.join(self.sides)}")

@@ -549,11 +549,13 @@ def group_by_kinds(
         Kinds, rows (a full slice if there is one group) and the targets in these rows.
     """
     f = targets.points.shape[1]
-    if not targets.more:
+    if not targets.extra_vectors:
         yield point_normal_kinds(f), slice(None), targets
         return
-    names = list(targets.more)
-    has_vector = np.stack([~np.isnan(targets.more[name][..., 0]) for name in names], axis=2)
+    names = list(targets.extra_vectors)
+    has_vector = np.stack(
+        [~np.isnan(targets.extra_vectors[name][..., 0]) for name in names], axis=2
+    )
     if "tangents" in names:
         has_tangent = has_vector[..., names.index("tangents")]
         has_tangent[:] = has_tangent.any(axis=1, keepdims=True)
@@ -573,8 +575,8 @@ def group_by_kinds(
             yield kinds, slice(None), targets
             return
         rows = np.flatnonzero(group == i)
-        row_numbers = np.array([targets.number(row) for row in rows.tolist()])
-        yield kinds, rows, replace(targets.rows(rows), picked=row_numbers)
+        row_numbers = np.array([targets.row_number(row) for row in rows.tolist()])
+        yield kinds, rows, replace(targets.rows(rows), row_numbers=row_numbers)
 
 
 def target_fields(robot: RobotDescription) -> tuple[Field, ...]:

@@ -102,7 +102,7 @@ class RobotKernels:
         description = self._robot
         both = ca.vertcat(q, joint_positions(description, q))
         # As the file has them: bounds that were derived from these are not judged by themselves.
-        strokes = description.strokes
+        strokes = description.actuator_limits
         names = np.array(description.actuator_names)[description.continuous]
         motors, joints = (
             np.isin(all_names, names)

@@ -184,7 +184,7 @@ def solve_rows(block: SolveBlock, events: NDArray[np.int64], form: TraceFormat) 
     rows["phase_iterations"] = np.stack(list(batch.phases.values()), axis=1)
     rows["events"] = events
     rows["target_points"], rows["target_normals"] = targets.points, targets.normals
-    for name, vectors in targets.more.items():
+    for name, vectors in targets.extra_vectors.items():
         rows[f"target_{name}"] = vectors
     rows["start"] = block.starts
     if targets.fixed is not None:

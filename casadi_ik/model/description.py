@@ -1,4 +1,4 @@
-"""The description of an arm-hand: frozen data, checked once, numpy only."""
+"""The description of a robot: frozen data, validated once, in NumPy only."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ class Finger:
         name: Unique name.
         link: Link that carries the contact frame.
         placement: (4, 4) pose of the contact frame in that link.
-        normal: (3,) outward pad normal, unit, in the contact frame.
+        normal: (3,) outward unit pad normal, in the contact frame.
         joints: Names of the movable joints from the palm to the contact, in order.
-        tangent: (3,) second axis of the pad, unit, in the contact frame and orthogonal to the
-            normal: what a contact's tangent turns about the normal. If the description names
-            none, the contact frame's x axis made orthogonal to the normal.
-        radius: Of the pad, a ball that touches with any point of it [m]; 0: a plane.
+        tangent: (3,) unit second axis of the pad, in the contact frame and orthogonal to the
+            normal; a contact's tangent fixes the rotation of this axis about the normal. Default:
+            the contact frame's x axis, made orthogonal to the normal.
+        radius: Radius of a ball-shaped pad, which touches with any point [m]; 0 for a plane.
     """
 
     name: str
@@ -49,14 +49,14 @@ class Finger:
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """An arm with a hand of a robot that has several, or that stands on a trunk.
+    """One arm-hand of a multi-arm robot.
 
     Attributes:
         name: Unique name ("left").
-        palm_link: Link that its palm frame sits on.
+        palm_link: Link that carries the palm frame.
         palm_placement: (4, 4) pose of the palm frame in that link.
-        named_thumb: Name of its finger placed first; None if the description names none.
-        fingers: Names of its fingers.
+        named_thumb: Name of the finger placed first; None if the description names none.
+        fingers: Names of the fingers.
         arm: Names of the motors between the trunk and the palm.
         hand: Names of the motors beyond the palm.
     """
@@ -72,27 +72,27 @@ class Side:
 
 @dataclass(frozen=True, eq=False)
 class RobotDescription:
-    """An arm-hand, a hand alone on a fixed base, or a body: arm-hands on a common trunk.
+    """An arm-hand, a hand on a fixed base, or a multi-arm robot: arm-hands on a common trunk.
 
-    A body is one tree like any other robot, without a palm of its own: that is its root. `sides`
-    and `trunk` say which motors are whose.
+    A multi-arm robot is a single tree. It has no palm; `palm_link` is its root. `sides` and `trunk`
+    assign its motors.
 
     Attributes:
         name: Name of the description.
-        root: The base link; contacts and normals are expressed in its frame.
-        joints: All joints, parents before children, fixed ones included.
-        actuators: The motors in the fixed order of q.
-        fingers: The fingers, in the order of `contacts`.
+        root: Base link; contacts and normals are expressed in its frame.
+        joints: All joints, parents before children, including fixed ones.
+        actuators: Motors in the order of q.
+        fingers: Fingers in the order of `contacts`.
         named_thumb: Name of the finger placed first; None if the description names none.
-        palm_link: Link the palm frame sits on.
+        palm_link: Link that carries the palm frame.
         palm_placement: (4, 4) pose of the palm frame in that link.
         home: (n,) home position of the actuators.
-        sources: Where the numbers come from, by tag.
-        shapes: Of its links, for collisions; none where they are not described.
-        path: The file that it was read from; None: its parts are shipped.
-        sides: Of a body, its arm-hands; none of an arm-hand or a hand.
-        trunk: Of a body, the motors that move every palm: a waist, a lift, a mobile base.
-        trunk_link: Of a body, the link that the sides stand on; the root if it has no trunk motors.
+        sources: Sources of the numbers by tag.
+        shapes: Collision shapes of the links.
+        path: File of the description; None for a combination of shipped parts.
+        sides: Arm-hands of a multi-arm robot; empty otherwise.
+        trunk: Motors of a multi-arm robot that move every palm: a waist, a lift, a mobile base.
+        trunk_link: Link of a multi-arm robot that carries the sides; the root without trunk motors.
     """
 
     name: str
@@ -116,39 +116,40 @@ class RobotDescription:
         """Name of the finger placed first.
 
         Raises:
-            UnsupportedError: The description names none, or it is a body, which has one by side.
+            UnsupportedError: The description names none, or the robot has several sides with a
+                thumb each.
         """
-        self.one_hand("thumb")
+        self.require_single_hand("thumb")
         if self.named_thumb is None:
             raise UnsupportedError(
-                f"robot {self.name!r} names no thumb, which is needed here; write 'thumb: FINGER' "
-                f"in its description, one of {', '.join(self.finger_names)}"
+                f"robot {self.name!r} names no thumb, which this feature needs; write "
+                f"'thumb: FINGER' in its description, one of {', '.join(self.finger_names)}"
             )
         return self.named_thumb
 
-    def one_hand(self, what: str) -> None:
-        """See to it that this is no body, for what can do one arm with one hand alone.
+    def require_single_hand(self, feature: str) -> None:
+        """Check that this is not a multi-arm robot.
 
         Args:
-            what: What needs it, for the message.
+            feature: Feature that needs a single hand, for the message.
 
         Raises:
-            UnsupportedError: It is one.
+            UnsupportedError: It is a multi-arm robot.
         """
         if self.sides:
             sides = ", ".join(side.name for side in self.sides)
             raise UnsupportedError(
-                f"{what} is for one arm with one hand, found {self.name!r}, a body ({sides}); take "
-                f"robot.side({self.sides[0].name!r})"
+                f"{feature} is for one arm with one hand, found {self.name!r}, a multi-arm robot "
+                f"({sides}); use robot.side({self.sides[0].name!r})"
             )
 
     def __getstate__(self) -> dict[str, Any]:
-        """Its fields alone: what was worked out of them so far is no part of what it is."""
+        """Return the fields without cached properties."""
         return {item.name: getattr(self, item.name) for item in fields(self)}
 
     @cached_property
     def movable(self) -> tuple[Joint, ...]:
-        """The joints that move, in order: the entries of theta."""
+        """Movable joints in order: the entries of theta."""
         return tuple(joint for joint in self.joints if joint.type != "fixed")
 
     @cached_property
@@ -168,82 +169,83 @@ class RobotDescription:
 
     @cached_property
     def lower(self) -> Array:
-        """(n,) lower limits of the actuators, which keep all joints within theirs as well."""
+        """Lower limits (n,) of the actuators, which imply those of all joints."""
         return self._ranges[0]
 
     @cached_property
     def upper(self) -> Array:
-        """(n,) upper limits of the actuators, which keep all joints within theirs as well."""
+        """Upper limits (n,) of the actuators, which imply those of all joints."""
         return self._ranges[1]
 
     @cached_property
     def _ranges(self) -> tuple[Array, Array]:
-        found = motor_ranges(self.movable, self.actuators, self.home, f"robot {self.name!r}")
-        return read_only(found[0]), read_only(found[1])
+        where = f"robot {self.name!r}"
+        lower, upper = motor_ranges(self.movable, self.actuators, self.home, where)
+        return read_only(lower), read_only(upper)
 
     @cached_property
-    def strokes(self) -> tuple[Array, Array]:
-        """(n,) what the actuators could do by themselves, whatever their joints' limits say."""
+    def actuator_limits(self) -> tuple[Array, Array]:
+        """Lower and upper limits (n,) of the actuators alone, regardless of joint limits."""
         lower = [actuator.lower for actuator in self.actuators]
         return read_only(lower), read_only([actuator.upper for actuator in self.actuators])
 
     @cached_property
-    def mechanical(self) -> tuple[Array, Array]:
-        """(n,) ends that the mechanisms set by themselves: where a slider's triangle is flat.
+    def mechanical_limits(self) -> tuple[Array, Array]:
+        """Limits (n,) due to mechanisms: positions at which a slider's triangle is flat.
 
-        Infinite for all other actuators.
+        They are infinite for all other actuators.
         """
         lower = dict.fromkeys(self.actuator_names, -np.inf)
         upper = dict.fromkeys(self.actuator_names, np.inf)
         for joint in self.movable:
             coupling = joint.coupling
             if coupling is not None and coupling.of in lower:
-                least, most = coupling.stroke
-                lower[coupling.of] = max(lower[coupling.of], least)
-                upper[coupling.of] = min(upper[coupling.of], most)
+                start, end = coupling.stroke
+                lower[coupling.of] = max(lower[coupling.of], start)
+                upper[coupling.of] = min(upper[coupling.of], end)
         return read_only(list(lower.values())), read_only(list(upper.values()))
 
     @cached_property
     def _independent_turns(self) -> NDArray[np.bool_]:
         """(n,) True for motors that move one revolute joint, by their own angle."""
-        moved: dict[int, list[Joint]] = {i: [] for i in range(len(self.actuators))}
+        joints_of: dict[int, list[Joint]] = {i: [] for i in range(len(self.actuators))}
         for joint in self.movable:
-            for motor in self.driving([joint.name]):
-                moved[motor].append(joint)
+            for motor in self.driving_actuators([joint.name]):
+                joints_of[motor].append(joint)
         return np.array(
             [
                 len(joints) == 1 and joints[0].type == "revolute" and joints[0].coupling is None
-                for joints in moved.values()
+                for joints in joints_of.values()
             ],
             dtype=bool,
         )
 
     @cached_property
     def continuous(self) -> NDArray[np.bool_]:
-        """(n,) True for motors without limits, whose `lower` and `upper` are the search range."""
+        """Mask (n,) of motors without limits, whose `lower` and `upper` are the search range."""
         unlimited = np.array([actuator.continuous for actuator in self.actuators], dtype=bool)
         return self._independent_turns & unlimited
 
     @cached_property
-    def turning(self) -> tuple[int, ...]:
-        """Positions in q of the motors that may take the same pose in several turns."""
+    def multi_turn(self) -> tuple[int, ...]:
+        """Indices in q of the motors that can reach the same pose in several turns."""
         wide = self.continuous | (self.upper - self.lower >= 2 * np.pi)
         return tuple(np.flatnonzero(self._independent_turns & wide).tolist())
 
     @cached_property
-    def stops(self) -> tuple[Array, Array]:
-        """(n,) limits of motions; ±`CONTINUOUS_LIMIT` for continuous motors."""
+    def motion_limits(self) -> tuple[Array, Array]:
+        """Lower and upper limits (n,) of motions; ±`CONTINUOUS_LIMIT` for continuous motors."""
         lower = np.where(self.continuous, -CONTINUOUS_LIMIT, self.lower)
         return read_only(lower), read_only(np.where(self.continuous, CONTINUOUS_LIMIT, self.upper))
 
     @cached_property
     def joint_lower(self) -> Array:
-        """(m,) lower limits of the movable joints."""
+        """Lower limits (m,) of the movable joints."""
         return read_only([joint.lower for joint in self.movable])
 
     @cached_property
     def joint_upper(self) -> Array:
-        """(m,) upper limits of the movable joints."""
+        """Upper limits (m,) of the movable joints."""
         return read_only([joint.upper for joint in self.movable])
 
     @cached_property
@@ -252,10 +254,10 @@ class RobotDescription:
         return links_of(self)
 
     def finger(self, name: str) -> Finger:
-        """The finger of that name.
+        """Return the finger of a name.
 
         Raises:
-            UnknownNameError: There is none; the message lists the fingers.
+            UnknownNameError: The finger does not exist; the message lists the fingers.
         """
         for finger in self.fingers:
             if finger.name == name:
@@ -266,10 +268,10 @@ class RobotDescription:
         )
 
     def actuator_index(self, name: str) -> int:
-        """Position of an actuator in q.
+        """Return the index of an actuator in q.
 
         Raises:
-            UnknownNameError: There is none; the message lists the actuators.
+            UnknownNameError: The actuator does not exist; the message lists the actuators.
         """
         try:
             return self.actuator_names.index(name)
@@ -280,10 +282,10 @@ class RobotDescription:
             ) from None
 
     def chain(self, link: str) -> tuple[Joint, ...]:
-        """The joints from the root to a link, in order, fixed ones included.
+        """Return the joints from the root to a link, in order, including fixed ones.
 
         Raises:
-            UnknownNameError: There is no such link.
+            UnknownNameError: The link does not exist.
         """
         if link not in self.links:
             raise UnknownNameError(f"robot {self.name!r} has no link {link!r}")
@@ -291,32 +293,32 @@ class RobotDescription:
 
     @cached_property
     def arm_actuators(self) -> tuple[int, ...]:
-        """Positions in q of the arm's actuators (empty for a hand alone, and for a body)."""
+        """Indices in q of the arm's actuators; empty for a hand alone and for a multi-arm robot."""
         if self.sides:
             return ()
         return tuple(i for i, a in enumerate(self.actuators) if a.part == "arm")
 
     @cached_property
     def hand_actuators(self) -> tuple[int, ...]:
-        """Positions in q of the hand's actuators, all but the arm's; of a body all its hands'."""
+        """Indices in q of all actuators but the arm's; of a multi-arm robot, those of all hands."""
         if self.sides:
-            return tuple(place for _, hand in self.side_actuators for place in hand)
+            return tuple(index for _, hand in self.side_actuators for index in hand)
         arm = set(self.arm_actuators)
         return tuple(i for i in range(len(self.actuators)) if i not in arm)
 
     @property
     def as_hand(self) -> RobotDescription:
-        """A body as a hand on a fixed base, whose motors are all motors there are."""
+        """The robot as a hand on a fixed base, to which all motors of a multi-arm robot belong."""
         return replace(self, sides=(), trunk=(), trunk_link="") if self.sides else self
 
     @cached_property
     def trunk_actuators(self) -> tuple[int, ...]:
-        """Positions in q of the motors that move every palm of a body."""
+        """Indices in q of the motors that move every palm of a multi-arm robot."""
         return tuple(self.actuator_index(name) for name in self.trunk)
 
     @cached_property
     def side_actuators(self) -> tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]:
-        """Positions in q of the motors of arm and hand, by side."""
+        """Indices in q of the motors of arm and hand, by side."""
         return tuple(
             (
                 tuple(map(self.actuator_index, side.arm)),
@@ -325,11 +327,11 @@ class RobotDescription:
             for side in self.sides
         )
 
-    def side_named(self, name: str) -> Side:
-        """A side of a body.
+    def get_side(self, name: str) -> Side:
+        """Return a side of a multi-arm robot.
 
         Raises:
-            UnknownNameError: There is none; the message lists the sides.
+            UnknownNameError: The side does not exist; the message lists the sides.
         """
         for side in self.sides:
             if side.name == name:
@@ -337,32 +339,33 @@ class RobotDescription:
         sides = ", ".join(side.name for side in self.sides) or "none"
         raise UnknownNameError(f"robot {self.name!r} has no side {name!r}; its sides: {sides}")
 
-    def side(self, name: str, carried: bool = False) -> RobotDescription:
-        """An arm-hand of a body by itself, as it stands on the link that ends the trunk.
+    def side(self, name: str, with_trunk: bool = False) -> RobotDescription:
+        """Return a side as an arm-hand whose root is the link at the trunk's end.
 
-        Its motors, fingers and links keep their names; q is ordered as in the body.
+        Motors, fingers and links keep their names, and the order of q is preserved.
 
         Args:
-            name: Of the side.
-            carried: Whether the trunk is a part of it, as the first joints of its arm.
+            name: Name of the side.
+            with_trunk: True to include the trunk as the first joints of the arm.
 
         Raises:
-            UnknownNameError: There is none; the message lists the sides.
+            UnknownNameError: The side does not exist; the message lists the sides.
         """
-        found = self.side_named(name)
-        root, arm = self.trunk_link, found.arm
-        if carried:
+        side = self.get_side(name)
+        root, arm = self.trunk_link, side.arm
+        if with_trunk:
             root, arm = self.root, (*self.trunk, *arm)
-        parts = dict.fromkeys(arm, "arm") | dict.fromkeys(found.hand, "hand")
-        places = {i for i, motor in enumerate(self.actuator_names) if motor in parts}
-        others = self.links_moved(set(range(len(self.actuators))) - places)
-        kept = set(self.links_moved(places) - (others if carried else set())) | {found.palm_link}
-        for finger in found.fingers:
-            kept.add(self.finger(finger).link)
-        for link in tuple(kept):
-            kept |= {joint.child for joint in self.chain(link)}
-        kept -= {joint.child for joint in self.chain(root)}
-        to_palm = {joint.name for joint in self.chain(found.palm_link)}
+        parts = dict.fromkeys(arm, "arm") | dict.fromkeys(side.hand, "hand")
+        motors = {i for i, motor in enumerate(self.actuator_names) if motor in parts}
+        moved_by_others = self.links_moved(set(range(len(self.actuators))) - motors)
+        excluded = moved_by_others if with_trunk else set()
+        links = set(self.links_moved(motors) - excluded) | {side.palm_link}
+        for finger in side.fingers:
+            links.add(self.finger(finger).link)
+        for link in tuple(links):
+            links |= {joint.child for joint in self.chain(link)}
+        links -= {joint.child for joint in self.chain(root)}
+        to_palm = {joint.name for joint in self.chain(side.palm_link)}
         return replace(
             self,
             name=f"{self.name}.{name}",
@@ -370,7 +373,7 @@ class RobotDescription:
             joints=tuple(
                 replace(joint, part="arm" if joint.name in to_palm else "hand")
                 for joint in self.joints
-                if joint.child in kept
+                if joint.child in links
             ),
             actuators=tuple(
                 replace(motor, part=parts[motor.name])
@@ -383,59 +386,59 @@ class RobotDescription:
                     joints=tuple(
                         joint.name
                         for joint in self.chain(finger.link)
-                        if joint.type != "fixed" and joint.child in kept
+                        if joint.type != "fixed" and joint.child in links
                         if joint.name not in to_palm
                     ),
                 )
-                for finger in map(self.finger, found.fingers)
+                for finger in map(self.finger, side.fingers)
             ),
-            named_thumb=found.named_thumb,
-            palm_link=found.palm_link,
-            palm_placement=found.palm_placement,
-            home=self.home[sorted(places)],
-            shapes=self.shapes.without(set(self.links) - kept - {root}),
+            named_thumb=side.named_thumb,
+            palm_link=side.palm_link,
+            palm_placement=side.palm_placement,
+            home=self.home[sorted(motors)],
+            shapes=self.shapes.without(set(self.links) - links - {root}),
             sides=(),
             trunk=(),
             trunk_link="",
         )
 
     def finger_actuators(self, name: str) -> tuple[int, ...]:
-        """Positions in q of the actuators that move a finger relative to the palm.
+        """Return the indices in q of the actuators that move a finger relative to the palm.
 
         Raises:
-            UnknownNameError: There is no such finger.
+            UnknownNameError: The finger does not exist.
         """
-        return tuple(sorted(self.driving(self.finger(name).joints)))
+        return tuple(sorted(self.driving_actuators(self.finger(name).joints)))
 
     @cached_property
     def finger_motors(self) -> tuple[str, ...]:
-        """The actuators that move a finger relative to the palm, in the order of q."""
+        """Names of the actuators that move a finger relative to the palm, in the order of q."""
         used = {i for name in self.finger_names for i in self.finger_actuators(name)}
         return tuple(self.actuator_names[i] for i in sorted(used))
 
     @cached_property
     def finger_joints(self) -> tuple[str, ...]:
-        """All movable joints of the fingers, in the order of `joint_names`."""
+        """Names of all movable joints of the fingers, in the order of `joint_names`."""
         used = {name for finger in self.fingers for name in finger.joints}
         return tuple(name for name in self.joint_names if name in used)
 
     def links_moved(self, actuators: Collection[int]) -> frozenset[str]:
-        """Links that one of some actuators (positions in q) moves."""
-        moved: set[str] = set()
+        """Return the links that any of some actuators (indices in q) moves."""
+        links: set[str] = set()
         for link in self.links:
             joints = [joint.name for joint in self.chain(link) if joint.type != "fixed"]
-            if not self.driving(joints).isdisjoint(actuators):
-                moved.add(link)
-        return frozenset(moved)
+            if not self.driving_actuators(joints).isdisjoint(actuators):
+                links.add(link)
+        return frozenset(links)
 
-    def driving(self, joints: Iterable[str]) -> set[int]:
-        """Positions in q of the actuators of some joints."""
+    def driving_actuators(self, joints: Iterable[str]) -> set[int]:
+        """Return the indices in q of the actuators that drive some joints."""
         by_name = {joint.name: joint for joint in self.joints}
-        found: set[int] = set()
+        actuators: set[int] = set()
         for joint_name in joints:
             joint = by_name[joint_name]
             while joint.coupling is not None and joint.coupling.of in by_name:
                 joint = by_name[joint.coupling.of]
             source = joint.name if joint.coupling is None else joint.coupling.of
-            found.add(self.actuator_index(source))
-        return found
+            actuators.add(self.actuator_index(source))
+        return actuators

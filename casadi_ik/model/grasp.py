@@ -1,4 +1,4 @@
-"""Contacts and grasps: where each fingertip must touch and which way it must face."""
+"""Contacts and grasps: target points and orientations of fingertips, or palm poses."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from casadi_ik.model.pose import Free, inverse
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Largest errors at which a contact is reached.
+    """Largest errors of a contact that counts as reached.
 
     Attributes:
         position: Distance of the contact point [m].
         angle: Angle of the pad normal [rad].
 
     Raises:
-        InputError: Not a positive finite number.
+        InputError: A value is not a positive finite number.
 
     Example:
         >>> ik.Tolerance(position=1e-3, angle=np.deg2rad(1)).position
@@ -44,44 +44,44 @@ class Tolerance:
 
 
 UNIT_ROUNDING = 1e-15
-"""A vector whose length is so near to 1 has been normalised before."""
+"""Largest difference from length 1 of a vector that is not normalised again."""
 
 MIN_PLAIN_LENGTH, MAX_PLAIN_LENGTH = 1e-100, 1e100
-"""Between these the squares of a length are neither rounded to zero nor infinite."""
+"""Bounds of lengths whose squares neither underflow nor overflow."""
 
 
 def real_array(value: Any) -> Array:
-    """A new array of real numbers.
+    """Return a new array of real numbers.
 
     Raises:
-        ValueError: Something else: text, complex numbers (whose imaginary part would be lost), or
-            masked ones (whose mask would).
-        TypeError: The same.
+        ValueError: The value is text, complex (its imaginary part would be lost) or masked (its
+            mask would be lost).
+        TypeError: The value cannot be converted.
     """
     if isinstance(value, np.ma.MaskedArray):
-        raise ValueError("a masked array, expected plain numbers (NaN marks what is free)")
+        raise ValueError("is a masked array; expected plain numbers (NaN marks free ones)")
     array = np.array(value)
     if array.dtype.kind == "c":
-        raise ValueError("complex numbers, expected real ones")
+        raise ValueError("is complex; expected real numbers")
     return array if array.dtype == np.float64 else np.array(value, dtype=np.float64)
 
 
 def unit_vectors(vectors: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Directions of any length, from the smallest number to the largest.
+    """Normalise vectors of any length, from the smallest number to the largest.
 
     Args:
         vectors: (..., 3); NaN gives NaN.
 
     Returns:
-        Unit vectors, and (...) which of the vectors are zero (these give NaN). What is of unit
-        length to the last digits stays as it is.
+        Unit vectors, and a mask (...) of vectors that are zero, which give NaN. Vectors of unit
+        length up to rounding are not changed.
     """
     with np.errstate(over="ignore", under="ignore"):
         length = _length(vectors)
-    odd = (length < MIN_PLAIN_LENGTH) | (length > MAX_PLAIN_LENGTH)
-    if odd.any():
-        # By powers of two, which change no digit; in two halves, as one may be out of range.
-        power = np.where(odd, -np.frexp(np.abs(vectors).max(axis=-1))[1], 0)[..., None]
+    is_extreme = (length < MIN_PLAIN_LENGTH) | (length > MAX_PLAIN_LENGTH)
+    if is_extreme.any():
+        # Scaling by a power of two is exact. It is split because the factor may be out of range.
+        power = np.where(is_extreme, -np.frexp(np.abs(vectors).max(axis=-1))[1], 0)[..., None]
         vectors = np.ldexp(np.ldexp(vectors, power // 2), power - power // 2)
         length = _length(vectors)
     length = np.where(np.abs(length - 1) < UNIT_ROUNDING, 1.0, length)
@@ -90,7 +90,7 @@ def unit_vectors(vectors: Array) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def _length(vectors: Array) -> Array:
-    """(...), summed in order: the same bits in an exported solver."""
+    """Return lengths (...); the order of summation is that of an exported solver."""
     squares = vectors * vectors
     return np.sqrt(squares[..., 0] + squares[..., 1] + squares[..., 2])
 
@@ -101,28 +101,28 @@ EXTRA_VECTORS: Mapping[str, str] = {
     "plane": "the contact may be anywhere on the plane through the point with this normal",
     "ball": "the pad's ball touches the point where its outward normal is this one",
 }
-"""What a contact may have beside point and normal, by name; arrays have an s at the end."""
+"""Vectors of a contact besides point and normal, by name; names of arrays add an s."""
 
 POINT_CONSTRAINTS = ("line", "plane", "ball")
-"""Those that say where the point is touched: a contact has one at most."""
+"""Vectors that relax or move the contact point; a contact has at most one of them."""
 
 
 def invalid_reason(vectors: Mapping[str, Array]) -> str | None:
-    """What is wrong with the vectors of one contact: the first line of it, or None.
+    """Return why the vectors of one contact are invalid; None if they are valid.
 
     Args:
-        vectors: By name; "point" [m] and unit vectors, absent if free.
+        vectors: Vectors by name: "point" [m] and unit vectors; free ones are absent.
     """
     for name in EXTRA_VECTORS:
         if name in vectors and "point" not in vectors:
-            return f"{name}: found one without a point, expected both"
-    places = [name for name in POINT_CONSTRAINTS if name in vectors]
-    if len(places) > 1:
-        return f"{' and '.join(places[:2])}: found both, expected one of them"
+            return f"{name}: is given without a point; expected both"
+    constraints = [name for name in POINT_CONSTRAINTS if name in vectors]
+    if len(constraints) > 1:
+        return f"{' and '.join(constraints[:2])}: found both, expected one of them"
     if "tangent" not in vectors:
         return None
     if "normal" not in vectors:
-        return "tangent: found one without a normal, expected both"
+        return "tangent: is given without a normal; expected both"
     cosine = float(vectors["tangent"] @ vectors["normal"])
     if not abs(cosine) <= MAX_SKEW:
         degrees = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
@@ -134,29 +134,29 @@ def invalid_reason(vectors: Mapping[str, Array]) -> str | None:
 
 
 def invalid_mask(vectors: Mapping[str, Array]) -> Bools:
-    """Which contacts `invalid_reason` has something to say about, all at once.
+    """Return a mask of the contacts for which `invalid_reason` returns a reason.
 
     Args:
-        vectors: (..., 3) by name, as there, of all contacts; NaN where free.
+        vectors: (..., 3) arrays by name of all contacts; NaN where free.
     """
-    given = {name: ~np.isnan(array[..., 0]) for name, array in vectors.items()}
-    bad = np.zeros_like(given["point"])
+    present = {name: ~np.isnan(array[..., 0]) for name, array in vectors.items()}
+    invalid = np.zeros_like(present["point"])
     for name in EXTRA_VECTORS:
-        if name in given:
-            bad |= given[name] & ~given["point"]
-    places = [given[name] for name in POINT_CONSTRAINTS if name in given]
-    if places:
-        bad |= np.sum(places, axis=0) > 1
-    if "tangent" in given:
+        if name in present:
+            invalid |= present[name] & ~present["point"]
+    constraints = [present[name] for name in POINT_CONSTRAINTS if name in present]
+    if constraints:
+        invalid |= np.sum(constraints, axis=0) > 1
+    if "tangent" in present:
         cosine = np.einsum("...i,...i->...", vectors["tangent"], vectors["normal"])
-        bad |= given["tangent"] & ~(np.abs(cosine) <= MAX_SKEW)
-    return bad
+        invalid |= present["tangent"] & ~(np.abs(cosine) <= MAX_SKEW)
+    return invalid
 
 
 def orthogonal_tangents(tangent: Array, normal: Array) -> Array:
-    """Tangents (..., 3) without what rounding left of them along the normals, unit."""
-    across = tangent - normal * np.einsum("...i,...i->...", normal, tangent)[..., None]
-    return across / np.sqrt(np.einsum("...i,...i->...", across, across))[..., None]
+    """Return unit tangents (..., 3) with the component along the normals removed."""
+    projected = tangent - normal * np.einsum("...i,...i->...", normal, tangent)[..., None]
+    return projected / np.sqrt(np.einsum("...i,...i->...", projected, projected))[..., None]
 
 
 FREE_VECTOR = np.full(3, np.nan)
@@ -164,34 +164,34 @@ FREE_VECTOR = np.full(3, np.nan)
 
 @dataclass(frozen=True, eq=False)
 class Contact:
-    """Desired contact of one fingertip, in the robot's base frame.
+    """Target contact of one fingertip, in the robot's base frame.
 
     Attributes:
         point: (3,) contact point [m].
         normal: (3,) outward pad normal of the fingertip: it points out of the fingertip, into the
-            object. Any length but zero, stored as a unit vector. None leaves it free.
-        tolerance: When it counts as reached, or None: the solver's tolerance.
-        tangent: (3,) where the second axis of the contact frame must point
-            (`ArmHand.contact_frames`), orthogonal to the normal: with it, the whole pose of the
-            fingertip is given. None leaves the turn about the normal free.
+            object. Any length but zero, stored as a unit vector. None if free.
+        tolerance: Tolerance of this contact; None: the solver's tolerance.
+        tangent: (3,) direction of the second axis of the contact frame (`ArmHand.contact_frames`),
+            orthogonal to the normal, which fixes the pose of the fingertip. None if the rotation
+            about the normal is free.
         line: (3,) direction of a line through the point on which the contact may be anywhere.
         plane: (3,) normal of a plane through the point in which the contact may be anywhere.
-        ball: (3,) outward normal, into the object, that the pad's ball has where it touches the
-            point. The pad may roll over the point unless a normal says which way it faces; where
-            the robot's description has no ball for the pad, it touches with its point.
+        ball: (3,) outward normal, into the object, of the pad's ball where it touches the point.
+            The pad may roll over the point unless a normal is given; a pad without a ball in the
+            robot's description touches with its contact point.
 
-    A contact with a direction alone, wherever the fingertip is, is ``Contact(direction=...)``: its
-    point is NaN and its normal that direction.
+    ``Contact(direction=...)`` is a direction alone, for a fingertip that may be anywhere: its point
+    is NaN and its normal is the direction.
 
     Raises:
-        InputError: A wrong shape, a number that is not finite, a zero direction, a tangent that is
-            not orthogonal to the normal, or a tolerance that is none.
+        InputError: A shape or tolerance is wrong, a number is not finite, a direction is zero, or
+            the tangent is not orthogonal to the normal.
 
     Example:
         >>> contact = ik.Contact([0.5, 0.1, 0.6], normal=[0, -2, 0])
         >>> print(contact.normal)
         [ 0. -1.  0.]
-        >>> sliding = ik.Contact([0.5, 0.1, 0.6], line=[0, 0, 1])  # anywhere on an upright line
+        >>> sliding = ik.Contact([0.5, 0.1, 0.6], line=[0, 0, 1])  # anywhere on a vertical line
     """
 
     point: Array
@@ -219,20 +219,20 @@ class Contact:
         if tolerance is not None:
             warn_of_wide_tolerance(tolerance.position, tolerance.angle)
         object.__setattr__(self, "tolerance", tolerance)
-        given = {"normal": normal, "tangent": tangent, "line": line, "plane": plane, "ball": ball}
+        inputs = {"normal": normal, "tangent": tangent, "line": line, "plane": plane, "ball": ball}
         if direction is not None:
-            others = [
-                name for name, value in {"point": point, **given}.items() if value is not None
+            names = [
+                name for name, value in {"point": point, **inputs}.items() if value is not None
             ]
-            if others:
-                raise InputError(f"direction: found it beside {others[0]}, expected it alone")
+            if names:
+                raise InputError(f"direction: is given together with {names[0]}; expected it alone")
             object.__setattr__(self, "point", read_only(np.full(3, np.nan)))
             object.__setattr__(self, "normal", _unit(direction, "direction"))
             return
         if point is None:
             raise InputError("point: missing, expected three numbers (or a direction alone)")
         vectors = {"point": _vector(point, "point")}
-        vectors |= {name: _unit(v, name) for name, v in given.items() if v is not None}
+        vectors |= {name: _unit(v, name) for name, v in inputs.items() if v is not None}
         problem = invalid_reason(vectors)
         if problem:
             raise InputError(problem)
@@ -244,17 +244,17 @@ class Contact:
             object.__setattr__(self, name, vector)
 
     def at(self: Any, pose: ArrayLike | None = None) -> Contact:
-        """The contact that moves with a frame into the base frame.
+        """Return the contact transformed from a frame into the base frame.
 
-        Of the class, ``Contact.at(pose)`` asks for a fingertip's whole pose: the point is the
-        pose's origin, the normal its first axis, the tangent its second, as
-        `ArmHand.contact_frames` gives them.
+        Called on the class, ``Contact.at(pose)`` is a contact with the whole pose of a fingertip:
+        the point is the pose's origin, the normal its first axis, the tangent its second, as in
+        `ArmHand.contact_frames`.
 
         Args:
-            pose: (4, 4) where the frame is in which this one is given.
+            pose: (4, 4) pose of the frame in which this contact is given.
 
         Raises:
-            InputError: No rigid motion.
+            InputError: The pose is not a rigid motion.
 
         Example:
             >>> pose = np.eye(4)
@@ -267,13 +267,13 @@ class Contact:
         if pose is None or not isinstance(self, Contact):
             return Contact(np.zeros(3), [1, 0, 0], tangent=[0, 1, 0]).at(single_pose(self))
         motion = single_pose(pose)
-        turn = motion[:3, :3]
+        rotation = motion[:3, :3]
         if not np.isfinite(self.point).all():
             assert self.normal is not None
-            return Contact(direction=turn @ self.normal, tolerance=self.tolerance)
+            return Contact(direction=rotation @ self.normal, tolerance=self.tolerance)
         vectors = {name: getattr(self, name) for name in ("normal", *EXTRA_VECTORS)}
-        turned = {name: turn @ vector for name, vector in vectors.items() if vector is not None}
-        return Contact(turn @ self.point + motion[:3, 3], tolerance=self.tolerance, **turned)
+        rotated = {name: rotation @ v for name, v in vectors.items() if v is not None}
+        return Contact(rotation @ self.point + motion[:3, 3], tolerance=self.tolerance, **rotated)
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,23 +281,23 @@ class Grasp:
     """A contact for each finger (omitted fingers are free), or a palm pose and a hand posture.
 
     Attributes:
-        contacts: Contact by finger name; none where a palm is given.
-        robot: Name (or path) of the robot the grasp was made for; "" if not said.
-        name: What it is called, for reports.
-        object: Name of the shipped object it grasps; "" if not said.
-        object_pose: (4, 4) pose of that object in the base frame, or None. A `Free` pose is looked
-            for by `Solver.solve`: the contacts are then in the object's frame.
-        posture: A hand posture by actuator that realises the contacts, where one is known; with a
-            palm the posture to take, a number for every motor that moves a finger [rad or m].
-        palm: (4, 4) pose of the robot's palm frame in the base frame: then the hand is as the
-            posture has it, and only the arm is looked for. Of a body with several sides the poses
-            by side: hands of those that are left out stay. None: the contacts say all.
-        pregrasp: The same hand before it closes, if it is known: a palm and a posture.
-        squeeze: The same hand as it squeezes, if it is known: a palm and a posture.
+        contacts: Contact by finger name; empty for a palm pose.
+        robot: Name (or path) of the robot the grasp was made for; "" if unknown.
+        name: Name of the grasp, for reports.
+        object: Name of the shipped object it grasps; "" if unknown.
+        object_pose: (4, 4) pose of that object in the base frame, or None. `Solver.solve`
+            determines a `Free` pose; contacts are then in the object's frame.
+        posture: Hand posture by actuator that realises the contacts, if known [rad or m]; with a
+            palm, the posture to take, with a number for every motor that moves a finger.
+        palm: (4, 4) pose of the robot's palm frame in the base frame, with which only the arm is
+            solved for; for a multi-arm robot a mapping from side to pose, whose other hands do not
+            move. None: contacts determine the palm.
+        pregrasp: Palm and posture before the hand closes, if known.
+        squeeze: Palm and posture of the squeezing hand, if known.
 
     Raises:
-        InputError: No contact at all, a palm that is no rigid motion, has no posture or has
-            contacts beside it.
+        InputError: There is no contact, or a palm is not a rigid motion, has no posture or is given
+            together with contacts.
 
     Example:
         >>> pinch = ik.Grasp(
@@ -324,9 +324,9 @@ class Grasp:
         if self.palm is not None:
             object.__setattr__(self, "palm", _frozen_palms(self.palm))
             if self.contacts:
-                raise InputError("palm: found it beside contacts, expected one of them")
+                raise InputError("palm: is given together with contacts; expected one of them")
             if not self.posture:
-                raise InputError("posture: missing, expected one for the hand of the palm")
+                raise InputError("posture: missing; expected one for the hand of the palm")
         elif not self.contacts:
             raise InputError("contacts: found none, expected at least one finger, or a palm")
         for finger, contact in self.contacts.items():
@@ -337,26 +337,26 @@ class Grasp:
         object.__setattr__(self, "contacts", MappingProxyType(dict(self.contacts)))
 
     def __reduce__(self) -> tuple[type[Grasp], tuple[Any, ...]]:
-        """Its fields; the mapping that cannot be changed is made anew."""
+        """Return the fields; the read-only mapping is created again."""
         palm = dict(self.palm) if isinstance(self.palm, Mapping) else self.palm
-        held = self.robot, self.name, self.object, self.object_pose, dict(self.posture), palm
-        return type(self), (dict(self.contacts), *held, self.pregrasp, self.squeeze)
+        names = self.robot, self.name, self.object
+        poses = self.object_pose, dict(self.posture), palm
+        return type(self), (dict(self.contacts), *names, *poses, self.pregrasp, self.squeeze)
 
     def at(self, pose: ArrayLike) -> Grasp:
-        """The grasp moved as a whole: given in an object's frame, it is placed with the object.
+        """Return the grasp transformed by a pose, as from an object's frame into the base frame.
 
         ``grasp.at(a).at(b)`` is ``grasp.at(b @ a)``.
 
         Args:
-            pose: (4, 4) where the frame is, in the robot's base frame, in which the contacts are
+            pose: (4, 4) pose, in the robot's base frame, of the frame in which the contacts are
                 given.
 
         Returns:
-            The contacts or the palm, what comes before and after, and the object where there is
-            one, in the base frame.
+            The grasp with contacts or palm, pregrasp, squeeze, and object pose in the base frame.
 
         Raises:
-            InputError: Another shape, a number that is not finite, or no rigid motion.
+            InputError: The pose has another shape, a number that is not finite, or is not rigid.
 
         Example:
             >>> pose = np.eye(4)
@@ -366,43 +366,43 @@ class Grasp:
             [0.   0.   0.01]
         """
         motion = single_pose(pose)
-        place = self.object_pose
-        if isinstance(place, Free):
-            place = motion
-        elif place is not None:
-            place = motion @ place
+        object_pose = self.object_pose
+        if isinstance(object_pose, Free):
+            object_pose = motion
+        elif object_pose is not None:
+            object_pose = motion @ object_pose
         elif self.object:
-            place = motion
+            object_pose = motion
         contacts = {finger: contact.at(motion) for finger, contact in self.contacts.items()}
         palm = self.palm
         if isinstance(palm, Mapping):
-            palm = {side: motion @ one for side, one in palm.items()}
+            palm = {side: motion @ side_pose for side, side_pose in palm.items()}
         elif palm is not None:
             palm = motion @ palm
-        before, after = (one and one.at(motion) for one in (self.pregrasp, self.squeeze))
+        pregrasp, squeeze = (grasp and grasp.at(motion) for grasp in (self.pregrasp, self.squeeze))
         return replace(
             self,
             contacts=contacts,
-            object_pose=place,
+            object_pose=object_pose,
             palm=palm,
-            pregrasp=before,
-            squeeze=after,
+            pregrasp=pregrasp,
+            squeeze=squeeze,
         )
 
     @property
     def known_pose(self) -> Array | None:
-        """(4, 4) where the object is; None: not said, or it is looked for."""
+        """Pose (4, 4) of the object; None if it is unknown or free."""
         return None if isinstance(self.object_pose, Free) else self.object_pose
 
     @property
-    def one_palm(self) -> Array | None:
-        """(4, 4) where the palm of a single arm has to be; None: not said, or said by side."""
+    def single_palm(self) -> Array | None:
+        """Palm pose (4, 4) of a single arm; None without a palm, or with palms by side."""
         return None if isinstance(self.palm, Mapping) else self.palm
 
     def in_object_frame(self) -> Grasp:
-        """The contacts as the object sees them, to be placed by `at`.
+        """Return the grasp in the object's frame, the inverse of `at`.
 
-        A grasp that does not say where its object is counts as given in the object's frame.
+        A grasp without an object pose is taken to be in the object's frame.
 
         Example:
             >>> seen = grasp.in_object_frame()
@@ -413,16 +413,16 @@ class Grasp:
         return self if self.known_pose is None else self.at(inverse(self.known_pose))
 
     def arrays(self, fingers: Sequence[str]) -> tuple[Array, Array]:
-        """Points and normals in the order of the given fingers.
+        """Return points and normals in the order of the fingers.
 
         Args:
             fingers: The robot's fingers.
 
         Returns:
-            points (f, 3) [m] and normals (f, 3); NaN marks what is free.
+            points (f, 3) [m] and normals (f, 3); NaN marks free ones.
 
         Raises:
-            InputError: The grasp has a contact for a finger that is not among them.
+            InputError: The grasp has a contact for an unknown finger.
 
         Example:
             >>> points, normals = grasp.arrays(robot.fingers)
@@ -443,27 +443,27 @@ class Grasp:
         return np.array(points), np.array(normals)
 
     def more(self, fingers: Sequence[str]) -> dict[str, Array]:
-        """What the contacts have beside point and normal.
+        """Return the vectors of the contacts besides point and normal.
 
         Args:
             fingers: The robot's fingers.
 
         Returns:
-            (f, 3) by name ("tangents", "lines", "planes", "balls"), NaN where free; only what any
-            has.
+            (f, 3) arrays by name ("tangents", "lines", "planes", "balls"), NaN where free; arrays
+            that no contact has are omitted.
 
         Example:
-            >>> grasp.more(robot.fingers)  # points and normals are all that it asks for
+            >>> grasp.more(robot.fingers)  # this grasp has points and normals only
             {}
         """
-        found: dict[str, Array] = {}
+        arrays: dict[str, Array] = {}
         for finger, contact in self.contacts.items():
             for name in EXTRA_VECTORS:
                 vector = getattr(contact, name)
                 if vector is not None:
-                    rows = found.setdefault(f"{name}s", np.full((len(fingers), 3), np.nan))
+                    rows = arrays.setdefault(f"{name}s", np.full((len(fingers), 3), np.nan))
                     rows[fingers.index(finger)] = vector
-        return found
+        return arrays
 
 
 def _frozen_palms(palm: Any) -> Array | Mapping[str, Array]:
@@ -471,7 +471,8 @@ def _frozen_palms(palm: Any) -> Array | Mapping[str, Array]:
         return read_only(single_pose(palm, "palm").copy())
     if not palm:
         raise InputError("palm: found no side, expected a pose by side")
-    poses = {side: read_only(single_pose(one, f"palm.{side}").copy()) for side, one in palm.items()}
+    items = palm.items()
+    poses = {side: read_only(single_pose(p, f"palm.{side}").copy()) for side, p in items}
     return MappingProxyType(poses)
 
 
@@ -479,9 +480,8 @@ def _unit(value: Any, name: str) -> Array:
     vector = _vector(value, name)
     x, y, z = vector.tolist()
     length = math.sqrt(x * x + y * y + z * z)
-    if (
-        MIN_PLAIN_LENGTH < length < MAX_PLAIN_LENGTH
-    ):  # `unit_vectors`, whose arrays take long for a single one
+    # Same result as `unit_vectors`, whose arrays are slow for a single vector.
+    if MIN_PLAIN_LENGTH < length < MAX_PLAIN_LENGTH:
         return vector if abs(length - 1) < UNIT_ROUNDING else read_only(vector / length)
     vector, zero = unit_vectors(vector)
     if zero:

@@ -1,4 +1,4 @@
-"""Arms and hands in other people's files, as parts of a robot."""
+"""Arms and hands in URDF and MJCF files as parts of a robot."""
 
 from __future__ import annotations
 
@@ -22,87 +22,89 @@ from casadi_ik.model.urdf_mjcf import read_tree
 from casadi_ik.model.xml_tree import RobotTree, TreeJoint
 
 CONTINUOUS_RANGE = 2 * math.pi
-"""A joint without ends may turn this far to either side [rad]."""
+"""Search range of a joint without limits, to either side of zero [rad]."""
 
-GRID = 257
-"""Positions of a leader at which the range of a follower without limits is looked for."""
+FOLLOWER_GRID = 257
+"""Positions of the leader at which the range of a follower without limits is evaluated."""
 
 Entry = ArmFromFile | HandFromFile
 
 
-def arm_from_file(entry: ArmFromFile, key: str, beside: Path) -> RobotPart:
-    """The chain of joints from root to tip.
+def arm_from_file(entry: ArmFromFile, key: str, description: Path) -> RobotPart:
+    """Return an arm: the chain of joints from root to tip.
 
     Args:
-        entry: What the description says of it.
-        key: Where.
-        beside: The description, whose folder the file's path counts from.
+        entry: Entry of the description.
+        key: Key of the entry.
+        description: File of the description, to which the entry's file is relative.
 
     Raises:
-        DescriptionError: One line that names file, link or joint, and what to write.
-        MissingExtraError: What reads the file's format is not installed.
+        DescriptionError: The message names file, link or joint, and the required change.
+        MissingExtraError: The package that reads the file's format is not installed.
     """
-    tree, where, root = _opened(entry, key, beside)
+    tree, where, root = _open_tree(entry, key, description)
     tip = entry.tip
     if tip is None:
-        last = leaf_links(tree, root)
-        if len(last) != 1:
+        leaves = leaf_links(tree, root)
+        if len(leaves) != 1:
             raise DescriptionError(
-                f"{where}.tip: missing; {tree.path.name} ends in several links, write one of "
-                + ", ".join(last)
+                f"{where}.tip: missing; {tree.path.name} ends in several links; expected one of "
+                + ", ".join(leaves)
             )
-        tip = last[0]
-    tree.known_link(tip, f"{where}.tip: {tree.path.name}")
+        tip = leaves[0]
+    tree.require_link(tip, f"{where}.tip: {tree.path.name}")
     chain = tree.chain(root, tip, f"{where}.tip: {tree.path.name}")
     source = {key: f"{tree.path.name}, links {root} to {tip}"}
     return _part(tree, entry, (chain, ()), LinkFrame(link=tip), source, where)
 
 
 def hand_from_file(
-    entry: HandFromFile, pads: Mapping[str, PadEntry], key: str, beside: Path
+    entry: HandFromFile, pads: Mapping[str, PadEntry], key: str, description: Path
 ) -> RobotPart:
-    """Everything below the palm, and the chain that leads to it.
+    """Return a hand: all joints below the palm, and the chain from the root to the palm.
 
     Args:
-        entry: What the description says of it.
-        pads: Its contact frames by finger.
-        key: Where the entry stands.
-        beside: The description, whose folder the file's path counts from.
+        entry: Entry of the description.
+        pads: Contact frames by finger.
+        key: Key of the entry.
+        description: File of the description, to which the entry's file is relative.
 
     Raises:
-        DescriptionError: One line that names file, link or joint, and what to write.
-        MissingExtraError: What reads the file's format is not installed.
+        DescriptionError: The message names file, link or joint, and the required change.
+        MissingExtraError: The package that reads the file's format is not installed.
     """
-    tree, where, root = _opened(entry, key, beside)
+    tree, where, root = _open_tree(entry, key, description)
     palm = palm_frame(entry.palm or root)
-    tree.known_link(palm.link, f"{where}.palm: {tree.path.name}")
+    tree.require_link(palm.link, f"{where}.palm: {tree.path.name}")
     chain = tree.chain(root, palm.link, f"{where}.palm: {tree.path.name}")
     hand = tuple(joints_below(tree, palm.link))
-    carried = {palm.link, *(joint.child for joint in hand)}
+    hand_links = {palm.link, *(joint.child for joint in hand)}
     for name, pad in pads.items():
-        tree.known_link(pad.link, f"{beside}: fingers.{name}.link: {tree.path.name}")
-        if pad.link not in carried:
+        pad_key = f"{description}: fingers.{name}.link"
+        tree.require_link(pad.link, f"{pad_key}: {tree.path.name}")
+        if pad.link not in hand_links:
             raise DescriptionError(
-                f"{beside}: fingers.{name}.link: {pad.link!r} does not hang on the palm "
-                f"{palm.link!r} of {tree.path.name}; write another link or another palm"
+                f"{pad_key}: {pad.link!r} is not below the palm {palm.link!r} of "
+                f"{tree.path.name}; expected another link or another palm"
             )
     source = {key: f"{tree.path.name}, palm {palm.link}"}
     part = _part(tree, entry, (chain, hand), palm, source, where)
-    return replace(part, where=f"{beside}: ", pads=pads)
+    return replace(part, where=f"{description}: ", pads=pads)
 
 
 def palm_frame(palm: str | LinkFrame) -> LinkFrame:
-    """The frame of a palm, of which the link alone may be said."""
+    """Return the frame of a palm; a link alone gives the link's frame."""
     return palm if isinstance(palm, LinkFrame) else LinkFrame(link=palm)
 
 
-def _opened(entry: Entry, key: str, beside: Path) -> tuple[RobotTree, str, str]:
-    """The file, the description with the key, and the link that the part begins with."""
-    path, where = beside.parent / Path(entry.file).expanduser(), f"{beside}: {key}"
+def _open_tree(entry: Entry, key: str, description: Path) -> tuple[RobotTree, str, str]:
+    """Return the tree of the entry's file, the prefix of messages, and the part's root link."""
+    path, where = description.parent / Path(entry.file).expanduser(), f"{description}: {key}"
     if not path.exists():
         raise DescriptionError(f"{where}.file: {path}: no such file")
     tree = read_tree(path, entry.xacro)
-    return tree, where, tree.known_link(entry.root or tree.root, f"{where}.root: {tree.path.name}")
+    root = tree.require_link(entry.root or tree.root, f"{where}.root: {tree.path.name}")
+    return tree, where, root
 
 
 def _part(
@@ -113,14 +115,23 @@ def _part(
     source: dict[str, str],
     where: str,
 ) -> RobotPart:
-    """The joints of an arm, or of what moves a palm, and those of a hand, as a part."""
+    """Return the chosen joints as a part.
+
+    Args:
+        tree: Joints of the file.
+        entry: Entry of the description.
+        chosen: Joints of the arm (or above the palm), and joints of the hand.
+        end: Frame of the tip or palm.
+        source: Source of the numbers by tag.
+        where: Description and key, for messages.
+    """
     root = chosen[0][0].parent if chosen[0] else end.link
-    joints, actuators = _Chosen(tree, entry, *chosen, where).parts()
+    joints, actuators = _PartJoints(tree, entry, *chosen, where).convert()
     links = [root, *(joint.child for joint in joints)]
     shapes = NO_SHAPES
-    if not tree.shapes.meshes & set(links):  # so that nothing is left out
-        simple = tree.shapes.entries
-        entries = {link: list(simple[link]) for link in links if link in simple}
+    if not tree.shapes.meshes & set(links):  # simple shapes alone would be incomplete
+        primitives = tree.shapes.entries
+        entries = {link: list(primitives[link]) for link in links if link in primitives}
         shapes = link_shapes(CollisionEntry(links=entries), links, tree.path)
     frame = frame_matrix(end)
     return RobotPart(
@@ -129,38 +140,38 @@ def _part(
     )
 
 
-class _Chosen:
-    """The joints of a file that a robot has, as its own."""
+class _PartJoints:
+    """Conversion of the chosen joints of a file to joints and motors of a robot."""
 
     def __init__(
         self,
         tree: RobotTree,
         entry: Entry,
         chain: tuple[TreeJoint, ...],
-        joints_below: tuple[TreeJoint, ...],
+        hand: tuple[TreeJoint, ...],
         where: str,
     ) -> None:
         self._tree = tree
         self._where = f"{where}: {tree.path.name}"
         self._key = where
         self._arm = {joint.name for joint in chain}
-        self._joints = {joint.name: joint for joint in (*chain, *joints_below)}
+        self._joints = {joint.name: joint for joint in (*chain, *hand)}
         for key, names in (("locked", entry.locked), ("limits", entry.limits)):
             for name in names:
-                tree.known_joint(name, f"{where}.{key}: {tree.path.name}")
+                tree.require_joint(name, f"{where}.{key}: {tree.path.name}")
         for name, (low, high) in entry.limits.items():
             if not low < high:
                 raise DescriptionError(
                     f"{where}.limits.{name}: lower {low:.6g} is not below upper {high:.6g}"
                 )
         self._locked, self._stated = entry.locked, entry.limits
-        self._ends: dict[str, tuple[float, float]] = {}
-        self._extra: dict[str, Actuator] = {}
+        self._ranges: dict[str, tuple[float, float]] = {}
+        self._additional: dict[str, Actuator] = {}
 
-    def parts(self) -> tuple[list[Joint], list[Actuator]]:
-        """Joints, and the motors in the joints' order."""
+    def convert(self) -> tuple[list[Joint], list[Actuator]]:
+        """Return the joints, and the motors in the joints' order."""
         for name in self._joints:
-            self._refuse_circle(name)
+            self._check_mimic_chain(name)
         joints = [self._joint(joint) for joint in self._joints.values()]
         motors = [
             Actuator(
@@ -176,13 +187,13 @@ class _Chosen:
             for joint in joints
             if joint.type != "fixed" and joint.coupling is None
         ]
-        motors += self._extra.values()
+        motors += self._additional.values()
         movable = {joint.name: joint for joint in joints if joint.type != "fixed"}
         check_couplings(movable, motors, self._tree.path)
         return joints, motors
 
     def _is_continuous(self, name: str) -> bool:
-        """Return whether a joint has no limits."""
+        """Return True if a joint has no limits."""
         joint = self._tree.by_name[name]
         limited = name in self._tree.motors or name in self._stated or joint.limits is not None
         return joint.type == "continuous" and not limited
@@ -190,13 +201,14 @@ class _Chosen:
     def _joint(self, joint: TreeJoint) -> Joint:
         part = "arm" if joint.name in self._arm else "hand"
         coupling = self._coupling(joint)
-        held = self._held(joint.name)
-        moves = "prismatic" if joint.type == "prismatic" else "revolute"
+        position = self._fixed_position(joint.name)
+        moving_type = "prismatic" if joint.type == "prismatic" else "revolute"
         placement, kind, low, high = joint.placement, "fixed", 0.0, 0.0
-        if held is not None:
-            placement, coupling = placement @ joint_motion(moves, joint.axis, held), None
+        if position is not None:
+            placement = placement @ joint_motion(moving_type, joint.axis, position)
+            coupling = None
         elif joint.type != "fixed":
-            kind = moves
+            kind = moving_type
             low, high = self._limits(joint.name)
         return Joint(
             joint.name,
@@ -213,26 +225,26 @@ class _Chosen:
             joint.effort,
         )
 
-    def _refuse_circle(self, name: str) -> None:
-        seen: list[str] = []
+    def _check_mimic_chain(self, name: str) -> None:
+        chain: list[str] = []
         current: str | None = name
         while current is not None and current in self._tree.by_name:
-            seen.append(current)
+            chain.append(current)
             coupling = self._tree.by_name[current].coupling
             current = None if coupling is None or current in self._locked else coupling.of
-            if current in seen:
+            if current in chain:
                 raise DescriptionError(
-                    f"{self._where}: joint {name!r} mimics in a circle: "
-                    f"{' -> '.join([*seen, current])}; write locked: {{{name}: 0}} under "
+                    f"{self._where}: joint {name!r} mimics itself: "
+                    f"{' -> '.join([*chain, current])}; write locked: {{{name}: 0}} under "
                     f"{self._key.rpartition(' ')[2]}"
                 )
         if current is not None and current not in self._tree.motors:
             raise DescriptionError(
-                f"{self._where}: joint {seen[-1]!r} mimics {current!r}, which is no joint"
+                f"{self._where}: joint {chain[-1]!r} mimics {current!r}, which is not a joint"
             )
 
-    def _held(self, name: str) -> float | None:
-        """Where a joint stands for good [rad or m]; None if it moves."""
+    def _fixed_position(self, name: str) -> float | None:
+        """Return the position of a joint that does not move [rad or m]; None if it moves."""
         if name not in self._tree.by_name:
             return None
         joint = self._tree.by_name[name]
@@ -246,7 +258,7 @@ class _Chosen:
                 f"locked: {{{name}: 0}} under {self._key.rpartition(' ')[2]}"
             )
         if joint.coupling is not None:
-            source = self._held(joint.coupling.of)
+            source = self._fixed_position(joint.coupling.of)
             if source is not None:
                 return float(joint.coupling.followed(np.array([source]))[0])
             if isinstance(joint.coupling, Linear) and joint.coupling.ratio == 0:
@@ -257,31 +269,31 @@ class _Chosen:
         return None
 
     def _limits(self, name: str) -> tuple[float, float]:
-        """Ends of a motor or joint that moves."""
+        """Return the limits of a motor or joint that moves."""
         if name in self._tree.motors:
             return self._tree.motors[name]
-        if name not in self._ends:
-            self._ends[name] = self._found_limits(self._tree.by_name[name])
-        return self._ends[name]
+        if name not in self._ranges:
+            self._ranges[name] = self._derive_limits(self._tree.by_name[name])
+        return self._ranges[name]
 
-    def _found_limits(self, joint: TreeJoint) -> tuple[float, float]:
+    def _derive_limits(self, joint: TreeJoint) -> tuple[float, float]:
         limits = self._stated.get(joint.name, joint.limits)
         if limits is not None:
             return limits
-        if joint.coupling is not None:  # as far as what it follows takes it
+        if joint.coupling is not None:  # the range of the leader determines that of the follower
             low, high = self._limits(joint.coupling.of)
-            values = joint.coupling.followed(np.linspace(low, high, GRID))
+            values = joint.coupling.followed(np.linspace(low, high, FOLLOWER_GRID))
             slack = 1e-6 + 1e-3 * float(np.ptp(values))
             return float(values.min()) - slack, float(values.max()) + slack
         if joint.type == "continuous":
             return -CONTINUOUS_RANGE, CONTINUOUS_RANGE
         raise DescriptionError(
-            f"{self._where}: joint {joint.name!r} of link {joint.child!r} states no limits; write "
+            f"{self._where}: joint {joint.name!r} of link {joint.child!r} has no limits; write "
             f"limits: {{{joint.name}: [LOWER, UPPER]}} under {self._key.rpartition(' ')[2]}"
         )
 
     def _coupling(self, joint: TreeJoint) -> Coupling | None:
-        """What a joint follows among the joints that are there, or a motor of its own."""
+        """Return the coupling of a joint to a joint of the part, or to an additional motor."""
         coupling = joint.coupling
         while coupling is not None and coupling.of not in self._joints:
             name = coupling.of
@@ -291,7 +303,7 @@ class _Chosen:
                 break
             if not (isinstance(coupling, Linear) and isinstance(leader.coupling, Linear)):
                 raise DescriptionError(
-                    f"{self._where}: joint {joint.name!r} follows {name!r}, which is no part of "
+                    f"{self._where}: joint {joint.name!r} follows {name!r}, which is not part of "
                     f"this robot; write locked: {{{joint.name}: 0}}"
                 )
             coupling = Linear(
@@ -302,11 +314,11 @@ class _Chosen:
         return coupling
 
     def _add_motor(self, name: str, leader: TreeJoint | None) -> None:
-        """A motor that moves no joint of this robot but what follows it."""
-        if name in self._extra or self._held(name) is not None:
+        """Add a motor that moves only its followers."""
+        if name in self._additional or self._fixed_position(name) is not None:
             return
         low, high = self._limits(name)
-        slides = leader is not None and leader.type == "prismatic"
+        is_prismatic = leader is not None and leader.type == "prismatic"
         velocity, effort = (math.inf,) * 2 if leader is None else (leader.velocity, leader.effort)
-        unit = "m" if slides else "rad"
-        self._extra[name] = Actuator(name, unit, low, high, velocity, "hand", effort)
+        unit = "m" if is_prismatic else "rad"
+        self._additional[name] = Actuator(name, unit, low, high, velocity, "hand", effort)

@@ -12,19 +12,19 @@ from casadi_ik.model.couplings import Coupling
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """A joint of the tree.
+    """A joint of the kinematic tree.
 
     Attributes:
         name: Unique name.
-        parent: Link it hangs on.
-        child: Link it carries; the child's frame is the joint's frame.
+        parent: Parent link.
+        child: Child link; its frame is the joint's frame.
         type: "revolute" [rad], "prismatic" [m] or "fixed".
-        placement: (4, 4) pose of the joint frame in the parent link at zero.
+        placement: (4, 4) pose of the joint frame in the parent link at position zero.
         axis: (3,) unit axis in the joint frame.
         lower: Lower limit [rad or m].
         upper: Upper limit [rad or m].
         velocity: Velocity limit [rad/s or m/s], inf if unknown.
-        coupling: What the joint follows; None if it is an actuator itself.
+        coupling: Coupling to an actuator or another joint; None if the joint is its own actuator.
         part: "arm", "mount" or "hand".
         effort: Largest torque or force [N m or N], inf if unknown.
     """
@@ -45,16 +45,16 @@ class Joint:
 
 @dataclass(frozen=True)
 class Actuator:
-    """A motor: what the solver sets.
+    """A motor: a coordinate of q.
 
     Attributes:
         name: Unique name.
         unit: "rad" or "m".
-        lower: Lower limit of its own; `RobotDescription.lower` minds its joints' limits as well.
-        upper: Upper limit, likewise.
+        lower: Lower limit of the motor alone; `RobotDescription.lower` includes limits of joints.
+        upper: Upper limit of the motor alone.
         velocity: Velocity limit [unit/s], inf if unknown.
         part: "arm" or "hand".
-        effort: Largest torque or force, at its own position [N m or N], inf if unknown.
+        effort: Largest torque or force at the motor [N m or N], inf if unknown.
         continuous: True for a motor without limits; lower and upper are then the range that is
             searched, one turn to either side of zero.
     """

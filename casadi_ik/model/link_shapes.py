@@ -1,4 +1,4 @@
-"""Shapes of links for collisions, and the pairs of links that are checked."""
+"""Collision shapes of links, and pairs of links that may touch."""
 
 from __future__ import annotations
 
@@ -25,36 +25,37 @@ from casadi_ik.model.xml_tree import parse_xml, read_robot_file, required_attrib
 
 
 def srdf_pairs(path: Path) -> list[tuple[tuple[str, str], str]]:
-    """The pairs of ``disable_collisions``, each with the file's reason.
+    """Return the pairs of ``disable_collisions``, each with the reason that the file states.
 
     Raises:
-        DescriptionError: The file cannot be read, is no SRDF, or a pair lacks a link.
+        DescriptionError: The file cannot be read, is not an SRDF, or a pair lacks a link.
     """
     element = parse_xml(read_robot_file(path), path)
     if element.tag != "robot":
         raise DescriptionError(f"{path}: found <{element.tag}>, expected <robot> of an SRDF")
-    found: list[tuple[tuple[str, str], str]] = []
+    pairs: list[tuple[tuple[str, str], str]] = []
     for i, pair in enumerate(element.iter("disable_collisions")):
         where = f"{path}: disable_collisions[{i}]"
         links = required_attribute(pair, "link1", where), required_attribute(pair, "link2", where)
-        found.append((links, f"{path.name}: {pair.get('reason', 'no reason given')}"))
-    return found
+        pairs.append((links, f"{path.name}: {pair.get('reason', 'no reason given')}"))
+    return pairs
 
 
-MOST_AROUND = 4
-"""Capsules across a side of a box or a cylinder, at the most."""
+MAX_CAPSULES_ACROSS = 4
+"""Largest number of capsules across a side of a box or a cylinder."""
 
 
 @dataclass(frozen=True, eq=False)
 class LinkCapsule:
-    """A shape of the robot.
+    """A capsule or sphere of the robot.
 
     Attributes:
-        link: The link it moves with.
-        center: (3,) middle of its segment in the link's frame [m].
-        half: (3,) from there to the segment's end [m]; zero for a sphere.
-        radius: [m].
-        covers: Number of the solid of the robot that it helps to hold; -1: it is a shape itself.
+        link: Link that carries it.
+        center: (3,) centre of its segment in the link's frame [m].
+        half: (3,) vector from the centre to the segment's end [m]; zero for a sphere.
+        radius: Radius [m].
+        covers: Index of the solid of the robot that it encloses with others; -1: it is a shape
+            itself.
     """
 
     link: str
@@ -69,10 +70,10 @@ class LinkSolid:
     """A box or a cylinder of the robot.
 
     Attributes:
-        link: The link it moves with.
+        link: Link that carries it.
         kind: "box" or "cylinder".
-        size: (3,) [m]: edges; or radius, length and nothing.
-        pose: (4, 4) in the link's frame.
+        size: (3,) edges, or radius, length and 0 [m].
+        pose: (4, 4) pose in the link's frame.
     """
 
     link: str
@@ -86,9 +87,9 @@ class Touching:
     """Two links whose shapes may touch.
 
     Attributes:
-        links: Their names.
-        reason: Why.
-        depth: By how much they may overlap [m].
+        links: Names of the links.
+        reason: Reason in words.
+        depth: Largest allowed penetration [m].
     """
 
     links: tuple[str, str]
@@ -98,60 +99,71 @@ class Touching:
 
 @dataclass(frozen=True, eq=False)
 class Shapes:
-    """The shapes of an arm, a hand or a robot."""
+    """The collision shapes of an arm, a hand or a robot.
+
+    Attributes:
+        capsules: Capsules and spheres.
+        solids: Boxes and cylinders.
+        touching: Pairs of links that may touch.
+    """
 
     capsules: tuple[LinkCapsule, ...] = ()
     solids: tuple[LinkSolid, ...] = ()
     touching: tuple[Touching, ...] = ()
 
     def renamed(self, names: Mapping[str, str]) -> Shapes:
-        """The same, of links with other names."""
+        """Return the shapes with other names of links."""
         return Shapes(
-            tuple(replace(one, link=names.get(one.link, one.link)) for one in self.capsules),
-            tuple(replace(one, link=names.get(one.link, one.link)) for one in self.solids),
+            tuple(replace(item, link=names.get(item.link, item.link)) for item in self.capsules),
+            tuple(replace(item, link=names.get(item.link, item.link)) for item in self.solids),
             tuple(
-                replace(one, links=tuple(names.get(link, link) for link in one.links))
-                for one in self.touching
+                replace(pair, links=tuple(names.get(link, link) for link in pair.links))
+                for pair in self.touching
             ),
         )
 
     def mirrored(self) -> Shapes:
-        """Those of the mirror image, in which every link's y is turned round."""
+        """Return the shapes of the mirror image, in which the y axis of every link is inverted."""
         mirror = np.diag([1.0, -1.0, 1.0, 1.0])
         across = np.diagonal(mirror)[:3]
         return Shapes(
             tuple(
                 replace(
-                    one, center=read_only(one.center * across), half=read_only(one.half * across)
+                    capsule,
+                    center=read_only(capsule.center * across),
+                    half=read_only(capsule.half * across),
                 )
-                for one in self.capsules
+                for capsule in self.capsules
             ),
-            tuple(replace(one, pose=read_only(mirror @ one.pose @ mirror)) for one in self.solids),
+            tuple(
+                replace(solid, pose=read_only(mirror @ solid.pose @ mirror))
+                for solid in self.solids
+            ),
             self.touching,
         )
 
     def without(self, links: Collection[str]) -> Shapes:
-        """The same without those of some links."""
-        kept = [i for i, one in enumerate(self.solids) if one.link not in links]
-        place = {old: new for new, old in enumerate(kept)} | {-1: -1}
+        """Return the shapes without those of some links."""
+        remaining = [i for i, solid in enumerate(self.solids) if solid.link not in links]
+        new_index = {old: new for new, old in enumerate(remaining)} | {-1: -1}
         return Shapes(
             tuple(
-                replace(one, covers=place[one.covers])
-                for one in self.capsules
-                if one.link not in links
+                replace(capsule, covers=new_index[capsule.covers])
+                for capsule in self.capsules
+                if capsule.link not in links
             ),
-            tuple(self.solids[i] for i in kept),
+            tuple(self.solids[i] for i in remaining),
             self.touching,
         )
 
     def __add__(self, other: Shapes) -> Shapes:
         shift = len(self.solids)
-        theirs = tuple(
-            replace(one, covers=one.covers + shift) if one.covers >= 0 else one
-            for one in other.capsules
+        shifted = tuple(
+            replace(item, covers=item.covers + shift) if item.covers >= 0 else item
+            for item in other.capsules
         )
         return Shapes(
-            self.capsules + theirs, self.solids + other.solids, self.touching + other.touching
+            self.capsules + shifted, self.solids + other.solids, self.touching + other.touching
         )
 
 
@@ -159,15 +171,15 @@ NO_SHAPES = Shapes()
 
 
 def link_shapes(entry: CollisionEntry | None, links: Iterable[str], path: Path) -> Shapes:
-    """The shapes of a description, checked.
+    """Return the checked shapes of a description.
 
     Args:
-        entry: What it says; None: nothing.
-        links: Its links.
-        path: Its file, from whose folder that of an SRDF counts.
+        entry: Entry of the description; None for no shapes.
+        links: Links of the description.
+        path: File of the description, to which the path of an SRDF is relative.
 
     Raises:
-        DescriptionError: With file, key, what was found and what was expected.
+        DescriptionError: The entry is malformed; the message names file, key and expected value.
     """
     if entry is None:
         return NO_SHAPES
@@ -181,21 +193,21 @@ def link_shapes(entry: CollisionEntry | None, links: Iterable[str], path: Path) 
             if isinstance(shape, BoxEntry | CylinderEntry):
                 covers = len(solids)
                 solids.append(_solid(link, shape))
-            capsules += [LinkCapsule(link, *one, covers) for one in capsules_of(shape)]
+            capsules += [LinkCapsule(link, *capsule, covers) for capsule in capsules_of(shape)]
     touching: list[Touching] = []
     for i, pair in enumerate(entry.touching):
         key = f"{where}: collision.touching[{i}]"
         for link in pair.links:
             require_name(link, names, "link", f"{key}.links")
         if not pair.reason.strip():
-            raise DescriptionError(f"{key}.reason: is empty, expected why they may touch")
+            raise DescriptionError(f"{key}.reason: is empty; expected why the links may touch")
         touching.append(Touching(pair.links, pair.reason, pair.depth or math.inf))
     if entry.srdf is not None:
-        place = Path(entry.srdf).expanduser()
-        place = place if place.is_absolute() else path.parent / place
-        pairs = srdf_pairs(place)
-        # Such a file may speak of more than this robot has.
-        touching += [Touching(*one) for one in pairs if set(one[0]) <= set(names)]
+        file = Path(entry.srdf).expanduser()
+        file = file if file.is_absolute() else path.parent / file
+        # The file may name links that this robot does not use.
+        pairs = [pair for pair in srdf_pairs(file) if set(pair[0]) <= set(names)]
+        touching += [Touching(*pair) for pair in pairs]
     return Shapes(tuple(capsules), tuple(solids), tuple(touching))
 
 
@@ -207,56 +219,65 @@ def _solid(link: str, shape: BoxEntry | CylinderEntry) -> LinkSolid:
 
 
 def capsules_of(shape: ShapeEntry) -> list[tuple[Array, Array, float]]:
-    """Middles, halves and radii of capsules that hold a shape, in the link's frame.
+    """Return centres, half segments and radii of capsules that enclose a shape.
 
-    Spheres and capsules are themselves. A box is cut across its two shorter sides into up to
-    `MOST_AROUND` bars each, as square as may be; each bar's capsule goes through its corners. A
-    cylinder longer than wide becomes one capsule that holds its rims, a flat one is taken as its
+    Spheres and capsules are returned unchanged. A box is cut across its two shorter sides into up
+    to `MAX_CAPSULES_ACROSS` bars, as square as possible; the capsule of a bar contains its corners.
+    A cylinder longer than wide is enclosed by one capsule, a flat one is treated as its bounding
     box.
     """
     if isinstance(shape, SphereEntry):
         return [(read_only(shape.center), read_only(np.zeros(3)), shape.radius)]
     if isinstance(shape, CapsuleEntry):
-        one, other = np.array(shape.ends[0]), np.array(shape.ends[1])
-        return [(read_only((one + other) / 2), read_only((other - one) / 2), shape.radius)]
+        start, end = np.array(shape.ends[0]), np.array(shape.ends[1])
+        return [(read_only((start + end) / 2), read_only((end - start) / 2), shape.radius)]
     pose = frame_matrix(Frame(shape.xyz, shape.rpy))
     if isinstance(shape, CylinderEntry):
         if shape.length < 2 * shape.radius:
             size = np.array([2 * shape.radius, 2 * shape.radius, shape.length])
-            return _bars(size, pose)
-        return [_bar(np.zeros(3), np.array([0, 0, 1.0]), shape.length / 2, shape.radius, pose)]
-    return _bars(np.array(shape.size), pose)
+            return _box_capsules(size, pose)
+        axis = np.array([0, 0, 1.0])
+        return [_bar_capsule(np.zeros(3), axis, shape.length / 2, shape.radius, pose)]
+    return _box_capsules(np.array(shape.size), pose)
 
 
-def _bars(size: Array, pose: Array) -> list[tuple[Array, Array, float]]:
+def _box_capsules(size: Array, pose: Array) -> list[tuple[Array, Array, float]]:
     order = np.argsort(size, kind="stable")
-    thin, middle, long = (int(i) for i in order)
-    # Bars about as wide as the box is thick; where it is a plate, as many as there may be.
-    count = min(MOST_AROUND, max(1, math.ceil(size[middle] / max(size[thin], 1e-9) - 1e-9)))
+    shortest, middle, longest = (int(i) for i in order)
+    # Bars are about as wide as the box is thick, unless the box is a thin plate.
+    ratio = size[middle] / max(size[shortest], 1e-9)
+    count = min(MAX_CAPSULES_ACROSS, max(1, math.ceil(ratio - 1e-9)))
     width = size[middle] / count
-    axis = np.eye(3)[long]
-    found = []
+    axis = np.eye(3)[longest]
+    capsules = []
     for i in range(count):
         center = np.zeros(3)
         center[middle] = (i + 0.5) * width - size[middle] / 2
-        reach = math.hypot(width, size[thin]) / 2
-        found.append(_bar(center, axis, size[long] / 2, reach, pose))
-    return found
+        corner_radius = math.hypot(width, size[shortest]) / 2
+        capsules.append(_bar_capsule(center, axis, size[longest] / 2, corner_radius, pose))
+    return capsules
 
 
-def _bar(
-    center: Array, axis: Array, half: float, reach: float, pose: Array
+def _bar_capsule(
+    center: Array, axis: Array, half: float, corner_radius: float, pose: Array
 ) -> tuple[Array, Array, float]:
-    """The capsule through the ends of a bar whose corners are `reach` from its axis.
+    """Return the capsule of smallest volume, of 26 radii, that encloses a bar.
 
-    A wider capsule ends earlier: of all that hold the bar, the one of the least volume among some.
+    Args:
+        center: (3,) centre of the bar.
+        axis: (3,) unit vector along the bar.
+        half: Half length of the bar [m].
+        corner_radius: Distance of its corners from its axis [m].
+        pose: (4, 4) frame of centre and axis in the link.
     """
-    best = (math.inf, half, reach)
-    for grown in np.linspace(1.0, 1.5, 26) * reach:
-        inside = max(half - math.sqrt(max(grown * grown - reach * reach, 0.0)), 0.0)
-        radius = math.hypot(half, reach) if inside == 0.0 else float(grown)
-        volume = math.pi * radius * radius * (2 * inside + 4 / 3 * radius)
-        best = min(best, (volume, inside, radius))
-    _, inside, radius = best
+    best = (math.inf, half, corner_radius)
+    for trial in np.linspace(1.0, 1.5, 26) * corner_radius:
+        # The wider the capsule, the earlier its segment may end.
+        shortening = math.sqrt(max(trial * trial - corner_radius * corner_radius, 0.0))
+        segment = max(half - shortening, 0.0)
+        radius = math.hypot(half, corner_radius) if segment == 0.0 else float(trial)
+        volume = math.pi * radius * radius * (2 * segment + 4 / 3 * radius)
+        best = min(best, (volume, segment, radius))
+    _, segment, radius = best
     rotation = pose[:3, :3]
-    return read_only(rotation @ center + pose[:3, 3]), read_only(rotation @ axis * inside), radius
+    return read_only(rotation @ center + pose[:3, 3]), read_only(rotation @ axis * segment), radius

@@ -1,6 +1,6 @@
-"""Links held together by joints: what carries what, of files, parts and robots alike, and where.
+"""Trees of joints (of files, parts or robots): order, chains, subtrees, and forward kinematics.
 
-Forward kinematics are in numpy, of one or many configurations: nothing is built or compiled.
+Forward kinematics are in NumPy, for one or many configurations: no graph is built or compiled.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from casadi_ik.model.joints import Joint
 
 
 class TreeEdge(Protocol):
-    """What hangs a link on another one."""
+    """A connection of a parent and a child link."""
 
     @property
     def parent(self) -> str:
-        """The link above."""
+        """Parent link."""
         ...
 
     @property
     def child(self) -> str:
-        """The link below."""
+        """Child link."""
         ...
 
 
 class TypedEdge(TreeEdge, Protocol):
-    """The same, of a type: "fixed" or one that moves."""
+    """A connection with a type: "fixed", or a type of joint that moves."""
 
     @property
     def type(self) -> str:
-        """The type."""
+        """Type of the connection."""
         ...
 
 
@@ -45,41 +45,41 @@ J_co = TypeVar("J_co", bound=TypedEdge, covariant=True)
 
 
 class JointTree(Protocol[J_co]):
-    """Links held together by joints: a file's, a part's or a robot's."""
+    """A tree of links and joints: of a file, a part or a robot."""
 
     @property
     def root(self) -> str:
-        """The base link."""
+        """Root link."""
         ...
 
     @property
     def joints(self) -> Sequence[J_co]:
-        """The joints, parents before children."""
+        """Joints, parents before children."""
         ...
 
 
 def parents_first(joints: Iterable[L], root: str) -> tuple[L, ...]:
-    """The order of the file, moved only where a child stands before its parent.
+    """Return joints with parents before children, otherwise in their order.
 
-    Joints that do not hang on the root are left out.
+    Joints that are not connected to the root are omitted.
     """
-    hung, waiting = {root}, list(joints)
-    placed: list[L] = []
-    while waiting:
-        joint = next((one for one in waiting if one.parent in hung), None)
+    connected, remaining = {root}, list(joints)
+    ordered: list[L] = []
+    while remaining:
+        joint = next((joint for joint in remaining if joint.parent in connected), None)
         if joint is None:
             break
-        waiting.remove(joint)
-        placed.append(joint)
-        hung.add(joint.child)
-    return tuple(placed)
+        remaining.remove(joint)
+        ordered.append(joint)
+        connected.add(joint.child)
+    return tuple(ordered)
 
 
 def require_name(name: str, names: Collection[str], noun: str, where: str) -> str:
-    """The name of a link or joint, if it is among some.
+    """Return the name of a link or joint if it exists.
 
     Raises:
-        DescriptionError: It is not; the message lists them.
+        DescriptionError: The name does not exist; the message lists those that do.
     """
     if name not in names:
         raise DescriptionError(f"{where}: unknown {noun} {name!r}; known: {', '.join(names)}")
@@ -87,58 +87,59 @@ def require_name(name: str, names: Collection[str], noun: str, where: str) -> st
 
 
 def links_of(tree: JointTree[TypedEdge]) -> tuple[str, ...]:
-    """All links, the root first."""
+    """Return all links, the root first."""
     return (tree.root, *(joint.child for joint in tree.joints))
 
 
-def chain_to(tree: JointTree[J], link: str, top: str | None = None) -> list[J]:
-    """The joints down to a link, in order: from the root, or from a link above it."""
+def chain_to(tree: JointTree[J], link: str, start: str | None = None) -> list[J]:
+    """Return the joints from the root, or from the link `start`, to a link, in order."""
     by_child = {joint.child: joint for joint in tree.joints}
-    found: list[J] = []
-    while link != top and link in by_child:
-        found.append(by_child[link])
+    chain: list[J] = []
+    while link != start and link in by_child:
+        chain.append(by_child[link])
         link = by_child[link].parent
-    return found[::-1]
+    return chain[::-1]
 
 
 def joints_below(tree: JointTree[J], link: str) -> list[J]:
-    """All joints that a link carries, directly or not."""
-    carried, found = {link}, []
+    """Return all joints that a link carries, directly or indirectly."""
+    links, joints = {link}, []
     for joint in tree.joints:
-        if joint.parent in carried:
-            carried.add(joint.child)
-            found.append(joint)
-    return found
+        if joint.parent in links:
+            links.add(joint.child)
+            joints.append(joint)
+    return joints
 
 
 def rigid_links(tree: JointTree[TypedEdge], link: str) -> list[str]:
-    """A link and all that is fixed to it below."""
-    found = [link]
+    """Return a link and all links below that are fixed to it."""
+    links = [link]
     for joint in tree.joints:
-        if joint.type == "fixed" and joint.parent in found:
-            found.append(joint.child)
-    return found
+        if joint.type == "fixed" and joint.parent in links:
+            links.append(joint.child)
+    return links
 
 
 def moving_below(tree: JointTree[J], link: str) -> list[J]:
-    """The first moving joints below a link, those behind fixed ones included."""
-    carried = rigid_links(tree, link)
-    return [one for one in tree.joints if one.type != "fixed" and one.parent in carried]
+    """Return the first moving joints below a link, including those behind fixed joints."""
+    links = rigid_links(tree, link)
+    return [joint for joint in tree.joints if joint.type != "fixed" and joint.parent in links]
 
 
 def joint_depth(tree: JointTree[TypedEdge], link: str) -> int:
-    """The most moving joints in a row below a link."""
-    return max((1 + joint_depth(tree, one.child) for one in moving_below(tree, link)), default=0)
+    """Return the largest number of moving joints in series below a link."""
+    depths = (1 + joint_depth(tree, joint.child) for joint in moving_below(tree, link))
+    return max(depths, default=0)
 
 
 def leaf_links(tree: JointTree[TypedEdge], link: str) -> list[str]:
-    """The links below a link that carry nothing."""
+    """Return the links below a link that have no children."""
     parents = {joint.parent for joint in tree.joints}
     return [joint.child for joint in joints_below(tree, link) if joint.child not in parents]
 
 
 def rigid_bodies(tree: JointTree[TypedEdge]) -> tuple[dict[str, str], set[frozenset[str]]]:
-    """By link the link it is fixed to that moves, or the root; and which of these share a joint."""
+    """Return the moving link that each link is fixed to, and the pairs that share a joint."""
     bodies, neighbours = {tree.root: tree.root}, set()
     for joint in tree.joints:
         parent = bodies[joint.parent]
@@ -148,21 +149,21 @@ def rigid_bodies(tree: JointTree[TypedEdge]) -> tuple[dict[str, str], set[frozen
 
 
 def joint_positions(joints: Iterable[Joint], motors: Mapping[str, ArrayLike]) -> dict[str, Array]:
-    """Positions (k,) of all movable joints behind their couplings, by name.
+    """Return the positions (k,) of all movable joints, after couplings, by name.
 
     Args:
         joints: All joints that couplings refer to, in any order.
         motors: Positions by motor [rad or m], numbers or (k,).
     """
     by_name = {joint.name: joint for joint in joints if joint.type != "fixed"}
-    found = {name: np.atleast_1d(np.asarray(value, float)) for name, value in motors.items()}
+    positions = {name: np.atleast_1d(np.asarray(value, float)) for name, value in motors.items()}
 
     def position(name: str) -> Array:
-        if name not in found:
+        if name not in positions:
             coupling = by_name[name].coupling
             assert coupling is not None, f"joint {name!r} has no motor"
-            found[name] = coupling.followed(position(coupling.of))
-        return found[name]
+            positions[name] = coupling.followed(position(coupling.of))
+        return positions[name]
 
     return {name: position(name) for name in by_name}
 
@@ -170,16 +171,15 @@ def joint_positions(joints: Iterable[Joint], motors: Mapping[str, ArrayLike]) ->
 def link_poses(
     root: str, joints: Iterable[Joint], values: Mapping[str, ArrayLike]
 ) -> dict[str, Array]:
-    """Poses of links in the root's frame, by name.
+    """Return the poses of links in the root's frame by name.
 
     Args:
-        root: The base link.
+        root: Root link.
         joints: Joints from the root outwards: all, or those of some chains.
-        values: Positions by joint name [rad or m], numbers or (k,); joints that are not named
-            stay at zero.
+        values: Positions by joint name [rad or m], numbers or (k,); other joints are at zero.
 
     Returns:
-        (4, 4) each, or (k, 4, 4) of links that a joint with k positions moves.
+        (4, 4) each, or (k, 4, 4) for links that a joint with k positions moves.
     """
     poses = {root: np.eye(4)}
     for joint in joints:
@@ -191,14 +191,14 @@ def link_poses(
 
 
 def joint_motion(kind: str, axis: Array, positions: ArrayLike) -> Array:
-    """(4, 4) or (k, 4, 4): what a joint of a type does at positions () or (k,) [rad or m]."""
+    """Return the displacement (..., 4, 4) of a joint at positions (...) [rad or m]."""
     value = np.asarray(positions, dtype=float)[..., None, None]
-    moved = np.zeros((*value.shape[:-2], 4, 4)) + np.eye(4)
+    pose = np.zeros((*value.shape[:-2], 4, 4)) + np.eye(4)
     if kind == "prismatic":
-        moved[..., :3, 3] = value[..., 0] * axis
+        pose[..., :3, 3] = value[..., 0] * axis
     elif kind == "revolute":
         # Rodrigues' formula.
         x, y, z = axis
         cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        moved[..., :3, :3] += np.sin(value) * cross + (1 - np.cos(value)) * (cross @ cross)
-    return moved
+        pose[..., :3, :3] += np.sin(value) * cross + (1 - np.cos(value)) * (cross @ cross)
+    return pose

@@ -1,4 +1,4 @@
-"""Grasp files."""
+"""Grasp files, read and written."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from casadi_ik.model.grasp import EXTRA_VECTORS, Contact, Grasp, Tolerance
 
 
 class ToleranceEntry(Struct, frozen=True):
-    """When a contact counts as reached; what is left out is as everywhere.
+    """Tolerances of a contact; omitted values are the defaults.
 
     Attributes:
-        position: Largest distance of the points [m].
+        position: Largest position error [m].
         angle: Largest angle between the normals [rad].
     """
 
@@ -40,18 +40,18 @@ class ToleranceEntry(Struct, frozen=True):
 
 
 class ContactEntry(Struct, frozen=True):
-    """A finger's contact; ``direction`` stands alone, everything else needs a point.
+    """A contact of a finger; ``direction`` excludes the other keys, all of which need a point.
 
     Attributes:
-        point: Where the fingertip touches, in the robot's base frame (an object's, if its pose is
-            said elsewhere) [m].
-        normal: Which way the pad faces: out of the fingertip, into the object; left out: any.
-        tolerance: When it counts as reached; left out: as for all.
-        tangent: Where the second axis of the contact frame points; it needs a normal.
-        line: Direction of a line through the point on which the fingertip may be anywhere.
-        plane: Normal of a plane through the point in which the fingertip may be anywhere.
-        ball: Outward normal that the pad's ball has where it touches the point.
-        direction: Which way the pad faces wherever it is; it stands alone.
+        point: Contact point in the robot's base frame, or in an object's frame if its pose is given
+            elsewhere [m].
+        normal: Outward normal of the pad, into the object; default: free.
+        tolerance: Tolerances of the contact; default: those of all contacts.
+        tangent: Direction of the second axis of the contact frame; needs a normal.
+        line: Direction of a line through the point on which the contact may be anywhere.
+        plane: Normal of a plane through the point in which the contact may be anywhere.
+        ball: Outward normal of the pad's ball where it touches the point.
+        direction: Outward normal of a pad that may be anywhere.
     """
 
     point: Point | None = None
@@ -65,11 +65,11 @@ class ContactEntry(Struct, frozen=True):
 
 
 class GraspedObjectEntry(Struct, frozen=True):
-    """The object that is grasped and where it is.
+    """The grasped object and its pose.
 
     Attributes:
-        name: A shipped object, or the path of an object file.
-        pose: Of the object in the robot's base frame.
+        name: Shipped object, or path of an object file.
+        pose: Pose of the object in the robot's base frame.
     """
 
     name: str
@@ -80,14 +80,14 @@ class GraspFile(Struct, frozen=True):
     """A grasp: ``models/grasps/*.yaml``.
 
     Attributes:
-        contacts: By finger; a finger left out is free.
-        robot: The robot it was made for: a shipped name, ARM+HAND, or a path.
-        description: One sentence.
-        object: What is grasped, and where it is.
-        posture: Position by actuator of the hand that it was made from [rad or m]; with a palm the
+        contacts: Contact by finger; omitted fingers are free.
+        robot: Robot that the grasp was made for: shipped name, ARM+HAND, or path.
+        description: Description in one sentence.
+        object: Grasped object and its pose.
+        posture: Position by hand actuator that realises the contacts [rad or m]; with a palm, the
             posture to take.
-        palm: Instead of contacts where the robot's palm frame is to be.
-        palms: The same of a body, by side.
+        palm: Pose of the robot's palm frame, instead of contacts.
+        palms: Pose of the palm frame by side of a multi-arm robot.
     """
 
     contacts: dict[str, ContactEntry] = msgspec.field(default_factory=dict)
@@ -118,24 +118,24 @@ def load_grasp(name_or_path: str | Path) -> Grasp:
     return grasp_from_entry(entry, path, path.stem)
 
 
-def grasp_from_entry(entry: GraspFile, path: Path, name: str, where: str = "") -> Grasp:
-    """A grasp as a file has it.
+def grasp_from_entry(entry: GraspFile, path: Path, name: str, key_prefix: str = "") -> Grasp:
+    """Return the grasp of a file entry.
 
     Args:
-        entry: What the file says.
+        entry: Entry of the file.
         path: The file.
-        name: What to call it.
-        where: Key of the entry in the file, with a dot behind.
+        name: Name of the grasp.
+        key_prefix: Key of the entry in the file with a trailing dot, for messages.
 
     Raises:
-        DescriptionError: A malformed contact.
+        DescriptionError: A contact is malformed.
     """
     contacts: dict[str, Contact] = {}
     for finger, contact in entry.contacts.items():
         try:
             contacts[finger] = _contact(contact)
         except InputError as error:
-            raise DescriptionError(f"{path}: {where}contacts.{finger}.{error}") from error
+            raise DescriptionError(f"{path}: {key_prefix}contacts.{finger}.{error}") from error
     try:
         return Grasp(
             contacts=contacts,
@@ -147,33 +147,33 @@ def grasp_from_entry(entry: GraspFile, path: Path, name: str, where: str = "") -
             palm=_palm(entry),
         )
     except InputError as error:
-        raise DescriptionError(f"{path}: {where}{error}") from error
+        raise DescriptionError(f"{path}: {key_prefix}{error}") from error
 
 
 def _palm(entry: GraspFile) -> Array | dict[str, Array] | None:
     if entry.palm and entry.palms:
-        raise InputError("palms: found it beside palm, expected one of them")
+        raise InputError("palms: is given together with palm; expected one of them")
     if entry.palms:
         return {side: frame_matrix(frame) for side, frame in entry.palms.items()}
     return frame_matrix(entry.palm) if entry.palm else None
 
 
 def _contact(entry: ContactEntry) -> Contact:
-    given: dict[str, Any] = msgspec.structs.asdict(entry)
+    arguments: dict[str, Any] = msgspec.structs.asdict(entry)
     if entry.tolerance is not None:
-        given["tolerance"] = Tolerance(entry.tolerance.position, entry.tolerance.angle)
-    return Contact(**given)
+        arguments["tolerance"] = Tolerance(entry.tolerance.position, entry.tolerance.angle)
+    return Contact(**arguments)
 
 
 def grasp_to_dict(grasp: Grasp) -> dict[str, Any]:
-    """A grasp as a file has it, to the last digit; what comes before and after it is left out."""
+    """Return the data of a grasp file, to the last digit, without pregrasp and squeeze."""
     contacts: dict[str, dict[str, Any]] = {}
     for finger, contact in grasp.contacts.items():
-        given = {key: getattr(contact, key) for key in ("point", "normal", *EXTRA_VECTORS)}
+        vectors = {key: getattr(contact, key) for key in ("point", "normal", *EXTRA_VECTORS)}
         if np.isnan(contact.point).any():
-            given = {"direction": contact.normal}
+            vectors = {"direction": contact.normal}
         entry: dict[str, Any] = {
-            key: _numbers(value) for key, value in given.items() if value is not None
+            key: _numbers(value) for key, value in vectors.items() if value is not None
         }
         if contact.tolerance is not None:
             position, angle = contact.tolerance.position, contact.tolerance.angle
@@ -184,8 +184,8 @@ def grasp_to_dict(grasp: Grasp) -> dict[str, Any]:
         pose = grasp.known_pose
         data["object"] = {"name": grasp.object} | ({} if pose is None else {"pose": _frame(pose)})
     data |= {"contacts": contacts} if contacts else {}
-    if grasp.one_palm is not None:
-        data["palm"] = _frame(grasp.one_palm)
+    if grasp.single_palm is not None:
+        data["palm"] = _frame(grasp.single_palm)
     elif isinstance(grasp.palm, Mapping):
         data["palms"] = {side: _frame(pose) for side, pose in grasp.palm.items()}
     if grasp.posture:
@@ -202,7 +202,7 @@ def _numbers(values: Array) -> list[float]:
 
 
 def shipped_grasps(robot: str) -> tuple[str, ...]:
-    """Names of the shipped grasps for a robot.
+    """Return the names of the shipped grasps for a robot.
 
     Args:
         robot: Name of the robot.
@@ -218,13 +218,13 @@ def shipped_grasps(robot: str) -> tuple[str, ...]:
 
 
 class CandidatesFile(Struct, frozen=True):
-    """Grasps in a list, of which one is to be chosen.
+    """A list of grasps to choose from.
 
     Attributes:
         candidates: Grasps.
-        robot: Of all that name no other.
-        description: One sentence.
-        object: Of all that name no other.
+        robot: Robot of grasps that name none.
+        description: Description in one sentence.
+        object: Object of grasps that name none.
     """
 
     candidates: list[GraspFile]
@@ -234,34 +234,34 @@ class CandidatesFile(Struct, frozen=True):
 
 
 def load_grasp_files(path: Path) -> tuple[Grasp, ...]:
-    """Load grasps.
+    """Load all grasps of a file or folder.
 
     Args:
-        path: A YAML file with a list of grasps (``candidates:``) or with a single one, or a folder
-            of such files, taken by their names.
+        path: YAML file with a list of grasps (``candidates:``) or a single grasp, or a folder of
+            such files, which are read in alphabetical order.
 
     Raises:
-        DescriptionError: It is missing, empty or malformed; the message names file and key.
+        DescriptionError: A file is missing, empty or malformed; the message names file and key.
     """
     if not path.is_dir():
-        return _of_file(path)
+        return _load_file(path)
     files = sorted(item for item in path.iterdir() if item.suffix in (".yaml", ".yml"))
     if not files:
         raise DescriptionError(f"{path}: found no YAML file, expected grasp files")
-    return tuple(grasp for file in files for grasp in _of_file(file))
+    return tuple(grasp for file in files for grasp in _load_file(file))
 
 
-def _of_file(path: Path) -> tuple[Grasp, ...]:
+def _load_file(path: Path) -> tuple[Grasp, ...]:
     raw = parse_yaml(path)
     if not (isinstance(raw, dict) and "candidates" in raw):
         return (load_grasp(path),)
     file, _ = validated(raw, CandidatesFile, path)
     if not file.candidates:
         raise DescriptionError(f"{path}: candidates: found none, expected at least one grasp")
-    found = []
+    grasps = []
     for i, entry in enumerate(file.candidates):
-        whole = msgspec.structs.replace(
+        complete = msgspec.structs.replace(
             entry, robot=entry.robot or file.robot, object=entry.object or file.object
         )
-        found.append(grasp_from_entry(whole, path, f"{path.stem}[{i}]", f"candidates[{i}]."))
-    return tuple(found)
+        grasps.append(grasp_from_entry(complete, path, f"{path.stem}[{i}]", f"candidates[{i}]."))
+    return tuple(grasps)

@@ -1,4 +1,4 @@
-"""Arms and hands, described or imported, become one `RobotDescription`."""
+"""Loading of robots: described or imported arms and hands become one `RobotDescription`."""
 
 from __future__ import annotations
 
@@ -43,33 +43,33 @@ from casadi_ik.model.schema import (
 
 
 def load_description(name_or_path: str | Path) -> RobotDescription:
-    """Load an arm-hand description.
+    """Load a robot description.
 
     Args:
-        name_or_path: A shipped name (`shipped_names("arm_hands")`), a shipped arm and a shipped
-            hand joined by a plus sign ("panda+allegro_right"), one of the two alone ("panda",
-            whose one fingertip ``flange`` is its tip, facing along z; "allegro_right", which
-            stands on a fixed base), a shipped body (`shipped_names("bodies")`, "g1+dex3") with a
-            hand after a plus sign if it has none ("two_ur10e+leap"), or the path of a YAML file,
-            whose ``arm`` and ``hand`` may be shipped names or paths relative to it, or may stand in
-            somebody's URDF or MJCF.
+        name_or_path: Any of: a shipped arm-hand (`shipped_names("arm_hands")`); a shipped arm and a
+            shipped hand joined by a plus sign ("panda+allegro_right"); a shipped arm ("panda",
+            whose fingertip ``flange`` is its tip and faces along z) or hand ("allegro_right", on a
+            fixed base); a shipped multi-arm robot (`shipped_names("bodies")`), followed by a plus
+            sign and a hand if it has none ("two_ur10e+leap"); or the path of a YAML file, whose
+            ``arm`` and ``hand`` may be shipped names, paths relative to it, or parts of a URDF or
+            MJCF file.
 
     Raises:
         UnknownNameError: No shipped description has that name.
         DescriptionError: A file is missing or malformed; the message names file and key.
-        MissingExtraError: What reads a file's format is not installed.
+        MissingExtraError: The package that reads a file's format is not installed.
     """
-    found = resolve_robot(name_or_path)
-    if not isinstance(found, tuple):
-        return _robot(found)
-    first, hand = found
+    files = resolve_robot(name_or_path)
+    if not isinstance(files, tuple):
+        return _robot(files)
+    first, hand = files
     if first is None or first.parent.name != BODIES_FOLDER:
         return _pair(first, hand)
     body, units = read(first, BodyFile)
     if hand is None:
         return body_from_parts(body, first, units)
-    named = msgspec.structs.replace(body, name=f"{body.name}+{hand.stem}")
-    return body_from_parts(named, first, units, hand.stem)
+    body = msgspec.structs.replace(body, name=f"{body.name}+{hand.stem}")
+    return body_from_parts(body, first, units, hand.stem)
 
 
 FLANGE = RobotPart(
@@ -77,11 +77,11 @@ FLANGE = RobotPart(
     *([], [], {}, "flange", np.eye(4), {}),
     pads={"flange": PadEntry(link="flange", normal=(0.0, 0.0, 1.0))},
 )
-"""What an arm has that stands alone: its tip, which touches what is before it."""
+"""Hand of an arm alone: its tip, which touches along z."""
 
 
 def _pair(arm_path: Path | None, hand_path: Path | None) -> RobotDescription:
-    """A shipped arm with a shipped hand, as their files say that they are put together."""
+    """Return a shipped arm with a shipped hand, mounted as the hand's file states."""
     arm, hand = None, FLANGE
     if arm_path is not None:
         arm = part_from_file(read(arm_path, ArmFile)[0], arm_path)
@@ -92,13 +92,13 @@ def _pair(arm_path: Path | None, hand_path: Path | None) -> RobotDescription:
 
 
 def file_type(raw: Any) -> type[ArmHandFile | ImportedFile | BodyFile | ImportedBody]:
-    """Which kind of robot a description is of, by its keys."""
+    """Return the type of a robot description, which its keys determine."""
     keys = raw if isinstance(raw, dict) else {}
     if "sides" in keys:
         return ImportedBody if "robot" in keys else BodyFile
     hand = keys.get("hand")
-    in_a_file = "robot" in keys or (isinstance(hand, dict) and "file" in hand)
-    return ImportedFile if in_a_file else ArmHandFile
+    is_imported = "robot" in keys or (isinstance(hand, dict) and "file" in hand)
+    return ImportedFile if is_imported else ArmHandFile
 
 
 def _robot(path: Path) -> RobotDescription:
@@ -109,14 +109,16 @@ def _robot(path: Path) -> RobotDescription:
     elif isinstance(top, ImportedBody):
         robot = body_from_file(top, path, units)
     else:
-        robot = _on_arm(top, units, path)
-    # What a description says of a link goes before what its file says.
-    said = () if top.collision is None else top.collision.links
-    more = link_shapes(top.collision, robot.links, path)
-    return replace(robot, shapes=robot.shapes.without(said) + more, path=path)
+        robot = _single_hand_robot(top, units, path)
+    # Shapes of the description override those of imported files.
+    overridden = () if top.collision is None else top.collision.links
+    shapes = robot.shapes.without(overridden) + link_shapes(top.collision, robot.links, path)
+    return replace(robot, shapes=shapes, path=path)
 
 
-def _on_arm(top: ArmHandFile | ImportedFile, units: dict[str, str], path: Path) -> RobotDescription:
+def _single_hand_robot(
+    top: ArmHandFile | ImportedFile, units: dict[str, str], path: Path
+) -> RobotDescription:
     require_usable_name(top.name, f"{path}: name")
     arm = None if top.arm is None else load_part(top.arm, "arm", path)
     if isinstance(top, ArmHandFile):
@@ -126,7 +128,7 @@ def _on_arm(top: ArmHandFile | ImportedFile, units: dict[str, str], path: Path) 
         if entry is None or (top.hand and top.robot):
             raise DescriptionError(f"{path}: expected either 'hand' or 'robot'")
         if arm is not None and top.robot is not None:
-            raise DescriptionError(f"{path}: arm: found beside 'robot', which has its own")
+            raise DescriptionError(f"{path}: arm: is given together with 'robot', which has an arm")
         hand = hand_from_file(entry, top.fingers, key, path)
     if arm is None and top.mount != Frame():
         arm = RobotPart("base", f"{path}: ", "base", [], [], {}, "base", np.eye(4), {})
@@ -148,16 +150,16 @@ def _arm_hand(
     sources: dict[str, str],
     where: str,
 ) -> RobotDescription:
-    """The robot of an arm (if there is one) and a hand on it."""
+    """Return the robot of an arm (or None) and a hand on it."""
     if arm is not None:
         hand = prefix_shared_names(hand, arm)
     hand = assign_wrist_to_arm(hand)
     joints, root, parts = list(hand.joints), hand.root, [(hand.name, hand)]
     if arm is not None:
-        fixed = fixed_joint("mount", arm.tip_link, hand.root, arm.tip @ mount)
-        joints, root = [*arm.joints, fixed, *joints], arm.root
+        mount_joint = fixed_joint("mount", arm.tip_link, hand.root, arm.tip @ mount)
+        joints, root = [*arm.joints, mount_joint, *joints], arm.root
         parts.insert(0, (arm.name, arm))
-    home = home or {motor: at for _, part in parts for motor, at in part.home.items()}
+    home = home or {motor: value for _, part in parts for motor, value in part.home.items()}
     palms = {hand.tip_link}
     robot, flat = join_parts(name, root, joints, parts, palms, home, units, sources, where)
     if thumb is None and hand.thumb in fingers:

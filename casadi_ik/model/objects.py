@@ -1,4 +1,4 @@
-"""Objects to be grasped: a shape with its mass, from a file that names its sources; or a mesh."""
+"""Objects to be grasped: a shape with its mass from a description with sources, or a mesh."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from casadi_ik.model.urdf_body import BODY_FORMATS
 
 
 class MassEntry(Struct, frozen=True):
-    """A mass [kg] and where it is from.
+    """A mass and its source.
 
     Attributes:
-        value: [kg].
+        value: Mass [kg].
         source: Tags of `sources`.
     """
 
@@ -39,12 +39,12 @@ class MeshFileEntry(
     tag="mesh",
     kw_only=True,
 ):
-    """A body bounded by triangles; its pieces are taken as convex where collisions are looked at.
+    """A body bounded by triangles; collision checks take its pieces as convex.
 
     Attributes:
-        source: Tags of the sources of its numbers.
-        file: A mesh, or several that are one body; paths are counted from the object's file.
-        scale: By what factor it is larger than they say, in metres.
+        source: Tags of `sources` for the numbers.
+        file: Mesh, or meshes that form one body; relative to the object's file.
+        scale: Factor from the unit of the files to metres.
     """
 
     source: str
@@ -52,7 +52,7 @@ class MeshFileEntry(
     scale: Factor = 1.0
 
     def check(self) -> str:
-        """What is wrong with the numbers, as "key: found, expected", or ""."""
+        """Return the problem of the numbers as "key: found, expected", or ""."""
         return "" if self.file else "file: found none, expected at least one"
 
 
@@ -60,12 +60,12 @@ class ObjectFile(Struct, frozen=True):
     """An object: ``models/objects/*.yaml``.
 
     Attributes:
-        name: What it is called.
-        description: One sentence.
-        frame: Where its frame is, in words; z points up when it stands.
-        shape: Centred in its frame; of a mesh the frame is the mesh's.
-        mass: And where that is from.
-        sources: Where numbers are from, by tag.
+        name: Name.
+        description: Description in one sentence.
+        frame: Location of its frame, in words; z points up when the object stands.
+        shape: Shape, centred in the object's frame; a mesh is in its own frame.
+        mass: Mass and its source.
+        sources: Sources of numbers by tag.
     """
 
     name: str
@@ -81,12 +81,12 @@ class GraspObject:
     """A graspable object.
 
     Attributes:
-        name: Of the description.
-        description: One sentence.
-        frame: Where the object frame is, in words; its z points up when the object stands.
-        shape: The primitive, centred in the object frame, or the mesh in its own.
-        mass: [kg]; NaN where it is not known.
-        sources: Where the numbers come from, by tag.
+        name: Name of the description.
+        description: Description in one sentence.
+        frame: Location of the object frame, in words; z points up when the object stands.
+        shape: Primitive, centred in the object frame, or mesh in its own frame.
+        mass: Mass [kg]; NaN if unknown.
+        sources: Sources of the numbers by tag.
     """
 
     name: str
@@ -97,15 +97,15 @@ class GraspObject:
     sources: dict[str, str]
 
     def signed_distance(self, points: ArrayLike) -> Array:
-        """Distance of points (k, 3) of the object frame to the surface (k,) [m], < 0 inside."""
+        """Return the distances (k,) of points (k, 3) to the surface [m], negative inside."""
         return self.shape.signed_distance(points)
 
     def normal(self, points: ArrayLike) -> Array:
-        """Unit outward surface normal (k, 3) nearest to points (k, 3) of the object frame."""
+        """Return the unit outward surface normals (k, 3) nearest to points (k, 3)."""
         return self.shape.normal(points)
 
     def mesh(self, resolution: int = 32) -> Mesh:
-        """Vertices (v, 3) [m] and triangles (t, 3) in the object frame, for drawing."""
+        """Return vertices (v, 3) [m] and triangles (t, 3) in the object frame, for drawing."""
         return self.shape.mesh(resolution)
 
 
@@ -113,8 +113,8 @@ def load_object(name_or_path: str | Path) -> GraspObject:
     """Load an object.
 
     Args:
-        name_or_path: A shipped name (`shipped_names("objects")`), the path of a YAML file, or that
-            of a mesh in metres or of a URDF: ``mug.obj``; ``mug.obj@0.08`` is larger by that
+        name_or_path: A shipped name (`shipped_names("objects")`), the path of a YAML file, or the
+            path of a mesh in metres or of a URDF: ``mug.obj``; ``mug.obj@0.08`` scales it by that
             factor, and ``body.stl,handle.stl`` are one body.
 
     Raises:
@@ -122,7 +122,7 @@ def load_object(name_or_path: str | Path) -> GraspObject:
         DescriptionError: The file is missing or malformed; the message names file and key.
     """
     if is_mesh_name(name_or_path):
-        return _of_mesh(str(name_or_path))
+        return _object_from_mesh(str(name_or_path))
     path = resolve_description(name_or_path, "objects")
     entry, _ = read(path, ObjectFile)
     problem = entry.shape.check()
@@ -141,26 +141,26 @@ def load_object(name_or_path: str | Path) -> GraspObject:
 
 
 def is_mesh_name(name: str | Path) -> bool:
-    """Return whether an object's name is that of meshes or URDFs."""
-    files, _, _ = _mesh_words(str(name))
+    """Return True if an object's name consists of paths of meshes or URDFs."""
+    files, _, _ = _split_mesh_name(str(name))
     return all(file.lower().endswith(BODY_FORMATS) for file in files)
 
 
-def _mesh_words(name: str) -> tuple[list[str], str, str]:
-    """Files, "@" or "", and the factor behind it."""
-    files, at, factor = name.rpartition("@")
-    if not at or "/" in factor:
-        files, at, factor = name, "", "1"
-    return files.split(","), at, factor
+def _split_mesh_name(name: str) -> tuple[list[str], str, str]:
+    """Return the files, "@" or "", and the scale factor after it."""
+    files, separator, factor = name.rpartition("@")
+    if not separator or "/" in factor:
+        files, separator, factor = name, "", "1"
+    return files.split(","), separator, factor
 
 
-def _of_mesh(name: str) -> GraspObject:
-    files, _, factor = _mesh_words(name)
+def _object_from_mesh(name: str) -> GraspObject:
+    files, _, factor = _split_mesh_name(name)
     try:
         scale = float(factor)
     except ValueError:
         scale = np.nan
     if not 0 < scale < np.inf:
         raise DescriptionError(f"{name}: found factor {factor!r}, expected a number > 0")
-    shape = load_mesh_shape([Path(one).expanduser() for one in files], scale, name)
+    shape = load_mesh_shape([Path(file).expanduser() for file in files], scale, name)
     return GraspObject(name, "A mesh.", "that of the mesh", shape, np.nan, {})

@@ -1,4 +1,4 @@
-"""An arm or a hand as a part of a robot: checked, and read from our own files joint by joint."""
+"""Arms and hands as parts of a robot: validation, renaming and mirror images."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from casadi_ik.model.schema import ActuatorEntry, ArmFile, HandFile, JointEntry,
 
 
 def check_couplings(joints: dict[str, Joint], actuators: list[Actuator], path: Path) -> None:
-    """Whether every coupling ends at an actuator, and every actuator moves something.
+    """Check that every coupling leads to an actuator, and that every actuator moves a joint.
 
     Args:
-        joints: The movable joints by name.
+        joints: Movable joints by name.
         actuators: The actuators.
-        path: The file they stand in.
+        path: File of the joints.
 
     Raises:
-        DescriptionError: See above; or a coupling follows something of another unit, or a slider
-            leaves its triangle.
+        DescriptionError: A check fails, a coupling follows a coordinate of another unit, or a
+            slider leaves its triangle.
     """
     units = {joint.name: "m" if joint.type == "prismatic" else "rad" for joint in joints.values()}
     units |= {actuator.name: actuator.unit for actuator in actuators}
@@ -39,7 +39,7 @@ def check_couplings(joints: dict[str, Joint], actuators: list[Actuator], path: P
     for actuator in actuators:
         if actuator.name not in joints and actuator.name not in followed:
             raise DescriptionError(
-                f"{path}: actuators.{actuator.name}: moves nothing; expected the name of a joint, "
+                f"{path}: actuators.{actuator.name}: moves no joint; expected the name of a joint, "
                 "or a coupling that follows it"
             )
     for joint in joints.values():
@@ -49,9 +49,9 @@ def check_couplings(joints: dict[str, Joint], actuators: list[Actuator], path: P
         if coupling.source_unit and units[coupling.of] != coupling.source_unit:
             raise DescriptionError(
                 f"{path}: joint {joint.name!r}: coupling.of: {coupling.of!r} is in "
-                f"{units[coupling.of]}, expected something in {coupling.source_unit}"
+                f"{units[coupling.of]}; expected a coordinate in {coupling.source_unit}"
             )
-        motor = next((one for one in actuators if one.name == coupling.of), None)
+        motor = next((actuator for actuator in actuators if actuator.name == coupling.of), None)
         if motor is not None:
             where = f"{path}: joint {joint.name!r}: coupling"
             coupling.check_stroke(motor.name, motor.lower, motor.upper, where)
@@ -60,7 +60,7 @@ def check_couplings(joints: dict[str, Joint], actuators: list[Actuator], path: P
 def _check_coupling(
     joint: Joint, by_name: dict[str, Joint], actuators: set[str], path: Path
 ) -> None:
-    """Follow a joint's couplings down to an actuator."""
+    """Check that a joint's couplings lead to an actuator."""
     where = f"{path}: joint {joint.name!r}"
     followed, current = [joint.name], joint
     while current.coupling is not None:
@@ -79,22 +79,22 @@ def _check_coupling(
         current = by_name[source]
     if current.name not in actuators:
         raise DescriptionError(
-            f"{where}: coupling: missing, and there is no {current.name!r} under 'actuators'"
+            f"{where}: coupling: missing; expected one, or {current.name!r} under 'actuators'"
         )
 
 
 def require_unique(names: Iterable[str], where: str) -> None:
-    """Refuse a name that appears twice."""
-    seen: set[str] = set()
+    """Refuse names that appear twice."""
+    unique: set[str] = set()
     for name in names:
         require_usable_name(name, where)
-        if name in seen:
+        if name in unique:
             raise DescriptionError(f"{where}: {name!r} appears twice")
-        seen.add(name)
+        unique.add(name)
 
 
 def require_usable_name(name: str, where: str) -> None:
-    """Refuse a name that is empty, or too long to be read in a table or a file's name."""
+    """Refuse a name that is empty, or too long for tables and file names."""
     if not 0 < len(name) <= LIMITS.name_text:
         raise DescriptionError(
             f"{where}: found a name of {len(name)} characters, expected 1 to {LIMITS.name_text}"
@@ -102,16 +102,16 @@ def require_usable_name(name: str, where: str) -> None:
 
 
 def require_source(tags: str, sources: dict[str, str], where: str) -> None:
-    """Refuse source tags (separated by blanks or commas) that are empty or not explained."""
+    """Refuse source tags (separated by spaces or commas) that are missing or unknown."""
     for tag in tags.replace(",", " ").split():
         if tag not in sources:
             raise DescriptionError(f"{where}: unknown tag {tag!r}; sources: {', '.join(sources)}")
     if not tags.strip():
-        raise DescriptionError(f"{where}: is empty; every number needs its source")
+        raise DescriptionError(f"{where}: is empty; expected the source of the numbers")
 
 
 HAND_PREFIX = "hand_"
-"""Put before a name of the hand that the arm has as well."""
+"""Prefix of a name of the hand that the arm has, too."""
 
 
 @dataclass(frozen=True)
@@ -119,19 +119,19 @@ class RobotPart:
     """An arm or a hand.
 
     Attributes:
-        name: What it is called.
-        where: What stands before its keys in messages: its file, "arm.yaml: ".
-        root: Its base link.
-        joints: Its joints, parents before children.
-        actuators: Its motors.
-        sources: Where its numbers come from, by tag.
-        tip_link: Link that carries what comes next: an arm's tip, a hand's palm.
+        name: Name of the part.
+        where: Prefix of its keys in messages: its file, "arm.yaml: ".
+        root: Root link.
+        joints: Joints, parents before children.
+        actuators: Motors.
+        sources: Sources of the numbers by tag.
+        tip_link: Link that carries the next part: tip of an arm, palm of a hand.
         tip: (4, 4) pose of the tip or palm frame in that link.
-        home: Positions of some motors.
-        shapes: Of its links, for collisions.
-        pads: A hand's contact frames, by finger.
-        thumb: The finger placed first, if it says so itself.
-        mount: (4, 4) pose of a hand's root on an arm's tip, if the robot says nothing.
+        home: Home positions of some motors.
+        shapes: Collision shapes of the links.
+        pads: Contact frames of a hand by finger.
+        thumb: Finger placed first; None if the part names none.
+        mount: (4, 4) default pose of a hand's root on an arm's tip.
     """
 
     name: str
@@ -156,75 +156,79 @@ class RobotPart:
     @property
     def movers(self) -> set[str]:
         """Names of all joints and motors."""
-        return {one.name for one in (*self.joints, *self.actuators)}
+        return {item.name for item in (*self.joints, *self.actuators)}
 
 
 def prefix_shared_names(hand: RobotPart, arm: RobotPart) -> RobotPart:
-    """Return the hand with `HAND_PREFIX` before every name that the arm has too."""
+    """Return the hand with `HAND_PREFIX` before every name that the arm has, too."""
     movers = arm.movers | {"mount"}
     return _renamed(
         hand,
-        lambda name: _free(name, arm.links, hand.links),
-        lambda name: _free(name, movers, hand.movers),
+        lambda name: _prefixed(name, arm.links, hand.links),
+        lambda name: _prefixed(name, movers, hand.movers),
     )
 
 
-def prefix_side(part: RobotPart, side: str, shared: str | None = None) -> RobotPart:
-    """The part, with the side's name before all names that do not begin with it.
+def prefix_side(part: RobotPart, side: str, shared_link: str | None = None) -> RobotPart:
+    """Return the part with the side's name before all names that do not begin with it.
 
     Args:
         part: An arm or a hand.
-        side: "left" makes "left_" of it.
-        shared: A link that keeps its name.
+        side: Name of the side; "left" gives the prefix "left_".
+        shared_link: Link that keeps its name.
     """
 
-    def own(name: str) -> str:
-        return name if name == shared or name.startswith(f"{side}_") else f"{side}_{name}"
+    def prefixed(name: str) -> str:
+        unchanged = name == shared_link or name.startswith(f"{side}_")
+        return name if unchanged else f"{side}_{name}"
 
-    named = _renamed(part, own, own)
-    thumb = None if part.thumb is None else own(part.thumb)
-    return replace(named, pads={own(name): pad for name, pad in named.pads.items()}, thumb=thumb)
+    renamed = _renamed(part, prefixed, prefixed)
+    thumb = None if part.thumb is None else prefixed(part.thumb)
+    pads = {prefixed(name): pad for name, pad in renamed.pads.items()}
+    return replace(renamed, pads=pads, thumb=thumb)
 
 
 def mirrored(part: RobotPart) -> RobotPart:
-    """The part's mirror image, left for right: y is turned round in its root's frame.
+    """Return the mirror image of a part, in which y is inverted in the frame of its root.
 
-    Every frame of it is mirrored in its own y. A joint turns about the mirrored axis; where the
-    opposite one is nearer to what it was, it turns about that and runs the other way round, if it
-    is not coupled otherwise than linearly.
+    Every frame is mirrored in its own y. The axis of a joint is mirrored, too; if the opposite axis
+    is closer to the original one, the joint uses that one and its positions change sign, unless it
+    has a coupling that is not linear.
     """
-    bent = [one for one in part.joints if one.coupling and not isinstance(one.coupling, Linear)]
-    stays = {one.name for one in bent} | {one.coupling.of for one in bent if one.coupling}
-    turned: set[str] = set()
+    nonlinear = [j for j in part.joints if j.coupling and not isinstance(j.coupling, Linear)]
+    unchanged = {j.name for j in nonlinear} | {j.coupling.of for j in nonlinear if j.coupling}
+    inverted: set[str] = set()
     joints = []
     for joint in part.joints:
         axis = joint.axis * MIRROR_SIGNS
         if joint.type == "revolute":
             axis = -axis
-        if joint.type != "fixed" and axis @ joint.axis < 0 and joint.name not in stays:
+        if joint.type != "fixed" and axis @ joint.axis < 0 and joint.name not in unchanged:
             axis = -axis
-            turned.add(joint.name)
+            inverted.add(joint.name)
         joints.append(replace(joint, axis=read_only(axis), placement=_mirrored(joint.placement)))
-    # A motor that is no joint runs with those that follow it.
-    followed = {j.coupling.of for j in joints if j.coupling is not None and j.name in turned}
-    turned |= followed - {joint.name for joint in joints}
+    # A motor that is not a joint changes its sign with the joints that follow it.
+    followed = {j.coupling.of for j in joints if j.coupling is not None and j.name in inverted}
+    inverted |= followed - {joint.name for joint in joints}
     return replace(
         part,
-        joints=[_run_back(joint, turned) for joint in joints],
+        joints=[_inverted_joint(joint, inverted) for joint in joints],
         actuators=[
-            replace(one, lower=-one.upper, upper=-one.lower) if one.name in turned else one
-            for one in part.actuators
+            replace(motor, lower=-motor.upper, upper=-motor.lower)
+            if motor.name in inverted
+            else motor
+            for motor in part.actuators
         ],
         tip=_mirrored(part.tip),
         mount=_mirrored(part.mount),
-        home={name: -at if name in turned else at for name, at in part.home.items()},
+        home={name: -q if name in inverted else q for name, q in part.home.items()},
         shapes=part.shapes.mirrored(),
         pads={name: _mirrored_pad(pad) for name, pad in part.pads.items()},
     )
 
 
 MIRROR_SIGNS = np.array([1.0, -1.0, 1.0])
-"""What a vector is multiplied by in the mirror."""
+"""Signs of the components of a vector in the mirror image."""
 
 
 def _mirrored(pose: Array) -> Array:
@@ -233,31 +237,36 @@ def _mirrored(pose: Array) -> Array:
 
 
 def _mirrored_pad(pad: PadEntry) -> PadEntry:
-    def across(vector: tuple[float, ...]) -> tuple[float, ...]:
+    def mirror(vector: tuple[float, ...]) -> tuple[float, ...]:
         return vector[0], -vector[1], vector[2]
 
     return msgspec.structs.replace(
         pad,
-        xyz=across(pad.xyz),
+        xyz=mirror(pad.xyz),
         rpy=(-pad.rpy[0], pad.rpy[1], -pad.rpy[2]),
-        normal=across(pad.normal),
-        tangent=None if pad.tangent is None else across(pad.tangent),
+        normal=mirror(pad.normal),
+        tangent=None if pad.tangent is None else mirror(pad.tangent),
     )
 
 
-def _run_back(joint: Joint, turned: set[str]) -> Joint:
-    """A joint of a mirror image whose positions, or those that it follows, change their sign."""
-    coupling, back = joint.coupling, joint.name in turned
-    if isinstance(coupling, Linear) and (back or coupling.of in turned):
-        sign = -1.0 if back else 1.0
-        ratio = coupling.ratio * sign * (-1.0 if coupling.of in turned else 1.0)
+def _inverted_joint(joint: Joint, inverted: set[str]) -> Joint:
+    """Return a joint of a mirror image after the positions of some joints have changed sign.
+
+    Args:
+        joint: Joint of the mirror image.
+        inverted: Names of joints and motors whose positions have changed sign.
+    """
+    coupling, is_inverted = joint.coupling, joint.name in inverted
+    if isinstance(coupling, Linear) and (is_inverted or coupling.of in inverted):
+        sign = -1.0 if is_inverted else 1.0
+        ratio = coupling.ratio * sign * (-1.0 if coupling.of in inverted else 1.0)
         coupling = msgspec.structs.replace(coupling, ratio=ratio, offset=sign * coupling.offset)
-    lower, upper = (-joint.upper, -joint.lower) if back else (joint.lower, joint.upper)
+    lower, upper = (-joint.upper, -joint.lower) if is_inverted else (joint.lower, joint.upper)
     return replace(joint, coupling=coupling, lower=lower, upper=upper)
 
 
 def _renamed(part: RobotPart, link: Callable[[str], str], mover: Callable[[str], str]) -> RobotPart:
-    """The part with other names of links, and of joints and motors."""
+    """Return the part with other names of links, and of joints and motors."""
     joints = [
         replace(
             joint,
@@ -273,7 +282,7 @@ def _renamed(part: RobotPart, link: Callable[[str], str], mover: Callable[[str],
         part,
         root=link(part.root),
         joints=joints,
-        actuators=[replace(one, name=mover(one.name)) for one in part.actuators],
+        actuators=[replace(motor, name=mover(motor.name)) for motor in part.actuators],
         shapes=part.shapes.renamed({name: link(name) for name in part.links}),
         tip_link=link(part.tip_link),
         home={mover(name): value for name, value in part.home.items()},
@@ -284,10 +293,10 @@ def _renamed(part: RobotPart, link: Callable[[str], str], mover: Callable[[str],
     )
 
 
-def _free(name: str, taken: Collection[str], own: Collection[str]) -> str:
-    if name not in taken:
+def _prefixed(name: str, arm_names: Collection[str], hand_names: Collection[str]) -> str:
+    if name not in arm_names:
         return name
-    while name in taken or name in own:
+    while name in arm_names or name in hand_names:
         name = HAND_PREFIX + name
     return name
 
@@ -296,23 +305,23 @@ JOINT_TYPES = ("revolute", "prismatic", "fixed")
 
 
 def part_from_file(file: ArmFile | HandFile, path: Path) -> RobotPart:
-    """An arm or a hand of a file of ours, checked.
+    """Return the checked arm or hand of a description file.
 
     Args:
-        file: What it says.
+        file: Record of the file.
         path: The file.
 
     Raises:
-        DescriptionError: With file, key, what was found and what was expected.
+        DescriptionError: The file is malformed; the message names file, key and expected value.
     """
-    hand = isinstance(file, HandFile)
-    kind, key, end = ("hand", "palm", file.palm) if hand else ("arm", "tip", file.tip)
+    is_hand = isinstance(file, HandFile)
+    kind, key, end = ("hand", "palm", file.palm) if is_hand else ("arm", "tip", file.tip)
     joints = _joints(file.joints, file.root, file.sources, kind, path)
-    motors = _actuators(file.actuators if hand else None, joints, file.sources, kind, path)
+    motors = _actuators(file.actuators if is_hand else None, joints, file.sources, kind, path)
     links = (file.root, *(joint.child for joint in joints))
     require_name(end.link, links, "link", f"{path}: {key}.link")
     require_source(end.source, file.sources, f"{path}: {key}.source")
-    for name, finger in file.fingers.items() if hand else ():
+    for name, finger in file.fingers.items() if is_hand else ():
         require_source(finger.source, file.sources, f"{path}: fingers.{name}.source")
     if file.collision is not None and file.collision.links:
         require_source(file.collision.source, file.sources, f"{path}: collision.source")
@@ -328,7 +337,7 @@ def part_from_file(file: ArmFile | HandFile, path: Path) -> RobotPart:
         file.home,
         link_shapes(file.collision, links, path),
     )
-    if not hand:
+    if not is_hand:
         return part
     return replace(part, pads=file.fingers, thumb=file.thumb, mount=frame_matrix(file.mount))
 
@@ -336,7 +345,7 @@ def part_from_file(file: ArmFile | HandFile, path: Path) -> RobotPart:
 def _joints(
     entries: list[JointEntry], root: str, sources: dict[str, str], part: str, path: Path
 ) -> list[Joint]:
-    """Checked joints, parents before children."""
+    """Return checked joints, parents before children."""
     names = [entry.name for entry in entries]
     require_unique(names, f"{path}: joints")
     require_unique([root, *(entry.child for entry in entries)], f"{path}: joints: child links")
@@ -355,13 +364,13 @@ def _joints(
         if entry.coupling is not None:
             entry.coupling.check(f"{where}: coupling")
     ordered = parents_first(entries, root)
-    stray = next((entry for entry in entries if entry not in ordered), None)
-    if stray is not None:
+    detached = next((entry for entry in entries if entry not in ordered), None)
+    if detached is not None:
         links = {entry.child for entry in entries}
-        problem = "is part of a frame cycle" if stray.parent in links else "is no link"
+        problem = "is part of a cycle" if detached.parent in links else "is not a link"
         raise DescriptionError(
-            f"{path}: joint {stray.name!r}: parent: {stray.parent!r} {problem}; "
-            f"expected a chain of joints down to the root {root!r}"
+            f"{path}: joint {detached.name!r}: parent: {detached.parent!r} {problem}; "
+            f"expected a chain of joints from the root {root!r}"
         )
     return [_joint(entry, part) for entry in ordered]
 
@@ -391,7 +400,7 @@ def _actuators(
     part: str,
     path: Path,
 ) -> list[Actuator]:
-    """The part's actuators, after checking that every coupling ends at one of them."""
+    """Return the part's actuators, after a check that every coupling leads to one of them."""
     by_name = {joint.name: joint for joint in joints if joint.type != "fixed"}
     if entries is None:
         entries = {name: ActuatorEntry() for name, j in by_name.items() if j.coupling is None}

@@ -1,4 +1,4 @@
-"""What may stand in an arm, hand or arm-hand file."""
+"""Records of arm, hand and robot files; their docstrings describe the JSON Schemas."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ class _Shape(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field=
     """A shape.
 
     Attributes:
-        excess: By how much it is larger than the mesh it holds, at most [m].
+        excess: Largest distance between the surface of the shape and the mesh that it encloses [m].
     """
 
 
 class SphereEntry(_Shape, frozen=True, tag="sphere", kw_only=True):
-    """A ball about a point of the link.
+    """A ball.
 
     Attributes:
-        radius: [m].
-        center: In the link's frame [m].
+        radius: Radius [m].
+        center: Centre in the link's frame [m].
     """
 
     radius: Size
@@ -31,11 +31,11 @@ class SphereEntry(_Shape, frozen=True, tag="sphere", kw_only=True):
 
 
 class CapsuleEntry(_Shape, frozen=True, tag="capsule", kw_only=True):
-    """All within the radius of the segment between two points of the link.
+    """A capsule: all points within the radius of a segment.
 
     Attributes:
-        ends: Two points of the link's frame [m].
-        radius: [m].
+        ends: End points of the segment in the link's frame [m].
+        radius: Radius [m].
     """
 
     ends: tuple[Point, Point]
@@ -44,11 +44,11 @@ class CapsuleEntry(_Shape, frozen=True, tag="capsule", kw_only=True):
 
 
 class BoxEntry(_Shape, frozen=True, tag="box", kw_only=True):
-    """A box about its own frame's origin.
+    """A box centred in its frame.
 
     Attributes:
-        size: Along its own x, y and z [m].
-        xyz: Its middle in the link's frame [m].
+        size: Edges along x, y and z of its frame [m].
+        xyz: Centre in the link's frame [m].
         rpy: Angles about the fixed axes x, y, z [rad], as in URDF.
     """
 
@@ -59,12 +59,12 @@ class BoxEntry(_Shape, frozen=True, tag="box", kw_only=True):
 
 
 class CylinderEntry(_Shape, frozen=True, tag="cylinder", kw_only=True):
-    """A cylinder along z about its own frame's origin.
+    """A cylinder along z, centred in its frame.
 
     Attributes:
-        radius: [m].
-        length: Along its own z [m].
-        xyz: Its middle in the link's frame [m].
+        radius: Radius [m].
+        length: Length along z of its frame [m].
+        xyz: Centre in the link's frame [m].
         rpy: Angles about the fixed axes x, y, z [rad], as in URDF.
     """
 
@@ -79,12 +79,12 @@ ShapeEntry = SphereEntry | CapsuleEntry | BoxEntry | CylinderEntry
 
 
 class TouchingEntry(Struct, frozen=True):
-    """Two links that may touch, and why.
+    """Two links that may touch, with the reason.
 
     Attributes:
-        links: Their names; in a scene a solid's too.
-        reason: Why, in words.
-        depth: How far their shapes may overlap [m]; left out: any.
+        links: Names of the links; in a scene also of a solid.
+        reason: Reason in words.
+        depth: Largest allowed penetration [m]; default: any.
     """
 
     links: tuple[str, str]
@@ -97,9 +97,9 @@ class CollisionEntry(Struct, frozen=True):
 
     Attributes:
         links: Shapes by link.
-        touching: Pairs of links that are not checked, or less strictly.
-        source: Tags of `sources` that the shapes are from.
-        srdf: A file with more pairs that may touch.
+        touching: Pairs of links that are not checked, or whose penetration is allowed.
+        source: Tags of `sources` for the shapes.
+        srdf: SRDF file with further pairs that may touch.
     """
 
     links: dict[str, list[ShapeEntry]] = msgspec.field(default_factory=dict)
@@ -109,20 +109,20 @@ class CollisionEntry(Struct, frozen=True):
 
 
 class JointEntry(Struct, frozen=True):
-    """A joint; ``coupling`` absent means that it is its own actuator.
+    """A joint; without ``coupling`` it is its own actuator.
 
     Attributes:
-        name: Of the joint; an actuator of a joint that follows none has it too.
-        parent: Link that it is on.
-        child: Link that it moves.
-        axis: Direction in the child's frame about which (prismatic: along which) the child moves.
-        limits: Lower and upper end [rad or m].
-        source: Tags of `sources` that its numbers are from.
+        name: Name of the joint; an actuator of a joint without coupling has the same name.
+        parent: Parent link.
+        child: Child link.
+        axis: Axis of rotation (prismatic: of translation) in the child's frame.
+        limits: Lower and upper limit [rad or m].
+        source: Tags of `sources` for the numbers.
         type: revolute, prismatic or fixed.
-        origin: The child's frame in the parent's while the joint reads zero.
-        velocity: Its limit [rad/s or m/s]; left out: not known.
-        effort: Its largest torque or force [N m or N]; left out: not known.
-        coupling: What it follows; left out: it has a motor of its own.
+        origin: Pose of the child's frame in the parent's at joint position zero.
+        velocity: Velocity limit [rad/s or m/s]; default: unknown.
+        effort: Largest torque or force [N m or N]; default: unknown.
+        coupling: Coupling to an actuator or joint; default: the joint has a motor.
     """
 
     name: str
@@ -139,14 +139,14 @@ class JointEntry(Struct, frozen=True):
 
 
 class ActuatorEntry(Struct, frozen=True):
-    """A motor; limits and velocity are the joint's where it drives a joint of the same name.
+    """A motor; limits and velocity default to those of the joint of the same name.
 
     Attributes:
-        limits: Lower and upper end [rad or m]; left out: the joint's of the same name.
-        velocity: Its limit [rad/s or m/s]; left out: the joint's.
-        effort: Its largest torque or force [N m or N]; left out: the joint's.
-        unit: rad or m, where no joint has its name.
-        source: Tags of `sources` that its numbers are from.
+        limits: Lower and upper limit [rad or m]; default: those of the joint of the same name.
+        velocity: Velocity limit [rad/s or m/s]; default: that of the joint.
+        effort: Largest torque or force [N m or N]; default: that of the joint.
+        unit: rad or m, if no joint has this name.
+        source: Tags of `sources` for the numbers.
     """
 
     limits: tuple[JointValue, JointValue] | None = None
@@ -163,7 +163,7 @@ class LinkFrame(Frame, frozen=True, kw_only=True):
         link: Name of the link.
         xyz: Origin in the link's frame [m].
         rpy: Angles about the fixed axes x, y, z [rad], as in URDF.
-        source: Tags of `sources` that its numbers are from.
+        source: Tags of `sources` for the numbers.
     """
 
     link: str
@@ -171,31 +171,32 @@ class LinkFrame(Frame, frozen=True, kw_only=True):
 
 
 class BallPad(Struct, frozen=True, tag_field="kind", tag="ball"):
-    """A pad that touches with any point of a ball; at zero lean with the contact frame's origin.
+    """A pad that touches with any point of a ball, nominally with the contact frame's origin.
 
     Attributes:
-        radius: Of the ball, whose middle is behind the contact frame's origin [m].
+        radius: Radius of the ball, which touches the contact frame's origin from inside the pad
+            [m].
     """
 
     radius: Size
 
 
 class PlanePad(Struct, frozen=True, tag_field="kind", tag="plane"):
-    """A flat pad: it touches with the contact frame's origin and faces what it touches."""
+    """A flat pad: it touches with the contact frame's origin and faces the surface."""
 
 
 class PadEntry(Frame, frozen=True, kw_only=True):
-    """The contact frame of a finger: where its pad touches and which way that faces.
+    """The contact frame of a finger: contact point and orientation of its pad.
 
-    Normal and tangent are made orthogonal.
+    The tangent is made orthogonal to the normal.
 
     Attributes:
-        link: Link that the pad is on.
+        link: Link of the pad.
         normal: Direction out of the pad, away from the finger, in the contact frame.
-        xyz: Where the pad touches, in the link's frame [m].
+        xyz: Contact point in the link's frame [m].
         rpy: Angles of the contact frame about the link's fixed axes [rad].
-        tangent: The pad's second axis; left out: the frame's x axis.
-        pad: What it touches with; left out: a plane.
+        tangent: Second axis of the pad; default: the frame's x axis.
+        pad: Shape of the pad; default: a plane.
     """
 
     link: str
@@ -208,21 +209,21 @@ class FingertipEntry(PadEntry, frozen=True, kw_only=True):
     """The contact frame of a finger of a described hand; see `PadEntry`.
 
     Attributes:
-        source: Tags of `sources` that its numbers are from.
+        source: Tags of `sources` for the numbers.
     """
 
     source: str
 
 
-class _Described(Struct, frozen=True, kw_only=True):
-    """What a file of ours says of whatever it describes.
+class _Description(Struct, frozen=True, kw_only=True):
+    """Keys that all descriptions have.
 
     Attributes:
-        name: What it is called.
-        description: What it is, the first sentence by itself.
-        home: Position by actuator where it is taken to stand [rad or m].
-        collision: Shapes of its links; these go before those of its parts, or of its file.
-        sources: Where numbers are from, by tag.
+        name: Name.
+        description: Description; the first sentence is a summary.
+        home: Home position by actuator [rad or m].
+        collision: Shapes of the links; these override those of its parts, or of its file.
+        sources: Sources of numbers by tag.
     """
 
     name: str
@@ -231,12 +232,12 @@ class _Described(Struct, frozen=True, kw_only=True):
     collision: CollisionEntry | None = None
 
 
-class _Part(_Described, frozen=True, kw_only=True):
-    """What a robot is put together from.
+class _PartFile(_Description, frozen=True, kw_only=True):
+    """An arm or hand file.
 
     Attributes:
-        root: Link that all others hang on.
-        joints: In any order.
+        root: Root link.
+        joints: Joints in any order.
     """
 
     root: str
@@ -244,28 +245,28 @@ class _Part(_Described, frozen=True, kw_only=True):
     sources: dict[str, str]
 
 
-class ArmFile(_Part, frozen=True, kw_only=True):
+class ArmFile(_PartFile, frozen=True, kw_only=True):
     """An arm: ``models/arms/*.yaml``.
 
     Attributes:
-        tip: Frame that a hand is mounted on.
+        tip: Frame on which a hand is mounted.
     """
 
     tip: LinkFrame
 
 
-class HandFile(_Part, frozen=True, kw_only=True):
+class HandFile(_PartFile, frozen=True, kw_only=True):
     """A hand: ``models/hands/*.yaml``.
 
-    ``thumb``, ``mount`` and ``home`` hold for a robot that is put together by name; others say
-    them themselves.
+    ``thumb``, ``mount`` and ``home`` apply to robots that are named ARM+HAND; other robots state
+    their own.
 
     Attributes:
         palm: Frame of the palm: z away from it, y towards the thumb.
         fingers: Contact frame by finger.
-        actuators: Motors by name; left out: one for each joint without coupling.
+        actuators: Motors by name; default: one for each joint without coupling.
         thumb: Finger that is placed first.
-        mount: The hand's root on an arm's tip.
+        mount: Pose of the hand's root on an arm's tip.
     """
 
     palm: LinkFrame
@@ -276,15 +277,15 @@ class HandFile(_Part, frozen=True, kw_only=True):
 
 
 class _FromFile(Struct, frozen=True, kw_only=True):
-    """What stands in somebody's file.
+    """A part of a URDF, xacro or MJCF file.
 
     Attributes:
-        file: URDF, xacro or MJCF; a path counts from the description.
-        root: Link that it begins with; left out: the file's.
-        locked: Joints that stand still, and where [rad or m].
-        limits: Limits by joint that go before the file's [rad or m].
-        xacro: Values of the file's arguments, NAME:=VALUE; true: its macros are expanded although
-            it is not called ``.xacro``.
+        file: URDF, xacro or MJCF; relative to the description.
+        root: Root link of the part; default: that of the file.
+        locked: Fixed positions by joint [rad or m].
+        limits: Limits by joint that override those of the file [rad or m].
+        xacro: Values of the file's arguments, NAME:=VALUE; true: expand macros although the file is
+            not called ``.xacro``.
     """
 
     file: str
@@ -295,17 +296,17 @@ class _FromFile(Struct, frozen=True, kw_only=True):
 
 
 class ArmFromFile(_FromFile, frozen=True, kw_only=True):
-    """An arm in somebody's file: the chain from ``root`` to ``tip``.
+    """An arm in a URDF or MJCF file: the chain from ``root`` to ``tip``.
 
     Attributes:
-        tip: Link that a hand is mounted on; left out: the only end of the chain.
+        tip: Link on which a hand is mounted; default: the only end of the chain.
     """
 
     tip: str | None = None
 
 
 class HandFromFile(_FromFile, frozen=True, kw_only=True):
-    """A hand in somebody's file, or a whole robot: what is above ``palm`` moves the hand.
+    """A hand in a URDF or MJCF file, or a whole robot, whose joints above ``palm`` move the hand.
 
     Attributes:
         palm: Link of the palm, or a frame on it.
@@ -314,20 +315,20 @@ class HandFromFile(_FromFile, frozen=True, kw_only=True):
     palm: str | LinkFrame | None = None
 
 
-class _Robot(_Described, frozen=True, kw_only=True):
+class _Robot(_Description, frozen=True, kw_only=True):
     """A robot."""
 
     sources: dict[str, str] = msgspec.field(default_factory=dict)
 
 
-class _OnArm(_Robot, frozen=True, kw_only=True):
-    """A robot of one hand, on an arm or on a fixed base.
+class _SingleHandRobot(_Robot, frozen=True, kw_only=True):
+    """A robot with one hand, on an arm or on a fixed base.
 
     Attributes:
-        thumb: Finger that is placed first; the paper's methods need one.
-        arm: A shipped name, a path, or an arm in somebody's file; left out: the hand stands on a
-            fixed base.
-        mount: The hand's root on the arm's tip.
+        thumb: Finger that is placed first; thumb-first methods need one.
+        arm: Shipped name, path, or arm in a URDF or MJCF file; default: the hand is on a fixed
+            base.
+        mount: Pose of the hand's root on the arm's tip.
     """
 
     thumb: str | None = None
@@ -335,25 +336,25 @@ class _OnArm(_Robot, frozen=True, kw_only=True):
     mount: Frame = Frame()
 
 
-class ArmHandFile(_OnArm, frozen=True, kw_only=True):
-    """A robot: an arm (or none), a described hand, and what joins them.
+class ArmHandFile(_SingleHandRobot, frozen=True, kw_only=True):
+    """A robot: an arm (or none), a described hand, and the mount between them.
 
     Attributes:
-        hand: A shipped name, a path, or the hand itself.
-        fingers: The hand's fingers that take part, in their order.
+        hand: Shipped name, path, or the description of the hand.
+        fingers: Fingers of the hand that are used, in order.
     """
 
     hand: str | HandFile
     fingers: list[str]
 
 
-class ImportedFile(_OnArm, frozen=True, kw_only=True):
-    """A robot whose hand is in somebody's file: either ``hand`` or ``robot``, which has an arm.
+class ImportedFile(_SingleHandRobot, frozen=True, kw_only=True):
+    """A robot whose hand is in a URDF or MJCF file: ``hand``, or ``robot`` with its arm.
 
     Attributes:
-        fingers: Contact frame by finger, since no file says where a pad is.
-        hand: A hand in a file of its own.
-        robot: A whole robot in one file; then there is no `arm`.
+        fingers: Contact frame by finger, which URDF and MJCF do not state.
+        hand: Hand in a file of its own.
+        robot: Whole robot in one file; excludes ``arm``.
     """
 
     fingers: dict[str, PadEntry]
@@ -362,18 +363,18 @@ class ImportedFile(_OnArm, frozen=True, kw_only=True):
 
 
 class PartSide(Struct, frozen=True):
-    """An arm-hand of a body that is put together.
+    """A side of a multi-arm robot that is composed of parts.
 
     Attributes:
-        arm: A shipped name, a path, or an arm in somebody's file.
-        hand: A shipped name, a path, or the hand itself; left out: the one that the robot's name
-            has after its plus sign.
-        at: Where the arm's root stands on the trunk's end; left out by all sides whose arms have
-            the same root: they share that link.
-        mount: The hand's root on the arm's tip; left out: as the hand says.
-        mirror: Which of "arm" and "hand" are mirror images of what is described, left for right.
-        fingers: The hand's fingers that take part; left out: all.
-        thumb: Finger that is placed first; left out: the hand's.
+        arm: Shipped name, path, or arm in a URDF or MJCF file.
+        hand: Shipped name, path, or the description of the hand; default: the hand after the plus
+            sign of the robot's name.
+        at: Pose of the arm's root on the trunk's end; omitted by all sides if their arms share a
+            root link.
+        mount: Pose of the hand's root on the arm's tip; default: that of the hand.
+        mirror: Parts ("arm", "hand") that are mirror images of the description, left for right.
+        fingers: Fingers of the hand that are used; default: all.
+        thumb: Finger that is placed first; default: that of the hand.
     """
 
     arm: str | ArmFromFile
@@ -386,16 +387,16 @@ class PartSide(Struct, frozen=True):
 
 
 class BodyFile(_Robot, frozen=True, kw_only=True):
-    """A body that is put together: arm-hands by name on a common trunk.
+    """A multi-arm robot that is composed of parts: arm-hands by name on a common trunk.
 
-    Every name of a link, joint, motor or finger gets the side's name and an underscore before it,
-    unless it begins with them.
+    Names of links, joints, motors and fingers are prefixed by the side's name and an underscore,
+    unless they begin with it.
 
     Attributes:
         sides: Arm-hand by name.
-        trunk: What carries all arms: a shipped name of ``models/trunks``, a path, or a chain in
-            somebody's file; left out: they stand still.
-        home: Position by actuator that goes before those of the parts [rad or m].
+        trunk: Part that carries all arms: shipped name of ``models/trunks``, path, or chain in a
+            URDF or MJCF file; default: a fixed base.
+        home: Home position by actuator, which overrides those of the parts [rad or m].
     """
 
     sides: dict[str, PartSide]
@@ -403,11 +404,11 @@ class BodyFile(_Robot, frozen=True, kw_only=True):
 
 
 class FileSide(Struct, frozen=True):
-    """An arm-hand of a body in somebody's file.
+    """A side of a multi-arm robot in a URDF or MJCF file.
 
     Attributes:
-        palm: Link of its palm, or a frame on it; what is below is the hand.
-        fingers: Contact frame by finger, since no file says where a pad is.
+        palm: Link of its palm, or a frame on it; the hand is everything below.
+        fingers: Contact frame by finger, which URDF and MJCF do not state.
         thumb: Finger that is placed first.
     """
 
@@ -417,12 +418,12 @@ class FileSide(Struct, frozen=True):
 
 
 class ImportedBody(_Robot, frozen=True, kw_only=True):
-    """A body in somebody's file.
+    """A multi-arm robot in a URDF or MJCF file.
 
     Attributes:
-        robot: The file; its ``locked`` names what does not take part, such as legs and head.
-        sides: Arm-hand by name; fingers get it and an underscore before their names.
-        trunk: Link that all sides stand on; left out: the last one that carries all palms.
+        robot: The file; its ``locked`` names joints that are not used, such as legs and head.
+        sides: Arm-hand by name; fingers are prefixed by the name and an underscore.
+        trunk: Link that carries all sides; default: the last link that carries all palms.
     """
 
     robot: HandFromFile

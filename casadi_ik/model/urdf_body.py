@@ -1,4 +1,4 @@
-"""Objects to be grasped that a URDF describes: its meshes and simple shapes as one body."""
+"""Objects that a URDF describes: its meshes and simple shapes as one body."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from casadi_ik.model.sandbox import package_folders
 from casadi_ik.model.xml_tree import origin_pose, parse_numbers, parse_xml, read_robot_file
 
 BODY_FORMATS = (*MESH_FORMATS, ".urdf")
-"""Endings of files that bound a body by triangles."""
+"""File name extensions of bodies bounded by triangles."""
 
 Triangles = tuple[Array, NDArray[np.int64]]
 
 
 def read_body(path: Path, where: str) -> Triangles:
-    """Read the corners (k, 3) and triangles (t, 3) of a mesh file or a URDF.
+    """Return the vertices (k, 3) and triangles (t, 3) of a mesh file or a URDF.
 
     Args:
         path: A mesh, or a URDF whose visual geometry is read, or its collision geometry if it has
@@ -30,7 +30,7 @@ def read_body(path: Path, where: str) -> Triangles:
         where: File and key that name it, for messages.
 
     Raises:
-        DescriptionError: There is no such file, it is damaged, or holds no geometry.
+        DescriptionError: The file does not exist, is damaged, or has no geometry.
     """
     if path.suffix.lower() != ".urdf":
         return read_mesh(path, where)
@@ -42,7 +42,7 @@ def read_body(path: Path, where: str) -> Triangles:
     poses = _link_poses(root, path)
     for kind in ("visual", "collision"):
         parts = [
-            _moved(_geometry(element, path), poses[name] @ _pose(element, path))
+            _transformed(_geometry(element, path), poses[name] @ _pose(element, path))
             for name, link in _links(root).items()
             for element in link.findall(kind)
         ]
@@ -60,7 +60,7 @@ def _links(root: Element) -> dict[str, Element]:
 
 
 def _link_poses(root: Element, path: Path) -> dict[str, Array]:
-    """Poses (4, 4) of all links in the frame of the root link, with movable joints at zero."""
+    """Return the poses (4, 4) of all links in the root frame, with movable joints at zero."""
     parents: dict[str, tuple[str, Array]] = {}
     for joint in root.findall("joint"):
         parent, child = joint.find("parent"), joint.find("child")
@@ -95,7 +95,7 @@ def _geometry(element: Element, path: Path) -> Triangles:
     name = shape.get("filename", "")
     file = _mesh_file(name, path)
     if file is None:
-        raise DescriptionError(f"{path}: no such mesh {name!r}, expected it beside the URDF")
+        raise DescriptionError(f"{path}: no such mesh {name!r}; expected it next to the URDF")
     scale = parse_numbers(shape.get("scale", "1 1 1"))
     sizes = sorted(map(abs, scale)) or [0.0]
     if len(scale) != 3 or not 0 < sizes[0] <= sizes[-1] <= LIMITS.mesh_coordinate:
@@ -127,16 +127,17 @@ def _simple(shape: Element, path: Path) -> Triangles:
 
 
 def _mesh_file(name: str, path: Path) -> Path | None:
-    """Return the file of a mesh: beside the URDF, or in a package above it; None if missing."""
+    """Return the file of a mesh, relative to the URDF or in a ROS package; None if missing."""
     scheme, _, inside = name.partition("://")
-    places = [path.parent / name.removeprefix("file://")]
+    paths = [path.parent / name.removeprefix("file://")]
     if scheme in ("package", "model"):
-        package, _, rest = inside.partition("/")
-        places = [one / rest for found in package_folders(package, path) for one in found]
-        places += [path.parent / rest, path.parent / Path(rest).name]
-    return next((place for place in places if place.is_file()), None)
+        package, _, mesh = inside.partition("/")
+        folders = [folder for group in package_folders(package, path) for folder in group]
+        paths = [folder / mesh for folder in folders]
+        paths += [path.parent / mesh, path.parent / Path(mesh).name]
+    return next((candidate for candidate in paths if candidate.is_file()), None)
 
 
-def _moved(mesh: Triangles, pose: Array) -> Triangles:
+def _transformed(mesh: Triangles, pose: Array) -> Triangles:
     points, triangles = mesh
     return points @ pose[:3, :3].T + pose[:3, 3], triangles

@@ -1,4 +1,4 @@
-"""Write a robot description as URDF, for viewers and for checking by other libraries."""
+"""Export of a robot description as URDF, for viewers and for checks by other libraries."""
 
 from __future__ import annotations
 
@@ -12,34 +12,35 @@ from casadi_ik.files.reading import roll_pitch_yaw
 from casadi_ik.model.description import RobotDescription
 
 LINK_RADIUS = {"arm": 0.055, "mount": 0.03, "hand": 0.009}
-"""Radius of the drawn cylinders [m] by part; for looks only."""
+"""Radius of the visual cylinders by part [m]; appearance only."""
 
 COLOURS = {"arm": "0.93 0.55 0.20 1", "mount": "0.35 0.35 0.38 1", "hand": "0.35 0.35 0.38 1"}
 
 
 def to_urdf(robot: RobotDescription) -> str:
-    """The robot as URDF text.
+    """Return the robot as URDF text.
 
-    Every link gets simple cylinders from its frame to its children to be seen, its shapes for
-    collisions (a capsule as a cylinder and two spheres), and every finger a fixed
-    link ``<finger>_contact`` whose frame is the contact frame. A joint that follows an actuator
-    or joint linearly becomes a mimic joint; other couplings have no URDF form:
-    their joints stay independent (set them from `ArmHand.joints`), with the coupling as a comment.
+    Each link has cylinders from its frame to its children as visual geometry, and its collision
+    shapes (a capsule is a cylinder and two spheres). Each finger has a fixed link
+    ``<finger>_contact`` whose frame is the contact frame. A linear coupling becomes a mimic joint.
+    Other couplings have no URDF
+    equivalent: their joints stay independent (take their positions from `ArmHand.joints`), with the
+    coupling as a comment.
 
     Args:
         robot: The description.
 
     Returns:
         URDF XML, joint limits in rad and m. Unknown velocity limits are written as 10, unknown
-        efforts as 0, since URDF demands a number.
+        efforts as 0, because URDF requires a number.
     """
     root = ElementTree.Element("robot", name=robot.name)
     mimics = _leaders(robot)
     part = {robot.root: "arm"} | {joint.child: joint.part for joint in robot.joints}
     for link in robot.links:
         element = ElementTree.SubElement(root, "link", name=link)
-        _draw(element, link, robot, part)
-        _solid(element, link, robot)
+        _add_visuals(element, link, robot, part)
+        _add_collisions(element, link, robot)
     motors = zip(robot.actuator_names, robot.continuous, strict=True)
     continuous = {name for name, unlimited in motors if unlimited}
     for joint in robot.joints:
@@ -54,11 +55,11 @@ def to_urdf(robot: RobotDescription) -> str:
         if joint.coupling is not None and joint.coupling.slope is None:
             element.append(ElementTree.Comment(f" {joint.coupling} "))
         velocity = joint.velocity if math.isfinite(joint.velocity) else 10.0
-        ends = {} if kind == "continuous" else {"lower": joint.lower, "upper": joint.upper}
+        limits = {} if kind == "continuous" else {"lower": joint.lower, "upper": joint.upper}
         ElementTree.SubElement(
             element,
             "limit",
-            {name: repr(end) for name, end in ends.items()},
+            {name: repr(value) for name, value in limits.items()},
             effort=repr(joint.effort if math.isfinite(joint.effort) else 0.0),
             velocity=repr(velocity),
         )
@@ -79,10 +80,10 @@ def to_urdf(robot: RobotDescription) -> str:
 
 
 def _leaders(robot: RobotDescription) -> dict[str, tuple[str, float, float]]:
-    """Which joint a joint mimics in URDF, with ratio and offset.
+    """Return the joint that each joint mimics in URDF, with ratio and offset.
 
-    URDF has no motors, so the first joint on a shared motor leads the others; and chains of
-    followers are multiplied out, so that no leader follows anything itself.
+    URDF has no motors, so the first joint of a shared motor leads the others. Chains of followers
+    are multiplied out, so that no leader follows another joint.
     """
     joints = {joint.name: joint for joint in robot.movable}
     first: dict[str, tuple[str, float, float]] = {}
@@ -106,7 +107,7 @@ def _leaders(robot: RobotDescription) -> dict[str, tuple[str, float, float]]:
     return mimics
 
 
-def _draw(
+def _add_visuals(
     element: ElementTree.Element, link: str, robot: RobotDescription, part: dict[str, str]
 ) -> None:
     ends = [joint.placement[:3, 3] for joint in robot.joints if joint.parent == link]
@@ -116,7 +117,7 @@ def _draw(
         if length < 1e-4:
             continue
         visual = ElementTree.SubElement(element, "visual")
-        _origin(visual, _along(end))
+        _origin(visual, _pose_along(end))
         geometry = ElementTree.SubElement(visual, "geometry")
         radius = LINK_RADIUS[part[link]]
         ElementTree.SubElement(geometry, "cylinder", radius=repr(radius), length=repr(length))
@@ -124,21 +125,21 @@ def _draw(
         ElementTree.SubElement(material, "color", rgba=COLOURS[part[link]])
 
 
-def _solid(element: ElementTree.Element, link: str, robot: RobotDescription) -> None:
-    """The link's shapes for collisions; a capsule is a cylinder and two spheres."""
-    for one in robot.shapes.capsules:
-        if one.link != link or one.covers >= 0:
+def _add_collisions(element: ElementTree.Element, link: str, robot: RobotDescription) -> None:
+    """Add the link's collision shapes; a capsule is a cylinder and two spheres."""
+    for capsule in robot.shapes.capsules:
+        if capsule.link != link or capsule.covers >= 0:
             continue
-        length = 2 * float(np.linalg.norm(one.half))
-        radius = repr(one.radius)
-        ends = [one.center] if length == 0 else [one.center - one.half, one.center + one.half]
-        for end in ends:
+        length = 2 * float(np.linalg.norm(capsule.half))
+        radius = repr(capsule.radius)
+        center, half = capsule.center, capsule.half
+        for end in [center] if length == 0 else [center - half, center + half]:
             pose = np.eye(4)
             pose[:3, 3] = end
             _collision(element, pose, "sphere", radius=radius)
         if length:
-            pose = _along(2 * one.half)
-            pose[:3, 3] = one.center
+            pose = _pose_along(2 * half)
+            pose[:3, 3] = center
             _collision(element, pose, "cylinder", radius=radius, length=repr(length))
     for solid in robot.shapes.solids:
         if solid.link == link and solid.kind == "box":
@@ -154,8 +155,8 @@ def _collision(element: ElementTree.Element, pose: Array, kind: str, **sizes: st
     ElementTree.SubElement(ElementTree.SubElement(collision, "geometry"), kind, sizes)
 
 
-def _along(end: Array) -> Array:
-    """Pose half way to `end` with z pointing there."""
+def _pose_along(end: Array) -> Array:
+    """Return the pose at half of a vector with z along it."""
     z = end / np.linalg.norm(end)
     x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [1.0, 0.0, 0.0], z)
     x /= np.linalg.norm(x)

@@ -1,4 +1,4 @@
-"""What a file says of a robot: links, joints and simple shapes, before anything is chosen."""
+"""Robot files as trees of links, joints and simple shapes, and checked access to XML."""
 
 from __future__ import annotations
 
@@ -29,26 +29,26 @@ class _ForbiddenError(ValueError):
 
 
 def read_robot_file(path: Path) -> str:
-    """The text of a file.
+    """Return the text of a robot file.
 
     Raises:
-        DescriptionError: It cannot be read, or is larger than any robot.
+        DescriptionError: The file cannot be read, or is too large.
     """
     return read_text(path, scaled_limit(LIMITS.robot_bytes), RAISE_HINT, "utf-8-sig")
 
 
 def parse_xml(text: str, path: Path) -> Element:
-    """Parse XML that declares no entities: a few lines of them can grow without end.
+    """Parse XML that declares no entities, which could expand exponentially.
 
     Args:
         text: The text.
-        path: The file it is from.
+        path: File of the text.
 
     Raises:
-        DescriptionError: Not XML, a document type, or nested without end.
+        DescriptionError: The text is not XML, has a document type, or is nested too deeply.
     """
     try:
-        _look_through(text)
+        _check_structure(text)
         return ElementTree.fromstring(text)
     except _ForbiddenError as error:
         raise DescriptionError(f"{path}: {error}") from error
@@ -56,9 +56,9 @@ def parse_xml(text: str, path: Path) -> Element:
         raise DescriptionError(f"{path}: not valid XML: {error}") from error
 
 
-def _look_through(text: str) -> None:
-    """One event at a time, before anything is built."""
-    parser = expat.ParserCreate("utf-8")  # what the text is, whatever it says of itself
+def _check_structure(text: str) -> None:
+    """Check the events of a text before elements are built."""
+    parser = expat.ParserCreate("utf-8")  # overrides an encoding that the text declares
     depth = 0
 
     def start(*_: object) -> None:
@@ -72,7 +72,7 @@ def _look_through(text: str) -> None:
         depth -= 1
 
     def refuse(*_: object) -> None:
-        raise _ForbiddenError("has a document type (<!DOCTYPE ...>), expected plain elements")
+        raise _ForbiddenError("has a document type (<!DOCTYPE ...>); expected plain elements")
 
     parser.StartElementHandler = start
     parser.EndElementHandler = end
@@ -81,10 +81,10 @@ def _look_through(text: str) -> None:
 
 
 def required_attribute(element: Element | None, name: str, where: str) -> str:
-    """An attribute of an element.
+    """Return an attribute of an element.
 
     Raises:
-        DescriptionError: There is none.
+        DescriptionError: The attribute is missing.
     """
     value = None if element is None else element.get(name)
     if not value:
@@ -93,26 +93,33 @@ def required_attribute(element: Element | None, name: str, where: str) -> str:
 
 
 def check_size(links: int, moving: int, path: Path) -> None:
-    """Refuse what is larger than any robot, before anything is looked for in it.
+    """Refuse a robot with too many links or joints.
 
     Raises:
-        DescriptionError: It has too many links or joints that move.
+        DescriptionError: A limit is exceeded.
     """
     counts = ("links", links, LIMITS.links), ("moving joints", moving, LIMITS.moving_joints)
-    for noun, count, most in counts:
-        if count > scaled_limit(most):
+    for noun, count, max_count in counts:
+        if count > scaled_limit(max_count):
             raise DescriptionError(
-                f"{path}: found {count} {noun}, expected at most {scaled_limit(most)} {RAISE_HINT}"
+                f"{path}: found {count} {noun}, expected at most {scaled_limit(max_count)} "
+                f"{RAISE_HINT}"
             )
 
 
 def finite_number(
-    element: Element | None, name: str, where: str, most: float = LIMITS.robot_number
+    element: Element | None, name: str, where: str, max_value: float = LIMITS.robot_number
 ) -> float | None:
-    """A number of an element; None if it is not there.
+    """Return a number of an element; None if it is missing.
+
+    Args:
+        element: The element; None if it is missing.
+        name: Name of the attribute.
+        where: File and key, for the message.
+        max_value: Largest absolute value.
 
     Raises:
-        DescriptionError: Something that is no number, or a larger one than `most`.
+        DescriptionError: The attribute is not a number, or too large.
     """
     text = None if element is None else element.get(name)
     if text is None:
@@ -121,22 +128,22 @@ def finite_number(
         value = float(text)
     except ValueError:
         value = math.nan
-    if not (math.isfinite(value) and abs(value) <= most):
+    if not (math.isfinite(value) and abs(value) <= max_value):
         raise DescriptionError(
-            f"{where}: {name}: found {text!r}, expected a finite number{_to(most)}"
+            f"{where}: {name}: found {text!r}, expected a finite number{_range_text(max_value)}"
         )
     return value
 
 
-def _to(most: float) -> str:
-    return f" up to {most:g}" if math.isfinite(most) else ""
+def _range_text(max_value: float) -> str:
+    return f" up to {max_value:g}" if math.isfinite(max_value) else ""
 
 
 def check_vector(element: Element | None, name: str, where: str) -> None:
-    """Refuse an attribute that is not three finite numbers, if it is there.
+    """Refuse an attribute that is not three finite numbers; it may be missing.
 
     Raises:
-        DescriptionError: It is not.
+        DescriptionError: The attribute is not three finite numbers.
     """
     text = None if element is None else element.get(name)
     if text is None:
@@ -145,20 +152,21 @@ def check_vector(element: Element | None, name: str, where: str) -> None:
         values = [float(word) for word in text.split()]
     except ValueError:
         values = []
-    most = LIMITS.robot_number
-    if len(values) != 3 or not all(abs(one) <= most for one in values):
+    max_value = LIMITS.robot_number
+    if len(values) != 3 or not all(abs(value) <= max_value for value in values):
         raise DescriptionError(
-            f"{where}: {name}: found {text!r}, expected three finite numbers{_to(most)}"
+            f"{where}: {name}: found {text!r}, expected three finite numbers"
+            f"{_range_text(max_value)}"
         )
 
 
 @dataclass(frozen=True, eq=False)
 class FileShapes:
-    """What a file says of the shapes of its links.
+    """The collision shapes in a robot file.
 
     Attributes:
-        entries: By link its shapes, in its frame, if all of them are simple.
-        meshes: Links with a mesh, or with what has no form here.
+        entries: Shapes by link, in its frame, of links that have only simple shapes.
+        meshes: Links with a mesh or an unsupported shape.
     """
 
     entries: Mapping[str, Sequence[ShapeEntry]]
@@ -169,27 +177,27 @@ NO_FILE_SHAPES = FileShapes({}, frozenset())
 
 
 def urdf_shapes(element: Element) -> FileShapes:
-    """Those of the elements ``collision`` of a URDF."""
+    """Return the shapes of the ``collision`` elements of a URDF."""
     entries: dict[str, list[ShapeEntry]] = {}
     meshes: set[str] = set()
     for link in element.findall("link"):
         name = link.get("name", "")
-        for one in link.findall("collision"):
-            shape = _of_element(one)
+        for collision in link.findall("collision"):
+            shape = _collision_entry(collision)
             if shape is None:
                 meshes.add(name)
             else:
                 entries.setdefault(name, []).append(shape)
-    return _told(entries, meshes)
+    return _file_shapes(entries, meshes)
 
 
 def mjcf_shapes(mujoco: Any, model: Any, names: Sequence[str]) -> FileShapes:
-    """Those of the geoms of an MJCF that can collide; planes are no part of a robot.
+    """Return the shapes of the geoms of an MJCF that can collide, without planes.
 
     Args:
         mujoco: The module.
-        model: Its model.
-        names: Of the bodies' links.
+        model: MuJoCo's model.
+        names: Names of the links by body.
     """
     entries: dict[str, list[ShapeEntry]] = {}
     meshes: set[str] = set()
@@ -204,16 +212,16 @@ def mjcf_shapes(mujoco: Any, model: Any, names: Sequence[str]) -> FileShapes:
         else:
             pose = mjcf_pose(mujoco, model.geom_pos[geom], model.geom_quat[geom])
             entries.setdefault(name, []).append(shape_entry(*shape, pose))
-    return _told(entries, meshes)
+    return _file_shapes(entries, meshes)
 
 
 def collides(model: Any, geom: int) -> bool:
-    """Whether a geom of an MJCF is there to be collided with, not only to be seen."""
+    """Return True if a geom of an MJCF takes part in collisions."""
     return bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
 
 
 def simple_geom(mujoco: Any, model: Any, geom: int) -> tuple[str, list[float]] | None:
-    """Kind and sizes [m] of a geom of an MJCF, for `shape_entry`; None for a mesh or the like."""
+    """Return kind and sizes [m] of a geom of an MJCF; None if it is not simple."""
     types, (x, y, z) = mujoco.mjtGeom, model.geom_size[geom].tolist()
     return {
         int(types.mjGEOM_BOX): ("box", [2 * x, 2 * y, 2 * z]),
@@ -224,20 +232,20 @@ def simple_geom(mujoco: Any, model: Any, geom: int) -> tuple[str, list[float]] |
 
 
 def mjcf_pose(mujoco: Any, position: Array, quaternion: Array) -> Array:
-    """(4, 4) of a position (3,) [m] and a quaternion (4,), scalar first."""
-    pose, flat = np.eye(4), np.empty(9)
-    mujoco.mju_quat2Mat(flat, np.asarray(quaternion, dtype=float))
-    pose[:3, :3], pose[:3, 3] = flat.reshape(3, 3), position
+    """Return the pose (4, 4) of a position (3,) [m] and a quaternion (4,), w x y z."""
+    pose, rotation = np.eye(4), np.empty(9)
+    mujoco.mju_quat2Mat(rotation, np.asarray(quaternion, dtype=float))
+    pose[:3, :3], pose[:3, 3] = rotation.reshape(3, 3), position
     return pose
 
 
 def shape_entry(kind: str, size: Sequence[float], pose: Array) -> ShapeEntry:
-    """A simple shape as a description has it.
+    """Return a simple shape as a record of a description.
 
     Args:
         kind: "box", "sphere", "capsule" or "cylinder".
-        size: Its edges; its radius; its radius and length, a capsule's without its caps [m].
-        pose: (4, 4) in the link; capsules and cylinders lie along z.
+        size: Edges, radius, or radius and length, of a capsule without its caps [m].
+        pose: (4, 4) pose in the link; capsules and cylinders are along z.
     """
     x, y, z = (float(value) for value in pose[:3, 3])
     roll, pitch, yaw = (float(value) for value in roll_pitch_yaw(pose[:3, :3]))
@@ -252,14 +260,14 @@ def shape_entry(kind: str, size: Sequence[float], pose: Array) -> ShapeEntry:
     return CapsuleEntry(ends=(first, last), radius=size[0])
 
 
-def _of_element(collision: Element) -> ShapeEntry | None:
-    """A shape of a URDF; None if it is a mesh, or not what URDF knows."""
+def _collision_entry(collision: Element) -> ShapeEntry | None:
+    """Return the shape of a ``collision`` element; None for a mesh or an invalid element."""
     shape, pose = simple_shape(collision), origin_pose(collision)
     return None if shape is None or pose is None else shape_entry(*shape, pose)
 
 
 def simple_shape(element: Element) -> tuple[str, list[float]] | None:
-    """Kind and sizes [m] of an element ``collision`` or ``visual``; None: a mesh, or nonsense."""
+    """Return kind and sizes [m] of a shape element of a URDF; None if it is not simple."""
     geometry = element.find("geometry")
     if geometry is None or len(geometry) != 1:
         return None
@@ -267,12 +275,12 @@ def simple_shape(element: Element) -> tuple[str, list[float]] | None:
     keys = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length")}
     size = [v for key in keys.get(shape.tag, ()) for v in parse_numbers(shape.get(key, ""))]
     expected = {"box": 3, "sphere": 1, "cylinder": 2}.get(shape.tag, 0)
-    sound = expected and len(size) == expected and min(size) > 0
-    return (shape.tag, size) if sound else None
+    is_valid = expected and len(size) == expected and min(size) > 0
+    return (shape.tag, size) if is_valid else None
 
 
 def origin_pose(element: Element) -> Array | None:
-    """(4, 4) of the element's origin; None if that is nonsense."""
+    """Return the pose (4, 4) of the element's origin; None if it is invalid."""
     origin = element.find("origin")
     xyz, rpy = (
         parse_numbers("0 0 0" if origin is None else origin.get(key, "0 0 0"))
@@ -284,34 +292,34 @@ def origin_pose(element: Element) -> Array | None:
 
 
 def parse_numbers(text: str) -> list[float]:
-    """The numbers of an attribute; none if one is not finite, or larger than any robot's."""
+    """Return the numbers of an attribute; an empty list if one is invalid or too large."""
     try:
         values = [float(word) for word in text.split()]
     except ValueError:
         return []
-    return values if all(abs(one) <= LIMITS.robot_number for one in values) else []
+    return values if all(abs(value) <= LIMITS.robot_number for value in values) else []
 
 
-def _told(entries: dict[str, list[ShapeEntry]], meshes: set[str]) -> FileShapes:
-    simple = {link: tuple(found) for link, found in entries.items() if link not in meshes}
+def _file_shapes(entries: dict[str, list[ShapeEntry]], meshes: set[str]) -> FileShapes:
+    simple = {link: tuple(shapes) for link, shapes in entries.items() if link not in meshes}
     return FileShapes(simple, frozenset(meshes))
 
 
 @dataclass(frozen=True, eq=False)
 class TreeJoint:
-    """A joint as its file has it.
+    """A joint of a robot file.
 
     Attributes:
-        name: Its name.
-        parent: Link it hangs on.
-        child: Link it carries.
-        type: "revolute", "continuous", "prismatic" or "fixed"; or a kind of several axes.
-        placement: (4, 4) pose of the child in the parent at zero.
+        name: Name.
+        parent: Parent link.
+        child: Child link.
+        type: "revolute", "continuous", "prismatic", "fixed", or a type with several axes.
+        placement: (4, 4) pose of the child in the parent at position zero.
         axis: (3,) unit axis in the child's frame.
-        limits: Lower and upper [rad or m]; None if the file states none.
-        velocity: Velocity limit [rad/s or m/s], inf if the file states none (or zero).
-        coupling: What it follows; None if nothing.
-        effort: Largest torque or force [N m or N], inf if the file states none (or zero).
+        limits: Lower and upper limit [rad or m]; None if the file has none.
+        velocity: Velocity limit [rad/s or m/s], inf if the file has none (or zero).
+        coupling: Coupling to another joint or motor; None if there is none.
+        effort: Largest torque or force [N m or N], inf if the file has none (or zero).
     """
 
     name: str
@@ -328,17 +336,17 @@ class TreeJoint:
 
 @dataclass(frozen=True, eq=False)
 class RobotTree:
-    """The joints of a file.
+    """The joints and shapes of a robot file.
 
     Attributes:
         path: The file.
-        root: Its base link.
+        root: Root link.
         joints: All joints, parents before children.
-        motors: Lower and upper end of motors that are no joints (a tendon's), by name.
-        shapes: Those of its links for collisions.
-        element: Of a URDF what it was read from, its macros expanded.
-        model: Of an MJCF the module and its model.
-        notes: What of the file was ignored or left out, a sentence each.
+        motors: Lower and upper limit by name of motors that are not joints (tendons).
+        shapes: Collision shapes of the links.
+        element: Root element of a URDF, with macros expanded.
+        model: The module mujoco and the model of an MJCF.
+        notes: Parts of the file that were ignored, a sentence each.
     """
 
     path: Path
@@ -357,11 +365,11 @@ class RobotTree:
 
     @cached_property
     def by_name(self) -> dict[str, TreeJoint]:
-        """The joints by name."""
+        """Joints by name."""
         return {joint.name: joint for joint in self.joints}
 
     def chain(self, root: str, link: str, where: str) -> tuple[TreeJoint, ...]:
-        """The joints from one link down to another.
+        """Return the joints between two links.
 
         Args:
             root: The upper link.
@@ -369,34 +377,34 @@ class RobotTree:
             where: File and key, for the message.
 
         Raises:
-            DescriptionError: The one is not below the other.
+            DescriptionError: The lower link is not below the upper one.
         """
         chain = chain_to(self, link, root)
         if (chain[0].parent if chain else link) != root:
-            raise DescriptionError(f"{where}: link {link!r} does not hang on link {root!r}")
+            raise DescriptionError(f"{where}: link {link!r} is not below link {root!r}")
         return tuple(chain)
 
-    def known_link(self, link: str, where: str) -> str:
-        """The link, if there is one of that name.
+    def require_link(self, link: str, where: str) -> str:
+        """Return a link if it exists.
 
         Raises:
-            DescriptionError: There is none; the message lists the links.
+            DescriptionError: The link does not exist; the message lists the links.
         """
         return require_name(link, self.links, "link", where)
 
-    def known_joint(self, joint: str, where: str) -> str:
-        """The joint, if there is one of that name.
+    def require_joint(self, joint: str, where: str) -> str:
+        """Return a joint if it exists.
 
         Raises:
-            DescriptionError: There is none; the message lists those that move.
+            DescriptionError: The joint does not exist; the message lists the movable joints.
         """
-        moving = [one.name for one in self.joints if one.type != "fixed"]
+        movable = [tree_joint.name for tree_joint in self.joints if tree_joint.type != "fixed"]
         if joint in self.by_name:
             return joint
-        return require_name(joint, moving, "joint", where)
+        return require_name(joint, movable, "joint", where)
 
 
 def fixed_tree_joint(name: str, parent: str, child: str, placement: Array) -> TreeJoint:
-    """A joint that does not move."""
+    """Return a fixed joint."""
     axis = np.array([0.0, 0.0, 1.0])
     return TreeJoint(name, parent, child, "fixed", placement, axis, None, math.inf, None)

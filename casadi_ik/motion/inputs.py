@@ -212,7 +212,7 @@ class FollowerInputs:
         }
         points, normals = asked("points", weights[:, 0] > 0), asked("normals", weights[:, 1] > 0)
         normals /= np.linalg.norm(normals, axis=2, keepdims=True)
-        problem = TargetBatch(points, normals, Tolerance(), enforce_limits=True, more=more)
+        problem = TargetBatch(points, normals, Tolerance(), enforce_limits=True, extra_vectors=more)
         position, angle, _ = deviations(self._robot, problem, q[None])
         return position[0], angle[0]
 

@@ -283,7 +283,7 @@ class MovingSolver:
         start, target = self._request.start(q0), single_pose(pose)
         if chosen.known_pose is None:
             raise InputError("held: found a grasp without a known object_pose, expected one")
-        self.robot.description.one_hand("place")
+        self.robot.description.require_single_hand("place")
         if not self.robot.description.arm_actuators:
             raise UnsupportedError(f"place: {self.robot.name!r} has no arm that moves its palm")
         moved = target @ inverse(chosen.known_pose)
@@ -407,7 +407,7 @@ class MovingSolver:
         """What the last part of the way to a grasp keeps to."""
         asked: Any = grasp if isinstance(grasp, Grasp) else getattr(grasp, "grasp", grasp)
         problem = self._request.of_grasps([asked], None)
-        before = asked.pregrasp and asked.pregrasp.one_palm
+        before = asked.pregrasp and asked.pregrasp.single_palm
         return ApproachPlan(
             self._path_plan(start),
             problem,
@@ -446,13 +446,15 @@ class MovingSolver:
         )
 
     def _bounds(self, targets: TargetBatch | None) -> tuple[Array, Array]:
-        """Return the (n,) lower and upper limits of motions, see `RobotDescription.stops`."""
+        """Return the (n,) lower and upper limits of motions, see `RobotDescription.motion_limits`."""
         if targets is None:
             targets = self._anything(0.0)
         robot = self.robot.description
         lower, upper = targets.bounds(robot)
         endless = robot.continuous & (lower < upper)
-        return np.where(endless, robot.stops[0], lower), np.where(endless, robot.stops[1], upper)
+        return np.where(endless, robot.motion_limits[0], lower), np.where(
+            endless, robot.motion_limits[1], upper
+        )
 
     def _anything(self, place: float) -> TargetBatch:
         """A target with all contacts at a place, or none if that is NaN."""

@@ -334,8 +334,8 @@ class Retargeter:
         for side, frames in recorded.items():
             hand = self._hands[side]
             frames = hand.order.converted(frames)
-            hand.order.assume_usual()
-            lost = hand.filter.of_recording(frames, times)
+            hand.order.assume_standard()
+            lost = hand.filter.rejection_reasons(frames, times)
             kept[side] = frames.copy()
             kept[side][[i for i, reason in enumerate(lost) if reason]] = np.nan
             reasons += [reason for reason in lost if reason]

@@ -33,14 +33,14 @@ def contacts_between(targets: TargetBatch, i: int, count: int) -> TargetBatch:
         return way / np.maximum(np.linalg.norm(way, axis=2, keepdims=True), 1e-12)
 
     normals, more = turned(targets.normals), {}
-    for name, values in targets.more.items():
+    for name, values in targets.extra_vectors.items():
         way = turned(values)
         if name == "tangents":
             way -= normals * np.sum(normals * way, axis=2, keepdims=True)
             way /= np.maximum(np.linalg.norm(way, axis=2, keepdims=True), 1e-12)
         more[name] = way
     points = mixed(targets.points)
-    return replace(targets, points=points, normals=normals, more=more, object_pose=None)
+    return replace(targets, points=points, normals=normals, extra_vectors=more, object_pose=None)
 
 
 @dataclass(frozen=True)
@@ -283,7 +283,7 @@ class Path:
         robot = self.engine.robot
         change = after - before
         largest = int(np.argmax(np.abs(change) / (robot.upper - robot.lower)))
-        lower, upper = robot.description.stops
+        lower, upper = robot.description.motion_limits
         at = (held - lower <= 1e-6) | (upper - held <= 1e-6)
         names = tuple(name for name, there in zip(robot.actuators, at, strict=True) if there)
         return Jump(i, robot.actuators[largest], float(change[largest]), names)

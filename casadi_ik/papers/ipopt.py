@@ -497,7 +497,7 @@ class IpoptMethod(Method):
         starts = np.clip(q0, robot.lower, robot.upper) if targets.enforce_limits else q0
         for row in range(count):
             begin = time.perf_counter()
-            sequence = np.random.SeedSequence([seed, targets.number(row)])
+            sequence = np.random.SeedSequence([seed, targets.row_number(row)])
             runs = self._runs(starts[row], goals[row], targets, np.random.default_rng(sequence))
             best = min(runs, key=lambda run: run.cost)
             q[row] = best.q

@@ -283,7 +283,7 @@ def _with_object_pose(
     if pose is None:
         return targets
     known_poses = [grasp.known_pose for grasp in grasps if grasp.known_pose is not None]
-    vectors = {"points": targets.points, "normals": targets.normals, **targets.more}
+    vectors = {"points": targets.points, "normals": targets.normals, **targets.extra_vectors}
     for name, array in vectors.items() if known_poses else ():
         # Into the object frame first.
         stack = np.stack(known_poses)
@@ -302,7 +302,7 @@ def _with_object_pose(
         targets,
         points=points,
         normals=normals,
-        more=vectors,
+        extra_vectors=vectors,
         object_pose=object_poses,
         palms=palms,
     )
@@ -345,7 +345,7 @@ class _Search:
             if not len(selected):
                 continue
             group = targets.rows(np.searchsorted(indices, selected))
-            group = replace(group, picked=selected, prefer="limits")
+            group = replace(group, row_numbers=selected, prefer="limits")
             engine, query = self.engine.engine_for(group), self.engine.collision_query(group)
             for first in range(0, len(selected), CHOOSE_PARAMETERS.chunk_size):
                 last = min(first + CHOOSE_PARAMETERS.chunk_size, len(selected))

@@ -34,7 +34,7 @@ def place_targets(targets: TargetBatch, poses: Array) -> TargetBatch:
         targets,
         points=targets.points[0] @ rotation + poses[:, None, :3, 3],
         normals=targets.normals[0] @ rotation,
-        more={name: array[0] @ rotation for name, array in targets.more.items()},
+        extra_vectors={name: array[0] @ rotation for name, array in targets.extra_vectors.items()},
         object_pose=poses if targets.object else None,
     )
 

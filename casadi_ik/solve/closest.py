@@ -329,9 +329,10 @@ class FloatingPalmFit:
         )
         normals = np.einsum("kij,kfj->kfi", rotation_to_zero, targets.normals)
         more = {
-            key: np.einsum("kij,kfj->kfi", rotation_to_zero, v) for key, v in targets.more.items()
+            key: np.einsum("kij,kfj->kfi", rotation_to_zero, v)
+            for key, v in targets.extra_vectors.items()
         }
-        return replace(targets, points=points, normals=normals, more=more)
+        return replace(targets, points=points, normals=normals, extra_vectors=more)
 
     def _wrist(self, targets: TargetBatch, rotation: Array, origin: Array) -> tuple[Array, Array]:
         """Return (m,) distances of the wrist from the shoulder and from the arm's range [m]."""

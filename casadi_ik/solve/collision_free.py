@@ -503,7 +503,7 @@ class CollisionFreeSearch:
             return
         count = COLLISION_FREE_PARAMETERS.random_arms
         target_index = np.repeat(rows, count)
-        numbers = np.array([self.targets.number(int(row)) for row in rows])
+        numbers = np.array([self.targets.row_number(int(row)) for row in rows])
         starts = np.concatenate(_shifted_samples(robot, self.seed, numbers, count))
         given = self.hands[0][0]
         starts[::2, hand] = given[target_index[::2]][:, hand]
@@ -775,9 +775,9 @@ def resolve_collisions(
         return batch
     begin, q = time.perf_counter(), batch.q.copy()
     reports = np.array(batch.collisions, dtype=object)
-    numbers = np.array([targets.number(row) for row in rows.tolist()], dtype=np.intp)
+    numbers = np.array([targets.row_number(row) for row in rows.tolist()], dtype=np.intp)
     # The number of a target seeds its random numbers: a result does not depend on the batch.
-    selected = replace(targets.rows(rows), picked=numbers)
+    selected = replace(targets.rows(rows), row_numbers=numbers)
     robot = finder_of(selected.rows(slice(0, 1))).robot
     for _, kind_rows, kind_targets in group_by_kinds(selected):
         chosen = rows[kind_rows]

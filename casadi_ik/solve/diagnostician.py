@@ -91,7 +91,7 @@ class Diagnostician:
         self._palm_free = FloatingPalmFit(self._trials)
         self._prover = Prover(robot.description, compiled)
         self._sides = [
-            Prover(robot.description.side(side.name, carried=True), compiled)
+            Prover(robot.description.side(side.name, with_trunk=True), compiled)
             for side in robot.description.sides
         ]
 
@@ -250,7 +250,7 @@ class Diagnostician:
             rows = np.flatnonzero(has_contacts & np.array([proof is None for proof in proofs]))
             if not len(rows) or targets.fixed is not None:
                 continue
-            part = targets.rows(rows).of_fingers(fingers)
+            part = targets.rows(rows).for_fingers(fingers)
             for row, proof in zip(
                 rows.tolist(), prover.prove(part, max_boxes=most[rows]), strict=True
             ):
@@ -420,8 +420,10 @@ def _with_free_fingers(targets: TargetBatch, fingers: list[int]) -> TargetBatch:
         array[:, fingers] = np.nan
         return array
 
-    more = {name: free(array) for name, array in targets.more.items()}
-    return replace(targets, points=free(targets.points), normals=free(targets.normals), more=more)
+    more = {name: free(array) for name, array in targets.extra_vectors.items()}
+    return replace(
+        targets, points=free(targets.points), normals=free(targets.normals), extra_vectors=more
+    )
 
 
 def _reachable(

@@ -253,7 +253,7 @@ class Engine:
         Raises:
             InputError: Bad q0, or a target that the method does not support.
         """
-        if targets.more and (engine := self.engine_for(targets)) is not self:
+        if targets.extra_vectors and (engine := self.engine_for(targets)) is not self:
             return engine.solve_one(targets, options)
         method, start, outcome = self.hand_search, self.robot.start(options.q0), None
         is_plain = (

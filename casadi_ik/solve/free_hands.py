@@ -218,7 +218,7 @@ class UnconstrainedFingers:
         parameters = UNCONSTRAINED_FINGER_PARAMETERS
         self._description = description = robot.description
         is_unconstrained = np.isnan(targets.points[..., 0]) & np.isnan(targets.normals[..., 0])
-        for vectors in targets.more.values():
+        for vectors in targets.extra_vectors.values():
             is_unconstrained &= np.isnan(vectors[..., 0])
         moves_finger = np.zeros((len(description.finger_names), len(robot.lower)), dtype=bool)
         for finger, name in enumerate(description.finger_names):

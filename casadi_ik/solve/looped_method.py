@@ -187,10 +187,10 @@ class LoopedMethod(ABC):
             raise UnsupportedError(f"fixed: method {self.name!r} cannot keep actuators fixed")
         if self.takes_free_contacts:
             return
-        for name, array in targets.more.items():
+        for name, array in targets.extra_vectors.items():
             present = np.argwhere(~np.isnan(array[..., 0]))
             if len(present):
-                row, finger = targets.number(int(present[0, 0])), present[0, 1]
+                row, finger = targets.row_number(int(present[0, 0])), present[0, 1]
                 raise RowError(
                     f"{name}: row {row} has a value for {self.robot.finger_names[finger]!r}, which "
                     f"method {self.name!r} does not support; expected point and normal only",
@@ -199,7 +199,7 @@ class LoopedMethod(ABC):
         for name, array in (("points", targets.points), ("normals", targets.normals)):
             free = np.argwhere(np.isnan(array[..., 0]))
             if len(free):
-                row, finger = targets.number(int(free[0, 0])), free[0, 1]
+                row, finger = targets.row_number(int(free[0, 0])), free[0, 1]
                 raise RowError(
                     f"{name}: row {row} has no value for {self.robot.finger_names[finger]!r}; "
                     f"method {self.name!r} expects a point and a normal for every finger",

@@ -175,11 +175,13 @@ class RemedyFinder:
                 self.targets,
                 points=np.concatenate([targets.points for _, _, targets in freeings]),
                 normals=np.concatenate([targets.normals for _, _, targets in freeings]),
-                more={
-                    name: np.concatenate([targets.more[name] for _, _, targets in freeings])
-                    for name in self.targets.more
+                extra_vectors={
+                    name: np.concatenate(
+                        [targets.extra_vectors[name] for _, _, targets in freeings]
+                    )
+                    for name in self.targets.extra_vectors
                 },
-                picked=None,
+                row_numbers=None,
                 object_pose=None,  # Only contacts matter.
             )
             for i, q in self._solutions(candidates, self._limits.tiled(len(candidates))).items():
@@ -249,9 +251,9 @@ def _with_free_contacts(targets: TargetBatch, points: Array, normals: Array) -> 
     has_point, has_normal = ~np.isnan(points), ~np.isnan(normals)
     more = {
         name: np.where(has_point & has_normal if name == "tangents" else has_point, array, np.nan)
-        for name, array in targets.more.items()
+        for name, array in targets.extra_vectors.items()
     }
-    return replace(targets, points=points.copy(), normals=normals, more=more)
+    return replace(targets, points=points.copy(), normals=normals, extra_vectors=more)
 
 
 SHIFTS = (0.01, 0.02, 0.04, 0.08, 0.16)
@@ -365,7 +367,7 @@ def _shifted(targets: TargetBatch, shifts: Array) -> TargetBatch:
         candidates,
         points=candidates.points + shifts[:, None],
         object_pose=pose,
-        picked=None,
+        row_numbers=None,
         first_row=0,
     )
 
@@ -379,7 +381,9 @@ def _removable_fingers(
     named = np.flatnonzero(has_point | facing)
     # Without a finger of another contact kind the target would need another solver.
     plain = [
-        i for i in named.tolist() if all(np.isnan(v[0, i]).all() for v in targets.more.values())
+        i
+        for i in named.tolist()
+        if all(np.isnan(v[0, i]).all() for v in targets.extra_vectors.values())
     ]
     if len(named) < 2:
         return ()

@@ -310,7 +310,9 @@ class Request:
         if len(self.robot.sides) == 1:
             (side,) = self.robot.sides
             grasps = [
-                grasp if grasp.one_palm is None else replace(grasp, palm={side: grasp.one_palm})
+                grasp
+                if grasp.single_palm is None
+                else replace(grasp, palm={side: grasp.single_palm})
                 for grasp in grasps
             ]
         if any(isinstance(grasp.palm, Mapping) for grasp in grasps):
@@ -342,7 +344,7 @@ class Request:
             tolerances,
             self.enforce_limits,
             fixed=self.fixed_vector(fixed) if fixed else None,
-            more=_stack_vectors(more, len(fingers)) if any(more) else {},
+            extra_vectors=_stack_vectors(more, len(fingers)) if any(more) else {},
             prefer=prefer,
             object=grasps[0].object,
             object_pose=_object_poses(grasps),
@@ -351,7 +353,7 @@ class Request:
     def _of_palm_grasps(
         self, grasps: Sequence[Grasp], fixed: Mapping[str, float] | None, prefer: str
     ) -> TargetBatch:
-        palms = [grasp.one_palm for grasp in grasps if grasp.one_palm is not None]
+        palms = [grasp.single_palm for grasp in grasps if grasp.single_palm is not None]
         if len(palms) < len(grasps):
             raise InputError("grasps: found palms and contacts, expected the same in all")
         if self.robot.description.sides:
@@ -440,7 +442,7 @@ class Request:
             self._default_tolerances,
             self.enforce_limits,
             fixed=fixed_q,
-            more=more,
+            extra_vectors=more,
             prefer=prefer,
             palms=poses,
         )
@@ -458,7 +460,7 @@ class Request:
     def fixed_vector(self, fixed: Mapping[str, float] | None) -> Array | None:
         """Return the positions of fixed actuators as an array, see `fixed_array`."""
         robot = self.robot
-        return fixed_array(fixed or {}, robot.actuators, *robot.description.stops)
+        return fixed_array(fixed or {}, robot.actuators, *robot.description.motion_limits)
 
     def start(self, q0: ArrayLike | None, name: str = "q0") -> Array:
         """Return a start configuration (n,); None: the robot's home.

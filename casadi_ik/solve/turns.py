@@ -45,7 +45,7 @@ def nearest_turns(
         bounds: (n,) or (..., n) lower and upper bounds; a motor with equal bounds is fixed.
         every_motor: Whether to move motors with limits too, within their bounds.
     """
-    columns = list(robot.turning)
+    columns = list(robot.multi_turn)
     if not columns or not (every_motor or robot.continuous.any()):
         return q
     lower, upper = (np.broadcast_to(bound, q.shape)[..., columns] for bound in bounds)

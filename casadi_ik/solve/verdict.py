@@ -252,11 +252,11 @@ def deviations(robot: ArmHand, targets: TargetBatch, q: Array) -> tuple[Array, A
     if len(targets) == 1:
         points, normals = points[0], normals[0]
     position, angle, excess = robot.deviations(q, points, normals)
-    if not targets.more:
+    if not targets.extra_vectors:
         return position, angle, excess
     frames = robot.frames_at(q)
     offset = frames[..., :3, 3] - points
-    for name, array in targets.more.items():
+    for name, array in targets.extra_vectors.items():
         vectors = array[0] if len(targets) == 1 else array
         is_present = np.broadcast_to(~np.isnan(vectors[..., 0]), position.shape)
         if name == "lines":

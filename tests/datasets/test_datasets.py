@@ -152,7 +152,7 @@ def test_many_palms() -> None:
                 "posture": {"a": 1.0},
                 "contacts": {"thumb": ik.Contact([0, 0, 1])},
             },
-            "palm: found it beside contacts",
+            "palm: is given together with contacts",
         ),
     ],
 )

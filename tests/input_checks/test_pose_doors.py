@@ -47,7 +47,7 @@ def frame_of(contact: ik.Contact) -> Array:
 
 def turned_palm(pose: Any) -> Array:
     """(3, 3) of a grasp's palm."""
-    palm = ik.Grasp(palm=pose, posture={"bh_spread": 0.1}).one_palm
+    palm = ik.Grasp(palm=pose, posture={"bh_spread": 0.1}).single_palm
     assert palm is not None
     return palm[:3, :3]
 
@@ -71,7 +71,7 @@ def palm_of_data_set(matrix: Array) -> Array:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "set.npy"
         np.save(path, np.array(row, dtype=object))
-        palm = ik.load_candidates(path, robot_of(ALLEGRO), take="palm").grasps[0].one_palm
+        palm = ik.load_candidates(path, robot_of(ALLEGRO), take="palm").grasps[0].single_palm
     assert palm is not None
     return palm[:3, :3]
 
@@ -127,7 +127,7 @@ def table(wxyz: Array) -> Array:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "grasps.csv"
         path.write_text(",".join(columns) + "\n" + ",".join(map(str, columns.values())) + "\n")
-        palm = ik.load_candidates(path, robot, take="palm").grasps[0].one_palm
+        palm = ik.load_candidates(path, robot, take="palm").grasps[0].single_palm
     assert palm is not None
     return palm[:3, :3]
 

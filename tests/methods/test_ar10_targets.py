@@ -70,7 +70,7 @@ def test_without_limits_a_slider_keeps_to_its_triangle(robot, method, rng):
     points, normals = robot.contacts(robot.random(rng, 2))
     points[:, 1:] += rng.uniform(-0.03, 0.03, (2, 4, 3))
     batch = ik.Solver(robot, method, limits="ignore").solve_batch(points, normals)
-    lower, upper = robot.description.mechanical
+    lower, upper = robot.description.mechanical_limits
     assert np.isfinite(lower[-10:]).all()
     assert np.all(batch.q >= lower)
     assert np.all(batch.q <= upper)

@@ -334,7 +334,7 @@ def test_grasp_files(tmp_path: Path, thumb, expected):
     ("thumb", "message"),
     [
         ("normal: [0, -1, 0]", "contacts.thumb.point: missing"),
-        ("point: [0, 0, 1], tangent: [0, 0, 1]", "thumb.tangent: found one without a normal"),
+        ("point: [0, 0, 1], tangent: [0, 0, 1]", "thumb.tangent: is given without a normal"),
         (
             "point: [0, 0, 1], normal: [0, -1, 0], tangent: [0, -1, 1]",
             r"thumb.tangent: found \[0.0, -0.7071\d+, 0.7071\d+\] at 45 deg to the normal",
@@ -342,7 +342,7 @@ def test_grasp_files(tmp_path: Path, thumb, expected):
         ("point: [0, 0, 1], line: [0, 0, 0]", "thumb.line: found .* expected a direction"),
         ("point: [0, 0, 1], line: [0, 0, 1], plane: [0, 0, 1]", "thumb.line and plane: found both"),
         ("point: [0, 0, 1], plane: [0, 0, 1], ball: [0, 0, 1]", "thumb.plane and ball: found both"),
-        ("point: [0, 0, 1], direction: [0, 0, 1]", "thumb.direction: found it beside point"),
+        ("point: [0, 0, 1], direction: [0, 0, 1]", "thumb.direction: is given together with point"),
         ("point: [0, 0, 1], tangents: [0, 0, 1]", "tangents"),
     ],
 )
@@ -370,7 +370,7 @@ def test_bad_arrays(robot, solvers):
             normals,
             "0: tangent: .* expected",
         ),
-        ({"tangents": tangents}, lone, "1: tangent: found one without a normal"),
+        ({"tangents": tangents}, lone, "1: tangent: is given without a normal"),
         ({"tangents": bad(np.where(tangents[4:] > 0, np.inf, tangents[4:]))}, normals, "finite"),
         ({"tangents": bad(0 * tangents[4:])}, normals, "0: tangent: .* not zero"),
         ({"lines": tangents, "planes": bad(tangents[4:])}, normals, "line and plane: found both"),

@@ -57,7 +57,7 @@ def test_joint_limits_are_kept(tmp_path, rng):
     )
     robot = ik.load_robot(path)
     # Over the motors' own strokes: the robot's ranges leave out what takes a joint past its limit.
-    q = rng.uniform(*robot.description.strokes, (20, len(robot.actuators)))
+    q = rng.uniform(*robot.description.actuator_limits, (20, len(robot.actuators)))
     beyond = np.asarray(robot.joints(q)["left_3"]) > 0.25
     assert 3 <= beyond.sum() <= 18
     start = (robot.lower + robot.upper) / 2

@@ -149,7 +149,7 @@ def test_trunk_and_sides_are_found_in_a_file(in_a_file: Path):
             "move no side; write them under locked: {neck: 0, tail: 0}",
         ),
         ("sides:", "trunk: left_arm\nsides:", "does not carry the palm of 'right'"),
-        ("link: left_tip", "link: right_tip", "fingers.tip.link: 'right_tip' does not hang on"),
+        ("link: left_tip", "link: right_tip", "fingers.tip.link: 'right_tip' is not below"),
         (
             "right: {palm: right_palm, fingers: {tip: {link: right_tip",
             "right: {palm: left_palm, fingers: {tip: {link: left_tip",

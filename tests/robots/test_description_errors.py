@@ -33,7 +33,7 @@ hand | limits: [0 deg, 180 deg] => limits: [180 deg, 0 deg]
 hand | {limits: [0 deg, 180 deg], velocity: 2 rad/s, source: limits assumed} => {}
     actuators.bh_spread: limits | missing
 hand | actuators:\n => actuators:\n  spare: {limits: [0, 1], source: mdh}\n
-    actuators.spare | moves nothing
+    actuators.spare | moves no joint
 hand | actuators:\n => actuators:\n  bh_finger_2_spread: {}\n
     actuators.bh_finger_2_spread | follows 'bh_spread' already
 hand | 180 deg], velocity: 2 rad/s => 180 deg], velocity: 0
@@ -43,7 +43,7 @@ hand | source: limits assumed}\n  bh_thumb_prox => }\n  bh_thumb_prox
 hand | 180 deg], velocity: 2 rad/s => 180 deg], unit: deg
     actuators.bh_spread: unit | expected 'rad' or 'm'
 hand |   bh_thumb_distal: {}\n => #
-    joint 'bh_thumb_distal': coupling | no 'bh_thumb_distal' under 'actuators'
+    joint 'bh_thumb_distal': coupling | 'bh_thumb_distal' under 'actuators'
 hand | coupling: {kind: linear, of: bh_spread} => coupling: {kind: linear, of: bh_spred}
     joint 'bh_finger_2_spread': coupling.of | unknown joint or actuator 'bh_spred'; known:
 hand | coupling: {kind: linear, of: bh_spread} => coupling: {kind: wire, of: bh_spread}
@@ -53,17 +53,17 @@ hand | coupling: {kind: linear, of: bh_spread} => coupling: {kind: linear, of: b
 hand | coupling: {kind: linear, of: bh_spread} => coupling: {kind: linear, of: bh_finger_2_spread}
     joint 'bh_finger_2_spread': coupling.of | is a cycle bh_finger_2_spread -> bh_finger_2_spread
 hand | {kind: linear, of: bh_spread} => {kind: lead-screw, of: bh_spread, b: 1, c: 2}
-    joint 'bh_finger_2_spread': coupling.of | 'bh_spread' is in rad, expected something in m
+    joint 'bh_finger_2_spread': coupling.of | 'bh_spread' is in rad; expected a coordinate in m
 hand | name: bh_thumb_distal => name: bh_thumb_proximal
     joints | 'bh_thumb_proximal' appears twice
 hand | child: bh_thumb_link_3 => child: bh_thumb_link_2
     joints: child links | 'bh_thumb_link_2' appears twice
 arm | child: lwr_link_1 => child: bh_base
-    joint 'lwr_joint_2': parent | 'lwr_link_1' is no link
+    joint 'lwr_joint_2': parent | 'lwr_link_1' is not a link
 hand | parent: bh_thumb_link_2 => parent: bh_thumb_link_7
-    joint 'bh_thumb_distal': parent | 'bh_thumb_link_7' is no link
+    joint 'bh_thumb_distal': parent | 'bh_thumb_link_7' is not a link
 hand | name: bh_thumb_proximal, parent: bh_base => name: bh_thumb_proximal, parent: bh_thumb_link_3
-    joint 'bh_thumb_proximal': parent | 'bh_thumb_link_3' is part of a frame cycle
+    joint 'bh_thumb_proximal': parent | 'bh_thumb_link_3' is part of a cycle
 arm | axis: [0, -1, 0] => axis: [0, 0, 0]
     joint 'lwr_joint_2': axis | zero
 arm | axis: [0, 0, 1], => axis: [0, 0, 1], type: hinge,

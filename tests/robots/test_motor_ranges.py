@@ -64,7 +64,7 @@ def test_no_random_configuration_is_beyond_a_joint_limit(narrow, rng):
 
 def test_the_range_is_as_wide_as_the_joints_allow(narrow):
     """At either end of every motor that was narrowed, some joint stands at its own limit."""
-    strokes = narrow.description.strokes
+    strokes = narrow.description.actuator_limits
     narrowed = set()
     for side, ends in enumerate((narrow.lower, narrow.upper)):
         for i, name in enumerate(narrow.actuators):
@@ -81,8 +81,8 @@ def test_the_range_is_as_wide_as_the_joints_allow(narrow):
 def test_shipped_robots_keep_their_strokes_to_the_last_digit():
     for name in ik.shipped_names("arm_hands"):
         robot = ik.load_robot(name)
-        np.testing.assert_array_equal(robot.lower, robot.description.strokes[0])
-        np.testing.assert_array_equal(robot.upper, robot.description.strokes[1])
+        np.testing.assert_array_equal(robot.lower, robot.description.actuator_limits[0])
+        np.testing.assert_array_equal(robot.upper, robot.description.actuator_limits[1])
 
 
 def test_numbers_are_those_of_the_graphs(rng):

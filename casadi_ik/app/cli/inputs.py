@@ -197,5 +197,5 @@ def the_fixed(said: Said, robot: ArmHand) -> dict[str, float]:
         if name in fixed:
             raise InputError(f"--fixed: {name} appears twice")
         fixed[name] = in_si(value, units.get(name, ""), said)
-    fixed_array(fixed, robot.actuators, *robot.description.stops)
+    fixed_array(fixed, robot.actuators, *robot.description.motion_limits)
     return fixed

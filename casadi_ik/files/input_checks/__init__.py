@@ -1,7 +1,7 @@
-"""Checks of what enters from outside: poses, frames of a tracker, units, times.
+"""Checks of input data: poses, frames of a tracker, units, times.
 
-Every entrance (Python, command line, files, streams, adapters) uses these functions, so that each
-rule exists once:
+All interfaces (Python, command line, files, streams, adapters) use these functions, so that each
+rule is implemented once:
 
 - `poses`: a matrix or quaternion that is nearly a rotation becomes the nearest rotation; anything
   else is an `InvalidPoseError`.

@@ -1,8 +1,8 @@
-"""The rule for orders of keypoints: those of known data sets are recognised by the bones.
+"""Keypoint orders: the orders of known data sets are recognised by the lengths of bones.
 
 Lengths of bones and gaps between knuckles do not depend on the posture. In the right order they are
-those of a hand, up to its size: knuckles a palm's length from the wrist, bones that become shorter
-towards the tips.
+those of a hand, up to its size: knuckles at a palm's length from the wrist, and bones that become
+shorter towards the tips.
 """
 
 from __future__ import annotations
@@ -22,12 +22,13 @@ FINGERS = range(5)
 
 
 def _order(wrist: int, *fingers: tuple[int, ...]) -> NDArray[np.intp]:
-    """Return the places of the usual keypoints: the wrist, then four of each finger."""
+    """Return the indices of the standard keypoints: the wrist, then four of each finger."""
     return np.array([wrist, *(key for finger in fingers for key in finger)], dtype=np.intp)
 
 
 STANDARD_ORDER = "MediaPipe, OpenPose"
-"""Name of the usual order: the wrist, then from the thumb on four keypoints a finger, tips last."""
+"""Name of the standard order: the wrist, then from the thumb on four keypoints a finger, tips last.
+"""
 
 _MANO = ((13, 14, 15, 16), (1, 2, 3, 17), (4, 5, 6, 18), (10, 11, 12, 19), (7, 8, 9, 20))
 
@@ -59,10 +60,10 @@ KEYPOINT_ORDERS: dict[str, NDArray[np.intp]] = {
         20, *((15 + f, 10 + f, 5 + f, f) for f in FINGERS)
     ),
 }
-"""Places of the usual keypoints in frames of each order (21,): ``frame[ORDERS[name]]`` is usual."""
+"""Indices (21,) that sort a frame into the standard order: ``frame[KEYPOINT_ORDERS[name]]``."""
 
 PAIRS: NDArray[np.intp] = np.vstack([BONES, [(1, 5), (5, 9), (9, 13), (13, 17)]])
-"""(24, 2) pairs of keypoints whose distance does not depend on the posture, or hardly (1 to 5)."""
+"""Pairs (24, 2) of keypoints whose distance hardly depends on the posture."""
 
 LENGTHS = np.array(
     [
@@ -74,16 +75,17 @@ LENGTHS = np.array(
         *(66, 21, 20, 20),
     ]
 )
-"""(24,) their distances in an adult's hand [mm], rounded; only their ratios count."""
+"""Distances (24,) of the pairs in an adult's hand [mm], rounded; only their ratios matter."""
 
 
 @dataclass(frozen=True)
 class OrderLimits:
-    """Limits at which an order of keypoints is recognised.
+    """Thresholds of the recognition of keypoint orders.
 
     Attributes:
-        fits: Largest root mean square of the logarithms of ratios to `LENGTHS` in the right order.
-        better: Difference by which another order must fit better than the usual one.
+        fits: Largest misfit of the right order: root mean square of the logarithms of ratios to
+            `LENGTHS` [-].
+        better: Difference by which another order must fit better than the standard one.
         frames: Largest number of frames that are compared.
         smallest: Largest distance of two keypoints of a small fist [m].
         largest: Largest distance of two keypoints of a large open hand [m].
@@ -100,10 +102,10 @@ ORDER_LIMITS = OrderLimits()
 
 
 def misfit(distances: Array, order: NDArray[np.intp]) -> float:
-    """Return how badly an order fits a hand: root mean square of logarithms of ratios, up to scale.
+    """Return the misfit of an order: root mean square of logarithms of length ratios, up to scale.
 
     Args:
-        distances: (21, 21) between keypoints [m], or their medians over frames.
+        distances: (21, 21) distances between keypoints [m], or their medians over frames.
         order: See `KEYPOINT_ORDERS`.
     """
     first, second = order[PAIRS].T
@@ -120,27 +122,28 @@ def distances_between(frames: Array) -> Array:
 
 
 class OrderConverter:
-    """Converts the frames of one hand to the usual order, once their order is recognised.
+    """Converter of the frames of one hand to the standard order, once their order is recognised.
 
     Attributes:
-        name: The order that was recognised, see `KEYPOINT_ORDERS`; "" as long as none is.
-        is_decided: Whether frames are converted by a known order from now on.
+        name: Recognised order, see `KEYPOINT_ORDERS`; "" until then.
+        is_decided: True if the order is known and used from now on.
     """
 
     def __init__(self, where: str) -> None:
-        """Take the name of the argument, for warnings."""
+        """Store the name of the argument, for warnings."""
         self.name, self.is_decided = "", False
         self._where, self._tries = where, 0
         self._newest: Array | None = None
 
-    def assume_usual(self) -> None:
-        """Take the frames that come as in the usual order."""
+    def assume_standard(self) -> None:
+        """Take the coming frames as being in the standard order."""
         self.name, self.is_decided = STANDARD_ORDER, True
 
     def converted(self, frames: Array) -> Array:
-        """Return frames (k, 21, 3) in the usual order; unchanged while no order is recognised.
+        """Return frames (k, 21, 3) in the standard order; unchanged until an order is recognised.
 
-        A warning says which order was found, or that a hand is in none of the known ones.
+        A warning names a recognised order other than the standard one, and reports a hand in none
+        of them.
         """
         if self.is_decided:
             return frames if self.name == STANDARD_ORDER else frames[:, KEYPOINT_ORDERS[self.name]]
@@ -163,10 +166,10 @@ class OrderConverter:
         self._warn(f"are in the order of {self.name}, and are converted")
         return frames[:, KEYPOINT_ORDERS[self.name]]
 
-    def _warn(self, found: str) -> None:
+    def _warn(self, problem: str) -> None:
         message = (
-            f"{self._where}: the joints {found}; expected the order of {STANDARD_ORDER}: 0 the "
-            "wrist, then four for each finger from the thumb on, tips 4, 8, 12, 16, 20"
+            f"{self._where}: the keypoints {problem}; expected the order of {STANDARD_ORDER}: 0 "
+            "the wrist, then four for each finger from the thumb on, tips 4, 8, 12, 16, 20"
         )
         warnings.warn(message, InputWarning, stacklevel=2)
 

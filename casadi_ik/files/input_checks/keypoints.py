@@ -1,4 +1,4 @@
-"""The rules for frames of a hand tracker: lost hands are recognised, known orders converted.
+"""Checks of hand tracker frames: frames of a lost hand are rejected with a reason.
 
 A tracker that has lost the hand sends zeros, -1, or the same numbers for several keypoints; one
 that mistakes a joint sends a bone that is too long, or a hand that jumps. Such a frame is not an
@@ -17,33 +17,35 @@ from numpy.typing import NDArray
 from casadi_ik.files.arrays import Array
 
 KEYPOINTS = 21
-"""Keypoints of a hand."""
+"""Number of keypoints of a hand."""
 
 KNUCKLES = (5, 17)
-"""Knuckles of index and little finger: with the wrist they tell how a hand is turned."""
+"""Knuckles of the index and little finger, which with the wrist determine the orientation of a
+hand.
+"""
 
 BONES: NDArray[np.intp] = np.array(
     [(0 if key % 4 == 1 else key - 1, key) for key in range(1, KEYPOINTS)], dtype=np.intp
 )
-"""(20, 2) keypoints at the ends of each bone, in the usual order: wrist, then four a finger."""
+"""Keypoints (20, 2) at the ends of each bone, in the standard order: wrist, then four a finger."""
 
 SENTINELS = (0.0, -1.0)
-"""Numbers that trackers send for all three coordinates of a keypoint they have not found."""
+"""Numbers that trackers send for all coordinates of a missing keypoint."""
 
 
 @dataclass(frozen=True)
 class FrameLimits:
-    """Largest differences between a frame of a hand and the person's other frames.
+    """Largest differences between a frame of a hand and other frames of the same person.
 
     Attributes:
         speed: Largest speed of a keypoint [m/s]; hands of people are slower than 10 m/s.
         slack: Distance that a keypoint may jump at any speed [m]: noise of fast trackers.
-        stretch: Largest length of a bone over its median length in the frames before [-].
-        palm_lengths: Length that a bone may have beyond that, in lengths of the palm [-].
+        stretch: Largest length of a bone over its median length in previous frames [-].
+        palm_lengths: Additional length of a bone, in lengths of the palm [-].
         spread: Largest distance of a wrist at exactly zero from the middle of the hand, over the
             median distance of the keypoints from there [-].
-        memory: Number of frames whose median is compared with.
-        flatness: Least sine of the angle between the directions to the two knuckles [-].
+        memory: Number of frames in the median.
+        flatness: Smallest sine of the angle between the directions to the two knuckles [-].
     """
 
     speed: float = 10.0
@@ -63,7 +65,7 @@ def lost_frame_reason(frame: Array, used: NDArray[np.intp], wrist: int = 0) -> s
 
     Args:
         frame: (21, 3) keypoints [m].
-        used: Keypoints that count, each once; the others may be anything.
+        used: Keypoints that are checked, each once.
         wrist: Keypoint of the wrist.
     """
     points = frame[used]
@@ -73,9 +75,9 @@ def lost_frame_reason(frame: Array, used: NDArray[np.intp], wrist: int = 0) -> s
     for key, (x, y, z) in zip(used.tolist(), rows, strict=True):
         if not (x == y == z and x in SENTINELS):
             continue
-        if key == wrist:  # the origin may be there
-            away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-            if away[used == wrist][0] <= FRAME_LIMITS.spread * float(np.median(away)):
+        if key == wrist:  # the wrist may be the origin of the keypoints
+            distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+            if distances[used == wrist][0] <= FRAME_LIMITS.spread * float(np.median(distances)):
                 continue
         return f"keypoint {key} is exactly {x:g} {y:g} {z:g}"
     if len(set(map(tuple, rows))) < len(rows):
@@ -95,14 +97,19 @@ def bone_lengths(frames: Array) -> Array:
 
 
 class FrameFilter:
-    """Rejects frames of one hand that differ implausibly from the frames before.
+    """A filter that rejects frames of one hand that differ implausibly from previous frames.
 
     Attributes:
         reason: Why the last frame was rejected, "" if it was accepted.
     """
 
     def __init__(self, used: Sequence[int], wrist: int = 0) -> None:
-        """Take the keypoints that count, and that of the wrist."""
+        """Create a filter.
+
+        Args:
+            used: Keypoints that are checked.
+            wrist: Keypoint of the wrist.
+        """
         self._used, self._wrist = np.unique(np.array([*used, wrist, *KNUCKLES])), wrist
         self._bones: deque[Array] = deque(maxlen=FRAME_LIMITS.memory)
         self._reference: Array | None = None
@@ -112,14 +119,14 @@ class FrameFilter:
         self._elapsed, self._count = 0.0, 0
         self.reason = ""
 
-    def of_recording(self, frames: Array, times: Array) -> list[str]:
-        """Return why each frame of a recording is rejected, "" where it is not.
+    def rejection_reasons(self, frames: Array, times: Array) -> list[str]:
+        """Return why each frame of a recording is rejected, "" where it is accepted.
 
         Bones are compared with their median length in the whole recording.
 
         Args:
-            frames: (k, 21, 3) [m].
-            times: (k,) [s].
+            frames: (k, 21, 3) keypoints [m].
+            times: (k,) times [s].
         """
         recording = FrameFilter(self._used.tolist(), self._wrist)
         usable = [
@@ -136,11 +143,11 @@ class FrameFilter:
         return reasons
 
     def accepts(self, frame: Array, elapsed: float) -> bool:
-        """Decide whether a frame (21, 3) is plausible.
+        """Return True if a frame (21, 3) is plausible, and store it.
 
         Args:
-            frame: The newest frame, which may be the same as before.
-            elapsed: Time since the call before [s].
+            frame: The newest frame, which may equal the previous one.
+            elapsed: Time since the previous call [s].
         """
         self._elapsed += elapsed
         if self._newest is not None and np.array_equal(frame, self._newest):
@@ -151,7 +158,8 @@ class FrameFilter:
             return False
         self._bones.append(self._lengths)
         self._count += 1
-        # The median is of 1, 2, 4, ... frames at first, then taken when all frames are new.
+        # Sorting every frame would be slow: the median is updated after 1, 2, 4, ... frames, then
+        # whenever all frames in memory are new.
         if self._count % FRAME_LIMITS.memory == 0 or self._count & (self._count - 1) == 0:
             self._reference = _median(self._bones)
         self._accepted, self._elapsed = self._newest, 0.0
@@ -164,43 +172,43 @@ class FrameFilter:
         self._lengths = lengths = bone_lengths(frame)
         if self._reference is not None:
             palm = max(self._reference[4], self._reference[16])
-            most = FRAME_LIMITS.stretch * self._reference + FRAME_LIMITS.palm_lengths * palm
-            long = lengths > most
-            if long.any():
-                bone = int(np.argmax(long))
+            max_lengths = FRAME_LIMITS.stretch * self._reference + FRAME_LIMITS.palm_lengths * palm
+            is_too_long = lengths > max_lengths
+            if is_too_long.any():
+                bone = int(np.argmax(is_too_long))
                 return (
                     f"the bone to keypoint {BONES[bone, 1]} is {lengths[bone]:.3g} m long, "
                     f"{self._reference[bone]:.3g} m in other frames"
                 )
         if self._accepted is not None:
-            away = frame[self._used] - self._accepted[self._used]
-            most = FRAME_LIMITS.speed * self._elapsed + FRAME_LIMITS.slack
-            squares = np.einsum("ij,ij->i", away, away)
-            if squares.max() > most**2:
-                moved = np.sqrt(squares)
-                key = self._used[int(np.argmax(moved))]
-                return f"keypoint {key} jumps by {moved.max():.3g} m in {self._elapsed:.3g} s"
+            displacements = frame[self._used] - self._accepted[self._used]
+            max_distance = FRAME_LIMITS.speed * self._elapsed + FRAME_LIMITS.slack
+            squares = np.einsum("ij,ij->i", displacements, displacements)
+            if squares.max() > max_distance**2:
+                distances = np.sqrt(squares)
+                key = self._used[int(np.argmax(distances))]
+                return f"keypoint {key} jumps by {distances.max():.3g} m in {self._elapsed:.3g} s"
         return ""
 
 
 def _median(lengths: Sequence[Array] | deque[Array]) -> Array | None:
-    """Return the median (20,) of lengths that are not NaN; infinite where all are."""
+    """Return the median (20,) of finite lengths; infinity where there is none."""
     if not lengths:
         return None
     rows = np.array(lengths)
-    seen = np.isfinite(rows)
-    ordered = np.sort(np.where(seen, rows, np.inf), axis=0)
-    middle = np.maximum(seen.sum(axis=0) - 1, 0) // 2
+    finite = np.isfinite(rows)
+    ordered = np.sort(np.where(finite, rows, np.inf), axis=0)
+    middle = np.maximum(finite.sum(axis=0) - 1, 0) // 2
     return ordered[middle, np.arange(rows.shape[1])]
 
 
 def lost_contacts_reason(points: Array) -> str:
     """Return why contact points (f, 3) are those of a lost hand; "" if they may be contacts."""
-    known = points[np.isfinite(points).all(axis=1)]
-    if not len(known):
+    fixed_points = points[np.isfinite(points).all(axis=1)]
+    if not len(fixed_points):
         return ""
-    if not known.any():
+    if not fixed_points.any():
         return "every contact point is exactly 0 0 0"
-    if len(known) > 1 and (known == known[0]).all():
+    if len(fixed_points) > 1 and (fixed_points == fixed_points[0]).all():
         return "all contact points coincide"
     return ""

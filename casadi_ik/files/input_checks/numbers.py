@@ -1,4 +1,4 @@
-"""The rules for single numbers as arguments: other types and values raise an InputError."""
+"""Checks of single numbers as arguments: other types and values raise an InputError."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ def checked_number(
         value: The argument.
         where: Name of the argument, for the message.
         expected: Kind and range of the number, for the message.
-        low: Least value.
+        low: Smallest value.
         high: Largest value.
 
     Raises:
-        InputError: It is not a number, or out of range.
+        InputError: The argument is not a number, or out of range.
     """
     is_number = isinstance(value, (int, float, np.integer, np.floating))
     if not is_number or isinstance(value, bool) or not (low <= value <= high):
@@ -35,21 +35,21 @@ def checked_number(
     return number
 
 
-def checked_integer(value: Any, where: str, least: int) -> int:
+def checked_integer(value: Any, where: str, minimum: int) -> int:
     """Return an argument as an integer.
 
     Args:
         value: The argument.
         where: Name of the argument, for the message.
-        least: Least value.
+        minimum: Smallest value.
 
     Raises:
-        InputError: It is not an integer, or less than that.
+        InputError: The argument is not an integer, or smaller.
     """
     try:
         number = operator.index(value)
     except TypeError:
-        number = least - 1
-    if isinstance(value, bool) or number < least:
-        raise InputError(f"{where}: found {value!r}, expected an integer >= {least}")
+        number = minimum - 1
+    if isinstance(value, bool) or number < minimum:
+        raise InputError(f"{where}: found {value!r}, expected an integer >= {minimum}")
     return number

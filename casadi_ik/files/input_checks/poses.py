@@ -1,4 +1,4 @@
-"""The rule for rotations and rigid poses: rounded ones are corrected, others are refused."""
+"""Checks of rotations and rigid poses: rounded ones are corrected, others are refused."""
 
 from __future__ import annotations
 
@@ -87,9 +87,9 @@ def checked_pose(pose: ArrayLike, name: str = "object_pose") -> Array:
         name: Name of the argument, or file and key.
 
     Raises:
-        InputError: Another shape.
-        InvalidPoseError: A number that is not finite, a matrix that is not nearly a rotation, or
-            another last row than 0 0 0 1.
+        InputError: The array has another shape.
+        InvalidPoseError: A number is not finite, a matrix is not nearly a rotation, or the last row
+            is not 0 0 0 1.
     """
     try:
         array = np.asarray(pose, dtype=float)
@@ -111,10 +111,10 @@ def checked_pose(pose: ArrayLike, name: str = "object_pose") -> Array:
 
 
 def single_pose(pose: ArrayLike, name: str = "pose") -> Array:
-    """Return a single pose (4, 4), see `checked_pose`.
+    """Return a single pose (4, 4); see `checked_pose`.
 
     Raises:
-        InputError: As there, or there are several.
+        InputError: The array is not a single pose.
     """
     array = checked_pose(pose, name)
     if array.ndim != 2:
@@ -123,7 +123,7 @@ def single_pose(pose: ArrayLike, name: str = "pose") -> Array:
 
 
 def unit_quaternions(quaternions: Array) -> tuple[Array, Bools]:
-    """Return quaternions of length 1, and which of the given ones have another length.
+    """Return normalised quaternions, and which of the quaternions do not have length 1.
 
     Args:
         quaternions: (..., 4) in any order of components.
@@ -139,11 +139,11 @@ def unit_quaternions(quaternions: Array) -> tuple[Array, Bools]:
 
 
 def checked_quaternion(quaternion: ArrayLike, where: str) -> Array:
-    """Return a quaternion (4,) of length 1, in the order of components that is given.
+    """Return a quaternion (4,) normalised, with its order of components.
 
     Raises:
-        InputError: Another shape.
-        InvalidPoseError: A length that differs too much from 1.
+        InputError: The array has another shape.
+        InvalidPoseError: The length differs too much from 1.
     """
     values = np.asarray(quaternion, dtype=float)
     if values.shape != (4,):
@@ -160,7 +160,7 @@ def checked_quaternion(quaternion: ArrayLike, where: str) -> Array:
 def rotations_from_quaternions(quaternions: Array) -> Array:
     """Return the rotations (k, 3, 3) of quaternions (k, 4), w x y z, of nearly length 1.
 
-    Rows of another length give NaN, which the entrances report as invalid rows.
+    Rows of another length give NaN, which callers report as invalid rows.
     """
     w, x, y, z = unit_quaternions(np.asarray(quaternions, dtype=float))[0].T
     rows = [

@@ -1,4 +1,4 @@
-"""The rules for times: seconds, and motions of a countable number of cycles."""
+"""Checks of times: times are in seconds, and motions have a limited number of cycles."""
 
 from __future__ import annotations
 
@@ -11,28 +11,29 @@ from casadi_ik.files.arrays import Array
 from casadi_ik.files.limits import LIMITS, RAISE_HINT, scaled_limit
 
 MAX_FRAME_INTERVAL = 1.0
-"""Median time between frames of a hand from which on times are not in seconds [s].
+"""Median time between frames of a hand at and above which times are not in seconds [s].
 
-Trackers send at least ten frames a second; in milliseconds these are 100 apart, and a kilohertz is
-1 apart."""
+Trackers send at least ten frames a second; in milliseconds these are 100 apart, and at 1 kHz they
+are 1 apart.
+"""
 
 MAX_WAYPOINT_INTERVAL = 5.0
-"""The same for contacts [s], which may be waypoints of a slow motion."""
+"""Same limit for contacts [s], which may be waypoints of a slow motion."""
 
 MIN_FRAMES = 3
-"""Fewer frames tell nothing about their unit."""
+"""Smallest number of frames that is checked; fewer do not determine the unit."""
 
 TIME_UNITS = ((1e6, "nanoseconds", 1e-9), (1e3, "microseconds", 1e-6), (0.0, "milliseconds", 1e-3))
-"""Median interval from which on times are probably in a unit, the unit, and its seconds."""
+"""Median interval from which times are probably in a unit, the unit, and its length [s]."""
 
 
-def check_time_unit(times: Array, where: str, longest: float = MAX_FRAME_INTERVAL) -> None:
+def check_time_unit(times: Array, where: str, max_interval: float = MAX_FRAME_INTERVAL) -> None:
     """Refuse times of frames that are probably not in seconds.
 
     Args:
-        times: (k,) growing numbers.
+        times: (k,) increasing numbers.
         where: File and key.
-        longest: Median interval from which on they are refused [s].
+        max_interval: Median interval at and above which they are refused [s].
 
     Raises:
         InputError: The message names the interval and the likely unit.
@@ -40,11 +41,11 @@ def check_time_unit(times: Array, where: str, longest: float = MAX_FRAME_INTERVA
     if len(times) < MIN_FRAMES:
         return
     interval = float(np.median(np.diff(times)))
-    if interval < longest:
+    if interval < max_interval:
         return
-    unit, factor = next((name, factor) for least, name, factor in TIME_UNITS if interval >= least)
+    unit, factor = next((name, factor) for start, name, factor in TIME_UNITS if interval >= start)
     raise InputError(
-        f"{where}: frames are {interval:.4g} s apart; expected seconds, less than {longest:g} "
+        f"{where}: frames are {interval:.4g} s apart; expected seconds, less than {max_interval:g} "
         f"between frames (numbers in {unit}? multiply by {factor:g})"
     )
 
@@ -54,16 +55,16 @@ def cycle_count(seconds: float, period: float, where: str) -> int:
 
     Args:
         seconds: Duration of the motion [s].
-        period: Of a cycle [s].
+        period: Duration of a cycle [s].
         where: Name of the argument, or file and key.
 
     Raises:
-        InputError: There are more than `FileLimits.stream_cycles`; the message has their number.
+        InputError: There are more cycles than `FileLimits.stream_cycles`.
     """
-    count, most = seconds / period, scaled_limit(LIMITS.stream_cycles)
-    if not count <= most:
+    count, max_count = seconds / period, scaled_limit(LIMITS.stream_cycles)
+    if not count <= max_count:
         raise InputError(
             f"{where}: {seconds:.4g} s in cycles of {period:.4g} s are {count:.4g} cycles; "
-            f"expected at most {most:,} {RAISE_HINT}"
+            f"expected at most {max_count:,} {RAISE_HINT}"
         )
     return math.ceil(count)

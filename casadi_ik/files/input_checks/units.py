@@ -1,6 +1,6 @@
-"""The rules for units: numbers that are probably not in metres or radians cause a warning.
+"""Checks of units: numbers that are probably not in metres or radians cause a warning.
 
-They remain accepted: a large obstacle or a wide tolerance may be meant. Each message names the
+They remain accepted: a large obstacle or a wide tolerance may be intended. Each message names the
 value, the limit and the likely mistake.
 """
 
@@ -40,7 +40,7 @@ class UsualSizes:
 USUAL_SIZES = UsualSizes()
 
 ROUNDING_MARGIN = 1e-9
-"""Relative excess that causes no warning: 30 deg are 30 deg however they are converted."""
+"""Relative excess that causes no warning, such as the rounding of 30 deg in radians [-]."""
 
 
 def _warn(message: str) -> None:
@@ -53,16 +53,16 @@ def warn_of_far_contacts(points: Array, where: str, base_travel: float = 0.0) ->
     Args:
         points: Contact points [m]; NaN where free.
         where: Name of the argument, or file and key.
-        base_travel: Distance that a mobile base goes [m].
+        base_travel: Distance that a mobile base travels [m].
     """
-    most = USUAL_SIZES.contact + base_travel
-    beyond = np.abs(points) > most  # most points need no length: they are inside the box
+    max_distance = USUAL_SIZES.contact + base_travel
+    beyond = np.abs(points) > max_distance  # the test of a box is cheaper than lengths
     if not beyond.any():
         return
-    away = float(np.linalg.norm(points[beyond.any(axis=-1)][0]))
+    distance = float(np.linalg.norm(points[beyond.any(axis=-1)][0]))
     _warn(
-        f"{where}: a contact is {away:.4g} m from the robot's base; expected at most {most:.4g} m "
-        "(numbers in mm? 1 mm is 0.001)"
+        f"{where}: a contact is {distance:.4g} m from the robot's base; expected at most "
+        f"{max_distance:.4g} m (numbers in mm? 1 mm is 0.001)"
     )
 
 
@@ -86,21 +86,22 @@ def warn_of_wide_tolerance(position: float, angle: float, where: str = "toleranc
         )
 
 
-def warn_of_obstacle(away: float, size: float, where: str) -> None:
+def warn_of_obstacle(distance: float, size: float, where: str) -> None:
     """Warn of an obstacle that is very large or very far away.
 
     Args:
-        away: Distance of its origin from the base [m].
+        distance: Distance of its origin from the base [m].
         size: Its edge or diameter [m].
         where: Name of the scene or file, and key.
     """
     if size > USUAL_SIZES.obstacle * (1 + ROUNDING_MARGIN):
-        found, most = f"a solid is {size:.4g} m large", USUAL_SIZES.obstacle
-    elif away > USUAL_SIZES.obstacle_away:
-        found, most = f"a solid is {away:.4g} m from the robot's base", USUAL_SIZES.obstacle_away
+        problem, bound = f"a solid is {size:.4g} m large", USUAL_SIZES.obstacle
+    elif distance > USUAL_SIZES.obstacle_away:
+        problem = f"a solid is {distance:.4g} m from the robot's base"
+        bound = USUAL_SIZES.obstacle_away
     else:
         return
-    _warn(f"{where}: {found}; expected at most {most:g} m (numbers in mm? 1 mm is 0.001)")
+    _warn(f"{where}: {problem}; expected at most {bound:g} m (numbers in mm? 1 mm is 0.001)")
 
 
 def warn_of_large_mesh(points: Array, where: str) -> None:

@@ -518,7 +518,7 @@ class EnhancedMethod(_QiuMethod[EnhancedStep]):
         """Lay out the step; the budget is the paper's."""
         super().__init__(robot, options, compiled)
         self.name = f"enhanced-{options.steps}"
-        robot.one_hand(self.name)
+        robot.require_single_hand(self.name)
         self.step = EnhancedStep(robot, options)
         self.max_iterations = options.max_iterations
 
@@ -542,7 +542,7 @@ class OriginalMethod(_QiuMethod[OriginalStep]):
         """Lay out the step; the budget is the paper's."""
         super().__init__(robot, options, compiled)
         self.name = f"original-{options.steps}"
-        robot.one_hand(self.name)
+        robot.require_single_hand(self.name)
         self.step = OriginalStep(robot, options)
         self.max_iterations = options.max_iterations
 

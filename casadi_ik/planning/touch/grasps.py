@@ -324,7 +324,7 @@ def grasps_of(
         >>> len(found), bool(found[0].load >= found[4].load)
         (5, True)
     """
-    solver.robot.description.one_hand("grasps_of")
+    solver.robot.description.require_single_hand("grasps_of")
     begin, parameters = time.process_time(), TouchParameters()
     robot = solver.robot
     object_pose = np.eye(4) if pose is None else single_pose(pose)

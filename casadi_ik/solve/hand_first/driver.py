@@ -181,7 +181,7 @@ class SearchPlan:
             "N_MENDED": self.pool if self.mends else self.options.candidates,
             "N_MORE": len(layouts.contacts.data) - 2,
             "N_SIDES": len(self.sides),
-            "N_TURNING": len(robot.turning),
+            "N_TURNING": len(robot.multi_turn),
         }
 
     @property
@@ -340,7 +340,7 @@ class SearchPlan:
             "TABLE_SQUEEZE": np.array([1 - spread.at_limits for spread in spreads]),
             "TABLE_ROWS": np.array([spread.count for spread in spreads]),
             **(self._side_tables() if self.sides else {}),
-            **(self._turning_tables() if robot.turning else {}),
+            **(self._turning_tables() if robot.multi_turn else {}),
         }
 
     def _side_tables(self) -> dict[str, NDArray[Any]]:
@@ -360,7 +360,7 @@ class SearchPlan:
     def _turning_tables(self) -> dict[str, NDArray[Any]]:
         """Return the places in q of the motors that turn, and which of them have no limits."""
         robot = self.layouts.robot
-        turning = np.array(robot.turning, dtype=np.int64)
+        turning = np.array(robot.multi_turn, dtype=np.int64)
         return {"TURNING": turning, "CONTINUOUS": robot.continuous[turning].astype(np.int64)}
 
     def _finger_tables(self) -> dict[str, NDArray[Any]]:

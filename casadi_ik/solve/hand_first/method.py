@@ -94,7 +94,7 @@ def side_by_side(
 def part_of(targets: TargetBatch, fingers: Sequence[int], motors: Sequence[int]) -> TargetBatch:
     """The part of targets that is of some fingers, on a robot of some motors."""
     fixed = None if targets.fixed is None else targets.fixed[..., motors]
-    return replace(targets.of_fingers(fingers), fixed=fixed)
+    return replace(targets.for_fingers(fingers), fixed=fixed)
 
 
 def _of_body(

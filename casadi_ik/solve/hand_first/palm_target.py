@@ -61,7 +61,7 @@ def palm_contacts(robot: RobotDescription, targets: TargetBatch) -> TargetBatch:
         targets,
         points=palms[:, None, :3, 3],
         normals=palms[:, None, :3, 0],
-        more={"tangents": palms[:, None, :3, 1]},
+        extra_vectors={"tangents": palms[:, None, :3, 1]},
         tolerance=targets.largest_tolerance,
         fixed=None if targets.fixed is None else targets.fixed[..., arm],
         palms=None,

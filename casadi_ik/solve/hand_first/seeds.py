@@ -145,7 +145,7 @@ class Seeds:
         far = np.where([a.unit == "rad" for a in description.actuators], np.pi, 0.0)
         lower = np.minimum(middle - far, self._robot.lower)
         upper = np.maximum(middle + far, self._robot.upper)
-        ends = description.mechanical
+        ends = description.mechanical_limits
         return np.maximum(lower, ends[0]), np.minimum(upper, ends[1])
 
 

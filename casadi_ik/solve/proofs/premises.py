@@ -42,7 +42,7 @@ def motor_limits(robot: RobotDescription, targets: TargetBatch) -> tuple[Array, 
     `RobotDescription.lower` and `upper` exclude positions that are useless to a method; a proof
     must include them.
     """
-    lower, upper = robot.strokes if targets.enforce_limits else robot.mechanical
+    lower, upper = robot.actuator_limits if targets.enforce_limits else robot.mechanical_limits
     if targets.fixed is None:
         return lower, upper
     free = np.isnan(targets.fixed)

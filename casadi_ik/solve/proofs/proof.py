@@ -130,8 +130,8 @@ class Proof:
             # The proof of a multi-arm robot is a proof for one of its sides.
             if set(self.fingers) <= set(side.fingers):
                 fingers = [robot.fingers.index(finger) for finger in side.fingers]
-                side_target = None if target is None else target.of_fingers(fingers)
-                description = description.side(side.name, carried=True)
+                side_target = None if target is None else target.for_fingers(fingers)
+                description = description.side(side.name, with_trunk=True)
                 break
         return self.seal == self._seal() and _is_confirmed(self, description, side_target)
 
@@ -531,7 +531,7 @@ def contact_balls(
             slopes_of_joints[0, :, column, m] = point_slope * half_width[:, None]
             slopes_of_joints[1, :, column, m] = normal_slope * half_width[:, None]
             displacement, rotation = displacement + point_share, rotation + normal_share
-            (driver,) = robot.driving([name])
+            (driver,) = robot.driving_actuators([name])
             k = list(motors).index(robot.actuator_names[driver])
             shares[0, :, column, k] += point_share
             shares[1, :, column, k] += normal_share

@@ -145,9 +145,9 @@ class Prover:
         self, targets: TargetBatch, known_hands: Array | None, box_limits: Counts
     ) -> list[Proof | None]:
         is_usable = ~np.isnan(targets.points[:, :, 0])
-        for name in SLIDING_ARRAYS & targets.more.keys():
+        for name in SLIDING_ARRAYS & targets.extra_vectors.keys():
             # A contact on a line or a plane need not reach the point itself.
-            is_usable &= np.isnan(targets.more[name][..., 0])
+            is_usable &= np.isnan(targets.extra_vectors[name][..., 0])
         is_usable &= ~np.array(fingers_without_limits(self._robot, motor_box(self._robot, targets)))
         proofs: list[Proof | None] = [None] * len(targets)
         for group, max_boxes in self._finger_groups():

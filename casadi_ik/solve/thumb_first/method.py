@@ -57,7 +57,7 @@ class ThumbFirstMethod(LoopedMethod):
             kinds: Kind of contact of each finger (default: point and normal).
         """
         super().__init__(robot, options, compiled)
-        robot.one_hand(self.name)
+        robot.require_single_hand(self.name)
         self.options: ThumbFirstParameters = options
         self._kinds = kinds or point_normal_kinds(len(robot.fingers))
         self.step = ThumbFirstStep(robot, options, self._kinds, arm_family(robot))

@@ -461,7 +461,7 @@ def _widen(joints: dict[str, dict[str, Any]], names: set[str], path: Path) -> No
     q = ca.SX.sym("q", len(robot.actuators))
     positions = ca.Function("joints", [q], [joint_positions(robot, q)])
     # Every mechanism depends on one actuator, so that all strokes are sampled simultaneously.
-    strokes = np.linspace(*robot.strokes, GRID)
+    strokes = np.linspace(*robot.actuator_limits, GRID)
     ranges = np.array(positions(strokes.T))
     for joint, values in zip(robot.movable, ranges, strict=True):
         if joint.name in names and joint.coupling is not None and joint.coupling.slope is None:
