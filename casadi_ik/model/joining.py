@@ -191,7 +191,7 @@ def _finger(name: str, hand: RobotPart, flat: FlatJoints, side: str) -> Finger:
     # A pad on the palm's link is the fixed jaw of a gripper.
     if not chain and hand.actuators and entry.link != hand.tip_link:
         raise DescriptionError(
-            f"{where}.link: no joint moves {entry.link!r} relative to the palm {hand.tip_link!r}"
+            f"{where}.link: no joint moves {entry.link!r} against the palm {hand.tip_link!r}"
         )
     normal = np.asarray(entry.normal, dtype=float) / length
     return Finger(
