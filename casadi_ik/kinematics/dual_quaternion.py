@@ -67,7 +67,7 @@ def from_pose(R: Expr, p: Expr) -> Expr:
 
 
 def from_quaternion(r: Expr, p: Expr) -> Expr:
-    """Return the dual quaternion (8, 1) of unit quaternion r (4, 1) and translation p (3, 1) [m]."""
+    """Return the dual quaternion (8, 1) of a quaternion r (4, 1) and a translation p (3, 1)."""
     return ca.vertcat(r, quaternion_multiply(ca.vertcat(0.0, 0.5 * p), r))
 
 

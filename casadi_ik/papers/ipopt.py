@@ -69,10 +69,10 @@ class IpoptParameters:
     optimality: float = 1e-14
 
     def __post_init__(self) -> None:
-        for name, least in (("restarts", 0), ("max_iterations", 1)):
+        for name, smallest in (("restarts", 0), ("max_iterations", 1)):
             value = getattr(self, name)
-            if not (isinstance(value, int) and not isinstance(value, bool) and value >= least):
-                raise InputError(f"{name}: found {value!r}, expected a whole number >= {least}")
+            if not (isinstance(value, int) and not isinstance(value, bool) and value >= smallest):
+                raise InputError(f"{name}: found {value!r}, expected a whole number >= {smallest}")
         value = self.optimality
         number = isinstance(value, (int, float)) and not isinstance(value, bool)
         if not (number and math.isfinite(value) and value > 0):
@@ -81,23 +81,23 @@ class IpoptParameters:
 
 def contact_errors(contacts: ContactRows, residuals: Array) -> tuple[Array, Array]:
     """Return distances [m] and angles [rad] (k, f) of residuals (k, r); zero where free."""
-    parts = [residuals[:, own] for own in contacts.slices]
+    parts = [residuals[:, rows] for rows in contacts.slices]
     lengths = np.stack([np.linalg.norm(part, axis=1) for part in parts], axis=1)
     f = len(contacts.kinds)
     return lengths[:, :f] * LENGTH, 2 * np.arcsin(np.minimum(lengths[:, f:] / 2, 1.0))
 
 
-NEAR = 0.1
+WARM_START_COST = 0.1
 """Cost below which a start is near a solution, so that Ipopt is warm-started."""
 
-COLD, WARM = 0.1, 1e-11
+COLD_BARRIER, WARM_BARRIER = 0.1, 1e-11
 """Initial barrier parameters mu of cold and warm starts."""
 
-PULL = 1e-8
+PROXIMITY_WEIGHT = 1e-8
 """Weight of the distance from a warm start: it acts only along the self-motion of the arm, where
 the barrier would otherwise draw the arm to the centre of its range."""
 
-INSIDE = 1e-8
+BOUND_PUSH = 1e-8
 """Distance by which a start at a bound is moved inside, relative to the range (or the value)."""
 
 
@@ -177,7 +177,7 @@ class WholeNlp:
             "g": rows,
         }
         self._watch = Watch(n + self._rows, rows.numel(), self.program["p"].numel())
-        self._solvers = {mu: self._solver(mu, options) for mu in (COLD, WARM)}
+        self._solvers = {mu: self._solver(mu, options) for mu in (COLD_BARRIER, WARM_BARRIER)}
         # The callback of Ipopt writes to this object, so that solves must not overlap.
         self._lock = ForkSafeLock()
 
@@ -194,12 +194,12 @@ class WholeNlp:
             "ipopt.acceptable_iter": 0,
             "ipopt.max_iter": options.max_iterations,
             "ipopt.mu_init": barrier,
-            "ipopt.bound_mult_init_method": "mu-based" if barrier == WARM else "constant",
+            "ipopt.bound_mult_init_method": "mu-based" if barrier == WARM_BARRIER else "constant",
             "ipopt.bound_relax_factor": 0.0,
-            "ipopt.bound_push": INSIDE,
-            "ipopt.bound_frac": INSIDE,
-            "ipopt.slack_bound_push": INSIDE,
-            "ipopt.slack_bound_frac": INSIDE,
+            "ipopt.bound_push": BOUND_PUSH,
+            "ipopt.bound_frac": BOUND_PUSH,
+            "ipopt.slack_bound_push": BOUND_PUSH,
+            "ipopt.slack_bound_frac": BOUND_PUSH,
         }
         return ca.nlpsol("whole", "ipopt", self.program, settings)
 
@@ -224,15 +224,17 @@ class WholeNlp:
         first = self._residual(start, parameters)
         cost = float(first @ first)
         if cost < EXACT**2 and self._within(start, joints):
-            return self._unmoved(start, first, Status.STALLED)
+            return self._run_without_ipopt(start, first, Status.STALLED)
         free, zero = np.full(self._rows, np.inf), np.zeros(self._rows)
         with self._lock, interrupt_afterwards():
             self._watch.begin(self._rows, joints)
-            begin, near = start / self._scale, cost < NEAR
-            solver = self._solvers[WARM if near else COLD]
+            scaled_start, is_near = start / self._scale, cost < WARM_START_COST
+            solver = self._solvers[WARM_BARRIER if is_near else COLD_BARRIER]
             answer = solver(
-                x0=np.concatenate([begin, first]),
-                p=np.concatenate([parameters, begin, [PULL if near else 0.0]]),
+                x0=np.concatenate([scaled_start, first]),
+                p=np.concatenate(
+                    [parameters, scaled_start, [PROXIMITY_WEIGHT if is_near else 0.0]]
+                ),
                 lbx=np.concatenate([lower / self._scale, -free]),
                 ubx=np.concatenate([upper / self._scale, free]),
                 lbg=np.concatenate([zero, joints[0]]),
@@ -241,7 +243,7 @@ class WholeNlp:
             path, rows = self._watch.end()
             stats: dict[str, Any] = solver.stats()
         if not len(path):  # Ipopt could not evaluate the start
-            return self._unmoved(start, first, Status.INVALID)
+            return self._run_without_ipopt(start, first, Status.INVALID)
         path = path[:, : self._n] * self._scale
         residuals = rows[:, : self._rows]
         q = np.clip(np.array(answer["x"]).ravel()[: self._n] * self._scale, lower, upper)
@@ -270,10 +272,10 @@ class WholeNlp:
     def _within(self, q: Array, limits: tuple[Array, Array]) -> bool:
         return within(np.array(self._joints(q)).ravel(), limits)
 
-    def _unmoved(self, q: Array, residual: Array, status: Status) -> NlpRun:
+    def _run_without_ipopt(self, q: Array, residual: Array, status: Status) -> NlpRun:
         """Return a run without Ipopt: one row."""
-        nothing = np.full(1, np.nan)
-        return NlpRun(q, residual, True, status, q[None], residual[None], nothing, nothing, nothing)
+        absent = np.full(1, np.nan)
+        return NlpRun(q, residual, True, status, q[None], residual[None], absent, absent, absent)
 
 
 _ENDINGS = {
@@ -291,28 +293,30 @@ def limited_joints(robot: RobotDescription) -> list[int]:
     """
     q = ca.SX.sym("q", len(robot.actuators))
     theta = ca.Function("theta", [q], [joint_positions(robot, q)])
-    ends = np.stack([np.array(theta(end)).ravel() for end in (robot.lower, robot.upper)])
-    beyond = (ends.min(axis=0) < robot.joint_lower - JOINT_SLACK) | (
-        ends.max(axis=0) > robot.joint_upper + JOINT_SLACK
+    end_positions = np.stack([np.array(theta(end)).ravel() for end in (robot.lower, robot.upper)])
+    exceeds_limits = (end_positions.min(axis=0) < robot.joint_lower - JOINT_SLACK) | (
+        end_positions.max(axis=0) > robot.joint_upper + JOINT_SLACK
     )
     by_name = {joint.name: joint for joint in robot.movable}
-    found = []
+    indices = []
     for i, joint in enumerate(robot.movable):
-        bent, current = False, joint
+        is_nonmonotone, current = False, joint
         while current is not None and current.coupling is not None:
-            bent |= not current.coupling.monotone
+            is_nonmonotone |= not current.coupling.monotone
             current = by_name.get(current.coupling.of)
-        if joint.coupling is not None and (bent or beyond[i] or not np.isfinite(ends[:, i]).all()):
-            found.append(i)
-    return found
+        if joint.coupling is not None and (
+            is_nonmonotone or exceeds_limits[i] or not np.isfinite(end_positions[:, i]).all()
+        ):
+            indices.append(i)
+    return indices
 
 
 def _column(stats: dict[str, Any], name: str, rows: int) -> Array:
     """Return a statistic of Ipopt by iteration; NaN in restoration phases."""
-    kept = np.asarray(stats.get("iterations", {}).get(name, []), dtype=float)
+    recorded = np.asarray(stats.get("iterations", {}).get(name, []), dtype=float)
     column = np.full(rows, np.nan)
-    if len(kept) == rows:
-        column[:] = kept
+    if len(recorded) == rows:
+        column[:] = recorded
     return column
 
 

@@ -138,14 +138,14 @@ def rows(task: ScrewTask, robot: RobotDescription, q: Expr, target: dict[str, Ex
 
 def values(task: ScrewTask, robot: RobotDescription, q: Expr) -> dict[str, Expr]:
     """Return the target that q (n, 1) meets, as the task's target fields."""
-    seen = tip(task, robot, q)
-    every = {
-        "pose": seen.motion.pose,
-        "point": seen.point,
-        "normal": seen.normal_now,
-        "distance": safe_norm(seen.point),
+    fingertip = tip(task, robot, q)
+    all_values = {
+        "pose": fingertip.motion.pose,
+        "point": fingertip.point,
+        "normal": fingertip.normal_now,
+        "distance": safe_norm(fingertip.point),
     }
-    return {field.name: every[field.name] for field in task.target_fields}
+    return {field.name: all_values[field.name] for field in task.target_fields}
 
 
 def tip(task: ScrewTask, robot: RobotDescription, q: Expr) -> Tip:

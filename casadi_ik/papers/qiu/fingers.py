@@ -102,7 +102,7 @@ def planar_finger(robot: RobotDescription, name: str) -> PlanarFinger:
     origins, axes, contact, normal = _reference(robot, name, chain)
     y = axes[-2]
     spread_joint = chain[0] if len(chain) == 3 else None
-    z = axes[0] if spread_joint else _across(normal, y)
+    z = axes[0] if spread_joint else _perpendicular_direction(normal, y)
     if abs(y @ axes[-1] - 1) > ALIGNED or abs(y @ z) > ALIGNED or abs(y @ normal) > ALIGNED:
         raise UnsupportedError(f"{where}: its flexion axes are not parallel or not in plane")
     x = np.cross(y, z)
@@ -162,7 +162,7 @@ def _reference(
     return moved[:-1], turned[:-1], moved[-1], turned[-1]
 
 
-def _across(normal: Array, y: Array) -> Array:
+def _perpendicular_direction(normal: Array, y: Array) -> Array:
     """Return a direction perpendicular to the flexion axis, for a finger without spread."""
     z = normal - (normal @ y) * y
     return z / np.linalg.norm(z)

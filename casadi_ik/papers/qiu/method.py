@@ -126,9 +126,14 @@ class EnhancedStep(QiuStep[QiuParameters]):
 
     def first_state(self, starts: Array) -> dict[str, float | Array]:
         """Return the values of all state fields for starts (k, n)."""
-        most = float(np.finfo(float).max)
-        begun = {"phase": float(Phase.THUMB_REACHING), "best": most, "waited": 0.0, "reached": 0.0}
-        return super().first_state(starts) | begun
+        largest = float(np.finfo(float).max)
+        initial = {
+            "phase": float(Phase.THUMB_REACHING),
+            "best": largest,
+            "waited": 0.0,
+            "reached": 0.0,
+        }
+        return super().first_state(starts) | initial
 
     def row(
         self, q: Expr, positions: Expr, angles: Expr, *, phase: Phase, **measured: Expr
@@ -160,8 +165,8 @@ class EnhancedStep(QiuStep[QiuParameters]):
         state = ca.MX.sym("state", self.state.size)
         parameters = ca.MX.sym("parameters", self.parameters.size)
         fingers = finger_step_function(self.robot, self.options.finger_step)
-        seen = self._palm_view()(state, parameters)
-        closed = fingers(state[self.state.slice("q")], *seen)
+        palm_targets = self._palm_view()(state, parameters)
+        closed = fingers(state[self.state.slice("q")], *palm_targets)
         align = ca.Function(
             "align", [state, parameters], list(self._align()(state, parameters, closed))
         )
@@ -191,8 +196,8 @@ class EnhancedStep(QiuStep[QiuParameters]):
         )
         position, normal = contact_tasks(body, robot.thumb, goals[robot.thumb], columns)
         tasks = [palm, position, normal] if self.options.palm_task else [position, normal]
-        step = self._spread(self._combined(tasks, self._reaching(p)), columns)
-        q_next = self._moved(s["q"], step, p)
+        step = self._expand_step(self._combined(tasks, self._reaching(p)), columns)
+        q_next = self._step_within_limits(s["q"], step, p)
 
         positions, angles = contact_errors(body.kinematics, goals, robot.finger_names)
         thumb = robot.finger_names.index(robot.thumb)
@@ -205,17 +210,17 @@ class EnhancedStep(QiuStep[QiuParameters]):
             errors = ca.vertcat(errors, safe_norm(palm.error) / p["angle_tolerance"][thumb])
         within, summed = ca.mmax(errors) <= 1, ca.sum1(errors)
         better = summed < 0.99 * s["best"]
-        waited = ca.if_else(better, 0.0, s["waited"] + 1)
+        slow_iterations = ca.if_else(better, 0.0, s["waited"] + 1)
         enough = ca.logic_or(
-            waited >= p["reaching_patience"], s["reached"] + 1 >= p["reaching_iterations"]
+            slow_iterations >= p["reaching_patience"], s["reached"] + 1 >= p["reaching_iterations"]
         )
         finished = ca.logic_or(within, enough)
-        after = self.state.pack(
+        new_state = self.state.pack(
             {
                 "q": ca.if_else(within, s["q"], q_next),
                 "phase": ca.if_else(finished, float(Phase.HAND_ALIGNMENT), s["phase"]),
                 "best": ca.if_else(better, summed, s["best"]),
-                "waited": ca.if_else(finished, 0.0, waited),
+                "waited": ca.if_else(finished, 0.0, slow_iterations),
                 "reached": s["reached"] + 1,
             }
         )
@@ -231,7 +236,7 @@ class EnhancedStep(QiuStep[QiuParameters]):
             sigma_thumb=_smallest(position.jacobian) * MILLIMETRE,
             sigma_palm=_smallest(palm.jacobian[:, : len(robot.arm_actuators)]),
         )
-        return ca.Function("reach", [state, parameters], with_cse(after, record, status))
+        return ca.Function("reach", [state, parameters], with_cse(new_state, record, status))
 
     def _align(self) -> ca.Function:
         """Return the graph of hand alignment (section II-C), after the finger step."""
@@ -241,22 +246,26 @@ class EnhancedStep(QiuStep[QiuParameters]):
         positions, angles = contact_errors(body.kinematics, goals, robot.finger_names)
         solved = within_tolerance(positions, angles, p["position_tolerance"], p["angle_tolerance"])
 
-        others = {name: goal for name, goal in goals.items() if name != robot.thumb}
-        translation, rotation = palm_motion(body, others)
+        other_goals = {name: goal for name, goal in goals.items() if name != robot.thumb}
+        translation, rotation = palm_motion(body, other_goals)
         chain = closed_chain(body, self.chain, MILLIMETRE, self.options.platform)
-        moved = closed
+        q_after_chain = closed
         if self.options.closed_chain:
             motion = self._palm_tasks(chain.J_cc, translation, rotation, p)
             active = self._combined(motion, self._chain_solver(p))
-            moved = self._moved(closed, chain.motor_steps(active, closed.numel()), p)
+            q_after_chain = self._step_within_limits(
+                closed, chain.motor_steps(active, closed.numel()), p
+            )
 
         columns = robot.arm_actuators + robot.finger_actuators(robot.thumb)
-        keep = contact_tasks(actuated(robot, moved), robot.thumb, goals[robot.thumb], columns)
-        step = self._spread(self._combined(keep, self._reaching(p)), columns)
-        q_next = self._moved(moved, step, p)
+        keep = contact_tasks(
+            actuated(robot, q_after_chain), robot.thumb, goals[robot.thumb], columns
+        )
+        step = self._expand_step(self._combined(keep, self._reaching(p)), columns)
+        q_next = self._step_within_limits(q_after_chain, step, p)
 
         status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
-        after = self.state.pack(s | {"q": ca.if_else(solved, closed, q_next)})
+        new_state = self.state.pack(s | {"q": ca.if_else(solved, closed, q_next)})
         thumb_linear, _ = body.contact_jacobian(robot.thumb, columns)
         spectrum = singular_values(chain.H_p)
         record = self.row(
@@ -272,7 +281,7 @@ class EnhancedStep(QiuStep[QiuParameters]):
             condition_closed_chain=condition_number(spectrum),
         )
         return ca.Function(
-            "align_rest", [state, parameters, closed], with_cse(after, record, status)
+            "align_rest", [state, parameters, closed], with_cse(new_state, record, status)
         )
 
     def _palm_tasks(
@@ -305,14 +314,14 @@ class EnhancedStep(QiuStep[QiuParameters]):
         solver = selective(p["chain_gamma"], p["longest_error"], p["widest_error"])
         return weighted(solver, p["weights"])
 
-    def _spread(self, step: ca.SX, columns: tuple[int, ...]) -> ca.SX:
+    def _expand_step(self, step: ca.SX, columns: tuple[int, ...]) -> ca.SX:
         """Return a step of some actuators as a step of all (n, 1)."""
         full = ca.SX.zeros(len(self.robot.actuators), 1)
         for i, column in enumerate(columns):
             full[column] = step[i]
         return full
 
-    def _moved(self, q: ca.SX, step: ca.SX, p: dict[str, ca.SX]) -> ca.SX:
+    def _step_within_limits(self, q: ca.SX, step: ca.SX, p: dict[str, ca.SX]) -> ca.SX:
         """Return q after a step, capped and clipped to enforced limits."""
         q_next = q + step * ca.fmin(1.0, p["step_cap"] / ca.fmax(_largest(step), 1e-12))
         return clamp_to_limits(self.robot, q_next, p["enforce_limits"])
@@ -344,8 +353,8 @@ class OriginalStep(QiuStep[OriginalParameters]):
             Field("longest_error", unit="mm"),
             Field("widest_error", unit="rad"),
         )
-        moved = STEP_SIZE.of(robot, "largest motor change of this iteration")
-        super().__init__(robot, options, (), numbers, (moved,))
+        step_size = STEP_SIZE.of(robot, "largest motor change of this iteration")
+        super().__init__(robot, options, (), numbers, (step_size,))
 
     def _iteration(self) -> ca.Function:
         state = ca.MX.sym("state", self.state.size)
@@ -357,8 +366,8 @@ class OriginalStep(QiuStep[OriginalParameters]):
             # Instruction fetch bounds an iteration: tasks of one size share one function.
             sizes = {len(columns) for _, columns in self._kinds}
             solve = {size: self._solve(size) for size in sorted(sizes)}
-            place = self.parameters.slice
-            longest = {True: place("longest_error"), False: place("widest_error")}
+            slice_of = self.parameters.slice
+            longest = {True: slice_of("longest_error"), False: slice_of("widest_error")}
             steps = [
                 solve[len(columns)](parameters, parameters[longest[is_position]], pair)
                 for (is_position, columns), pair in zip(self._kinds, pairs, strict=True)
@@ -403,8 +412,8 @@ class OriginalStep(QiuStep[OriginalParameters]):
             desired = palm_orientation(robot, goals)
             tasks.insert(0, palm_orientation_task(body, desired, arm, euler))
         errors = ca.horzcat(*contact_errors(body.kinematics, goals, robot.finger_names))
-        seen = [ca.densify(ca.horzcat(task.jacobian, task.error)) for task in tasks]
-        return ca.Function("view", [state, parameters], with_cse(errors, *seen))
+        task_pairs = [ca.densify(ca.horzcat(task.jacobian, task.error)) for task in tasks]
+        return ca.Function("view", [state, parameters], with_cse(errors, *task_pairs))
 
     def _solve(self, count: int) -> ca.Function:
         """Return the graph of the step of one task by the actuators that move it.
@@ -426,7 +435,7 @@ class OriginalStep(QiuStep[OriginalParameters]):
         for i, (is_position, columns) in enumerate(self._kinds):
             pair = ca.SX.sym(f"pair_{i}", 3, len(columns) + 1)
             pairs.append(pair)
-            tasks.append(Task(_spread(pair[:, :-1], columns, n), pair[:, -1], is_position))
+            tasks.append(Task(_expand_columns(pair[:, :-1], columns, n), pair[:, -1], is_position))
         return pairs, tasks
 
     def _stacked(self) -> ca.Function:
@@ -441,13 +450,13 @@ class OriginalStep(QiuStep[OriginalParameters]):
     def _combined(self) -> ca.Function:
         """Return the graph that combines the steps of all tasks."""
         n, (pairs, tasks) = len(self.robot.actuators), self._pairs()
-        given, steps = [], []
+        step_symbols, steps = [], []
         for i, (_, columns) in enumerate(self._kinds):
-            given.append(ca.SX.sym(f"step_{i}", len(columns)))
-            steps.append(_spread(given[i].T, columns, n).T)
+            step_symbols.append(ca.SX.sym(f"step_{i}", len(columns)))
+            steps.append(_expand_columns(step_symbols[i].T, columns, n).T)
         damping = self.options.damping if self.options.projectors == "damped" else None
         step = ca.densify(combine(tasks, steps, self.options.projection, damping))
-        return ca.Function("combined", [*pairs, *given], with_cse(step))
+        return ca.Function("combined", [*pairs, *step_symbols], with_cse(step))
 
     def _ending(self) -> ca.Function:
         """Return the graph that takes the step or ends the solve."""
@@ -458,7 +467,7 @@ class OriginalStep(QiuStep[OriginalParameters]):
         solved = within_tolerance(positions, angles, p["position_tolerance"], p["angle_tolerance"])
         q_next = clamp_to_limits(robot, q + step, p["enforce_limits"])
         status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
-        after = self.state.pack({"q": ca.if_else(solved, q, q_next)})
+        new_state = self.state.pack({"q": ca.if_else(solved, q, q_next)})
         record = self.record.pack(
             {
                 "q": q,
@@ -471,11 +480,11 @@ class OriginalStep(QiuStep[OriginalParameters]):
             }
         )
         return ca.Function(
-            "ending", [state, parameters, errors, step], with_cse(after, record, status)
+            "ending", [state, parameters, errors, step], with_cse(new_state, record, status)
         )
 
 
-def _spread(matrix: ca.SX, columns: tuple[int, ...], n: int) -> ca.SX:
+def _expand_columns(matrix: ca.SX, columns: tuple[int, ...], n: int) -> ca.SX:
     """Return a matrix (r, k) as the given columns of one with n, the others structurally zero."""
     wide = ca.SX(matrix.shape[0], n)
     wide[:, list(columns)] = matrix
@@ -524,8 +533,13 @@ class EnhancedMethod(_QiuMethod[EnhancedStep]):
 
     def phase_counts(self, states: Array, iterations: Counts) -> Mapping[Phase, Counts]:
         """Return the iterations by phase; those after thumb reaching are hand alignment."""
-        reached = states[:, self.step.state.slice("reached").start].astype(iterations.dtype)
-        return {Phase.THUMB_REACHING: reached, Phase.HAND_ALIGNMENT: iterations - reached}
+        reaching_iterations = states[:, self.step.state.slice("reached").start].astype(
+            iterations.dtype
+        )
+        return {
+            Phase.THUMB_REACHING: reaching_iterations,
+            Phase.HAND_ALIGNMENT: iterations - reaching_iterations,
+        }
 
     @property
     def jacobians(self) -> Mapping[str, RecordedJacobian]:

@@ -123,8 +123,8 @@ def _check_fields(record: QiuParameters | OriginalParameters) -> None:
         value = getattr(record, entry.name)
         if entry.name in CHOICES:
             if value not in CHOICES[entry.name]:
-                known = ", ".join(CHOICES[entry.name])
-                raise InputError(f"{entry.name}: found {value!r}, expected one of {known}")
+                names = ", ".join(CHOICES[entry.name])
+                raise InputError(f"{entry.name}: found {value!r}, expected one of {names}")
         elif isinstance(entry.default, bool):
             if not isinstance(value, bool):
                 raise InputError(f"{entry.name}: found {value!r}, expected true or false")
@@ -132,8 +132,8 @@ def _check_fields(record: QiuParameters | OriginalParameters) -> None:
             _check_number(entry.name, value, isinstance(entry.default, int))
 
 
-def _check_number(name: str, value: object, whole: bool) -> None:
-    kind, types = ("an integer", (int,)) if whole else ("a number", (int, float))
+def _check_number(name: str, value: object, is_integer: bool) -> None:
+    kind, types = ("an integer", (int,)) if is_integer else ("a number", (int, float))
     zero = name in MAY_BE_ZERO
     number = isinstance(value, types) and not isinstance(value, bool)
     if not (number and (value > 0 or (zero and value == 0))):  # type: ignore[operator]
@@ -224,8 +224,8 @@ class QiuStep(Generic[Options]):
         self.state = Layout((Field("q", (len(robot.actuators),)), *state))
         self.parameters = Layout((*target_fields(robot), limits, *numbers))
         first, last = (Q, POSITION_ERROR, ANGLE_ERROR), (LIMIT_MASK, PHASE, STATUS)
-        ends = [[field.of(robot) for field in fields] for fields in (first, last)]
-        self.record = Layout.record(*ends[0], *measured, *ends[1])
+        fields_of_robot = [[field.of(robot) for field in fields] for fields in (first, last)]
+        self.record = Layout.record(*fields_of_robot[0], *measured, *fields_of_robot[1])
 
     def graph(self) -> StepGraph:
         """Return the step graph."""

@@ -156,14 +156,14 @@ class Calibration:
         Returns:
             Singular value and the larger components by parameter, the worst first.
         """
-        found = []
+        directions = []
         for value, direction in zip(self.singular_values, self.directions, strict=True):
             if value < below:
                 large = np.flatnonzero(np.abs(direction) > 0.3 * np.abs(direction).max())
                 order = large[np.argsort(-np.abs(direction[large]))]
                 names = {self.parameters[i].name: float(direction[i]) for i in order}
-                found.append((float(value), names))
-        return found[::-1]
+                directions.append((float(value), names))
+        return directions[::-1]
 
     @property
     def unknown_directions(self) -> int:
@@ -228,16 +228,16 @@ class _Fit:
 
     def misfit(self, x: Array) -> tuple[Array, Array]:
         """Return errors (m, 6) [m, rad], 0 if not measured, and their Jacobian by x (m, 6, k)."""
-        seen, model = self.measurements, self.model
+        measurements, model = self.measurements, self.model
         values = model.nominal + model.prior * x
-        errors = np.zeros((len(seen), 6))
-        jacobians = np.zeros((len(seen), 6, len(x)))
-        for finger in seen.measured_fingers:
-            rows = seen.rows(finger)
-            found = model.misfit(finger, seen.q[rows], values, seen.poses[rows])
-            errors[rows], jacobians[rows] = found[0], found[1] * model.prior
-        errors[~seen.turned, 3:] = 0.0
-        jacobians[~seen.turned, 3:] = 0.0
+        errors = np.zeros((len(measurements), 6))
+        jacobians = np.zeros((len(measurements), 6, len(x)))
+        for finger in measurements.measured_fingers:
+            rows = measurements.rows(finger)
+            residuals = model.misfit(finger, measurements.q[rows], values, measurements.poses[rows])
+            errors[rows], jacobians[rows] = residuals[0], residuals[1] * model.prior
+        errors[~measurements.turned, 3:] = 0.0
+        jacobians[~measurements.turned, 3:] = 0.0
         return errors, jacobians
 
     def step(self, x: Array, noise: Array) -> Array:
@@ -259,7 +259,7 @@ class _Fit:
 
     def whitened(self, errors: Array, noise: Array) -> tuple[Array, Array, Array]:
         """Return errors over the noise (m, 6), their root mean squares (m,) and numbers (m,)."""
-        white = errors / _each(noise)
+        white = errors / _noise_by_component(noise)
         numbers = np.where(self.measurements.turned, 6.0, 3.0)
         return white, np.sqrt((white**2).sum(axis=1) / numbers), numbers
 
@@ -276,13 +276,13 @@ class _Fit:
         """Return standard deviations from medians of the errors, which are robust to outliers."""
         errors, jacobians = self.misfit(x)
         _, rho, _ = self.whitened(errors, noise)
-        known, _ = self._known(jacobians, noise, self.loss.weight(rho))
-        free = 1 - _used(known) / self._rows()
-        turned = self.measurements.turned
+        singular_values, _ = self._singular_directions(jacobians, noise, self.loss.weight(rho))
+        free = 1 - _effective_parameters(singular_values) / self._rows()
+        has_angle = self.measurements.turned
         position = np.median((errors[:, :3] ** 2).sum(axis=1))
         estimate = [math.sqrt(position / CHI_SQUARE_MEDIAN / free), float(noise[1])]
-        if turned.any():
-            angle = np.median((errors[turned, 3:] ** 2).sum(axis=1))
+        if has_angle.any():
+            angle = np.median((errors[has_angle, 3:] ** 2).sum(axis=1))
             estimate[1] = math.sqrt(angle / CHI_SQUARE_MEDIAN / free)
         # Exact data have no noise but rounding errors.
         return np.maximum(np.array(estimate), 1e-8)
@@ -291,12 +291,16 @@ class _Fit:
         """Return the number of measured values."""
         return int(np.where(self.measurements.turned, 6, 3).sum())
 
-    def _known(self, jacobians: Array, noise: Array, weights: Array) -> tuple[Array, Array]:
+    def _singular_directions(
+        self, jacobians: Array, noise: Array, weights: Array
+    ) -> tuple[Array, Array]:
         """Return singular values (k,) and directions (k, k) of the whitened, weighted Jacobian."""
         rows = _stacked(jacobians, noise, np.sqrt(weights))
         few = len(rows) < rows.shape[1]  # else the directions are complete without the rest of U
-        _, known, directions = np.linalg.svd(rows, full_matrices=few)
-        return np.concatenate([known, np.zeros(len(directions) - len(known))]), directions
+        _, singular_values, directions = np.linalg.svd(rows, full_matrices=few)
+        return np.concatenate(
+            [singular_values, np.zeros(len(directions) - len(singular_values))]
+        ), directions
 
     def result(
         self, x: Array, noise: Array, estimated: bool, before: Array, steps: int, converged: bool
@@ -313,27 +317,27 @@ class _Fit:
 
         # Sandwich of an M-estimator with a prior: curvature outside, variance of the score inside.
         curved = _stacked(jacobians, noise, np.sqrt(self.loss.slope(weights, rho, numbers)))
-        _, sizes, turns = np.linalg.svd(np.vstack([curved, eye]), full_matrices=False)
-        outer = (turns.T / sizes**2) @ turns
-        known, directions = self._known(jacobians, noise, weights)
+        _, sizes, right_vectors = np.linalg.svd(np.vstack([curved, eye]), full_matrices=False)
+        outer = (right_vectors.T / sizes**2) @ right_vectors
+        singular_values, directions = self._singular_directions(jacobians, noise, weights)
         # With too few data the assumed noise replaces the estimated scatter.
-        scatter = (weights * rho) ** 2 / (1 - _used(known) / self._rows())
+        scatter = (weights * rho) ** 2 / (1 - _effective_parameters(singular_values) / self._rows())
         share = scatter if estimated else self.loss.slope(weights, rho, numbers)
         inner = information(share) + eye
         prior = self.model.prior
         covariance = np.outer(prior, prior) * (outer @ inner @ outer)
-        turned = self.measurements.turned
+        has_angle = self.measurements.turned
         return Calibration(
             parameters=self.model.parameters,
             values=self.model.nominal + prior * x,
             covariance=0.5 * (covariance + covariance.T),
-            singular_values=known,
+            singular_values=singular_values,
             directions=directions,
             weights=weights,
-            noise=(float(noise[0]), float(noise[1]) if turned.any() else math.nan),
+            noise=(float(noise[0]), float(noise[1]) if has_angle.any() else math.nan),
             noise_estimated=estimated,
-            before=_sizes(before, turned),
-            after=_sizes(errors, turned),
+            before=_error_norms(before, has_angle),
+            after=_error_norms(errors, has_angle),
             iterations=steps,
             converged=converged,
         )
@@ -351,21 +355,21 @@ class _Fit:
 
 def _stacked(jacobians: Array, noise: Array, roots: Array) -> Array:
     """Return whitened Jacobians (m, 6, k), times root weights, as rows (6 m, k)."""
-    scaled = jacobians * (roots[:, None] / _each(noise))[:, :, None]
+    scaled = jacobians * (roots[:, None] / _noise_by_component(noise))[:, :, None]
     return scaled.reshape(-1, jacobians.shape[2])
 
 
-def _used(known: Array) -> float:
+def _effective_parameters(singular_values: Array) -> float:
     """Return the effective number of parameters from the singular values."""
-    return float((known**2 / (known**2 + 1)).sum())
+    return float((singular_values**2 / (singular_values**2 + 1)).sum())
 
 
-def _each(noise: Array) -> Array:
+def _noise_by_component(noise: Array) -> Array:
     return np.repeat(noise, 3)
 
 
-def _sizes(errors: Array, turned: NDArray[np.bool_]) -> Array:
-    angles = np.where(turned, np.linalg.norm(errors[:, 3:], axis=1), np.nan)
+def _error_norms(errors: Array, has_angle: NDArray[np.bool_]) -> Array:
+    angles = np.where(has_angle, np.linalg.norm(errors[:, 3:], axis=1), np.nan)
     return np.column_stack([np.linalg.norm(errors[:, :3], axis=1), angles])
 
 
@@ -428,31 +432,37 @@ def write_description(
     _write(top, path)
 
 
-def _coupling(entry: dict[str, Any], numbers: dict[str, float]) -> None:
+def _set_coupling(entry: dict[str, Any], numbers: dict[str, float]) -> None:
     entry["coupling"] |= numbers
 
 
-def _origin(entry: dict[str, Any], numbers: dict[str, float]) -> None:
+def _set_origin(entry: dict[str, Any], numbers: dict[str, float]) -> None:
     entry["origin"] = entry.get("origin", {}) | {"xyz": [numbers[key] for key in "xyz"]}
 
 
-def _axis(entry: dict[str, Any], numbers: dict[str, float]) -> None:
+def _set_axis(entry: dict[str, Any], numbers: dict[str, float]) -> None:
     axis = np.asarray(entry["axis"], dtype=float)
-    turned = tilted(axis / np.linalg.norm(axis), ca.DM([numbers["1"], numbers["2"]]))
-    entry["axis"] = np.array(turned).ravel().tolist()
+    axis_estimate = tilted(axis / np.linalg.norm(axis), ca.DM([numbers["1"], numbers["2"]]))
+    entry["axis"] = np.array(axis_estimate).ravel().tolist()
 
 
-def _tip(entry: dict[str, Any], numbers: dict[str, float]) -> None:
+def _set_tip(entry: dict[str, Any], numbers: dict[str, float]) -> None:
     entry["xyz"] = [numbers[key] for key in "xyz"]
 
 
-def _turn(entry: dict[str, Any], numbers: dict[str, float]) -> None:
-    before = frame_matrix(Frame(rpy=tuple(entry.get("rpy", (0.0, 0.0, 0.0)))))[:3, :3]
-    after = ca.DM(before) @ exp_so3(ca.DM([numbers[key] for key in "xyz"]))
-    entry["rpy"] = np.array(matrix_to_rpy(after)).ravel().tolist()
+def _set_rotation(entry: dict[str, Any], numbers: dict[str, float]) -> None:
+    R_before = frame_matrix(Frame(rpy=tuple(entry.get("rpy", (0.0, 0.0, 0.0)))))[:3, :3]
+    R_after = ca.DM(R_before) @ exp_so3(ca.DM([numbers[key] for key in "xyz"]))
+    entry["rpy"] = np.array(matrix_to_rpy(R_after)).ravel().tolist()
 
 
-_PARTS = {"coupling": _coupling, "origin": _origin, "axis": _axis, "tip": _tip, "turn": _turn}
+_PARTS = {
+    "coupling": _set_coupling,
+    "origin": _set_origin,
+    "axis": _set_axis,
+    "tip": _set_tip,
+    "turn": _set_rotation,
+}
 
 
 def _widen(joints: dict[str, dict[str, Any]], names: set[str], path: Path) -> None:
