@@ -164,12 +164,12 @@ static int begin_hand(search *job) {
     look->fresh = 0;
     /* The order does not matter here, and where the robot is has been looked at. */
     job->terms[TERMS_NEAREST] = 0;
-    code = from_table(job, look->round);
+    code = seed_from_tables(job, look->round);
     job->terms[TERMS_NEAREST] = near;
   }
   if (code != DONE) return code;
   for (i = 0; i < N_CANDIDATES; ++i) {
-    memcpy(job->near + i * N_HAND, job->postures + look->fit * N_HAND,
+    memcpy(job->seed_pool + i * N_HAND, job->postures + look->fit * N_HAND,
            N_HAND * sizeof(scalar));
   }
   for (i = 0; i < N_MOTORS; ++i) {
@@ -180,7 +180,7 @@ static int begin_hand(search *job) {
   inputs[1] = job->normals;
   inputs[2] = here;
   inputs[3] = job->terms;
-  inputs[4] = job->near;
+  inputs[4] = job->seed_pool;
   outputs[0] = job->state;
   outputs[1] = job->parameters;
   code = BEGIN(&map);
@@ -325,13 +325,13 @@ static int begin_carry(search *job, const scalar *q, const scalar *palms, int ph
   map_job map = mapping(1, inputs, ALONE, outputs, ALONE);
   int code, i, k;
   for (i = 0; i < N_CANDIDATES; ++i) {
-    for (k = 0; k < N_HAND; ++k) job->near[i * N_HAND + k] = q[HAND[k]];
+    for (k = 0; k < N_HAND; ++k) job->seed_pool[i * N_HAND + k] = q[HAND[k]];
   }
   inputs[0] = job->points;
   inputs[1] = job->normals;
   inputs[2] = q;
   inputs[3] = job->terms;
-  inputs[4] = job->near;
+  inputs[4] = job->seed_pool;
   outputs[0] = job->state;
   outputs[1] = job->parameters;
   code = BEGIN(&map);

@@ -1,6 +1,6 @@
-/* What Python calls of hand-first: one search, a batch of them, one decision, one round's hands. */
+/* Entry points for Python: one search, a batch, one decision, and the seeds of one restart. */
 
-/* k targets; all rows are one after the other. */
+/* k targets with contiguous rows. */
 typedef struct {
   search *searches;            /* one for each slot of the loop */
   const double *points, *normals, *more, *here, *terms;
@@ -10,7 +10,7 @@ typedef struct {
   int64_t *restarts;
 } batch;
 
-/* Searches for the target in the job; SLICE_OVER: to be called again. */
+/* Search for the target in the job; returns SLICE_OVER if it has to be called again. */
 EXPORT int casadi_ik_search(search *job) {
   int code;
   if (!job->paused && !search_begin(job)) return MALFORMED;
@@ -19,39 +19,39 @@ EXPORT int casadi_ik_search(search *job) {
   return job->paused ? SLICE_OVER : code;
 }
 
-/* A batch: `follow` for the search in a slot, which takes its question from the rows of the batch
- * and leaves its answer there. */
+/* Call `follow` for the search in a slot, which reads its target from the rows of the batch and
+ * writes its answer there. */
 EXPORT int casadi_ik_follow(void *method, int64_t slot, int64_t solve, int32_t *status) {
-  const batch *all = method;
-  search *job = all->searches + slot;
+  const batch *rows = method;
+  search *job = rows->searches + slot;
   int code, i;
   if (*status == UNBEGUN) {
-    memcpy(job->points, all->points + 3 * N_FINGERS * solve, sizeof job->points);
-    memcpy(job->normals, all->normals + 3 * N_FINGERS * solve, sizeof job->normals);
+    memcpy(job->points, rows->points + 3 * N_FINGERS * solve, sizeof job->points);
+    memcpy(job->normals, rows->normals + 3 * N_FINGERS * solve, sizeof job->normals);
     for (i = 0; i < 3 * N_FINGERS * N_MORE; ++i) {
-      job->more[i] = all->more[3 * N_FINGERS * N_MORE * solve + i];
+      job->more[i] = rows->more[3 * N_FINGERS * N_MORE * solve + i];
     }
-    memcpy(job->here, all->here + N_MOTORS * solve, sizeof job->here);
-    memcpy(job->terms, all->terms + all->terms_step * solve, sizeof job->terms);
-    job->most = all->most[solve];
-    job->may_begin = FOREVER;
+    memcpy(job->here, rows->here + N_MOTORS * solve, sizeof job->here);
+    memcpy(job->terms, rows->terms + rows->terms_step * solve, sizeof job->terms);
+    job->most = rows->most[solve];
+    job->restart_quota = FOREVER;
     job->judged = 0;
   }
   code = follow(job, 0, 0, status);
   if (code != DONE) return code;
-  memcpy(all->q + N_MOTORS * solve, job->q, sizeof job->q);
-  memcpy(all->counts + N_COUNTS * solve, job->state + STATE_COUNTS, N_COUNTS * sizeof(double));
-  all->restarts[solve] = job->restarts;
+  memcpy(rows->q + N_MOTORS * solve, job->q, sizeof job->q);
+  memcpy(rows->counts + N_COUNTS * solve, job->state + STATE_COUNTS, N_COUNTS * sizeof(double));
+  rows->restarts[solve] = job->restarts;
   return DONE;
 }
 
-/* One decision, for a solve by steps: `status` is how the state in the job ended, or UNBEGUN. */
+/* Decide once, for a solve by steps: `loop_status` is how the iterations ended, or UNBEGUN. */
 EXPORT int casadi_ik_decide(search *job) {
   int32_t status = (int32_t) job->loop_status;
-  job->may_begin = 1;
+  job->restart_quota = 1;
   job->judged = 0;
   return follow(job, 0, 0, &status);
 }
 
-/* The hands of a round whose postures look like the target, into `postures`. */
-EXPORT int casadi_ik_postures(search *job) { return from_table(job, job->round); }
+/* Write the seeds of a restart from tables to `postures`. */
+EXPORT int casadi_ik_postures(search *job) { return seed_from_tables(job, job->round); }

@@ -1,6 +1,6 @@
-"""The driver of hand-first: C that is made for a robot, and its calls for one target and for many.
+"""Driver of hand-first: C code generated for a robot, and its calls for one target and for batches.
 
-What is done when stands in hand_first.c and seeds.c, and in the loop that calls them. Here they get
+The algorithm is in hand_first.c and seeds.c, and in the loop that calls them. This module provides
 their memory, their constants and the kernels that they call.
 """
 
@@ -41,10 +41,10 @@ from casadi_ik.solve.turns import TURN
 from casadi_ik.solve.verdict import LIMIT_SLACK, TOLERANCE_SLACK, construct_unchecked
 
 MALFORMED = -9
-"""What a search returns for a question that is none."""
+"""Return code of a search for a malformed target."""
 
 SMALLEST = 1e-9
-"""Smallest range [rad or m] a motion is measured by."""
+"""Lower bound of the ranges that scale motor distances [rad or m]."""
 
 KERNELS = {
     "look_up": "lookup_job",
@@ -53,7 +53,7 @@ KERNELS = {
     "seen": "map_job",
     "judge": "map_job",
 }
-"""The compiled functions it calls, and what they work on."""
+"""Job type of each compiled function that a search calls."""
 
 EXPORT = """
 #if defined(_WIN32)
@@ -64,41 +64,41 @@ EXPORT = """
 """
 
 HANDS = "EXPORT int casadi_ik_hands"
-"""What a body calls of its sides' libraries."""
+"""Declaration of the function that a multi-arm robot calls for seeds of its sides."""
 
 OF_SIDES = """
 typedef int (*find_hands)(void *, const double *, const double *, const double *, int64_t, int64_t,
                           double *);
 #define HANDS(side, ...) ((find_hands) job->hands[side])((void *) job->sides[side], __VA_ARGS__)
 """
-"""How a body does it."""
+"""Macro by which a multi-arm robot calls the seed function of a side."""
 
 STATE = (
     *("q", "phase", "candidate", "earlier", "held", "returns"),
     *("best_cost", "best_q", "counts"),
 )
-"""What the C reads and writes of a state."""
+"""State fields that the C code reads and writes."""
 
 
 @cache
 def source_text(name: str) -> str:
-    """The text of one of the files beside this one, as "hand_first"."""
+    """Return the text of a C file of this package by its stem, such as "hand_first"."""
     source = resources.files("casadi_ik.solve.hand_first") / f"{name}.c"
     return source.read_text(encoding="utf-8")
 
 
 @dataclass(frozen=True, eq=False)
 class SearchPlan:
-    """What the C is made of for a robot and a way of taking limits.
+    """Ingredients of the C code for a robot, with or without enforced limits.
 
     Attributes:
-        layouts: Of the step.
-        options: Of the method.
-        budget: Iterations of a round.
-        seeds: The hand postures that rounds begin from.
-        enforce_limits: Whether limits are part of being solved.
-        made: What gives the kernels below, which are compiled when first asked for.
-        sides: Of a body, what its sides' hands are found by.
+        layouts: Layouts of the step.
+        options: Parameters of the method.
+        budget: Maximum number of iterations of a restart.
+        seeds: Hand postures from which restarts begin.
+        enforce_limits: Whether a solution must respect limits.
+        made: Factories of the kernels below, which are compiled at the first use.
+        sides: Plans of the sides of a multi-arm robot, for the seeds of their hands.
     """
 
     layouts: HandFirstLayouts
@@ -111,63 +111,63 @@ class SearchPlan:
 
     @property
     def begin(self) -> FunctionKernel:
-        """Makes first state and parameters of a round."""
+        """Kernel of the first state and the parameters of a restart."""
         return self.made["begin"]()
 
     @property
     def solve(self) -> LoopKernel:
-        """The loop."""
+        """Compiled loop."""
         return self.made["solve"]()
 
     @property
     def contacts(self) -> FunctionKernel:
-        """Contact points and normals of configurations, for what is exported."""
+        """Kernel of contact points and normals of configurations, for exported solvers."""
         return self.made["contacts"]()
 
     @property
     def judge(self) -> FunctionKernel:
-        """Errors and excess over limits of a configuration."""
+        """Kernel of the errors of a configuration and its excess over limits."""
         return self.made["judge"]()
 
     @property
     def rounds(self) -> int:
-        """How many there are at most."""
+        """Maximum number of restarts of a search."""
         return self.options.all_rounds(self.layouts.robot)
 
     @property
     def mends(self) -> bool:
-        """Whether every finger by itself mends the postures that rounds begin from."""
+        """Whether the seeds of later restarts are repaired finger by finger."""
         return self.enforce_limits and self.seeds.mends
 
     @property
     def pool(self) -> int:
-        """Postures of which a round's are taken, at most."""
+        """Maximum number of postures from which the seeds of a restart are selected."""
         options = self.options
         mended = max(options.pool, options.candidates)
         return mended if self.mends else options.candidates * max(options.rounds - 1, 1)
 
     @property
     def kernels(self) -> dict[str, Any]:
-        """Those that are called, by the names of `KERNELS`."""
+        """Called kernels by their names in `KERNELS`."""
         found = {"begin": self.begin, "solve": self.solve, "judge": self.judge}
         return found if self.sides else found | self.of_hands
 
     @property
     def of_hands(self) -> dict[str, Any]:
-        """Those that find hands."""
+        """Kernels that find seeds."""
         found = {"look_up": self.seeds.table.lookup}
         return found | ({"seen": self.seeds.seen} if self.mends else {})
 
     @property
     def source(self) -> str:
-        """The C of a search."""
+        """C code of a search."""
         names = "spread", "sides" if self.sides else "seeds", "hand_first"
         texts = map(source_text, names)
         return driver_text("loops") + "".join(texts)
 
     @property
     def sizes(self) -> dict[str, int]:
-        """The macros that dimensions of arrays are made of."""
+        """Macros of array dimensions."""
         robot, layouts = self.layouts.robot, self.layouts
         return {
             "N_FINGERS": len(robot.fingers),
@@ -186,7 +186,7 @@ class SearchPlan:
 
     @property
     def fields(self) -> dict[str, tuple[str, int | None, str]]:
-        """Type, length (None: a number) and meaning of what a search has in memory, 8 bytes."""
+        """Type, length (None: scalar) and meaning of the members of a search, 8 bytes each."""
         f, n, h, _, state, parameters, candidates, pool, mended, more, *_ = self.sizes.values()
         double, whole = "double", "int64_t"
         h = max(h, 1)  # a tool has no motors, and C no empty arrays
@@ -211,26 +211,26 @@ class SearchPlan:
             "status": (whole, None, ""),
             "judged": (whole, None, "on its way: whether there is a verdict"),
             "round": (whole, None, ""),
-            "again": (whole, None, "1 = near `here` there was none: the search without preference"),
-            "may_begin": (whole, None, "rounds of this call"),
+            "preference_dropped": (whole, None, "1 = restarts are repeated without the preference"),
+            "restart_quota": (whole, None, "restarts that this call may still begin"),
             "slot": (whole, None, "of the loop, -1 = not under way"),
             "begun": (whole, None, "iterations before the round"),
             "loop_status": (whole, None, ""),
             "paused": (whole, None, ""),
             "state": (double, state, ""),
             "parameters": (double, parameters, ""),
-            "last": (double, state, "the state in which the round before ended"),
+            "previous_state": (double, state, "last state of the previous restart"),
             "mark": (double, state, ""),
             "postures": (double, candidates * h, "of the round"),
-            "bests": (double, 2 * h, "the best hand, and the one that was it before"),
-            "n_bests": (whole, None, ""),
-            "near": (double, mended * h, "room for seeds.c, and for a scene's hands"),
-            "left": (double, mended, ""),
-            "found": (whole, pool, ""),
+            "incumbent_hands": (double, 2 * h, "the best hand and the previous best hand"),
+            "incumbent_count": (whole, None, ""),
+            "seed_pool": (double, mended * h, "work memory of seeds.c and of collision checks"),
+            "seed_error": (double, mended, "sums of squared contact errors"),
+            "seed_rows": (whole, pool, ""),
         }
 
     def members(self) -> str:
-        """The `fields` as members of a struct of C."""
+        """Return the `fields` as members of a C struct."""
         lines = []
         for name, (kind, length, doc) in self.fields.items():
             size = "" if length is None else f"[{length}]"
@@ -243,12 +243,12 @@ class SearchPlan:
         reals: Mapping[str, float] | None = None,
         arrays: Mapping[str, NDArray[Any]] | None = None,
     ) -> str:
-        """All of them but the `sizes`, as C text.
+        """Return all constants except the `sizes` as C text.
 
         Args:
-            source: Text in C; arrays are those that it names.
-            reals: Those of the constants that are others than in Python.
-            arrays: Likewise.
+            source: C text; only arrays that it names are defined.
+            reals: Numbers that replace those of Python.
+            arrays: Arrays that replace those of Python.
         """
         numbers = self._real_numbers() | dict(reals or {})
         lines = (f"#define {name} {number(value)}\n" for name, value in numbers.items())
@@ -289,7 +289,7 @@ class SearchPlan:
 
     @property
     def _options(self) -> dict[str, Any]:
-        """Those that are numbers; of the two for few and many motors the robot's and the other."""
+        """Numeric options; of pairs for few and many motors the robot's, and that for many."""
         many, found = self.options.is_many(self.layouts.robot), dict[str, Any]()
         for name, value in asdict(self.options).items():
             if isinstance(value, int | float):
@@ -313,7 +313,7 @@ class SearchPlan:
 
     @property
     def _carried(self) -> list[int]:
-        """Places in the state."""
+        """Indices of the state entries that are kept across restarts."""
         slices = map(self.layouts.state.slice, self.layouts.carried)
         return [place for one in slices for place in range(one.start, one.stop)]
 
@@ -344,7 +344,7 @@ class SearchPlan:
         }
 
     def _side_tables(self) -> dict[str, NDArray[Any]]:
-        """How a body's fingers, hands and motors are shared out; filled up with zeros."""
+        """Return the fingers, hands and motors of each side, padded with zeros."""
         robot = self.layouts.robot
         motors = [sorted((*arm, *hand)) for arm, hand in robot.side_actuators]
         places = np.zeros((len(motors), max(map(len, motors))), dtype=np.int64)
@@ -364,7 +364,7 @@ class SearchPlan:
         return {"TURNING": turning, "CONTINUOUS": robot.continuous[turning].astype(np.int64)}
 
     def _finger_tables(self) -> dict[str, NDArray[Any]]:
-        """Those by which postures are mended, filled up with zeros."""
+        """Return the tables of single fingers for repairs, padded with zeros."""
         tables = self.seeds.fingers
         most = max(len(table.places) for table in tables)
         places = np.zeros((len(tables), most), dtype=np.int64)
@@ -381,9 +381,9 @@ class SearchPlan:
 
 
 class Searches:
-    """Memory for some searches at a time, and the calls that make them; not shared by threads.
+    """Memory of concurrent searches and the calls that run them; not shared by threads.
 
-    The arrays of the first are there to be written into and read.
+    The attributes are views of the first search.
 
     Attributes:
         points: (f, 3) [m], NaN where free; write into it.
@@ -403,8 +403,8 @@ class Searches:
         """Compile what is not compiled yet.
 
         Args:
-            plan: What it is made of; its kernels are compiled.
-            count: How many searches may be under way.
+            plan: Ingredients of the C code; its kernels are compiled.
+            count: Number of concurrent searches.
 
         Raises:
             KernelError: The compiler refused.
@@ -444,7 +444,7 @@ class Searches:
         self._beyond = ctypes.c_double.from_address(self._base + offsets["beyond"][1])
 
     def _hands_of(self, plan: SearchPlan, place: int) -> tuple[Any, ...]:
-        """Memory of a side's searches for hands, one for each search of the body."""
+        """Allocate the seed searches of a side, one for each search of the multi-arm robot."""
         name, library = _library(plan)
         if library is None:
             raise KernelError(f"{name}: no compiler, and no kernel made ahead")
@@ -458,13 +458,13 @@ class Searches:
         return kept
 
     def ask(self, targets: TargetBatch, row: int, here: Array, given: Array) -> None:
-        """Put one of k targets in.
+        """Write a target to the arrays.
 
         Args:
             targets: k targets.
-            row: Which of them.
-            here: (n,) where the robot is.
-            given: Its terms.
+            row: Index of the target.
+            here: (n,) start configuration.
+            given: Terms of the target.
         """
         self.points[...], self.normals[...] = targets.points[row], targets.normals[row]
         self.here[...], self.terms[...] = here, given
@@ -472,10 +472,10 @@ class Searches:
             vectors[...] = targets.vectors(f"{name}s")[row]
 
     def __call__(self, rounds: int) -> int | None:
-        """Search for the target that stands in the arrays.
+        """Search for the target in the arrays.
 
         Args:
-            rounds: At most.
+            rounds: Maximum number of restarts.
 
         Returns:
             Code of `Status`, after the verdict where there is one; None: the target is malformed.
@@ -498,10 +498,10 @@ class Searches:
         return self._status.value
 
     def answer(self, status: int) -> SingleOutcome:
-        """The last answer, copied.
+        """Return a copy of the last answer.
 
         Args:
-            status: What the call returned.
+            status: Status that the call returned.
         """
         errors = None
         if not self.more:
@@ -519,11 +519,11 @@ class Searches:
         )
 
     def decide(self, status: int, rounds: int) -> bool:
-        """Whether a round follows; it then begins with `state` and `parameters`.
+        """Return whether a restart follows; it then begins with `state` and `parameters`.
 
         Args:
-            status: How the loop ended in `state`, or `UNBEGUN`.
-            rounds: At most.
+            status: Status with which the loop ended in `state`, or `UNBEGUN`.
+            rounds: Maximum number of restarts.
         """
         self._one["loop_status"], self._one["most"] = status, rounds
         code = self._decide(self._address)
@@ -532,7 +532,7 @@ class Searches:
         return code == DriverCode.GOES_ON
 
     def hands(self, number: int) -> Array:
-        """Postures (candidates, hand) of a round that look like the target in the arrays."""
+        """Return the seeds (candidates, hand) of a restart for the target in the arrays."""
         self._one["round"], self.terms[-1] = number, 0.0  # in no particular order
         check(self._name, self._find_postures(self._address))
         return self.postures.copy()
@@ -545,13 +545,13 @@ class Searches:
         rounds: NDArray[np.int64],
         trace: bool,
     ) -> Outcome:
-        """Search for k targets, some of them at a time.
+        """Search for k targets, `SLOTS` of them at a time.
 
         Args:
             targets: The targets.
-            q0: (k, n) where the robot is.
-            given: Their terms, (t,) or (k, t).
-            rounds: (k,) at most.
+            q0: (k, n) start configurations.
+            given: Terms of the targets, (t,) or (k, t).
+            rounds: (k,) maximum numbers of restarts.
             trace: Whether to keep every iteration.
         """
         plan, count = self.plan, len(targets)
@@ -597,7 +597,7 @@ class Searches:
 
 
 def _called(plan: SearchPlan, searches: NDArray[Any], kernels: dict[str, Any]) -> tuple[Any, ...]:
-    """Write down what searches call; returns what has to be kept meanwhile."""
+    """Store the addresses of kernels in searches; return the objects that must stay alive."""
     tables = plan.seeds.tables(plan.enforce_limits)
     for i, table in enumerate(tables):
         searches["tiles"][:, i] = memory(table.lookup.tiles)
@@ -607,20 +607,20 @@ def _called(plan: SearchPlan, searches: NDArray[Any], kernels: dict[str, Any]) -
 
 
 class SearchPool:
-    """Memory of searches, made once for as many threads as are at work at a time."""
+    """Pool of search memory, which grows with the number of concurrent threads."""
 
     def __init__(self, plan: Callable[[bool], SearchPlan]) -> None:
-        """Nothing is compiled before it is asked for.
+        """Store the factory of plans; nothing is compiled yet.
 
         Args:
-            plan: For limits that are enforced or not.
+            plan: Return the plan with or without enforced limits.
         """
         self._plan = plan
         self._free: dict[tuple[bool, int], list[Searches]] = {}
 
     @contextmanager
     def lent(self, enforce_limits: bool, count: int = 1) -> Iterator[Searches]:
-        """Memory for one search, or for `SLOTS` if there are more targets than one."""
+        """Lend memory for one search, or for `SLOTS` searches if there are several targets."""
         size = SLOTS if count > 1 else 1
         free = self._free.setdefault((enforce_limits, size), [])
         try:
@@ -632,7 +632,7 @@ class SearchPool:
 
 
 def can_search(plan: SearchPlan) -> bool:
-    """Whether there is compiled code of a search and of all that it calls."""
+    """Return whether a search and all functions that it calls are compiled."""
     called = (
         *plan.kernels.values(),
         *(one for side in plan.sides for one in side.of_hands.values()),
@@ -642,7 +642,7 @@ def can_search(plan: SearchPlan) -> bool:
 
 
 def _library(plan: SearchPlan) -> tuple[str, ctypes.CDLL | None]:
-    """Name and compiled code of a search."""
+    """Return name and compiled library of a search."""
     robot = plan.layouts.robot
     name = ca.Function.fix_name(f"hand_first_search_{robot.name}")
     given = robot, plan.options, plan.layouts.kinds, plan.budget, plan.enforce_limits
@@ -652,7 +652,7 @@ def _library(plan: SearchPlan) -> tuple[str, ctypes.CDLL | None]:
 
 
 def _form(plan: SearchPlan) -> list[Any]:
-    """The memory of a search, as a record of numpy."""
+    """Return the memory of a search as a NumPy record type."""
     kinds = {"double": np.float64, "int64_t": np.int64}
     form: list[Any] = [
         (name, kinds[kind], () if length is None else (length,))
@@ -663,7 +663,7 @@ def _form(plan: SearchPlan) -> list[Any]:
 
 
 def _text(plan: SearchPlan, wide: bool) -> str:
-    """The C text of the library."""
+    """Return the C text of the library."""
     jobs = (driver_text(name) for name in ("loop_job", "map_job", "lookup_job"))
     pointers = "".join(f"  int (*{name})({job} *);\n" for name, job in KERNELS.items())
     calls = "".join(f"#define {name.upper()}(work) (job->{name})(work)\n" for name in KERNELS)

@@ -1,30 +1,31 @@
-/* Hand first: the search for one target, from the question to the verdict.
+/* Hand-first: the search for one target, from its inputs to the verdict.
  *
- * A search makes rounds until a target is solved or none is left that may help. A round takes up to
- * N_CANDIDATES hand postures (seeds.c, of a body sides.c), one after the other. Of each it takes
- * the palm pose that suits it best (candidate), fits palm and hand to the contacts as if the hand
- * could fly (hand fit), has the arm carry the palm there in closed form (arm placement, or
- * arm choice if what is near q0 is wanted), moves all motors where the arm cannot follow exactly
- * (refinement), and brings the largest error down where contacts contradict each other (balance).
- * An iteration is one step of the stage that the solve is in, and the choice of the next stage:
+ * A search restarts until the target is solved or no further restart is worthwhile. A restart
+ * tries up to N_CANDIDATES hand postures (seeds.c; for a multi-arm robot sides.c), one after the
+ * other. For each posture it computes the best palm pose (candidate), fits palm and hand to the
+ * contacts as if the hand were floating (hand fit), places the arm in closed form (arm placement,
+ * or arm choice if the preference is q0), moves all motors where the arm cannot follow exactly
+ * (refinement), and minimises the largest relative error where contacts contradict each other
+ * (balance). One iteration is one step of the current stage and the choice of the next stage:
  * iteration.c.
  *
- * The loop (compile/runtime/loop.c) makes the iterations, of many targets side by side or of one,
- * and asks `follow` whenever they end. A batch, one target, `fast`, a solve by steps and an
- * exported solver all come here.
+ * The loop (compile/runtime/loop.c) runs the iterations, of one target or of many in lanes, and
+ * calls `follow` when the iterations of a target end. A batch, a single target, `fast`, a solve by
+ * steps and an exported solver all use this file.
  *
- * BEGIN, SOLVE and JUDGE call compiled kernels, as in seeds.c; the constants come from driver.py.
+ * BEGIN, SOLVE and JUDGE call compiled kernels, as in seeds.c; driver.py defines the constants.
  */
 
-/* Hand postures from anywhere, and all motors of the first of them: for what no table holds. */
-static void from_anywhere(search *job, int64_t number, double *first) {
+/* Low-discrepancy hand postures over the limits, and a whole configuration for the first of them:
+ * seeds of the restarts after those from tables. */
+static void seed_low_discrepancy(search *job, int64_t number, double *first) {
   int i, k;
   for (i = 0; i < N_CANDIDATES; ++i) {
-    const int64_t place = number * N_CANDIDATES + i + 1;
+    const int64_t sample = number * N_CANDIDATES + i + 1;
     for (k = 0; k < N_HAND; ++k) {
       const int column = HAND[k];
       job->postures[i * N_HAND + k] =
-          ANYWHERE_LOWER[column] + even(place, ALL_STEPS[column]) * ANYWHERE_RANGE[column];
+          ANYWHERE_LOWER[column] + even(sample, ALL_STEPS[column]) * ANYWHERE_RANGE[column];
     }
   }
   for (k = 0; k < N_MOTORS; ++k) {
@@ -33,47 +34,49 @@ static void from_anywhere(search *job, int64_t number, double *first) {
   }
 }
 
-/* By turns, where the best so far nearly fits, hands on the line through it and the one that was it
- * before: contacts move little along it, and of its hands the arm may hold another. Whether it made
- * the round's; not of a body, whose sides find hands by themselves. */
-static int from_line(search *job, int64_t number) {
-  double *best = job->bests, *before = job->bests + N_HAND, longest = 0;
-  int i, k, other = 0;
-  if (N_SIDES || !number || !(job->last[STATE_BEST_COST] < NEARLY_FITS)) return 0;
-  for (k = 0; k < N_HAND; ++k) other |= job->last[STATE_BEST_Q + HAND[k]] != best[k];
-  if (other) {
-    memcpy(before, best, N_HAND * sizeof(double));
-    for (k = 0; k < N_HAND; ++k) best[k] = job->last[STATE_BEST_Q + HAND[k]];
-    ++job->n_bests;
+/* In every second global restart, if the incumbent nearly fits, place the seeds on the line through
+ * the last two incumbent hands: contacts move little along it, and the arm may reach another of its
+ * hands. Updates the incumbents; returns 1 if it has set the seeds. Not for multi-arm robots, whose
+ * sides are seeded independently. */
+static int seed_along_incumbents(search *job, int64_t number) {
+  double *best = job->incumbent_hands, *previous = job->incumbent_hands + N_HAND, max_part = 0;
+  int i, k, is_new = 0;
+  if (N_SIDES || !number || !(job->previous_state[STATE_BEST_COST] < NEARLY_FITS)) return 0;
+  for (k = 0; k < N_HAND; ++k) is_new |= job->previous_state[STATE_BEST_Q + HAND[k]] != best[k];
+  if (is_new) {
+    memcpy(previous, best, N_HAND * sizeof(double));
+    for (k = 0; k < N_HAND; ++k) best[k] = job->previous_state[STATE_BEST_Q + HAND[k]];
+    ++job->incumbent_count;
   }
   for (k = 0; k < N_HAND; ++k) {
-    const double part = fabs(best[k] - before[k]) / ANYWHERE_RANGE[HAND[k]];
-    if (part > longest) longest = part;
+    const double part = fabs(best[k] - previous[k]) / ANYWHERE_RANGE[HAND[k]];
+    if (part > max_part) max_part = part;
   }
-  if (job->n_bests < 2 || number % 2 || !(longest > 0)) return 0;
+  if (job->incumbent_count < 2 || number % 2 || !(max_part > 0)) return 0;
   for (i = 0; i < N_CANDIDATES; ++i) {
-    const double way = 2 * even(number * N_CANDIDATES + i + 1, ALL_STEPS[0]) - 1;
+    const double offset = 2 * even(number * N_CANDIDATES + i + 1, ALL_STEPS[0]) - 1;
     for (k = 0; k < N_HAND; ++k) {
-      const double step = ALONG_LINE * way / longest * (best[k] - before[k]);
+      const double step = ALONG_LINE * offset / max_part * (best[k] - previous[k]);
       job->postures[i * N_HAND + k] = best[k] + step;
     }
   }
   return 1;
 }
 
-/* First state and parameters of the round, from its postures; what was found before stays. */
-static int begin_round(search *job) {
+/* Set the first state and the parameters of a restart from its seeds. The fields CARRIED of the
+ * state are kept across restarts. */
+static int start_restart(search *job) {
   const int64_t number = job->round, later = number - ROUNDS;
   const double *inputs[5 + N_MORE];
   double *outputs[2], first[N_MOTORS];
   map_job map = mapping(1, inputs, ALONE, outputs, ALONE);
   int code = DONE, i, k;
-  memcpy(job->last, job->state, sizeof job->last);
-  if (later >= 0) from_anywhere(job, later, first);
-  if (from_line(job, number)) code = DONE;
-  else if (later < 0) code = from_table(job, number);
+  memcpy(job->previous_state, job->state, sizeof job->previous_state);
+  if (later >= 0) seed_low_discrepancy(job, later, first);
+  if (seed_along_incumbents(job, number)) code = DONE;
+  else if (later < 0) code = seed_from_tables(job, number);
 #if MENDS
-  else code = from_spread(job, number);
+  else code = seed_repaired(job, number);
 #endif
   if (code != DONE) return code;
   inputs[0] = job->points;
@@ -87,18 +90,19 @@ static int begin_round(search *job) {
   code = BEGIN(&map);
   if (code != DONE) return code;
   if (!number) {
-    for (i = 0; job->again && i < N_COUNTS; ++i) {
-      job->state[STATE_COUNTS + i] = job->last[STATE_COUNTS + i];
+    for (i = 0; job->preference_dropped && i < N_COUNTS; ++i) {
+      job->state[STATE_COUNTS + i] = job->previous_state[STATE_COUNTS + i];
     }
     return DONE;
   }
   job->state[STATE_PHASE] = CANDIDATE_PHASE;
   job->state[STATE_CANDIDATE] = 0.0;
   if (later >= 0) {
-    /* The first begins as a whole: what stands in the way may be arm and hand together. By turns it
-     * is the best so far, where that nearly fits: a refinement gives up in a flat valley. */
-    const int goes_on = later % 2 && job->last[STATE_BEST_COST] < NEARLY_FITS;
-    if (goes_on) memcpy(first, job->last + STATE_BEST_Q, sizeof first);
+    /* A global restart begins with a refinement of all motors, because arm and hand together may
+     * be the obstacle. Every second one starts from the incumbent if that nearly fits: a refinement
+     * stalls in a flat valley. */
+    const int from_incumbent = later % 2 && job->previous_state[STATE_BEST_COST] < NEARLY_FITS;
+    if (from_incumbent) memcpy(first, job->previous_state + STATE_BEST_Q, sizeof first);
     for (k = 0; k < N_MOTORS; ++k) {
       job->state[STATE_Q + k] = clipped(first[k], job->parameters[PARAMETERS_LOWER + k],
                                         job->parameters[PARAMETERS_UPPER + k]);
@@ -106,43 +110,45 @@ static int begin_round(search *job) {
     job->state[STATE_PHASE] = REFINEMENT_PHASE;
     for (i = 0; i < N_FRESH; ++i) job->state[FRESH_PLACES[i]] = FRESH_VALUES[i];
   }
-  for (i = 0; i < N_CARRIED; ++i) job->state[CARRIED[i]] = job->last[CARRIED[i]];
-  job->state[STATE_EARLIER] = job->last[STATE_EARLIER] + N_CANDIDATES;
+  for (i = 0; i < N_CARRIED; ++i) job->state[CARRIED[i]] = job->previous_state[CARRIED[i]];
+  job->state[STATE_EARLIER] = job->previous_state[STATE_EARLIER] + N_CANDIDATES;
   return DONE;
 }
 
-/* Whether the round may help. One from a table does not where fits only come back to a minimum that
- * misses; one that not every target gets needs a target that ends elsewhere each time, and nearer
- * the longer it takes. */
-static int may_help(const search *job) {
+/* Return 1 if another restart is worthwhile. Table seeds are not once most fits have converged to
+ * the same infeasible minimum. Extra global restarts require that minima keep changing and that
+ * the best cost shrinks with the number of restarts. */
+static int restart_is_worthwhile(const search *job) {
   const double returns = job->state[STATE_RETURNS], cost = job->state[STATE_BEST_COST];
-  const int held = job->state[STATE_HELD] > 0;
-  const double most = held ? SAME_MINIMUM_MANY : SAME_MINIMUM;
-  const double near = held ? FAR_COST_MANY : FAR_COST;
-  const int64_t rugged = job->round - FIRST_RUGGED;
-  if (rugged >= 0) {
-    return returns < most && cost < near && cost < FAR_COST_SHRINKS / (double) (rugged + 1);
+  const int is_underactuated = job->state[STATE_HELD] > 0;
+  const double max_returns = is_underactuated ? SAME_MINIMUM_MANY : SAME_MINIMUM;
+  const double max_cost = is_underactuated ? FAR_COST_MANY : FAR_COST;
+  const int64_t extra = job->round - FIRST_RUGGED;
+  if (extra >= 0) {
+    return returns < max_returns && cost < max_cost
+        && cost < FAR_COST_SHRINKS / (double) (extra + 1);
   }
-  return returns < most || cost < FLAT_COST || job->round < SURE_ROUNDS || job->round >= ROUNDS;
+  return returns < max_returns || cost < FLAT_COST || job->round < SURE_ROUNDS
+      || job->round >= ROUNDS;
 }
 
-/* The next round that may help; 0 if there is none. A preference orders answers: where none was
- * found near `here`, all rounds follow without it. */
-static int choose_round(search *job) {
+/* Advance to the next worthwhile restart; return 0 if there is none. A preference only ranks
+ * answers: if no answer near `here` exists, all restarts are repeated without the preference. */
+static int next_restart(search *job) {
 #if N_SIDES
   if (job->state[STATE_HOPELESS] > 0) return 0;
 #endif
   do ++job->round;
-  while (job->round < job->most && !may_help(job));
+  while (job->round < job->most && !restart_is_worthwhile(job));
   if (job->round < job->most) return 1;
   if (!job->most || !(job->terms[TERMS_NEAREST] > 0)) return 0;
   job->terms[TERMS_NEAREST] = 0.0;
-  job->again = 1;
+  job->preference_dropped = 1;
   job->round = 0;
   return 1;
 }
 
-/* The verdict, which has the last word on what is solved. */
+/* Compute the verdict, which decides the status. */
 static int judge(search *job) {
   const double slack = 1 + TOLERANCE_SLACK;
   const double *inputs[3];
@@ -169,8 +175,8 @@ static int judge(search *job) {
 }
 
 #if N_TURNING
-/* A search begins within half a turn of zero where a motor has no limits: its bounds are no stops. */
-static void take_turns(search *job) {
+/* Shift motors without limits to within half a turn of zero, because their bounds are not stops. */
+static void remove_full_turns(search *job) {
   int i;
   for (i = 0; i < N_TURNING; ++i) {
     const int k = TURNING[i];
@@ -179,9 +185,9 @@ static void take_turns(search *job) {
   }
 }
 
-/* Moves motors of the answer by full turns to be nearest to `here`: those without limits, and the
- * others within their bounds if that is preferred. A motor whose bounds are equal is held. */
-static void nearest_turns(search *job) {
+/* Move motors of the answer by full turns towards `here`: motors without limits, and, if the
+ * preference is q0, the others within their bounds. Motors with equal bounds stay. */
+static void move_to_nearest_turns(search *job) {
   int i;
   for (i = 0; i < N_TURNING; ++i) {
     const int k = TURNING[i];
@@ -197,32 +203,33 @@ static void nearest_turns(search *job) {
 }
 #endif
 
-/* What follows when the loop has come to an end of the target's iterations, or it is new: the next
- * round (GOES_ON), or the answer (DONE); SLICE_OVER where this call may not begin one. */
+/* Continue after the iterations of a target have ended, or begin a new target. Returns GOES_ON
+ * after starting a restart, DONE with the answer, or SLICE_OVER if the restart quota of this call
+ * is used up. */
 static int follow(void *method, int64_t slot, int64_t solve, int32_t *status) {
   search *job = method;
-  int code = DONE, goes_on = *status == UNBEGUN;
+  int code = DONE, continues = *status == UNBEGUN;
   (void) slot, (void) solve;
   if (*status != SOLVED_STATUS) {
-    if (!job->may_begin) return SLICE_OVER;
+    if (!job->restart_quota) return SLICE_OVER;
 #if N_TURNING
-    if (goes_on) take_turns(job);
+    if (continues) remove_full_turns(job);
 #endif
-    if (goes_on) job->round = job->again = job->n_bests = 0;
-    else goes_on = choose_round(job);
+    if (continues) job->round = job->preference_dropped = job->incumbent_count = 0;
+    else continues = next_restart(job);
   }
-  if (goes_on) {
-    --job->may_begin;
-    code = begin_round(job);
+  if (continues) {
+    --job->restart_quota;
+    code = start_restart(job);
     return code == DONE ? GOES_ON : code;
   }
   job->status = *status == RUNNING ? ITERATION_LIMIT_STATUS
               : *status == REPEATED ? STALLED_STATUS
               : *status < 0 ? INVALID_STATUS : *status;
-  if (job->again) job->terms[TERMS_NEAREST] = 1.0;
+  if (job->preference_dropped) job->terms[TERMS_NEAREST] = 1.0;
   memcpy(job->q, job->state + STATE_Q, sizeof job->q);
 #if N_TURNING
-  nearest_turns(job);
+  move_to_nearest_turns(job);
 #endif
   job->restarts = (int64_t) job->state[STATE_EARLIER]
                 + (int64_t) clipped((double) (int64_t) job->state[STATE_CANDIDATE], 0.0,
@@ -232,7 +239,8 @@ static int follow(void *method, int64_t slot, int64_t solve, int32_t *status) {
   return code;
 }
 
-/* So many steps of what is in `state`; `next` says what follows. SLICE_OVER: there is more. */
+/* Run at most `steps` iterations from `state`; `next` is called when they end. Returns SLICE_OVER
+ * if the solve has not ended. */
 static int iterate(search *job, int64_t steps,
                    int (*next)(void *, int64_t, int64_t, int32_t *)) {
   int32_t status = (int32_t) job->loop_status;
@@ -264,19 +272,20 @@ static double length_of(const double *vector) {
   return sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2]);
 }
 
-/* Whether a vector is free, or a direction: that gets length one as `unit_vectors` makes it. */
-static int made_unit(double *vector) {
+/* Normalise a direction as `unit_vectors` does; free vectors (NaN) stay. Returns 0 if the vector is
+ * neither. */
+static int normalise_if_direction(double *vector) {
   double length;
   int i;
   if (vector[0] != vector[0]) return vector[1] != vector[1] && vector[2] != vector[2];
   if (!(is_finite(vector[0]) && is_finite(vector[1]) && is_finite(vector[2]))) return 0;
   length = length_of(vector);
   if (!(length >= SMALL_LENGTH && length <= LARGE_LENGTH)) {
-    /* By powers of two, which change no digit; in two halves, as one may be out of range. */
-    double most = 0;
+    /* Scale by powers of two, which is exact; in two steps, since one may be out of range. */
+    double largest = 0;
     int power, half;
-    for (i = 0; i < 3; ++i) most = fabs(vector[i]) > most ? fabs(vector[i]) : most;
-    (void) frexp(most, &power);
+    for (i = 0; i < 3; ++i) largest = fabs(vector[i]) > largest ? fabs(vector[i]) : largest;
+    (void) frexp(largest, &power);
     half = (-power - (power & 1)) / 2;
     for (i = 0; i < 3; ++i) vector[i] = ldexp(ldexp(vector[i], half), -power - half);
     length = length_of(vector);
@@ -287,33 +296,33 @@ static int made_unit(double *vector) {
   return 1;
 }
 
-/* Takes up the question that stands in the job; 0 if it is malformed. */
+/* Check the target in the job and begin its search; return 0 if it is malformed. */
 static int search_begin(search *job) {
-  int i, asked = 0, sound = 1;
+  int i, has_point = 0, is_valid = 1;
   for (i = 0; i < N_FINGERS; ++i) {
     double *point = job->points + 3 * i, *normal = job->normals + 3 * i;
-    const int placed = is_finite(point[0]) && is_finite(point[1]) && is_finite(point[2]);
-    const int placeless = !is_number(point[0]) && !is_number(point[1]) && !is_number(point[2]);
-    sound &= placed || (placeless && !is_number(normal[0]));
-    sound &= made_unit(normal);
-    asked |= placed;
+    const int is_given = is_finite(point[0]) && is_finite(point[1]) && is_finite(point[2]);
+    const int is_free = !is_number(point[0]) && !is_number(point[1]) && !is_number(point[2]);
+    is_valid &= is_given || (is_free && !is_number(normal[0]));
+    is_valid &= normalise_if_direction(normal);
+    has_point |= is_given;
   }
-  for (i = 0; i < N_MOTORS; ++i) sound &= is_finite(job->here[i]);
+  for (i = 0; i < N_MOTORS; ++i) is_valid &= is_finite(job->here[i]);
   job->slot = -1;
   job->loop_status = UNBEGUN;
   job->iterations = 0;
   job->restarts = 0;
   job->judged = 1;
   job->status = RUNNING;
-  return sound && asked;
+  return is_valid && has_point;
 }
 
-/* Goes on for so many iterations, and begins so many rounds at most; `status` says whether the
- * search is over. */
+/* Continue the search for at most `steps` iterations and `rounds` restarts; `status` remains
+ * RUNNING until the search has ended. */
 static int search_run(search *job, int64_t steps, int64_t rounds) {
   int code;
   if (job->status != RUNNING || steps <= 0) return DONE;
-  job->may_begin = rounds;
+  job->restart_quota = rounds;
   code = iterate(job, steps, follow);
   return code == SLICE_OVER ? DONE : code;
 }

@@ -1,4 +1,4 @@
-/* The hands of a round that look like a target, for a body that the robot is a side of: sides.c. */
+/* Write the seeds of a restart for a side of a multi-arm robot (sides.c). */
 FIND_HANDS(search *job, const double *points, const double *normals, const double *here,
            int64_t nearest, int64_t round, double *postures) {
   int code;
@@ -8,7 +8,7 @@ FIND_HANDS(search *job, const double *points, const double *normals, const doubl
   memcpy(job->terms + TERMS_LOWER, LOWER, sizeof LOWER);
   memcpy(job->terms + TERMS_UPPER, UPPER, sizeof UPPER);
   job->terms[TERMS_NEAREST] = (double) nearest;
-  code = from_table(job, round);
+  code = seed_from_tables(job, round);
   memcpy(postures, job->postures, N_CANDIDATES * N_HAND * sizeof(double));
   return code;
 }

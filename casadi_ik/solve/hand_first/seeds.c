@@ -1,19 +1,22 @@
-/* Where the rounds of hand-first begin: hand postures, each round's of another kind.
+/* Seeds of the restarts of hand-first: hand postures from tables.
  *
- * The first round compares the target with a table of postures. The next ones compare it with a
- * table many times as large, half of it at limits. Of hands with many motors they begin from any
- * postures, of which every finger takes the one that suits it best by itself.
+ * The first restart compares the target with a table of postures. The next restarts compare it
+ * with a larger table, half of whose postures are at limits. For hands with many motors they take
+ * low-discrepancy postures instead and repair them finger by finger.
  *
- * The kernels are called by the macros LOOK_UP and SEEN (if MENDS), which take a pointer to a job of
- * the drivers; the constants come from driver.py.
+ * The macros LOOK_UP and SEEN (if MENDS) call kernels with a pointer to a job; driver.py defines
+ * the constants.
  */
 
-static double posture(int table, int64_t row, int motor) {
+/* Return the position of a motor in a row of a table of postures. */
+
+static double table_posture(int table, int64_t row, int motor) {
   const double spread = (even(row + 1, HAND_STEPS[motor]) - 0.5) / TABLE_SQUEEZE[table] + 0.5;
   return TABLE_LOWER[table][motor] + clipped(spread, 0.0, 1.0) * TABLE_RANGE[table][motor];
 }
 
-static int look_up(search *job, int table, int64_t wanted) {
+/* Write the `count` rows of a table nearest to the target to `seed_rows`, nearest first. */
+static int look_up_rows(search *job, int table, int64_t count) {
   const double *inputs[2];
   lookup_job look = {0};
   inputs[0] = job->points;
@@ -21,60 +24,62 @@ static int look_up(search *job, int table, int64_t wanted) {
   look.inputs = inputs;
   look.input_steps = ALONE;
   look.tiles = TILES(table);
-  look.found = job->found;
+  look.found = job->seed_rows;
   look.rows = TABLE_ROWS[table];
-  look.wanted = wanted;
+  look.wanted = count;
   look.count = 1;
   return LOOK_UP(&look);
 }
 
-static double apart(const double *one, const double *other) {
+static double squared_distance(const double *a, const double *b) {
   double sum = 0.0;
   int i;
-  for (i = 0; i < N_HAND; ++i) sum += (one[i] - other[i]) * (one[i] - other[i]);
+  for (i = 0; i < N_HAND; ++i) sum += (a[i] - b[i]) * (a[i] - b[i]);
   return sum;
 }
 
 #if MENDS
-/* The row of a finger's table that is nearest to what is wanted of it, and its distance. */
-LOOPS static int nearest_row(int finger, const double *wanted, double *least) {
+/* Return the row of a finger's table nearest to its target features, and its distance. */
+LOOPS static int nearest_row(int finger, const double *features, double *min_distance) {
   double distance[FINGER_ROWS];
   int best = 0, i, k;
   for (i = 0; i < FINGER_ROWS; ++i) distance[i] = 0.0;
   for (k = 0; k < FINGER_FEATURES; ++k) {
-    const double factor = wanted[k * N_FINGERS + finger];
+    const double factor = features[k * N_FINGERS + finger];
     for (i = 0; i < FINGER_ROWS; ++i) distance[i] += FINGER_TIPS[finger][k][i] * factor;
   }
   for (i = 1; i < FINGER_ROWS; ++i) {
     if (distance[i] < distance[best]) best = i;
   }
-  *least = distance[best];
+  *min_distance = distance[best];
   return best;
 }
 
-/* A table of whole hands is thin where there are many motors: of 16 motors thousands of postures are
- * fewer than two for each. Seen from a palm, though, the fingers know nothing of each other, and a
- * small table of every finger together stands for all combinations of its rows. So a posture is
- * mended in turns: the palm pose that suits it best, then for that pose the best row of each finger.
- * `left` is what is left of its contacts' squared errors with the best palm. */
-static int mend_one(search *job, double *hand, double *left) {
-  double wanted[FINGER_FEATURES * N_FINGERS], own[N_FINGERS], least;
+/* Repair a hand posture finger by finger; `error` is its remaining sum of squared contact errors
+ * with the best palm pose.
+ *
+ * A table of whole hands is sparse for many motors: with 16 motors, thousands of postures are
+ * fewer than two values per motor. Given the palm pose, however, fingers are independent, and
+ * small tables of single fingers cover all combinations of their rows. The repair alternates
+ * between the best palm pose of the posture and the best row of each finger for that pose. */
+static int repair_per_finger(search *job, double *hand, double *error) {
+  double features[FINGER_FEATURES * N_FINGERS], finger_errors[N_FINGERS], distance;
   const double *inputs[3];
   double *outputs[3];
-  int turn, finger, k, code;
+  int pass, finger, k, code;
   inputs[0] = job->points;
   inputs[1] = job->normals;
   inputs[2] = hand;
-  outputs[0] = wanted;
-  outputs[1] = own;
-  outputs[2] = left;
-  for (turn = 0; turn <= FINGER_TURNS; ++turn) {
+  outputs[0] = features;
+  outputs[1] = finger_errors;
+  outputs[2] = error;
+  for (pass = 0; pass <= FINGER_TURNS; ++pass) {
     map_job map = mapping(1, inputs, ALONE, outputs, ALONE);
     code = SEEN(&map);
     if (code != DONE) return code;
-    for (finger = 0; turn < FINGER_TURNS && finger < N_FINGERS; ++finger) {
-      const int best = nearest_row(finger, wanted, &least);
-      if (!(least < own[finger])) continue;
+    for (finger = 0; pass < FINGER_TURNS && finger < N_FINGERS; ++finger) {
+      const int best = nearest_row(finger, features, &distance);
+      if (!(distance < finger_errors[finger])) continue;
       for (k = 0; k < FINGER_MOTORS[finger]; ++k) {
         hand[FINGER_PLACES[finger][k]] = FINGER_POSTURES[finger][best][k];
       }
@@ -83,19 +88,20 @@ static int mend_one(search *job, double *hand, double *left) {
   return DONE;
 }
 
-/* Postures from those of `near`: of the mended ones those of which least is left. */
-static int mend(search *job, int64_t count) {
-  int64_t i, place;
+/* Repair the postures of the seed pool; the seeds are those with the smallest errors. */
+static int repair_pool(search *job, int64_t count) {
+  int64_t i, rank;
   for (i = 0; i < count; ++i) {
-    const int code = mend_one(job, job->near + i * N_HAND, job->left + i);
+    const int code = repair_per_finger(job, job->seed_pool + i * N_HAND, job->seed_error + i);
     if (code != DONE) return code;
-    for (place = i; place > 0 && job->left[i] < job->left[job->found[place - 1]]; --place) {
-      job->found[place] = job->found[place - 1];
+    for (rank = i; rank > 0; --rank) {
+      if (!(job->seed_error[i] < job->seed_error[job->seed_rows[rank - 1]])) break;
+      job->seed_rows[rank] = job->seed_rows[rank - 1];
     }
-    job->found[place] = i;
+    job->seed_rows[rank] = i;
   }
   for (i = 0; i < N_CANDIDATES; ++i) {
-    const double *best = job->near + job->found[i % count] * N_HAND;
+    const double *best = job->seed_pool + job->seed_rows[i % count] * N_HAND;
     memcpy(job->postures + i * N_HAND, best, N_HAND * sizeof(double));
   }
   return DONE;
@@ -103,27 +109,30 @@ static int mend(search *job, int64_t count) {
 #endif
 
 #if MENDS
-/* Mended postures that do not look like the target in particular, other ones in every round; late
- * ones by turns as they are. */
-static int from_spread(search *job, int64_t number) {
-  const int plain = number >= LATE_ROUND && number % 2;
-  const int64_t count = plain ? N_CANDIDATES : POOL;
+/* Seed with repaired low-discrepancy postures, different ones in every restart; in every second
+ * late restart with postures that are not repaired. */
+static int seed_repaired(search *job, int64_t number) {
+  const int is_unrepaired = number >= LATE_ROUND && number % 2;
+  const int64_t count = is_unrepaired ? N_CANDIDATES : POOL;
   int64_t i;
   int k;
   for (i = 0; i < count; ++i) {
-    for (k = 0; k < N_HAND; ++k) job->near[i * N_HAND + k] = posture(1, number * POOL + i, k);
+    for (k = 0; k < N_HAND; ++k) {
+      job->seed_pool[i * N_HAND + k] = table_posture(1, number * POOL + i, k);
+    }
   }
-  if (plain) {
-    memcpy(job->postures, job->near, sizeof job->postures);
+  if (is_unrepaired) {
+    memcpy(job->postures, job->seed_pool, sizeof job->postures);
     return DONE;
   }
-  return mend(job, count);
+  return repair_pool(job, count);
 }
 #endif
 
-/* Nearest to where the robot is first; its own posture before them, instead of the last. */
-static void order(search *job, int own) {
-  /* One number more than needed: a tool has no motors, and C no empty arrays. */
+/* Sort the seeds by their distance to the hand in q0. If `own`, that hand replaces the last seed
+ * and comes first. */
+static void sort_by_distance_to_q0(search *job, int own) {
+  /* One element more than needed, because a rigid tool has no motors and C has no empty arrays. */
   double here[N_HAND + 1], near[N_HAND + 1], sorted[N_CANDIDATES * N_HAND + 1];
   double distance[N_CANDIDATES];
   const int first = own && HAS_ARM && N_CANDIDATES > 1;
@@ -136,40 +145,41 @@ static void order(search *job, int own) {
     near[k] = here[k] / ORDER_RANGES[k];
   }
   for (i = 0; i < count; ++i) {
-    double place[N_HAND + 1];
-    for (k = 0; k < N_HAND; ++k) place[k] = job->postures[i * N_HAND + k] / ORDER_RANGES[k];
-    distance[i] = apart(place, near);
+    double scaled[N_HAND + 1];
+    for (k = 0; k < N_HAND; ++k) scaled[k] = job->postures[i * N_HAND + k] / ORDER_RANGES[k];
+    distance[i] = squared_distance(scaled, near);
   }
   for (i = 0; i < count; ++i) {
-    int before = first;
+    int rank = first;
     for (j = 0; j < count; ++j) {
-      before += distance[j] < distance[i] || (distance[j] == distance[i] && j < i);
+      rank += distance[j] < distance[i] || (distance[j] == distance[i] && j < i);
     }
-    for (k = 0; k < N_HAND; ++k) sorted[before * N_HAND + k] = job->postures[i * N_HAND + k];
+    for (k = 0; k < N_HAND; ++k) sorted[rank * N_HAND + k] = job->postures[i * N_HAND + k];
   }
   for (k = 0; first && k < N_HAND; ++k) sorted[k] = here[k];
   memcpy(job->postures, sorted, N_CANDIDATES * N_HAND * sizeof(double));
 }
 
-/* Postures whose contacts look like the target, in later rounds the next best of another table. */
-static int from_table(search *job, int64_t number) {
+/* Seed with the postures whose contacts resemble the target most; in later restarts with the next
+ * best of a larger table. */
+static int seed_from_tables(search *job, int64_t number) {
   const int table = !number ? 0 : !ENFORCE_LIMITS && number % 2 ? 2 : 1;
   const int64_t before = number ? (number - 1) * N_CANDIDATES : 0;
   int code, i, k;
 #if MENDS
   if (number) {
-    code = from_spread(job, number);
-    if (code == DONE && job->terms[TERMS_NEAREST] > 0) order(job, 0);
+    code = seed_repaired(job, number);
+    if (code == DONE && job->terms[TERMS_NEAREST] > 0) sort_by_distance_to_q0(job, 0);
     return code;
   }
 #endif
-  code = look_up(job, table, before + N_CANDIDATES);
+  code = look_up_rows(job, table, before + N_CANDIDATES);
   if (code != DONE) return code;
   for (i = 0; i < N_CANDIDATES; ++i) {
     for (k = 0; k < N_HAND; ++k) {
-      job->postures[i * N_HAND + k] = posture(table, job->found[before + i], k);
+      job->postures[i * N_HAND + k] = table_posture(table, job->seed_rows[before + i], k);
     }
   }
-  if (job->terms[TERMS_NEAREST] > 0) order(job, !number);
+  if (job->terms[TERMS_NEAREST] > 0) sort_by_distance_to_q0(job, !number);
   return DONE;
 }

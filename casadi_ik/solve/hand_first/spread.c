@@ -1,4 +1,5 @@
-/* What all files of hand-first work with: numbers, even spreads, calls of kernels for one sample. */
+/* Shared helpers: tests of numbers, low-discrepancy sequences, and calls of kernels for one
+ * sample. */
 
 static const int64_t ALONE[] = {0, 0, 0, 0, 0, 0, 0, 0};
 
@@ -10,7 +11,7 @@ static double clipped(double x, double low, double high) {
   return above < high ? above : high;
 }
 
-/* Entry of the i-th point, counted from 1, of an even spread. */
+/* Return a coordinate of point i (from 1) of an additive low-discrepancy sequence. */
 static double even(int64_t i, double step) {
   const double x = 0.5 + (double) i * step;
   return x - (double) (int64_t) x;
