@@ -1,4 +1,4 @@
-"""Numbers of the hand-first method, each with what it was chosen by."""
+"""Parameters of the hand-first method, with the evidence for their values."""
 
 from __future__ import annotations
 
@@ -10,60 +10,63 @@ from casadi_ik.model.description import RobotDescription
 
 @dataclass(frozen=True)
 class HandFirstParameters:
-    """Parameters of the method.
+    """Parameters of the search.
 
-    A round begins from up to `candidates` hand postures. In order there are `rounds` from tables,
-    `global_rounds` from anywhere that every target gets, and `rugged_rounds` more for targets that
-    end elsewhere each time. Many motors are more than `many_motors` of the hand: such a hand has so
-    many places where fits end that few of them tell little. Where held motors leave a hand or arm
-    less than its motions, no table holds its postures, and the numbers for many motors count.
+    A restart (round) tries up to `candidates` hand postures. There are `rounds` restarts from
+    tables, then `global_rounds` from low-discrepancy postures for every target, then up to
+    `rugged_rounds` for targets whose fits keep converging to new minima. A hand with more than
+    `many_motors` motors has many local minima, so that a few of them say little. Pairs of values
+    are for hands with few and with many motors. If fixed motors leave a hand or arm with fewer
+    motions, no table contains its postures, and the values for many motors apply.
 
     Attributes:
-        table: Hand postures the targets' shapes are compared with.
-        candidates: Of those, how many a round of the compiled loop may start from.
-        wide_table: The same for the rounds after the first.
-        rounds: Rounds that begin from the tables, each from the next best candidates.
-        max_rounds: Rounds of all kinds at most, each of up to `candidates` hand postures: the limit
-            of effort. 1 solves nearly all that can be reached. None: as many as may help.
-        few_motors_table: Part of `table` that a hand with few motors and more than three fingers
-            is compared with: its contacts' shape is more telling, and each row costs as much as
-            three of three fingers. Of 4,000 targets of a Panda with a hand of five fingers and six
-            motors 16 instead of 4 need a second posture, and all of them an eighth less time.
-        many_motors: See above.
-        at_limits: Part of the range that the wide table moves to the limits.
-        sure_rounds: Rounds from tables in any case.
-        finger_rows: Postures of a finger that is chosen by itself; with four times as many no more
-            fits succeed.
-        finger_turns: How often palm and fingers are chosen in turns; a third time mends little.
-        pool: Postures mended finger by finger for a round after the first: not those that look like
-            the target, but as many others in every round. With 64 a batch of an Allegro, LEAP or
-            Shadow hand takes up to a third longer.
-        late_round: From this round on every second one begins from postures that are not mended. Of
-            64,000 targets of a LEAP hand near limits 140 are left after 16 rounds and 16 after 64
-            where all are, 100 and 8 by turns.
-        global_rounds: See above.
-        rugged_rounds: Of a hand with few motors, and with many. Of 640,000 targets at limits of
-            LEAP hands on eight arms 200 are left after 32 rounds of all kinds, 55 after 64, 14
-            after 100, 6 after 150 and 2 after the last.
-        same_minimum: When so many fits and balances have ended where one had before, no table holds
-            another kind; of a hand with few motors, and with many. With eight a reachable target
-            was given up one round too early; sixteen cost a tenth more time where contacts
-            contradict each other. A hand with many motors comes back to a minimum that just misses
-            from many sides: one target did 166 times ten rounds before it was solved.
-        flat_cost: Cost (0.01 mm, 0.1 mrad) above which this is a minimum, no long flat valley.
-        nearly_fits: Cost (0.3 mm, 3 mrad) below which every second round from anywhere goes on from
-            the best so far, and the others take hands on the line through the last two that were
-            the best. Three parallel fingers meet their contacts all along such a line, but for
-            some um, and the arm can hold but one end of it: of 8,800 targets about 44 of a KUKA LWR
-            with a Barrett hand that the climbing search had missed at 1e-6, 1,284 are missed
-            without such lines, 368 with them.
-        along_line: How far along the line such hands are at most [of the range of the motor that
-            moves most].
-        far_cost: Cost (14 mm, 8 deg; 0.3 m) from which on a target that still misses is taken to be
-            out of reach; of a hand with few motors, and with many.
-        far_cost_shrinks: After the k-th rugged round at most this / (k + 1): the longer a target
-            stays far off the less there is to hope. One had more than 3 after 7 rounds and was
-            solved in the 18th, one 0.3 after 26 and was solved in the 75th.
+        table: Number of hand postures in the table of the first restart.
+        candidates: Maximum number of hand postures of a restart.
+        wide_table: Number of hand postures in the table of later restarts.
+        rounds: Number of restarts from the tables, each from the next best candidates.
+        max_rounds: Maximum number of restarts of all kinds, the limit of effort. With 1 nearly all
+            reachable targets are solved. None: as many as are worthwhile.
+        few_motors_table: Fraction of `table` for hands with few motors and more than three fingers:
+            the shape of their contacts is more distinctive, and a row costs three times as much as
+            with three fingers. Source: of 4,000 targets of a Panda with a hand of five fingers and
+            six motors 16 instead of 4 need a second posture, and all take an eighth less time.
+        many_motors: Largest number of motors of a hand with few motors.
+        at_limits: Fraction of the range that the wide table maps to the limits.
+        sure_rounds: Minimum number of restarts from tables.
+        finger_rows: Number of postures of a single finger for repairs. Source: four times as many
+            give no more successful fits.
+        finger_turns: Number of alternations between palm pose and fingers in a repair; a third one
+            improves little.
+        pool: Number of low-discrepancy postures that are repaired for a restart. Source: with 64 a
+            batch of an Allegro, LEAP or Shadow hand takes up to a third longer.
+        late_round: Number of the restart from which every second one uses postures without repair.
+            Source: of 64,000 targets of a LEAP hand near limits 140 are unsolved after 16 restarts
+            and 16 after 64 if all are repaired, 100 and 8 if they alternate.
+        global_rounds: Number of global restarts for every target.
+        rugged_rounds: Maximum number of extra global restarts. Source: of 640,000 targets at limits
+            of LEAP hands on eight arms 200 are unsolved after 32 restarts of all kinds, 55 after
+            64, 14 after 100, 6 after 150 and 2 after the last.
+        same_minimum: Number of fits that converged to a previous minimum after which the tables
+            offer no other kind. Source: with eight a reachable target was given up one restart too
+            early; sixteen take a tenth more time where contacts contradict each other. A hand with
+            many motors reaches a minimum that barely misses from many sides: one target did so 166
+            times ten restarts before it was solved.
+        flat_cost: Cost (0.01 mm, 0.1 mrad) above which the end of a fit is a minimum, not a point
+            in a flat valley.
+        nearly_fits: Cost (0.3 mm, 3 mrad) below which every second global restart starts from the
+            incumbent, and the others use hands on the line through the last two incumbents. Three
+            parallel fingers meet their contacts within micrometres along such a line, of which the
+            arm can reach one end only. Source: of 8,800 targets around 44 of a KUKA LWR with a
+            Barrett hand that the search had missed at 1e-6, 1,284 are missed without such lines,
+            368 with them.
+        along_line: Largest distance of such hands along the line [range of the motor that moves
+            most].
+        far_cost: Cost (14 mm, 8 deg; 0.3 m) above which a target that is still missed counts as out
+            of reach.
+        far_cost_shrinks: The cost limit after extra restart k is at most this / (k + 1), because
+            success becomes less likely the longer a target stays far off. Source: one target had a
+            cost above 3 after 7 restarts and was solved in the 18th, another one 0.3 after 26 and
+            was solved in the 75th.
     """
 
     table: int = 1024
@@ -106,16 +109,16 @@ class HandFirstParameters:
                 )
 
     def is_many(self, robot: RobotDescription) -> bool:
-        """Whether a robot's hand has many motors."""
+        """Return whether the hand of a robot has many motors."""
         return len(robot.hand_actuators) > self.many_motors
 
     @property
     def first_rugged(self) -> int:
-        """Rounds before those from anywhere that not every target gets."""
+        """Number of restarts before the extra ones."""
         return self.rounds + self.global_rounds
 
     def all_rounds(self, robot: RobotDescription) -> int:
-        """Rounds of all kinds at most."""
+        """Return the maximum number of restarts of all kinds."""
         every = self.first_rugged + self.rugged_rounds[self.is_many(robot)]
         every = min(every, BODY.rounds) if robot.sides else every
         return min(every, self.max_rounds or every)
@@ -123,17 +126,18 @@ class HandFirstParameters:
 
 @dataclass(frozen=True)
 class StageParameters:
-    """When one stage of a solve follows another.
+    """Criteria by which one stage of a solve follows another.
 
     Attributes:
-        before_the_arm: Part of the tolerances that a hand is fitted to: the arm that follows it
-            adds its rounding, which at 1e-6 has made an answer of 1.0000006e-6.
-        fit_part: Part of them that a hand of a body or of a later round is fitted to, where it can
-            be: a hand that fits by half has its palm where the arm need not reach. Of 20,000
-            targets around one that a climbing search had missed at 5 mm, 2,762 are missed where
-            all hands fit by half, 2,131 with a tenth, 73 with a hundredth, 49 with a thousandth.
-        own_hand: Cost, with the best palm, up to which the hand as it is is fitted before others.
-        whole: Cost up to which a start is refined as a whole (three contacts off by 4 cm each).
+        before_the_arm: Fraction of the tolerances to which a hand is fitted; the arm that follows
+            adds its rounding. Source: at 1e-6 it made an answer of 1.0000006e-6.
+        fit_part: Fraction of the tolerances to which hands of later restarts and of multi-arm
+            robots are fitted where possible: a hand that fits barely may have its palm out of the
+            arm's reach. Source: of 20,000 targets around one that the search had missed at 5 mm,
+            2,762 are missed with a half, 2,131 with a tenth, 73 with a hundredth, 49 with a
+            thousandth.
+        own_hand: Largest cost, with the best palm pose, at which the hand of q0 is fitted first.
+        whole: Largest cost at which q0 itself is refined (three contacts off by 40 mm each).
     """
 
     before_the_arm: float = 0.999
@@ -147,40 +151,42 @@ STAGES = StageParameters()
 
 @dataclass(frozen=True)
 class BodyParameters:
-    """How trunks are tried for the palms of a body.
+    """Parameters of the search for the trunk of a multi-arm robot.
 
     Attributes:
-        rounds: Rounds of all kinds at most. Of 500,000 targets of two Pandas with Allegros near
-            limits 18 are missed at 1e-6 with 16, 3 with these, in the same time.
-        first_trunks: Trunks tried for the palms of the first hand postures of the first round.
-        later_trunks: The same of later rounds. Near limits few trunks lead to all palms: of 100,000
-            targets of a G1 at 1e-6 with half of the motors within 1 % of an end 18 are missed
-            with 48 in all rounds, 2 to 4 with these.
-        other_trunks: For palms of hand postures that are not the first.
-        least_trunks: Trunks tried in any case for palms of hands that fit: of 40,000 of an H1-2 one
-            that is solved is still 8 cm off after 60, none more than 3 after 120.
-        far_trunks: Trunks times the least cost they came to (1: 10 cm or 1 rad) from which on a
-            target is out of reach. Of 200,000 targets of an H1-2 at 1e-6 near limits those that
-            are solved last have 59, 42 and 37, all but eight less than 15; at 5 mm 150 lost one of
-            200,000, 400 none.
-        loose_trunks: The same where contacts leave palms a freedom. Without, two Pandas with
-            Allegros look for a second for what is 2 m away.
-        one_arm_trunks: The same of one arm on a trunk. Of 1,000,000 targets of an LWR on a mobile
-            base near limits 20 were lost with 400 at 5 mm, some even with 5,000.
-        at_limits: Part of a motor's range that every second trunk moves to its limits.
-        patience: Steps of trunk and arms with little gain before they are given up; with 3 instead
-            of 8 three times as many of these targets are missed.
-        budget: Steps of trunk and arms in all, ten times as many where little is left.
-        nearly: Cost (3 cm and 18 deg) below which arms are placed anew at the trunk found.
-        again_trials: Looks at their redundancies then.
-        around: The look that begins around one value of the redundancy, of every second trunk.
-        from_anywhere: Every so many trunks the arms begin from anywhere instead.
-        later_anywhere: The same of later rounds: what closed forms do not lead to at 60 trunks they
-            hardly ever lead to.
-        closer_every: Every so many trunks one between an even spread and the best one so far.
-        trunk_unit: What counts as a unit of the trunk where what is near is wanted; of arms 1.
-        box: After so many trunks half as far from the best one.
-        missed: Margin below zero of an arm that is within its limits, but not where it should be.
+        rounds: Maximum number of restarts of all kinds. Source: of 500,000 targets of two Pandas
+            with Allegro hands near limits 18 are missed at 1e-6 with 16, 3 with 64, in the same
+            time.
+        first_trunks: Number of trunk trials for the first hand postures of the first restart.
+        later_trunks: Number of trunk trials in later restarts. Near limits few trunks reach all
+            palms. Source: of 100,000 targets of a G1 at 1e-6 with half of the motors within 1 % of
+            a limit 18 are missed with 48 in all restarts, 2 to 4 with these.
+        other_trunks: Number of trunk trials for hand postures after the first.
+        least_trunks: Minimum number of trunk trials for hands that fit. Source: of 40,000 targets
+            of an H1-2 one that is solved is still 80 mm off after 60, none more than 30 mm after
+            120.
+        far_trunks: Largest product of trunk trials and their smallest cost (1: 100 mm or 1 rad);
+            above it a target counts as out of reach. Source: of 200,000 targets of an H1-2 at 1e-6
+            near limits the three that are solved last have 59, 42 and 37, all but eight less than
+            15; at 5 mm 150 lost one of 200,000, 400 none.
+        loose_trunks: The same limit where contacts leave palms free. Source: without it two Pandas
+            with Allegro hands search for a second for targets 2 m away.
+        one_arm_trunks: The same limit for one arm on a trunk. Source: of 1,000,000 targets of an
+            LWR on a mobile base near limits 20 were lost with 400 at 5 mm, some even with 5,000.
+        at_limits: Fraction of a motor's range that every second trunk maps to its limits.
+        patience: Number of consecutive steps of trunk and arms with slow progress that ends them.
+            Source: with 3 instead of 8 three times as many of these targets are missed.
+        budget: Maximum number of steps of trunk and arms; ten times as many at small costs.
+        nearly: Cost (30 mm and 18 deg) below which arms are placed again at the best trunk.
+        again_trials: Number of redundancy samples of that placement.
+        around: Index of the redundancy sample from which every second trunk samples locally.
+        from_anywhere: Period of trunk trials whose arms start from low-discrepancy configurations.
+        later_anywhere: The same period in later restarts: targets that closed forms miss at 60
+            trunks are hardly ever found by them.
+        closer_every: Period of trunk trials near the best trunk so far.
+        trunk_unit: Scale of trunk motions relative to arm motions if the preference is q0.
+        box: Number of trials after which the sampling radius around the best trunk has halved.
+        missed: Negative margin of an arm within its limits that misses its palm pose.
     """
 
     rounds: int = 64
