@@ -1,4 +1,4 @@
-"""State, parameters and record of the hand-first method, and where a solve begins."""
+"""State, parameters and record of the hand-first method, and the start of a solve."""
 
 from __future__ import annotations
 
@@ -58,20 +58,20 @@ class Stage(IntEnum):
 
 
 BY_SIDE = 32
-"""What is added to a stage's number for every side of a body before the one that it is of."""
+"""Offset of stage numbers per side of a multi-arm robot: stage + 32 * side."""
 
 
 SAID = Layout(
     (
-        Field("settled", doc="whether the fit or the balance is at its end"),
-        Field("within", doc="whether contacts are within tolerance; of an arm, within its bounds"),
-        Field("near", doc="whether an arm is the real one; whether its steps end near the pose"),
+        Field("settled", doc="1 if the fit or the balance has ended"),
+        Field("within", doc="1 if contacts are within tolerance; for an arm, within its bounds"),
+        Field("near", doc="1 if an arm is the real one; 1 if its steps end near the pose"),
         Field("miss", doc="root mean square error of a fit, relative to the tolerances"),
-        Field("cost", doc="before a fit of the hand; of an arm's step; largest part of a balance"),
-        Field("at_end", doc="joint of the arm, from 1, to be sent to the other end; 0: none"),
+        Field("cost", doc="cost before a hand fit or of an arm step; largest ratio of a balance"),
+        Field("at_end", doc="arm joint, from 1, to move to its opposite limit; 0: none"),
     )
 )
-"""What a stage says of where it leads."""
+"""Outputs of a stage that decide the next stage."""
 
 PLACES = {
     **{stage: i for i, stage in enumerate(STAGES)},
@@ -81,14 +81,14 @@ PLACES = {
     Stage.TOLERANT_HAND_FIT: STAGES.index(Phase.HAND_FIT),
     Stage.TOLERANT_REFINEMENT: STAGES.index(Phase.REFINEMENT),
 }
-"""Where a stage is counted."""
+"""Index of the counter of each stage."""
 
 CARRIED = (
     *("passed", "near", "least_excess", "balanced", "least", "returns"),
     *("best_cost", "best_q", "counts"),
 )
-"""What a round leaves to the next: how far the numeric arm's list of starts is through, which fits
-were balanced in vain, and what was found."""
+"""State fields kept across restarts: the position in the start table of the numeric arm, the minima
+that were tried, and the incumbent."""
 
 NOTHING = float("nan")
 
@@ -97,12 +97,12 @@ LOOSE = "1 if the contacts of a side are fewer conditions than palm and hand hav
 
 @dataclass(frozen=True, eq=False)
 class HandFirstLayouts:
-    """The three layouts for one robot.
+    """Layouts of state, parameters and record for one robot.
 
     Attributes:
-        robot: The description.
-        candidates: How many hand postures the stages may start from.
-        kinds: Of the contacts, by finger.
+        robot: Description of the robot.
+        candidates: Maximum number of hand postures of a restart.
+        kinds: Kinds of the contacts, by finger.
     """
 
     robot: RobotDescription
@@ -111,61 +111,71 @@ class HandFirstLayouts:
 
     @cached_property
     def arm(self) -> tuple[int, ...]:
-        """Positions in q of the motors of the arm, or of a body's arms."""
+        """Indices in q of the motors of the arm, or of all arms of a multi-arm robot."""
         robot = self.robot
         sides = (place for arm, _ in robot.side_actuators for place in arm)
         return tuple(sides) if robot.sides else robot.arm_actuators
 
     @cached_property
     def stages(self) -> tuple[Phase, ...]:
-        """Those that its solves may be in, as they are counted."""
+        """Phases of the solves, in the order of their counters."""
         return (*STAGES, Phase.TRUNK) if self.robot.sides else STAGES
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
-        """Their names."""
+        """Names of the phases."""
         return tuple(stage.label for stage in self.stages)
 
     @cached_property
     def contacts(self) -> ContactRows:
-        """The contacts' rows."""
+        """Rows of the contacts."""
         return ContactRows(self.kinds)
 
     @cached_property
     def state(self) -> Layout:
-        """What an iteration hands to the next."""
+        """Layout of the state that one iteration passes to the next."""
         n = len(self.robot.actuators)
         sides = (len(self.robot.sides),) if self.robot.sides else ()
         return Layout(
             (
-                Field("q", (n,), doc="arm and hand; while the hand is fitted only the hand's part"),
+                Field("q", (n,), doc="arm and hand; during a hand fit only the hand is meaningful"),
                 Field("palm_rotation", (3, 3)),
                 Field("palm_origin", (3,), unit="m"),
                 Field("phase"),
-                Field("candidate", doc="index of the hand posture started from; -1: all as in q0"),
-                Field("earlier", doc="hand postures tried in earlier rounds"),
-                Field("turn", doc="which palm of those that contacts leave free comes first"),
+                Field("candidate", doc="index of the hand posture; -1: the one of q0"),
+                Field("earlier", doc="number of hand postures tried in earlier restarts"),
+                Field("turn", doc="index of the first palm rotation where contacts leave it free"),
                 Field("damping"),
-                Field("growth", doc="factor of the damping if the next step gains nothing"),
+                Field("growth", doc="factor of the damping if the next step is rejected"),
                 Field("cost", doc="cost at q (or at palm and hand)"),
                 Field("fits", doc="1 if palm and hand meet the contacts"),
-                Field("waited", doc="evaluations in a row that gained little"),
-                Field("spent", doc="evaluations in this phase"),
-                Field("power", doc="powers done while the contacts are balanced"),
-                Field("near", doc="cost of the near fit that last went on to the arm, 0: none"),
+                Field("waited", doc="number of consecutive steps with slow progress"),
+                Field("spent", doc="number of steps in this stage"),
+                Field("power", doc="number of completed powers of the balance"),
+                Field(
+                    "near",
+                    doc="cost of the last minimum of a hand fit that missed by little, 0: none",
+                ),
                 Field("least_excess", doc="smallest cost of a tolerant hand fit that failed"),
-                Field("balanced", doc="cost of the refinement last balanced, 0: none"),
-                Field("least", doc="smallest largest part of the tolerances balanced to so far"),
-                Field("held", doc="1 if held motors leave hand or arm less than its motions"),
-                Field("returns", doc="how often a fit or a balance ended where one had before"),
+                Field(
+                    "balanced",
+                    doc="cost of the last minimum of a refinement that missed by little, 0: none",
+                ),
+                Field("least", doc="smallest largest tolerance ratio of a balance so far"),
+                Field("held", doc="1 if hand or arm has too few free motors"),
+                Field(
+                    "returns", doc="number of fits and balances that ended at a previous minimum"
+                ),
                 Field("margin", sides, doc="best margin of the arm so far, negative: a violation"),
                 Field("arm", (len(self.arm),), doc="arm with the best margin"),
-                Field("swivel", sides, unit="rad", doc="last number of that arm's redundancy"),
-                Field("starts", doc="starts of the numeric arm stage so far"),
-                Field("turned", doc="joints of this start that were sent to the other side"),
-                Field("passed", doc="how far the palm of the last start was from the one wanted"),
+                Field("swivel", sides, unit="rad", doc="redundancy parameter of that arm"),
+                Field("starts", doc="number of starts of the numeric arm stage"),
+                Field(
+                    "turned", doc="last joint of this start that was moved to its opposite limit"
+                ),
+                Field("passed", doc="distance of the palm of the last start from the palm pose"),
                 Field("best_cost", doc="smallest cost of a whole configuration so far"),
-                Field("best_q", (n,), doc="the configuration it belongs to"),
+                Field("best_q", (n,), doc="the configuration with that cost"),
                 Field("counts", (len(self.stages),), doc="iterations by stage"),
                 *(self._of_sides if self.robot.sides else ()),
             )
@@ -173,36 +183,36 @@ class HandFirstLayouts:
 
     @property
     def carried(self) -> tuple[str, ...]:
-        """What a round leaves to the next: of a body also what came of its trunks."""
+        """State fields kept across restarts; for a multi-arm robot also the trunk trials."""
         return (*CARRIED, "trunks", "looked", "far") if self.robot.sides else CARRIED
 
     @property
     def _of_sides(self) -> tuple[Field, ...]:
-        """What a body's solves know besides."""
+        """Additional state fields of multi-arm robots."""
         n, sides = len(self.robot.actuators), range(len(self.robot.sides))
         palms = [
             (Field(f"palm_rotation_{i}", (3, 3)), Field(f"palm_origin_{i}", (3,), unit="m"))
             for i in sides
         ]
         return (
-            Field("side", doc="the side whose hand is fitted"),
-            Field("first", doc="index of the hand posture that every side began from"),
-            Field("farthest", doc="the largest index that a side has come to"),
+            Field("side", doc="index of the side whose hand is fitted"),
+            Field("first", doc="index of the first hand posture of every side"),
+            Field("farthest", doc="largest index of a hand posture of any side"),
             Field("fitted", (len(sides),), doc="1 if palm and hand meet the contacts, by side"),
             *(field for palm in palms for field in palm),
             Field("palms_least", doc="smallest cost of trunk steps for these palms"),
-            Field("palms_best", (n,), doc="the configuration it belongs to"),
-            Field("again", doc="1 once arms were placed anew at the trunk found"),
-            Field("tried", doc="trunks tried for these palms"),
-            Field("trunks", doc="trunks tried for all palms"),
-            Field("looked", doc="those of them that were tried for palms of hands that fit"),
+            Field("palms_best", (n,), doc="the configuration with that cost"),
+            Field("again", doc="1 after the arms were placed again at the best trunk"),
+            Field("tried", doc="number of trunk trials for these palms"),
+            Field("trunks", doc="number of trunk trials for all palms"),
+            Field("looked", doc="number of trunk trials for palms of hands that fit"),
             Field("far", doc="smallest cost of trunk steps for such palms"),
-            Field("hopeless", doc="1 if that is too far for so many trunks"),
+            Field("hopeless", doc="1 if the target counts as out of reach"),
         )
 
     @cached_property
     def parameters(self) -> Layout:
-        """The problem and the numbers of the method."""
+        """Layout of the target and the parameters of the method."""
         n, f = len(self.robot.actuators), len(self.robot.fingers)
         hand = len(self.robot.hand_actuators)
         return Layout(
@@ -282,7 +292,7 @@ class HandFirstLayouts:
 
     @cached_property
     def _row(self) -> ca.Function:
-        """What is logged, from the numbers of a stage; of a residual of NaN nothing is known."""
+        """Graph of a record from the results of a stage; a residual of NaN is unknown."""
         robot, n = self.robot, len(self.robot.actuators)
         q, lower, upper = (ca.SX.sym(name, n) for name in ("q", "lower", "upper"))
         residual = ca.SX.sym("residual", self.contacts.size)
@@ -308,13 +318,13 @@ class HandFirstLayouts:
 
 
 def with_rows(q: Expr, rows: Sequence[int], values: Expr) -> Expr:
-    """Replace some of the entries of q."""
+    """Return q with the given entries replaced."""
     places = {row: i for i, row in enumerate(rows)}
     return ca.vertcat(*(values[places[i]] if i in places else q[i] for i in range(q.numel())))
 
 
 def terms(robot: RobotDescription) -> Layout:
-    """What all targets of a batch have in common."""
+    """Return the layout of the parameters that all targets of a batch share."""
     n, f = len(robot.actuators), len(robot.fingers)
     return Layout(
         (
@@ -322,16 +332,15 @@ def terms(robot: RobotDescription) -> Layout:
             Field("angle_tolerance", (f,), unit="rad"),
             Field("lower", (n,), doc="lower bounds of q"),
             Field("upper", (n,), doc="upper bounds of q"),
-            Field("nearest", doc="1 if the solution nearest to where the robot is is wanted"),
+            Field("nearest", doc="1 if the solution nearest to q0 is preferred"),
         )
     )
 
 
 def beginning(layouts: HandFirstLayouts) -> FunctionGraph:
-    """First state and parameters of the step.
+    """Return the graph of the first state and the parameters of a restart.
 
-    Hand motors that move free fingers only stay where they are; every start is moved into the
-    bounds.
+    Hand motors that only move free fingers stay at q0; every start is clipped to the bounds.
 
     Returns:
         points (f, 3) [m], normals (f, 3) and the contacts' other vectors, NaN where free, where
@@ -433,7 +442,7 @@ def _is_loose(layouts: HandFirstLayouts, known: Expr) -> Expr:
 
 
 def _is_number(x: Expr) -> Expr:
-    """1 where x is a number, 0 where NaN; written so that it is not simplified to 1."""
+    """Return 1 where x is a number, 0 where NaN, in a form that is not simplified to 1."""
     return ca.logic_or(x <= 0, x > 0)
 
 
@@ -442,7 +451,7 @@ def _or_zero(x: Expr, known: Expr) -> Expr:
 
 
 def _mover(robot: RobotDescription, actuator: int, known: Expr) -> Expr:
-    """1 if an actuator moves a finger that has a contact."""
+    """Return 1 if an actuator moves a finger that has a contact."""
     moved = [i for i, f in enumerate(robot.finger_names) if actuator in robot.finger_actuators(f)]
     return ca.mmax(ca.vertcat(ca.SX(0), known[moved]))
 
