@@ -38,27 +38,27 @@ ClearanceJob = c_struct("clearance_job", {"RECENT": RECENT})
 OBSTACLES = 4
 """Maximum number of clearances that a goal configuration takes into account."""
 
-SPARE = 0.1
-"""Largest displacement of a shape [m] until a guard checks all pairs again."""
+RELIST_MOTION = 0.1
+"""Largest motion of shapes after which a guard compares all pairs again [m]."""
 
-Surroundings = c_struct("surroundings", driver="guard_job")
+NearbyPairs = c_struct("nearby_pairs", driver="guard_job")
 GuardJob = c_struct("guard_job")
 
 
 class Guarding:
-    """What keeps a follower clear, on memory of its own; not to be shared by threads.
+    """Compiled collision checks of a follower and their memory; not thread-safe.
 
     Attributes:
-        poses: (m, 12) of the scene's solids; see `surround`.
-        goal: (n,) configuration that keeps away; write into it.
-        rooms: (OBSTACLES,) what the nearest pairs lack there [m]; 0: nothing.
-        slopes: (OBSTACLES, n) how these distances grow [m per rad or m].
-        q: (n,) where the motors are; write into it, as into the next two.
-        last: (n,) their last step.
-        wanted: (n,) their next.
-        part: (n,) the shares of it that are free; 0: the motor brakes.
-        step: (n,) the step after which they can come to rest free.
-        rest: (n,) where that is.
+        poses: (m, 12) poses of the scene's solids; see `surround`.
+        goal: (n,) configuration that avoids obstacles; callers write into it.
+        lacking: (OBSTACLES,) lacking clearances of the nearest pairs at the goal [m].
+        slopes: (OBSTACLES, n) gradients of their distances [m per rad or m].
+        q: (n,) positions of the motors; callers write into it, and into the next two.
+        last_step: (n,) last step of the motors.
+        wanted_step: (n,) next step without obstacles.
+        share: (n,) share of that step that is free, by motor; 0 if the motor brakes.
+        step: (n,) step after which the motors can come to rest free.
+        q_rest: (n,) positions at rest after that step.
     """
 
     def __init__(
@@ -71,78 +71,80 @@ class Guarding:
         side: Array,
         change: Array,
         shares: tuple[float, ...],
-        **given: float,
+        **distances: float,
     ) -> None:
-        """Lay the memory out.
+        """Allocate the memory.
 
         Args:
-            kernel: Of the robot, compiled.
-            poses: (m, 12) of the scene's solids.
-            table: The pairs.
-            levers: (p, n) see `collision.distances.levers`.
+            kernel: Compiled kernel of the robot.
+            poses: (m, 12) poses of the scene's solids.
+            table: Pairs of shapes.
+            levers: (p, n) levers of the motors, see `collision.distances.levers`.
             hand: (n,) 1 for motors beyond a palm.
             side: (n,) number of a motor's side; -1 for motors that move all palms.
-            change: (n,) how much a step may differ from the last.
-            shares: As in the driver.
-            given: Likewise.
+            change: (n,) largest change of a step from cycle to cycle.
+            shares: Shares of the wanted step that are tried in turn.
+            distances: The scalars `required_distance`, `avoided_distance` and `nudge` of guard_job.
         """
         count, n = levers.shape
-        # Of its own: what stands about the robot may move.
+        # A copy, because the solids may move.
         self.poses = np.array(poses)
-        names = "goal", "q", "last", "wanted", "part", "step", "rest"
-        numbers = {name: np.zeros(n) for name in names}
-        self.goal, self.q, self.last, self.wanted, self.part, self.step, self.rest = (
-            numbers.values()
+        names = "goal", "q", "last_step", "wanted_step", "share", "step", "q_rest"
+        vectors = {name: np.zeros(n) for name in names}
+        self.goal, self.q, self.last_step, self.wanted_step, self.share, self.step, self.q_rest = (
+            vectors.values()
         )
-        self.rooms, self.slopes = np.zeros(OBSTACLES), np.zeros((OBSTACLES, n))
-        about, kept = kernel.job(self.q, self.poses, table, math.inf, -math.inf)
-        self._at, distances = np.full((2, n), math.nan), np.empty((2, 2, count))
-        listed = np.empty((2, 2, count), dtype=np.int64)
-        arrays = numbers | {
+        self.lacking, self.slopes = np.zeros(OBSTACLES), np.zeros((OBSTACLES, n))
+        scene, scene_arrays = kernel.job(self.q, self.poses, table, math.inf, -math.inf)
+        self._q_listed, numbers = np.full((2, n), math.nan), np.empty((2, 2, count))
+        pair_numbers = np.empty((2, 2, count), dtype=np.int64)
+        arrays = vectors | {
             "levers": np.pad(levers, ((0, 0), (0, -n % 8))),
             "hand": doubles(hand),
             "side": doubles(side),
-            "widest": levers.max(axis=0, initial=0.0),
+            "max_levers": levers.max(axis=0, initial=0.0),
             "change": doubles(change),
             "shares": doubles(shares),
-            "rooms": self.rooms,
+            "lacking": self.lacking,
             "slopes": self.slopes,
         }
-        here = [
-            Surroundings(
-                at=memory(at),
-                near=memory(near),
-                known=memory(known),
-                close=memory(close),
-                limits=memory(limits),
+        nearby = [
+            NearbyPairs(
+                q_listed=memory(q_listed),
+                listed=memory(listed),
+                distance_bounds=memory(bounds),
+                candidates=memory(candidates),
+                required=memory(required),
             )
-            for at, (near, close), (known, limits) in zip(self._at, listed, distances, strict=True)
+            for q_listed, (listed, candidates), (bounds, required) in zip(
+                self._q_listed, pair_numbers, numbers, strict=True
+            )
         ]
         self._job = GuardJob(
-            about=ctypes.addressof(about),
-            by_goal=ctypes.addressof(here[0]),
-            by_way=ctypes.addressof(here[1]),
+            scene=ctypes.addressof(scene),
+            near_goal=ctypes.addressof(nearby[0]),
+            near_path=ctypes.addressof(nearby[1]),
             n_shares=len(shares),
-            spare=SPARE,
+            relist_motion=RELIST_MOTION,
             **{name: memory(array) for name, array in arrays.items()},
-            **given,
+            **distances,
         )
-        self._kept = about, kept, here, listed, distances, arrays
+        self._referenced = scene, scene_arrays, nearby, pair_numbers, numbers, arrays
         self._name, self._reference = kernel.name, ctypes.byref(self._job)
         self._keep_away, self._stop_in_time = kernel.guards
 
     def surround(self, poses: Array) -> None:
-        """Take the scene's solids to be elsewhere, (m, 12)."""
+        """Set the poses (m, 12) of the scene's solids."""
         self.poses[...] = poses
-        self._at[...] = math.nan
+        self._q_listed[...] = math.nan
 
     def keep_away(self) -> None:
-        """Work out what the goal has to keep away from."""
+        """Compute the lacking clearances and slopes at the goal."""
         if code := self._keep_away(self._reference):
             check(self._name, code)
 
     def stop_in_time(self) -> None:
-        """Find the step."""
+        """Compute the free step."""
         if code := self._stop_in_time(self._reference):
             check(self._name, code)
 

@@ -39,10 +39,10 @@ from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import point_normal_kinds
 from casadi_ik.model.targets import TargetBatch, Tolerance
 from casadi_ik.motion import recovery
-from casadi_ik.motion.clear import motor_units
 from casadi_ik.motion.cycle import Cycle
 from casadi_ik.motion.follower import PALM_WEIGHT
-from casadi_ik.motion.inputs import FADING, contact_weights
+from casadi_ik.motion.free_path import motor_units
+from casadi_ik.motion.inputs import ERROR_TIME, contact_weights
 from casadi_ik.motion.motion import RUN_UP, own_velocities
 from casadi_ik.motion.moving import FOLLOWING_PULL, SETTLING
 from casadi_ik.solve.hand_first.driver import SearchPlan, source_text
@@ -102,7 +102,7 @@ class FollowSources:
             "CYCLE": standalone_source(row_major(cycle.graph.function), CodeOptions()),
             "FOLLOW_CONSTANTS": self._constants(cycle),
             "FOLLOW_STATE": str(cycle.state.size),
-            "FOLLOW_ASKED": str(cycle.parameters.size),
+            "FOLLOW_PARAMETERS": str(cycle.parameters.size),
             "FOLLOW_RECORD": str(cycle.record.size),
             "FOLLOW_TRAIL": str(recovery.CAPACITY),
         }
@@ -137,11 +137,11 @@ class FollowSources:
             "MOVES_PALM": int(bool(cycle.palms)),
             "TRAIL_CAPACITY": recovery.CAPACITY,
         }
-        places |= _places("STATE", cycle.state) | _places("ASKED", cycle.parameters)
+        places |= _places("STATE", cycle.state) | _places("PARAMETER", cycle.parameters)
         numbers = {
             "TOLERANCE_SLACK": TOLERANCE_SLACK,
             "SETTLING": SETTLING,
-            "FADING": FADING,
+            "ERROR_TIME": ERROR_TIME,
             "PULL": FOLLOWING_PULL,
             "RUN_UP": RUN_UP,
             "PALM_WEIGHT": PALM_WEIGHT,

@@ -1,4 +1,4 @@
-"""Motion: targets followed cycle by cycle, known paths, teleoperation, the way to a grasp."""
+"""Motion: followers of moving targets, tracking of paths, retargeting, and reaching grasps."""
 
 from casadi_ik.motion.approach import Approach, ReachStatus
 from casadi_ik.motion.follower import Follower, FollowState, FollowStatus

@@ -1,4 +1,4 @@
-"""The last part of the way to a grasp, found backwards: the hand opens, and goes straight back."""
+"""Straight approaches to grasps, planned backwards: the hand opens, and moves straight back."""
 
 from __future__ import annotations
 
@@ -17,41 +17,41 @@ from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import point_normal_kinds
 from casadi_ik.model.targets import TargetBatch
-from casadi_ik.motion.clear import least_clearance
-from casadi_ik.motion.cycle import of_side
-from casadi_ik.motion.inputs import ANY, FollowerInputs, FollowPlan
+from casadi_ik.motion.cycle import side_name
+from casadi_ik.motion.free_path import least_clearance
+from casadi_ik.motion.inputs import UNUSED_NORMAL, FollowerInputs, FollowPlan
 
 
 @dataclass(frozen=True, eq=False)
-class LastPart:
-    """Postures on the way to a grasp.
+class ApproachPath:
+    """Postures of an approach.
 
     Attributes:
-        coming: (k, n) the open hand comes straight to where it will close.
-        closing: (k, n) it closes, the last posture is the grasp.
+        coming: (k, n) postures of the straight motion with an open hand.
+        closing: (k, n) postures while the hand closes; the last one is the grasp.
     """
 
     coming: Array
     closing: Array
 
 
-class Closer:
-    """Finds the last part of the way on one robot, backwards: the hand opens, and goes.
+class ApproachFinder:
+    """Planner of straight approaches of one robot, backwards from the grasp.
 
     Attributes:
-        postures: Of each of both parts.
-        cycles: Cycles that each posture is given.
-        stray: How far the palm may be from its straight way [m].
+        postures: Number of postures of each of the two parts.
+        cycles: Cycles of the follower's graph per posture.
+        max_deviation: Largest deviation of the palm from the straight line [m].
     """
 
     postures = 40
     cycles = 3
-    stray = 2e-3
+    max_deviation = 2e-3
 
     def __init__(self, plan: FollowPlan) -> None:
-        """Compile what is not compiled yet; the plan has no limits of velocity."""
+        """Compile the graph unless it is cached; the plan has no velocity limits."""
         self._robot = plan.robot
-        self._asked = FollowerInputs(plan, point_normal_kinds(len(plan.robot.fingers)), 0)
+        self._inputs = FollowerInputs(plan, point_normal_kinds(len(plan.robot.fingers)), 0)
 
     def find(
         self,
@@ -59,35 +59,36 @@ class Closer:
         q: Array,
         opening: float,
         distance: float,
-        ways: Array,
-    ) -> LastPart | None:
-        """The last part of the way to a solution; None if there is none.
+        directions: Array,
+    ) -> ApproachPath | None:
+        """Return the approach to a solution; None if the arm cannot follow it.
 
         Args:
-            problem: The grasp.
+            problem: Grasp.
             q: (n,) its solution.
-            opening: How far the fingertips are from their contacts while the hand is open [m].
-            distance: How far it comes straight [m].
-            ways: (f, 3) unit, the way each finger's hand comes, base frame.
+            opening: Distance of the fingertips of the open hand from their contacts [m].
+            distance: Length of the straight motion [m].
+            directions: (f, 3) unit vectors of the approach of each finger's hand, base frame.
         """
         robot = self._robot
         points, normals = robot.contacts(q)
-        given = ~np.isnan(problem.points[0, :, 0])
+        has_contact = ~np.isnan(problem.points[0, :, 0])
         share = np.linspace(0.0, 1.0, self.postures)[:, None, None]
-        opened = points - opening * share * normals
-        opening_way = self._walk(q, opened, {}, given)
-        there = opening_way[-1]
-        if not self._asked.cycle.palms:
-            return LastPart(there[None], opening_way[::-1])
-        coming = self.straight(there, -distance * ways * hands_used(robot, problem))
-        return None if coming is None else LastPart(coming[::-1], opening_way[::-1])
+        opened_tips = points - opening * share * normals
+        opening_path = self._follow(q, opened_tips, {}, has_contact)
+        q_open = opening_path[-1]
+        if not self._inputs.cycle.palms:
+            return ApproachPath(q_open[None], opening_path[::-1])
+        coming = self.straight(q_open, -distance * directions * hands_used(robot, problem))
+        return None if coming is None else ApproachPath(coming[::-1], opening_path[::-1])
 
     def straight(self, q: Array, shift: Array) -> Array | None:
-        """(k, n) postures from q on with all of the hand moved; None: it strays.
+        """Return postures (k, n) of a translation of the whole hand; None if it deviates.
 
         Args:
-            q: (n,).
-            shift: (3,), or (f, 3) the same for fingers of a hand, base frame [m].
+            q: (n,) first posture.
+            shift: (3,) translation, or (f, 3) with equal rows for the fingers of a hand, base frame
+                [m].
         """
         robot, share = self._robot, np.linspace(0.0, 1.0, self.postures)[:, None, None]
         tips, palms = robot.contacts(q)[0], dict[str | None, Array]()
@@ -95,60 +96,63 @@ class Closer:
         for side, hand in robot.hands.items():
             palms[side] = np.repeat(robot.palm(q, side)[None], self.postures, axis=0)
             palms[side][:, :3, 3] += share[:, 0] * shifts[hand[0]]
-        every = np.ones(len(tips), dtype=bool)
-        found = self._walk(q, tips + share * shifts, palms, every)
+        all_fingers = np.ones(len(tips), dtype=bool)
+        path = self._follow(q, tips + share * shifts, palms, all_fingers)
         for side, poses in palms.items():
-            off = np.linalg.norm(robot.palm(found, side)[:, :3, 3] - poses[:, :3, 3], axis=1)
-            if off.max() > self.stray:
+            deviation = np.linalg.norm(robot.palm(path, side)[:, :3, 3] - poses[:, :3, 3], axis=1)
+            if deviation.max() > self.max_deviation:
                 return None
-        return found
+        return path
 
-    def _walk(
-        self, q: Array, tips: Array, palms: Mapping[str | None, Array], given: Array
+    def _follow(
+        self, q: Array, tips: Array, palms: Mapping[str | None, Array], has_contact: Array
     ) -> Array:
-        """(k, n) postures from q on, with fingertips and palms where they are asked for.
+        """Return postures (k, n) that follow targets of fingertips and palms.
 
         Args:
-            q: (n,).
-            tips: (k, f, 3) [m].
-            palms: (k, 4, 4) by side; where they are if it is left out.
-            given: (f,) whether a fingertip counts.
+            q: (n,) first posture.
+            tips: (k, f, 3) target positions of the fingertips [m].
+            palms: (k, 4, 4) target poses of palms by side; other palms keep their poses.
+            has_contact: (f,) True if the target of a fingertip counts.
         """
-        asked, f = self._asked, len(given)
+        inputs, f = self._inputs, len(has_contact)
         values: dict[str, Any] = {
             "points": tips,
-            "normals": [ANY] * f,
-            "weights": np.stack([given, 0 * given], axis=1),
+            "normals": [UNUSED_NORMAL] * f,
+            "weights": np.stack([has_contact, 0 * has_contact], axis=1),
             "position_tolerance": np.ones(f),
             "angle_tolerance": np.ones(f),
         }
-        for side in asked.cycle.palms:
+        for side in inputs.cycle.palms:
             poses = palms.get(side, self._robot.palm(q, side))
-            wanted = {"point": poses[..., :3, 3], "axes": poses[..., :3, :3], "weight": np.ones(2)}
-            values |= {of_side(f"palm_{name}", side): array for name, array in wanted.items()}
-        rows = np.repeat(asked.rows(len(tips), values), self.cycles, axis=0)
-        states, _ = asked.run.run(asked.state_at(q), rows)
-        found = states[self.cycles - 1 :: self.cycles, : len(q)]
-        found[0] = q
-        return found
+            fields = {"point": poses[..., :3, 3], "axes": poses[..., :3, :3], "weight": np.ones(2)}
+            values |= {side_name(f"palm_{name}", side): array for name, array in fields.items()}
+        rows = np.repeat(inputs.rows(len(tips), values), self.cycles, axis=0)
+        states, _ = inputs.run.run(inputs.state_at(q), rows)
+        path = states[self.cycles - 1 :: self.cycles, : len(q)]
+        path[0] = q
+        return path
 
 
 def hands_used(robot: ArmHand, problem: TargetBatch) -> Array:
-    """(f, 1) for each finger 1 if its hand touches something, 0: then the hand stays."""
-    given, used = ~np.isnan(problem.points[0, :, 0]), np.zeros((len(robot.fingers), 1))
+    """Return (f, 1): 1 for fingers of a hand with a contact; 0 for those of a hand that rests."""
+    has_contact, is_used = ~np.isnan(problem.points[0, :, 0]), np.zeros((len(robot.fingers), 1))
     for hand in map(list, robot.hands.values()):
-        used[hand] = given[hand].any()
-    return used
+        is_used[hand] = has_contact[hand].any()
+    return is_used
 
 
-LEAN = float(np.tan(np.deg2rad(35.0)))
-"""How far ways lean that are tried when none before could be gone."""
+TILT = float(np.tan(np.deg2rad(35.0)))
+"""Tangent of the tilt of the approach directions that are tried last."""
 
-NARROWER = np.array([1.0, 0.5, 0.25])
-"""Of the opening that was asked for: where the hand, or a table, leaves no room for the whole."""
+OPENING_SHARES = np.array([1.0, 0.5, 0.25])
+"""Shares of the requested opening that are tried: the hand or a table may not permit all of it."""
 
-PRESSED = 1e-3
-"""What a pad may be in the object while the open hand comes: as far off as a contact may be [m]."""
+MAX_PAD_PENETRATION = 1e-3
+"""Largest penetration of a pad into the object before the hand closes [m].
+
+It equals a typical position tolerance of a contact.
+"""
 
 
 def _unit(vector: Array) -> Array:
@@ -164,30 +168,30 @@ class ReachStatus(Enum):
     """
 
     REACHED = "reached"
-    """There is a motion, and what was to be checked is free all the way."""
+    """There is a motion; with a scene it is free of collisions."""
     NOT_SOLVED = "not solved"
-    """The grasp has no solution (`Solver.solve` says why)."""
+    """The grasp has no solution; `Solver.solve` tells why."""
     NO_APPROACH = "no approach"
-    """From no solution the open hand can go straight back without touching anything."""
+    """The open hand can retreat straight from none of the solutions without a collision."""
     NO_RETREAT = "no retreat"
-    """With what it holds the hand cannot be lifted, or go back, as it was asked."""
+    """The hand with the object cannot be lifted or retreat as requested."""
     NO_WAY = "no way"
-    """No way to a pre-grasp, or to a posture, was found."""
+    """There is no path to a pre-grasp or posture."""
 
 
 @dataclass(frozen=True, eq=False)
 class Approach:
-    """The last part of a motion to a grasp.
+    """Straight approach to a grasp.
 
     Attributes:
         status: REACHED, NO_APPROACH or NOT_SOLVED.
-        reason: In words; "" if there is one.
-        q: (n,) the solution of the grasp that it ends with; None if there is none.
-        coming: (k, n) postures from the pre-grasp straight to where the hand closes, fingers open;
-            None likewise.
-        closing: (k, n) postures from there to the grasp; None likewise.
+        reason: Reason of a failure, "" on success.
+        q: (n,) solution of the grasp at which the approach ends; None on failure.
+        coming: (k, n) postures of the straight motion from the pre-grasp with open fingers; None on
+            failure.
+        closing: (k, n) postures while the hand closes, up to the grasp; None on failure.
         clearance: Smallest distance before the hand closes [m]; None without a scene.
-        tried: Solutions of the grasp that were looked at.
+        tried: Number of solutions of the grasp that were tried.
 
     Example:
         >>> found = solver.approach(grasp, distance=0.1)
@@ -205,26 +209,27 @@ class Approach:
 
     @property
     def success(self) -> bool:
-        """Whether there is one."""
+        """True if there is an approach."""
         return self.status is ReachStatus.REACHED
 
     @property
     def pregrasp(self) -> Array | None:
-        """(n,) where it begins."""
+        """First posture (n,) of the approach; None on failure."""
         return None if self.coming is None else self.coming[0]
 
 
 @dataclass(frozen=True, eq=False)
 class ApproachPlan:
-    """What the last part of a way has to keep to.
+    """Requirements of an approach.
 
     Attributes:
-        plan: The robot, and the scene.
-        problem: The grasp.
-        opening: Of the hand before it closes [m].
-        distance: Of the straight approach [m].
-        direction: (3,) the way the hand comes, base frame; None: as the grasp has it.
-        pregrasp: (3,) where the grasp has the palm before it, base frame [m]; None: not said.
+        plan: Robot and scene.
+        problem: Grasp.
+        opening: Distance of the fingertips from their contacts before the hand closes [m].
+        distance: Length of the straight motion [m].
+        direction: (3,) direction of the approach, base frame; None: it follows from the grasp.
+        pregrasp: (3,) position of the palm at the pre-grasp, base frame [m]; None if the grasp does
+            not specify it.
     """
 
     plan: FollowPlan
@@ -234,165 +239,179 @@ class ApproachPlan:
     direction: Array | None = None
     pregrasp: Array | None = None
 
-    def ways(self, q: Array) -> list[Array]:
-        """(f, 3) unit, the ways hands may come to a solution (n,), the first that can be gone is.
+    def directions(self, q: Array) -> list[Array]:
+        """Return approach directions (f, 3) to a solution (n,), in the order of preference.
 
-        The one that was said, or: from where the grasp has its palm before it, from the palm to the
-        contacts, from above, between those, and leaning to each side.
+        The unit vectors are the direction of the plan; or those from the pre-grasp, or else from
+        the palm to the contacts, from above, between both, and tilted to each side.
         """
         robot = self.plan.robot
         if self.direction is not None:
             return [np.tile(_unit(self.direction), (len(robot.fingers), 1))]
-        given, tips = ~np.isnan(self.problem.points[0, :, 0]), robot.contacts(q)[0]
-        every = dict[int, list[Array]]()
+        has_contact, tips = ~np.isnan(self.problem.points[0, :, 0]), robot.contacts(q)[0]
+        by_finger = dict[int, list[Array]]()
         for side, hand in robot.hands.items():
-            fingers = [i for i in hand if given[i]]
-            ways = self._ways_of_hand(robot.palm(q, side), tips[fingers])
-            every |= dict.fromkeys(hand, ways)
-        return [np.stack(ways) for ways in zip(*(every[i] for i in sorted(every)), strict=True)]
+            fingers = [i for i in hand if has_contact[i]]
+            directions = self._hand_directions(robot.palm(q, side), tips[fingers])
+            by_finger |= dict.fromkeys(hand, directions)
+        columns = (by_finger[i] for i in sorted(by_finger))
+        return [np.stack(directions) for directions in zip(*columns, strict=True)]
 
-    def _ways_of_hand(self, palm: Array, tips: Array) -> list[Array]:
-        """(3,) unit, of a hand whose fingertips (k, 3) touch."""
+    def _hand_directions(self, palm: Array, tips: Array) -> list[Array]:
+        """Return approach directions (3,) of a hand with fingertips (k, 3) in contact."""
         down = np.array([0.0, 0.0, -1.0])
         first = tips.mean(axis=0) - palm[:3, 3] if len(tips) else down
         if self.pregrasp is not None:
-            way = palm[:3, 3] - self.pregrasp
-            # A palm that is nearer to its grasp before it does not say from where it comes.
-            first = way if np.linalg.norm(way) > 5e-3 else first
+            line = palm[:3, 3] - self.pregrasp
+            # A pre-grasp very near to the grasp does not define a direction.
+            first = line if np.linalg.norm(line) > 5e-3 else first
         first = _unit(first)
-        sides = [s * palm[:3, axis] for axis in (0, 1) for s in (1.0, -1.0)]
-        others = [first + down, down, *(first + LEAN * side for side in sides)]
-        return [first, *(_unit(one) if np.linalg.norm(one) > 0.1 else first for one in others)]
+        sides = [sign * palm[:3, axis] for axis in (0, 1) for sign in (1.0, -1.0)]
+        alternatives = [first + down, down, *(first + TILT * side for side in sides)]
+        lengths = map(np.linalg.norm, alternatives)
+        pairs = zip(alternatives, lengths, strict=True)
+        return [first, *(_unit(vector) if length > 0.1 else first for vector, length in pairs)]
 
 
 @dataclass(frozen=True, eq=False)
-class Tried:
-    """What became of one solution of a grasp.
+class ApproachAttempt:
+    """Result of planning the approach to one solution of a grasp.
 
     Attributes:
-        closer: Finds straight ways.
-        number: Of the solution, from 1.
-        q: (n,) the solution.
-        last: The last part of the way; None if it cannot be gone.
-        reason: Why not, "" if it can.
-        open_handed: What is not to be touched before the hand closes; None: nothing is checked.
-        holding: What is not to be touched while it closes; likewise.
-        coming: What is not to be touched while it comes: one of both.
+        finder: Planner of straight motions.
+        number: Number of the solution, from 1.
+        q: (n,) solution of the grasp.
+        path: Approach; None if there is none.
+        reason: Reason of a failure, "" on success.
+        open_query: Collision checks before the hand closes; None checks nothing.
+        closing_query: Collision checks while it closes; None checks nothing.
+        coming_query: Collision checks of the straight motion: one of these two.
     """
 
-    closer: Closer
+    finder: ApproachFinder
     number: int
     q: Array
-    last: LastPart | None
+    path: ApproachPath | None
     reason: str
-    open_handed: CollisionQuery | None
-    holding: CollisionQuery | None
-    coming: CollisionQuery | None
+    open_query: CollisionQuery | None
+    closing_query: CollisionQuery | None
+    coming_query: CollisionQuery | None
 
 
-def approaches(asked: ApproachPlan, solutions: Sequence[Array]) -> Iterator[Tried]:
-    """What becomes of solutions (n,) of a grasp, in order."""
-    closer = Closer(asked.plan)
-    holding, open_handed = _surroundings(asked)
+def approaches(plan: ApproachPlan, solutions: Sequence[Array]) -> Iterator[ApproachAttempt]:
+    """Yield the approaches to solutions (n,) of a grasp, in their order."""
+    finder = ApproachFinder(plan.plan)
+    closing_query, open_query = _queries(plan)
     for number, q in enumerate(solutions, start=1):
-        barred = -1.0
-        last, reason, coming = None, "", open_handed
-        for opening, way in product(asked.opening * NARROWER, asked.ways(q)):
-            if barred == opening:
+        blocked_opening = -1.0
+        path, reason, coming_query = None, "", open_query
+        for opening, directions in product(plan.opening * OPENING_SHARES, plan.directions(q)):
+            if blocked_opening == opening:
                 continue
-            last = closer.find(asked.problem, q, opening, asked.distance, way)
-            why, coming = _blocked(asked, last, holding, open_handed)
-            reason = reason or why
-            if not why:
+            path = finder.find(plan.problem, q, opening, plan.distance, directions)
+            obstruction, coming_query = _obstruction(plan, path, closing_query, open_query)
+            reason = reason or obstruction
+            if not obstruction:
                 reason = ""
                 break
-            last = None
-            if why.startswith(CLOSES):
-                barred = opening  # whichever way the hand comes
-        yield Tried(closer, number, q, last, reason, open_handed, holding, coming)
+            path = None
+            if obstruction.startswith(CLOSING_PREFIX):
+                blocked_opening = opening  # for all directions
+        yield ApproachAttempt(
+            finder, number, q, path, reason, open_query, closing_query, coming_query
+        )
 
 
-def approach(asked: ApproachPlan, solutions: Sequence[Array], why: str) -> Approach:
-    """The last part of the way to the first of some solutions for which there is one.
+def approach(plan: ApproachPlan, solutions: Sequence[Array], reason: str) -> Approach:
+    """Plan the approach to the first solution of a grasp that has one.
 
     Args:
-        asked: What to keep to.
-        solutions: (n,) each, of the grasp, best first.
-        why: Why there are none.
+        plan: Requirements.
+        solutions: (n,) solutions of the grasp, best first.
+        reason: Reason why there are no solutions.
     """
     if not solutions:
-        return Approach(ReachStatus.NOT_SOLVED, why, None, None, None, None, 0)
+        return Approach(ReachStatus.NOT_SOLVED, reason, None, None, None, None, 0)
     reason = ""
-    for one in approaches(asked, solutions):
-        if one.last is None:
-            reason = reason or one.reason
+    for attempt in approaches(plan, solutions):
+        path = attempt.path
+        if path is None:
+            reason = reason or attempt.reason
             continue
         clearance = None
-        if one.coming is not None:
-            clearance, _ = least_clearance(one.coming, one.last.coming)
-        return Approach(
-            ReachStatus.REACHED, "", one.q, one.last.coming, one.last.closing, clearance, one.number
-        )
+        if attempt.coming_query is not None:
+            clearance, _ = least_clearance(attempt.coming_query, path.coming)
+        postures = attempt.q, path.coming, path.closing
+        return Approach(ReachStatus.REACHED, "", *postures, clearance, attempt.number)
     count = len(solutions)
     return Approach(ReachStatus.NO_APPROACH, reason, None, None, None, None, count)
 
 
-def _surroundings(asked: ApproachPlan) -> tuple[CollisionQuery | None, CollisionQuery | None]:
-    """What is checked while the hand closes, and before: then fingers touch no object either."""
-    check, problem = asked.plan.check, asked.problem
+def _queries(plan: ApproachPlan) -> tuple[CollisionQuery | None, CollisionQuery | None]:
+    """Return the collision checks while the hand closes, and before it does.
+
+    Before the hand closes, the fingers must not touch the object either.
+    """
+    check, problem = plan.plan.check, plan.problem
     if check is None:
         return None, None
-    one = np.zeros(1, dtype=np.intp)
-    untouched = replace(problem, points=np.full_like(problem.points, np.nan))
-    return check.collision_query(problem).rows(one), check.collision_query(untouched).rows(one)
+    row = np.zeros(1, dtype=np.intp)
+    without_contacts = replace(problem, points=np.full_like(problem.points, np.nan))
+    closing_query = check.collision_query(problem).rows(row)
+    return closing_query, check.collision_query(without_contacts).rows(row)
 
 
-CLOSES = "the closing"
+CLOSING_PREFIX = "the closing"
+"""First words of the reason if the hand cannot close."""
 
 
-def _blocked(
-    asked: ApproachPlan,
-    last: LastPart | None,
-    holding: CollisionQuery | None,
-    open_handed: CollisionQuery | None,
+def _obstruction(
+    plan: ApproachPlan,
+    path: ApproachPath | None,
+    closing_query: CollisionQuery | None,
+    open_query: CollisionQuery | None,
 ) -> tuple[str, CollisionQuery | None]:
-    """Why the last part cannot be gone, "": it can; and what is not touched as the hand comes.
+    """Return what obstructs an approach ("" if it is free), and the checks of its straight motion.
 
-    Shapes of fingers are rounder than fingers are. Where a hand cannot open far enough for them,
-    links with a contact may touch the object, if their pads keep out of it.
+    Collision shapes of fingers are rounder than the fingers. Where a hand cannot open far enough
+    for them, links with a contact may touch the object if their pads do not penetrate it.
     """
-    if last is None:
-        return "the arm cannot follow the straight way back", open_handed
-    if holding is None or open_handed is None:
+    if path is None:
+        return "the arm cannot follow the straight retreat", open_query
+    if closing_query is None or open_query is None:
         return "", None
-    if len(last.closing) > 1 and (touching := least_clearance(holding, last.closing)[1]):
-        return f"{CLOSES} is not free: {touching}", open_handed
-    if len(last.coming) < 2:
-        return "", open_handed
-    _, touching = least_clearance(open_handed, last.coming)
-    if not touching:
-        return "", open_handed
-    begins = not least_clearance(open_handed, last.coming[:1])[1]
-    if begins and not least_clearance(holding, last.coming)[1] and _pads_clear(asked, last.coming):
-        return "", holding
-    return f"the approach is not free: {touching}", open_handed
+    if len(path.closing) > 1 and (contact := least_clearance(closing_query, path.closing)[1]):
+        return f"{CLOSING_PREFIX} is not free: {contact}", open_query
+    if len(path.coming) < 2:
+        return "", open_query
+    _, contact = least_clearance(open_query, path.coming)
+    if not contact:
+        return "", open_query
+    pregrasp_is_free = not least_clearance(open_query, path.coming[:1])[1]
+    if (
+        pregrasp_is_free
+        and not least_clearance(closing_query, path.coming)[1]
+        and _pads_are_free(plan, path.coming)
+    ):
+        return "", closing_query
+    return f"the approach is not free: {contact}", open_query
 
 
-def _pads_clear(asked: ApproachPlan, q: Array) -> bool:
-    """Whether the pads of postures (k, n) keep out of the object."""
-    check, problem = asked.plan.check, asked.problem
+def _pads_are_free(plan: ApproachPlan, q: Array) -> bool:
+    """Return True if the pads do not penetrate the object in postures (k, n)."""
+    check, problem = plan.plan.check, plan.problem
     assert check is not None
     name = problem.object or check.scene.grasped or ""
     pose = None if problem.object_pose is None else problem.object_pose[0]
     if pose is None and name not in check.scene.items:
         return False
-    place = check.scene.items[name].pose if pose is None else pose
-    thing = check.scene.holding(name, place).items[name]
+    object_pose = check.scene.items[name].pose if pose is None else pose
+    solid = check.scene.holding(name, object_pose).items[name]
     pad = Scene({"pad": {"kind": "sphere", "radius": 1e-4}}).items["pad"]
-    given = ~np.isnan(problem.points[0, :, 0])
+    has_contact = ~np.isnan(problem.points[0, :, 0])
     poses = np.tile(np.eye(4), (len(q), 1, 1))
-    for i in np.flatnonzero(given):
-        poses[:, :3, 3] = asked.plan.robot.contacts(q)[0][:, i]
-        if gaps(pad, [thing], poses).min() < -PRESSED:
+    for i in np.flatnonzero(has_contact):
+        poses[:, :3, 3] = plan.plan.robot.contacts(q)[0][:, i]
+        if gaps(pad, [solid], poses).min() < -MAX_PAD_PENETRATION:
             return False
     return True

@@ -1,4 +1,4 @@
-"""A robot that follows moving contacts: one call a cycle, arrays in, motor positions out."""
+"""Follower of moving contacts: one call per cycle, from target arrays to motor positions."""
 
 from __future__ import annotations
 
@@ -9,20 +9,22 @@ from enum import Enum
 import numpy as np
 from numpy.typing import ArrayLike
 
+from casadi_ik.collision.clearance_kernel import OBSTACLES
 from casadi_ik.errors import InputError, InvalidPoseError
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.input_checks.keypoints import lost_contacts_reason
 from casadi_ik.files.input_checks.poses import single_pose
 from casadi_ik.kinematics.contacts import Kinds, group_by_kinds, point_normal_kinds
 from casadi_ik.model.grasp import Grasp, real_array
-from casadi_ik.motion.clear import OBSTACLES, Guard, motor_units, stopping_way
+from casadi_ik.motion.free_path import motor_units
+from casadi_ik.motion.guard import Guard, stopping_distance
 from casadi_ik.motion.inputs import FollowerInputs, FollowPlan
 from casadi_ik.motion.recovery import Recovery
 from casadi_ik.solve.solution import Pair
 from casadi_ik.solve.verdict import TOLERANCE_SLACK
 
 Poses = Mapping[str | None, Array]
-"""Of palms (4, 4), by side; None: of the only one."""
+"""Poses of palms (4, 4) by side; the side is None for a single arm-hand."""
 
 
 class FollowStatus(Enum):
@@ -36,14 +38,14 @@ class FollowStatus(Enum):
     FOLLOWING = "following"
     """Every contact is within tolerance."""
     LATE = "late"
-    """The motors are under way: velocities and accelerations permit no more."""
+    """The motors are on their way; velocity and acceleration limits delay them."""
     MISSED = "missed"
-    """No posture was found on this branch that meets the contacts: out of reach, or behind a
+    """No configuration on this branch meets the contacts: they are out of reach, or beyond a
     limit."""
     BLOCKED = "blocked"
-    """Going on would touch something: the motors stop short."""
+    """A collision would follow: the motors stop before it."""
     HOLDING = "holding"
-    """The frame was none: the motors come to rest and wait."""
+    """The frame is invalid: the motors decelerate to rest and wait for a valid one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,19 +53,19 @@ class FollowState:
     """State after the last cycle.
 
     Attributes:
-        status: In one word.
-        reason: What was wrong with the frame, "" if nothing was.
-        q: (n,) where the motors are told to be [rad or m].
-        velocity: (n,) how fast they go there [rad/s or m/s].
-        position_error: (f,) how far the fingertips are from their contacts then [m], NaN where
-            free.
-        angle_error: (f,) likewise [rad].
-        goal: (n,) the posture they are on their way to.
-        goal_position_error: (f,) how far off the contacts that is [m], NaN where free.
-        goal_angle_error: (f,) likewise [rad].
-        clearance: Distance of the pair nearest to being too near [m]; None without a scene.
-        closest: That pair.
-        cycles: How many there were.
+        status: Result of the cycle.
+        reason: Why the frame was invalid, "" if it was valid.
+        q: (n,) commanded positions of the motors at the end of the cycle [rad or m].
+        velocity: (n,) velocities of the motors in the cycle [rad/s or m/s].
+        position_error: (f,) position errors of the fingertips at q [m], NaN where free.
+        angle_error: (f,) angle errors at q [rad], NaN where free.
+        goal: (n,) configuration that the motors track [rad or m].
+        goal_position_error: (f,) position errors at the goal [m], NaN where free.
+        goal_angle_error: (f,) angle errors at the goal [rad], NaN where free.
+        clearance: Distance of the pair with the least clearance beyond its margin [m]; None without
+            a scene.
+        closest: Names of that pair; None without a scene.
+        cycles: Number of cycles so far.
 
     Example:
         >>> follower = solver.follow(q0=solution.q)
@@ -90,25 +92,25 @@ class FollowState:
 NO_FRAME = "no frame yet"
 
 IDENTITY = np.eye(4)
-"""A palm's pose that trackers send for a lost hand: no palm is in the base with its axes."""
+"""Pose that trackers send for a lost hand; no real palm coincides with the base frame."""
 
 PALM_WEIGHT = 0.1
-"""How much a palm's place and its axes count unless said, a contact counting 1."""
+"""Default weight of a palm's position and axes relative to a contact."""
 
 
 class Follower:
-    """Follows moving contacts cycle by cycle, within the limits of the motors.
+    """Follower of moving contacts, cycle by cycle, within the limits of the motors.
 
-    Whatever the targets do: positions, velocities and accelerations stay within limits, the
-    posture stays on its branch, and where the solver has a scene the robot can always come to rest
-    before it touches anything that stands still. A frame that is none (partly NaN, infinite, a
-    zero normal, no contact at all) is no error of a stream: the motors come to rest, and go on
-    with the next. An instance follows one robot; threads need one each.
+    For all targets positions, velocities and accelerations stay within limits, the configuration
+    stays on its branch, and with a scene the robot can always come to rest before it touches
+    anything that stands still. An invalid frame (partly NaN, infinite, a zero normal, no contact)
+    is not an error: the motors come to rest, and continue with the next valid frame. An instance is
+    not thread-safe.
 
     Attributes:
         period: Time from cycle to cycle [s].
-        velocity: (n,) limits that are kept [rad/s or m/s].
-        acceleration: (n,) limits that are kept [rad/s^2 or m/s^2].
+        velocity: (n,) velocity limits [rad/s or m/s].
+        acceleration: (n,) acceleration limits [rad/s^2 or m/s^2].
 
     Example:
         >>> follower = solver.follow(q0=robot.home, period=0.001)
@@ -121,46 +123,46 @@ class Follower:
     """
 
     def __init__(self, plan: FollowPlan) -> None:
-        """Compile what is not compiled yet, and lay the memory out; `Solver.follow` makes it."""
+        """Compile the graphs and allocate the memory; `Solver.follow` calls this."""
         self._plan = plan
         self.period = plan.period
         self.velocity, self.acceleration = plan.rates.velocity, plan.rates.acceleration
         self._change = plan.rates.steps(plan.period)[1]
         robot = plan.robot
         self._n, self._shape = len(robot.actuators), (len(robot.fingers), 3)
-        self._usual = point_normal_kinds(self._shape[0])
-        self._tolerances = self._own = tuple(plan.request.tolerances.values())
-        self._all_asked: dict[Kinds, FollowerInputs] = {}
+        self._point_kinds = point_normal_kinds(self._shape[0])
+        self._tolerances = self._plan_tolerances = tuple(plan.request.tolerances.values())
+        self._inputs_by_kinds: dict[Kinds, FollowerInputs] = {}
         self._posture = plan.posture
         self._guard = None if plan.check is None else Guard(plan)
-        self._asked = self._of(self._usual)
-        fastest, change = plan.rates.steps(plan.period)
+        self._inputs = self._inputs_of(self._point_kinds)
+        max_step, max_change = plan.rates.steps(plan.period)
         units = motor_units(robot)
-        self._recovery = Recovery(units, fastest, change, plan.period, self._guard)
+        self._recovery = Recovery(units, max_step, max_change, plan.period, self._guard)
         self.reset(plan.q0)
 
-    def _of(self, kinds: Kinds) -> FollowerInputs:
-        """The memory for some kinds of contacts."""
-        found = self._all_asked.get(kinds)
-        if found is None:
+    def _inputs_of(self, kinds: Kinds) -> FollowerInputs:
+        """Return the graph and memory for given kinds of contacts."""
+        inputs = self._inputs_by_kinds.get(kinds)
+        if inputs is None:
             obstacles = 0 if self._guard is None else OBSTACLES
-            found = self._all_asked[kinds] = FollowerInputs(self._plan, kinds, obstacles)
-            found.lead_to(self._posture)
-        return found
+            inputs = self._inputs_by_kinds[kinds] = FollowerInputs(self._plan, kinds, obstacles)
+            inputs.set_posture(self._posture)
+        return inputs
 
-    def _take_up(self, kinds: Kinds) -> None:
-        """Go on with contacts of some kinds."""
-        n, old = 3 * self._n + 1, self._asked.run.state
-        self._asked = self._of(kinds)
-        state = self._asked.run.state
-        # The errors that are left belong to other rows; none is the honest guess.
-        state[:n], state[n:] = old[:n], 0.0
+    def _switch_kinds(self, kinds: Kinds) -> None:
+        """Continue with contacts of other kinds."""
+        n, previous = 3 * self._n + 1, self._inputs.run.state
+        self._inputs = self._inputs_of(kinds)
+        state = self._inputs.run.state
+        # The previous residual belongs to other rows.
+        state[:n], state[n:] = previous[:n], 0.0
 
     def reset(self, q: ArrayLike) -> None:
-        """Go on from a posture, at rest: for a robot that something else has moved.
+        """Restart at rest at a configuration, for a robot that something else has moved.
 
         Args:
-            q: (n,) [rad or m]; moved into the limits.
+            q: (n,) positions of the motors [rad or m]; clipped to the limits.
 
         Raises:
             InputError: Wrong shape or numbers.
@@ -171,21 +173,20 @@ class Follower:
             >>> bool(np.allclose(follower.state.q, solution.q))
             True
         """
-        inside = self._inside(q)
-        self._asked.run.state[:] = self._asked.state_at(inside)
-        self._reason, self._cycles, self._stopped = NO_FRAME, 0, False
-        self._recovery.reset(inside)
+        clipped = self._clipped(q)
+        self._inputs.run.state[:] = self._inputs.state_at(clipped)
+        self._reason, self._cycles, self._is_stopped = NO_FRAME, 0, False
+        self._recovery.reset(clipped)
 
     def branch(self, q: ArrayLike) -> None:
-        """Change the branch: the motors go to a posture, every one on its own, and follow there.
+        """Change the branch: each motor moves to a configuration, and the robot follows there.
 
-        Motions that the contacts leave free lead to this posture from now on.
-
-        A solution of the contacts of now (`Solver.solve`, `Solver.solve_all`) is what to ask for:
-        from another posture the goal moves on to them at once.
+        Free motions lead to this configuration from now on. It should be a solution of the present
+        contacts (`Solver.solve`, `Solver.solve_all`): otherwise the goal leaves it for the contacts
+        at once.
 
         Args:
-            q: (n,) [rad or m]; moved into the limits.
+            q: (n,) positions of the motors [rad or m]; clipped to the limits.
 
         Raises:
             InputError: Wrong shape or numbers.
@@ -196,14 +197,14 @@ class Follower:
             >>> follower(grasp).shape
             (14,)
         """
-        n, state, goal = self._n, self._asked.run.state, self._inside(q)
+        n, state, goal = self._n, self._inputs.run.state, self._clipped(q)
         state[2 * n : 3 * n], state[3 * n] = goal, 0.0
         self._recovery.follow()
         self._posture = goal
-        for asked in self._all_asked.values():
-            asked.lead_to(goal)
+        for inputs in self._inputs_by_kinds.values():
+            inputs.set_posture(goal)
 
-    def _inside(self, q: ArrayLike) -> Array:
+    def _clipped(self, q: ArrayLike) -> Array:
         return np.clip(self._plan.request.start(q), *self._plan.bounds)
 
     def __call__(
@@ -213,196 +214,197 @@ class Follower:
         palm: ArrayLike | Mapping[str, ArrayLike] | None = None,
         palm_weight: tuple[float, float] = (PALM_WEIGHT, PALM_WEIGHT),
     ) -> Array:
-        """One cycle.
+        """Compute one cycle.
 
         Args:
-            target: A grasp, whose contacts may be of any kind; or (f, 3) contact points [m], base
-                frame, in `robot.fingers` order, NaN marks a free finger.
-            normals: (f, 3) outward pad normals of any length, NaN marks a free one; None: all are
+            target: Grasp with contacts of any kind; or (f, 3) contact points [m], base frame, in
+                the order of `robot.fingers`, NaN for a free finger.
+            normals: (f, 3) outward pad normals of any length, NaN for a free one; None: all are
                 free.
-            palm: (4, 4) where the palm is wanted, base frame, as far as the contacts leave it
-                free; of a body by side; None: anywhere.
-            palm_weight: How much its place and its axes count, a contact counting 1.
+            palm: (4, 4) target pose of the palm, base frame, or poses by side of a multi-arm robot;
+                it counts as far as the contacts permit. None: the palm is free.
+            palm_weight: Weights of the palm's position and axes relative to a contact.
 
         Returns:
-            (n,) where the motors are to be at the end of the cycle [rad or m].
+            (n,) positions of the motors at the end of the cycle [rad or m].
 
         Raises:
-            InputError: Wrong shapes or no numbers, or a grasp the robot cannot take. Points,
-                normals and poses of a tracker that has lost the hand are not an error: the motors
-                come to rest, and `FollowState.reason` says why.
+            InputError: Wrong shapes, values that are not numeric, or a grasp of another robot.
+                Invalid points, normals and poses of a tracker that has lost the hand are not an
+                error: the motors come to rest, and `FollowState.reason` tells why.
         """
         self._cycles += 1
         poses, self._reason = self._poses(palm)
         if isinstance(target, Grasp):
-            self._ask_grasp(target, normals)
+            self._set_grasp(target, normals)
             return self._finish(self._hold() if self._reason else self._step(poses, palm_weight))
         points = self._vectors("points", target)
-        facing = None if normals is None else self._vectors("normals", normals)
-        # All coordinates of a lost hand are alike: seldom the case, and cheap to see.
+        directions = None if normals is None else self._vectors("normals", normals)
+        # All points of a lost hand coincide; this cheap test is rarely true.
         if points[0, 0] == points[-1, 0]:
             self._reason = self._reason or lost_contacts_reason(points)
         if self._reason:
             return self._finish(self._hold())
-        if self._asked.cycle.kinds != self._usual:
-            self._take_up(self._usual)
-        self._tolerances = self._own
-        self._asked.ask(points, facing)
-        after = self._step(poses, palm_weight)
-        if not self._asked.sound:
-            after = self._step_partly(points, facing, poses, palm_weight)
-        return self._finish(after)
+        if self._inputs.cycle.kinds != self._point_kinds:
+            self._switch_kinds(self._point_kinds)
+        self._tolerances = self._plan_tolerances
+        self._inputs.set_contacts(points, directions)
+        state = self._step(poses, palm_weight)
+        if not self._inputs.is_finite:
+            state = self._repeat_with_free_contacts(points, directions, poses, palm_weight)
+        return self._finish(state)
 
     def _finish(self, state: Array) -> Array:
-        """Return where the motors are after a cycle, (n,), and update the recovery."""
+        """Update the recovery after a cycle; return the positions (n,) of the motors."""
         n = self._n
         q = state[:n].copy()
         if self._reason:
             self._recovery.follow()
         else:
-            self._recovery.update(self._asked, q, state[n : 2 * n], self._stopped)
+            self._recovery.update(self._inputs, q, state[n : 2 * n], self._is_stopped)
         return q
 
     def _step(self, palms: Poses, palm_weight: tuple[float, float]) -> Array:
-        """The state after a step towards what was asked."""
-        asked = self._asked
+        """Make a step towards the target; return the new state."""
+        inputs = self._inputs
         if palms:
-            asked.ask_palms(palms, palm_weight)
-        step = self._recovery.step(asked.run.state)
+            inputs.set_palms(palms, palm_weight)
+        step = self._recovery.step(inputs.run.state)
         if self._guard is not None:
-            after, self._stopped = self._guard.step(asked, step)
+            state, self._is_stopped = self._guard.step(inputs, step)
         else:
-            after = asked.run.step() if step is None else asked.step_by(step)
+            state = inputs.run.step() if step is None else inputs.step_by(step)
         if palms:
-            asked.free_palms()
-        return after
+            inputs.clear_palms()
+        return state
 
-    def _step_partly(
+    def _repeat_with_free_contacts(
         self,
         points: Array,
         normals: Array | None,
         palms: Poses,
         palm_weight: tuple[float, float],
     ) -> Array:
-        """The same instead of the last step, with contacts of which some are free or none."""
-        asked = self._asked
-        asked.run.back()
+        """Repeat the last step with contacts of which some are free or invalid."""
+        inputs = self._inputs
+        inputs.run.back()
         free = np.full(self._shape, np.nan)
-        self._reason = asked.ask_partly(points, free if normals is None else normals)
+        self._reason = inputs.set_partial_contacts(points, free if normals is None else normals)
         if not self._reason:
-            after = self._step(palms, palm_weight)
-            if asked.sound:
-                return after
-            asked.run.back()
+            state = self._step(palms, palm_weight)
+            if inputs.is_finite:
+                return state
+            inputs.run.back()
             self._reason = "a number is out of range"
         return self._hold()
 
     def _hold(self) -> Array:
-        """Return the state after a step in which the motors come to rest."""
+        """Make a step in which the motors decelerate to rest; return the new state."""
         self._recovery.follow()
-        self._asked.ask_nothing()
-        self._go_to_rest(self._asked)
+        self._inputs.clear_target()
+        self._set_goal_at_rest(self._inputs)
         return self._step({}, (PALM_WEIGHT, PALM_WEIGHT))
 
-    def _ask_grasp(self, grasp: Grasp, normals: ArrayLike | None) -> None:
+    def _set_grasp(self, grasp: Grasp, normals: ArrayLike | None) -> None:
         if normals is not None:
-            raise InputError("normals: found beside a grasp, expected them in it")
+            raise InputError("normals: found in addition to a grasp, expected None")
         problem = self._plan.request.of_grasps([grasp], None)
         ((kinds, _, _),) = group_by_kinds(problem)
-        if kinds != self._asked.cycle.kinds:
-            self._take_up(kinds)
+        if kinds != self._inputs.cycle.kinds:
+            self._switch_kinds(kinds)
         self._tolerances = problem.tolerances
-        self._asked.ask_problem(problem)
+        self._inputs.set_target(problem)
         if self._guard is not None:
-            self._guard.surround(problem)
+            self._guard.set_target(problem)
 
-    def _go_to_rest(self, asked: FollowerInputs) -> None:
-        """Make the place where the motors can stop their goal."""
-        n, state = self._n, asked.run.state
-        state[2 * n : 3 * n] = state[:n] + stopping_way(state[n : 2 * n], self._change)
+    def _set_goal_at_rest(self, inputs: FollowerInputs) -> None:
+        """Set the goal to the positions at which the motors can stop."""
+        n, state = self._n, inputs.run.state
+        state[2 * n : 3 * n] = state[:n] + stopping_distance(state[n : 2 * n], self._change)
         state[3 * n] = 0.0
 
     def _vectors(self, name: str, value: ArrayLike) -> Array:
-        """(f, 3) numbers, NaN and infinity among them."""
+        """Return vectors (f, 3); their numbers may be NaN or infinite."""
         if type(value) is np.ndarray and value.dtype == np.float64 and value.shape == self._shape:
             return value
         try:
             array = real_array(value)
         except (TypeError, ValueError) as error:
-            raise InputError(f"{name}: expected an array of numbers: {error}") from error
+            raise InputError(f"{name}: array is not numeric: {error}") from error
         if array.shape != self._shape:
             raise InputError(f"{name}: found shape {array.shape}, expected {self._shape}")
         return array
 
     @property
     def moves_palm(self) -> bool:
-        """Whether there is an arm, so that the palm may be asked for."""
-        return bool(self._asked.cycle.palms)
+        """True if an arm moves the palm, so that it may have a target pose."""
+        return bool(self._inputs.cycle.palms)
 
     def _poses(self, palm: ArrayLike | Mapping[str, ArrayLike] | None) -> tuple[Poses, str]:
-        """Return the poses by side (of an arm with a hand by None), and what is wrong with them."""
+        """Return the poses of palms by side, and the reason why they are invalid, or ""."""
         if palm is None:
             return {}, ""
-        known = self._asked.cycle.palms
-        if not known:
-            raise InputError("palm: found a pose for a hand that stands still, expected None")
+        palms = self._inputs.cycle.palms
+        if not palms:
+            raise InputError("palm: found a pose for a palm that does not move, expected None")
         poses = palm if isinstance(palm, Mapping) else {None: palm}
         for side in poses:
-            if side not in known:
-                names = ", ".join(name for name in known if name)
+            if side not in palms:
+                names = ", ".join(name for name in palms if name)
                 expected = f"poses by side: {names}" if names else "one pose"
-                found = "one pose" if side is None else f"side {side!r}"
-                raise InputError(f"palm: found {found}, expected {expected}")
-        exact = dict[str | None, Array]()
+                actual = "one pose" if side is None else f"side {side!r}"
+                raise InputError(f"palm: found {actual}, expected {expected}")
+        checked = dict[str | None, Array]()
         for side, pose in poses.items():
             name = "palm" if side is None else f"palm.{side}"
             try:
-                exact[side] = single_pose(pose, name)
+                checked[side] = single_pose(pose, name)
             except InvalidPoseError as error:
                 return {}, str(error)
-            if (exact[side] == IDENTITY).all():
+            if (checked[side] == IDENTITY).all():
                 return {}, f"{name}: the identity, which trackers send for a lost hand"
-        return exact, ""
+        return checked, ""
 
     @property
     def state(self) -> FollowState:
         """State after the last cycle."""
-        n, asked = self._n, self._asked
-        q, moved, goal = (part.copy() for part in asked.run.state[: 3 * n].reshape(3, n))
-        free = asked.views["weights"].T == 0
+        n, inputs = self._n, self._inputs
+        q, last_step, goal = (row.copy() for row in inputs.run.state[: 3 * n].reshape(3, n))
+        is_free = inputs.views["weights"].T == 0
         names = "position_error", "angle_error", "goal_position_error", "goal_angle_error"
         errors = {
-            name: np.where(free[i % 2], np.nan, asked.record[name]) for i, name in enumerate(names)
+            name: np.where(is_free[i % 2], np.nan, inputs.record[name])
+            for i, name in enumerate(names)
         }
-        if self._stopped:
-            # What was recorded is of the step that was not made.
-            errors["position_error"], errors["angle_error"] = asked.errors(q)
-        clear = None if self._guard is None else self._guard.clearance(q)
+        if self._is_stopped:
+            # The record describes the step of the graph, which the guard has replaced.
+            errors["position_error"], errors["angle_error"] = inputs.errors(q)
+        clearances = None if self._guard is None else self._guard.clearance(q)
         return FollowState(
             status=self._status(errors),
             reason=self._reason,
             q=q,
-            velocity=moved / self.period,
+            velocity=last_step / self.period,
             goal=goal,
             **errors,
-            clearance=None if clear is None else float(clear.distance[0]),
-            closest=None if clear is None else clear.pair(0),
+            clearance=None if clearances is None else float(clearances.distance[0]),
+            closest=None if clearances is None else clearances.pair(0),
             cycles=self._cycles,
         )
 
     def _status(self, errors: dict[str, Array]) -> FollowStatus:
         if self._reason:
             return FollowStatus.HOLDING
-        if self._met(errors["position_error"], errors["angle_error"]):
+        if self._is_met(errors["position_error"], errors["angle_error"]):
             return FollowStatus.FOLLOWING
-        if self._stopped:
+        if self._is_stopped:
             return FollowStatus.BLOCKED
-        if self._met(errors["goal_position_error"], errors["goal_angle_error"]):
+        if self._is_met(errors["goal_position_error"], errors["goal_angle_error"]):
             return FollowStatus.LATE
         return FollowStatus.MISSED
 
-    def _met(self, position: Array, angle: Array) -> bool:
-        most = np.array([(one.position, one.angle) for one in self._tolerances]).T
-        slack = most * (1 + TOLERANCE_SLACK)
-        # What is free is NaN, and no miss.
-        return not ((position > slack[0]) | (angle > slack[1])).any()
+    def _is_met(self, position: Array, angle: Array) -> bool:
+        tolerances = np.array([(item.position, item.angle) for item in self._tolerances]).T
+        limits = tolerances * (1 + TOLERANCE_SLACK)
+        # Errors of free contacts are NaN, and exceed nothing.
+        return not ((position > limits[0]) | (angle > limits[1])).any()

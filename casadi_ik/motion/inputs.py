@@ -1,4 +1,4 @@
-"""What a follower keeps to all the time, and what it is asked in a cycle."""
+"""Configuration of a follower, and its inputs in a cycle."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import LENGTH, Kinds
 from casadi_ik.model.targets import TargetBatch, Tolerance
-from casadi_ik.motion.cycle import Cycle, of_side
+from casadi_ik.motion.cycle import Cycle, side_name
 from casadi_ik.motion.motion import Rates
 from casadi_ik.solve.request import Request
 from casadi_ik.solve.verdict import deviations
 
-FADING = 0.05
-"""Seconds in which an error of the contacts fades."""
+ERROR_TIME = 0.05
+"""Time constant with which an error of the contacts decays [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class FollowPlan:
-    """What a follower keeps to all the time.
+    """Configuration of a follower.
 
     Attributes:
         request: Robot and tolerances.
-        check: The scene about the robot; None: collisions are not checked.
-        compiled: Whether in compiled code.
-        q0: (n,) where the robot is [rad or m].
-        bounds: (n,) lower and upper, what is held included.
+        check: Scene of the robot; None: collisions are not checked.
+        compiled: True to use compiled code.
+        q0: (n,) initial positions of the motors [rad or m].
+        bounds: (n,) lower and upper limits; they are equal for fixed motors.
         period: Time from cycle to cycle [s].
-        rates: Limits of the motors' motion.
-        posture: (n,) where motions lead that the contacts leave free.
-        settling: Time in which they come there [s]; infinite: they do not.
-        pull: See `Cycle`.
+        rates: Limits of velocities and accelerations.
+        posture: (n,) posture to which free motions lead [rad or m].
+        settling: Time constant of free motions [s]; infinite: they stay where they are.
+        pull: Weight of the anchor, see `Cycle`.
     """
 
     request: Request
@@ -55,63 +55,62 @@ class FollowPlan:
 
     @property
     def robot(self) -> ArmHand:
-        """The robot."""
+        """Robot of the request."""
         return self.request.robot
 
     @property
-    def habits(self) -> dict[str, float]:
-        """How free motions and errors fade from cycle to cycle, as parameters of a cycle.
+    def cycle_parameters(self) -> dict[str, float]:
+        """Decay of free motions and of errors from cycle to cycle, as parameters of a cycle.
 
-        A free motion is that of a critically damped spring between the motors and their posture.
+        Free motions are those of a critically damped spring between the motors and their posture.
         """
         if math.isinf(self.settling):
-            return {"pull": self.pull, "keep": 0.0, "drift": 0.0, "patience": 0.0}
-        kept = math.exp(-self.period / self.settling)
+            return {"pull": self.pull, "momentum": 0.0, "spring": 0.0, "error_decay": 0.0}
+        decay = math.exp(-self.period / self.settling)
         return {
             "pull": self.pull,
-            "keep": kept**2,
-            "drift": (1 - kept) ** 2,
-            "patience": math.exp(-self.period / FADING),
+            "momentum": decay**2,
+            "spring": (1 - decay) ** 2,
+            "error_decay": math.exp(-self.period / ERROR_TIME),
         }
 
 
-WHOLE, PLACES = "points and normals", "points"
-"""What all fingers are asked for."""
+POINTS_AND_NORMALS, POINTS_ONLY = "points and normals", "points"
+"""Inputs of all fingers for which the weights are set already."""
 
-ANY = (1.0, 0.0, 0.0)
-"""A normal that does not count, as a unit vector all the same."""
+UNUSED_NORMAL = (1.0, 0.0, 0.0)
+"""Placeholder of a free normal: graphs divide by its length."""
 
 
 class FollowerInputs:
-    """One graph's memory, for contacts of some kinds.
+    """Graph of a cycle for contacts of given kinds, and its memory.
 
     Attributes:
-        run: The graph, step by step.
-        views: Its parameters by name; write into them.
-        record: What its last step tells, by name.
+        run: Graph that is evaluated step by step.
+        views: Its parameters by name; callers write into them.
+        record: Results of its last step by name.
     """
 
     def __init__(self, plan: FollowPlan, kinds: Kinds, obstacles: int) -> None:
-        """Compile what is not compiled yet."""
+        """Compile the graph unless it is cached."""
         self._robot = plan.robot
         self.cycle = cycle = Cycle(plan.robot.description, kinds, obstacles)
         self.run = Recurrence(FunctionKernel(cycle.graph, plan.compiled))
         self.views: dict[str, Array] = cycle.parameters.unpack(self.run.parameters)
         self.record: dict[str, Array] = cycle.record.unpack(self.run.record)
-        fastest, change = plan.rates.steps(plan.period)
+        max_step, max_change = plan.rates.steps(plan.period)
         self._fill(lower=plan.bounds[0], upper=plan.bounds[1], posture=plan.posture)
-        self._fill(fastest=fastest, change=change)
+        self._fill(max_step=max_step, max_change=max_change)
         tolerances = tuple(plan.request.tolerances.values())
-        self._usual, self._tolerances = contact_weights(tolerances), tolerance_rows(tolerances)
-        self._fill(**plan.habits)
-        self._told = self.run.record
+        self._weights, self._tolerances = contact_weights(tolerances), tolerance_rows(tolerances)
+        self._fill(**plan.cycle_parameters)
         names = "error_ratio", "goal_error_ratio"
         self._ratios = tuple(cycle.record.slice(name).start for name in names)
         self._points, self._normals = self.views["points"], self.views["normals"]
         self._mode = ""
 
     def state_at(self, q: Array) -> Array:
-        """The state of rest at a posture (n,)."""
+        """Return the state of rest at a posture (n,)."""
         rest = {item.name: np.zeros(item.shape) for item in self.cycle.state}
         return self.cycle.state.pack(rest | {"q": q, "goal": q, "locked_on": 1.0})
 
@@ -120,20 +119,21 @@ class FollowerInputs:
             self.views[name][...] = value
 
     def rows(self, count: int, values: Mapping[str, ArrayLike]) -> Array:
-        """(count, ...) parameters of cycles.
+        """Return the parameters (count, ...) of several cycles.
 
         Args:
-            count: How many.
-            values: (count, ...) by name, or one for all of them; what is left out stays as it is.
+            count: Number of cycles.
+            values: (count, ...) by name, or one value for all cycles; other parameters keep their
+                present values.
         """
-        every = np.repeat(self.run.parameters[None], count, axis=0)
+        rows = np.repeat(self.run.parameters[None], count, axis=0)
         for name, value in values.items():
-            own = every[:, self.cycle.parameters.slice(name)]
-            own[...] = np.reshape(value, (-1, own.shape[1]))
-        return every
+            columns = rows[:, self.cycle.parameters.slice(name)]
+            columns[...] = np.reshape(value, (-1, columns.shape[1]))
+        return rows
 
-    def ask(self, points: Array, normals: Array | None) -> None:
-        """Ask for points and normals that are all there; `sound` tells if they were not.
+    def set_contacts(self, points: Array, normals: Array | None) -> None:
+        """Set contacts of all fingers; after the step `is_finite` tells whether they were valid.
 
         Args:
             points: (f, 3) [m].
@@ -142,56 +142,56 @@ class FollowerInputs:
         self._points[...] = points
         if normals is not None:
             self._normals[...] = normals
-        mode = WHOLE if normals is not None else PLACES
+        mode = POINTS_AND_NORMALS if normals is not None else POINTS_ONLY
         if self._mode != mode:
-            known = np.array([1.0, mode == WHOLE])
-            self._fill(weights=known * self._usual, **self._tolerances)
+            is_set = np.array([1.0, normals is not None])
+            self._fill(weights=is_set * self._weights, **self._tolerances)
             if normals is None:
-                self._normals[...] = ANY
+                self._normals[...] = UNUSED_NORMAL
             self._mode = mode
 
     @property
-    def sound(self) -> bool:
-        """Whether what was asked in the last step were numbers and directions."""
-        return math.isfinite(self._told[-1])
+    def is_finite(self) -> bool:
+        """True if the target of the last step was finite and no normal was zero."""
+        return math.isfinite(self.run.record[-1])
 
-    def ask_partly(self, points: Array, normals: Array) -> str:
-        """Ask for points and normals of which some may be free.
+    def set_partial_contacts(self, points: Array, normals: Array) -> str:
+        """Set contacts of which some may be free.
 
         Args:
             points: (f, 3) [m]; all NaN where a finger is free.
             normals: (f, 3) of any length; all NaN where free.
 
         Returns:
-            What is wrong with them, "" if nothing is; then nothing is asked.
+            Reason why they are invalid, "" if they are valid. Invalid contacts are not set.
         """
-        reason = fault(points, normals)
+        reason = invalid_frame_reason(points, normals)
         if reason:
             return reason
         self._mode = ""
-        known = ~np.isnan(np.stack([points[:, 0], normals[:, 0]], axis=1))
-        facing = np.where(known[:, 1:], normals, ANY)
-        self._fill(points=np.nan_to_num(points), normals=facing)
-        self._fill(weights=known * self._usual, **self._tolerances)
+        is_set = ~np.isnan(np.stack([points[:, 0], normals[:, 0]], axis=1))
+        normals = np.where(is_set[:, 1:], normals, UNUSED_NORMAL)
+        self._fill(points=np.nan_to_num(points), normals=normals)
+        self._fill(weights=is_set * self._weights, **self._tolerances)
         return ""
 
-    def ask_problem(self, problem: TargetBatch) -> None:
-        """Ask for one target of the graph's kinds, checked before."""
+    def set_target(self, problem: TargetBatch) -> None:
+        """Set one target of the graph's kinds of contacts, checked before."""
         self._mode = ""
         rows = contact_rows(self.cycle, problem)
         self._fill(**{name: values[0] for name, values in rows.items()})
         self._fill(**tolerance_rows(problem.tolerances))
 
-    def ask_palms(self, poses: Mapping[str | None, Array], weight: tuple[float, float]) -> None:
-        """Ask for poses of palms (4, 4) by side, as far as contacts leave them free."""
+    def set_palms(self, poses: Mapping[str | None, Array], weight: tuple[float, float]) -> None:
+        """Set target poses (4, 4) of palms by side; they count as far as contacts permit."""
         for side, pose in poses.items():
-            asked = {"point": pose[:3, 3], "axes": pose[:3, :3], "weight": weight}
-            self._fill(**{of_side(f"palm_{name}", side): value for name, value in asked.items()})
+            values = {"point": pose[:3, 3], "axes": pose[:3, :3], "weight": weight}
+            self._fill(**{side_name(f"palm_{name}", side): value for name, value in values.items()})
 
-    def free_palms(self) -> None:
-        """Ask for no pose of a palm."""
+    def clear_palms(self) -> None:
+        """Remove the target poses of palms."""
         for side in self.cycle.palms:
-            self._fill(**{of_side("palm_weight", side): 0.0})
+            self._fill(**{side_name("palm_weight", side): 0.0})
 
     def exact_error_ratio(self, q: Array) -> float:
         """Return the largest error of the present target over its tolerance at a posture (n,)."""
@@ -200,17 +200,17 @@ class FollowerInputs:
         return float(np.nanmax(errors / np.maximum(tolerances, 1e-12)))
 
     def errors(self, q: Array) -> tuple[Array, Array]:
-        """How far a posture (n,) is off what was asked last: (f,) [m], (f,) [rad], NaN if free."""
+        """Return the errors of a posture (n,) to the target: (f,) [m], (f,) [rad], NaN if free."""
         weights = self.views["weights"]
 
-        def asked(name: str, known: Bools) -> Array:
-            return np.where(known[:, None], self.views[name], np.nan)[None]
+        def target(name: str, is_set: Bools) -> Array:
+            return np.where(is_set[:, None], self.views[name], np.nan)[None]
 
         more = {
-            f"{name}s": asked(f"{name}s", np.any(self.views[f"{name}s"], axis=1))
+            f"{name}s": target(f"{name}s", np.any(self.views[f"{name}s"], axis=1))
             for name in self.cycle.contacts.data[2:]
         }
-        points, normals = asked("points", weights[:, 0] > 0), asked("normals", weights[:, 1] > 0)
+        points, normals = target("points", weights[:, 0] > 0), target("normals", weights[:, 1] > 0)
         normals /= np.linalg.norm(normals, axis=2, keepdims=True)
         problem = TargetBatch(points, normals, Tolerance(), enforce_limits=True, extra_vectors=more)
         position, angle, _ = deviations(self._robot, problem, q[None])
@@ -219,82 +219,90 @@ class FollowerInputs:
     @property
     def error_ratio(self) -> float:
         """Largest error of the motors over its tolerance in the last step."""
-        return float(self._told[self._ratios[0]])
+        return float(self.run.record[self._ratios[0]])
 
     @property
     def goal_error_ratio(self) -> float:
         """Largest error of the goal over its tolerance in the last step."""
-        return float(self._told[self._ratios[1]])
+        return float(self.run.record[self._ratios[1]])
 
     def error_ratio_at(self, q: Array) -> float:
-        """Return the `error_ratio` of the present target at a posture (n,), but for one step."""
-        state, record = self.run.state.copy(), self._told.copy()
+        """Return the `error_ratio` of the present target after one step from a posture (n,)."""
+        state, record = self.run.state.copy(), self.run.record.copy()
         self.step_from_rest(q)
         ratio = self.error_ratio
         self.run.back()
-        self.run.state[:], self._told[:] = state, record
+        self.run.state[:], self.run.record[:] = state, record
         return ratio
 
     def step_from_rest(self, q: Array) -> Array:
-        """Make a step from rest at a posture (n,) instead of the present state; the new state."""
+        """Make a step from rest at a posture (n,) instead of the present state.
+
+        Returns:
+            New state.
+        """
         n, state = len(q), self.run.state
         state[:n], state[n : 2 * n], state[2 * n : 3 * n], state[3 * n :] = q, 0.0, q, 0.0
         return self.run.step()
 
     def step_by(self, step: Array) -> Array:
-        """Make a given step (n,) of the motors instead of one to the contacts; the new state."""
-        n, before = len(step), self.run.state.copy()
-        q = before[:n] + step
+        """Make a given step (n,) of the motors instead of one to the contacts.
+
+        Returns:
+            New state.
+        """
+        n, previous = len(step), self.run.state.copy()
+        q = previous[:n] + step
         state = self.step_from_rest(q)
         state[:n], state[n : 2 * n], state[2 * n : 3 * n], state[3 * n] = q, step, q, 0.0
-        self.run.before[:] = before
+        self.run.before[:] = previous
         return state
 
-    def lead_to(self, posture: Array) -> None:
-        """Where motions lead that the contacts leave free, (n,)."""
+    def set_posture(self, posture: Array) -> None:
+        """Set the posture (n,) to which free motions lead."""
         self._fill(posture=posture)
 
-    def ask_nothing(self) -> None:
-        """Ask for nothing: the goal stays."""
+    def clear_target(self) -> None:
+        """Remove contacts and palm poses, so that the goal stays where it is."""
         self._mode = ""
-        self._fill(points=0.0, normals=ANY, weights=0.0)
-        self.free_palms()
+        self._fill(points=0.0, normals=UNUSED_NORMAL, weights=0.0)
+        self.clear_palms()
 
 
 def contact_weights(tolerances: tuple[Tolerance, ...]) -> Array:
-    """(f, 2) how much places and facings count: as 1 / tolerance, the tightest counts 1."""
-    loose = np.array([(one.position / LENGTH, one.angle) for one in tolerances])
-    return loose.min() / loose
+    """Return the weights (f, 2) of points and normals: inverse tolerances, the largest is 1."""
+    limits = np.array([(item.position / LENGTH, item.angle) for item in tolerances])
+    return limits.min() / limits
 
 
 def tolerance_rows(tolerances: tuple[Tolerance, ...]) -> dict[str, Array]:
-    """Tolerances (f,) as the parameters of a cycle."""
+    """Return tolerances (f,) as parameters of a cycle."""
     return {
-        "position_tolerance": np.array([one.position for one in tolerances]),
-        "angle_tolerance": np.array([one.angle for one in tolerances]),
+        "position_tolerance": np.array([item.position for item in tolerances]),
+        "angle_tolerance": np.array([item.angle for item in tolerances]),
     }
 
 
 def contact_rows(cycle: Cycle, targets: TargetBatch) -> dict[str, Array]:
-    """Targets as the parameters of a cycle's contacts.
+    """Return the contacts of targets as parameters of a cycle.
 
     Args:
-        cycle: The graph.
-        targets: k targets of its kinds.
+        cycle: Graph of the cycle.
+        targets: k targets of its kinds of contacts.
 
     Returns:
-        By field (k, ...): vectors, with zeros where free, and weights.
+        (k, ...) by field: vectors, which are 0 where free, and weights.
     """
-    known = [~np.isnan(array[..., 0]) for array in (targets.points, targets.normals)]
+    is_set = [~np.isnan(array[..., 0]) for array in (targets.points, targets.normals)]
     values: dict[str, Array] = {
         f"{name}s": np.nan_to_num(targets.vectors(f"{name}s")) for name in cycle.contacts.data
     }
-    values["normals"] = np.where(known[1][..., None], values["normals"], ANY)
-    return values | {"weights": np.stack(known, axis=2) * contact_weights(targets.tolerances)}
+    values["normals"] = np.where(is_set[1][..., None], values["normals"], UNUSED_NORMAL)
+    return values | {"weights": np.stack(is_set, axis=2) * contact_weights(targets.tolerances)}
 
 
-def fault(points: Array, normals: Array) -> str:
-    """What is wrong with a frame of a stream; "": nothing.
+def invalid_frame_reason(points: Array, normals: Array) -> str:
+    """Return why a frame of a stream is invalid, "" if it is valid.
 
     Args:
         points: (f, 3), all NaN where a finger is free.
@@ -306,11 +314,11 @@ def fault(points: Array, normals: Array) -> str:
             return f"{name} are partly NaN"
         if np.isinf(array).any():
             return f"{name} are infinite"
-    free, faces = np.isnan(points[:, 0]), ~np.isnan(normals[:, 0])
-    if free.all():
+    is_free, has_normal = np.isnan(points[:, 0]), ~np.isnan(normals[:, 0])
+    if is_free.all():
         return "there is no contact"
-    if (free & faces).any():
+    if (is_free & has_normal).any():
         return "a normal has no point"
-    if not normals[faces].any(axis=1).all():
+    if not normals[has_normal].any(axis=1).all():
         return "a normal is zero"
     return ""

@@ -1,4 +1,4 @@
-"""A motion of the motors in time: how fast they may move, when they are where, and its files."""
+"""Timed motions: velocity and acceleration limits, time parametrisation, and files."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.logs.cdr import JOINT_TRAJECTORY, cdr_message, ros_channel, write_postures
 
 CROSSING = 1.0
-"""Seconds in which a motor whose velocity limit nobody states crosses its range."""
+"""Time in which a motor without a velocity limit crosses its range [s]."""
 
 RUN_UP = 0.25
-"""Seconds in which a motor comes from rest to its velocity limit, if no acceleration is given."""
+"""Time from rest to the velocity limit of a motor without an acceleration limit [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,52 +31,59 @@ class Rates:
     """Limits of the motors' motion.
 
     Attributes:
-        velocity: (n,) [rad/s or m/s].
-        acceleration: (n,) [rad/s^2 or m/s^2].
+        velocity: (n,) velocity limits [rad/s or m/s].
+        acceleration: (n,) acceleration limits [rad/s^2 or m/s^2].
     """
 
     velocity: Array
     acceleration: Array
 
     def steps(self, period: float) -> tuple[Array, Array]:
-        """Longest step of a cycle and by how much it may differ from the last, (n,) each."""
+        """Return the longest step of a cycle, and its largest change, (n,) each."""
         return self.velocity * period, self.acceleration * period**2
 
 
 def own_velocities(robot: ArmHand) -> Array:
-    """(n,) velocity limits of the description; a range in `CROSSING` where it has none."""
-    stated = np.array([actuator.velocity for actuator in robot.description.actuators])
+    """Return the velocity limits (n,) of the description, or range / `CROSSING` if it has none."""
+    limits = np.array([actuator.velocity for actuator in robot.description.actuators])
     ranges = robot.upper - robot.lower
-    return np.where(np.isfinite(stated), stated, ranges / CROSSING)
+    return np.where(np.isfinite(limits), limits, ranges / CROSSING)
 
 
 def rates_of(robot: ArmHand, velocity: Any, acceleration: Any) -> Rates:
-    """The limits that are asked for.
+    """Return the velocity and acceleration limits of a motion.
 
     Args:
-        robot: The robot.
-        velocity: (n,) or a number; None: the description's.
-        acceleration: (n,) or a number; None: the velocity limit within `RUN_UP`.
+        robot: Robot that moves.
+        velocity: Velocity limits, (n,) or a number; None: those of the description.
+        acceleration: Acceleration limits, (n,) or a number; None: those that reach the velocity
+            limit within `RUN_UP`.
 
     Raises:
-        InputError: Other than positive numbers.
+        InputError: A limit is not a positive number.
     """
-    fastest = own_velocities(robot) if velocity is None else each(robot, "velocity", velocity)
+    if velocity is None:
+        limits = own_velocities(robot)
+    else:
+        limits = positive_per_motor(robot, "velocity", velocity)
     if acceleration is None:
-        return Rates(fastest, fastest / RUN_UP)
-    return Rates(fastest, each(robot, "acceleration", acceleration))
+        return Rates(limits, limits / RUN_UP)
+    return Rates(limits, positive_per_motor(robot, "acceleration", acceleration))
 
 
 def shares(q: Array, period: float, rates: Rates) -> tuple[float, float]:
-    """The largest parts of the limits that samples take, at rest before and after.
+    """Return the largest velocity and acceleration of samples relative to the limits.
+
+    The motors are at rest before the first sample and after the last one.
 
     Args:
-        q: (m, n) where the motors are, one period after the other.
-        period: [s].
-        rates: The limits.
+        q: (m, n) positions of the motors at intervals of one period.
+        period: Time between two samples [s].
+        rates: Limits of velocities and accelerations.
 
     Returns:
-        Of the velocity, by first differences; of the acceleration, by second differences.
+        Shares of the velocity limits (first differences) and of the acceleration limits (second
+        differences).
     """
     velocity, acceleration = differences(q, period)
     return (
@@ -86,100 +93,99 @@ def shares(q: Array, period: float, rates: Rates) -> tuple[float, float]:
 
 
 def differences(q: Array, period: float) -> tuple[Array, Array]:
-    """First (m - 1, n) and second (m, n) differences of samples over time.
+    """Return the first (m - 1, n) and second (m, n) difference quotients of samples.
 
-    Before the first sample and after the last the motors move mirrored: the velocity there is zero,
-    and the second difference twice the step over the time squared.
+    The motion is mirrored at the first and the last sample: the velocity is zero there, and the
+    second difference quotient is twice the step over the squared period.
     """
     steps = np.diff(q, axis=0)
     if not len(steps):
         return steps, np.zeros_like(q)
-    around = np.concatenate([-steps[:1], steps, -steps[-1:]])
-    return steps / period, np.diff(around, axis=0) / period**2
+    mirrored = np.concatenate([-steps[:1], steps, -steps[-1:]])
+    return steps / period, np.diff(mirrored, axis=0) / period**2
 
 
-def checked(
-    name: str, value: Any, shape: tuple[int, ...], fits: Callable[[Array], Any], expected: str
+def finite_array(
+    name: str, value: Any, shape: tuple[int, ...], is_valid: Callable[[Array], Any], expected: str
 ) -> Array:
-    """Finite numbers of a shape that fit.
+    """Return a value as an array, after checks of its shape and numbers.
 
     Raises:
-        InputError: Something else; the message says what was expected.
+        InputError: The value is not finite, not valid, or of another shape.
     """
     try:
         array = np.array(value, dtype=float)
     except (TypeError, ValueError):
         array = np.zeros(0)
-    if array.shape != shape or not np.isfinite(array).all() or not np.all(fits(array)):
+    if array.shape != shape or not np.isfinite(array).all() or not np.all(is_valid(array)):
         raise InputError(f"{name}: found {value!r}, expected {expected}")
     return array
 
 
-def each(robot: ArmHand, name: str, value: Any) -> Array:
-    """One positive number per motor, see `checked`."""
+def positive_per_motor(robot: ArmHand, name: str, value: Any) -> Array:
+    """Return one positive number per motor, see `finite_array`."""
     n = len(robot.actuators)
     shape, expected = () if np.ndim(value) == 0 else (n,), f"a number > 0, or {n} of them"
-    found = checked(name, value, shape, lambda array: array > 0, expected)
-    return np.array(np.broadcast_to(found, (n,)))
+    array = finite_array(name, value, shape, lambda array: array > 0, expected)
+    return np.array(np.broadcast_to(array, (n,)))
 
 
 def seconds(name: str, value: Any) -> float:
-    """A positive number of seconds, see `checked`."""
-    return float(checked(name, value, (), lambda x: x > 0, "a number of seconds > 0"))
+    """Return a positive number of seconds, see `finite_array`."""
+    return float(finite_array(name, value, (), lambda x: x > 0, "a number of seconds > 0"))
 
 
 def length(name: str, value: Any) -> float:
-    """A number of metres >= 0, see `checked`."""
-    return float(checked(name, value, (), lambda x: x >= 0, "a number of metres >= 0"))
+    """Return a number of metres >= 0, see `finite_array`."""
+    return float(finite_array(name, value, (), lambda x: x >= 0, "a number of metres >= 0"))
 
 
-def a_direction(name: str, value: Any) -> Array:
-    """(3,) a direction, see `checked`."""
-    return checked(name, value, (3,), np.any, "three numbers, not all zero")
+def direction_vector(name: str, value: Any) -> Array:
+    """Return a direction (3,), see `finite_array`."""
+    return finite_array(name, value, (3,), np.any, "three numbers, not all zero")
 
 
 def unbounded(robot: ArmHand) -> Rates:
-    """No limits, for cycles of one second."""
-    anything = 1e6 * np.maximum(robot.upper - robot.lower, 1.0)
-    return Rates(anything, anything)
+    """Return limits that are never reached, for cycles of one second."""
+    limits = 1e6 * np.maximum(robot.upper - robot.lower, 1.0)
+    return Rates(limits, limits)
 
 
 @dataclass(frozen=True)
 class TimingTuning:
-    """Numbers of the timing of a path.
+    """Parameters of the time parametrisation of a path.
 
     Attributes:
-        shortest: A posture is left out that is nearer to the next than this part of the whole way.
-        grid: Places of a path at which its speed is found, at least.
-        spare: Part of the limits that the speed is found for: between the places it is a little
-            higher.
-        before: How far before a posture the speed is found, too, as a part of the way from the
-            place before.
+        min_segment: Postures nearer to the next than this part of the path length are omitted.
+        grid: Minimum number of grid points at which the speed is computed.
+        limit_share: Share of the limits that is used at the grid points, because the speed is
+            higher between them.
+        last_grid_offset: Distance of an additional grid point before each posture, relative to the
+            grid interval.
     """
 
-    shortest: float = 1e-6
+    min_segment: float = 1e-6
     grid: int = 200
-    spare: float = 0.99
-    before: float = 0.1
+    limit_share: float = 0.99
+    last_grid_offset: float = 0.1
 
 
 def timed(path: Array, rates: Rates, period: float) -> Array:
-    """A path from rest to rest, by TOPP-RA (Pham & Pham 2018).
+    """Return samples of a path from rest to rest, timed by TOPP-RA (Pham & Pham 2018).
 
-    The curve through the postures is cubic between each two and never leaves what lies between them
-    (Fritsch & Carlson 1980), so that it keeps to limits that the postures keep to. Its second
-    derivative is a straight line from posture to posture and leaps there: the acceleration limits
-    are asked for at both ends of every stretch between the places where the speed is found, and
-    these are before, at and between postures. What counts in the end is what is sent: where the
-    first and second differences of the samples take more than the limits, the whole is slower.
+    The curve through the postures is cubic and monotonic between each two (Fritsch & Carlson 1980),
+    so it satisfies all limits that the postures satisfy. Its second derivative is linear between
+    postures and discontinuous at them: the acceleration limits are imposed at both ends of every
+    grid interval, and there are grid points before, at and between postures. If first and second
+    differences of the samples still exceed the limits, the motion is slowed down.
 
     Args:
-        path: (k, n) postures, passed on a smooth curve.
-        rates: The limits.
+        path: (k, n) postures that the curve passes.
+        rates: Limits of velocities and accelerations.
         period: Time between two samples [s].
 
     Returns:
-        (m, n) where the motors are, one period after the other; both ends are those of the path.
+        (m, n) positions of the motors at intervals of one period, with the ends of the path.
 
     Raises:
         MissingExtraError: toppra is not installed.
@@ -198,70 +204,74 @@ def timed(path: Array, rates: Rates, period: float) -> Array:
     if not lengths.max(initial=0.0) > 1e-9:
         return path[:1]
     toppra.setup_logging("ERROR")
-    # In units of what it may take and what a motor goes in it at full acceleration: near one.
-    takes = max(lengths / rates.velocity) + math.sqrt(max(lengths / rates.acceleration))
-    unit = rates.acceleration * takes**2
-    ways = np.linalg.norm(np.diff(path / unit, axis=0), axis=1)
-    kept = path[np.append(ways > tuning.shortest * ways.sum(), True)] / unit
-    ways = np.linalg.norm(np.diff(kept, axis=0), axis=1)
-    along = np.append(0.0, np.cumsum(ways))
-    along /= along[-1]
-    slopes = PchipInterpolator(along, kept).derivative()(along)
-    fastest, strongest = (
-        tuning.spare * rates.velocity * takes / unit,
-        np.full(len(unit), tuning.spare),
-    )
+    # Scale time and positions such that all numbers are near 1.
+    duration = max(lengths / rates.velocity) + math.sqrt(max(lengths / rates.acceleration))
+    unit = rates.acceleration * duration**2
+    segment_lengths = np.linalg.norm(np.diff(path / unit, axis=0), axis=1)
+    is_long = segment_lengths > tuning.min_segment * segment_lengths.sum()
+    postures = path[np.append(is_long, True)] / unit
+    segment_lengths = np.linalg.norm(np.diff(postures, axis=0), axis=1)
+    parameters = np.append(0.0, np.cumsum(segment_lengths))
+    parameters /= parameters[-1]
+    slopes = PchipInterpolator(parameters, postures).derivative()(parameters)
+    max_velocity = tuning.limit_share * rates.velocity * duration / unit
+    max_acceleration = np.full(len(unit), tuning.limit_share)
     both_ends = constraint.DiscretizationType.Interpolation
-    asked = [
-        constraint.JointVelocityConstraint(np.stack([-fastest, fastest], axis=1)),
+    constraints = [
+        constraint.JointVelocityConstraint(np.stack([-max_velocity, max_velocity], axis=1)),
         constraint.JointAccelerationConstraint(
-            np.stack([-strongest, strongest], axis=1), discretization_scheme=both_ends
+            np.stack([-max_acceleration, max_acceleration], axis=1),
+            discretization_scheme=both_ends,
         ),
     ]
-    cuts = max(2, math.ceil(tuning.grid / (len(kept) - 1)))
-    parts = np.linspace(0.0, 1.0, cuts, endpoint=False)
-    way: Any = None
-    # The short stretches before postures are sometimes too short for its linear programs.
-    for some in (np.append(parts, 1.0 - tuning.before / cuts), parts):
-        grid = np.append((along[:-1, None] + np.diff(along)[:, None] * some).ravel(), 1.0)
-        way = algorithm.TOPPRA(
-            asked,
-            SimplePath(along, kept, slopes),
+    intervals = max(2, math.ceil(tuning.grid / (len(postures) - 1)))
+    regular = np.linspace(0.0, 1.0, intervals, endpoint=False)
+    trajectory: Any = None
+    # The interval before a posture is sometimes too short for the linear programs of TOPP-RA.
+    for shares_of_segment in (
+        np.append(regular, 1.0 - tuning.last_grid_offset / intervals),
+        regular,
+    ):
+        points = parameters[:-1, None] + np.diff(parameters)[:, None] * shares_of_segment
+        grid = np.append(points.ravel(), 1.0)
+        trajectory = algorithm.TOPPRA(
+            constraints,
+            SimplePath(parameters, postures, slopes),
             gridpoints=grid,
             parametrizer="ParametrizeConstAccel",
         ).compute_trajectory()
-        if way is not None:
+        if trajectory is not None:
             break
-    assert way is not None
-    count = cycle_count(takes * way.duration, period, "period")
+    assert trajectory is not None
+    count = cycle_count(duration * trajectory.duration, period, "period")
     while True:
-        q = unit * way(np.linspace(0.0, way.duration, count + 1))
-        q = np.clip(q, path.min(axis=0), path.max(axis=0))  # of rounding
+        q = unit * trajectory(np.linspace(0.0, trajectory.duration, count + 1))
+        q = np.clip(q, path.min(axis=0), path.max(axis=0))  # remove rounding errors
         q[0], q[-1] = path[0], path[-1]
         velocity, acceleration = shares(q, period, rates)
-        over = max(velocity, math.sqrt(acceleration))
-        if over <= 1.0:
+        slowdown = max(velocity, math.sqrt(acceleration))
+        if slowdown <= 1.0:
             return q
-        count = max(count + 1, cycle_count(count * over * period, period, "period"))
+        count = max(count + 1, cycle_count(count * slowdown * period, period, "period"))
 
 
 SUFFIXES = (".npz", ".csv", ".mcap")
-"""Kinds of files."""
+"""Suffixes of the file formats of a motion."""
 
 BILLION = 1_000_000_000
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A timed motion: motor positions at k times.
+    """Timed motion: motor positions at k times.
 
     Attributes:
-        robot: The robot.
-        times: (k,) from the start [s].
-        q: (k, n) [rad or m].
-        velocity: (k, n) [rad/s or m/s].
-        acceleration: (k, n) [rad/s^2 or m/s^2].
-        notes: More that belongs to the times, (k, ...) by name; in npz files only.
+        robot: Robot that moves.
+        times: (k,) times from the start [s].
+        q: (k, n) positions [rad or m].
+        velocity: (k, n) velocities [rad/s or m/s].
+        acceleration: (k, n) accelerations [rad/s^2 or m/s^2].
+        notes: Additional arrays (k, ...) by name; only npz files contain them.
 
     Example:
         >>> times, q = np.array([0.0, 0.1]), np.stack([robot.home, robot.home])
@@ -283,13 +293,13 @@ class Motion:
     def of_cycles(
         cls, robot: ArmHand, period: float, q: Array, notes: dict[str, np.ndarray]
     ) -> Motion:
-        """What a follower returned cycle by cycle.
+        """Return the motion of a follower.
 
         Args:
-            robot: The robot.
-            period: Time of a cycle [s].
-            q: (k + 1, n) where the robot was at rest first, then the answers.
-            notes: (k + 1, ...) by name.
+            robot: Robot that moves.
+            period: Time from cycle to cycle [s].
+            q: (k + 1, n) configuration at rest, then the configurations after the cycles.
+            notes: (k + 1, ...) arrays by name.
         """
         velocity = np.diff(q, axis=0, prepend=q[:1]) / period
         acceleration = np.diff(velocity, axis=0, prepend=velocity[:1]) / period
@@ -300,13 +310,13 @@ class Motion:
     def of_samples(
         cls, robot: ArmHand, period: float, q: Array, notes: dict[str, np.ndarray]
     ) -> Motion:
-        """A motion from rest to rest, by samples: rates are their central differences.
+        """Return a motion from rest to rest; its velocities are central differences of samples.
 
         Args:
-            robot: The robot.
+            robot: Robot that moves.
             period: Time from sample to sample [s].
-            q: (k, n) where the motors are.
-            notes: (k, ...) by name.
+            q: (k, n) positions of the motors.
+            notes: (k, ...) arrays by name.
         """
         steps, acceleration = differences(q, period)
         velocity = np.zeros_like(q)
@@ -315,27 +325,27 @@ class Motion:
         return cls(robot, times, q, velocity, acceleration, notes)
 
     def write(self, path: str | Path) -> None:
-        """Write a file; its kind follows from the suffix.
+        """Write a file in the format of its suffix.
 
-        ``.npz``: `times`, `q`, `velocity`, `acceleration`, `actuators` and the notes. ``.csv``:
-        time, then positions, velocities and accelerations by actuator. ``.mcap``: for ROS 2 and
-        viewers, the whole as ``trajectory_msgs/JointTrajectory`` on ``/joint_trajectory``, every
-        time as ``sensor_msgs/JointState`` of all joints, and the robot as URDF.
+        ``.npz`` has `times`, `q`, `velocity`, `acceleration`, `actuators` and the notes. ``.csv``
+        has the time, then positions, velocities and accelerations by actuator. ``.mcap`` is for
+        ROS 2 and viewers: ``trajectory_msgs/JointTrajectory`` on ``/joint_trajectory``,
+        ``sensor_msgs/JointState`` of all joints at every time, and the robot as URDF.
 
         Args:
-            path: The file; it is there when it is complete.
+            path: File path; the file appears once it is complete.
 
         Raises:
-            InputError: Another suffix.
-            OSError: It cannot be written.
+            InputError: The suffix is unknown.
+            OSError: The file cannot be written.
         """
-        with atomic_write(Path(path)) as part:
-            self.write_to(part)
+        with atomic_write(Path(path)) as temporary:
+            self.write_to(temporary)
 
     def write_to(self, path: Path) -> None:
-        """Write a file that is not there yet, as `write` does but in its place."""
-        every = self._npz, self._csv, self._mcap
-        writers: dict[str, Callable[[Path], None]] = dict(zip(SUFFIXES, every, strict=True))
+        """Write a new file without a temporary one, see `write`."""
+        methods = self._npz, self._csv, self._mcap
+        writers: dict[str, Callable[[Path], None]] = dict(zip(SUFFIXES, methods, strict=True))
         write = writers.get(path.suffix.lower())
         if write is None:
             expected = ", ".join(SUFFIXES)
@@ -356,8 +366,8 @@ class Motion:
 
     def _csv(self, path: Path) -> None:
         names = [
-            f"{name}{what}"
-            for what in ("", ".velocity", ".acceleration")
+            f"{name}{suffix}"
+            for suffix in ("", ".velocity", ".acceleration")
             for name in self.robot.actuators
         ]
         rows = np.hstack([self.times[:, None], self.q, self.velocity, self.acceleration])
@@ -374,13 +384,13 @@ class Motion:
             writer.finish()
 
     def _messages(self, writer: Writer) -> None:
-        robot, none = self.robot, np.zeros(0)
+        robot, no_efforts = self.robot, np.zeros(0)
         root, stamps = robot.description.root, np.rint(self.times * BILLION).astype(np.int64)
         points: list[str | list[str] | Array | tuple[int, int] | int] = []
         rows = zip(stamps.tolist(), self.q, self.velocity, self.acceleration, strict=True)
         for stamp, *values in rows:
-            points += [*values, none, divmod(stamp, BILLION)]
-        whole = cdr_message((0, 0), root, list(robot.actuators), len(self), *points)
+            points += [*values, no_efforts, divmod(stamp, BILLION)]
+        trajectory = cdr_message((0, 0), root, list(robot.actuators), len(self), *points)
         channel = ros_channel(writer, "/joint_trajectory", JOINT_TRAJECTORY)
-        writer.add_message(channel, 0, whole, 0)
+        writer.add_message(channel, 0, trajectory, 0)
         write_postures(writer, robot, self.q, stamps.tolist())

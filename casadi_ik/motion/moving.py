@@ -1,4 +1,4 @@
-"""What a solver does with a robot that moves: the part of `Solver` that is about motion."""
+"""Motion methods of `Solver`: following, tracking, reaching, placing and moving."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from casadi_ik.model.targets import TargetBatch
 from casadi_ik.motion.approach import Approach, ApproachPlan, approach
 from casadi_ik.motion.follower import Follower
 from casadi_ik.motion.inputs import FollowPlan
-from casadi_ik.motion.motion import a_direction, length, rates_of, seconds, unbounded
-from casadi_ik.motion.reach import Carried, Pace, Reach, WayPlan, move, place, reach
+from casadi_ik.motion.motion import direction_vector, length, rates_of, seconds, unbounded
+from casadi_ik.motion.reach import CarriedObject, Pace, Reach, ReachPlan, move, place, reach
 from casadi_ik.motion.track import PathTracker, Track, track
 from casadi_ik.solve.engine import Engine, SolveOptions
 from casadi_ik.solve.request import Request
@@ -30,21 +30,24 @@ from casadi_ik.solve.solution import Chosen
 from casadi_ik.solve.verdict import LIMIT_SLACK, judge
 
 SETTLING = 0.1
-"""Seconds in which motions that contacts leave free come to their posture."""
+"""Default time constant of free motions towards their posture [s]."""
 
 FOLLOWING_PULL = 0.1
-"""Weight of momentum in a stream. Of 16 random smooth paths of kuka_lwr_barrett at half the
-velocity limits, 1e-3 missed a part of three, this of one (3.6 % of the cycles)."""
+"""Weight of the anchor of a follower.
+
+Source: of 16 random smooth paths of kuka_lwr_barrett at half the velocity limits, a follower with
+1e-3 misses a part of three, with 0.1 of one (3.6 % of the cycles).
+"""
 
 PATH_PULL = 1e-5
-"""Weight of the posture before along a path, where steps are as large as they have to be."""
+"""Weight of the anchor along a known path, where steps may be large."""
 
 
 class MovingSolver:
-    """The motions of a solver.
+    """Motion methods of a solver.
 
     Attributes:
-        robot: The robot.
+        robot: Robot that moves.
     """
 
     robot: ArmHand
@@ -60,20 +63,20 @@ class MovingSolver:
         posture: ArrayLike | None = None,
         settling: float = SETTLING,
     ) -> Follower:
-        """Follow targets that move, one call a cycle: see `Follower`.
+        """Return a follower of moving targets, which is called once per cycle.
 
         Args:
-            q0: (n,) where the robot is, at rest [rad or m]; None: at home.
+            q0: (n,) positions of the motors at rest [rad or m]; None: home.
             period: Time from cycle to cycle [s].
-            velocity: Limits of the motors, (n,) or a number [rad/s or m/s]; None: the
-                description's, and a range in a second where it has none.
-            acceleration: Limits, (n,) or a number [rad/s^2 or m/s^2]; None: from rest to the
-                velocity limit in a quarter of a second.
-            posture: (n,) where motions lead that the contacts leave free; None: q0.
-            settling: In what time they come there [s].
+            velocity: Velocity limits of the motors, (n,) or a number [rad/s or m/s]; None: those of
+                the description, or the range of a motor in one second if it has none.
+            acceleration: Acceleration limits, (n,) or a number [rad/s^2 or m/s^2]; None: those that
+                reach the velocity limit from rest in a quarter of a second.
+            posture: (n,) posture to which free motions lead; None: q0.
+            settling: Time constant of free motions [s].
 
         Raises:
-            InputError: Bad numbers.
+            InputError: A value is out of range.
 
         Example:
             >>> follower = solver.follow(q0=solution.q, period=0.001)
@@ -82,7 +85,7 @@ class MovingSolver:
         """
         start = self._request.start(q0)
         rates = rates_of(self.robot, velocity, acceleration)
-        comfortable = start if posture is None else self._request.start(posture, "posture")
+        free_posture = start if posture is None else self._request.start(posture, "posture")
         return Follower(
             FollowPlan(
                 self._request,
@@ -92,7 +95,7 @@ class MovingSolver:
                 self._bounds(None),
                 seconds("period", period),
                 rates,
-                comfortable,
+                free_posture,
                 seconds("settling", settling),
                 FOLLOWING_PULL,
             )
@@ -107,24 +110,26 @@ class MovingSolver:
         seed: int = 0,
         fixed: Mapping[str, float] | None = None,
     ) -> Track:
-        """Follow a path of grasps that is known: every solution continues the one before.
+        """Track a known path of grasps: every solution continues the previous one.
 
-        The motion begins with the solution of the first grasp from which the others are reached
-        without a jump between branches; a jump that cannot be avoided is reported. Where the
-        solver has a scene, the motion stops short of what is in its way.
+        The motion begins at the solution of the first grasp from which the others are reached
+        without a jump between branches; jumps that cannot be avoided are reported. With a scene the
+        motion stops before obstacles.
 
         Args:
-            grasps: In order; the tolerances are those of the first.
-            q0: (n,) where the robot is [rad or m]: the motion begins near it. None: it begins far
-                from the limits.
-            period: Time from one grasp to the next [s]; then the motors' velocity limits are kept,
-                and a grasp that moves too fast is followed as well as they allow.
-            velocity: Other velocity limits, (n,) or a number [rad/s or m/s].
-            seed: As for `solve`.
-            fixed: As for `solve`.
+            grasps: Grasps in order; the tolerances are those of the first.
+            q0: (n,) positions of the motors near which the motion begins [rad or m]; None: it
+                begins far from the limits.
+            period: Time from one grasp to the next [s]. With a period the velocity limits are kept,
+                and grasps that move too fast are tracked as well as the limits permit.
+            velocity: Velocity limits in place of those of the description, (n,) or a number [rad/s
+                or m/s].
+            seed: See `solve`.
+            fixed: See `solve`.
 
         Raises:
-            InputError: No grasp, bad q0, period or velocity, or a grasp the robot cannot take.
+            InputError: There are no grasps, a value is out of range, or a grasp does not fit the
+                robot.
             UnsupportedError: The method is not hand-first.
 
         Example:
@@ -135,10 +140,10 @@ class MovingSolver:
             ((3, 14), True, ())
         """
         if not grasps:
-            raise InputError("grasps: found none, expected at least one")
+            raise InputError("grasps: found 0 grasps, expected at least one")
         if period is None and velocity is not None:
-            raise InputError("velocity: given without a period, expected both")
-        # A palm that is given counts as the contacts that it leads to.
+            raise InputError("velocity: period is missing, expected both or none")
+        # Palm poses are tracked by the contacts that follow from them.
         targets = replace(self._request.of_grasps(grasps, fixed), palms=None)
         if targets.fixed is not None and targets.fixed.ndim > 1:
             targets = replace(targets, fixed=self._request.fixed_vector(fixed))
@@ -167,37 +172,36 @@ class MovingSolver:
         lift: float = 0.0,
         retreat: float = 0.0,
     ) -> Reach:
-        """The way from where the robot is to a grasp, in time.
+        """Plan a timed motion from a configuration to a grasp.
 
-        It goes to a pre-grasp, where the hand is open; comes straight; and closes. Of a grasp
-        solutions are tried, nearest first, until there is a way to one; of what `choose` answers
-        (``ranked[0]``) it is that very posture or none. With a scene all of it is checked, between
-        its points too: the straight way there if it is free, else one by OMPL; fingers touch the
-        object only while they close. With `lift` or `retreat` it goes on: the object moves with
-        the palm then, and is compared with the scene by points of its surface.
+        The robot moves to a pre-grasp with an open hand, approaches straight, and closes the hand.
+        Solutions of a grasp are tried, nearest first, until one can be reached; for a result of
+        `choose` (``ranked[0]``) only its own configuration is tried. With a scene the motion is
+        checked, also between its samples: the path to the pre-grasp is straight if that is free,
+        otherwise OMPL plans it; fingers touch the object only while they close. With `lift` or
+        `retreat` the motion continues: the object moves with the palm, and points of its surface
+        are checked against the scene.
 
         Args:
-            grasp: A contact per finger, or an answer of `choose`.
-            q0: (n,) where the robot is, at rest [rad or m]; None: at home.
-            opening: How far the fingertips are from their contacts before they close [m].
-            distance: How far the hand comes straight [m].
-            velocity: As for `follow`.
-            acceleration: As for `follow`.
+            grasp: Grasp with a contact per finger, or a result of `choose`.
+            q0: (n,) positions of the motors at rest [rad or m]; None: home.
+            opening: Distance of the fingertips from their contacts before they close [m].
+            distance: Length of the straight approach [m].
+            velocity: See `follow`.
+            acceleration: See `follow`.
             period: Time between two samples of the motion [s].
-            seed: Of starts and of a planner.
-            limit: Solutions that are tried at most.
-            direction: (3,) the way the hand comes, base frame: ``[0, 0, -1]`` from above. None:
-                from where the grasp has its palm before it, if it says (`Grasp.pregrasp`), else
-                along the line from the palm to the contacts; where that cannot be gone, from above,
-                between both, or leaning to a side.
-            lift: How far the hand goes straight up, along z of the base, after it closed [m].
-            retreat: How far it goes back then, against the way it came [m].
+            seed: Seed of the solver and of the path planner.
+            limit: Maximum number of solutions that are tried.
+            direction: (3,) direction of the approach, base frame: ``[0, 0, -1]`` is from above.
+                None: from the pre-grasp of the grasp (`Grasp.pregrasp`), or else from the palm to
+                the contacts; if that is blocked, from above, between both, or tilted to a side.
+            lift: Height by which the hand is lifted along z of the base after closing [m].
+            retreat: Length of the retreat along the reverse approach after that [m].
 
         Raises:
-            InputError: Bad numbers, or a grasp the robot cannot take.
+            InputError: A value is out of range, or the grasp does not fit the robot.
             MissingExtraError: toppra is not installed (extra `motion`).
-            UnsupportedError: The method is not hand-first, or a hand that no arm moves is to be
-                lifted.
+            UnsupportedError: The method is not hand-first, or no arm can lift the hand.
 
         Example:
             >>> found = solver.reach(grasp, q0=robot.home)
@@ -209,15 +213,16 @@ class MovingSolver:
             True
         """
         start = self._request.start(q0)
-        onward = length("lift", lift), length("retreat", retreat)
-        if any(onward) and not (
+        lengths = length("lift", lift), length("retreat", retreat)
+        if any(lengths) and not (
             self.robot.description.arm_actuators or self.robot.description.sides
         ):
             raise UnsupportedError(f"lift: {self.robot.name!r} has no arm that moves its palm")
         pace = self._pace(velocity, acceleration, period)
-        last = self._last_part(grasp, start, opening, distance, direction)
-        asked = WayPlan(last, pace, seed, np.clip(start, *last.plan.bounds))
-        return reach(asked, *self._solutions(grasp, last.problem, start, seed, limit), *onward)
+        approach_plan = self._approach_plan(grasp, start, opening, distance, direction)
+        plan = ReachPlan(approach_plan, pace, seed, np.clip(start, *approach_plan.plan.bounds))
+        solutions = self._solutions(grasp, approach_plan.problem, start, seed, limit)
+        return reach(plan, *solutions, *lengths)
 
     def place(
         self,
@@ -234,36 +239,36 @@ class MovingSolver:
         limit: int = 4,
         direction: ArrayLike | None = None,
     ) -> Reach:
-        """The way from where the hand holds an object to where it stands elsewhere, in time.
+        """Plan a timed motion that places the object in the hand at a pose.
 
-        The object is carried over its place, straight or around what is in the way; comes straight
-        down; the hand opens, and goes straight back. With a scene all of it is checked, the object
-        with the scene while it is carried, hand and object afterwards.
+        The object is carried above the pose, straight or around obstacles, and lowered straight;
+        the hand opens and retreats straight. With a scene the motion is checked: the object against
+        the scene while it is carried, the hand against both afterwards.
 
         Args:
-            held: What was reached: an answer of `choose` or `grasps_of`, whose grasp says where its
-                object is.
-            pose: (4, 4) where the object is to stand, base frame.
-            q0: (n,) where the robot is, at rest: at the end of `reach`, say [rad or m].
-            lower: From how far above the object comes straight down [m].
-            opening: How far the fingertips are from their contacts before the hand goes [m].
-            distance: How far it goes straight [m].
-            velocity: As for `follow`.
-            acceleration: As for `follow`.
+            held: Grasp that the hand holds: a result of `choose` or `grasps_of` whose grasp has an
+                object pose.
+            pose: (4, 4) target pose of the object, base frame.
+            q0: (n,) positions of the motors at rest, for example the end of `reach` [rad or m].
+            lower: Height from which the object is lowered straight [m].
+            opening: Distance of the fingertips from their contacts before the hand retreats [m].
+            distance: Length of the straight retreat [m].
+            velocity: See `follow`.
+            acceleration: See `follow`.
             period: Time between two samples of the motion [s].
-            seed: Of starts and of a planner.
-            limit: Postures that are tried at most.
-            direction: (3,) against which the hand goes, as for `reach`.
+            seed: Seed of the solver and of the path planner.
+            limit: Maximum number of solutions that are tried.
+            direction: (3,) reverse direction of the retreat, see `reach`.
 
         Returns:
-            A `Reach` whose parts are "carrying", "lowering", "opening" and "leaving"; its `q` is
-            where the object stands and the hand has not opened yet.
+            Motion with the parts "carrying", "lowering", "opening" and "leaving"; its `q` is the
+            configuration at the target pose before the hand opens.
 
         Raises:
-            InputError: Bad numbers, or a grasp that does not say where its object is.
+            InputError: A value is out of range, or the grasp has no object pose.
             MissingExtraError: toppra is not installed (extra `motion`).
-            UnsupportedError: The method is not hand-first, no arm moves the palm, or the robot is a
-                body.
+            UnsupportedError: The method is not hand-first, no arm moves the palm, or the robot has
+                several arms.
 
         Example:
             >>> best = solver.choose([grasp])[0]
@@ -277,30 +282,30 @@ class MovingSolver:
         chosen = getattr(held, "grasp", None)
         if not isinstance(chosen, Grasp) or not hasattr(held, "q"):
             raise InputError(
-                f"held: found {type(held).__name__}, expected an answer with its grasp and its q,"
-                " as choose and grasps_of return them"
+                f"held: found {type(held).__name__}, expected a result of choose or grasps_of with"
+                " grasp and q"
             )
         start, target = self._request.start(q0), single_pose(pose)
         if chosen.known_pose is None:
-            raise InputError("held: found a grasp without a known object_pose, expected one")
+            raise InputError("held: object_pose of the grasp is missing, expected a pose")
         self.robot.description.require_single_hand("place")
         if not self.robot.description.arm_actuators:
             raise UnsupportedError(f"place: {self.robot.name!r} has no arm that moves its palm")
-        moved = target @ inverse(chosen.known_pose)
+        motion = target @ inverse(chosen.known_pose)
         q = self._request.start(held.q, "q")
         motors = self.robot.description.finger_motors
         hand = {name: float(q[self.robot.actuators.index(name)]) for name in motors}
-        palm = Grasp(robot=chosen.robot, palm=moved @ self.robot.palm(q), posture=hand)
-        there = replace(chosen.at(moved), pregrasp=None)
-        last = self._last_part(there, start, opening, distance, direction)
+        palm = Grasp(robot=chosen.robot, palm=motion @ self.robot.palm(q), posture=hand)
+        placed = replace(chosen.at(motion), pregrasp=None)
+        approach_plan = self._approach_plan(placed, start, opening, distance, direction)
         carried = None
         if self._engine.check is not None:
-            carried = Carried(self._engine.check, self._request.of_grasps([chosen], None), q)
-        pace, above = self._pace(velocity, acceleration, period), length("lower", lower)
-        asked = WayPlan(last, pace, seed, np.clip(start, *last.plan.bounds))
+            carried = CarriedObject(self._engine.check, self._request.of_grasps([chosen], None), q)
+        pace, height = self._pace(velocity, acceleration, period), length("lower", lower)
+        plan = ReachPlan(approach_plan, pace, seed, np.clip(start, *approach_plan.plan.bounds))
         problem = self._request.of_grasps([palm], None)
         solutions = self._solutions(palm, problem, start, seed, limit)
-        return place(asked, *solutions, carried, above)
+        return place(plan, *solutions, carried, height)
 
     def move(
         self,
@@ -311,25 +316,25 @@ class MovingSolver:
         period: float = 0.01,
         seed: int = 0,
     ) -> Reach:
-        """The way from one posture to another, in time: straight, or around what is in the way.
+        """Plan a timed motion from rest to rest between two configurations.
 
-        From rest to rest. With a scene it is free, between its points too; no finger may touch
-        what the scene calls grasped. Where the straight way (in motors) is not free, OMPL looks
-        for another.
+        With a scene the motion is free of collisions, also between its samples; no finger may touch
+        the grasped object of the scene. Where the straight line of the motors is not free, OMPL
+        plans another path.
 
         Args:
-            q0: (n,) where the robot is [rad or m].
-            q1: (n,) where it is to be.
-            velocity: As for `follow`.
-            acceleration: As for `follow`.
+            q0: (n,) first configuration [rad or m].
+            q1: (n,) last configuration [rad or m].
+            velocity: See `follow`.
+            acceleration: See `follow`.
             period: Time between two samples of the motion [s].
-            seed: Of a planner.
+            seed: Seed of the path planner.
 
         Returns:
-            A `Reach` of one part, "going"; NO_WAY if none was found.
+            Motion with the part "going"; its status is NO_WAY if there is no path.
 
         Raises:
-            InputError: Bad numbers, or a posture beyond limits.
+            InputError: A value is out of range, or a configuration exceeds limits.
             MissingExtraError: toppra is not installed (extra `motion`).
 
         Example:
@@ -340,9 +345,9 @@ class MovingSolver:
         ends = self._request.start(q0), self._request.start(q1, "q1")
         lower, upper = self._bounds(None)
         for name, q in zip(("q0", "q1"), ends, strict=True):
-            off = np.maximum(lower - q, q - upper)
-            i = int(off.argmax())
-            if not off[i] <= LIMIT_SLACK:
+            excess = np.maximum(lower - q, q - upper)
+            i = int(excess.argmax())
+            if not excess[i] <= LIMIT_SLACK:
                 raise InputError(
                     f"{name}: found {self.robot.actuators[i]} at {q[i]:g}, expected a number from "
                     f"{lower[i]:g} to {upper[i]:g}"
@@ -350,7 +355,9 @@ class MovingSolver:
         pace = self._pace(velocity, acceleration, period)
         query, check = None, self._engine.check
         if check is not None:
-            query = check.collision_query(self._anything(np.nan)).rows(np.zeros(1, dtype=np.intp))
+            query = check.collision_query(self._placeholder_target(np.nan)).rows(
+                np.zeros(1, dtype=np.intp)
+            )
         return move(self.robot, ends, query, pace, seed)
 
     def approach(
@@ -363,23 +370,24 @@ class MovingSolver:
         limit: int = 8,
         direction: ArrayLike | None = None,
     ) -> Approach:
-        """The last part of the way to a grasp: a pre-grasp, straight on, closing.
+        """Plan the straight approach to a grasp, from a pre-grasp to the closed hand.
 
-        The hand is open at the pre-grasp and comes straight. Solutions of the grasp are tried,
-        nearest to q0 first; of what `choose` answers it is that very posture. With a scene all of
-        it is checked, between its points too; fingers touch the object only while they close.
+        The hand is open at the pre-grasp and moves straight. Solutions of the grasp are tried,
+        nearest to q0 first; for a result of `choose` only its own configuration is tried. With a
+        scene the approach is checked, also between its postures; fingers touch the object only
+        while they close.
 
         Args:
-            grasp: As for `reach`.
-            distance: How far the hand comes straight [m].
-            opening: How far the fingertips are from their contacts before they close [m].
-            q0: (n,) where the robot is [rad or m]; None: at home.
-            seed: Of starts.
-            limit: Solutions that are tried at most.
-            direction: As for `reach`.
+            grasp: See `reach`.
+            distance: Length of the straight motion [m].
+            opening: Distance of the fingertips from their contacts before they close [m].
+            q0: (n,) positions of the motors [rad or m]; None: home.
+            seed: Seed of the solver.
+            limit: Maximum number of solutions that are tried.
+            direction: See `reach`.
 
         Raises:
-            InputError: Bad numbers, or a grasp the robot cannot take.
+            InputError: A value is out of range, or the grasp does not fit the robot.
             UnsupportedError: The method is not hand-first.
 
         Example:
@@ -388,15 +396,15 @@ class MovingSolver:
             (True, (14,))
         """
         start = self._request.start(q0)
-        last = self._last_part(grasp, start, opening, distance, direction)
-        return approach(last, *self._solutions(grasp, last.problem, start, seed, limit))
+        plan = self._approach_plan(grasp, start, opening, distance, direction)
+        return approach(plan, *self._solutions(grasp, plan.problem, start, seed, limit))
 
     def _pace(
         self, velocity: ArrayLike | None, acceleration: ArrayLike | None, period: float
     ) -> Pace:
         return Pace(rates_of(self.robot, velocity, acceleration), seconds("period", period))
 
-    def _last_part(
+    def _approach_plan(
         self,
         grasp: Grasp | Chosen,
         start: Array,
@@ -404,41 +412,44 @@ class MovingSolver:
         distance: float,
         direction: ArrayLike | None,
     ) -> ApproachPlan:
-        """What the last part of the way to a grasp keeps to."""
-        asked: Any = grasp if isinstance(grasp, Grasp) else getattr(grasp, "grasp", grasp)
-        problem = self._request.of_grasps([asked], None)
-        before = asked.pregrasp and asked.pregrasp.single_palm
+        """Return the requirements of the approach to a grasp."""
+        target: Any = grasp if isinstance(grasp, Grasp) else getattr(grasp, "grasp", grasp)
+        problem = self._request.of_grasps([target], None)
+        pregrasp_palm = target.pregrasp and target.pregrasp.single_palm
         return ApproachPlan(
             self._path_plan(start),
             problem,
             length("opening", opening),
             length("distance", distance),
-            None if direction is None else a_direction("direction", direction),
-            None if before is None else before[:3, 3],
+            None if direction is None else direction_vector("direction", direction),
+            None if pregrasp_palm is None else pregrasp_palm[:3, 3],
         )
 
     def _solutions(
         self, grasp: Grasp | Chosen, problem: TargetBatch, start: Array, seed: int, limit: int
     ) -> tuple[list[Array], str]:
-        """Solutions (n,) of a grasp, nearest first, or that which was chosen; why there is none."""
+        """Return the solutions (n,) of a grasp, nearest first, and the reason if there are none.
+
+        A result of `choose` has only its own configuration.
+        """
         if not isinstance(grasp, Grasp):
             q = self._request.start(grasp.q, "q")
             verdict = judge(self.robot, problem, q[None])
             if verdict.solved(problem.enforce_limits)[0]:
                 return [q], ""
-            off = f"{1e3 * np.nanmax(verdict.position_error):.3g} mm"
-            return [], f"the posture that was chosen does not take its grasp ({off} off, or limits)"
+            error = f"{1e3 * np.nanmax(verdict.position_error):.3g} mm"
+            return [], f"q of the chosen grasp is not a solution (error {error}, or limits)"
         engine = self._engine.engine_for(problem)
-        found = engine.finder.find(
+        alternatives = engine.finder.find(
             problem, start, seed, limit, "q0", apart=0.05, query=engine.collision_query(problem)
         )
-        # A solve looks further for an answer that is free than a list of all does.
+        # A solve searches longer for a collision-free solution than the list of alternatives.
         best = engine.solve(replace(problem, prefer="q0"), SolveOptions(start, seed))
-        every = [*best.q[best.success], *(one.q for one in found)][:limit]
-        return every, "" if every else "the grasp has no solution"
+        solutions = [*best.q[best.success], *(item.q for item in alternatives)][:limit]
+        return solutions, "" if solutions else "the grasp has no solution"
 
     def _path_plan(self, q0: Array, targets: TargetBatch | None = None) -> FollowPlan:
-        """Paths are gone along at any speed."""
+        """Return the configuration of the graph for paths, without limits of velocities."""
         bounds, rates = self._bounds(targets), unbounded(self.robot)
         check, compiled = self._engine.check, self._engine.compiled
         return FollowPlan(
@@ -446,9 +457,9 @@ class MovingSolver:
         )
 
     def _bounds(self, targets: TargetBatch | None) -> tuple[Array, Array]:
-        """Return the (n,) limits of motions, see `RobotDescription.motion_limits`."""
+        """Return the (n,) lower and upper limits of motions, see `RobotDescription.motion_limits`."""
         if targets is None:
-            targets = self._anything(0.0)
+            targets = self._placeholder_target(0.0)
         robot = self.robot.description
         lower, upper = targets.bounds(robot)
         endless = robot.continuous & (lower < upper)
@@ -456,8 +467,8 @@ class MovingSolver:
             endless, robot.motion_limits[1], upper
         )
 
-    def _anything(self, place: float) -> TargetBatch:
-        """A target with all contacts at a place, or none if that is NaN."""
-        anywhere = np.zeros((1, len(self.robot.fingers), 3))
-        found = self._request.of_arrays(anywhere, anywhere + 1.0, None)
-        return replace(found, points=anywhere + place)
+    def _placeholder_target(self, coordinate: float) -> TargetBatch:
+        """Return a target with equal coordinates of all contacts; NaN frees them."""
+        zeros = np.zeros((1, len(self.robot.fingers), 3))
+        target = self._request.of_arrays(zeros, zeros + 1.0, None)
+        return replace(target, points=zeros + coordinate)

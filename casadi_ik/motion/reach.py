@@ -1,7 +1,7 @@
-"""From where a robot is to a grasp, or a posture, in time: the way there, the approach, closing.
+"""Timed motions to grasps and postures: path, approach, closing, lifting and placing.
 
-The last part of the way is found backwards (`casadi_ik.motion.approach`). What
-the hand holds afterwards moves with the palm, and must not touch either (`Carried`).
+The approach is planned backwards (`casadi_ik.motion.approach`). An object that the hand holds moves
+with the palm and must not collide either (`CarriedObject`).
 """
 
 from __future__ import annotations
@@ -19,144 +19,145 @@ from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.pose import inverse
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.motion.approach import (
+    ApproachAttempt,
     ApproachPlan,
     ReachStatus,
-    Tried,
     approaches,
     hands_used,
 )
-from casadi_ik.motion.clear import free_way, least_clearance
+from casadi_ik.motion.free_path import least_clearance, plan_path
 from casadi_ik.motion.motion import Motion, Rates, shares, timed
 
 
-class Carried:
-    """A robot with what its hand holds; nothing where the scene does not know the object.
+class CarriedObject:
+    """Collision checks of a robot and the object in its hand, if the scene knows the object.
 
     Attributes:
-        step: Motion of the palm [m] between two places where the object is compared with the scene.
-        turn: Way of the motors together between two postures that are compared [rad].
-        giving: By how much it may come nearer to what it stands on, or touches, while it is taken
-            away [m].
+        step: Motion of the palm between two checks of the object [m].
+        motor_step: Motion of all motors together between two checks of the robot [rad].
+        slack: Decrease of the object's distance from its support that is permitted while the hand
+            takes it away [m].
     """
 
     step = 1e-3
-    turn = 0.03
-    giving = 1e-3
+    motor_step = 0.03
+    slack = 1e-3
 
     def __init__(self, check: SceneCheck, problem: TargetBatch, q: Array) -> None:
-        """Take the object.
+        """Attach the object to the palm.
 
         Args:
-            check: The scene.
-            problem: The grasp.
-            q: (n,) the posture in which it is held first.
+            check: Scene.
+            problem: Grasp.
+            q: (n,) posture in which the hand grasps the object.
         """
         self._check, self._problem, self._robot = check, problem, check.robot
         self._name = problem.object or check.scene.grasped or ""
         pose = None if problem.object_pose is None else problem.object_pose[0]
         if pose is None and self._name in check.scene.items:
             pose = check.scene.items[self._name].pose
-        # In the hands of several sides it goes with that of the first.
-        used = hands_used(check.robot, problem)[:, 0] > 0
+        # An object in the hands of several sides moves with the first of them.
+        is_used = hands_used(check.robot, problem)[:, 0] > 0
         hands = check.robot.hands
-        holds = [side for side, hand in hands.items() if used[list(hand)].any()]
-        self._side = (holds or list(hands))[0]
+        holding_sides = [side for side, hand in hands.items() if is_used[list(hand)].any()]
+        self._side = (holding_sides or list(hands))[0]
         self._in_palm = None if pose is None else inverse(self._palm(q)) @ pose
         if pose is not None:
-            self._held = check.scene.holding(self._name, np.eye(4)).items[self._name]
+            self._object = check.scene.holding(self._name, np.eye(4)).items[self._name]
 
     def _palm(self, q: Array) -> Array:
         return self._robot.palm(q, self._side)
 
-    def blocked(self, q: Array) -> str:
-        """What is in the way from each of k postures (k, n) straight to the next; "": nothing."""
-        # Between postures what is held goes straight, and the palm on an arc: steps are small.
-        fine = _finely(q, q, self.turn)
-        return least_clearance(self._query_at(fine), fine)[1] or self._comes_near(q)
+    def path_obstruction(self, q: Array) -> str:
+        """Return what obstructs the straight path through postures (k, n), "" if it is free."""
+        # Between postures the object moves straight and the palm on an arc, so steps are small.
+        fine = _resampled(q, q, self.motor_step)
+        return least_clearance(self._query_at(fine), fine)[1] or self._object_contact(q)
 
-    def in_the_way(self, q: Array) -> str:
-        """What touches in one posture (1, n); "": nothing."""
-        found = self._query_at(q).check(q)
-        if not found.free[0]:
-            return f"{' and '.join(found.pair(0) or ())} touch"
-        return self._comes_near(q, self.giving)
+    def contact_at(self, q: Array) -> str:
+        """Return what touches in one posture (1, n), "" if nothing does."""
+        clearances = self._query_at(q).check(q)
+        if not clearances.free[0]:
+            return f"{' and '.join(clearances.pair(0) or ())} touch"
+        return self._object_contact(q, self.slack)
 
     def _query_at(self, q: Array) -> CollisionQuery:
-        every = self._problem.rows(np.zeros(len(q), dtype=np.intp))
+        problems = self._problem.rows(np.zeros(len(q), dtype=np.intp))
         if self._in_palm is None:
-            return self._check.collision_query(every).rows(np.zeros(1, dtype=np.intp))
+            return self._check.collision_query(problems).rows(np.zeros(1, dtype=np.intp))
         poses = self._palm(q) @ self._in_palm
-        held = replace(every, object=self._name, object_pose=poses)
-        return self._check.collision_query(held, carried=True)
+        carrying = replace(problems, object=self._name, object_pose=poses)
+        return self._check.collision_query(carrying, carried=True)
 
-    def _comes_near(self, q: Array, before: float | None = None) -> str:
-        """What in the scene the object comes too near to, as far as it is not there already.
+    def _object_contact(self, q: Array, initial: float | None = None) -> str:
+        """Return which obstacle the object touches, unless it was as near initially.
 
         Args:
             q: (k, n) postures.
-            before: How near it may have been before [m]; None: as in the first posture.
+            initial: Initial distance from obstacles [m]; None: that of the first posture.
         """
         scene = self._check.scene
         if self._in_palm is None:
             return ""
-        poses = self._palm(_finely(q, self._palm(q)[:, :3, 3], self.step)) @ self._in_palm
-        allowed = {frozenset(one.links) for one in scene.touching}
+        poses = self._palm(_resampled(q, self._palm(q)[:, :3, 3], self.step)) @ self._in_palm
+        allowed = {frozenset(contact.links) for contact in scene.touching}
         for name, item in scene.items.items():
             pair = frozenset((name, self._name))
             if name == self._name or pair in allowed:
                 continue
-            usual = scene.margin if item.margin is None else item.margin
-            apart = gaps(self._held, [item], poses)
-            there = float(apart[0]) if before is None else before
-            if apart.min() < min(scene.margins.get(pair, usual), there - self.giving):
+            default_margin = scene.margin if item.margin is None else item.margin
+            distances = gaps(self._object, [item], poses)
+            first = float(distances[0]) if initial is None else initial
+            if distances.min() < min(scene.margins.get(pair, default_margin), first - self.slack):
                 return f"{self._name} and {name} touch"
         return ""
 
 
-def _finely(q: Array, places: Array, step: float) -> Array:
-    """Postures (m, n) on the straight ways from each of some (k, n) to the next.
+def _resampled(q: Array, positions: Array, step: float) -> Array:
+    """Return postures (m, n) on the straight segments between consecutive postures.
 
     Args:
-        q: (k, n).
-        places: (k, d) where something is there.
-        step: How far apart two of them are at most.
+        q: (k, n) postures.
+        positions: (k, d) positions of a point in these postures.
+        step: Largest distance of two consecutive positions.
     """
-    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
-    counts = np.maximum(np.ceil(steps / step), 1).astype(int)
-    at = [i + np.arange(count) / count for i, count in enumerate(counts)]
-    along = np.append(np.concatenate([np.zeros(0), *at]), len(q) - 1)
-    return np.array([np.interp(along, np.arange(len(q)), column) for column in q.T]).T
+    lengths = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    counts = np.maximum(np.ceil(lengths / step), 1).astype(int)
+    shares = [i + np.arange(count) / count for i, count in enumerate(counts)]
+    parameters = np.append(np.concatenate([np.zeros(0), *shares]), len(q) - 1)
+    return np.array([np.interp(parameters, np.arange(len(q)), column) for column in q.T]).T
 
 
 PARTS = ("going", "coming", "closing", "lifting", "retreating")
-"""Of a motion: to the pre-grasp, straight to the object, around it, up and back with it."""
+"""Parts of a motion: to the pre-grasp, approach, closing, lifting and retreat with the object."""
 
 GOING, COMING, CLOSING, LIFTING, RETREATING = PARTS
 
 CARRYING, LOWERING, OPENING, LEAVING = "carrying", "lowering", "opening", "leaving"
-"""Of a motion that places: over the place, straight down, off the object, straight back."""
+"""Parts of a motion that places: carrying, lowering, opening of the hand, straight retreat."""
 
 UP = np.array([0.0, 0.0, 1.0])
-"""Of the base frame."""
+"""Vertical axis of the base frame."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reach:
-    """A timed motion to a grasp or to a posture.
+    """Timed motion to a grasp or to a posture.
 
     Attributes:
-        status: How it went.
-        reason: In words.
-        motion: From q0 at rest to the grasp at rest, and on if it was asked for; its note "part"
-            says which of `PARTS` each time belongs to. None if there is none.
-        q: (n,) the solution of the grasp where the hand has closed, or the posture that was asked
-            for; None likewise.
-        clearance: Smallest distance on the way before the hand closes [m], as `Clearances` counts
-            it, between samples too: it is nowhere less by more than 0.1 mm. None without a scene.
-        tried: Solutions of the grasp that were looked at.
-        velocity_share: Largest part of a motor's velocity limit that the samples take, by their
-            first differences; 0 without a motion.
-        acceleration_share: Likewise of the acceleration, by second differences.
+        status: Result of the planning.
+        reason: How the path was planned, or the reason of a failure.
+        motion: Motion from q0 at rest to the grasp at rest, and further if requested; its note
+            "part" names the part (of `PARTS`) of each sample. None on failure.
+        q: (n,) solution of the grasp at which the hand closes, or the requested posture; None on
+            failure.
+        clearance: Smallest distance before the hand closes [m], see `Clearances`; between samples
+            it is less by at most 0.1 mm. None without a scene.
+        tried: Number of solutions of the grasp that were tried.
+        velocity_share: Largest velocity of the samples (first differences) relative to the limits;
+            0 without a motion.
+        acceleration_share: Largest acceleration of the samples (second differences) relative to the
+            limits; 0 without a motion.
 
     Example:
         >>> found = solver.reach(grasp)
@@ -175,16 +176,16 @@ class Reach:
 
     @property
     def success(self) -> bool:
-        """Whether there is a motion."""
+        """True if there is a motion."""
         return self.status is ReachStatus.REACHED
 
 
 @dataclass(frozen=True, eq=False)
 class Pace:
-    """How fast a motion is.
+    """Timing of a motion.
 
     Attributes:
-        rates: Its limits.
+        rates: Limits of velocities and accelerations.
         period: Time between two samples [s].
     """
 
@@ -193,14 +194,14 @@ class Pace:
 
 
 @dataclass(frozen=True, eq=False)
-class WayPlan:
-    """What a whole way has to keep to.
+class ReachPlan:
+    """Requirements of a motion to a grasp.
 
     Attributes:
-        approach: What its part at the object has to keep to.
-        pace: Its speed.
-        seed: Of a planner.
-        q0: (n,) where the robot is.
+        approach: Requirements of its approach.
+        pace: Timing.
+        seed: Seed of the path planner.
+        q0: (n,) initial posture.
     """
 
     approach: ApproachPlan
@@ -210,194 +211,203 @@ class WayPlan:
 
     @property
     def robot(self) -> ArmHand:
-        """The robot."""
+        """Robot of the approach."""
         return self.approach.plan.robot
 
 
-Way = tuple[str, Array]
+Segment = tuple[str, Array]
 """Name of a part, and postures (k, n) on it."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Stage:
-    """Ways that are checked against the same.
+    """Segments with the same collision checks.
 
     Attributes:
-        ways: The ways.
-        query: What must not be touched on them; None: nothing is checked.
-        counts: Whether their clearance is that of the motion.
+        segments: Segments in their order.
+        query: Collision checks; None checks nothing.
+        counts: True if their clearance counts as that of the motion.
     """
 
-    ways: Sequence[Way]
-    query: CollisionQuery | Carried | None
+    segments: Sequence[Segment]
+    query: CollisionQuery | CarriedObject | None
     counts: bool = True
 
 
 def reach(
-    asked: WayPlan, solutions: Sequence[Array], why: str, lift: float, retreat: float
+    plan: ReachPlan, solutions: Sequence[Array], reason: str, lift: float, retreat: float
 ) -> Reach:
-    """The way to the first of some solutions to which there is one.
+    """Plan a motion to the first solution of a grasp that can be reached.
 
     Args:
-        asked: What to keep to.
-        solutions: (n,) each, of the grasp, best first.
-        why: Why there are none.
-        lift: How far the hand goes straight up after it closed [m].
-        retreat: How far it goes back then, against the way it came [m].
+        plan: Requirements.
+        solutions: (n,) solutions of the grasp, best first.
+        reason: Reason why there are no solutions.
+        lift: Height by which the hand is lifted after it has closed [m].
+        retreat: Length of the retreat along the reverse approach after that [m].
     """
-    check, problem, robot = asked.approach.plan.check, asked.approach.problem, asked.robot
+    check, problem, robot = plan.approach.plan.check, plan.approach.problem, plan.robot
 
-    def whole(one: Tried) -> Reach:
-        last = one.last
-        if last is None:
-            return failed(ReachStatus.NO_APPROACH, one.reason)
-        carried = None if check is None else Carried(check, problem, one.q)
-        ends, _ = robot.contacts(last.coming[[0, -1]])
+    def plan_motion(attempt: ApproachAttempt) -> Reach:
+        path = attempt.path
+        if path is None:
+            return failed(ReachStatus.NO_APPROACH, attempt.reason)
+        carried = None if check is None else CarriedObject(check, problem, attempt.q)
+        ends, _ = robot.contacts(path.coming[[0, -1]])
         back = ends[0] - ends[1]
         back /= np.maximum(np.linalg.norm(back, axis=1, keepdims=True), 1e-9)
-        q, used, after = one.q, hands_used(robot, problem), list[Way]()
+        q, is_used, segments = attempt.q, hands_used(robot, problem), list[Segment]()
         for name, shift in ((LIFTING, lift * UP), (RETREATING, retreat * back)):
             if not shift.any():
                 continue
-            way = one.closer.straight(q, shift * used)
-            if way is None:
-                reason = f"the arm cannot follow the straight way of {name}"
+            postures = attempt.finder.straight(q, shift * is_used)
+            if postures is None:
+                reason = f"the arm cannot follow the straight line of {name}"
                 return failed(ReachStatus.NO_RETREAT, reason)
-            if carried is not None and (reason := carried.blocked(way)):
+            if carried is not None and (reason := carried.path_obstruction(postures)):
                 return failed(ReachStatus.NO_RETREAT, f"{name} is not free: {reason}")
-            after.append((name, way))
-            q = way[-1]
-        going, how = _going(asked, GOING, last.coming[0], one.open_handed)
+            segments.append((name, postures))
+            q = postures[-1]
+        going, note = _plan_segments(plan, GOING, path.coming[0], attempt.open_query)
         stages = (
-            _Stage(going, one.open_handed),
-            _Stage([(COMING, last.coming)], one.coming),
-            _Stage([(CLOSING, last.closing)], one.holding, counts=False),
-            _Stage(after, carried, counts=False),
+            _Stage(going, attempt.open_query),
+            _Stage([(COMING, path.coming)], attempt.coming_query),
+            _Stage([(CLOSING, path.closing)], attempt.closing_query, counts=False),
+            _Stage(segments, carried, counts=False),
         )
-        return _in_time(robot, stages, asked.pace, how, one.q, one.number)
+        return _timed_motion(robot, stages, plan.pace, note, attempt.q, attempt.number)
 
-    return _first(asked, solutions, why, whole)
+    return _first_motion(plan, solutions, reason, plan_motion)
 
 
 def place(
-    asked: WayPlan, solutions: Sequence[Array], why: str, carried: Carried | None, lower: float
+    plan: ReachPlan,
+    solutions: Sequence[Array],
+    reason: str,
+    carried: CarriedObject | None,
+    lower: float,
 ) -> Reach:
-    """The way to the first of some postures over which an object that is held can be placed.
+    """Plan a motion that places the object in the hand, to the first solution that permits it.
 
     Args:
-        asked: What to keep to; the hand leaves the object as it would come to it.
-        solutions: (n,) each, in which the hand has the object where it is to stand.
-        why: Why there are none.
-        carried: The robot with what it holds; None: nothing is checked.
-        lower: From how far above the object comes straight down [m].
+        plan: Requirements; the hand leaves the object along the reverse approach.
+        solutions: (n,) postures in which the object has its target pose, best first.
+        reason: Reason why there are no solutions.
+        carried: Collision checks of robot and object; None checks nothing.
+        lower: Height from which the object is lowered straight [m].
     """
 
-    def whole(one: Tried) -> Reach:
-        last = one.last
-        if last is None:
-            return failed(ReachStatus.NO_RETREAT, one.reason.replace("approach", "way back"))
-        up = one.closer.straight(one.q, lower * UP)
+    def plan_motion(attempt: ApproachAttempt) -> Reach:
+        path = attempt.path
+        if path is None:
+            retreat_reason = attempt.reason.replace("approach", "retreat")
+            return failed(ReachStatus.NO_RETREAT, retreat_reason)
+        up = attempt.finder.straight(attempt.q, lower * UP)
         if up is None:
-            return failed(ReachStatus.NO_APPROACH, "the arm cannot follow the straight way down")
+            return failed(ReachStatus.NO_APPROACH, "the arm cannot follow the straight line down")
         down = up[::-1]
-        if carried is not None and (reason := carried.blocked(down)):
-            return failed(ReachStatus.NO_APPROACH, f"the way down is not free: {reason}")
-        carrying, how = _going(asked, CARRYING, down[0], carried)
+        if carried is not None and (obstruction := carried.path_obstruction(down)):
+            return failed(ReachStatus.NO_APPROACH, f"the path down is not free: {obstruction}")
+        carrying, note = _plan_segments(plan, CARRYING, down[0], carried)
         stages = (
             _Stage([*carrying, (LOWERING, down)] if carrying else [], carried, counts=False),
-            _Stage([(OPENING, last.closing[::-1])], one.holding, counts=False),
-            _Stage([(LEAVING, last.coming[::-1])], one.coming),
+            _Stage([(OPENING, path.closing[::-1])], attempt.closing_query, counts=False),
+            _Stage([(LEAVING, path.coming[::-1])], attempt.coming_query),
         )
-        return _in_time(asked.robot, stages, asked.pace, how, one.q, one.number)
+        return _timed_motion(plan.robot, stages, plan.pace, note, attempt.q, attempt.number)
 
-    return _first(asked, solutions, why, whole)
+    return _first_motion(plan, solutions, reason, plan_motion)
 
 
 def move(
     robot: ArmHand, ends: tuple[Array, Array], query: CollisionQuery | None, pace: Pace, seed: int
 ) -> Reach:
-    """The way from one posture (n,) to another.
+    """Plan a motion from one posture (n,) to another.
 
     Args:
-        robot: The robot.
-        ends: Where it is, and where it is to be.
-        query: What must not be touched; None: nothing is checked.
-        pace: How fast it is.
-        seed: Of a planner.
+        robot: Robot that moves.
+        ends: First and last posture.
+        query: Collision checks; None checks nothing.
+        pace: Timing.
+        seed: Seed of the path planner.
     """
-    corners, how = free_way(robot, *ends, query, seed)
-    stages = [_Stage(_between(GOING, corners), query)]
-    return _in_time(robot, stages, pace, how, ends[1], 1)
+    corners, note = plan_path(robot, *ends, query, seed)
+    stages = [_Stage(_segments(GOING, corners), query)]
+    return _timed_motion(robot, stages, pace, note, ends[1], 1)
 
 
-def _first(
-    asked: WayPlan, solutions: Sequence[Array], why: str, whole: Callable[[Tried], Reach]
+def _first_motion(
+    plan: ReachPlan,
+    solutions: Sequence[Array],
+    reason: str,
+    plan_motion: Callable[[ApproachAttempt], Reach],
 ) -> Reach:
-    """The first whole way that there is; of those that there are not the reason that says most."""
+    """Return the first motion that succeeds, or the failure that got farthest."""
     if not solutions:
-        return failed(ReachStatus.NOT_SOLVED, why)
-    tried: list[Reach] = []
-    for one in approaches(asked.approach, solutions):
-        tried.append(whole(one))
-        if tried[-1].success:
-            return tried[-1]
-    # That which came farthest says most.
+        return failed(ReachStatus.NOT_SOLVED, reason)
+    failures: list[Reach] = []
+    for attempt in approaches(plan.approach, solutions):
+        result = plan_motion(attempt)
+        if result.success:
+            return result
+        failures.append(result)
     order = list(ReachStatus)
-    most = max(tried, key=lambda one: order.index(one.status))
-    return failed(most.status, most.reason, len(solutions))
+    farthest = max(failures, key=lambda result: order.index(result.status))
+    return failed(farthest.status, farthest.reason, len(solutions))
 
 
-def _going(
-    asked: WayPlan, name: str, end: Array, query: CollisionQuery | Carried | None
-) -> tuple[list[Way], str]:
-    """The free way from where the robot is, none if there is none; and how it was found, or why."""
-    corners, how = free_way(asked.robot, asked.q0, end, query, asked.seed)
-    return _between(name, corners), how if corners is None else f"way there: {how}"
+def _plan_segments(
+    plan: ReachPlan, name: str, end: Array, query: CollisionQuery | CarriedObject | None
+) -> tuple[list[Segment], str]:
+    """Plan the free path from q0; return its segments, and how it was planned or why it was not."""
+    corners, note = plan_path(plan.robot, plan.q0, end, query, plan.seed)
+    return _segments(name, corners), note if corners is None else f"path: {note}"
 
 
-def _between(name: str, corners: Array | None) -> list[Way]:
+def _segments(name: str, corners: Array | None) -> list[Segment]:
     return [] if corners is None else [(name, np.stack(pair)) for pair in pairwise(corners)]
 
 
 def failed(status: ReachStatus, reason: str, tried: int = 0) -> Reach:
-    """A motion that there is not, and why."""
+    """Return the result of a failure."""
     return Reach(status, reason, None, None, None, tried)
 
 
-def _in_time(
-    robot: ArmHand, stages: Sequence[_Stage], pace: Pace, how: str, q: Array, tried: int
+def _timed_motion(
+    robot: ArmHand, stages: Sequence[_Stage], pace: Pace, note: str, q: Array, tried: int
 ) -> Reach:
-    """Stages, each from where the last one ends, in time, at rest between their ways, and checked.
+    """Return the timed motion of consecutive stages, at rest between segments, and check it.
 
     Args:
-        robot: The robot.
-        stages: The stages; without a way in the first there is none.
-        pace: How fast they are.
-        how: How the way was found, or why there is none.
-        q: (n,) where the hand holds something, or the end.
-        tried: Solutions that were looked at.
+        robot: Robot that moves.
+        stages: Stages; the planning has failed if the first has no segments.
+        pace: Timing.
+        note: How the path was planned, or why it was not.
+        q: (n,) posture at the grasp, or at the end.
+        tried: Number of solutions that were tried.
     """
-    if not stages[0].ways:
-        return failed(ReachStatus.NO_WAY, how)
-    ways = [way for stage in stages for way in stage.ways]
-    samples, names = [ways[0][1][:1]], [ways[0][0]]
-    for name, way in ways:
-        samples.append(timed(way, pace.rates, pace.period)[1:])
+    if not stages[0].segments:
+        return failed(ReachStatus.NO_WAY, note)
+    segments = [segment for stage in stages for segment in stage.segments]
+    samples, names = [segments[0][1][:1]], [segments[0][0]]
+    for name, postures in segments:
+        samples.append(timed(postures, pace.rates, pace.period)[1:])
         names += [name] * len(samples[-1])
     parts = np.array(names)
     motion = Motion.of_samples(robot, pace.period, np.concatenate(samples), {"part": parts})
     clearance, reason, first = None, "", 0
     for stage in stages:
-        last = first + int(np.isin(parts, [name for name, _ in stage.ways]).sum())
-        # Each begins where the one before ends.
+        last = first + int(np.isin(parts, [name for name, _ in stage.segments]).sum())
+        # Each stage begins at the last posture of the one before.
         postures, first = motion.q[max(first - 1, 0) : last], last
-        if isinstance(stage.query, Carried):
-            reason = stage.query.blocked(postures)
+        if isinstance(stage.query, CarriedObject):
+            reason = stage.query.path_obstruction(postures)
         elif stage.query is not None:
-            here, reason = least_clearance(stage.query, postures)
+            stage_clearance, reason = least_clearance(stage.query, postures)
             if stage.counts:
-                clearance = here if clearance is None else min(clearance, here)
+                known = () if clearance is None else (clearance,)
+                clearance = min((stage_clearance, *known))
         if reason:
             return failed(ReachStatus.NO_WAY, f"the timed motion is not free: {reason}")
-    taken = shares(motion.q, pace.period, pace.rates)
-    return Reach(ReachStatus.REACHED, how, motion, q, clearance, tried, *taken)
+    limit_shares = shares(motion.q, pace.period, pace.rates)
+    return Reach(ReachStatus.REACHED, note, motion, q, clearance, tried, *limit_shares)

@@ -112,8 +112,8 @@ def test_image_landmarks_are_one_line(run: Command, tmp_path: Path) -> None:
     seen = np.tile(3.0 * hand(0.5, np.zeros(3)) + [0.3, 0.5, 1e-7], (3, 1, 1))
     frames, out = write(tmp_path, keypoints=seen), tmp_path / "motion.mcap"
     done = run("follow", frames, "--robot", "kuka_lwr_barrett", "--out", out)
-    assert "frames.npz: keypoints: found places in a picture" in done.error
-    assert "take its world landmarks" in done.error
+    assert "frames.npz: keypoints: " in done.error
+    assert "world landmarks" in done.error
     assert sorted(tmp_path.iterdir()) == [frames]
 
 

@@ -9,7 +9,7 @@ from samplers import smooth_path
 from toy_robots import grasp_of, grasps_of
 
 import casadi_ik as ik
-from casadi_ik.motion.clear import RESOLUTION, between, motor_units
+from casadi_ik.motion.free_path import RESOLUTION, check_path, motor_units
 
 PERIOD = 0.004
 
@@ -185,7 +185,7 @@ def test_what_stands_between_two_free_postures_is_seen(robot):
     solver = ik.Solver(robot, scene=ik.Scene({"pole": pole}))
     around = clearances_around(solver)
     assert around.free(way).all()
-    found = between(around, way)
+    found = check_path(around, way)
     assert found.free.tolist() == [False, True]
     assert found.surplus[0] < 0
     assert not around.free(found.worst[:1])[0]
@@ -197,7 +197,7 @@ def test_what_stands_between_two_free_postures_is_seen(robot):
     moving = carrying._engine.collision_query(problems.holding("ball", poses))
     standing = np.tile(robot.home, (2, 1))
     assert moving.free(standing).all()
-    assert not between(moving, standing).free[0]
+    assert not check_path(moving, standing).free[0]
 
 
 def test_a_path_that_is_free_is_followed_as_without_a_scene(robot, solver):

@@ -11,7 +11,7 @@ import pytest
 from dense_ways import dense
 
 import casadi_ik as ik
-from casadi_ik.motion.clear import free_way, motor_units
+from casadi_ik.motion.free_path import motor_units, plan_path
 from casadi_ik.motion.motion import rates_of, shares, timed
 
 
@@ -135,11 +135,11 @@ def test_around_what_is_in_the_way(robot):
     problem = solver._request.of_arrays(*robot.contacts(ways[1:]), None)
     around = solver._engine.collision_query(problem).rows(np.zeros(1, dtype=int))
     assert not around.free(dense(ways, motor_units(robot))).all()
-    corners, how = free_way(robot, *ways, around, seed=0)
+    corners, how = plan_path(robot, *ways, around, seed=0)
     assert "OMPL" in how
     np.testing.assert_array_equal(corners[[0, -1]], ways)
     assert around.free(dense(corners, motor_units(robot))).all()
-    inside, why = free_way(robot, ways.mean(axis=0), ways[1], around, seed=0)
+    inside, why = plan_path(robot, ways.mean(axis=0), ways[1], around, seed=0)
     assert (inside, why) == (None, "the start is not free: bh_base and ball touch")
 
 
@@ -250,7 +250,7 @@ def test_the_very_posture_that_was_chosen(robot, grasp, on_table):
     moved = replace(ranked[0], grasp=grasp.at(away))
     missed = solver.reach(moved)
     assert missed.status is ik.motion.ReachStatus.NOT_SOLVED
-    assert "does not take its grasp" in missed.reason
+    assert "100 mm" in missed.reason
     assert solver.approach(moved).reason == missed.reason
     with pytest.raises(ik.errors.InputError, match="grasp: found int, expected a Grasp"):
         solver.reach(3)

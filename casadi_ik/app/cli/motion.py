@@ -262,7 +262,7 @@ def _reached(found: Reach, motion: Motion, units: Units) -> dict[str, str]:
     room = "collision not checked" if found.clearance is None else ""
     return {
         "time": f"{times[-1]:.2f} s: {', '.join(spent)}",
-        "way there": found.reason.removeprefix("way there: "),
+        "path": found.reason.removeprefix("path: "),
         "clearance": room or f"{scale * (found.clearance or 0.0):.3g} {unit}",
         "motors": f"up to {100 * found.velocity_share:.0f} % of their velocity limits, "
         f"{100 * found.acceleration_share:.0f} % of their acceleration limits (by the samples)",

@@ -1,23 +1,25 @@
-/* What keeps a follower clear, behind clearance.c: see `motion.clear`.
+/* Collision avoidance of a follower, appended to clearance.c; see motion/guard.py.
  *
- * Of a pair nothing is worked out while what it was apart, less what motors can have moved it since,
- * is more than enough: steps of motors times levers.
+ * A pair is not evaluated while its last known distance, less the largest motion since then (steps of
+ * motors times levers), exceeds the distance that it must keep.
  */
 
-/* Numbers of a row of levers, the last of them zeros: as many as fill vectors. */
+/* Numbers of a row of levers, padded with zeros to fill vectors. */
 enum { ROW = (N_Q + 7) / 8 * 8 };
 
-/* How far motors are from a place, at most on a way that turns nowhere, and what that moves. */
-static LANES_TARGET scalar strayed(const guard_job *job, const scalar *at, const scalar *from,
-                                   const scalar *to, scalar *far) {
-  scalar most = 0;
+/* Computes the largest distance of each motor from q_0 on a monotonic path between two configurations;
+ * returns an upper bound of the motion of all shapes. */
+static LANES_TARGET scalar displacement_bound(const guard_job *job, const scalar *q_0,
+                                              const scalar *from, const scalar *to,
+                                              scalar *motor_distances) {
+  scalar bound = 0;
   int k;
   for (k = 0; k < N_Q; ++k) {
-    const scalar a = fabs(from[k] - at[k]), b = fabs(to[k] - at[k]);
-    far[k] = b > a ? b : a;
-    most += job->widest[k] * far[k];
+    const scalar a = fabs(from[k] - q_0[k]), b = fabs(to[k] - q_0[k]);
+    motor_distances[k] = b > a ? b : a;
+    bound += job->max_levers[k] * motor_distances[k];
   }
-  return most;
+  return bound;
 }
 
 static LANES_TARGET void place(placing *space) {
@@ -26,101 +28,101 @@ static LANES_TARGET void place(placing *space) {
   STEP(space->space.arg, space->space.res, (1 << LANES) - 1);
 }
 
-/* Places all lanes at once. */
+/* Places the shapes of one configuration in all lanes. */
 static LANES_TARGET void place_at(placing *space, const scalar *q) {
   int k;
   for (k = 0; k < N_Q; ++k) space->q[k] = SPREAD(q[k]);
   place(space);
 }
 
-/* Lower bound of a pair's distance: how far the balls about its shapes are apart. */
-LANES_INLINE lanes balls_apart(const clearance_job *about, int64_t pair, const lanes *placed) {
-  const int i = about->pairs[2 * pair], j = about->pairs[2 * pair + 1], solid = j - N_CAPSULES;
-  const lanes *other = placed + (solid < 0 ? 6 * j : 6 * N_CAPSULES + 12 * solid + 9);
-  const scalar reach = solid < 0 ? about->radii[j] + about->halves[j] : about->solids[solid].reach;
-  const vector r = minus(load(placed + 6 * i), load(other));
-  return lanes_sqrt(dot(r, r)) - (about->radii[i] + about->halves[i] + about->offsets[pair] + reach);
+/* Returns lower bounds of a pair's distance: the distances of its bounding balls. */
+LANES_INLINE lanes ball_distance(const clearance_job *scene, int64_t pair, const lanes *placed) {
+  const int i = scene->pairs[2 * pair], j = scene->pairs[2 * pair + 1], solid = j - N_CAPSULES;
+  const lanes *second = placed + (solid < 0 ? 6 * j : 6 * N_CAPSULES + 12 * solid + 9);
+  const scalar reach = solid < 0 ? scene->radii[j] + scene->halves[j] : scene->solids[solid].reach;
+  const vector r = minus(load(placed + 6 * i), load(second));
+  return lanes_sqrt(dot(r, r)) - (scene->radii[i] + scene->halves[i] + scene->offsets[pair] + reach);
 }
 
-/* Lists the pairs whose bounding balls are nearer than the horizon at a configuration, with a lower
- * bound of their distances that is exact below `sure`. The balls are compared in scalars: all lanes
- * hold the same configuration, and few pairs pass. */
-static LANES_TARGET void look(const guard_job *job, placing *space, surroundings *here,
-                              const scalar *from, scalar sure) {
-  const clearance_job *about = job->about;
+/* Lists the pairs whose bounding balls are nearer than the horizon at a configuration, with lower
+ * bounds of their distances that are exact below `exact_below`. The balls are compared in scalars: all
+ * lanes hold the same configuration, and few pairs pass. */
+static LANES_TARGET void list_nearby_pairs(const guard_job *job, placing *space, nearby_pairs *pairs,
+                                           const scalar *q, scalar exact_below) {
+  const clearance_job *scene = job->scene;
   int64_t pair;
-  place_at(space, from);
-  here->n_near = here->spent = 0;
-  for (pair = 0; pair < about->n_pairs; ++pair) {
-    const int i = about->pairs[2 * pair], j = about->pairs[2 * pair + 1], solid = j - N_CAPSULES;
+  place_at(space, q);
+  pairs->n_listed = pairs->n_checked = 0;
+  for (pair = 0; pair < scene->n_pairs; ++pair) {
+    const int i = scene->pairs[2 * pair], j = scene->pairs[2 * pair + 1], solid = j - N_CAPSULES;
     const lanes *a = space->placed + 6 * i;
     const lanes *b = space->placed + (solid < 0 ? 6 * j : 6 * N_CAPSULES + 12 * solid + 9);
     const scalar x = lanes_at(a[0], 0) - lanes_at(b[0], 0);
     const scalar y = lanes_at(a[1], 0) - lanes_at(b[1], 0);
     const scalar z = lanes_at(a[2], 0) - lanes_at(b[2], 0);
-    const scalar radii = about->radii[i] + about->halves[i] + about->offsets[pair]
-                         + (solid < 0 ? about->radii[j] + about->halves[j] : about->solids[solid].reach);
-    const scalar square = x * x + y * y + z * z, beyond = here->horizon + radii;
-    scalar known;
+    const scalar radii = scene->radii[i] + scene->halves[i] + scene->offsets[pair]
+                         + (solid < 0 ? scene->radii[j] + scene->halves[j] : scene->solids[solid].reach);
+    const scalar square = x * x + y * y + z * z, limit = pairs->horizon + radii;
+    scalar bound;
     lanes distance;
-    if (beyond > 0 && square >= beyond * beyond) continue;
-    known = sqrt(square) - radii;
-    if (!(known >= sure)) {
-      known = sure;
-      if (apart(about, pair, space->placed, SPREAD(sure), space->lines, &distance)) {
-        known = lanes_at(distance, 0);
+    if (limit > 0 && square >= limit * limit) continue;
+    bound = sqrt(square) - radii;
+    if (!(bound >= exact_below)) {
+      bound = exact_below;
+      if (apart(scene, pair, space->placed, SPREAD(exact_below), space->lines, &distance)) {
+        bound = lanes_at(distance, 0);
       }
     }
-    here->known[here->n_near] = known;
-    here->near[here->n_near++] = pair;
+    pairs->distance_bounds[pairs->n_listed] = bound;
+    pairs->listed[pairs->n_listed++] = pair;
   }
 }
 
-/* Lists the pairs that may come nearer than a distance on a way that turns nowhere. */
-static LANES_TARGET void come_close(const guard_job *job, placing *space, surroundings *here,
-                                    const scalar *from, const scalar *to, scalar wanted) {
-  scalar far[ROW] = {0};
-  const scalar least = strayed(job, from, from, to, far);
-  scalar most = strayed(job, here->at, from, to, far);
+/* Selects the pairs that may come nearer than a distance on a monotonic path. */
+static LANES_TARGET void select_candidates(const guard_job *job, placing *space, nearby_pairs *pairs,
+                                           const scalar *from, const scalar *to, scalar required) {
+  scalar motor_distances[ROW] = {0};
+  const scalar path_motion = displacement_bound(job, from, from, to, motor_distances);
+  scalar motion = displacement_bound(job, pairs->q_listed, from, to, motor_distances);
   int64_t i;
   int k;
-  /* A look costs no more than pairs that come into question because motors have gone on. */
-  if (!(wanted + most <= here->horizon)
-      || (here->spent > job->about->n_pairs && 2 * least < most)) {
-    memcpy(here->at, from, N_Q * sizeof(scalar));
-    most = strayed(job, here->at, from, to, far);
-    here->horizon = wanted + most + job->spare;
-    look(job, space, here, from, wanted + most);
+  /* Listing costs no more than the candidates that exist only because motors have moved on. */
+  if (!(required + motion <= pairs->horizon)
+      || (pairs->n_checked > job->scene->n_pairs && 2 * path_motion < motion)) {
+    memcpy(pairs->q_listed, from, N_Q * sizeof(scalar));
+    motion = displacement_bound(job, pairs->q_listed, from, to, motor_distances);
+    pairs->horizon = required + motion + job->relist_motion;
+    list_nearby_pairs(job, space, pairs, from, required + motion);
   }
-  here->n_close = 0;
-  for (i = 0; i < here->n_near; ++i) {
-    const scalar *lever = job->levers + here->near[i] * ROW;
-    scalar left = here->known[i] - wanted;
-    lanes sum = SPREAD(0.0), row, way;
-    if (left >= most) continue;
-    ++here->spent;
+  pairs->n_candidates = 0;
+  for (i = 0; i < pairs->n_listed; ++i) {
+    const scalar *lever = job->levers + pairs->listed[i] * ROW;
+    scalar surplus = pairs->distance_bounds[i] - required;
+    lanes pair_motion = SPREAD(0.0), row, distances;
+    if (surplus >= motion) continue;
+    ++pairs->n_checked;
     for (k = 0; k < ROW; k += LANES) {
       memcpy(&row, lever + k, sizeof(lanes));
-      memcpy(&way, far + k, sizeof(lanes));
-      sum += row * way;
+      memcpy(&distances, motor_distances + k, sizeof(lanes));
+      pair_motion += row * distances;
     }
-    for (k = 0; k < LANES; ++k) left -= lanes_at(sum, k);
-    if (left >= 0) continue;
-    here->limits[here->n_close] = wanted;
-    here->close[here->n_close++] = here->near[i];
+    for (k = 0; k < LANES; ++k) surplus -= lanes_at(pair_motion, k);
+    if (surplus >= 0) continue;
+    pairs->required[pairs->n_candidates] = required;
+    pairs->candidates[pairs->n_candidates++] = pairs->listed[i];
   }
 }
 
 /* Inserts a pair into the list of the nearest pairs, which is sorted by distance. */
-static void insert_nearest(scalar *near, int64_t *nearest, int64_t pair, scalar distance) {
+static void insert_nearest(scalar *distances, int64_t *nearest, int64_t pair, scalar distance) {
   int64_t k = OBSTACLES + 1;
-  for (; k > 0 && distance < near[k - 1]; --k) {
+  for (; k > 0 && distance < distances[k - 1]; --k) {
     if (k > OBSTACLES) continue;
-    near[k] = near[k - 1];
+    distances[k] = distances[k - 1];
     nearest[k] = nearest[k - 1];
   }
   if (k > OBSTACLES) return;
-  near[k] = distance;
+  distances[k] = distance;
   nearest[k] = pair;
 }
 
@@ -128,43 +130,44 @@ static void insert_nearest(scalar *near, int64_t *nearest, int64_t pair, scalar 
  * lacking up to the distance of the nearest pair beyond the list: a pair that enters the list or
  * leaves it lacks nothing there, so the lacking clearances are continuous functions of the goal. */
 LANES_TARGET DRIVER(keep_away, guard_job) {
-  const clearance_job *about = job->about;
-  surroundings *here = job->by_goal;
+  const clearance_job *scene = job->scene;
+  nearby_pairs *pairs = job->near_goal;
   placing space;
-  scalar near[OBSTACLES + 1];
-  int64_t nearest[OBSTACLES + 1], few = OBSTACLES, i, k;
-  int motor = 0, lane, outcome = set_up(&space.space, room(about));
+  scalar distances[OBSTACLES + 1];
+  int64_t nearest[OBSTACLES + 1], count = OBSTACLES, i, k;
+  int motor = 0, lane, outcome = set_up(&space.space, room(scene));
   if (outcome != DONE) return outcome;
-  lay_out(&space, about);
-  come_close(job, &space, here, job->goal, job->goal, job->minded);
-  for (i = 0; i <= few; ++i) near[i] = job->minded;
-  if (here->n_close) place_at(&space, job->goal);
-  for (i = 0; i < here->n_close; ++i) {
+  lay_out(&space, scene);
+  select_candidates(job, &space, pairs, job->goal, job->goal, job->avoided_distance);
+  for (i = 0; i <= count; ++i) distances[i] = job->avoided_distance;
+  if (pairs->n_candidates) place_at(&space, job->goal);
+  for (i = 0; i < pairs->n_candidates; ++i) {
     lanes distance;
-    if (apart(about, here->close[i], space.placed, SPREAD(job->minded), space.lines, &distance)) {
-      insert_nearest(near, nearest, here->close[i], lanes_at(distance, 0));
+    if (apart(scene, pairs->candidates[i], space.placed, SPREAD(job->avoided_distance), space.lines,
+              &distance)) {
+      insert_nearest(distances, nearest, pairs->candidates[i], lanes_at(distance, 0));
     }
   }
-  for (i = 0; i < few; ++i) job->rooms[i] = near[few] - near[i];
-  for (i = 0; i < few && job->rooms[i] > 0; ++i) {
+  for (i = 0; i < count; ++i) job->lacking[i] = distances[count] - distances[i];
+  for (i = 0; i < count && job->lacking[i] > 0; ++i) {
     memset(job->slopes + i * N_Q, 0, N_Q * sizeof(scalar));
   }
-  few = i;
-  while (few && motor < N_Q) {
-    int nudged[LANES], count = 0;
-    for (; motor < N_Q && count < LANES; ++motor) {
-      for (i = 0; i < few && job->levers[nearest[i] * ROW + motor] == 0; ++i) continue;
-      if (i < few) nudged[count++] = motor;
+  count = i;
+  while (count && motor < N_Q) {
+    int nudged[LANES], n_nudged = 0;
+    for (; motor < N_Q && n_nudged < LANES; ++motor) {
+      for (i = 0; i < count && job->levers[nearest[i] * ROW + motor] == 0; ++i) continue;
+      if (i < count) nudged[n_nudged++] = motor;
     }
-    if (!count) break;
+    if (!n_nudged) break;
     for (k = 0; k < N_Q; ++k) space.q[k] = SPREAD(job->goal[k]);
-    for (lane = 0; lane < count; ++lane) ((scalar *) (space.q + nudged[lane]))[lane] += job->nudge;
+    for (lane = 0; lane < n_nudged; ++lane) ((scalar *) (space.q + nudged[lane]))[lane] += job->nudge;
     place(&space);
-    for (i = 0; i < few; ++i) {
+    for (i = 0; i < count; ++i) {
       lanes distance;
-      apart(about, nearest[i], space.placed, SPREAD(INFINITY), space.lines, &distance);
-      for (lane = 0; lane < count; ++lane) {
-        job->slopes[i * N_Q + nudged[lane]] = (lanes_at(distance, lane) - near[i]) / job->nudge;
+      apart(scene, nearest[i], space.placed, SPREAD(INFINITY), space.lines, &distance);
+      for (lane = 0; lane < n_nudged; ++lane) {
+        job->slopes[i * N_Q + nudged[lane]] = (lanes_at(distance, lane) - distances[i]) / job->nudge;
       }
     }
   }
@@ -172,135 +175,137 @@ LANES_TARGET DRIVER(keep_away, guard_job) {
   return outcome;
 }
 
-/* Where a motor is after so many cycles: the first makes the step, in all others it brakes. */
-LANES_INLINE lanes after(const guard_job *job, int motor, lanes cycles) {
+/* Returns the positions of a motor after some cycles: the first makes the step, the others brake. */
+LANES_INLINE lanes position_after(const guard_job *job, int motor, lanes cycles) {
   const scalar step = fabs(job->step[motor]), change = job->change[motor];
   const lanes braked = smaller(cycles - 1, SPREAD(floor(step / change)));
-  const lanes way = step * (braked + 1) - change * braked * (braked + 1) / 2;
-  return job->q[motor] + (job->step[motor] < 0 ? -way : way);
+  const lanes distance = step * (braked + 1) - change * braked * (braked + 1) / 2;
+  return job->q[motor] + (job->step[motor] < 0 ? -distance : distance);
 }
 
-/* Marks motors that a pair holds back: those of a hand that can part it by itself, else whole sides;
- * a trunk's motor all. */
-static void hold_back(const guard_job *job, const scalar *lever, int *held) {
+/* Marks the motors that a pair stops: those of a hand that can separate it alone, otherwise whole
+ * sides, or all motors if the trunk moves it. */
+static void mark_blocking_motors(const guard_job *job, const scalar *lever, int *is_blocking) {
   int k, i;
   for (k = 0; k < N_Q; ++k) {
     if (!(lever[k] > 0)) continue;
-    held[k] = 1;
+    is_blocking[k] = 1;
     for (i = 0; !(job->hand[k] > 0) && i < N_Q; ++i) {
-      held[i] |= job->side[k] < 0 || job->side[i] == job->side[k];
+      is_blocking[i] |= job->side[k] < 0 || job->side[i] == job->side[k];
     }
   }
 }
 
-/* Marks motors that move pairs nearer than is free, or nearer than they are if that is less, in any
- * cycle from one to another. Those cycles alone are left out between which a pair has no time for it:
+/* Marks the motors of pairs that violate their required distance in a cycle of an interval; a pair that
+ * is nearer already must not come nearer. Returns 1 if there is such a pair. Skips only the cycles in
+ * between which a pair cannot violate it:
  *
- *     its least distance >= (distance before + distance after - motion between) / 2
+ *     least distance >= (distance before + distance after - motion in between) / 2
  */
-static LANES_TARGET int find_touching(const guard_job *job, placing *space, int64_t from,
-                                       int64_t to, int64_t n_pairs, int *touching) {
-  const surroundings *here = job->by_way;
-  int64_t cycle[LANES], n_unsure = 0, i;
-  int unsure[LANES] = {0}, found = 0, lane, k;
-  lanes now, next, moved[N_Q], longest = SPREAD(0.0);
-  scalar way = 0;
+static LANES_TARGET int find_touching(const guard_job *job, placing *space, int64_t first, int64_t last,
+                                      int64_t n_pairs, int *is_blocking) {
+  const nearby_pairs *pairs = job->near_path;
+  int64_t cycle[LANES], n_uncertain = 0, i;
+  int is_uncertain[LANES] = {0}, any_touch = 0, lane, k;
+  lanes now, next, moved[N_Q], motion_bounds = SPREAD(0.0);
+  scalar largest_bound = 0;
   for (lane = 0; lane < LANES; ++lane) {
-    cycle[lane] = from + (to - from) * lane / (LANES - 1);
+    cycle[lane] = first + (last - first) * lane / (LANES - 1);
     ((scalar *) &now)[lane] = (scalar) cycle[lane];
-    ((scalar *) &next)[lane] = (scalar) (from + (to - from) * (lane + 1) / (LANES - 1));
+    ((scalar *) &next)[lane] = (scalar) (first + (last - first) * (lane + 1) / (LANES - 1));
   }
   for (k = 0; k < N_Q; ++k) {
-    space->q[k] = after(job, k, now);
-    moved[k] = lanes_fabs(after(job, k, next) - space->q[k]);
-    longest += job->widest[k] * moved[k];
+    space->q[k] = position_after(job, k, now);
+    moved[k] = lanes_fabs(position_after(job, k, next) - space->q[k]);
+    motion_bounds += job->max_levers[k] * moved[k];
   }
   for (lane = 0; lane < LANES; ++lane) {
-    if (!(lanes_at(longest, lane) <= way)) way = lanes_at(longest, lane);
+    if (!(lanes_at(motion_bounds, lane) <= largest_bound)) largest_bound = lanes_at(motion_bounds, lane);
   }
   place(space);
   for (i = 0; i < n_pairs; ++i) {
-    const int64_t pair = here->close[i];
+    const int64_t pair = pairs->candidates[i];
     const scalar *lever = job->levers + pair * ROW;
     lanes distance, motion = SPREAD(0.0);
-    scalar most = 0, limit = here->limits[i];
-    int touches = 0, again = 0;
-    if (lanes_all(balls_apart(job->about, pair, space->placed) >= SPREAD(job->enough + way / 2))) {
+    scalar largest = 0, required = pairs->required[i];
+    int touches = 0, needs_refinement = 0;
+    if (lanes_all(ball_distance(job->scene, pair, space->placed)
+                  >= SPREAD(job->required_distance + largest_bound / 2))) {
       continue;
     }
     for (k = 0; k < N_Q; ++k) motion += lever[k] * moved[k];
     for (lane = 0; lane < LANES; ++lane) {
-      if (!(lanes_at(motion, lane) <= most)) most = lanes_at(motion, lane);
+      if (!(lanes_at(motion, lane) <= largest)) largest = lanes_at(motion, lane);
     }
-    if (!apart(job->about, pair, space->placed, SPREAD(job->enough + most / 2), space->lines,
-               &distance)) {
+    if (!apart(job->scene, pair, space->placed, SPREAD(job->required_distance + largest / 2),
+               space->lines, &distance)) {
       continue;
     }
-    if (from == 0 && lanes_at(distance, 0) < limit) limit = lanes_at(distance, 0);
+    if (first == 0 && lanes_at(distance, 0) < required) required = lanes_at(distance, 0);
     for (lane = 0; lane < LANES; ++lane) {
-      touches |= !(lanes_at(distance, lane) >= limit);
+      touches |= !(lanes_at(distance, lane) >= required);
       if (lane < LANES - 1 && cycle[lane + 1] - cycle[lane] > 1) {
-        const scalar both = lanes_at(distance, lane) + lanes_at(distance, lane + 1);
-        const int missed = !(both - lanes_at(motion, lane) >= 2 * limit);
-        unsure[lane] |= missed;
-        again |= missed;
+        const scalar sum = lanes_at(distance, lane) + lanes_at(distance, lane + 1);
+        const int may_touch = !(sum - lanes_at(motion, lane) >= 2 * required);
+        is_uncertain[lane] |= may_touch;
+        needs_refinement |= may_touch;
       }
     }
-    if (again) {
-      /* The pairs that have to be looked at again come first. */
-      here->close[i] = here->close[n_unsure];
-      here->limits[i] = here->limits[n_unsure];
-      here->close[n_unsure] = pair;
-      here->limits[n_unsure++] = limit;
+    if (needs_refinement) {
+      /* Pairs that shorter intervals have to decide come first. */
+      pairs->candidates[i] = pairs->candidates[n_uncertain];
+      pairs->required[i] = pairs->required[n_uncertain];
+      pairs->candidates[n_uncertain] = pair;
+      pairs->required[n_uncertain++] = required;
     }
-    found |= touches;
-    if (touches) hold_back(job, lever, touching);
+    any_touch |= touches;
+    if (touches) mark_blocking_motors(job, lever, is_blocking);
   }
-  for (lane = 0; !found && lane < LANES - 1; ++lane) {
-    if (!unsure[lane]) continue;
-    found = find_touching(job, space, cycle[lane], cycle[lane + 1], n_unsure, touching);
+  for (lane = 0; !any_touch && lane < LANES - 1; ++lane) {
+    if (!is_uncertain[lane]) continue;
+    any_touch = find_touching(job, space, cycle[lane], cycle[lane + 1], n_uncertain, is_blocking);
   }
-  return found;
+  return any_touch;
 }
 
-/* Makes of a step so much that the robot stays free and can come to rest free: motors that move a
- * pair too near make less of theirs, and brake at last. What all motors of a pair that brake lead to
- * was free in the cycle before. */
+/* Computes the largest tried part of the wanted step after which the robot is free and can come to rest
+ * free. Motors of a pair that comes too near make a smaller share, and brake finally; braking of all
+ * motors of a pair was checked in the cycle before. */
 LANES_TARGET DRIVER(stop_in_time, guard_job) {
   placing space;
-  int tried[N_Q] = {0}, touching[N_Q], k, less, outcome = set_up(&space.space, room(job->about));
+  int attempts[N_Q] = {0}, is_blocking[N_Q], k, is_reduced, outcome = set_up(&space.space, room(job->scene));
   if (outcome != DONE) return outcome;
-  lay_out(&space, job->about);
+  lay_out(&space, job->scene);
   do {
     scalar cycles = 0, sum = 0;
-    int going = 0;
+    int any_moves = 0;
     for (k = 0; k < N_Q; ++k) {
-      const scalar left = fabs(job->last[k]) - job->change[k];
-      const scalar braked = left > 0 ? (job->last[k] < 0 ? -left : left) : 0;
-      job->part[k] = tried[k] < job->n_shares ? job->shares[tried[k]] : 0;
+      const scalar speed = fabs(job->last_step[k]) - job->change[k];
+      const scalar braked = speed > 0 ? (job->last_step[k] < 0 ? -speed : speed) : 0;
+      job->share[k] = attempts[k] < job->n_shares ? job->shares[attempts[k]] : 0;
       job->step[k] = braked;
-      if (job->part[k] > 0) job->step[k] += job->part[k] * (job->wanted[k] - braked);
-      going |= tried[k] < job->n_shares;
+      if (job->share[k] > 0) job->step[k] += job->share[k] * (job->wanted_step[k] - braked);
+      any_moves |= attempts[k] < job->n_shares;
       cycles = fmax(cycles, floor(fabs(job->step[k]) / job->change[k]) + 1);
     }
     for (k = 0; k < N_Q; ++k) {
-      sum += job->rest[k] = lanes_at(after(job, k, SPREAD(cycles)), 0);
-      touching[k] = 0;
+      sum += job->q_rest[k] = lanes_at(position_after(job, k, SPREAD(cycles)), 0);
+      is_blocking[k] = 0;
     }
-    if (!going) break;
+    if (!any_moves) break;
     if (isfinite(sum)) {
-      come_close(job, &space, job->by_way, job->q, job->rest, job->enough);
-      find_touching(job, &space, 0, (int64_t) cycles, job->by_way->n_close, touching);
+      select_candidates(job, &space, job->near_path, job->q, job->q_rest, job->required_distance);
+      find_touching(job, &space, 0, (int64_t) cycles, job->near_path->n_candidates, is_blocking);
     } else {
-      /* What is no number is nowhere. */
-      for (k = 0; k < N_Q; ++k) touching[k] = 1;
+      /* Non-finite input: all motors brake. */
+      for (k = 0; k < N_Q; ++k) is_blocking[k] = 1;
     }
-    for (less = k = 0; k < N_Q; ++k) {
-      if (!touching[k] || tried[k] == job->n_shares) continue;
-      ++tried[k];
-      less = 1;
+    for (is_reduced = k = 0; k < N_Q; ++k) {
+      if (!is_blocking[k] || attempts[k] == job->n_shares) continue;
+      ++attempts[k];
+      is_reduced = 1;
     }
-  } while (less);
+  } while (is_reduced);
   give_back(&space.space);
   return outcome;
 }

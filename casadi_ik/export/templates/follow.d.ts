@@ -1,15 +1,15 @@
   /**
-   * Begins to follow moving contacts, at rest at q0 (null: at home).
-   * @param options Time from cycle to cycle [s], 0.01 unless said, and limits of the motors; without
-   * them the description's, and from rest to the velocity limit in a quarter of a second.
+   * Starts to follow moving contacts, at rest at q0 (null: at home).
+   * @param options Time from cycle to cycle [s] (default: 0.01), and limits of the motors. Defaults are
+   * the velocities of the robot's description, and accelerations that reach them in 0.25 s.
    */
   followFrom(
     q0?: ArrayLike<number> | null,
     options?: { period?: number; velocity?: ArrayLike<number>; acceleration?: ArrayLike<number> },
   ): void;
   /**
-   * One cycle: positions, velocities and accelerations stay within limits, whatever the targets do.
-   * @param palm Rotation row by row, then the origin: counts as far as the contacts leave it free.
+   * Computes one cycle: positions, velocities and accelerations stay within limits for all targets.
+   * @param palm Rotation row by row, then the origin; it counts as far as the contacts permit.
    */
   follow(
     points: ArrayLike<number>,

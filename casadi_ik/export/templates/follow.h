@@ -7,10 +7,10 @@ enum {
   @GUARD@_MISSED = 3     /* no configuration on this branch meets the contacts */
 };
 
-/* The way back of a follower that is stuck: a trail of postures of its past, and a line to one. */
+/* Recovery of a follower that is stuck: a trail of postures that it has passed, and a line to one. */
 typedef struct {
   double trail[@FOLLOW_TRAIL@][@GUARD@_MOTORS], start[@GUARD@_MOTORS], line[@GUARD@_MOTORS];
-  double least, least_ratio, longest_step, done, line_step, next_step, line_fastest, line_change;
+  double least_since, least_ratio, longest_step, done, line_step, next_step, line_max_step, line_change;
   int64_t count, cycles_to_check, check_cycles, patience, comparisons, cycles_stuck, candidate, destination;
   int64_t is_returning, has_line;
 } @PREFIX@_recovery;
@@ -21,9 +21,9 @@ typedef struct {
   double q[@GUARD@_MOTORS], velocity[@GUARD@_MOTORS];
   double position_error[@GUARD@_FINGERS], angle_error[@GUARD@_FINGERS]; /* of q; 0 where free */
   int64_t status;
-  double period, change[@GUARD@_MOTORS];
-  double state[@FOLLOW_STATE@], after[@FOLLOW_STATE@];
-  double asked[@FOLLOW_ASKED@], record[@FOLLOW_RECORD@];
+  double period, max_change[@GUARD@_MOTORS];
+  double state[@FOLLOW_STATE@], new_state[@FOLLOW_STATE@];
+  double parameters[@FOLLOW_PARAMETERS@], record[@FOLLOW_RECORD@];
   @PREFIX@_recovery recovery;
 } @PREFIX@_follower;
 

@@ -15,12 +15,12 @@
     this._ask(points, normals);
     if (palm) filled(this._palm, palm, "palm");
     const status = wasm.follow(palm ? 1 : 0);
-    const told = new Float64Array(wasm.memory.buffer, wasm.followed_at(), 2 * (n + f));
+    const results = new Float64Array(wasm.memory.buffer, wasm.followed_at(), 2 * (n + f));
     return {
       status,
-      q: told.slice(0, n),
-      velocity: told.slice(n, 2 * n),
-      positionError: told.slice(2 * n, 2 * n + f),
-      angleError: told.slice(2 * n + f),
+      q: results.slice(0, n),
+      velocity: results.slice(n, 2 * n),
+      positionError: results.slice(2 * n, 2 * n + f),
+      angleError: results.slice(2 * n + f),
     };
   }

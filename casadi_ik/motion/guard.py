@@ -1,0 +1,214 @@
+"""Collision avoidance of a follower, cycle by cycle.
+
+Two rules keep a follower free of collisions. The goal avoids obstacles softly, as far as contacts
+permit: small clearances are rows of its least squares. And a step is made only if the robot can
+brake to rest afterwards without violating a margin in any cycle; otherwise motors brake. The step
+before was made under the same condition, so braking is safe: by induction the robot never violates
+the margin of what stands still.
+
+Cycles between which a pair cannot come near are skipped, and so are pairs that were far apart when
+all pairs were last compared. Both bounds are steps of motors times levers
+(`collision.distances.levers`). A pair that the motors of one hand can separate stops these motors;
+a pair that an arm moves stops its side; a pair that the trunk moves stops all motors.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from casadi_ik.collision.clearance import Clearances, CollisionQuery
+from casadi_ik.collision.clearance_kernel import OBSTACLES, Guarding
+from casadi_ik.collision.distances import levers
+from casadi_ik.files.arrays import Array, Bools
+from casadi_ik.model.targets import TargetBatch
+from casadi_ik.motion.inputs import FollowerInputs, FollowPlan
+
+
+def stopping_distance(step: Array, change: Array) -> Array:
+    """Return the signed distances (n,) that motors travel while they brake to rest.
+
+    Args:
+        step: (n,) their last steps.
+        change: (n,) largest change of a step from cycle to cycle.
+    """
+    cycles = np.floor(np.abs(step) / change)
+    return np.sign(step) * (np.abs(step) * cycles - change * cycles * (cycles + 1) / 2)
+
+
+def stopping_path(q: Array, step: Array, change: Array) -> Array:
+    """Return the positions of motors that make a step and then brake to rest.
+
+    Args:
+        q: (n,) positions before the step.
+        step: (n,) step.
+        change: (n,) largest change of a step from cycle to cycle.
+
+    Returns:
+        (k, n) positions at the end of each cycle; the first is after the step, the last at rest.
+    """
+    speed = np.abs(step)
+    cycles = np.floor(speed / change)
+    braked = np.minimum(np.arange(cycles.max() + 1)[:, None], cycles)
+    return q + step + np.sign(step) * (speed * braked - change * braked * (braked + 1) / 2)
+
+
+class Guard:
+    """Collision checks of a follower in its scene.
+
+    Attributes:
+        near: Clearance beyond the margin below which the goal avoids a pair [m].
+        nudge: Step of the finite differences of clearances [rad or m].
+        exact: Accuracy of distances of solids, with a reserve [m].
+        shares: Parts of the wanted step that are tried in turn before a motor brakes.
+    """
+
+    near = 0.01
+    nudge = 1e-4
+    exact = 1e-6
+    shares = (1.0,)
+
+    def __init__(self, plan: FollowPlan) -> None:
+        """Prepare the scene for targets that all fingers touch."""
+        assert plan.check is not None
+        self._check, self._robot = plan.check, plan.robot.description
+        fingers, n = len(plan.robot.fingers), len(plan.robot.actuators)
+        self._n, self._change = n, plan.rates.steps(plan.period)[1]
+        self._hand = np.isin(np.arange(n), self._robot.hand_actuators).astype(float)
+        self._side = np.zeros(n)
+        self._side[list(self._robot.trunk_actuators)] = -1
+        for number, motors in enumerate(self._robot.side_actuators):
+            self._side[list(sum(motors, ()))] = number
+        anywhere = np.zeros((1, fingers, 3))
+        self._query = self._query_of(plan.request.of_arrays(anywhere, anywhere + 1.0, None))
+        self._allocate()
+
+    def set_target(self, problem: TargetBatch) -> None:
+        """Adapt the scene to one target: which fingers touch, and the pose of the object."""
+        query, previous = self._query_of(problem), self._query
+        self._query = query
+        if query.table is not previous.table:
+            self._allocate()
+        elif self._compiled is not None and not np.array_equal(query.poses, previous.poses):
+            self._compiled.surround(query.poses)
+
+    def _query_of(self, problem: TargetBatch) -> CollisionQuery:
+        return self._check.collision_query(problem).rows(np.zeros(1, dtype=np.intp))
+
+    def _allocate(self) -> None:
+        """Allocate the memory of the compiled checks."""
+        query = self._query
+        self._required = query.margin + self.exact
+        self._avoided = query.margin + self.near
+        self._levers = levers(self._robot, query.table)
+        self._compiled = None
+        if query.kernel.entry is not None:
+            self._compiled = Guarding(
+                query.kernel,
+                query.poses,
+                query.table,
+                self._levers,
+                self._hand,
+                self._side,
+                self._change,
+                self.shares,
+                required_distance=self._required,
+                avoided_distance=self._avoided,
+                nudge=self.nudge,
+            )
+
+    def clearance(self, q: Array) -> Clearances:
+        """Return the clearance of a configuration (n,)."""
+        return self._query.check(q[None])
+
+    def are_free(self, q: Array) -> bool:
+        """Return True if configurations (m, n) are free of collisions."""
+        return bool((self._query.check(q).surplus >= self.exact).all())
+
+    def step(self, inputs: FollowerInputs, step: Array | None = None) -> tuple[Array, bool]:
+        """Make a step, or the part of it after which the motors can still stop in time.
+
+        Args:
+            inputs: Graph of the cycle and its memory.
+            step: (n,) step of the motors; None uses that of the graph.
+
+        Returns:
+            The new state, and True if motors had to brake.
+        """
+        n, run = self._n, inputs.run
+        state = run.state
+        if step is None:
+            lacking, slopes = inputs.views["lacking"], inputs.views["slopes"]
+            lacking[...], slopes[...] = self._lacking_clearances(state[2 * n : 3 * n])
+            new_state = run.step()
+        else:
+            new_state = inputs.step_by(step)
+        q, wanted_step = state[:n], new_state[n : 2 * n]
+        share, step, q_rest = self._free_step(q, state[n : 2 * n], wanted_step)
+        is_stopped = share < 1.0
+        if not is_stopped.any():
+            return new_state, False
+        new_state[:n], new_state[n : 2 * n] = q + step, step
+        # A goal beyond an obstacle would be reached through it.
+        np.copyto(new_state[2 * n : 3 * n], q_rest, where=is_stopped)
+        new_state[3 * n] = 0.0
+        return new_state, True
+
+    def _free_step(
+        self, q: Array, last_step: Array, wanted_step: Array
+    ) -> tuple[Array, Array, Array]:
+        """Return the part of a wanted step that is free and can end free.
+
+        Motors that move a pair below its required distance, or nearer than it is if that is less,
+        make a smaller part of their steps, and brake finally: braking of all motors of a pair was
+        checked in the cycle before.
+
+        Returns:
+            (n,) share of the wanted step by motor, (n,) the step, (n,) positions at rest after it.
+        """
+        if (guarding := self._compiled) is not None:
+            guarding.q[...], guarding.last_step[...] = q, last_step
+            guarding.wanted_step[...] = wanted_step
+            guarding.stop_in_time()
+            return guarding.share, guarding.step, guarding.q_rest
+        braked = np.sign(last_step) * np.maximum(np.abs(last_step) - self._change, 0.0)
+        shares, attempts = np.array([*self.shares, 0.0]), np.zeros(self._n, dtype=int)
+        while True:
+            step = braked + shares[attempts] * (wanted_step - braked)
+            path = stopping_path(q, step, self._change)
+            initial, *distances = self._query.kernel.all_distances(
+                np.concatenate([q[None], path]), self._query.poses, self._query.table
+            )
+            is_touching = ~(distances >= np.minimum(initial, self._required)).all(axis=0)
+            is_reduced = self._blocking_motors(self._levers[is_touching] > 0)
+            is_reduced &= attempts < len(self.shares)
+            if not is_reduced.any():
+                return shares[attempts], step, path[-1]
+            attempts += is_reduced
+
+    def _blocking_motors(self, moves_pair: Bools) -> Bools:
+        """Return the motors (n,) that pairs stop, given which motors (p, n) move them.
+
+        `mark_blocking_motors` of guard.c does the same.
+        """
+        arms = (moves_pair & (self._hand == 0)).any(axis=0)
+        sides = np.isin(self._side, self._side[arms]) | (self._side[arms] < 0).any()
+        return moves_pair.any(axis=0) | sides
+
+    def _lacking_clearances(self, goal: Array) -> tuple[Array, Array]:
+        """Return the lacking clearances (o,) of the nearest pairs at a goal [m], and slopes (o, n).
+
+        Clearance is lacking up to the distance of the nearest pair beyond the list, see guard.c.
+        """
+        if (guarding := self._compiled) is not None:
+            guarding.goal[...] = goal
+            guarding.keep_away()
+            return guarding.lacking, guarding.slopes
+        lacking, slopes = np.zeros(OBSTACLES), np.zeros((OBSTACLES, self._n))
+        nudged = goal + np.concatenate([np.zeros((1, self._n)), self.nudge * np.eye(self._n)])
+        distances = self._query.kernel.all_distances(nudged, self._query.poses, self._query.table)
+        order = np.argsort(distances[0], kind="stable")
+        nearest, omitted = order[:OBSTACLES], order[OBSTACLES : OBSTACLES + 1]
+        count, threshold = len(nearest), distances[0, omitted].min(initial=self._avoided)
+        lacking[:count] = np.maximum(threshold - distances[0, nearest], 0.0)
+        slopes[:count] = ((distances[1:, nearest] - distances[0, nearest]) / self.nudge).T
+        return lacking, slopes
