@@ -457,7 +457,7 @@ class MovingSolver:
         )
 
     def _bounds(self, targets: TargetBatch | None) -> tuple[Array, Array]:
-        """Return the (n,) lower and upper limits of motions, see `RobotDescription.motion_limits`."""
+        """Return the limits (n,) of motions, see `RobotDescription.motion_limits`."""
         if targets is None:
             targets = self._placeholder_target(0.0)
         robot = self.robot.description
