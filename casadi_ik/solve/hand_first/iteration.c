@@ -1,20 +1,21 @@
-/* One iteration of hand first: what the stage of a solve computes, and which stage comes next.
+/* One iteration of hand-first: one step of the current stage, and the choice of the next stage.
  *
- * Of each hand posture of a round a solve takes the palm pose that suits it best (candidate), and
- * fits palm and hand to the contacts as if the hand could fly (hand fit). The arm carries the palm
- * there: in closed form (arm placement, or arm choice if what is near to where the robot is is
- * wanted), or step by step (arm steps). Where it cannot follow exactly, all motors move (refinement).
- * Where a fit or a refinement misses, it continues with errors within tolerance at no cost (tolerant
- * hand fit, tolerant refinement); then the largest error is brought down (balance). What does not lead to
- * a solution ends with the next posture; after the last one the best there was is left.
+ * For each hand posture of a restart a solve computes the best palm pose (candidate), and fits
+ * palm and hand to the contacts as if the hand were floating (hand fit). The arm is then placed in
+ * closed form (arm placement, or arm choice if the preference is q0) or by damped steps (arm
+ * steps). Where it cannot follow exactly, all motors move (refinement). Where a fit or a
+ * refinement misses, it continues with errors within tolerance at no cost (tolerant hand fit,
+ * tolerant refinement); then the largest relative error is minimised (balance). A stage that does
+ * not lead to a solution is followed by the next posture, and after the last posture the incumbent
+ * is returned.
  *
- * Of a body every hand flies to its contacts by itself, one side after the other. Then all arms are
- * placed at a trunk, the one where the robot is first; where they cannot all follow, trunk and arms
- * move together with the palms kept (trunk), and where that leads nowhere another trunk is tried.
+ * In a multi-arm robot the hands are fitted independently, one side after the other. Then all arms
+ * are placed with the trunk where it is. If some cannot follow, trunk and arms move together with
+ * the palms kept (trunk), and if that fails other trunk positions are tried.
  *
- * The capital names with arguments are the functions of step.py: from state x and parameters p they
- * make state y, what they say of it, and the record of the iteration. The solves in the lanes are all
- * in the same stage (loop.c); each goes on by itself. Constants come from iteration.py.
+ * The capitalised functions are those of step.py: from state x and parameters p they compute state
+ * y, the outputs of the stage and the record. The solves in all lanes are in the same stage
+ * (loop.c), but continue independently. iteration.py defines the constants.
  */
 
 #ifdef LANES
@@ -23,13 +24,13 @@
 #define WIDTH 1
 #endif
 
-/* The numbers of one lane. */
+/* Data of one lane. */
 typedef struct {
   double *x, *y, *said;
   const double *p, *own;       /* parameters; the same in a row, with the postures */
 } solve;
 
-/* The function of the side that is at work; a robot has one side, unless it is a body. */
+/* Call the function of the current side; only multi-arm robots have several sides. */
 #if N_SIDES > 1
 #define OF_SIDE(function, ...) \
   do switch (side) { \
@@ -60,7 +61,7 @@ static void begin_fit(solve s) {
   Y(WAITED) = Y(SPENT) = 0;
 }
 
-/* The best arm so far, within its bounds. */
+/* Set the arm to the best one so far, clipped to its bounds. */
 static void set_arm(solve s) {
   int i;
   for (i = 0; i < N_ARM; ++i) {
@@ -71,7 +72,7 @@ static void set_arm(solve s) {
 }
 
 #if N_SIDES
-/* The hand of a side begins from a posture. */
+/* Continue with a hand posture of a side. */
 static int to_side(solve s, int side, double candidate) {
   Y(SIDE) = side;
   Y(CANDIDATE) = candidate;
@@ -84,7 +85,8 @@ static int to_next_candidate(solve s) {
   return to_side(s, 0, Y(FIRST));
 }
 
-/* Where a motor begins at a trunk: evenly spread, by turns with half of the range at its ends. */
+/* Return the low-discrepancy position of a motor for a trunk trial; in every second trial a
+ * fraction AT_LIMITS of the range is mapped to the limits. */
 static double spread(solve s, int motor, double step) {
   const double x = 0.5 + X(TRUNKS) * step, low = ENTRY(P(LOWER), motor);
   const int at_ends = (int) X(TRUNKS) % 2;
@@ -94,7 +96,7 @@ static double spread(solve s, int motor, double step) {
   return low + part * (ENTRY(P(UPPER), motor) - low);
 }
 
-/* Arms are placed anew, all at the trunk that q has. */
+/* Place all arms again for the trunk of q. */
 static int to_placement(solve s) {
   int i;
   for (i = 0; i < N_SIDES; ++i) ENTRY(Y(MARGIN), i) = NO_MARGIN;
@@ -102,7 +104,8 @@ static int to_placement(solve s) {
   return goes_to(s, ARM_PLACEMENT_STAGE);
 }
 
-/* Where a palm is now known the next side follows, and after the last one all arms. */
+/* Store the palm pose of a side and continue with the next side, after the last one with all
+ * arms. */
 static int after_side(solve s, int skipped) {
   const int side = (int) X(SIDE);
   double away = 0;
@@ -112,7 +115,7 @@ static int after_side(solve s, int skipped) {
   }
   ENTRY(Y(FITTED), side) = Y(FITS);
   for (i = 0; i < 3; ++i) away += ENTRY(Y(PALM_ORIGIN), i) * ENTRY(Y(PALM_ORIGIN), i);
-  /* What is farther than trunk and arm drawn straight no trunk brings near. */
+  /* No trunk position reaches palms beyond the stretched length of trunk and arm. */
   if (!skipped && away > SIDE_REACH[side] * SIDE_REACH[side]) return to_next_candidate(s);
   if (X(CANDIDATE) > X(FARTHEST)) Y(FARTHEST) = X(CANDIDATE);
   if (side + 1 < N_SIDES) return to_side(s, side + 1, X(FIRST));
@@ -122,7 +125,7 @@ static int after_side(solve s, int skipped) {
   Y(SIDE) = N_SIDES;
   Y(TRIED) = 0;
   to_placement(s);
-  /* What is near is looked for from where the robot is. */
+  /* If the preference is q0, trunk and arms start from q0. */
   if (P(NEAREST) > 0) goes_to(s, TRUNK_STAGE);
   return RUNNING_STATUS;
 }
@@ -138,9 +141,10 @@ static int after_all_placements(solve s) {
   return X(FITS) > 0 ? SOLVED_STATUS : RUNNING_STATUS;
 }
 
-/* The farther off the nearest palms of hands that fit are, the fewer trunks are worth a try; more
- * where contacts leave palms a freedom, since others may be near, and for one arm. Without a trunk
- * it is arms from anywhere that are tried, which tell nothing. */
+/* Return 1 if the target counts as out of reach. The larger the smallest cost of palms of hands
+ * that fit, the fewer trunk trials are worthwhile; more are where contacts leave palms free, since
+ * others may be near, and for one arm. Without a trunk the trials use low-discrepancy arms, which
+ * say nothing about the reach. */
 static int is_hopeless(solve s) {
   const double most = N_SIDES < 2 ? ONE_ARM_TRUNKS : P(LOOSE) > 0 ? LOOSE_TRUNKS : FAR_TRUNKS;
   if (!N_TRUNK || !(X(FITS) > 0)) return 0;
@@ -160,7 +164,7 @@ static int after_trunk(solve s) {
   }
   if (!SAYS(SETTLED)) return goes_to(s, TRUNK_STAGE);
   if (!(X(AGAIN) > 0) && SAID(COST) < NEARLY) {
-    /* Arms that are placed anew at the trunk found may be of other branches. */
+    /* Arms that are placed again at this trunk may be on other branches. */
     Y(AGAIN) = 1;
     return to_placement(s);
   }
@@ -175,7 +179,7 @@ static int after_trunk(solve s) {
     most = 0;
   }
   if (Y(TRIED) >= most) {
-    /* What is beyond the reach of arms may be within tolerances. */
+    /* Palms out of reach may still be within tolerance. */
     for (i = 0; i < N_MOTORS; ++i) ENTRY(Y(Q), i) = ENTRY(Y(PALMS_BEST), i);
     begin_fit(s);
     return goes_to(s, REFINEMENT_STAGE);
@@ -186,7 +190,7 @@ static int after_trunk(solve s) {
     const double anywhere = spread(s, k, TRUNK_STEPS[i]);
     ENTRY(Y(Q), k) = anywhere;
     if ((int) Y(TRIED) % CLOSER_EVERY == CLOSER_EVERY - 1) {
-      /* Near the best trunk so far, the nearer the more were tried. */
+      /* Sample around the best trunk, with a radius that shrinks with the number of trials. */
       const double best = ENTRY(Y(PALMS_BEST), k);
       ENTRY(Y(Q), k) = best + (anywhere - best) * BOX / (BOX + Y(TRIED));
     }
@@ -196,8 +200,8 @@ static int after_trunk(solve s) {
   }
   for (i = 0; i < N_SIDES; ++i) ENTRY(Y(SWIVEL), i) = ENTRY(Y(ARM), i);
   to_placement(s);
-  /* By turns arms are looked for all over their redundancy, or around one value of it, or they
-   * begin from anywhere. */
+  /* Alternate between arms over the whole redundancy, arms around one value of it, and arms from
+   * low-discrepancy configurations. */
   if ((int) Y(TRIED) % (later ? LATER_ANYWHERE : FROM_ANYWHERE) == 0) return goes_to(s, TRUNK_STAGE);
   if ((int) Y(TRIED) % 2) Y(SPENT) = AROUND;
   return RUNNING_STATUS;
@@ -209,8 +213,8 @@ static int to_next_candidate(solve s) {
 }
 #endif
 
-/* Return 1 if the tolerances may hold near the minimum of the exact fit that a solve has come to, and
- * it is not the minimum that missed before. Near misses at that minimum are counted. */
+/* Return 1 if the tolerances may hold near the minimum of the exact fit that a solve has come to,
+ * and it is not the minimum that missed before. Near misses at that minimum are counted. */
 static int is_new_miss(solve s, double *missed, double before) {
   const double cost = Y(COST), difference = cost - before;
   if (SAID(MISS) > NEAR_MISS) return 0;
@@ -263,7 +267,7 @@ static int after_candidate(solve s) {
   return STALLED_STATUS;
 }
 
-/* A family is searched in closed form; what that missed in earlier rounds step by step. */
+/* Return the stage that places the arm: closed forms first, damped steps in later restarts. */
 static int placement(solve s) {
   const int searched = NEAR_IS_SEARCHED && P(NEAREST) > 0;
   if (IS_COMPLETE || (HAS_FAMILY && !(X(EARLIER) > 0) && !searched)) return ARM_PLACEMENT_STAGE;
@@ -292,7 +296,7 @@ static int after_tolerant_hand_fit(solve s) {
 
 static int after_hand_fit(solve s) {
   const int first = X(CANDIDATE) + X(EARLIER) <= 0 && X(SPENT) < 1;
-  /* The hand as it is is only worth a fit if its contacts are shaped a little like these. */
+  /* The hand of q0 is fitted only if its contacts roughly resemble the target. */
   if (N_CANDIDATES > 1 && P(NEAREST) > 0 && first && SAID(COST) > OWN_HAND) {
     return to_next_candidate(s);
   }
@@ -330,8 +334,9 @@ static int after_choice(solve s) {
 }
 
 #if N_STARTS
-/* The arm begins at the next row of the table: the nearest to the palm pose that is farther than the
- * last one; of all, after the last. If what is near is wanted it begins as it is. */
+/* Start the arm at the next row of the table: the nearest to the palm pose that is farther than
+ * the previous start; after the last row, the nearest of all. If the preference is q0, the first
+ * start is q0. */
 LOOPS static void before_arm_steps(solve s) {
   double distance[N_STARTS], nearest = 1e300, again = 1e300;
   int i, k, found = 0, first = 0;
@@ -354,7 +359,8 @@ LOOPS static void before_arm_steps(solve s) {
 
 static int after_arm_steps(solve s) {
   const int settled = SAYS(SETTLED), exact = SAID(COST) < EXACT_COST;
-  /* What the first round missed may lie beyond the gap between two limits of a joint. */
+  /* Solutions that the first restart missed may lie beyond the gap between the limits of a
+   * joint. */
   const int sent = settled && X(EARLIER) > 0 ? (int) SAID(AT_END) : 0;
   if (sent) {
     const int k = ARM[sent - 1];
@@ -362,7 +368,8 @@ static int after_arm_steps(solve s) {
   }
   if (settled) Y(TURNED) = sent;
   Y(STARTS) = X(STARTS) + (settled && !sent);
-  /* In the first round what is left of an arm of too few motors is for arm and hand together. */
+  /* In the first restart the refinement reduces the remaining error of an arm with too few
+   * motors. */
   if (!(exact || (settled && SAYS(NEAR) && X(EARLIER) < 1) || Y(STARTS) >= MOST_STARTS)) {
     return goes_to(s, ARM_STEPS_STAGE);
   }
