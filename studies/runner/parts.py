@@ -27,7 +27,7 @@ PART = ".part"
 """Ending of a file that is not complete."""
 
 STUDIES = Path(__file__).parents[1]
-PACKAGES = (*places.PACKAGES, "polars")
+PACKAGES = (*places.REQUIRED_PACKAGES, "polars")
 
 
 class Part(Protocol):

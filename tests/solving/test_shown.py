@@ -83,7 +83,7 @@ PROGRAM = """
 import sys
 import numpy as np
 import casadi_ik as ik
-from casadi_ik import progress
+from casadi_ik.files import progress
 progress.PATIENCE = 0.0
 robot = ik.load_robot("kuka_lwr_barrett")
 points, normals = robot.contacts(robot.random(np.random.default_rng(0), 400))

@@ -172,7 +172,7 @@ def test_nothing_is_shared(cup: viewing.Viewer, monkeypatch: pytest.MonkeyPatch)
 
 def test_malformed_messages_neither_end_the_page_nor_fill_the_terminal(tmp_path: Path) -> None:
     code = (
-        "from casadi_ik import viewing; import casadi_ik as ik, sys\n"
+        "from casadi_ik.app import viewer as viewing; import casadi_ik as ik, sys\n"
         "viewer = viewing.view_grasp(ik.load_robot('kuka_lwr_barrett'), ik.load_grasp('cup'))\n"
         "panel, controls = viewer.page._panel, viewer.page._handles._controls\n"
         "print(viewer.url, panel._drag._impl.uuid, controls['thumb'].handle.name,\n"
