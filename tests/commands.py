@@ -12,6 +12,6 @@ __all__ = ["COMMANDS", "GROUPS", "load", "main", "schema_of", "shown"]
 
 def shown(*words: str) -> viewing.Viewer:
     """What `casadi-ik view` shows, without waiting until it is stopped."""
-    from casadi_ik.app.cli.view import opened
+    from casadi_ik.app.cli.view import open_viewer
 
-    return opened(parse(["view", *words])[1])
+    return open_viewer(parse(["view", *words])[1])

@@ -102,7 +102,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
         "Log": log,
         "LogInfo": log.info(),
         "Table": log.iterations(),
-        "OneSolve": one_solve,
+        "SolveRecord": one_solve,
         "Explanation": ik.logs.explain(one_solve),
     }
 
@@ -112,7 +112,7 @@ KINDS = (
     *("Candidates", "Solution", "blocked Solution", "CollisionReport", "ContactVerdict"),
     *("BatchSolution", "Diagnosis", "Ranking", "Choice", "Alternatives", "Sensitivity"),
     *("Clearances", "FoundGrasps", "FoundGrasp", "FollowState", "Track", "Reach", "Motion"),
-    *("Approach", "Log", "LogInfo", "Table", "OneSolve", "Explanation"),
+    *("Approach", "Log", "LogInfo", "Table", "SolveRecord", "Explanation"),
 )
 
 

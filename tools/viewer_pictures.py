@@ -26,7 +26,7 @@ from PIL import Image as Pillow
 
 from casadi_ik.app.cli.main import main as command
 from casadi_ik.app.cli.table import parse
-from casadi_ik.app.cli.view import opened
+from casadi_ik.app.cli.view import open_viewer
 from casadi_ik.app.viewer.grasp_page import GraspPage
 from casadi_ik.files.shipped import resolve_description
 
@@ -55,7 +55,7 @@ Use = Callable[[Any, Any], None]
 
 def taken(browser: Any, words: list[str], path: Path, use: Use) -> None:
     """Open what `casadi-ik view` opens, use it, save what is seen."""
-    viewer = opened(parse(["view", *words])[1])
+    viewer = open_viewer(parse(["view", *words])[1])
     page = browser.open("about:blank", *WINDOW)
     page.call("Page.addScriptToEvaluateOnNewDocument", source=BENCH.COMMON)
     page.go(viewer.url)

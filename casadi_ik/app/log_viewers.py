@@ -35,9 +35,9 @@ from casadi_ik.files.writing import atomic_write
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.logs.cdr import ros_channel, write_postures
 from casadi_ik.logs.container import CDR_HEADER
-from casadi_ik.logs.events import SERIOUS, told
+from casadi_ik.logs.events import SERIOUS, describe
 from casadi_ik.logs.format import schema_name, schema_text
-from casadi_ik.logs.solve import OneSolve
+from casadi_ik.logs.solve import SolveRecord
 
 try:
     from foxglove import Schema
@@ -57,7 +57,7 @@ ARROW_LENGTH = 0.05
 """Length of the arrow of a normal [m]."""
 
 
-def write_view(path: str | os.PathLike[str], solve: OneSolve, robot: ArmHand) -> None:
+def write_view(path: str | os.PathLike[str], solve: SolveRecord, robot: ArmHand) -> None:
     """Write a viewer file.
 
     Args:
@@ -81,7 +81,7 @@ def write_view(path: str | os.PathLike[str], solve: OneSolve, robot: ArmHand) ->
 class _View:
     """Writer of the topics of one solve."""
 
-    def __init__(self, writer: Writer, solve: OneSolve, robot: ArmHand) -> None:
+    def __init__(self, writer: Writer, solve: SolveRecord, robot: ArmHand) -> None:
         self.writer = writer
         self.solve = solve
         self.robot = robot
@@ -195,12 +195,12 @@ class _View:
         lines = [
             (0, fox.LogLevel.Info, f"{solve.method} on {solve.robot}, solve {solve.solve_id + 1}")
         ]
-        lines += [(span.first, fox.LogLevel.Info, span.phase) for span in solve.stretches]
+        lines += [(span.first, fox.LogLevel.Info, span.phase) for span in solve.phase_spans]
         lines += [
             (
                 event.iteration,
                 fox.LogLevel.Warning if event.kind in SERIOUS else fox.LogLevel.Info,
-                told(event),
+                describe(event),
             )
             for event in solve.events
             if event.kind != "PHASE_CHANGE"
@@ -222,7 +222,7 @@ def shipped_layout() -> Path:
     return models_folder() / "viewer" / "layout.json"
 
 
-def layout_of(solve: OneSolve, robot: ArmHand) -> dict[str, Any]:
+def layout_of(solve: SolveRecord, robot: ArmHand) -> dict[str, Any]:
     """Return the shipped layout with the plots and the fixed frame of a solve.
 
     Args:
@@ -245,7 +245,7 @@ def layout_of(solve: OneSolve, robot: ArmHand) -> dict[str, Any]:
     return layout
 
 
-def _plot_lines(solve: OneSolve, name: str) -> list[tuple[str, str]]:
+def _plot_lines(solve: SolveRecord, name: str) -> list[tuple[str, str]]:
     """Return path and label of a plot line per element of a field."""
     fields = {item.name: item for item in solve.layout}
     if name not in fields:

@@ -16,7 +16,7 @@ from mcap.writer import Writer
 from casadi_ik.errors import LogError
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arm_hand import ArmHand
-from casadi_ik.logs.container import CDR_HEADER, MESSAGE, read_chunk, read_contents, reading
+from casadi_ik.logs.container import CDR_HEADER, MESSAGE, open_log_file, read_chunk, read_contents
 
 Stamp = tuple[int, int]
 """Seconds and nanoseconds: a time, or a duration."""
@@ -175,7 +175,7 @@ def read_motion(path: str | os.PathLike[str]) -> RecordedMotion:
         >>> motion = ik.logs.read_motion("still.mcap")
         >>> points, normals = robot.contacts(motion.ordered(robot.actuators))
     """
-    with reading(Path(path)) as stream:
+    with open_log_file(Path(path)) as stream:
         contents = read_contents(Path(path))
         topics = {channel.id: channel.topic for channel in contents.summary.channels.values()}
         found: dict[str, bytes] = {}

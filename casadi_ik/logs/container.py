@@ -108,11 +108,11 @@ class Contents:
     @property
     def counts(self) -> Mapping[int, int]:
         """Messages by channel id."""
-        return counts_of(self.summary)
+        return message_counts(self.summary)
 
 
 @contextlib.contextmanager
-def reading(path: Path, doing: str = "read") -> Iterator[IO[bytes]]:
+def open_log_file(path: Path, doing: str = "read") -> Iterator[IO[bytes]]:
     """The open file; whatever is wrong with it becomes one `LogError` that names it."""
     cannot = f"{path}: cannot {doing} the log"
     try:
@@ -132,7 +132,7 @@ def read_contents(path: Path) -> Contents:
         NothingWrittenError: It is empty or torn before its first record was whole.
         LogError: It is missing, is no MCAP file or is damaged.
     """
-    with reading(path) as stream:
+    with open_log_file(path) as stream:
         size, closed = check_magic(stream)
         if not closed:
             return replace(scan(stream, path), complete=False)
@@ -171,7 +171,7 @@ def _written(record: McapRecord) -> bytes:
     return builder.end()
 
 
-def read_chunk(stream: IO[bytes], index: ChunkIndex) -> Unpacked:
+def read_chunk(stream: IO[bytes], index: ChunkIndex) -> UnpackedChunk:
     """A chunk by its index, unpacked and verified.
 
     Raises:
@@ -274,7 +274,7 @@ def _index_metadata(stream: IO[bytes], summary: Summary) -> None:
         start += length
 
 
-def counts_of(summary: Summary) -> dict[int, int]:
+def message_counts(summary: Summary) -> dict[int, int]:
     """Messages by channel id, counted on in place while a file grows."""
     if summary.statistics is None:
         summary.statistics = Statistics(0, 0, {}, 0, 0, 0, 0, 0, 0)
@@ -284,12 +284,12 @@ def counts_of(summary: Summary) -> dict[int, int]:
 def add_chunk(summary: Summary, index: ChunkIndex, runs: Sequence[Run]) -> None:
     """Note a chunk and count its messages."""
     summary.chunk_indexes.append(index)
-    counts = counts_of(summary)
+    counts = message_counts(summary)
     for run in runs:
         counts[run.channel] = counts.get(run.channel, 0) + len(run.log_time)
 
 
-def beginning(
+def file_head(
     summary: Summary, library: str, metadata: Metadata, attachments: Sequence[Attachment]
 ) -> bytes:
     """The first bytes of a file, up to the first chunk; their indexes go into the summary.
@@ -309,14 +309,14 @@ def beginning(
     return builder.end()
 
 
-def ending(summary: Summary, position: int) -> bytes:
+def file_tail(summary: Summary, position: int) -> bytes:
     """The last bytes of a file, from the end of its data on.
 
     Args:
         summary: Of the file.
         position: Offset at which they will stand.
     """
-    chunks, counts, builder = summary.chunk_indexes, counts_of(summary), RecordBuilder()
+    chunks, counts, builder = summary.chunk_indexes, message_counts(summary), RecordBuilder()
     statistics = Statistics(
         attachment_count=len(summary.attachment_indexes),
         channel_count=len(summary.channels),
@@ -558,7 +558,7 @@ class Run:
         return np.stack([self.log_time, offsets], axis=1).tobytes()
 
 
-def fill(
+def write_messages(
     buffer: NDArray[np.uint8],
     channel: int,
     rows: NDArray[Any],
@@ -606,7 +606,7 @@ def index_messages(index: ChunkIndex, runs: Sequence[Run], position: int) -> byt
     return records
 
 
-def packed_chunk(
+def pack_chunk(
     data: memoryview,
     runs: Sequence[Run],
     compression: str,
@@ -657,7 +657,7 @@ def chunk_index(chunk: Chunk, position: int) -> ChunkIndex:
 
 
 @dataclass(frozen=True, eq=False)
-class Unpacked:
+class UnpackedChunk:
     """A chunk, unpacked and verified.
 
     Attributes:
@@ -687,7 +687,7 @@ class Unpacked:
         raise LogError(f"a message of channel {run.channel} is not what its schema says")
 
 
-def unpack(chunk: Chunk, where: str) -> Unpacked:
+def unpack(chunk: Chunk, where: str) -> UnpackedChunk:
     """Unpack a chunk and find its messages.
 
     Args:
@@ -711,7 +711,7 @@ def unpack(chunk: Chunk, where: str) -> Unpacked:
     first, last = chunk.message_start_time, chunk.message_end_time
     if any(int(run.log_time.min()) < first or int(run.log_time.max()) > last for run in runs):
         raise LogError(f"{where} holds messages of other times than it says")
-    return Unpacked(chunk, data, runs, definitions)
+    return UnpackedChunk(chunk, data, runs, definitions)
 
 
 def _decompressed(packed: bytes, compression: str, size: int) -> bytes:

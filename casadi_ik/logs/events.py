@@ -1,6 +1,6 @@
-"""Events of a log: their kinds with phrases and colours, thresholds, and how they are found.
+"""Events of a log: kinds with phrases and colours, thresholds, and detection.
 
-They are found in the traces of many solves at once, going by the names of the fields:
+Events are detected in the traces of many solves at once by the names of the fields:
 
 ========================  ==============================================================
 standard field            events
@@ -11,15 +11,15 @@ standard field            events
 ``ACTIVE_MASK``           ACTIVATED, RELEASED
 ``sigma_<jacobian>``      NEAR_SINGULAR (smallest singular value; NaN while not measured)
 ``condition_<jacobian>``  ILL_CONDITIONED (condition number; NaN while not measured)
-``COST``, or else         STALL, and the progress that OSCILLATION asks for
+``COST``, or else         STALL, and the progress that excludes OSCILLATION
 ``POSITION_ERROR`` and
 ``ANGLE_ERROR``
 ``Q``                     OSCILLATION
 ``CLEARANCE``             COLLISION_ENTERED, COLLISION_LEFT (of a log with a scene)
 ========================  ==============================================================
 
-The standard fields are those of `casadi_ik.solve.trace`. One that a layout does not have gives
-no events. A finder is a function in `FINDERS`.
+The standard fields are those of `casadi_ik.solve.trace`. A layout without a field has none of its
+events. Each function of `DETECTORS` detects some kinds of events.
 """
 
 from __future__ import annotations
@@ -60,14 +60,14 @@ Words = NDArray[np.uint32]
 class EventKind(IntEnum):
     """Kind of an event in an iteration: its code, phrase and colour.
 
-    "Value against threshold" in the docstrings is what the event's two numbers are.
+    The docstrings of the kinds state the value and the threshold of their events.
 
     Attributes:
-        phrase: The event in a few words, with fields of `Happening` in braces; `mm` is the value
+        phrase: Format of a short description, with fields of `Event` in braces; `mm` is the value
             in millimetres.
-        subject: What it is about, likewise; `before` and `after` are names of phases.
-        color: Of its marks in diagrams; "": not marked, it shows as a phase or a limit.
-        serious: Whether it may be why a solve fails.
+        subject: Format of the subject; `before` and `after` are names of phases.
+        color: Colour of marks in diagrams; "" for events that appear as phases or limits.
+        serious: True if the event can be the cause of a failure.
 
     Example:
         >>> ik.logs.EventKind.LIMIT_HIT.name
@@ -87,7 +87,7 @@ class EventKind(IntEnum):
         color: str = "",
         serious: bool = False,
     ) -> Self:
-        """A member by its row."""
+        """Create a member from its code and attributes."""
         kind = int.__new__(cls, code)
         kind._value_ = code
         kind.phrase, kind.subject, kind.color, kind.serious = phrase, subject, color, serious
@@ -100,7 +100,7 @@ class EventKind(IntEnum):
         "#8e4ec6",
         True,
     )
-    """A Jacobian's smallest singular value has fallen below its threshold."""
+    """The smallest singular value of a Jacobian has fallen below its threshold."""
     ILL_CONDITIONED = (
         1,
         "{jacobian} ill-conditioned: condition number {value} (above {threshold})",
@@ -108,70 +108,71 @@ class EventKind(IntEnum):
         "#b48ad6",
         True,
     )
-    """A Jacobian's condition number has risen above its threshold."""
+    """The condition number of a Jacobian has risen above its threshold."""
     LIMIT_HIT = 2, "{joints} at its limit ({value})"
-    """An actuator has come to a limit: its position, twice."""
-    LIMIT_LEFT = 3, "{joints} off its limit ({threshold}), now {value}"
-    """An actuator has left a limit: its position against that on the limit."""
+    """An actuator has reached a limit. Value and threshold: its position."""
+    LIMIT_LEFT = 3, "{joints} left its limit ({threshold}), now {value}"
+    """An actuator has left a limit. Value: its position; threshold: its position on the limit."""
     ACTIVATED = 4, "{joints} activated: {value} active constraints, {threshold} before"
-    """Constraints have joined the active set: its size against that before."""
+    """Constraints have joined the active set. Value and threshold: its size now and before."""
     RELEASED = 5, "{joints} released: {value} active constraints, {threshold} before"
-    """Constraints have left the active set: its size against that before."""
+    """Constraints have left the active set. Value and threshold: its size now and before."""
     RESTART = 6, "restart {value}", "{threshold} -> {value}", "#2f6db3"
-    """A new start: its number against that before."""
-    PHASE_CHANGE = 7, "on to {phase}", "{before} -> {after}"
-    """Another phase: its code against that before."""
-    STALL = 8, "{phase} stalls: errors change by {value} of themselves", "{phase}", "#2b333b", True
-    """The errors stand still: their relative spread against what counts as still."""
+    """A restart. Value and threshold: its number and the number before."""
+    PHASE_CHANGE = 7, "phase {phase}", "{before} -> {after}"
+    """A change of phase. Value and threshold: codes of the new and the previous phase."""
+    STALL = 8, "{phase} stalled (relative error change {value})", "{phase}", "#2b333b", True
+    """The errors no longer change. Value and threshold: relative spread of the errors."""
     OSCILLATION = (
         9,
-        "{joints} to and fro without progress: steps up to {value}",
+        "oscillation of {joints} without progress: steps up to {value}",
         "{joints}",
         "#0f8b8d",
         True,
     )
-    """Actuators go to and fro without progress: the longest step against what counts as one."""
-    COLLISION_ENTERED = 10, "something touches: clearance {mm} mm"
-    """Two shapes have come nearer than they may: the clearance against the margin."""
-    COLLISION_LEFT = 11, "nothing touches any more: clearance {mm} mm"
-    """No two shapes are nearer than they may be any more: the clearance against the margin."""
+    """Actuators oscillate without progress. Value: largest step; threshold: smallest step."""
+    COLLISION_ENTERED = 10, "collision: clearance {mm} mm"
+    """The clearance has fallen below the margin. Value: clearance; threshold: margin."""
+    COLLISION_LEFT = 11, "end of collision: clearance {mm} mm"
+    """The clearance has risen above the margin. Value: clearance; threshold: margin."""
 
 
 SINGULAR = (EventKind.NEAR_SINGULAR, EventKind.ILL_CONDITIONED)
-"""The kinds that make a solve a singular one."""
+"""Kinds of events near singularities."""
 
 MOVES = (EventKind.LIMIT_HIT, EventKind.LIMIT_LEFT, EventKind.OSCILLATION)
-"""The kinds whose numbers are positions or steps of actuators."""
+"""Kinds whose values are positions or steps of actuators."""
 
 SERIOUS = tuple(kind.name for kind in EventKind if kind.serious)
-"""Names of the kinds that may be why a solve fails."""
+"""Names of the kinds that can be the cause of a failure."""
 
 EVENT_COLORS: Mapping[str, str] = {kind.name: kind.color for kind in EventKind if kind.color}
-"""Colours of the kinds that are marked in diagrams, by name."""
+"""Colours of the kinds that are marked in diagrams by name."""
 
 
 @dataclass(frozen=True)
 class EventRules:
-    """When something counts as an event; the defaults are checked by studies/event_thresholds.py.
+    """Thresholds of events; studies/event_thresholds.py checks the defaults.
 
     Attributes:
         singular: Smallest singular value below which a Jacobian is near singular, by the name
-            behind ``sigma_``, in the unit of that field. One not named here has the threshold
-            that its method states (`RecordedJacobian.singular`).
-        condition: Condition number above which it is ill-conditioned, by the name behind
-            ``condition_``; likewise.
-        release: A Jacobian has to rise above this multiple of its threshold (a condition number
-            to fall below the threshold by this factor) before it can enter again.
-        limit_slack: How far a coordinate has to move from its limit to have left it [rad or m];
-            so that a rounding error is not an event.
-        stall_window: Iterations over which a stall is judged.
-        stall_change: Spread of the error over the window, relative to the error, that counts as
-            standing still.
-        oscillation_window: Iterations over which an oscillation is judged, at least 3.
-        oscillation_step: Shortest step of a coordinate that counts as moving [rad or m].
-        oscillation_progress: Relative fall of the error over the window that counts as progress.
-        clearance: Clearance below which something is touched [m]; a log with a scene takes the
-            scene's margin.
+            after ``sigma_``, in the unit of that field. Other Jacobians have the threshold of
+            their method (`RecordedJacobian.singular`).
+        condition: Condition number above which a Jacobian is ill-conditioned, by the name after
+            ``condition_``; other Jacobians have the threshold of their method.
+        release: Factor of hysteresis: a singular value must exceed its threshold by this factor
+            (a condition number must fall below it) before the event can occur again.
+        limit_slack: Distance from a limit at which an actuator has left it [rad or m]; it
+            excludes events due to rounding.
+        stall_window: Number of iterations over which a stall is detected.
+        stall_change: Spread of the error over the window, relative to the error, below which the
+            solve has stalled.
+        oscillation_window: Number of iterations over which an oscillation is detected, at least 3.
+        oscillation_step: Smallest step of an oscillating actuator [rad or m].
+        oscillation_progress: Relative decrease of the error over the window that counts as
+            progress.
+        clearance: Clearance below which the robot is in collision [m]; logs with a scene use the
+            margin of the scene.
 
     Example:
         >>> ik.logs.EventRules(release=3.0).release
@@ -192,27 +193,27 @@ class EventRules:
     def __post_init__(self) -> None:
         if self.stall_window < 1 or self.oscillation_window < 3:
             raise InputError(
-                f"event rules: windows {self.stall_window} and {self.oscillation_window},"
+                f"event rules: found windows {self.stall_window} and {self.oscillation_window},"
                 " expected at least 1 (stall) and 3 (oscillation)"
             )
         if self.release < 1:
-            raise InputError(f"event rules: release {self.release}, expected at least 1")
+            raise InputError(f"event rules: release: found {self.release}, expected at least 1")
 
 
 @dataclass(frozen=True)
-class Happening:
+class Event:
     """An event of a solve.
 
     Attributes:
-        iteration: In which iteration, from 0.
+        iteration: Iteration of the event, from 0.
         kind: Name of its `EventKind`, e.g. "NEAR_SINGULAR".
-        jacobian: The Jacobian concerned; "" if none.
-        joints: The actuators concerned.
-        phase: The phase it happened in; "" without phases.
-        value: The number that made it an event.
-        threshold: The number it was compared with, or the value before.
-        unit: Of both, "rad" or "m", if they are positions or steps of actuators.
-        subject: What it is about, as `EventKind.subject` says.
+        jacobian: Name of the Jacobian; "" for kinds without one.
+        joints: Names of the actuators.
+        phase: Phase of the iteration; "" if the method has no phases.
+        value: Value that caused the event.
+        threshold: Threshold of the value, or the previous value.
+        unit: Unit of both, "rad" or "m", if they are positions or steps of actuators.
+        subject: Subject of the event in the format of `EventKind.subject`.
     """
 
     iteration: int
@@ -226,71 +227,71 @@ class Happening:
     subject: str = ""
 
 
-def told(event: Happening) -> str:
-    """An event in a few words."""
+def describe(event: Event) -> str:
+    """Return a short description of an event."""
     if event.kind not in EventKind.__members__:
-        return f"{plain_name(event.kind.lower())}: {number(event.value)}"
+        return f"{plain_name(event.kind.lower())}: {format_number(event.value)}"
     return EventKind[event.kind].phrase.format(
         jacobian=plain_name(event.jacobian),
-        joints=listed(event.joints),
+        joints=joined_names(event.joints),
         phase=plain_name(event.phase),
-        value=quantity(event.value, event.unit),
-        threshold=quantity(event.threshold, event.unit),
+        value=format_quantity(event.value, event.unit),
+        threshold=format_quantity(event.threshold, event.unit),
         mm=f"{1e3 * event.value:.2f}",
     )
 
 
 def plain_name(name: str) -> str:
-    """A name of the code as words: ``closed_chain`` is "closed chain"."""
+    """Return an identifier as words: "closed chain" for ``closed_chain``."""
     return name.replace("_", " ").replace("-", " ")
 
 
-def number(value: float) -> str:
-    """Three digits."""
+def format_number(value: float) -> str:
+    """Format a number with three significant digits."""
     return f"{value:.3g}"
 
 
-def quantity(value: float, unit: str) -> str:
-    """A value with its unit as people read it: angles in degrees, lengths in millimetres."""
+def format_quantity(value: float, unit: str) -> str:
+    """Format a value with its unit: angles in degrees, lengths in millimetres."""
     if unit == "rad":
         return f"{math.degrees(value):.4g} deg"
-    return f"{1e3 * value:.4g} mm" if unit == "m" else number(value)
+    return f"{1e3 * value:.4g} mm" if unit == "m" else format_number(value)
 
 
-def plural(count: int, thing: str) -> str:
-    """How many of a thing: "1 restart", "2 restarts"."""
-    return f"{count} {thing}" + ("" if count == 1 else "s")
+def counted_noun(count: int, noun: str) -> str:
+    """Return a count with its noun: "1 restart", "2 restarts"."""
+    return f"{count} {noun}" + ("" if count == 1 else "s")
 
 
-def listed(names: Sequence[str], most: int = 4) -> str:
-    """Names with commas, the first few of many."""
-    shown = ", ".join(names[:most])
-    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
+def joined_names(names: Sequence[str], max_names: int = 4) -> str:
+    """Join the first names with commas and count the remaining ones."""
+    text = ", ".join(names[:max_names])
+    return text if len(names) <= max_names else f"{text} and {len(names) - max_names} more"
 
 
 def errors_text(position: float, angle: float) -> str:
-    """Distance and angle to a contact; what is free (NaN) is left out.
+    """Format the errors of a contact; free components (NaN) are left out.
 
     Args:
-        position: [m].
-        angle: [rad].
+        position: Position error [m].
+        angle: Angle error [rad].
     """
     parts = [] if math.isnan(position) else [f"{1e3 * position:.2f} mm"]
     parts += [] if math.isnan(angle) else [f"{math.degrees(angle):.2f} deg"]
     return " and ".join(parts) or "free"
 
 
-# How events are stored.
+# Storage of events.
 
 
 def jacobian_names(form: TraceFormat) -> tuple[str, ...]:
-    """Names of the Jacobians whose measures a trace holds; one per element of such a field."""
-    found = (name for item in form.layout for name in measured_jacobians(form, item))
-    return tuple(dict.fromkeys(found))
+    """Return the names of the measured Jacobians, one per element of their fields."""
+    names = (name for item in form.layout for name in measured_jacobians(form, item))
+    return tuple(dict.fromkeys(names))
 
 
 def measured_jacobians(form: TraceFormat, item: Field) -> tuple[str, ...]:
-    """Names of the Jacobians that the elements of a field measure; none if it measures none."""
+    """Return the names of the Jacobians of a field of measurements; () for other fields."""
     name = item.name.removeprefix(SIGMA).removeprefix(CONDITION)
     if name == item.name:
         return ()
@@ -300,7 +301,7 @@ def measured_jacobians(form: TraceFormat, item: Field) -> tuple[str, ...]:
 
 
 def mask_words(form: TraceFormat) -> int:
-    """Number of 32-bit words of a mask of all actuators."""
+    """Return the number of 32-bit words of a mask of all actuators."""
     sizes = {item.name: item.size for item in form.layout}
     coordinates = -(-sizes.get(Q.name, 1) // WORD_BITS)
     masks = (sizes.get(mask.name, 1) for mask in (LIMIT_MASK, ACTIVE_MASK))
@@ -308,7 +309,7 @@ def mask_words(form: TraceFormat) -> int:
 
 
 def event_layout(words: int) -> Layout:
-    """Fields of an event whose mask of actuators has so many words."""
+    """Return the fields of an event; its mask of actuators has `words` words."""
     return Layout.record(
         Field("value", (), "f8", "", "the number that made it an event"),
         Field("threshold", (), "f8", "", "what it was compared with, or the value before"),
@@ -322,7 +323,7 @@ def event_layout(words: int) -> Layout:
 
 
 def event_format(form: TraceFormat) -> TraceFormat:
-    """Layout and labels of the events of a method whose traces have the given format."""
+    """Return layout and labels of the events of traces of a format."""
     labels = {
         "kind": tuple(kind.name for kind in EventKind),
         "jacobian": ("none", *jacobian_names(form)),
@@ -337,11 +338,11 @@ def _actuators(form: TraceFormat) -> tuple[str, ...]:
     return form.labels.get(Q.name) or form.labels.get(LIMIT_MASK.name, ())
 
 
-# How they are found.
+# Detection of events.
 
 
-class Found(NamedTuple):
-    """Events of a kind: their rows (e,), and the rest as numbers or (e,), joints as (e, words)."""
+class EventRows(NamedTuple):
+    """Events of a kind: rows (e,), scalars or arrays (e,) of values, joints as masks (e, words)."""
 
     kind: EventKind
     row: Rows
@@ -357,29 +358,30 @@ def detect_events(
     counts: NDArray[np.int64],
     rules: EventRules | None = None,
 ) -> NDArray[Any]:
-    """All events of several solves, by solve and iteration.
+    """Detect the events of several solves.
 
     Args:
-        form: How to read the rows.
-        rows: (m,) the rows of one solve after the other.
-        counts: (k,) how many rows each solve has.
-        rules: When something counts as an event.
+        form: Format of the rows.
+        rows: (m,) rows of all solves, one solve after another.
+        counts: (k,) number of rows of each solve.
+        rules: Thresholds of events.
 
     Returns:
-        (e,) rows of `event_format`; "solve_id" counts the solves from 0.
+        (e,) rows of `event_format` sorted by solve and iteration; "solve_id" counts the solves
+        from 0.
     """
     traces = Traces(form, rows, counts, rules or EventRules())
     with np.errstate(invalid="ignore"):
-        found = [each for finder in FINDERS for each in finder(traces)] if len(rows) else []
-    found = [each for each in found if len(each.row)]
-    row = np.concatenate([np.zeros(0, np.intp), *(each.row for each in found)])
+        batches = [batch for detect in DETECTORS for batch in detect(traces)] if len(rows) else []
+    batches = [batch for batch in batches if len(batch.row)]
+    row = np.concatenate([np.zeros(0, np.intp), *(batch.row for batch in batches)])
     events = np.zeros(len(row), event_format(form).layout.dtype)
     first, masks = 0, as_matrix(events["joint_mask"])
-    for each in found:
-        part = slice(first, first := first + len(each.row))
+    for batch in batches:
+        part = slice(first, first := first + len(batch.row))
         for name in ("kind", "value", "threshold", "jacobian"):
-            events[name][part] = getattr(each, name)
-        joints = np.asarray(each.joints)
+            events[name][part] = getattr(batch, name)
+        joints = np.asarray(batch.joints)
         masks[part, : joints.shape[-1] if joints.ndim else None] = joints
     solve = traces.solve[row]
     events["solve_id"] = solve
@@ -390,14 +392,14 @@ def detect_events(
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredJacobian:
     """A Jacobian with the columns of a trace that measure it.
 
     Attributes:
-        joints: Actuators whose motion it maps.
+        joints: Actuators of its columns.
         singular: Threshold of its smallest singular value.
         condition: Threshold of its condition number.
-        columns: Field and column of `SIGMA` and of `CONDITION`, as far as there are any.
+        columns: (field, column) of its measurements by `SIGMA` and `CONDITION`.
     """
 
     joints: tuple[str, ...]
@@ -408,13 +410,13 @@ class Measured:
 
 @dataclass(frozen=True, eq=False)
 class Traces:
-    """Rows of several solves, one solve after the other.
+    """Rows of several solves, one solve after another.
 
     Attributes:
-        form: How to read them.
-        rows: (m,) of the format's layout.
-        counts: (k,) rows of each solve.
-        rules: When something counts as an event.
+        form: Format of the rows.
+        rows: (m,) rows of the layout of the format.
+        counts: (k,) number of rows of each solve.
+        rules: Thresholds of events.
     """
 
     form: TraceFormat
@@ -430,7 +432,7 @@ class Traces:
 
     @cached_property
     def solve(self) -> Rows:
-        """(m,) the solve that a row belongs to, from 0."""
+        """(m,) index of the solve of each row, from 0."""
         return np.repeat(np.arange(len(self.counts)), self.counts)
 
     @cached_property
@@ -440,12 +442,12 @@ class Traces:
 
     @cached_property
     def firsts(self) -> Rows:
-        """The rows that are the first of their solves."""
+        """First rows of all solves that have rows."""
         return self.starts[self.counts > 0]
 
     @cached_property
-    def piece(self) -> NDArray[np.int32]:
-        """(m,) number of the stretch of one solve, phase and start that a row belongs to."""
+    def run(self) -> NDArray[np.int32]:
+        """(m,) number of the run of rows with the same solve, phase and restart."""
         new = np.zeros(len(self.rows), dtype=bool)
         new[self.firsts] = True
         for name in (PHASE.name, RESTART.name):
@@ -455,56 +457,55 @@ class Traces:
         return np.cumsum(new, dtype=np.int32)
 
     @cached_property
-    def jacobians(self) -> list[Measured]:
-        """The measured Jacobians in the order of `jacobian_names`."""
-        found: dict[str, Measured] = {}
+    def jacobians(self) -> list[MeasuredJacobian]:
+        """Measured Jacobians in the order of `jacobian_names`."""
+        jacobians: dict[str, MeasuredJacobian] = {}
         for item in self.form.layout:
             kind = SIGMA if item.name.startswith(SIGMA) else CONDITION
             name = item.name.removeprefix(kind)
-            known = self.form.jacobians.get(name, RecordedJacobian())
-            singular = self.rules.singular.get(name, known.singular)
-            condition = self.rules.condition.get(name, known.condition)
+            recorded = self.form.jacobians.get(name, RecordedJacobian())
+            singular = self.rules.singular.get(name, recorded.singular)
+            condition = self.rules.condition.get(name, recorded.condition)
             for column, label in enumerate(measured_jacobians(self.form, item)):
-                new = Measured(known.joints, singular, condition)
-                found.setdefault(label, new).columns[kind] = item.name, column
-        return list(found.values())
+                jacobian = MeasuredJacobian(recorded.joints, singular, condition)
+                jacobians.setdefault(label, jacobian).columns[kind] = item.name, column
+        return list(jacobians.values())
 
     def matrix(self, name: str) -> NDArray[Any]:
-        """A field of all rows, (m, size); a view."""
+        """Return a view of a field of all rows, (m, size)."""
         return as_matrix(self.rows[name])
 
     def column(self, name: str, column: int = 0) -> NDArray[Any]:
-        """One column of a field of all rows, (m,) in one piece."""
+        """Return a contiguous column of a field of all rows, (m,)."""
         key = f"{name}.{column}"
         if key not in self._columns:
             self._columns[key] = np.ascontiguousarray(self.matrix(name)[:, column])
         return self._columns[key]
 
     def columns(self, name: str) -> NDArray[Any]:
-        """A field of all rows as (size, m), each column in one piece: this runs faster."""
+        """Return a field of all rows as (size, m), which is faster to process by column."""
         return self.matrix(name).T.copy(order="C")
 
-    def before(self, values: NDArray[Any], start: ArrayLike) -> NDArray[Any]:
-        """Values (m, ...) in the row before each; in the first rows of solves `start`."""
-        before = np.empty_like(values)
-        before[1:] = values[:-1]
-        before[self.firsts] = start
-        return before
+    def previous(self, values: NDArray[Any], start: ArrayLike) -> NDArray[Any]:
+        """Return the values (m, ...) of the previous rows, and `start` in first rows of solves."""
+        previous = np.empty_like(values)
+        previous[1:] = values[:-1]
+        previous[self.firsts] = start
+        return previous
 
-    def longer(self, window: int) -> tuple[Traces, Rows]:
-        """The solves that have more rows than a window, and the numbers of their rows."""
-        wanted = self.counts > window
-        number = np.flatnonzero(np.repeat(wanted, self.counts))
-        if wanted.all():
-            return self, number
-        return Traces(
-            self.form, np.take(self.rows, number), self.counts[wanted], self.rules
-        ), number
+    def longer_than(self, window: int) -> tuple[Traces, Rows]:
+        """Return the solves with more rows than a window, and the indices of their rows."""
+        is_long = self.counts > window
+        indices = np.flatnonzero(np.repeat(is_long, self.counts))
+        if is_long.all():
+            return self, indices
+        rows = np.take(self.rows, indices)
+        return Traces(self.form, rows, self.counts[is_long], self.rules), indices
 
     def nearest_singular(self, row: Rows) -> NDArray[np.int64]:
-        """Number of the Jacobian that is nearest to its threshold in each row, from 1 on.
+        """Return the number, from 1, of the Jacobian nearest to its threshold in each row.
 
-        0 where none has come nearer than the factor `EventRules.release`.
+        The number is 0 if no singular value is within the factor `EventRules.release`.
         """
         distance = np.full((len(row), len(self.jacobians) + 1), np.inf)
         distance[:, 0] = self.rules.release
@@ -515,101 +516,100 @@ class Traces:
         return np.argmin(distance, axis=1)
 
     def words(self, joints: Bools) -> Words:
-        """Actuators (e, n) as words (e, words) of a mask."""
+        """Pack flags of actuators (e, n) into words (e, words) of a mask."""
         padded = np.zeros((len(joints), 32 * mask_words(self.form)), dtype=bool)
         padded[:, : joints.shape[1]] = joints
         return words_of(padded)
 
 
-def _changes(traces: Traces) -> Iterator[Found]:
-    """Another phase, or another start."""
+def _changes(traces: Traces) -> Iterator[EventRows]:
+    """Detect changes of phase and restarts."""
     for name, kind in ((PHASE.name, EventKind.PHASE_CHANGE), (RESTART.name, EventKind.RESTART)):
         if name in traces.names:
             codes = traces.column(name)
-            before = traces.before(codes, codes[traces.firsts])
-            row = np.flatnonzero(codes != before)
-            yield Found(kind, row, codes[row], before[row])
+            previous = traces.previous(codes, codes[traces.firsts])
+            row = np.flatnonzero(codes != previous)
+            yield EventRows(kind, row, codes[row], previous[row])
 
 
-def _limits(traces: Traces) -> Iterator[Found]:
-    """Bits of the limit mask that come and go.
+def _limits(traces: Traces) -> Iterator[EventRows]:
+    """Detect changes of bits of the limit mask.
 
-    Before the first row of a solve no bit counts as set, so a start on a limit is a hit. A bit
-    that goes while the coordinate stays within `EventRules.limit_slack` of where it was on the
-    limit is no leaving; if it comes again before the coordinate has moved, that is no hit.
+    A start at a limit is a hit. If a bit is cleared while the actuator stays within
+    `EventRules.limit_slack` of its position on the limit, the actuator has not left the limit, and
+    it does not hit the limit if the bit is set again before it has moved.
     """
     if LIMIT_MASK.name not in traces.names:
         return
     mask = np.ascontiguousarray(traces.matrix(LIMIT_MASK.name))
-    before = traces.before(mask, 0)
-    hit, hit_bit = _places(mask & ~before)
-    left, left_bit = _places(before & ~mask)
-    limit, ends = (
-        _q(traces, left - 1, left_bit),
-        (traces.starts + traces.counts)[traces.solve[left]],
-    )
-    no_hit, leaves = np.zeros(len(hit), dtype=bool), np.ones(len(left), dtype=bool)
-    # Those that have not moved yet are looked at a row later, up to the next hit or the end.
-    still = np.arange(len(left))
+    previous = traces.previous(mask, 0)
+    hit, hit_bit = _set_bits(mask & ~previous)
+    leave, leave_bit = _set_bits(previous & ~mask)
+    limit = _positions(traces, leave - 1, leave_bit)
+    ends = (traces.starts + traces.counts)[traces.solve[leave]]
+    is_repeated, has_left = np.zeros(len(hit), dtype=bool), np.ones(len(leave), dtype=bool)
+    # Actuators that have not moved yet are followed row by row to the next hit or the end.
+    pending = np.arange(len(leave))
     while True:
-        row, bit = left[still], left_bit[still]
-        still = still[np.abs(_q(traces, row, bit) - limit[still]) <= traces.rules.limit_slack]
-        if not len(still):
+        row, bit = leave[pending], leave_bit[pending]
+        distance = np.abs(_positions(traces, row, bit) - limit[pending])
+        pending = pending[distance <= traces.rules.limit_slack]
+        if not len(pending):
             break
-        left[still] += 1
-        row, bit = left[still], left_bit[still]
-        over = row == ends[still]
-        words = mask[np.where(over, 0, row), bit >> 5] >> (bit & 31).astype(np.uint32)
-        back = ~over & (words & 1 > 0)
-        no_hit |= np.isin(hit * 2**16 + hit_bit, (row * 2**16 + bit)[back])
-        leaves[still[over | back]] = False
-        still = still[~(over | back)]
-    hit, hit_bit = hit[~no_hit], hit_bit[~no_hit]
-    left, left_bit, limit = left[leaves], left_bit[leaves], limit[leaves]
+        leave[pending] += 1
+        row, bit = leave[pending], leave_bit[pending]
+        at_end = row == ends[pending]
+        words = mask[np.where(at_end, 0, row), bit >> 5] >> (bit & 31).astype(np.uint32)
+        is_back = ~at_end & (words & 1 > 0)
+        is_repeated |= np.isin(hit * 2**16 + hit_bit, (row * 2**16 + bit)[is_back])
+        has_left[pending[at_end | is_back]] = False
+        pending = pending[~(at_end | is_back)]
+    hit, hit_bit = hit[~is_repeated], hit_bit[~is_repeated]
+    leave, leave_bit, limit = leave[has_left], leave_bit[has_left], limit[has_left]
     for kind, row, bit, threshold in (
-        (EventKind.LIMIT_HIT, hit, hit_bit, _q(traces, hit, hit_bit)),
-        (EventKind.LIMIT_LEFT, left, left_bit, limit),
+        (EventKind.LIMIT_HIT, hit, hit_bit, _positions(traces, hit, hit_bit)),
+        (EventKind.LIMIT_LEFT, leave, leave_bit, limit),
     ):
         joints = np.zeros((len(row), mask_words(traces.form)), np.uint32)
         joints[np.arange(len(row)), bit >> 5] = 1 << (bit & 31)
-        yield Found(kind, row, _q(traces, row, bit), threshold, joints)
+        yield EventRows(kind, row, _positions(traces, row, bit), threshold, joints)
 
 
-def _active(traces: Traces) -> Iterator[Found]:
-    """Constraints that join or leave the active set."""
+def _active(traces: Traces) -> Iterator[EventRows]:
+    """Detect constraints that join or leave the active set."""
     if ACTIVE_MASK.name in traces.names:
         mask = np.ascontiguousarray(traces.matrix(ACTIVE_MASK.name))
-        before = traces.before(mask, mask[traces.firsts])
-        changes = ((EventKind.ACTIVATED, mask & ~before), (EventKind.RELEASED, before & ~mask))
+        previous = traces.previous(mask, mask[traces.firsts])
+        changes = ((EventKind.ACTIVATED, mask & ~previous), (EventKind.RELEASED, previous & ~mask))
         for kind, joints in changes:
             row = np.flatnonzero(joints.any(axis=1))
-            size, size_before = (bits_of(words[row]).sum(axis=1) for words in (mask, before))
-            yield Found(kind, row, size, size_before, joints[row])
+            size, size_before = (bits_of(words[row]).sum(axis=1) for words in (mask, previous))
+            yield EventRows(kind, row, size, size_before, joints[row])
 
 
-def _collisions(traces: Traces) -> Iterator[Found]:
-    """Where the clearance falls below the margin and where it is back above it.
+def _collisions(traces: Traces) -> Iterator[EventRows]:
+    """Detect where the clearance falls below the margin and rises above it again.
 
-    Before the first row of a solve nothing counts as touched, so a start in collision is an entry.
+    A start in collision is an entry.
     """
     if CLEARANCE in traces.names:
         clearance, margin = traces.column(CLEARANCE), traces.rules.clearance
-        # Clearances are kept in single precision.
-        touching = clearance < margin - 1e-7
-        before = traces.before(touching, False)
-        for kind, there in (
-            (EventKind.COLLISION_ENTERED, touching & ~before),
-            (EventKind.COLLISION_LEFT, ~touching & before),
+        # The tolerance covers the single precision of logged clearances.
+        in_collision = clearance < margin - 1e-7
+        previous = traces.previous(in_collision, False)
+        for kind, changes in (
+            (EventKind.COLLISION_ENTERED, in_collision & ~previous),
+            (EventKind.COLLISION_LEFT, ~in_collision & previous),
         ):
-            row = np.flatnonzero(there)
-            yield Found(kind, row, clearance[row], margin)
+            row = np.flatnonzero(changes)
+            yield EventRows(kind, row, clearance[row], margin)
 
 
-def _singular(traces: Traces) -> Iterator[Found]:
-    """Where a Jacobian comes to be singular; the entry only.
+def _singular(traces: Traces) -> Iterator[EventRows]:
+    """Detect where a Jacobian becomes near singular or ill-conditioned.
 
-    It may enter again once it was better than its threshold by the factor `EventRules.release`,
-    or was not computed (NaN) in between.
+    The event can occur again once the value was better than its threshold by the factor
+    `EventRules.release`, or was not computed (NaN).
     """
     names, release = _actuators(traces.form), traces.rules.release
     for number, jacobian in enumerate(traces.jacobians, start=1):
@@ -617,163 +617,163 @@ def _singular(traces: Traces) -> Iterator[Found]:
         if SIGMA in jacobian.columns and jacobian.singular > 0:
             value, limit = traces.column(*jacobian.columns[SIGMA]), jacobian.singular
             row = _entries(traces, value < limit, ~(value <= limit * release))
-            yield Found(EventKind.NEAR_SINGULAR, row, value[row], limit, joints, number)
+            yield EventRows(EventKind.NEAR_SINGULAR, row, value[row], limit, joints, number)
         if CONDITION in jacobian.columns and jacobian.condition < math.inf:
             value, limit = traces.column(*jacobian.columns[CONDITION]), jacobian.condition
             row = _entries(traces, value > limit, ~(value >= limit / release))
-            yield Found(EventKind.ILL_CONDITIONED, row, value[row], limit, joints, number)
+            yield EventRows(EventKind.ILL_CONDITIONED, row, value[row], limit, joints, number)
 
 
-def _stalls(traces: Traces) -> Iterator[Found]:
-    """Where the error has stood still over the window; the entry only.
+def _stalls(traces: Traces) -> Iterator[EventRows]:
+    """Detect where the error stalls.
 
-    Standing still: over the last `EventRules.stall_window` iterations, none of them in another
-    phase or restart, the errors spread by at most `EventRules.stall_change` of the largest of
-    them (largest of all fingers, so that a finger in place cannot hide the one that is stuck).
+    A solve has stalled if over the last `EventRules.stall_window` iterations of one phase and
+    restart the errors spread by at most `EventRules.stall_change` of the largest error. The largest
+    of all fingers counts, so that a converged finger does not hide one that is stuck.
     """
     window, limit = traces.rules.stall_window, traces.rules.stall_change
-    longer, number = traces.longer(window)
-    if not (groups := _errors(longer)):
+    long_traces, indices = traces.longer_than(window)
+    if not (groups := _errors(long_traces)):
         return
-    spread = largest = np.zeros(len(number) - window)
+    spread = largest = np.zeros(len(indices) - window)
     for errors in groups:
         high, low = (_over_window(errors, window + 1, pick) for pick in (np.maximum, np.minimum))
         top = high.max(axis=0)
         spread = np.maximum(spread, (high - low).max(axis=0) / np.where(top > 0, top, 1))
         largest = np.maximum(largest, top)
-    found = _begins(_one_piece(longer, window) & (spread <= limit) & (largest > 0))
-    row, at_limit = number[found + window], 0
+    is_stalled = _same_run(long_traces, window) & (spread <= limit) & (largest > 0)
+    starts = _rising_edges(is_stalled)
+    row, at_limit = indices[starts + window], 0
     if LIMIT_MASK.name in traces.names:
         at_limit = traces.matrix(LIMIT_MASK.name)[row]
-    near = traces.nearest_singular(row)
-    yield Found(EventKind.STALL, row, spread[found], limit, at_limit, near)
+    jacobian = traces.nearest_singular(row)
+    yield EventRows(EventKind.STALL, row, spread[starts], limit, at_limit, jacobian)
 
 
-def _oscillations(traces: Traces) -> Iterator[Found]:
-    """Where coordinates go to and fro without progress; the entry only.
+def _oscillations(traces: Traces) -> Iterator[EventRows]:
+    """Detect where actuators oscillate without progress.
 
-    To and fro: every step of the coordinate in the last `EventRules.oscillation_window`
-    iterations is longer than `EventRules.oscillation_step` and against the one before. Without
-    progress: no error has fallen by more than `EventRules.oscillation_progress` over these
-    iterations.
+    An actuator oscillates if each of its steps in the last `EventRules.oscillation_window`
+    iterations is longer than `EventRules.oscillation_step` and opposite to the previous step. There
+    is no progress if no error decreases by more than `EventRules.oscillation_progress`.
     """
     rules, window = traces.rules, traces.rules.oscillation_window
-    longer, number = traces.longer(window)
-    if Q.name not in traces.names or not len(number):
+    long_traces, indices = traces.longer_than(window)
+    if Q.name not in traces.names or not len(indices):
         return
-    steps = np.diff(longer.columns(Q.name), axis=1)
+    steps = np.diff(long_traces.columns(Q.name), axis=1)
     up, down = steps > rules.oscillation_step, steps < -rules.oscillation_step
-    turning = (up[:, 1:] & down[:, :-1]) | (down[:, 1:] & up[:, :-1])
-    swinging = _over_window(turning, window - 1, np.minimum)
-    caught = np.logical_or.reduce(swinging, axis=0)
-    if caught.any():
-        caught &= _one_piece(longer, window)
-        for errors in _errors(longer):
+    is_reversed = (up[:, 1:] & down[:, :-1]) | (down[:, 1:] & up[:, :-1])
+    oscillates = _over_window(is_reversed, window - 1, np.minimum)
+    without_progress = np.logical_or.reduce(oscillates, axis=0)
+    if without_progress.any():
+        without_progress &= _same_run(long_traces, window)
+        for errors in _errors(long_traces):
             norm = np.sqrt(np.einsum("ij,ij->j", errors, errors))
-            caught &= norm[window:] >= (1 - rules.oscillation_progress) * norm[:-window]
-    found = _begins(caught)
-    joints, row = swinging[:, found].T, number[found + window]
-    step = np.where(joints, np.abs(steps[:, found + window - 1]).T, 0).max(axis=1)
-    words, near = traces.words(joints), traces.nearest_singular(row)
-    yield Found(EventKind.OSCILLATION, row, step, rules.oscillation_step, words, near)
+            without_progress &= norm[window:] >= (1 - rules.oscillation_progress) * norm[:-window]
+    starts = _rising_edges(without_progress)
+    joints, row = oscillates[:, starts].T, indices[starts + window]
+    step = np.where(joints, np.abs(steps[:, starts + window - 1]).T, 0).max(axis=1)
+    words, jacobian = traces.words(joints), traces.nearest_singular(row)
+    yield EventRows(EventKind.OSCILLATION, row, step, rules.oscillation_step, words, jacobian)
 
 
-FINDERS: tuple[Callable[[Traces], Iterator[Found]], ...] = (
+DETECTORS: tuple[Callable[[Traces], Iterator[EventRows]], ...] = (
     *(_changes, _limits, _active, _collisions, _singular, _stalls, _oscillations),
 )
-"""Each looks at the traces of all solves in one go."""
+"""Detectors of events; each processes the traces of all solves at once."""
 
 
-def _begins(holds: Bools) -> Rows:
-    """Where a condition holds that did not hold in the row before.
+def _rising_edges(flags: Bools) -> Rows:
+    """Return the rows whose flag is set and whose previous flag is not.
 
-    It never holds in the first rows of a solve, so that solves need no telling apart.
+    The flags must not be set in the first rows of solves, so that solves need no separation.
     """
-    return np.flatnonzero(holds & ~np.concatenate([[False], holds[:-1]]))
+    return np.flatnonzero(flags & ~np.concatenate([[False], flags[:-1]]))
 
 
 def _errors(traces: Traces) -> list[NDArray[Any]]:
-    """What a solve brings down, (columns, m) per unit; a column that is never a number is zero."""
+    """Return the errors that a solve minimises, (columns, m) per unit, with 0 for free columns."""
     fields = (COST,) if COST.name in traces.names else (POSITION_ERROR, ANGLE_ERROR)
-    found = []
+    groups = []
     for name in (item.name for item in fields if item.name in traces.names and len(traces.rows)):
         errors = np.abs(traces.columns(name))
-        missing = np.isnan(errors)
-        if missing.any():
-            never = np.logical_and.reduceat(missing, traces.starts, axis=1)
-            errors[np.repeat(never, traces.counts, axis=1)] = 0
-        found.append(errors)
-    return found
+        is_missing = np.isnan(errors)
+        if is_missing.any():
+            is_free = np.logical_and.reduceat(is_missing, traces.starts, axis=1)
+            errors[np.repeat(is_free, traces.counts, axis=1)] = 0
+        groups.append(errors)
+    return groups
 
 
-def _one_piece(traces: Traces, window: int) -> Bools:
-    """For each row from `window` on: do the last `window` steps lie in one phase and restart."""
-    return traces.piece[window:] == traces.piece[:-window]
+def _same_run(traces: Traces, window: int) -> Bools:
+    """Return for rows from `window` on whether the last `window` steps have one phase and restart."""
+    return traces.run[window:] == traces.run[:-window]
 
 
-def _entries(traces: Traces, begun: Bools, ended: Bools) -> Rows:
-    """Rows where a condition begins to hold.
+def _entries(traces: Traces, begins: Bools, ends: Bools) -> Rows:
+    """Return the rows where a condition with hysteresis starts to hold.
 
-    It holds from a row where it has begun until one where it has ended; in between nothing
-    changes. Before the first row of a solve it does not hold.
+    The condition holds from a row with `begins` to a row with `ends`. It does not hold before the
+    first row of a solve.
 
     Args:
-        traces: Where the solves begin.
-        begun: (m,).
-        ended: (m,).
+        traces: Traces of the solves.
+        begins: (m,) True where the condition starts to hold.
+        ends: (m,) True where the condition ceases to hold.
     """
-    if not begun.any():
+    if not begins.any():
         return np.zeros(0, np.intp)
-    # Most solves have none: only the others need be looked at row by row.
-    concerned = np.zeros(len(traces.counts), dtype=bool)
-    concerned[traces.solve[begun]] = True
-    decided = np.flatnonzero((begun | ended) & concerned[traces.solve])
-    before = np.concatenate([[-1], decided[:-1]])
-    fresh = ended[before] | (traces.solve[before] != traces.solve[decided])
-    fresh[0] = True
-    return decided[begun[decided] & fresh]
+    # Only the few solves with a start are processed row by row.
+    has_start = np.zeros(len(traces.counts), dtype=bool)
+    has_start[traces.solve[begins]] = True
+    decisive = np.flatnonzero((begins | ends) & has_start[traces.solve])
+    previous = np.concatenate([[-1], decisive[:-1]])
+    can_start = ends[previous] | (traces.solve[previous] != traces.solve[decisive])
+    can_start[0] = True
+    return decisive[begins[decisive] & can_start]
 
 
-def _over_window(values: NDArray[Any], window: int, pick: np.ufunc) -> NDArray[Any]:
-    """Largest or smallest of each `window` columns one after the other, (n, m - window + 1)."""
+def _over_window(values: NDArray[Any], window: int, reduce: np.ufunc) -> NDArray[Any]:
+    """Reduce every `window` consecutive columns to their maximum or minimum, (n, m - window + 1)."""
     width = 1
     while 2 * width <= window:
-        values = pick(values[:, width:], values[:, :-width])
+        values = reduce(values[:, width:], values[:, :-width])
         width *= 2
-    rest = window - width
-    return pick(values[:, rest:], values[:, :-rest]) if rest else values
+    shift = window - width
+    return reduce(values[:, shift:], values[:, :-shift]) if shift else values
 
 
 def as_matrix(values: NDArray[Any]) -> NDArray[Any]:
-    """Values (k, ...) as (k, size)."""
+    """Return values (k, ...) as a matrix (k, size)."""
     return values.reshape(len(values), math.prod(values.shape[1:]))
 
 
 def bits_of(mask: NDArray[Any]) -> Bools:
-    """The bits of unsigned words (m, words), least significant first, (m, 8 * bytes)."""
+    """Unpack unsigned words (m, words) to bits (m, 8 * bytes), least significant bit first."""
     octets = np.ascontiguousarray(mask).view(np.uint8)
     return np.unpackbits(octets, axis=1, bitorder="little").astype(bool)
 
 
 def words_of(bits: Bools) -> Words:
-    """The inverse of `bits_of` for 32-bit words."""
+    """Pack bits into 32-bit words; the inverse of `bits_of`."""
     return np.packbits(bits, axis=1, bitorder="little").view("<u4")
 
 
-def _places(words: NDArray[Any]) -> tuple[Rows, Rows]:
-    """Row and bit, both (e,), of every bit that is set in words (m, words)."""
+def _set_bits(words: NDArray[Any]) -> tuple[Rows, Rows]:
+    """Return row and bit, both (e,), of every bit that is set in words (m, words)."""
     flat = words.reshape(-1)
-    some = np.flatnonzero(flat)
-    place, bit = np.nonzero(bits_of(flat[some][:, None]))
-    row, word = np.divmod(some[place], words.shape[1])
+    nonzero = np.flatnonzero(flat)
+    index, bit = np.nonzero(bits_of(flat[nonzero][:, None]))
+    row, word = np.divmod(nonzero[index], words.shape[1])
     return row, word * 32 + bit
 
 
-def _q(traces: Traces, row: Rows, bit: Rows) -> NDArray[Any]:
-    """Coordinates (e,); NaN where the trace has none."""
+def _positions(traces: Traces, row: Rows, bit: Rows) -> NDArray[Any]:
+    """Return actuator positions (e,); NaN if the trace has none."""
     values = np.full(len(row), np.nan)
     if Q.name in traces.names:
         q = traces.matrix(Q.name)
-        known = bit < q.shape[1]
-        values[known] = q[row[known], bit[known]]
+        has_position = bit < q.shape[1]
+        values[has_position] = q[row[has_position], bit[has_position]]
     return values

@@ -29,10 +29,10 @@ from casadi_ik.errors import InputError, LogError
 from casadi_ik.files.writing import to_json
 from casadi_ik.logs.container import ForeignLogError, check_size
 
-KINDS = ("iteration", "solve", "event")
+MESSAGE_KINDS = ("iteration", "solve", "event")
 """The kinds of messages, each on a topic of its own per method."""
 
-ITERATION = 1_000_000
+ITERATION_PERIOD = 1_000_000
 """Log time between two iterations: 1 ms [ns]."""
 
 _ROS_TYPES = {"f8": "float64", "f4": "float32", "u4": "uint32", "i4": "int32", "u1": "uint8"}
@@ -70,7 +70,7 @@ class LogClock:
     @property
     def room(self) -> int:
         """Iterations of a solve that there is time for."""
-        return self.slot // ITERATION
+        return self.slot // ITERATION_PERIOD
 
     def check(self, first: int, count: int) -> None:
         """Check that there is time for so many solves from `first` on.
@@ -85,17 +85,17 @@ class LogClock:
 
     def times(self, solve_id: NDArray[np.int64], iteration: NDArray[np.int64]) -> np.ndarray:
         """Log times of iterations, uint64 [ns]; both arguments of the same shape."""
-        return (self.t0 + solve_id * self.slot + iteration * ITERATION).astype(np.uint64)
+        return (self.t0 + solve_id * self.slot + iteration * ITERATION_PERIOD).astype(np.uint64)
 
     def locate(self, log_times: np.ndarray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Solve and iteration of log times: the inverse of `times`, two int64 arrays."""
         since = log_times.astype(np.int64) - self.t0
         solve_id = since // self.slot
-        return solve_id, (since - solve_id * self.slot) // ITERATION
+        return solve_id, (since - solve_id * self.slot) // ITERATION_PERIOD
 
 
 def topic(method: str, kind: str) -> str:
-    """Topic of a method's messages; kind is one of `KINDS`."""
+    """Topic of a method's messages; kind is one of `MESSAGE_KINDS`."""
     return f"/ik/{method}/{kind}"
 
 
@@ -106,7 +106,7 @@ def schema_name(kind: str, method: str, layout: Layout, fingers: int) -> str:
     "casadi_ik/msg/IterationEnhancedDlsQ14F3J4".
 
     Args:
-        kind: One of `KINDS`.
+        kind: One of `MESSAGE_KINDS`.
         method: Name of the method.
         layout: Of its iterations.
         fingers: Number of fingers.
@@ -221,7 +221,7 @@ class _Record(msgspec.Struct):
     packages: dict[str, Text] = {}
     machine: dict[str, Any] = {}
     parameters: dict[str, Any] = {}
-    iteration_ns: Number = str(ITERATION)
+    iteration_ns: Number = str(ITERATION_PERIOD)
     compression: Text = ""
     created: Text = ""
     python: Text = ""
@@ -237,7 +237,7 @@ def log_metadata(
     clock: LogClock,
 ) -> dict[str, str]:
     """The metadata record of a log: text by key; structured values as JSON."""
-    return signed(
+    return with_checksum(
         {
             "format": FORMAT,
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -246,7 +246,7 @@ def log_metadata(
             "keep": json.dumps(keep),
             "t0_ns": str(clock.t0),
             "slot_ns": str(clock.slot),
-            "iteration_ns": str(ITERATION),
+            "iteration_ns": str(ITERATION_PERIOD),
             "compression": compression,
             "code_version": _version("casadi-ik"),
             "packages": json.dumps(package_versions(PACKAGES)),
@@ -257,7 +257,7 @@ def log_metadata(
     )
 
 
-def signed(record: Mapping[str, str]) -> dict[str, str]:
+def with_checksum(record: Mapping[str, str]) -> dict[str, str]:
     """The entries with their checksum."""
     entries = sorted((key, text) for key, text in record.items() if key != CHECKSUM)
     return {**record, CHECKSUM: f"{zlib.crc32(json.dumps(entries).encode()):08x}"}
@@ -273,7 +273,7 @@ def package_versions(names: Iterable[str]) -> dict[str, str]:
     return {name: _version(name) for name in names}
 
 
-def own_record(records: Sequence[Metadata]) -> Mapping[str, str]:
+def casadi_ik_record(records: Sequence[Metadata]) -> Mapping[str, str]:
     """Our record among those of a file.
 
     Raises:
@@ -287,14 +287,14 @@ def own_record(records: Sequence[Metadata]) -> Mapping[str, str]:
         kind = LogError if found else ForeignLogError
         raise kind(f"not a log of casadi_ik: {problem} (found: {names})")
     (record,) = found
-    if record != signed(record):
+    if record != with_checksum(record):
         raise LogError("the log is damaged: its metadata fail their checksum")
     if record.get("format") != FORMAT:
         raise LogError(f"format: found {record.get('format', '')[:20]!r}, expected {FORMAT!r}")
     return record
 
 
-def values_of(record: Mapping[str, str]) -> Mapping[str, Any]:
+def parse_metadata(record: Mapping[str, str]) -> Mapping[str, Any]:
     """The entries of our record, structured ones as what they say.
 
     Raises:
@@ -311,19 +311,21 @@ def values_of(record: Mapping[str, str]) -> Mapping[str, Any]:
     except msgspec.ValidationError as error:
         text, _, place = str(error).partition(" - at `$.")
         raise LogError(f"metadata: {place.rstrip('`') or 'record'}: {text}") from error
-    if found.iteration_ns != str(ITERATION):
-        raise LogError(f"metadata: iteration_ns: found {found.iteration_ns}, expected {ITERATION}")
+    if found.iteration_ns != str(ITERATION_PERIOD):
+        raise LogError(
+            f"metadata: iteration_ns: found {found.iteration_ns}, expected {ITERATION_PERIOD}"
+        )
     return {**msgspec.structs.asdict(found), **values}
 
 
-def clock_of(values: Mapping[str, Any]) -> LogClock:
+def clock_from_metadata(values: Mapping[str, Any]) -> LogClock:
     """The rule of a log's times.
 
     Raises:
         LogError: It leaves no time for an iteration.
     """
     t0, slot = int(values["t0_ns"]), int(values["slot_ns"])
-    if not (t0 < 2**63 and ITERATION <= slot < 2**63):
+    if not (t0 < 2**63 and ITERATION_PERIOD <= slot < 2**63):
         raise LogError(f"metadata: found t0_ns {t0}, slot_ns {slot}, which leave no time")
     return LogClock(t0, slot)
 

@@ -14,8 +14,8 @@ import numpy as np
 from casadi_ik.errors import LogError, UnknownNameError, printable
 from casadi_ik.files.arrays import Counts
 from casadi_ik.logs.events import EventKind
-from casadi_ik.logs.format import KINDS
-from casadi_ik.logs.shards import Paths, Shard, Sources, open_shards
+from casadi_ik.logs.format import MESSAGE_KINDS
+from casadi_ik.logs.shards import Paths, Shard, ShardOrigins, open_shards
 from casadi_ik.logs.tables import MethodRows, Table
 
 logger = logging.getLogger(__name__)
@@ -140,13 +140,13 @@ class Log:
         return f"<Log of {len(self.shards)} file(s), methods {', '.join(self.methods) or 'none'}>"
 
     @cached_property
-    def sources(self) -> Sources:
+    def sources(self) -> ShardOrigins:
         """Where the solves come from, and how they are numbered.
 
         Raises:
             LogError: A solve is in two files, or what a merged log says of its shards is wrong.
         """
-        return Sources(self.shards)
+        return ShardOrigins(self.shards)
 
     def info(self) -> LogInfo:
         """What is in it.
@@ -163,7 +163,8 @@ class Log:
             robot=self.shards[0].robot,
             counts={
                 method: {
-                    kind: sum(shard.count(method, kind) for shard in self.shards) for kind in KINDS
+                    kind: sum(shard.count(method, kind) for shard in self.shards)
+                    for kind in MESSAGE_KINDS
                 }
                 for method in self.methods
             },

@@ -29,27 +29,27 @@ from casadi_ik.logs.container import (
     COMPRESSORS,
     Contents,
     Run,
-    Unpacked,
+    UnpackedChunk,
     add_chunk,
-    beginning,
     check_magic,
-    counts_of,
-    ending,
+    file_head,
+    file_tail,
     index_messages,
-    packed_chunk,
+    message_counts,
+    open_log_file,
+    pack_chunk,
     read_chunk,
     read_summary,
-    reading,
     scan,
 )
-from casadi_ik.logs.format import CHECKSUM, KINDS, METADATA_NAME, SHARDS, signed
+from casadi_ik.logs.format import CHECKSUM, MESSAGE_KINDS, METADATA_NAME, SHARDS, with_checksum
 from casadi_ik.logs.reader import Log
 from casadi_ik.logs.shards import Paths, Shard, open_shards
-from casadi_ik.logs.writer import locked
+from casadi_ik.logs.writer import lock_file
 
 
 @dataclass(frozen=True)
-class Finished:
+class RepairResult:
     """The result of repairing a log.
 
     Attributes:
@@ -67,7 +67,7 @@ class Finished:
     cut: int
 
 
-def finish_log(path: str | os.PathLike[str]) -> Finished:
+def finish_log(path: str | os.PathLike[str]) -> RepairResult:
     """Repair a truncated log in place.
 
     Every complete chunk is verified by its checksum; what is torn behind the last of them is cut,
@@ -84,14 +84,14 @@ def finish_log(path: str | os.PathLike[str]) -> Finished:
         >>> finished = ik.logs.finish_log("cup.mcap")  # whole already: nothing is changed
     """
     path = Path(path)
-    with reading(path, "finish") as stream:
+    with open_log_file(path, "finish") as stream:
         _, closed = check_magic(stream)
         contents = scan(stream, path)
         whole = contents.complete and _ends_well(stream, contents)
         replaced = 0 if whole else _close(contents)
     # Of a file that was closed nothing is torn: only its summary is written anew.
     cut = 0 if closed else replaced
-    return Finished(path, not whole, len(contents.chunks), sum(contents.counts.values()), cut)
+    return RepairResult(path, not whole, len(contents.chunks), sum(contents.counts.values()), cut)
 
 
 def _close(contents: Contents) -> int:
@@ -99,9 +99,9 @@ def _close(contents: Contents) -> int:
     tail = b""
     if contents.owed:
         tail = index_messages(contents.chunks[-1], contents.owed, contents.end)
-    tail += ending(contents.summary, contents.end + len(tail))
+    tail += file_tail(contents.summary, contents.end + len(tail))
     with contents.path.open("r+b") as stream:
-        if not locked(stream.fileno(), contents.path) or (
+        if not lock_file(stream.fileno(), contents.path) or (
             stream.seek(0, os.SEEK_END) != contents.size
         ):
             raise LogError("cannot finish the log: its writer is still at it")
@@ -126,7 +126,7 @@ def _ends_well(stream: IO[bytes], contents: Contents) -> bool:
 
 
 @dataclass(frozen=True)
-class Merged:
+class MergeResult:
     """The result of joining logs.
 
     Attributes:
@@ -146,7 +146,7 @@ class Merged:
     left_out: tuple[Path, ...] = ()
 
 
-def merge_logs(shards: Paths, target: str | os.PathLike[str]) -> Merged:
+def merge_logs(shards: Paths, target: str | os.PathLike[str]) -> MergeResult:
     """Join shards to one log.
 
     Args:
@@ -178,8 +178,8 @@ def merge_logs(shards: Paths, target: str | os.PathLike[str]) -> Merged:
     with refused, atomic_write(path) as part, part.open("xb") as stream:
         merge.write(stream)
         size = stream.tell()
-    messages = sum(counts_of(merge.summary).values())
-    return Merged(path, len(opened), solves, messages, size, tuple(left_out))
+    messages = sum(message_counts(merge.summary).values())
+    return MergeResult(path, len(opened), solves, messages, size, tuple(left_out))
 
 
 def _check_alike(shard: Shard, first: Shard) -> None:
@@ -218,7 +218,7 @@ class _Merge:
         numbers: dict[str, int] = {}
         for shard in log.shards:
             topics, same, own = dict[int, tuple[int, str, Layout]](), True, shard.contents.summary
-            for method, kind in product(shard.methods, KINDS):
+            for method, kind in product(shard.methods, MESSAGE_KINDS):
                 topic = shard.topic(method, kind)
                 channel = own.channels[topic.channel]
                 number = numbers.setdefault(channel.topic, len(numbers) + 1)
@@ -248,7 +248,7 @@ class _Merge:
         log, record = self.log, self._metadata()
         library = f"casadi_ik {record['code_version']}"
         attachments = _attachments(log.shards)
-        head = beginning(self.summary, library, Metadata(METADATA_NAME, record), attachments)
+        head = file_head(self.summary, library, Metadata(METADATA_NAME, record), attachments)
         builder = RecordBuilder()
         for definitions in (self.summary.schemas, self.summary.channels):
             for definition in definitions.values():
@@ -260,16 +260,16 @@ class _Merge:
             for index in shard.contents.chunks
         ]
         for _, i, index in sorted(chunks, key=lambda chunk: chunk[:2]):
-            with reading(log.shards[i].path) as source:
+            with open_log_file(log.shards[i].path) as source:
                 chunk = read_chunk(source, index)
                 if chunk.runs:
                     data, moved, runs = self._copied(chunk, i, stream.tell())
                     stream.write(data)
                     add_chunk(self.summary, moved, runs)
-        stream.write(ending(self.summary, stream.tell()))
+        stream.write(file_tail(self.summary, stream.tell()))
 
     def _copied(
-        self, chunk: Unpacked, i: int, position: int
+        self, chunk: UnpackedChunk, i: int, position: int
     ) -> tuple[bytes, ChunkIndex, Sequence[Run]]:
         """A chunk of a shard as the new log has it at an offset: bytes, index, messages.
 
@@ -302,7 +302,7 @@ class _Merge:
                 runs.append(Run(number, start, run.size, run.log_time + later))
                 start += len(pieces[-1])
             data = b"".join(pieces)
-        return *packed_chunk(memoryview(data), runs, compression, position, packed), runs
+        return *pack_chunk(memoryview(data), runs, compression, position, packed), runs
 
     def _metadata(self) -> dict[str, str]:
         """The metadata: of the first shard, and in what each of them differs from it."""
@@ -320,7 +320,7 @@ class _Merge:
             differs = {key: text for key, text in own.items() if text != base.get(key)}
             about = {"file": source.file, "first": source.first}
             origins.append({**about, "solves": solves, "differs": differs})
-        return signed({**base, SHARDS: json.dumps(origins)})
+        return with_checksum({**base, SHARDS: json.dumps(origins)})
 
 
 def _ranges(numbers: Counts) -> list[list[int]]:

@@ -30,21 +30,21 @@ from casadi_ik.logs.container import (
     NOT_IN_CHUNKS,
     ForeignLogError,
     NothingWrittenError,
+    open_log_file,
     read_chunk,
     read_contents,
-    reading,
     record_at,
 )
 from casadi_ik.logs.events import event_layout
 from casadi_ik.logs.format import (
-    KINDS,
+    MESSAGE_KINDS,
     SHARDS,
-    clock_of,
-    own_record,
+    casadi_ik_record,
+    clock_from_metadata,
     parse_layout,
+    parse_metadata,
     parsed_json,
     topic,
-    values_of,
 )
 from casadi_ik.logs.rows import solve_layout
 from casadi_ik.logs.tables import Labels, MethodRows
@@ -94,14 +94,14 @@ class Shard:
         self.path = path
         self.name = name or path.name
         self.contents = read_contents(path)
-        with reading(path):
+        with open_log_file(path):
             contents = self.contents
             if not (contents.complete or contents.chunks or contents.records):
                 raise NothingWrittenError("the log is truncated before its metadata")
-            self.record: Mapping[str, str] = own_record(contents.records)
-            self.metadata: Mapping[str, Any] = values_of(self.record)
+            self.record: Mapping[str, str] = casadi_ik_record(contents.records)
+            self.metadata: Mapping[str, Any] = parse_metadata(self.record)
             self.robot: str = self.metadata["robot"]
-            self.clock = clock_of(self.metadata)
+            self.clock = clock_from_metadata(self.metadata)
             if not contents.chunks and any(contents.counts.values()):
                 raise ForeignLogError(NOT_IN_CHUNKS)
             self._topics = self._described()
@@ -123,7 +123,7 @@ class Shard:
         Raises:
             LogError: One is damaged.
         """
-        with reading(self.path) as stream:
+        with open_log_file(self.path) as stream:
             found = self.contents.summary.attachment_indexes
             return {
                 item.name: record_at(Attachment, stream, item.offset, item.length) for item in found
@@ -165,7 +165,7 @@ class Shard:
                 raise UnknownNameError(f"no field {each!r}; there are: {names}")
         none = _chosen(np.zeros(0, found.layout.dtype), fields)
         all_times, all_rows = [np.zeros(0, np.uint64)], [opaque(none)]
-        with reading(self.path) as stream:
+        with open_log_file(self.path) as stream:
             for index in self.contents.chunks:
                 if not self._may_hold(index, found.channel, solves):
                     continue
@@ -215,15 +215,15 @@ class Shard:
         found: dict[tuple[str, str], Topic] = {}
         for channel in summary.channels.values():
             method = channel.metadata.get("method")
-            if method is None or channel.topic != topic(method, KINDS[0]):
+            if method is None or channel.topic != topic(method, MESSAGE_KINDS[0]):
                 continue
             if not 0 < len(method) <= 200:
                 raise LogError(f"a method's name has {len(method)} characters")
-            for kind in KINDS:
+            for kind in MESSAGE_KINDS:
                 own = by_name.get(topic(method, kind))
                 if own is None or own.schema_id not in summary.schemas:
                     raise LogError(f"no topic {topic(method, kind)!r}, or no schema of it")
-                layout, labels = described(kind, own, summary.schemas[own.schema_id])
+                layout, labels = parse_channel(kind, own, summary.schemas[own.schema_id])
                 found[method, kind] = Topic(own.id, layout, labels)
         return found
 
@@ -295,7 +295,7 @@ def open_shards(path: Paths) -> tuple[list[Shard], list[Path]]:
     return shards, empty
 
 
-class Source(msgspec.Struct):
+class OriginalShard(msgspec.Struct):
     """A shard as it was written; a merged log, which says so of each, has several in one file.
 
     Attributes:
@@ -318,7 +318,7 @@ class Source(msgspec.Struct):
     metadata: Mapping[str, Any] = {}
 
 
-class Sources:
+class ShardOrigins:
     """Where the solves of a log come from.
 
     Attributes:
@@ -334,9 +334,9 @@ class Sources:
                 log says of its shards is malformed.
         """
         self.offsets = _offsets(shards) if _overlapping(shards) else [0] * len(shards)
-        self.sources: list[Source] = []
+        self.sources: list[OriginalShard] = []
         for i, (shard, offset) in enumerate(zip(shards, self.offsets, strict=True)):
-            with reading(shard.path):
+            with open_log_file(shard.path):
                 for source in _sources(shard):
                     source.holder, source.first = i, source.first + offset
                     source.solves = {
@@ -344,7 +344,7 @@ class Sources:
                         for method, pairs in source.solves.items()
                     }
                     source.record = {**shard.record, **source.differs}
-                    source.metadata = values_of(source.record)
+                    source.metadata = parse_metadata(source.record)
                     self.sources.append(source)
 
     @property
@@ -376,7 +376,7 @@ class Sources:
         return found
 
 
-def described(kind: str, channel: Channel, schema: Schema) -> tuple[Layout, Labels]:
+def parse_channel(kind: str, channel: Channel, schema: Schema) -> tuple[Layout, Labels]:
     """Layout and labels of the messages of a channel.
 
     A log may come from anybody. Its schemas and labels are checked once, when it is opened, against
@@ -468,15 +468,17 @@ def _chosen(rows: NDArray[Any], fields: Sequence[str] | None) -> NDArray[Any]:
     return repack_fields(rows[[name for name in rows.dtype.names or () if name in fields]])
 
 
-def _sources(shard: Shard) -> list[Source]:
+def _sources(shard: Shard) -> list[OriginalShard]:
     """What a merged log says of its shards; of any other the one that it is."""
     what = f"metadata: {SHARDS}"
-    found: list[Source] = parsed_json(what, shard.record.get(SHARDS, "[]"), list[Source])
+    found: list[OriginalShard] = parsed_json(
+        what, shard.record.get(SHARDS, "[]"), list[OriginalShard]
+    )
     for each in found:
         pairs = [number for ranges in each.solves.values() for pair in ranges for number in pair]
         if not all(0 <= number < 2**32 for number in (each.first, *pairs)):
             raise LogError(f"{what}: a number of a solve is negative or too large")
-    return found or [Source(shard.name)]
+    return found or [OriginalShard(shard.name)]
 
 
 def _overlapping(shards: Sequence[Shard]) -> bool:

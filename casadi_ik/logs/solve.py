@@ -1,4 +1,4 @@
-"""One solve out of a log, with all that is known of it."""
+"""Records of single solves, read from a log."""
 
 from __future__ import annotations
 
@@ -16,21 +16,22 @@ from casadi_ik.errors import LogError, UnknownNameError
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import EXTRA_ARRAY_NAMES
-from casadi_ik.logs.events import Happening, bits_of, errors_text, measured_jacobians
+from casadi_ik.logs.events import Event, bits_of, errors_text, measured_jacobians
 from casadi_ik.logs.reader import Log
-from casadi_ik.logs.tables import MethodRows, Table, element_name, happenings, label_of
+from casadi_ik.logs.renamed import warn_renamed
+from casadi_ik.logs.tables import MethodRows, Table, element_name, events_of, label_of
 from casadi_ik.model.targets import Tolerance
 from casadi_ik.solve.request import NO_PREFERENCE
 from casadi_ik.solve.trace import SIGMA, TraceFormat
 
 
 @dataclass(frozen=True)
-class Stretch:
-    """Iterations in a row that are in one phase.
+class PhaseSpan:
+    """Consecutive iterations of one phase.
 
     Attributes:
-        phase: Its name.
-        first: First iteration.
+        phase: Name of the phase.
+        first: First iteration, from 0.
         last: Last iteration.
     """
 
@@ -40,7 +41,7 @@ class Stretch:
 
     @property
     def rows(self) -> slice:
-        """The iterations as rows of the trace."""
+        """Slice of the iterations in the trace."""
         return slice(self.first, self.last + 1)
 
     def __len__(self) -> int:
@@ -48,20 +49,22 @@ class Stretch:
 
 
 @dataclass(frozen=True, eq=False)
-class Asked:
-    """The conditions of a solve; with its targets and the solver's options they repeat it.
+class LoggedTarget:
+    """Conditions of a logged solve.
+
+    A solve can be repeated from its contacts, these conditions and the parameters of the solver.
 
     Attributes:
-        tolerances: What counted as reached, by finger.
-        limits: "enforce" or "ignore".
-        seed: Of its random numbers, which follow from the number of the solve as well.
-        start: (n,) where it began [rad or m]; None if that is not known.
-        fixed: Actuators that were held, and where [rad or m].
-        prefer: Which of several solutions was wanted; None: the method cannot choose.
+        tolerances: Tolerances of the contacts by finger.
+        limits: Treatment of limits, "enforce" or "ignore".
+        seed: Seed of the random numbers, which depend on the number of the solve as well.
+        start: (n,) start configuration [rad or m]; None if unknown.
+        fixed: Positions of fixed actuators by name [rad or m].
+        prefer: Preference among solutions; None if the method has none.
 
     Example:
-        >>> asked = ik.logs.one_solve(ik.logs.open("cup.mcap")).asked
-        >>> asked.limits, asked.seed, bool(np.allclose(asked.start, robot.home))
+        >>> target = ik.logs.one_solve(ik.logs.open("cup.mcap")).target
+        >>> target.limits, target.seed, bool(np.allclose(target.start, robot.home))
         ('enforce', 0, True)
     """
 
@@ -74,41 +77,42 @@ class Asked:
 
 
 @dataclass(frozen=True, eq=False)
-class OneSolve:
-    """A solve; f fingers.
+class SolveRecord:
+    """Record of a solve for f fingers.
 
     Attributes:
         method: Name of the method.
         robot: Name of the robot.
-        solve_id: Number of the solve.
-        started: When it began [ns since the Unix epoch].
-        time: How long it took [s].
-        status: Name of the status it ended with.
-        success: Whether the grasp is solved.
-        restarts: How often it began anew.
-        iterations: How many iterations it took, kept or not.
-        fingers: Finger names, the order of every (f,) array.
-        position_error: (f,) [m] at the end; NaN if free.
-        angle_error: (f,) [rad] at the end; NaN if free.
-        ok: (f,) which contacts are within tolerance.
-        target_points: (f, 3) [m] in the base frame; NaN if free.
-        target_normals: (f, 3); NaN if free.
+        solve_id: Number of the solve in the log, from 0.
+        started: Start time [ns since the Unix epoch].
+        time: Duration [s].
+        status: Name of the final status.
+        success: True if the target is solved.
+        restarts: Number of restarts.
+        iterations: Number of iterations, logged or not.
+        fingers: Names of the fingers in the order of every (f,) array.
+        position_error: (f,) final position errors [m]; NaN for free contacts.
+        angle_error: (f,) final angle errors [rad]; NaN for free contacts.
+        ok: (f,) True for contacts within tolerance.
+        target_points: (f, 3) contact points in the base frame [m]; NaN if free.
+        target_normals: (f, 3) contact normals in the base frame; NaN if free.
         layout: Fields of a row of the trace.
         labels: Names of codes, bits and elements by field.
-        rows: The trace, a row per iteration; none if the log has kept the totals only.
-        events: What happened, by iteration.
-        parameters: What the solver was set to.
-        asked: The question apart from its targets.
-        shard: Name of the shard it comes from, if the log has several.
-        number: Its number there; random numbers follow from it and the seed.
-        target_more: (f, 3) what contacts have beside ("tangents", "lines", "planes", "balls"),
-            NaN if free; nothing that is free everywhere.
-        clearance: Of the answer [m]; None if the solver had no scene.
-        closest: The pair that is nearest to being too near; None as well if there is nothing.
+        rows: Trace with a row per iteration; empty if the log holds only the totals.
+        events: Events in the order of iterations.
+        parameters: Parameters of the solver.
+        target: Conditions of the solve in addition to its contacts.
+        shard: Name of the shard of the solve; "" unless the log has several shards.
+        number: Number of the solve in its shard, from which its random numbers follow.
+        target_more: (f, 3) further vectors of the contacts ("tangents", "lines", "planes",
+            "balls"), NaN if free; arrays that are free everywhere are absent.
+        clearance: Clearance of the solution [m]; None without a scene.
+        closest: Pair of shapes with the smallest clearance beyond its margin; None without a scene
+            or without a pair.
 
     Example:
-        >>> one = ik.logs.one_solve(ik.logs.open("cup.mcap"))
-        >>> one.success, one.status, one.fingers
+        >>> record = ik.logs.one_solve(ik.logs.open("cup.mcap"))
+        >>> record.success, record.status, record.fingers
         (True, 'SOLVED', ('thumb', 'finger_2', 'finger_3'))
     """
 
@@ -130,9 +134,9 @@ class OneSolve:
     layout: Layout
     labels: Mapping[str, tuple[str, ...]]
     rows: np.ndarray[Any, np.dtype[Any]]
-    events: tuple[Happening, ...]
+    events: tuple[Event, ...]
     parameters: Mapping[str, Any]
-    asked: Asked
+    target: LoggedTarget
     shard: str = ""
     number: int = 0
     target_more: Mapping[str, Array] = field(default_factory=dict)
@@ -140,40 +144,52 @@ class OneSolve:
     closest: tuple[str, str] | None = None
 
     @property
+    def asked(self) -> LoggedTarget:
+        """Deprecated name of `target`."""
+        warn_renamed("SolveRecord.asked", "SolveRecord.target", stacklevel=3)
+        return self.target
+
+    @property
+    def stretches(self) -> tuple[PhaseSpan, ...]:
+        """Deprecated name of `phase_spans`."""
+        warn_renamed("SolveRecord.stretches", "SolveRecord.phase_spans", stacklevel=3)
+        return self.phase_spans
+
+    @property
     def tolerances(self) -> tuple[Tolerance, ...]:
-        """What counted as reached, by finger."""
-        return self.asked.tolerances
+        """Tolerances of the contacts by finger."""
+        return self.target.tolerances
 
     @property
     def position_tolerance(self) -> Array:
-        """(f,) [m]."""
-        return np.array([each.position for each in self.tolerances])
+        """(f,) position tolerances [m]."""
+        return np.array([tolerance.position for tolerance in self.tolerances])
 
     @property
     def angle_tolerance(self) -> Array:
-        """(f,) [rad]."""
-        return np.array([each.angle for each in self.tolerances])
+        """(f,) angle tolerances [rad]."""
+        return np.array([tolerance.angle for tolerance in self.tolerances])
 
     def columns(self, name: str) -> Array:
-        """A field of all rows as a matrix, (k, size)."""
+        """Return a field of all rows as a matrix (k, size)."""
         return self.rows[name].reshape(len(self.rows), -1).astype(float)
 
     def bits(self, name: str) -> NDArray[np.bool_]:
-        """The bits of a mask in all rows, (k, bits)."""
+        """Return the bits of a mask in all rows, (k, bits)."""
         return bits_of(self.rows[name].reshape(len(self.rows), -1))
 
     def errors_of(self, finger: int) -> str:
-        """How far a finger ended from its contact, in words."""
+        """Return the final errors of a finger as text."""
         return errors_text(float(self.position_error[finger]), float(self.angle_error[finger]))
 
     def name_of(self, field: str, index: int) -> str:
-        """The name of an element or bit of a field, or its number."""
+        """Return the name of an element or bit of a field, or the field with the index."""
         names = self.labels.get(field, ())
         return names[index] if index < len(names) else f"{field} {index}"
 
     @cached_property
     def sigmas(self) -> dict[str, Array]:
-        """(k,) smallest singular value in all rows, by Jacobian; NaN where not measured."""
+        """(k,) smallest singular value of each Jacobian by name; NaN where not measured."""
         form = TraceFormat(self.layout, self.labels)
         return {
             name: self.columns(item.name)[:, i]
@@ -183,33 +199,33 @@ class OneSolve:
         }
 
     @cached_property
-    def stretches(self) -> tuple[Stretch, ...]:
-        """The phases in the order in which they were gone through; one without phases."""
+    def phase_spans(self) -> tuple[PhaseSpan, ...]:
+        """Phases in chronological order; one span if the method has no phases."""
         count = len(self.rows)
         if count == 0 or "phase" not in self.layout.names:
-            return (Stretch("", 0, count - 1),) if count else ()
+            return (PhaseSpan("", 0, count - 1),) if count else ()
         codes = self.rows["phase"].astype(int)
         starts = [0, *(np.flatnonzero(np.diff(codes)) + 1).tolist()]
         ends = [*(start - 1 for start in starts[1:]), count - 1]
         return tuple(
-            Stretch(label_of(self.labels.get("phase", ()), int(codes[first])), first, last)
+            PhaseSpan(label_of(self.labels.get("phase", ()), int(codes[first])), first, last)
             for first, last in zip(starts, ends, strict=True)
         )
 
 
 def one_solve(
     log: Log, solve: int | None = None, method: str | None = None, counted_from: int = 0
-) -> OneSolve:
+) -> SolveRecord:
     """Read one solve from a log.
 
     Args:
         log: The log.
-        solve: Its number; may be left out if the log holds one solve only.
-        method: Its method; may be left out if only one has a solve of that number.
-        counted_from: Number that the first solve has for who asks.
+        solve: Number of the solve; optional if the log holds a single solve.
+        method: Method of the solve; optional if only one method has a solve of this number.
+        counted_from: Number of the first solve in `solve` and in messages.
 
     Raises:
-        UnknownNameError: There is no such solve, or it is not said which of several.
+        UnknownNameError: The log has no such solve, or the arguments select several.
         LogError: The log is damaged.
 
     Example:
@@ -217,30 +233,31 @@ def one_solve(
         'hand-first'
     """
     table = log.solves(solve=None if solve is None else solve - counted_from, method=method)
-    found = [part for part in table.parts if len(part)]
+    parts = [part for part in table.parts if len(part)]
     if len(table) != 1:
-        held = ", ".join(
-            f"{part.method} {_range(part.solve_id + counted_from)}"
-            for part in found or log.solves().parts
+        available = ", ".join(
+            f"{part.method} {_number_range(part.solve_id + counted_from)}"
+            for part in parts or log.solves().parts
         )
-        problem = f"no solve {solve}" if solve is not None else "no solve"
-        if found:
-            problem = "which solve?" if solve is None else f"solve {solve} of which method?"
-        raise UnknownNameError(f"{problem}; the log holds: {held or 'nothing'}")
-    (part,) = found
+        name = "solve" if solve is None else f"solve {solve}"
+        problem = f"{name} is not in the log"
+        if parts:
+            problem = "solve: number is missing" if solve is None else f"{name}: method is missing"
+        raise UnknownNameError(f"{problem}; the log holds: {available or 'no solve'}")
+    (part,) = parts
     row, number = part.rows[0], int(part.solve_id[0])
     if not np.isfinite([row["started"], row["time"], row["seed"]]).all():
-        raise LogError(f"solve {number} of {part.method}: its times or its seed are no numbers")
+        raise LogError(f"solve {number} of {part.method}: times or seed are not numeric")
     record = next(Table("solve", (part,)).records())
     iterations = log.iterations(method=part.method, solve=number).part
     events = log.events(method=part.method, solve=number).part
     sources = log.sources.sources
     source = sources[0 if part.shard is None else int(part.shard[0])]
-    more = targets_beside(row)
+    optional = optional_targets(row)
     checked = "clearance" in part.names
     closest = (record["closest_first"], record["closest_second"]) if checked else ("none", "none")
-    return OneSolve(
-        **{name: row[name] for name in _AS_LOGGED},
+    return SolveRecord(
+        **{name: row[name] for name in _COPIED_FIELDS},
         method=part.method,
         robot=log.metadata["robot"],
         solve_id=number,
@@ -255,74 +272,75 @@ def one_solve(
         layout=_layout(iterations),
         labels=iterations.labels,
         rows=iterations.rows,
-        events=tuple(happenings(events)),
+        events=tuple(events_of(events)),
         parameters=source.metadata["parameters"],
-        asked=_asked(part),
+        target=_target_of(part),
         shard=source.file if len(sources) > 1 else "",
         number=number - source.first,
-        target_more={name: array for name, array in more.items() if not np.isnan(array).all()},
+        target_more={name: array for name, array in optional.items() if not np.isnan(array).all()},
         clearance=float(row["clearance"]) if checked else None,
         closest=None if "none" in closest else closest,
     )
 
 
-def targets_beside(row: np.void) -> dict[str, Array]:
-    """(f, 3) what the contacts of a solve's row have beside points and normals, by name."""
+def optional_targets(row: np.void) -> dict[str, Array]:
+    """Return the contact vectors (f, 3) of a row besides points and normals by name."""
     names = row.dtype.names or ()
     return {name: row[f"target_{name}"] for name in EXTRA_ARRAY_NAMES if f"target_{name}" in names}
 
 
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
-"""A number in a URDF."""
+"""Pattern of numbers in a URDF."""
 
-_AS_LOGGED = ("position_error", "angle_error", "target_points", "target_normals")
+_COPIED_FIELDS = ("position_error", "angle_error", "target_points", "target_normals")
 
 
 def check_robot(robot: ArmHand, urdf: str, where: str) -> None:
-    """Check that a robot is the one that a log was written for.
+    """Check that a robot is the robot of a log.
 
     Args:
         robot: The robot.
-        urdf: The robot description attached to the log.
-        where: The log, for the message.
+        urdf: Robot description attached to the log.
+        where: Name of the log in the error message.
 
     Raises:
-        LogError: They differ by more than rounding.
+        LogError: The descriptions differ by more than rounding.
     """
     texts = robot.urdf(), urdf
     frame, expected_frame = (NUMBER.sub("#", text) for text in texts)
     values, expected = (np.array(NUMBER.findall(text), float) for text in texts)
     if frame != expected_frame or not np.allclose(values, expected, rtol=1e-9, atol=1e-9):
         raise LogError(
-            f"{where}: the robot {robot.name!r} is not the one in the log (its URDF differs);"
-            " give the description that was solved for (--robot)"
+            f"{where}: robot {robot.name!r} is not the robot of the log (the URDFs differ); expected"
+            " the description that was used for the solve (--robot)"
         )
 
 
-def _asked(part: MethodRows) -> Asked:
-    """The question of the only solve of a part."""
+def _target_of(part: MethodRows) -> LoggedTarget:
+    """Return the conditions of the only solve of a part."""
     row, names = part.rows[0], part.labels.get("q", ())
     prefer = label_of(part.labels.get("prefer", ()), int(row["prefer"]))
-    (held,) = bits_of(np.atleast_1d(row["fixed_mask"])[None])
-    held = np.flatnonzero(held[: len(row["start"])]).tolist()
+    (is_fixed,) = bits_of(np.atleast_1d(row["fixed_mask"])[None])
+    fixed = np.flatnonzero(is_fixed[: len(row["start"])]).tolist()
     pairs = zip(row["position_tolerance"].tolist(), row["angle_tolerance"].tolist(), strict=True)
-    return Asked(
+    return LoggedTarget(
         tolerances=tuple(Tolerance(*pair) for pair in pairs),
         limits="enforce" if row["limits_enforced"] else "ignore",
         seed=int(row["seed"]),
         start=row["start"],
-        fixed={element_name(names, i): float(row["start"][i]) for i in held},
+        fixed={element_name(names, i): float(row["start"][i]) for i in fixed},
         prefer=None if prefer == NO_PREFERENCE else prefer,
     )
 
 
-def _range(numbers: NDArray[np.int64]) -> str:
+def _number_range(numbers: NDArray[np.int64]) -> str:
+    """Return the first and last of some solve numbers as text."""
     first, last = int(numbers.min()), int(numbers.max())
     return f"solve {first}" if first == last else f"solves {first} to {last}"
 
 
 def _layout(part: MethodRows) -> Layout:
-    """The layout of the rows."""
+    """Return the layout of the rows of a part."""
     kind = part.rows.dtype
     return Layout(
         tuple(

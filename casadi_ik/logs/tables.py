@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.compile.layout import opaque
 from casadi_ik.errors import LogError, MissingExtraError, UnknownNameError, os_errors
-from casadi_ik.logs.events import MOVES, SINGULAR, EventKind, Happening, as_matrix, bits_of
+from casadi_ik.logs.events import MOVES, SINGULAR, Event, EventKind, as_matrix, bits_of
 
 if TYPE_CHECKING:
     import polars as pl
@@ -223,7 +223,7 @@ class Table:
             if (origins := part.origins) is not None:
                 columns["shard"] = origins
             if self.kind == "event":
-                found = happenings(part)
+                found = events_of(part)
                 columns["subject"] = [event.subject for event in found]
                 columns["unit"] = [event.unit for event in found]
             for values in zip(*columns.values(), strict=True):
@@ -234,7 +234,7 @@ class Table:
         return ("solve_id",) if self.kind == "solve" else ("solve_id", "iteration")
 
 
-def happenings(part: MethodRows) -> list[Happening]:
+def events_of(part: MethodRows) -> list[Event]:
     """The rows of events, one by one, as people have them."""
     bits = bits_of(as_matrix(part.rows["joint_mask"]))
     names = ("kind", "jacobian", "joint_mask", "phase", "value", "threshold")
@@ -256,7 +256,7 @@ def happenings(part: MethodRows) -> list[Happening]:
             value=f"{value:.0f}",
         )
         found.append(
-            Happening(
+            Event(
                 iteration,
                 kind,
                 jacobian if kind in singular else "",
@@ -299,7 +299,7 @@ def _columns(part: MethodRows, keys: Sequence[str]) -> dict[str, Any]:
     if (origins := part.origins) is not None:
         columns["shard"] = origins
     if "joint_mask" in part.names:
-        found = happenings(part)
+        found = events_of(part)
         columns["joints"] = [", ".join(event.joints) for event in found]
         columns["subject"] = [event.subject for event in found]
     return columns

@@ -33,15 +33,15 @@ from casadi_ik.logs.container import (
     MESSAGE,
     Run,
     add_chunk,
-    beginning,
     check_size,
-    ending,
-    fill,
-    packed_chunk,
+    file_head,
+    file_tail,
+    pack_chunk,
+    write_messages,
 )
 from casadi_ik.logs.events import SINGULAR, EventKind, EventRules, detect_events, event_format
 from casadi_ik.logs.format import (
-    KINDS,
+    MESSAGE_KINDS,
     METADATA_NAME,
     LogClock,
     log_metadata,
@@ -185,7 +185,7 @@ class McapRecorder:
             attached.append(Attachment(now, now, "robot.urdf", "application/xml", urdf.encode()))
         library = f"casadi_ik {entries['code_version']}"
         try:
-            start = beginning(summary, library, Metadata(METADATA_NAME, entries), attached)
+            start = file_head(summary, library, Metadata(METADATA_NAME, entries), attached)
         except LogError as error:
             raise LogError(f"{self.path}: {error}") from None
         self._chunks = _Chunks(LogFile(self.path), summary, start, compression)
@@ -287,7 +287,7 @@ class McapRecorder:
         texts = [schema_text(each.layout, each.labels) for each in formats.values()]
         channels = {}
         for (kind, each), text in zip(formats.items(), texts, strict=True):
-            number = len(KINDS) * len(self._methods) + len(channels) + 1
+            number = len(MESSAGE_KINDS) * len(self._methods) + len(channels) + 1
             name = schema_name(kind, block.method, form.layout, len(block.fingers))
             metadata = {
                 "offered_qos_profiles": "",
@@ -523,7 +523,7 @@ class _Chunks:
             first = start
             for part in parts:
                 stop = start + len(part.rows) * part.size
-                fill(data[start:stop], *part[:5])
+                write_messages(data[start:stop], *part[:5])
                 start = stop
             if parts:
                 log_time = np.concatenate([part.log_time for part in parts])
@@ -534,13 +534,13 @@ class _Chunks:
     def _put(self, data: np.ndarray, runs: list[Run]) -> None:
         start = b"" if self._file.position else self._start
         position = self._file.position + len(start)
-        written, index = packed_chunk(data.data, runs, self._compression, position)
+        written, index = pack_chunk(data.data, runs, self._compression, position)
         self._file.write(start + written)
         add_chunk(self._summary, index, runs)
 
     def _finish(self) -> None:
         start = b"" if self._file.position else self._start
-        self._file.write(start + ending(self._summary, self._file.position + len(start)))
+        self._file.write(start + file_tail(self._summary, self._file.position + len(start)))
         self._file.close()
 
 
@@ -573,7 +573,7 @@ class LogFile:
             self._descriptor = os.open(path, flags, 0o666)
         except OSError as error:
             raise self._failure(error) from error
-        if not locked(self._descriptor, path):
+        if not lock_file(self._descriptor, path):
             os.close(self._descriptor)
             raise LogError(f"{path}: cannot write the log: another writer is at it")
 
@@ -615,7 +615,7 @@ class LogFile:
         return LogError(f"{self.path}: cannot write the log: {error.strerror or error}")
 
 
-def locked(descriptor: int, path: Path) -> bool:
+def lock_file(descriptor: int, path: Path) -> bool:
     """Lock an open file, where the file system has locks.
 
     Returns:

@@ -9,28 +9,28 @@ from casadi_ik.app.cli.table import COMMANDS, GROUPS, load, usage
 
 
 def command_line() -> str:
-    """A section per command: what it does, its usage, what can be said, examples, exit codes."""
+    """Return a section per command: summary, usage, options, examples, exit codes."""
     parts = []
     for name in COMMANDS:
-        found = None if name in GROUPS else load(name)
-        first, _, rest = found.text if found else GROUPS[name].partition("\n\n")
-        parts += [f"{'#' * (name.count(' ') + 2)} `{PROGRAM} {name}`", _text(first)]
-        if found:
-            parts.append(f"```text\n{usage(name, found)}\n```")
-            parts += [_option(option) for option in found.options]
-        if rest:
-            parts.append(f"```text\n{rest.rstrip()}\n```")
+        command = None if name in GROUPS else load(name)
+        summary, _, details = command.doc_parts if command else GROUPS[name].partition("\n\n")
+        parts += [f"{'#' * (name.count(' ') + 2)} `{PROGRAM} {name}`", _text(summary)]
+        if command:
+            parts.append(f"```text\n{usage(name, command)}\n```")
+            parts += [_option(option) for option in command.options]
+        if details:
+            parts.append(f"```text\n{details.rstrip()}\n```")
     return "\n\n".join(parts)
 
 
 def _option(option: Option) -> str:
-    """An option as a definition."""
-    needed = " *(needed)*" if option.needed else ""
-    return f"`{option.said}`{needed}\n: {_text(option.text)}"
+    """Return an option as a Markdown definition."""
+    required = " *(required)*" if option.required else ""
+    return f"`{option.syntax}`{required}\n: {_text(option.help_text)}"
 
 
 def _text(text: str) -> str:
-    """Help as Markdown: what looks like an option, a file or a code of its own is code."""
+    """Return help as Markdown with options as code."""
     parts = re.split(r"(`[^`]*`)", " ".join(text.split()))
     return (
         "".join(

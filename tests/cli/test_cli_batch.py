@@ -102,7 +102,7 @@ def test_blocks_and_jobs_do_not_show(
     """Nor does it matter how the arrays lie in the file."""
     found = []
     for block, jobs in ((4096, 1), (5, 2), (1, 1)):
-        monkeypatch.setattr("casadi_ik.app.cli.batch.BLOCK", block)
+        monkeypatch.setattr("casadi_ik.app.cli.batch.MAX_BLOCK", block)
         out = tmp_path / f"{block}.npz"
         words = ("--method", method, "--jobs", jobs, "--seed", 3, "--out", out)
         assert run("batch", hands(count), *ROBOT, *words).exit == 1
@@ -119,7 +119,7 @@ def test_log_of_blocks_numbers_the_rows_through(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("casadi_ik.app.cli.batch.BLOCK", 16)
+    monkeypatch.setattr("casadi_ik.app.cli.batch.MAX_BLOCK", 16)
     out, log = tmp_path / "o.npz", tmp_path / "o.mcap"
     run("batch", hands(60), *ROBOT, "--out", out, "--log", log)
     solves = list(ik.logs.open(log).solves().records())

@@ -84,7 +84,7 @@ def test_outputs_do_not_overwrite_each_other_or_the_input(
     assert error == f"{same}: --out: found the file of --log, expected another"
     (tmp_path / "input.json").hardlink_to(grasp)
     error = run("solve", grasp, "--out", tmp_path / "input.json").error
-    assert "found the file of the input" in error
+    assert "--out" in error
     assert grasp.read_text().startswith("contacts:")
 
 

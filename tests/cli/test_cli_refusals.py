@@ -1,7 +1,7 @@
-"""Bad input: exit code 2, one line that says where, what was found and expected, nothing written.
+"""Bad input: exit code 2, one line on stderr with location and value, and no output files.
 
-What is wrong *in* files, of grasps, targets, robots, logs, is tested with what reads them; here it
-is that the command line says it, of which file, and the options of its own.
+Errors in the contents of files are tested with their readers. These tests check that the command
+line reports them with the file or option. A case lists words that the error must contain.
 """
 
 from __future__ import annotations
@@ -65,139 +65,139 @@ ARRAYS: dict[str, Callable[[Any, Any], dict[str, Any]]] = {
 
 ROBOT = "--robot kuka_lwr_barrett"
 CASES = f"""
-slove good.yaml => COMMAND: found 'slove', did you mean 'solve'? (see casadi-ik --help)
-paint => COMMAND: found 'paint', expected one of solve, batch,
-log evnts => COMMAND: found 'evnts', did you mean 'events'? (see casadi-ik log --help)
-robots please => found 'please', expected nothing
-solve => the following arguments are required: GRASP
-solve good.yaml apple => found 'apple', expected nothing behind GRASP
-solve good.yaml --tolerence-angle 1 => --tolerence-angle: no such option, did you mean '--tolerance
-solve good.yaml --colour red => --colour: no such option
-solve good.yaml --jobs 2 => --jobs: no such option
-completion tcsh => SHELL: found 'tcsh', expected one of bash, zsh, fish
+slove good.yaml => COMMAND 'slove' 'solve' --help
+paint => COMMAND 'paint'
+log evnts => COMMAND 'evnts' 'events' --help
+robots please => 'please'
+solve => GRASP
+solve good.yaml apple => 'apple' GRASP
+solve good.yaml --tolerence-angle 1 => --tolerence-angle '--tolerance
+solve good.yaml --colour red => --colour
+solve good.yaml --jobs 2 => --jobs
+completion tcsh => SHELL 'tcsh'
 
-solve cpu => no shipped grasp is called 'cpu'; did you mean 'cup'?
-solve nothing => no shipped grasp is called 'nothing'; shipped: allegro_cup,
-solve nothing.yaml => nothing.yaml: no such file
-solve / => /:
-solve broken.yaml => broken.yaml:
-solve binary.yaml => binary.yaml: cannot be read: not UTF-8
-solve code.yaml => code.yaml:1:1: not valid YAML: could not
-solve nan.yaml => nan.yaml: contacts.thumb.point[0]: found nan, expected a finite number
-solve zero.yaml => zero.yaml: contacts.thumb.normal: found [0.0, 0.0, 0.0], expected
-solve unit.yaml => unknown unit 'inch'
-solve pinky.yaml => pinky.yaml: contacts.pinky: no such finger; the robot's fingers: thumb, finger_2
-solve no_robot.yaml => no_robot.yaml: robot: missing, expected it in the file or --robot
-solve other.yaml => other.yaml: robot: no shipped arm-hand is called 'no_such'
-solve two.yaml --method enhanced-dls => two.yaml: points: row 0
-solve good.yaml --method enhanced-dls --robot hand_only.yaml => --method enhanced-dls:
+solve cpu => 'cpu' 'cup'
+solve nothing => 'nothing' allegro_cup
+solve nothing.yaml => nothing.yaml
+solve / => /
+solve broken.yaml => broken.yaml
+solve binary.yaml => binary.yaml
+solve code.yaml => code.yaml:1:1
+solve nan.yaml => nan.yaml contacts.thumb.point[0]
+solve zero.yaml => zero.yaml contacts.thumb.normal 0.0
+solve unit.yaml => 'inch'
+solve pinky.yaml => pinky.yaml contacts.pinky thumb finger_2
+solve no_robot.yaml => no_robot.yaml robot --robot
+solve other.yaml => other.yaml robot 'no_such'
+solve two.yaml --method enhanced-dls => two.yaml points
+solve good.yaml --method enhanced-dls --robot hand_only.yaml => --method enhanced-dls
 
-solve good.yaml --robot pandas => no shipped arm-hand is called 'pandas'; did you mean 'panda'?
-solve good.yaml --robot ./no.yaml => no.yaml: no such file
-solve good.yaml --method hand-fist => --method: found 'hand-fist', did you mean 'hand-first'?
-solve good.yaml --method x => --method: found 'x', expected one of hand-first,
-solve good.yaml --scene tabel => --scene: no shipped scene is called 'tabel'; did you mean 'table'?
-solve good.yaml --limits some => --limits: found 'some', expected one of enforce, ignore
-solve good.yaml --finger-step magic => --finger-step: found 'magic', expected one of ipopt, closed
-solve good.yaml --prefer clearance => needs a solver with a scene
-solve good.yaml --q0 1 2 3 => --q0: found 3 numbers, expected 14: lwr_joint_1,
-solve good.yaml --q0 1,2,x => --q0: found 'x', expected a number
-solve good.yaml --q0 -inf => --q0: found '-inf', expected a finite number
-solve good.yaml --q0 => --q0: expected
-solve good.yaml --object-pose 1 2 => --object-pose: found 2 numbers, expected 6: x y z [m] roll
-solve good.yaml --tolerance-position -1 => --tolerance-position: found '-1', expected a number > 0
-solve good.yaml --tolerance-angle nan => --tolerance-angle: found 'nan', expected a number > 0
-solve good.yaml --seed -1 => --seed: found '-1', expected a whole number >= 0
-solve good.yaml --seed 99999999999999999999 => --seed: found
-solve good.yaml --fixed lwr_joint_3=9 => fixed.lwr_joint_3: found 9.0, expected a number from -2.9
-solve good.yaml --fixed elbow=0 => fixed: no actuator 'elbow', expected one of lwr_joint_1,
-solve good.yaml --fixed lwr_joint_3 => --fixed: found 'lwr_joint_3', expected NAME=NUMBER
-solve good.yaml --fixed lwr_joint_3=0 lwr_joint_3=1 => --fixed: lwr_joint_3 appears twice
-solve good.yaml --max-rounds 1 --method thumb-first => --max-rounds: option 'max_rounds' does not
-solve good.yaml --picture a.bmp => --picture: found 'a.bmp', expected a name ending in .png
-solve good.yaml --out= => --out: found '', expected the name of a file
-solve good.yaml --out a.parquet => --out: found 'a.parquet', expected a name ending in .json
+solve good.yaml --robot pandas => 'pandas' 'panda'
+solve good.yaml --robot ./no.yaml => no.yaml
+solve good.yaml --method hand-fist => --method 'hand-fist' 'hand-first'
+solve good.yaml --method x => --method 'x'
+solve good.yaml --scene tabel => --scene 'tabel' 'table'
+solve good.yaml --limits some => --limits 'some'
+solve good.yaml --finger-step magic => --finger-step 'magic'
+solve good.yaml --prefer clearance => scene
+solve good.yaml --q0 1 2 3 => --q0 3 14 lwr_joint_1
+solve good.yaml --q0 1,2,x => --q0 'x'
+solve good.yaml --q0 -inf => --q0 '-inf'
+solve good.yaml --q0 => --q0
+solve good.yaml --object-pose 1 2 => --object-pose 2 6
+solve good.yaml --tolerance-position -1 => --tolerance-position '-1' 0
+solve good.yaml --tolerance-angle nan => --tolerance-angle 'nan' 0
+solve good.yaml --seed -1 => --seed '-1' 0
+solve good.yaml --seed 99999999999999999999 => --seed
+solve good.yaml --fixed lwr_joint_3=9 => fixed.lwr_joint_3 9.0 -2.9
+solve good.yaml --fixed elbow=0 => fixed 'elbow' lwr_joint_1
+solve good.yaml --fixed lwr_joint_3 => --fixed 'lwr_joint_3'
+solve good.yaml --fixed lwr_joint_3=0 lwr_joint_3=1 => --fixed lwr_joint_3
+solve good.yaml --max-rounds 1 --method thumb-first => --max-rounds 'max_rounds'
+solve good.yaml --picture a.bmp => --picture 'a.bmp'
+solve good.yaml --out= => --out ''
+solve good.yaml --out a.parquet => --out 'a.parquet'
 
-batch targets.npz --out o.npz => the following arguments are required: --robot
-batch targets.npz {ROBOT} => the following arguments are required: --out
-batch targets.npz {ROBOT} --out o.csv => --out: found 'o.csv', expected OUT.npz, OUT.parquet or
-batch no.npz {ROBOT} --out o.npz => no.npz: cannot be read: No such file
-batch empty {ROBOT} --out o.npz => empty: contains no .npz or .parquet file
-batch text.npz {ROBOT} --out o.npz => text.npz: not an npz file
-batch no_points.npz {ROBOT} --out o.npz => no_points.npz: points: missing, expected
-batch flat.npz {ROBOT} --out o.npz => flat.npz: points: found shape (3, 3)
-batch rows.npz {ROBOT} --out o.npz => found 3 and 2 rows
-batch no_rows.npz {ROBOT} --out o.npz => points: found no targets
-batch objects.npz {ROBOT} --out o.npz => points: found values of type object
-batch words.npz {ROBOT} --out o.npz => points: found values of type <U32
-batch odd.npz {ROBOT} --out o.npz => odd.npz: points: cannot be read
+batch targets.npz --out o.npz => --robot
+batch targets.npz {ROBOT} => --out
+batch targets.npz {ROBOT} --out o.csv => --out 'o.csv' OUT.npz OUT.parquet
+batch no.npz {ROBOT} --out o.npz => no.npz
+batch empty {ROBOT} --out o.npz => empty
+batch text.npz {ROBOT} --out o.npz => text.npz
+batch no_points.npz {ROBOT} --out o.npz => no_points.npz points
+batch flat.npz {ROBOT} --out o.npz => flat.npz points (3, 3)
+batch rows.npz {ROBOT} --out o.npz => 3 2
+batch no_rows.npz {ROBOT} --out o.npz => points
+batch objects.npz {ROBOT} --out o.npz => points
+batch words.npz {ROBOT} --out o.npz => points
+batch odd.npz {ROBOT} --out o.npz => odd.npz points
 
-choose empty_list.yaml {ROBOT} --out r.json => candidates: found none, expected at least one grasp
-choose elbow.yaml {ROBOT} --out r.json => contacts.elbow: no such finger
-choose empty {ROBOT} --out r.json => empty: found no YAML file, expected grasp files
-choose no.yaml {ROBOT} --out r.json => no.yaml: no such file or folder
-choose free.npz {ROBOT} --out r.json => free.npz: row 0: contacts: found none
-choose in_mm.npz {ROBOT} --out r.json => expected at most 5 m (numbers in mm?)
-choose targets.npz {ROBOT} --prefer best --out r.json => --prefer: found 'best'
-choose targets.npz {ROBOT} --prefer clearance --out r.json => needs a solver with a scene
-choose targets.npz {ROBOT} --limit 0 --out r.json => --limit: found '0', expected a whole num
-choose targets.npz {ROBOT} --layout mine --out r.json => --layout: found 'mine', expected one of
-choose targets.npz {ROBOT} --out r.parquet => --out: found 'r.parquet', expected a name ending in
+choose empty_list.yaml {ROBOT} --out r.json => candidates
+choose elbow.yaml {ROBOT} --out r.json => contacts.elbow
+choose empty {ROBOT} --out r.json => empty
+choose no.yaml {ROBOT} --out r.json => no.yaml
+choose free.npz {ROBOT} --out r.json => free.npz 0 contacts
+choose in_mm.npz {ROBOT} --out r.json => 5
+choose targets.npz {ROBOT} --prefer best --out r.json => --prefer 'best'
+choose targets.npz {ROBOT} --prefer clearance --out r.json => scene
+choose targets.npz {ROBOT} --limit 0 --out r.json => --limit '0'
+choose targets.npz {ROBOT} --layout mine --out r.json => --layout 'mine'
+choose targets.npz {ROBOT} --out r.parquet => --out 'r.parquet'
 
-follow twenty.npz {ROBOT} --out m.npz => keypoints: found shape (4, 20, 3), expected
-follow neither.npz {ROBOT} --out m.npz => expected keypoints (k, 21, 3) or points (k, 3, 3); found
-follow no_rows.npz {ROBOT} --out m.npz => points: found shape (0, 3, 3), expected
-follow words.npz {ROBOT} --out m.npz => points: found values of type
-follow in_mm.npz {ROBOT} --out m.npz => expected at most 5 m (numbers in mm?)
-follow back.npz {ROBOT} --out m.npz => times: expected 2 growing numbers
-follow extra.npz {ROBOT} --out m.npz => extra: unknown, expected
-follow targets.npz {ROBOT} --period 0 --out m.npz => --period: found '0'
-follow targets.npz {ROBOT} --retarget no.yaml --out m.npz => no.yaml: cannot be read
-follow targets.npz {ROBOT} --retarget sides.yaml --out m.npz => sides.yaml: sides.left
-follow targets.npz --out m.npz => --robot: missing, expected it here or as robot in --retarget
-follow torn.npz {ROBOT} --out m.npz => torn.npz: not an npz file
-follow targets.npz {ROBOT} --out m.parquet => expected a name ending in .mcap, .npz, .csv
-reach cup --q0 1 2 --out w.npz => --q0: found 2 numbers, expected 14
-reach cup --rank 2 --out w.npz => --rank: expected it with
-reach cup --direction 1 --out w.npz => --direction: found 1 numbers, expected 3
-reach cup --direction 0 0 0 --out w.npz => --direction: found three zeros
+follow twenty.npz {ROBOT} --out m.npz => keypoints (4, 20, 3)
+follow neither.npz {ROBOT} --out m.npz => 21 3
+follow no_rows.npz {ROBOT} --out m.npz => points (0, 3, 3)
+follow words.npz {ROBOT} --out m.npz => points
+follow in_mm.npz {ROBOT} --out m.npz => 5
+follow back.npz {ROBOT} --out m.npz => times 2
+follow extra.npz {ROBOT} --out m.npz => extra
+follow targets.npz {ROBOT} --period 0 --out m.npz => --period '0'
+follow targets.npz {ROBOT} --retarget no.yaml --out m.npz => no.yaml
+follow targets.npz {ROBOT} --retarget sides.yaml --out m.npz => sides.yaml sides.left
+follow targets.npz --out m.npz => --robot --retarget
+follow torn.npz {ROBOT} --out m.npz => torn.npz
+follow targets.npz {ROBOT} --out m.parquet => 'm.parquet' .mcap .npz .csv
+reach cup --q0 1 2 --out w.npz => --q0 2 14
+reach cup --rank 2 --out w.npz => --rank
+reach cup --direction 1 --out w.npz => --direction 1 3
+reach cup --direction 0 0 0 --out w.npz => --direction
 
 calibrate none.csv --robot ar10 --out c.yaml => none.csv
-calibrate toe.csv --robot ar10 --out c.yaml => toe.csv:2: finger: found 'toe', expected one of
-calibrate short.csv --robot ar10 --out c.yaml => short.csv:2: found 5 columns, the header has 6
+calibrate toe.csv --robot ar10 --out c.yaml => toe.csv:2 finger 'toe'
+calibrate short.csv --robot ar10 --out c.yaml => short.csv:2 5 6
 calibrate no.csv --robot ar10 --out c.yaml => no.csv
-calibrate toe.csv --robot ar10 --loss median --out c.yaml => --loss: found 'median'
-calibrate toe.csv --robot ar10 --estimate screws --out c.yaml => --estimate: found 'screws'
-calibrate toe.csv --robot ar10 --out c.json => found 'c.json', expected a name ending in .yaml
+calibrate toe.csv --robot ar10 --loss median --out c.yaml => --loss 'median'
+calibrate toe.csv --robot ar10 --estimate screws --out c.yaml => --estimate 'screws'
+calibrate toe.csv --robot ar10 --out c.json => 'c.json'
 
-view cup --port 99999 => --port: found '99999', expected a whole number from 1 to 65535
-view cpu => shipped robot (casadi-ik robots); did you mean 'cup'?
-log info => the following arguments are required: FILE
-log info no.mcap => no.mcap:
-log info empty => empty:
-log info text.mcap => text.mcap:
-log solves log.mcap --status SOLV => log.mcap: no status 'SOLV'; there are:
-log solves log.mcap --method paper => log.mcap: no method 'paper'; the log holds: hand-first
-log solves log.mcap --most 0 => --most: found '0', expected a whole number >= 1
-log events log.mcap --event BOOM => log.mcap: no event 'BOOM'; there are:
-log events log.mcap --phase nap => log.mcap: no phase 'nap'; there are:
-log why log.mcap 99 => log.mcap: no solve 99; the log holds: hand-first solves 1 to 3
-log why log.mcap --solve 99 => log.mcap: no solve 99; the log holds: hand-first solves 1 to 3
-log plot log.mcap => log.mcap: which solve?; the log holds: hand-first solves 1 to 3
-log plot log.mcap 1 --out a.jpg => --out: found 'a.jpg', expected a name ending in .png
-log plot log.mcap 1 --out no/a.png => no/a.png: --out: cannot be written
-log compare log.mcap => the logs hold hand-first, expected two methods (say --methods)
-log compare log.mcap --methods paper hand-first => --methods: found 'paper', the logs hold
-log export log.mcap --solve 1 --out a.txt => --out: found 'a.txt', expected
-log export log.mcap --solve 1 --out log.mcap => log.mcap: --out: found the file of the input
-log export log.mcap --out view.mcap => log.mcap: which solve?; the log holds
-log export log.mcap --solve 1 --robot x --out v.mcap => log.mcap: robot (say --robot): no shipped a
-log export log.mcap --solve 1 --robot ar10 --out v.mcap => log.mcap: the robot 'ar10' is not the one
-log export log.mcap --what rows --out a.csv => --what: found 'rows', expected one of
-log finish no.mcap => no.mcap: cannot finish the log: No such
-log merge log.mcap log.mcap --out all.mcap => log.mcap: solve 1 of hand-first is in log.mcap
-log merge log.mcap --out log.mcap => log.mcap: --out: found the file of the input
-log merge log.mcap => the following arguments are required: --out
+view cup --port 99999 => --port '99999' 1 65535
+view cpu => 'cpu' 'cup'
+log info => FILE
+log info no.mcap => no.mcap
+log info empty => empty
+log info text.mcap => text.mcap
+log solves log.mcap --status SOLV => log.mcap 'SOLV'
+log solves log.mcap --method paper => log.mcap 'paper'
+log solves log.mcap --most 0 => --most '0' 1
+log events log.mcap --event BOOM => log.mcap 'BOOM'
+log events log.mcap --phase nap => log.mcap 'nap'
+log why log.mcap 99 => log.mcap 99 1 3
+log why log.mcap --solve 99 => log.mcap 99 1 3
+log plot log.mcap => log.mcap 1 3
+log plot log.mcap 1 --out a.jpg => --out 'a.jpg'
+log plot log.mcap 1 --out no/a.png => no/a.png --out
+log compare log.mcap => --methods
+log compare log.mcap --methods paper hand-first => --methods 'paper'
+log export log.mcap --solve 1 --out a.txt => --out 'a.txt'
+log export log.mcap --solve 1 --out log.mcap => log.mcap --out
+log export log.mcap --out view.mcap => log.mcap
+log export log.mcap --solve 1 --robot x --out v.mcap => log.mcap --robot
+log export log.mcap --solve 1 --robot ar10 --out v.mcap => log.mcap 'ar10'
+log export log.mcap --what rows --out a.csv => --what 'rows'
+log finish no.mcap => no.mcap
+log merge log.mcap log.mcap --out all.mcap => log.mcap 1
+log merge log.mcap --out log.mcap => log.mcap --out
+log merge log.mcap => --out
 """
 LINES = [line for line in CASES.splitlines() if line]
 
@@ -231,12 +231,13 @@ def test_one_line_and_nothing_written(
     words, _, expected = line.partition(" => ")
     monkeypatch.chdir(place)
     before = sorted(place.rglob("*"))
-    assert expected in run(*words.split()).error
+    error = run(*words.split()).error
+    assert all(part in error for part in expected.split()), error
     assert sorted(place.rglob("*")) == before
 
 
 def test_a_refusal_of_a_process(run_process: Command, place: Path) -> None:
-    assert "no solve 99" in run_process("log", "why", place / "log.mcap", 99).error
+    assert "log.mcap: solve 99 " in run_process("log", "why", place / "log.mcap", 99).error
 
 
 def _changed(array: np.ndarray, where: Any, value: float) -> np.ndarray:
@@ -309,7 +310,7 @@ RANKED: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "short": (lambda data: data["ranked"][0]["solution"].update(q=[1, 2]), "q: found shape (2,)"),
     "words": (lambda data: data["ranked"][0]["solution"].update(q=["a"]), "Expected `float`"),
     "rank": (lambda _: None, "--rank: found 4, but"),
-    "pose": (lambda _: None, "--object-pose: other.json says where its objects are"),
+    "pose": (lambda _: None, "--object-pose: other.json"),
 }
 
 

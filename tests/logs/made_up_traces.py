@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from casadi_ik.compile.layout import Field, Layout
-from casadi_ik.logs import Asked
-from casadi_ik.logs.events import Happening, told
-from casadi_ik.logs.solve import OneSolve
+from casadi_ik.logs import LoggedTarget
+from casadi_ik.logs.events import Event, describe
+from casadi_ik.logs.solve import SolveRecord
 from casadi_ik.model.targets import Tolerance
 
-__all__ = ["Field", "Happening", "Layout", "OneSolve", "told"]
+__all__ = ["Event", "Field", "Layout", "SolveRecord", "describe"]
 
 FINGERS = ("thumb", "finger_2")
 JOINTS = ("joint_a", "joint_b", "joint_c")
@@ -43,7 +43,7 @@ def make_rows(count: int = 40) -> np.ndarray[Any, np.dtype[Any]]:
     return rows
 
 
-def make_one(rows: np.ndarray[Any, np.dtype[Any]], **changes: Any) -> OneSolve:
+def make_one(rows: np.ndarray[Any, np.dtype[Any]], **changes: Any) -> SolveRecord:
     """A solve with a trace; how it ended follows from its last row."""
     position, angle = (
         rows["position_error"][-1].astype(float),
@@ -71,12 +71,12 @@ def make_one(rows: np.ndarray[Any, np.dtype[Any]], **changes: Any) -> OneSolve:
         "rows": rows,
         "events": (),
         "parameters": {},
-        "asked": Asked((Tolerance(5e-3, float(np.deg2rad(3))),) * len(FINGERS)),
+        "target": LoggedTarget((Tolerance(5e-3, float(np.deg2rad(3))),) * len(FINGERS)),
     }
-    return OneSolve(**(values | changes))
+    return SolveRecord(**(values | changes))
 
 
-def event(iteration: int, kind: str, value: float = 0.0, **changes: Any) -> Happening:
+def event(iteration: int, kind: str, value: float = 0.0, **changes: Any) -> Event:
     """An event with nothing in it but what is said."""
     values: dict[str, Any] = {"jacobian": "", "joints": (), "phase": "", "threshold": 0.0}
-    return Happening(iteration, kind, value=value, **(values | changes))
+    return Event(iteration, kind, value=value, **(values | changes))

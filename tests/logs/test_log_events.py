@@ -365,9 +365,9 @@ def test_why_names_what_blocks_and_that_nothing_was_checked(robot, tmp_path: Pat
     blocked = solver.solve(cup, log=path, diagnose=False)
     assert blocked.status is ik.Status.COLLISION
     story = logs.explain(logs.one_solve(logs.open(path)))
-    assert any("something touched from iteration" in line for line in story.met)
+    assert any("collision" in line for line in story.incidents)
     text = "\n".join(story.verdict)
-    assert "limits are kept, but something touches" in text
+    assert "collision" in text
     assert f"balloon overlap by {-1e3 * blocked.clearance:.2f} mm" in text
     plain = tmp_path / "plain.mcap"
     ik.Solver(robot).solve(cup, log=plain)

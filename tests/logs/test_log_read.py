@@ -456,7 +456,7 @@ def test_what_the_shell_says(
     assert info.startswith(str(study))
     assert f"shards 3: {', '.join(NAMES)}" in info
     # A long path is folded in the middle of a word.
-    assert "empty.mcap:nothinginitiswhole" in info.replace(" ", "")
+    assert "empty.mcap:nocompletechunk" in info.replace(" ", "")
     assert "thumb position 0.005 | thumb position 0.001 (by shard)" in info
     solves = said("solves", study)
     assert "6 solves" in solves
@@ -464,7 +464,7 @@ def test_what_the_shell_says(
     assert f"solve 1 of {NAMES[1]}" in said("why", study, 3)
     merged = said("merge", study, "--out", tmp_path / "all.mcap")
     assert "6 of enhanced-dls" in merged
-    assert "empty.mcap:nothinginitiswhole" in merged.replace(" ", "")
+    assert "empty.mcap:nocompletechunk" in merged.replace(" ", "")
     assert f"solve 1 of {NAMES[1]}" in said("why", tmp_path / "all.mcap", 3)
 
 

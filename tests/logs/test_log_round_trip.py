@@ -320,7 +320,7 @@ def test_layouts_that_are_no_message(layout: Layout) -> None:
 GRASP = ik.load_grasp("cup")
 
 
-def repeated(solve: logs.OneSolve) -> ik.Solution:
+def repeated(solve: logs.SolveRecord) -> ik.Solution:
     """The same asked again, of a solver built from the log."""
     contacts = {
         finger: ik.Contact(point, None if np.isnan(normal).any() else normal, tolerance)
@@ -329,14 +329,14 @@ def repeated(solve: logs.OneSolve) -> ik.Solution:
         )
         if not np.isnan(point).any()
     }
-    asked = solve.asked
-    solver = ik.Solver(ik.load_robot(solve.robot), solve.method, limits=asked.limits)
+    target = solve.target
+    solver = ik.Solver(ik.load_robot(solve.robot), solve.method, limits=target.limits)
     return solver.solve(
         ik.Grasp(contacts),
-        q0=asked.start,
-        seed=asked.seed,
-        fixed=asked.fixed,
-        prefer=asked.prefer,
+        q0=target.start,
+        seed=target.seed,
+        fixed=target.fixed,
+        prefer=target.prefer,
     )
 
 
@@ -348,16 +348,16 @@ def test_a_solve_is_repeated_from_its_log(tmp_path: Path, limits: str) -> None:
     contacts["thumb"] = ik.Contact(contacts["thumb"].point, None, ik.Tolerance(1e-5, 0.2))
     fixed = {"lwr_joint_3": 0.2, "bh_spread": float(robot.upper[7])}
     q0 = robot.random(np.random.default_rng(5), 1)[0]
-    path = tmp_path / "asked.mcap"
+    path = tmp_path / "target.mcap"
     solver = ik.Solver(robot, tolerance=ik.Tolerance(1e-3, 0.01), limits=limits)
     first = solver.solve(ik.Grasp(contacts), q0=q0, seed=12345678901, fixed=fixed, log=path)
     solve = logs.one_solve(logs.open(path))
-    asked = solve.asked
-    assert (asked.limits, asked.seed, asked.fixed) == (limits, 12345678901, fixed)
+    target = solve.target
+    assert (target.limits, target.seed, target.fixed) == (limits, 12345678901, fixed)
     free = [name not in fixed for name in robot.actuators]
-    assert asked.start is not None
-    np.testing.assert_array_equal(asked.start[free], q0[free])
-    assert asked.tolerances == (ik.Tolerance(1e-5, 0.2), *(ik.Tolerance(1e-3, 0.01),) * 2)
+    assert target.start is not None
+    np.testing.assert_array_equal(target.start[free], q0[free])
+    assert target.tolerances == (ik.Tolerance(1e-5, 0.2), *(ik.Tolerance(1e-3, 0.01),) * 2)
     again = repeated(solve)
     assert (again.status, again.iterations, again.restarts) == (
         *(first.status, first.iterations, first.restarts),
@@ -382,7 +382,7 @@ def test_held_actuators_beyond_one_word(write: Callable[..., Path]) -> None:
     log = logs.open(write(wide))
     assert log.solves().rows["fixed_mask"].shape == (1, 2)
     solve = logs.one_solve(log)
-    assert list(solve.asked.fixed.values()) == [0.5, -0.25]
-    assert solve.asked.limits == "ignore"
-    assert solve.asked.start is not None
-    assert solve.asked.start[[0, 1, 33]].tolist() == [1.0, 0.5, -0.25]
+    assert list(solve.target.fixed.values()) == [0.5, -0.25]
+    assert solve.target.limits == "ignore"
+    assert solve.target.start is not None
+    assert solve.target.start[[0, 1, 33]].tolist() == [1.0, 0.5, -0.25]

@@ -144,7 +144,7 @@ def test_motions_play(view, robot: ik.ArmHand, tmp_path: Path) -> None:
         (["nothing.mcap"], "nothing.mcap"),
         (["nothing.json"], "nothing.json: cannot be read"),
         (["cup", "--host", "192.0.2.1"], "host: found '192.0.2.1'"),
-        (["cup", "--port", "99999"], "--port: found '99999', expected a whole number from 1 to"),
+        (["cup", "--port", "99999"], "--port: found '99999'"),
     ],
 )
 def test_bad_words_are_one_line(

@@ -1,5 +1,5 @@
-"""The command line: `main` picks a command, a command gives an `Answer`, `main` shows it.
+"""Command line: `main` selects a command, which returns a `CommandResult` that `main` prints.
 
-Only `parser` and `values` are imported to understand a command line; what solves, draws or logs
-comes in with the command that needs it.
+Parsing a command line imports only `table` and `options`; modules that solve, draw or read logs are
+imported by the command that needs them.
 """

@@ -1,4 +1,4 @@
-"""`casadi-ik grasp`: from the mesh of an object to grasps that an arm-hand can make."""
+"""Command `casadi-ik grasp`."""
 
 from __future__ import annotations
 
@@ -14,10 +14,16 @@ from rich.text import Text
 
 from casadi_ik.api import Solver
 from casadi_ik.app.cli import options as opt
-from casadi_ik.app.cli.inputs import located, the_object_pose, the_robot, the_scene, the_start
+from casadi_ik.app.cli.inputs import (
+    load_robot_arg,
+    load_scene_arg,
+    located,
+    parse_object_pose,
+    parse_q0,
+)
 from casadi_ik.app.cli.options import Option
 from casadi_ik.app.cli.outputs import check_outputs, output
-from casadi_ik.app.cli.table import Answer, Said, command
+from casadi_ik.app.cli.table import Arguments, CommandResult, command
 from casadi_ik.app.cli.view import serve
 from casadi_ik.app.report import fields, files, headline, table
 from casadi_ik.collision.scene import Scene
@@ -30,34 +36,33 @@ from casadi_ik.solve.solution_files import RANKED_MEMBER, ranking_data
 
 
 @command(
-    Option("OBJECT", "a mesh in metres (stl, obj, ...), a shipped object or its YAML file"),
-    opt.THE_ROBOT,
+    Option("OBJECT", "mesh (stl, obj, ...), shipped object or YAML file"),
+    opt.REQUIRED_ROBOT,
     Option("--scale S", "unit of the mesh in metres: 0.001 for millimetres", 1.0, opt.positive),
     opt.OBJECT_POSE,
-    Option("--fingers N", "fingertips that touch", 3, opt.whole(2)),
+    Option("--fingers N", "number of fingertips in contact", 3, opt.integer(2)),
     Option("--mu MU", "friction coefficient", 0.5, opt.positive),
     Option(
         "--hold KG_N...",
-        "a mass [kg], and the squeeze [N] with which it has to be held",
-        read=lambda words: opt.numbers(words, 2, "kg N"),
+        "required payload [kg] and squeeze force [N]",
+        parse=lambda words: opt.numbers(words, 2, "kg N"),
     ),
     opt.SCENE,
     Option(
         "--prefer load|clearance|limits|q0",
-        "what comes first: most load per squeeze, far from what may be hit, from limits, or near "
-        "the start",
+        "ranking: load per squeeze, clearance, limit margin, near q0",
         default="load",
     ),
-    Option("--limit N", "grasps at most", 200, opt.whole(1)),
+    Option("--limit N", "maximum number of grasps", 200, opt.integer(1)),
     opt.Q0,
     opt.SEED,
-    Option("--jobs N", "threads", 1, opt.whole(1)),
-    opt.out("FOUND.npz", "write the grasps"),
-    opt.picture("--picture", "draw the best nine: hand and object"),
-    Option("--view", "show the grasps in the browser afterwards (needs 'casadi-ik[view]')"),
+    Option("--jobs N", "threads", 1, opt.integer(1)),
+    opt.out("FOUND.npz", "output file of the grasps"),
+    opt.picture("--picture", "picture of the best nine grasps"),
+    Option("--view", "show the grasps in the browser (needs 'casadi-ik[view]')"),
 )
-def grasp(said: Said) -> Answer:
-    r"""Find grasps of an object that the arm-hand can make, free of collision.
+def grasp(args: Arguments) -> CommandResult:
+    r"""Find collision-free grasps of an object that the arm can reach.
 
     Examples:
       casadi-ik grasp mug.obj --robot panda+allegro_right --scene table \
@@ -65,87 +70,89 @@ def grasp(said: Said) -> Answer:
       casadi-ik view mug.npz --scene table
       casadi-ik reach mug.npz --rank 1 --scene table --out way.mcap
 
-    Two opposing fingertips are matched with two opposing patches of the object, the
-    other fingers look for something to touch, palm and hand are moved until all
-    touch, the arm follows in closed form; what remains is judged in the scene and
-    ranked. FOUND.npz holds points, normals and balls (k, f, 3), as for `casadi-ik
-    batch` and `choose`, q, load, closure and clearance, and the ranked answers for
-    `casadi-ik reach` and `view`. If none is found, nothing is written.
+    The search matches two opposing fingertips with two opposing patches of the
+    object, places the other fingers on the surface, fits palm and hand posture,
+    solves the arm in closed form, checks collisions, and ranks the remaining grasps.
+    FOUND.npz holds points, normals and balls (k, f, 3) in the format of `casadi-ik
+    batch` and `choose`, q, load, closure and clearance, and the ranked solutions for
+    `casadi-ik reach` and `view`. If no grasp is found, no file is written.
 
-    exit codes: 0 at least one found, 1 none (the report says why), 2 bad input
+    exit codes: 0 at least one found, 1 none (see report), 2 bad input
     """
-    robot, scene = the_robot(said.robot), the_scene(said)
-    outputs = {"--out": said.out, "--picture": said.picture}
-    check_outputs(outputs, inputs=[Path(said.object)])
+    robot, scene = load_robot_arg(args.robot), load_scene_arg(args)
+    outputs = {"--out": args.out, "--picture": args.picture}
+    check_outputs(outputs, inputs=[Path(args.object)])
     draw = None
-    if said.picture is not None:
+    if args.picture is not None:
         with located("--picture", (MissingExtraError,)):
             from casadi_ik.app.pictures import draw_grasps as draw
-    if said.view:
+    if args.view:
         with located("--view", (MissingExtraError,)):
             import_module("casadi_ik.app.viewer")
-    surface = load_surface(said.object, said.scale, said.seed)
-    with located(said.object):
-        found = Solver(robot, scene=scene).grasps_of(
+    surface = load_surface(args.object, args.scale, args.seed)
+    with located(args.object):
+        grasps = Solver(robot, scene=scene).grasps_of(
             surface,
-            the_object_pose(said),
-            fingers=said.fingers,
-            mu=said.mu,
-            hold=said.hold,
-            limit=said.limit,
-            jobs=said.jobs,
-            seed=said.seed,
-            prefer=said.prefer,
-            q0=the_start(said, robot),
+            parse_object_pose(args),
+            fingers=args.fingers,
+            mu=args.mu,
+            hold=args.hold,
+            limit=args.limit,
+            jobs=args.jobs,
+            seed=args.seed,
+            prefer=args.prefer,
+            q0=parse_q0(args, robot),
         )
-    counts = fields({name: f"{number:,}" for name, number in found.counts.items()})
-    rest = f"{surface.object.name} with {robot.name}, {found.time:.2f} s of processor time"
-    if not len(found):
-        head = headline(False, "NONE FOUND", rest)
-        return Answer.solved(False, head, counts, Text(f"  {found.reason}"))
-    with output(said.out) as part:
-        part.write_bytes(found_data(found, robot.fingers))
+    counts = fields({name: f"{number:,}" for name, number in grasps.counts.items()})
+    subject = f"{surface.object.name} with {robot.name}, {grasps.time:.2f} s of processor time"
+    if not len(grasps):
+        title = headline(False, "NONE FOUND", subject)
+        return CommandResult.of_parts(False, title, counts, Text(f"  {grasps.reason}"))
+    with output(args.out) as part:
+        part.write_bytes(grasps_npz(grasps, robot.fingers))
     if draw is not None:
-        draw(robot, found, said.picture, scene=scene)
+        draw(robot, grasps, args.picture, scene=scene)
     best = table("rank", "load [N/N]", "clearance [mm]", "fingers")
-    for rank, one in enumerate(found[:10], 1):
-        room = "" if one.clearance is None else f"{1e3 * one.clearance:.1f}"
-        best.add_row(str(rank), f"{one.load:.3f}", room, " ".join(one.grasp.contacts))
-    head = headline(True, f"{len(found)} FOUND", rest)
-    report = Answer.solved(True, head, counts, best, *files(outputs))
-    return replace(report, after=partial(_view, robot, found, scene)) if said.view else report
+    for rank, entry in enumerate(grasps[:10], 1):
+        clearance = "" if entry.clearance is None else f"{1e3 * entry.clearance:.1f}"
+        best.add_row(str(rank), f"{entry.load:.3f}", clearance, " ".join(entry.grasp.contacts))
+    title = headline(True, f"{len(grasps)} FOUND", subject)
+    report = CommandResult.of_parts(True, title, counts, best, *files(outputs))
+    return replace(report, after=partial(_view, robot, grasps, scene)) if args.view else report
 
 
-def _view(robot: ArmHand, found: FoundGrasps, scene: Scene | None) -> None:
+def _view(robot: ArmHand, grasps: FoundGrasps, scene: Scene | None) -> None:
     """Show the grasps in the browser until Ctrl-C."""
     from casadi_ik.app.viewer import view_found
 
-    serve(view_found(robot, found, scene=scene))
+    serve(view_found(robot, grasps, scene=scene))
 
 
-def found_data(found: FoundGrasps, fingers: tuple[str, ...]) -> bytes:
-    """What FOUND.npz holds."""
-    k, f = len(found), len(fingers)
+def grasps_npz(grasps: FoundGrasps, fingers: tuple[str, ...]) -> bytes:
+    """Return the contents of FOUND.npz."""
+    k, f = len(grasps), len(fingers)
     arrays = {"points": np.full((k, f, 3), np.nan), "normals": np.full((k, f, 3), np.nan)}
-    for row, one in enumerate(found):
-        for name, contact in one.grasp.contacts.items():
+    for row, entry in enumerate(grasps):
+        for name, contact in entry.grasp.contacts.items():
             arrays["points"][row, fingers.index(name)] = contact.point
             arrays["normals"][row, fingers.index(name)] = contact.normal
-        for name, vectors in one.grasp.more(fingers).items():
+        for name, vectors in entry.grasp.more(fingers).items():
             arrays.setdefault(name, np.full((k, f, 3), np.nan))[row] = vectors
-    choices = [Choice(i, one.solution, one.score, one.grasp) for i, one in enumerate(found)]
-    ranking = Ranking(tuple(choices), k, k, {}, found.prefer)
-    data = ranking_data(ranking, [one.grasp.name for one in found])
-    for entry, one in zip(data["ranked"], found, strict=True):
-        entry["load"] = one.load
+    choices = [
+        Choice(i, entry.solution, entry.score, entry.grasp) for i, entry in enumerate(grasps)
+    ]
+    ranking = Ranking(tuple(choices), k, k, {}, grasps.prefer)
+    data = ranking_data(ranking, [entry.grasp.name for entry in grasps])
+    for item, entry in zip(data["ranked"], grasps, strict=True):
+        item["load"] = entry.load
     text = json.dumps(data, allow_nan=False)
     arrays |= {
-        "q": np.array([one.q for one in found]),
-        "load": np.array([one.load for one in found]),
-        "closure": np.array([one.closure for one in found]),
-        "clearance": np.array([one.solution.clearance for one in found], dtype=float),
+        "q": np.array([entry.q for entry in grasps]),
+        "load": np.array([entry.load for entry in grasps]),
+        "closure": np.array([entry.closure for entry in grasps]),
+        "clearance": np.array([entry.solution.clearance for entry in grasps], dtype=float),
         RANKED_MEMBER: np.frombuffer(text.encode(), dtype=np.uint8),
     }
-    held = io.BytesIO()
-    np.savez_compressed(held, allow_pickle=False, **arrays)
-    return held.getvalue()
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, **arrays)
+    return buffer.getvalue()

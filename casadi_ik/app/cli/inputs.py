@@ -1,4 +1,4 @@
-"""What was said, as robots, grasps, scenes and solvers."""
+"""Conversion of command-line arguments to robots, grasps, scenes and solvers."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from casadi_ik.api import METHODS, Solver
-from casadi_ik.app.cli.table import Said, in_si
+from casadi_ik.app.cli.table import Arguments, to_si
 from casadi_ik.app.report import HUMAN, SI, Units
 from casadi_ik.collision.scene import Scene, load_scene
 from casadi_ik.errors import (
@@ -33,11 +33,11 @@ from casadi_ik.model.targets import fixed_array
 def located(
     where: str, kinds: tuple[type[CasadiIKError], ...] = (InputError, UnknownNameError)
 ) -> Iterator[None]:
-    """Put the place in front of an error that does not know it.
+    """Prefix the message of errors with the file or option that they concern.
 
     Args:
-        where: A file or an option.
-        kinds: Which errors.
+        where: File or option.
+        kinds: Types of the errors.
     """
     try:
         yield
@@ -46,156 +46,164 @@ def located(
         raise
 
 
-def the_grasp(said: Said) -> tuple[Path, Grasp]:
-    """The grasp, moved with its object, and the file it is from.
+def load_grasp_arg(args: Arguments) -> tuple[Path, Grasp]:
+    """Return the file of the grasp, and the grasp at the given object pose.
 
     Raises:
-        UnknownNameError: No shipped grasp has that name.
+        UnknownNameError: No shipped grasp has this name.
         DescriptionError: The file is missing or malformed.
     """
-    path, pose = resolve_description(said.grasp, "grasps"), the_object_pose(said)
+    path, pose = resolve_description(args.grasp, "grasps"), parse_object_pose(args)
     grasp = load_grasp(path)
     return path, grasp if pose is None else grasp.in_object_frame().at(pose)
 
 
-def the_robot(name: str | None, path: Path | None = None, grasp: Grasp | None = None) -> ArmHand:
-    """The robot that was asked for, else the grasp file's, whose path counts from that file.
+def load_robot_arg(
+    name: str | None, path: Path | None = None, grasp: Grasp | None = None
+) -> ArmHand:
+    """Return the robot of ``--robot``, or else the one that the grasp file names.
+
+    Args:
+        name: Value of ``--robot``, or None.
+        path: File of the grasp; a robot file that it names is relative to it.
+        grasp: Grasp.
 
     Raises:
-        InputError: Neither is given.
-        UnknownNameError: No shipped robot has that name.
-        DescriptionError: Its file is missing or malformed.
+        InputError: Neither names a robot.
+        UnknownNameError: No shipped robot has this name.
+        DescriptionError: The file of the robot is missing or malformed.
     """
     if name is not None:
         with located("--robot"):
             return load_robot(name)
     if path is None or grasp is None or not grasp.robot:
-        raise InputError(f"{path}: robot: missing, expected it in the file or --robot")
+        raise InputError(f"{path}: robot: key is missing; expected it in the file, or --robot")
     with located(f"{path}: robot", (UnknownNameError, DescriptionError)):
-        found = resolve_robot(grasp.robot, relative_to=path)
-    return load_robot(grasp.robot if isinstance(found, tuple) else found)
+        resolved = resolve_robot(grasp.robot, relative_to=path)
+    return load_robot(grasp.robot if isinstance(resolved, tuple) else resolved)
 
 
 def robot_of_log(log: Log, file: str, name: str) -> ArmHand:
-    """A robot, after making sure that it is the one of a log.
+    """Load a robot and check that it is the robot of a log.
 
     Raises:
-        UnknownNameError: No shipped robot has that name.
+        UnknownNameError: No shipped robot has this name.
         LogError: The log was written for another robot.
     """
-    with located(f"{file}: robot (say --robot)", (UnknownNameError,)):
+    with located(f"{file}: robot (use --robot)", (UnknownNameError,)):
         robot = load_robot(name)
     check_robot(robot, log.attachment("robot.urdf").decode(), file)
     return robot
 
 
-def the_method(said: Said) -> str:
-    """The method.
+def parse_method(args: Arguments) -> str:
+    """Return the name of the method.
 
     Raises:
-        UnknownNameError: No such method.
+        UnknownNameError: No method has this name.
     """
-    method = said.method or METHODS[0]
+    method = args.method or METHODS[0]
     if method not in METHODS:
         raise UnknownNameError(f"--method: found {method!r}, {did_you_mean(method, METHODS)}")
     return method
 
 
-def the_solver(said: Said, robot: ArmHand) -> Solver:
-    """The solver for a robot; what a command has no option for is as usual.
+def make_solver(args: Arguments, robot: ArmHand) -> Solver:
+    """Return the solver of a robot; settings without an option have their default.
 
     Raises:
-        UnknownNameError: No such method, or no such scene.
-        UnsupportedError: The method cannot take the robot.
-        DescriptionError: The scene's file is missing or malformed.
+        UnknownNameError: No method or scene has this name.
+        UnsupportedError: The method does not support the robot.
+        DescriptionError: The file of the scene is missing or malformed.
     """
-    scene = the_scene(said)
-    if "method" not in said:
-        return Solver(robot, tolerance=the_tolerance(said), options=_options(said), scene=scene)
-    method = the_method(said)
-    about = "--finger-step" if said.max_rounds is None else "--max-rounds"
-    with located(f"--method {method}", (UnsupportedError,)), located(about):
+    scene = load_scene_arg(args)
+    if "method" not in args:
+        return Solver(robot, tolerance=parse_tolerance(args), options=_options(args), scene=scene)
+    method = parse_method(args)
+    option = "--finger-step" if args.max_rounds is None else "--max-rounds"
+    with located(f"--method {method}", (UnsupportedError,)), located(option):
         return Solver(
             robot,
             method,
-            the_tolerance(said),
-            said.limits,
-            said.finger_step,
-            options=_options(said),
+            parse_tolerance(args),
+            args.limits,
+            args.finger_step,
+            options=_options(args),
             scene=scene,
         )
 
 
-def _options(said: Said) -> dict[str, int]:
-    """What was said of the method's own parameters."""
-    rounds = getattr(said, "max_rounds", None)
-    return {} if rounds is None else {"max_rounds": rounds}
+def _options(args: Arguments) -> dict[str, int]:
+    """Return the parameters of the method that the command line sets."""
+    max_restarts = getattr(args, "max_rounds", None)
+    return {} if max_restarts is None else {"max_rounds": max_restarts}
 
 
-def the_tolerance(said: Said) -> Tolerance:
-    """When contacts count as reached."""
-    usual = Tolerance()
-    return Tolerance(said.tolerance_position or usual.position, said.tolerance_angle or usual.angle)
+def parse_tolerance(args: Arguments) -> Tolerance:
+    """Return the tolerance of contacts."""
+    default = Tolerance()
+    position = args.tolerance_position or default.position
+    return Tolerance(position, args.tolerance_angle or default.angle)
 
 
-def the_scene(said: Said) -> Scene | None:
-    """The scene that was asked for; None: nothing is checked.
+def load_scene_arg(args: Arguments) -> Scene | None:
+    """Return the scene, or None if collisions are not checked.
 
     Raises:
-        UnknownNameError: No shipped scene has that name.
+        UnknownNameError: No shipped scene has this name.
         DescriptionError: The file is missing or malformed.
     """
-    if said.scene is None:
+    if args.scene is None:
         return None
     with located("--scene", (UnknownNameError, DescriptionError)):
-        return load_scene(said.scene)
+        return load_scene(args.scene)
 
 
-def the_object_pose(said: Said) -> Array | None:
-    """(4, 4) where the object is in whose frame targets are; None: they are in the base frame."""
-    if said.object_pose is None:
+def parse_object_pose(args: Arguments) -> Array | None:
+    """Return the object pose (4, 4) in the base frame, or None if it is not given."""
+    if args.object_pose is None:
         return None
-    x, y, z, roll, pitch, yaw = said.object_pose
+    x, y, z, roll, pitch, yaw = args.object_pose
     return frame_matrix(Frame((x, y, z), (roll, pitch, yaw)))
 
 
-def the_units(said: Said) -> Units:
-    """What reports are in: degrees and mm, unless radians or m were asked for."""
+def report_units(args: Arguments) -> Units:
+    """Return the units of reports: degrees and mm unless the options say otherwise."""
     return {
-        "rad": (SI if said.deg is False else HUMAN)["rad"],
-        "m": (SI if said.mm is False else HUMAN)["m"],
+        "rad": (SI if args.deg is False else HUMAN)["rad"],
+        "m": (SI if args.mm is False else HUMAN)["m"],
     }
 
 
-def the_start(said: Said, robot: ArmHand) -> list[float] | None:
-    """The start, a number per actuator; None for home.
+def parse_q0(args: Arguments, robot: ArmHand) -> list[float] | None:
+    """Return the start configuration (n,) [rad or m], or None for the home configuration.
 
     Raises:
-        InputError: As many numbers as actuators were expected.
+        InputError: The number of values differs from the number of actuators.
     """
-    if said.q0 is None:
+    if args.q0 is None:
         return None
-    if len(said.q0) != len(robot.actuators):
+    if len(args.q0) != len(robot.actuators):
         raise InputError(
-            f"--q0: found {len(said.q0)} numbers, expected {len(robot.actuators)}: "
+            f"--q0: found {len(args.q0)} numbers, expected {len(robot.actuators)}: "
             + ", ".join(robot.actuators)
         )
     units = (actuator.unit for actuator in robot.description.actuators)
-    return [in_si(value, unit, said) for value, unit in zip(said.q0, units, strict=True)]
+    return [to_si(value, unit, args) for value, unit in zip(args.q0, units, strict=True)]
 
 
-def the_fixed(said: Said, robot: ArmHand) -> dict[str, float]:
-    """The actuators that are not to move.
+def parse_fixed(args: Arguments, robot: ArmHand) -> dict[str, float]:
+    """Return the positions of fixed actuators [rad or m] by name.
 
     Raises:
-        InputError: One is named twice, or its position is not within its limits.
-        UnknownNameError: No such actuator.
+        InputError: An actuator appears twice, or its position violates its limits.
+        UnknownNameError: No actuator has this name.
     """
     units = {actuator.name: actuator.unit for actuator in robot.description.actuators}
     fixed: dict[str, float] = {}
-    for name, value in said.fixed:
+    for name, value in args.fixed:
         if name in fixed:
             raise InputError(f"--fixed: {name} appears twice")
-        fixed[name] = in_si(value, units.get(name, ""), said)
+        fixed[name] = to_si(value, units.get(name, ""), args)
     fixed_array(fixed, robot.actuators, *robot.description.motion_limits)
     return fixed

@@ -1,4 +1,4 @@
-"""`casadi-ik log ...`: logs as tables, in words, as pictures, as other files."""
+"""Commands `casadi-ik log ...`: tables, explanations, plots, reports and exports of logs."""
 
 from __future__ import annotations
 
@@ -20,198 +20,204 @@ from casadi_ik.app.cli import options as opt
 from casadi_ik.app.cli.inputs import located, robot_of_log
 from casadi_ik.app.cli.options import Option
 from casadi_ik.app.cli.outputs import check_outputs, output, write_json
-from casadi_ik.app.cli.table import Answer, Said, command
+from casadi_ik.app.cli.table import Arguments, CommandResult, command
 from casadi_ik.app.report import count_text, duration, fields, files, headline, indented, table
 from casadi_ik.errors import InputError, MissingExtraError, UnknownNameError, printable
 from casadi_ik.logs.container import ForeignLogError, NothingWrittenError
-from casadi_ik.logs.events import SERIOUS, plain_name, quantity, told
-from casadi_ik.logs.explanation import Matched, explain, matched, side_by_side
+from casadi_ik.logs.events import SERIOUS, describe, format_quantity, plain_name
+from casadi_ik.logs.explanation import MatchedTargets, compare_solves, explain, match_targets
 from casadi_ik.logs.repair import finish_log, merge_logs
 from casadi_ik.logs.shards import log_files
-from casadi_ik.logs.solve import OneSolve, one_solve
-from casadi_ik.logs.tables import happenings
+from casadi_ik.logs.solve import SolveRecord, one_solve
+from casadi_ik.logs.tables import events_of
 
-SHOWN = 12
-"""How many of a list of names or numbers are shown."""
+MAX_ITEMS = 12
+"""Maximum number of names or numbers that a list shows."""
 
-USUAL_EVENTS = ("PHASE_CHANGE", "LIMIT_LEFT", "RELEASED")
-"""What happens in every solve and so is not told of each."""
+ROUTINE_EVENTS = ("PHASE_CHANGE", "LIMIT_LEFT", "RELEASED")
+"""Kinds of events that occur in every solve; the list of solves leaves them out."""
 
-TORN, EMPTY = (
-    "killed while writing, or still at it (casadi-ik log finish)",
-    "nothing in it is whole",
-)
-"""Why files of a study are named."""
+INCOMPLETE = "writer was killed or is still running (casadi-ik log finish)"
+"""Explanation of files without a summary."""
+
+EMPTY = "no complete chunk"
+"""Reason for files of a study that are left out."""
 
 LOGS = Option("FILE...", "logs, or folders of logs", key="files")
-LOG = Option("FILE", "a log, or a folder of shards")
-SOLVE = Option("--solve N", "number of the solve, from 1", read=opt.whole(1))
-ONE_SOLVE = (
+LOG = Option("FILE", "log, or folder of shards")
+SOLVE = Option("--solve N", "number of the solve, from 1", parse=opt.integer(1))
+SINGLE_SOLVE = (
     Option(
         "[SOLVE]",
         "number of the solve, from 1 (default: the only one)",
-        read=opt.whole(1),
-        key="one",
+        parse=opt.integer(1),
+        key="number",
     ),
-    Option("--solve N", "the same", read=opt.whole(1)),
+    Option("--solve N", "number of the solve, from 1", parse=opt.integer(1)),
     Option("--method M", "method (default: the only one)"),
 )
 FILTERS = (
-    Option("--method M", "of the solve"),
+    Option("--method M", "only solves of this method"),
     SOLVE,
-    Option("--status S", "of the solve, e.g. STALLED"),
-    Option("--event E", "solves in which one happened, and those events, e.g. NEAR_SINGULAR"),
-    Option("--phase P", "solves, iterations and events in it, e.g. hand-alignment"),
+    Option("--status S", "only solves with this status, e.g. STALLED"),
+    Option("--event E", "only solves with this event, e.g. NEAR_SINGULAR"),
+    Option("--phase P", "only rows of this phase, e.g. hand-alignment"),
 )
-MOST = Option("--most N", "rows shown", 40)
-KINDS = {".mcap": "viewer", ".parquet": "parquet", ".csv": "csv"}
-"""What `log export` writes, by the name's end."""
+MAX_ROWS = Option("--most N", "maximum number of rows", 40)
+FORMAT_OF_SUFFIX = {".mcap": "viewer", ".parquet": "parquet", ".csv": "csv"}
+"""Format of `log export` by suffix of the output."""
 
 
 @command(LOGS)
-def info(said: Said) -> Answer:
-    """Tell what logs hold: methods, solves, iterations, events, size and origin."""
+def info(args: Arguments) -> CommandResult:
+    """Summarise logs: methods, solves, iterations, events, size and origin."""
     parts: list[RenderableType] = []
-    for name in said.files:
+    for name in args.files:
         log = logs.open(name)
-        about = log.info()
-        parts += [_title(name), fields(_container(log, about)), _methods(log, about)]
-        parts.append(fields(_origin(log)))
-    return Answer(Group(*parts))
+        summary = log.info()
+        parts += [_title(name), fields(_container_fields(log, summary))]
+        parts += [_method_table(log, summary), fields(_origin_fields(log))]
+    return CommandResult(Group(*parts))
 
 
-@command(LOGS, *FILTERS, MOST)
-def solves(said: Said) -> Answer:
-    """List solves and how they ended."""
-    found = logs.open(said.files).solves(**_filters(said))
+@command(LOGS, *FILTERS, MAX_ROWS)
+def solves(args: Arguments) -> CommandResult:
+    """List solves with their status."""
+    selection = logs.open(args.files).solves(**_filters(args))
     parts: list[RenderableType] = []
-    left = said.most
-    for part in found.parts:
-        shown = part.first(left)
-        left -= len(shown)
-        if len(shown):
+    remaining = args.most
+    for part in selection.parts:
+        rows = part.first(remaining)
+        remaining -= len(rows)
+        if len(rows):
             parts.append(Text(f"  {part.method}", "bold"))
-            records = logs.Table("solve", (shown,)).records()
-            for shard, of_shard in groupby(records, lambda record: record.get("shard")):
+            records = logs.Table("solve", (rows,)).records()
+            for shard, shard_records in groupby(records, lambda record: record.get("shard")):
                 parts += [] if shard is None else [Text(f"  from {shard}", "dim")]
-                parts.append(_solve_rows(part, of_shard))
-    return Answer(Group(*parts, _count(len(found), said.most, "solve")))
+                parts.append(_solve_table(part, shard_records))
+    return CommandResult(Group(*parts, _row_count(len(selection), args.most, "solve")))
 
 
-@command(LOGS, *FILTERS, MOST)
-def events(said: Said) -> Answer:
+@command(LOGS, *FILTERS, MAX_ROWS)
+def events(args: Arguments) -> CommandResult:
     """List events: singularities, limits, stalls, ..."""
-    found = logs.open(said.files).events(**_filters(said))
+    selection = logs.open(args.files).events(**_filters(args))
     numbers = ("solve", "iteration")
-    rows = table(*numbers, "method", "phase", "what happened", right=numbers)
-    for part in (each.first(said.most - len(rows.rows)) for each in found.parts):
-        for number, event in zip(part.solve_id.tolist(), happenings(part), strict=True):
-            text = Text(told(event), "yellow" if event.kind in SERIOUS else "")
+    rows = table(*numbers, "method", "phase", "event", right=numbers)
+    for part in selection.parts:
+        part = part.first(args.most - len(rows.rows))
+        for number, event in zip(part.solve_id.tolist(), events_of(part), strict=True):
+            text = Text(describe(event), "yellow" if event.kind in SERIOUS else "")
             rows.add_row(str(number + 1), str(event.iteration + 1), part.method, event.phase, text)
-    return Answer(Group(_only_last_wraps(rows), _count(len(found), said.most, "event")))
+    count = _row_count(len(selection), args.most, "event")
+    return CommandResult(Group(_wrap_last_column(rows), count))
 
 
-@command(LOG, *ONE_SOLVE)
-def why(said: Said) -> Answer:
+@command(LOG, *SINGLE_SOLVE)
+def why(args: Arguments) -> CommandResult:
     """Explain one solve in words."""
-    solve = _the_solve(said, logs.open(said.file))
-    found = explain(solve)
-    parts: list[RenderableType] = [headline(solve.success, solve.status, found.headline)]
+    solve = _load_solve(args, logs.open(args.file))
+    explanation = explain(solve)
+    parts: list[RenderableType] = [headline(solve.success, solve.status, explanation.headline)]
     if solve.shard:
         parts.append(Text(f"  solve {solve.number + 1} of {solve.shard}"))
-    for title, lines in found.parts.items():
+    for title, lines in explanation.parts.items():
         parts.append(Text(f"  {title}", "bold"))
         parts += [indented(line, width=4) for line in lines]
-    return Answer(Group(*parts))
+    return CommandResult(Group(*parts))
 
 
 @command(
     LOG,
-    *ONE_SOLVE,
+    *SINGLE_SOLVE,
     Option(
         "--out FILE.png",
-        "where to (default: named after log, method and solve, in this folder)",
-        read=opt.file_name(".png"),
+        "output file (default: named after log, method and solve)",
+        parse=opt.file_name(".png"),
     ),
     Option(
         "--range FIRST LAST",
-        "iterations drawn, from 1; long runs hide what happens at their beginning (default: all)",
-        read=opt.each(opt.whole(1)),
+        "first and last iteration to draw, from 1 (default: all)",
+        parse=opt.word_list(opt.integer(1)),
     ),
 )
-def plot(said: Said) -> Answer:
-    """Draw how one solve went (needs 'casadi-ik[plots]')."""
+def plot(args: Arguments) -> CommandResult:
+    """Plot the convergence of one solve (needs 'casadi-ik[plots]')."""
     with located("log plot", (MissingExtraError,)):
         from casadi_ik.app.pictures import draw_convergence
-    log = logs.open(said.file)
-    solve = _the_solve(said, log)
-    named = Path(f"{Path(said.file).stem}-{solve.method}-{solve.solve_id + 1}.png")
-    file = said.out or named
-    check_outputs({"--out": file}, inputs=[Path(said.file)])
-    chosen = {"method": solve.method, "solve": solve.solve_id}
-    with located(f"{said.file}: solve {solve.solve_id + 1}"):
+    log = logs.open(args.file)
+    solve = _load_solve(args, log)
+    default_name = Path(f"{Path(args.file).stem}-{solve.method}-{solve.solve_id + 1}.png")
+    file = args.out or default_name
+    check_outputs({"--out": file}, inputs=[Path(args.file)])
+    filters = {"method": solve.method, "solve": solve.solve_id}
+    with located(f"{args.file}: solve {solve.solve_id + 1}"):
         draw_convergence(
-            log.iterations(**chosen),
+            log.iterations(**filters),
             file,
-            events=log.events(**chosen),
-            tolerance=min(solve.tolerances, key=lambda each: each.position),
-            span=tuple(said.range) if said.range else None,
+            events=log.events(**filters),
+            tolerance=min(solve.tolerances, key=lambda tolerance: tolerance.position),
+            span=tuple(args.range) if args.range else None,
             title=f"{solve.method} · solve {solve.solve_id + 1} · {solve.iterations} iterations"
             f" · {solve.status}",
         )
-    return Answer(Group(*files({"plot": file})))
+    return CommandResult(Group(*files({"plot": file})))
 
 
 @command(
     LOGS,
-    Option("--solve N", "one solve, by its number with the first method", read=opt.whole(1)),
-    Option("--methods M M", "which two; last on the line (default: the only two)"),
+    Option("--solve N", "number of a solve of the first method, from 1", parse=opt.integer(1)),
+    Option("--methods M M", "two methods; last on the line (default: the only two)"),
 )
-def compare(said: Said) -> Answer:
-    """Compare two methods on the same targets: one side by side, many in numbers."""
-    opened = [logs.open(name) for name in said.files]
-    first, second = _two_methods(opened, said.methods)
-    pairs = matched(opened, first, second)
-    if said.solve is not None:
-        pairs = pairs.of_first(said.solve - 1)
+def compare(args: Arguments) -> CommandResult:
+    """Compare two methods on the same targets: one target in detail, many by statistics."""
+    open_logs = [logs.open(name) for name in args.files]
+    first, second = _two_methods(open_logs, args.methods)
+    pairs = match_targets(open_logs, first, second)
+    if args.solve is not None:
+        pairs = pairs.of_first(args.solve - 1)
     if len(pairs) == 0:
-        asked = "" if said.solve is None else f" of solve {said.solve}"
-        where = ", ".join(said.files)
-        raise InputError(f"{where}: {first} and {second}: no target{asked} in common")
+        number = "" if args.solve is None else f" of solve {args.solve}"
+        files_text = ", ".join(args.files)
+        raise InputError(f"{files_text}: {first} and {second}: no target{number} in common")
     if len(pairs) > 1:
-        return Answer(_many_compared(pairs))
-    (pair,) = pairs.pairs
-    both = [one_solve(each.log, each.solve_id, each.method) for each in pair]
-    rows = table("", *(f"{each.method}, solve {each.solve_id + 1}" for each in both))
-    for line in side_by_side(*both):
-        rows.add_row(line.what, line.first, line.second)
-    return Answer(rows)
+        return CommandResult(_comparison_summary(pairs))
+    ((first_outcome, second_outcome),) = pairs.pairs
+    records = (
+        one_solve(first_outcome.log, first_outcome.solve_id, first_outcome.method),
+        one_solve(second_outcome.log, second_outcome.solve_id, second_outcome.method),
+    )
+    rows = table("", *(f"{record.method}, solve {record.solve_id + 1}" for record in records))
+    for row in compare_solves(*records):
+        rows.add_row(row.quantity, row.first, row.second)
+    return CommandResult(rows)
 
 
 @command(
     LOGS,
-    opt.out("REPORT.html", "where to"),
-    Option("--title TEXT", "of the page (default: what the log is called)"),
-    Option("--most N", "solves listed with their stories", 200),
+    opt.out("REPORT.html", "output file"),
+    Option("--title TEXT", "title of the page (default: name of the log)"),
+    Option("--most N", "maximum number of solves listed with details", 200),
 )
-def report(said: Said) -> Answer:
-    """Write a study as a page that needs nothing but a browser (needs 'casadi-ik[plots]').
+def report(args: Arguments) -> CommandResult:
+    """Write a study as a self-contained HTML page (needs 'casadi-ik[plots]').
 
-    It has success, time and iterations by method and targets, failures by reason, the
-    hardest solves with their stories, to filter and sort, and where solves fail. Several
-    logs of one robot are told as one.
+    The page shows success, time and iterations by method and target set, failures by
+    reason, a table of the hardest solves with details that can be filtered and
+    sorted, and the positions of unsolved targets. Logs of the same robot are
+    combined.
     """
     with located("log report", (MissingExtraError,)):
         from casadi_ik.app.pictures import study_page
-    paths = [Path(name) for name in said.files]
+    paths = [Path(name) for name in args.files]
     log = logs.open(paths)
-    check_outputs({"--out": said.out}, inputs=paths)
-    title = said.title or ", ".join(path.stem for path in paths)
-    page = study_page(log, title, said.most)
-    with output(said.out) as part:
+    check_outputs({"--out": args.out}, inputs=paths)
+    title = args.title or ", ".join(path.stem for path in paths)
+    page = study_page(log, title, args.most)
+    with output(args.out) as part:
         part.write_text(page, encoding="utf-8")
     count = count_text(sum(len(part) for part in log.solves().parts), "solve")
-    return Answer(Group(Text(f"  {count}"), *files({"page": said.out})))
+    return CommandResult(Group(Text(f"  {count}"), *files({"page": args.out})))
 
 
 @command(
@@ -220,154 +226,164 @@ def report(said: Said) -> Answer:
     Option("--what iterations|solves|events", "rows of a table", "iterations"),
     Option(
         "--to viewer|parquet|csv",
-        f"kind of file (default: what --out ends in: {', '.join(KINDS)})",
+        f"format (default: by suffix of --out: {', '.join(FORMAT_OF_SUFFIX)})",
     ),
-    Option("--robot R", "for a viewer: a shipped name or a YAML file (default: the log's)"),
-    opt.out("FILE", "where to", opt.file_name()),
+    Option("--robot R", "robot of a viewer file: name or YAML file (default: the log's)"),
+    opt.out("FILE", "output file", opt.file_name()),
 )
-def export(said: Said) -> Answer:
+def export(args: Arguments) -> CommandResult:
     """Write tables, or a file for a viewer.
 
-    VIEW.mcap, for Foxglove (app.foxglove.dev) and Lichtblick: one solve with the
-    robot, its frames, joints, contacts, phases and events, 10 ms an iteration; needs
-    'casadi-ik[viewer]'. Beside it VIEW.layout.json is written, a layout to import
-    there.
-    TABLE.parquet or TABLE.csv: rows of numbers, needs 'casadi-ik[dataframes]'.
+    VIEW.mcap is a file for Foxglove (app.foxglove.dev) and Lichtblick: one solve with
+    the robot, its frames, joints, contacts, phases and events at 10 ms per iteration
+    (needs 'casadi-ik[viewer]'). The file VIEW.layout.json next to it is a layout to
+    import in the viewer.
+    TABLE.parquet or TABLE.csv is a table (needs 'casadi-ik[dataframes]').
     """
-    kind = said.to or KINDS.get(said.out.suffix.lower())
+    kind = args.to or FORMAT_OF_SUFFIX.get(args.out.suffix.lower())
     if kind is None:
         raise InputError(
-            f"--out: found {str(said.out)!r}, expected {', '.join(KINDS)}, or say --to"
+            f"--out: found {str(args.out)!r}, expected a suffix {', '.join(FORMAT_OF_SUFFIX)}, or "
+            "--to"
         )
     if kind == "viewer":
-        return _exported_view(said, said.out)
-    check_outputs({"--out": said.out}, inputs=[Path(said.file)])
-    log = logs.open(said.file)
+        return _export_view(args, args.out)
+    check_outputs({"--out": args.out}, inputs=[Path(args.file)])
+    log = logs.open(args.file)
     with located("log export", (MissingExtraError,)):
-        frame = getattr(log, said.what)(**_filters(said)).frame()
-    with output(said.out) as part:
+        frame = getattr(log, args.what)(**_filters(args)).frame()
+    with output(args.out) as part:
         (frame.write_parquet if kind == "parquet" else frame.write_csv)(part)
-    about = {"rows": f"{frame.height} {said.what}", "columns": str(frame.width)}
-    return Answer(Group(fields(about), *files({kind: said.out})))
+    summary = {"rows": f"{frame.height} {args.what}", "columns": str(frame.width)}
+    return CommandResult(Group(fields(summary), *files({kind: args.out})))
 
 
 @command(LOGS)
-def finish(said: Said) -> Answer:
+def finish(args: Arguments) -> CommandResult:
     """Repair logs in place whose writer was killed.
 
-    In a folder those in which nothing is whole are named and left as they are.
+    Files of a folder without a complete chunk are reported and not changed.
     """
     parts: list[RenderableType] = []
-    for path, _ in (found := log_files(said.files)):
+    paths = log_files(args.files)
+    for path, _ in paths:
         try:
-            done = finish_log(path)
+            result = finish_log(path)
         except NothingWrittenError:
-            if len(found) == 1:
+            if len(paths) == 1:
                 raise
-            about = {"done": f"left as it is: {EMPTY}"}
+            entries = {"result": f"not changed: {EMPTY}"}
         except ForeignLogError as error:
-            if len(found) == 1:
+            if len(paths) == 1:
                 raise
-            about = {"done": f"left as it is: {str(error).removeprefix(f'{path}: ')}"}
+            entries = {"result": f"not changed: {str(error).removeprefix(f'{path}: ')}"}
         else:
-            cut = f"{_size(done.cut)} of a torn tail cut" if done.cut else "a summary was written"
-            about = {
-                "done": f"finished, {cut}" if done.changed else "whole already",
-                "holds": f"{count_text(done.chunks, 'chunk')}, "
-                f"{count_text(done.messages, 'message')}",
+            repair = (
+                f"{_size(result.cut)} of a torn tail removed" if result.cut else "summary added"
+            )
+            counts = (
+                f"{count_text(result.chunks, 'chunk')}, {count_text(result.messages, 'message')}"
+            )
+            entries = {
+                "result": f"repaired: {repair}" if result.changed else "already complete",
+                "contents": counts,
             }
-        parts += [_title(str(path)), fields(about)]
-    return Answer(Group(*parts))
+        parts += [_title(str(path)), fields(entries)]
+    return CommandResult(Group(*parts))
 
 
-@command(LOGS, opt.out("FILE.mcap", "the log that has all of it"))
-def merge(said: Said) -> Answer:
-    """Join the shards of a study, without recompressing."""
-    check_outputs({"--out": said.out}, inputs=[path for path, _ in log_files(said.files)])
-    done = merge_logs(said.files, said.out)
-    about = {
-        "shards": str(done.shards),
-        "solves": ", ".join(f"{count} of {name}" for name, count in done.solves.items()) or "none",
-        "messages": str(done.messages),
-        "size": _size(done.size),
-        "left out": _named(done.left_out, EMPTY),
+@command(LOGS, opt.out("FILE.mcap", "output file"))
+def merge(args: Arguments) -> CommandResult:
+    """Merge the shards of a study without recompression."""
+    check_outputs({"--out": args.out}, inputs=[path for path, _ in log_files(args.files)])
+    result = merge_logs(args.files, args.out)
+    entries = {
+        "shards": str(result.shards),
+        "solves": ", ".join(f"{count} of {name}" for name, count in result.solves.items())
+        or "none",
+        "messages": str(result.messages),
+        "size": _size(result.size),
+        "skipped": _item_list(result.left_out, EMPTY),
     }
-    return Answer(Group(fields(about), *files({"log": said.out})))
+    return CommandResult(Group(fields(entries), *files({"log": args.out})))
 
 
-def _exported_view(said: Said, file: Path) -> Answer:
+def _export_view(args: Arguments, file: Path) -> CommandResult:
+    """Write a solve for a viewer, and the layout next to it."""
     with located("log export", (MissingExtraError,)):
         from casadi_ik.app.log_viewers import layout_of, write_view
     layout = file.with_suffix(".layout.json")
-    check_outputs({"--out": file, "the layout": layout}, inputs=[Path(said.file)])
-    log = logs.open(said.file)
-    solve = _the_solve(said, log)
-    robot = robot_of_log(log, said.file, said.robot or solve.robot)
+    check_outputs({"--out": file, "the layout": layout}, inputs=[Path(args.file)])
+    log = logs.open(args.file)
+    solve = _load_solve(args, log)
+    robot = robot_of_log(log, args.file, args.robot or solve.robot)
     write_view(file, solve, robot)
     write_json(layout, layout_of(solve, robot))
-    return Answer(Group(*files({"viewer": file, "layout": layout})))
+    return CommandResult(Group(*files({"viewer": file, "layout": layout})))
 
 
-def _the_solve(said: Said, log: logs.Log) -> OneSolve:
-    """The solve that was asked for.
+def _load_solve(args: Arguments, log: logs.Log) -> SolveRecord:
+    """Return the solve that the arguments select.
 
     Raises:
         LogError: The log is damaged.
-        UnknownNameError: There is no such solve, or several; the message names the file.
+        UnknownNameError: The log has no such solve, or several; the message names the file.
     """
-    number = getattr(said, "one", None)
+    number = getattr(args, "number", None)
     try:
-        asked = said.solve if number is None else number
-        return one_solve(log, asked, said.method, counted_from=1)
+        number = args.solve if number is None else number
+        return one_solve(log, number, args.method, counted_from=1)
     except UnknownNameError as error:
-        where = "" if said.file in str(error) else f"{said.file}: "
-        raise UnknownNameError(f"{where}{error}") from error
+        prefix = "" if args.file in str(error) else f"{args.file}: "
+        raise UnknownNameError(f"{prefix}{error}") from error
 
 
-def _filters(said: Said) -> dict[str, Any]:
-    """The filters of a command as `Log` takes them."""
-    found = {one.name.strip("-"): getattr(said, one.attribute) for one in FILTERS}
-    return found if said.solve is None else {**found, "solve": said.solve - 1}
+def _filters(args: Arguments) -> dict[str, Any]:
+    """Return the filters of a command as keyword arguments of methods of `Log`."""
+    filters = {option.name.strip("-"): getattr(args, option.attribute) for option in FILTERS}
+    return filters if args.solve is None else {**filters, "solve": args.solve - 1}
 
 
 def _title(name: str) -> Text:
     return Text(name, "bold", no_wrap=True, overflow="ignore")
 
 
-def _only_last_wraps(rows: Table) -> Table:
+def _wrap_last_column(rows: Table) -> Table:
+    """Disable wrapping in all columns but the last."""
     for column in rows.columns[:-1]:
         column.no_wrap = True
     return rows
 
 
-def _count(count: int, most: int, thing: str) -> RenderableType:
-    if count <= most:
-        return Text(f"  {count_text(count, thing)}")
-    return Text(f"  the first {most} of {count_text(count, thing)} (--most shows more)")
+def _row_count(count: int, max_rows: int, noun: str) -> RenderableType:
+    """Return the number of rows, and how to list more than `max_rows` of them."""
+    if count <= max_rows:
+        return Text(f"  {count_text(count, noun)}")
+    return Text(f"  first {max_rows} of {count_text(count, noun)} (use --most to list more)")
 
 
-def _named(items: Sequence[Any], why_named: str = "") -> str:
-    """How many there are, the first few, and why they are named; "" if there are none."""
+def _item_list(items: Sequence[Any], reason: str = "") -> str:
+    """Return the count of items, the first few, and the reason; "" without items."""
     if not items:
         return ""
-    more = f" and {len(items) - SHOWN} more" if len(items) > SHOWN else ""
+    suffix = f" and {len(items) - MAX_ITEMS} more" if len(items) > MAX_ITEMS else ""
     count = f"{len(items)}: " if len(items) > 1 else ""
-    text = f"{count}{', '.join(map(str, items[:SHOWN]))}{more}"
-    return f"{text}: {why_named}" if why_named else text
+    text = f"{count}{', '.join(map(str, items[:MAX_ITEMS]))}{suffix}"
+    return f"{text}: {reason}" if reason else text
 
 
 def _size(count: int) -> str:
-    """Bytes in the unit that suits them."""
+    """Format a number of bytes with a suitable unit."""
     for unit, scale in (("MB", 1e6), ("kB", 1e3)):
         if count >= scale:
             return f"{count / scale:.3g} {unit}"
     return f"{count} bytes"
 
 
-def _solve_rows(part: logs.MethodRows, records: Iterable[Mapping[str, Any]]) -> Table:
-    """A row per solve of one method; restarts only if there are any."""
+def _solve_table(part: logs.MethodRows, records: Iterable[Mapping[str, Any]]) -> Table:
+    """Return a table of solves of one method, with restarts if there are any."""
     restarts = ["restarts"] if part.rows["restarts"].any() else []
-    numbers = ("iterations", *restarts, "mm off", "deg off", "time")
+    numbers = ("iterations", *restarts, "error [mm]", "error [deg]", "time")
     rows = table("solve", "status", *numbers, "events", right=("solve", *numbers))
     for record in records:
         rows.add_row(
@@ -375,64 +391,66 @@ def _solve_rows(part: logs.MethodRows, records: Iterable[Mapping[str, Any]]) -> 
             Text(record["status"], "green" if record["success"] else "red"),
             str(record["iterations"]),
             *(str(record[name]) for name in restarts),
-            _worst(record["position_error"], 1e3),
-            _worst(record["angle_error"], math.degrees(1.0)),
+            _largest_error(record["position_error"], 1e3),
+            _largest_error(record["angle_error"], math.degrees(1.0)),
             duration(record["time"]),
-            _tally(part.labels["events"], record) + ("" if record["kept"] else " (totals only)"),
+            _event_counts(part.labels["events"], record)
+            + ("" if record["kept"] else " (totals only)"),
         )
-    return _only_last_wraps(rows)
+    return _wrap_last_column(rows)
 
 
-def _worst(values: Any, factor: float) -> str:
-    """The largest error of all fingers; "free" if none has one."""
-    known = [value for value in np.ravel(values).tolist() if not math.isnan(value)]
-    return f"{factor * max(known):.2f}" if known else "free"
+def _largest_error(values: Any, factor: float) -> str:
+    """Return the largest error of all fingers; "free" if every contact is free."""
+    finite = [value for value in np.ravel(values).tolist() if not math.isnan(value)]
+    return f"{factor * max(finite):.2f}" if finite else "free"
 
 
-def _tally(kinds: Sequence[str], record: Mapping[str, Any]) -> str:
-    """How often what happened in a solve, by the names of `--event`; what was held."""
+def _event_counts(kinds: Sequence[str], record: Mapping[str, Any]) -> str:
+    """Return the counts of events of a solve by kind, and its fixed actuators."""
     counts = zip(kinds, np.ravel(record["events"]).tolist(), strict=True)
-    found = [f"{count} {kind}" for kind, count in counts if count and kind not in USUAL_EVENTS]
-    return ", ".join(found + [f"{name} held" for name in record.get("fixed_mask", ())])
+    texts = [f"{count} {kind}" for kind, count in counts if count and kind not in ROUTINE_EVENTS]
+    return ", ".join(texts + [f"{name} fixed" for name in record.get("fixed_mask", ())])
 
 
-def _container(log: logs.Log, about: logs.LogInfo) -> dict[str, str]:
-    """Robot, size and what is wrong with files."""
-    iterations = sum(counts["iteration"] for counts in about.counts.values())
-    each_takes = f", {about.size / iterations:.0f} bytes/iteration" if iterations else ""
-    packed = f"{about.chunks}, compression {about.compression}"
-    if about.compressed:
-        packed += f" ({about.uncompressed / about.compressed:.1f} times smaller)"
-    attached = (f"{name} ({_size(length)})" for name, length in about.attachments.items())
+def _container_fields(log: logs.Log, summary: logs.LogInfo) -> dict[str, str]:
+    """Return robot, sizes, attachments and incomplete files as text by name."""
+    iterations = sum(counts["iteration"] for counts in summary.counts.values())
+    per_iteration = f", {summary.size / iterations:.0f} bytes/iteration" if iterations else ""
+    chunks = f"{summary.chunks}, compression {summary.compression}"
+    if summary.compressed:
+        chunks += f" (ratio {summary.uncompressed / summary.compressed:.1f})"
+    attached = (f"{name} ({_size(length)})" for name, length in summary.attachments.items())
     sources = log.sources.names
     return {
-        "robot": about.robot,
-        "shards": _named(sources) if len(sources) > 1 else "",
-        "size": f"{_size(about.size)}{each_takes}",
-        "chunks": packed,
-        "attached": ", ".join(attached) or "nothing",
-        "unfinished": _named(about.unfinished, TORN),
-        "left out": _named(about.left_out, EMPTY),
+        "robot": summary.robot,
+        "shards": _item_list(sources) if len(sources) > 1 else "",
+        "size": f"{_size(summary.size)}{per_iteration}",
+        "chunks": chunks,
+        "attachments": ", ".join(attached) or "none",
+        "incomplete": _item_list(summary.unfinished, INCOMPLETE),
+        "skipped": _item_list(summary.left_out, EMPTY),
     }
 
 
-def _methods(log: logs.Log, about: logs.LogInfo) -> RenderableType:
+def _method_table(log: logs.Log, summary: logs.LogInfo) -> RenderableType:
+    """Return a table of counts, statuses, singular values and events by method."""
     right = ("solves", "iterations")
     rows = table("method", *right, "status", "smallest sigma", "events", right=right)
-    for method, counts in about.counts.items():
-        found = log.solves(method=method)
-        tallies = []
-        for table_of, field in ((found, "status"), (log.events(method=method), "kind")):
-            tally = Counter(name for part in table_of.parts for name in part.readable(field))
+    for method, counts in summary.counts.items():
+        solves = log.solves(method=method)
+        columns = []
+        for selection, field in ((solves, "status"), (log.events(method=method), "kind")):
+            tally = Counter(name for part in selection.parts for name in part.readable(field))
             lines = (f"{count} {name}" for name, count in tally.most_common())
-            tallies.append("\n".join(lines) or "none")
+            columns.append("\n".join(lines) or "none")
         numbers = str(counts["solve"]), str(counts["iteration"])
-        rows.add_row(method, *numbers, tallies[0], _smallest(found), tallies[1])
+        rows.add_row(method, *numbers, columns[0], _smallest_sigma(solves), columns[1])
     return rows
 
 
-def _smallest(solves: logs.Table) -> str:
-    """Return the smallest singular value of every Jacobian, or that it was not measured."""
+def _smallest_sigma(solves: logs.Table) -> str:
+    """Return the smallest singular value of every Jacobian, or "not measured"."""
     field, lowest = "lowest_sigma", dict[str, float]()
     for part in solves.parts:
         for i, name in enumerate(part.labels.get(field, ()) if field in part.names else ()):
@@ -445,85 +463,98 @@ def _smallest(solves: logs.Table) -> str:
     return "\n".join(lines) or "not measured"
 
 
-def _origin(log: logs.Log) -> dict[str, str]:
-    """The metadata that says where a log is from, as text by name; all that its shards say."""
-    told = [_told(source.metadata) for source in log.sources.sources]
+def _origin_fields(log: logs.Log) -> dict[str, str]:
+    """Return the metadata of a log as text by name, with the values of all its shards."""
+    shards = [_metadata_texts(source.metadata) for source in log.sources.sources]
     pairs = {}
-    for name in dict.fromkeys(name for each in told for name in each):
-        texts = list(dict.fromkeys(each.get(name, "none") for each in told))
-        more = f" | {len(texts) - SHOWN} more" if len(texts) > SHOWN else ""
-        differ = len(texts) > 1 and name != "created"
-        text = f"{' | '.join(texts[:SHOWN])}{more} (by shard)" if differ else texts[0]
+    for name in dict.fromkeys(name for shard in shards for name in shard):
+        texts = list(dict.fromkeys(shard.get(name, "none") for shard in shards))
+        suffix = f" | {len(texts) - MAX_ITEMS} more" if len(texts) > MAX_ITEMS else ""
+        text = texts[0]
+        if len(texts) > 1 and name != "created":
+            text = f"{' | '.join(texts[:MAX_ITEMS])}{suffix} (by shard)"
         pairs[printable(name, 60)] = printable(text, 2000)
     return pairs
 
 
-def _told(metadata: Mapping[str, Any]) -> dict[str, str]:
-    """The metadata of one shard, as text by name."""
+def _metadata_texts(metadata: Mapping[str, Any]) -> dict[str, str]:
+    """Return the metadata of one shard as text by name."""
     packages = {"casadi_ik": metadata.get("code_version"), "python": metadata.get("python")}
     packages |= metadata.get("packages", {})
     parameters = metadata.get("parameters", {})
-    told = {
+    texts = {
         "created": str(metadata.get("created")),
         "seed": str(metadata.get("seed")),
-        "machine": _flat(metadata.get("machine", {})),
+        "machine": _one_line(metadata.get("machine", {})),
         "versions": " ".join(f"{name} {value}" for name, value in packages.items()),
         **({} if "scene" in parameters else {"collision": "not checked"}),
     }
     for name, value in parameters.items():
-        told[name.replace("_", " ")] = _tolerance(value) if name == "tolerance" else _flat(value)
-    return told
+        text = _tolerance_text(value) if name == "tolerance" else _one_line(value)
+        texts[name.replace("_", " ")] = text
+    return texts
 
 
-def _tolerance(value: Any) -> str:
-    """Tolerances by finger in millimetres and degrees; said once if they are the same for all."""
+def _tolerance_text(value: Any) -> str:
+    """Format tolerances by finger in mm and degrees, as one value if all fingers agree."""
     try:
         texts = {
-            finger: f"{quantity(each['position'], 'm')} and {quantity(each['angle'], 'rad')}"
-            for finger, each in value.items()
+            finger: f"{format_quantity(item['position'], 'm')} and {format_quantity(item['angle'], 'rad')}"
+            for finger, item in value.items()
         }
     except (AttributeError, TypeError, KeyError, ValueError, OverflowError):
-        return _flat(value)  # not as this package writes it
-    one = set(texts.values())
-    return one.pop() if len(one) == 1 else _flat(texts)
+        return _one_line(value)  # metadata that another program has written
+    distinct = set(texts.values())
+    return distinct.pop() if len(distinct) == 1 else _one_line(texts)
 
 
-def _flat(value: Any) -> str:
-    """JSON on one line, a mapping as "name value, ..."."""
+def _one_line(value: Any) -> str:
+    """Format JSON data on one line, and a mapping as "name value, ..."."""
     if isinstance(value, Mapping):
-        return ", ".join(f"{key} {_flat(item)}" for key, item in value.items()) or "none"
+        return ", ".join(f"{key} {_one_line(item)}" for key, item in value.items()) or "none"
     if isinstance(value, float):
         return f"{value:.6g}"
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def _two_methods(opened: list[logs.Log], asked: list[str] | None) -> tuple[str, str]:
-    held = list(dict.fromkeys(method for log in opened for method in log.methods))
-    for method in asked or ():
-        if method not in held:
-            raise InputError(f"--methods: found {method!r}, the logs hold {', '.join(held)}")
-    both = asked or held
-    if len(both) != 2:
+def _two_methods(open_logs: list[logs.Log], names: list[str] | None) -> tuple[str, str]:
+    """Return the two methods of ``--methods``, or else the only two methods of the logs.
+
+    Raises:
+        InputError: A method is not in the logs, or the logs hold another number of methods.
+    """
+    available = list(dict.fromkeys(method for log in open_logs for method in log.methods))
+    for method in names or ():
+        if method not in available:
+            raise InputError(f"--methods: found {method!r}, expected one of {', '.join(available)}")
+    pair = names or available
+    if len(pair) != 2:
         raise InputError(
-            f"the logs hold {', '.join(held) or 'no method'}, expected two methods (say --methods)"
+            f"--methods: option is missing and the logs hold {', '.join(available) or 'no method'}; "
+            "expected two methods"
         )
-    return both[0], both[1]
+    return pair[0], pair[1]
 
 
-def _many_compared(pairs: Matched) -> RenderableType:
-    success = np.array([[each.success for each in pair] for pair in pairs.pairs])
-    iterations = np.array([[each.iterations for each in pair] for pair in pairs.pairs])
-    times = np.array([[each.time for each in pair] for pair in pairs.pairs])
-    rows = table("method", "solved", "iterations where both", "time where both", right=("solved",))
-    both = success.all(axis=1)
-    lines = [f"solved by both {both.sum()}, by neither {(~success.any(axis=1)).sum()}"]
+def _comparison_summary(pairs: MatchedTargets) -> RenderableType:
+    """Return success, mean iterations and mean time of two methods on the same targets."""
+    outcomes = pairs.pairs
+    success = np.array([[outcome.success for outcome in pair] for pair in outcomes])
+    iterations = np.array([[outcome.iterations for outcome in pair] for pair in outcomes])
+    times = np.array([[outcome.time for outcome in pair] for pair in outcomes])
+    columns = ("method", "solved", "mean iterations", "mean time")
+    rows = table(*columns, right=("solved",))
+    by_both = success.all(axis=1)
+    lines = ["means are over the targets that both methods solve"]
+    lines.append(f"solved by both {by_both.sum()}, by neither {(~success.any(axis=1)).sum()}")
     for i, name in enumerate((pairs.first, pairs.second)):
         means = ("-", "-")
-        if both.any():
-            means = (f"{iterations[both, i].mean():.1f}", f"{1e3 * times[both, i].mean():.3g} ms")
+        if by_both.any():
+            mean_time = 1e3 * times[by_both, i].mean()
+            means = (f"{iterations[by_both, i].mean():.1f}", f"{mean_time:.3g} ms")
         rows.add_row(name, f"{success[:, i].sum()} of {len(success)}", *means)
         only = np.flatnonzero(success[:, i] & ~success[:, 1 - i]).tolist()
-        numbers = _named([pairs.pairs[j][0].solve_id + 1 for j in only]).partition(": ")
-        named = f" (solve {numbers[2] or numbers[0]})" if only else ""
-        lines.append(f"only by {name}: {len(only)}{named}")
+        numbers = _item_list([outcomes[j][0].solve_id + 1 for j in only]).partition(": ")
+        suffix = f" (solve {numbers[2] or numbers[0]})" if only else ""
+        lines.append(f"only by {name}: {len(only)}{suffix}")
     return Group(rows, *(Text(f"  {line}") for line in lines))

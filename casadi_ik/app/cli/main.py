@@ -1,4 +1,4 @@
-"""Entry point: one command in, an exit code out."""
+"""Entry point of the command line: signals, output to the terminal, exit codes."""
 
 from __future__ import annotations
 
@@ -23,98 +23,105 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line.
 
     Args:
-        argv: Arguments behind the program's name; None takes those of the process.
+        argv: Arguments after the name of the program; None means those of the process.
 
     Returns:
-        0 done or solved, 1 a valid problem not solved, 2 bad input (one line on stderr),
-        130 interrupted, 143 terminated, 141 the reader of stdout went away. What no one foresaw is
-        raised.
+        0 done or solved, 1 valid problem not solved, 2 bad input (one line on stderr),
+        130 interrupted, 143 terminated, 141 reader of stdout gone. Unexpected errors are raised.
     """
     with _Signals(whole_process=argv is None) as signals:
         try:
             return _run(sys.argv[1:] if argv is None else argv)
-        except KeyboardInterrupt as stopped:
-            signals.over = True
-            terminated = isinstance(stopped, Terminated)
-            word = "terminated" if terminated else "interrupted"
-            print(f"casadi-ik: error: {word}", file=sys.stderr)  # noqa: T201
-            return 128 + (signal.SIGTERM if terminated else signal.SIGINT)
+        except KeyboardInterrupt as error:
+            signals.is_finished = True
+            is_sigterm = isinstance(error, Terminated)
+            reason = "terminated" if is_sigterm else "interrupted"
+            print(f"casadi-ik: error: {reason}", file=sys.stderr)  # noqa: T201
+            return 128 + (signal.SIGTERM if is_sigterm else signal.SIGINT)
 
 
 def _run(words: Sequence[str]) -> int:
-    # Here, so that Ctrl-C while they are imported is said in one line, too.
-    from casadi_ik.app.cli.outputs import say
+    # Imported after the signal handlers are installed, so that Ctrl-C during the import ends in one
+    # line as well.
+    from casadi_ik.app.cli.outputs import print_message
     from casadi_ik.app.cli.table import Exit, parse
 
     def show_warning(message: Warning | str, *_: object, **__: object) -> None:
-        """A warning as one line, without the place in the code that Python adds."""
-        say("warning", str(message))
+        """Print a warning as one line, without the source line that Python adds."""
+        print_message("warning", str(message))
 
     with warnings.catch_warnings():
         warnings.showwarning = show_warning
         try:
-            run, said = parse(words)
-            with _size_limits(getattr(said, "size_limits", None)):
-                answer = run(said)
-            _show(answer.report)
-            if answer.after is not None:
-                answer.after()
-            return answer.exit
+            run, args = parse(words)
+            with _size_limits(getattr(args, "size_limits", None)):
+                result = run(args)
+            _show(result.report)
+            if result.after is not None:
+                result.after()
+            return result.exit
         except CasadiIKError as error:
-            say("error", str(error))
+            print_message("error", str(error))
             return Exit.BAD_INPUT
         except BrokenPipeError:
             return Exit.BROKEN_PIPE
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM came: what handles Ctrl-C keeps or removes files as it does there."""
+    """Exception raised on SIGTERM; handlers of Ctrl-C clean up files for it, too."""
 
 
 class _Signals:
-    """Ctrl-C and SIGTERM raise inside the block, until it is over; a second SIGTERM does not.
+    """Context manager that turns Ctrl-C and the first SIGTERM into exceptions.
 
-    A signal that the program around us handles or ignores is left alone. One that comes while
-    CasADi is at work waits: what is raised while it converts arguments is swallowed there, or taken
-    for a wrong argument.
+    Signals that the calling program handles or ignores are not changed. A signal that arrives while
+    CasADi code runs is delayed: CasADi swallows an exception raised while it converts arguments, or
+    reports it as a wrong argument.
 
     Attributes:
-        over: Whether nothing is to be stopped any more: the block is about to be left.
+        is_finished: True once the command has ended; further signals are ignored.
     """
 
-    USUAL: ClassVar = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+    DEFAULT_HANDLERS: ClassVar = {
+        signal.SIGINT: signal.default_int_handler,
+        signal.SIGTERM: signal.SIG_DFL,
+    }
 
     def __init__(self, whole_process: bool) -> None:
-        """Take whether nothing comes after the block but the end of the process."""
-        self.over = False
+        """Initialise; `whole_process` is True if the process ends after the block."""
+        self.is_finished = False
         self._terminated = False
-        self._waiting: threading.Timer | None = None
+        self._delayed: threading.Timer | None = None
         self._whole_process = whole_process
         main_thread = threading.current_thread() is threading.main_thread()
-        self._ours = [one for one, of in self.USUAL.items() if signal.getsignal(one) is of]
-        self._ours = self._ours if main_thread else []
+        self._handled = [
+            number
+            for number, default in self.DEFAULT_HANDLERS.items()
+            if main_thread and signal.getsignal(number) is default
+        ]
 
     def __enter__(self) -> _Signals:
-        for one in self._ours:
-            signal.signal(one, self._stop)
+        for number in self._handled:
+            signal.signal(number, self._stop)
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._waiting is not None:
-            self._waiting.cancel()
-        # Where a handler is left, Python has the default back before the process has ended.
-        ignored = self.over and self._whole_process
-        for one in self._ours:
-            signal.signal(one, signal.SIG_IGN if ignored else self.USUAL[one])
+        if self._delayed is not None:
+            self._delayed.cancel()
+        # Python restores the default handlers before the process ends: a late signal would kill it.
+        is_ignored = self.is_finished and self._whole_process
+        for number in self._handled:
+            default = self.DEFAULT_HANDLERS[number]
+            signal.signal(number, signal.SIG_IGN if is_ignored else default)
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
-        if self.over or (self._terminated and number == signal.SIGTERM):
+        if self.is_finished or (self._terminated and number == signal.SIGTERM):
             return
         while frame is not None:
             if frame.f_globals.get("__name__") == "casadi.casadi":
-                self._waiting = threading.Timer(0.02, signal.raise_signal, [number])
-                self._waiting.daemon = True
-                self._waiting.start()
+                self._delayed = threading.Timer(0.02, signal.raise_signal, [number])
+                self._delayed.daemon = True
+                self._delayed.start()
                 return
             frame = frame.f_back
         if number == signal.SIGTERM:
@@ -124,11 +131,11 @@ class _Signals:
 
 
 def _show(report: RenderableType) -> None:
-    """Print a report; plain and 80 columns wide where stdout is no terminal.
+    """Print a report; without colours and 80 columns wide unless stdout is a terminal.
 
     Raises:
-        CasadiIKError: It cannot be printed.
-        BrokenPipeError: Whoever read it went away.
+        CasadiIKError: stdout cannot be written.
+        BrokenPipeError: The reader of stdout has closed it.
     """
     if sys.stdout is None:  # closed by the shell: >&-
         return
@@ -159,7 +166,7 @@ def _render(report: RenderableType) -> None:
         def render(
             self, renderable: RenderableType, options: ConsoleOptions | None = None
         ) -> Iterable[Segment]:
-            """Names may come from any file: none of them writes to the terminal what it likes."""
+            """Escape control characters, which names from untrusted files may contain."""
             for segment in super().render(renderable, options):
                 yield segment if segment.control else segment._replace(text=printable(segment.text))
 
@@ -167,18 +174,18 @@ def _render(report: RenderableType) -> None:
 
 
 def _abandon_stdout() -> None:
-    """Point stdout nowhere, so that the interpreter's own flush at exit has nothing to say."""
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, sys.stdout.fileno())
-    os.close(nowhere)
+    """Redirect stdout to the null device, so that the flush at exit does not fail again."""
+    null_device = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null_device, sys.stdout.fileno())
+    os.close(null_device)
 
 
 @contextmanager
 def _size_limits(factor: float | None) -> Iterator[None]:
-    """All limits of files times a factor meanwhile, in what is started as well."""
+    """Multiply the size limits of input files by a factor, in child processes as well."""
     from casadi_ik.files.limits import LIMITS_VARIABLE
 
-    before = os.environ.get(LIMITS_VARIABLE)
+    previous = os.environ.get(LIMITS_VARIABLE)
     if factor is not None:
         os.environ[LIMITS_VARIABLE] = repr(factor)
     try:
@@ -186,5 +193,5 @@ def _size_limits(factor: float | None) -> Iterator[None]:
     finally:
         if factor is not None:
             del os.environ[LIMITS_VARIABLE]
-        if before is not None:
-            os.environ[LIMITS_VARIABLE] = before
+        if previous is not None:
+            os.environ[LIMITS_VARIABLE] = previous

@@ -1,6 +1,6 @@
-"""What can be said behind a command: how words are read, and every option that several have.
+"""Command-line options: their declaration, the parsers of their values, and shared options.
 
-An option that one command alone has is declared with that command.
+An option that only one command has is declared with that command.
 """
 
 from __future__ import annotations
@@ -14,106 +14,107 @@ from pathlib import Path
 from typing import Any
 
 PROGRAM = "casadi-ik"
-"""What the command is called."""
+"""Name of the program."""
 
 
 @dataclass(frozen=True)
 class Option:
-    """An option, or an argument without dashes.
+    """A named option or a positional argument of a command.
 
     Attributes:
-        said: How it is said, in the way of usage lines: "--seed N", "--q0 V..." (one or more
-            words), "--limits enforce|ignore" (one of these), "--pads" (yes, if it is said),
-            "--[no-]deg" (yes or no), "GRASP", "[SOLVE]" (may be left out), "[LOG...]".
-        help: What it means; without its default, unless `default` does not tell it.
-        default: The value if it is not said.
-        read: Makes the value of a word, or of all words where there may be several; None: what
-            `KINDS` has for what stands for the value, else the word or words as they are.
-        needed: Whether an option has to be said.
-        repeated: Whether it may be said again, for more.
-        key: What holds the value, if it is not called as the option or the argument.
+        syntax: Usage: "--seed N", "--q0 V..." (one or more words), "--limits enforce|ignore"
+            (choices), "--pads" (flag), "--[no-]deg" (flag with its negation), "GRASP" (positional),
+            "[SOLVE]" (optional), "[LOG...]" (any number).
+        help: Meaning; the default is appended unless the text states it.
+        default: Value of an option that is not given.
+        parse: Parser of the word, or of the list of words if several are allowed. None: the parser
+            of the metavar in `VALUE_TYPES`, or the words unchanged.
+        required: Whether the option is mandatory.
+        repeated: Whether the option may be repeated; the values are concatenated.
+        key: Attribute of the value, if it differs from the name of the option.
     """
 
-    said: str
+    syntax: str
     help: str
     default: Any = None
-    read: Callable[[Any], Any] | None = None
-    needed: bool = False
+    parse: Callable[[Any], Any] | None = None
+    required: bool = False
     repeated: bool = False
     key: str = ""
 
     @property
     def name(self) -> str:
-        """The option with its dashes; of an argument without dashes its key."""
-        if not self.dashed:
+        """Name with its dashes; the key of a positional argument."""
+        if not self.is_named:
             return self.key or self.metavar.lower()
-        return self.said.partition(" ")[0].replace("[no-]", "")
+        return self.syntax.partition(" ")[0].replace("[no-]", "")
 
     @property
     def attribute(self) -> str:
-        """The attribute of what was said that holds the value."""
+        """Attribute of `Arguments` that holds the value."""
         return self.key or self.name.lstrip("-").replace("-", "_")
 
     @property
-    def dashed(self) -> bool:
-        """Whether it begins with dashes."""
-        return self.said.startswith("-")
+    def is_named(self) -> bool:
+        """True for an option with dashes, False for a positional argument."""
+        return self.syntax.startswith("-")
 
     @property
-    def value(self) -> str:
-        """What stands for its value or values; "" for a flag."""
-        return self.said.partition(" ")[2] if self.dashed else self.said
+    def value_syntax(self) -> str:
+        """Syntax of the value without the name; "" for a flag."""
+        return self.syntax.partition(" ")[2] if self.is_named else self.syntax
 
     @property
     def metavar(self) -> str:
-        """What stands for one word of its value."""
-        return self.value.strip("[].")
+        """Placeholder of one word of the value; "" for a flag."""
+        return self.value_syntax.strip("[].")
 
     @property
     def choices(self) -> list[str]:
-        """The words that an option takes, if they are some and no others."""
-        return self.metavar.split("|") if self.dashed and "|" in self.metavar else []
+        """Allowed words; empty if any word is allowed."""
+        return self.metavar.split("|") if self.is_named and "|" in self.metavar else []
 
     @property
-    def count(self) -> str | int | None:
-        """How many words there are, as argparse's ``nargs``."""
-        if "..." in self.value:
-            return "*" if self.value.startswith("[") else "+"
-        if self.value.startswith("["):
+    def nargs(self) -> str | int | None:
+        """Number of words, as ``nargs`` of argparse."""
+        if "..." in self.value_syntax:
+            return "*" if self.value_syntax.startswith("[") else "+"
+        if self.value_syntax.startswith("["):
             return "?"
-        return self.value.count(" ") + 1 if " " in self.value else None
+        return self.value_syntax.count(" ") + 1 if " " in self.value_syntax else None
 
     @property
     def unit(self) -> str:
-        """Of its numbers: "m", "rad", "pose" (both), "motor" (of each motor its own), or ""."""
-        return KINDS[self.value][1] if self.dashed and self.value in KINDS else ""
+        """Unit of the numbers: "m", "rad", "pose" (both), "motor" (depends on the motor), or ""."""
+        is_typed = self.is_named and self.value_syntax in VALUE_TYPES
+        return VALUE_TYPES[self.value_syntax][1] if is_typed else ""
 
     @property
-    def text(self) -> str:
-        """The help, its default included."""
-        given = isinstance(self.default, (int, float, str)) and self.default is not False
-        plain = given and "(default:" not in self.help
-        return f"{self.help} (default: {self.default})" if plain else self.help
+    def help_text(self) -> str:
+        """Help with the default value."""
+        has_default = isinstance(self.default, (int, float, str)) and self.default is not False
+        append = has_default and "(default:" not in self.help
+        return f"{self.help} (default: {self.default})" if append else self.help
 
-    def of(self, words: Any) -> Any:
-        """The value of the word, or words, that were said.
+    def value_of(self, words: Any) -> Any:
+        """Parse the word or words of the value.
 
         Raises:
-            ValueError: They are none; the message says what was found and what was expected.
+            ValueError: The value is invalid; the message states it and the expected value.
         """
-        read = self.read
-        if read is None and self.choices:
-            read = one_of(*self.choices)
-        elif read is None and self.dashed and self.value in KINDS:
-            read = KINDS[self.value][0]
-        return words if read is None else read(words)
+        parse = self.parse
+        if parse is None and self.choices:
+            parse = choice(*self.choices)
+        elif parse is None and self.is_named and self.value_syntax in VALUE_TYPES:
+            parse = VALUE_TYPES[self.value_syntax][0]
+        return words if parse is None else parse(words)
 
 
-# How words become values; a ValueError says what was found and what was expected.
+# Parsers of values. Each raises a ValueError with the value found and the value expected.
 
 
 def number(word: str) -> float:
-    """A finite number."""
+    """Parse a finite number."""
     try:
         value = float(word)
     except ValueError:
@@ -124,7 +125,7 @@ def number(word: str) -> float:
 
 
 def numbers(words: Sequence[str], count: int = 0, meaning: str = "") -> list[float]:
-    """Finite numbers, separated by commas or spaces; any count of them unless one is given."""
+    """Parse finite numbers separated by commas or spaces; `count` of them unless it is 0."""
     values = [number(word) for word in " ".join(words).replace(",", " ").split()]
     if count and len(values) != count:
         raise ValueError(f"found {len(values)} numbers, expected {count}: {meaning}")
@@ -132,41 +133,41 @@ def numbers(words: Sequence[str], count: int = 0, meaning: str = "") -> list[flo
 
 
 def positive(word: str) -> float:
-    """A positive finite number."""
+    """Parse a positive finite number."""
     with contextlib.suppress(ValueError):
         if (value := number(word)) > 0:
             return value
     raise ValueError(f"found {word!r}, expected a number > 0")
 
 
-def whole(least: int, most: int = 2**63 - 1) -> Callable[[str], int]:
-    """A whole number; what 64 bits hold, unless said."""
+def integer(lower: int, upper: int = 2**63 - 1) -> Callable[[str], int]:
+    """Return a parser of integers within bounds."""
 
-    def read(word: str) -> int:
+    def parse(word: str) -> int:
         with contextlib.suppress(ValueError):
-            if least <= int(word) <= most:
+            if lower <= int(word) <= upper:
                 return int(word)
-        expected = f">= {least}" if most == 2**63 - 1 else f"from {least} to {most}"
-        raise ValueError(f"found {word!r}, expected a whole number {expected}")
+        expected = f">= {lower}" if upper == 2**63 - 1 else f"from {lower} to {upper}"
+        raise ValueError(f"found {word!r}, expected an integer {expected}")
 
-    return read
+    return parse
 
 
-def one_of(*names: str) -> Callable[[str], str]:
-    """One of some words."""
+def choice(*names: str) -> Callable[[str], str]:
+    """Return a parser that accepts only the given names."""
 
-    def read(word: str) -> str:
+    def parse(word: str) -> str:
         if word not in names:
             raise ValueError(f"found {word!r}, expected one of {', '.join(names)}")
         return word
 
-    return read
+    return parse
 
 
 def file_name(*suffixes: str) -> Callable[[str], Path]:
-    """A file to be written, with one of the suffixes if any are given."""
+    """Return a parser of output files with one of the suffixes, or with any if none is given."""
 
-    def read(word: str) -> Path:
+    def parse(word: str) -> Path:
         if not word:
             raise ValueError("found '', expected the name of a file")
         path = Path(word)
@@ -174,16 +175,16 @@ def file_name(*suffixes: str) -> Callable[[str], Path]:
             raise ValueError(f"found {word!r}, expected a name ending in {', '.join(suffixes)}")
         return path
 
-    return read
+    return parse
 
 
 def json_name(word: str) -> Path:
-    """A JSON file to be written; one without suffix is one, too."""
+    """Parse the name of a JSON output file; the suffix may be absent."""
     return file_name(".json")(word) if Path(word).suffix else file_name()(word)
 
 
 def assignment(word: str) -> tuple[str, float]:
-    """A name and its number, ``NAME=V``."""
+    """Parse a name and its number, ``NAME=V``."""
     name, _, value = word.partition("=")
     with contextlib.suppress(ValueError):
         if name:
@@ -191,87 +192,74 @@ def assignment(word: str) -> tuple[str, float]:
     raise ValueError(f"found {word!r}, expected NAME=NUMBER")
 
 
-def each(read: Callable[[str], Any]) -> Callable[[Sequence[str]], list[Any]]:
-    """Reads several words, each for itself."""
-    return lambda words: [read(word) for word in words]
+def word_list(parse: Callable[[str], Any]) -> Callable[[Sequence[str]], list[Any]]:
+    """Return a parser that applies `parse` to every word."""
+    return lambda words: [parse(word) for word in words]
 
 
-KINDS: dict[str, tuple[Callable[[Any], Any], str]] = {
-    "N": (whole(1), ""),
+VALUE_TYPES: dict[str, tuple[Callable[[Any], Any], str]] = {
+    "N": (integer(1), ""),
     "SECONDS": (positive, ""),
     "METRES": (positive, "m"),
     "RADIANS": (positive, "rad"),
     "FACTOR": (positive, ""),
     "V...": (numbers, "motor"),
-    "NAME=V...": (each(assignment), "motor"),
+    "NAME=V...": (word_list(assignment), "motor"),
     "POSE...": (partial(numbers, count=6, meaning="x y z [m] roll pitch yaw [rad]"), "pose"),
 }
-"""How the value of an option is read, and its `Option.unit`, by what stands for it."""
+"""Parser and `Option.unit` by the syntax of the value."""
 
-IN_UNITS = (
-    Option(
-        "--[no-]deg",
-        "angles said here and in the report are in degrees (--no-deg: in radians; default: said in "
-        "radians, reported in degrees)",
-    ),
-    Option(
-        "--[no-]mm",
-        "lengths said here and in the report are in mm (--no-mm: in m; default: said in m, "
-        "reported in mm)",
-    ),
+UNIT_OPTIONS = (
+    Option("--[no-]deg", "use degrees (default: options in radians, report in degrees)"),
+    Option("--[no-]mm", "use millimetres (default: options in m, report in mm)"),
 )
-"""Of every command that takes lengths or angles; what files hold is in m and rad."""
+"""Options of every command that takes lengths or angles. Files always hold m and rad."""
 
 
-# What several commands take.
+# Options that several commands share.
 
-GRASP = Option("GRASP", "a shipped name (`casadi-ik grasps`) or a YAML file")
+GRASP = Option("GRASP", "name listed by `casadi-ik grasps`, or YAML file")
 ROBOT = Option(
     "--robot R",
-    "a shipped name (`casadi-ik robots`) or a YAML file (default: what the file read says)",
+    "name listed by `casadi-ik robots`, or YAML file (default: the robot named in the input file)",
 )
-THE_ROBOT = Option("--robot R", "a shipped name (`casadi-ik robots`) or a YAML file", needed=True)
-METHOD = Option("--method M", "one of `casadi-ik methods` (default: the first of them)")
+REQUIRED_ROBOT = Option(
+    "--robot R", "name listed by `casadi-ik robots`, or YAML file", required=True
+)
+METHOD = Option("--method M", "name listed by `casadi-ik methods` (default: the first)")
 Q0 = Option(
     "--q0 V...",
-    "where the robot is: a number per actuator [rad or m], spaces or commas between; last "
-    "on the line (default: home)",
+    "start position per actuator [rad or m]; last on the line (default: home)",
 )
 PREFER = Option(
     "--prefer limits|manipulability|q0|clearance",
-    "which of several solutions comes first: far from its limits, with a manipulable arm, near the "
-    "start, or with --scene far from what may be hit (default: q0 if it is given, else limits)",
+    "criterion for the choice of solution (default: q0 if it is given, else limits)",
 )
 SCENE = Option(
     "--scene FILE",
-    "what must not be touched: a shipped name (`casadi-ik scenes`) or a YAML file (default: "
-    "collisions are not checked)",
+    "obstacles: name listed by `casadi-ik scenes`, or YAML file (default: collisions are not "
+    "checked)",
 )
 OBJECT_POSE = Option(
-    "--object-pose POSE...",
-    "where the object is: x y z [m] roll pitch yaw [rad] in the base frame; contacts move "
-    "with it, and those of a file that does not say where its object is are in its frame",
+    "--object-pose POSE...", "object in the base frame: x y z [m] roll pitch yaw [rad]"
 )
-SEED = Option("--seed N", "of all random numbers", 0, whole(0))
+SEED = Option("--seed N", "seed of all random numbers", 0, integer(0))
 TOLERANCES = (
     Option(
         "--tolerance-position METRES",
-        "when a contact point counts as reached (default: 0.005, 5 mm)",
+        "largest position error of a reached contact (default: 0.005, 5 mm)",
     ),
     Option(
         "--tolerance-angle RADIANS",
-        "when a contact normal counts as reached (default: 0.0524, 3 deg)",
+        "largest angle error of a reached contact (default: 0.0524, 3 deg)",
     ),
 )
-MAX_ROUNDS = Option(
+MAX_RESTARTS = Option(
     "--max-rounds N",
-    "rounds of hand postures at most before a target is given up; 1 solves nearly all that "
-    "can be reached (default: as many as may help)",
+    "maximum restarts per target (default: until none is worthwhile)",
 )
 LIMITS = Option(
-    "--limits enforce|ignore",
-    "whether being solved includes the limits; ignore: the paper's way",
-    "enforce",
+    "--limits enforce|ignore", "treatment of limits; ignore: as in the paper", "enforce"
 )
 SOLVER = (
     METHOD,
@@ -281,49 +269,55 @@ SOLVER = (
     OBJECT_POSE,
     SEED,
     *TOLERANCES,
-    MAX_ROUNDS,
+    MAX_RESTARTS,
     LIMITS,
     Option(
         "--finger-step ipopt|closed-form",
-        "solver of the fingers' own step in the paper's methods; closed-form gives the same "
-        "answer much faster (default: ipopt)",
+        "finger solver of the paper's methods; closed-form is faster (default: ipopt)",
     ),
     Option(
         "--fixed NAME=V...",
-        "actuators that are not to move, and where they stand [rad or m]",
+        "actuators held fixed, with their positions [rad or m]",
         (),
         repeated=True,
     ),
     Option(
         "--log FILE.mcap",
-        "write every iteration to a log; a batch in parts: into a folder, read as one log",
-        read=file_name(),
+        "log of every iteration; a folder for a batch in parts",
+        parse=file_name(),
     ),
 )
-"""Of `solve` and `batch`."""
+"""Options of `solve` and `batch`."""
 
 SIZE_LIMITS = Option(
     "--size-limits FACTOR",
-    "allow files that are so many times as large as usual, packed and unpacked",
+    "factor on input-size limits, compressed and uncompressed",
 )
-"""Of commands that read what is somebody else's."""
+"""Option of every command that reads untrusted files."""
 
 
-def out(metavar: str, text: str, read: Callable[[str], Any] | None = None) -> Option:
-    """A needed ``--out``; names must end in the metavar's suffix, unless `read` is given."""
-    read = read or file_name(*filter(None, [Path(metavar).suffix]))
-    return Option(f"--out {metavar}", text, read=read, needed=True)
+def out(metavar: str, text: str, parse: Callable[[str], Any] | None = None) -> Option:
+    """Return a required option ``--out``.
+
+    Args:
+        metavar: Placeholder of the file; its suffix is mandatory unless `parse` is given.
+        text: Help.
+        parse: Parser of the name.
+    """
+    parse = parse or file_name(*filter(None, [Path(metavar).suffix]))
+    return Option(f"--out {metavar}", text, parse=parse, required=True)
 
 
 def diagnose(default: bool) -> Option:
-    """Whether failures are explained; ``--no-diagnose`` says no."""
-    usual = "yes" if default else "no"
-    text = f"find out why what is not solved is not (default: {usual})"
-    return Option("--[no-]diagnose", text, default)
+    """Return the option ``--[no-]diagnose``."""
+    default_text = "yes" if default else "no"
+    return Option(
+        "--[no-]diagnose", f"diagnose unsolved targets (default: {default_text})", default
+    )
 
 
 def picture(name: str, text: str) -> Option:
-    """A picture to be written."""
+    """Return an option for a picture (PNG) or animation (GIF) to be written."""
     suffix = ".gif" if name == "--animation" else ".png"
-    help_of = f"{text} (needs 'casadi-ik[plots]')"
-    return Option(f"{name} FILE{suffix}", help_of, read=file_name(suffix))
+    help_text = f"{text} (needs 'casadi-ik[plots]')"
+    return Option(f"{name} FILE{suffix}", help_text, parse=file_name(suffix))

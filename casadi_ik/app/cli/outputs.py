@@ -1,4 +1,4 @@
-"""What a command puts out: lines on stderr, and files that are complete or not there at all."""
+"""Outputs of commands: messages on stderr, and files that are written completely or not at all."""
 
 from __future__ import annotations
 
@@ -17,45 +17,46 @@ from casadi_ik.files.writing import atomic_write, resolve_links, temporary_path
 
 
 class OutputError(CasadiIKError):
-    """An output cannot be written."""
+    """Error of an output that cannot be written."""
 
 
-def say(kind: str, text: str) -> None:
-    """Print one line on stderr behind the program's name.
+def print_message(kind: str, text: str) -> None:
+    """Print one line on stderr that starts with the name of the program.
 
     Args:
-        kind: What it is about: "error", "warning".
-        text: The rest; line breaks in it become spaces, and it is cut to a few hundred characters.
+        kind: Kind of message, such as "error" or "warning".
+        text: Message; line breaks become spaces, and long texts are shortened.
     """
     print(f"{PROGRAM}: {kind}: {shortened(' '.join(text.split()))}", file=sys.stderr)  # noqa: T201
 
 
 def check_outputs(outputs: Mapping[str, Path | None], inputs: Iterable[Path] = ()) -> None:
-    """See to it that outputs can be written and overwrite neither each other nor an input.
+    """Check that outputs can be written and overwrite neither each other nor an input.
 
     Args:
-        outputs: The path of each by option; None if it was not asked for.
-        inputs: Files that are read.
+        outputs: Path by option; None if the option is not given.
+        inputs: Files that the command reads.
 
     Raises:
-        OutputError: The message names path and option.
+        OutputError: A file cannot be written, or two paths mean the same file.
     """
-    taken: dict[object, str] = {}
+    owners: dict[object, str] = {}
     for path in inputs:
         with contextlib.suppress(OSError):
-            taken |= dict.fromkeys(_identities(resolve_links(path)), "the input")
+            owners |= dict.fromkeys(_identities(resolve_links(path)), "the input")
     for option, path in outputs.items():
         if path is None:
             continue
         with writing(path, option):
             target = resolve_links(path)
-            same = _identities(target)
-            for identity in same:
-                if identity in taken:
-                    owner = taken[identity]
-                    problem = f"found the file of {owner}, expected another"
-                    raise OutputError(f"{path}: {option}: {problem}")
-            taken |= dict.fromkeys(same, option)
+            identities = _identities(target)
+            for identity in identities:
+                if identity in owners:
+                    raise OutputError(
+                        f"{path}: {option}: file is the same as that of {owners[identity]}; "
+                        "expected a different file"
+                    )
+            owners |= dict.fromkeys(identities, option)
             _refuse_special(target)
             part = temporary_path(target)
             part.touch(exist_ok=False)
@@ -64,54 +65,54 @@ def check_outputs(outputs: Mapping[str, Path | None], inputs: Iterable[Path] = (
 
 @contextlib.contextmanager
 def output(path: Path, option: str = "--out") -> Iterator[Path]:
-    """Give a path beside a file's place, of the same suffix, and put the file there once complete.
+    """Yield a temporary path of the same suffix, and move the file to `path` once it is complete.
 
     Args:
-        path: Where it shall stand.
-        option: The option that asked for it.
+        path: Path of the output.
+        option: Option that names the output, for errors.
 
     Raises:
-        OutputError: It cannot be written; nothing is left behind.
+        OutputError: The file cannot be written; no partial file remains.
     """
     with writing(path, option), atomic_write(path) as part:
         yield part
 
 
 def write_json(path: Path, data: Any) -> None:
-    """Write what ``--out`` asks for as JSON.
+    """Write data as JSON to the file of ``--out``.
 
     Raises:
-        OutputError: It cannot be written.
+        OutputError: The file cannot be written.
     """
     with output(path) as part:
         part.write_text(json.dumps(data, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def writing(path: Path, option: str) -> contextlib.AbstractContextManager[None]:
-    """Say of what the system refuses which output it concerns.
+    """Return a context that turns an OSError into an OutputError with path and option.
 
     Args:
-        path: Where the output shall stand.
-        option: The option that asked for it.
+        path: Path of the output.
+        option: Option that names the output.
 
     Raises:
-        OutputError: The system refused.
+        OutputError: The block raised an OSError.
     """
     return os_errors(f"{path}: {option}: cannot be written", OutputError)
 
 
 def folder_of(path: Path) -> Path:
-    """The folder an output will stand in, whatever links lead there."""
+    """Return the folder of an output after resolving symbolic links."""
     return resolve_links(path).parent
 
 
 def _identities(target: Path) -> list[object]:
-    """By what a file is known: its path, and its place on the disk if it is there (hard links)."""
+    """Return the path of a file and, if it exists, its device and inode (hard links share them)."""
     try:
-        found = target.stat()
+        info = target.stat()
     except OSError:
         return [target]
-    return [target, (found.st_dev, found.st_ino)]
+    return [target, (info.st_dev, info.st_ino)]
 
 
 def _refuse_special(target: Path) -> None:

@@ -1,4 +1,4 @@
-"""`casadi-ik solve` and `casadi-ik choose`: one grasp, and the best of many."""
+"""Commands `casadi-ik solve` and `casadi-ik choose`."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from rich.text import Text
 
 from casadi_ik.app.cli import options as opt
 from casadi_ik.app.cli.inputs import (
+    load_grasp_arg,
+    load_robot_arg,
     located,
-    the_fixed,
-    the_grasp,
-    the_object_pose,
-    the_robot,
-    the_solver,
-    the_start,
-    the_units,
+    make_solver,
+    parse_fixed,
+    parse_object_pose,
+    parse_q0,
+    report_units,
 )
 from casadi_ik.app.cli.options import Option
 from casadi_ik.app.cli.outputs import check_outputs, write_json
-from casadi_ik.app.cli.table import Answer, Said, command
+from casadi_ik.app.cli.table import Arguments, CommandResult, command
 from casadi_ik.app.report import duration, files, ranking_report, solution_report
 from casadi_ik.collision.clearance import SceneCheck
 from casadi_ik.collision.scene import Scene
@@ -36,25 +36,25 @@ from casadi_ik.solve.request import Request, tolerances_by_finger
 from casadi_ik.solve.solution import Solution
 from casadi_ik.solve.solution_files import ranking_data, solution_data
 
-REPEATED_FOR = 0.2
-"""How long a solve is repeated to time it [s], unless one alone takes longer."""
+TIMING_BUDGET = 0.2
+"""Time for which a solve is repeated to measure its time [s]."""
 
-SLOW = 1.0
-"""A first solve that takes longer [s], where others do not, is told of."""
+SLOW_FIRST_SOLVE = 1.0
+"""Time of a first solve above which the report explains it [s]."""
 
 
 @command(
     opt.GRASP,
     opt.ROBOT,
     *opt.SOLVER,
-    Option("--out FILE.json", "write the solution as JSON", read=opt.json_name),
-    opt.picture("--picture", "draw the grasp"),
-    opt.picture("--picture-dark", "the same for a dark page"),
+    Option("--out FILE.json", "output file of the solution", parse=opt.json_name),
+    opt.picture("--picture", "picture of the grasp"),
+    opt.picture("--picture-dark", "picture on a dark background"),
     opt.diagnose(default=True),
     opt.SIZE_LIMITS,
 )
-def solve(said: Said) -> Answer:
-    """Find the position of every motor for one grasp.
+def solve(args: Arguments) -> CommandResult:
+    """Solve the inverse kinematics of one grasp.
 
     Examples:
       casadi-ik solve cup
@@ -62,59 +62,64 @@ def solve(said: Said) -> Answer:
       casadi-ik solve cup --scene table --picture cup.png
       casadi-ik solve my.yaml --robot mine.yaml --tolerance-position 2 --mm
 
-    a grasp file:
+    Example of a grasp file:
       robot: kuka_lwr_barrett
       contacts:   # point [m], outward pad normal, in the robot's base frame
         thumb:    {point: [-0.83, 0.15, 0.41], normal: [0.48, -0.88, 0]}
         finger_2: {point: [-0.84, 0.11, 0.435], normal: [0.72, 0.70, 0]}
         finger_3: {point: [-0.84, 0.11, 0.385], normal: [0.72, 0.70, 0]}
 
-    exit codes: 0 solved, 1 not solved (the report says why), 2 bad input
+    --object-pose moves the contacts with the object. If the file states no pose of
+    its object, its contacts are in the object's frame.
+
+    exit codes: 0 solved, 1 not solved (see report), 2 bad input
     """
-    path, grasp = the_grasp(said)
-    robot = the_robot(said.robot, path, grasp)
-    q0, fixed = the_start(said, robot), the_fixed(said, robot)
+    path, grasp = load_grasp_arg(args)
+    robot = load_robot_arg(args.robot, path, grasp)
+    q0, fixed = parse_q0(args, robot), parse_fixed(args, robot)
     with located(str(path)):
         grasp.arrays(robot.fingers)
-    pictures = {"--picture": said.picture, "--picture-dark": said.picture_dark}
-    outputs = {"--log": said.log, "--out": said.out, **pictures}
+    pictures = {"--picture": args.picture, "--picture-dark": args.picture_dark}
+    outputs = {"--log": args.log, "--out": args.out, **pictures}
     check_outputs(outputs, inputs=[path])
     draw = _drawing(path, grasp) if any(pictures.values()) else None
-    solver = the_solver(said, robot)
+    solver = make_solver(args, robot)
 
-    def solved(log: Path | None = None, diagnose: bool = False) -> Solution:
-        return solver.solve(grasp, q0, said.seed, log, diagnose, fixed, said.prefer)
+    def run_solver(log: Path | None = None, diagnose: bool = False) -> Solution:
+        return solver.solve(grasp, q0, args.seed, log, diagnose, fixed, args.prefer)
 
     with located(str(path)):
-        solution = solved(said.log, said.diagnose)
-    first, solution = solution.time, replace(solution, time=_warm_time(solved, solution))
-    if said.out is not None:
-        write_json(said.out, solution_data(solution))
+        solution = run_solver(args.log, args.diagnose)
+    first, solution = solution.time, replace(solution, time=_warm_time(run_solver, solution))
+    if args.out is not None:
+        write_json(args.out, solution_data(solution))
     for option, file in pictures.items():
         if draw is not None and file is not None:
             dark = option == "--picture-dark"
             draw(robot, solution, grasp, file, scene=solver.scene, dark=dark)
-    notes = [] if said.scene else _penetration(robot, grasp, solution)
-    if first > max(10 * solution.time, SLOW):
-        notes.append(f"the first solve took {duration(first)}: kernels were compiled or loaded")
+    notes = [] if args.scene else _penetration(robot, grasp, solution)
+    if first > max(10 * solution.time, SLOW_FIRST_SOLVE):
+        notes.append(
+            f"the first solve took {duration(first)} because kernels were compiled or loaded"
+        )
     name, enforced = grasp.name or str(path), solver.limits == "enforce"
-    report = solution_report(solution, robot, name, the_units(said), enforced, notes)
-    return Answer.solved(solution.success, report, *files(outputs))
+    report = solution_report(solution, robot, name, report_units(args), enforced, notes)
+    return CommandResult.of_parts(solution.success, report, *files(outputs))
 
 
-def _warm_time(solved: Callable[[], Solution], solution: Solution) -> float:
-    """How long a solve takes where nothing has to be compiled or loaded [s].
+def _warm_time(run_solver: Callable[[], Solution], solution: Solution) -> float:
+    """Return the time of a solve without compilation and loading of kernels [s].
 
-    What was not solved is not solved again: it takes its time.
+    An unsolved grasp is not repeated because its solve takes long.
     """
     times = [solution.time]
-    while solution.success and len(times) < 4 and sum(times[1:]) < REPEATED_FOR:
-        times.append(solved().time)
+    while solution.success and len(times) < 4 and sum(times[1:]) < TIMING_BUDGET:
+        times.append(run_solver().time)
     return min(times)
 
 
 def _penetration(robot: ArmHand, grasp: Grasp, solution: Solution) -> list[str]:
-    """That an answer penetrates the object it grasps, if it does and that is known."""
+    """Return a note if the solution penetrates the grasped object and both have shapes."""
     shapes = robot.description.shapes.capsules
     if not (solution.success and grasp.object and grasp.object_pose is not None and shapes):
         return []
@@ -124,8 +129,8 @@ def _penetration(robot: ArmHand, grasp: Grasp, solution: Solution) -> list[str]:
         query = check.collision_query(request.of_grasps([grasp], None))
     except CasadiIKError:  # a robot or an object without shapes
         return []
-    mine = np.array([grasp.object in names for names in query.table.names], dtype=bool)
-    clear = query.with_table(query.table.select(mine)).check(solution.q[None])
+    of_object = np.array([grasp.object in names for names in query.table.names], dtype=bool)
+    clear = query.with_table(query.table.select(of_object)).check(solution.q[None])
     pair = clear.pair(0)
     if clear.free[0] or pair is None:
         return []
@@ -134,11 +139,11 @@ def _penetration(robot: ArmHand, grasp: Grasp, solution: Solution) -> list[str]:
 
 
 def _drawing(path: Path, grasp: Grasp) -> Callable[..., Any]:
-    """The function that draws a solution, after making sure that it can.
+    """Return the function that draws a solution after checking its requirements.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
-        CasadiIKError: The grasp names an object that there is not, or a malformed one.
+        CasadiIKError: The object of the grasp is unknown or malformed.
     """
     with located("--picture", (MissingExtraError,)):
         from casadi_ik.app.pictures import draw_solution
@@ -149,58 +154,48 @@ def _drawing(path: Path, grasp: Grasp) -> Callable[..., Any]:
 
 
 @command(
-    Option("CANDIDATES", "the grasps, see below"),
-    opt.THE_ROBOT,
+    Option("CANDIDATES", "file or folder of candidate grasps, see below"),
+    opt.REQUIRED_ROBOT,
     opt.OBJECT_POSE,
     Option(
         "--layout L",
-        f"of the file: {', '.join(LAYOUT_NAMES)} (default: detected from it)",
-        read=opt.one_of(*LAYOUT_NAMES),
+        f"format of the file: {', '.join(LAYOUT_NAMES)} (default: detected)",
+        parse=opt.choice(*LAYOUT_NAMES),
     ),
     Option(
         "--hand FILE",
-        "what the file calls the hand's joints and where it has the hand's frame: a shipped "
-        "name or a YAML file (default: the shipped one that fits the robot)",
+        "joint names and hand frame of the file: shipped name or YAML file (default: the shipped "
+        "one for the robot)",
     ),
     Option(
         "--take palm|contacts",
-        "what a palm and a posture of a data set or table are taken for",
+        "goal of rows with palm and posture: palm pose or fingertips",
         "palm",
     ),
     Option(
         "--object NAME",
-        "what a data set or table grasps: a shipped name, a YAML file or a mesh (in convex "
-        "pieces; as large as the data say); of --take contacts only the pads that touch it "
-        "count",
+        "object of a data set or table: name, YAML file or mesh",
     ),
-    Option(
-        "--of NAME",
-        "of which object's grasps, by the file's own name, where it has those of several",
-    ),
-    Option(
-        "--scale FACTOR",
-        "of which size of the object, by the file's own scale, where it has several",
-    ),
+    Option("--of NAME", "use only grasps of this object (name as in the file)"),
+    Option("--scale FACTOR", "use only grasps of this object scale (as in the file)"),
     Option(
         "--invalid error|drop|clip",
-        "what becomes of rows of a data set or table with joints beyond their limits or with "
-        "no grasp in them: the file is refused, they are left out, or joints are put at their "
-        "limits",
+        "treatment of rows without grasp or beyond joint limits",
         "error",
     ),
     opt.SCENE,
     opt.PREFER,
     opt.Q0,
-    Option("--limit N", "answers at most", 10),
-    Option("--per-candidate N", "answers of one candidate at most", 1),
+    Option("--limit N", "maximum number of solutions", 10),
+    Option("--per-candidate N", "maximum number of solutions per candidate", 1),
     opt.SEED,
     *opt.TOLERANCES,
-    opt.MAX_ROUNDS,
-    opt.out("RANKED.json", "write the answers", opt.json_name),
+    opt.MAX_RESTARTS,
+    opt.out("RANKED.json", "output file of the ranked solutions", opt.json_name),
     opt.SIZE_LIMITS,
 )
-def choose(said: Said) -> Answer:
-    r"""Of many grasps find those that are best to take, and how.
+def choose(args: Arguments) -> CommandResult:
+    r"""Rank candidate grasps and return the best feasible ones.
 
     Examples:
       casadi-ik choose candidates.yaml --robot panda+allegro_right --scene table \
@@ -209,57 +204,67 @@ def choose(said: Said) -> Answer:
           --prefer q0 --out ranked.json
 
     CANDIDATES is one of
-      a YAML file with a list of grasps, each as a grasp file has it:
+      a YAML file with a list of grasps in the format of grasp files:
         candidates:
           - contacts: {thumb: {point: [0.02, 0.1, 0], normal: [0, -1, 0]}, ...}
           - contacts: ...
       a folder of grasp files
       an npz file with points and normals (k, f, 3), as for `casadi-ik batch`
-      an npy file of getagrip, dexgraspnet, bodex, dexgraspbench or dexonomy: palms
-        and hands are as they are there, only the arm is looked for (--take
-        contacts: only the fingertips are)
-      a pt file of multidex, the same; --of says of which of its objects
-      a table (.csv, .npz, .parquet) with columns x y z, qw qx qy qz or roll pitch
-        yaw (where the robot's palm frame is to be) and the hand's joints by name
-    Nothing in a file is run. docs/choosing.md says what is in them.
+      an npy file of getagrip, dexgraspnet, bodex, dexgraspbench or dexonomy with
+        palm poses and hand postures
+      a pt file of multidex; --of selects one of its objects
+      a table (.csv, .npz, .parquet) with the palm pose in columns x y z and qw qx
+        qy qz or roll pitch yaw, and the joint positions of the hand by name
+    No code in a file is executed. docs/choosing.md describes the formats.
 
-    RANKED.json holds the answers, best first, each with the number of its candidate
-    and its score, and how many candidates have none, by reason.
+    Palm poses and hand postures of a file are kept, and only the arm is solved.
+    With --take contacts only the fingertips are kept; if --object names an object,
+    only the pads that touch it count. A mesh is decomposed into convex pieces and
+    scaled as the data state.
+
+    --invalid error rejects a file with invalid rows, drop skips these rows, and clip
+    moves joints to their limits.
+
+    --object-pose moves the contacts with the object. Contacts of a file without an
+    object pose are in the object's frame.
+
+    RANKED.json holds the solutions, best first, with the number of the candidate and
+    the score, and the number of candidates without solution by reason.
 
     exit codes: 0 at least one found, 1 none (the report counts the reasons),
     2 bad input
     """
-    path = Path(said.candidates)
-    robot = the_robot(said.robot)
-    q0, pose = the_start(said, robot), the_object_pose(said)
+    path = Path(args.candidates)
+    robot = load_robot_arg(args.robot)
+    q0, pose = parse_q0(args, robot), parse_object_pose(args)
     grasps = load_candidates(
         path,
         robot,
-        said.layout,
-        said.hand,
-        take=said.take,
-        grasped=said.object,
-        of=said.of,
-        scale=said.scale,
-        invalid=said.invalid,
+        args.layout,
+        args.hand,
+        take=args.take,
+        grasped=args.object,
+        of=args.of,
+        scale=args.scale,
+        invalid=args.invalid,
     )
-    check_outputs({"--out": said.out}, inputs=[path])
-    solver = the_solver(said, robot)
+    check_outputs({"--out": args.out}, inputs=[path])
+    solver = make_solver(args, robot)
     with located(str(path)):
         ranking = solver.choose(
             grasps,
             pose,
             q0,
-            said.limit,
-            said.prefer,
-            said.seed,
-            per_candidate=said.per_candidate,
+            args.limit,
+            args.prefer,
+            args.seed,
+            per_candidate=args.per_candidate,
         )
     names = [grasp.name for grasp in grasps]
-    write_json(said.out, ranking_data(ranking, names))
+    write_json(args.out, ranking_data(ranking, names))
     notes = [*grasps.notes] + ([] if solver.scene else ["collision not checked"])
-    report = ranking_report(ranking, names, path.name, the_units(said))
-    written = files({"--out": said.out})
-    return Answer.solved(
-        bool(ranking.entries), report, *(Text(f"  {note}") for note in notes), *written
+    report = ranking_report(ranking, names, path.name, report_units(args))
+    output_lines = files({"--out": args.out})
+    return CommandResult.of_parts(
+        bool(ranking.entries), report, *(Text(f"  {note}") for note in notes), *output_lines
     )

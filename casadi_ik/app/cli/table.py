@@ -1,18 +1,19 @@
-"""The table of commands: parser, help and the page of the documentation are made from it.
+"""Table of commands, from which parser, help and reference documentation are generated.
 
-To add a command, write its function with its options in a module of this folder, new or not::
+To add a command, write its function with its options in a module of this package::
 
-    @command(GRASP, ROBOT, Option("--colour C", "what it is drawn in", "red"))
-    def paint(said: Said) -> Answer:
+    @command(GRASP, ROBOT, Option("--colour C", "colour of the drawing", "red"))
+    def paint(args: Arguments) -> CommandResult:
         \"\"\"Paint a grasp.
 
-        Examples, formats of files and exit codes: what `--help` says below the options.
+        Examples, file formats and exit codes, printed by `--help` below the options.
         \"\"\"
-        return Answer(f"{said.grasp} in {said.colour}")
+        return CommandResult(f"{args.grasp} in {args.colour}")
 
-and give it a row in `COMMANDS`. Its module is imported when it is called. Its value is read by the
-option's `read`, errors of which become one line on stderr that begins with the option's name.
-Lengths and angles come to the function in m and rad, whatever `--mm` and `--deg` say.
+and add a row to `COMMANDS`. The module is imported when the command is called. Each value is
+parsed by `parse` of its option; a `ValueError` becomes one line on stderr that starts with the
+name of the option. Lengths and angles reach the function in m and rad whatever `--mm` and `--deg`
+are.
 """
 
 from __future__ import annotations
@@ -22,14 +23,14 @@ import inspect
 import math
 import re
 import textwrap
-from argparse import Namespace as Said
+from argparse import Namespace as Arguments
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from casadi_ik.app.cli.options import IN_UNITS, PROGRAM, Option
+from casadi_ik.app.cli.options import PROGRAM, UNIT_OPTIONS, Option
 from casadi_ik.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
@@ -39,12 +40,12 @@ COMMANDS = {
     "solve": ("solve.solve", "solve one grasp"),
     "batch": ("batch.batch", "solve many targets of one robot"),
     "follow": ("motion.follow", "follow a moving hand, or moving contacts"),
-    "reach": ("motion.reach", "find the timed motion from where the robot is to a grasp"),
-    "grasp": ("grasp.grasp", "find grasps of an object's mesh that the robot can make"),
-    "choose": ("solve.choose", "find the best of many grasps of one object"),
-    "import": ("own_robot.import_robot", "describe your robot from its URDF or MJCF files"),
+    "reach": ("motion.reach", "plan a timed motion to a grasp"),
+    "grasp": ("grasp.grasp", "find feasible grasps of an object's mesh"),
+    "choose": ("solve.choose", "rank candidate grasps of an object"),
+    "import": ("own_robot.import_robot", "describe a robot by its URDF or MJCF files"),
     "export": ("own_robot.export", "write a robot's solver as plain C or WebAssembly"),
-    "compile": ("own_robot.compile_ahead", "compile robots' kernels ahead of use"),
+    "compile": ("own_robot.compile_ahead", "compile the kernels of robots ahead of use"),
     "schemas": ("lists.schemas", "write JSON Schemas of robot, grasp and other files"),
     "calibrate": ("own_robot.calibrate", "estimate a hand's dimensions from measured poses"),
     "robots": ("lists.robots", "list the shipped robots: fingers and actuators"),
@@ -52,84 +53,84 @@ COMMANDS = {
     "grasps": ("lists.grasps", "list the shipped grasps"),
     "objects": ("lists.objects", "list the shipped objects"),
     "scenes": ("lists.scenes", "list the shipped scenes"),
-    "log": ("", "look into logs"),
-    "log info": ("log.info", "what logs hold"),
-    "log solves": ("log.solves", "list solves and how they ended"),
+    "log": ("", "inspect logs"),
+    "log info": ("log.info", "summarise the contents of logs"),
+    "log solves": ("log.solves", "list solves with their status"),
     "log events": ("log.events", "list events: singularities, limits, stalls, ..."),
     "log why": ("log.why", "explain one solve in words"),
-    "log plot": ("log.plot", "draw how one solve went"),
+    "log plot": ("log.plot", "plot the convergence of one solve"),
     "log compare": ("log.compare", "compare two methods on the same targets"),
-    "log report": ("log.report", "write a study as one page"),
+    "log report": ("log.report", "write a study as an HTML page"),
     "log export": ("log.export", "write tables, or a file for a viewer"),
     "log finish": ("log.finish", "repair logs in place whose writer was killed"),
-    "log merge": ("log.merge", "join the shards of a study, without recompressing"),
-    "view": ("view.view", "drag contacts in the browser, arm and hand follow; play a log"),
-    "completion": ("lists.completion", "complete words in bash, zsh or fish with TAB"),
+    "log merge": ("log.merge", "merge the shards of a study without recompression"),
+    "view": ("view.view", "open the interactive viewer, or play a log"),
+    "completion": ("lists.completion", "print TAB completion for bash, zsh or fish"),
 }
-"""What is said: module and function in this folder, and what it does, in a few words."""
+"""Subcommand -> ("module.function" in this package, one-line summary)."""
 
 GROUPS = {
     "": """\
-Inverse kinematics for robot arms with multi-fingered hands: fingertip contacts in,
-motor positions out, or the reason why not.
+Inverse kinematics for robot arms with multi-fingered hands: motor positions that
+bring the fingertips to given contacts, or a diagnosis if there are none.
 
 Examples:
   casadi-ik grasps                      list the shipped grasps
-  casadi-ik solve cup                   solve one of them
-  casadi-ik solve my.yaml --log my.mcap your own, with a log of every iteration
-  casadi-ik log info my.mcap            what the log holds
+  casadi-ik solve cup                   solve a shipped grasp
+  casadi-ik solve my.yaml --log my.mcap solve your grasp and log every iteration
+  casadi-ik log info my.mcap            summarise the log
 
-Lengths are in m and angles in rad, in files and in options; behind --mm and
---deg those of options and reports are in mm and degrees.
+Lengths are in m and angles in rad, in files and in options. With --mm and --deg,
+options and reports use mm and degrees.
 
 exit codes: 0 solved (or done), 1 a valid problem not solved, 2 bad input
 """,
     "log": """\
-Look into logs that `--log` has written.
+Inspect logs that `--log` has written.
 
 Examples:
-  casadi-ik log info cup.mcap                        what it holds
-  casadi-ik log solves study/ --status STALLED       those that stalled
+  casadi-ik log info cup.mcap                        summary
+  casadi-ik log solves study/ --status STALLED       stalled solves
   casadi-ik log events cup.mcap --event NEAR_SINGULAR
   casadi-ik log why cup.mcap 3                       solve 3 in words
   casadi-ik log plot cup.mcap 3 --out 3.png
   casadi-ik log compare ours.mcap paper.mcap         two methods
-  casadi-ik log report study/ --out report.html      success, times, the hardest
+  casadi-ik log report study/ --out report.html      success, times, hardest solves
   casadi-ik log export cup.mcap --solve 3 --out view.mcap      for Foxglove
   casadi-ik log export study/ --what solves --out solves.parquet
   casadi-ik log finish torn.mcap                     repair a torn log
   casadi-ik log merge a.mcap b.mcap --out all.mcap
 
-A folder stands for all logs in it.
+A folder means all logs in it.
 """,
 }
-"""What is said of the program, and of commands that have commands of their own."""
+"""Help of the program ("") and of commands with subcommands."""
 
 WIDTH = 78
-"""Columns of help."""
+"""Line width of help texts [columns]."""
 
 
 class Exit(IntEnum):
-    """Exit codes of the program, beside those of signals (130: Ctrl-C, 143: SIGTERM)."""
+    """Exit codes of the program, in addition to those of signals (130 Ctrl-C, 143 SIGTERM)."""
 
     DONE = 0
-    """Done; for `solve` and `batch`: everything is solved."""
+    """Success; for `solve` and `batch`: every target is solved."""
     NOT_SOLVED = 1
-    """A valid problem that is not solved; the report says why."""
+    """The problem is valid but not solved; the report states the reason."""
     BAD_INPUT = 2
-    """One line on stderr says where, what was found and what was expected."""
+    """The input is invalid; one line on stderr states where and what was expected."""
     BROKEN_PIPE = 141
-    """Whoever read the report went away (128 + SIGPIPE)."""
+    """The reader of stdout closed it (128 + SIGPIPE)."""
 
 
 @dataclass(frozen=True)
-class Answer:
-    """The end of a command; by now all files are written.
+class CommandResult:
+    """Report and exit code of a command that has written all its files.
 
     Attributes:
-        report: What to show on stdout; a text is printed as it is.
-        exit: The exit code.
-        after: What is done once the report is shown; None: nothing.
+        report: Report for stdout; a string is printed unchanged.
+        exit: Exit code.
+        after: Function to call once the report is printed, or None.
     """
 
     report: RenderableType
@@ -137,11 +138,11 @@ class Answer:
     after: Callable[[], None] | None = None
 
     @staticmethod
-    def solved(solved: bool, *report: RenderableType) -> Answer:
-        """The end of a command that has something to solve, and the parts of its report."""
+    def of_parts(success: bool, *report: RenderableType) -> CommandResult:
+        """Return the result of a command that succeeds or fails, from the parts of its report."""
         from rich.console import Group
 
-        return Answer(Group(*report), Exit.DONE if solved else Exit.NOT_SOLVED)
+        return CommandResult(Group(*report), Exit.DONE if success else Exit.NOT_SOLVED)
 
 
 @dataclass(frozen=True)
@@ -149,152 +150,156 @@ class Command:
     """A command of the table.
 
     Attributes:
-        run: Does it.
-        options: What can be said behind it.
+        run: Function that executes the command.
+        options: Options and positional arguments.
     """
 
-    run: Callable[[Said], Answer]
+    run: Callable[[Arguments], CommandResult]
     options: tuple[Option, ...]
 
     @property
-    def text(self) -> tuple[str, str, str]:
-        """What it does, and the rest of what is to be known: its function's docstring, parted."""
+    def doc_parts(self) -> tuple[str, str, str]:
+        """First paragraph of the docstring, the separator, and the remaining text."""
         return (inspect.getdoc(self.run) or "").partition("\n\n")
 
 
-def command(*options: Option) -> Callable[[Callable[[Said], Answer]], Command]:
-    """Make a command of a function that takes what was said."""
-    in_units = IN_UNITS if any(option.unit for option in options) else ()
-    return lambda run: Command(run, options + in_units)
+def command(*options: Option) -> Callable[[Callable[[Arguments], CommandResult]], Command]:
+    """Return a decorator that makes a command of a function of its arguments."""
+    unit_options = UNIT_OPTIONS if any(option.unit for option in options) else ()
+    return lambda run: Command(run, options + unit_options)
 
 
 def load(name: str) -> Command:
-    """A command of the table, its module imported."""
+    """Import the module of a command and return the command."""
     module, function = COMMANDS[name][0].split(".")
     return getattr(import_module(f"casadi_ik.app.cli.{module}"), function)
 
 
-def names(group: str = "") -> list[str]:
-    """The commands of a group, "": those behind the program's name."""
+def command_names(group: str = "") -> list[str]:
+    """Return the commands of a group; "" is the group of top-level commands."""
     return [name for name in COMMANDS if name.rpartition(" ")[0] == group]
 
 
-def parse(words: Sequence[str]) -> tuple[Callable[[Said], Answer], Said]:
-    """What to do, and what was said about it.
+def parse(words: Sequence[str]) -> tuple[Callable[[Arguments], CommandResult], Arguments]:
+    """Return the function of the command line, and the arguments to call it with.
 
     Raises:
-        InputError: No such command or option, or a value that is none.
+        InputError: A command or option is unknown, or a value is invalid.
     """
     if list(words) == ["--version"]:
-        return lambda _: _version(), Said()
-    name, rest = "", list(words)
+        return lambda _: _version(), Arguments()
+    name, remaining = "", list(words)
     while name in GROUPS:
-        if not rest or rest[0] in ("-h", "--help"):
+        if not remaining or remaining[0] in ("-h", "--help"):
             break
-        name, rest = _next(name, rest[0]), rest[1:]
-    if name in GROUPS or {"-h", "--help"}.intersection(rest):
-        return lambda _: Answer(help_of(name)), Said()
-    found = load(name)
-    return found.run, _Parser(name, found).values(rest)
+        name, remaining = _resolve_command(name, remaining[0]), remaining[1:]
+    if name in GROUPS or {"-h", "--help"}.intersection(remaining):
+        return lambda _: CommandResult(command_help(name)), Arguments()
+    loaded = load(name)
+    return loaded.run, _Parser(name, loaded).parse_values(remaining)
 
 
-def help_of(name: str) -> str:
-    """The help of a command, of a group of them, or of the program ("")."""
+def command_help(name: str) -> str:
+    """Return the help of a command, of a group of commands, or of the program ("")."""
     if name not in GROUPS:
         return _Parser(name, load(name)).format_help()
-    first, _, rest = GROUPS[name].partition("\n\n")
-    rows = {one.removeprefix(name).strip(): COMMANDS[one][1] for one in names(name)}
+    summary, _, details = GROUPS[name].partition("\n\n")
+    rows = {sub.removeprefix(name).strip(): COMMANDS[sub][1] for sub in command_names(name)}
     width = max(map(len, rows)) + 2
-    listed = "\n".join(f"  {one:<{width}}{summary}" for one, summary in rows.items())
-    words = " ".join(filter(None, (PROGRAM, name, "COMMAND ...")))
-    more = "--help behind a command says what it takes"
-    return f"usage: {words}\n\n{_filled(first)}\n\ncommands: ({more})\n{listed}\n\n{rest}"
+    listing = "\n".join(f"  {sub:<{width}}{text}" for sub, text in rows.items())
+    words = " ".join(filter(None, (PROGRAM, name, "COMMAND")))
+    hint = f"run `{words} --help` for details"
+    return f"usage: {words} ...\n\n{_wrap(summary)}\n\ncommands: ({hint})\n{listing}\n\n{details}"
 
 
-def usage(name: str, what: Command) -> str:
-    """How a command is called: what has to be said."""
-    words = [one.said for one in what.options if one.needed or not one.dashed]
-    more = ["[OPTIONS]"] if any(one.dashed for one in what.options) else []
-    return " ".join([PROGRAM, name, *words, *more])
+def usage(name: str, loaded: Command) -> str:
+    """Return the usage line with the required arguments of a command."""
+    words = [item.syntax for item in loaded.options if item.required or not item.is_named]
+    optional = ["[OPTIONS]"] if any(item.is_named for item in loaded.options) else []
+    return " ".join([PROGRAM, name, *words, *optional])
 
 
-def _filled(text: str) -> str:
-    """Prose to the width of help; a paragraph in which a line is indented stays as it is."""
-    parts = []
-    for part in text.split("\n\n"):
-        plain = not any(line.startswith(" ") for line in part.splitlines())
-        parts.append(textwrap.fill(part, WIDTH, break_on_hyphens=False) if plain else part)
-    return "\n\n".join(parts)
+def _wrap(text: str) -> str:
+    """Wrap paragraphs to the width of help; keep those with an indented line unchanged."""
+    paragraphs = []
+    for paragraph in text.split("\n\n"):
+        is_prose = not any(line.startswith(" ") for line in paragraph.splitlines())
+        wrapped = textwrap.fill(paragraph, WIDTH, break_on_hyphens=False)
+        paragraphs.append(wrapped if is_prose else paragraph)
+    return "\n\n".join(paragraphs)
 
 
-def _next(group: str, word: str) -> str:
-    """The command that a word means.
+def _resolve_command(group: str, word: str) -> str:
+    """Return the full name of a command of a group.
 
     Raises:
-        InputError: None.
+        InputError: The group has no such command.
     """
-    known = {one.rpartition(" ")[2]: one for one in names(group)}
-    if word in known:
-        return known[word]
+    by_word = {name.rpartition(" ")[2]: name for name in command_names(group)}
+    if word in by_word:
+        return by_word[word]
     program = f"{PROGRAM} {group}".strip()
-    raise InputError(f"COMMAND: found {word!r}, {did_you_mean(word, known)} (see {program} --help)")
+    raise InputError(
+        f"COMMAND: found {word!r}, {did_you_mean(word, by_word)} (see {program} --help)"
+    )
 
 
-def _version() -> Answer:
+def _version() -> CommandResult:
     from importlib.metadata import version
 
-    return Answer(f"{PROGRAM} {version('casadi-ik')}\n")
+    return CommandResult(f"{PROGRAM} {version('casadi-ik')}\n")
 
 
 class _Parser(argparse.ArgumentParser):
-    """The parser of one command; its errors are one line like all others."""
+    """Parser of one command whose errors are reported as one line."""
 
-    def __init__(self, name: str, what: Command) -> None:
-        description, _, rest = what.text
+    def __init__(self, name: str, loaded: Command) -> None:
+        description, _, details = loaded.doc_parts
         super().__init__(
             prog=f"{PROGRAM} {name}",
-            usage=usage(name, what),
-            description=_filled(description),
-            epilog=_filled(rest),
+            usage=usage(name, loaded),
+            description=_wrap(description),
+            epilog=_wrap(details),
             formatter_class=lambda prog: argparse.RawDescriptionHelpFormatter(prog, width=WIDTH),
             allow_abbrev=False,
         )
-        # So that `--q0 -1e-3,0.2` reads as numbers and not as an option.
+        # argparse would read `-1e-3,0.2` in `--q0 -1e-3,0.2` as an option.
         self._negative_number_matcher = re.compile(r"-(\d|\.\d|inf|nan)", re.IGNORECASE)
-        self._options = what.options
-        for option in what.options:
-            self.add_argument(option.name, **_argument(option))
+        self._options = loaded.options
+        for option in loaded.options:
+            self.add_argument(option.name, **_argparse_settings(option))
 
-    def values(self, words: Sequence[str]) -> Said:
-        """What was said, every option by its key, lengths and angles in m and rad.
+    def parse_values(self, words: Sequence[str]) -> Arguments:
+        """Return the values of all options, with lengths and angles in m and rad.
 
         Raises:
-            InputError: A word that has no place, one that is missing, or a value that is none.
+            InputError: A word is unexpected, a required option is missing, or a value is invalid.
         """
-        said, rest = self.parse_known_args(words)
-        if rest:
-            self.error(self._unknown(rest[0]))
+        args, unknown = self.parse_known_args(words)
+        if unknown:
+            self.error(self._unknown_word(unknown[0]))
         for option in self._options:
-            raw = getattr(said, option.attribute)
+            raw = getattr(args, option.attribute)
             if raw is None or raw == []:
-                setattr(said, option.attribute, option.default)
+                setattr(args, option.attribute, option.default)
             elif option.metavar:
                 try:
-                    value = option.of(raw)
+                    value = option.value_of(raw)
                 except ValueError as error:
-                    self.error(f"{option.name if option.dashed else option.metavar}: {error}")
-                setattr(said, option.attribute, _all_in_si(value, option.unit, said))
-        return said
+                    self.error(f"{option.name if option.is_named else option.metavar}: {error}")
+                setattr(args, option.attribute, _value_to_si(value, option.unit, args))
+        return args
 
-    def _unknown(self, word: str) -> str:
+    def _unknown_word(self, word: str) -> str:
+        """Return the error message for a word that the command does not take."""
         if word.startswith("-"):
-            names = [one.name for one in self._options if one.dashed]
-            return f"{word}: no such option, {did_you_mean(word, names, 'none is like it')}"
-        places = " ".join(one.metavar for one in self._options if not one.dashed)
-        return f"found {word!r}, expected nothing behind {places or self.prog}"
+            names = [option.name for option in self._options if option.is_named]
+            return f"{word}: option is unknown, {did_you_mean(word, names, 'see the help')}"
+        positional = " ".join(item.metavar for item in self._options if not item.is_named)
+        return f"unexpected argument {word!r} after {positional or self.prog}"
 
     def error(self, message: str) -> NoReturn:
-        """Refuse the command line.
+        """Reject the command line.
 
         Raises:
             InputError: Always.
@@ -302,29 +307,29 @@ class _Parser(argparse.ArgumentParser):
         raise InputError(f"{message.removeprefix('argument ')} (see {self.prog} --help)")
 
 
-def _argument(option: Option) -> dict[str, Any]:
-    """An option as argparse takes it; values are read, and defaults put in, afterwards."""
-    found: dict[str, Any] = {"help": option.text.replace("%", "%%")}
+def _argparse_settings(option: Option) -> dict[str, Any]:
+    """Return arguments of `add_argument`; values and defaults are set by `parse_values`."""
+    settings: dict[str, Any] = {"help": option.help_text.replace("%", "%%")}
     if not option.metavar:
-        switch = argparse.BooleanOptionalAction if "[no-]" in option.said else "store_true"
-        return found | {"action": switch, "dest": option.attribute, "default": None}
-    several = isinstance(option.count, int)
-    found["metavar"] = tuple(option.metavar.split()) if several else option.metavar
-    found["nargs"] = option.count
-    if option.dashed:
-        found |= {"required": option.needed, "dest": option.attribute}
-    return found | ({"action": "extend"} if option.repeated else {})
+        action = argparse.BooleanOptionalAction if "[no-]" in option.syntax else "store_true"
+        return settings | {"action": action, "dest": option.attribute, "default": None}
+    has_fixed_count = isinstance(option.nargs, int)
+    settings["metavar"] = tuple(option.metavar.split()) if has_fixed_count else option.metavar
+    settings["nargs"] = option.nargs
+    if option.is_named:
+        settings |= {"required": option.required, "dest": option.attribute}
+    return settings | ({"action": "extend"} if option.repeated else {})
 
 
-def in_si(value: float, unit: str, said: Said) -> float:
-    """A number that was said, in m or rad, whatever `--mm` and `--deg` say."""
+def to_si(value: float, unit: str, args: Arguments) -> float:
+    """Convert a number of the command line to m or rad, as `--mm` and `--deg` require."""
     if unit == "m":
-        return 1e-3 * value if said.mm else value
-    return math.radians(value) if unit == "rad" and said.deg else value
+        return 1e-3 * value if args.mm else value
+    return math.radians(value) if unit == "rad" and args.deg else value
 
 
-def _all_in_si(value: Any, unit: str, said: Said) -> Any:
-    """The value of an option likewise; that of motors, whose units are the robot's, as it is."""
+def _value_to_si(value: Any, unit: str, args: Arguments) -> Any:
+    """Convert the value of an option; motor positions are converted once the robot is known."""
     if unit == "pose":
-        return [in_si(one, "m" if i < 3 else "rad", said) for i, one in enumerate(value)]
-    return in_si(value, unit, said)
+        return [to_si(x, "m" if i < 3 else "rad", args) for i, x in enumerate(value)]
+    return to_si(value, unit, args)

@@ -1,4 +1,4 @@
-"""`casadi-ik view`."""
+"""Command `casadi-ik view`."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ import numpy as np
 from casadi_ik import logs
 from casadi_ik.app.cli import options as opt
 from casadi_ik.app.cli.inputs import (
+    load_grasp_arg,
+    load_robot_arg,
+    load_scene_arg,
     located,
+    parse_method,
+    parse_object_pose,
+    parse_tolerance,
     robot_of_log,
-    the_grasp,
-    the_method,
-    the_object_pose,
-    the_robot,
-    the_scene,
-    the_tolerance,
 )
 from casadi_ik.app.cli.options import Option
-from casadi_ik.app.cli.table import Answer, Said, command
+from casadi_ik.app.cli.table import Arguments, CommandResult, command
 from casadi_ik.errors import (
     InputError,
     LogError,
@@ -34,7 +34,7 @@ from casadi_ik.files.shipped import shipped_names
 from casadi_ik.integrations.datasets import load_candidates
 from casadi_ik.kinematics.arm_hand import ArmHand, load_robot
 from casadi_ik.logs import RecordedMotion, read_motion
-from casadi_ik.logs.solve import OneSolve, one_solve
+from casadi_ik.logs.solve import SolveRecord, one_solve
 from casadi_ik.solve.solution_files import is_ranked, read_ranked
 
 if TYPE_CHECKING:
@@ -43,13 +43,13 @@ if TYPE_CHECKING:
     Choices = dict[str, Candidate]
 
 
-SOLVES = opt.each(opt.whole(1))
+SOLVE_NUMBERS = opt.word_list(opt.integer(1))
 
 
 @command(
     Option(
         "[GRASP|ROBOT|LOG|CHOICES...]",
-        "a shipped name or a file; of logs one or two (default: cup)",
+        "shipped name or file; one or two logs (default: cup)",
         ["cup"],
         key="what",
     ),
@@ -59,107 +59,112 @@ SOLVES = opt.each(opt.whole(1))
     opt.LIMITS,
     *opt.TOLERANCES,
     opt.OBJECT_POSE,
-    Option("--solve N...", "which solve of each log (default: the only one)", read=SOLVES),
-    Option("--pads", "correct the pads of a robot's file"),
+    Option(
+        "--solve N...",
+        "number of the solve of each log (default: the only one)",
+        parse=SOLVE_NUMBERS,
+    ),
+    Option("--pads", "edit the pads of a robot file"),
     Option(
         "--host ADDRESS",
-        "where it is served; 0.0.0.0: to everybody (default: 127.0.0.1, this machine only)",
+        "address of the server; 0.0.0.0: all networks (default: 127.0.0.1)",
         "127.0.0.1",
     ),
     Option(
         "--port N",
-        "where it is served (default: the first free from 8080)",
-        read=opt.whole(1, 65535),
+        "port of the server (default: first free from 8080)",
+        parse=opt.integer(1, 65535),
     ),
     opt.SIZE_LIMITS,
 )
-def view(said: Said) -> Answer:
-    """Show a grasp, a robot, answers or a solve in the browser (needs 'casadi-ik[view]').
+def view(args: Arguments) -> CommandResult:
+    """Open a grasp, robot, ranking or log in the browser (needs 'casadi-ik[view]').
 
     Examples:
       casadi-ik view cup --scene table          drag contacts, the cup, the table
-      casadi-ik view panda+allegro_right        a robot as it stands at home
-      casadi-ik view ranked.json                answers of `casadi-ik choose`
-      casadi-ik view found.npz                  answers of `casadi-ik grasp`
-      casadi-ik view candidates.yaml --robot R  each solved when it is chosen
-      casadi-ik view cup.mcap                   play a solve; of two side by side
-      casadi-ik view way.mcap                   play what `reach` or `follow` wrote
+      casadi-ik view panda+allegro_right        show a robot at home
+      casadi-ik view ranked.json                show solutions of `casadi-ik choose`
+      casadi-ik view found.npz                  show solutions of `casadi-ik grasp`
+      casadi-ik view candidates.yaml --robot R  solve each candidate on selection
+      casadi-ik view cup.mcap                   play a solve (two logs: both)
+      casadi-ik view way.mcap                   play a motion of `reach` or `follow`
       casadi-ik view my_robot.yaml --pads       correct guessed pads by hand
 
-    The page stays until Ctrl-C. Only this machine can open it unless --host says
-    otherwise; whoever can open it can move what is on it, and all browsers see the
-    same.
+    The page is served until Ctrl-C. By default only this machine can open it; see
+    --host. Everybody who can open the page can edit it, and all browsers show the
+    same state.
 
     exit codes: 0 closed, 2 bad input
     """
-    serve(opened(said))
-    return Answer("closed\n")
+    serve(open_viewer(args))
+    return CommandResult("closed\n")
 
 
 def serve(viewer: Viewer) -> None:
-    """Say where a page is, and wait until it is closed."""
-    sys.stdout.write(f"{viewer.url}   (Ctrl-C ends it)\n")
+    """Print the address of a page and wait until it is closed."""
+    sys.stdout.write(f"{viewer.url}   (press Ctrl-C to quit)\n")
     sys.stdout.flush()
     viewer.wait()
 
 
-def opened(said: Said) -> Viewer:
-    """The page that was asked for, running.
+def open_viewer(args: Arguments) -> Viewer:
+    """Start the viewer that the arguments select.
 
     Raises:
-        CasadiIKError: Bad input, or nothing can be served.
+        CasadiIKError: The input is invalid, or the server cannot start.
     """
     with located("view", (MissingExtraError,)):
         from casadi_ik.app import viewer as viewing
     from casadi_ik.app.viewer import Settings
 
-    served: dict[str, Any] = {"host": said.host, "port": said.port}
-    if all(_is_log(Path(one)) for one in said.what):
-        if len(said.what) == 1 and (motion := _motion(said.what[0])):
-            robot = the_robot(said.robot or motion.robot, Path(said.what[0]))
-            with located(said.what[0]):
+    server_settings: dict[str, Any] = {"host": args.host, "port": args.port}
+    if all(_is_log(Path(name)) for name in args.what):
+        if len(args.what) == 1 and (motion := _motion_of(args.what[0])):
+            robot = load_robot_arg(args.robot or motion.robot, Path(args.what[0]))
+            with located(args.what[0]):
                 q = motion.ordered(robot.actuators)
             return viewing.view_motion(
                 robot,
                 motion.times,
                 q,
-                scene=the_scene(said),
-                label=Path(said.what[0]).stem,
-                **served,
+                scene=load_scene_arg(args),
+                label=Path(args.what[0]).stem,
+                **server_settings,
             )
         with located("view"):
-            return viewing.view_log(*_the_logs(said), scene=the_scene(said), **served)
-    if len(said.what) > 1:
-        raise InputError(f"view: found {len(said.what)} names, expected one (or two logs)")
-    said.grasp = name = said.what[0]
+            scene = load_scene_arg(args)
+            return viewing.view_log(*_load_solves(args), scene=scene, **server_settings)
+    if len(args.what) > 1:
+        raise InputError(f"view: found {len(args.what)} names, expected one (or two logs)")
+    args.grasp = name = args.what[0]
     path, kind = Path(name), _kind(name)
-    if said.pads:
+    if args.pads:
         if kind != "robot" or not path.is_file():
-            raise InputError(f"{name}: --pads: expected the YAML file of a robot")
-        return viewing.view_pads(path, **served)
-    settings = Settings(the_method(said), the_tolerance(said), said.limits)
-    scene = the_scene(said)
-    more = {"scene": scene, "settings": settings, **served}
+            raise InputError(f"{name}: --pads: file is not a robot; expected a robot's YAML file")
+        return viewing.view_pads(path, **server_settings)
+    settings = Settings(parse_method(args), parse_tolerance(args), args.limits)
+    scene = load_scene_arg(args)
+    scene_settings = {"scene": scene, "settings": settings, **server_settings}
     if kind == "robot":
         robot = load_robot(path if path.is_file() else name)
-        return viewing.view_grasp(robot, **more)
+        return viewing.view_grasp(robot, **scene_settings)
     if kind == "grasp":
-        path, grasp = the_grasp(said)
-        robot = the_robot(said.robot, path, grasp)
+        path, grasp = load_grasp_arg(args)
+        robot = load_robot_arg(args.robot, path, grasp)
         with located(str(path)):
             grasp.arrays(robot.fingers)
-        return viewing.view_grasp(robot, grasp, **more)
-    robot, choices = (_ranked if is_ranked(path) else _candidates)(path, said)
+        return viewing.view_grasp(robot, grasp, **scene_settings)
+    robot, choices = (_ranked_choices if is_ranked(path) else _candidate_choices)(path, args)
     first = next(iter(choices.values()))
-    return viewing.view_grasp(robot, first.grasp, q=first.q, candidates=choices, **more)
+    return viewing.view_grasp(robot, first.grasp, q=first.q, candidates=choices, **scene_settings)
 
 
 def _is_log(path: Path) -> bool:
     return path.suffix == ".mcap" or (path.is_dir() and any(path.rglob("*.mcap")))
 
 
-def _motion(file: str) -> RecordedMotion | None:
-    """What `reach` or `follow` wrote; None: a log of solves."""
+def _motion_of(file: str) -> RecordedMotion | None:
+    """Read a motion of `reach` or `follow`; return None for a log of solves."""
     try:
         return read_motion(file)
     except LogError as error:
@@ -169,11 +174,11 @@ def _motion(file: str) -> RecordedMotion | None:
 
 
 def _kind(name: str) -> str:
-    """Whether a name or file is that of a grasp, a robot or candidates.
+    """Return the kind of a name or file: "grasp", "robot" or "candidates".
 
     Raises:
-        UnknownNameError: It is no name.
-        InputError: A file holds none of them.
+        UnknownNameError: The name is unknown.
+        InputError: The file has another kind.
     """
     path = Path(name)
     if path.suffix in (".json", ".npz") or path.is_dir():
@@ -188,51 +193,54 @@ def _kind(name: str) -> str:
         if keys & {"arm", "hand", "robot", "joints", "links"}:
             return "robot"
         raise InputError(
-            f"{name}: expected a grasp (contacts:), candidates (candidates:) or a robot (hand:)"
+            f"{name}: kind of file is unknown; expected a grasp (key contacts), candidates (key "
+            "candidates) or a robot (key hand)"
         )
     if name in shipped_names("grasps"):
         return "grasp"
     kinds = ("arm_hands", "bodies", "arms", "hands")
     if "+" in name or any(name in shipped_names(kind) for kind in kinds):
         return "robot"
-    known = [one for kind in ("grasps", *kinds) for one in shipped_names(kind)]
-    meant = did_you_mean(name, known, "or give the path of a file")
+    known = [entry for kind in ("grasps", *kinds) for entry in shipped_names(kind)]
+    suggestion = did_you_mean(name, known, "expected a shipped name or the path of a file")
     raise UnknownNameError(
         f"{name!r} is neither a shipped grasp (casadi-ik grasps) nor a shipped robot (casadi-ik "
-        f"robots); {meant}"
+        f"robots); {suggestion}"
     )
 
 
-def _the_logs(said: Said) -> list[tuple[OneSolve, ArmHand]]:
-    """A solve of each log, and its robot.
+def _load_solves(args: Arguments) -> list[tuple[SolveRecord, ArmHand]]:
+    """Return a solve of each log with its robot.
 
     Raises:
         LogError: A log is missing or damaged, or was written for another robot.
-        UnknownNameError: There is no such solve, or several and none is named.
-        InputError: More solves are named than there are logs.
+        UnknownNameError: The log has no such solve, or several and no number is given.
+        InputError: More solve numbers than logs are given.
     """
-    numbers = said.solve or []
-    if len(numbers) > len(said.what):
-        raise InputError(f"--solve: found {len(numbers)}, expected one for each log")
-    found: list[tuple[OneSolve, ArmHand]] = []
-    for i, file in enumerate(said.what):
+    numbers = args.solve or []
+    if len(numbers) > len(args.what):
+        raise InputError(
+            f"--solve: found {len(numbers)} numbers, expected at most {len(args.what)}, one per log"
+        )
+    solves: list[tuple[SolveRecord, ArmHand]] = []
+    for i, file in enumerate(args.what):
         log = logs.open(file)
-        with located(f"{file} (say --solve, --method)", (UnknownNameError,)):
+        with located(f"{file} (use --solve, --method)", (UnknownNameError,)):
             number = numbers[i] if i < len(numbers) else None
-            solve = one_solve(log, number, said.method, counted_from=1)
-        found.append((solve, robot_of_log(log, file, said.robot or solve.robot)))
-    return found
+            solve = one_solve(log, number, args.method, counted_from=1)
+        solves.append((solve, robot_of_log(log, file, args.robot or solve.robot)))
+    return solves
 
 
-def _candidates(path: Path, said: Said) -> tuple[ArmHand, Choices]:
-    """The grasps of a file of candidates, and their robot.
+def _candidate_choices(path: Path, args: Arguments) -> tuple[ArmHand, Choices]:
+    """Return the robot and the grasps of a file of candidates by name.
 
     Raises:
-        InputError: The file is malformed, or no robot is said.
+        InputError: The file is malformed, or ``--robot`` is missing.
     """
     from casadi_ik.app.viewer import Candidate
 
-    robot, pose = the_robot(said.robot, path), the_object_pose(said)
+    robot, pose = load_robot_arg(args.robot, path), parse_object_pose(args)
     choices: Choices = {}
     for number, grasp in enumerate(load_candidates(path, robot), 1):
         name = f"{number}: {grasp.name}" if grasp.name else str(number)
@@ -240,21 +248,23 @@ def _candidates(path: Path, said: Said) -> tuple[ArmHand, Choices]:
     return robot, choices
 
 
-def _ranked(path: Path, said: Said) -> tuple[ArmHand, Choices]:
-    """The answers of `casadi-ik choose` and `grasp`, each with its grasp, else what it reaches.
+def _ranked_choices(path: Path, args: Arguments) -> tuple[ArmHand, Choices]:
+    """Return the robot and the solutions of a file of `casadi-ik choose` or `grasp` by name.
 
     Raises:
-        InputError: The file is none of that kind, or has no answers.
+        InputError: The file is not a ranking, or holds no solutions.
     """
     from casadi_ik.app.viewer import Candidate
 
-    found = read_ranked(path)
+    ranking = read_ranked(path)
     with located(f"{path}: ranked[0].solution.robot"):
-        robot = the_robot(said.robot or found[0].solution.robot)
+        robot = load_robot_arg(args.robot or ranking[0].solution.robot)
     choices: Choices = {}
-    for place, one in enumerate(found, 1):
-        with located(f"{path}: ranked[{place - 1}].solution.q"):
-            q = robot.configuration(np.array([one.solution.q]))[0]
-        grasp = None if one.grasp is None else one.placed(path, place)
-        choices[f"{place}. {one.label}"] = Candidate(grasp, q, one.load, one.solution.clearance)
+    for rank, entry in enumerate(ranking, 1):
+        with located(f"{path}: ranked[{rank - 1}].solution.q"):
+            q = robot.configuration(np.array([entry.solution.q]))[0]
+        grasp = None if entry.grasp is None else entry.placed(path, rank)
+        choices[f"{rank}. {entry.label}"] = Candidate(
+            grasp, q, entry.load, entry.solution.clearance
+        )
     return robot, choices

@@ -20,7 +20,7 @@ from casadi_ik.errors import printable
 from casadi_ik.files.arrays import Array, Bools, Counts
 from casadi_ik.files.shipped import models_folder
 from casadi_ik.logs.events import SINGULAR, EventKind
-from casadi_ik.logs.explanation import explain, worst
+from casadi_ik.logs.explanation import explain, worst_error_ratio
 from casadi_ik.logs.reader import Log
 from casadi_ik.logs.solve import one_solve
 from casadi_ik.logs.tables import MethodRows
@@ -198,7 +198,7 @@ def _details_html(log: Log, group: SolveGroup, i: int) -> str:
     explanation = explain(solve)
     parts = [f"<p>{_escape(explanation.headline)}</p>"]
     if len(solve.rows):
-        parts.append(error_curve(worst(solve)))
+        parts.append(error_curve(worst_error_ratio(solve)))
     for title, lines in explanation.parts.items():
         items = "".join(f"<li>{_escape(line)}</li>" for line in lines)
         parts.append(f"<h4>{title}</h4><ul>{items}</ul>")

@@ -14,7 +14,7 @@ from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import DescriptionError, InputError, MissingExtraError
 from casadi_ik.files.reading import read_yaml
 from casadi_ik.kinematics.arm_hand import ArmHand, load_robot
-from casadi_ik.logs.solve import OneSolve
+from casadi_ik.logs.solve import SolveRecord
 from casadi_ik.model.grasp import Grasp
 from casadi_ik.planning.touch.grasps import FoundGrasp
 
@@ -129,7 +129,7 @@ def view_found(
 
 
 def view_log(
-    *solves: tuple[OneSolve, ArmHand],
+    *solves: tuple[SolveRecord, ArmHand],
     scene: Scene | None = None,
     host: str = HOST,
     port: int | None = None,

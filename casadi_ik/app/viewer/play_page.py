@@ -29,8 +29,8 @@ from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import InputError, LogError
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arm_hand import ArmHand
-from casadi_ik.logs.events import EVENT_COLORS, plain_name, told
-from casadi_ik.logs.solve import OneSolve
+from casadi_ik.logs.events import EVENT_COLORS, describe, plain_name
+from casadi_ik.logs.solve import SolveRecord
 from casadi_ik.model.grasp import Contact, Grasp
 from casadi_ik.solve.verdict import ContactVerdict
 
@@ -123,7 +123,7 @@ class SolvePlayback(Playback):
         solve: The logged solve.
     """
 
-    solve: OneSolve
+    solve: SolveRecord
 
     unit = "iteration"
 
@@ -174,7 +174,7 @@ class SolvePlayback(Playback):
     def summary_html(self, row: int, time: float) -> str:
         """Return iteration, phase, errors and events in words."""
         solve = self.solve
-        span = next(span for span in solve.stretches if span.first <= row <= span.last)
+        span = next(span for span in solve.phase_spans if span.first <= row <= span.last)
         phase = plain_name(span.phase) or "one phase"
         color = palette.MET if solve.success else palette.MISSED
         is_last = row == len(self) - 1
@@ -186,7 +186,7 @@ class SolvePlayback(Playback):
             f'{status}</div><div class="ik-iteration">iteration <b>{row + 1}</b> of {len(self)}'
             f"{ended_text} · {html.escape(phase)}</div>"
         )
-        event_texts = [told(event) for event in solve.events if event.iteration == row]
+        event_texts = [describe(event) for event in solve.events if event.iteration == row]
         # The list always has the height of three lines, so that the charts do not move.
         events = "".join(f"<li>{html.escape(line)}</li>" for line in event_texts)
         style = "margin:0.2em 0;padding-left:1.1em;height:4.5em;overflow:auto"
@@ -195,7 +195,7 @@ class SolvePlayback(Playback):
     def charts(self, row: int) -> str:
         """Return charts of errors and singular values over the iterations."""
         solve, times = self.solve, self.times
-        phases = dict.fromkeys(span.phase for span in solve.stretches)
+        phases = dict.fromkeys(span.phase for span in solve.phase_spans)
         color_of_phase = {
             name: palette.PHASE_COLORS[k % len(palette.PHASE_COLORS)]
             for k, name in enumerate(phases)
@@ -203,7 +203,7 @@ class SolvePlayback(Playback):
         events = [event for event in solve.events if event.kind in EVENT_COLORS]
         bands = [
             (span.first + 0.5, span.last + 1.5, color_of_phase[span.phase])
-            for span in solve.stretches
+            for span in solve.phase_spans
         ]
         bands += [
             (event.iteration + 1, event.iteration + 1, EVENT_COLORS[event.kind]) for event in events
@@ -240,7 +240,7 @@ class SolvePlayback(Playback):
         return "".join(charts) + (legend(entries) if entries else "")
 
 
-def solve_playback(solve: OneSolve, robot: ArmHand) -> SolvePlayback:
+def solve_playback(solve: SolveRecord, robot: ArmHand) -> SolvePlayback:
     """Return the playback of a logged solve.
 
     Raises:
