@@ -707,7 +707,7 @@ def _errors(traces: Traces) -> list[NDArray[Any]]:
 
 
 def _same_run(traces: Traces, window: int) -> Bools:
-    """Return for rows from `window` on whether the last `window` steps have one phase and restart."""
+    """Return for rows from `window` on if the last `window` steps have one phase and restart."""
     return traces.run[window:] == traces.run[:-window]
 
 
@@ -735,7 +735,7 @@ def _entries(traces: Traces, begins: Bools, ends: Bools) -> Rows:
 
 
 def _over_window(values: NDArray[Any], window: int, reduce: np.ufunc) -> NDArray[Any]:
-    """Reduce every `window` consecutive columns to their maximum or minimum, (n, m - window + 1)."""
+    """Reduce every `window` consecutive columns to a maximum or minimum, (n, m - window + 1)."""
     width = 1
     while 2 * width <= window:
         values = reduce(values[:, width:], values[:, :-width])

@@ -311,8 +311,8 @@ def check_robot(robot: ArmHand, urdf: str, where: str) -> None:
     values, expected = (np.array(NUMBER.findall(text), float) for text in texts)
     if frame != expected_frame or not np.allclose(values, expected, rtol=1e-9, atol=1e-9):
         raise LogError(
-            f"{where}: robot {robot.name!r} is not the robot of the log (the URDFs differ); expected"
-            " the description that was used for the solve (--robot)"
+            f"{where}: robot {robot.name!r} is not the robot of the log (the URDFs differ);"
+            " expected the description that was used for the solve (--robot)"
         )
 
 

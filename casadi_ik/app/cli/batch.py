@@ -304,7 +304,7 @@ def _part_solutions(folder: BatchFolder, source: TargetSource, number: int) -> d
 def _batch_settings(
     args: Arguments, solver: Solver, source: TargetSource, settings: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return all inputs that determine the solutions, so that parts of other batches are refused."""
+    """Return all inputs that determine the solutions, to refuse parts of other batches."""
     scene = None
     if args.scene is not None:
         file = resolve_description(args.scene, "scenes")

@@ -383,7 +383,7 @@ def _size(count: int) -> str:
 def _solve_table(part: logs.MethodRows, records: Iterable[Mapping[str, Any]]) -> Table:
     """Return a table of solves of one method, with restarts if there are any."""
     restarts = ["restarts"] if part.rows["restarts"].any() else []
-    numbers = ("iterations", *restarts, "error [mm]", "error [deg]", "time")
+    numbers = ("iterations", *restarts, "pos [mm]", "ang [deg]", "time")
     rows = table("solve", "status", *numbers, "events", right=("solve", *numbers))
     for record in records:
         rows.add_row(
@@ -499,7 +499,9 @@ def _tolerance_text(value: Any) -> str:
     """Format tolerances by finger in mm and degrees, as one value if all fingers agree."""
     try:
         texts = {
-            finger: f"{format_quantity(item['position'], 'm')} and {format_quantity(item['angle'], 'rad')}"
+            finger: " and ".join(
+                (format_quantity(item["position"], "m"), format_quantity(item["angle"], "rad"))
+            )
             for finger, item in value.items()
         }
     except (AttributeError, TypeError, KeyError, ValueError, OverflowError):
@@ -530,8 +532,8 @@ def _two_methods(open_logs: list[logs.Log], names: list[str] | None) -> tuple[st
     pair = names or available
     if len(pair) != 2:
         raise InputError(
-            f"--methods: option is missing and the logs hold {', '.join(available) or 'no method'}; "
-            "expected two methods"
+            "--methods: option is missing; expected two methods of those in the logs: "
+            f"{', '.join(available) or 'none'}"
         )
     return pair[0], pair[1]
 

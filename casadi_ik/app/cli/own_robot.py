@@ -239,8 +239,8 @@ def _import_report(
             "the files have no collision shapes: a scene needs `collision:` in the description"
         )
     notes.append(
-        "pads, thumb, palm and home are guesses: check the lines marked GUESS, and delete the lines "
-        "of links that are not fingers"
+        "pads, thumb, palm and home are guesses: check the lines marked GUESS, and delete the "
+        "lines of links that are not fingers"
     )
     yellow = [Text(f"  {note}", "yellow") for note in notes]
     return [headline(True, "IMPORTED", summary), fields(pairs), rows, *yellow]
