@@ -95,7 +95,7 @@ Examples:
   casadi-ik log why cup.mcap 3                       solve 3 in words
   casadi-ik log plot cup.mcap 3 --out 3.png
   casadi-ik log compare ours.mcap paper.mcap         two methods
-  casadi-ik log report study/ --out report.html      success, times, hardest solves
+  casadi-ik log report study/ --out report.html      study as a page
   casadi-ik log export cup.mcap --solve 3 --out view.mcap      for Foxglove
   casadi-ik log export study/ --what solves --out solves.parquet
   casadi-ik log finish torn.mcap                     repair a torn log
