@@ -283,10 +283,10 @@ def calibrate(args: Arguments) -> CommandResult:
     frame:
       finger,index_proximal_slider,index_middle_slider,x,y,z,qw,qx,qy,qz
       index,0.0485,0.0512,-0.0462,0.0896,0.1447,0.7065,0.0282,-0.7065,-0.0282
-    The columns are the actuators that move the finger [rad or m], the contact point
-    [m] and, if measured, the contact frame as a unit quaternion (its four columns may
-    be absent, or empty in a row). The noise is estimated from the data if they
-    suffice; --noise-position and --noise-angle are used otherwise.
+    The columns are the actuators that move the finger [rad or m], the contact
+    point [m] and, if measured, the contact frame as a unit quaternion (its four
+    columns may be absent, or empty in a row). The noise is estimated from the data
+    if they suffice; --noise-position and --noise-angle are used otherwise.
 
     exit codes: 0 written, 1 no estimate was found, 2 bad input
     """

@@ -77,11 +77,11 @@ bring the fingertips to given contacts, or a diagnosis if there are none.
 Examples:
   casadi-ik grasps                      list the shipped grasps
   casadi-ik solve cup                   solve a shipped grasp
-  casadi-ik solve my.yaml --log my.mcap solve your grasp and log every iteration
+  casadi-ik solve my.yaml --log my.mcap solve your grasp with a log
   casadi-ik log info my.mcap            summarise the log
 
-Lengths are in m and angles in rad, in files and in options. With --mm and --deg,
-options and reports use mm and degrees.
+Lengths are in m and angles in rad, in files and in options. With --mm and
+--deg, options and reports use mm and degrees.
 
 exit codes: 0 solved (or done), 1 a valid problem not solved, 2 bad input
 """,
