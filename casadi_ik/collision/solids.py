@@ -352,9 +352,9 @@ def _distinct_directions(directions: Array, count: int) -> Array:
 
     Every direction is close to a selected one. Earlier directions are preferred.
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
-    tree, angle = cKDTree(directions), FIRST_ANGLE
+    tree, angle = KDTree(directions), FIRST_ANGLE
     while True:
         covered, selected = np.zeros(len(directions), dtype=bool), list[int]()
         for i in range(len(directions)):

@@ -2,9 +2,9 @@
 
 A follower descends to a local minimum: after contacts that were out of reach, or at an obstacle, it
 may be stuck although it followed the same contacts before. `Recovery` therefore stores a *trail*:
-the postures that the motors have passed, at distances of `SPACING`. If the error of the contacts
-has not decreased for `PATIENCE`, it computes the error at the postures of the trail, a few of them
-in a cycle. If the least error is less than `GAIN` times the present one, the motors stop and return
+the postures that the motors have passed, at distances of `SPACING`. If the contacts were met before
+and their error has not decreased for `PATIENCE`, it computes the error at the postures of the
+trail, a few of them in a cycle. If the least error is less than `GAIN` times the present one, the motors stop and return
 to that posture. They move on straight lines, each from rest to rest: to the first posture of the
 trail, counted from the destination, to which the line is free, so they take short cuts. The lines
 are checked at a few postures in a cycle, and the guard checks every step in addition.
@@ -89,7 +89,7 @@ class Recovery:
     def reset(self, q: Array) -> None:
         """Start the trail at a posture (n,)."""
         self._trail[0], self._count, self._cycles_to_check = q, 1, 1
-        self._destination = 0
+        self._destination, self._has_met = 0, False
         self.follow()
 
     def follow(self) -> None:
@@ -131,9 +131,12 @@ class Recovery:
             self._extend_trail(q)
         ratio = inputs.error_ratio
         if is_stopped or (ratio > MET and inputs.goal_error_ratio > MET):
-            self._check_progress(inputs, ratio, q if is_stopped else None)
-        elif self._least_since < math.inf:
-            self._start_clock(math.inf)
+            if self._has_met:
+                self._check_progress(inputs, ratio, q if is_stopped else None)
+        else:
+            self._has_met = True
+            if self._least_since < math.inf:
+                self._start_clock(math.inf)
 
     def _distances(self, q: Array) -> Array:
         """Return the distances of the trail's postures from a posture (n,)."""

@@ -276,8 +276,9 @@ static void update_recovery(@PREFIX@_follower *follower) {
   if (--recovery->cycles_to_check <= 0) extend_trail(recovery, follower->state + STATE_Q);
   if (follower->record[RECORD_ERROR_RATIO] > 1 + TOLERANCE_SLACK
       && follower->record[RECORD_GOAL_ERROR_RATIO] > 1 + TOLERANCE_SLACK) {
-    check_progress(follower);
+    if (recovery->has_met) check_progress(follower);
   } else {
+    recovery->has_met = 1;
     start_clock(recovery, INFINITY);
   }
 }
@@ -351,6 +352,7 @@ int @PREFIX@_follow_from(@PREFIX@_follower *follower, const double *q0, double p
       is_valid ? (int64_t) fmin(ceil(TRAIL_CAPACITY * period / TRAIL_SEARCH_TIME), TRAIL_CAPACITY) : 0;
   copy(follower->recovery.trail[0], follower->q, N_MOTORS);
   follower->recovery.count = follower->recovery.cycles_to_check = 1;
+  follower->recovery.has_met = 0;
   follow_contacts(&follower->recovery);
   return is_valid ? 0 : @GUARD@_BAD_INPUT;
 }

@@ -12,7 +12,7 @@ typedef struct {
   double trail[@FOLLOW_TRAIL@][@GUARD@_MOTORS], start[@GUARD@_MOTORS], line[@GUARD@_MOTORS];
   double least_since, least_ratio, longest_step, done, line_step, next_step, line_max_step, line_change;
   int64_t count, cycles_to_check, check_cycles, patience, comparisons, cycles_stuck, candidate, destination;
-  int64_t is_returning, has_line;
+  int64_t is_returning, has_line, has_met;
 } @PREFIX@_recovery;
 
 /* A robot that follows moving contacts. Its results are q (positions of the motors at the end of the
