@@ -195,8 +195,8 @@ Change = Callable[[Path], list[str]]
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda _: [], "holds parts of this batch, expected --resume"),
-        (lambda _: ["--resume", "--seed", "7"], "seed: these parts were made with 0, this batch"),
+        (lambda _: [], "out: holds parts of this batch"),
+        (lambda _: ["--resume", "--seed", "7"], "seed: parts have 0, this batch has 7"),
         (lambda out: _damage(out), "damaged"),
         (
             lambda out: _copy(out),

@@ -402,7 +402,7 @@ def test_near_a_toggle_is_an_event_that_names_the_motors(ar10, tmp_path, monkeyp
     q = ar10.random(np.random.default_rng(1), 1)[0]
     _, events = logged(ar10, tmp_path / "clear.mcap", q)
     assert events == []
-    monkeypatch.setattr("casadi_ik.solve.limits.NEAR_TOGGLE", 1.0)
+    monkeypatch.setattr("casadi_ik.solve.limits.TOGGLE_THRESHOLD", 1.0)
     rows, events = logged(ar10, tmp_path / "near.mcap", q)
     assert (rows["sigma_coupling"] < 1.0).all()
     assert events
