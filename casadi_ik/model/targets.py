@@ -277,7 +277,7 @@ def target_arrays(
             has_direction & ~free_point,
             first_row,
             DIRECTIONS_KEY,
-            "has a point, too",
+            "has a point and a direction; expected one of them",
         )
         unit = np.where(has_direction[..., None], unit_directions, unit)
         free_point = free_point & ~has_direction

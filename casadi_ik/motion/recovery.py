@@ -4,10 +4,11 @@ A follower descends to a local minimum: after contacts that were out of reach, o
 may be stuck although it followed the same contacts before. `Recovery` therefore stores a *trail*:
 the postures that the motors have passed, at distances of `SPACING`. If the contacts were met before
 and their error has not decreased for `PATIENCE`, it computes the error at the postures of the
-trail, a few of them in a cycle. If the least error is less than `GAIN` times the present one, the motors stop and return
-to that posture. They move on straight lines, each from rest to rest: to the first posture of the
-trail, counted from the destination, to which the line is free, so they take short cuts. The lines
-are checked at a few postures in a cycle, and the guard checks every step in addition.
+trail, a few of them in a cycle. If the least error is less than `GAIN` times the present one, the
+motors stop and return to that posture. They move on straight lines, each from rest to rest: to the
+first posture of the trail, counted from the destination, to which the line is free, so they take
+short cuts. The lines are checked at a few postures in a cycle, and the guard checks every step in
+addition.
 """
 
 from __future__ import annotations

@@ -463,7 +463,9 @@ def test_the_stretches_are_all_that_is_allowed_and_no_more(name):
         for kind in BENDS:
             of_kind = [b.swivel for b in found if (b.shoulder, b.elbow, b.wrist) == kind]
             arms = arm.branches.arms(palm, ik.solve.ArmBranch(*kind, arm.range), scan)
-            row = np.abs(arm.branches._closed_form(palm[:3, :3], palm[:3, 3], scan)[0] - arms[:, None])
+            row = np.abs(
+                arm.branches._closed_form(palm[:3, :3], palm[:3, 3], scan)[0] - arms[:, None]
+            )
             (row,) = np.flatnonzero(row.max(axis=(0, 2)) == 0)
             inside = np.any([arm.contains(b, scan) for b in of_kind] or [scan > 1e9], axis=0)
             np.testing.assert_array_equal(inside, margins[:, row] >= 0)

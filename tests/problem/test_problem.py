@@ -71,10 +71,10 @@ def test_malformed_targets(solver, points, normals, says):
 @pytest.mark.parametrize(
     ("directions", "says"),
     [
-        (arrays()[1], "directions: row 0, finger 0 has a point too, expected it alone"),
+        (arrays()[1], "directions: row 0, finger 0 has a point and a direction; expected one"),
         (np.zeros((2, 3, 3)), "directions: row 0, finger 0 is zero, expected a direction"),
         (np.full((2, 3, 3), np.inf), "directions: row 0, finger 0 is infinite"),
-        (arrays(k=3)[1], "points and directions: found 2 and 3 rows, expected as many"),
+        (arrays(k=3)[1], "points and directions: found 2 and 3 rows"),
         (arrays(f=2)[1], "directions: found shape (2, 2, 3), expected (k, 3, 3)"),
         ("up", "directions: expected an array of numbers"),
     ],

@@ -109,7 +109,7 @@ def test_what_is_refused(robot):
     solver = ik.Solver(robot)
     asked = grasp(robot, robot.home)
     with pytest.raises(
-        ik.errors.UnknownNameError, match="fixed: no actuator 'elbow', expected one of lwr_"
+        ik.errors.UnknownNameError, match="fixed: unknown actuator 'elbow'; expected one of lwr_"
     ):
         solver.solve(asked, fixed={"elbow": 0.0})
     with pytest.raises(
