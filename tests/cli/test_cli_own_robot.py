@@ -59,7 +59,7 @@ def test_import_and_solve(run_process: Command, tmp_path: Path, rng: np.random.G
     hand(tmp_path)
     done = run_process("import", "arm.urdf", "hand.urdf", "--out", "mine.yaml", "--check").fine()
     words = done.out.split()
-    for word in ("IMPORTED", "tool_flange:", "15", "GUESS", "library", "mine.yaml"):
+    for word in ("IMPORTED", "tool_flange:", "15", "GUESS:", "library", "mine.yaml"):
         assert word in words, done.out
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "arm.urdf",
