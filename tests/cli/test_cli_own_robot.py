@@ -59,7 +59,7 @@ def test_import_and_solve(run_process: Command, tmp_path: Path, rng: np.random.G
     hand(tmp_path)
     done = run_process("import", "arm.urdf", "hand.urdf", "--out", "mine.yaml", "--check").fine()
     words = done.out.split()
-    for word in ("IMPORTED", "tool_flange:", "15", "GUESS:", "library", "mine.yaml"):
+    for word in ("IMPORTED", "tool_flange:", "15", "GUESS:", "reference", "mine.yaml"):
         assert word in words, done.out
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "arm.urdf",
@@ -169,9 +169,9 @@ def test_a_humanoid_s_trunk_and_sides_are_found(
     said = " ".join(done.out.split())
     for words in (
         "31 motors (3 trunk; left 7 arm, 7 hand; right 7 arm, 7 hand), 6 fingers",
-        "trunk torso_link: the last link that carries all palms",
+        "trunk torso_link: last link that carries all palms",
         "locked leg, head: moves no side",
-        "as its own library has it",
+        "equal to the reference library",
     ):
         assert words in said, done.out
     robot = ik.load_robot(out)
@@ -216,7 +216,7 @@ def test_joints_without_limits_get_assumed_ones(run: Command, tmp_path: Path) ->
     assert done.exit == 0
     data = yaml.safe_load((tmp_path / "mine.yaml").read_text())
     assert data["hand"]["limits"]["ff_a"] == [-3.14159, 3.14159]
-    assert "assumed, since hand.urdf states none" in " ".join(done.out.split())
+    assert "assumed, because hand.urdf states none" in " ".join(done.out.split())
 
 
 def test_a_palm_with_arms_for_fingers_is_doubted(run: Command, tmp_path: Path) -> None:
@@ -365,7 +365,7 @@ REFUSALS = {
     "an arm for a hand": (("arm.urdf", "hand.urdf", "--palm", "mf_3"), "no joint moves below"),
     "one file twice": (("arm.urdf", "arm.urdf"), "arm.urdf: arm and hand are the same file"),
     "arm that branches": (("two.urdf", "hand.urdf"), "--tip: missing; two.urdf branches at 'base'"),
-    "description": (("hand.yaml",), "is a description already, expected --picture and no --out"),
+    "description": (("hand.yaml",), "file is a description; expected --picture"),
     "output is the input": (("hand.urdf", "--out", "hand.urdf"), "expected a name ending in .yaml"),
 }
 
