@@ -182,7 +182,9 @@ class RemedyFinder:
                     for name in self.targets.extra_vectors
                 },
                 row_numbers=None,
-                object_pose=None,  # Only contacts matter.
+                # Only contacts matter.
+                object_pose=None,
+                palms=None,
             )
             for i, q in self._solutions(candidates, self._limits.tiled(len(candidates))).items():
                 part, finger, _ = freeings[i]

@@ -222,7 +222,7 @@ PACKED = HEAD + b"DATA binary_compressed\n"
     [
         ("a.npy", b"", "cannot be read"),
         ("a.npy", b"\x93NUMPY\x01\x00v\x00{'descr': '|O', 'fortran_order': False, ", "cannot be"),
-        ("a.ply", b"solid", "no PLY file"),
+        ("a.ply", b"solid", "is not a PLY file"),
         ("a.ply", b"ply\nelement vertex 9\nproperty float x\nend_header\n", "x, y"),
         ("a.ply", b"ply\nformat what 1.0\n", "cannot be read"),
         ("a.ply", b"ply\nelement vertex 99999999999\nend_header\n", "at most 10000000"),
@@ -231,14 +231,14 @@ PACKED = HEAD + b"DATA binary_compressed\n"
         ("a.pcd", PACKED + struct.pack("<II", 2, 9) + b"ab", "9 bytes"),
         ("a.pcd", PACKED + struct.pack("<II", 3, 108) + b"\xe0", "end"),
         ("a.pcd", PACKED + struct.pack("<II", 3, 108) + b" \x05a", "dam"),
-        ("a.pcd", HEAD + b"DATA zipped\n", "are zipped"),
+        ("a.pcd", HEAD + b"DATA zipped\n", "found zipped"),
         ("a.pcd", HEAD + b"DATA binary\nabc", "after 0 of 9"),
         ("a.pcd", HEAD + b"TYPE Q F F\nDATA binary\n", "cannot be"),
         ("a.xyz", b"1 2\n3 4\n", "cannot be read"),
         ("a.xyz", b"", "found no points"),
         ("a.xyz", b"nan nan nan\n", "found no points"),
         ("a.npz", b"PK", "not an npz file"),
-        ("a.las", b"", "expected a name ending in .npy, .npz, .ply, .pcd, .xyz, .txt, .csv"),
+        ("a.las", b"", "expected a name that ends in .npy, .npz, .ply, .pcd, .xyz, .txt, .csv"),
     ],
 )  # fmt: skip
 def test_files_that_are_none_are_one_line(tmp_path, name, data, message):
@@ -269,7 +269,7 @@ def test_arrays_and_keys_that_do_not_fit(tmp_path):
         ({"points": points, "voxel": -1}, "voxel: found -1, expected >= 0"),
         ({"points": points, "radius": 0}, "radius: found 0, expected > 0"),
         ({"file": str(tmp_path / "no.npy")}, "no such file"),
-        ({"file": str(tmp_path / "bomb.npz")}, "unpacks to 264000[0-9]* bytes, ex"),
+        ({"file": str(tmp_path / "bomb.npz")}, "unpacks to 264000[0-9]* bytes; ex"),
         ({"points": np.random.default_rng(0).normal(size=(100_001, 3))}, "found 100001 points"),
     ):
         with pytest.raises(errors.DescriptionError, match=message) as caught:

@@ -160,5 +160,5 @@ def test_a_flat_part_is_thin_and_a_flat_mesh_is_refused(tmp_path: Path) -> None:
     assert len(extents) == 4
     assert min(extents) == pytest.approx(1e-3, rel=1e-3)
     _written(alone, [sheet])
-    with pytest.raises(ik.errors.DescriptionError, match=r"all points are in a plane"):
+    with pytest.raises(ik.errors.DescriptionError, match=r"points are coplanar"):
         ik.Scene({"a": {"kind": "mesh", "file": str(alone), "parts": True}})
