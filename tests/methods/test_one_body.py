@@ -10,8 +10,8 @@ import casadi_ik as ik
 
 BODIES = ("g1+dex3", "two_pandas+allegro", "two_ur10e+leap", "mobile_kuka_lwr_barrett")
 ONE_HAND = (
-    r"is for one arm with one hand, found 'g1\+dex3', a body \(left, right\); "
-    r"take robot\.side\('left'\)$"
+    r"is for one arm with one hand, found 'g1\+dex3', a multi-arm robot \(left, right\); "
+    r"use robot\.side\('left'\)$"
 )
 FINE = ik.Tolerance(position=1e-6, angle=1e-6)
 
