@@ -20,19 +20,17 @@ from trace_checks import (
     COST,
     DAMPING,
     RESTART,
-    STANDARD,
     Kept,
     Layout,
     SolveBlock,
-    StandardField,
     check_trace,
-    trace_format,
 )
 
 import casadi_ik as ik
 from casadi_ik import logs
+from casadi_ik.solve.trace import STANDARD_FIELDS, StandardField, trace_format
 
-REQUIRED = {field for field in STANDARD if field.required}
+REQUIRED = {field for field in STANDARD_FIELDS if field.required}
 PAPER = {"finger_step": "closed-form", "max_iterations": 400}
 METHODS: Mapping[str, tuple[set[StandardField], dict[str, Any]]] = {
     "hand-first": ({COST, DAMPING, RESTART, ACCEPTED}, {}),
@@ -97,7 +95,7 @@ def test_every_method_is_here():
 @pytest.mark.parametrize("method", METHODS)
 def test_a_method_records_the_standard_fields(blocks, method):
     names = {field.name for field in REQUIRED | METHODS[method][0]}
-    found = set(blocks[method].format.layout.names) & {field.name for field in STANDARD}
+    found = set(blocks[method].format.layout.names) & {field.name for field in STANDARD_FIELDS}
     assert found == names
 
 
@@ -109,7 +107,7 @@ def test_what_a_trace_says_is_true(robot, blocks, method):
 CASES = [
     (method, field)
     for method, (optional, _) in METHODS.items()
-    for field in STANDARD
+    for field in STANDARD_FIELDS
     if field in REQUIRED | optional
 ]
 
@@ -124,7 +122,7 @@ def test_a_field_that_is_zero_is_noticed(robot, blocks, method, field):
         check_trace(robot, dataclasses.replace(blocks[method], rows=rows))
 
 
-@pytest.mark.parametrize("field", STANDARD, ids=lambda field: field.name)
+@pytest.mark.parametrize("field", STANDARD_FIELDS, ids=lambda field: field.name)
 def test_a_field_of_another_kind_is_refused(robot, blocks, field):
     layout = blocks["thumb-first"].format.layout
     other = "u1" if field.dtype != "u1" else "f8"

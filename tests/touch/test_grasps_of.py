@@ -12,7 +12,7 @@ from scipy.optimize import linprog
 
 import casadi_ik as ik
 from casadi_ik import errors
-from casadi_ik.app.cli.grasp import found_data
+from casadi_ik.app.cli.grasp import grasps_npz
 from casadi_ik.planning.touch.strength import DIRECTIONS, GIVE, generators, loads, stiffnesses
 
 PLACE = np.eye(4)
@@ -62,7 +62,7 @@ def test_every_grasp_is_confirmed_in_the_scene(found):
 
 def test_what_is_written_is_what_was_found(found):
     solver, grasps = found
-    held = np.load(io.BytesIO(found_data(grasps, solver.robot.fingers)))
+    held = np.load(io.BytesIO(grasps_npz(grasps, solver.robot.fingers)))
     asked = {name: held[name] for name in ("points", "normals", "balls") if name in held}
     batch = solver.solve_batch(**asked, q0=held["q"])
     assert batch.success.all()
