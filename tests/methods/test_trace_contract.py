@@ -133,7 +133,7 @@ def test_a_field_of_another_kind_is_refused(robot, blocks, field):
         trace_format(changed, robot.description)
     without = Layout(tuple(f for f in layout if f.name != field.name))
     if field.required:
-        with pytest.raises(ik.errors.InputError, match=f"no field {field.name!r}"):
+        with pytest.raises(ik.errors.InputError, match=f"field {field.name!r} is missing"):
             trace_format(without, robot.description)
     else:
         assert field.name not in trace_format(without, robot.description).labels

@@ -497,9 +497,9 @@ def test_sheets_and_specks_are_no_bodies(tmp_path):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("# nothing\n", "is an empty mesh, expected triangles"),
-        ("v 0 0 0\nv nan 1 0\nv 0 1 1\nf 1 2 3\n", "has corners that are not finite"),
-        ("v 0 0 0\nv inf 1 0\nv 0 1 1\nf 1 2 3\n", "has corners that are not finite"),
+        ("# nothing\n", "the mesh is empty; expected triangles"),
+        ("v 0 0 0\nv nan 1 0\nv 0 1 1\nf 1 2 3\n", "a vertex is not finite"),
+        ("v 0 0 0\nv inf 1 0\nv 0 1 1\nf 1 2 3\n", "a vertex is not finite"),
     ],
 )
 def test_what_is_no_mesh_is_refused(tmp_path, text, expected):
