@@ -298,7 +298,7 @@ def test_other_hands_are_looked_at_as_in_python(tmp_path):
     (out / "grasped.c").write_text(GRASPED)
     sources = [str(path.relative_to(out)) for path in out.glob("src/*.c")]
     compiled(out, "-O0", "grasped.c", *sources, "-o", "grasped", "-lm")
-    grasps, asked = page["of_grasps"](robot, "panda+shadow"), b""
+    grasps, asked = page["grasp_entries"](robot, "panda+shadow"), b""
     for one in grasps:
         solids = [[s["kind"], *s["size"], *s["pose"]] for s in one["solids"]]
         free = [np.nan] * 3
@@ -406,7 +406,7 @@ def test_kernels_compiled_ahead_with_progress(capsys):
 def test_without_a_compiler_nothing_is_compiled_ahead(monkeypatch, capsys):
     monkeypatch.setenv("CC", "none")
     assert main(["compile", "kuka_lwr_barrett"]) == 2
-    assert "there is no C compiler" in capsys.readouterr().err
+    assert "no C compiler is installed" in capsys.readouterr().err
 
 
 WARNED = ("-std=c11", "-Wall", "-Wextra", "-Wpedantic", "-Wdouble-promotion", "-Werror")
