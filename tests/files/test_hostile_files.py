@@ -119,7 +119,7 @@ def test_an_output_that_is_the_input_by_another_name(tmp_path: Path) -> None:
     source, link = tmp_path / "in.yaml", tmp_path / "link.mcap"
     source.write_text("")
     link.hardlink_to(source)
-    with pytest.raises(OutputError, match="found the file of the input"):
+    with pytest.raises(OutputError, match="--log: file is the same as that of the input"):
         check_outputs({"--log": link}, inputs=[source])
 
 
