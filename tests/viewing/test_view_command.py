@@ -140,7 +140,7 @@ def test_motions_play(view, robot: ik.ArmHand, tmp_path: Path) -> None:
         (["cupp"], "'cupp' is neither a shipped grasp"),
         (["cup", "mug"], "found 2 names, expected one (or two logs)"),
         (["cup", "--method", "x"], "--method: found 'x'"),
-        (["cup", "--pads"], "--pads: expected the YAML file of a robot"),
+        (["cup", "--pads"], "--pads: file is not a robot; expected a robot"),
         (["nothing.mcap"], "nothing.mcap"),
         (["nothing.json"], "nothing.json: cannot be read"),
         (["cup", "--host", "192.0.2.1"], "host: found '192.0.2.1'"),
