@@ -224,7 +224,9 @@ def test_a_batch_may_hold_directions_alone(robot, solvers):
     grasp = ik.Grasp({robot.fingers[0]: ik.Contact(direction=directions[1, 0]), **contacts})
     one = solver.solve(grasp)
     np.testing.assert_allclose(one.q, batch.q[1], atol=1e-12)
-    with pytest.raises(ik.errors.RowError, match="directions: row 1, finger 0 has a point and a direction"):
+    with pytest.raises(
+        ik.errors.RowError, match="directions: row 1, finger 0 has a point and a direction"
+    ):
         solver.solve_batch(at[..., :3, 3], at[..., :3, 0], directions=directions)
 
 

@@ -24,7 +24,7 @@ from runner.report import interval_text, mean_metric, median_metric, rate_metric
 from runner.study import STUDY_FILE, claim, missing, read_results, run
 
 import casadi_ik as ik
-from casadi_ik import integrations as batches
+from casadi_ik.integrations import batches
 
 STUDY = small_study.STUDY
 FOLDERS = os.pathsep.join((str(Path(small_study.__file__).parent), *sys.path))
@@ -79,13 +79,13 @@ def scheduler() -> Iterator[str]:
 
 
 def test_a_dask_cluster_without_workers_is_refused(scheduler, tmp_path, monkeypatch):
-    monkeypatch.setattr(batches.parts, "PATIENCE", 1)
+    monkeypatch.setattr(batches, "CLUSTER_TIMEOUT", 1)
     with pytest.raises(ik.errors.InputError, match="found no worker within 1 s"):
         run(STUDY, tmp_path, dask=scheduler)
 
 
 def test_no_dask_scheduler_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(batches.parts, "PATIENCE", 1)
+    monkeypatch.setattr(batches, "CLUSTER_TIMEOUT", 1)
     with pytest.raises(ik.errors.InputError, match="found no scheduler"):
         run(STUDY, tmp_path, dask="tcp://127.0.0.1:9")
 
@@ -111,7 +111,7 @@ def test_a_worker_with_another_version_is_named(monkeypatch):
     with pytest.raises(
         ik.errors.InputError, match=r"tcp://worker:1 has .*casadi-ik 0\.0\.1.*expected"
     ):
-        batches.parts._check(Client(), "tcp://here:1", batches.parts.PACKAGES)  # type: ignore[arg-type]
+        batches._check_workers(Client(), "tcp://here:1", batches.REQUIRED_PACKAGES)  # type: ignore[arg-type]
 
 
 def test_killed_at_random_moments_nothing_is_lost_or_doubled(done, tmp_path):

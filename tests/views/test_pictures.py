@@ -66,7 +66,7 @@ def test_alternatives_are_drawn_side_by_side(robot, grasp) -> None:
     for axes, each in zip(figure.axes, found, strict=True):
         start, end = each.branch.swivel
         assert f"elbow {'+' if each.branch.elbow > 0 else '−'}" in axes.get_title()
-        assert f"swings {np.rad2deg(end - start):.0f}°" in axes.get_title()
+        assert f"swivel range {np.rad2deg(end - start):.0f}°" in axes.get_title()
     images = [axes.images[0].get_array() for axes in figure.axes]
     assert np.abs(images[0] - images[1]).max() > 0.3
     with pytest.raises(errors.InputError, match="alternatives: found none"):
