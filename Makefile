@@ -32,16 +32,12 @@ $(VENV)/python.stamp:
 	touch $@
 
 $(VENV)/demo.stamp: $(VENV)/python.stamp pyproject.toml constraints.txt
-	$(INSTALL) -e ".[plots,reference]"
+	$(INSTALL) -e ".[plots]"
 	touch $@
 
 $(VENV)/dev.stamp: $(VENV)/python.stamp pyproject.toml constraints.txt
-	$(INSTALL) -e ".[test,lint,docs]"
-	touch $@ $(VENV)/demo.stamp $(VENV)/docs.stamp
-
-$(VENV)/docs.stamp: $(VENV)/python.stamp pyproject.toml constraints.txt
-	$(INSTALL) -e ".[docs]"
-	touch $@
+	$(INSTALL) -e ".[dev]"
+	touch $@ $(VENV)/demo.stamp
 
 # The grasp of a real object by the default method, then by the paper's, and the two side by side.
 demo: $(VENV)/demo.stamp
@@ -63,7 +59,7 @@ lint: $(VENV)/dev.stamp
 	$(SPHINX)
 
 # Of pages and docstrings as they are; notebooks with the outputs that are stored in them.
-docs: $(VENV)/docs.stamp
+docs: $(VENV)/dev.stamp
 	$(SPHINX)
 	@echo "out/docs/index.html"
 
@@ -71,7 +67,7 @@ docs: $(VENV)/docs.stamp
 page: $(VENV)/dev.stamp
 	$(BIN)/python page/build.py --out out/page
 
-# Where the other solvers are installed (pip install -e ".[peers]") they are measured too.
+# Where the other solvers are installed (pip install -r studies/peers.txt) they are measured too.
 bench: $(VENV)/dev.stamp
 	$(BIN)/python studies/bench.py --report out/bench
 

@@ -147,3 +147,57 @@ class PictureError(CasadiIKError):
 
 class MissingExtraError(CasadiIKError, ImportError):
     """Error of an optional dependency that is not installed; the message says how to install it."""
+
+
+EXTRA_OF_MODULE = {
+    "collada": "meshes",
+    "scipy": "meshes",
+    "trimesh": "meshes",
+    "mujoco": "robots",
+    "xacro": "robots",
+    "matplotlib": "plots",
+    "pyvista": "plots",
+    "vtk": "plots",
+    "vtkmodules": "plots",
+    "foxglove": "view",
+    "viser": "view",
+    "ompl": "motion",
+    "toppra": "motion",
+    "pinocchio": "reference",
+    "proxsuite": "reference",
+    "ziglang": "compiler",
+}
+"""Extra that installs an optional module."""
+
+PACKAGE_OF_MODULE = {"dask": "'dask[distributed]'", "zenoh": "eclipse-zenoh"}
+"""Name of the package that installs a module, where it is not the module's name."""
+
+
+def install_command(module: str) -> str:
+    """Return the command that installs an optional module."""
+    if module in EXTRA_OF_MODULE:
+        return f"pip install 'casadi-ik[{EXTRA_OF_MODULE[module]}]'"
+    return f"pip install {PACKAGE_OF_MODULE.get(module, module)}"
+
+
+@contextmanager
+def optional_import(purpose: str) -> Iterator[None]:
+    """Convert a failed import of an optional dependency into a `MissingExtraError`.
+
+    Args:
+        purpose: Function that needs the dependency, for the message ("meshes").
+
+    Raises:
+        MissingExtraError: The dependency is not installed, or cannot be loaded.
+    """
+    try:
+        yield
+    except MissingExtraError:
+        raise
+    except ImportError as error:
+        module = (error.name or "").partition(".")[0]
+        if not isinstance(error, ModuleNotFoundError) or not module:
+            raise MissingExtraError(f"{purpose}: {module} cannot be loaded: {error}") from error
+        raise MissingExtraError(
+            f"{purpose}: {module} is not installed; {install_command(module)}"
+        ) from error

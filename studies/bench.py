@@ -5,7 +5,7 @@
     python studies/bench.py                                    # everything that is quick
     python studies/bench.py --part batch fast --robots ur5e+shadow --against ../other
     python studies/bench.py --part first-use export logs --report out/bench
-    python studies/bench.py --part peers --robots panda+allegro_right      # extra `peers`
+    python studies/bench.py --part peers --robots panda+allegro_right      # studies/peers.txt
     python studies/bench.py --part view --page out/page/index.html         # needs Chromium
 
 Every package measured has a process of its own that runs the same code (`bench_parts.py`, public

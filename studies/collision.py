@@ -316,7 +316,7 @@ def main(arguments: list[str] | None = None) -> None:
     heads += ["mink, mean [ms]", "ours, mean [ms]", "ratio"]
     peers = peer_rows(kinds["mink"])
     body += ["## Others", PEERS]
-    body += [markdown_table(heads, peers) if peers else "Not run (extra `peers`)."]
+    body += [markdown_table(heads, peers) if peers else "Not run (`studies/peers.txt`)."]
     run_by, code = command(__file__, arguments), {"collision": codes or None}
     publish("Free of collision", body, options.report, run_by, code, metrics)
 

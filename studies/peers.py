@@ -1,6 +1,6 @@
 """Other solvers on our problem, each set up as its experts would, with our restarts and verdict.
 
-    pip install -e ".[peers]"
+    pip install -r studies/peers.txt
     python studies/bench.py --part peers
 
 Every peer sees the robot through a URDF, contacts as points and normals, and joints that follow

@@ -9,7 +9,7 @@ III). Every target is solved from the robot's home, with limits ignored and enfo
     python studies/table_one.py --full --methods hand-first  # some of the methods
     python studies/table_one.py --count 0                    # only the report on what is there
     python studies/table_one.py --methods enhanced-dls --set chain_damping=50 --out out/lambda_50
-    dask scheduler & dask worker tcp://HOST:8786 &            # casadi-ik[studies] installed there
+    dask scheduler & dask worker tcp://HOST:8786 &            # casadi-ik[dev] installed there
     python studies/table_one.py --full --dask tcp://HOST:8786
 
 Stopped or killed it goes on where it was. The report (Markdown, HTML, figures, `metrics.json`)

@@ -25,10 +25,9 @@ from typing import Any
 
 import numpy as np
 from mcap.writer import Writer
-from scipy.spatial.transform import Rotation
 
 from casadi_ik.app.drawing import palette
-from casadi_ik.errors import LogError, MissingExtraError, os_errors
+from casadi_ik.errors import LogError, optional_import, os_errors
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.shipped import models_folder
 from casadi_ik.files.writing import atomic_write
@@ -39,13 +38,10 @@ from casadi_ik.logs.events import SERIOUS, describe
 from casadi_ik.logs.format import schema_name, schema_text
 from casadi_ik.logs.solve import SolveRecord
 
-try:
+with optional_import("viewer files"):
     from foxglove import Schema
     from foxglove import messages as fox
-except ImportError as error:
-    raise MissingExtraError(
-        "viewer files need foxglove-sdk, which is not installed: pip install 'casadi-ik[viewer]'"
-    ) from error
+    from scipy.spatial.transform import Rotation
 
 ITERATION_PERIOD = 10_000_000
 """Time between two iterations [ns]."""

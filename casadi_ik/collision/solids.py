@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from casadi_ik.errors import DescriptionError
+from casadi_ik.errors import DescriptionError, optional_import
 from casadi_ik.files.arrays import Array
 from casadi_ik.model.objects import load_object
 from casadi_ik.model.shapes import (
@@ -316,7 +316,8 @@ def hull(points: Array, where: str) -> Solid:
         raise DescriptionError(f"{where}: points are not finite; expected finite numbers")
     if np.linalg.matrix_rank(points - points.mean(axis=0), tol=1e-9) < 3:
         raise DescriptionError(f"{where}: points are coplanar; expected a body")
-    from scipy.spatial import ConvexHull, QhullError
+    with optional_import("convex hulls"):
+        from scipy.spatial import ConvexHull, QhullError
 
     try:
         faces = ConvexHull(points)
@@ -352,7 +353,8 @@ def _distinct_directions(directions: Array, count: int) -> Array:
 
     Every direction is close to a selected one. Earlier directions are preferred.
     """
-    from scipy.spatial import KDTree
+    with optional_import("convex hulls"):
+        from scipy.spatial import KDTree
 
     tree, angle = KDTree(directions), FIRST_ANGLE
     while True:

@@ -20,7 +20,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.errors import DescriptionError
+from casadi_ik.errors import DescriptionError, MissingExtraError, optional_import
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.limits import LIMITS, RAISE_HINT, raise_hint, scaled_limit
 from casadi_ik.files.reading import read_bytes
@@ -116,6 +116,7 @@ def read_mesh(path: Path, where: str) -> tuple[Array, NDArray[np.int64]]:
 
     Raises:
         DescriptionError: The file does not exist, has no triangles, or is too large.
+        MissingExtraError: The package that reads meshes is not installed.
     """
     if not path.is_file():
         raise DescriptionError(f"{where}: no such file {str(path)!r}")
@@ -128,6 +129,8 @@ def read_mesh(path: Path, where: str) -> tuple[Array, NDArray[np.int64]]:
     data = read_bytes(path, where, scaled_limit(LIMITS.mesh_bytes), RAISE_HINT)
     try:
         points, triangles = _parse_mesh(data, kind[1:])
+    except MissingExtraError:
+        raise
     except Exception as error:  # libraries raise exceptions of any type for damaged files
         reason = " ".join(str(error).split()) or type(error).__name__
         raise DescriptionError(f"{where}: cannot be read: {reason}") from error
@@ -173,7 +176,8 @@ def _silent(logger: str) -> Iterator[None]:
 
 
 def _read_trimesh(data: bytes, kind: str) -> list[tuple[Any, Any]]:
-    import trimesh
+    with optional_import("meshes"):
+        import trimesh
 
     library: Any = trimesh
     scene = library.load_scene(io.BytesIO(data), file_type=kind, process=False, skip_materials=True)
@@ -182,7 +186,8 @@ def _read_trimesh(data: bytes, kind: str) -> list[tuple[Any, Any]]:
 
 def _read_collada(data: bytes) -> list[tuple[Any, Any]]:
     """Return the geometries of a COLLADA scene in metres, with the poses of the scene applied."""
-    import collada
+    with optional_import("COLLADA meshes"):
+        import collada
 
     library: Any = collada
     root = ElementTree.fromstring(data)

@@ -1,7 +1,7 @@
 """Batches in parts: workers solve parts, which are stored atomically, so a killed batch can resume.
 
 Workers are processes of this machine or of a Dask cluster, both through joblib. Workers of a
-cluster need the package with its extra `cluster`, but no shared folder.
+cluster need the package and dask[distributed], but no shared folder.
 """
 
 from __future__ import annotations
@@ -116,14 +116,14 @@ def check_installed(cluster: str | None) -> None:
     except ImportError as error:
         raise UnsupportedError(
             "batches in parts (--resume, --part-size, --dask, Parquet, folders) need joblib: "
-            "pip install 'casadi-ik[cluster]'"
+            "pip install joblib"
         ) from error
     if cluster is None:
         return
     try:
         import dask.distributed  # noqa: F401 - makes its loggers
     except ImportError as error:
-        raise UnsupportedError("--dask needs Dask: pip install 'casadi-ik[cluster]'") from error
+        raise UnsupportedError("--dask needs Dask: pip install 'dask[distributed]'") from error
 
 
 def _client(address: str) -> Client:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from casadi_ik.api import Solver
-from casadi_ik.errors import MissingExtraError
+from casadi_ik.errors import optional_import
 from casadi_ik.files.arrays import Array
 
 
@@ -118,10 +118,8 @@ def jax_layer(
 
 
 def _import_extra(name: str) -> Any:
-    try:
+    with optional_import("integrations.differentiable"):
         return import_module(name)
-    except ImportError as error:
-        raise MissingExtraError(f"{name} is missing: pip install 'casadi-ik[{name}]'") from error
 
 
 def _solve(solver: Solver, options: Any, points: Array, normals: Array) -> tuple[Any, Any]:

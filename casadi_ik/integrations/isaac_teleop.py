@@ -11,23 +11,18 @@ from typing import Any
 
 import numpy as np
 
-from casadi_ik.errors import MissingExtraError
+from casadi_ik.errors import optional_import
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.motion.follower import Follower
 from casadi_ik.motion.retarget import Retarget, Retargeter
 
-try:
+with optional_import("integrations.isaac_teleop"):
     from isaacteleop.retargeting_engine.interface import (
         BaseRetargeter,
         OptionalType,
         TensorGroupType,
     )
     from isaacteleop.retargeting_engine.tensor_types import FloatType, HandInput, HandInputIndex
-except ImportError as error:
-    raise MissingExtraError(
-        "the retargeter needs isaacteleop, which is not installed: "
-        "pip install 'casadi-ik[isaac-teleop]'"
-    ) from error
 
 
 class ArmHandRetargeter(BaseRetargeter):

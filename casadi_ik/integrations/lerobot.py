@@ -13,20 +13,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from casadi_ik.api import Solver
-from casadi_ik.errors import InputError, InvalidPoseError, MissingExtraError
+from casadi_ik.errors import InputError, InvalidPoseError, optional_import
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.input_checks.keypoints import lost_contacts_reason
 from casadi_ik.files.input_checks.poses import single_pose
 from casadi_ik.model.grasp import Contact, Grasp
 from casadi_ik.solve.status import Status
 
-try:
+with optional_import("integrations.lerobot"):
     from lerobot.configs.types import FeatureType, PipelineFeatureType, PolicyFeature
     from lerobot.processor import ProcessorStepRegistry, RobotActionProcessorStep
-except ImportError as error:
-    raise MissingExtraError(
-        "the adapter needs lerobot, which is not installed: pip install 'casadi-ik[lerobot]'"
-    ) from error
 
 POINT_KEYS, NORMAL_KEYS = ("x", "y", "z"), ("nx", "ny", "nz")
 """Suffixes of the keys of a contact in an action."""

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from casadi_ik.api import Solver
-from casadi_ik.errors import CasadiIKError, InputError, InvalidPoseError, MissingExtraError
+from casadi_ik.errors import CasadiIKError, InputError, InvalidPoseError, optional_import
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.input_checks.keypoints import lost_contacts_reason
 from casadi_ik.files.input_checks.poses import unit_quaternions
@@ -29,12 +29,8 @@ from casadi_ik.logs.cdr import CdrReader, cdr, cdr_message
 from casadi_ik.logs.container import CDR_HEADER
 from casadi_ik.solve.status import Status
 
-try:
+with optional_import("integrations.ros2"):
     import zenoh
-except ImportError as error:
-    raise MissingExtraError(
-        "the ROS 2 node needs eclipse-zenoh, which is not installed: pip install 'casadi-ik[ros2]'"
-    ) from error
 
 POSE_SIZE = 7
 """Numbers of a pose: x y z [m] and a quaternion x y z w."""

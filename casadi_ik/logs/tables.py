@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.compile.layout import opaque
-from casadi_ik.errors import LogError, MissingExtraError, UnknownNameError, os_errors
+from casadi_ik.errors import LogError, UnknownNameError, optional_import, os_errors
 from casadi_ik.logs.events import MOVES, SINGULAR, Event, EventKind, as_matrix, bits_of
 
 if TYPE_CHECKING:
@@ -192,12 +192,8 @@ class Table:
         Raises:
             MissingExtraError: polars is not installed.
         """
-        try:
+        with optional_import("dataframes"):
             import polars as pl
-        except ImportError as error:
-            raise MissingExtraError(
-                "dataframes need polars: pip install 'casadi-ik[dataframes]'"
-            ) from error
         frames = [pl.DataFrame(_columns(part, self._keys)) for part in self.parts]
         return pl.concat(frames, how="diagonal") if frames else pl.DataFrame()
 

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from casadi_ik.errors import DescriptionError
+from casadi_ik.errors import DescriptionError, optional_import
 from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.files.input_checks.units import warn_of_large_mesh
 from casadi_ik.files.limits import LIMITS, raise_hint, scaled_limit
@@ -478,8 +478,9 @@ def _oriented(
         triangles: (t, 3) triangles.
         merged: (t, 3) the same, corners at the same place being one.
     """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
+    with optional_import("meshes"):
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
 
     t = len(triangles)
     starts, ends = merged[:, [0, 1, 2]].T.ravel(), merged[:, [1, 2, 0]].T.ravel()
@@ -521,8 +522,9 @@ def pieces_of(points: Array, triangles: NDArray[np.int64]) -> list[Mesh]:
     of_triangle = np.arange(len(edges)) % len(triangles)
     order = np.lexsort((of_triangle, edges))
     of_two = of_triangle[order[counts[edges[order]] % 2 == 0]].reshape(-1, 2)
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
+    with optional_import("meshes"):
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
 
     meeting = coo_array((np.ones(len(of_two)), of_two.T), shape=(len(triangles),) * 2)
     _, labels = connected_components(meeting, directed=False)
@@ -596,7 +598,8 @@ def _to_triangles(points: Array, corners: Array) -> tuple[Array, Array]:
     squares = (points**2).sum(axis=1)[:, None] + (middles**2).sum(axis=1)
     to_middle = np.sqrt(np.maximum(squares - 2 * points @ middles.T, 0.0))
     away, face = np.empty((len(points), 3)), np.empty((len(points), 3))
-    from trimesh.triangles import closest_point
+    with optional_import("meshes"):
+        from trimesh.triangles import closest_point
 
     for i, point in enumerate(points):
         near = np.flatnonzero(to_middle[i] - radii <= to_middle[i].min() + MESHES.rounded)

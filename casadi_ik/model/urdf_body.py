@@ -8,7 +8,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.errors import DescriptionError
+from casadi_ik.errors import DescriptionError, optional_import
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.limits import LIMITS
 from casadi_ik.files.number_files import MESH_FORMATS, read_mesh
@@ -107,7 +107,8 @@ def _geometry(element: Element, path: Path) -> Triangles:
 
 
 def _simple(shape: Element, path: Path) -> Triangles:
-    import trimesh
+    with optional_import("meshes"):
+        import trimesh
 
     create = trimesh.creation
     keys = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length")}

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from casadi_ik.errors import DescriptionError, MissingExtraError, os_errors
+from casadi_ik.errors import DescriptionError, MissingExtraError, install_command, os_errors
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.limits import LIMITS, RAISE_HINT, scaled_limit
 from casadi_ik.model import sandbox
@@ -65,7 +65,7 @@ def run_sandbox(
     """
     if find_spec(reader) is None:
         noun = "has xacro macros" if reader == XACRO_READER else "is MJCF"
-        raise MissingExtraError(f"{path}: {noun}; to read it: pip install 'casadi-ik[{reader}]'")
+        raise MissingExtraError(f"{path}: {noun}; to read it: {install_command(reader)}")
     seconds, doing = (
         scaled_limit(LIMITS.reader_seconds),
         "expand" if reader == XACRO_READER else "read",

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from mcap.writer import Writer
 
-from casadi_ik.errors import InputError, MissingExtraError
+from casadi_ik.errors import InputError, optional_import
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.input_checks.times import cycle_count
 from casadi_ik.files.writing import atomic_write
@@ -190,15 +190,11 @@ def timed(path: Array, rates: Rates, period: float) -> Array:
     Raises:
         MissingExtraError: toppra is not installed.
     """
-    try:
+    with optional_import("timing"):
         import toppra
         from scipy.interpolate import PchipInterpolator
         from toppra import algorithm, constraint
         from toppra.simplepath import SimplePath
-    except ImportError as error:
-        raise MissingExtraError(
-            "timing needs toppra, which is not installed: pip install 'casadi-ik[motion]'"
-        ) from error
     tuning = TimingTuning()
     lengths = np.abs(np.diff(path, axis=0)).sum(axis=0)
     if not lengths.max(initial=0.0) > 1e-9:

@@ -284,9 +284,7 @@ def import_polars() -> Any:
     try:
         import polars as pl
     except ImportError as error:
-        raise UnsupportedError(
-            "Parquet files need polars: pip install 'casadi-ik[dataframes]'"
-        ) from error
+        raise UnsupportedError("Parquet files need polars: pip install polars") from error
     return pl
 
 

@@ -1,6 +1,6 @@
 """Studies: seeded targets solved in several ways, part by part, resumable.
 
-Needs the extra `studies`.
+Needs the extra `dev`.
 """
 
 import os
@@ -14,5 +14,5 @@ os.environ.setdefault("CASADI_IK_COMPILE", "wait")
 for _name in ("joblib", "matplotlib", "polars"):
     if find_spec(_name) is None:
         raise MissingExtraError(
-            f"studies need {_name}, which is not installed: pip install 'casadi-ik[studies]'"
+            f"studies need {_name}, which is not installed: pip install 'casadi-ik[dev]'"
         )

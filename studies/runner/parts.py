@@ -138,7 +138,7 @@ def _progress() -> Progress:
 def backend(jobs: int, dask: str | None) -> Iterator[None]:
     """Where joblib's calls go meanwhile, see `casadi_ik.integrations.batches`.
 
-    A cluster needs the installed package with its extra `studies` and nothing else: the study's own
+    A cluster needs the installed package with its extra `dev` and nothing else: the study's own
     modules are sent to it, and what its workers solve comes back as bytes.
 
     Args:

@@ -252,7 +252,7 @@ def run(
             blocks being solved and nothing else; the next one goes on.
         jobs: Processes on this machine.
         dask: Address of a Dask scheduler whose workers solve instead; they need the installed
-            package with its extra `studies`, and neither this folder nor this script.
+            package with its extra `dev`, and neither this folder nor this script.
         log: What to log, in one file per block; None: no logs.
 
     Raises:

@@ -167,7 +167,7 @@ def test_a_table_needs_polars(
 ) -> None:
     monkeypatch.setitem(sys.modules, "polars", None)
     error = run("batch", target_file(), *ROBOT, "--out", tmp_path / "o.parquet").error
-    assert error == "--out: Parquet files need polars: pip install 'casadi-ik[dataframes]'"
+    assert error == "--out: Parquet files need polars: pip install polars"
 
 
 def test_process(run_process: Command, target_file: TargetFile, tmp_path: Path) -> None:

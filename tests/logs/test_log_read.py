@@ -247,7 +247,7 @@ def test_without_polars(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "polars", None)
     table = logs.open(write(make_block(4))).iterations()
     assert len(table.array()) == 4
-    with pytest.raises(errors.MissingExtraError, match=r"casadi-ik\[dataframes\]"):
+    with pytest.raises(errors.MissingExtraError, match="pip install polars"):
         table.frame()
 
 

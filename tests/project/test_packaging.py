@@ -10,6 +10,7 @@ import yaml
 from processes import python
 
 import casadi_ik as ik
+from casadi_ik.errors import EXTRA_OF_MODULE
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -23,10 +24,46 @@ def test_version_is_said_once():
     assert citation["version"] == ik.__version__
 
 
-def test_the_core_asks_for_no_second_opinion():
+def test_the_core_is_light():
     names = [line.split(">")[0].split(";")[0] for line in PROJECT["dependencies"]]
-    assert not {"pin", "matplotlib", "pyvista", "polars"} & set(names)
-    assert any(line.startswith("pin>") for line in PROJECT["optional-dependencies"]["reference"])
+    assert not {"pin", "matplotlib", "pyvista", "polars", "scipy", "trimesh"} & set(names)
+    assert len(names) <= 8
+    assert len(PROJECT["optional-dependencies"]) <= 8
+
+
+def test_modules_belong_to_the_extra_that_errors_name():
+    extras = PROJECT["optional-dependencies"]
+    packages = {"collada": "pycollada", "foxglove": "foxglove-sdk", "pinocchio": "pin"}
+    for module, extra in EXTRA_OF_MODULE.items():
+        package = packages.get(module, module).removesuffix("modules")
+        assert any(line.startswith(f"{package}>=") for line in extras[extra]), module
+
+
+CORE_ONLY = """
+import sys
+for name in {modules!r}:
+    sys.modules[name] = None
+from casadi_ik.app.cli.main import main
+code = main(["solve", "cup", "--scene", "table", "--log", {log!r}])
+code = code or main(["log", "info", {log!r}])
+import casadi_ik as ik
+try:
+    ik.load_surface({mesh!r})
+except ik.errors.MissingExtraError as error:
+    print(error)
+sys.exit(code)
+"""
+
+
+def test_the_core_solves_and_logs_without_extras(tmp_path):
+    mesh = tmp_path / "mesh.obj"
+    mesh.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n")
+    modules = [*EXTRA_OF_MODULE, "polars", "joblib", "dask"]
+    modules.remove("ziglang")
+    program = CORE_ONLY.format(modules=modules, log=str(tmp_path / "a.mcap"), mesh=str(mesh))
+    done = python("-c", program)
+    assert done.returncode == 0, done
+    assert "pip install 'casadi-ik[meshes]'" in done.stdout
 
 
 @pytest.mark.parametrize(

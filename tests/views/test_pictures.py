@@ -168,7 +168,7 @@ def test_without_the_extra_the_error_says_what_to_install(missing: str) -> None:
         "except casadi_ik.CasadiIKError as error: print(type(error).__name__, error)"
     )
     done = python("-c", code, check=True)
-    assert done.stdout.startswith(f"MissingExtraError pictures need {missing},")
+    assert done.stdout.startswith(f"MissingExtraError pictures: {missing} ")
     assert "pip install 'casadi-ik[plots]'" in done.stdout
     assert done.stdout.count("\n") == 1
 

@@ -76,7 +76,7 @@ def _out(word: str) -> Path:
     opt.out("OUT", "OUT.npz, OUT.parquet, or a folder for parts (no suffix)", _out),
     Option(
         "--dask ADDRESS",
-        "Dask scheduler, tcp://HOST:8786 (needs 'casadi-ik[cluster]')",
+        "Dask scheduler, tcp://HOST:8786 (needs dask[distributed])",
     ),
     Option("--resume", "write resumable parts; skip parts already done"),
     Option("--part-size N", f"number of targets per part (default: {DEFAULT_PART_SIZE})"),
@@ -115,7 +115,7 @@ def batch(args: Arguments) -> CommandResult:
       reason (k,), nearest_q (k, n) with the smallest contact errors,
       enough_position (k,) [m] and enough_angle (k,) [rad]: the smallest tolerances
       with which the target would be solved
-    OUT.parquet holds the same as a table (needs 'casadi-ik[dataframes]') with a row
+    OUT.parquet holds the same as a table (needs polars) with a row
     per target and a column per motor: q_MOTOR, FINGER_position_error and so on.
     An invalid row (partly NaN, infinite, zero normal) gets the status INVALID and
     NaN. It is reported on stderr, and the other rows are solved.

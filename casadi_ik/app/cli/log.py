@@ -236,9 +236,9 @@ def export(args: Arguments) -> CommandResult:
 
     VIEW.mcap is a file for Foxglove (app.foxglove.dev) and Lichtblick: one solve with
     the robot, its frames, joints, contacts, phases and events at 10 ms per iteration
-    (needs 'casadi-ik[viewer]'). The file VIEW.layout.json next to it is a layout to
+    (needs 'casadi-ik[view]'). The file VIEW.layout.json next to it is a layout to
     import in the viewer.
-    TABLE.parquet or TABLE.csv is a table (needs 'casadi-ik[dataframes]').
+    TABLE.parquet or TABLE.csv is a table (needs polars).
     """
     kind = args.to or FORMAT_OF_SUFFIX.get(args.out.suffix.lower())
     if kind is None:

@@ -76,8 +76,8 @@ def import_robot(args: Arguments) -> CommandResult:
       casadi-ik import my_robot.yaml --picture my_robot.png    after a correction
       casadi-ik solve my_grasp.yaml --robot my_robot.yaml
 
-    Files are URDF, xacro (needs casadi-ik[xacro]) or MJCF (needs casadi-ik[mujoco]); names
-    such as panda_description are looked up by casadi-ik[robot-descriptions].
+    Files are URDF, xacro (needs casadi-ik[robots]) or MJCF (needs casadi-ik[robots]); names
+    such as panda_description are looked up by robot_descriptions.
     The files do not state fingertips, position and normal of pads, thumb, palm and
     home configuration: these are guessed. Each guess is marked in the description,
     and --picture shows them. The description refers to the files. A file with several

@@ -8,13 +8,16 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
-from trimesh import Trimesh
-from trimesh.creation import revolve, torus
-from trimesh.graph import smooth_shade
 
+from casadi_ik.errors import optional_import
 from casadi_ik.files.arrays import Array
 from casadi_ik.integrations.importing.surfaces import Surface, together
 from casadi_ik.model.shapes import capsule_mesh
+
+with optional_import("drawing"):
+    from trimesh import Trimesh
+    from trimesh.creation import revolve, torus
+    from trimesh.graph import smooth_shade
 
 SEGMENTS = 32
 """Number of points around an axis of revolution."""

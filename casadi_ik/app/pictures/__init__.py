@@ -3,18 +3,14 @@
 import warnings
 
 from casadi_ik.app.pictures.backend import import_matplotlib
-from casadi_ik.errors import MissingExtraError
+from casadi_ik.errors import optional_import
 
-try:
+with optional_import("pictures"):
     import_matplotlib()
     with warnings.catch_warnings():
         # PyVista's download library warns in notebooks without widgets.
         warnings.filterwarnings("ignore", "IProgress not found")
         import pyvista as _pyvista  # noqa: F401
-except ImportError as error:
-    raise MissingExtraError(
-        f"pictures need {error.name}, which is not installed: pip install 'casadi-ik[plots]'"
-    ) from error
 
 from casadi_ik.app.pictures.charts import draw_convergence
 from casadi_ik.app.pictures.grasps import draw_alternatives, draw_grasps

@@ -11,19 +11,15 @@ from numpy.typing import ArrayLike
 
 from casadi_ik.app.drawing.drawables import file_meshes
 from casadi_ik.collision.scene import Scene
-from casadi_ik.errors import DescriptionError, InputError, MissingExtraError
+from casadi_ik.errors import DescriptionError, InputError, optional_import
 from casadi_ik.files.reading import read_yaml
 from casadi_ik.kinematics.arm_hand import ArmHand, load_robot
 from casadi_ik.logs.solve import SolveRecord
 from casadi_ik.model.grasp import Grasp
 from casadi_ik.planning.touch.grasps import FoundGrasp
 
-try:
+with optional_import("the viewer"):
     import viser as _  # noqa: F401
-except ImportError as error:
-    raise MissingExtraError(
-        f"the viewer needs {error.name}, which is not installed: pip install 'casadi-ik[view]'"
-    ) from error
 
 from casadi_ik.app.viewer.access import HOST, LOOPBACK, PORT, Server, Viewer, serve
 from casadi_ik.app.viewer.candidates import Candidate, Candidates

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from casadi_ik.errors import DescriptionError, MissingExtraError, UnsupportedError
+from casadi_ik.errors import DescriptionError, UnsupportedError, optional_import
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.input_checks.poses import rotations_from_quaternions
 from casadi_ik.files.limits import LIMITS
@@ -351,10 +351,8 @@ def _load_npy(path: Path) -> Array:
 
 def _read_hdf5(path: Path) -> tuple[Any, Any, Any]:
     """Transforms, success and scale of a file of ACRONYM."""
-    try:
+    with optional_import(f"{path}: HDF5 files"):
         library: Any = importlib.import_module("h5py")
-    except ImportError as error:
-        raise MissingExtraError(f"{path}: HDF5 files need h5py: pip install h5py") from error
     try:
         with library.File(path, "r") as file:
             for name in ("grasps/transforms", "grasps/qualities/flex/object_in_gripper"):

@@ -8,14 +8,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
-from trimesh.remesh import subdivide_to_size
 
 from casadi_ik.collision.solids import sphere_directions
+from casadi_ik.errors import optional_import
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.reading import roll_pitch_yaw
 from casadi_ik.integrations.importing.surfaces import Surface, clusters
 from casadi_ik.model.schema import BoxEntry, CapsuleEntry, ShapeEntry, SphereEntry
+
+with optional_import("shapes of imported links"):
+    from scipy.spatial import KDTree
+    from trimesh.remesh import subdivide_to_size
 
 Rows = NDArray[np.intp]
 

@@ -481,7 +481,7 @@ def file_of(name: str, key: str = "ROBOT") -> Path:
         if error.name == "robot_descriptions":
             raise MissingExtraError(
                 f"{key}: {name!r} is no file; to look for it by name: "
-                "pip install 'casadi-ik[robot-descriptions]'"
+                "pip install robot_descriptions"
             ) from error
         raise InputError(f"{key}: robot_descriptions has no {name!r}") from error
     except Exception as error:  # of git, of the network, of the disk

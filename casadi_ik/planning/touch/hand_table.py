@@ -18,7 +18,7 @@ from casadi_ik.compile.cancellation import SLICE, run_cancellable
 from casadi_ik.compile.codegen import c_struct, define, driver_text
 from casadi_ik.compile.function_kernel import FunctionKernel
 from casadi_ik.compile.graphs import FunctionGraph, recipe
-from casadi_ik.errors import UnsupportedError
+from casadi_ik.errors import UnsupportedError, optional_import
 from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.forward import actuated
@@ -398,7 +398,8 @@ def hand_kernel(robot: RobotDescription) -> FunctionKernel:
 def _sobol(dimensions: int, count: int, seed: int) -> Array:
     """Return Sobol points (count, dimensions) in [0, 1]."""
     power = int(np.ceil(np.log2(max(count, 2))))
-    qmc: Any = import_module("scipy.stats").qmc
+    with optional_import("grasp synthesis"):
+        qmc: Any = import_module("scipy.stats").qmc
     return qmc.Sobol(dimensions, rng=seed).random_base2(power)[:count]
 
 

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.collision.solids import Kind, Solid
 from casadi_ik.compile.cache import trusted_cache, user_temp_dir
-from casadi_ik.errors import InputError, os_errors
+from casadi_ik.errors import InputError, optional_import, os_errors
 from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.files.input_checks.numbers import checked_integer, checked_number
 from casadi_ik.files.writing import atomic_write
@@ -209,7 +209,8 @@ class Surface:
 
 
 def _tree(points: Array) -> Any:
-    return import_module("scipy.spatial").cKDTree(points)
+    with optional_import("grasp synthesis"):
+        return import_module("scipy.spatial").cKDTree(points)
 
 
 class TriangleMesh(Protocol):

@@ -20,6 +20,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from casadi_ik.errors import optional_import
 from casadi_ik.kinematics.contacts import (
     LENGTH,
     POSITION,
@@ -110,7 +111,8 @@ class ProxqpNode(ca.Callback):
 
     def eval(self, arg: Any) -> list[Any]:
         """Solve one program; infeasible equations are replaced by the closest feasible ones."""
-        from proxsuite import proxqp as backend
+        with optional_import('step="proxqp"'):
+            from proxsuite import proxqp as backend
 
         H, g, A, b, lower, upper = (np.array(x) for x in arg)
         program = backend.dense.QP(len(g), len(b), 0, True)

@@ -19,9 +19,8 @@ import casadi as ca
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from scipy.optimize import lsq_linear
 
-from casadi_ik.errors import InputError, UnknownNameError
+from casadi_ik.errors import InputError, UnknownNameError, optional_import
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.reading import Frame, frame_matrix, read_yaml
 from casadi_ik.files.shipped import resolve_description
@@ -30,6 +29,9 @@ from casadi_ik.kinematics.se3 import exp_so3, matrix_to_rpy
 from casadi_ik.model.load_robot import load_description
 from casadi_ik.papers.chandra.calibration.measurements import Measurements
 from casadi_ik.papers.chandra.calibration.model import HandModel, Parameter, tilted
+
+with optional_import("calibration"):
+    from scipy.optimize import lsq_linear
 
 CAUCHY, HUBER = 2.385, 1.345
 """Tuning constants for 95 % efficiency on one normal component (Holland & Welsch 1977)."""
