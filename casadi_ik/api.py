@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from casadi_ik.collision.clearance import Clearances, SceneCheck
 from casadi_ik.collision.scene import Scene, grasped_in
 from casadi_ik.compile.loop import Stepper
-from casadi_ik.errors import InputError
+from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.files.input_checks.poses import checked_pose, single_pose
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.logs import Compression, Keep
@@ -89,11 +89,17 @@ class Solver(MovingSolver):
         Raises:
             UnknownNameError: The method or an option does not exist.
             InputError: An argument has an invalid value.
-            UnsupportedError: The method does not support the robot, or the robot has no shapes.
+            UnsupportedError: The robot has no motors, the method does not support it, or a scene is
+                given and it has no shapes.
             DescriptionError: The scene does not fit the robot.
         """
         if not isinstance(robot, ArmHand):
             raise InputError(f"robot: found {robot!r}, expected what load_robot returns")
+        if not robot.actuators:
+            raise UnsupportedError(
+                f"robot: {robot.name} has no motors; expected one with an arm or a moving hand, such "
+                f"as load_robot('ur5e+{robot.name}')"
+            )
         if limits not in LIMIT_MODES:
             raise InputError(f"limits: found {limits!r}, expected one of {', '.join(LIMIT_MODES)}")
         if scene is not None and not isinstance(scene, Scene):

@@ -290,9 +290,10 @@ def solve(part: Part) -> dict[str, Any]:
 
 
 def robots_of(words: Sequence[str]) -> list[str]:
-    """Names of robots; "pairs" is every shipped arm with every shipped hand, "tour" each once.
+    """Return names of robots.
 
-    "catalogue" is every shipped arm, hand, arm with a hand, and body.
+    "pairs" is every shipped arm with every shipped hand; "tour" is each arm once. "catalogue" is
+    every shipped arm, hand with motors, arm-hand, and body.
     """
     arms, hands = ik.shipped_names("arms"), ik.shipped_names("hands")
     names: list[str] = []
@@ -306,7 +307,8 @@ def robots_of(words: Sequence[str]) -> list[str]:
         elif word == "catalogue":
             bodies = ik.shipped_names("bodies")
             bodies = [f"{body}+leap" if body == "two_ur10e" else body for body in bodies]
-            names += [*ik.shipped_names("arm_hands"), *hands, *arms, *bodies]
+            moving = [hand for hand in hands if load(hand).actuators]
+            names += [*ik.shipped_names("arm_hands"), *moving, *arms, *bodies]
         else:
             names.append(word)
     return list(dict.fromkeys(names))

@@ -138,7 +138,10 @@ def test_a_hand_of_one_joint_says_where_it_is() -> None:
     robot = ik.load_robot("so100_jaw")
     assert robot.joints([0.2]) == {"so100_jaw": 0.2}
     np.testing.assert_array_equal(robot.joints([[0.2], [0.3]])["so100_jaw"], [0.2, 0.3])
-    assert ik.load_robot("tool").joints(np.zeros((2, 0))) == {}
+    tool = ik.load_robot("tool")
+    assert tool.joints(np.zeros((2, 0))) == {}
+    with pytest.raises(ik.errors.UnsupportedError, match="tool has no motors"):
+        ik.Solver(tool)
 
 
 def test_an_arm_alone_is_a_robot_whose_fingertip_is_its_tip(rng: np.random.Generator) -> None:
