@@ -406,9 +406,12 @@ class Cycle:
         squared_residual, clearance_rows = ca.dot(residual, residual), None
         if origin is not None:
             lacking = ca.fmax(p["lacking"], 0.0)
-            weight = CYCLE_TUNING.clearance_weight / LENGTH
+            # Clearances and contacts balance independently of the period: the squared weight of a
+            # row, times the part of the clearance that a cycle restores, is constant.
+            restored_part = 1 - p["momentum"]
+            weight = CYCLE_TUNING.clearance_weight / LENGTH / ca.sqrt(restored_part)
             slopes = -p["slopes"] * ca.repmat(weight * ca.if_else(lacking > 0, 1.0, 0.0), 1, n)
-            restored = weight * (1 - p["momentum"]) * lacking
+            restored = weight * restored_part * lacking
             clearance_rows = slopes @ ca.diag(scales), restored + slopes @ (start - origin)
         residual = residual - error
         pull = ca.sqrt(p["pull"])

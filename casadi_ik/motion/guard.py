@@ -197,7 +197,7 @@ class Guard:
     def _lacking_clearances(self, goal: Array) -> tuple[Array, Array]:
         """Return the lacking clearances (o,) of the nearest pairs at a goal [m], and slopes (o, n).
 
-        Clearance is lacking up to the distance of the nearest pair beyond the list, see guard.c.
+        The lacking clearances are continuous functions of the goal, see `keep_away` of guard.c.
         """
         if (guarding := self._compiled) is not None:
             guarding.goal[...] = goal
@@ -209,6 +209,7 @@ class Guard:
         order = np.argsort(distances[0], kind="stable")
         nearest, omitted = order[:OBSTACLES], order[OBSTACLES : OBSTACLES + 1]
         count, threshold = len(nearest), distances[0, omitted].min(initial=self._avoided)
-        lacking[:count] = np.maximum(threshold - distances[0, nearest], 0.0)
+        share = (threshold - distances[0, nearest]) / (self._avoided - self._required)
+        lacking[:count] = np.maximum(share * (self._avoided - distances[0, nearest]), 0.0)
         slopes[:count] = ((distances[1:, nearest] - distances[0, nearest]) / self.nudge).T
         return lacking, slopes

@@ -208,3 +208,15 @@ def test_a_path_that_is_free_is_followed_as_without_a_scene(robot, solver):
     track = solver.track(moving, q0=path[0])
     assert track.success.all()
     assert track.jumps == ()
+
+
+def test_free_motions_lead_around_a_collision_of_the_followed_postures():
+    """The contacts are those of postures that mostly collide; the robot can hold them otherwise."""
+    robot = ik.load_robot("g1+dex3")
+    solver = ik.Solver(robot, scene=ik.Scene())
+    path = smooth_path(robot, 1, 1500, 1e-3, 0.3)
+    path = robot.home + 0.4 * (path - path[0])
+    follower = solver.follow(path[0], 1e-3)
+    for points, normals in zip(*robot.contacts(path), strict=True):
+        follower(points, normals)
+        assert follower.state.status is ik.motion.FollowStatus.FOLLOWING

@@ -126,9 +126,10 @@ static void insert_nearest(scalar *distances, int64_t *nearest, int64_t pair, sc
   nearest[k] = pair;
 }
 
-/* Computes the lacking clearances of the nearest pairs at the goal and their gradients. Clearance is
- * lacking up to the distance of the nearest pair beyond the list: a pair that enters the list or
- * leaves it lacks nothing there, so the lacking clearances are continuous functions of the goal. */
+/* Computes the lacking clearances of the nearest pairs at the goal and their gradients. A pair lacks
+ * the part of its distance below `avoided_distance`, multiplied by how much nearer it is than the
+ * nearest pair beyond the list, relative to the width of the avoided zone. A pair that enters the list
+ * or leaves it therefore lacks nothing: the lacking clearances are continuous functions of the goal. */
 LANES_TARGET DRIVER(keep_away, guard_job) {
   const clearance_job *scene = job->scene;
   nearby_pairs *pairs = job->near_goal;
@@ -148,7 +149,10 @@ LANES_TARGET DRIVER(keep_away, guard_job) {
       insert_nearest(distances, nearest, pairs->candidates[i], lanes_at(distance, 0));
     }
   }
-  for (i = 0; i < count; ++i) job->lacking[i] = distances[count] - distances[i];
+  for (i = 0; i < count; ++i) {
+    const scalar zone = job->avoided_distance - job->required_distance;
+    job->lacking[i] = (distances[count] - distances[i]) / zone * (job->avoided_distance - distances[i]);
+  }
   for (i = 0; i < count && job->lacking[i] > 0; ++i) {
     memset(job->slopes + i * N_Q, 0, N_Q * sizeof(scalar));
   }
