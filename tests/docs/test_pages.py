@@ -263,8 +263,38 @@ def test_the_readme_is_short_and_says_what_is_so(folder: Path) -> None:
     cells = [c for line in text.splitlines() if line.startswith("|") for c in line.split("|")]
     assert max(len(cell.split()) for cell in cells) <= 20
     assert ", ".join(f"{name} {label(mean)}" for name, mean in means().items()) in text
-    kernels = importlib.import_module("build_kernels")
-    assert ", ".join(kernels.ROBOTS) in " ".join(text.split())
+
+
+LINK = re.compile(r"\]\(([^)#]+)(?:#[^)]*)?\)|(?:src|srcset)=\"([^\"]+)\"")
+"""Targets of links and of pictures."""
+
+PUBLISHED = {
+    "https://casadi-ik.github.io/casadi_ik/": ".md",
+    "https://raw.githubusercontent.com/casadi-ik/casadi_ik/main/": "",
+    "https://github.com/casadi-ik/casadi_ik/blob/main/": "",
+}
+"""Addresses of the site and of files, and the extension of their sources."""
+
+
+def test_links_of_the_readme_are_absolute_and_name_files_of_the_repository() -> None:
+    """Package indexes show the README without the files beside it."""
+    targets = [a or b for a, b in LINK.findall(PAGES[0].read_text(encoding="utf-8"))]
+    assert len(targets) > 20
+    for target in targets:
+        base = next(base for base in PUBLISHED if target.startswith(base))
+        path = target.removeprefix(base)
+        if PUBLISHED[base]:
+            path = path.replace(".html", PUBLISHED[base])
+        assert (ROOT / path).is_file(), target
+
+
+def test_pages_install_no_unpublished_package() -> None:
+    """Packages of this project are installed from a checkout until they are published."""
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        assert not re.search(r"(pip install|uv add|conda install) casadi-ik(-kernels)?\b", text), (
+            page
+        )
 
 
 def test_every_public_name_is_on_a_page_of_the_reference() -> None:
