@@ -9,6 +9,16 @@ import textwrap
 from pathlib import Path
 from typing import Any
 
+import pytest
+
+POSIX = pytest.mark.skipif(os.name != "posix", reason="needs signals or devices of POSIX")
+"""Mark of tests that send signals, limit resources or open devices."""
+
+NOT_ROOT = pytest.mark.skipif(
+    os.name != "posix" or os.geteuid() == 0, reason="needs permissions of POSIX that apply"
+)
+"""Mark of tests of files that may not be read or written."""
+
 ROOT = Path(__file__).parents[1]
 
 

@@ -17,6 +17,7 @@ import polars as pl
 import pytest
 from commands import main
 from dask_processes import scheduler_process, worker_process
+from processes import POSIX
 
 import casadi_ik as ik
 
@@ -78,6 +79,7 @@ def wait_for_parts(folder: Path, least: int, process: subprocess.Popen[str]) -> 
     raise AssertionError(f"{folder}: fewer than {least} parts")
 
 
+@POSIX
 def test_killed_and_taken_up_again(targets: Path, whole: dict[str, np.ndarray], tmp_path: Path):
     """The client is killed; what it had finished is kept as it is, and the rest is done."""
     out, folder = tmp_path / "out.npz", tmp_path / "out.npz.parts"
@@ -106,6 +108,7 @@ def test_killed_and_taken_up_again(targets: Path, whole: dict[str, np.ndarray], 
     assert len(log.solves()) == COUNT - 1
 
 
+@POSIX
 def test_terminated(targets: Path, tmp_path: Path):
     """SIGTERM to the client alone: the finished parts stay, its workers do not."""
     out = tmp_path / "out"
@@ -140,6 +143,7 @@ def cluster() -> Iterator[tuple[str, subprocess.Popen[str], list[subprocess.Pope
         yield address, scheduler, workers
 
 
+@POSIX
 def test_a_cluster_that_loses_a_worker_then_its_scheduler(
     cluster, targets: Path, whole: dict[str, np.ndarray], tmp_path: Path
 ):
@@ -279,6 +283,7 @@ def test_answers_are_an_npz_a_table_or_a_folder(targets: Path, tmp_path: Path, c
     np.testing.assert_array_equal(pl.read_parquet(out)["success"], whole["success"])
 
 
+@POSIX
 @pytest.mark.parametrize("wait_for", ["out.npz.parts", "out.npz.parts/part-*.npz"])
 def test_terminated_leaves_nothing_half_written(
     targets: Path, tmp_path: Path, wait_for: str

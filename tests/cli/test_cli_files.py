@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import resource
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +10,7 @@ import numpy as np
 import polars as pl
 import pytest
 from command_line import FAST, Command
+from processes import NOT_ROOT, POSIX
 from torch_zip import write_torch
 
 import casadi_ik as ik
@@ -56,7 +55,7 @@ def test_unwritable(
 
 
 @pytest.mark.usefixtures("unsolved")
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+@NOT_ROOT
 @pytest.mark.parametrize("option", ["--out", "--log", "--picture"])
 def test_read_only(option: str, run: Command, grasp_file: GraspFile, tmp_path: Path) -> None:
     suffix = ".png" if option == "--picture" else ".json"
@@ -67,6 +66,7 @@ def test_read_only(option: str, run: Command, grasp_file: GraspFile, tmp_path: P
         assert reason in run("solve", grasp_file(), *FAST, option, path).error
 
 
+@POSIX
 @pytest.mark.usefixtures("unsolved")
 def test_special_files_are_left_alone(run: Command, grasp_file: GraspFile) -> None:
     error = run("solve", grasp_file(), *FAST, "--out", "/dev/null").error
@@ -90,9 +90,12 @@ def test_outputs_do_not_overwrite_each_other_or_the_input(
 
 
 def _at_most(size: int) -> Callable[[], None]:
+    import resource
+
     return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
 
 
+@POSIX
 @pytest.mark.parametrize("size", [4_000, 16_000])
 def test_disk_full_on_the_log(
     size: int, run: Command, run_process: Command, grasp_file: GraspFile, tmp_path: Path
@@ -105,6 +108,7 @@ def test_disk_full_on_the_log(
     assert [item.name for item in tmp_path.iterdir()] == [grasp.name]
 
 
+@POSIX
 def test_disk_full_on_the_output(
     run: Command, run_process: Command, target_file: TargetFile, tmp_path: Path
 ) -> None:

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import FAST, Command, Run
+from processes import POSIX
 
 import casadi_ik as ik
 
@@ -133,6 +134,7 @@ def test_console_script() -> None:
     assert done.stdout.startswith("casadi-ik ")
 
 
+@POSIX
 def test_reader_goes_away() -> None:
     reading, writing = os.pipe()
     os.close(reading)
@@ -159,6 +161,7 @@ def test_poor_terminal(run_process: Command) -> None:
     assert done.out.isascii()
 
 
+@POSIX
 def test_ctrl_c_while_modules_are_imported() -> None:
     """Without waiting for the right moment: whoever imports CasADi sends the signal."""
     code = """if True:
@@ -176,6 +179,7 @@ def test_ctrl_c_while_modules_are_imported() -> None:
     assert done.stderr == "casadi-ik: error: interrupted\n"
 
 
+@POSIX
 @pytest.mark.parametrize(
     ("jobs", "finished", "signals"),
     [
@@ -250,6 +254,7 @@ def wait_for(folder: Path, finished: bool) -> bool:
     return False
 
 
+@POSIX
 def test_a_killed_batch(run: Command, tmp_path: Path) -> None:
     """It leaves no result; what it leaves is removed by a later one that finds it old."""
     robot = ik.load_robot(ROBOT)

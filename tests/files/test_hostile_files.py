@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from processes import POSIX
 
 import casadi_ik as ik
 from casadi_ik import model as grasps
@@ -153,6 +154,7 @@ def test_hostile_npz(tmp_path: Path, shape: tuple[int, ...], size: int, says: st
         TargetFile(path, 3).check(64)
 
 
+@POSIX
 def test_an_endless_file() -> None:
     with pytest.raises(ik.errors.InputError, match="not a regular file"):
         TargetFile(Path("/dev/zero"), 3).check(64)

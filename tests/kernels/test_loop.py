@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 import casadi as ca
 import numpy as np
 import pytest
-from processes import python
+from processes import POSIX, python
 
 import casadi_ik as ik
 from casadi_ik.compile import (
@@ -286,6 +286,7 @@ def test_pauses_change_nothing(monkeypatch):
     assert_same(kernel.run(states, parameters, 300, trace=True), whole)
 
 
+@POSIX
 @needs_compiler
 def test_keyboard_interrupt_reaches_a_compiled_loop():
     script = """

@@ -29,6 +29,7 @@ from mcap.reader import make_reader
 from mcap.records import Chunk, DataEnd, Footer, Header, MessageIndex
 from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+from processes import NOT_ROOT, POSIX
 
 from casadi_ik import errors, logs
 
@@ -88,7 +89,7 @@ def test_a_cut_log(whole: Path, seed: int, caplog: pytest.LogCaptureFixture) -> 
     assert log.attachment("robot.urdf") == urdf
 
 
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
+@POSIX
 @pytest.mark.parametrize("after", [0.0, 0.05, 0.2])
 def test_a_killed_writer(tmp_path: Path, after: float) -> None:
     """All but the chunk being filled and the one being written is there."""
@@ -244,7 +245,7 @@ def test_what_is_no_log(tmp_path: Path) -> None:
     assert (tmp_path / "text").read_bytes() == files["text"]
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+@NOT_ROOT
 def test_a_read_only_log(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     many_chunks(path, CompressionType.NONE)

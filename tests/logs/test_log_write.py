@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from made_up_solves import LABELS, T0, Field, Layout, TraceFormat, changed, make_block
+from processes import POSIX
 
 from casadi_ik import errors, logs
 
@@ -79,6 +80,7 @@ def test_disk_full_at_the_very_end(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     )
 
 
+@POSIX
 def test_paths_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").write_text("")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import tomllib
 from pathlib import Path
 
@@ -97,3 +98,23 @@ def test_the_recipe_has_the_dependencies_of_the_core():
     bounds = sorted(line.rpartition(" ")[2] for line in run if not line.startswith("python >"))
     assert bounds == sorted(">=" + line.split(">=")[1] for line in PROJECT["dependencies"])
     assert recipe["context"]["version"] == ik.__version__
+
+
+POSIX_MODULES = {"fcntl", "grp", "pty", "pwd", "resource", "termios"}
+POSIX_CALLS = {"chown", "fork", "geteuid", "getuid", "killpg", "mkfifo", "SIGKILL"}
+
+
+@pytest.mark.parametrize("folder", ["casadi_ik", "tests", "studies", "tools"])
+def test_modules_can_be_imported_on_windows(folder):
+    """Code outside functions imports and calls only what every platform has."""
+    for path in (ROOT / folder).rglob("*.py"):
+        pending = list(ast.parse(path.read_text(encoding="utf-8")).body)
+        for node in pending:
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda | ast.Try):
+                continue
+            if isinstance(node, ast.BoolOp):  # `os.name != "posix" or os.geteuid() == 0`
+                continue
+            names = {alias.name for alias in getattr(node, "names", ())}
+            assert not isinstance(node, ast.Import) or not names & POSIX_MODULES, path
+            assert not isinstance(node, ast.Attribute) or node.attr not in POSIX_CALLS, path
+            pending += ast.iter_child_nodes(node)

@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from processes import python
+from processes import POSIX, python
 
 import casadi_ik as ik
 from casadi_ik.compile.cancellation import CancelledError, stop_if_cancelled
@@ -36,6 +36,7 @@ SCRIPT = """
 """
 
 
+@POSIX
 @pytest.mark.parametrize(
     ("method", "count", "diagnose", "compiled"),
     [
@@ -59,6 +60,7 @@ def test_threads_stop(method: str, count: int, diagnose: bool, compiled: bool) -
     assert threads == "1"
 
 
+@POSIX
 def test_a_stream_has_handed_over_what_is_finished(robot) -> None:
     points, normals = robot.contacts(robot.random(np.random.default_rng(0), 30))
     solver = ik.Solver(robot)

@@ -19,7 +19,7 @@ import pytest
 import small_study
 from dask_processes import scheduler_process, worker_process
 from distributed.versions import get_versions
-from processes import python
+from processes import POSIX, python
 from runner.report import interval_text, mean_metric, median_metric, rate_metric
 from runner.study import STUDY_FILE, claim, missing, read_results, run
 
@@ -114,6 +114,7 @@ def test_a_worker_with_another_version_is_named(monkeypatch):
         batches._check_workers(Client(), "tcp://here:1", batches.REQUIRED_PACKAGES)  # type: ignore[arg-type]
 
 
+@POSIX
 def test_killed_at_random_moments_nothing_is_lost_or_doubled(done, tmp_path):
     """Two workers and their parent are killed again and again until the study is through."""
     rng = random.Random(3)

@@ -1,7 +1,6 @@
 """Meshes that are double-sided, fine, of many pieces, or of very unequal triangles."""
 
 import re
-import resource
 import sys
 
 import numpy as np
@@ -62,6 +61,8 @@ def test_bodies_that_touch_are_not_double_sided(tmp_path):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="memory is limited by RLIMIT_AS")
 def test_fine_meshes_need_little_memory(tmp_path, solver):
+    import resource
+
     path = saved(tmp_path, trimesh.creation.icosphere(6, 0.034))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     surface = ik.load_surface(path)
