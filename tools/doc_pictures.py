@@ -1,9 +1,9 @@
-"""Pictures of the documentation that no single command makes.
+"""Draw the pictures of the documentation that no single command draws.
 
-A scene's post passed and not; eight arm-hands in a row; a grasp that no posture meets; a humanoid
-that holds a box::
+    python tools/doc_pictures.py --out docs --only contacts scene pairs unreachable humanoid
 
-    python tools/doc_pictures.py --out docs --only scene pairs unreachable humanoid
+The pictures show the frames of a contact, an obstacle with and without a scene, eight arm-hands, an
+unreachable grasp, and a humanoid that holds a box.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from casadi_ik.app.drawing.drawables import (
     scene_drawables,
     target_marks,
 )
-from casadi_ik.app.drawing.surfaces import ball
+from casadi_ik.app.drawing.surfaces import arrow, ball
 from casadi_ik.app.pictures.charts import new_figure, save_picture
 from casadi_ik.app.pictures.scene3d import Image, Scene3D, composite, corner_points
 from casadi_ik.collision.clearance import closest_points
@@ -61,30 +61,106 @@ def shot(
     scene: ik.Scene | None = None,
     pair: tuple[str, str] | None = None,
 ) -> Image:
-    """A robot with what it grasps and what stands about it, on white."""
-    body = bodies_at(robot, q)
-    thing = None if grasp is None else object_drawable(grasp.object)
-    pose = None if grasp is None else grasp.known_pose
-    things = [] if thing is None or pose is None else [thing.transformed(pose)]
+    """Return an image of a robot with its object, obstacles and the nearest pair, on white."""
+    links, objects = bodies_at(robot, q), placed_object(grasp)
+    obstacles = [] if scene is None else scene_drawables(scene, "table")
     with closing(Scene3D()) as stage:
-        stage.add("robot", body)
-        stage.add("object", things, 0.6)
+        stage.add("robot", links)
+        stage.add("object", objects, 0.6)
         if grasp is not None:
-            marks = [one for c in grasp.contacts.values() for one in target_marks(c, c.point)]
-            stage.add("object marks", marks)
-        around = [] if scene is None else scene_drawables(scene, "table")
-        stage.add("scene", around)
+            stage.add("object marks", contact_targets(grasp))
+        stage.add("scene", obstacles)
         if scene is not None and pair is not None:
-            found = closest_points(robot, q, scene, pair)
-            if found is not None:
-                stage.add("touching", clearance_marks(found, show_shapes=True), 0.6)
-        stage.add_floor(ground_height(robot, scene), body + things + around)
-        stage.aim(view, corner_points(body + things + around), pixels, (0.03, 0.03))
+            closest = closest_points(robot, q, scene, pair)
+            if closest is not None:
+                stage.add("nearest pair", clearance_marks(closest, show_shapes=True), 0.6)
+        stage.add_floor(ground_height(robot, scene), links + objects + obstacles)
+        stage.aim(view, corner_points(links + objects + obstacles), pixels, (0.03, 0.03))
         return np.clip(composite(1.0, stage.render()), 0.0, 1.0)
 
 
+def placed_object(grasp: ik.Grasp | None) -> list[Drawable]:
+    """Return the drawable of the object of a grasp at its pose; none if either is unknown."""
+    drawable = None if grasp is None else object_drawable(grasp.object)
+    pose = None if grasp is None else grasp.known_pose
+    return [] if drawable is None or pose is None else [drawable.transformed(pose)]
+
+
+def contact_targets(grasp: ik.Grasp) -> list[Drawable]:
+    """Return the marks of all contacts of a grasp."""
+    contacts = grasp.contacts.values()
+    return [mark for contact in contacts for mark in target_marks(contact, contact.point)]
+
+
+def axes_of(name: str, pose: Array, length: float) -> list[Drawable]:
+    """Return the x, y and z axes (red, green, blue) of a frame (4, 4)."""
+    colors = ("#d62f3c", "#1f9d55", "#2f6db3")
+    return [
+        Drawable(f"{name} {i}", arrow(pose[:3, 3], pose[:3, i], length, 0.11 * length), color)
+        for i, color in enumerate(colors)
+    ]
+
+
+def contacts(path: Path) -> None:
+    """Draw the base frame, the palm frame and the contacts of a grasp, with labels."""
+    robot, grasp = ik.load_robot("kuka_lwr_barrett"), ik.load_grasp("cup")
+    q = ik.Solver(robot).solve(grasp).q
+    links, objects = bodies_at(robot, q), placed_object(grasp)
+    palm, flange = robot.palm(q), robot.links(q)["lwr_flange"]
+    points, normals = robot.contacts(q)
+    view = close_view(robot, q)
+    hand = [link for link in links if link.role != "arm"]
+    panes = (
+        (
+            overview(palm[:3, 3], view),
+            links,
+            axes_of("base", np.eye(4), 0.28),
+            (0.0, 0.0, 0.36, 1.0),
+            (420, 580),
+            [
+                ("base frame", np.zeros(3), (24, -46)),
+                ("arm", robot.links(q)["lwr_link_3"][:3, 3], (-60, 40)),
+                ("hand", palm[:3, 3], (-30, 50)),
+            ],
+        ),
+        (
+            view,
+            hand,
+            axes_of("palm", palm, 0.045),
+            (0.36, 0.0, 0.64, 1.0),
+            (740, 580),
+            [
+                ("flange of the arm", flange[:3, 3], (90, 40)),
+                ("palm frame", palm[:3, 3], (-190, 60)),
+                ("pad", points[1], (105, 60)),
+                ("contact point", points[0], (-150, -50)),
+                ("normal, into the object", points[0] + 0.025 * normals[0], (-60, -100)),
+            ],
+        ),
+    )
+    figure = new_figure(10.4, 5.2, dpi=110)
+    for camera, shown, axes_drawn, box, pixels, labels in panes:
+        with closing(Scene3D()) as stage:
+            stage.add("robot", shown, 0.8 if shown is hand else 1.0)
+            stage.add("object", objects, 0.5)
+            stage.add("object marks", contact_targets(grasp))
+            stage.add("frame", axes_drawn)
+            stage.aim(camera, corner_points(shown + objects + axes_drawn), pixels, (0.10, 0.14))
+            image = np.clip(composite(1.0, stage.render()), 0.0, 1.0)
+            ends = stage.project(np.array([point for _, point, _ in labels]))
+        axes = figure.add_axes(box)
+        axes.set_axis_off()
+        axes.imshow(image)
+        for (text, _, offset), end in zip(labels, ends, strict=True):
+            axes.annotate(
+                text, end, offset, xycoords="data", textcoords="offset points", size=13,
+                color=palette.INK, arrowprops={"arrowstyle": "-", "color": palette.FAINT},
+            )  # fmt: skip
+    save_picture(figure, path)
+
+
 def panels(images: list[Image], titles: list[str], size: tuple[float, float]) -> Figure:
-    """Images in a row, each with a title below."""
+    """Return a figure with images in a row, each with a title below."""
     figure = new_figure(*size, dpi=100)
     for i, (image, title) in enumerate(zip(images, titles, strict=True)):
         axes = figure.add_axes((i / len(images), 0.1, 1 / len(images), 0.9))
@@ -96,30 +172,31 @@ def panels(images: list[Image], titles: list[str], size: tuple[float, float]) ->
 
 
 def scene(path: Path) -> None:
-    """A post that the arm passes through, and that it goes around."""
+    """Draw an obstacle that the arm passes through without a scene, and avoids with it."""
     robot, grasp = ik.load_robot("kuka_lwr_barrett"), ik.load_grasp("cup")
-    free = ik.Solver(robot).solve(grasp)
-    # Where the forearm is without it.
-    elbow, wrist = (robot.links(free.q)[f"lwr_link_{i}"][:3, 3] for i in (4, 6))
-    middle = 0.6 * elbow + 0.4 * wrist
-    post = POST["post"] | {"xyz": [*middle[:2].tolist(), 0.5]}
-    about = ik.Scene(POST | {"post": post}, margin=0.02, name="post")
-    kept = ik.Solver(robot, scene=about).solve(grasp)
-    print("scene", free.status.name, kept.status.name, f"{1e3 * (kept.clearance or 0):.0f} mm")
-    toward = float(np.arctan2(middle[1], middle[0]))
-    view = (toward + np.deg2rad(100.0), float(np.deg2rad(38.0)))
-    clear = ik.Solver(robot, scene=about).check(free.q, grasp)
-    hit = None if clear is None else clear.pair(0)
+    without = ik.Solver(robot).solve(grasp)
+    # The post stands in the forearm of the solution without a scene.
+    elbow, wrist = (robot.links(without.q)[f"lwr_link_{i}"][:3, 3] for i in (4, 6))
+    forearm = 0.6 * elbow + 0.4 * wrist
+    post = POST["post"] | {"xyz": [*forearm[:2].tolist(), 0.5]}
+    obstacles = ik.Scene(POST | {"post": post}, margin=0.02, name="post")
+    with_scene = ik.Solver(robot, scene=obstacles).solve(grasp)
+    clearance = f"{1e3 * (with_scene.clearance or 0):.0f} mm"
+    print("scene", without.status.name, with_scene.status.name, clearance)
+    azimuth = float(np.arctan2(forearm[1], forearm[0]) + np.deg2rad(100.0))
+    view = (azimuth, float(np.deg2rad(38.0)))
+    check = ik.Solver(robot, scene=obstacles).check(without.q, grasp)
+    colliding = None if check is None else check.pair(0)
     images = [
-        shot(robot, free.q, view, (460, 480), grasp, about, hit),
-        shot(robot, kept.q, view, (460, 480), grasp, about),
+        shot(robot, without.q, view, (460, 480), grasp, obstacles, colliding),
+        shot(robot, with_scene.q, view, (460, 480), grasp, obstacles),
     ]
     titles = ["without the scene: the arm is in the post", "with the scene: it goes around"]
     save_picture(panels(images, titles, (9.2, 5.3)), path)
 
 
 def pairs(path: Path) -> None:
-    """Eight arm-hands at home."""
+    """Draw eight arm-hands at home."""
     images, titles = [], []
     for name, title in PAIRS:
         robot = ik.load_robot(name)
@@ -131,13 +208,13 @@ def pairs(path: Path) -> None:
 
 
 def unreachable(path: Path) -> None:
-    """A grasp that no posture meets: how far the wrist can be, the nearest posture, the reason."""
+    """Draw an unreachable grasp: the reach of the wrist, the nearest configuration, the reason."""
     robot, grasp = ik.load_robot("kuka_lwr_barrett"), ik.load_grasp("cup")
     pose = grasp.known_pose
     assert pose is not None
-    away = pose.copy()
-    away[:3, 3] += [-0.35, 0.05, 0.05]
-    far = grasp.in_object_frame().at(away)
+    far_pose = pose.copy()
+    far_pose[:3, 3] += [-0.35, 0.05, 0.05]
+    far = grasp.in_object_frame().at(far_pose)
     solution = ik.Solver(robot).solve(far)
     assert solution.diagnosis is not None
     q, lines = solution.diagnosis.q, solution.diagnosis.lines
@@ -145,30 +222,26 @@ def unreachable(path: Path) -> None:
     links = robot.links(q)
     shoulder, elbow, wrist = (links[f"lwr_link_{i}"][:3, 3] for i in (2, 4, 6))
     reach = float(np.linalg.norm(elbow - shoulder) + np.linalg.norm(wrist - elbow))
-    body = bodies_at(robot, q)
-    thing = object_drawable(far.object)
-    assert thing is not None
-    things = [thing.transformed(away)]
-    marks = [one for c in far.contacts.values() for one in target_marks(c, c.point)]
-    view, pixels = overview(away[:3, 3], close_view(robot, q)), (1000, 520)
+    bodies, objects = bodies_at(robot, q), placed_object(far)
+    view, pixels = overview(far_pose[:3, 3], close_view(robot, q)), (1000, 520)
     shell = [Drawable("reach", ball(reach, shoulder), palette.MISSED)]
     with closing(Scene3D()) as stage:
-        stage.add("robot", body)
-        stage.add("object", things, 0.6)
-        stage.add("marks", marks)
+        stage.add("robot", bodies)
+        stage.add("object", objects, 0.6)
+        stage.add("marks", contact_targets(far))
         stage.add("reach", shell, 0.10)
-        stage.add_floor(0.0, body + things)
-        stage.aim(view, corner_points(body + things), pixels, (0.12, 0.06))
+        stage.add_floor(0.0, bodies + objects)
+        stage.aim(view, corner_points(bodies + objects), pixels, (0.12, 0.06))
         image = np.clip(composite(1.0, stage.render()), 0.0, 1.0)
-        ends = stage.project(np.array([wrist, away[:3, 3]]))
+        ends = stage.project(np.array([wrist, far_pose[:3, 3]]))
     figure = new_figure(10.0, 6.4, dpi=100)
     axes = figure.add_axes((0.0, 0.0, 1.0, 0.82))
     axes.set_axis_off()
     axes.imshow(image)
     note = {"xycoords": "data", "textcoords": "offset points", "size": 10, "color": palette.INK}
     line = {"arrowstyle": "-", "color": palette.FAINT, "lw": 0.8}
-    axes.annotate("as far as the wrist gets", ends[0], (-40, -70), arrowprops=line, **note)
-    axes.annotate("where the cup is", ends[1], (-30, 60), arrowprops=line, **note)
+    axes.annotate("reach of the wrist", ends[0], (-40, -70), arrowprops=line, **note)
+    axes.annotate("cup", ends[1], (-30, 60), arrowprops=line, **note)
     figure.text(
         0.02, 0.955, "UNREACHABLE", size=16, weight="bold", color=palette.MISSED, va="center"
     )
@@ -178,37 +251,45 @@ def unreachable(path: Path) -> None:
 
 
 def humanoid(path: Path) -> None:
-    """A G1 that holds a box, wherever both hands reach it; contacts as in notebook 10."""
+    """Draw a G1 that holds a box at any pose that both hands reach; contacts as in notebook 10."""
     robot, size = ik.load_robot("g1+dex3"), np.array([0.07, 0.40, 0.04])
     contacts: dict[str, ik.Contact] = {}
     for side, y in (("left", 1), ("right", -1)):
         contacts[f"{side}_thumb"] = ik.Contact([0, 0.14 * y, size[2] / 2], [0, 0, -1])
         contacts[f"{side}_middle"] = ik.Contact([0, 0.16 * y, -size[2] / 2], [0, 0, 1])
         contacts[f"{side}_index"] = ik.Contact([0, 0.12 * y, -size[2] / 2], [0, 0, 1])
-    about = ik.Scene({"box": {"kind": "box", "size": size.tolist()}})
+    obstacles = ik.Scene({"box": {"kind": "box", "size": size.tolist()}})
     free = ik.Free((0.28, -0.02, 0.08, 0, 0, 0), (0.42, 0.02, 0.25, 0, 0, 0))
-    solver = ik.Solver(robot, scene=about)
-    held = solver.solve(ik.Grasp(contacts, object="box", object_pose=free))
-    pose = held.object_pose
-    assert held.success
+    solver = ik.Solver(robot, scene=obstacles)
+    solution = solver.solve(ik.Grasp(contacts, object="box", object_pose=free))
+    pose = solution.object_pose
+    assert solution.success
     assert pose is not None
     grasp = ik.Grasp(contacts, object="box", object_pose=np.eye(4)).at(pose)
     views = [(float(np.deg2rad(angle)), float(np.deg2rad(14.0))) for angle in (38.0, -52.0)]
-    there = about.moved("box", pose)
-    images = [shot(robot, held.q, view, (460, 560), grasp, there) for view in views]
+    placed = obstacles.moved("box", pose)
+    images = [shot(robot, solution.q, view, (460, 560), grasp, placed) for view in views]
     save_picture(panels(images, ["from the left", "from the right"], (9.2, 5.6)), path)
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Draw what is asked for."""
-    every = {"scene": scene, "pairs": pairs, "unreachable": unreachable, "humanoid": humanoid}
+    """Draw the pictures that the command line names."""
+    pictures = {
+        "contacts": contacts,
+        "scene": scene,
+        "pairs": pairs,
+        "unreachable": unreachable,
+        "humanoid": humanoid,
+    }
     parser = argparse.ArgumentParser(description="Pictures of the documentation.")
-    parser.add_argument("--out", type=Path, default=Path("docs"), help="folder")
-    parser.add_argument("--only", nargs="*", default=tuple(every), choices=every, help="which")
+    parser.add_argument("--out", type=Path, default=Path("docs"), help="output folder")
+    parser.add_argument(
+        "--only", nargs="*", default=tuple(pictures), choices=pictures, help="names of pictures"
+    )
     options = parser.parse_args(arguments)
     for name in options.only:
         file = options.out / f"{name}.png"
-        every[name](file)
+        pictures[name](file)
         print(file, file.stat().st_size)
 
 

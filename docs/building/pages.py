@@ -1,13 +1,14 @@
-"""Parts of pages that are made from the package: `<!-- here: NAME ARGUMENTS -->` in a page.
+"""Parts of pages that are generated from the package: `<!-- here: NAME ARGUMENTS -->`.
 
-On a line of its own such a comment is replaced by the Markdown that the function of that name
-makes of the arguments. In the repository the page reads on without it.
+A line with such a comment is replaced by the Markdown that the function of that name returns for
+the arguments.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 from sphinx.application import Sphinx
@@ -23,22 +24,9 @@ from building.api import (
 )
 from building.commands import command_line
 from building.files import file_reference, quantities
-from building.results import results_table, retitled
 
 HERE = re.compile(r"^<!-- here: ([a-z-]+) ?(.*?) ?-->$", re.MULTILINE)
 ROOT = Path(__file__).parents[2]
-
-
-def _other_pages(*known: str) -> str:
-    """The pages in docs/ that no list of pages names."""
-    lists = ("index.md", "extending.md", "community.md")
-    text = "\n".join((ROOT / "docs" / name).read_text(encoding="utf-8") for name in lists)
-    named = set(re.findall(r"^(?:.*<)?(?:/docs/)?([a-z_0-9/]+)>?$", text, re.MULTILINE))
-    pages = sorted(path.stem for path in (ROOT / "docs").glob("*.md"))
-    others = [name for name in pages if name not in {"index", *named, *known}]
-    if not others:
-        return ""
-    return "\n".join(["```{toctree}", ":hidden:", ":caption: More", "", *others, "```"])
 
 
 PARTS: dict[str, Callable[..., str]] = {
@@ -47,9 +35,13 @@ PARTS: dict[str, Callable[..., str]] = {
     "command-line": command_line,
     "files": file_reference,
     "quantities": quantities,
-    "other-pages": _other_pages,
-    "results": results_table,
 }
+
+
+@cache
+def _listed_reports() -> str:
+    """Return the page of reports; the reports that it does not list are not in the menu."""
+    return (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
 
 
 def _expand(app: Sphinx, docname: str, source: list[str]) -> None:
@@ -58,17 +50,19 @@ def _expand(app: Sphinx, docname: str, source: list[str]) -> None:
     def part(match: re.Match[str]) -> str:
         name, arguments = match[1], match[2].split()
         if name not in PARTS:
-            raise ExtensionError(f"{docname}: found <!-- here: {name} -->, known: {list(PARTS)}")
+            raise ExtensionError(
+                f"{docname}: {name!r} is not a part; expected one of {list(PARTS)}"
+            )
         return PARTS[name](*arguments)
 
     if docname.startswith("docs/"):
         source[0] = HERE.sub(part, source[0])
-    elif docname.startswith("studies/results/"):
-        source[0] = retitled(docname, source[0])
+    elif docname.startswith("studies/results/") and f"\n/{docname}\n" not in _listed_reports():
+        source[0] = f"---\norphan: true\n---\n\n{source[0]}"
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Tell Sphinx of it."""
+    """Register the extension."""
     app.connect("builder-inited", write_pages)
     app.connect("source-read", _expand)
     app.connect("autodoc-process-docstring", readable, priority=900)

@@ -215,7 +215,7 @@ def choose(args: Arguments) -> CommandResult:
       a pt file of multidex; --of selects one of its objects
       a table (.csv, .npz, .parquet) with the palm pose in columns x y z and qw qx
         qy qz or roll pitch yaw, and the joint positions of the hand by name
-    No code in a file is executed. docs/choosing.md describes the formats.
+    No code in a file is executed. docs/datasets.md describes the formats.
 
     Palm poses and hand postures of a file are kept, and only the arm is solved.
     With --take contacts only the fingertips are kept; if --object names an object,
