@@ -97,8 +97,8 @@ class Solver(MovingSolver):
             raise InputError(f"robot: found {robot!r}, expected what load_robot returns")
         if not robot.actuators:
             raise UnsupportedError(
-                f"robot: {robot.name} has no motors; expected one with an arm or a moving hand, such "
-                f"as load_robot('ur5e+{robot.name}')"
+                f"robot: {robot.name} has no motors; expected one with motors, such as "
+                f"load_robot('ur5e+{robot.name}')"
             )
         if limits not in LIMIT_MODES:
             raise InputError(f"limits: found {limits!r}, expected one of {', '.join(LIMIT_MODES)}")
