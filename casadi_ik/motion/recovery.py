@@ -49,8 +49,12 @@ RESOLUTION = 0.02
 CHECKS = 8
 """Number of postures of a line that are checked in a cycle."""
 
-ATTEMPTS = 40
+MAX_LINES = 40
 """Maximum number of lines of one return."""
+
+MAX_STOPS = 2
+"""Number of stops by the guard in one return after which the follower chooses again: the
+destination may have changed with the target."""
 
 MET = 1 + TOLERANCE_SLACK
 """Largest error ratio at which the contacts are met."""
@@ -201,7 +205,7 @@ class Recovery:
         if self._candidate < 0:
             self._start_clock(ratio)
             self._is_returning = bool(self._least_ratio < GAIN * ratio)
-            self._has_line, self._attempts = False, 0
+            self._has_line, self._lines, self._stops = False, 0, 0
             self._target = -1
 
     def _continue_return(self, q: Array, last_step: Array, is_stopped: bool) -> None:
@@ -214,6 +218,9 @@ class Recovery:
         if is_stopped:
             self._has_line, self._target = False, -1
             self._append(q)
+            self._stops += 1
+            if self._stops > MAX_STOPS:
+                self.follow()
         elif self._done >= 1.0 - 1e-12:
             self._has_line = False
             self._count = self._target + 1
@@ -226,8 +233,8 @@ class Recovery:
         """Check a part of a line, and start the motion along it once all of it is free."""
         if self._target < 0:
             self._target, self._checked = self._destination, 0
-            self._attempts += 1
-            if self._attempts > ATTEMPTS:
+            self._lines += 1
+            if self._lines > MAX_LINES:
                 self.follow()
                 return
         line = self._trail[self._target] - q
