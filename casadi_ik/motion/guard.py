@@ -73,6 +73,7 @@ class Guard:
         self._check, self._robot = plan.check, plan.robot.description
         fingers, n = len(plan.robot.fingers), len(plan.robot.actuators)
         self._n, self._change = n, plan.rates.steps(plan.period)[1]
+        self._bounds = plan.bounds
         self._hand = np.isin(np.arange(n), self._robot.hand_actuators).astype(float)
         self._side = np.zeros(n)
         self._side[list(self._robot.trunk_actuators)] = -1
@@ -124,6 +125,18 @@ class Guard:
         """Return True if configurations (m, n) are free of collisions."""
         return bool((self._query.check(q).surplus >= self.exact).all())
 
+    def posture_with_clearance(self, q: Array, units: Array) -> Array:
+        """Return the nearest configuration (n,) with the lacking clearances of one, to first order.
+
+        Args:
+            q: (n,) configuration.
+            units: (n,) unit of each motor [rad or m], in which distances are measured.
+        """
+        lacking, slopes = self._lacking_clearances(q)
+        rows = slopes[lacking > 0] * units
+        motion = units * (np.linalg.pinv(rows, rcond=0.1) @ lacking[lacking > 0])
+        return np.clip(q + motion, *self._bounds)
+
     def step(self, inputs: FollowerInputs, step: Array | None = None) -> tuple[Array, bool]:
         """Make a step, or the part of it after which the motors can still stop in time.
 
@@ -147,7 +160,8 @@ class Guard:
         is_stopped = share < 1.0
         if not is_stopped.any():
             return new_state, False
-        new_state[:n], new_state[n : 2 * n] = q + step, step
+        # Rounding errors of a motor that stops at a limit must not exceed it.
+        new_state[:n], new_state[n : 2 * n] = np.clip(q + step, *self._bounds), step
         # A goal beyond an obstacle would be reached through it.
         np.copyto(new_state[2 * n : 3 * n], q_rest, where=is_stopped)
         new_state[3 * n] = 0.0

@@ -99,6 +99,7 @@ class FollowerInputs:
         self.views: dict[str, Array] = cycle.parameters.unpack(self.run.parameters)
         self.record: dict[str, Array] = cycle.record.unpack(self.run.record)
         max_step, max_change = plan.rates.steps(plan.period)
+        self._bounds = plan.bounds
         self._fill(lower=plan.bounds[0], upper=plan.bounds[1], posture=plan.posture)
         self._fill(max_step=max_step, max_change=max_change)
         tolerances = tuple(plan.request.tolerances.values())
@@ -252,7 +253,7 @@ class FollowerInputs:
             New state.
         """
         n, previous = len(step), self.run.state.copy()
-        q = previous[:n] + step
+        q = np.clip(previous[:n] + step, *self._bounds)
         state = self.step_from_rest(q)
         state[:n], state[n : 2 * n], state[2 * n : 3 * n], state[3 * n] = q, step, q, 0.0
         self.run.before[:] = previous

@@ -7,7 +7,8 @@ and their error has not decreased for `PATIENCE`, it computes the error at the p
 trail, a few of them in a cycle. If the least error is less than `GAIN` times the present one, the
 motors stop and return to that posture. They move on straight lines, each from rest to rest: to the
 first posture of the trail, counted from the destination, to which the line is free, so they take
-short cuts. The lines are checked at a few postures in a cycle, and the guard checks every step in
+short cuts. Where no line is free, as in contact with an obstacle, the motors first increase the
+clearances. The lines are checked at a few postures in a cycle, and the guard checks every step in
 addition.
 """
 
@@ -52,9 +53,9 @@ CHECKS = 8
 MAX_LINES = 40
 """Maximum number of lines of one return."""
 
-MAX_STOPS = 2
-"""Number of stops by the guard in one return after which the follower chooses again: the
-destination may have changed with the target."""
+MAX_STOPS = 6
+"""Maximum number of stops in one return, by the guard or because no line is free; after another one
+the follower compares postures again, because the target may have moved."""
 
 MET = 1 + TOLERANCE_SLACK
 """Largest error ratio at which the contacts are met."""
@@ -216,8 +217,9 @@ class Recovery:
             return
         self._done, self._line_step = self._done + self._next_step, self._next_step
         if is_stopped:
-            self._has_line, self._target = False, -1
             self._append(q)
+            self._has_line = False
+            self._try_shorter_line()
             self._stops += 1
             if self._stops > MAX_STOPS:
                 self.follow()
@@ -228,6 +230,11 @@ class Recovery:
             has_arrived, self._target = self._target <= self._destination, -1
             if has_arrived:
                 self.follow()
+
+    def _try_shorter_line(self) -> None:
+        """Choose the posture halfway between the present target and the end of the trail."""
+        self._target = min((self._target + self._count) // 2, self._count - 1)
+        self._checked = 0
 
     def _choose_line(self, q: Array) -> None:
         """Check a part of a line, and start the motion along it once all of it is free."""
@@ -245,8 +252,7 @@ class Recovery:
         elif last > self._checked:
             shares = np.arange(self._checked + 1, last + 1)[:, None] / count
             if not self._guard.are_free(q + shares * line):
-                # Try the posture halfway between this one and the end of the trail.
-                self._target, self._checked = (self._target + self._count) // 2, 0
+                self._try_shorter_line()
                 return
             self._checked = last
         if self._checked >= count:
@@ -256,4 +262,13 @@ class Recovery:
                 self._line_change = float((self._max_change / np.abs(line)).min())
             self._has_line = self._line_fastest < math.inf
             if not self._has_line:
-                self.follow()
+                self._move_away(q)
+
+    def _move_away(self, q: Array) -> None:
+        """Increase the clearances of a posture from which no line is free, such as one in contact."""
+        if self._guard is None or self._stops > MAX_STOPS:
+            self.follow()
+            return
+        self._append(self._guard.posture_with_clearance(q, self._units))
+        self._target, self._checked = self._count - 1, 0
+        self._stops += 1
