@@ -31,6 +31,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "myst_nb",
     "sphinx_copybutton",
+    "building.llms",
     "building.mathml",
     "building.pages",
     "building.sources",
