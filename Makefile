@@ -13,11 +13,12 @@ PAPER := $(BIN)/casadi-ik solve cup --method enhanced-dls --log $(OUT)/cup_paper
 SPHINX := $(BIN)/sphinx-build -E -q -W --keep-going -b html -c docs . out/docs \
   && $(BIN)/python docs/building/links.py out/docs
 
-.PHONY: help demo test lint docs page bench notebooks clean
+.PHONY: help demo test test-all lint docs page bench notebooks clean
 
 help:
 	@echo "make demo       set up and solve the grasp of a real object, by our method and the paper's"
-	@echo "make test       set up and run the tests"
+	@echo "make test       set up and run the tests, at most 5 minutes on two cores"
+	@echo "make test-all   run the slow tests, which make test leaves out"
 	@echo "make lint       style, types, layers, documentation"
 	@echo "make docs       build the documentation site: out/docs/index.html"
 	@echo "make page       build the page that solves in the browser: out/page/index.html"
@@ -47,9 +48,14 @@ demo: $(VENV)/demo.stamp
 	$(PAPER)
 	$(BIN)/casadi-ik log compare $(OUT)/cup.mcap $(OUT)/cup_paper.mcap
 
-# One more at a time than there are cores: some wait, for a browser or for a process of their own.
+# One worker more than there are cores, because some tests wait for a browser or another process.
+PYTEST := $(BIN)/python -m pytest -n $$($(BIN)/python -c "import os; print(1 + os.cpu_count())")
+
 test: $(VENV)/dev.stamp
-	$(BIN)/python -m pytest -n $$($(BIN)/python -c "import os; print(1 + os.cpu_count())")
+	$(PYTEST) -m "not slow"
+
+test-all: $(VENV)/dev.stamp
+	$(PYTEST) -m slow
 
 lint: $(VENV)/dev.stamp
 	$(BIN)/ruff check

@@ -160,6 +160,7 @@ def humanoid(folder: Path, robot: ik.ArmHand) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_humanoid_s_trunk_and_sides_are_found(
     run: Command, tmp_path: Path, rng: np.random.Generator
 ) -> None:
@@ -185,6 +186,7 @@ def test_a_humanoid_s_trunk_and_sides_are_found(
     assert ik.Solver(robot).solve_batch(points, normals).success.all()
 
 
+@pytest.mark.slow
 def test_palms_of_a_body_are_named(run: Command, tmp_path: Path) -> None:
     robot = ik.load_robot("g1+dex3")
     path, out = humanoid(tmp_path, robot), tmp_path / "mine.yaml"

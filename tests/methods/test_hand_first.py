@@ -68,6 +68,7 @@ def test_out_of_reach_the_contacts_come_near(robot, exact, rng):
     assert (batch.position_error.mean(axis=1) < np.linalg.norm(points.mean(axis=1), axis=1)).all()
 
 
+@pytest.mark.slow
 def test_optimisation_changes_no_bit(robot, rng, monkeypatch):
     # One after the other with an arm, many at once without: each compiles the shorter half.
     hand = ik.load_robot("ar10")

@@ -135,7 +135,12 @@ def questions(tmp_path_factory) -> Callable[[str], tuple[Questions, Questions]]:
 
 
 @pytest.mark.parametrize(
-    ("name", "call"), [(name, call) for name, (_, calls) in ROBOTS.items() for call in calls]
+    ("name", "call"),
+    [
+        pytest.param(name, call, marks=() if name == "arm_and_hand" else pytest.mark.slow)
+        for name, (_, calls) in ROBOTS.items()
+        for call in calls
+    ],
 )
 def test_answers_do_not_depend_on_the_pose_of_the_base(questions, name, call):
     answers, moved = (getattr(robot, call)() for robot in questions(name))
