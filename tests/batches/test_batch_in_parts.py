@@ -144,3 +144,165 @@ def cluster() -> Iterator[tuple[str, subprocess.Popen[str], list[subprocess.Pope
 
 
 @pytest.mark.slow
+@POSIX
+def test_a_cluster_that_loses_a_worker_then_its_scheduler(
+    cluster, targets: Path, whole: dict[str, np.ndarray], tmp_path: Path
+):
+    address, scheduler, workers = cluster
+    out = tmp_path / "out"
+    words = (targets, *ROBOT, *PARTS, "--resume", "--dask", address, "--out", out)
+    process = begun(*words)
+    wait_for_parts(out, 5, process)
+    workers[0].kill()
+    there = len(wait_for_parts(out, 12, process))
+    assert there >= 12
+    scheduler.kill()
+    report, error = process.communicate(timeout=6000)
+    if process.returncode == 2:
+        assert report == ""
+        assert f"casadi-ik: error: --dask {address}: the cluster was lost" in error
+        assert "--resume" in error
+        assert "Traceback" not in error
+    else:  # it was faster than the kill
+        assert process.returncode == 1, error
+
+    assert main(["batch", str(targets), *ROBOT, *PARTS, "--resume", "--out", str(out)]) == 1
+    parts = [answers(path) for path in sorted(out.glob("part-*.npz"))]
+    assert len(parts) == COUNT // SIZE
+    found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    same(found, whole)
+
+
+def test_a_folder_of_files_and_a_table(
+    targets: Path, robot: ik.ArmHand, whole: dict[str, np.ndarray], tmp_path: Path
+):
+    """A Parquet file and an npz file, one after the other."""
+    with np.load(targets) as arrays:
+        points, normals = arrays["points"][:250].copy(), arrays["normals"][:250]
+    columns = {
+        f"{finger}_{axis}": array[:, i, j]
+        for i, finger in enumerate(robot.fingers)
+        for endings, array in ((("x", "y", "z"), points), (("nx", "ny", "nz"), normals))
+        for j, axis in enumerate(endings)
+    }
+    folder = tmp_path / "targets"
+    folder.mkdir()
+    pl.DataFrame(columns)[:130].write_parquet(folder / "a.parquet")
+    np.savez(folder / "b.npz", points=points[130:], normals=normals[130:])
+    out = tmp_path / "out.npz"
+    assert main(["batch", str(folder), *ROBOT, *PARTS, "--out", str(out)]) == 0
+    same(answers(out), {name: array[:250] for name, array in whole.items()})
+
+
+Change = Callable[[Path], list[str]]
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda _: [], "out: holds parts of this batch"),
+        (lambda _: ["--resume", "--seed", "7"], "seed: parts have 0, this batch has 7"),
+        (lambda out: _damage(out), "damaged"),
+        (
+            lambda out: _copy(out),
+            "part-000001.npz: row: found 10 targets from 0 on, expected 10 targets from 10 on",
+        ),
+    ],
+)
+def test_what_is_there_must_belong(
+    change: Change, says: str, robot: ik.ArmHand, tmp_path: Path, capsys
+):
+    points, normals = robot.contacts(robot.random(np.random.default_rng(4), 20))
+    path, out = tmp_path / "targets.npz", tmp_path / "out"
+    np.savez(path, points=points, normals=normals)
+    words = ["batch", str(path), *ROBOT, "--part-size", "10", "--out", str(out)]
+    assert main(words) == 0
+    capsys.readouterr()
+    assert main([*words, *change(out)]) == 2
+    error = capsys.readouterr().err
+    assert says in error
+    assert error.count("\n") == 1
+
+
+def _damage(out: Path) -> list[str]:
+    path = out / "part-000001.npz"
+    path.write_bytes(path.read_bytes()[:100])
+    return ["--resume"]
+
+
+def _copy(out: Path) -> list[str]:
+    (out / "part-000001.npz").write_bytes((out / "part-000000.npz").read_bytes())
+    return ["--resume"]
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("missing.parquet", "missing.parquet: not a Parquet file"),
+        ("empty", "contains no .npz or .parquet file"),
+        ("other.parquet", "thumb_x: missing, expected columns thumb_x"),
+    ],
+)
+def test_bad_targets(name: str, says: str, tmp_path: Path, capsys):
+    (tmp_path / "empty").mkdir()
+    pl.DataFrame({"x": [1.0]}).write_parquet(tmp_path / "other.parquet")
+    out = tmp_path / "out"
+    assert main(["batch", str(tmp_path / name), *ROBOT, "--out", str(out)]) == 2
+    error = capsys.readouterr().err
+    assert says in error
+    assert error.count("\n") == 1
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("missing", ["joblib", "polars"])
+def test_an_extra_that_is_missing_leaves_nothing(
+    missing: str, robot: ik.ArmHand, tmp_path: Path, capsys, monkeypatch
+):
+    """It is said before anything is written that would ask for --resume."""
+    points, normals = robot.contacts(robot.random(np.random.default_rng(4), 2))
+    path = tmp_path / "targets.npz"
+    np.savez(path, points=points, normals=normals)
+    if missing == "polars":
+        path = path.rename(tmp_path / "targets.parquet")
+    monkeypatch.setitem(sys.modules, missing, None)
+    for out in (tmp_path / "out.npz", tmp_path / "out"):
+        assert main(["batch", str(path), *ROBOT, "--resume", "--out", str(out)]) == 2
+        error = capsys.readouterr().err
+        assert f"pip install {missing}" in error
+        assert error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_answers_are_an_npz_a_table_or_a_folder(targets: Path, tmp_path: Path, capsys, whole):
+    assert main(["batch", str(targets), *ROBOT, "--out", str(tmp_path / "out.csv")]) == 2
+    error = capsys.readouterr().err
+    assert "out.csv', expected OUT.npz" in error
+    assert error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+    out = tmp_path / "out.parquet"
+    assert main(["batch", str(targets), *ROBOT, "--out", str(out)]) == 1
+    np.testing.assert_array_equal(pl.read_parquet(out)["success"], whole["success"])
+
+
+@pytest.mark.slow
+@POSIX
+@pytest.mark.parametrize("wait_for", ["out.npz.parts", "out.npz.parts/part-*.npz"])
+def test_terminated_leaves_nothing_half_written(
+    targets: Path, tmp_path: Path, wait_for: str
+) -> None:
+    """What is left after SIGTERM are whole parts with their logs; without a part, nothing."""
+    out, logs = tmp_path / "out.npz", tmp_path / "logs"
+    process = begun(targets, *ROBOT, *PARTS, "--jobs", 2, "--out", out, "--log", logs)
+    while process.poll() is None and not list(tmp_path.glob(wait_for)):
+        time.sleep(0.01)
+    process.terminate()
+    said = process.communicate(timeout=6000)
+    assert process.returncode == 143, said
+    parts = sorted((tmp_path / "out.npz.parts").glob("part-*.npz"))
+    left = {path for path in tmp_path.rglob("*") if path.is_file()}
+    written = set(logs.glob("part-*.mcap"))
+    manifest = {tmp_path / "out.npz.parts" / "batch.json"} if parts else set()
+    assert left == {*parts, *written, *manifest}
+    assert {path.stem for path in written} >= {path.stem for path in parts}
+    assert all(len(answers(part)["q"]) == SIZE for part in parts)
+    assert all(len(ik.logs.open(log).solves()) == SIZE for log in written)

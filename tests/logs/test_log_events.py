@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,8 +12,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_up_solves import (
-    FORMAT,
-    LABELS,
     SINGULARITY_THRESHOLDS,
     Field,
     JacobianMeasures,
@@ -22,8 +19,6 @@ from made_up_solves import (
     RecordedJacobian,
     TraceFormat,
     event_format,
-    main,
-    make_block,
 )
 
 import casadi_ik as ik
@@ -493,18 +488,6 @@ def test_singular_arms_are_events_in_every_method(robot, log):
         assert set(event["joint_mask"]) == set(robot.actuators[:7])
 
 
-def test_why_tells_of_every_jacobian(log):
-    for solve in range(2):
-        met = " | ".join(logs.explain(logs.one_solve(log, solve)).met)
-        for name in ("arm", "hand"):
-            assert (
-                f"{name} near singular" in met
-                or f"{name} never near singular" in met
-                or (f"smallest singular value of the {name} down to" in met)
-            ), met
-        assert "not measured" not in met
-
-
 def test_thumb_first_measures_its_closed_chain(robot):
     """Five rows of the thumb's contact over arm and thumb; by central differences again."""
     measures = JacobianMeasures(robot.description, closed_chain=True)
@@ -529,26 +512,3 @@ def test_thumb_first_measures_its_closed_chain(robot):
         s = np.linalg.svd(np.array(found).T, compute_uv=False)
         assert values["sigma_closed_chain"][row] == pytest.approx(s[-1], rel=1e-3)
         assert values["condition_closed_chain"][row] == pytest.approx(s[0] / s[-1], rel=1e-3)
-
-
-def test_the_virtual_machine_measures_the_same(robot):
-    q = robot.random(np.random.default_rng(5), 9)
-    rows = np.zeros(9, [("q", "f8", q.shape[1]), ("phase", "u1")])
-    rows["q"] = q
-    fast, slow = (JacobianMeasures(robot.description, compiled=c)(rows) for c in (True, False))
-    np.testing.assert_allclose(fast[:, ::2], slow[:, ::2], rtol=1e-4, atol=1e-6)
-
-
-def test_info_tells_what_was_not_measured(write, tmp_path: Path, capsys, robot):
-    """A log of rows without singular values says so, and does not say that nothing happened."""
-    plain = Layout(tuple(f for f in FORMAT.layout if not f.name.startswith("sigma_")))
-    form = dataclasses.replace(FORMAT, layout=plain, labels=LABELS, jacobians={})
-    path = write(make_block(5, 5, form=form), name="bare.mcap")
-    assert main(["log", "info", str(path)]) == 0
-    assert "not measured" in capsys.readouterr().out
-    solved = ik.Solver(robot).solve(ik.load_grasp("cup"), log=tmp_path / "cup.mcap")
-    assert solved.success
-    assert main(["log", "info", str(tmp_path / "cup.mcap")]) == 0
-    shown = capsys.readouterr().out
-    assert "not measured" not in shown
-    assert "arm 0." in shown

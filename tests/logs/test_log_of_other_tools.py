@@ -42,6 +42,7 @@ def rows_of(path: Path) -> list[bytes]:
         {"repeat_channels": False, "repeat_schemas": False},
         {"use_statistics": False, "use_summary_offsets": False, "index_types": IndexType.NONE},
         {"enable_crcs": False, "compression": CompressionType.LZ4},
+        {"chunk_size": 20_000, "compression": CompressionType.NONE},
     ],
 )
 def test_the_summary_and_its_parts_are_optional(log: Path, options: dict[str, Any]) -> None:

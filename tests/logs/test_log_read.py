@@ -6,6 +6,7 @@ import dataclasses
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -24,12 +25,9 @@ from made_up_solves import (
     chunks_of,
     main,
     make_block,
-    rewritten,
 )
 from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC as MAGIC
-from mcap.writer import CompressionType, IndexType
-from rosbags.highlevel import AnyReader
 
 import casadi_ik as ik
 from casadi_ik import errors, logs
@@ -99,31 +97,27 @@ def test_only_the_chunks_asked_for_are_read(write: Write) -> None:
 
 
 @pytest.mark.parametrize(
-    ("question", "reason"),
+    ("filters", "known"),
     [
-        ({"method": "ipopt"}, r"no method 'ipopt'; the log holds: enhanced-dls"),
-        ({"status": "solved"}, r"no status 'solved'; there are: .*SOLVED"),
-        ({"event": "CRASH"}, r"no event 'CRASH'; there are: NEAR_SINGULAR"),
-        ({"phase": ["refinement", "dinner"]}, r"no phase 'dinner'; there are: thumb reaching"),
+        ({"method": "ipopt"}, "enhanced-dls"),
+        ({"status": "solved"}, "SOLVED"),
+        ({"event": "CRASH"}, "NEAR_SINGULAR"),
+        ({"phase": ["refinement", "dinner"]}, "thumb reaching"),
+        ({"fields": ["costs"]}, "q, palm, cost"),
+        ({"stauts": "SOLVED"}, "method, solve, status"),
     ],
 )
-def test_names_that_are_not_there(write: Write, question: dict[str, str], reason: str) -> None:
+def test_unknown_names(write: Write, filters: dict[str, Any], known: str) -> None:
+    """A filter, its value or a field that the log does not have is named beside the known ones."""
     log = logs.open(write(make_block(30)))
-    for ask in (log.solves, log.iterations, log.events):
-        with pytest.raises(errors.UnknownNameError, match=reason):
-            ask(**question)  # type: ignore[arg-type]
-
-
-def test_a_filter_that_is_not_there(write: Write) -> None:
-    log = logs.open(write(make_block(3)))
-    for ask in (log.solves, log.iterations, log.events):
-        with pytest.raises(TypeError, match="no filter 'stauts'; there are: method, solve, status"):
-            ask(stauts="SOLVED")  # type: ignore[call-arg]
-
-
-def test_a_field_that_is_not_there(write: Write) -> None:
-    with pytest.raises(errors.UnknownNameError, match="no field 'costs'; there are: q, palm, cost"):
-        logs.open(write(make_block(3))).iterations(fields=["costs"])
+    ((name, value),) = filters.items()
+    unknown = name if name == "stauts" else value if isinstance(value, str) else value[-1]
+    expected = TypeError if name == "stauts" else errors.UnknownNameError
+    for table in (
+        (log.iterations,) if name == "fields" else (log.solves, log.iterations, log.events)
+    ):
+        with pytest.raises(expected, match=f"'{unknown}'.*{known}"):
+            table(**filters)
 
 
 def test_several_files_are_one_log(write: Write, tmp_path: Path) -> None:
@@ -249,34 +243,6 @@ def test_without_polars(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(table.array()) == 4
     with pytest.raises(errors.MissingExtraError, match="pip install polars"):
         table.frame()
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"compression": CompressionType.LZ4},
-        {"compression": CompressionType.NONE, "index_types": IndexType.CHUNK | IndexType.METADATA},
-        {"enable_crcs": False},
-    ],
-)
-def test_a_log_that_other_tools_have_rearranged(write: Write, options: dict[str, object]) -> None:
-    """Messages of all topics mixed, in other chunks, perhaps without their index."""
-    path = write(make_block(30, 80, 3))
-    ours, theirs = logs.open(path), logs.open(rewritten(path, chunk_size=20_000, **options))
-    for one, other in (
-        (ours.iterations(), theirs.iterations()),
-        (ours.solves(), theirs.solves()),
-        (ours.events(), theirs.events()),
-        (ours.iterations(solve=1), theirs.iterations(solve=1)),
-    ):
-        assert one.rows.tobytes() == other.rows.tobytes()
-        np.testing.assert_array_equal(one.solve_id, other.solve_id)
-
-
-def test_messages_outside_chunks_are_refused(write: Write) -> None:
-    path = rewritten(write(make_block(5)), use_chunking=False)
-    with pytest.raises(errors.LogError, match=r"copy\.mcap: the messages are not in chunks"):
-        logs.open(path)
 
 
 COUNTS = ([40, 30], [20, 50, 10], [60])
@@ -501,33 +467,6 @@ def one(number: int) -> SolveBlock:
     return make_block(50, first=number)
 
 
-def test_chunks_are_copied_as_they_are_and_others_can_read_the_result(
-    write: Write, tmp_path: Path
-) -> None:
-    shards = [write(one(i), name=f"{i}.mcap", urdf="<robot/>") for i in range(3)]
-    target = tmp_path / "all.mcap"
-    merged = logs.merge_logs(shards, target)
-    data = target.read_bytes()
-    assert merged.size == len(data)
-    for shard in shards:
-        whole = shard.read_bytes()
-        for chunk in chunks_of(shard):
-            begin = chunk.chunk_start_offset
-            length = chunk.chunk_length + chunk.message_index_length
-            assert whole[begin : begin + length] in data
-    assert logs.open(target).attachment("robot.urdf") == b"<robot/>"
-    with target.open("rb") as stream:
-        reader = make_reader(stream, validate_crcs=True)
-        messages = len(list(reader.iter_messages()))
-        summary = reader.get_summary()
-    assert summary is not None
-    assert summary.statistics is not None
-    assert messages == merged.messages == summary.statistics.message_count
-    with AnyReader([target]) as reader:
-        assert reader.message_count == messages
-        assert sum(1 for _ in reader.messages()) == messages
-
-
 def test_shards_that_contradict_are_refused(write: Write, tmp_path: Path) -> None:
     first = write(one(0), name="first.mcap", urdf="<robot/>")
     layout = Layout.record(Field("q", (3,)), Field("phase", dtype="u1"))
@@ -552,26 +491,3 @@ def test_shards_that_contradict_are_refused(write: Write, tmp_path: Path) -> Non
         assert str(shard) in str(caught.value)
         assert str(first) in str(caught.value)
     assert sorted(tmp_path.iterdir()) == before
-
-
-def test_shards_that_cannot_be_read(write: Write, tmp_path: Path) -> None:
-    good = write(one(0))
-    torn = tmp_path / "torn.mcap"
-    torn.write_bytes(write(one(1), name="1.mcap").read_bytes()[:-30])
-    (tmp_path / "text").write_text("robot: ar10 and some more\n")
-    (tmp_path / "nothing").mkdir()
-    cases = {
-        torn: "truncated or damaged .*log finish",
-        tmp_path / "missing": "cannot read the log: No such file",
-        tmp_path / "nothing": "no log in this folder",
-        tmp_path / "text": "not an MCAP file",
-    }
-    for shard, reason in cases.items():
-        with pytest.raises(errors.LogError, match=reason) as caught:
-            logs.merge_logs([good, shard], tmp_path / "all.mcap")
-        assert str(caught.value).startswith(f"{shard}: ")
-    with pytest.raises(errors.LogError, match="found no shards"):
-        logs.merge_logs([], tmp_path / "all.mcap")
-    with pytest.raises(errors.LogError, match="cannot write the merged log: No such file"):
-        logs.merge_logs([good], tmp_path / "nowhere" / "all.mcap")
-    assert not (tmp_path / "all.mcap").exists()

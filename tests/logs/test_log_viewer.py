@@ -4,18 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import re
-import shutil
-import subprocess
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pinocchio
 import pytest
-from made_up_solves import make_block
 from mcap.reader import make_reader
 from viewer_reader import Decoded, decode, layout_of, matrix, shipped_layout, write_view
 
@@ -192,98 +187,3 @@ def test_every_path_of_the_layout_is_in_the_file(view: Path, decoded: Decoded) -
         assert match is not None
         value = getattr(decoded.last(match[1]), match[2])
         assert match[3] is None or len(value) > int(match[3])
-
-
-PACKAGES = (
-    "@mcap/core@2.2.2",
-    "@foxglove/rosmsg@5.0.5",
-    "@foxglove/rosmsg2-serialization@3.1.0",
-    "fzstd@0.1.1",
-    "protobufjs@7.4.0",
-)
-
-
-@pytest.fixture(scope="module")
-def packages() -> Path:
-    """A folder with the packages, made once per machine; without node or registry, no test."""
-    npm = shutil.which("npm")
-    if npm is None or shutil.which("node") is None:
-        pytest.skip("needs node and npm")
-    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-    folder = cache / "casadi_ik_tests" / "-".join(name.rpartition("@")[2] for name in PACKAGES)
-    if not (folder / "complete").exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        command = [npm, "install", "--no-audit", "--no-fund", "--prefix", folder, *PACKAGES]
-        try:
-            subprocess.run(command, check=True, capture_output=True, timeout=120)
-        except (subprocess.CalledProcessError, subprocess.TimeoutExpired) as error:
-            pytest.skip(f"npm cannot install: {error}")
-        (folder / "complete").touch()
-    return folder
-
-
-def read(packages: Path, path: Path) -> list[dict[str, Any]]:
-    """Topic, time and values of every message, by time."""
-    script = Path(__file__).parent / "read_log.mjs"
-    done = subprocess.run(
-        ["node", script, packages, path], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    return [json.loads(line) for line in done.stdout.splitlines()]
-
-
-def numbers(value: Any) -> np.ndarray:
-    """Numbers as the script prints them."""
-    names = {"NaN": np.nan, "Infinity": np.inf, "-Infinity": -np.inf}
-    items = value if isinstance(value, list) else [value]
-    return np.array([names[x] if isinstance(x, str) else x for x in items], dtype=float)
-
-
-@pytest.mark.parametrize("compression", ["none", "zstd"])
-def test_mcap_core_and_rosmsg2_serialization(
-    packages: Path, tmp_path: Path, write: Callable[..., Path], compression: str
-) -> None:
-    path = write(make_block(40, 7), urdf="<robot/>", compression=compression)
-    messages = read(packages, path)
-    log = logs.open(path)
-    for kind, table in (
-        ("iteration", log.iterations()),
-        ("solve", log.solves()),
-        ("event", log.events()),
-    ):
-        found = [m for m in messages if m["topic"] == f"/ik/enhanced-dls/{kind}"]
-        assert len(found) == len(table) > 0
-        for message, row in zip(found, table.rows, strict=True):
-            for name in table.names:
-                np.testing.assert_array_equal(numbers(message["values"][name]), row[name].ravel())
-    times = [int(message["time"]) for message in messages]
-    assert times == sorted(times)
-
-
-def test_the_viewer_file(packages: Path, view: Path, decoded: Decoded) -> None:
-    """Every message of every topic is deserialised, to the same values."""
-    topics: dict[str, list[dict[str, Any]]] = {}
-    for message in read(packages, view):
-        topics.setdefault(message["topic"], []).append(message["values"])
-    assert {name: len(found) for name, found in topics.items()} == {
-        name: len(found) for name, found in decoded.topics.items()
-    }
-    ours = {name: decoded.topics[name][-1][1] for name in topics}
-    theirs = {name: found[-1] for name, found in topics.items()}
-    assert theirs["/robot_description"]["data"] == ours["/robot_description"].data
-    assert theirs["/joint_states"]["name"] == list(ours["/joint_states"].name)
-    for topic, name in (("/joint_states", "position"), ("/ik/iteration", "q")):
-        np.testing.assert_array_equal(
-            numbers(theirs[topic][name]), np.asarray(getattr(ours[topic], name))
-        )
-    for message, expected in zip(
-        theirs["/ik/targets"]["entities"], ours["/ik/targets"].entities, strict=True
-    ):
-        position, ours_at = message["spheres"][0]["pose"]["position"], expected.spheres[0].pose
-        assert message["id"] == expected.id
-        assert [position[axis] for axis in "xyz"] == [
-            getattr(ours_at.position, axis) for axis in "xyz"
-        ]
-    children = [frame["child_frame_id"] for frame in theirs["/tf"]["transforms"]]
-    assert children == [frame.child_frame_id for frame in ours["/tf"].transforms]
-    assert theirs["/ik/messages"]["message"] == ours["/ik/messages"].message

@@ -43,15 +43,19 @@ def record_many(path: Path, blocks: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("room", "solves"), [(0, 0), (100, 0), (20_000, 0), (3_000_000, 6), (7_300_000, 18)]
+    ("room", "solves"), [(0, 0), (100, 0), (20_000, 0), (3_000_000, 6), (7_300_000, 18), (-100, 24)]
 )
 def test_disk_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: int, solves: int) -> None:
-    """In the first chunk: nothing is left. Later: every chunk that fitted can be read."""
+    """Nothing remains of a first chunk that does not fit; every other complete chunk is read.
+
+    A negative room is short of the whole log by so many bytes, which the summary lacks.
+    """
     path = tmp_path / "cup.mcap"
+    if room < 0:
+        record_many(tmp_path / "whole.mcap", 4)
+        room += (tmp_path / "whole.mcap").stat().st_size
     full_disk(monkeypatch, room)
-    with pytest.raises(
-        errors.LogError, match=r"cup\.mcap: cannot write the log: No space left"
-    ) as caught:
+    with pytest.raises(errors.LogError, match=r"cup\.mcap: .*No space left") as caught:
         record_many(path, 4)
     assert isinstance(caught.value.__cause__, OSError)
     if not solves:
@@ -62,22 +66,6 @@ def test_disk_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: int, s
     assert len(log.solves()) >= solves
     found = log.iterations(solve=0)
     assert found.rows.tobytes() == make_block(1000).rows.tobytes()
-
-
-def test_disk_full_at_the_very_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every chunk is written, but there is no room for the summary."""
-    record_many(tmp_path / "whole.mcap", 2)
-    size = (tmp_path / "whole.mcap").stat().st_size
-    full_disk(monkeypatch, size - 100)
-    path = tmp_path / "cup.mcap"
-    with pytest.raises(errors.LogError, match="No space left"):
-        record_many(path, 2)
-    log = logs.open(path)
-    assert len(log.solves()) == 12
-    assert (
-        log.iterations().rows.tobytes()
-        == logs.open(tmp_path / "whole.mcap").iterations().rows.tobytes()
-    )
 
 
 @POSIX
@@ -237,17 +225,17 @@ def test_blocks_that_contradict_leave_the_log_usable(tmp_path: Path) -> None:
         recorder.record(make_block(5, first=7))
 
 
-def test_unknown_compression(tmp_path: Path) -> None:
-    with pytest.raises(errors.LogError, match="'gzip': expected one of none, lz4, zstd"):
-        logs.McapRecorder(tmp_path / "a", robot_name="r", compression="gzip")  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize(
     "options", [{"sample": 1.5}, {"sample": float("nan")}, {"seed": -1}, {"seed": 0.5}]
 )
 def test_bad_policies_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(errors.InputError, match=rf"keep\.{next(iter(options))}: found"):
         logs.Keep(**options)
+
+
+def test_unknown_compression(tmp_path: Path) -> None:
+    with pytest.raises(errors.LogError, match=r"'gzip'.*none, lz4, zstd"):
+        logs.McapRecorder(tmp_path / "a", robot_name="r", compression="gzip")  # type: ignore[arg-type]
 
 
 def test_metadata_is_complete(write: Write) -> None:
@@ -290,16 +278,6 @@ def test_metadata_is_complete(write: Write) -> None:
     assert info.size == path.stat().st_size
     assert (info.compression, info.chunks) == ("zstd", 1)
     assert 0 < info.compressed < info.uncompressed
-
-
-def test_log_times_are_arithmetic() -> None:
-    clock = logs.LogClock(1000, slot=5_000_000)
-    solve, iteration = np.array([3, 3, 4]), np.array([0, 4, 0])
-    times = clock.times(solve, iteration)
-    np.testing.assert_array_equal(times, [15_001_000, 19_001_000, 20_001_000])
-    for found, expected in zip(clock.locate(times), (solve, iteration), strict=True):
-        np.testing.assert_array_equal(found, expected)
-    assert clock.room == 5
 
 
 def test_a_solve_of_more_iterations_than_there_is_time_for_has_its_totals(tmp_path: Path) -> None:
