@@ -4,6 +4,7 @@
 
     python studies/bench.py                                    # everything that is quick
     python studies/bench.py --part batch fast --robots ur5e+shadow --against ../other
+    python studies/bench.py --against ../other --limit 1.25                # exit code 1 if slower
     python studies/bench.py --part first-use export logs --report out/bench
     python studies/bench.py --part peers --robots panda+allegro_right      # studies/peers.txt
     python studies/bench.py --part view --page out/page/index.html         # needs Chromium
@@ -143,6 +144,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--count", type=int, default=4000, help="targets of a batch")
     parser.add_argument("--turns", type=int, default=7, help="of every measurement")
     parser.add_argument("--against", type=Path, help="folder of another checkout of the package")
+    parser.add_argument(
+        "--limit", type=float, help="largest ratio of times to --against; above: exit code 1"
+    )
     parser.add_argument("--page", type=Path, default=Path(), help="of view: index.html (make page)")
     parser.add_argument("--report", type=Path, help="folder of the report")
     options = parser.parse_args(arguments)
@@ -162,6 +166,7 @@ def main(arguments: list[str] | None = None) -> None:
             for row in rows_of(case, mine, theirs):
                 rows.append(row)
                 console.print("  ".join(row), soft_wrap=True, highlight=False)
+    slow = slower_rows(rows, options.limit) if options.limit and options.against else []
     if options.report:
         load = ", ".join(f"{value:.1f}" for value in os.getloadavg())
         parts = [INTRODUCTION.format(turns=options.turns, load=load)]
@@ -172,6 +177,16 @@ def main(arguments: list[str] | None = None) -> None:
         for folder, name in ((options.against, "CHECKOUT"), (options.report, "REPORT")):
             run_by = run_by.replace(str(folder), name)
         publish("Timings", parts, options.report, run_by, {"bench": code_version()})
+    if slow:
+        sys.exit(
+            "\n".join(f"slower than --limit {options.limit:g}: {' '.join(row)}" for row in slow)
+        )
+
+
+def slower_rows(rows: list[list[str]], limit: float) -> list[list[str]]:
+    """Return the rows of times [us] whose median ratio exceeds a limit."""
+    times = [row for row in rows if "us" in row[3].split() and row[-1]]
+    return [row for row in times if float(row[-1]) > limit]
 
 
 if __name__ == "__main__":

@@ -128,6 +128,9 @@ def wheel(files: dict[str, bytes], target: str, out: Path) -> Path:
         f"Metadata-Version: 2.1\nName: casadi-ik-kernels\nVersion: {version}\n"
         "Summary: Kernels of casadi-ik compiled ahead\nLicense: BSD-3-Clause\n"
         f"Requires-Dist: casadi-ik=={version}\n"
+        "Description-Content-Type: text/markdown\n"
+        "\n"
+        f"Prebuilt kernels for [casadi-ik](https://github.com/casadi-ik/casadi_ik) {version}.\n"
     )
     whole = {f"{NAME}/{name}": content for name, content in files.items()} | {
         f"{about}/METADATA": metadata.encode(),

@@ -310,7 +310,7 @@ def _exclusive_build(path: Path) -> Iterator[None]:
         yield
         return
     until = time.monotonic() + BUILD_WAIT
-    with path.open("w") as file:
+    with path.open("w", encoding="ascii") as file:
         while time.monotonic() < until:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

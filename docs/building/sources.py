@@ -72,7 +72,7 @@ def _pages(app: Sphinx) -> Iterator[tuple[str, dict[str, str], str]]:
         found |= about.get("sources", {})
     style = HtmlFormatter(lineanchors="L", anchorlinenos=False, cssclass="highlight")
     for module, path in sorted(found.items()):
-        body = highlight(Path(path).read_text(), PythonLexer(), style)
+        body = highlight(Path(path).read_text(encoding="utf-8"), PythonLexer(), style)
         title = module
         yield (
             f"{FOLDER}/{module}",

@@ -48,6 +48,14 @@ def test_two_checkouts_by_turns(tmp_path):
     assert str(ROOT) not in text
 
 
+def test_rows_above_a_ratio_are_reported():
+    row = ["batch", "ar10", "5 mm", "us", "9", "6", "1.500", "1.400"]
+    count = ["batch", "ar10", "5 mm", "solved", "9", "6", "1.500", "1.500"]
+    missing = ["batch", "ar10", "5 mm", "us", "9", "", "", ""]
+    assert bench.slower_rows([row, count, missing], 1.3) == [row]
+    assert bench.slower_rows([row, count, missing], 1.45) == []
+
+
 @pytest.mark.parametrize("name", ["xarm7+ability", "kinova_gen3+inspire_rh56", "ur5e+shadow"])
 def test_peers_see_the_robot_that_we_solve(name):
     """Couplings with offsets and several followers of a motor are in their URDF."""

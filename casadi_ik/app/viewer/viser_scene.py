@@ -489,13 +489,13 @@ def set_up_scene(server: Server, title: str, floor: float, dark: bool) -> None:
         position=(0.0, 0.0, floor),
     )
     gui.configure_theme(
-        control_layout="collapsible",
         control_width="medium",
         show_logo=False,
         show_share_button=False,
         dark_mode=dark,
         brand_color=palette.rgb("#2f6db3"),
     )
+    gui.main_panel.dock_right()
     gui.set_panel_label(title)
     server.access.title = title
 
