@@ -265,7 +265,7 @@ class Recovery:
                 self._move_away(q)
 
     def _move_away(self, q: Array) -> None:
-        """Increase the clearances of a posture from which no line is free, such as one in contact."""
+        """Increase the clearances of a posture from which no line is free, as one in contact."""
         if self._guard is None or self._stops > MAX_STOPS:
             self.follow()
             return
