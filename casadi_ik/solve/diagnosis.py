@@ -32,6 +32,9 @@ class Reason(StrEnum):
     REACHABLE = "the contacts can be reached; the method did not find the way"
 
 
+MAX_ADVICE = Tolerance(position=0.02, angle=math.radians(15.0))
+"""Largest tolerance that a report recommends; a wider one makes a grasp meaningless."""
+
 PALM_REASONS = {
     Reason.HAND: "the hand cannot take the required posture",
     Reason.REACH: "the arm does not reach the palm pose",
@@ -243,10 +246,11 @@ class Diagnosis(ReprMixin):
             lines.append(f"solvable with a normal left free: {' or '.join(normals)}")
         if all_normals:
             lines.append("solvable with all normals left free")
-        lines.append(
-            f"solvable within {_length(self.enough.position, 'm')} "
-            f"and {_length(self.enough.angle, 'rad')}"
-        )
+        if self.enough.position <= MAX_ADVICE.position and self.enough.angle <= MAX_ADVICE.angle:
+            lines.append(
+                f"solvable within {_length(self.enough.position, 'm')} "
+                f"and {_length(self.enough.angle, 'rad')}"
+            )
         return tuple(lines)
 
     def _proof_lines(self) -> tuple[str, ...]:
