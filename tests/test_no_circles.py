@@ -37,7 +37,6 @@ def imported_modules(path: Path, modules: set[str]) -> set[str]:
 ALLOWED = {
     "casadi_ik.planning.touch.hand_table": "casadi_ik.planning.touch.candidates",
     "casadi_ik.planning.touch.strength": "casadi_ik.planning.touch.grasps",
-    "casadi_ik.solve.hand_first.iteration": "casadi_ik.solve.hand_first.step",
 }
 """Imports of a type only, which are still to be removed."""
 

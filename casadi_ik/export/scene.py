@@ -27,8 +27,8 @@ from casadi_ik.solve.alternatives import side_links
 from casadi_ik.solve.arm_search import RedundancySamples
 from casadi_ik.solve.collision_free import COLLISION_FREE_PARAMETERS
 from casadi_ik.solve.free_hands import UNCONSTRAINED_FINGER_PARAMETERS
-from casadi_ik.solve.hand_first.body import BodyStep
 from casadi_ik.solve.hand_first.method import HandFirstMethod
+from casadi_ik.solve.hand_first.multi_arm import MultiArmStep
 from casadi_ik.solve.trials import CARRY_ONLY, PALM_SCALES, TRUNK_STRETCH
 
 MOST = 1000
@@ -356,7 +356,7 @@ class SceneSources:
         )
         sizes = {"LOOK_ROUNDS": self._rounds, "HAS_CLOSED_ARM": closed}
         sizes |= {"N_HAND_PARTS": self._hand_coordinates}
-        sizes |= {"STATE_TURN": self.method.step.layouts.state.slice("turn").start}
+        sizes |= {"STATE_PALM_NUMBER": self.method.step.layouts.state.slice("palm_number").start}
         reals = {
             "LOOK_ALIKE": COLLISION_FREE_PARAMETERS.min_hand_difference,
             "PALM_TURN": PALM_SCALES[0],
@@ -455,9 +455,9 @@ class BodySceneSources(SceneSources):
     """
 
     @cached_property
-    def step(self) -> BodyStep:
+    def step(self) -> MultiArmStep:
         """The step of its method."""
-        assert isinstance(self.method.step, BodyStep)
+        assert isinstance(self.method.step, MultiArmStep)
         return self.method.step
 
     @property
@@ -526,7 +526,7 @@ class BodySceneSources(SceneSources):
             place = state.slice(name)
             carry |= dict.fromkeys(range(place.start, place.stop), value)
         places = {
-            "STATE_FIRST": state.slice("first").start,
+            "STATE_FIRST_CANDIDATE": state.slice("first_candidate").start,
             "STATE_PALMS": state.slice("palm_rotation_0").start,
             "N_CARRY": len(carry),
             "N_CARRYING": len(motors),

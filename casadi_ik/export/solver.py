@@ -45,9 +45,9 @@ from casadi_ik.motion.free_path import motor_units
 from casadi_ik.motion.inputs import ERROR_TIME, contact_weights
 from casadi_ik.motion.motion import RUN_UP, own_velocities
 from casadi_ik.motion.moving import FOLLOWING_PULL, SETTLING
-from casadi_ik.solve.hand_first.driver import SearchPlan, source_text
 from casadi_ik.solve.hand_first.method import HandFirstMethod
 from casadi_ik.solve.hand_first.parameters import HandFirstParameters
+from casadi_ik.solve.hand_first.search_code import SearchPlan, source_text
 from casadi_ik.solve.hand_first.state import terms
 from casadi_ik.solve.request import POSTURE_LIMIT_SLACK, contacts_from_palms
 from casadi_ik.solve.verdict import LIMIT_SLACK, TOLERANCE_SLACK
@@ -220,7 +220,7 @@ class SideSources:
         """Declaration of its function."""
         return (
             f"int {self.prefix}_hands(struct {self.prefix} *job, const scalar *points, "
-            "const scalar *normals,\n    const scalar *here, int64_t nearest, int64_t round, "
+            "const scalar *normals,\n    const scalar *q0, int64_t nearest, int64_t round, "
             "scalar *postures);\n"
         )
 
@@ -230,13 +230,15 @@ class SideSources:
         return (
             f"    case {self.place}:\n"
             f"      job->side_{self.place}.memory = &job->memory;\n"
-            f"      return {self.prefix}_hands(&job->side_{self.place}, points, normals, here, "
+            f"      return {self.prefix}_hands(&job->side_{self.place}, points, normals, q0, "
             "nearest, round,\n                                postures);\n"
         )
 
     def source(self, names: Iterable[str]) -> str:
         """Return the text of its file, which calls the named kernels."""
-        texts = driver_text("loops") + "".join(map(source_text, ("spread", "seeds", "hands")))
+        texts = driver_text("loops") + "".join(
+            map(source_text, ("spread", "restarts", "seeds", "hands"))
+        )
         calls = "".join(
             f"#define {name.upper()}(work) {self.prefix}_{name}_kernel(work, job->memory)\n"
             for name in names
@@ -253,7 +255,7 @@ class SideSources:
 
 HANDS_OF = """\
 static int hands_of(search *job, int side, const scalar *points, const scalar *normals,
-                    const scalar *here, int64_t nearest, int64_t round, scalar *postures) {
+                    const scalar *q0, int64_t nearest, int64_t round, scalar *postures) {
   switch (side) {
 @CASES@    default: return SLICE_OVER;
   }
@@ -264,7 +266,7 @@ static int hands_of(search *job, int side, const scalar *points, const scalar *n
 
 def tiles(prefix: str, plan: SearchPlan) -> str:
     """Return the macro that selects a lookup table; hands with repaired seeds have only one."""
-    first, later = (f"{prefix}_table_{i}" for i in (0, 0 if plan.mends else 1))
+    first, later = (f"{prefix}_table_{i}" for i in (0, 0 if plan.repairs_seeds else 1))
     return f"#define TILES(table) ((table) ? {later} : {first})\n"
 
 
@@ -324,13 +326,17 @@ class SolverSources:
     def _hand_parts(self, name: str, plan: SearchPlan) -> tuple[Part, ...]:
         """Return the kernels that look up hand seeds."""
         lookup = plan.seeds.table.lookup
-        tables = zip(plan.seeds.tables(enforce_limits=True), plan.seeds.spreads, strict=False)
-        rows = max(spread.count for _, spread in tables) + TILE
+        tables = zip(plan.seeds.tables(enforce_limits=True), plan.seeds.table_samples, strict=False)
+        rows = max(samples.count for _, samples in tables) + TILE
         # Distances of all rows and of their tiles are 32 bits each.
         room = rows if self.single is None else rows + rows // TILE
         constants = define(lookup.constants | {"REGISTER_BYTES": 0})
         found = (self._part(f"{name}look_up", "lookup", lookup.key, constants, room),)
-        return found + ((self._part(f"{name}seen", "map", plan.seeds.seen),) if plan.mends else ())
+        return found + (
+            (self._part(f"{name}finger_errors", "map", plan.seeds.finger_errors),)
+            if plan.repairs_seeds
+            else ()
+        )
 
     def _scene_parts(self) -> tuple[Part, ...]:
         scene = self.scene
@@ -438,7 +444,7 @@ class SolverSources:
     @property
     def side_files(self) -> dict[str, str]:
         """Files of the sides by path."""
-        return {f"src/{side.prefix}.c": side.source(side.plan.of_hands) for side in self.sides}
+        return {f"src/{side.prefix}.c": side.source(side.plan.seed_kernels) for side in self.sides}
 
     @cached_property
     def _tables(self) -> dict[str, NDArray[np.int16]]:

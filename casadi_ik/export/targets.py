@@ -119,7 +119,7 @@ def _answers(
         HandFirstMethod(robot, HandFirstParameters()),
         Request(solver.robot, solver.tolerances, True),
     )
-    search = method.alone(enforce_limits=True)
+    search = method.new_search(enforce_limits=True)
     assert search is not None
     for row in range(len(points)):
         q0 = None if starts is None else starts[row]
@@ -127,8 +127,8 @@ def _answers(
         target = request.of_arrays(
             points[row : row + 1], normals[row : row + 1], None, prefer=prefer
         )
-        search.ask(target, 0, request.start(q0), method.terms(target))
-        answer = search.answer(search(method.rounds) or 0)
+        search.set_target(target, 0, request.start(q0), method.terms(target))
+        answer = search.result(search(method.rounds) or 0)
         yield answer.q, answer.status, answer.iterations, answer.restarts
 
 

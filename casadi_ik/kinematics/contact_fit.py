@@ -284,8 +284,8 @@ def evaluate_step(
     accepted = decreases_cost(trial)
     cost = ca.if_else(accepted, cost_after, cost_before)
     cost_ratio = cost / ca.fmax(cost_before, 1e-300)
-    slow_steps = ca.if_else(cost_ratio > FIT.slow, s["waited"] + 1, 0.0)
-    evaluations = s["spent"] + 1
+    slow_steps = ca.if_else(cost_ratio > FIT.slow, s["slow_steps"] + 1, 0.0)
+    evaluations = s["stage_iterations"] + 1
     effort = ca.if_else(cost < FIT.promising, float(FIT.persistence), 1.0)
     is_exhausted = ca.logic_or(slow_steps >= patience * effort, evaluations >= budget * effort)
     is_stuck = ca.logic_and(ca.logic_not(accepted), s["damping"] > FIT.damping_ceiling)
@@ -304,8 +304,8 @@ def evaluate_step(
     lm_state = initial_lm_state() | {
         "damping": ca.fmax(s["damping"] * factor, FIT.damping_floor),
         "growth": ca.if_else(accepted, FIT.growth, 2 * s["growth"]),
-        "waited": slow_steps,
-        "spent": evaluations,
+        "slow_steps": slow_steps,
+        "stage_iterations": evaluations,
     }
     lm_state = {
         name: ca.if_else(settled, initial_lm_state()[name], lm_state[name]) for name in lm_state
@@ -315,7 +315,12 @@ def evaluate_step(
 
 def initial_lm_state() -> dict[str, float]:
     """Return the initial values of the state fields of a fit."""
-    return {"damping": FIT.damping, "growth": FIT.growth, "waited": 0.0, "spent": 0.0}
+    return {
+        "damping": FIT.damping,
+        "growth": FIT.growth,
+        "slow_steps": 0.0,
+        "stage_iterations": 0.0,
+    }
 
 
 def contact_residual(
@@ -631,7 +636,7 @@ def minimax_step(
         accepted, sum_after > MINIMAX.stall_ratio * sum_before, damping > MINIMAX.damping_ceiling
     )
     powers_done = s["power"] + is_stalled
-    steps = s["spent"] + 1
+    steps = s["stage_iterations"] + 1
     is_finished = ca.logic_or(powers_done >= len(MINIMAX.powers), steps >= MINIMAX.budget)
     power_sum = ca.if_else(accepted, sum_after, sum_before) * largest ** (power - 2)
     is_infeasible = power_sum > len(contacts.slices) * MINIMAX.infeasible_ratio**power
@@ -640,7 +645,7 @@ def minimax_step(
     state = {
         "damping": ca.fmax(s["damping"] * damping_factor, MINIMAX.damping_floor),
         "power": powers_done,
-        "spent": steps,
+        "stage_iterations": steps,
     }
     return MinimaxStep(
         q=ca.if_else(accepted, trial.x, q),

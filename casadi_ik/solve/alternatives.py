@@ -24,7 +24,7 @@ from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.grasp import Tolerance
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.arm_search import ArmSearch, Preference
-from casadi_ik.solve.hand_first.body import BodyStep
+from casadi_ik.solve.hand_first.multi_arm import MultiArmStep
 from casadi_ik.solve.method import HandSearch
 from casadi_ik.solve.request import CLEARANCE, resolve_preference
 from casadi_ik.solve.solution import Alternative, ArmBranch
@@ -127,7 +127,7 @@ class AlternativeFinder:
     def side_searches(self) -> list[ArmSearch]:
         """Arm search of every side of a multi-arm robot; empty unless all have a closed form."""
         step, arms = self.trials.method.step, self.robot.description.side_actuators
-        families = [side.family for side in step.sides] if isinstance(step, BodyStep) else []
+        families = [side.family for side in step.sides] if isinstance(step, MultiArmStep) else []
         return [
             self._arm_search(family, list(arms[side][0]), side)
             for side, family in enumerate(families)

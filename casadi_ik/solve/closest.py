@@ -271,8 +271,8 @@ class FloatingPalmFit:
         """Fit seeds (c, p, hand) to c of the targets."""
         trials = self._trials
         owner, states, parameters = trials.hand_rows(targets, chosen, q0, postures)
-        parameters[:, trials.parameters.slice("alone")] = 1.0
-        parameters[:, trials.parameters.slice("reach")] = 0.0
+        parameters[:, trials.parameters.slice("hand_only")] = 1.0
+        parameters[:, trials.parameters.slice("reach_weight")] = 0.0
         return self._run(targets, owner, states, parameters)
 
     def _slide_towards_arm(self, targets: TargetBatch, fits: HandFits, rows: Rows) -> HandFits:
@@ -287,7 +287,7 @@ class FloatingPalmFit:
             states[:, trials.state.slice(name)] = value
         loose = parameters[:, trials.parameters.slice("position_tolerance")].min(axis=1)
         weight = np.sqrt(np.minimum(loose / (3 * fits.outside[rows]), 1.0))
-        parameters[:, trials.parameters.slice("reach")] = weight[:, None]
+        parameters[:, trials.parameters.slice("reach_weight")] = weight[:, None]
         trials.set_tolerance(parameters, UNREACHABLE_TOLERANCE)
         slid = self._run(targets, fits.owner[rows], states, parameters)
         return replace(slid, parameters=fits.parameters[rows])
@@ -297,7 +297,7 @@ class FloatingPalmFit:
         trials = self._trials
         states = trials.method.run_rows(states, parameters).states
         # Runs from these states may continue with the arm.
-        parameters[:, trials.parameters.slice("alone")] = 0.0
+        parameters[:, trials.parameters.slice("hand_only")] = 0.0
         rotation = states[:, trials.state.slice("palm_rotation")].reshape(-1, 3, 3)
         origin = states[:, trials.state.slice("palm_origin")]
         hand = states[:, trials.state.slice("q")].copy()

@@ -265,7 +265,7 @@ class Engine:
                 return interim
             method.prepare()
             started = time.perf_counter()
-            single = method.quick(targets, start)
+            single = method.solve_single(targets, start)
             if single is not None:
                 solution = self._single_solution(targets, single, start, started)
                 if solution is not None:

@@ -54,10 +54,10 @@ class FastSolver:
         f, n = len(robot.fingers), len(robot.actuators)
         self._home, self._shapes = robot.home, ((f, 3), (f, 3), (n,))
         self.position_error, self.angle_error = np.full(f, np.nan), np.full(f, np.nan)
-        self._search = search = method.alone(request.enforce_limits)
+        self._search = search = method.new_search(request.enforce_limits)
         if search is None:
             return
-        self._points, self._normals, self._start = search.points, search.normals, search.here
+        self._points, self._normals, self._start = search.points, search.normals, search.q0
         self._parameters, self._q = search.terms, search.q
         self._max_restarts = method.rounds
         self.position_error, self.angle_error = search.position_error, search.angle_error

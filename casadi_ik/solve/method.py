@@ -288,7 +288,7 @@ class SingleSearch(Protocol):
     Attributes:
         points: (f, 3) contact points [m], NaN where free; an input.
         normals: (f, 3) pad normals, NaN where free; an input.
-        here: (n,) start configuration [rad or m]; an input.
+        q0: (n,) start configuration [rad or m]; an input.
         terms: Parameters that targets share, as `HandSearch.terms` returns them; an input.
         q: (n,) result [rad or m]; overwritten by each call, like the errors.
         position_error: (f,) distances [m].
@@ -297,7 +297,7 @@ class SingleSearch(Protocol):
 
     points: Array
     normals: Array
-    here: Array
+    q0: Array
     terms: Array
     q: Array
     position_error: Array
@@ -349,12 +349,12 @@ class HandSearch(Method, Protocol):
         """Solve a batch with at most `rounds` restarts; see `Method.run`."""
         ...
 
-    def quick(self, targets: TargetBatch, q0: Array) -> SingleOutcome | None:
+    def solve_single(self, targets: TargetBatch, q0: Array) -> SingleOutcome | None:
         """Solve one target from q0 (n,) with less overhead than `run`; None if it cannot."""
         ...
 
-    def alone(self, enforce_limits: bool) -> SingleSearch | None:
-        """Return memory for one search after the other; None without a compiler."""
+    def new_search(self, enforce_limits: bool) -> SingleSearch | None:
+        """Return memory for successive searches; None without a compiler."""
         ...
 
     def terms(self, targets: TargetBatch) -> Array:
@@ -366,7 +366,7 @@ class HandSearch(Method, Protocol):
         ...
 
     def rows(
-        self, targets: TargetBatch, q0: Array, postures: Array, begun: bool = False
+        self, targets: TargetBatch, q0: Array, postures: Array, skip_q0: bool = False
     ) -> tuple[Array, Array]:
         """Return initial states and parameters of the loop for `run_rows`.
 
@@ -374,7 +374,7 @@ class HandSearch(Method, Protocol):
             targets: k targets.
             q0: (k, n) start configurations.
             postures: (k, candidates, hand) seeds, or (k, 1, hand).
-            begun: Whether to skip the search for a solution near q0.
+            skip_q0: Whether to skip the search for a solution near q0.
         """
         ...
 

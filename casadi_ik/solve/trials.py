@@ -25,12 +25,12 @@ EXHAUSTED = 1e6
 """Trial number after the last one, so that no further trial follows."""
 
 CARRY_ONLY = {
-    "first": EXHAUSTED,
-    "farthest": EXHAUSTED,
-    "fits": 1.0,
-    "fitted": 1.0,
-    "tried": EXHAUSTED,
-    "again": 1.0,
+    "first_candidate": EXHAUSTED,
+    "last_candidate": EXHAUSTED,
+    "hand_fits": 1.0,
+    "side_fits": 1.0,
+    "trunk_trials": EXHAUSTED,
+    "trunk_arms_placed_again": 1.0,
 }
 """State fields of a row that only moves trunk and arms to given palm poses."""
 
@@ -127,12 +127,12 @@ class Subproblems:
             postures: (k, hand) seeds [rad or m].
             turns: (k,) numbers that select the palm pose where contacts leave the palm free.
         """
-        states, parameters = self.method.rows(targets, start, postures[:, None], begun=True)
+        states, parameters = self.method.rows(targets, start, postures[:, None], skip_q0=True)
         states[:, self.state.slice("candidate")] = self.method.options.candidates - 1
         if self.robot.description.sides:
             # Each side has a single seed, its part of the posture.
-            states[:, self.state.slice("first")] = self.method.options.candidates - 1
-        states[:, self.state.slice("turn").start] = turns
+            states[:, self.state.slice("first_candidate")] = self.method.options.candidates - 1
+        states[:, self.state.slice("palm_number").start] = turns
         return states, parameters
 
     def hand_rows(

@@ -302,7 +302,7 @@ def fit_parameters(robot, points, normals):
         "weights": np.ones((3, 2)),
         "lower": robot.lower,
         "upper": robot.upper,
-        "reach": 1.0,
+        "reach_weight": 1.0,
     }
     return {name: ca.DM(value) for name, value in values.items()}
 

@@ -249,7 +249,7 @@ static int choose_arm(@PREFIX@_solver *solver, const scalar *lower, const scalar
   job.range = ARM_RANGE;
   job.q = q;
   job.palms = palm;
-  job.starts = solver->here;
+  job.starts = solver->q0;
   job.poses = solver->scene.poses;
   job.margin = solver->scene.margin;
   job.rounding = ROUNDING;
@@ -321,7 +321,7 @@ static int choose_arms(@PREFIX@_solver *solver, const scalar *lower, const scala
   job.range = own->range;
   job.q = q;
   job.palms = palms + 16 * side;
-  job.starts = solver->here;
+  job.starts = solver->q0;
   job.poses = solver->scene.poses;
   job.margin = solver->scene.margin;
   job.rounding = ROUNDING;

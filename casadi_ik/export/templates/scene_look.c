@@ -25,7 +25,7 @@ static void end_look(@PREFIX@_solver *solver, int found) {
 @}@
   if (!found && solver->terms[TERMS_NEAREST] > 0 && !look->again) {
     solver->terms[TERMS_NEAREST] = 0;
-    memcpy(solver->here, HOME, sizeof solver->here);
+    memcpy(solver->q0, HOME, sizeof solver->q0);
     look->again = 1;
     solver->slot = -1;
     solver->loop_status = UNBEGUN;
@@ -86,7 +86,7 @@ static scalar hand_rated(const @PREFIX@_solver *solver, const scalar *q) {
   for (k = 0; k < count; ++k) {
     const int i = HAS_CLOSED_ARM ? HAND[k] : k;
     if (near) {
-      const scalar part = (q[i] - solver->here[i]) / LOOK_RANGES[i];
+      const scalar part = (q[i] - solver->q0[i]) / LOOK_RANGES[i];
       value -= part * part;
     } else {
       const scalar below = q[i] - LOWER[i], above = UPPER[i] - q[i];
@@ -173,7 +173,7 @@ static int begin_hand(search *job) {
            N_HAND * sizeof(scalar));
   }
   for (i = 0; i < N_MOTORS; ++i) {
-    here[i] = clipped(job->here[i], job->terms[TERMS_LOWER + i],
+    here[i] = clipped(job->q0[i], job->terms[TERMS_LOWER + i],
                       job->terms[TERMS_UPPER + i]);
   }
   inputs[0] = job->points;
@@ -187,9 +187,9 @@ static int begin_hand(search *job) {
   job->state[STATE_PHASE] = CANDIDATE_PHASE;
   job->state[STATE_CANDIDATE] = N_CANDIDATES - 1;
   /* A different palm for each posture, where contacts leave the palm free. */
-  job->state[STATE_TURN] = (scalar) (look->round * N_CANDIDATES + look->fit);
+  job->state[STATE_PALM_NUMBER] = (scalar) (look->round * N_CANDIDATES + look->fit);
 @BODY{@
-  job->state[STATE_FIRST] = N_CANDIDATES - 1;
+  job->state[STATE_FIRST_CANDIDATE] = N_CANDIDATES - 1;
 @}@
   job->slot = -1;
   job->loop_status = RUNNING;

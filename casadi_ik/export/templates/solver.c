@@ -20,7 +20,7 @@ void @PREFIX@_init(@PREFIX@_solver *solver) {
   memset(solver, 0, sizeof *solver);
   memcpy(solver->terms, TERMS, sizeof TERMS);
   memcpy(solver->ranges, TERMS + TERMS_LOWER, sizeof solver->ranges);
-  solver->most = ALL_ROUNDS;
+  solver->max_restarts = ALL_ROUNDS;
   solver->status = @GUARD@_BAD_INPUT;
 @SCENE_INIT?@}
 
@@ -42,7 +42,7 @@ int @PREFIX@_begin(@PREFIX@_solver *solver, const scalar *points, const scalar *
                    const scalar *q0) {
   memcpy(solver->points, points, sizeof solver->points);
   memcpy(solver->normals, normals, sizeof solver->normals);
-  memcpy(solver->here, q0 ? q0 : HOME, sizeof solver->here);
+  memcpy(solver->q0, q0 ? q0 : HOME, sizeof solver->q0);
   memcpy(solver->terms + TERMS_LOWER, solver->ranges, sizeof solver->ranges);
   solver->terms[TERMS_NEAREST] = q0 ? 1 : 0;
 @SCENE_BEGIN?@  if (!search_begin(solver)) solver->status = @GUARD@_BAD_INPUT;

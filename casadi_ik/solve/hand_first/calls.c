@@ -3,8 +3,8 @@
 /* k targets with contiguous rows. */
 typedef struct {
   search *searches;            /* one for each slot of the loop */
-  const double *points, *normals, *more, *here, *terms;
-  const int64_t *most;
+  const double *points, *normals, *extra_vectors, *q0, *terms;
+  const int64_t *max_restarts;
   int64_t terms_step;          /* doubles from one target's terms to the next's, 0 = the same */
   double *q, *counts;
   int64_t *restarts;
@@ -28,14 +28,14 @@ EXPORT int casadi_ik_follow(void *method, int64_t slot, int64_t solve, int32_t *
   if (*status == UNBEGUN) {
     memcpy(job->points, rows->points + 3 * N_FINGERS * solve, sizeof job->points);
     memcpy(job->normals, rows->normals + 3 * N_FINGERS * solve, sizeof job->normals);
-    for (i = 0; i < 3 * N_FINGERS * N_MORE; ++i) {
-      job->more[i] = rows->more[3 * N_FINGERS * N_MORE * solve + i];
+    for (i = 0; i < 3 * N_FINGERS * N_EXTRA_VECTORS; ++i) {
+      job->extra_vectors[i] = rows->extra_vectors[3 * N_FINGERS * N_EXTRA_VECTORS * solve + i];
     }
-    memcpy(job->here, rows->here + N_MOTORS * solve, sizeof job->here);
+    memcpy(job->q0, rows->q0 + N_MOTORS * solve, sizeof job->q0);
     memcpy(job->terms, rows->terms + rows->terms_step * solve, sizeof job->terms);
-    job->most = rows->most[solve];
+    job->max_restarts = rows->max_restarts[solve];
     job->restart_quota = FOREVER;
-    job->judged = 0;
+    job->has_verdict = 0;
   }
   code = follow(job, 0, 0, status);
   if (code != DONE) return code;
@@ -49,7 +49,7 @@ EXPORT int casadi_ik_follow(void *method, int64_t slot, int64_t solve, int32_t *
 EXPORT int casadi_ik_decide(search *job) {
   int32_t status = (int32_t) job->loop_status;
   job->restart_quota = 1;
-  job->judged = 0;
+  job->has_verdict = 0;
   return follow(job, 0, 0, &status);
 }
 

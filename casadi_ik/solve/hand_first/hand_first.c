@@ -1,24 +1,24 @@
 /* Hand-first: the search for one target, from its inputs to the verdict.
  *
- * A search restarts until the target is solved or no further restart is worthwhile. A restart
- * tries up to N_CANDIDATES hand postures (seeds.c; for a multi-arm robot sides.c), one after the
- * other. For each posture it computes the best palm pose (candidate), fits palm and hand to the
- * contacts as if the hand were floating (hand fit), places the arm in closed form (arm placement,
- * or arm choice if the preference is q0), moves all motors where the arm cannot follow exactly
- * (refinement), and minimises the largest relative error where contacts contradict each other
- * (balance). One iteration is one step of the current stage and the choice of the next stage:
+ * A search restarts until the target is solved or no further restart is worthwhile (restarts.c).
+ * A restart tries up to N_CANDIDATES hand postures (seeds.c; for a multi-arm robot sides.c), one
+ * after the other. For each posture it computes the best palm pose (candidate), fits palm and hand
+ * to the contacts as if the hand were floating (hand fit), places the arm in closed form (arm
+ * placement, or arm choice if the preference is q0), moves all motors where the arm cannot follow
+ * exactly (refinement), and minimises the largest relative error where contacts contradict each
+ * other (balance). One iteration is one step of the current stage and the choice of the next stage:
  * iteration.c.
  *
  * The loop (compile/runtime/loop.c) runs the iterations, of one target or of many in lanes, and
  * calls `follow` when the iterations of a target end. A batch, a single target, `fast`, a solve by
  * steps and an exported solver all use this file.
  *
- * BEGIN, SOLVE and JUDGE call compiled kernels, as in seeds.c; driver.py defines the constants.
+ * BEGIN, SOLVE and JUDGE call compiled kernels, as in seeds.c; search_code.py defines the constants.
  */
 
-/* Low-discrepancy hand postures over the limits, and a whole configuration for the first of them:
- * seeds of the restarts after those from tables. */
-static void seed_low_discrepancy(search *job, int64_t number, double *first) {
+#if !REPAIRS
+/* Write low-discrepancy hand postures over the limits to the seeds. */
+static void seed_low_discrepancy(search *job, int64_t number) {
   int i, k;
   for (i = 0; i < N_CANDIDATES; ++i) {
     const int64_t sample = number * N_CANDIDATES + i + 1;
@@ -28,63 +28,96 @@ static void seed_low_discrepancy(search *job, int64_t number, double *first) {
           ANYWHERE_LOWER[column] + even(sample, ALL_STEPS[column]) * ANYWHERE_RANGE[column];
     }
   }
+}
+#endif
+
+/* Write a low-discrepancy configuration over the limits. */
+static void sample_configuration(int64_t number, double *q) {
+  int k;
   for (k = 0; k < N_MOTORS; ++k) {
-    first[k] = ANYWHERE_LOWER[k]
-             + even(number * N_CANDIDATES + 1, ALL_STEPS[k]) * ANYWHERE_RANGE[k];
+    q[k] = ANYWHERE_LOWER[k] + even(number * N_CANDIDATES + 1, ALL_STEPS[k]) * ANYWHERE_RANGE[k];
   }
 }
 
-/* In every second global restart, if the incumbent nearly fits, place the seeds on the line through
- * the last two incumbent hands: contacts move little along it, and the arm may reach another of its
- * hands. Updates the incumbents; returns 1 if it has set the seeds. Not for multi-arm robots, whose
- * sides are seeded independently. */
-static int seed_along_incumbents(search *job, int64_t number) {
-  double *best = job->incumbent_hands, *previous = job->incumbent_hands + N_HAND, max_part = 0;
-  int i, k, is_new = 0;
-  if (N_SIDES || !number || !(job->previous_state[STATE_BEST_COST] < NEARLY_FITS)) return 0;
+/* Store the hand of the incumbent if it has changed; the previous one is kept. */
+static void update_incumbent_hands(search *job) {
+  double *best = job->incumbent_hands, *previous = job->incumbent_hands + N_HAND;
+  int k, is_new = 0;
   for (k = 0; k < N_HAND; ++k) is_new |= job->previous_state[STATE_BEST_Q + HAND[k]] != best[k];
-  if (is_new) {
-    memcpy(previous, best, N_HAND * sizeof(double));
-    for (k = 0; k < N_HAND; ++k) best[k] = job->previous_state[STATE_BEST_Q + HAND[k]];
-    ++job->incumbent_count;
-  }
+  if (!is_new) return;
+  memcpy(previous, best, N_HAND * sizeof(double));
+  for (k = 0; k < N_HAND; ++k) best[k] = job->previous_state[STATE_BEST_Q + HAND[k]];
+  ++job->incumbent_count;
+}
+
+/* Write hand postures on the line through the last two incumbent hands to the seeds: contacts move
+ * little along it, and the arm may reach another of its hands. Return 0 if the hands are equal. */
+static int seed_along_line(search *job, int64_t number) {
+  const double *best = job->incumbent_hands, *previous = job->incumbent_hands + N_HAND;
+  double max_fraction = 0;
+  int i, k;
   for (k = 0; k < N_HAND; ++k) {
-    const double part = fabs(best[k] - previous[k]) / ANYWHERE_RANGE[HAND[k]];
-    if (part > max_part) max_part = part;
+    const double fraction = fabs(best[k] - previous[k]) / ANYWHERE_RANGE[HAND[k]];
+    if (fraction > max_fraction) max_fraction = fraction;
   }
-  if (job->incumbent_count < 2 || number % 2 || !(max_part > 0)) return 0;
+  if (!(max_fraction > 0)) return 0;
   for (i = 0; i < N_CANDIDATES; ++i) {
     const double offset = 2 * even(number * N_CANDIDATES + i + 1, ALL_STEPS[0]) - 1;
     for (k = 0; k < N_HAND; ++k) {
-      const double step = ALONG_LINE * offset / max_part * (best[k] - previous[k]);
+      const double step = ALONG_LINE * offset / max_fraction * (best[k] - previous[k]);
       job->postures[i * N_HAND + k] = best[k] + step;
     }
   }
   return 1;
 }
 
-/* Set the first state and the parameters of a restart from its seeds. The fields CARRIED of the
- * state are kept across restarts. */
-static int start_restart(search *job) {
-  const int64_t number = job->round, later = number - ROUNDS;
-  const double *inputs[5 + N_MORE];
-  double *outputs[2], first[N_MOTORS];
-  map_job map = mapping(1, inputs, ALONE, outputs, ALONE);
-  int code = DONE, i, k;
-  memcpy(job->previous_state, job->state, sizeof job->previous_state);
-  if (later >= 0) seed_low_discrepancy(job, later, first);
-  if (seed_along_incumbents(job, number)) code = DONE;
-  else if (later < 0) code = seed_from_tables(job, number);
-#if MENDS
-  else code = seed_repaired(job, number);
+/* Write the seeds of a restart. */
+static int write_seeds(search *job, int64_t number) {
+  if (tracks_incumbents(job, number)) update_incumbent_hands(job);
+  if (seeds_along_line(job, number) && seed_along_line(job, number)) return DONE;
+  if (!is_global_restart(number)) return seed_from_tables(job, number);
+#if REPAIRS
+  return seed_repaired(job, number);
+#else
+  seed_low_discrepancy(job, number - ROUNDS);
+  return DONE;
 #endif
+}
+
+/* Begin a global restart with the refinement of a configuration. */
+static void start_refinement(search *job, int64_t number) {
+  double q[N_MOTORS];
+  int i, k;
+  if (starts_at_incumbent(job, number)) {
+    memcpy(q, job->previous_state + STATE_BEST_Q, sizeof q);
+  } else {
+    sample_configuration(number - ROUNDS, q);
+  }
+  for (k = 0; k < N_MOTORS; ++k) {
+    job->state[STATE_Q + k] =
+        clipped(q[k], job->parameters[PARAMETERS_LOWER + k], job->parameters[PARAMETERS_UPPER + k]);
+  }
+  job->state[STATE_PHASE] = REFINEMENT_PHASE;
+  for (i = 0; i < N_FIT_FIELDS; ++i) job->state[FIT_FIELDS[i]] = FIT_VALUES[i];
+}
+
+/* Set the first state and the parameters of a restart. The fields KEPT_FIELDS of the state are kept
+ * across restarts. */
+static int start_restart(search *job) {
+  const int64_t number = job->round;
+  const double *inputs[5 + N_EXTRA_VECTORS];
+  double *outputs[2];
+  map_job map = mapping(1, inputs, ALONE, outputs, ALONE);
+  int code, i;
+  memcpy(job->previous_state, job->state, sizeof job->previous_state);
+  code = write_seeds(job, number);
   if (code != DONE) return code;
   inputs[0] = job->points;
   inputs[1] = job->normals;
-  for (i = 0; i < N_MORE; ++i) inputs[2 + i] = job->more + 3 * N_FINGERS * i;
-  inputs[2 + N_MORE] = job->here;
-  inputs[3 + N_MORE] = job->terms;
-  inputs[4 + N_MORE] = job->postures;
+  for (i = 0; i < N_EXTRA_VECTORS; ++i) inputs[2 + i] = job->extra_vectors + 3 * N_FINGERS * i;
+  inputs[2 + N_EXTRA_VECTORS] = job->q0;
+  inputs[3 + N_EXTRA_VECTORS] = job->terms;
+  inputs[4 + N_EXTRA_VECTORS] = job->postures;
   outputs[0] = job->state;
   outputs[1] = job->parameters;
   code = BEGIN(&map);
@@ -97,55 +130,13 @@ static int start_restart(search *job) {
   }
   job->state[STATE_PHASE] = CANDIDATE_PHASE;
   job->state[STATE_CANDIDATE] = 0.0;
-  if (later >= 0) {
-    /* A global restart begins with a refinement of all motors, because arm and hand together may
-     * be the obstacle. Every second one starts from the incumbent if that nearly fits: a refinement
-     * stalls in a flat valley. */
-    const int from_incumbent = later % 2 && job->previous_state[STATE_BEST_COST] < NEARLY_FITS;
-    if (from_incumbent) memcpy(first, job->previous_state + STATE_BEST_Q, sizeof first);
-    for (k = 0; k < N_MOTORS; ++k) {
-      job->state[STATE_Q + k] = clipped(first[k], job->parameters[PARAMETERS_LOWER + k],
-                                        job->parameters[PARAMETERS_UPPER + k]);
-    }
-    job->state[STATE_PHASE] = REFINEMENT_PHASE;
-    for (i = 0; i < N_FRESH; ++i) job->state[FRESH_PLACES[i]] = FRESH_VALUES[i];
+  if (is_global_restart(number)) start_refinement(job, number);
+  for (i = 0; i < N_KEPT_FIELDS; ++i) {
+    job->state[KEPT_FIELDS[i]] = job->previous_state[KEPT_FIELDS[i]];
   }
-  for (i = 0; i < N_CARRIED; ++i) job->state[CARRIED[i]] = job->previous_state[CARRIED[i]];
-  job->state[STATE_EARLIER] = job->previous_state[STATE_EARLIER] + N_CANDIDATES;
+  job->state[STATE_CANDIDATES_BEFORE] =
+      job->previous_state[STATE_CANDIDATES_BEFORE] + N_CANDIDATES;
   return DONE;
-}
-
-/* Return 1 if another restart is worthwhile. Table seeds are not once most fits have converged to
- * the same infeasible minimum. Extra global restarts require that minima keep changing and that
- * the best cost shrinks with the number of restarts. */
-static int restart_is_worthwhile(const search *job) {
-  const double returns = job->state[STATE_RETURNS], cost = job->state[STATE_BEST_COST];
-  const int is_underactuated = job->state[STATE_HELD] > 0;
-  const double max_returns = is_underactuated ? SAME_MINIMUM_MANY : SAME_MINIMUM;
-  const double max_cost = is_underactuated ? FAR_COST_MANY : FAR_COST;
-  const int64_t extra = job->round - FIRST_RUGGED;
-  if (extra >= 0) {
-    return returns < max_returns && cost < max_cost
-        && cost < FAR_COST_SHRINKS / (double) (extra + 1);
-  }
-  return returns < max_returns || cost < FLAT_COST || job->round < SURE_ROUNDS
-      || job->round >= ROUNDS;
-}
-
-/* Advance to the next worthwhile restart; return 0 if there is none. A preference only ranks
- * answers: if no answer near `here` exists, all restarts are repeated without the preference. */
-static int next_restart(search *job) {
-#if N_SIDES
-  if (job->state[STATE_HOPELESS] > 0) return 0;
-#endif
-  do ++job->round;
-  while (job->round < job->most && !restart_is_worthwhile(job));
-  if (job->round < job->most) return 1;
-  if (!job->most || !(job->terms[TERMS_NEAREST] > 0)) return 0;
-  job->terms[TERMS_NEAREST] = 0.0;
-  job->preference_dropped = 1;
-  job->round = 0;
-  return 1;
 }
 
 /* Compute the verdict, which decides the status. */
@@ -154,7 +145,7 @@ static int judge(search *job) {
   const double *inputs[3];
   double *outputs[3];
   map_job map = mapping(1, inputs, ALONE, outputs, ALONE);
-  int code, i, met = 1;
+  int code, i, is_met = 1;
   inputs[0] = job->q;
   inputs[1] = job->points;
   inputs[2] = job->normals;
@@ -164,12 +155,12 @@ static int judge(search *job) {
   code = JUDGE(&map);
   if (code != DONE) return code;
   for (i = 0; i < N_FINGERS; ++i) {
-    met &= job->position_error[i] <= job->terms[i] * slack || !is_number(job->points[3 * i]);
-    met &= job->angle_error[i] <= job->terms[N_FINGERS + i] * slack
+    is_met &= job->position_error[i] <= job->terms[i] * slack || !is_number(job->points[3 * i]);
+    is_met &= job->angle_error[i] <= job->terms[N_FINGERS + i] * slack
         || !is_number(job->normals[3 * i]);
   }
-  if (ENFORCE_LIMITS) met &= job->beyond <= LIMIT_SLACK;
-  if (met) job->status = SOLVED_STATUS;
+  if (ENFORCE_LIMITS) is_met &= job->beyond <= LIMIT_SLACK;
+  if (is_met) job->status = SOLVED_STATUS;
   else if (job->status == SOLVED_STATUS) job->status = STALLED_STATUS;
   return DONE;
 }
@@ -180,24 +171,24 @@ static void remove_full_turns(search *job) {
   int i;
   for (i = 0; i < N_TURNING; ++i) {
     const int k = TURNING[i];
-    job->turns[i] = CONTINUOUS[i] ? TURN * floor(job->here[k] / TURN + 0.5) : 0.0;
-    job->here[k] -= job->turns[i];
+    job->turns[i] = CONTINUOUS[i] ? TURN * floor(job->q0[k] / TURN + 0.5) : 0.0;
+    job->q0[k] -= job->turns[i];
   }
 }
 
-/* Move motors of the answer by full turns towards `here`: motors without limits, and, if the
+/* Move motors of the answer by full turns towards `q0`: motors without limits, and, if the
  * preference is q0, the others within their bounds. Motors with equal bounds stay. */
 static void move_to_nearest_turns(search *job) {
   int i;
   for (i = 0; i < N_TURNING; ++i) {
     const int k = TURNING[i];
     const double low = job->terms[TERMS_LOWER + k], high = job->terms[TERMS_UPPER + k];
-    const double q = job->q[k], turns = floor((job->here[k] - q) / TURN + 0.5);
+    const double q = job->q[k], turns = floor((job->q0[k] - q) / TURN + 0.5);
     if (CONTINUOUS[i] && low < high) {
       job->q[k] = q + TURN * turns + job->turns[i];
     } else if (job->terms[TERMS_NEAREST] > 0) {
-      const double least = ceil((low - q) / TURN), most = floor((high - q) / TURN);
-      job->q[k] = q + TURN * clipped(turns, least < 0 ? least : 0.0, most > 0 ? most : 0.0);
+      const double first = ceil((low - q) / TURN), last = floor((high - q) / TURN);
+      job->q[k] = q + TURN * clipped(turns, first < 0 ? first : 0.0, last > 0 ? last : 0.0);
     }
   }
 }
@@ -231,10 +222,10 @@ static int follow(void *method, int64_t slot, int64_t solve, int32_t *status) {
 #if N_TURNING
   move_to_nearest_turns(job);
 #endif
-  job->restarts = (int64_t) job->state[STATE_EARLIER]
+  job->restarts = (int64_t) job->state[STATE_CANDIDATES_BEFORE]
                 + (int64_t) clipped((double) (int64_t) job->state[STATE_CANDIDATE], 0.0,
                                     N_CANDIDATES - 1);
-  if (!N_MORE && job->judged) code = judge(job);
+  if (!N_EXTRA_VECTORS && job->has_verdict) code = judge(job);
   *status = (int32_t) job->status;
   return code;
 }
@@ -307,12 +298,12 @@ static int search_begin(search *job) {
     is_valid &= normalise_if_direction(normal);
     has_point |= is_given;
   }
-  for (i = 0; i < N_MOTORS; ++i) is_valid &= is_finite(job->here[i]);
+  for (i = 0; i < N_MOTORS; ++i) is_valid &= is_finite(job->q0[i]);
   job->slot = -1;
   job->loop_status = UNBEGUN;
   job->iterations = 0;
   job->restarts = 0;
-  job->judged = 1;
+  job->has_verdict = 1;
   job->status = RUNNING;
   return is_valid && has_point;
 }

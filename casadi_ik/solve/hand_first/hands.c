@@ -1,10 +1,10 @@
 /* Write the seeds of a restart for a side of a multi-arm robot (sides.c). */
-FIND_HANDS(search *job, const double *points, const double *normals, const double *here,
+FIND_HANDS(search *job, const double *points, const double *normals, const double *q0,
            int64_t nearest, int64_t round, double *postures) {
   int code;
   memcpy(job->points, points, sizeof job->points);
   memcpy(job->normals, normals, sizeof job->normals);
-  memcpy(job->here, here, sizeof job->here);
+  memcpy(job->q0, q0, sizeof job->q0);
   memcpy(job->terms + TERMS_LOWER, LOWER, sizeof LOWER);
   memcpy(job->terms + TERMS_UPPER, UPPER, sizeof UPPER);
   job->terms[TERMS_NEAREST] = (double) nearest;

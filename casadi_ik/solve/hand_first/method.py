@@ -1,8 +1,8 @@
-"""The hand-first method: lookup of postures, then one compiled loop over all stages."""
+"""Hand-first: searches from hand postures of tables, in one compiled loop over all stages."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 from itertools import chain, product
@@ -20,12 +20,19 @@ from casadi_ik.kinematics.contacts import Kinds, point_normal_kinds
 from casadi_ik.kinematics.robot_kernels import RobotKernels
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.targets import TargetBatch
-from casadi_ik.solve.hand_first.body import BodyStep
-from casadi_ik.solve.hand_first.driver import Searches, SearchPlan, SearchPool, can_search
+from casadi_ik.solve.hand_first.driver import Searches, SearchPool
+from casadi_ik.solve.hand_first.independent_sides import (
+    SideSolver,
+    robot_trace,
+    solve_sides_independently,
+)
+from casadi_ik.solve.hand_first.iteration import iteration_graph
+from casadi_ik.solve.hand_first.multi_arm import MultiArmStep
 from casadi_ik.solve.hand_first.palm_target import PALM_KINDS, palm_contacts, palm_robot
 from casadi_ik.solve.hand_first.parameters import HandFirstParameters
+from casadi_ik.solve.hand_first.search_code import SearchPlan, can_search
 from casadi_ik.solve.hand_first.seeds import Seeds
-from casadi_ik.solve.hand_first.state import CARRIED, beginning
+from casadi_ik.solve.hand_first.state import KEPT_ACROSS_RESTARTS, beginning
 from casadi_ik.solve.hand_first.step import HandFirstStep
 from casadi_ik.solve.limits import coupling_jacobian
 from casadi_ik.solve.looped_method import LoopedMethod, Start
@@ -33,109 +40,24 @@ from casadi_ik.solve.method import HandSearch, Outcome, SingleOutcome
 from casadi_ik.solve.proofs.premises import ArmSpan, arm_span, palms_in_span
 from casadi_ik.solve.request import PREFERENCES
 from casadi_ik.solve.status import Phase, Status
-from casadi_ik.solve.trace import RecordedJacobian, pack_mask
+from casadi_ik.solve.trace import RecordedJacobian
 from casadi_ik.solve.verdict import judge
 
-SideRun = Callable[[TargetBatch, Array], Outcome]
-"""Solves the targets of a side from where it is."""
-
-
-def side_by_side(
-    robot: RobotDescription,
-    runs: Sequence[SideRun],
-    targets: TargetBatch,
-    q0: Array,
-    phases: Sequence[str],
-    record: np.dtype[Any] | None,
-) -> Outcome:
-    """Solve every side by itself.
-
-    Args:
-        robot: The body.
-        runs: What solves its sides.
-        targets: k targets.
-        q0: (k, n) where the robot is, within bounds.
-        phases: Names of all phases, in order.
-        record: Of the rows of a trace of the body; None: no trace is wanted.
-    """
-    count, q = len(targets), np.array(q0)
-    status = np.full(count, int(Status.SOLVED))
-    iterations, restarts = np.zeros((2, count), dtype=np.int64)
-    seconds, spent = np.zeros(count), {name: np.zeros(count, dtype=np.int64) for name in phases}
-    traces: list[list[NDArray[Any]]] = [[] for _ in range(count)]
-    for run, side, (arm, hand) in zip(runs, robot.sides, robot.side_actuators, strict=True):
-        motors = sorted((*arm, *hand))
-        fingers = [robot.finger_names.index(name) for name in side.fingers]
-        known = [targets.points, targets.normals]
-        asked = np.any([~np.isnan(one[:, fingers, 0]) for one in known], axis=(0, 2))
-        rows = np.flatnonzero(asked)
-        if not len(rows):
-            continue
-        found = run(part_of(targets.rows(rows), fingers, motors), q[rows][:, motors])
-        before = q[rows]
-        q[rows[:, None], motors] = found.q
-        worse = (status[rows] == Status.SOLVED) & (found.status != Status.SOLVED)
-        status[rows[worse]] = found.status[worse]
-        iterations[rows] += found.iterations
-        restarts[rows] += found.restarts
-        seconds[rows] += found.time
-        for name, numbers in found.phases.items():
-            spent[name][rows] += numbers
-        if record is not None:
-            for row, here, own in zip(rows.tolist(), before, found.trace, strict=True):
-                traces[row].append(_of_body(robot, own, here, motors, fingers, record))
-    whole = None
-    if record is not None:
-        every = [part for parts in traces for part in parts]
-        whole = np.concatenate([np.empty(0, record), *every])
-    return Outcome(q, status, iterations, restarts, seconds, spent, whole)
-
-
-def part_of(targets: TargetBatch, fingers: Sequence[int], motors: Sequence[int]) -> TargetBatch:
-    """The part of targets that is of some fingers, on a robot of some motors."""
-    fixed = None if targets.fixed is None else targets.fixed[..., motors]
-    return replace(targets.for_fingers(fingers), fixed=fixed)
-
-
-def _of_body(
-    robot: RobotDescription,
-    rows: NDArray[Any],
-    here: Array,
-    motors: Sequence[int],
-    fingers: Sequence[int],
-    record: np.dtype[Any],
-) -> NDArray[Any]:
-    """The rows of a side's trace as rows of the body, all other motors at `here` (n,)."""
-    found = np.zeros(len(rows), record)
-    for name in record.names or ():
-        if found[name].dtype.kind == "f":
-            found[name] = np.nan
-        if name == "q":
-            found[name] = here
-            found[name][:, motors] = rows[name]
-        elif name in ("position_error", "angle_error"):
-            found[name][:, fingers] = rows[name]
-        elif name != "limit_mask" and name in (rows.dtype.names or ()):
-            found[name] = rows[name]
-    at_limits = (found["q"] <= robot.lower) | (found["q"] >= robot.upper)
-    found["limit_mask"] = pack_mask(at_limits).reshape(found["limit_mask"].shape)
-    return found
-
-
-NEAREST = "q0"
-"""The preference for what is near the start."""
+Q0_PREFERENCE = "q0"
+"""Preference for the solution nearest to q0."""
 
 
 class HandFirstMethod(LoopedMethod):
-    """`hand-first`: contacts fix palm and hand, the arm follows in closed form.
+    """Method `hand-first`: contacts determine palm and hand, the arm follows in closed form.
 
-    Rounds begin from other hand postures each; nearly all targets need one round only. What follows
-    a round is said in C (hand_first.c), for a batch, one target and a solve by steps alike. Without
-    a compiler there are the rounds from tables only, in CasADi's virtual machine.
+    Each restart has other hand postures as seeds; nearly all targets need one restart only. C code
+    decides about restarts (restarts.c), for a batch, a single target and a stepper. Without a
+    compiler there are table restarts only, in CasADi's virtual machine.
 
     Attributes:
-        step: Its step for this robot.
-        preferences: What it can prefer.
+        step: Graphs of the stages for the robot.
+        seeds: Tables of hand postures.
+        preferences: Supported preferences.
     """
 
     name = "hand-first"
@@ -151,33 +73,40 @@ class HandFirstMethod(LoopedMethod):
         compiled: bool = True,
         kinds: Kinds | None = None,
     ) -> None:
-        """Recognise the arm and lay out the step; point and normal if no kinds are given."""
+        """Recognise the arm, and define the layouts.
+
+        Args:
+            robot: Description of the robot.
+            options: Parameters of the method.
+            compiled: False: use CasADi's virtual machine.
+            kinds: Kinds of the contacts, by finger; None: points with normals.
+        """
         robot = robot if compiled else robot.as_hand
         super().__init__(robot, options, compiled)
         self.options: HandFirstParameters = options
         self._kinds = kinds or point_normal_kinds(len(robot.fingers))
         if robot.sides:
-            self.step: HandFirstStep = BodyStep(robot, options.candidates, self._kinds)
+            self.step: HandFirstStep = MultiArmStep(robot, options.candidates, self._kinds)
         else:
             self.step = HandFirstStep(robot, arm_family(robot), options.candidates, self._kinds)
         self.seeds = Seeds(robot, options, compiled)
         self._searches = SearchPool(self.plan)
-        self._kept: tuple[Any, Array] | None = None
+        self._cached_terms: tuple[Any, Array] | None = None
 
     def step_graph(self) -> StepGraph:
-        """The whole iteration."""
-        return self.step.graph()
+        """Return the graph of an iteration."""
+        return iteration_graph(self.step)
 
     def for_kinds(self, kinds: Kinds) -> HandFirstMethod:
-        """The same for contacts of other kinds."""
+        """Return the method for contacts of other kinds."""
         if kinds == self._kinds:
             return self
         return HandFirstMethod(self.robot, self.options, self._compiled, kinds)
 
     @cached_property
     def is_compiled(self) -> bool:
-        """Whether all that solves call is compiled: made ahead some may be missing."""
-        if self._is_apart:
+        """True if all kernels are compiled; of precompiled kernels some may be missing."""
+        if self._has_independent_sides:
             return all(side.is_compiled for side in self._sides)
         return self._is_searchable
 
@@ -186,8 +115,8 @@ class HandFirstMethod(LoopedMethod):
         return self.kernel.compiled and can_search(self.plan(enforce_limits=True))
 
     @property
-    def _is_apart(self) -> bool:
-        """Whether the robot is a body whose sides know nothing of each other."""
+    def _has_independent_sides(self) -> bool:
+        """True for a multi-arm robot without a trunk."""
         return bool(self.robot.sides) and not self.robot.trunk
 
     @property
@@ -196,22 +125,22 @@ class HandFirstMethod(LoopedMethod):
         return self
 
     def in_virtual_machine(self) -> HandFirstMethod:
-        """The same, never compiled; a body is one hand with all motors there."""
+        """Return the method without compiled code; a multi-arm robot becomes one hand there."""
         return HandFirstMethod(self.robot.as_hand, self.options, False, self._kinds)
 
     def __reduce__(self) -> tuple[type[HandFirstMethod], tuple[Any, ...]]:
-        """What it was made from."""
+        """Return the arguments of the constructor."""
         return HandFirstMethod, (self.robot, self.options, self._compiled, self._kinds)
 
     def prepare(self, batches: bool = False) -> None:
-        """Build and compile what one target takes, and fill the table of the first round.
+        """Build and compile the kernels of a single target, and fill the table of its seeds.
 
         Args:
-            batches: Whether to compile what many targets take, too.
+            batches: Whether to also compile the kernels of batches.
         """
-        if batches and not self._is_apart:
+        if batches and not self._has_independent_sides:
             _ = self.kernel.lanes
-        if self._is_apart:
+        if self._has_independent_sides:
             for side in self._sides:
                 side.prepare(batches)
             return
@@ -224,11 +153,11 @@ class HandFirstMethod(LoopedMethod):
 
     @property
     def jacobians(self) -> Mapping[str, RecordedJacobian]:
-        """Those of the couplings."""
+        """Jacobians of the couplings."""
         return coupling_jacobian(self.robot)
 
     def plan(self, enforce_limits: bool) -> SearchPlan:
-        """What the C of its driver is made of."""
+        """Return the ingredients of the C code of a search."""
         kernels = RobotKernels(self.robot)
         return SearchPlan(
             layouts=self.step.layouts,
@@ -236,7 +165,7 @@ class HandFirstMethod(LoopedMethod):
             budget=self.max_iterations,
             seeds=self.seeds,
             enforce_limits=enforce_limits,
-            made={
+            kernel_factories={
                 "begin": lambda: self.first,
                 "solve": lambda: self.kernel,
                 "contacts": lambda: kernels.contacts,
@@ -247,7 +176,7 @@ class HandFirstMethod(LoopedMethod):
 
     @cached_property
     def _sides(self) -> list[HandFirstMethod]:
-        """The same for every side of a body by itself."""
+        """Methods of the sides of a multi-arm robot."""
         robot = self.robot
         return [
             HandFirstMethod(
@@ -261,15 +190,15 @@ class HandFirstMethod(LoopedMethod):
 
     @property
     def rounds(self) -> int:
-        """How many a search has at most."""
+        """Maximum number of restarts of a search."""
         return self.options.all_rounds(self.robot)
 
     def run(
         self, targets: TargetBatch, q0: Array, seed: int, trace: bool, rounds: int | None = None
     ) -> Outcome:
-        """Solve a batch; see `Method.run`. No random numbers are drawn.
+        """Solve a batch with at most `rounds` restarts; see `Method.run`.
 
-        `rounds` are so many of each search at most instead of all.
+        No random numbers are drawn.
         """
         outcome = self._run_contacts(targets, q0, seed, trace, rounds)
         if targets.palms is None:
@@ -284,16 +213,16 @@ class HandFirstMethod(LoopedMethod):
         if not self.is_compiled:
             method = self.in_virtual_machine() if self.robot.sides else self
             return method._run_from_tables(targets, q0, trace, rounds)
-        if self._is_apart:
-            return self._side_by_side(targets, q0, seed, trace, rounds)
-        most = np.full(len(targets), self._rounds_for(targets))
+        if self._has_independent_sides:
+            return self._run_independent_sides(targets, q0, seed, trace, rounds)
+        max_restarts = np.full(len(targets), self._max_restarts(targets))
         if rounds is not None:
-            most = np.minimum(most, rounds)
+            max_restarts = np.minimum(max_restarts, rounds)
         reachable = None if targets.palms is None else palms_in_span(self._span, targets)
         if reachable is not None:
-            most[~reachable] = 0  # a first round leads near what the arm cannot reach
+            max_restarts[~reachable] = 0  # the first restart alone ends near unreachable palms
         with self._searches.lent(targets.enforce_limits, len(targets)) as searches:
-            return searches.batch(targets, q0, self.terms(targets), most, trace)
+            return searches.batch(targets, q0, self.terms(targets), max_restarts, trace)
 
     def _run_palms(
         self,
@@ -327,20 +256,20 @@ class HandFirstMethod(LoopedMethod):
             q[:, arm] = palms.q
             met = self._meets_palms(targets.rows(rows), q)
             solved[rows] = met
-            outcome = outcome.continued(rows, q, met, palms, self._of_hand(palms, q, trace))
-        content = outcome.status == Status.SOLVED
-        status = np.where(content & ~solved, int(Status.STALLED), outcome.status)
+            outcome = outcome.continued(rows, q, met, palms, self._palm_traces(palms, q, trace))
+        has_failed = (outcome.status == Status.SOLVED) & ~solved
+        status = np.where(has_failed, int(Status.STALLED), outcome.status)
         status[solved] = Status.SOLVED
         return replace(outcome, status=status)
 
-    def _of_hand(self, palms: Outcome, q: Array, trace: bool) -> list[NDArray[np.void]] | None:
+    def _palm_traces(self, palms: Outcome, q: Array, trace: bool) -> list[NDArray[np.void]] | None:
         """Return traces of the palm search as traces of the arm-hand; None without a trace."""
         if not trace:
             return None
         arm, record = list(self.robot.arm_actuators), self.graph.record.dtype
         return [
-            _of_body(self.robot, rows, at, arm, [], record)
-            for rows, at in zip(palms.trace, q, strict=True)
+            robot_trace(self.robot, rows, row_q, arm, [], record)
+            for rows, row_q in zip(palms.trace, q, strict=True)
         ]
 
     def _meets_palms(self, targets: TargetBatch, q: Array) -> NDArray[np.bool_]:
@@ -357,199 +286,203 @@ class HandFirstMethod(LoopedMethod):
         robot = palm_robot(self.robot)
         return HandFirstMethod(robot, self.options, self._compiled, PALM_KINDS)
 
-    def _side_by_side(
+    def _run_independent_sides(
         self, targets: TargetBatch, q0: Array, seed: int, trace: bool, rounds: int | None
     ) -> Outcome:
-        """Solve a body whose sides know nothing of each other."""
+        """Solve a multi-arm robot without a trunk."""
 
-        def runs(side: HandFirstMethod) -> SideRun:
-            return lambda part, here: side.run(part, here, seed, trace, rounds)
+        def side_solver(side: HandFirstMethod) -> SideSolver:
+            return lambda side_targets, q: side.run(side_targets, q, seed, trace, rounds)
 
-        return side_by_side(
+        return solve_sides_independently(
             self.robot,
-            list(map(runs, self._sides)),
+            list(map(side_solver, self._sides)),
             targets,
             np.where(self.robot.continuous, q0, np.clip(q0, *targets.bounds(self.robot))),
             self.step.layouts.labels,
             self.graph.record.dtype if trace else None,
         )
 
-    def quick(self, targets: TargetBatch, q0: Array) -> SingleOutcome | None:
-        """What `run` would find for one target from q0 (n,), sooner; None: ask `run`."""
-        if not self.is_compiled or self._is_apart:
+    def solve_single(self, targets: TargetBatch, q0: Array) -> SingleOutcome | None:
+        """Solve one target from q0 (n,) as `run` does, but faster; None: use `run`."""
+        if not self.is_compiled or self._has_independent_sides:
             return None
         with self._searches.lent(targets.enforce_limits) as search:
-            search.ask(targets, 0, q0, self.terms(targets))
-            status = search(self._rounds_for(targets))
-            return None if status is None else search.answer(status)
+            search.set_target(targets, 0, q0, self.terms(targets))
+            status = search(self._max_restarts(targets))
+            return None if status is None else search.result(status)
 
-    def alone(self, enforce_limits: bool) -> Searches | None:
-        """Memory for one search after the other; None without a compiler."""
+    def new_search(self, enforce_limits: bool) -> Searches | None:
+        """Return memory for successive searches; None without a compiler."""
         self.prepare()
         return Searches(self.plan(enforce_limits), 1) if self._is_searchable else None
 
     def stepper(self, targets: TargetBatch, q0: Array) -> Stepper:
-        """One target, one iteration at a time; see `Method.stepper`."""
+        """Return a stepper of one target, see `Method.stepper`."""
         self._check(targets)
-        search, rounds = self.alone(targets.enforce_limits), self._rounds_for(targets)
+        search, max_restarts = self.new_search(targets.enforce_limits), self._max_restarts(targets)
         if search is None:
             return super().stepper(targets, q0)
-        search.ask(targets, 0, q0, self.terms(targets).reshape(-1))
+        search.set_target(targets, 0, q0, self.terms(targets).reshape(-1))
 
-        def following(status: int, state: Array) -> Start | None:
+        def next_restart(status: int, state: Array) -> Start | None:
             search.state[...] = state
-            if not search.decide(status, rounds):
+            if not search.decide(status, max_restarts):
                 return None
             return search.state.copy(), search.parameters.copy()
 
-        search.decide(UNBEGUN, rounds)
-        return Stepper(self.kernel, search.state, search.parameters, following)
+        search.decide(UNBEGUN, max_restarts)
+        return Stepper(self.kernel, search.state, search.parameters, next_restart)
 
     def postures(self, targets: TargetBatch, number: int) -> Array:
-        """Candidates (k, candidates, hand) of a round whose postures look like the targets.
+        """Return the seeds (k, candidates, hand) of a table restart [rad or m].
 
         Args:
-            targets: The targets.
-            number: The round, below `options.rounds`.
+            targets: k targets.
+            number: Number of the restart, below `options.rounds`.
         """
         count, terms = self.options.candidates, self.terms(targets)
         if not self.is_compiled or not (number or self.robot.sides):
-            table, most = self.seeds.table, (number + 1) * count
-            return table.nearest(targets.points, targets.normals, most)[:, -count:]
-        every = np.broadcast_to(terms, (len(targets), terms.shape[-1]))
-        here = np.zeros(len(self.robot.actuators))
+            table, row_count = self.seeds.table, (number + 1) * count
+            return table.nearest(targets.points, targets.normals, row_count)[:, -count:]
+        terms_by_row = np.broadcast_to(terms, (len(targets), terms.shape[-1]))
+        q0 = np.zeros(len(self.robot.actuators))
         with self._searches.lent(targets.enforce_limits) as search:
-            found = np.empty((len(targets), *search.postures.shape))
+            seeds = np.empty((len(targets), *search.postures.shape))
             for row in range(len(targets)):
-                search.ask(targets, row, here, every[row])
-                found[row] = search.hands(number)
-        return found
+                search.set_target(targets, row, q0, terms_by_row[row])
+                seeds[row] = search.seeds(number)
+        return seeds
 
     def begin(self, targets: TargetBatch, q0: Array, number: int = 0) -> Start:
-        """A round from a table; where what is near q0 is wanted, its own hand comes first."""
+        """Return states and parameters of a table restart.
+
+        If the preference is q0, the hand of q0 is the first seed of the first restart.
+        """
         postures = self.postures(targets, number)
-        nearest = targets.prefer == NEAREST and not number
+        nearest = targets.prefer == Q0_PREFERENCE and not number
         if nearest and self.robot.arm_actuators and postures.shape[1] > 1:
-            own = np.clip(q0, *targets.bounds(self.robot))[:, None]
-            own = own[:, :, list(self.robot.hand_actuators)]
-            postures = np.concatenate([own, postures[:, :-1]], axis=1)
-        return self.rows(targets, q0, postures, begun=number > 0)
+            start = np.clip(q0, *targets.bounds(self.robot))[:, None]
+            hand_of_q0 = start[:, :, list(self.robot.hand_actuators)]
+            postures = np.concatenate([hand_of_q0, postures[:, :-1]], axis=1)
+        return self.rows(targets, q0, postures, skip_q0=number > 0)
 
     def _run_from_tables(
         self, targets: TargetBatch, q0: Array, trace: bool, rounds: int | None
     ) -> Outcome:
-        """Solve a batch in the virtual machine: the next nearest hands for what is left over."""
+        """Solve a batch in the virtual machine, with table restarts of the unsolved targets."""
         layout, count = self.step.layouts.state, len(targets)
         status, iterations = np.zeros((2, count), dtype=np.int64)
         states, seconds = np.zeros((count, layout.size)), np.zeros(count)
         traces: list[list[NDArray[Any]]] = [[] for _ in range(count)]
         searches = [targets]
-        if targets.prefer == NEAREST:
+        if targets.prefer == Q0_PREFERENCE:
             searches.append(replace(targets, prefer="limits"))
-        most = min(self.rounds, self.options.rounds, rounds or self.rounds)
-        for asked, number in product(searches, range(most)):
-            left = np.flatnonzero(status != Status.SOLVED)
-            if not len(left):
+        max_restarts = min(self.rounds, self.options.rounds, rounds or self.rounds)
+        for search_targets, number in product(searches, range(max_restarts)):
+            unsolved = np.flatnonzero(status != Status.SOLVED)
+            if not len(unsolved):
                 break
-            first, parameters = self.begin(asked.rows(left), q0[left], number)
+            first, parameters = self.begin(search_targets.rows(unsolved), q0[unsolved], number)
             if number:
-                for name in CARRIED:
-                    first[:, layout.slice(name)] = states[left, layout.slice(name)]
-                first[:, layout.slice("earlier")] = number * self.options.candidates
+                for name in KEPT_ACROSS_RESTARTS:
+                    first[:, layout.slice(name)] = states[unsolved, layout.slice(name)]
+                candidates_before = number * self.options.candidates
+                first[:, layout.slice("candidates_before")] = candidates_before
             result = self.kernel.run(first, parameters, self.max_iterations, trace)
-            states[left], status[left] = result.states, Status.from_loop(result.status)
-            iterations[left] += result.iterations
-            seconds[left] += result.time
-            for target, rows in zip(left.tolist(), result.trace, strict=trace):
+            states[unsolved], status[unsolved] = result.states, Status.from_loop(result.status)
+            iterations[unsolved] += result.iterations
+            seconds[unsolved] += result.time
+            for target, rows in zip(unsolved.tolist(), result.trace, strict=trace):
                 traces[target].append(rows)
-        none, counts = np.empty(0, self.graph.record.dtype), self.phase_counts(states, iterations)
+        no_rows = np.empty(0, self.graph.record.dtype)
+        counts = self.phase_counts(states, iterations)
         return Outcome(
             q=states[:, layout.slice("q")].copy(),
             status=status,
             iterations=iterations,
             restarts=self.restarts(states),
             time=seconds,
-            phases={phase.label: spent for phase, spent in counts.items()},
-            rows=np.concatenate([none, *chain.from_iterable(traces)]) if trace else None,
+            phases={phase.label: count for phase, count in counts.items()},
+            rows=np.concatenate([no_rows, *chain.from_iterable(traces)]) if trace else None,
         )
 
-    def _rounds_for(self, targets: TargetBatch) -> int:
-        """So many; of hands that are given none from anywhere but what every target gets."""
-        every = self.rounds
-        return every if targets.palms is None else min(every, self.options.first_rugged)
+    def _max_restarts(self, targets: TargetBatch) -> int:
+        """Return the maximum number of restarts; palm targets get no extra restarts."""
+        count = self.rounds
+        return count if targets.palms is None else min(count, self.options.first_rugged)
 
     @cached_property
     def _span(self) -> ArmSpan | None:
         return arm_span(self.robot)
 
     def phase_counts(self, states: Array, iterations: Counts) -> Mapping[Phase, Counts]:
-        """The step counts them."""
+        """Return the counts of the states by phase."""
         del iterations
         counts = states[:, self.step.layouts.state.slice("counts")].astype(np.int64)
-        return {stage: counts[:, i] for i, stage in enumerate(self.step.layouts.stages)}
+        return {phase: counts[:, i] for i, phase in enumerate(self.step.layouts.phases)}
 
     def restarts(self, states: Array) -> Counts:
-        """Hand postures tried but the first."""
+        """Return the number of hand postures tried after the first."""
         layout = self.step.layouts.state
-        earlier, candidate = (
+        candidates_before, candidate = (
             states[:, layout.slice(name).start].astype(np.int64)
-            for name in ("earlier", "candidate")
+            for name in ("candidates_before", "candidate")
         )
-        return earlier + np.clip(candidate, 0, self.options.candidates - 1)
+        return candidates_before + np.clip(candidate, 0, self.options.candidates - 1)
 
     def rows(
-        self, targets: TargetBatch, q0: Array, postures: Array, begun: bool = False
+        self, targets: TargetBatch, q0: Array, postures: Array, skip_q0: bool = False
     ) -> tuple[Array, Array]:
-        """States and parameters of the loop, to be changed before `run_rows`.
+        """Return states and parameters (k, ...) of the loop for `run_rows`.
 
         Args:
             targets: k targets.
-            q0: (k, n).
-            postures: (k, candidates, hand) hand postures to start from, or (k, 1, hand). Motors
-                that move free fingers only stay as in q0.
-            begun: Whether a solution near q0 was looked for before, if one is wanted.
-
-        Returns:
-            (k, ...) states and parameters.
+            q0: (k, n) start configurations [rad or m].
+            postures: (k, candidates, hand) seeds, or (k, 1, hand) [rad or m]. Motors that only move
+                free fingers stay at q0.
+            skip_q0: Whether to skip the search for a solution near q0.
         """
         hand = len(self.step.layouts.robot.hand_actuators)
-        tried = np.broadcast_to(postures, (len(targets), self.options.candidates, hand))
+        seeds = np.broadcast_to(postures, (len(targets), self.options.candidates, hand))
         vectors = (targets.vectors(f"{name}s") for name in self.step.layouts.contacts.data)
-        # A kernel's column is a vector: of a hand with one motor there is no second dimension.
-        tried = tried.reshape(len(targets), *self.first.input_shapes[-1])
-        asked = *vectors, q0, self.terms(targets), tried
-        states, parameters = self.first(*asked)
-        if begun:
+        # Kernels take a column as a vector: the seeds of one motor have no second dimension.
+        seeds = seeds.reshape(len(targets), *self.first.input_shapes[-1])
+        states, parameters = self.first(*vectors, q0, self.terms(targets), seeds)
+        if skip_q0:
             layout = self.step.layouts.state
             states[:, layout.slice("phase")] = float(Phase.CANDIDATE)
             states[:, layout.slice("candidate")] = 0.0
         return states, parameters
 
     def run_rows(self, states: Array, parameters: Array) -> LoopResult:
-        """Run the compiled loop on rows as made by `rows`."""
+        """Run the loop from states and parameters made by `rows`."""
         return self.kernel.run(states, parameters, self.max_iterations)
 
     def terms(self, targets: TargetBatch) -> Array:
-        """What `beginning` calls terms; kept, since making them costs as much as a solve."""
-        if targets.fixed is not None:
-            return self._terms_of(targets)
-        asked = targets.tolerances, targets.enforce_limits, targets.prefer
-        kept = self._kept
-        if kept is None or kept[0] != asked:
-            self._kept = kept = asked, self._terms_of(targets)
-        return kept[1]
+        """Return the parameters that targets share, see `state.terms`.
 
-    def _terms_of(self, targets: TargetBatch) -> Array:
+        They are cached, because their computation takes as long as a solve.
+        """
+        if targets.fixed is not None:
+            return self._compute_terms(targets)
+        key = targets.tolerances, targets.enforce_limits, targets.prefer
+        cached = self._cached_terms
+        if cached is None or cached[0] != key:
+            self._cached_terms = cached = key, self._compute_terms(targets)
+        return cached[1]
+
+    def _compute_terms(self, targets: TargetBatch) -> Array:
         bounds = targets.bounds(self.robot)
-        nearest = np.array([float(targets.prefer == NEAREST)])
-        every = targets.position_tolerance, targets.angle_tolerance, *bounds, nearest
+        nearest = np.array([float(targets.prefer == Q0_PREFERENCE)])
+        fields = targets.position_tolerance, targets.angle_tolerance, *bounds, nearest
         if bounds[0].ndim == 1:
-            return np.concatenate(every)
-        # Each target has bounds of its own.
-        rows = (np.broadcast_to(part, (len(targets), part.shape[-1])) for part in every)
+            return np.concatenate(fields)
+        # The bounds differ between targets.
+        rows = (np.broadcast_to(field, (len(targets), field.shape[-1])) for field in fields)
         return np.concatenate(list(rows), axis=1)
 
     @cached_property
     def first(self) -> FunctionKernel:
-        """Makes first state and parameters of a round."""
+        """Kernel of the first state and the parameters of a restart."""
         return FunctionKernel(beginning(self.step.layouts), self._compiled)

@@ -28,8 +28,8 @@ class HandFirstParameters:
             reachable targets are solved. None: as many as are worthwhile.
         few_motors_table: Fraction of `table` for hands with few motors and more than three fingers:
             the shape of their contacts is more distinctive, and a row costs three times as much as
-            with three fingers. Source: of 4,000 targets of a Panda with a hand of five fingers and
-            six motors 16 instead of 4 need a second posture, and all take an eighth less time.
+            with three fingers. Source: 4,000 targets of a Panda with a hand of five fingers and six
+            motors; 16 instead of 4 need a second posture, and all are an eighth faster.
         many_motors: Largest number of motors of a hand with few motors.
         at_limits: Fraction of the range that the wide table maps to the limits.
         sure_rounds: Minimum number of restarts from tables.
@@ -38,7 +38,7 @@ class HandFirstParameters:
         finger_turns: Number of alternations between palm pose and fingers in a repair; a third one
             improves little.
         pool: Number of low-discrepancy postures that are repaired for a restart. Source: with 64 a
-            batch of an Allegro, LEAP or Shadow hand takes up to a third longer.
+            batch of an Allegro, LEAP or Shadow hand is slower by up to a third.
         late_round: Number of the restart from which every second one uses postures without repair.
             Source: of 64,000 targets of a LEAP hand near limits 140 are unsolved after 16 restarts
             and 16 after 64 if all are repaired, 100 and 8 if they alternate.
@@ -100,12 +100,12 @@ class HandFirstParameters:
                 continue
             if isinstance(value, bool) or not (isinstance(value, int) and value >= 1):
                 raise InputError(f"{field.name}: found {value!r}, expected a whole number >= 1")
-        least = self.candidates * self.rounds
+        min_rows = self.candidates * self.rounds
         for name in ("table", "wide_table"):
-            if getattr(self, name) < least:
+            if getattr(self, name) < min_rows:
                 raise InputError(
                     f"{name}: found {getattr(self, name)}, expected at least candidates x rounds = "
-                    f"{least}"
+                    f"{min_rows}"
                 )
 
     def is_many(self, robot: RobotDescription) -> bool:
@@ -119,96 +119,105 @@ class HandFirstParameters:
 
     def all_rounds(self, robot: RobotDescription) -> int:
         """Return the maximum number of restarts of all kinds."""
-        every = self.first_rugged + self.rugged_rounds[self.is_many(robot)]
-        every = min(every, BODY.rounds) if robot.sides else every
-        return min(every, self.max_rounds or every)
+        count = self.first_rugged + self.rugged_rounds[self.is_many(robot)]
+        count = min(count, TRUNK_PARAMETERS.max_restarts) if robot.sides else count
+        return min(count, self.max_rounds or count)
 
 
 @dataclass(frozen=True)
 class StageParameters:
-    """Criteria by which one stage of a solve follows another.
+    """Criteria for the choice of the next stage.
 
     Attributes:
-        before_the_arm: Fraction of the tolerances to which a hand is fitted; the arm that follows
-            adds its rounding. Source: at 1e-6 it made an answer of 1.0000006e-6.
-        fit_part: Fraction of the tolerances to which hands of later restarts and of multi-arm
-            robots are fitted where possible: a hand that fits barely may have its palm out of the
-            arm's reach. Source: of 20,000 targets around one that the search had missed at 5 mm,
-            2,762 are missed with a half, 2,131 with a tenth, 73 with a hundredth, 49 with a
-            thousandth.
-        own_hand: Largest cost, with the best palm pose, at which the hand of q0 is fitted first.
-        whole: Largest cost at which q0 itself is refined (three contacts off by 40 mm each).
+        fit_fraction: Fraction of the tolerances to which a hand is fitted; the rounding of the arm
+            comes on top. Source: with 1 a solution at 1e-6 had an error of 1.0000006e-6.
+        tight_fit_fraction: Fraction of the tolerances to which hands of later restarts and of
+            multi-arm robots are fitted where possible: the palm of a hand that barely fits may be
+            out of the arm's reach. Source: of 20,000 targets around one that the search had missed
+            at 5 mm, 2,762 are missed with a half, 2,131 with a tenth, 73 with a hundredth, 49 with
+            a thousandth.
+        max_cost_of_q0_hand: Largest cost, with the best palm pose, at which the hand of q0 is
+            fitted first.
+        max_cost_of_q0: Largest cost at which q0 itself is refined (three contacts off by 40 mm
+            each).
     """
 
-    before_the_arm: float = 0.999
-    fit_part: float = 0.01
-    own_hand: float = 0.5
-    whole: float = 0.5
+    fit_fraction: float = 0.999
+    tight_fit_fraction: float = 0.01
+    max_cost_of_q0_hand: float = 0.5
+    max_cost_of_q0: float = 0.5
 
 
-STAGES = StageParameters()
+STAGE_PARAMETERS = StageParameters()
 
 
 @dataclass(frozen=True)
-class BodyParameters:
-    """Parameters of the search for the trunk of a multi-arm robot.
+class TrunkParameters:
+    """Parameters of the search for trunk and arms of a multi-arm robot.
 
     Attributes:
-        rounds: Maximum number of restarts of all kinds. Source: of 500,000 targets of two Pandas
-            with Allegro hands near limits 18 are missed at 1e-6 with 16, 3 with 64, in the same
-            time.
-        first_trunks: Number of trunk trials for the first hand postures of the first restart.
-        later_trunks: Number of trunk trials in later restarts. Near limits few trunks reach all
-            palms. Source: of 100,000 targets of a G1 at 1e-6 with half of the motors within 1 % of
-            a limit 18 are missed with 48 in all restarts, 2 to 4 with these.
-        other_trunks: Number of trunk trials for hand postures after the first.
-        least_trunks: Minimum number of trunk trials for hands that fit. Source: of 40,000 targets
-            of an H1-2 one that is solved is still 80 mm off after 60, none more than 30 mm after
-            120.
-        far_trunks: Largest product of trunk trials and their smallest cost (1: 100 mm or 1 rad);
-            above it a target counts as out of reach. Source: of 200,000 targets of an H1-2 at 1e-6
-            near limits the three that are solved last have 59, 42 and 37, all but eight less than
-            15; at 5 mm 150 lost one of 200,000, 400 none.
-        loose_trunks: The same limit where contacts leave palms free. Source: without it two Pandas
-            with Allegro hands search for a second for targets 2 m away.
-        one_arm_trunks: The same limit for one arm on a trunk. Source: of 1,000,000 targets of an
-            LWR on a mobile base near limits 20 were lost with 400 at 5 mm, some even with 5,000.
-        at_limits: Fraction of a motor's range that every second trunk maps to its limits.
+        max_restarts: Maximum number of restarts of all kinds. Source: of 500,000 targets of two
+            Pandas with Allegro hands near limits 18 are missed at 1e-6 with 16, 3 with 64, in the
+            same time.
+        first_trunk_trials: Maximum number of trunk trials for the first hand postures of the first
+            restart.
+        later_trunk_trials: The same number in later restarts. Near limits few trunk positions reach
+            all palm poses. Source: of 100,000 targets of a G1 at 1e-6 with half of the motors
+            within 1 % of a limit 18 are missed with 48 in all restarts, 2 to 4 with these.
+        other_trunk_trials: Maximum number of trunk trials for hand postures after the first.
+        min_fitting_trials: Minimum number of trunk trials with hands that fit. Source: of 40,000
+            targets of an H1-2 one that is solved is still 80 mm off after 60, none more than 30 mm
+            after 120.
+        max_weighted_trials: Largest product of the number of trunk trials and their smallest cost
+            (1: 100 mm or 1 rad); above it a target counts as out of reach. Source: of 200,000
+            targets of an H1-2 at 1e-6 near limits the three that are solved last have 59, 42 and
+            37, all but eight less than 15; at 5 mm 150 lost one of 200,000, 400 none.
+        max_weighted_trials_free_palms: The same limit where contacts leave palms free. Source:
+            without it two Pandas with Allegro hands search for a second for targets 2 m away.
+        max_weighted_trials_one_arm: The same limit for one arm on a trunk. Source: of 1,000,000
+            targets of an LWR on a mobile base near limits 20 were lost with 400 at 5 mm, some even
+            with 5,000.
+        trunk_limit_fraction: Fraction of a motor's range that every second trunk trial maps to the
+            limits.
         patience: Number of consecutive steps of trunk and arms with slow progress that ends them.
             Source: with 3 instead of 8 three times as many of these targets are missed.
         budget: Maximum number of steps of trunk and arms; ten times as many at small costs.
-        nearly: Cost (30 mm and 18 deg) below which arms are placed again at the best trunk.
-        again_trials: Number of redundancy samples of that placement.
-        around: Index of the redundancy sample from which every second trunk samples locally.
-        from_anywhere: Period of trunk trials whose arms start from low-discrepancy configurations.
-        later_anywhere: The same period in later restarts: targets that closed forms miss at 60
-            trunks are hardly ever found by them.
-        closer_every: Period of trunk trials near the best trunk so far.
+        replacement_cost: Cost (30 mm and 18 deg) below which arms are placed again at the trunk of
+            the trial.
+        replacement_trials: Number of arm trials of that placement.
+        local_arm_trial: Number of the arm trial with which every second trunk trial begins, so that
+            arms are sampled around one value of the redundancy only.
+        free_arms_period: Period of the trunk trials whose arms start from low-discrepancy
+            configurations instead of closed forms.
+        later_free_arms_period: The same period in later restarts: targets that closed forms miss at
+            60 trunk positions are hardly ever solved by them.
+        local_trunk_period: Period of the trunk trials near the best trunk position so far.
         trunk_unit: Scale of trunk motions relative to arm motions if the preference is q0.
-        box: Number of trials after which the sampling radius around the best trunk has halved.
-        missed: Negative margin of an arm within its limits that misses its palm pose.
+        radius_trials: Number of trials after which the sampling radius around the best trunk
+            position has halved.
+        miss_margin: Negative margin of an arm within its limits that misses its palm pose.
     """
 
-    rounds: int = 64
-    first_trunks: int = 60
-    later_trunks: int = 800
-    other_trunks: int = 24
-    least_trunks: int = 120
-    far_trunks: float = 400.0
-    loose_trunks: float = 4000.0
-    one_arm_trunks: float = 40000.0
-    at_limits: float = 0.5
+    max_restarts: int = 64
+    first_trunk_trials: int = 60
+    later_trunk_trials: int = 800
+    other_trunk_trials: int = 24
+    min_fitting_trials: int = 120
+    max_weighted_trials: float = 400.0
+    max_weighted_trials_free_palms: float = 4000.0
+    max_weighted_trials_one_arm: float = 40000.0
+    trunk_limit_fraction: float = 0.5
     patience: int = 8
     budget: int = 25
-    nearly: float = 0.1
-    again_trials: int = 4
-    around: int = 5
-    from_anywhere: int = 8
-    later_anywhere: int = 2
-    closer_every: int = 4
+    replacement_cost: float = 0.1
+    replacement_trials: int = 4
+    local_arm_trial: int = 5
+    free_arms_period: int = 8
+    later_free_arms_period: int = 2
+    local_trunk_period: int = 4
     trunk_unit: float = 0.25
-    box: float = 8.0
-    missed: float = 1e-12
+    radius_trials: float = 8.0
+    miss_margin: float = 1e-12
 
 
-BODY = BodyParameters()
+TRUNK_PARAMETERS = TrunkParameters()

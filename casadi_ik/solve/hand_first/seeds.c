@@ -4,15 +4,14 @@
  * with a larger table, half of whose postures are at limits. For hands with many motors they take
  * low-discrepancy postures instead and repair them finger by finger.
  *
- * The macros LOOK_UP and SEEN (if MENDS) call kernels with a pointer to a job; driver.py defines
- * the constants.
+ * The macros LOOK_UP and FINGER_ERRORS (if REPAIRS) call kernels with a pointer to a job;
+ * search_code.py defines the constants.
  */
 
 /* Return the position of a motor in a row of a table of postures. */
-
 static double table_posture(int table, int64_t row, int motor) {
-  const double spread = (even(row + 1, HAND_STEPS[motor]) - 0.5) / TABLE_SQUEEZE[table] + 0.5;
-  return TABLE_LOWER[table][motor] + clipped(spread, 0.0, 1.0) * TABLE_RANGE[table][motor];
+  const double part = (even(row + 1, HAND_STEPS[motor]) - 0.5) / TABLE_SQUEEZE[table] + 0.5;
+  return TABLE_LOWER[table][motor] + clipped(part, 0.0, 1.0) * TABLE_RANGE[table][motor];
 }
 
 /* Write the `count` rows of a table nearest to the target to `seed_rows`, nearest first. */
@@ -38,7 +37,7 @@ static double squared_distance(const double *a, const double *b) {
   return sum;
 }
 
-#if MENDS
+#if REPAIRS
 /* Return the row of a finger's table nearest to its target features, and its distance. */
 LOOPS static int nearest_row(int finger, const double *features, double *min_distance) {
   double distance[FINGER_ROWS];
@@ -75,13 +74,13 @@ static int repair_per_finger(search *job, double *hand, double *error) {
   outputs[2] = error;
   for (pass = 0; pass <= FINGER_TURNS; ++pass) {
     map_job map = mapping(1, inputs, ALONE, outputs, ALONE);
-    code = SEEN(&map);
+    code = FINGER_ERRORS(&map);
     if (code != DONE) return code;
     for (finger = 0; pass < FINGER_TURNS && finger < N_FINGERS; ++finger) {
       const int best = nearest_row(finger, features, &distance);
       if (!(distance < finger_errors[finger])) continue;
       for (k = 0; k < FINGER_MOTORS[finger]; ++k) {
-        hand[FINGER_PLACES[finger][k]] = FINGER_POSTURES[finger][best][k];
+        hand[FINGER_COLUMNS[finger][k]] = FINGER_POSTURES[finger][best][k];
       }
     }
   }
@@ -108,20 +107,19 @@ static int repair_pool(search *job, int64_t count) {
 }
 #endif
 
-#if MENDS
-/* Seed with repaired low-discrepancy postures, different ones in every restart; in every second
- * late restart with postures that are not repaired. */
+#if REPAIRS
+/* Seed with low-discrepancy postures, different ones in every restart, and repair them unless the
+ * restart omits it. */
 static int seed_repaired(search *job, int64_t number) {
-  const int is_unrepaired = number >= LATE_ROUND && number % 2;
-  const int64_t count = is_unrepaired ? N_CANDIDATES : POOL;
+  const int64_t count = repairs_seeds(number) ? POOL : N_CANDIDATES;
   int64_t i;
   int k;
   for (i = 0; i < count; ++i) {
     for (k = 0; k < N_HAND; ++k) {
-      job->seed_pool[i * N_HAND + k] = table_posture(1, number * POOL + i, k);
+      job->seed_pool[i * N_HAND + k] = table_posture(TABLE_OF_LATER_SEEDS, number * POOL + i, k);
     }
   }
-  if (is_unrepaired) {
+  if (!repairs_seeds(number)) {
     memcpy(job->postures, job->seed_pool, sizeof job->postures);
     return DONE;
   }
@@ -129,25 +127,25 @@ static int seed_repaired(search *job, int64_t number) {
 }
 #endif
 
-/* Sort the seeds by their distance to the hand in q0. If `own`, that hand replaces the last seed
- * and comes first. */
-static void sort_by_distance_to_q0(search *job, int own) {
+/* Sort the seeds by their distance to the hand of q0. If `inserts_q0`, that hand replaces the last
+ * seed and comes first. */
+static void sort_by_distance_to_q0(search *job, int inserts_q0) {
   /* One element more than needed, because a rigid tool has no motors and C has no empty arrays. */
-  double here[N_HAND + 1], near[N_HAND + 1], sorted[N_CANDIDATES * N_HAND + 1];
+  double hand_of_q0[N_HAND + 1], scaled_q0[N_HAND + 1], sorted[N_CANDIDATES * N_HAND + 1];
   double distance[N_CANDIDATES];
-  const int first = own && HAS_ARM && N_CANDIDATES > 1;
+  const int first = inserts_q0 && HAS_ARM && N_CANDIDATES > 1;
   const int count = first ? N_CANDIDATES - 1 : N_CANDIDATES;
   int i, j, k;
   for (k = 0; k < N_HAND; ++k) {
     const int column = HAND[k];
-    here[k] = clipped(job->here[column], job->terms[TERMS_LOWER + column],
-                      job->terms[TERMS_UPPER + column]);
-    near[k] = here[k] / ORDER_RANGES[k];
+    hand_of_q0[k] = clipped(job->q0[column], job->terms[TERMS_LOWER + column],
+                            job->terms[TERMS_UPPER + column]);
+    scaled_q0[k] = hand_of_q0[k] / ORDER_RANGES[k];
   }
   for (i = 0; i < count; ++i) {
     double scaled[N_HAND + 1];
     for (k = 0; k < N_HAND; ++k) scaled[k] = job->postures[i * N_HAND + k] / ORDER_RANGES[k];
-    distance[i] = squared_distance(scaled, near);
+    distance[i] = squared_distance(scaled, scaled_q0);
   }
   for (i = 0; i < count; ++i) {
     int rank = first;
@@ -156,28 +154,28 @@ static void sort_by_distance_to_q0(search *job, int own) {
     }
     for (k = 0; k < N_HAND; ++k) sorted[rank * N_HAND + k] = job->postures[i * N_HAND + k];
   }
-  for (k = 0; first && k < N_HAND; ++k) sorted[k] = here[k];
+  for (k = 0; first && k < N_HAND; ++k) sorted[k] = hand_of_q0[k];
   memcpy(job->postures, sorted, N_CANDIDATES * N_HAND * sizeof(double));
 }
 
 /* Seed with the postures whose contacts resemble the target most; in later restarts with the next
  * best of a larger table. */
 static int seed_from_tables(search *job, int64_t number) {
-  const int table = !number ? 0 : !ENFORCE_LIMITS && number % 2 ? 2 : 1;
-  const int64_t before = number ? (number - 1) * N_CANDIDATES : 0;
+  const int table = table_of_restart(number);
+  const int64_t first = number ? (number - 1) * N_CANDIDATES : 0;
   int code, i, k;
-#if MENDS
+#if REPAIRS
   if (number) {
     code = seed_repaired(job, number);
     if (code == DONE && job->terms[TERMS_NEAREST] > 0) sort_by_distance_to_q0(job, 0);
     return code;
   }
 #endif
-  code = look_up_rows(job, table, before + N_CANDIDATES);
+  code = look_up_rows(job, table, first + N_CANDIDATES);
   if (code != DONE) return code;
   for (i = 0; i < N_CANDIDATES; ++i) {
     for (k = 0; k < N_HAND; ++k) {
-      job->postures[i * N_HAND + k] = table_posture(table, job->seed_rows[before + i], k);
+      job->postures[i * N_HAND + k] = table_posture(table, job->seed_rows[first + i], k);
     }
   }
   if (job->terms[TERMS_NEAREST] > 0) sort_by_distance_to_q0(job, !number);

@@ -1,4 +1,4 @@
-"""State, parameters and record of the hand-first method, and the start of a solve."""
+"""State, parameters and record of the hand-first method, and the start of a restart."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ from casadi_ik.solve.trace import (
     Q,
 )
 
-STAGES = (
+COUNTED_PHASES = (
     *(Phase.REFINEMENT, Phase.CANDIDATE, Phase.HAND_FIT, Phase.ARM_PLACEMENT),
     *(Phase.BALANCE, Phase.ARM_CHOICE),
 )
-"""The stages of an arm-hand in the order of their codes; a body has `Phase.TRUNK` after them."""
+"""Phases with a counter of iterations, in order; multi-arm robots have `Phase.TRUNK` after them."""
 
 
 class Stage(IntEnum):
-    """What a solve does next, `phase` of the state; where `Phase` has it by its code."""
+    """Stage of the next iteration; a stage that is a phase in logs has the code of the phase."""
 
     START = 0
     REFINEMENT = Phase.REFINEMENT
@@ -57,42 +57,50 @@ class Stage(IntEnum):
     TOLERANT_REFINEMENT = max(Phase) + 3
 
 
-BY_SIDE = 32
-"""Offset of stage numbers per side of a multi-arm robot: stage + 32 * side."""
+SIDE_OFFSET = 32
+"""Offset of stage codes per side of a multi-arm robot: stage + 32 * side."""
 
 
-SAID = Layout(
+STAGE_RESULT = Layout(
     (
-        Field("settled", doc="1 if the fit or the balance has ended"),
-        Field("within", doc="1 if contacts are within tolerance; for an arm, within its bounds"),
-        Field("near", doc="1 if an arm is the real one; 1 if its steps end near the pose"),
-        Field("miss", doc="root mean square error of a fit, relative to the tolerances"),
-        Field("cost", doc="cost before a hand fit or of an arm step; largest ratio of a balance"),
-        Field("at_end", doc="arm joint, from 1, to move to its opposite limit; 0: none"),
+        Field("is_settled", doc="1 if the fit, the steps or the balance have ended"),
+        Field("is_within", doc="1 if all contacts are within tolerance"),
+        Field("is_idle", doc="candidate: 1 if no finger of the side has a contact"),
+        Field("arm_is_allowed", doc="1 if the best arm is within its limits, or near enough to q0"),
+        Field("arm_is_exact", doc="1 if the arm of this trial meets the palm pose"),
+        Field("arm_is_close", doc="1 if an arm of few motors is as close as the tolerance asks"),
+        Field("rms_ratio", doc="root mean square of the errors of a fit, relative to tolerances"),
+        Field("cost", doc="cost before a hand fit, or of steps of an arm or a trunk"),
+        Field("max_ratio", doc="balance: largest error relative to its tolerance"),
+        Field("joint_to_flip", doc="arm joint, from 1, to move to its opposite limit; 0: none"),
     )
 )
 """Outputs of a stage that decide the next stage."""
 
-PLACES = {
-    **{stage: i for i, stage in enumerate(STAGES)},
-    Stage.TRUNK: len(STAGES),
-    Stage.START: STAGES.index(Phase.REFINEMENT),
-    Stage.ARM_STEPS: STAGES.index(Phase.ARM_PLACEMENT),
-    Stage.TOLERANT_HAND_FIT: STAGES.index(Phase.HAND_FIT),
-    Stage.TOLERANT_REFINEMENT: STAGES.index(Phase.REFINEMENT),
+COUNTER_OF_STAGE = {
+    **{stage: i for i, stage in enumerate(COUNTED_PHASES)},
+    Stage.TRUNK: len(COUNTED_PHASES),
+    Stage.START: COUNTED_PHASES.index(Phase.REFINEMENT),
+    Stage.ARM_STEPS: COUNTED_PHASES.index(Phase.ARM_PLACEMENT),
+    Stage.TOLERANT_HAND_FIT: COUNTED_PHASES.index(Phase.HAND_FIT),
+    Stage.TOLERANT_REFINEMENT: COUNTED_PHASES.index(Phase.REFINEMENT),
 }
 """Index of the counter of each stage."""
 
-CARRIED = (
-    *("passed", "near", "least_excess", "balanced", "least", "returns"),
-    *("best_cost", "best_q", "counts"),
+KEPT_ACROSS_RESTARTS = (
+    *("arm_start_distance", "hand_fit_minimum", "hand_fit_min_excess", "refinement_minimum"),
+    *("balance_min_ratio", "repeated_minima", "best_cost", "best_q", "counts"),
 )
 """State fields kept across restarts: the position in the start table of the numeric arm, the minima
 that were tried, and the incumbent."""
 
-NOTHING = float("nan")
+TRUNK_KEPT_ACROSS_RESTARTS = (
+    *("trunk_total_trials", "trunk_fitting_trials", "trunk_fitting_min_cost"),
+)
+"""State fields of multi-arm robots kept across restarts: the trunk trials."""
 
-LOOSE = "1 if the contacts of a side are fewer conditions than palm and hand have motions"
+UNKNOWN = float("nan")
+"""Value of a record field that a stage does not compute."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,18 +121,18 @@ class HandFirstLayouts:
     def arm(self) -> tuple[int, ...]:
         """Indices in q of the motors of the arm, or of all arms of a multi-arm robot."""
         robot = self.robot
-        sides = (place for arm, _ in robot.side_actuators for place in arm)
-        return tuple(sides) if robot.sides else robot.arm_actuators
+        all_arms = (motor for arm, _ in robot.side_actuators for motor in arm)
+        return tuple(all_arms) if robot.sides else robot.arm_actuators
 
     @cached_property
-    def stages(self) -> tuple[Phase, ...]:
+    def phases(self) -> tuple[Phase, ...]:
         """Phases of the solves, in the order of their counters."""
-        return (*STAGES, Phase.TRUNK) if self.robot.sides else STAGES
+        return (*COUNTED_PHASES, Phase.TRUNK) if self.robot.sides else COUNTED_PHASES
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
         """Names of the phases."""
-        return tuple(stage.label for stage in self.stages)
+        return tuple(phase.label for phase in self.phases)
 
     @cached_property
     def contacts(self) -> ContactRows:
@@ -133,112 +141,142 @@ class HandFirstLayouts:
 
     @cached_property
     def state(self) -> Layout:
-        """Layout of the state that one iteration passes to the next."""
+        """Layout of the state that one iteration passes to the next.
+
+        A field of one stage has the name of the stage as prefix. The damped steps of all fits
+        share damping, growth, cost, slow_steps and stage_iterations.
+        """
         n = len(self.robot.actuators)
         sides = (len(self.robot.sides),) if self.robot.sides else ()
         return Layout(
             (
-                Field("q", (n,), doc="arm and hand; during a hand fit only the hand is meaningful"),
-                Field("palm_rotation", (3, 3)),
-                Field("palm_origin", (3,), unit="m"),
-                Field("phase"),
+                Field("q", (n,), doc="configuration [rad or m]; in a hand fit only of the hand"),
+                Field("palm_rotation", (3, 3), doc="palm orientation of the hand, base frame"),
+                Field("palm_origin", (3,), unit="m", doc="palm position of the hand, base frame"),
+                Field("phase", doc="code of the stage of the next iteration, see `Stage`"),
                 Field("candidate", doc="index of the hand posture; -1: the one of q0"),
-                Field("earlier", doc="number of hand postures tried in earlier restarts"),
-                Field("turn", doc="index of the first palm rotation where contacts leave it free"),
-                Field("damping"),
+                Field("candidates_before", doc="number of hand postures of earlier restarts"),
+                Field(
+                    "palm_number", doc="index of the first palm pose where contacts leave it free"
+                ),
+                Field("damping", doc="Levenberg-Marquardt damping of the next step"),
                 Field("growth", doc="factor of the damping if the next step is rejected"),
-                Field("cost", doc="cost at q (or at palm and hand)"),
-                Field("fits", doc="1 if palm and hand meet the contacts"),
-                Field("waited", doc="number of consecutive steps with slow progress"),
-                Field("spent", doc="number of steps in this stage"),
-                Field("power", doc="number of completed powers of the balance"),
+                Field("cost", doc="cost at q, or at palm and hand in a hand fit"),
+                Field("slow_steps", doc="number of consecutive steps with slow progress"),
+                Field("stage_iterations", doc="iterations of this stage; of an arm the next trial"),
+                Field("hand_fits", doc="1 if palm and hand meet the contacts"),
                 Field(
-                    "near",
-                    doc="cost of the last minimum of a hand fit that missed by little, 0: none",
+                    "hand_fit_minimum",
+                    doc="cost of the last minimum of a hand fit that nearly met the contacts, or 0",
                 ),
-                Field("least_excess", doc="smallest cost of a tolerant hand fit that failed"),
                 Field(
-                    "balanced",
-                    doc="cost of the last minimum of a refinement that missed by little, 0: none",
+                    "hand_fit_min_excess", doc="smallest cost of a tolerant hand fit that failed"
                 ),
-                Field("least", doc="smallest largest tolerance ratio of a balance so far"),
-                Field("held", doc="1 if hand or arm has too few free motors"),
                 Field(
-                    "returns", doc="number of fits and balances that ended at a previous minimum"
+                    "refinement_minimum",
+                    doc="cost of the last minimum of a refinement that nearly met them, or 0",
                 ),
-                Field("margin", sides, doc="best margin of the arm so far, negative: a violation"),
-                Field("arm", (len(self.arm),), doc="arm with the best margin"),
-                Field("swivel", sides, unit="rad", doc="redundancy parameter of that arm"),
-                Field("starts", doc="number of starts of the numeric arm stage"),
+                Field("power", doc="balance: number of completed powers"),
                 Field(
-                    "turned", doc="last joint of this start that was moved to its opposite limit"
+                    "balance_min_ratio",
+                    doc="smallest result of a balance: largest error relative to its tolerance",
                 ),
-                Field("passed", doc="distance of the palm of the last start from the palm pose"),
-                Field("best_cost", doc="smallest cost of a whole configuration so far"),
-                Field("best_q", (n,), doc="the configuration with that cost"),
-                Field("counts", (len(self.stages),), doc="iterations by stage"),
-                *(self._of_sides if self.robot.sides else ()),
+                Field("is_underactuated", doc="1 if hand or arm has too few free motors"),
+                Field(
+                    "repeated_minima",
+                    doc="number of fits and balances that end no lower than before",
+                ),
+                Field("arm_margin", sides, doc="margin of the best arm; negative: outside limits"),
+                Field("arm_best", (len(self.arm),), doc="arm with the best margin [rad or m]"),
+                Field("arm_redundancy", sides, unit="rad", doc="redundancy parameter of that arm"),
+                Field("arm_starts", doc="number of starts of the arm steps"),
+                Field(
+                    "arm_flipped_joint",
+                    doc="last arm joint, from 1, moved to its opposite limit at this start; or 0",
+                ),
+                Field(
+                    "arm_start_distance",
+                    doc="distance of the last entry of the start table from the palm pose",
+                ),
+                Field("best_cost", doc="smallest cost of a whole configuration"),
+                Field("best_q", (n,), doc="configuration of that cost [rad or m]"),
+                Field("counts", (len(self.phases),), doc="iterations by phase"),
+                *(self._side_fields if self.robot.sides else ()),
             )
         )
 
     @property
-    def carried(self) -> tuple[str, ...]:
-        """State fields kept across restarts; for a multi-arm robot also the trunk trials."""
-        return (*CARRIED, "trunks", "looked", "far") if self.robot.sides else CARRIED
+    def kept_across_restarts(self) -> tuple[str, ...]:
+        """State fields kept across restarts."""
+        extra = TRUNK_KEPT_ACROSS_RESTARTS if self.robot.sides else ()
+        return (*KEPT_ACROSS_RESTARTS, *extra)
 
     @property
-    def _of_sides(self) -> tuple[Field, ...]:
+    def _side_fields(self) -> tuple[Field, ...]:
         """Additional state fields of multi-arm robots."""
         n, sides = len(self.robot.actuators), range(len(self.robot.sides))
         palms = [
-            (Field(f"palm_rotation_{i}", (3, 3)), Field(f"palm_origin_{i}", (3,), unit="m"))
+            (
+                Field(f"palm_rotation_{i}", (3, 3), doc="palm orientation of side, base frame"),
+                Field(f"palm_origin_{i}", (3,), unit="m", doc="palm position of side, base frame"),
+            )
             for i in sides
         ]
         return (
-            Field("side", doc="index of the side whose hand is fitted"),
-            Field("first", doc="index of the first hand posture of every side"),
-            Field("farthest", doc="largest index of a hand posture of any side"),
-            Field("fitted", (len(sides),), doc="1 if palm and hand meet the contacts, by side"),
+            Field("side", doc="index of the side whose hand is fitted; after all: their number"),
+            Field("first_candidate", doc="index of the first hand posture of every side"),
+            Field("last_candidate", doc="largest index of a hand posture of any side"),
+            Field("side_fits", (len(sides),), doc="1 if palm and hand meet the contacts, by side"),
             *(field for palm in palms for field in palm),
-            Field("palms_least", doc="smallest cost of trunk steps for these palms"),
-            Field("palms_best", (n,), doc="the configuration with that cost"),
-            Field("again", doc="1 after the arms were placed again at the best trunk"),
-            Field("tried", doc="number of trunk trials for these palms"),
-            Field("trunks", doc="number of trunk trials for all palms"),
-            Field("looked", doc="number of trunk trials for palms of hands that fit"),
-            Field("far", doc="smallest cost of trunk steps for such palms"),
-            Field("hopeless", doc="1 if the target counts as out of reach"),
+            Field("trunk_min_cost", doc="smallest cost of trunk steps for these palm poses"),
+            Field("trunk_best_q", (n,), doc="configuration of that cost [rad or m]"),
+            Field("trunk_arms_placed_again", doc="1 if arms were placed again at this trunk"),
+            Field("trunk_trials", doc="number of trunk trials for these palm poses"),
+            Field("trunk_total_trials", doc="number of trunk trials of all restarts"),
+            Field("trunk_fitting_trials", doc="number of trunk trials with hands that fit"),
+            Field("trunk_fitting_min_cost", doc="smallest cost of trunk steps with such hands"),
+            Field("is_out_of_reach", doc="1 if the target counts as out of reach"),
         )
 
     @cached_property
     def parameters(self) -> Layout:
-        """Layout of the target and the parameters of the method."""
+        """Layout of the target and of the parameters of the method."""
         n, f = len(self.robot.actuators), len(self.robot.fingers)
         hand = len(self.robot.hand_actuators)
         return Layout(
             (
                 *self.contacts.fields,
-                Field("position_tolerance", (f,), unit="m"),
-                Field("angle_tolerance", (f,), unit="rad"),
-                Field("lower", (n,), doc="lower bounds of q"),
-                Field("upper", (n,), doc="upper bounds of q"),
-                Field("reach", doc="weight of the arm's reach while the hand is fitted"),
-                Field("alone", doc="1 if a solve ends with the hand's fit, and the arm stays out"),
-                Field("start", (n,), doc="where the robot is, within bounds"),
-                Field("nearest", doc="1 if the solution nearest to the start is wanted"),
-                *((Field("loose", doc=LOOSE),) if self.robot.sides else ()),
-                Field("postures", (self.candidates, hand), doc="hand postures to try"),
+                Field("position_tolerance", (f,), unit="m", doc="by finger"),
+                Field("angle_tolerance", (f,), unit="rad", doc="by finger"),
+                Field("lower", (n,), doc="lower bounds of q [rad or m]"),
+                Field("upper", (n,), doc="upper bounds of q [rad or m]"),
+                Field("reach_weight", doc="weight of the arm's reach in the fit of the hand"),
+                Field("hand_only", doc="1 if the solve ends with the hand fit"),
+                Field("start", (n,), doc="q0 clipped to the bounds [rad or m]"),
+                Field("nearest", doc="1 if the solution nearest to q0 is preferred"),
+                *(self._side_parameters if self.robot.sides else ()),
+                Field("postures", (self.candidates, hand), doc="hand postures to try [rad or m]"),
             )
         )
 
+    @property
+    def _side_parameters(self) -> tuple[Field, ...]:
+        """Additional parameters of multi-arm robots."""
+        return (
+            Field(
+                "palms_are_free",
+                doc="1 if a side has fewer contact conditions than motions of palm and hand",
+            ),
+        )
+
     @cached_property
-    def whole(self) -> ContactLeastSquares:
-        """The contacts as a function of all motors; the stages share its functions."""
+    def all_motors(self) -> ContactLeastSquares:
+        """Contacts as a function of all motors, whose graphs the stages share."""
         return ContactLeastSquares(self.robot, self.contacts, self.parameters)
 
     @cached_property
     def record(self) -> Layout:
-        """What is logged of an iteration."""
+        """Layout of the logged row of an iteration."""
         robot = self.robot
         return Layout.record(
             Q.of(robot, "actuator positions before the step; where the arm is placed, after it"),
@@ -257,7 +295,7 @@ class HandFirstLayouts:
         )
 
     def hand_bounds(self, q: Expr, p: dict[str, Expr], first: int) -> BoxBounds:
-        """Bounds of the hand's actuators."""
+        """Return the bounds of the hand's motors, which begin at row `first` of a step."""
         rows = list(self.robot.hand_actuators)
         return BoxBounds(q[rows], p["lower"][rows], p["upper"][rows], first)
 
@@ -267,26 +305,26 @@ class HandFirstLayouts:
         p: dict[str, Expr],
         q: Expr,
         phase: Phase,
-        tried: TrialStep | None = None,
+        trial: TrialStep | None = None,
         accepted: Expr = 0.0,
-        margin: Expr = NOTHING,
+        margin: Expr = UNKNOWN,
     ) -> Expr:
-        """What is logged at q (n, 1), but for the status.
+        """Return the record of an iteration at q (n, 1), except its status.
 
         Args:
             s: State before the iteration.
             p: Parameters.
-            q: The configuration.
-            phase: The stage.
-            tried: The damped step, if the stage makes one.
-            accepted: Whether it was taken.
-            margin: Of the arm, if the stage places it.
+            q: Configuration.
+            phase: Phase of the iteration.
+            trial: Damped step, if the stage makes one.
+            accepted: 1 if the step was accepted.
+            margin: Margin of the best arm, if the stage places the arm.
         """
-        residual, cost, size = ca.SX.nan(self.contacts.size), NOTHING, NOTHING
-        if tried is not None:
-            residual = tried.residual_before[: self.contacts.size]
-            cost, size = ca.sumsqr(tried.residual_before), tried.max_change
-        restart = s["earlier"] + ca.fmax(s["candidate"], 0.0)
+        residual, cost, size = ca.SX.nan(self.contacts.size), UNKNOWN, UNKNOWN
+        if trial is not None:
+            residual = trial.residual_before[: self.contacts.size]
+            cost, size = ca.sumsqr(trial.residual_before), trial.max_change
+        restart = s["candidates_before"] + ca.fmax(s["candidate"], 0.0)
         numbers = cost, s["damping"], size, margin, restart, accepted, float(phase)
         return self._row(q, residual, *numbers, p["weights"], p["lower"], p["upper"])
 
@@ -301,17 +339,17 @@ class HandFirstLayouts:
         numbers = {name: ca.SX.sym(name) for name in names}
         positions, chords = self.contacts.errors(residual)
         angles = 2 * ca.asin(ca.fmin(chords / 2, 1.0))
-        # A least number is never NaN; the cost is where the residual is.
-        known = ca.logic_and(weights[:, 1] > 0, numbers["cost"] >= 0)
+        # The minimum above is never NaN, but the cost is where the residual is.
+        has_angle = ca.logic_and(weights[:, 1] > 0, numbers["cost"] >= 0)
         row = self.record.pack(
             {
                 "q": q,
                 **numbers,
-                "position_error": ca.if_else(weights[:, 0] > 0, positions, NOTHING),
-                "angle_error": ca.if_else(known, angles, NOTHING),
+                "position_error": ca.if_else(weights[:, 0] > 0, positions, UNKNOWN),
+                "angle_error": ca.if_else(has_angle, angles, UNKNOWN),
                 **coupling_values(robot, q),
                 "limit_mask": pack_bits(ca.logic_or(q <= lower, q >= upper)),
-                "status": 0.0,  # filled in by the iteration
+                "status": 0.0,  # set after the choice of the next stage
             }
         )
         return call_function("row", [q, residual, *numbers.values(), weights, lower, upper], [row])
@@ -319,8 +357,8 @@ class HandFirstLayouts:
 
 def with_rows(q: Expr, rows: Sequence[int], values: Expr) -> Expr:
     """Return q with the given entries replaced."""
-    places = {row: i for i, row in enumerate(rows)}
-    return ca.vertcat(*(values[places[i]] if i in places else q[i] for i in range(q.numel())))
+    index = {row: i for i, row in enumerate(rows)}
+    return ca.vertcat(*(values[index[i]] if i in index else q[i] for i in range(q.numel())))
 
 
 def terms(robot: RobotDescription) -> Layout:
@@ -328,10 +366,10 @@ def terms(robot: RobotDescription) -> Layout:
     n, f = len(robot.actuators), len(robot.fingers)
     return Layout(
         (
-            Field("position_tolerance", (f,), unit="m"),
-            Field("angle_tolerance", (f,), unit="rad"),
-            Field("lower", (n,), doc="lower bounds of q"),
-            Field("upper", (n,), doc="upper bounds of q"),
+            Field("position_tolerance", (f,), unit="m", doc="by finger"),
+            Field("angle_tolerance", (f,), unit="rad", doc="by finger"),
+            Field("lower", (n,), doc="lower bounds of q [rad or m]"),
+            Field("upper", (n,), doc="upper bounds of q [rad or m]"),
             Field("nearest", doc="1 if the solution nearest to q0 is preferred"),
         )
     )
@@ -343,16 +381,15 @@ def beginning(layouts: HandFirstLayouts) -> FunctionGraph:
     Hand motors that only move free fingers stay at q0; every start is clipped to the bounds.
 
     Returns:
-        points (f, 3) [m], normals (f, 3) and the contacts' other vectors, NaN where free, where
-        the robot is (n, 1), the `terms`, hand postures to try (candidates, hand) -> state,
-        parameters.
+        points (f, 3) [m], normals (f, 3) and the other vectors of the contacts, NaN where free;
+        q0 (n, 1), the `terms`, hand postures to try (candidates, hand) -> state, parameters.
     """
     robot = layouts.robot
     f, n = len(robot.fingers), len(robot.actuators)
     name = ca.Function.fix_name(f"hand_first_beginning_{robot.name}{kinds_suffix(layouts.kinds)}")
     return FunctionGraph(
         name,
-        lambda: _build(name, layouts),
+        lambda: _build_beginning(name, layouts),
         {
             **{f"{vector}s": (f, 3) for vector in layouts.contacts.data},
             "here": (n, 1),
@@ -364,35 +401,34 @@ def beginning(layouts: HandFirstLayouts) -> FunctionGraph:
     )
 
 
-def _build(name: str, layouts: HandFirstLayouts) -> ca.Function:
+def _build_beginning(name: str, layouts: HandFirstLayouts) -> ca.Function:
     robot, hand = layouts.robot, list(layouts.robot.hand_actuators)
     f, n = len(robot.fingers), len(robot.actuators)
     vectors = {f"{vector}s": ca.SX.sym(f"{vector}s", f, 3) for vector in layouts.contacts.data}
-    here = ca.SX.sym("q", n)
-    common = terms(robot)
-    given = common.symbols("terms")
-    t = common.unpack(given)
+    q0 = ca.SX.sym("q", n)
+    terms_vector = terms(robot).symbols("terms")
+    t = terms(robot).unpack(terms_vector)
     postures = ca.SX.sym("postures", layouts.candidates, len(hand))
 
-    numbers = {key: _is_number(array[:, 0]) for key, array in vectors.items()}
-    known = ca.horzcat(numbers["points"], numbers["normals"])
-    asked = ca.logic_or(known[:, 0], known[:, 1])
-    needed = ca.vertcat(*(_mover(robot, actuator, asked) for actuator in hand))
-    held = _bounded(here[hand], t, hand)
-    tried = [
-        ca.if_else(needed, _bounded(postures[i, :].T, t, hand), held)
+    is_set = {key: _is_number(array[:, 0]) for key, array in vectors.items()}
+    weights = ca.horzcat(is_set["points"], is_set["normals"])
+    has_contact = ca.logic_or(weights[:, 0], weights[:, 1])
+    is_needed = ca.vertcat(*(_moves_contact(robot, motor, has_contact) for motor in hand))
+    hand_of_q0 = _clip(q0[hand], t, hand)
+    seeds = [
+        ca.if_else(is_needed, _clip(postures[i, :].T, t, hand), hand_of_q0)
         for i in range(layouts.candidates)
     ]
-    start = _bounded(here, t, list(range(n)))
+    start = _clip(q0, t, list(range(n)))
     parameters = layouts.parameters.pack(
         {
-            **{key: _or_zero(array, numbers[key]) for key, array in vectors.items()},
-            "weights": known,
-            "reach": 1.0,
-            "alone": 0.0,
+            **{key: _or_zero(array, is_set[key]) for key, array in vectors.items()},
+            "weights": weights,
+            "reach_weight": 1.0,
+            "hand_only": 0.0,
             "start": start,
-            **({"loose": _is_loose(layouts, known)} if robot.sides else {}),
-            "postures": ca.horzcat(*tried).T,
+            **({"palms_are_free": _palms_are_free(layouts, weights)} if robot.sides else {}),
+            "postures": ca.horzcat(*seeds).T,
             **t,
         }
     )
@@ -401,44 +437,44 @@ def _build(name: str, layouts: HandFirstLayouts) -> ca.Function:
         zero
         | {
             "q": start,
-            "best_q": here,
+            "best_q": q0,
             "best_cost": sys.float_info.max,
-            "least": sys.float_info.max,
-            "least_excess": sys.float_info.max,
-            "held": _is_held(layouts, t),
+            "balance_min_ratio": sys.float_info.max,
+            "hand_fit_min_excess": sys.float_info.max,
+            "is_underactuated": _is_underactuated(layouts, t),
             "phase": ca.if_else(t["nearest"], float(Stage.START), float(Stage.CANDIDATE)),
             "candidate": -t["nearest"],
         }
         | initial_lm_state()
     )
-    inputs = [*vectors.values(), here, given, postures]
+    inputs = [*vectors.values(), q0, terms_vector, postures]
     return ca.Function(name, inputs, with_cse(state, parameters))
 
 
-def _is_held(layouts: HandFirstLayouts, t: dict[str, Expr]) -> Expr:
-    """1 if motors of the hand are held, or the arm's free ones cannot take the palm to any pose.
+def _is_underactuated(layouts: HandFirstLayouts, t: dict[str, Expr]) -> Expr:
+    """Return 1 if motors of the hand are fixed, or the arm cannot move the palm to any pose.
 
-    Fewer than six are too few, be they held, of a short arm or of a hand that stands alone.
-
-    A hand that is held as a whole needs no search.
+    An arm cannot with fewer than six free motors, whether motors are fixed, the arm is short or the
+    hand stands alone. A hand whose motors are all fixed needs no search, and counts as actuated.
     """
     hand, arm = list(layouts.robot.hand_actuators), list(layouts.arm)
     free_hand, free_arm = (
         ca.sum1(t["lower"][rows] < t["upper"][rows]) if rows else 0 for rows in (hand, arm)
     )
-    less = ca.logic_or(free_hand < len(hand), free_arm < POSE_DIMENSION)
-    return ca.logic_and(less, free_hand > 0)
+    has_too_few = ca.logic_or(free_hand < len(hand), free_arm < POSE_DIMENSION)
+    return ca.logic_and(has_too_few, free_hand > 0)
 
 
-def _is_loose(layouts: HandFirstLayouts, known: Expr) -> Expr:
-    """1 if contacts of which `known` (f, 2) are given leave palms of a body a freedom."""
-    robot, place = layouts.robot, layouts.robot.finger_names.index
-    loose = ca.SX(float(layouts.kinds != point_normal_kinds(len(robot.fingers))))
+def _palms_are_free(layouts: HandFirstLayouts, weights: Expr) -> Expr:
+    """Return 1 if contacts with `weights` (f, 2) leave a palm of a multi-arm robot a motion."""
+    robot, finger_index = layouts.robot, layouts.robot.finger_names.index
+    is_free = ca.SX(float(layouts.kinds != point_normal_kinds(len(robot.fingers))))
     for side, (_, hand) in zip(robot.sides, robot.side_actuators, strict=True):
-        conditions = ca.sum1(known[list(map(place, side.fingers)), :] @ ca.SX([3, 2]))
-        fewer = ca.logic_and(conditions > 0, conditions < POSE_DIMENSION + len(hand))
-        loose = ca.logic_or(loose, fewer)
-    return loose
+        fingers = list(map(finger_index, side.fingers))
+        conditions = ca.sum1(weights[fingers, :] @ ca.SX([3, 2]))
+        has_fewer = ca.logic_and(conditions > 0, conditions < POSE_DIMENSION + len(hand))
+        is_free = ca.logic_or(is_free, has_fewer)
+    return is_free
 
 
 def _is_number(x: Expr) -> Expr:
@@ -446,15 +482,15 @@ def _is_number(x: Expr) -> Expr:
     return ca.logic_or(x <= 0, x > 0)
 
 
-def _or_zero(x: Expr, known: Expr) -> Expr:
-    return ca.if_else(ca.repmat(known, 1, 3), x, 0.0)
+def _or_zero(x: Expr, is_set: Expr) -> Expr:
+    return ca.if_else(ca.repmat(is_set, 1, 3), x, 0.0)
 
 
-def _mover(robot: RobotDescription, actuator: int, known: Expr) -> Expr:
+def _moves_contact(robot: RobotDescription, actuator: int, has_contact: Expr) -> Expr:
     """Return 1 if an actuator moves a finger that has a contact."""
-    moved = [i for i, f in enumerate(robot.finger_names) if actuator in robot.finger_actuators(f)]
-    return ca.mmax(ca.vertcat(ca.SX(0), known[moved]))
+    fingers = [i for i, f in enumerate(robot.finger_names) if actuator in robot.finger_actuators(f)]
+    return ca.mmax(ca.vertcat(ca.SX(0), has_contact[fingers]))
 
 
-def _bounded(q: Expr, t: dict[str, Expr], actuators: list[int]) -> Expr:
+def _clip(q: Expr, t: dict[str, Expr], actuators: list[int]) -> Expr:
     return ca.fmin(ca.fmax(q, t["lower"][actuators]), t["upper"][actuators])

@@ -170,8 +170,8 @@ class ThumbFirstLayouts:
                 Field("damping"),
                 Field("growth", doc="placement: factor of the damping after a rejected step"),
                 Field("cost", doc="placement: squared distance from the palm pose"),
-                Field("waited", doc="consecutive iterations with slow progress"),
-                Field("spent", doc="iterations in this phase"),
+                Field("slow_steps", doc="consecutive iterations with slow progress"),
+                Field("stage_iterations", doc="iterations in this phase"),
                 Field("power", doc="completed powers of the minimax stage"),
                 Field("balanced", doc="cost at the last start of the minimax stage; 0 if none"),
                 Field("best_cost", doc="smallest cost so far"),
@@ -509,10 +509,12 @@ class ThumbFirstStep(ThumbFirstLayouts):
         )
         cost = errors.cost
         solved = self._is_within(errors, p)
-        slow_steps = ca.if_else(cost > self.options.gain * errors_before.cost, s["waited"] + 1, 0.0)
+        slow_steps = ca.if_else(
+            cost > self.options.gain * errors_before.cost, s["slow_steps"] + 1, 0.0
+        )
         is_stuck = ca.logic_and(ca.logic_not(accepted), s["damping"] > self.options.damping_ceiling)
         is_finished = ca.logic_or(
-            slow_steps >= self.options.patience, s["spent"] + 1 >= self.options.budget
+            slow_steps >= self.options.patience, s["stage_iterations"] + 1 >= self.options.budget
         )
         is_finished = ca.logic_or(ca.logic_or(is_finished, is_stuck), is_skipped)
         starts_minimax = ca.logic_and(
@@ -535,8 +537,8 @@ class ThumbFirstStep(ThumbFirstLayouts):
             phase=ca.if_else(starts_minimax, float(Phase.BALANCE), next_phase),
             start=s["start"] + has_failed,
             damping=ca.if_else(starts_minimax, FIT.damping, damping),
-            waited=slow_steps,
-            spent=ca.if_else(starts_minimax, 0.0, s["spent"] + 1),
+            slow_steps=slow_steps,
+            stage_iterations=ca.if_else(starts_minimax, 0.0, s["stage_iterations"] + 1),
             power=0.0,
             balanced=ca.if_else(starts_minimax, cost, s["balanced"]),
             best_cost=ca.if_else(better, cost, s["best_cost"]),
@@ -567,7 +569,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
         """Return whether q0 or its hand posture is too far from the target for a start."""
         if not self.robot.arm_actuators:
             return ca.SX(0)
-        is_first = ca.logic_and(s["spent"] < 1, s["start"] <= 0)
+        is_first = ca.logic_and(s["stage_iterations"] < 1, s["start"] <= 0)
         return ca.logic_and(
             ca.logic_and(p["nearest"], is_first), errors.cost > self.options.as_it_is
         )

@@ -1,0 +1,113 @@
+"""Multi-arm robots without a trunk, whose sides are solved independently."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.files.arrays import Array
+from casadi_ik.model.description import RobotDescription
+from casadi_ik.model.targets import TargetBatch
+from casadi_ik.solve.method import Outcome
+from casadi_ik.solve.status import Status
+from casadi_ik.solve.trace import pack_mask
+
+SideSolver = Callable[[TargetBatch, Array], Outcome]
+"""Function that solves the targets of a side from start configurations (k, n) of the side."""
+
+
+def solve_sides_independently(
+    robot: RobotDescription,
+    solvers: Sequence[SideSolver],
+    targets: TargetBatch,
+    q0: Array,
+    phases: Sequence[str],
+    record: np.dtype[Any] | None,
+) -> Outcome:
+    """Solve each side of a multi-arm robot independently.
+
+    Args:
+        robot: Description of the robot.
+        solvers: Solvers of its sides.
+        targets: k targets.
+        q0: (k, n) start configurations within bounds [rad or m].
+        phases: Names of all phases, in order.
+        record: Record type of the rows of a trace of the robot; None: no trace.
+    """
+    count, q = len(targets), np.array(q0)
+    status = np.full(count, int(Status.SOLVED))
+    iterations, restarts = np.zeros((2, count), dtype=np.int64)
+    seconds = np.zeros(count)
+    phase_counts = {name: np.zeros(count, dtype=np.int64) for name in phases}
+    traces: list[list[NDArray[Any]]] = [[] for _ in range(count)]
+    for solve, side, (arm, hand) in zip(solvers, robot.sides, robot.side_actuators, strict=True):
+        motors = sorted((*arm, *hand))
+        fingers = [robot.finger_names.index(name) for name in side.fingers]
+        vectors = [targets.points, targets.normals]
+        has_contact = np.any([~np.isnan(array[:, fingers, 0]) for array in vectors], axis=(0, 2))
+        rows = np.flatnonzero(has_contact)
+        if not len(rows):
+            continue
+        side_targets = select_side(targets.rows(rows), fingers, motors)
+        outcome = solve(side_targets, q[rows][:, motors])
+        q_before = q[rows]
+        q[rows[:, None], motors] = outcome.q
+        is_worse = (status[rows] == Status.SOLVED) & (outcome.status != Status.SOLVED)
+        status[rows[is_worse]] = outcome.status[is_worse]
+        iterations[rows] += outcome.iterations
+        restarts[rows] += outcome.restarts
+        seconds[rows] += outcome.time
+        for name, counts in outcome.phases.items():
+            phase_counts[name][rows] += counts
+        if record is not None:
+            for row, other_q, trace in zip(rows.tolist(), q_before, outcome.trace, strict=True):
+                traces[row].append(robot_trace(robot, trace, other_q, motors, fingers, record))
+    all_rows = None
+    if record is not None:
+        parts = [trace for target_traces in traces for trace in target_traces]
+        all_rows = np.concatenate([np.empty(0, record), *parts])
+    return Outcome(q, status, iterations, restarts, seconds, phase_counts, all_rows)
+
+
+def select_side(targets: TargetBatch, fingers: Sequence[int], motors: Sequence[int]) -> TargetBatch:
+    """Return the targets of the fingers of a side, for a robot with the motors of the side."""
+    fixed = None if targets.fixed is None else targets.fixed[..., motors]
+    return replace(targets.for_fingers(fingers), fixed=fixed)
+
+
+def robot_trace(
+    robot: RobotDescription,
+    trace: NDArray[Any],
+    q: Array,
+    motors: Sequence[int],
+    fingers: Sequence[int],
+    record: np.dtype[Any],
+) -> NDArray[Any]:
+    """Return the trace of a part of a robot as a trace of the robot.
+
+    Args:
+        robot: Description of the robot.
+        trace: Rows of the part.
+        q: (n,) positions of the other motors [rad or m].
+        motors: Indices in q of the motors of the part.
+        fingers: Indices of the fingers of the part.
+        record: Record type of the rows of the robot.
+    """
+    rows = np.zeros(len(trace), record)
+    for name in record.names or ():
+        if rows[name].dtype.kind == "f":
+            rows[name] = np.nan
+        if name == "q":
+            rows[name] = q
+            rows[name][:, motors] = trace[name]
+        elif name in ("position_error", "angle_error"):
+            rows[name][:, fingers] = trace[name]
+        elif name != "limit_mask" and name in (trace.dtype.names or ()):
+            rows[name] = trace[name]
+    at_limits = (rows["q"] <= robot.lower) | (rows["q"] >= robot.upper)
+    rows["limit_mask"] = pack_mask(at_limits).reshape(rows["limit_mask"].shape)
+    return rows
