@@ -10,12 +10,12 @@ import sys
 import tomllib
 from pathlib import Path
 
-HERE = Path(__file__).parent
-sys.path[:0] = [str(HERE), str(HERE.parent)]
+DOCS = Path(__file__).parent
+sys.path[:0] = [str(DOCS), str(DOCS.parent)]
 
 import casadi_ik  # noqa: E402
 
-PROJECT = tomllib.loads((HERE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+PROJECT = tomllib.loads((DOCS.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 URLS = PROJECT.get("urls", {})
 
 project = "casadi_ik"
@@ -51,7 +51,7 @@ exclude_patterns = [".*", "**/.*", "out", "build", "dist", "casadi_ik", "models"
 # Notebooks are executed by the tests; here they are shown as they were stored.
 nb_execution_mode = "off"
 nb_merge_streams = True
-# Tables and formulas that a cell prints look as those of the text around it.
+# Tables and formulas in outputs of cells are converted like those of the text.
 nb_render_markdown_format = "myst"
 myst_enable_extensions = ["attrs_block", "attrs_inline", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3

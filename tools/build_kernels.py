@@ -1,12 +1,12 @@
-"""Wheels of kernels compiled ahead, for machines without a compiler and for quick first answers.
+"""Build wheels of prebuilt kernels, for machines without a compiler and for fast first solves.
 
     python tools/build_kernels.py [ROBOT...] [--target NAME...] [--out DIR] [--jobs N] [--all]
 
 writes `casadi_ik_kernels-VERSION-py3-none-PLATFORM.whl` for every target (all five unless named):
 the C of the robots (the twelve of `ROBOTS` unless named) at both vector widths, cross-compiled by
-zig (`pip install 'casadi-ik[compiler]'`). The package takes such libraries where the wheel is
-installed and was made for the same sources. A machine without AVX-512 cannot run the C of the wider
-vectors, which is made on the way; it says so, and leaves it out.
+zig (`pip install 'casadi-ik[compiler]'`). The package uses these libraries if the wheel is
+installed and was built from the same sources. A machine without AVX-512 cannot generate the C of
+the wider vectors, which needs to run it; the tool then reports and omits it.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ ROBOTS = {
     "ur10e+schunk_svh": "an industrial arm and hand",
     "kinova_gen3+robotiq_3f": "a mobile manipulator's arm and an industrial hand",
 }
-"""Robots whose kernels the wheel brings, and why."""
+"""Robots of the default wheel, and the reasons for them."""
 
 TARGETS = {
     "linux_x86_64": ("x86_64-linux-gnu.2.17", "manylinux2014_x86_64"),
@@ -53,66 +53,66 @@ TARGETS = {
     "macos_arm64": ("aarch64-macos.11.0", "macosx_11_0_arm64"),
     "windows_x86_64": ("x86_64-windows-gnu", "win_amd64"),
 }
-"""What zig calls a platform, and what a wheel does."""
+"""Name of a platform in zig, and in wheels."""
 
 WIDTHS = (4, 8)
-"""Solves side by side; of ARM's registers the compiler takes two for four doubles."""
+"""Numbers of lanes; on ARM the compiler uses two registers for four doubles."""
 
 NAME = libraries.PREBUILT_PACKAGE
 
 
 @dataclass(frozen=True)
 class Text:
-    """C of a library.
+    """C code of a library.
 
     Attributes:
-        name: Of its file ahead, without suffix.
-        text: The C.
+        name: Name of the file without suffix.
+        text: C code.
     """
 
     name: str
     text: str
 
     def fits(self, target: str) -> bool:
-        """Whether a target's machines can have use for it."""
+        """Return whether machines of a target can use the library."""
         return "x86_64" in target or "_lanes8-" not in self.name
 
 
 def texts_of(robots: Sequence[str], everything: bool) -> list[Text]:
-    """The C that robots need, made on the way through all their uses."""
-    found: dict[str, str] = {}
-    libraries.text_listeners.append(found.__setitem__)
+    """Return the C code that all uses of the robots generate."""
+    texts: dict[str, str] = {}
+    libraries.text_listeners.append(texts.__setitem__)
     found_wide = machine_lanes()
     with tempfile.TemporaryDirectory() as cache:
         changed = {"CASADI_IK_CACHE": cache, "CASADI_IK_CFLAGS": "-O0", "CASADI_IK_COMPILE": "wait"}
         os.environ.update(changed)
         for width in WIDTHS:
             if width > found_wide:
-                say(f"this machine has no registers for {width} doubles: left out")
+                say(f"this machine has no registers for {width} doubles: omitted")
                 continue
             os.environ["CASADI_IK_LANES"] = str(width)
             for name in robots:
                 robot = ik.load_robot(name)
-                for what, use in uses(robot, everything):
+                for purpose, use in uses(robot, everything):
                     use()
-                    say(f"{name}, {width} side by side: {what}")
+                    say(f"{name}, {width} lanes: {purpose}")
         del os.environ["CASADI_IK_LANES"]
         _ = machine_lanes()
-    found.pop("", None)
-    return [Text(name, text) for name, text in sorted(found.items())]
+    texts.pop("", None)
+    return [Text(name, text) for name, text in sorted(texts.items())]
 
 
-def compiled(texts: Sequence[Text], target: str, folder: Path, jobs: int) -> None:
-    """Compile for a target, every library into a file of its own."""
+def compile_texts(texts: Sequence[Text], target: str, folder: Path, jobs: int) -> None:
+    """Compile every library for a target."""
     command = (sys.executable, *ZIG, "-target", TARGETS[target][0])
     zig = Compiler(command, "", (*FLAGS, "-s"))
 
     def build(text: Text) -> None:
-        with tempfile.TemporaryDirectory(dir=folder.parent) as place:
-            source = Path(place) / "kernel.c"
+        with tempfile.TemporaryDirectory(dir=folder.parent) as temporary:
+            source = Path(temporary) / "kernel.c"
             source.write_text(text.text, encoding="utf-8")
-            zig.build(source, Path(place) / "kernel.so")
-            (Path(place) / "kernel.so").replace(folder / f"{text.name}.so")
+            zig.build(source, Path(temporary) / "kernel.so")
+            (Path(temporary) / "kernel.so").replace(folder / f"{text.name}.so")
 
     with ThreadPoolExecutor(jobs) as threads:
         for i, _ in enumerate(threads.map(build, texts), start=1):
@@ -123,7 +123,7 @@ def compiled(texts: Sequence[Text], target: str, folder: Path, jobs: int) -> Non
 def wheel(files: dict[str, bytes], target: str, out: Path) -> Path:
     """Write the wheel of a target."""
     version, tag = ik.__version__, f"py3-none-{TARGETS[target][1]}"
-    about = f"{NAME}-{version}.dist-info"
+    info = f"{NAME}-{version}.dist-info"
     metadata = (
         f"Metadata-Version: 2.1\nName: casadi-ik-kernels\nVersion: {version}\n"
         "Summary: Kernels of casadi-ik compiled ahead\nLicense: BSD-3-Clause\n"
@@ -132,17 +132,20 @@ def wheel(files: dict[str, bytes], target: str, out: Path) -> Path:
         "\n"
         f"Prebuilt kernels for [casadi-ik](https://github.com/casadi-ik/casadi_ik) {version}.\n"
     )
-    whole = {f"{NAME}/{name}": content for name, content in files.items()} | {
-        f"{about}/METADATA": metadata.encode(),
-        f"{about}/WHEEL": (
+    content_by_name = {f"{NAME}/{name}": content for name, content in files.items()} | {
+        f"{info}/METADATA": metadata.encode(),
+        f"{info}/WHEEL": (
             f"Wheel-Version: 1.0\nGenerator: build_kernels\nRoot-Is-Purelib: false\nTag: {tag}\n"
         ).encode(),
     }
-    rows = [f"{name},sha256={_digest(content)},{len(content)}" for name, content in whole.items()]
-    record = "\n".join([*rows, f"{about}/RECORD,,", ""])
+    rows = [
+        f"{name},sha256={_digest(content)},{len(content)}"
+        for name, content in content_by_name.items()
+    ]
+    record = "\n".join([*rows, f"{info}/RECORD,,", ""])
     path = out / f"{NAME}-{version}-{tag}.whl"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
-        for name, content in (whole | {f"{about}/RECORD": record.encode()}).items():
+        for name, content in (content_by_name | {f"{info}/RECORD": record.encode()}).items():
             archive.writestr(zipfile.ZipInfo(name, (2020, 1, 1, 0, 0, 0)), content)
     return path
 
@@ -152,30 +155,32 @@ def _digest(content: bytes) -> str:
 
 
 def say(text: str) -> None:
-    """Print at once."""
+    """Print without buffering."""
     print(text, flush=True)
 
 
 def main() -> None:
-    """Build what the arguments say."""
+    """Build the wheels that the command line names."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("robots", nargs="*", help=f"instead of {', '.join(ROBOTS)}")
     parser.add_argument("--target", nargs="*", choices=TARGETS, default=list(TARGETS))
     parser.add_argument("--out", type=Path, default=Path("dist"))
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--all", action="store_true", help="scenes, choices, motions, logs too")
-    said = parser.parse_args()
-    said.out.mkdir(parents=True, exist_ok=True)
-    texts = texts_of(said.robots or list(ROBOTS), said.all)
-    for target in said.target:
-        with tempfile.TemporaryDirectory() as place:
-            folder = Path(place) / "kernels"
+    parser.add_argument("--all", action="store_true", help="also of scenes, ranking, motions, logs")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    texts = texts_of(options.robots or list(ROBOTS), options.all)
+    for target in options.target:
+        with tempfile.TemporaryDirectory() as temporary:
+            folder = Path(temporary) / "kernels"
             folder.mkdir()
-            compiled([text for text in texts if text.fits(target)], target, folder, said.jobs)
+            compile_texts(
+                [text for text in texts if text.fits(target)], target, folder, options.jobs
+            )
             files = {"__init__.py": b'"""Kernels of casadi-ik, compiled ahead."""\n'}
             files["made_for"] = package_sources().encode()
             files |= {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
-        path = wheel(files, target, said.out)
+        path = wheel(files, target, options.out)
         say(f"{path}: {len(files) - 2} libraries, {path.stat().st_size / 1e6:.1f} MB")
 
 

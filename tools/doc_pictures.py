@@ -139,13 +139,13 @@ def contacts(path: Path) -> None:
         ),
     )
     figure = new_figure(10.4, 5.2, dpi=110)
-    for camera, shown, axes_drawn, box, pixels, labels in panes:
+    for camera, framed, axes_drawn, box, pixels, labels in panes:
         with closing(Scene3D()) as stage:
-            stage.add("robot", shown, 0.8 if shown is hand else 1.0)
+            stage.add("robot", framed, 0.8 if framed is hand else 1.0)
             stage.add("object", objects, 0.5)
             stage.add("object marks", contact_targets(grasp))
             stage.add("frame", axes_drawn)
-            stage.aim(camera, corner_points(shown + objects + axes_drawn), pixels, (0.10, 0.14))
+            stage.aim(camera, corner_points(framed + objects + axes_drawn), pixels, (0.10, 0.14))
             image = np.clip(composite(1.0, stage.render()), 0.0, 1.0)
             ends = stage.project(np.array([point for _, point, _ in labels]))
         axes = figure.add_axes(box)
@@ -174,21 +174,21 @@ def panels(images: list[Image], titles: list[str], size: tuple[float, float]) ->
 def scene(path: Path) -> None:
     """Draw an obstacle that the arm passes through without a scene, and avoids with it."""
     robot, grasp = ik.load_robot("kuka_lwr_barrett"), ik.load_grasp("cup")
-    without = ik.Solver(robot).solve(grasp)
+    unobstructed = ik.Solver(robot).solve(grasp)
     # The post stands in the forearm of the solution without a scene.
-    elbow, wrist = (robot.links(without.q)[f"lwr_link_{i}"][:3, 3] for i in (4, 6))
+    elbow, wrist = (robot.links(unobstructed.q)[f"lwr_link_{i}"][:3, 3] for i in (4, 6))
     forearm = 0.6 * elbow + 0.4 * wrist
     post = POST["post"] | {"xyz": [*forearm[:2].tolist(), 0.5]}
     obstacles = ik.Scene(POST | {"post": post}, margin=0.02, name="post")
     with_scene = ik.Solver(robot, scene=obstacles).solve(grasp)
     clearance = f"{1e3 * (with_scene.clearance or 0):.0f} mm"
-    print("scene", without.status.name, with_scene.status.name, clearance)
+    print("scene", unobstructed.status.name, with_scene.status.name, clearance)
     azimuth = float(np.arctan2(forearm[1], forearm[0]) + np.deg2rad(100.0))
     view = (azimuth, float(np.deg2rad(38.0)))
-    check = ik.Solver(robot, scene=obstacles).check(without.q, grasp)
+    check = ik.Solver(robot, scene=obstacles).check(unobstructed.q, grasp)
     colliding = None if check is None else check.pair(0)
     images = [
-        shot(robot, without.q, view, (460, 480), grasp, obstacles, colliding),
+        shot(robot, unobstructed.q, view, (460, 480), grasp, obstacles, colliding),
         shot(robot, with_scene.q, view, (460, 480), grasp, obstacles),
     ]
     titles = ["without the scene: the arm is in the post", "with the scene: it goes around"]
@@ -214,21 +214,21 @@ def unreachable(path: Path) -> None:
     assert pose is not None
     far_pose = pose.copy()
     far_pose[:3, 3] += [-0.35, 0.05, 0.05]
-    far = grasp.in_object_frame().at(far_pose)
-    solution = ik.Solver(robot).solve(far)
+    far_grasp = grasp.in_object_frame().at(far_pose)
+    solution = ik.Solver(robot).solve(far_grasp)
     assert solution.diagnosis is not None
     q, lines = solution.diagnosis.q, solution.diagnosis.lines
     print("unreachable", solution.status.name, lines)
     links = robot.links(q)
     shoulder, elbow, wrist = (links[f"lwr_link_{i}"][:3, 3] for i in (2, 4, 6))
     reach = float(np.linalg.norm(elbow - shoulder) + np.linalg.norm(wrist - elbow))
-    bodies, objects = bodies_at(robot, q), placed_object(far)
+    bodies, objects = bodies_at(robot, q), placed_object(far_grasp)
     view, pixels = overview(far_pose[:3, 3], close_view(robot, q)), (1000, 520)
     shell = [Drawable("reach", ball(reach, shoulder), palette.MISSED)]
     with closing(Scene3D()) as stage:
         stage.add("robot", bodies)
         stage.add("object", objects, 0.6)
-        stage.add("marks", contact_targets(far))
+        stage.add("marks", contact_targets(far_grasp))
         stage.add("reach", shell, 0.10)
         stage.add_floor(0.0, bodies + objects)
         stage.aim(view, corner_points(bodies + objects), pixels, (0.12, 0.06))

@@ -1,9 +1,9 @@
-"""Capsules for a shipped arm or hand, fitted to somebody's meshes, written into its description.
+"""Fit collision shapes of a built-in arm or hand to meshes and write them to its description.
 
     python tools/fit_shapes.py KIND NAME FILE.urdf [--names "WHAT THE FILE IS"]
 
-The file's joints are found again by their axes at zero, so its names and frames do not matter. The
-fit, and which links may touch, are those of `casadi-ik import`.
+Joints of the file are matched by their axes at zero, so names and frames may differ. The fit and
+the pairs of links that may touch are computed as by `casadi-ik import`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from casadi_ik.model.schema import ArmFile, HandFile
 
 
 def main() -> None:
-    """Fit and write."""
+    """Fit the shapes and write the description."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("kind", choices=("arms", "trunks", "hands"))
     parser.add_argument("name")
@@ -34,43 +34,52 @@ def main() -> None:
     parser.add_argument("--most", type=int, default=SHAPE_FIT.max_capsules)
     parser.add_argument("--saving", type=float, default=SHAPE_FIT.min_saving)
     parser.add_argument(
-        "--apart", nargs="*", default=[], help="our links that hold several of the file: each alone"
+        "--apart",
+        nargs="*",
+        default=[],
+        help="links with several links of the file: fit each separately",
     )
-    parser.add_argument("--without", nargs="*", default=[], help="links of the file to leave out")
+    parser.add_argument("--without", nargs="*", default=[], help="links of the file to ignore")
     parser.add_argument(
         "--shapes",
         nargs="+",
         choices=("collision", "seen"),
         default=["collision"],
-        help="which of the file's shapes to hold; collision: of a link without any what is seen",
+        help="shapes of the file to enclose; collision: visual shapes of links without any",
     )
-    given = parser.parse_args()
-    path = resolve_description(given.name, given.kind)
-    part = part_from_file(read(path, HandFile if given.kind == "hands" else ArmFile)[0], path)
+    options = parser.parse_args()
+    path = resolve_description(options.name, options.kind)
+    part = part_from_file(read(path, HandFile if options.kind == "hands" else ArmFile)[0], path)
     parts: dict[str, list[Surface]] = {}
-    for wanted in given.shapes:
-        found = in_our_links(part, given.file, set(given.without), seen=wanted == "seen")
-        for link, some in found.items():
-            parts.setdefault(link, []).extend(some)
-    surfaces = {link: whole for link, some in parts.items() if (whole := together(some))}
-    flat = {part.root} if given.kind == "hands" else set()
-    shapes = fit_links(surfaces, flat, max_capsules=given.most, min_saving=given.saving)
-    for link in given.apart:
-        named = {str(i): one for i, one in enumerate(parts[link])}
-        each = fit_links(named, named)
-        shapes[link] = [shape for found in each.values() for shape in found]
+    for kind in options.shapes:
+        by_link = in_our_links(part, options.file, set(options.without), visual=kind == "seen")
+        for link, surfaces_of_link in by_link.items():
+            parts.setdefault(link, []).extend(surfaces_of_link)
+    surfaces = {
+        link: mesh
+        for link, surfaces_of_link in parts.items()
+        if (mesh := together(surfaces_of_link))
+    }
+    flat = {part.root} if options.kind == "hands" else set()
+    shapes = fit_links(surfaces, flat, max_capsules=options.most, min_saving=options.saving)
+    for link in options.apart:
+        pieces = {str(i): surface for i, surface in enumerate(parts[link])}
+        fitted = fit_links(pieces, pieces)
+        shapes[link] = [shape for group in fitted.values() for shape in group]
     touching = may_touch(part, shapes, surfaces)
-    write(path, shapes, touching, given.names or given.file.name)
+    write(path, shapes, touching, options.names or options.file.name)
     count = sum(map(len, shapes.values()))
-    for link, found in shapes.items():
-        print(f"  {link}: {len(found)}, {1e3 * largest_excess({link: found}):.0f} mm")
+    for link, fitted_shapes in shapes.items():
+        print(
+            f"  {link}: {len(fitted_shapes)}, {1e3 * largest_excess({link: fitted_shapes}):.0f} mm"
+        )
     print(
-        f"{given.name}: {len(shapes)} links, {count} shapes, "
+        f"{options.name}: {len(shapes)} links, {count} shapes, "
         f"at most {1e3 * largest_excess(shapes):.0f} mm"
     )
     print("  without:", [x for x in link_poses(part.root, part.joints, {}) if x not in shapes])
-    for one in touching:
-        print("  ", one.links, one.reason)
+    for pair in touching:
+        print("  ", pair.links, pair.reason)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,9 @@
-"""The animation at the top of the README: a grasped object is dragged, arm and hand follow.
-
-Two files, for light and for dark pages::
+"""Draw the animation of the README: an object is dragged, and arm and hand follow.
 
     python tools/hero.py --out docs
 
-Every picture is a solve of its own: the grasp where the object is, from where the robot stands.
+writes a file for light and one for dark pages. Every frame is a solve that starts from the
+configuration of the previous frame.
 """
 
 from __future__ import annotations
@@ -33,138 +32,151 @@ from casadi_ik.files.arrays import Array
 
 ROBOT, GRASP = "kuka_lwr_barrett", "cup"
 
-WHOLE, CLOSE, BESIDE = (470, 400), (290, 290), 55
-"""Of the robot and of the hand from close by [pixels]; how far the second is below the top."""
+FULL_SIZE, INSET_SIZE, INSET_TOP = (470, 400), (290, 290), 55
+"""Sizes of the view of the robot and of the close-up, and top of the latter [pixels]."""
 
-PICTURES, SECONDS = 68, 6.3
-"""Of a round."""
+FRAME_COUNT, SECONDS = 68, 6.3
+"""Number of frames, and duration [s]."""
 
 SWAY = np.array([0.09, -0.15, 0.12])
-"""How far the object goes to either side of where the grasp has it [m]."""
+"""Amplitude of the translation of the object [m]."""
 
 TURN = 0.3
-"""By how much it turns about the vertical to either side [rad]."""
+"""Amplitude of the rotation of the object about the vertical [rad]."""
 
 
 def path(grasp: ik.Grasp) -> list[ik.Grasp]:
-    """The grasp along a way of its object, slow at both ends."""
-    alone, start = grasp.in_object_frame(), grasp.known_pose
+    """Return the grasp along a path of its object, slow at both ends."""
+    in_frame, start = grasp.in_object_frame(), grasp.known_pose
     assert start is not None
-    found = []
-    for angle in -0.8 * np.pi * np.cos(np.linspace(0.0, np.pi, PICTURES // 2 + 1)):
+    grasps = []
+    for angle in -0.8 * np.pi * np.cos(np.linspace(0.0, np.pi, FRAME_COUNT // 2 + 1)):
         pose = start.copy()
         c, s = np.cos(TURN * np.sin(angle)), np.sin(TURN * np.sin(angle))
         pose[:3, :3] = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ start[:3, :3]
-        way = [np.sin(2 * angle), np.sin(angle), 0.5 - 0.5 * np.cos(angle)]
-        pose[:3, 3] += SWAY * way
-        found.append(alone.at(pose))
-    return found
+        offset = [np.sin(2 * angle), np.sin(angle), 0.5 - 0.5 * np.cos(angle)]
+        pose[:3, 3] += SWAY * offset
+        grasps.append(in_frame.at(pose))
+    return grasps
 
 
 def pictures(
-    robot: ik.ArmHand, grasps: list[ik.Grasp], every_q: Array
+    robot: ik.ArmHand, grasps: list[ik.Grasp], configurations: Array
 ) -> tuple[list[Image], list[Image]]:
-    """Images (h, w, 3) for light and for dark pages."""
-    thing = object_drawable(GRASP)
-    assert thing is not None
-    bodied = [bodies_at(robot, q) for q in every_q]
-    about = corner_points([one for body in bodied[::3] for one in body])
-    places = np.array([one.known_pose[:3, 3] for one in grasps if one.known_pose is not None])
-    close = close_view(robot, every_q[0])
-    whole = overview(places.mean(axis=0), close)
-    near = 0.135 * np.vstack([np.eye(3), -np.eye(3)])
-    found: tuple[list[Image], list[Image]] = ([], [])
+    """Return images (h, w, 3) for light and for dark pages."""
+    cup = object_drawable(GRASP)
+    assert cup is not None
+    robots = [bodies_at(robot, q) for q in configurations]
+    workspace = corner_points([drawable for body in robots[::3] for drawable in body])
+    positions = np.array(
+        [drawable.known_pose[:3, 3] for drawable in grasps if drawable.known_pose is not None]
+    )
+    close_up = close_view(robot, configurations[0])
+    far_view = overview(positions.mean(axis=0), close_up)
+    inset_points = 0.135 * np.vstack([np.eye(3), -np.eye(3)])
+    frames: tuple[list[Image], list[Image]] = ([], [])
     with closing(Scene3D()) as stage:
-        for grasp, body, place in zip(grasps, bodied, places, strict=True):
+        for grasp, body, position in zip(grasps, robots, positions, strict=True):
             pose = grasp.known_pose
             assert pose is not None
-            far = [np.linalg.norm(one.surface.points - place, axis=1).min() > 0.3 for one in body]
-            stage.replace("robot", [one for one, off in zip(body, far, strict=True) if not off])
-            stage.replace("far", [one for one, off in zip(body, far, strict=True) if off])
-            stage.replace("object", [thing.transformed(pose)], 0.6)
+            is_far = [
+                np.linalg.norm(drawable.surface.points - position, axis=1).min() > 0.3
+                for drawable in body
+            ]
+            stage.replace(
+                "robot", [drawable for drawable, off in zip(body, is_far, strict=True) if not off]
+            )
+            stage.replace(
+                "far", [drawable for drawable, off in zip(body, is_far, strict=True) if off]
+            )
+            stage.replace("object", [cup.transformed(pose)], 0.6)
             marks = [
-                one
+                drawable
                 for contact in grasp.contacts.values()
-                for one in target_marks(contact, contact.point, 1.2)
+                for drawable in target_marks(contact, contact.point, 1.2)
             ]
             stage.replace("marks", marks)
-            stage.aim(whole, about, WHOLE, (0.02, 0.04))
-            layers, tip = _layers(stage, "far"), stage.project(place[None])[0]
+            stage.aim(far_view, workspace, FULL_SIZE, (0.02, 0.04))
+            layers, tip = _layers(stage, "far"), stage.project(position[None])[0]
             floors = []
             for dark in (False, True):
-                stage.add_floor(0.0, [*body, thing.transformed(pose)], about, dark, texels=512)
-                stage.aim(whole, about, WHOLE, (0.02, 0.04))
+                stage.add_floor(0.0, [*body, cup.transformed(pose)], workspace, dark, texels=512)
+                stage.aim(far_view, workspace, FULL_SIZE, (0.02, 0.04))
                 floors.append(stage.render("floor"))
-            stage.aim(close, near + place, CLOSE)
-            inset, second = _layers(stage), stage.project(place[None])[0]
-            for images, floor, color in zip(found, floors, PAPERS, strict=True):
+            stage.aim(close_up, inset_points + position, INSET_SIZE)
+            inset, second = _layers(stage), stage.project(position[None])[0]
+            for images, floor, color in zip(frames, floors, PAPERS, strict=True):
                 paper = np.array(palette.rgb(color), np.float32) / 255
                 left = pointed(_composed(composite(paper, floor), layers), tip)
                 right = pointed(_composed(paper, inset), second)
-                image = np.empty((WHOLE[1], WHOLE[0] + CLOSE[0], 3), np.float32)
+                image = np.empty((FULL_SIZE[1], FULL_SIZE[0] + INSET_SIZE[0], 3), np.float32)
                 image[:] = paper
-                image[:, : WHOLE[0]] = left
-                image[BESIDE : BESIDE + CLOSE[1], WHOLE[0] :] = _rounded(right, paper)
+                image[:, : FULL_SIZE[0]] = left
+                image[INSET_TOP : INSET_TOP + INSET_SIZE[1], FULL_SIZE[0] :] = _rounded(
+                    right, paper
+                )
                 images.append(image)
-    return found
+    return frames
 
 
 PAPERS = ("#ffffff", palette.DARK_PAPER)
 
 
-def _layers(stage: Scene3D, *more: str) -> tuple[Image, Image]:
-    return stage.render("robot", "object", "marks", *more), stage.render("marks")
+def _layers(stage: Scene3D, *groups: str) -> tuple[Image, Image]:
+    return stage.render("robot", "object", "marks", *groups), stage.render("marks")
 
 
 def _composed(below: Image, layers: tuple[Image, Image]) -> Image:
-    """Marks that something hides are half seen."""
+    """Return an image with semi-transparent marks where other things hide them."""
     return composite(composite(below, layers[0]), layers[1], 0.5)
 
 
 def _rounded(image: Image, paper: Array) -> Image:
-    """An image in a circle with a thin rim."""
+    """Crop an image to a circle with a thin rim."""
     height, width = image.shape[:2]
     y, x = np.mgrid[:height, :width]
-    far = np.hypot(x - (width - 1) / 2, y - (height - 1) / 2) - 0.485 * width
+    distance = np.hypot(x - (width - 1) / 2, y - (height - 1) / 2) - 0.485 * width
     rim = np.array(palette.rgb(palette.FAINT), np.float32) / 255
-    inside = np.clip(0.5 - far, 0, 1)[..., None].astype(np.float32)
-    on_rim = np.clip(1.5 - np.abs(far), 0, 1)[..., None].astype(np.float32)
-    return on_rim * rim + (1 - on_rim) * (inside * image + (1 - inside) * paper)
+    disc = np.clip(0.5 - distance, 0, 1)[..., None].astype(np.float32)
+    on_rim = np.clip(1.5 - np.abs(distance), 0, 1)[..., None].astype(np.float32)
+    return on_rim * rim + (1 - on_rim) * (disc * image + (1 - disc) * paper)
 
 
-def pointed(image: Image, place: Array) -> Image:
-    """An image with a mouse pointer whose tip is at a place (2,) [pixels]."""
+def pointed(image: Image, position: Array) -> Image:
+    """Draw a mouse pointer with its tip at a position (2,) [pixels]."""
     outline = np.array([[0, 0], [0, 17], [4, 13], [7, 20], [10, 19], [7, 12], [12.5, 12]])
-    drawn = Pillow.fromarray(np.round(255 * np.clip(image, 0, 1)).astype(np.uint8))
-    large = drawn.resize((4 * drawn.width, 4 * drawn.height))
-    shape = [tuple(4 * (place + 1.3 * corner)) for corner in outline]
+    canvas = Pillow.fromarray(np.round(255 * np.clip(image, 0, 1)).astype(np.uint8))
+    large = canvas.resize((4 * canvas.width, 4 * canvas.height))
+    shape = [tuple(4 * (position + 1.3 * corner)) for corner in outline]
     ImageDraw.Draw(large).polygon(shape, fill="#ffffff", outline="#20262d", width=5)
-    return np.asarray(large.resize(drawn.size), np.float32) / 255
+    return np.asarray(large.resize(canvas.size), np.float32) / 255
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Solve, draw, write."""
+    """Solve, draw and write both animations."""
     parser = argparse.ArgumentParser(description="The animation of the README.")
     parser.add_argument("--out", type=Path, default=Path("docs"), help="folder")
     options = parser.parse_args(arguments)
     robot = ik.load_robot(ROBOT)
     solver, grasps = ik.Solver(robot), path(ik.load_grasp(GRASP))
-    q, found = robot.home, []
+    q, solutions = robot.home, []
     for grasp in grasps:
         solution = solver.solve(grasp, q0=q)
         if not solution.success:
             raise SystemExit(f"{GRASP}: {solution.status.name}")
         q = solution.q
-        found.append(q)
-    step = np.rad2deg(np.abs(np.diff(found, axis=0)).max())
+        solutions.append(q)
+    step = np.rad2deg(np.abs(np.diff(solutions, axis=0)).max())
     print(f"{len(grasps)} solves, the largest step {step:.0f} deg")
-    # And the same way back.
-    every_q = np.array(found + found[-2:0:-1])
+    # The second half is the reversed path.
+    configurations = np.array(solutions + solutions[-2:0:-1])
     grasps += grasps[-2:0:-1]
-    for name, images in zip(("light", "dark"), pictures(robot, grasps, every_q), strict=True):
+    for name, images in zip(
+        ("light", "dark"), pictures(robot, grasps, configurations), strict=True
+    ):
         file = options.out / f"hero_{name}.gif"
-        pause = round(1e3 * SECONDS / PICTURES / 10) * 10
-        save_picture(encode_gif(images, [pause] * PICTURES, 128), file)
+        pause = round(1e3 * SECONDS / FRAME_COUNT / 10) * 10
+        save_picture(encode_gif(images, [pause] * FRAME_COUNT, 128), file)
         print(file, file.stat().st_size)
 
 

@@ -1,4 +1,4 @@
-"""Compute the shipped grasps of the AR10 hand: fingertip pinches, held by Baxter's right arm.
+"""Compute the built-in grasps of the AR10 hand: fingertip pinches, held by Baxter's right arm.
 
 Run it again whenever an object, the hand or the recipes change::
 
@@ -38,8 +38,8 @@ PHALANX_GAP = 0.005  # [m] from a phalanx's axis to the object, but for the last
 PALM_GAP = 0.010  # [m] from the plane of the knuckles, y = 7.2 mm in the hand's root frame
 KNUCKLES = 0.0072  # [m]
 EDGE = 0.005  # [m] smallest distance of a contact from an edge
-ROOM = np.array([-0.15, 0.02, 0.03]), np.array([0.10, 0.15, 0.25])
-"""Corners [m] of where the object may be in the hand's root frame."""
+POSITION_BOUNDS = np.array([-0.15, 0.02, 0.03]), np.array([0.10, 0.15, 0.25])
+"""Corners of the object positions in the root frame of the hand [m]."""
 
 # The object's y axis, where the thumb presses, lies between the hand's y and -z; its z along -x,
 # so that the little finger is below when the object stands.
@@ -54,12 +54,12 @@ AXES = (
 LOW, HIGH = np.array([0.55, -0.55, 0.15]), np.array([0.85, -0.10, 0.40])
 ABOVE = 0.10
 PLACES = 4
-"""Places that a pinch is held at, until one is free."""
+"""Maximum number of placements of a pinch until one is collision-free."""
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """What to pinch and how to hold it.
+    """Object of a pinch and its orientation.
 
     Attributes:
         name: The object.
@@ -83,7 +83,7 @@ RECIPES = (
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Write the grasps; 0 when all were found."""
+    """Write the grasps; return 0 if all were found."""
     parser = argparse.ArgumentParser(description="Compute the shipped grasps of the AR10.")
     parser.add_argument("--only", choices=[r.name for r in RECIPES], help="one object")
     parser.add_argument("--seed", type=int, default=0)
@@ -107,19 +107,19 @@ def main(arguments: list[str] | None = None) -> int:
 def make(
     robot: ik.ArmHand, recipe: Recipe, rng: np.random.Generator, starts: int, seed: int
 ) -> str | None:
-    """The text of one grasp file, or None if nothing was found."""
+    """Return the text of a grasp file; None if no grasp was found."""
     item, description = load_object(recipe.name), robot.description
     scene = Scene(LOW, HIGH, recipe.up, ABOVE)
-    alone = SceneCheck(robot, ik.Scene(margin=MARGIN))
+    self_check = SceneCheck(robot, ik.Scene(margin=MARGIN))
     table = SceneCheck(robot, ik.load_scene("table"))
     problem = TipPinchProblem(
-        description, ROOT, item, recipe.sides, AXES, 0, EDGE, idle(robot), ROOM
+        description, ROOT, item, recipe.sides, AXES, 0, EDGE, idle(robot), POSITION_BOUNDS
     )
-    for found in problem.solve(rng, starts):
-        palm, fingers = gaps(robot, item, recipe.sides, found)
-        if found.residual > 1e-9 or palm < PALM_GAP or fingers < PHALANX_GAP:
+    for candidate in problem.solve(rng, starts):
+        palm, fingers = gaps(robot, item, recipe.sides, candidate)
+        if candidate.residual > 1e-9 or palm < PALM_GAP or fingers < PHALANX_GAP:
             continue
-        pinch = cleared(alone, recipe.name, recipe.sides, found, rng)
+        pinch = cleared(self_check, recipe.name, recipe.sides, candidate, rng)
         if pinch is None:
             continue
         for _ in range(PLACES):
@@ -136,7 +136,7 @@ def make(
 
 
 def idle(robot: ik.ArmHand) -> Array:
-    """(n,) the arm at zero, the hand at home (open): there a solve leaves fingers that are free."""
+    """Return (n,) the arm at zero and the hand at home, where unconstrained fingers stay."""
     q = robot.home.copy()
     q[list(robot.description.arm_actuators)] = 0.0
     return q
@@ -145,7 +145,7 @@ def idle(robot: ik.ArmHand) -> Array:
 def gaps(
     robot: ik.ArmHand, item: GraspObject, touching: dict[str, int], pinch: TipPinch
 ) -> tuple[float, float]:
-    """Smallest gaps [m]: object to the plane of the knuckles, phalanges' axes to the object.
+    """Return the smallest gaps [m]: object to plane of knuckles, axes of phalanges to object.
 
     The last phalanx of a finger that touches is tangent to the object and left out; the object is
     round, so nothing else of it can be inside.
@@ -162,8 +162,8 @@ def gaps(
             line.append(tip)
         for a, b in pairwise(line):
             samples.append(a + np.linspace(0, 1, 41)[:, None] * (b - a))
-    inside = np.concatenate(samples) @ hand[:3, :3].T + hand[:3, 3]
-    distances = item.signed_distance((inside - pose[:3, 3]) @ pose[:3, :3])
+    points_in_object = np.concatenate(samples) @ hand[:3, :3].T + hand[:3, 3]
+    distances = item.signed_distance((points_in_object - pose[:3, 3]) @ pose[:3, :3])
     vertices = item.mesh(96)[0] @ pose[:3, :3].T + pose[:3, 3]
     return float(vertices[:, 1].min() - KNUCKLES), float(distances.min())
 
@@ -176,9 +176,9 @@ def text_of(
     clear: tuple[float, float],
     seed: int,
 ) -> str:
-    """The file's text."""
-    held = "held upright" if recipe.up else "held"
-    scene = f"{held} in front of Baxter's right side"
+    """Return the text of the file."""
+    pose_text = "held upright" if recipe.up else "held"
+    scene = f"{pose_text} in front of Baxter's right side"
     palm, fingers = (1e3 * gap for gap in clear)
     header = [
         made_by("make_ar10_grasps.py", seed, recipe.name, ROBOT),

@@ -1,10 +1,10 @@
-"""Small files in the layouts of grasp data sets, made from hands of this project.
+"""Write small files in the layouts of grasp data sets, with hands of this project.
 
     python tools/make_grasp_sets.py FOLDER
 
-None of the data sets ships in a package. The layouts are those of their repositories, named in
-`models/datasets/*.yaml`; the grasps are random postures at random poses, seeded, so that what is
-read back can be compared with what was written.
+The data sets are not part of any package. The layouts are those of their repositories, which
+`models/datasets/*.yaml` names. The grasps are random postures at random poses with a seed, so
+that a test can compare the loaded grasps with the written ones.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ COUNT = 6
 
 @dataclass(frozen=True, eq=False)
 class Written:
-    """A file, and what it says.
+    """A file and its contents.
 
     Attributes:
         path: The file.
-        robot: Whose hand it is.
-        q: (k, n) what the robot's motors are at, hand and arm.
-        palms: (k, 4, 4) where the palm frame is, in the object's frame.
+        robot: Robot with the hand of the grasps.
+        q: (k, n) configurations.
+        palms: (k, 4, 4) palm poses in the object frame.
     """
 
     path: Path
@@ -56,19 +56,19 @@ class Written:
 
 
 def made(name: str, folder: Path, seed: int = 0, robot: ik.ArmHand | None = None) -> Written:
-    """Write a file for a shipped convention, or "table" for tables.
+    """Write a file of a built-in convention, or a table.
 
     Args:
-        name: Of the convention, with ".csv", ".npz" or ".parquet" where it is a table.
-        folder: Where to.
-        seed: Of postures and poses.
-        robot: Whose hand; None: one that has the convention's.
+        name: Name of the convention, or "table" with the suffix ".csv", ".npz" or ".parquet".
+        folder: Output folder.
+        seed: Random seed of postures and poses.
+        robot: Robot with the hand; None: one with the hand of the convention.
     """
     stem, _, kind = name.partition(".")
     layout, _, hand = stem.partition("_")
-    held = robot or ik.load_robot(ROBOTS.get(hand, "kuka_lwr_barrett"))
+    robot_of_file = robot or ik.load_robot(ROBOTS.get(hand, "kuka_lwr_barrett"))
     rng = np.random.default_rng(seed)
-    q = held.random(rng, COUNT)
+    q = robot_of_file.random(rng, COUNT)
     palms = np.tile(np.eye(4), (COUNT, 1, 1))
     palms[:, :3, :3] = np.linalg.qr(rng.normal(size=(COUNT, 3, 3)))[0]
     palms[:, :3, 0] *= np.linalg.det(palms[:, :3, :3])[:, None]
@@ -76,31 +76,34 @@ def made(name: str, folder: Path, seed: int = 0, robot: ik.ArmHand | None = None
     kind = kind or {"multidex": "pt", "isaac": "yaml"}.get(layout, "npy")
     path = folder / f"{stem}.{kind}"
     if layout == "table":
-        motors = held.description.finger_motors
-        values = q[:, [held.actuators.index(name) for name in motors]]
+        motors = robot_of_file.description.finger_motors
+        values = q[:, [robot_of_file.actuators.index(name) for name in motors]]
         if kind == "npz":
-            joints = tuple(n for n in held.description.finger_joints if n not in motors)
-            motors, values = (*motors, *joints), np.hstack([values, _joints(held, q, joints)])
+            joints = tuple(n for n in robot_of_file.description.finger_joints if n not in motors)
+            motors, values = (
+                (*motors, *joints),
+                np.hstack([values, _joints(robot_of_file, q, joints)]),
+            )
         _table(path, palms, motors, values)
     else:
         convention = load_convention(stem)
-        links = held.links(q)[convention.link]
-        frames = palms @ np.stack([inverse(pose) for pose in held.palm(q)]) @ links
+        links = robot_of_file.links(q)[convention.link]
+        frames = palms @ np.stack([inverse(pose) for pose in robot_of_file.palm(q)]) @ links
         frames = frames @ convention.pose
-        joints = _theirs(convention, held, q)
+        joints = _theirs(convention, robot_of_file, q)
         if convention.wrist:
             wrist = rng.uniform(-0.4, 0.4, (COUNT, len(convention.wrist)))
             joints = np.hstack([wrist, joints])
             bent = HandPoses("", np.zeros((COUNT, 3)), np.tile(np.eye(3), (COUNT, 1, 1)), joints)
-            there = convention.frames(bent) @ convention.pose
-            frames = frames @ np.stack([inverse(pose) for pose in there])
+            wrist_frames = convention.frames(bent) @ convention.pose
+            frames = frames @ np.stack([inverse(pose) for pose in wrist_frames])
         WRITERS[layout](path, frames, convention, joints)
-    return Written(path, held, q, palms)
+    return Written(path, robot_of_file, q, palms)
 
 
 def _joints(robot: ik.ArmHand, q: Array, names: tuple[str, ...]) -> Array:
-    found = robot.joints(q)
-    return np.stack([found[name] for name in names], axis=1)
+    joints = robot.joints(q)
+    return np.stack([joints[name] for name in names], axis=1)
 
 
 def _theirs(convention: Convention, robot: ik.ArmHand, q: Array) -> Array:
@@ -109,7 +112,7 @@ def _theirs(convention: Convention, robot: ik.ArmHand, q: Array) -> Array:
 
 
 def _getagrip(path: Path, frames: Array, convention: Convention, joints: Array) -> None:
-    """Dictionary of arrays; the fingers' directions are those of the palm's frame."""
+    """Write a dictionary of arrays; the directions of fingers are those of the palm frame."""
     del convention
     turns = np.repeat(frames[:, None, :3, :3], 4, axis=1)
     arrays = {
@@ -148,8 +151,12 @@ def _bodex(path: Path, frames: Array, convention: Convention, joints: Array) -> 
     del convention
     rows = _rows(frames, joints).astype(np.float32)
     stages = np.stack([_scaled(rows, 0.5), rows, _scaled(rows, 2.0)], axis=1)
-    held = {"robot_pose": stages[None], "obj_pose": OBJECT[None], "obj_scale": np.array([0.06])}
-    np.save(path, np.array(held, dtype=object))
+    robot_of_file = {
+        "robot_pose": stages[None],
+        "obj_pose": OBJECT[None],
+        "obj_scale": np.array([0.06]),
+    }
+    np.save(path, np.array(robot_of_file, dtype=object))
 
 
 def _dexgraspbench(path: Path, frames: Array, convention: Convention, joints: Array) -> None:
@@ -157,8 +164,12 @@ def _dexgraspbench(path: Path, frames: Array, convention: Convention, joints: Ar
     rows = _rows(frames, joints).astype(np.float32)
     stages = {"pregrasp_qpos": _scaled(rows, 0.5), "grasp_qpos": rows}
     stages |= {"squeeze_qpos": _scaled(rows, 2.0)}
-    held = stages | {"obj_pose": OBJECT, "obj_scale": np.float64(0.06), "obj_path": "assets"}
-    np.save(path, np.array(held, dtype=object))
+    robot_of_file = stages | {
+        "obj_pose": OBJECT,
+        "obj_scale": np.float64(0.06),
+        "obj_path": "assets",
+    }
+    np.save(path, np.array(robot_of_file, dtype=object))
 
 
 def _multidex(path: Path, frames: Array, convention: Convention, joints: Array) -> None:
@@ -219,7 +230,7 @@ def _scaled(rows: NDArray[Any], factor: float) -> Array:
 
 def _quaternions(rotations: Array) -> Array:
     """(k, 4) w x y z: eigenvectors of a symmetric matrix (Bar-Itzhack 2000)."""
-    found = []
+    joints = []
     for r in rotations:
         k = np.array(
             [
@@ -230,8 +241,8 @@ def _quaternions(rotations: Array) -> Array:
             ]
         )
         x, y, z, w = np.linalg.eigh(k)[1][:, -1]
-        found.append([w, x, y, z])
-    return np.array(found)
+        joints.append([w, x, y, z])
+    return np.array(joints)
 
 
 WRITERS: dict[str, Callable[[Path, Array, Convention, Array], None]] = {

@@ -1,4 +1,4 @@
-"""Compute the shipped grasps: a Barrett posture that pinches each object, held out by the arm.
+"""Compute the built-in grasps: a Barrett posture that pinches each object, held by the arm.
 
 Run it again whenever an object, the hand or the recipes change::
 
@@ -36,7 +36,7 @@ MIN_CONDITIONING = 0.10  # smallest singular value of the palm's Jacobian (metre
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Write or check the grasps; 0 when all are good."""
+    """Write or check the grasps; return 0 if all are valid."""
     parser = argparse.ArgumentParser(description="Compute the shipped grasps.")
     parser.add_argument("--only", choices=[r.name for r in RECIPES], help="one object")
     parser.add_argument("--check", action="store_true", help="verify the files, write nothing")
@@ -66,7 +66,7 @@ def main(arguments: list[str] | None = None) -> int:
 def make(
     hand: ArmHand, recipe: Recipe, rng: np.random.Generator, starts: int, seed: int
 ) -> str | None:
-    """The text of one grasp file, or None if nothing was found."""
+    """Return the text of a grasp file; None if no grasp was found."""
     item = load_object(recipe.name)
     for pinch in PinchProblem(hand, item, recipe).solve(rng, starts):
         gaps = pinch_gaps(hand, item, pinch)
@@ -87,7 +87,7 @@ def make(
 def scene(
     hand: ArmHand, item: GraspObject, recipe: Recipe, pinch: Pinch, rng: np.random.Generator
 ) -> Placement | None:
-    """The first good placement that the paper's method solves from home, else the first good one.
+    """Return the first valid placement, preferably one that the paper's method solves from home.
 
     A shipped grasp is a worked example, so a place is taken where there is something to see. It
     says nothing about success rates: the studies measure those on random arm configurations.
@@ -106,18 +106,18 @@ def scene(
 
 
 def pinch_gaps(hand: ArmHand, item: GraspObject, pinch: Pinch) -> Clearance:
-    """Gaps of a pinch."""
+    """Return the gaps of a pinch."""
     palm, _, _, lines, _ = hand.evaluate(np.zeros(7), pinch.posture)
     return clearance(item, pinch.object_in_palm, (lines - palm[:3, 3]) @ palm[:3, :3])
 
 
 def best_placement(placements: list[Placement]) -> Placement | None:
-    """The first that is well away from singularities."""
+    """Return the first pinch away from singularities."""
     return next((p for p in placements if p.conditioning > MIN_CONDITIONING), None)
 
 
 def report(pinch: Pinch, placement: Placement, gaps: Clearance) -> None:
-    """One line of numbers."""
+    """Return a line of numbers."""
     posture = " ".join(f"{value:6.2f}" for value in np.rad2deg(pinch.posture))
     arm = " ".join(f"{value:7.2f}" for value in np.rad2deg(placement.arm))
     millimetres = " ".join(f"{1e3 * gap:.1f}" for gap in (gaps.palm, gaps.fingers, gaps.between))

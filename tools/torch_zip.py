@@ -1,4 +1,4 @@
-"""A file as `torch.save` writes it since torch 1.6, without torch.
+"""Write files in the format of `torch.save` since torch 1.6, without torch.
 
 The pickle is written byte by byte, since it names functions of torch that need not be there
 (torch/serialization.py, `_save`; opcodes: the standard library's pickletools).
@@ -16,17 +16,17 @@ import numpy as np
 from casadi_ik.files.arrays import Array
 
 Content = dict[str, "Content"] | list["Content"] | tuple["Content", ...] | str | int | Array
-"""What can be in a file: tensors are arrays, kept as four bytes a number."""
+"""Content of a file; arrays become tensors of four-byte floats."""
 
 
 class _Writer:
-    """Bytes of a pickle, and the numbers of its tensors."""
+    """Bytes of a pickle and the values of its tensors."""
 
     def __init__(self) -> None:
         self.tensors: list[bytes] = []
 
     def of(self, content: Content) -> bytes:
-        """What puts the content on the reader's stack."""
+        """Return the opcodes that push the content onto the stack of the reader."""
         if isinstance(content, dict):
             items = b"".join(self.of(key) + self.of(value) for key, value in content.items())
             return pickle.EMPTY_DICT + pickle.MARK + items + pickle.SETITEMS
@@ -46,12 +46,14 @@ class _Writer:
         raw = np.ascontiguousarray(values, dtype="<f4")
         key, strides = str(len(self.tensors)), tuple(step // 4 for step in raw.strides)
         self.tensors.append(raw.tobytes())
-        kept = pickle.MARK + self.of("storage") + pickle.GLOBAL + b"torch\nFloatStorage\n"
-        kept += self.of(key) + self.of("cpu") + self.of(raw.size) + pickle.TUPLE + pickle.BINPERSID
+        storages = pickle.MARK + self.of("storage") + pickle.GLOBAL + b"torch\nFloatStorage\n"
+        storages += (
+            self.of(key) + self.of("cpu") + self.of(raw.size) + pickle.TUPLE + pickle.BINPERSID
+        )
         hooks = pickle.GLOBAL + b"collections\nOrderedDict\n" + pickle.EMPTY_TUPLE + pickle.REDUCE
-        rest = self.of(0) + self.of(raw.shape) + self.of(strides) + pickle.NEWFALSE + hooks
+        content = self.of(0) + self.of(raw.shape) + self.of(strides) + pickle.NEWFALSE + hooks
         build = pickle.GLOBAL + b"torch._utils\n_rebuild_tensor_v2\n"
-        return build + pickle.MARK + kept + rest + pickle.TUPLE + pickle.REDUCE
+        return build + pickle.MARK + storages + content + pickle.TUPLE + pickle.REDUCE
 
 
 def write_torch(path: Path, content: Content) -> None:
@@ -62,9 +64,9 @@ def write_torch(path: Path, content: Content) -> None:
         content: Containers, texts, whole numbers and arrays.
     """
     writer = _Writer()
-    said = pickle.PROTO + b"\x02" + writer.of(content) + pickle.STOP
+    pickle_bytes = pickle.PROTO + b"\x02" + writer.of(content) + pickle.STOP
     with ZipFile(path, "w") as archive:
-        archive.writestr(f"{path.stem}/data.pkl", said)
+        archive.writestr(f"{path.stem}/data.pkl", pickle_bytes)
         archive.writestr(f"{path.stem}/byteorder", "little")
         for key, raw in enumerate(writer.tensors):
             archive.writestr(f"{path.stem}/data/{key}", raw)

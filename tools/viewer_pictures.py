@@ -1,8 +1,7 @@
-"""The pictures of pages in the documentation: each page is opened in Chromium, used, and taken.
+"""Take the pictures of the viewer and of the web page in Chromium.
 
-What `casadi-ik view` shows of a grasp, of a contact out of reach, of ranked choices, of two logs,
-of the pads of an imported hand (`--hand`: its URDF), and the page without a server (`--page`: built
-by `make page`)::
+The pictures show a grasp, a contact out of reach, ranked grasps, two logs, the pads of an imported
+hand (`--hand`: its URDF), and the page without a server (`--page`: built by `make page`)::
 
     python tools/viewer_pictures.py --hand leap_hand_right.urdf --page out/page/index.html
 
@@ -34,27 +33,27 @@ ROBOT = "kuka_lwr_barrett"
 WINDOW = (1200, 760)
 
 CANDIDATES = ("cup", "mug", "apple", "orange", "tennis_ball", "tomato_soup_can")
-"""Grasps that are chosen among."""
+"""Candidates for the picture of ranked grasps."""
 
 ITERATION = 8
-"""Of two logs, as it is shown."""
+"""Iteration of the two logs to show."""
 
 FRAMES = 3
-"""After so many all that was asked for is in the picture."""
+"""Number of frames until the page is completely drawn."""
 
 CLOSE = "document.querySelector('.mantine-Notification-closeButton')"
-"""Of the note that there is no graphics card, which lies over the picture."""
+"""Close button of the note about a missing graphics card, which covers the picture."""
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "studies"))
 BENCH: Any = importlib.import_module("bench_view")
-"""Its browser, and what tells a page that something is painted."""
+"""Module with the browser and the script that detects painted frames."""
 
 Use = Callable[[Any, Any], None]
-"""What is done on a page, with the viewer and the browser's page."""
+"""Actions on a page, given the viewer and the page of the browser."""
 
 
-def taken(browser: Any, words: list[str], path: Path, use: Use) -> None:
-    """Open what `casadi-ik view` opens, use it, save what is seen."""
+def take_picture(browser: Any, words: list[str], path: Path, use: Use) -> None:
+    """Open a page of `casadi-ik view`, use it, and save a screenshot."""
     viewer = open_viewer(parse(["view", *words])[1])
     page = browser.open("about:blank", *WINDOW)
     page.call("Page.addScriptToEvaluateOnNewDocument", source=BENCH.COMMON)
@@ -64,12 +63,12 @@ def taken(browser: Any, words: list[str], path: Path, use: Use) -> None:
     page.evaluate(f"{CLOSE}?.click()")
     use(viewer.page, page)
     viewer.page.work.settle()
-    seen(page, path)
+    save_screenshot(page, path)
     viewer.stop()
 
 
-def seen(page: Any, path: Path) -> None:
-    """Save what is on the screen, once all of it is there."""
+def save_screenshot(page: Any, path: Path) -> None:
+    """Save a screenshot once the page is completely drawn."""
     time.sleep(1.0)
     for _ in range(FRAMES):
         page.evaluate("new Promise(done => requestAnimationFrame(() => setTimeout(done)))")
@@ -80,27 +79,27 @@ def seen(page: Any, path: Path) -> None:
     print(path)
 
 
-def dragged(name: str, *by: float) -> Use:
-    """The object or a contact dragged so far [m], in steps as a hand does."""
+def drag(name: str, *by: float) -> Use:
+    """Return an action that drags the object or a contact by a vector [m] in steps."""
 
-    def use(shown: GraspPage, _: Any) -> None:
-        shown.select(name)
-        start = shown.request.poses[name]
+    def use(page_state: GraspPage, _: Any) -> None:
+        page_state.select(name)
+        start = page_state.request.poses[name]
         for part in np.linspace(0.25, 1.0, 4):
             pose = start.copy()
             pose[:3, 3] += part * np.array(by)
-            shown.change(name, lambda request, pose=pose: request.with_pose(name, pose))
-            shown.work.settle()
+            page_state.change(name, lambda request, pose=pose: request.with_pose(name, pose))
+            page_state.work.settle()
 
     return use
 
 
-def gone_through(shown: GraspPage, page: Any) -> None:
-    """The best of the choices, and its solutions, seen with the whole arm."""
-    shown.choose(next(iter(shown.candidates)))
-    shown.work.settle()
+def show_solutions(page_state: GraspPage, page: Any) -> None:
+    """Show the best of the ranked grasps and its solutions, with the whole arm."""
+    page_state.choose(next(iter(page_state.candidates)))
+    page_state.work.settle()
     time.sleep(2.0)
-    for found in (
+    for element in (
         "[...document.querySelectorAll('[role=tab]')].find(one => one.innerText === 'Results')",
         "[...document.querySelectorAll('.mantine-Paper-root *')]"
         ".findLast(one => one.innerText?.trim() === 'Solutions')",
@@ -108,14 +107,14 @@ def gone_through(shown: GraspPage, page: Any) -> None:
     ):
         box = page.evaluate(
             "(({x, y, width, height}) => [x + width / 2, y + height / 2])"
-            f"({found}.getBoundingClientRect())"
+            f"({element}.getBoundingClientRect())"
         )
         page.click(*box)
         time.sleep(1.5)
 
 
-def chosen(folder: Path) -> list[str]:
-    """The answers that are chosen among a few grasps."""
+def ranked_grasps(folder: Path) -> list[str]:
+    """Rank the candidates; return the arguments of `casadi-ik view`."""
     ranked = folder / "ranked.json"
     grasps = folder / "candidates"
     grasps.mkdir()
@@ -126,8 +125,8 @@ def chosen(folder: Path) -> list[str]:
     return [str(ranked), *scene]
 
 
-def logged(folder: Path) -> list[str]:
-    """Two solves of the cup, by the paper's method and by ours."""
+def log_two_methods(folder: Path) -> list[str]:
+    """Log two solves of the cup, by a method of the paper and by hand-first."""
     paths = []
     for method in ("enhanced-dls", "hand-first"):
         paths.append(str(folder / f"{method}.mcap"))
@@ -135,48 +134,54 @@ def logged(folder: Path) -> list[str]:
     return paths
 
 
-def imported(urdf: Path, folder: Path) -> list[str]:
-    """A hand's description with guessed pads."""
+def import_hand(urdf: Path, folder: Path) -> list[str]:
+    """Import a hand with guessed pads; return the arguments of `casadi-ik view`."""
     path = folder / "my_hand.yaml"
     command(["import", str(urdf), "--out", str(path)])
     return [str(path), "--pads"]
 
 
-def alone(browser: Any, path: Path, picture: Path) -> None:
-    """The page without a server, once it has answered often enough to be warm."""
+def static_page(browser: Any, path: Path, picture: Path) -> None:
+    """Take a picture of the page without a server, after some solves as warm-up."""
     page = browser.open(path.resolve().as_uri(), *WINDOW)
     page.wait("globalThis.casadiIk?.now.answer && !casadiIk.viewport.framePending", 60.0)
     x, y = page.evaluate("casadiIk.pixel('object')")
     page.drag((x, y), (x + 6.0, y - 4.0), steps=12)
     page.wait("!casadiIk.viewport.framePending")
-    seen(page, picture)
+    save_screenshot(page, picture)
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Take them all."""
+    """Take the pictures that the command line names."""
     parser = argparse.ArgumentParser(description="The pictures of the pages.")
     parser.add_argument("--hand", type=Path, help="URDF of the hand whose pads are shown")
     parser.add_argument("--page", type=Path, help="index.html of the page without a server")
     parser.add_argument("--out", type=Path, default=Path("docs"), help="folder")
     parser.add_argument("--only", nargs="*", default=(), help="names of pictures, without .png")
     options = parser.parse_args(arguments)
-    wanted = set(options.only)
+    selected = set(options.only)
     with BENCH.browser_tools().Browser() as browser, tempfile.TemporaryDirectory() as name:
         folder, cup = Path(name), ["cup", "--scene", "table"]
         pictures: dict[str, tuple[Callable[[], list[str]], Use]] = {
-            "view": (lambda: cup, dragged("object", 0.02, 0.03, 0.01)),
-            "view_missed": (lambda: cup, dragged("thumb", 0.0, 0.0, 0.05)),
-            "view_choices": (lambda: chosen(folder), gone_through),
-            "view_log": (lambda: logged(folder), lambda shown, _: shown.show(ITERATION)),
+            "view": (lambda: cup, drag("object", 0.02, 0.03, 0.01)),
+            "view_missed": (lambda: cup, drag("thumb", 0.0, 0.0, 0.05)),
+            "view_choices": (lambda: ranked_grasps(folder), show_solutions),
+            "view_log": (
+                lambda: log_two_methods(folder),
+                lambda page_state, _: page_state.show(ITERATION),
+            ),
         }
         if options.hand is not None:
-            pads = imported(options.hand, folder)
-            pictures["view_pads"] = (lambda: pads, lambda shown, _: shown.select("finger_1"))
+            pads = import_hand(options.hand, folder)
+            pictures["view_pads"] = (
+                lambda: pads,
+                lambda page_state, _: page_state.select("finger_1"),
+            )
         for name, (words, use) in pictures.items():
-            if not wanted or name in wanted:
-                taken(browser, words(), options.out / f"{name}.png", use)
-        if options.page is not None and (not wanted or "page" in wanted):
-            alone(browser, options.page, options.out / "page.png")
+            if not selected or name in selected:
+                take_picture(browser, words(), options.out / f"{name}.png", use)
+        if options.page is not None and (not selected or "page" in selected):
+            static_page(browser, options.page, options.out / "page.png")
 
 
 if __name__ == "__main__":

@@ -11,27 +11,27 @@ from sphinx.domains.python import PyObject
 
 import casadi_ik
 
-HERE = re.compile(r"^<!-- here: api-pages (.*?) ?-->$", re.MULTILINE)
+PARTS = re.compile(r"^<!-- here: api-pages (.*?) ?-->$", re.MULTILINE)
 FOLDER = Path(__file__).parents[1] / "reference"
 
 
 def documented(*names: str) -> str:
-    """What autodoc is told to show: "Solver", "logs.open", "errors.InputError"."""
+    """Return the directives of autodoc for names such as "Solver" or "logs.open"."""
     blocks = []
     for name in names:
-        thing = found(name)
-        if inspect.isclass(thing):
+        target = public_object(name)
+        if inspect.isclass(target):
             options = [":members:"]
-            if issubclass(thing, BaseException):
+            if issubclass(target, BaseException):
                 options = [":show-inheritance:"]
-            elif issubclass(thing, enum.Enum):
-                options += [":undoc-members:", f":exclude-members: {_inherited(thing)}"]
-            elif issubclass(thing, (tuple, str)):
+            elif issubclass(target, enum.Enum):
+                options += [":undoc-members:", f":exclude-members: {_inherited(target)}"]
+            elif issubclass(target, (tuple, str)):
                 pass
             else:
                 options.append(":inherited-members:")
             lines = [f".. autoclass:: casadi_ik.{name}", *("   " + option for option in options)]
-        elif callable(thing):
+        elif callable(target):
             lines = [f".. autofunction:: casadi_ik.{name}"]
         else:
             lines = [f".. autodata:: casadi_ik.{name}", "   :no-value:"]
@@ -40,11 +40,11 @@ def documented(*names: str) -> str:
 
 
 def pages_of(*names: str) -> str:
-    """Names with the first sentences of their docstrings, linked to a page each."""
+    """Return a table of names, linked to their pages, with their summaries."""
     rows = ["| | |", "|---|---|"]
     for name in names:
-        thing = found(name)
-        text = inspect.getdoc(thing) if not isinstance(thing, tuple) else "Names of the methods."
+        target = public_object(name)
+        text = inspect.getdoc(target) if not isinstance(target, tuple) else "Names of the methods."
         first = (text or "").split("\n\n")[0].replace("\n", " ").replace("|", r"\|")
         first = re.sub(r"`([^`]+)`", r"{py:obj}`\1`", first)
         rows.append(f"| [`{name}`](names/{name}.md) | {first} |")
@@ -53,11 +53,11 @@ def pages_of(*names: str) -> str:
 
 
 def write_pages(_app: object) -> None:
-    """A page for every name in an `api-pages` of the reference, if it is not there as it is."""
+    """Write a page for every name of an `api-pages` line of the reference; keep unchanged files."""
     folder = FOLDER / "names"
     folder.mkdir(exist_ok=True)
     texts = [page.read_text(encoding="utf-8") for page in FOLDER.glob("*.md")]
-    names = {name for text in texts for listed in HERE.findall(text) for name in listed.split()}
+    names = {name for text in texts for listed in PARTS.findall(text) for name in listed.split()}
     for page in folder.glob("*.md"):
         if page.stem not in names:
             page.unlink()
@@ -67,46 +67,46 @@ def write_pages(_app: object) -> None:
             page.write_text(text, encoding="utf-8")
 
 
-def found(name: str) -> object:
-    """A public name's object: of casadi_ik, its logs or its errors."""
-    thing: object = casadi_ik
+def public_object(name: str) -> object:
+    """Return the object of a public name of casadi_ik."""
+    target: object = casadi_ik
     for part in name.split("."):
-        thing = getattr(thing, part)
-    return thing
+        target = getattr(target, part)
+    return target
 
 
-def _inherited(thing: type[enum.Enum]) -> str:
-    own = set(vars(thing))
-    return ", ".join(sorted(name for name in dir(thing) if name not in own and name[0] != "_"))
+def _inherited(target: type[enum.Enum]) -> str:
+    defined = set(vars(target))
+    return ", ".join(sorted(name for name in dir(target) if name not in defined and name[0] != "_"))
 
 
-def readable(
-    _app: object, _what: str, _name: str, _thing: object, _: object, lines: list[str]
+def readable_types(
+    _app: object, _kind: str, _name: str, _object: object, _: object, lines: list[str]
 ) -> None:
-    """Types stand in the text as they are, where an underscore at an end would be a link."""
+    """Remove trailing underscores of types in docstrings, which would become links."""
     lines[:] = [line.replace("np.bool_]", "np.bool]") for line in lines]
 
 
-def in_words(
+def short_signature(
     _app: object,
-    _what: str,
+    _kind: str,
     _name: str,
-    _thing: object,
+    _object: object,
     _: object,
-    said: str | None,
-    gives: str | None,
+    signature: str | None,
+    returns: str | None,
 ) -> tuple[str, str | None] | None:
-    """A signature as it stands in the source: short names of arrays, defaults that are made."""
+    """Return a signature with short names of arrays and `...` for computed defaults."""
 
-    def plain(text: str) -> str:
+    def shorten(text: str) -> str:
         text = re.sub(r"(?:~?\w+\.)*TypeAliasForwardRef\('(\w+)'\)", r"\1", text)
         return text.replace("<factory>", "...")
 
-    return None if said is None else (plain(said), gives and plain(gives))
+    return None if signature is None else (shorten(signature), returns and shorten(returns))
 
 
-def call_them_attributes() -> None:
-    """Docstrings say "Attributes", so the pages do."""
+def label_attributes() -> None:
+    """Label instance variables "Attributes", as the docstrings do."""
     for field in PyObject.doc_field_types:
         if field.name == "variable":
             field.label = "Attributes"

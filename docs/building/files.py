@@ -20,33 +20,33 @@ OF = {
     "reading": "",
     "retarget": "",
 }
-"""Which file the types of a module are part of."""
+"""Kind of file by the module of its types."""
 
-NAMES = {"ArmHandFile": "Robot described in full", "ImportedFile": "Robot in somebody's files"}
+NAMES = {"ArmHandFile": "Robot described in full", "ImportedFile": "Robot from URDF or MJCF"}
 
 
 def file_reference() -> str:
-    """A section per kind of file, with a table per mapping in it; what several have, once."""
+    """Return a section for each kind of file, with a table for each mapping."""
     parts: list[str] = []
-    seen: set[str] = set()
-    for kind, (_, about) in FILES.items():
+    written: set[str] = set()
+    for kind, (_, summary) in FILES.items():
         schema = schema_of(kind)
-        parts += [f"## {kind.capitalize()} files", f"{about}.", _schema_line(kind)]
-        for name, one in schema["definitions"].items():
-            if "properties" in one and name not in seen:
-                seen.add(name)
-                parts += [f"({_anchor(name)})=\n### {_title(name)}", _mapping(one)]
+        parts += [f"## {kind.capitalize()} files", f"{summary}.", _schema_line(kind)]
+        for name, mapping in schema["definitions"].items():
+            if "properties" in mapping and name not in written:
+                written.add(name)
+                parts += [f"({_anchor(name)})=\n### {_title(name)}", _mapping(mapping)]
     return "\n\n".join(parts)
 
 
 def quantities() -> str:
-    """What may stand for a number, by what it measures."""
+    """Return a table of the types of numbers and their units."""
     rows = ["| type | value |", "|---|---|"]
-    found: dict[str, Any] = {}
+    definitions: dict[str, Any] = {}
     for kind in FILES:
-        found |= schema_of(kind)["definitions"]
-    for name in sorted(name for name, one in found.items() if "properties" not in one):
-        text = found[name].get("description", "A text.")
+        definitions |= schema_of(kind)["definitions"]
+    for name in sorted(name for name, entry in definitions.items() if "properties" not in entry):
+        text = definitions[name].get("description", "A text.")
         rows.append(f"| {name} | {text} |")
     return "\n".join(rows)
 
@@ -55,39 +55,41 @@ def _schema_line(kind: str) -> str:
     return f"Schema for editors: [`{kind}.json`](../../models/schemas/{kind}.json)."
 
 
-def _mapping(one: dict[str, Any]) -> str:
-    rows = [one["description"].rstrip(".") + ".", "", "| key | value | |", "|---|---|---|"]
-    for key, said in one["properties"].items():
-        needed = key in one["required"]
-        default = said.get("default")
+def _mapping(mapping: dict[str, Any]) -> str:
+    rows = [mapping["description"].rstrip(".") + ".", "", "| key | value | |", "|---|---|---|"]
+    for key, schema in mapping["properties"].items():
+        required = key in mapping["required"]
+        default = schema.get("default")
         plain = default not in (None, "", [], {}, 0.0) and not isinstance(default, (dict, list))
-        text = said.get("description", "")
-        text += f" Else {json.dumps(default)}." if plain else ""
-        shown = f"**`{key}`**" if needed else f"`{key}`"
-        rows.append(f"| {shown} | {_value(said)} | {text} |".replace("\n", " "))
+        text = schema.get("description", "")
+        text += f" Default: {json.dumps(default)}." if plain else ""
+        key_text = f"**`{key}`**" if required else f"`{key}`"
+        rows.append(f"| {key_text} | {_value(schema)} | {text} |".replace("\n", " "))
     return "\n".join(rows)
 
 
-def _value(said: dict[str, Any]) -> str:
-    """The type of a value in words."""
-    if "allOf" in said:
-        return _value(said["allOf"][0])
-    if "$ref" in said:
-        name = said["$ref"].rpartition("/")[2]
+def _value(schema: dict[str, Any]) -> str:
+    """Return the type of a value in words."""
+    if "allOf" in schema:
+        return _value(schema["allOf"][0])
+    if "$ref" in schema:
+        name = schema["$ref"].rpartition("/")[2]
         return f"[{_title(name).lower()}](#{_anchor(name)})" if "." in name else name
-    if "const" in said:
-        return f"`{said['const']}`"
-    if "anyOf" in said:
-        return " or ".join(_value(one) for one in said["anyOf"] if one.get("type") != "null")
-    if said["type"] == "object":
-        return f"by name: {_value(said['additionalProperties'])}"
-    if said["type"] == "array":
-        items = said["items"]
+    if "const" in schema:
+        return f"`{schema['const']}`"
+    if "anyOf" in schema:
+        return " or ".join(
+            _value(option) for option in schema["anyOf"] if option.get("type") != "null"
+        )
+    if schema["type"] == "object":
+        return f"by name: {_value(schema['additionalProperties'])}"
+    if schema["type"] == "array":
+        items = schema["items"]
         if isinstance(items, list):  # a fixed number of them, all of one kind
             items = items[0]
         value = _value(items)
-        return f"[{said['minItems']} × {value}]" if "minItems" in said else f"list of {value}"
-    return {"integer": "whole number", "boolean": "true or false"}[said["type"]]
+        return f"[{schema['minItems']} × {value}]" if "minItems" in schema else f"list of {value}"
+    return {"integer": "whole number", "boolean": "true or false"}[schema["type"]]
 
 
 def _anchor(name: str) -> str:

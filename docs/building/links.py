@@ -1,4 +1,4 @@
-"""Whether all links of the built site lead somewhere, and all text was read as what it is.
+"""Check the built site for broken links and for Markdown that was not converted.
 
 `python docs/building/links.py DIR`
 """
@@ -17,7 +17,7 @@ LINK = re.compile(r"""<(?:a|img|link|script|source)\b[^>]*?\b(?:href|src)="([^"]
 NAMED = re.compile(r"""\b(?:id|name)="([^"]+)\"""")
 
 RAW = re.compile(r"(?:<p>[^<]*?|<m\w+>)(\|\s*---\s*\||\$[^$<]+\$|\[\d+pt\])")
-"""A table or a formula in Markdown that stands in a paragraph as it was written."""
+"""A table or formula in Markdown that was not converted."""
 
 
 @cache
@@ -26,24 +26,26 @@ def _named(page: Path) -> frozenset[str]:
 
 
 def broken(folder: Path) -> Iterator[str]:
-    """What leads nowhere, one line each; addresses elsewhere are not looked at."""
+    """Yield a line for each broken link; external addresses are not checked."""
     for page in sorted(folder.rglob("*.html")):
-        for link in {unescape(one) for one in LINK.findall(page.read_text(encoding="utf-8"))}:
+        for link in {
+            unescape(address) for address in LINK.findall(page.read_text(encoding="utf-8"))
+        }:
             if re.match(r"[a-z]+:", link):
                 continue
-            path, _, place = link.partition("#")
+            path, _, anchor = link.partition("#")
             target = page if not path else (page.parent / unquote(path.partition("?")[0])).resolve()
             if not target.exists():
                 yield f"{page.relative_to(folder)}: {link}: no such file"
-            elif place and target.suffix == ".html" and unquote(place) not in _named(target):
-                yield f"{page.relative_to(folder)}: {link}: no such place"
+            elif anchor and target.suffix == ".html" and unquote(anchor) not in _named(target):
+                yield f"{page.relative_to(folder)}: {link}: no such anchor"
 
 
 def unread(folder: Path) -> Iterator[str]:
-    """Tables and formulas that stand on a page as they were written, one line each."""
+    """Yield a line for each table and formula that was not converted."""
     for page in sorted(folder.rglob("*.html")):
-        for found in RAW.findall(page.read_text(encoding="utf-8")):
-            yield f"{page.relative_to(folder)}: {found}: is not drawn"
+        for raw in RAW.findall(page.read_text(encoding="utf-8")):
+            yield f"{page.relative_to(folder)}: {raw}: is not converted"
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""Equations as MathML: every browser draws it, no script and no network is needed.
+"""Equations as MathML, which browsers draw without scripts and without network access.
 
-The converter is docutils' own. What it makes of accents with an index and of the bars of a norm is
-put right here: the index goes beside the letter with its accent, the bars stay as high as letters.
+The converter is that of docutils, with two corrections: the index of a letter with an accent
+follows the letter, and the bars of a norm have the height of letters.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from sphinx.application import Sphinx
 from sphinx.util.math import get_node_equation_number
 
 TAG = re.compile(r"\\tag\{(.*?)\}")
-"""The number that a formula has in the paper it is from."""
+"""Number of an equation in its paper."""
 
 MATHML = "http://www.w3.org/1998/Math/MathML"
 ACCENTS = frozenset("˙¨→ˆ˜¯~^_")
 APPLY = "\u2061"
-"""What stands between a function and its argument: nothing is seen of it."""
+"""Invisible character between a function and its argument."""
 
 THIN = "0.17em"
 
 
 def mathml(tex: str, display: bool) -> str:
-    """A formula in TeX as MathML.
+    """Convert a formula in TeX to MathML.
 
     Raises:
-        MathError: TeX that the converter does not know; the build then fails and names the page.
+        MathError: The converter does not know a command; the build fails and names the page.
     """
     text = latex2mathml.tex2mathml(tex, as_block=display).replace("&ApplyFunction;", APPLY)
     root = ElementTree.fromstring(text)
@@ -43,13 +43,13 @@ def mathml(tex: str, display: bool) -> str:
             element.tag = _tag("msub")
         elif element.tag == _tag("mo") and element.text == "‖" and "minsize" not in element.attrib:
             element.set("stretchy", "false")
-    # Here, as others take the empty prefix for theirs.
+    # Not at import, because other libraries register the empty prefix too.
     ElementTree.register_namespace("", MATHML)
     return ElementTree.tostring(root, encoding="unicode")
 
 
 def _space_functions(row: ElementTree.Element) -> None:
-    """A thin space between a function and its letters, as TeX has it."""
+    """Insert a thin space between a function and its letters, as TeX does."""
     bars = _tag("mo"), _tag("mrow"), _tag("mspace")
     for function, applied in list(pairwise(row)):
         if applied.text != APPLY:
@@ -89,6 +89,6 @@ def _display(self: Any, node: nodes.math_block) -> None:
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Tell Sphinx of it."""
+    """Register the renderer of equations."""
     app.add_html_math_renderer("mathml", (_inline, None), (_display, None))
     return {"parallel_read_safe": True, "parallel_write_safe": True}

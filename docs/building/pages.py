@@ -15,17 +15,17 @@ from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
 
 from building.api import (
-    call_them_attributes,
     documented,
-    in_words,
+    label_attributes,
     pages_of,
-    readable,
+    readable_types,
+    short_signature,
     write_pages,
 )
 from building.commands import command_line
 from building.files import file_reference, quantities
 
-HERE = re.compile(r"^<!-- here: ([a-z-]+) ?(.*?) ?-->$", re.MULTILINE)
+PART_LINE = re.compile(r"^<!-- here: ([a-z-]+) ?(.*?) ?-->$", re.MULTILINE)
 ROOT = Path(__file__).parents[2]
 
 
@@ -56,7 +56,7 @@ def _expand(app: Sphinx, docname: str, source: list[str]) -> None:
         return PARTS[name](*arguments)
 
     if docname.startswith("docs/"):
-        source[0] = HERE.sub(part, source[0])
+        source[0] = PART_LINE.sub(part, source[0])
     elif docname.startswith("studies/results/") and f"\n/{docname}\n" not in _listed_reports():
         source[0] = f"---\norphan: true\n---\n\n{source[0]}"
 
@@ -65,7 +65,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     """Register the extension."""
     app.connect("builder-inited", write_pages)
     app.connect("source-read", _expand)
-    app.connect("autodoc-process-docstring", readable, priority=900)
-    app.connect("autodoc-process-signature", in_words)
-    call_them_attributes()
+    app.connect("autodoc-process-docstring", readable_types, priority=900)
+    app.connect("autodoc-process-signature", short_signature)
+    label_attributes()
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,6 +1,6 @@
-"""The role `src`: what computes an equation, by name, linked to its text on the site.
+"""The role `src`: a name of the package, linked to its source on the site.
 
-{src}`kinematics.se3.log_so3` fails the build if the package has no such thing.
+{src}`kinematics.se3.log_so3` fails the build if the package has no such name.
 """
 
 from __future__ import annotations
@@ -23,27 +23,27 @@ FOLDER = "_source"
 
 
 class Source(SphinxRole):
-    """Names something of the package, without the `casadi_ik.` before it."""
+    """Role for names of the package, without the prefix `casadi_ik.`."""
 
     def run(self) -> tuple[list[nodes.Node], list[nodes.system_message]]:
-        """The name as code, a link to its first line.
+        """Return the name as code, linked to its first line.
 
         Raises:
-            ExtensionError: There is no such thing.
+            ExtensionError: The package has no such name.
         """
         module, path, line = located(self.text, self.env.docname)
         self.env.metadata[self.env.docname].setdefault("sources", {})[module] = path
         up = "../" * self.env.docname.count("/")
         target = f"{up}{FOLDER}/{module}.html#L-{line}"
-        shown = nodes.literal("", self.text, classes=["src"])
-        return [nodes.reference("", "", shown, refuri=target, internal=True)], []
+        literal = nodes.literal("", self.text, classes=["src"])
+        return [nodes.reference("", "", literal, refuri=target, internal=True)], []
 
 
-def located(name: str, where: str) -> tuple[str, str, int]:
-    """Module, file and line of something in the package.
+def located(name: str, docname: str) -> tuple[str, str, int]:
+    """Return module, file and line of a name of the package.
 
     Raises:
-        ExtensionError: There is no such thing.
+        ExtensionError: The package has no such name.
     """
     parts = f"casadi_ik.{name}".split(".")
     for count in range(len(parts), 0, -1):
@@ -52,26 +52,36 @@ def located(name: str, where: str) -> tuple[str, str, int]:
             break
         except ModuleNotFoundError:
             continue
-    thing: Any = module
+    target_object: Any = module
     try:
         for part in parts[count:]:
-            module_like = inspect.ismodule(thing)
-            thing = getattr(thing, part) if module_like else inspect.getattr_static(thing, part)
+            module_like = inspect.ismodule(target_object)
+            target_object = (
+                getattr(target_object, part)
+                if module_like
+                else inspect.getattr_static(target_object, part)
+            )
     except AttributeError as error:
-        raise ExtensionError(f"{where}: src: casadi_ik has no {name}") from error
-    thing = thing.fget if isinstance(thing, property) else getattr(thing, "func", thing)
-    code = not inspect.ismodule(thing) and (inspect.isclass(thing) or inspect.isfunction(thing))
-    line = inspect.getsourcelines(thing)[1] if code else 1
+        raise ExtensionError(f"{docname}: src: casadi_ik has no {name}") from error
+    target_object = (
+        target_object.fget
+        if isinstance(target_object, property)
+        else getattr(target_object, "func", target_object)
+    )
+    code = not inspect.ismodule(target_object) and (
+        inspect.isclass(target_object) or inspect.isfunction(target_object)
+    )
+    line = inspect.getsourcelines(target_object)[1] if code else 1
     return module.__name__, str(inspect.getsourcefile(module)), line
 
 
 def _pages(app: Sphinx) -> Iterator[tuple[str, dict[str, str], str]]:
-    """A page for each module that is named anywhere."""
-    found: dict[str, str] = {}
-    for about in app.env.metadata.values():
-        found |= about.get("sources", {})
+    """Yield a page for each referenced module."""
+    sources: dict[str, str] = {}
+    for metadata in app.env.metadata.values():
+        sources |= metadata.get("sources", {})
     style = HtmlFormatter(lineanchors="L", anchorlinenos=False, cssclass="highlight")
-    for module, path in sorted(found.items()):
+    for module, path in sorted(sources.items()):
         body = highlight(Path(path).read_text(encoding="utf-8"), PythonLexer(), style)
         title = module
         yield (
@@ -82,7 +92,7 @@ def _pages(app: Sphinx) -> Iterator[tuple[str, dict[str, str], str]]:
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Tell Sphinx of it."""
+    """Register the extension."""
     app.add_role("src", Source())
     app.connect("html-collect-pages", _pages)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

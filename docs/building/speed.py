@@ -1,4 +1,4 @@
-"""The bar chart of speed beside other solvers, from the committed results of a study.
+"""Draw the bar chart of speed in comparison with other solvers, from results of a study.
 
     python docs/building/speed.py
 
@@ -24,11 +24,11 @@ ROWS = {
 """Name in the results, name in the chart."""
 
 INKS = {"light": ("#24292f", "#e08a2e", "#8c959f"), "dark": ("#e6edf3", "#e8944a", "#6e7681")}
-"""Text, our bar, other bars."""
+"""Colours of text, of the bar of casadi_ik, and of other bars."""
 
 
 def times() -> dict[str, list[float]]:
-    """Mean processor time of a target [ms] by solver, a number for each arm-hand pair."""
+    """Return the mean processor time of a target [ms] by solver, for each arm-hand pair."""
     pairs = json.loads(RESULTS.read_text(encoding="utf-8"))["pairs"].values()
     return {
         name: [pair["cells"][CELL][key]["mean"] / 1000.0 for pair in pairs]
@@ -37,12 +37,14 @@ def times() -> dict[str, list[float]]:
 
 
 def means() -> dict[str, float]:
-    """Geometric means of `times`."""
-    return {name: math.exp(sum(map(math.log, all_)) / len(all_)) for name, all_ in times().items()}
+    """Return the geometric means of `times`."""
+    return {
+        name: math.exp(sum(map(math.log, values)) / len(values)) for name, values in times().items()
+    }
 
 
 def label(time: float) -> str:
-    """A time as it stands at its bar."""
+    """Return the label of a bar."""
     return f"{time:.2g} ms"
 
 
@@ -54,10 +56,10 @@ def draw(paper: str) -> None:
     mpl.rcParams.update({"svg.hashsalt": "casadi_ik", "font.size": 11})
     import matplotlib.pyplot as plt
 
-    ink, ours, others = INKS[paper]
+    ink, highlight, gray = INKS[paper]
     figure, axes = plt.subplots(figsize=(7.4, 1.9), layout="constrained")
     for row, mean in enumerate(means().values()):
-        axes.barh(row, mean, height=0.7, color=others if row else ours)
+        axes.barh(row, mean, height=0.7, color=gray if row else highlight)
         axes.text(mean, row, f" {label(mean)}", va="center", color=ink, zorder=4)
     axes.set_yticks(range(len(ROWS)), list(ROWS.values()), color=ink)
     axes.get_yticklabels()[0].set_fontweight("bold")
@@ -72,5 +74,5 @@ def draw(paper: str) -> None:
 
 
 if __name__ == "__main__":
-    for one in INKS:
-        draw(one)
+    for background in INKS:
+        draw(background)

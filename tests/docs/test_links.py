@@ -22,7 +22,7 @@ def test_broken_links_are_named(tmp_path: Path) -> None:
         '<p id="top"></p> <img alt="" src="gone.png"> <a href="deep/b.html#nowhere">x</a>'
     )
     assert sorted(broken(tmp_path)) == [
-        "a.html: deep/b.html#nowhere: no such place",
+        "a.html: deep/b.html#nowhere: no such anchor",
         "a.html: gone.png: no such file",
     ]
 
@@ -33,8 +33,8 @@ def test_what_stands_as_it_was_written_is_named(tmp_path: Path) -> None:
         "<pre>| --- | $H_p$</pre><p>5 $ and no more</p><p><code>$x$</code></p>"
     )
     assert list(unread(tmp_path)) == [
-        "a.html: | --- |: is not drawn",
-        "a.html: $H_p$: is not drawn",
+        "a.html: | --- |: is not converted",
+        "a.html: $H_p$: is not converted",
     ]
 
 

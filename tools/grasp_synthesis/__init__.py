@@ -1,1 +1,1 @@
-"""How the shipped grasps are computed; run ``tools/make_grasps.py``."""
+"""Computation of the built-in grasps; run ``tools/make_grasps.py``."""

@@ -1,4 +1,4 @@
-"""Does anything run into anything: sampled, numpy only.
+"""Sampled collision checks in numpy.
 
 Phalanges are capsules of 9 mm radius around the lines knuckle - distal joint - {T}; a pad lies
 9.5 mm off its line, so a finger that only touches with its pad keeps 0.5 mm.
@@ -34,7 +34,7 @@ class Clearance:
 
 
 def clearance(item: GraspObject, object_in_palm: Array, lines: Array) -> Clearance:
-    """Gaps of a grasp.
+    """Return the gaps of a grasp.
 
     Args:
         item: The object.
@@ -43,16 +43,16 @@ def clearance(item: GraspObject, object_in_palm: Array, lines: Array) -> Clearan
     """
     rotation, origin = object_in_palm[:3, :3], object_in_palm[:3, 3]
     vertices = item.mesh(96)[0] @ rotation.T + origin
-    samples = [_along(line) for line in lines]
-    inside = (np.concatenate(samples) - origin) @ rotation
+    samples = [_segment_points(line) for line in lines]
+    points_in_object = (np.concatenate(samples) - origin) @ rotation
     gaps = [np.linalg.norm(a[:, None] - b[None], axis=2).min() for a, b in combinations(samples, 2)]
     return Clearance(
         palm=float(vertices[:, 2].min() - PALM_SURFACE),
-        fingers=float(item.signed_distance(inside).min() - PHALANX_RADIUS),
+        fingers=float(item.signed_distance(points_in_object).min() - PHALANX_RADIUS),
         between=float(min(gaps) - 2 * PHALANX_RADIUS),
     )
 
 
-def _along(line: Array) -> Array:
+def _segment_points(line: Array) -> Array:
     t = np.linspace(0, 1, 41)[:, None]
     return np.concatenate([a + t * (b - a) for a, b in pairwise(line)])

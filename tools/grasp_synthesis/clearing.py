@@ -20,7 +20,7 @@ IDLE = 400  # random postures of the fingers that do not touch, behind the usual
 def surroundings(
     check: SceneCheck, item: str, touching: Iterable[str], pinch: TipPinch, q: Array
 ) -> CollisionQuery:
-    """What a pinch held by q (n,) must not touch."""
+    """Return the scene of a pinch at q (n,): everything that it must not touch."""
     robot = check.robot
     points, normals = robot.contacts(q)
     rows = [(name, robot.fingers.index(name)) for name in touching]
@@ -41,7 +41,7 @@ def cleared(
     pinch: TipPinch,
     rng: np.random.Generator,
 ) -> TipPinch | None:
-    """The pinch with idle fingers where the hand touches nothing; None: there is no such place.
+    """Return the pinch with collision-free idle fingers; None if there are none.
 
     Args:
         check: The robot in an empty scene.
@@ -55,8 +55,8 @@ def cleared(
     hand = set(robot.description.hand_actuators)
     busy = {i for name in named for i in robot.description.finger_actuators(name)}
     idle = sorted(hand - busy)
-    tried = np.tile(pinch.q, (IDLE + 2, 1))
-    tried[1, idle] = robot.home[idle]
-    tried[2:, idle] = robot.random(rng, IDLE)[:, idle]
-    free = np.flatnonzero(around.free(tried))
-    return replace(pinch, q=tried[free[0]]) if len(free) else None
+    trial = np.tile(pinch.q, (IDLE + 2, 1))
+    trial[1, idle] = robot.home[idle]
+    trial[2:, idle] = robot.random(rng, IDLE)[:, idle]
+    free = np.flatnonzero(around.free(trial))
+    return replace(pinch, q=trial[free[0]]) if len(free) else None

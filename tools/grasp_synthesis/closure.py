@@ -1,4 +1,4 @@
-"""How much friction a three-finger grasp needs; numpy only."""
+"""Friction that a three-finger grasp needs; numpy only."""
 
 from __future__ import annotations
 

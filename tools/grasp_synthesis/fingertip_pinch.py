@@ -66,8 +66,8 @@ class TipPinchProblem:
         box_axis: int,
         edge_margin: float,
         idle: Array,
-        room: tuple[Array, Array],
-        apart: float = 0.0,
+        position_bounds: tuple[Array, Array],
+        min_contact_distance: float = 0.0,
     ) -> None:
         """Build it.
 
@@ -79,9 +79,9 @@ class TipPinchProblem:
             axes: Object axes x, y, z in the hand's root frame, about which it may turn by `TURN`.
             box_axis: For a box the axis whose faces are pinched.
             edge_margin: Distance of contacts from edges [m].
-            idle: (n,) where all other motors stand.
-            room: (3,) corners [m] of where the object may be in the hand's root frame.
-            apart: Least distance [m] of two contacts on the same side: fingers have a width.
+            idle: (n,) positions of all other motors.
+            position_bounds: (3,) corners of the object positions in the frame of the hand root [m].
+            min_contact_distance: Smallest distance of two contacts on the same side [m].
         """
         self.idle = idle
         self.motors = sorted({i for name in sides for i in robot.finger_actuators(name)})
@@ -91,9 +91,9 @@ class TipPinchProblem:
         surface, squeeze = ca.SX.sym("surface", 2, f), ca.SX.sym("squeeze", len(pairs))
         friction = ca.SX.sym("friction")
         q = ca.SX(ca.DM(idle))
-        centre, half = (robot.upper + robot.lower) / 2, (robot.upper - robot.lower) / 2
+        centre, half_range = (robot.upper + robot.lower) / 2, (robot.upper - robot.lower) / 2
         for i, motor in enumerate(self.motors):
-            q[motor] = centre[motor] + half[motor] * motors[i]
+            q[motor] = centre[motor] + half_range[motor] * motors[i]
         kinematics = actuated(robot, q).kinematics
         hand = kinematics.links[root]
         rotation = exp_so3(turn) @ ca.DM(np.array(axes).T)
@@ -127,18 +127,28 @@ class TipPinchProblem:
             cones += [press - PRESS, (1 + friction**2) * press**2 - ca.sumsqr(force)]
         on = list(sides.values())
         beside = [
-            ca.sumsqr(points[i] - points[j]) - (apart / LENGTH) ** 2
+            ca.sumsqr(points[i] - points[j]) - (min_contact_distance / LENGTH) ** 2
             for i, j in pairs
-            if apart and on[i] == on[j]
+            if min_contact_distance and on[i] == on[j]
         ]
         inequalities = ca.vertcat(*cones, *facing, *beside)
         cost = friction**2 + 0.02 * ca.sumsqr(motors**2)
         x = ca.vertcat(motors, place, turn, ca.vec(surface), squeeze, friction)
-        self.found = ca.Function("found", [x], [q, rotation, place * LENGTH])
+        self.solution = ca.Function("found", [x], [q, rotation, place * LENGTH])
         turning = 0.0 if isinstance(item.shape, Sphere) else TURN
         bounds = np.array([patch.bounds() for patch in patches])
-        low = [np.full(k, -RANGE), room[0] / LENGTH, np.full(3, -turning), bounds[:, 0].ravel()]
-        high = [np.full(k, RANGE), room[1] / LENGTH, np.full(3, turning), bounds[:, 1].ravel()]
+        low = [
+            np.full(k, -RANGE),
+            position_bounds[0] / LENGTH,
+            np.full(3, -turning),
+            bounds[:, 0].ravel(),
+        ]
+        high = [
+            np.full(k, RANGE),
+            position_bounds[1] / LENGTH,
+            np.full(3, turning),
+            bounds[:, 1].ravel(),
+        ]
         # The first tension, between the first two fingers, sets the scale of the others.
         lower = np.concatenate([*low, [1.0], np.full(len(pairs) - 1, -4.0), [0.0]])
         upper = np.concatenate([*high, [1.0], np.full(len(pairs) - 1, 4.0), [2.0]])
@@ -148,7 +158,7 @@ class TipPinchProblem:
         """Every local minimum found from random starts, best first."""
         pinches: list[TipPinch] = []
         for x, measure, residual in self.programme.minima(rng, starts):
-            q, rotation, origin = (np.array(part) for part in self.found(x))
+            q, rotation, origin = (np.array(part) for part in self.solution(x))
             pose = np.eye(4)
             pose[:3, :3], pose[:3, 3] = rotation, origin[:, 0]
             pinches.append(TipPinch(q[:, 0], pose, float(x[-1]), measure, residual))

@@ -86,13 +86,13 @@ class ArmHand:
             The palm's pose (4, 4), contact points (3, 3), normals (3, 3), finger lines
             (3, 3, 3): per finger knuckle, distal joint and tip; the arm's joints (6, 3).
         """
-        rotation, origin, points, normals, *rest = (
+        rotation, origin, points, normals, *remainder = (
             np.array(m) for m in self._numeric(arm, posture)
         )
         palm = np.eye(4)
         palm[:3, :3], palm[:3, 3] = rotation, origin[:, 0]
-        lines = np.stack([line.T for line in rest[:3]])
-        return palm, points.T, normals.T, lines, rest[3].T
+        lines = np.stack([line.T for line in remainder[:3]])
+        return palm, points.T, normals.T, lines, remainder[3].T
 
 
 def full_posture(symmetric: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Where an arm without a closed form holds a pinched object: near home, upright, in a region.
+"""Place a pinched object with an arm without a closed form: near home, upright, in a region.
 
 A nonlinear programme in the arm's joints from random starts around home; the measure that is
 minimised: ``|q - home|^2 / n + 5 |object - wished place|^2``.
@@ -23,7 +23,7 @@ STARTS = 12
 
 @dataclass(frozen=True)
 class Scene:
-    """How an object is held.
+    """Desired pose of a held object.
 
     Attributes:
         low: (3,) corner of where the object's middle may be [m], base frame.
@@ -41,7 +41,7 @@ class Scene:
 def hold(
     robot: RobotDescription, root: str, pinch: TipPinch, scene: Scene, rng: np.random.Generator
 ) -> Array | None:
-    """(n,) configuration that holds the object, or None if none was found.
+    """Return the (n,) configuration that holds the object; None if none was found.
 
     Args:
         robot: The arm-hand.

@@ -26,7 +26,7 @@ from casadi_ik.model.shapes import (
 
 
 def primitive(item: GraspObject) -> Shape:
-    """The shape of an object that is no mesh: shipped ones are none."""
+    """Return the shape of an object; built-in objects are not meshes."""
     assert not isinstance(item.shape, MeshShape)
     return item.shape
 
@@ -55,20 +55,20 @@ class Patch:
         if isinstance(s, BentCapsule):
             return np.array([-s.half_angle, -1.4]), np.array([s.half_angle, 1.4])
         if isinstance(s, Box):
-            half = np.delete(np.asarray(s.size) / 2, self.axis) - self.margin
-            return -half, half
-        half = s.height / 2 - self.margin
-        return np.array([-half, -1.4]), np.array([half, 1.4])
+            half_size = np.delete(np.asarray(s.size) / 2, self.axis) - self.margin
+            return -half_size, half_size
+        half_size = s.height / 2 - self.margin
+        return np.array([-half_size, -1.4]), np.array([half_size, 1.4])
 
-    def middle(self, along: float) -> Array:
-        """(2,) coordinates that a contact on the hand's mirror plane has anyway, else NaN.
+    def middle(self, offset: float) -> Array:
+        """Return (2,) coordinates of a contact on the mirror plane of the hand; NaN where free.
 
         Args:
-            along: Where the mirror plane cuts the object, from its middle [m].
+            offset: Where the mirror plane cuts the object, from its middle [m].
         """
         if isinstance(self.shape, Sphere):
             return np.array([np.pi / 2, np.nan])
-        return np.array([along, np.nan])
+        return np.array([offset, np.nan])
 
     def at(self, u: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Point and outward normal at u (2, 1).

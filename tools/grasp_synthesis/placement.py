@@ -97,7 +97,7 @@ def place(
     )
     linear, angular = kin.twist_columns(hand.arm_names, "lwr_flange", palm.origin)
     jacobian = ca.Function("jacobian", [arm], [ca.vertcat(linear, angular)])
-    found = []
+    placements = []
     for start in range(12):
         guess = home + 0.3 * rng.standard_normal(7)
         guess[5] *= -0.5 if start % 2 else 1.0  # both bends of the wrist
@@ -111,5 +111,5 @@ def place(
         if solver.stats()["success"]:
             q = np.array(result["x"])[:, 0]
             sigma = np.linalg.svd(np.array(jacobian(q)), compute_uv=False)[-1]
-            found.append(Placement(q, float(result["f"]), float(sigma)))
-    return sorted(found, key=lambda placement: placement.measure)
+            placements.append(Placement(q, float(result["f"]), float(sigma)))
+    return sorted(placements, key=lambda placement: placement.measure)

@@ -82,8 +82,12 @@ class PinchProblem:
         flexion = posture[1:]
         low, high = hand.lower[1:5], hand.upper[1:5]
         margin = ca.fmin(flexion - low, high - flexion)
-        apart = (flexion[:2] - flexion[2:]) / np.deg2rad(20.0)
-        cost = squeeze[0] + 0.1 * ca.sumsqr(UNIT_MARGIN / margin) + 0.02 * ca.sumsqr(apart)
+        flexion_difference = (flexion[:2] - flexion[2:]) / np.deg2rad(20.0)
+        cost = (
+            squeeze[0]
+            + 0.1 * ca.sumsqr(UNIT_MARGIN / margin)
+            + 0.02 * ca.sumsqr(flexion_difference)
+        )
         self.pose = ca.Function("pose", [x], [rotation, origin])
         spread = np.array([0.0, np.pi / 2] if spreads else [0.0, 0.0])
         spread = np.full(2, recipe.spread) if recipe.spread is not None else spread
@@ -102,14 +106,14 @@ class PinchProblem:
 
     def solve(self, rng: np.random.Generator, starts: int) -> list[Pinch]:
         """Every distinct local minimum found from random starts, best first."""
-        found: list[Pinch] = []
+        minima: list[Pinch] = []
         for x, measure, residual in self.programme.minima(rng, starts):
             rotation, origin = self.pose(x)
             pose = np.eye(4)
             pose[:3, :3], pose[:3, 3] = np.array(rotation), np.array(origin)[:, 0]
             posture = full_posture(x[:5])
-            found.append(Pinch(posture, pose, float(x[-2]), measure, residual))
-        return sorted(found, key=lambda pinch: pinch.measure)
+            minima.append(Pinch(posture, pose, float(x[-2]), measure, residual))
+        return sorted(minima, key=lambda pinch: pinch.measure)
 
 
 def _cones(contacts: dict[str, Pose], squeeze: ca.SX) -> list[ca.SX]:

@@ -1,4 +1,4 @@
-"""What to pinch on each object, and how it is held out: the only choices made by hand."""
+"""Manual choices for each object: the pinched sides and the orientation."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Recipe:
-    """How one object is grasped and shown.
+    """Pinch and presentation of an object.
 
     Attributes:
         name: The object.

@@ -1,4 +1,4 @@
-"""What is wrong with a grasp file, found from the file, the object and the robot alone."""
+"""Check a grasp file from the file, the object and the robot alone."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MAX_FRICTION = 1.5
 
 
 def problems(hand: ArmHand, path: Path) -> list[str]:
-    """Everything that a grasp file gets wrong; empty if it is good."""
+    """Return all faults of a grasp file; empty if it is valid."""
     grasp = load_grasp(path)
     if grasp.known_pose is None or set(grasp.posture) != set(hand.hand_names):
         return ["it lacks the object or some of the hand's actuators"]
@@ -33,8 +33,8 @@ def problems(hand: ArmHand, path: Path) -> list[str]:
         np.concatenate([hand_points, hand_points + 0.05 * hand_normals]),
         np.concatenate([points, points + 0.05 * normals]),
     )
-    moved = hand_points @ motion[:3, :3].T + motion[:3, 3]
-    turned = hand_normals @ motion[:3, :3].T
+    posture_points = hand_points @ motion[:3, :3].T + motion[:3, 3]
+    posture_normals = hand_normals @ motion[:3, :3].T
     in_palm = np.linalg.inv(motion @ palm) @ grasp.known_pose
     local_lines = (lines - palm[:3, 3]) @ palm[:3, :3]
     gaps = clearance(item, in_palm, local_lines)
@@ -44,8 +44,8 @@ def problems(hand: ArmHand, path: Path) -> list[str]:
         "a contact is off the surface": np.abs(item.signed_distance(local)).max() > EXACT,
         "a pad does not face the surface": np.abs(item.normal(local) + local_normals).max() > EXACT,
         "the posture is outside the limits": bool(outside),
-        "the posture does not give the points": np.abs(moved - points).max() > EXACT,
-        "the posture does not give the normals": np.abs(turned - normals).max() > EXACT,
+        "the posture does not give the points": np.abs(posture_points - points).max() > EXACT,
+        "the posture does not give the normals": np.abs(posture_normals - normals).max() > EXACT,
         f"the palm gap is {gaps.palm:.4f} m": gaps.palm < PALM_GAP,
         f"the phalanges' gap is {gaps.fingers:.4f} m": gaps.fingers < FINGER_GAP,
         f"the fingers' gap is {gaps.between:.4f} m": gaps.between < BETWEEN_GAP,
@@ -55,7 +55,7 @@ def problems(hand: ArmHand, path: Path) -> list[str]:
 
 
 def _fit(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """(4, 4) rigid motion that best carries source (k, 3) onto target (k, 3) (Kabsch)."""
+    """Return the (4, 4) rigid motion that best maps source (k, 3) onto target (k, 3) (Kabsch)."""
     a, b = source.mean(axis=0), target.mean(axis=0)
     u, _, vt = np.linalg.svd((source - a).T @ (target - b))
     sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])

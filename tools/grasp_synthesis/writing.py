@@ -18,7 +18,7 @@ from grasp_synthesis.recipes import Recipe
 def barrett_text(
     hand: ArmHand, recipe: Recipe, pinch: Pinch, placement: Placement, gaps: Clearance, seed: int
 ) -> str:
-    """The file's text for a Barrett grasp."""
+    """Return the text of the file of a Barrett grasp."""
     palm, points, normals, _, _ = hand.evaluate(placement.arm, pinch.posture)
     header = [
         made_by("make_grasps.py", seed, recipe.name, ROBOT),
@@ -43,7 +43,7 @@ def barrett_text(
 
 
 def made_by(script: str, seed: int, item: str, robot: str) -> str:
-    """The first line of a file."""
+    """Return the first line of a file."""
     return (
         f"Made by tools/{script} --seed {seed} from models/objects/{item}.yaml and "
         f"the robot {robot}. Rerun it instead of editing."
@@ -51,7 +51,7 @@ def made_by(script: str, seed: int, item: str, robot: str) -> str:
 
 
 def placed_at(arm: Array) -> str:
-    """The line about the arm [rad]."""
+    """Return the line about the arm [rad]."""
     degrees = np.rad2deg(arm).round(2) + 0.0
     return "Placed with the arm at " + ", ".join(f"{d:.2f}" for d in degrees) + " deg."
 
@@ -65,7 +65,7 @@ def grasp_text(
     posture: Iterable[str],
     contacts: Mapping[str, Mapping[str, Array]],
 ) -> str:
-    """The file's text; twelve decimals, so that the contacts stay exact.
+    """Return the text of the file, with twelve decimals, so that the contacts stay exact.
 
     Args:
         header: Comments.

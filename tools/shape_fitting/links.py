@@ -1,4 +1,4 @@
-"""Which link of a published file is which of ours: by the axes of their joints."""
+"""Match the links of a published file with those of a description by their joint axes."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from casadi_ik.model.urdf_mjcf import read_tree
 from casadi_ik.model.xml_tree import RobotTree, TreeJoint
 
 ALIKE = 2e-4
-"""Axes that differ by less [m, or as unit vectors] are one."""
+"""Largest difference of equal axes [m, or of unit vectors]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Axis:
-    """A joint's line at zero."""
+    """Axis of a joint at zero."""
 
     joint: str
     parent: str
     child: str
     point: Array
-    way: Array
+    direction: Array
 
 
 def in_our_links(
-    part: RobotPart, file: Path, without: set[str], seen: bool = False
+    part: RobotPart, file: Path, excluded: set[str], visual: bool = False
 ) -> dict[str, list[Surface]]:
-    """The shapes of the file's links by our link, in its frame; `seen` as for `link_surfaces`."""
+    """Return the meshes of a file by link of the description, in the frame of that link."""
     tree = read_tree(file)
     theirs = tree_poses(tree)
     ours = link_poses(part.root, part.joints, {})
@@ -60,7 +60,7 @@ def in_our_links(
     # The root's own body: all that is fixed to what the first joints hang on.
     first = next(j for j in part.joints if j.name in matched)
     body = rigid(tree, matched[first.name].parent)
-    for link in sorted(body - without):
+    for link in sorted(body - excluded):
         holder.setdefault(link, part.root)
     changed = True
     while changed:
@@ -69,11 +69,11 @@ def in_our_links(
             if (
                 joint.type == "fixed"
                 and joint.parent in holder
-                and joint.child not in {*holder, *without}
+                and joint.child not in {*holder, *excluded}
             ):
                 holder[joint.child] = holder[joint.parent]
                 changed = True
-    found, missing = link_surfaces(tree, list(holder), seen)
+    found, missing = link_surfaces(tree, list(holder), visual)
     for line in missing:
         print("  ", line)
     parts: dict[str, list[Surface]] = {}
@@ -85,18 +85,18 @@ def in_our_links(
 
 
 def rigid(tree: RobotTree, link: str) -> set[str]:
-    """All links of a body."""
+    """Return all links of a rigid body."""
     body, grown = {link}, True
     while grown:
-        more = {j.child for j in tree.joints if j.type == "fixed" and j.parent in body}
-        more |= {j.parent for j in tree.joints if j.type == "fixed" and j.child in body}
-        grown = not more <= body
-        body |= more
+        connected = {j.child for j in tree.joints if j.type == "fixed" and j.parent in body}
+        connected |= {j.parent for j in tree.joints if j.type == "fixed" and j.child in body}
+        grown = not connected <= body
+        body |= connected
     return body
 
 
 def tree_poses(tree: RobotTree) -> dict[str, Array]:
-    """Poses of the file's links at zero."""
+    """Return the poses of the links of a file at zero."""
     poses = {tree.root: np.eye(4)}
     for joint in tree.joints:
         poses[joint.child] = poses[joint.parent] @ joint.placement
@@ -106,7 +106,7 @@ def tree_poses(tree: RobotTree) -> dict[str, Array]:
 def match(
     part: RobotPart, axes: list[Axis], tree: RobotTree, theirs: dict[str, Array], base: Array
 ) -> dict[str, TreeJoint]:
-    """By our joint the file's, below that of the joint before."""
+    """Return the joint of the file for each joint of the description."""
     by_child = {joint.child: joint for joint in part.joints}
     found: dict[str, TreeJoint] = {}
     for axis in axes:
@@ -118,11 +118,13 @@ def match(
             pose = base @ theirs[joint.child]
             if joint.type == "fixed" or joint in found.values():
                 continue
-            way = pose[:3, :3] @ joint.axis
+            direction = pose[:3, :3] @ joint.axis
             off = axis.point - pose[:3, 3]
-            off = off - (off @ axis.way) * axis.way
-            turned = min(np.abs(way - axis.way).max(), np.abs(way + axis.way).max())
-            if turned < 5e-3 and np.linalg.norm(off) < 20 * ALIKE:
+            off = off - (off @ axis.direction) * axis.direction
+            deviation = min(
+                np.abs(direction - axis.direction).max(), np.abs(direction + axis.direction).max()
+            )
+            if deviation < 5e-3 and np.linalg.norm(off) < 20 * ALIKE:
                 found[axis.joint] = joint
                 break
     return found

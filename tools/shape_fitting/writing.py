@@ -1,4 +1,4 @@
-"""The shapes of a shipped description as YAML, in the place of those it had."""
+"""Replace the shapes of a description."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def write(
     touching: Sequence[Touching],
     names: str,
 ) -> None:
-    """Put ``collision:`` at the end of a description, and its source."""
+    """Write the key ``collision`` and its source to the end of a description."""
     text = path.read_text(encoding="utf-8")
     text = text.split("\ncollision:", 1)[0].rstrip("\n") + "\n"
     source = (
@@ -34,7 +34,7 @@ def write(
 
 
 def without_source(lines: list[str]) -> list[str]:
-    """A description's lines without an earlier source of shapes."""
+    """Return the lines of a description without the previous source of shapes."""
     if not any(line.startswith("  shapes: ") for line in lines):
         return lines
     start = next(i for i, line in enumerate(lines) if line.startswith("  shapes: "))
@@ -45,7 +45,7 @@ def without_source(lines: list[str]) -> list[str]:
 
 
 def wrapped(text: str) -> list[str]:
-    """A source in lines of at most 98 characters."""
+    """Format a source in lines of at most 98 characters."""
     lines, line = [], " "
     for word in text.split():
         if len(line) + 1 + len(word) > 98:
