@@ -231,9 +231,7 @@ def test_a_file_of_measurements_round_trip(index, ar10, tmp_path, rng):
 
 def test_bad_arguments(ar10, index, rng):
     description = ar10.description
-    with pytest.raises(
-        ik.errors.InputError, match="groups: found 'screws', expected some of linkage"
-    ):
+    with pytest.raises(ik.errors.InputError, match=r"groups:.*'screws'"):
         hand_parameters(description, ["index"], ["screws"])
     with pytest.raises(ik.errors.InputError, match="fingers: none"):
         hand_parameters(description, [])

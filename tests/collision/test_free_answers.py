@@ -105,9 +105,9 @@ def test_batches_are_what_single_solves_are(solver, robot):
         points[1:2], normals[1:2], object_pose=poses[1:2]
     )
     np.testing.assert_allclose(one.q[0], batch.q[1], atol=1e-9)
-    with pytest.raises(ik.errors.InputError, match="object_pose: found 2 poses, expected 3"):
+    with pytest.raises(ik.errors.InputError, match=r"object_pose:.*2.*3"):
         ik.Solver(robot, scene=held).solve_batch(points, normals, object_pose=poses[:2])
-    with pytest.raises(ik.errors.InputError, match="expected a scene that says what is 'grasped'"):
+    with pytest.raises(ik.errors.InputError, match="'grasped'"):
         solver.solve_batch(points, normals, object_pose=poses)
 
 

@@ -81,7 +81,7 @@ def test_pads_touch_the_mesh(tmp_path: Path) -> None:
     (several,) = ik.load_candidates(large, ROBOT, take="contacts", grasped=files)
     assert several.contacts["thumb"].point == pytest.approx([0.5, 0.0, 0.0], abs=1e-6)
     within = _grasp_file(tmp_path, np.zeros(3))
-    with pytest.raises(ik.errors.DescriptionError, match=r"no pad is within 10 mm of .*handle.obj"):
+    with pytest.raises(ik.errors.DescriptionError, match=r"10.*handle.obj"):
         ik.load_candidates(within, ROBOT, take="contacts", grasped=whole)
 
 

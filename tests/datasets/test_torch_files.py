@@ -32,9 +32,7 @@ def test_a_file_that_torch_wrote() -> None:
     says = r"found grasps of 2 objects \(contactdb\+apple, ycb\+pear\), expected one"
     with pytest.raises(ik.errors.DescriptionError, match=says):
         ik.load_candidates(path, robot)
-    with pytest.raises(
-        ik.errors.DescriptionError, match="of: found 'cup', expected one of 2 objects"
-    ):
+    with pytest.raises(ik.errors.DescriptionError, match=r"of:.*'cup'.*2"):
         ik.load_candidates(path, robot, of="cup")
 
 
@@ -60,9 +58,7 @@ def test_torch_files_of_other_kinds(tmp_path: Path) -> None:
     """The format before torch 1.6, no torch file at all, and tensors beyond their numbers."""
     path = tmp_path / "set.pt"
     path.write_bytes(pickle.dumps(0x1950A86A20F9469CFC6C, 2))
-    with pytest.raises(
-        ik.errors.DescriptionError, match=r"before torch 1\.6, .*: torch\.save\(torch\.load"
-    ):
+    with pytest.raises(ik.errors.DescriptionError, match=r"1\.6, .*:"):
         read_torch(path)
     path.write_bytes(b"x,y,z")
     with pytest.raises(ik.errors.DescriptionError, match="found no zip, expected a file of torch"):

@@ -147,9 +147,7 @@ def test_shipped_names_and_paths(tmp_path):
         == tmp_path / "part.yaml"
     )
     assert resolve_description(tmp_path / "part.yaml", "arms") == tmp_path / "part.yaml"
-    with pytest.raises(
-        ik.errors.UnknownNameError, match="no shipped arm-hand is called 'kuka'; shipped: "
-    ):
+    with pytest.raises(ik.errors.UnknownNameError, match=r"'kuka'; shipped: "):
         resolve_description("kuka", "arm_hands")
-    with pytest.raises(ik.errors.DescriptionError, match=r"nowhere\.yaml: no such file"):
+    with pytest.raises(ik.errors.DescriptionError, match=r"nowhere\.yaml:"):
         resolve_description(str(tmp_path / "nowhere.yaml"), "arms")

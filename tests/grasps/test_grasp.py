@@ -146,9 +146,7 @@ def test_missing_binary_and_unknown(tmp_path: Path) -> None:
     binary = tmp_path / "binary.yaml"
     binary.write_bytes(b"\xff\xfe\x00\x81")
     refused(binary, "", "not UTF-8")
-    with pytest.raises(
-        ik.errors.UnknownNameError, match=r"no shipped grasp is called 'teacup'.*cup"
-    ):
+    with pytest.raises(ik.errors.UnknownNameError, match=r"'teacup'.*cup"):
         ik.load_grasp("teacup")
 
 

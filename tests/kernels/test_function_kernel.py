@@ -142,11 +142,9 @@ def test_wrong_inputs_are_named():
     v, m = np.zeros(3), np.zeros((2, 3))
     with pytest.raises(ik.errors.InputError, match=r"2 inputs, expected 3 \(a, v, m\)"):
         kernel(1, v)
-    with pytest.raises(
-        ik.errors.InputError, match=r"input 'm' has shape \(3, 2\), expected \(2, 3\) or"
-    ):
+    with pytest.raises(ik.errors.InputError, match=r"'m'.*\(3, 2\).*\(2, 3\)"):
         kernel(1, v, m.T)
-    with pytest.raises(ik.errors.InputError, match="input 'v' is a batch of 4, another of 2"):
+    with pytest.raises(ik.errors.InputError, match=r"'v'.*4.*2"):
         kernel([1, 2], np.zeros((4, 3)), m)
 
 

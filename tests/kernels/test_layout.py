@@ -92,11 +92,11 @@ def test_bad_layouts_and_values_are_named():
     with pytest.raises(ik.errors.InputError, match="'f2'"):
         Layout((Field("a", (), "f2"),))
     layout = Layout((Field("a"), Field("b", (2,))))
-    with pytest.raises(ik.errors.InputError, match=r"missing \['b'\], unknown \['c'\]"):
+    with pytest.raises(ik.errors.InputError, match=r"\['b'\].*\['c'\]"):
         layout.pack({"a": 1, "c": 2})
-    with pytest.raises(ik.errors.InputError, match="'b' has 3 numbers, expected 2"):
+    with pytest.raises(ik.errors.InputError, match=r"'b'.*3.*2"):
         layout.pack({"a": 1, "b": [1, 2, 3]})
-    with pytest.raises(ik.errors.InputError, match="no field 'z'; known: a, b"):
+    with pytest.raises(ik.errors.InputError, match="'z'; known:"):
         layout.slice("z")
 
 
@@ -105,7 +105,7 @@ def test_step_whose_sizes_disagree_is_refused():
     function = ca.Function("f", [x, ca.SX.sym("p")], [x, x, 0])
     two, one = Layout((Field("x", (2,)),)), Layout((Field("p"),))
     StepGraph("fine", function, two, one, two)
-    with pytest.raises(ik.errors.InputError, match="step graph 'wrong'"):
+    with pytest.raises(ik.errors.InputError, match="'wrong'"):
         StepGraph("wrong", function, two, one, one)
 
 

@@ -258,7 +258,7 @@ def test_wrong_shapes_are_named():
     states, parameters = starts(3)
     with pytest.raises(ik.errors.InputError, match=r"states have shape \(4,\), expected \(k, 4\)"):
         kernel.run(states[0], parameters[0], 5)
-    with pytest.raises(ik.errors.InputError, match=r"expected \(2,\) or \(3, 2\)"):
+    with pytest.raises(ik.errors.InputError, match=r"\(2,\).*\(3, 2\)"):
         kernel.run(states, parameters[:2], 5)
     with pytest.raises(ik.errors.InputError, match="max_iterations is -1"):
         kernel.run(states, parameters, -1)

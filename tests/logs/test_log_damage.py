@@ -200,9 +200,7 @@ def test_damage_in_the_middle_is_refused_and_nothing_changed(tmp_path: Path, clo
     data[chunk.chunk_start_offset + chunk.chunk_length - 10] ^= 4
     path.write_bytes(data if closed else data[:-50])
     before = path.read_bytes()
-    with pytest.raises(
-        errors.LogError, match=rf"damaged in its middle: .* byte {chunk.chunk_start_offset}"
-    ):
+    with pytest.raises(errors.LogError, match=rf"middle:.*{chunk.chunk_start_offset}"):
         logs.finish_log(path)
     assert path.read_bytes() == before
 

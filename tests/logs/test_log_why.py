@@ -248,7 +248,7 @@ def test_two_methods_side_by_side() -> None:
     assert lines["smallest sigma, closed chain"] == ("0.03 in iteration 8", "0.5 in iteration 1")
     assert lines["limits at the end"] == ("none", "none")
     other = make_one(make_rows(), target_points=np.ones((2, 3)))
-    with pytest.raises(errors.InputError, match="solve 8 of enhanced-dls"):
+    with pytest.raises(errors.InputError, match=r"8.*enhanced-dls"):
         logs.compare_solves(solved, other)
 
 

@@ -42,9 +42,7 @@ def oracle(robot) -> PinocchioRobot:
 def test_verdict_on_targets_near_home(robot, oracle, method):
     points, normals = robot.contacts(near_home(robot, np.random.default_rng(11), 2))
     if method.startswith("enhanced") and robot.name not in PLANAR:
-        with pytest.raises(
-            errors.UnsupportedError, match=rf"'{re.escape(robot.name)}': finger .* planar"
-        ):
+        with pytest.raises(errors.UnsupportedError, match=rf"'{re.escape(robot.name)}':"):
             ik.Solver(robot, method, compiled=False)
         return
     options = {"finger_step": "closed-form"} if method.startswith("enhanced") else {}

@@ -224,9 +224,7 @@ def test_a_batch_may_hold_directions_alone(robot, solvers):
     grasp = ik.Grasp({robot.fingers[0]: ik.Contact(direction=directions[1, 0]), **contacts})
     one = solver.solve(grasp)
     np.testing.assert_allclose(one.q, batch.q[1], atol=1e-12)
-    with pytest.raises(
-        ik.errors.RowError, match="directions: row 1, finger 0 has a point and a direction"
-    ):
+    with pytest.raises(ik.errors.RowError, match=r"directions:.*1.*0"):
         solver.solve_batch(at[..., :3, 3], at[..., :3, 0], directions=directions)
 
 
@@ -380,9 +378,7 @@ def test_bad_arrays(robot, solvers):
         with pytest.raises(ik.errors.RowError, match=message) as caught:
             solver.solve_batch(points, facing, **more)
         assert caught.value.row == (0 if "lines" in more else 4)
-    with pytest.raises(
-        ik.errors.InputError, match=r"tangents: found shape \(5, 3\), expected \(5, 3, 3\)"
-    ):
+    with pytest.raises(ik.errors.InputError, match=r"tangents:.*\(5, 3\).*\(5, 3, 3\)"):
         solver.solve_batch(points, normals, tangents=tangents[..., 0])
 
 

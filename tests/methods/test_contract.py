@@ -295,19 +295,17 @@ def test_bad_arguments(case, change, says):
 
 def test_starts_as_many_as_targets(case):
     q0 = np.tile(case.robot.home, (3, 1))
-    with pytest.raises(ik.errors.InputError, match="q0: found 3 rows for 8 targets"):
+    with pytest.raises(ik.errors.InputError, match=r"q0:.*3.*8"):
         case.solver().solve_batch(case.points, case.normals, q0=q0)
     q0[1, 2] = np.nan
-    with pytest.raises(ik.errors.InputError, match="q0: "):
+    with pytest.raises(ik.errors.InputError, match=r"q0: .*NaN"):
         case.solver().solve_batch(case.points[:3], case.normals[:3], q0=q0)
 
 
 def test_a_grasp_of_another_hand(case):
-    with pytest.raises(
-        ik.errors.InputError, match=r"contacts\.pinky: no such finger; the robot's fingers: "
-    ):
+    with pytest.raises(ik.errors.InputError, match=r"contacts\.pinky:.*fingers: "):
         case.solver().solve(ik.Grasp({"pinky": ik.Contact([0, 0, 1])}))
-    with pytest.raises(ik.errors.InputError, match="grasp: found str, expected a Grasp"):
+    with pytest.raises(ik.errors.InputError, match=r"grasp:.*Grasp"):
         case.solver().solve("cup")
 
 
@@ -401,9 +399,7 @@ def test_bad_options(robot, method, options, says):
 
 
 def test_a_name_is_no_robot():
-    with pytest.raises(
-        ik.errors.InputError, match="robot: found 'kuka_lwr_barrett', expected what load_rob"
-    ):
+    with pytest.raises(ik.errors.InputError, match=r"robot:.*'kuka_lwr_barrett'.*load_rob"):
         ik.Solver("kuka_lwr_barrett")
 
 

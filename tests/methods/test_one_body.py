@@ -285,7 +285,7 @@ def test_one_palm_alone_leaves_the_other_arm():
 def test_palms_that_cannot_be_are_refused():
     robot = ik.load_robot("g1+dex3")
     solver, one = ik.Solver(robot), palm_grasp(robot, robot.home, ["left"])
-    with pytest.raises(ik.errors.InputError, match=r"palm\.middle: no such side.*left, right"):
+    with pytest.raises(ik.errors.InputError, match=r"palm\.middle:.*side.*left"):
         solver.solve(ik.Grasp(palm={"middle": np.eye(4)}, posture=one.posture))
     with pytest.raises(
         ik.errors.InputError,
@@ -294,9 +294,9 @@ def test_palms_that_cannot_be_are_refused():
         solver.solve(ik.Grasp(palm=np.eye(4), posture=one.posture))
     with pytest.raises(ik.errors.InputError, match=r"posture\..*: "):
         solver.solve(ik.Grasp(palm=one.palm, posture={**one.posture, "waist_yaw_joint": 0.0}))
-    with pytest.raises(ik.errors.InputError, match=r"palm\.left: "):
+    with pytest.raises(ik.errors.InputError, match=r"palm\.left: .*3.*8"):
         ik.Grasp(palm={"left": 2 * np.eye(4)}, posture=one.posture)
-    with pytest.raises(ik.errors.InputError, match="side: found None, expected one of left, right"):
+    with pytest.raises(ik.errors.InputError, match=r"side:.*None"):
         robot.palm(robot.home)
 
 
@@ -334,12 +334,12 @@ def test_an_object_that_nobody_reaches_is_told():
 def test_bounds_of_an_object_that_cannot_be_are_refused():
     robot = ik.load_robot("g1+dex3")
     box, _ = held_box(robot)
-    with pytest.raises(ik.errors.InputError, match=r"lower: found .* expected six finite numbers"):
+    with pytest.raises(ik.errors.InputError, match=r"lower: .*\[0\.0, 0\.0, 0\.0\]"):
         ik.Free([0, 0, 0], [1, 1, 1])
     with pytest.raises(ik.errors.InputError, match="expected none above"):
         ik.Free([1, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0])
     free = ik.Grasp(box.contacts, object_pose=ik.Free([0] * 6, [0] * 6))
-    with pytest.raises(ik.errors.InputError, match="object_pose: a Free pose"):
+    with pytest.raises(ik.errors.InputError, match=r"object_pose:.*Free"):
         ik.Solver(robot).choose([free])
     with pytest.raises(ik.errors.InputError, match=r"log: .* Free"):
         ik.Solver(robot).solve(free, log="nothing.mcap")
@@ -408,7 +408,7 @@ def test_a_side_by_itself_is_an_arm_hand():
     np.testing.assert_allclose(side.contacts(own)[0], body.contacts(q)[0], atol=1e-12)
     found = ik.Solver(side).solve_palms(side.palm(own), own)
     assert found.success.all()
-    with pytest.raises(ik.errors.UnknownNameError, match="no side 'middle'; its sides: "):
+    with pytest.raises(ik.errors.UnknownNameError, match=r"'middle'.*sides: "):
         body.side("middle")
 
 

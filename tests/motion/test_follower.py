@@ -205,19 +205,15 @@ def test_contacts_of_other_kinds(robot, solver):
 def test_what_is_refused(robot, solver):
     follower = solver.follow(robot.home, PERIOD)
     points, normals = robot.contacts(robot.home)
-    with pytest.raises(
-        ik.errors.InputError, match=r"points: found shape \(2, 3\), expected \(3, 3\)"
-    ):
+    with pytest.raises(ik.errors.InputError, match=r"points:.*\(2, 3\).*\(3, 3\)"):
         follower(points[:2], normals)
-    with pytest.raises(ik.errors.InputError, match="normals: "):
+    with pytest.raises(ik.errors.InputError, match=r"normals: .*'a'"):
         follower(points, [["a"]])
     with pytest.raises(ik.errors.InputError, match="normals: "):
         follower(ik.load_grasp("cup"), normals)
-    with pytest.raises(
-        ik.errors.InputError, match="period: found 0, expected a number of seconds > 0"
-    ):
+    with pytest.raises(ik.errors.InputError, match=r"period:.*0.*> 0"):
         solver.follow(period=0)
-    with pytest.raises(ik.errors.InputError, match="acceleration: found -1, expected a number > 0"):
+    with pytest.raises(ik.errors.InputError, match=r"acceleration:.*-1.*> 0"):
         solver.follow(acceleration=-1)
     with pytest.raises(ik.errors.InputError, match="velocity: found"):
         solver.follow(velocity=[1.0, 2.0])

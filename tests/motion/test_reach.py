@@ -166,9 +166,7 @@ def test_what_cannot_be_reached_is_said(robot, grasp):
     found = ik.Solver(robot, scene=ik.Scene(lid)).reach(grasp, distance=0.3, direction=[0, 0, -1])
     assert found.status in (ik.motion.ReachStatus.NO_APPROACH, ik.motion.ReachStatus.NOT_SOLVED)
     assert found.reason
-    with pytest.raises(
-        ik.errors.InputError, match="distance: found -1, expected a number of metres >= 0"
-    ):
+    with pytest.raises(ik.errors.InputError, match=r"distance:.*-1.*>= 0"):
         ik.Solver(robot).reach(grasp, distance=-1)
 
 
@@ -252,7 +250,7 @@ def test_the_very_posture_that_was_chosen(robot, grasp, on_table):
     assert missed.status is ik.motion.ReachStatus.NOT_SOLVED
     assert "100 mm" in missed.reason
     assert solver.approach(moved).reason == missed.reason
-    with pytest.raises(ik.errors.InputError, match="grasp: found int, expected a Grasp"):
+    with pytest.raises(ik.errors.InputError, match=r"grasp:.*Grasp"):
         solver.reach(3)
 
 
@@ -282,7 +280,7 @@ def test_a_direction_that_is_given_or_known(robot, grasp):
     above = robot.palm(one.q) - np.array([[0, 0, 0, 0]] * 2 + [[0, 0, 0, -0.05]] + [[0, 0, 0, 0]])
     before = ik.Grasp(palm=above, posture=motors)
     assert comes(replace(one, grasp=replace(grasp, pregrasp=before))) @ down > 0.999
-    with pytest.raises(ik.errors.InputError, match=r"direction: found .*, expected three numbers"):
+    with pytest.raises(ik.errors.InputError, match=r"direction: .*\[0, 0, 0\]"):
         solver.reach(grasp, direction=[0, 0, 0])
 
 
@@ -341,7 +339,5 @@ def test_from_posture_to_posture(robot, grasp, on_table):
     inside = around.move((start + robot.home) / 2, robot.home)
     assert (inside.status, inside.motion) == (ik.motion.ReachStatus.NO_WAY, None)
     assert inside.reason == "the start is not free: bh_base and ball touch"
-    with pytest.raises(
-        ik.errors.InputError, match=r"q1: found lwr_joint_1 at 9, expected a number from"
-    ):
+    with pytest.raises(ik.errors.InputError, match=r"q1:.*lwr_joint_1.*9"):
         solver.move(robot.home, [9.0, *robot.home[1:]])

@@ -173,7 +173,7 @@ def test_of_world_landmarks_the_wrist_stays(robot, retarget):
 def test_image_landmarks_are_refused_in_words(robot, size, retarget):
     """Parts of the picture's width and height, depths from the wrist; fingers may be beyond it."""
     frame = hand(0.3, np.zeros(3)) * size / 0.09 + [0.4, 0.5, 3e-7]
-    with pytest.raises(ik.errors.InputError, match=r"image landmarks.*expected metres"):
+    with pytest.raises(ik.errors.InputError, match=r"landmarks"):
         ik.motion.Retargeter(retarget(robot), robot)(frame)
     pixels = 1800 * (hand(0.3, np.zeros(3)) + 0.2)
     with pytest.raises(
@@ -241,9 +241,7 @@ def test_a_frame_with_nan_asks_for_nothing_and_is_forgotten(robot, retarget):
     assert np.isnan(wanted.points).all()
     after = retargeter(hand(0.4, np.zeros(3)))
     np.testing.assert_array_equal(after.points, before.points)
-    with pytest.raises(
-        ik.errors.InputError, match=r"keypoints: found shape \(20, 3\), expected \(21, 3\)"
-    ):
+    with pytest.raises(ik.errors.InputError, match=r"keypoints:.*\(20, 3\).*\(21, 3\)"):
         retargeter(bad[:20])
 
 
@@ -407,16 +405,16 @@ def test_two_hands_are_given_by_side(g1, both_hands):
         retargeter(both_hands["left"][0])
     with pytest.raises(ik.errors.InputError, match=r"keypoints\.head: "):
         retargeter({"head": both_hands["left"][0]})
-    with pytest.raises(ik.errors.InputError, match=r"keypoints\.left: found shape \(20, 3\)"):
+    with pytest.raises(ik.errors.InputError, match=r"keypoints\.left:.*\(20, 3\)"):
         retargeter({"left": np.zeros((20, 3))})
 
 
 def test_palms_of_a_body_are_asked_by_side(g1):
     follower = ik.Solver(g1).follow(g1.home, period=0.01)
     points, _ = g1.contacts(g1.home)
-    with pytest.raises(ik.errors.InputError, match="palm: found one pose, expected poses by side"):
+    with pytest.raises(ik.errors.InputError, match=r"palm: .*left, right"):
         follower(points, palm=np.eye(4))
-    with pytest.raises(ik.errors.InputError, match=r"palm: found side 'head'"):
+    with pytest.raises(ik.errors.InputError, match=r"palm:.*'head'"):
         follower(points, palm={"head": np.eye(4)})
 
 

@@ -102,17 +102,13 @@ def test_a_grasp_out_of_reach_is_come_near_to(robot, solver):
 
 def test_what_is_refused(robot, solver):
     moving = [grasp_at(robot, robot.home)] * 2
-    with pytest.raises(ik.errors.InputError, match="grasps: "):
+    with pytest.raises(ik.errors.InputError, match=r"grasps: .*0"):
         solver.track([])
-    with pytest.raises(ik.errors.InputError, match="velocity: "):
+    with pytest.raises(ik.errors.InputError, match=r"velocity: .*period"):
         solver.track(moving, velocity=1.0)
-    with pytest.raises(
-        ik.errors.InputError, match="period: found -1, expected a number of seconds > 0"
-    ):
+    with pytest.raises(ik.errors.InputError, match=r"period:.*-1.*> 0"):
         solver.track(moving, period=-1)
-    with pytest.raises(
-        ik.errors.InputError, match=r"velocity: found .*, expected a number > 0, or 14 of them"
-    ):
+    with pytest.raises(ik.errors.InputError, match=r"velocity:.*> 0.*14"):
         solver.track(moving, period=1.0, velocity=[1.0, 2.0])
     with pytest.raises(ik.errors.UnsupportedError, match="method: 'ipopt'"):
         ik.Solver(robot, "ipopt").track(moving)

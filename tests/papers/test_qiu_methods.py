@@ -195,16 +195,14 @@ def test_spread_keeps_motor_and_joints_within_limits(own_robot, rng):
 
 
 def test_unsupported_hands(own_robot, coupled_robot):
-    with pytest.raises(ik.errors.UnsupportedError, match="finger 'right' is not a planar finger"):
+    with pytest.raises(ik.errors.UnsupportedError, match="'right'"):
         finger_step_function(coupled_robot.description, "closed-form")
     replace(
         own_robot.with_name("hand.yaml"),
         "  finger_2: {link: bh_finger_2_link_3, xyz: [50 mm, 9.5 mm, 0], normal: [0, 1, 0]",
         "  finger_2: {link: bh_finger_2_link_3, xyz: [50 mm, 9.5 mm, 0], normal: [0, 1, 1]",
     )
-    with pytest.raises(
-        ik.errors.UnsupportedError, match="finger 'finger_2' is not a planar finger"
-    ):
+    with pytest.raises(ik.errors.UnsupportedError, match="'finger_2'"):
         finger_step_function(robots.load_description(own_robot), "ipopt")
 
 

@@ -87,9 +87,7 @@ def test_malformed_directions(solver, directions, says):
 
 @pytest.mark.parametrize("value", [0, -1e-3, float("nan"), float("inf"), "5 mm", None])
 def test_tolerance_is_a_positive_number(value):
-    with pytest.raises(
-        ik.errors.InputError, match=r"tolerance\.position: found .*, expected a number > 0"
-    ):
+    with pytest.raises(ik.errors.InputError, match=r"tolerance\.position:.*> 0"):
         ik.Tolerance(position=value)
     with pytest.raises(ik.errors.InputError, match=r"tolerance\.angle"):
         ik.Tolerance(angle=value)

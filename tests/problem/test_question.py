@@ -108,26 +108,16 @@ def test_a_spread_that_does_not_fit_is_found_out(robot):
 def test_what_is_refused(robot):
     solver = ik.Solver(robot)
     asked = grasp(robot, robot.home)
-    with pytest.raises(
-        ik.errors.UnknownNameError, match="fixed: unknown actuator 'elbow'; expected one of lwr_"
-    ):
+    with pytest.raises(ik.errors.UnknownNameError, match=r"fixed:.*'elbow'.*lwr_"):
         solver.solve(asked, fixed={"elbow": 0.0})
-    with pytest.raises(
-        ik.errors.InputError, match=r"fixed\.lwr_joint_1: found 7, expected a number from"
-    ):
+    with pytest.raises(ik.errors.InputError, match=r"fixed\.lwr_joint_1:.*7"):
         solver.solve(asked, fixed={"lwr_joint_1": 7})
     paper = ik.Solver(robot, "enhanced-dls", finger_step="closed-form")
-    with pytest.raises(
-        ik.errors.UnsupportedError, match="'enhanced-dls' cannot keep actuators fixed"
-    ):
+    with pytest.raises(ik.errors.UnsupportedError, match="'enhanced-dls'"):
         paper.solve(asked, fixed={"lwr_joint_1": 0.0})
-    with pytest.raises(
-        ik.errors.InputError, match=r"tolerance\.pinky: no such finger; the robot's fingers"
-    ):
+    with pytest.raises(ik.errors.InputError, match=r"tolerance\.pinky: .*thumb, finger_2"):
         ik.Solver(robot, tolerance={"pinky": COARSE})
-    with pytest.raises(
-        ik.errors.InputError, match=r"tolerance\.thumb: found 3, expected a Tolerance"
-    ):
+    with pytest.raises(ik.errors.InputError, match=r"tolerance\.thumb:.*3.*Tolerance"):
         ik.Solver(robot, tolerance={"thumb": 3})
-    with pytest.raises(ik.errors.InputError, match=r"tolerance: found 0\.1, expected a Tolerance"):
+    with pytest.raises(ik.errors.InputError, match=r"tolerance:.*0\.1.*Tolerance"):
         ik.Contact([0, 0, 1], tolerance=0.1)

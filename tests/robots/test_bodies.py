@@ -238,5 +238,5 @@ def test_what_is_wrong_with_parts_is_said(tmp_path: Path, old: str, new: str, sa
 
 
 def test_a_side_that_is_not_there_is_said():
-    with pytest.raises(ik.errors.UnknownNameError, match="its sides: left, right"):
+    with pytest.raises(ik.errors.UnknownNameError, match=r"'middle'.*left, right"):
         ik.load_robot("g1+dex3").description.side("middle")

@@ -216,5 +216,5 @@ def test_a_pad_that_no_joint_moves_is_on_the_palms_link(tmp_path: Path) -> None:
         "name: changed\narm: ur5e\nhand: hand.yaml\nmount: {xyz: [0, 0, 0]}\n"
         "fingers: [moving, fixed]\nthumb: moving\n"
     )
-    with pytest.raises(ik.errors.DescriptionError, match="no joint moves 'so100_fixed_jaw'"):
+    with pytest.raises(ik.errors.DescriptionError, match="'so100_fixed_jaw'"):
         ik.load_robot(tmp_path / "robot.yaml")

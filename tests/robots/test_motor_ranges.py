@@ -132,9 +132,7 @@ def test_a_motor_with_nowhere_to_go(tmp_path):
     data = yaml.safe_load(hand.read_text())
     next(j for j in data["joints"] if j["name"] == "left_spread")["limits"] = [0.9, 1]
     hand.write_text(yaml.safe_dump(data))
-    with pytest.raises(
-        ik.errors.DescriptionError, match=r"actuators\.spread: limits: no position from -0\.4 to"
-    ):
+    with pytest.raises(ik.errors.DescriptionError, match=r"actuators\.spread: limits:.*-0\.4"):
         ik.load_robot(path)
 
 

@@ -239,9 +239,9 @@ def test_random_configurations_lie_within_limits(robot):
 
 
 def test_unknown_names_list_the_known(robot):
-    with pytest.raises(ik.CasadiIKError, match="no finger 'pinky'; its fingers: thumb, finger_2"):
+    with pytest.raises(ik.CasadiIKError, match=r"'pinky'.*fingers:.*finger_2"):
         robot.description.finger("pinky")
-    with pytest.raises(ik.CasadiIKError, match="no actuator 'x'; its actuators: lwr_joint_1"):
+    with pytest.raises(ik.CasadiIKError, match=r"'x'.*actuators: lwr_joint_1"):
         robot.description.actuator_index("x")
     with pytest.raises(ik.CasadiIKError, match="no link 'x'"):
         robot.description.chain("x")

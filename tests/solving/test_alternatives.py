@@ -158,18 +158,14 @@ def test_none_where_there_is_none(robot, solver):
 
 def test_what_is_refused(robot, solver):
     asked = grasp_at(robot, robot.home)
-    with pytest.raises(ik.errors.InputError, match="limit: found 0, expected an integer >= 1"):
+    with pytest.raises(ik.errors.InputError, match=r"limit:.*0.*>= 1"):
         solver.solve_all(asked, limit=0)
     for apart in (-0.1, 1.5, float("nan"), "far", True):
-        with pytest.raises(
-            ik.errors.InputError, match=r"apart: found .*, expected a number from 0 to 1"
-        ):
+        with pytest.raises(ik.errors.InputError, match=r"apart:.*0.*1"):
             solver.solve_all(asked, apart=apart)
-    with pytest.raises(
-        ik.errors.InputError, match="prefer: found 'speed', expected one of limits, manip"
-    ):
+    with pytest.raises(ik.errors.InputError, match=r"prefer:.*'speed'"):
         solver.solve_all(asked, prefer="speed")
-    with pytest.raises(ik.errors.InputError, match=r"q0: found shape \(2, 14\), expected \(14,\)"):
+    with pytest.raises(ik.errors.InputError, match=r"q0:.*\(2, 14\).*\(14,\)"):
         solver.solve_all(asked, q0=np.zeros((2, 14)))
     with pytest.raises(ik.errors.UnsupportedError, match="method: 'ipopt' "):
         ik.Solver(robot, "ipopt").solve_all(asked)

@@ -232,5 +232,5 @@ def test_bad_questions_are_one_clear_line(solver, robot, candidates, cup):
         with pytest.raises(errors.InputError, match=text) as raised:
             solver.choose(**{"grasps": candidates, "object_pose": cup.object_pose} | words)
         assert "\n" not in str(raised.value)
-    with pytest.raises(errors.UnsupportedError, match="method: "):
+    with pytest.raises(errors.UnsupportedError, match=r"method: 'thumb-first'.*'hand-first'"):
         ik.Solver(robot, "thumb-first", compiled=False).choose(candidates, cup.object_pose)

@@ -41,9 +41,7 @@ def test_what_is_no_limit(robot):
     for value in (0, -1, 1.5, True):
         with pytest.raises(errors.InputError, match="expected a whole number >= 1"):
             ik.Solver(robot, options={"max_rounds": value})
-    with pytest.raises(
-        errors.UnknownNameError, match="option 'max_rounds' does not exist for method"
-    ):
+    with pytest.raises(errors.UnknownNameError, match="'max_rounds'"):
         ik.Solver(robot, "enhanced-dls", options={"max_rounds": 1})
 
 
@@ -71,11 +69,9 @@ def test_postures_are_names_or_whole_configurations(robot, rng):
     named = solver.solve_palms(palms, dict(zip(robot.actuators[7:], q[:, 7:].T, strict=True)))
     np.testing.assert_array_equal(solver.solve_palms(palms, q).q, named.q)
     np.testing.assert_array_equal(solver.solve_palms(palms[:1], q[0]).q, named.q[:1])
-    with pytest.raises(
-        errors.InputError, match=r"postures: found shape \(5, 7\), expected \(14,\)"
-    ):
+    with pytest.raises(errors.InputError, match=r"postures:.*\(5, 7\).*\(14,\)"):
         solver.solve_palms(palms, q[:, 7:])
-    with pytest.raises(errors.InputError, match="postures: found 'open', expected numbers"):
+    with pytest.raises(errors.InputError, match=r"postures:.*'open'"):
         solver.solve_palms(palms, "open")
 
 

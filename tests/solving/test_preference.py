@@ -82,7 +82,7 @@ def test_manipulability(robot, rng):
 
 def test_what_cannot_be_preferred(robot):
     q = robot.home
-    with pytest.raises(errors.InputError, match="prefer: found 'near', expected one of"):
+    with pytest.raises(errors.InputError, match=r"prefer:.*'near'"):
         ik.Solver(robot, compiled=False).solve(grasp_at(robot, q), prefer="near")
     with pytest.raises(errors.UnsupportedError, match=r"prefer: .*'ipopt'"):
         ik.Solver(robot, "ipopt").solve(grasp_at(robot, q), q0=q, prefer="q0")

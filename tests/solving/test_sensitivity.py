@@ -96,7 +96,7 @@ def test_refused(robot):
     points, normals = robot.contacts(q)
     with pytest.raises(errors.InputError, match="q: found shape"):
         solver.sensitivity(robot.home, points, normals)
-    with pytest.raises(errors.InputError, match="gradient: found shape"):
+    with pytest.raises(errors.InputError, match=r"gradient: .*\(2,\).*\(1, 14\)"):
         solver.sensitivity(q, points, normals, [1.0, 2.0])
     with pytest.raises(errors.InputError, match="row 0, finger 0"):
         solver.sensitivity(q, np.where(np.eye(3)[:1], np.nan, points), normals)

@@ -79,7 +79,7 @@ def test_bad_input_is_refused(stepped_solver: ik.Solver) -> None:
     grasp = ik.load_grasp("sugar_box")
     with pytest.raises(errors.InputError, match="q0"):
         stepped_solver.stepper(grasp, np.zeros((1, 14)))
-    with pytest.raises(errors.InputError, match="expected a Grasp"):
+    with pytest.raises(errors.InputError, match="Grasp"):
         stepped_solver.stepper("sugar_box")  # type: ignore[arg-type]
     with pytest.raises(errors.InputError, match="points: row 0 "):
         stepped_solver.stepper(ik.Grasp({"thumb": ik.Contact([0.5, 0, 0.5], [1, 0, 0])}))
@@ -87,5 +87,5 @@ def test_bad_input_is_refused(stepped_solver: ik.Solver) -> None:
 
 def test_a_method_that_cannot_be_stepped_says_why(stepped_solver: ik.Solver) -> None:
     other = ik.Solver(stepped_solver.robot, method="ipopt")
-    with pytest.raises(errors.UnsupportedError, match="Ipopt runs its iterations itself"):
+    with pytest.raises(errors.UnsupportedError, match="Ipopt"):
         other.stepper(ik.load_grasp("sugar_box"))

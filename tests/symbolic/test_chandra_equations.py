@@ -208,7 +208,7 @@ def test_eqs_15_16_signs_and_columns(toy):
 def test_relative_chain_leaves_the_arm_out(robot):
     tip = relative_chain(robot.description, "finger_2", "thumb")
     assert not any(name.startswith("lwr") for name in tip.chain.joints)
-    with pytest.raises(ik.errors.InputError, match="found 'thumb' twice"):
+    with pytest.raises(ik.errors.InputError, match="'thumb'"):
         relative_chain(robot.description, "thumb", "thumb")
 
 

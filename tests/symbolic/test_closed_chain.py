@@ -74,9 +74,7 @@ def test_the_papers_choice(robot):
 
 
 def test_no_closed_chain_without_an_arm(coupled_robot):
-    with pytest.raises(
-        ik.errors.UnsupportedError, match=r"arm \(0\), thumb \(3\).*at least six joints"
-    ):
+    with pytest.raises(ik.errors.UnsupportedError, match=r"\(0\).*\(3\)"):
         split(coupled_robot.description)
 
 

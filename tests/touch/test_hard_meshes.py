@@ -102,7 +102,7 @@ def test_the_hint_for_too_many_pieces_suffices(tmp_path, monkeypatch):
         piece.apply_translation(4e-3 * np.array(place))
         pieces.append(piece)
     path = saved(tmp_path, trimesh.util.concatenate(pieces))
-    with pytest.raises(errors.DescriptionError, match="found 1152 pieces") as refused:
+    with pytest.raises(errors.DescriptionError, match="1152") as refused:
         ik.load_surface(path)
     hint = re.search(r"CASADI_IK_LIMITS=(\d+)", str(refused.value))
     assert hint is not None

@@ -41,7 +41,7 @@ def test_a_picture_has_a_panel_for_each_of_the_best(solver, found, tmp_path):
 
 
 def test_nothing_is_no_picture(solver):
-    with pytest.raises(ik.errors.InputError, match="found: no grasps"):
+    with pytest.raises(ik.errors.InputError, match="found:"):
         views.draw_grasps(solver.robot, [])
 
 
