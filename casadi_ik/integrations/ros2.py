@@ -9,6 +9,7 @@ zenoh-bridge-ros2dds.
 # pyright: reportMissingImports=false
 from __future__ import annotations
 
+import argparse
 import os
 import struct
 import sys
@@ -158,6 +159,27 @@ def _now() -> tuple[int, int]:
     return divmod(time.time_ns(), 1_000_000_000)
 
 
-if __name__ == "__main__":  # python -m casadi_ik.integrations.ros2 ROBOT
-    with ContactNode(Solver(load_robot(sys.argv[1]))) as node:
+def main(arguments: list[str] | None = None) -> None:
+    """Run a node from the command line until Ctrl-C.
+
+    Args:
+        arguments: Words of the command line; None: those of the process.
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m casadi_ik.integrations.ros2",
+        description="Reply to each PoseArray of contacts with a JointState of the motors.",
+    )
+    parser.add_argument("robot", help="robot name or YAML file")
+    parser.add_argument("--contacts", default="contacts", help="key of the contacts")
+    parser.add_argument("--joints", default="joint_commands", help="key of the joint states")
+    options = parser.parse_args(arguments)
+    solver = Solver(load_robot(options.robot))
+    with ContactNode(solver, options.contacts, options.joints) as node:
+        sys.stderr.write(
+            f"{options.robot}: replies to {options.contacts!r} on {options.joints!r}; Ctrl-C ends\n"
+        )
         node.wait()
+
+
+if __name__ == "__main__":
+    main()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from typing import Any
 
 from casadi_ik.errors import InputError, UnknownNameError
@@ -134,6 +136,20 @@ def option_names(name: str) -> tuple[str, ...]:
         UnknownNameError: The method does not exist.
     """
     return _entry(name).options
+
+
+def changed_options(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options whose values are not the defaults of the method.
+
+    Args:
+        name: Name of a method; all options of an unknown one are returned.
+        options: Values by name, as a log stores them (tuples are lists).
+    """
+    if name not in _ENTRIES:
+        return dict(options)
+    entry = _ENTRIES[name]
+    defaults = json.loads(json.dumps(asdict(entry.record(**entry.fixed)), default=str))
+    return {key: value for key, value in options.items() if value != defaults.get(key, math.nan)}
 
 
 def with_finger_step(

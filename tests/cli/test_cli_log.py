@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -131,6 +132,19 @@ def test_a_torn_log_is_said_to_be_one(run: Command, folder: Path) -> None:
     assert done.exit == 0
     assert "(casadi-ik log finish)" in " ".join(done.out.split())
     assert "incomplete" not in run("log", "info", folder / "hand-first.mcap").out
+
+
+def test_info_fits_a_terminal_and_lists_changed_options(run_process: Command, folder: Path) -> None:
+    text = run_process("log", "info", folder / "hand-first.mcap").fine().out
+    assert max(map(len, text.splitlines())) <= 80
+    words = " ".join(text.split())
+    assert "options default" in words
+    assert re.search(r"events \d+ [A-Z_]+, \d+ [A-Z_]+", words)
+    words = " ".join(run_process("log", "info", folder / "enhanced-dls.mcap").fine().out.split())
+    options = re.search(r"options (.*?) (?:scene|event rules)", words)
+    assert options
+    assert "max_iterations 300" in options[1]
+    assert len(options[1].split(", ")) <= 3
 
 
 def test_finish_and_merge(run: Command, folder: Path, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -19,6 +20,8 @@ from command_line import FAST, Command, Run
 from processes import POSIX
 
 import casadi_ik as ik
+from casadi_ik.app.cli.table import COMMANDS, GROUPS, load
+from casadi_ik.integrations.datasets import LAYOUT_NAMES
 
 PROGRAM = [sys.executable, "-m", "casadi_ik"]
 ROBOT = "kuka_lwr_barrett"
@@ -70,6 +73,25 @@ def test_help(run: Command) -> None:
         if "\ncommands:" in done.out:
             assert run(*command.split()) == done
     assert run("--version").out == f"casadi-ik {version('casadi-ik')}\n"
+
+
+@pytest.mark.parametrize("name", sorted(COMMANDS.keys() - GROUPS.keys()))
+def test_help_texts_are_short(name: str) -> None:
+    """A noun phrase or an infinitive of at most 60 characters, the default included."""
+    for option in load(name).options:
+        text = option.help_text
+        assert len(text) <= 60, (option.name, text)
+        assert not re.match(r"(what|which|whether|how|where|when|as|if|it|there)\b", text), text
+        assert "unless said" not in text
+
+
+def test_layouts_of_candidates_are_listed(run: Command) -> None:
+    text = run("choose", "--help").fine().out
+    assert all(name in text for name in LAYOUT_NAMES)
+
+
+def test_misspelt_options_are_suggested(run: Command) -> None:
+    assert "'--tolerance-position'" in run("solve", "cup", "--tolerence-position", "1").error
 
 
 AS_A_MODULE = "import runpy; runpy.run_module('casadi_ik', run_name='__main__', alter_sys=True)"

@@ -38,7 +38,7 @@ from casadi_ik.solve.solution_files import RANKED_MEMBER, ranking_data
 @command(
     Option("OBJECT", "mesh (stl, obj, ...), shipped object or YAML file"),
     opt.REQUIRED_ROBOT,
-    Option("--scale S", "unit of the mesh in metres: 0.001 for millimetres", 1.0, opt.positive),
+    Option("--scale S", "unit of the mesh [m]: 0.001 for mm", 1.0, opt.positive),
     opt.OBJECT_POSE,
     Option("--fingers N", "number of fingertips in contact", 3, opt.integer(2)),
     Option("--mu MU", "friction coefficient", 0.5, opt.positive),
@@ -50,7 +50,7 @@ from casadi_ik.solve.solution_files import RANKED_MEMBER, ranking_data
     opt.SCENE,
     Option(
         "--prefer load|clearance|limits|q0",
-        "ranking: load per squeeze, clearance, limit margin, near q0",
+        "ranking criterion, see below",
         default="load",
     ),
     Option("--limit N", "maximum number of grasps", 200, opt.integer(1)),
@@ -72,7 +72,10 @@ def grasp(args: Arguments) -> CommandResult:
 
     The search matches two opposing fingertips with two opposing patches of the
     object, places the other fingers on the surface, fits palm and hand posture,
-    solves the arm in closed form, checks collisions, and ranks the remaining grasps.
+    solves the arm in closed form, checks collisions, and ranks the remaining grasps:
+    by load (weight that a unit of grip force holds), by clearance, by the margin to
+    joint limits, or by the distance from --q0.
+
     FOUND.npz holds points, normals and balls (k, f, 3) in the format of `casadi-ik
     batch` and `choose`, q, load, closure and clearance, and the ranked solutions for
     `casadi-ik reach` and `view`. If no grasp is found, no file is written.

@@ -228,7 +228,7 @@ def report(args: Arguments) -> CommandResult:
         "--to viewer|parquet|csv",
         f"format (default: by suffix of --out: {', '.join(FORMAT_OF_SUFFIX)})",
     ),
-    Option("--robot R", "robot of a viewer file: name or YAML file (default: the log's)"),
+    Option("--robot R", "robot of the viewer file (default: the log's)"),
     opt.out("FILE", "output file", opt.file_name()),
 )
 def export(args: Arguments) -> CommandResult:
@@ -434,19 +434,24 @@ def _container_fields(log: logs.Log, summary: logs.LogInfo) -> dict[str, str]:
 
 
 def _method_table(log: logs.Log, summary: logs.LogInfo) -> RenderableType:
-    """Return a table of counts, statuses, singular values and events by method."""
+    """Return counts, statuses and singular values by method, and the events below."""
     right = ("solves", "iterations")
-    rows = table("method", *right, "status", "smallest sigma", "events", right=right)
+    rows = table("method", *right, "status", "smallest sigma", right=right)
+    events: dict[str, str] = {}
     for method, counts in summary.counts.items():
         solves = log.solves(method=method)
-        columns = []
-        for selection, field in ((solves, "status"), (log.events(method=method), "kind")):
-            tally = Counter(name for part in selection.parts for name in part.readable(field))
-            lines = (f"{count} {name}" for name, count in tally.most_common())
-            columns.append("\n".join(lines) or "none")
         numbers = str(counts["solve"]), str(counts["iteration"])
-        rows.add_row(method, *numbers, columns[0], _smallest_sigma(solves), columns[1])
-    return rows
+        status = "\n".join(_tally(solves, "status")) or "none"
+        rows.add_row(method, *numbers, status, _smallest_sigma(solves))
+        events[method] = ", ".join(_tally(log.events(method=method), "kind")) or "none"
+    titles = {f"events of {name}" if len(events) > 1 else "events": name for name in events}
+    return Group(rows, fields({title: events[name] for title, name in titles.items()}))
+
+
+def _tally(selection: logs.Table, field: str) -> list[str]:
+    """Return "COUNT NAME" for every value of a field, the most frequent first."""
+    names = Counter(name for part in selection.parts for name in part.readable(field))
+    return [f"{count} {name}" for name, count in names.most_common()]
 
 
 def _smallest_sigma(solves: logs.Table) -> str:
@@ -491,6 +496,11 @@ def _metadata_texts(metadata: Mapping[str, Any]) -> dict[str, str]:
     }
     for name, value in parameters.items():
         text = _tolerance_text(value) if name == "tolerance" else _one_line(value)
+        if name == "options" and isinstance(value, Mapping):
+            from casadi_ik.solve.registry import changed_options  # imports CasADi
+
+            changed = changed_options(str(parameters.get("method")), value)
+            text = _one_line(changed) if changed else "default"
         texts[name.replace("_", " ")] = text
     return texts
 

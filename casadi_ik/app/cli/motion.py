@@ -158,22 +158,22 @@ def _collision_text(solver: Solver) -> str:
 
 
 @command(
-    Option("GRASP", f"{opt.GRASP.help}, or RANKED.json"),
+    Option("GRASP", "grasp name, YAML file, or RANKED.json"),
     Option("--rank N", "rank of the solution in RANKED.json (default: 1, the best)"),
     opt.ROBOT,
     MOTION,
-    opt.picture("--animation", "animation of the motion in real time"),
+    opt.picture("--animation", "animation in real time"),
     opt.OBJECT_POSE,
     opt.SCENE,
-    Option("--opening METRES", "distance of open fingertips from their contacts [m]", 0.02),
+    Option("--opening METRES", "gap between open fingertips and contacts [m]", 0.02),
     Option("--distance METRES", "length of the straight approach [m]", 0.08),
     Option(
         "--direction X...",
-        "approach direction x y z in the base frame (default: see below)",
+        "approach direction x y z, base frame (default: see below)",
         parse=partial(opt.numbers, count=3, meaning="x y z"),
     ),
-    Option("--lift METRES", "height of the lift with the grasped object [m]", 0.0),
-    Option("--retreat METRES", "retreat distance along the reverse approach [m]", 0.0),
+    Option("--lift METRES", "height of the lift with the object [m]", 0.0),
+    Option("--retreat METRES", "retreat along the reverse approach [m]", 0.0),
     Option("--period SECONDS", "time between two samples", 0.01),
     opt.SEED,
     *opt.TOLERANCES,

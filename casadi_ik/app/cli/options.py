@@ -221,7 +221,7 @@ UNIT_OPTIONS = (
 GRASP = Option("GRASP", "name listed by `casadi-ik grasps`, or YAML file")
 ROBOT = Option(
     "--robot R",
-    "name listed by `casadi-ik robots`, or YAML file (default: the robot named in the input file)",
+    "robot name or YAML file (default: the one of the input file)",
 )
 REQUIRED_ROBOT = Option(
     "--robot R", "name listed by `casadi-ik robots`, or YAML file", required=True
@@ -229,16 +229,15 @@ REQUIRED_ROBOT = Option(
 METHOD = Option("--method M", "name listed by `casadi-ik methods` (default: the first)")
 Q0 = Option(
     "--q0 V...",
-    "start position per actuator [rad or m]; last on the line (default: home)",
+    "start positions of the actuators [rad or m] (default: home)",
 )
 PREFER = Option(
     "--prefer limits|manipulability|q0|clearance",
-    "criterion for the choice of solution (default: q0 if it is given, else limits)",
+    "preferred solution (default: q0 if present, else limits)",
 )
 SCENE = Option(
     "--scene FILE",
-    "obstacles: name listed by `casadi-ik scenes`, or YAML file (default: collisions are not "
-    "checked)",
+    "scene name or YAML file of obstacles (default: none)",
 )
 OBJECT_POSE = Option(
     "--object-pose POSE...", "object in the base frame: x y z [m] roll pitch yaw [rad]"
@@ -247,20 +246,18 @@ SEED = Option("--seed N", "seed of all random numbers", 0, integer(0))
 TOLERANCES = (
     Option(
         "--tolerance-position METRES",
-        "largest position error of a reached contact (default: 0.005, 5 mm)",
+        "position tolerance of contacts (default: 0.005, 5 mm)",
     ),
     Option(
         "--tolerance-angle RADIANS",
-        "largest angle error of a reached contact (default: 0.0524, 3 deg)",
+        "angle tolerance of contacts (default: 0.0524, 3 deg)",
     ),
 )
 MAX_RESTARTS = Option(
     "--max-rounds N",
-    "maximum restarts per target (default: until none is worthwhile)",
+    "maximum number of restarts per target (default: adaptive)",
 )
-LIMITS = Option(
-    "--limits enforce|ignore", "treatment of limits; ignore: as in the paper", "enforce"
-)
+LIMITS = Option("--limits enforce|ignore", "joint limits; ignore: as in the paper", "enforce")
 SOLVER = (
     METHOD,
     Q0,
@@ -273,7 +270,7 @@ SOLVER = (
     LIMITS,
     Option(
         "--finger-step ipopt|closed-form",
-        "finger solver of the paper's methods; closed-form is faster (default: ipopt)",
+        "finger solver of the papers' methods (default: ipopt)",
     ),
     Option(
         "--fixed NAME=V...",

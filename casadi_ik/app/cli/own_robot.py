@@ -56,12 +56,12 @@ POSE_TOLERANCE = 1e-9
     Option("--palm LINK...", "palm link (one per hand for a body)"),
     Option(
         "--mount POSE...",
-        "hand base on the tip: x y z [m] roll pitch yaw [rad] (default: identity)",
+        "hand on the tip: x y z [m] roll pitch yaw [rad] (default: 0)",
     ),
     Option("--srdf FILE.srdf", "extra allowed contacts, in addition to those detected"),
     Option("--xacro", "expand macros in files without the suffix .xacro"),
     Option("--xacro-args NAME:=VALUE...", "arguments of a xacro file"),
-    opt.picture("--picture", "picture of the hand with its guessed pads"),
+    opt.picture("--picture", "picture of the guessed pads"),
     Option("--check", "compare the kinematics with pinocchio (MJCF: MuJoCo)"),
     opt.SIZE_LIMITS,
 )
@@ -257,17 +257,17 @@ def _import_report(
     ),
     Option(
         "--loss cauchy|huber|squares",
-        "loss function; squares does not reduce outliers",
+        "loss function; squares keeps outliers",
         "cauchy",
     ),
     Option(
         "--noise-position METRES",
-        "prior standard deviation of measured coordinates",
+        "prior noise of measured coordinates",
         0.5e-3,
     ),
     Option(
         "--noise-angle RADIANS",
-        "prior standard deviation of measured angles (default: 0.0175, 1 deg)",
+        "prior noise of measured angles (default: 0.0175, 1 deg)",
         math.radians(1.0),
     ),
     opt.out("CALIBRATED.yaml", "output file of the calibrated robot"),
@@ -345,11 +345,11 @@ def _calibration_report(estimate: calibration.Calibration, units: Units) -> list
 @command(
     Option("ROBOT", "name listed by `casadi-ik robots`, or YAML file"),
     opt.out("DIR", "output folder"),
-    Option("--method M", "method; only hand-first can be exported", "hand-first"),
+    Option("--method M", "method; only hand-first is possible", "hand-first"),
     Option("--prefix NAME", "prefix of all names (default: the robot's name)"),
     Option(
         "--target c|wasm",
-        "plain C or WebAssembly module (needs 'casadi-ik[compiler]')",
+        "plain C or WebAssembly ('casadi-ik[compiler]')",
         "c",
     ),
     Option(

@@ -159,17 +159,13 @@ def _drawing(path: Path, grasp: Grasp) -> Callable[..., Any]:
     opt.OBJECT_POSE,
     Option(
         "--layout L",
-        f"format of the file: {', '.join(LAYOUT_NAMES)} (default: detected)",
+        "format of the file, see below (default: detected)",
         parse=opt.choice(*LAYOUT_NAMES),
     ),
-    Option(
-        "--hand FILE",
-        "joint names and hand frame of the file: shipped name or YAML file (default: the shipped "
-        "one for the robot)",
-    ),
+    Option("--hand FILE", "hand of the file: name or YAML file (default: by robot)"),
     Option(
         "--take palm|contacts",
-        "goal of rows with palm and posture: palm pose or fingertips",
+        "goal of rows: palm pose or fingertips",
         "palm",
     ),
     Option(
@@ -180,7 +176,7 @@ def _drawing(path: Path, grasp: Grasp) -> Callable[..., Any]:
     Option("--scale FACTOR", "use only grasps of this object scale (as in the file)"),
     Option(
         "--invalid error|drop|clip",
-        "treatment of rows without grasp or beyond joint limits",
+        "treatment of invalid rows, see below",
         "error",
     ),
     opt.SCENE,
@@ -215,7 +211,9 @@ def choose(args: Arguments) -> CommandResult:
       a pt file of multidex; --of selects one of its objects
       a table (.csv, .npz, .parquet) with the palm pose in columns x y z and qw qx
         qy qz or roll pitch yaw, and the joint positions of the hand by name
-    No code in a file is executed. docs/datasets.md describes the formats.
+    --layout names the format: getagrip, dexgraspnet, bodex, dexgraspbench,
+    dexonomy, multidex, isaac_grasp, acronym, graspnet, poses or table. No code in
+    a file is executed. docs/datasets.md describes the formats.
 
     Palm poses and hand postures of a file are kept, and only the arm is solved.
     With --take contacts only the fingertips are kept; if --object names an object,

@@ -67,7 +67,7 @@ SOLVE_NUMBERS = opt.word_list(opt.integer(1))
     Option("--pads", "edit the pads of a robot file"),
     Option(
         "--host ADDRESS",
-        "address of the server; 0.0.0.0: all networks (default: 127.0.0.1)",
+        "server address; 0.0.0.0: all (default: 127.0.0.1)",
         "127.0.0.1",
     ),
     Option(
