@@ -22,7 +22,8 @@ import numpy as np
 from casadi_ik.api import Solver
 from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import InputError, KernelError, MissingExtraError, UnsupportedError, os_errors
-from casadi_ik.export.scene import BodySceneSources, SceneSources
+from casadi_ik.export.multi_arm_scene import MultiArmSceneSources
+from casadi_ik.export.scene import SceneSources
 from casadi_ik.export.single import SinglePrecision, filled
 from casadi_ik.export.solver import FollowSources, SolverSources, hand_first
 from casadi_ik.export.targets import (
@@ -157,8 +158,8 @@ def exported(
     allowing = SinglePrecision(robot) if single else None
     scene = None
     if capacity is not None:
-        kind = BodySceneSources if robot.description.sides else SceneSources
-        scene = kind.of(robot, method, prefix, capacity, allowing)
+        sources_class = MultiArmSceneSources if robot.description.sides else SceneSources
+        scene = sources_class.for_robot(robot, method, prefix, capacity, allowing)
     tolerance = next(iter(solver.tolerances.values()))
     sources = SolverSources(robot, method, prefix, tolerance, scene, allowing)
     shown = example(robot)

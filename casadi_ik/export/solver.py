@@ -342,10 +342,10 @@ class SolverSources:
         scene = self.scene
         if scene is None:
             return ()
-        placed, constants, room = scene.near
-        near = self._part("near", "clearance", placed, constants, room)
+        shape_poses, constants, work = scene.clearance_kernel
+        clearance = self._part("near", "clearance", shape_poses, constants, work)
         place = filled("place.c", {"PREFIX": self.prefix})
-        parts = (replace(near, text=near.text + place),)
+        parts = (replace(clearance, text=clearance.text + place),)
         return parts + tuple(self._part(name, "map", each) for name, each in scene.maps.items())
 
     def _part(

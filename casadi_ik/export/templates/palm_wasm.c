@@ -1,7 +1,9 @@
 
 EXPORTED(touched) int touched(void);
-EXPORTED(solve_palm) int solve_palm(int near);
+EXPORTED(solve_palm) int solve_palm(int prefer_q0);
 
-/* Of the palm in palm, and the posture in posture. */
+/* Computes the contacts of the posture at the palm pose. */
 int touched(void) { return @PREFIX@_touched(&solver, palm, posture, points, normals); }
-int solve_palm(int near) { return @PREFIX@_solve_palm(&solver, palm, posture, near ? q0 : 0); }
+int solve_palm(int prefer_q0) {
+  return @PREFIX@_solve_palm(&solver, palm, posture, prefer_q0 ? q0 : 0);
+}

@@ -1,8 +1,8 @@
   /**
-   * Puts a solid into the scene; Kind.NOTHING takes it out. Being solved includes that nothing
-   * touches.
+   * Places a solid in the scene; Kind.NOTHING removes it. A target is solved only if the robot is
+   * collision-free.
    * @param pose Rotation row by row, then the origin.
-   * @param grasped Whether the links whose pads are in contact may touch it.
+   * @param grasped True if links of fingertip pads with a contact may touch it.
    */
   setSolid(
     number: number,
@@ -11,12 +11,13 @@
     pose?: ArrayLike<number>,
     grasped?: boolean,
   ): void;
-  /** The distance to keep. */
+  /** Sets the required clearance [m]. */
   setMargin(margin: number): void;
-  /** How far a configuration is from touching, and which two are nearest. */
+  /** Returns the clearance of a configuration [m] and the nearest pair. */
   clearance(q: ArrayLike<number>): {
     clearance: number;
     closest: readonly [string, string] | null;
   };
-  /** Six numbers a capsule (middle, half), then twelve a solid (rotation row by row, origin). */
+  /** Returns shape poses: six numbers per capsule (middle of its segment, and the vector from there to
+   * its end), then twelve per solid (rotation row by row, origin). */
   shapes(q: ArrayLike<number>): Float64Array;

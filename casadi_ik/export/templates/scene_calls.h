@@ -6,14 +6,14 @@
  * A target is solved only if the robot collides neither with a solid nor with itself; self-collision
 @ONE_ARM{@
  * is checked in an empty scene as well. If an answer collides, the solver examines other arm
- * configurations for the same hand pose, and then up to @TRIED@ other hand poses with theirs, which may
+ * configurations for the same hand pose, and then up to @MAX_HAND_FITS@ other hand poses with theirs, which may
  * take as long as that many solves. If all of them collide, the status is @GUARD@_COLLISION, and q is
  * the answer of largest clearance. */
 @}@
 @BODY{@
- * is checked in an empty scene as well. If an answer collides, the solver examines up to @MOST_TRUNKS@
+ * is checked in an empty scene as well. If an answer collides, the solver examines up to @MAX_TRUNK_TRIALS@
  * other trunk and arm configurations for the same hand poses, with other arms at each of them, and in
- * between up to @TRIED@ other hand poses, which may take as long as that many solves. If all of them
+ * between up to @MAX_HAND_FITS@ other hand poses, which may take as long as that many solves. If all of them
  * collide, the status is @GUARD@_COLLISION, and q is the answer of largest clearance. */
 @}@
 int @PREFIX@_set_solid(@PREFIX@_solver *solver, int number, int kind, const @REAL@ *size,
@@ -27,4 +27,4 @@ void @PREFIX@_set_margin(@PREFIX@_solver *solver, @REAL@ margin);
 
 /* Computes the poses of the robot's shapes: six numbers per capsule (middle of its segment, and the
  * vector from there to its end), then twelve per solid (rotation row by row, origin). */
-void @PREFIX@_shapes(@PREFIX@_solver *solver, const @REAL@ *q, @REAL@ *places);
+void @PREFIX@_shapes(@PREFIX@_solver *solver, const @REAL@ *q, @REAL@ *poses);

@@ -21,25 +21,29 @@ typedef struct {
   @REAL@ margin;
   @PREFIX@_solid solids[@SOLIDS@];
   @REAL@ poses[12 * @GUARD@_SCENE];
-  int32_t grasped[@GUARD@_SCENE], pairs[2 * @MOST_PAIRS@];
-  @REAL@ offsets[@MOST_PAIRS@];
-  int64_t n_busy, n_held, n_pairs;
+  int32_t grasped[@GUARD@_SCENE], pairs[2 * @MAX_PAIRS@];
+  @REAL@ offsets[@MAX_PAIRS@];
+  int64_t idle_pairs_begin, idle_pairs_end, n_pairs;
   /* State of the search for a collision-free answer. */
 @ONE_ARM{@
-  int64_t looking, again, round, fit, n_met, next, iterations, restarts, fresh, n_known, n_swung;
+  int64_t is_searching, preference_dropped, restart, candidate, n_hands, next_hand;
+  int64_t iterations, restarts, has_new_hand, n_recorded_hands, n_free_hands;
 @}@
 @BODY{@
-  int64_t ends[@PARTS_OF_PAIRS@], listed;
-  int64_t looking, again, round, fit, lot, tried, under_way, fresh, iterations, restarts;
+  int64_t group_ends[@PAIR_GROUPS@], has_pair_list;
+  int64_t is_searching, preference_dropped, restart, candidate, trunk_stage, trunk_trial, task;
+  int64_t has_new_hand, iterations, restarts;
 @}@
-  @REAL@ q[@GUARD@_MOTORS], room; /* the answer of largest clearance */
+  @REAL@ best_q[@GUARD@_MOTORS], best_surplus; /* answer of largest clearance; clearance - margin */
 @BODY{@
   /* Collision-free hands of each side, and the poses of their palms. */
   int64_t n_hands[@SIDES@];
-  @REAL@ hands[@SIDES@][@N_LOOKED@][@GUARD@_MOTORS], palms[@SIDES@][@N_LOOKED@][12];
+  @REAL@ hands[@SIDES@][@MAX_HANDS@][@GUARD@_MOTORS], palms[@SIDES@][@MAX_HANDS@][12];
 @}@
 @ONE_ARM{@
-  @REAL@ met[@N_CANDIDATES@ * @GUARD@_MOTORS], rated[@N_CANDIDATES@];
-  @REAL@ known[@N_LOOKED@ * @N_HAND_PARTS@], swung[@N_LOOKED@ * @N_HAND_PARTS@];
+  /* Hands to try, sorted by rating; coordinates of all hand poses, and of collision-free ones. */
+  @REAL@ hands[@N_CANDIDATES@ * @GUARD@_MOTORS], ratings[@N_CANDIDATES@];
+  @REAL@ recorded_hands[@MAX_HANDS@ * @N_HAND_COORDINATES@];
+  @REAL@ free_hands[@MAX_HANDS@ * @N_HAND_COORDINATES@];
 @}@
 } @PREFIX@_scene;

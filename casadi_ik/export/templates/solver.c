@@ -15,7 +15,7 @@ typedef @PREFIX@_solver search;
 const char *const @PREFIX@_finger_names[] = {@FINGER_NAMES@};
 const char *const @PREFIX@_motor_names[] = {@MOTOR_NAMES@};
 
-@SCENE_LOOK@
+@SCENE_SEARCH@
 void @PREFIX@_init(@PREFIX@_solver *solver) {
   memset(solver, 0, sizeof *solver);
   memcpy(solver->terms, TERMS, sizeof TERMS);
@@ -50,7 +50,7 @@ int @PREFIX@_begin(@PREFIX@_solver *solver, const scalar *points, const scalar *
 }
 
 int @PREFIX@_run(@PREFIX@_solver *solver, int64_t iterations) {
-  if (solver->status == @GUARD@_RUNNING && run_on(solver, iterations) != DONE) {
+  if (solver->status == @GUARD@_RUNNING && continue_search(solver, iterations) != DONE) {
     solver->status = @GUARD@_INVALID;
   }
   return (int) solver->status;

@@ -43,7 +43,7 @@ extern const @REAL@ @PREFIX@_lower[@GUARD@_MOTORS], @PREFIX@_upper[@GUARD@_MOTOR
 /* Work memory that the parts of a solver share. */
 typedef struct {
   @REAL@ w[@W@];
-@SCENE_ROOM?@} @PREFIX@_memory;
+@SCENE_SCRATCH?@} @PREFIX@_memory;
 
 /* A solver. Its results are q, position_error, angle_error, beyond (largest excess of a motor or joint
  * over its limits, negative within them), iterations, restarts and status. The other members are

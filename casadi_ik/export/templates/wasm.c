@@ -1,4 +1,4 @@
-/* What JavaScript calls: one solver, and its numbers by address. */
+/* Functions that JavaScript calls: a solver, and the addresses of its arrays. */
 #include "@PREFIX@.h"
 
 #define EXPORTED(name) __attribute__((export_name(#name)))
@@ -18,9 +18,9 @@ EXPORTED(position_error_at) double *position_error_at(void);
 EXPORTED(angle_error_at) double *angle_error_at(void);
 EXPORTED(iterations) int iterations(void);
 EXPORTED(restarts) int restarts(void);
-EXPORTED(begin) int begin(int near);
-EXPORTED(run) int run(int most);
-EXPORTED(solve) int solve(int near);
+EXPORTED(begin) int begin(int prefer_q0);
+EXPORTED(run) int run(int max_iterations);
+EXPORTED(solve) int solve(int prefer_q0);
 EXPORTED(contacts) void contacts(void);
 EXPORTED(set_tolerance) void set_tolerance(int finger, double position, double angle);
 EXPORTED(set_range) void set_range(int motor, double lower, double upper);
@@ -36,10 +36,10 @@ double *position_error_at(void) { return solver.position_error; }
 double *angle_error_at(void) { return solver.angle_error; }
 int iterations(void) { return (int) solver.iterations; }
 int restarts(void) { return (int) solver.restarts; }
-int begin(int near) { return @PREFIX@_begin(&solver, points, normals, near ? q0 : 0); }
-int run(int most) { return @PREFIX@_run(&solver, most); }
-int solve(int near) { return @PREFIX@_solve(&solver, points, normals, near ? q0 : 0); }
-/* Of the configuration in q0. */
+int begin(int prefer_q0) { return @PREFIX@_begin(&solver, points, normals, prefer_q0 ? q0 : 0); }
+int run(int max_iterations) { return @PREFIX@_run(&solver, max_iterations); }
+int solve(int prefer_q0) { return @PREFIX@_solve(&solver, points, normals, prefer_q0 ? q0 : 0); }
+/* Computes the contacts of the configuration in q0. */
 void contacts(void) { @PREFIX@_contacts(&solver, q0, points, normals); }
 void set_tolerance(int finger, double position, double angle) {
   @PREFIX@_set_tolerance(&solver, finger, position, angle);
