@@ -124,3 +124,10 @@ def test_a_result_survives_copying(results: dict[str, Any], kind: str, how: str)
     again = COPIES[how](value)
     assert same(again, value)
     assert str(again).split(" at 0x")[0] == str(value).split(" at 0x")[0]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_representations_are_short(results: dict[str, Any], kind: str) -> None:
+    text = repr(results[kind])
+    assert text.count("\n") < 25
+    assert len(text) < 2000

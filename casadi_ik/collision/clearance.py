@@ -16,6 +16,7 @@ from casadi_ik.collision.model import CollisionModel, check_base, collision_mode
 from casadi_ik.collision.scene import Scene
 from casadi_ik.collision.solids import Solid, capsule
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.lazy_import import RecordReprMixin
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.link_shapes import Touching
 from casadi_ik.model.targets import TargetBatch
@@ -26,8 +27,8 @@ ROUNDING = 1e-9
 Pair = tuple[str, str]
 
 
-@dataclass(frozen=True, eq=False)
-class Clearances:
+@dataclass(frozen=True, eq=False, repr=False)
+class Clearances(RecordReprMixin):
     """Clearances of k configurations.
 
     Attributes:

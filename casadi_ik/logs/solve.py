@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from casadi_ik.compile.layout import Field, Layout
 from casadi_ik.errors import LogError, UnknownNameError
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.lazy_import import RecordReprMixin
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import EXTRA_ARRAY_NAMES
 from casadi_ik.logs.events import Event, bits_of, errors_text, measured_jacobians
@@ -76,8 +77,8 @@ class LoggedTarget:
     prefer: str | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class SolveRecord:
+@dataclass(frozen=True, eq=False, repr=False)
+class SolveRecord(RecordReprMixin):
     """Record of a solve for f fingers.
 
     Attributes:

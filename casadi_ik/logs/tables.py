@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.compile.layout import opaque
 from casadi_ik.errors import LogError, UnknownNameError, optional_import, os_errors
+from casadi_ik.files.lazy_import import RecordReprMixin
 from casadi_ik.logs.events import MOVES, SINGULAR, Event, EventKind, as_matrix, bits_of
 
 if TYPE_CHECKING:
@@ -99,8 +100,8 @@ class MethodRows:
         return values.tolist() if values.ndim == 1 else list(values)
 
 
-@dataclass(frozen=True, eq=False)
-class Table:
+@dataclass(frozen=True, eq=False, repr=False)
+class Table(RecordReprMixin):
     """Rows of one kind: of one method, or of several one after the other.
 
     What belongs to one part (`rows`, `labels`, ...) is available if there is only one.

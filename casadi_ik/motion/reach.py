@@ -15,6 +15,7 @@ import numpy as np
 from casadi_ik.collision.clearance import CollisionQuery, SceneCheck
 from casadi_ik.collision.distances import gaps
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.lazy_import import RecordReprMixin
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.pose import inverse
 from casadi_ik.model.targets import TargetBatch
@@ -140,8 +141,8 @@ UP = np.array([0.0, 0.0, 1.0])
 """Vertical axis of the base frame."""
 
 
-@dataclass(frozen=True, eq=False)
-class Reach:
+@dataclass(frozen=True, eq=False, repr=False)
+class Reach(RecordReprMixin):
     """Timed motion to a grasp or to a posture.
 
     Attributes:

@@ -22,6 +22,7 @@ import numpy as np
 from casadi_ik.compile import FunctionGraph, FunctionKernel
 from casadi_ik.compile.graphs import recipe
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.lazy_import import RecordReprMixin
 from casadi_ik.kinematics.contact_fit import contact_residual
 from casadi_ik.kinematics.contacts import ContactRows, Kinds, kinds_suffix
 from casadi_ik.kinematics.forward import motor_scales
@@ -39,8 +40,8 @@ The remaining effect is 1e-5 of a singular value of 1e-3. Singular values below 
 motions. With a damping of 1e-8 the rounding of free motions appears in the others (3e-7)."""
 
 
-@dataclass(frozen=True, eq=False)
-class Sensitivity:
+@dataclass(frozen=True, eq=False, repr=False)
+class Sensitivity(RecordReprMixin):
     """Derivatives of configurations, or of a scalar of them, by the contacts.
 
     Attributes:

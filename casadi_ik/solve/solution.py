@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.lazy_import import ReprMixin, import_lazily
+from casadi_ik.files.lazy_import import RecordReprMixin, ReprMixin, import_lazily
 from casadi_ik.kinematics.arm_hand import ArmHand, load_robot
 from casadi_ik.model.grasp import Contact, Grasp, Tolerance
 from casadi_ik.solve.diagnosis import Diagnosis
@@ -498,8 +498,8 @@ class ArmBranch:
     root: int = 0
 
 
-@dataclass(frozen=True, eq=False)
-class Alternative:
+@dataclass(frozen=True, eq=False, repr=False)
+class Alternative(RecordReprMixin):
     """A solution of a grasp that has several.
 
     Attributes:

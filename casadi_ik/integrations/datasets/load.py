@@ -20,6 +20,7 @@ from casadi_ik.errors import (
 )
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.input_checks.poses import rotations_from_quaternions
+from casadi_ik.files.lazy_import import RecordReprMixin
 from casadi_ik.files.limits import LIMITS, RAISE_HINT, scaled_limit
 from casadi_ik.files.number_files import check_unpacked_size, read_npz
 from casadi_ik.integrations.datasets.layouts import (
@@ -77,8 +78,8 @@ class ReadingSettings:
 READING_SETTINGS = ReadingSettings()
 
 
-@dataclass(frozen=True, eq=False)
-class Candidates(Sequence[Grasp]):
+@dataclass(frozen=True, eq=False, repr=False)
+class Candidates(RecordReprMixin, Sequence[Grasp]):
     """A sequence of grasps in the order of their file.
 
     Attributes:

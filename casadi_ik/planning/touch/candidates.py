@@ -17,6 +17,7 @@ from casadi_ik.collision.clearance import CollisionQuery, SceneCheck
 from casadi_ik.collision.distances import PairTable, pose_row
 from casadi_ik.compile.cancellation import SLICE, run_cancellable
 from casadi_ik.files.arrays import Array, Bools
+from casadi_ik.files.lazy_import import RecordReprMixin
 from casadi_ik.model.pose import inverse
 from casadi_ik.planning.touch.hand_table import (
     BINS,
@@ -97,8 +98,8 @@ class TouchParameters:
     min_rotation: float = float(np.deg2rad(15.0))
 
 
-@dataclass(frozen=True, eq=False)
-class Candidates:
+@dataclass(frozen=True, eq=False, repr=False)
+class Candidates(RecordReprMixin):
     """Palm poses and hand postures of k candidates, in the object's frame.
 
     Attributes:

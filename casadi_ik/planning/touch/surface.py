@@ -18,6 +18,7 @@ from casadi_ik.compile.cache import trusted_cache, user_temp_dir
 from casadi_ik.errors import InputError, optional_import, os_errors
 from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.files.input_checks.numbers import checked_integer, checked_number
+from casadi_ik.files.lazy_import import RecordReprMixin
 from casadi_ik.files.writing import atomic_write
 from casadi_ik.model.objects import GraspObject, load_object
 from casadi_ik.model.shapes import MeshShape
@@ -124,8 +125,8 @@ def cells(low: Array, high: Array, step: float) -> tuple[Array, NDArray[np.int64
     return np.append(low, step), counts, centers.reshape(-1, 3)
 
 
-@dataclass(frozen=True, eq=False)
-class Surface:
+@dataclass(frozen=True, eq=False, repr=False)
+class Surface(RecordReprMixin):
     """Surface of an object.
 
     Attributes:
