@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
 import yaml
+from write_notice import notice
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "robots_origin.md").read_text()
@@ -34,3 +36,15 @@ def test_every_repository_with_a_commit_has_its_licence_listed(path):
     text = " ".join(" ".join(yaml.safe_load(path.read_text())["sources"].values()).split())
     named = re.findall(r"([A-Za-z0-9][\w.-]*/[A-Za-z][\w.-]*) at [0-9a-f]{7,}", text)
     assert set(named) <= set(LICENCES)
+
+
+def test_every_licence_was_looked_up():
+    assert not [name for name, text in LICENCES.items() if "not looked up" in text]
+
+
+def test_notice_names_every_robot_with_its_licences():
+    assert (ROOT / "NOTICE").read_text(encoding="utf-8") == notice()
+    for path in FILES:
+        assert f"\n{path.stem}: " in notice()
+    files = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["license-files"]
+    assert files == ["LICENSE", "NOTICE"]
