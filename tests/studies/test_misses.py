@@ -45,17 +45,6 @@ def test_a_count_goes_on_and_lists_what_is_lost(tmp_path):
     assert "| kuka_lwr_barrett | 5 mm, 3 deg | 1 | 1 |" in text, "it can be solved"
 
 
-def test_palms_noise_and_few_fingers(tmp_path):
-    asked = [*ONE, "--sampler", "palms", "noise", "limits", "--fingers", "all", "2"]
-    asked += ["--count", "30", "--noise", "6", "3", "--looked", "1", "--out", str(tmp_path)]
-    misses.main([*asked, "--ratio"])
-    text = (tmp_path / "report" / "report.md").read_text()
-    assert "| kuka_lwr_barrett | palms of random hands | 5 mm, 3 deg | 30 | 0 |" in text
-    assert "| kuka_lwr_barrett | near limits; 2 fingers | 5 mm, 3 deg | 30 | 0 |" in text
-    assert "Gaussian noise of 6 mm" in text
-    assert text.count(" of 1 |") >= 1
-
-
 def test_a_search_goes_on_and_climbs(tmp_path):
     states = []
     for minutes in ("0.02", "0.04"):
@@ -78,27 +67,6 @@ def test_pairs_and_fingers():
     sets = finger_sets(robot, ["all", "3", "4", "thumb+ring"])
     assert set(sets) == {"all", "3", "thumb+ring"}
     assert robot.fingers.index(robot.thumb) in sets["3"]
-
-
-def test_a_heat_map_of_pairs(tmp_path):
-    rows = [
-        {"robot": pair, "tolerance": "1e-6", "usual": 1.5, "missed": [], "kind": "all kinds"}
-        for pair in ("panda+leap", "ur5e+leap", "ur5e+shadow")
-    ]
-    misses.heat_map(rows, tmp_path / "pairs.png")
-    assert (tmp_path / "pairs.png").stat().st_size > 5_000
-
-
-def test_tolerances_are_counted_by_robot(tmp_path, monkeypatch):
-    """Displaced contacts are within their tolerance; the report sums them up by robot."""
-    monkeypatch.setattr(misses, "ANGLES", (3, 30))
-    monkeypatch.setattr(misses, "DISTANCES", (5,))
-    words = ["--robots", "kuka_lwr_barrett", "--sampler", "tolerances", "--count", "20"]
-    misses.main([*words, "--out", str(tmp_path)])
-    assert len(list((tmp_path / "kuka_lwr_barrett").rglob("*.json"))) == 2 * len(misses.SHARES)
-    text = (tmp_path / "report" / "report.md").read_text()
-    assert "Of 120 displaced targets of 1 robots" in text
-    assert "| kuka_lwr_barrett | 120 |" in text
 
 
 def test_displaced_contacts_are_within_their_tolerance(robot, rng):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 
@@ -15,22 +13,6 @@ import casadi_ik as ik
 
 ACROSS = np.array([[0.03, 0.0, 0.0], [-0.03, 0.0, 0.0]])
 """Two opposite points of a ball of 30 mm [m]."""
-
-
-def test_the_study_writes_its_report_and_goes_on(tmp_path):
-    given = ["--robots", "panda+panda_hand", "--objects", "golf_ball", "--limit", "3"]
-    given += ["--parts", str(tmp_path / "parts"), "--out", str(tmp_path)]
-    touch.main([*given, "--minutes", "0"])
-    assert not list((tmp_path / "parts").rglob("*.json"))
-    touch.main(given)
-    found = {one["name"]: one for one in json.loads((tmp_path / "metrics.json").read_text())}
-    assert found["touch/panda+panda_hand/confirmed"]["value"] == 100
-    assert found["touch/panda+panda_hand/closed"]["value"] == 100
-    assert found["touch/panda+panda_hand/off"]["value"] < 1.0
-    done = {path: path.read_text() for path in (tmp_path / "parts").rglob("*.json")}
-    assert len(done) == 3
-    touch.main(given)
-    assert {path: path.read_text() for path in done} == done
 
 
 def test_every_pose_rests_on_the_table():

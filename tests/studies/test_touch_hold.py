@@ -18,17 +18,6 @@ import casadi_ik as ik
 RESULTS = Path(touch_hold.__file__).parent / "results"
 
 
-def test_the_study_writes_its_report(tmp_path):
-    given = ["--robots", "panda+panda_hand", "--objects", "tennis_ball", "sugar_box"]
-    touch_hold.main(
-        [*given, "--limit", "6", "--best", "3", "--samples", "1", "--out", str(tmp_path)]
-    )
-    text = (tmp_path / "report.md").read_text()
-    assert "| panda+panda_hand | tennis_ball | 3 | 3 |" in text
-    found = {one["name"]: one for one in json.loads((tmp_path / "metrics.json").read_text())}
-    assert found["touch_hold/panda+panda_hand/held"]["n"] == 6
-
-
 def test_what_is_squeezed_too_little_falls(monkeypatch):
     solver, surface = ik.Solver(ik.load_robot("panda+panda_hand")), ik.load_surface("tennis_ball")
     (one,) = solver.grasps_of(surface, standing(surface, 0.7), limit=1, among=1)
