@@ -78,6 +78,7 @@ def test_messages_are_those_of_ros(rng):
     assert again == data
 
 
+@pytest.mark.slow
 def test_a_process_asks_and_another_answers(node, rng):
     """Prints the median of the round trips (`pytest -s`), the decoding of the answer included."""
     config = zenoh.Config()

@@ -79,6 +79,7 @@ def wait_for_parts(folder: Path, least: int, process: subprocess.Popen[str]) -> 
     raise AssertionError(f"{folder}: fewer than {least} parts")
 
 
+@pytest.mark.slow
 @POSIX
 def test_killed_and_taken_up_again(targets: Path, whole: dict[str, np.ndarray], tmp_path: Path):
     """The client is killed; what it had finished is kept as it is, and the rest is done."""
@@ -108,6 +109,7 @@ def test_killed_and_taken_up_again(targets: Path, whole: dict[str, np.ndarray], 
     assert len(log.solves()) == COUNT - 1
 
 
+@pytest.mark.slow
 @POSIX
 def test_terminated(targets: Path, tmp_path: Path):
     """SIGTERM to the client alone: the finished parts stay, its workers do not."""

@@ -109,6 +109,7 @@ def names(folder: Path) -> dict[str, Any]:
     }
 
 
+@pytest.mark.slow
 def test_examples(names: dict[str, Any], folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     monkeypatch.setattr(registry, "_ENTRIES", dict(registry._ENTRIES))

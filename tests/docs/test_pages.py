@@ -161,6 +161,7 @@ def test_faults_are_seen() -> None:
     assert sum(1 for page in PAGES for _ in commands(page.read_text())) > 40
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "page",
     [page for page in PAGES if python_blocks(page) and page.stem not in NOT_PASTED],
@@ -191,6 +192,7 @@ def grasps_shown() -> Iterator[tuple[str, dict[str, Any]]]:
                 yield source.name, {"robot": "kuka_lwr_barrett"} | yaml.safe_load(found[0])
 
 
+@pytest.mark.slow
 def test_every_grasp_shown_is_solved(tmp_path: Path) -> None:
     shown = list(grasps_shown())
     assert len(shown) >= 5
@@ -240,6 +242,7 @@ def gone_through(page: Path, folder: Path) -> list[str]:
     return done
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("page", "count"),
     [

@@ -16,6 +16,8 @@ from processes import said
 
 import casadi_ik as ik
 
+pytestmark = pytest.mark.slow
+
 STRICT = ("-std=c11", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-ffp-contract=off")
 SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 PERIOD = 0.004

@@ -8,6 +8,8 @@ import shutil
 import pytest
 from export_matrix import run_cell
 
+pytestmark = pytest.mark.slow
+
 COUNT = 50
 """Targets per robot and mode: most of the time goes into compilation."""
 

@@ -306,10 +306,13 @@ def test_page(
     used_on_a_phone(opened(browser, url, 360, 740, phone=True))
 
 
-pytestmark = pytest.mark.skipif(
-    shutil.which("node") is None or importlib.util.find_spec("ziglang") is None,
-    reason="needs node and the package ziglang",
-)
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        shutil.which("node") is None or importlib.util.find_spec("ziglang") is None,
+        reason="needs node and the package ziglang",
+    ),
+]
 
 WRAPPER = """
 import { Solver, Status, home, motors, fingers } from "./arm.js";

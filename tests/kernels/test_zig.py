@@ -14,7 +14,9 @@ from casadi_ik.compile.compiler import find_compiler
 
 from .graphs import branching_step, needs_compiler, random_step
 
-pytestmark = pytest.mark.skipif(
+pytestmark = pytest.mark.slow
+
+NEEDS_ZIG = pytest.mark.skipif(
     importlib.util.find_spec("ziglang") is None, reason="needs the package ziglang"
 )
 
@@ -56,6 +58,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return {"CC": "", "PATH": place, "CASADI_IK_CACHE": str(tmp_path / "cache")}
 
 
+@NEEDS_ZIG
 def test_the_kernel_tests_pass(environment):
     files = ("test_loop.py", "test_function_kernel.py")
     done = python(
@@ -70,6 +73,7 @@ def test_the_kernel_tests_pass(environment):
     assert "skipped" not in done.stdout
 
 
+@NEEDS_ZIG
 def test_iterates_are_those_of_any_other_compiler(environment):
     zig = python("-c", ITERATES, env=environment, text=False)
     assert zig.stderr.split()[:1] == [b"True"], zig.stderr
@@ -79,8 +83,6 @@ def test_iterates_are_those_of_any_other_compiler(environment):
     assert len(zig.stdout) > 10_000
     assert zig.stdout == usual.stdout
 
-
-pytestmark = needs_compiler
 
 COUNT = 40
 
@@ -101,6 +103,7 @@ def iterates() -> bytes:
     return b"".join(found)
 
 
+@needs_compiler
 def test_optimisation_changes_no_bit(monkeypatch):
     usual, flags = iterates(), find_compiler()
     assert len(usual) > 10_000

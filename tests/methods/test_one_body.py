@@ -8,6 +8,8 @@ from toy_robots import grasp_at, grasp_of
 
 import casadi_ik as ik
 
+pytestmark = pytest.mark.slow
+
 BODIES = ("g1+dex3", "two_pandas+allegro", "two_ur10e+leap", "mobile_kuka_lwr_barrett")
 ONE_HAND = (
     r"is for one arm with one hand, found 'g1\+dex3', a multi-arm robot \(left, right\); "

@@ -67,6 +67,7 @@ def displaced_palms(robot, q, tolerance, part):
     return palms
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degrees", [10.0, 30.0])
 def test_an_arm_of_five_axes_reaches_palm_poses_within_tolerance(degrees):
     """Exact poses are out of its reach; it solved 2 to 9 of 20."""

@@ -93,6 +93,7 @@ def led_through_each_other(body, shares):
         yield goal, normals
 
 
+@pytest.mark.slow
 def test_hands_that_are_led_through_each_other_do_not_get_there():
     """They stop before each other, and follow again on the way back."""
     body = ik.load_robot("g1+dex3")
@@ -111,6 +112,7 @@ def test_hands_that_are_led_through_each_other_do_not_get_there():
     assert statuses[-1] is ik.motion.FollowStatus.FOLLOWING
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("period", [0.001, 0.01])
 def test_motors_come_to_rest_where_pairs_lack_clearance(period):
     """Nearly all pairs of links within a hand are nearer than the clearance that is kept."""
@@ -138,6 +140,7 @@ def test_an_arm_in_the_way_holds_back_its_own_side():
     assert follower.state.status is ik.motion.FollowStatus.FOLLOWING
 
 
+@pytest.mark.slow
 def test_thumbs_that_pass_each_other_on_the_way_to_rest_are_apart_in_every_cycle():
     """They are at the ends of that way, and at places on it, 25 cycles from one to the next."""
     body = ik.load_robot("g1+inspire")
