@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -104,34 +105,29 @@ def test_help_loads_neither_casadi_nor_rich() -> None:
     assert not {"casadi", "numpy", "rich"}.intersection(done.stdout.split())
 
 
-BASH = """
-source <("{python}" -m casadi_ik completion bash)
-COMP_WORDS=(casadi-ik {words}) COMP_CWORD={place}
-_casadi_ik
-echo "${{COMPREPLY[@]}}"
-"""
+COMPLETIONS = {
+    "sol": {"solve"},
+    "log ev": {"events"},
+    "solve cu": {"cup"},
+    "solve cup --tol": {"--tolerance-position", "--tolerance-angle"},
+    "solve cup --scene ta": {"table"},
+    "batch x --limits en": {"enforce"},
+    "log plot a.mcap --r": {"--range"},
+    "export ku": {"kuka_lwr_barrett", "kuka_lwr_barrett_coupled"},
+}
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")
-@pytest.mark.parametrize(
-    ("words", "found"),
-    [
-        ("sol", {"solve"}),
-        ("log ev", {"events"}),
-        ("solve cu", {"cup"}),
-        ("solve cup --tol", {"--tolerance-position", "--tolerance-angle"}),
-        ("solve cup --scene ta", {"table"}),
-        ("batch x --limits en", {"enforce"}),
-        ("log plot a.mcap --r", {"--range"}),
-        ("export ku", {"kuka_lwr_barrett", "kuka_lwr_barrett_coupled"}),
-    ],
-)
-def test_words_are_completed(words: str, found: set[str], tmp_path: Path) -> None:
-    script = BASH.format(python=sys.executable, words=words, place=len(words.split()))
+def test_words_are_completed(tmp_path: Path) -> None:
+    script = [f'source <("{sys.executable}" -m casadi_ik completion bash)']
+    for words in COMPLETIONS:
+        script.append(f"COMP_WORDS=(casadi-ik {words}) COMP_CWORD={len(words.split())}")
+        script.append('_casadi_ik; echo "${COMPREPLY[@]}"')
     done = subprocess.run(
-        ["bash", "-c", script], capture_output=True, text=True, check=True, cwd=tmp_path
+        ["bash", "-c", "\n".join(script)], capture_output=True, text=True, check=True, cwd=tmp_path
     )
-    assert (set(done.stdout.split()), done.stderr) == (found, "")
+    assert [set(line.split()) for line in done.stdout.splitlines()] == list(COMPLETIONS.values())
+    assert done.stderr == ""
 
 
 def test_completion_of_every_command(run: Command) -> None:
@@ -201,6 +197,7 @@ def test_ctrl_c_while_modules_are_imported() -> None:
     assert done.stderr == "casadi-ik: error: interrupted\n"
 
 
+@pytest.mark.slow
 @POSIX
 @pytest.mark.parametrize(
     ("jobs", "finished", "signals"),
@@ -276,6 +273,7 @@ def wait_for(folder: Path, finished: bool) -> bool:
     return False
 
 
+@pytest.mark.slow
 @POSIX
 def test_a_killed_batch(run: Command, tmp_path: Path) -> None:
     """It leaves no result; what it leaves is removed by a later one that finds it old."""
@@ -303,19 +301,21 @@ def test_a_killed_batch(run: Command, tmp_path: Path) -> None:
 
 
 def test_bugs_are_not_hidden(run: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("casadi_ik.app.cli.lists.method_summary", lambda _: 1 / 0)
+    monkeypatch.setattr(ik.Solver, "solve", lambda *_, **__: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        run("methods")
+        run("solve", "cup")
 
 
 def test_warnings_are_one_line(run: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    def warn(name: str) -> str:
+    solve = ik.Solver.solve
+
+    def warn(*arguments: Any, **options: Any) -> ik.Solution:
         with warnings.catch_warnings():
             warnings.simplefilter("once")
             warnings.warn("no C compiler:\n slower", UserWarning, stacklevel=1)
-        return name
+        return solve(*arguments, **options)
 
-    monkeypatch.setattr("casadi_ik.app.cli.lists.method_summary", warn)
-    done = run("methods")
+    monkeypatch.setattr(ik.Solver, "solve", warn)
+    done = run("solve", "cup")
     assert done.exit == 0
     assert set(done.err.splitlines()) == {"casadi-ik: warning: no C compiler: slower"}

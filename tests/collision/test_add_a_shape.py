@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 from capsule_arm import write_robot
 from package_copy import blocks, package_copy, run_with
 from toy_robots import replace
@@ -34,6 +35,7 @@ except ik.errors.DescriptionError as error:
 """
 
 
+@pytest.mark.slow
 def test_a_kind_is_added_in_three_files(tmp_path: Path) -> None:
     package = package_copy(tmp_path)
     name, row, make, entry = blocks("add_a_shape.md")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from toy_robots import grasp_of, moved
 
 import casadi_ik as ik
@@ -23,6 +24,7 @@ def posts() -> ik.Scene:
     return ik.Scene(solids)
 
 
+@pytest.mark.slow
 def test_calls_find_the_same_free_answers_at_the_edge_of_the_tolerance(robot):
     """Where the contacts cannot be met exactly, or not without a collision, 2 % were missed."""
     tolerance, rng = ik.Tolerance(5e-3, np.deg2rad(3)), np.random.default_rng(5)

@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from compilation import forget
 
 from casadi_ik.compile import compiler
 
@@ -21,7 +22,7 @@ def test_a_path_with_a_blank_has_to_be_quoted(
     program = tmp_path / "my tools" / "cc"
     program.parent.mkdir()
     program.symlink_to(found)
-    monkeypatch.setattr(compiler, "_warned", False)
+    forget(monkeypatch)
     monkeypatch.setenv("CC", f"{program}{options}")
     assert compiler.find_compiler() is None
     with pytest.warns(compiler.NoCompilerWarning) as caught:

@@ -99,12 +99,18 @@ def test_unaligned_numbers(compiled):
 
 
 @needs_compiler
-def test_pauses_change_nothing(monkeypatch):
+def test_pauses_for_signals_change_nothing():
+    """A call of more than half a second, which returns to Python every 0.2 s."""
     x = ca.SX.sym("x")
-    kernel = FunctionKernel(ca.Function("twice", [x], [2 * x]))
-    points = np.arange(1000.0)
-    monkeypatch.setattr("casadi_ik.compile.function_kernel.SLICE", 0.0)
-    np.testing.assert_array_equal(kernel(points)[0], 2 * points)
+    y, points = x, np.linspace(0, 3, 300_000)
+    for _ in range(100):
+        y = ca.sqrt(x + y)
+    expected = points
+    for _ in range(100):
+        expected = np.sqrt(points + expected)
+    np.testing.assert_array_equal(
+        FunctionKernel(ca.Function("roots", [x], [y]))(points)[0], expected
+    )
 
 
 @BOTH

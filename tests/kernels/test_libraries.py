@@ -26,6 +26,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from build_kernels import wheel
+from compilation import forbid_builds, forget
 
 import casadi_ik as ik
 from casadi_ik.compile import (
@@ -52,14 +53,8 @@ def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty cache, of a process that has loaded and said nothing yet."""
     place = tmp_path / "cache"
     monkeypatch.setenv("CASADI_IK_CACHE", str(place))
-    monkeypatch.setattr(compiler, "_warned", False)
     forget(monkeypatch)
     return place
-
-
-def forget(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(libraries, "_loaded", {})
-    monkeypatch.setattr(cache, "_warned", set())
 
 
 def scaled(factor: float = 2.0, name: str = "scaled") -> ca.Function:
@@ -79,10 +74,6 @@ def works() -> bool:
 
 def never() -> ca.Function:
     raise AssertionError("the graph was built")
-
-
-def refuse_to_build(*_: object) -> None:
-    raise AssertionError("built again")
 
 
 def kept(directory: Path, suffix: str) -> list[Path]:
@@ -115,7 +106,7 @@ def script(text: str, **changed: str) -> Iterator[subprocess.Popen[str]]:
 def test_second_use_builds_nothing(directory, monkeypatch):
     assert works()
     assert len(kept(directory, ".so")) == len(kept(directory, ".key")) == 1
-    monkeypatch.setattr(compiler.Compiler, "build", refuse_to_build)
+    forbid_builds(monkeypatch)
     assert kernel(never)(3)[0] == 6
     forget(monkeypatch)
     assert kernel(never)(3)[0] == 6
@@ -155,7 +146,7 @@ def test_broken_library_is_rebuilt(directory, monkeypatch, damage):
     forget(monkeypatch)
     assert works()
     forget(monkeypatch)
-    monkeypatch.setattr(compiler.Compiler, "build", refuse_to_build)
+    forbid_builds(monkeypatch)
     assert works()
 
 
@@ -259,7 +250,7 @@ def test_without_compiler_one_warning(directory, monkeypatch, tmp_path, cc):
     monkeypatch.setenv("CC", cc)
     if not cc:
         monkeypatch.setenv("PATH", str(tmp_path))
-        monkeypatch.setattr(compiler, "_zig", list)
+        monkeypatch.setitem(sys.modules, "ziglang", None)
     with pytest.warns(NoCompilerWarning, match="no C compiler") as caught:
         made = kernel()
     assert len(caught) == 1
@@ -518,13 +509,12 @@ def test_places_that_are_no_use(tmp_path, directory, monkeypatch, place):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         assert works()
-        monkeypatch.setattr(compiler.Compiler, "build", refuse_to_build)
-        monkeypatch.setattr(libraries, "_loaded", {})
+        forbid_builds(monkeypatch)
+        forget(monkeypatch)
         assert works()
-    (warning,) = caught
-    assert warning.category is CacheWarning
-    assert "cannot be used: " in str(warning.message)
-    assert len(str(warning.message)) < 500
+    assert {warning.category for warning in caught} == {CacheWarning}
+    (text,) = {str(warning.message) for warning in caught}
+    assert len(text) < 500
     assert (tmp_path / f"casadi_ik-{os.getuid()}").stat().st_mode & 0o777 == 0o700
 
 
@@ -601,9 +591,7 @@ def test_ctrl_c_leaves_nothing(directory, monkeypatch, when):
         return scaled()
 
     if when == "compiler":
-        monkeypatch.setattr(
-            compiler.Compiler, "build", lambda *_: signal.raise_signal(signal.SIGINT)
-        )
+        lie(directory, monkeypatch, "kill -INT $PPID; sleep 2")
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's "&" ignores it
     try:
         with pytest.raises(KeyboardInterrupt):

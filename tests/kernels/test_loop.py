@@ -278,12 +278,10 @@ def test_threads_share_a_kernel(compiled):
 
 
 @needs_compiler
-def test_pauses_change_nothing(monkeypatch):
-    kernel = LoopKernel(random_step())
-    states, parameters = starts(5)
-    whole = kernel.run(states, parameters, 300, trace=True)
-    monkeypatch.setattr("casadi_ik.compile.loop.SLICE", 0.0)
-    assert_same(kernel.run(states, parameters, 300, trace=True), whole)
+def test_pauses_for_signals_change_nothing():
+    """Runs of more than half a second, which return to Python every 0.2 s."""
+    kernel, count = LoopKernel(counting_step()), 50_000_000
+    assert kernel.run(np.zeros((1, 1)), [float(count)], 10**9).iterations.tolist() == [count]
 
 
 @POSIX
@@ -320,7 +318,7 @@ def lanes(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> in
     """Both widths, where the machine has them."""
     if machine_lanes() < request.param:
         pytest.skip(f"this machine has {machine_lanes()} lanes")
-    monkeypatch.setattr("casadi_ik.compile.loop.machine_lanes", lambda: request.param)
+    monkeypatch.setenv("CASADI_IK_LANES", str(request.param))
     return request.param
 
 
@@ -419,12 +417,14 @@ def test_every_end_beside_every_other(count):
 
 
 @LANES
-def test_lanes_pauses_change_nothing(monkeypatch):
-    monkeypatch.setattr("casadi_ik.compile.loop.SLICE", 0.0)
-    rng = np.random.default_rng(3)
-    count = COUNTS[-1]
-    states = np.column_stack([rng.normal(size=count), np.zeros(count)])
-    assert_as_alone(staged_step(4), states, rng.normal(size=(count, 1)), 400)
+def test_lanes_pause_for_signals():
+    kernel, ends = LoopKernel(counting_step("pausing")), 1e7 * np.arange(1.0, 10.0)[:, None]
+    assert kernel.lanes > 1
+    assert kernel.run(np.zeros((9, 1)), ends, 10**9).iterations.tolist() == ends[:, 0].tolist()
+
+
+@LANES
+def test_lanes_end_where_a_state_comes_back():
     assert_as_alone(circling_step("circling_lanes"), np.zeros((9, 1)), np.arange(9.0)[:, None], 500)
 
 

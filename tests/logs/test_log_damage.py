@@ -51,9 +51,9 @@ with logs.McapRecorder(sys.argv[1], robot_name="made_up") as recorder:
 
 
 @pytest.fixture
-def whole(write: Write, monkeypatch: pytest.MonkeyPatch) -> Path:
+def whole(write: Write, set_chunk_size: Callable[[int], None]) -> Path:
     """A log of several chunks and two methods."""
-    monkeypatch.setattr("casadi_ik.logs.writer.CHUNK_SIZE", 2**15)
+    set_chunk_size(2**15)
     blocks = [make_block(*[60] * 3, first=3 * i) for i in range(3)]
     return write(*blocks, make_block(20, 30, method="hand-first"), urdf="<robot/>" * 100)
 

@@ -375,11 +375,12 @@ def margins(robot, q):
     return np.min(list(robot.toggle_margins(q).values()), axis=0)
 
 
-def logged(robot, path, q):
+def logged(robot, path, q, rules=None):
     """A log of a solve that ends at q, and its rows and events."""
     points, normals = robot.contacts(q)
     solver = ik.Solver(robot)
-    batch = solver.solve_batch(points[None], normals[None], log=path)
+    with logs.McapRecorder(path, robot_name=robot.name, rules=rules) as recorder:
+        batch = solver.solve_batch(points[None], normals[None], log=recorder)
     assert batch.success.all()
     log = logs.open(path)
     return log.iterations().rows, list(log.events(event="NEAR_SINGULAR").records())
@@ -392,13 +393,13 @@ def test_the_least_margin_is_recorded(ar10, tmp_path):
     np.testing.assert_allclose(rows["sigma_coupling"], expected, rtol=1e-5)
 
 
-def test_near_a_toggle_is_an_event_that_names_the_motors(ar10, tmp_path, monkeypatch):
+def test_near_a_toggle_is_an_event_that_names_the_motors(ar10, tmp_path):
     """The shipped strokes keep clear of it, so the threshold is raised to where they go."""
     q = ar10.random(np.random.default_rng(1), 1)[0]
     _, events = logged(ar10, tmp_path / "clear.mcap", q)
     assert events == []
-    monkeypatch.setattr("casadi_ik.solve.limits.TOGGLE_THRESHOLD", 1.0)
-    rows, events = logged(ar10, tmp_path / "near.mcap", q)
+    rules = logs.EventRules(singular={"coupling": 1.0})
+    rows, events = logged(ar10, tmp_path / "near.mcap", q, rules)
     assert (rows["sigma_coupling"] < 1.0).all()
     assert events
     assert {event["jacobian"] for event in events} == {"coupling"}

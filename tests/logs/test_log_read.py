@@ -35,12 +35,6 @@ from casadi_ik import errors, logs
 Write = Callable[..., Path]
 
 
-@pytest.fixture
-def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every solve ends a chunk."""
-    monkeypatch.setattr("casadi_ik.logs.writer.CHUNK_SIZE", 1)
-
-
 def ids(log: logs.Log, **filters: object) -> list[int]:
     return log.solves(**filters).solve_id.tolist()  # type: ignore[arg-type]
 
@@ -79,9 +73,11 @@ def test_filters_of_iterations_and_events(write: Write) -> None:
     assert set(log.events(phase="hand alignment").rows["phase"]) == {1}
 
 
-@pytest.mark.usefixtures("small_chunks")
-def test_only_the_chunks_asked_for_are_read(write: Write) -> None:
+def test_only_the_chunks_asked_for_are_read(
+    write: Write, set_chunk_size: Callable[[int], None]
+) -> None:
     """Whatever is wrong with the others goes unnoticed."""
+    set_chunk_size(1)
     path = write(make_block(*[10] * 20))
     log, data = logs.open(path), bytearray(path.read_bytes())
     chunks = chunks_of(path)

@@ -60,7 +60,20 @@ class Case:
         return grasp_of(self.robot, self.points[row], self.normals[row])
 
 
-@pytest.fixture(scope="module", params=CASES, ids="-".join)
+SLOW_CASES = {("hand-first", "two_pandas+allegro"), ("hand-first", "two_ur10e+leap")}
+SLOW_CASES |= {(f"{kind}-sdls", "kuka_lwr_barrett") for kind in ("enhanced", "original")}
+SLOW_CASES |= {("original-sdls", "kuka_lwr_barrett_coupled")}
+SLOW_CASES |= {("ipopt", "baxter_ar10")}
+"""Cases that `make test` leaves to another method on the robot, or another robot of the method."""
+
+
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param(case, id="-".join(case), marks=pytest.mark.slow if case in SLOW_CASES else ())
+        for case in CASES
+    ],
+)
 def case(request) -> Case:
     method, name = request.param
     robot = ik.load_robot(name)

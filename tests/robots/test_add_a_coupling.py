@@ -65,6 +65,7 @@ assert missed.diagnosis.proof.check(robot)
 """
 
 
+@pytest.mark.slow
 def test_a_kind_is_added_in_two_files(tmp_path):
     (tmp_path / "robot").mkdir()
     path = write_coupled_robot(tmp_path / "robot")

@@ -152,6 +152,7 @@ def test_home_that_is_not_given_is_within(tmp_path):
     assert robot.beyond_limits(robot.home) <= 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance", [ik.Tolerance(), ik.Tolerance(1e-6, 1e-6)])
 @pytest.mark.parametrize("method", ["hand-first", "thumb-first"])
 def test_no_solve_ends_at_a_follower_beyond_its_limit(tmp_path, rng, method, tolerance):

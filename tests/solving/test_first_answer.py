@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from compilation import forbid_builds, forget
 from processes import python
 from toy_robots import grasp_of
 
 import casadi_ik as ik
-from casadi_ik.compile import libraries
-from casadi_ik.compile.compiler import Compiler, find_compiler
+from casadi_ik.compile.compiler import find_compiler
 from casadi_ik.export.project import uses
 
 pytestmark = pytest.mark.skipif(
@@ -107,7 +107,7 @@ def test_nothing_is_compiled_later(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setenv("CASADI_IK_CACHE", str(tmp_path))
 
     def through_all_uses() -> list[str]:
-        monkeypatch.setattr(libraries, "_loaded", {})
+        forget(monkeypatch)
         done = []
         for what, use in uses(ik.load_robot("ar10"), everything=True):
             use()
@@ -117,9 +117,6 @@ def test_nothing_is_compiled_later(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     done = through_all_uses()
     assert {"one target", "batches", "scenes", "choices", "ways to a grasp", "followers"} <= {*done}
 
-    def refuse(*_: object) -> None:
-        raise AssertionError("compiled again")
-
-    monkeypatch.setattr(Compiler, "build", refuse)
-    monkeypatch.setattr(subprocess, "Popen", refuse)
+    forbid_builds(monkeypatch)
+    monkeypatch.setattr(subprocess, "Popen", None)
     assert through_all_uses() == done

@@ -56,7 +56,7 @@ def test_threads_stop(method: str, count: int, diagnose: bool, compiled: bool) -
     assert done.stdout, f"ended before it was interrupted: {done.stderr}"
     word, seconds, threads = done.stdout.split()
     assert word == "interrupted", done.stderr
-    assert float(seconds) < 10
+    assert float(seconds) < 60
     assert threads == "1"
 
 

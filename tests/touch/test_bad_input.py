@@ -21,8 +21,8 @@ def solver():
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch):
-    """Keep meshes in a folder of the test, but kernels where they are."""
-    monkeypatch.setattr("casadi_ik.planning.touch.surface.trusted_cache", lambda: tmp_path)
+    """Keep meshes in a folder of the test."""
+    monkeypatch.setenv("CASADI_IK_CACHE", str(tmp_path))
 
 
 @pytest.mark.parametrize(

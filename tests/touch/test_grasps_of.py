@@ -118,6 +118,7 @@ def test_fingertips_touch_the_mesh(found):
                 np.testing.assert_array_equal(contact.point, tip[:3, 3])
 
 
+@pytest.mark.slow
 def test_no_pad_hovers_beyond_an_edge():
     """By distances of balls to an exact box, lying so that its long edges are at hand."""
     solver, pose = solver_of("panda+leap"), np.eye(4)
@@ -239,6 +240,7 @@ def test_grasps_differ_and_are_ranked(found):
             assert turned > 0.25 or max(apart) > 0.005
 
 
+@pytest.mark.slow
 def test_a_gripper_comes_from_any_side_about_the_line_between_its_pads(surface):
     solver = solver_of("panda+panda_hand")
     sectors = set()
@@ -383,6 +385,7 @@ def test_without_a_compiler_it_is_refused(found, surface, monkeypatch):
         found[0].grasps_of(surface, PLACE, limit=12, among=12)
 
 
+@pytest.mark.slow
 def test_what_has_to_be_held_is_held(surface):
     found = solver_of("panda+panda_hand").grasps_of(
         surface, PLACE, limit=5, among=5, hold=(0.1, 18.0)
@@ -391,6 +394,7 @@ def test_what_has_to_be_held_is_held(surface):
     assert all(one.load * 18.0 >= 0.1 * 9.8 for one in found)
 
 
+@pytest.mark.slow
 def test_torques_of_motors_limit_the_squeeze(surface):
     """The one that is used most has all that it can, by differences of its fingertips' places."""
     solver = solver_of("panda+leap")
@@ -433,6 +437,7 @@ def test_what_is_too_large_says_so(tmp_path):
     assert "no two patches" in found.reason
 
 
+@pytest.mark.slow
 def test_the_search_ends_when_nothing_new_is_found(tmp_path):
     cube = surface_of(tmp_path, trimesh.creation.box((0.012, 0.012, 0.012)))
     found = ik.Solver(ik.load_robot("panda+panda_hand")).grasps_of(cube, PLACE)
@@ -508,6 +513,7 @@ def test_what_is_no_mesh_is_refused(tmp_path, text, expected):
         ik.load_surface(tmp_path / "mesh.obj")
 
 
+@pytest.mark.slow
 def test_many_triangles_are_sampled(tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=7, radius=0.035)
     assert len(ball.faces) > 300_000
@@ -549,6 +555,7 @@ def test_what_is_out_of_reach_is_given_up(surface):
     assert found.counts["attempts"] < 100_000
 
 
+@pytest.mark.slow
 def test_fingers_lean_on_what_they_envelop(surface, tmp_path):
     """Their links alone, and no deeper than the scene says; plain scenes refuse these hands."""
     robot, deep = ik.load_robot("panda+leap"), 0.006

@@ -59,6 +59,7 @@ def test_bodies_that_touch_are_not_double_sided(tmp_path):
     assert not surface.notes
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="memory is limited by RLIMIT_AS")
 def test_fine_meshes_need_little_memory(tmp_path, solver):
     import resource
@@ -75,6 +76,7 @@ def test_fine_meshes_need_little_memory(tmp_path, solver):
     assert grown < 1.5e6  # 25 GB with a plane for each face of the hull
 
 
+@pytest.mark.slow
 def test_hulls_of_fine_meshes_enclose_them(tmp_path):
     fine = trimesh.creation.icosphere(5, 0.034)
     (item,) = ik.Scene().holding(str(saved(tmp_path, fine)), np.eye(4)).items.values()
@@ -85,6 +87,7 @@ def test_hulls_of_fine_meshes_enclose_them(tmp_path):
     assert distance.min() > -0.004 * 0.034
 
 
+@pytest.mark.slow
 def test_many_pieces_are_answered(tmp_path, solver):
     body, rng = [cylinder()], np.random.default_rng(0)
     for angle in rng.uniform(0, 2 * np.pi, 199):
@@ -95,6 +98,7 @@ def test_many_pieces_are_answered(tmp_path, solver):
     assert len(solver.grasps_of(surface, PLACE, limit=3, among=3)) == 3
 
 
+@pytest.mark.slow
 def test_the_hint_for_too_many_pieces_suffices(tmp_path, monkeypatch):
     pieces = []
     for place in np.ndindex(12, 12, 8):
