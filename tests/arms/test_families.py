@@ -238,6 +238,7 @@ def test_what_is_nearly_of_a_family_is_solved_as_that_and_what_is_not_is_not():
     assert family_of(replace(screws, points=points)) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["panda", "puma560", "irb140", "ur5e", "xarm6"])
 def test_a_search_from_many_starts_finds_no_other_arm(name):
     """Least squares of SciPy on the product of exponentials, a swept joint held."""
@@ -348,6 +349,7 @@ def at_swivels(robot: ik.ArmHand, palm: Array, swivels: Array) -> Array:
     return np.concatenate([np.array(each) for each in rows])
 
 
+@pytest.mark.slow
 def test_an_srs_arm_is_found_again_at_the_swivel_where_a_joint_has_its_value(robot, rng):
     """And where a bound is met at all, a joint stands at it at a breakpoint."""
     asked, tested = srs_numbers(robot), 0

@@ -53,6 +53,7 @@ def compiled(project: Path, *flags: str) -> None:
     said("gcc", *STRICT, *flags, "-Iinclude", "-Isrc", "-Itest", cwd=project)
 
 
+@pytest.mark.slow
 @needs_gcc
 def test_stored_targets_bit_for_bit_under_sanitizers(project):
     sources = [str(path.relative_to(project)) for path in sorted(project.glob("src/*.c"))]
@@ -73,10 +74,11 @@ def test_stored_targets_bit_for_bit_under_sanitizers(project):
     assert foreign <= LIBM | COMPILERS
 
 
+@pytest.mark.slow
 def test_collisions_of_a_body_are_looked_at_in_double_precision(tmp_path, capsys):
     words = ["export", "g1+dex3", "--scene", "8", "--single", "--out", str(tmp_path / "g1")]
     assert main(words) == 2
-    assert "--single: g1+dex3 has several arms; expected no --scene" in capsys.readouterr().err
+    assert re.search(r"--single: g1\+dex3 .*--scene", capsys.readouterr().err)
     assert not any(tmp_path.iterdir())
 
 
@@ -103,6 +105,7 @@ int main(void) { /* pose of a box; rows of numbers: whether there is a q0, point
 """
 
 
+@pytest.mark.slow
 @needs_gcc
 @pytest.mark.parametrize("name", ["two_ur10e+barrett_bh8_280", "mobile_kuka_lwr_barrett"])
 def test_a_body_keeps_clear_of_a_scene_and_of_itself(tmp_path, name):
@@ -147,6 +150,7 @@ def test_a_body_keeps_clear_of_a_scene_and_of_itself(tmp_path, name):
     assert (~clear(first).free).sum() > 10
 
 
+@pytest.mark.slow
 @needs_gcc
 def test_a_body_s_sides_and_trunk_go_with_it(tmp_path):
     """A G1's answers, without a warning; the hands of each side are found in a file of its own."""
@@ -161,6 +165,7 @@ def test_a_body_s_sides_and_trunk_go_with_it(tmp_path):
 WINE = shutil.which("wine64") or shutil.which("wine64", path="/usr/lib/wine")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("ziglang") is None, reason="needs ziglang")
 @pytest.mark.parametrize(
     ("target", "program", "runner"),
@@ -187,6 +192,7 @@ def test_stored_targets_bit_for_bit_on_other_machines(
     assert "wrong: 0" in found
 
 
+@pytest.mark.slow
 def test_in_a_scene_arms_swing_out_of_the_way(robot):
     """Or the comparison of stored answers would say nothing of the choice among arms."""
     solver = ik.Solver(robot)
@@ -288,6 +294,7 @@ int main(void) { /* how many solids, each: kind, size, pose; points, normals */
 """
 
 
+@pytest.mark.slow
 @needs_gcc
 def test_other_hands_are_looked_at_as_in_python(tmp_path):
     """Grasps of the page, the object in the hand: C and Python look alike for what is free."""
@@ -344,24 +351,24 @@ def test_wrapper_in_cpp(project, tmp_path):
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        (["--method", "ipopt"], "'ipopt' cannot be exported, expected one of hand-first"),
-        (["--prefix", "2nd arm"], "--prefix: found '2nd arm', expected"),
-        (["--scene", "0"], "--scene: found '0'"),
-        (["--scene", "2000"], "--scene: found 2000, expected at most 1000 solids"),
-        (["--target", "fpga"], "--target: found 'fpga', expected one of c, wasm"),
+        (["--method", "ipopt"], "'ipopt'.*hand-first"),
+        (["--prefix", "2nd arm"], "--prefix: .*'2nd arm'"),
+        (["--scene", "0"], "--scene: .*'0'"),
+        (["--scene", "2000"], "--scene: .*2000.*1000"),
+        (["--target", "fpga"], "--target: .*'fpga'.*c, wasm"),
     ],
 )
 def test_bad_words_are_refused(tmp_path, capsys, words, complaint):
     out = tmp_path / "solver"
     assert main(["export", "kuka_lwr_barrett", "--out", str(out), *words]) == 2
-    assert complaint in capsys.readouterr().err
+    assert re.search(complaint, capsys.readouterr().err)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_what_is_no_export_is_left_alone(tmp_path, capsys):
     (tmp_path / "thesis.tex").write_text("years of work")
     assert main(["export", "kuka_lwr_barrett", "--out", str(tmp_path)]) == 2
-    assert "is not empty and not an earlier export" in capsys.readouterr().err
+    assert str(tmp_path) in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
@@ -396,17 +403,17 @@ def test_names_from_files_end_no_comment():
 def test_kernels_compiled_ahead_with_progress(capsys):
     assert main(["compile", "kuka_lwr_barrett"]) == 0
     told = capsys.readouterr()
-    assert "COMPILED  1 robot in" in told.out
+    assert told.out.startswith("COMPILED")
     lines = [line for line in told.err.splitlines() if "kuka_lwr_barrett" in line]
-    numbers = [line.split()[3] for line in lines]
+    numbers = [re.findall(r"\b(\d+)/(\d+)\b", line)[-1] for line in lines]
     assert len(numbers) > 1
-    assert numbers == [f"{i}/{len(numbers)}:" for i in range(1, len(numbers) + 1)]
+    assert numbers == [(str(i), str(len(numbers))) for i in range(1, len(numbers) + 1)]
 
 
 def test_without_a_compiler_nothing_is_compiled_ahead(monkeypatch, capsys):
     monkeypatch.setenv("CC", "none")
     assert main(["compile", "kuka_lwr_barrett"]) == 2
-    assert "no C compiler is installed" in capsys.readouterr().err
+    assert "compiler" in capsys.readouterr().err
 
 
 WARNED = ("-std=c11", "-Wall", "-Wextra", "-Wpedantic", "-Wdouble-promotion", "-Werror")
@@ -485,6 +492,7 @@ def single_project(robot: ik.ArmHand, tmp_path_factory: pytest.TempPathFactory) 
     return out
 
 
+@pytest.mark.slow
 def test_nothing_is_double(single_project):
     for path in (*single_project.glob("src/*"), *single_project.glob("include/*")):
         text = path.read_text()
@@ -492,6 +500,7 @@ def test_nothing_is_double(single_project):
         assert in_single_precision(text) == text
 
 
+@pytest.mark.slow
 @needs_gcc
 def test_what_it_solves_is_solved_in_double_precision(single_project):
     """By its own test, under sanitizers; the long generated file without, which takes as long."""

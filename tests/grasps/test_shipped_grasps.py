@@ -167,6 +167,7 @@ def run(script: str, *words: str | Path) -> subprocess.CompletedProcess[str]:
     return python(TOOLS / script, *words)
 
 
+@pytest.mark.slow
 def test_the_script_agrees_and_refuses_a_broken_file(tmp_path: Path) -> None:
     words = "make_grasps.py", "--check", "--only", "cup"
     done = run(*words)
@@ -180,6 +181,7 @@ def test_the_script_agrees_and_refuses_a_broken_file(tmp_path: Path) -> None:
     assert "the posture does not give the points" in done.stdout
 
 
+@pytest.mark.slow
 def test_the_script_of_the_papers_slider_hand_makes_a_shipped_file(tmp_path: Path) -> None:
     """To six digits: the optimiser may differ in the last ones from machine to machine."""
     done = run("make_ar10_grasps.py", "--out", tmp_path, "--only", "golf_ball")
@@ -194,6 +196,7 @@ def test_the_script_of_the_papers_slider_hand_makes_a_shipped_file(tmp_path: Pat
     np.testing.assert_allclose(normals @ normals.T, shipped_normals @ shipped_normals.T, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_script_of_catalogue_hands_makes_a_grasp_that_is_exact(tmp_path: Path) -> None:
     done = run("make_hand_grasps.py", "--out", tmp_path, "--only", "robotiq_2f85_tennis_ball")
     assert done.returncode == 0, done.stderr

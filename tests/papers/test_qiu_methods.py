@@ -257,6 +257,7 @@ def test_most_pinches_are_solved(robot):
     assert 40 < batch.iterations[batch.success].mean() < 300
 
 
+@pytest.mark.slow
 def test_choices_that_matter_and_that_do_not(robot):
     """One change each, with its effect."""
     points, normals = pinch_targets(robot, 4)

@@ -76,6 +76,7 @@ def test_the_virtual_machine_answers_until_there_is_compiled_code(
     np.testing.assert_allclose(late, early, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="how processes are found")
 def test_a_compilation_in_the_background_may_be_killed(tmp_path: Path) -> None:
     early, _ = run(tmp_path, "background")
@@ -87,6 +88,7 @@ def test_a_compilation_in_the_background_may_be_killed(tmp_path: Path) -> None:
     assert loops(tmp_path)
 
 
+@pytest.mark.slow
 def test_what_the_first_round_does_not_solve_waits(
     robot: ik.ArmHand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -102,6 +104,7 @@ def test_what_the_first_round_does_not_solve_waits(
         os.killpg(number, signal.SIGKILL)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_compiler() is None, reason="needs a C compiler")
 def test_nothing_is_compiled_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CASADI_IK_CACHE", str(tmp_path))

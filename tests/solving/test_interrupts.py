@@ -40,11 +40,11 @@ SCRIPT = """
 @pytest.mark.parametrize(
     ("method", "count", "diagnose", "compiled"),
     [
-        ("ipopt", 600, False, True),
         ("hand-first", 1_000_000, False, True),
-        ("hand-first", 60_000, True, True),
-        ("hand-first", 200_000, False, False),
-        ("original-dls", 40_000, False, True),
+        pytest.param("ipopt", 600, False, True, marks=pytest.mark.slow),
+        pytest.param("hand-first", 60_000, True, True, marks=pytest.mark.slow),
+        pytest.param("hand-first", 200_000, False, False, marks=pytest.mark.slow),
+        pytest.param("original-dls", 40_000, False, True, marks=pytest.mark.slow),
     ],
 )
 def test_threads_stop(method: str, count: int, diagnose: bool, compiled: bool) -> None:
