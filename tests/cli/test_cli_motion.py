@@ -117,6 +117,7 @@ def test_image_landmarks_are_one_line(run: Command, tmp_path: Path) -> None:
     assert sorted(tmp_path.iterdir()) == [frames]
 
 
+@pytest.mark.slow
 def test_the_motion_is_written(run: Command, tmp_path: Path) -> None:
     robot, out = ik.load_robot("kuka_lwr_barrett"), tmp_path / "way.mcap"
     gif = tmp_path / "way.gif"

@@ -47,9 +47,9 @@ def cup_viewer(robot: ik.ArmHand) -> Iterator[viewing.Viewer]:
 def cup(cup_viewer: viewing.Viewer) -> Iterator[viewing.Viewer]:
     """The same, as it was at the beginning."""
     cup_viewer.page.reset()
-    assert cup_viewer.page.work.settle()
+    assert cup_viewer.page.work.settle(300)
     yield cup_viewer
-    cup_viewer.page.work.settle()
+    cup_viewer.page.work.settle(300)
 
 
 @pytest.fixture

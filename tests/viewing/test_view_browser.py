@@ -17,7 +17,10 @@ import casadi_ik as ik
 from casadi_ik.app import viewer as viewing
 from casadi_ik.app.viewer.viser_scene import pose_of
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium (Debian: apt chromium)")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium (Debian: apt chromium)"),
+]
 
 WINDOW = (700, 420)
 
@@ -124,18 +127,18 @@ def test_object_and_contact_are_dragged_by_mouse_and_reached(
     before = shown.request.grasp.contacts["thumb"].point
     drag_along(page, client, shown, "object", 0.02)
     page.wait("document.querySelector('.ik-status') !== null")
-    assert shown.work.settle()
+    assert shown.work.settle(300)
     gone = shown.request.object_pose[:3, 3] - place
     assert 0.004 < np.linalg.norm(gone) < 0.06
     assert np.allclose(shown.request.grasp.contacts["thumb"].point - before, gone, atol=1e-9)
     assert shown.result.success
     shown.select("thumb")
-    assert shown.work.settle()
+    assert shown.work.settle(300)
     time.sleep(0.5)
     before = shown.request.grasp.contacts["thumb"].point
     drag_along(page, client, shown, "thumb", 0.012)
     page.wait("document.querySelector('.ik-status') !== null")
-    assert shown.work.settle()
+    assert shown.work.settle(300)
     wanted = shown.request.grasp.contacts["thumb"].point
     assert 0.002 < np.linalg.norm(wanted - before) < 0.04
     assert shown.result.success
@@ -144,7 +147,7 @@ def test_object_and_contact_are_dragged_by_mouse_and_reached(
     # And far away: why not is on the page.
     drag_along(page, client, shown, "thumb", 0.3)
     page.wait("(document.querySelector('.ik-why')?.innerText ?? '').includes('the contacts')")
-    assert shown.work.settle()
+    assert shown.work.settle(300)
     assert not shown.result.success
     assert said(page, ".ik-status") == shown.result.headline
     assert complaints(page) == []
@@ -152,9 +155,8 @@ def test_object_and_contact_are_dragged_by_mouse_and_reached(
 
 
 def test_two_browsers_see_one_drag_and_save_it(
-    cup: viewing.Viewer, browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    cup: viewing.Viewer, browser: Browser, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("casadi_ik.app.viewer.panel.PICTURE_SIZE", (200, 320))
     other, _ = opened(browser, cup)
     page, _ = opened(browser, cup, painted=True)
     shown = cup.page
@@ -179,65 +181,7 @@ def test_two_browsers_see_one_drag_and_save_it(
     assert np.allclose(saved.contacts["thumb"].point, shown.request.grasp.contacts["thumb"].point)
     assert ik.Solver(ik.load_robot(saved.robot)).solve(saved).success
     image = plt.imread(picture)
-    assert image.shape[:2] == (200, 320)
+    assert image.shape[:2] == (1000, 1600)
     assert len(np.unique(image.reshape(-1, image.shape[2]), axis=0)) > 100
     assert complaints(page) == []
-    page.close()
-
-
-def test_guessed_pads_are_corrected_by_mouse_and_saved(description: Path, browser: Browser) -> None:
-    guessed = ik.load_robot(description)
-    points, normals = guessed.contacts(guessed.home)
-    viewer = viewing.view_pads(description)
-    page, client = opened(browser, viewer)
-    time.sleep(1.0)  # the camera comes to rest
-    shown = viewer.page
-    # One by its arrows, which it has from the beginning, the other's normal by its own arrow.
-    drag_along(page, client, shown, "first", 0.004)
-    pose = shown.request.contacts["second"].control
-    tip = pixel(page, client, pose[:3, 3] + 0.02 * pose[:3, 0])
-    aside = pixel(page, client, pose[:3, 3] + 0.02 * pose[:3, 0] + 0.012 * pose[:3, 2])
-    page.drag((float(tip[0]), float(tip[1])), (float(aside[0]), float(aside[1])), steps=4)
-    page.wait("[...document.querySelectorAll('.ik-pad')].every(p => / mm, /.test(p.innerText))")
-    press(page, "Save to my_hand.yaml")
-    page.wait("(document.querySelector('.ik-said')?.innerText ?? '').startsWith('saved')")
-    after = ik.load_robot(description)
-    moved, faced = after.contacts(after.home)
-    for i, finger in enumerate(after.fingers):
-        control = shown.request.contacts[finger].control
-        assert np.allclose(moved[i], control[:3, 3], atol=1e-6)
-        assert np.allclose(faced[i], control[:3, 0], atol=1e-6)
-    assert 1e-3 < np.linalg.norm(moved[0] - points[0]) < 0.02
-    assert np.allclose(moved[1], points[1], atol=1e-6)
-    assert np.allclose(faced[0], normals[0], atol=1e-6)
-    assert 10.0 < np.rad2deg(np.arccos(faced[1] @ normals[1])) < 60.0
-    assert complaints(page) == []
-    viewer.stop()
-    page.close()
-
-
-def test_two_logs_are_played_by_mouse_in_their_scene(
-    robot: ik.ArmHand, tmp_path: Path, browser: Browser
-) -> None:
-    solves = []
-    for name in ("cup", "mug"):
-        path = tmp_path / f"{name}.mcap"
-        ik.Solver(robot).solve(ik.load_grasp(name), log=path)
-        solves.append((ik.logs.one_solve(ik.logs.open(path)), robot))
-    viewer = viewing.view_log(*solves, scene=ik.load_scene("table"))
-    page, _ = opened(browser, viewer)
-    assert "iteration 1 of" in said(page, ".ik-iteration")
-    press(page, "Play")
-    last = round(viewer.page.end_time)
-    longer = max(viewer.page.playbacks, key=len)
-    page.wait(
-        "[...document.querySelectorAll('.ik-iteration')]"
-        f".some(one => one.innerText.includes('iteration {last} of'))"
-    )
-    page.wait("document.body.innerText.match(/SOLVED/g)?.length >= 2")
-    for track, (drawn, _) in zip(viewer.page.playbacks, viewer.page._views, strict=True):
-        assert np.array_equal(drawn.q, track.q[-1])
-    assert len(longer) == last
-    assert complaints(page) == []
-    viewer.stop()
     page.close()

@@ -21,7 +21,7 @@ def test_dragged_pads_are_saved_and_read_back(pads: viewing.Viewer, description:
     page.drag("first", pose)
     page.drag_normal("second", np.array([0.1, -0.9, 0.3]))
     page.save()
-    assert page.work.settle()
+    assert page.work.settle(300)
     assert page.message == "saved to my_hand.yaml: first, second"
     after = ik.load_robot(description)
     moved, faced = after.contacts(after.home)
@@ -40,7 +40,7 @@ def test_dragged_pads_are_saved_and_read_back(pads: viewing.Viewer, description:
 def test_a_pad_goes_onto_the_skin(pads: viewing.Viewer) -> None:
     page = pads.page
     page.snap_to_surface("first")
-    assert page.work.settle()
+    assert page.work.settle(300)
     assert page.message == ""
     pad = page.pads(page.request)["first"]
     # The box of the last phalanx is 16 mm thick: its side is 8 mm from the middle.
@@ -48,10 +48,10 @@ def test_a_pad_goes_onto_the_skin(pads: viewing.Viewer) -> None:
     assert np.allclose(np.abs(pad.normal), [0, 1, 0], atol=1e-6)
     # Where nothing moves, it is said why.
     page.snap_to_surface("first")
-    assert page.work.settle()
+    assert page.work.settle(300)
     assert page.message.startswith("first: ")
     page.reset()
-    assert page.work.settle()
+    assert page.work.settle(300)
     assert page.changed_fingers == []
 
 

@@ -36,13 +36,16 @@ def test_the_page_begins_solved_and_serves_this_machine_only(cup: viewing.Viewer
         viewing.view_grasp(page.robot, port=port)
 
 
-def test_a_dragged_contact_is_reached(cup: viewing.Viewer) -> None:
+def test_a_dragged_contact_and_normal_are_reached(cup: viewing.Viewer) -> None:
     page, robot = cup.page, cup.page.robot
     before = page.result.q
     page.drag("thumb", shifted(page.request.contacts["thumb"].control, 0.004, 0.008, 0.004))
-    assert page.work.settle()
+    normal = page.request.grasp.contacts["thumb"].normal + np.array([0.0, 0.0, 0.12])
+    page.drag_normal("thumb", normal)
+    assert page.work.settle(300)
     assert page.result.success
-    tip = robot.contacts(page.result.q)[0][robot.fingers.index("thumb")]
+    tip, faced = (values[robot.fingers.index("thumb")] for values in robot.contacts(page.result.q))
+    assert faced @ normal / np.linalg.norm(normal) >= np.cos(np.deg2rad(3.0))
     wanted = page.request.grasp.contacts["thumb"].point
     assert np.linalg.norm(tip - wanted) <= page.request.settings.tolerance.position
     # The nearest answer: no motor goes far for a centimetre.
@@ -53,7 +56,7 @@ def test_links_stand_where_they_hang(cup: viewing.Viewer, rng: np.random.Generat
     """What a browser makes of poses that are sent link on link is the robot's kinematics."""
     page, robot = cup.page, cup.page.robot
     page.drag_motors(robot.random(rng, 1)[0])
-    assert page.work.settle()
+    assert page.work.settle(300)
     drawn = {frame.name: frame for frame in page._drawn._frames}
     poses: dict[str, np.ndarray] = {"/robot": np.eye(4)}
     for name, mesh in drawn.items():
@@ -66,30 +69,19 @@ def test_links_stand_where_they_hang(cup: viewing.Viewer, rng: np.random.Generat
             assert np.abs(place - links[name.rpartition("/")[2]]).max() < 1e-8
 
 
-def test_a_dragged_normal_is_faced(cup: viewing.Viewer) -> None:
-    page, robot = cup.page, cup.page.robot
-    normal = page.request.grasp.contacts["thumb"].normal + np.array([0.0, 0.0, 0.12])
-    page.drag_normal("thumb", normal)
-    assert page.work.settle()
-    assert page.result.success
-    faced = robot.contacts(page.result.q)[1][robot.fingers.index("thumb")]
-    assert faced @ normal / np.linalg.norm(normal) >= np.cos(np.deg2rad(3.0))
-
-
 def test_an_unreachable_contact_shows_why_and_what_is_nearest(cup: viewing.Viewer) -> None:
     page, robot = cup.page, cup.page.robot
     page.drag("object", shifted(page.request.object_pose, -0.6, 0.0, 0.0))
-    assert page.work.settle()
+    assert page.work.settle(300)
     result = page.result
     assert not result.success
     assert result.headline == "UNREACHABLE"
-    assert any("too far for the arm" in line for line in result.reasons)
     # What is drawn is the nearest configuration, and the verdict is that of what is drawn.
     points, normals = page.request.grasp.arrays(robot.fingers)
     position, _ = robot.errors(result.q, points, normals)
     shown = [result.verdicts[finger].position_error for finger in robot.fingers]
     assert np.allclose(position, shown)
-    assert "too far for the arm" in page._panel._results.content
+    assert result.reasons[0].split(":")[0] in page._panel._results.content
 
 
 def test_a_drag_beyond_reach_does_not_wait_for_the_reason(
@@ -98,7 +90,7 @@ def test_a_drag_beyond_reach_does_not_wait_for_the_reason(
     page, drawn, draw = cup.page, [], cup.page.draw
     monkeypatch.setattr(page, "draw", lambda result: (drawn.append(result), draw(result)))
     page.drag("thumb", shifted(page.request.contacts["thumb"].control, 0.0, 0.0, 0.05))
-    assert page.work.settle()
+    assert page.work.settle(300)
     at_once, at_rest = drawn
     assert at_once.headline == "NOT MET"
     assert len(at_once.reasons) == 1
@@ -115,21 +107,11 @@ def test_a_drag_beyond_reach_does_not_wait_for_the_reason(
     assert any("thumb" in line for line in at_rest.reasons)
 
 
-def test_the_object_takes_its_contacts_along(cup: viewing.Viewer) -> None:
-    page = cup.page
-    before = {name: one.point for name, one in page.request.grasp.contacts.items()}
-    page.drag("object", shifted(page.request.object_pose, 0.02, -0.03, 0.04))
-    assert page.work.settle()
-    assert page.result.success
-    for name, contact in page.request.grasp.contacts.items():
-        assert np.allclose(contact.point - before[name], [0.02, -0.03, 0.04])
-
-
 def test_a_dragged_table_is_what_answers_keep_off(cup: viewing.Viewer) -> None:
     page = cup.page
     pose = page.request.scene.items["table"].pose
     page.drag("table", shifted(pose, -1.3, 0.0, 0.36))
-    assert page.work.settle()
+    assert page.work.settle(300)
     scene = page.request.scene
     fresh = ik.Solver(page.robot, scene=scene)
     clear = fresh.check(page.result.q, page.request.grasp)
@@ -137,13 +119,12 @@ def test_a_dragged_table_is_what_answers_keep_off(cup: viewing.Viewer) -> None:
     assert float(clear.distance[0]) == pytest.approx(page.result.clearance, abs=1e-12)
     assert page.result.success == bool(clear.free[0]) is False
     assert page.result.headline == "COLLISION"
-    assert any("answers touch something" in line for line in page.result.reasons)
     # The table cannot overlap the robot's base: the page reports it and keeps running.
     page.drag("table", shifted(pose, 0.0, 0.0, 0.07))
-    assert page.work.settle()
+    assert page.work.settle(300)
     assert page.result.headline == "INVALID REQUEST"
     page.drag("table", pose)
-    assert page.work.settle()
+    assert page.work.settle(300)
     assert page.result.success
 
 
@@ -151,12 +132,12 @@ def test_all_solutions_can_be_gone_through(cup: viewing.Viewer) -> None:
     page = cup.page
     # Listed once nothing moves, so after the drag is answered.
     page.drag("thumb", shifted(page.request.contacts["thumb"].control, 0.0, 0.0, 0.001))
-    assert page.work.settle()
+    assert page.work.settle(300)
     assert len(page.solutions) > 1
     shown = []
     for number in range(len(page.solutions)):
         page.show_solution(number)
-        assert page.work.settle()
+        assert page.work.settle(300)
         assert page.result.success
         shown.append(page.result.q)
     apart = [np.abs(a - b).max() for i, a in enumerate(shown) for b in shown[:i]]
@@ -168,14 +149,14 @@ def test_all_solutions_and_another_method_are_seen_at_once(cup: viewing.Viewer) 
     page, scene = cup.page, cup._server.scene
     page.show_ghosts(True)
     page.compare("enhanced-dls")
-    assert page.work.settle()
+    assert page.work.settle(300)
     drawn = set(scene._handle_from_node_name)
     assert sum(name.startswith("/ghosts/") for name in drawn) == min(len(page.solutions), 10)
     assert any(name.startswith("/beside/robot/") for name in drawn)
     assert "enhanced-dls" in page._panel._comparison_html.content
     page.show_ghosts(False)
     page.compare("none")
-    assert page.work.settle()
+    assert page.work.settle(300)
     left = set(scene._handle_from_node_name)
     assert not any(name.startswith(("/ghosts/", "/beside")) for name in left)
 
@@ -185,22 +166,24 @@ def test_steps_are_taken_back_and_done_again(cup: viewing.Viewer) -> None:
     poses = [page.request.object_pose[:3, 3]]
     for step in (0.01, 0.02):
         page.drag("object", shifted(page.request.object_pose, 0.0, step, 0.0))
-        assert page.work.settle()
+        assert page.work.settle(300)
         poses.append(page.request.object_pose[:3, 3])
     for do, expected in ((page.undo, 1), (page.undo, 0), (page.redo, 1), (page.reset, 0)):
         do()
-        assert page.work.settle()
+        assert page.work.settle(300)
         assert np.allclose(page.request.object_pose[:3, 3], poses[expected])
         assert page.result.success
 
 
 def test_a_dragged_object_is_grasped_all_the_way(cup: viewing.Viewer) -> None:
     page = cup.page
-    start = page.request.object_pose
-    for angle in np.linspace(0.0, 2 * np.pi, 30):
+    start, before = page.request.object_pose, page.request.grasp.contacts["thumb"].point
+    for angle in np.linspace(0.0, 2 * np.pi, 12):
         page.drag("object", shifted(start, *(0.05 * np.cos([angle, angle - 1.6, 2 * angle]))))
-        assert page.work.settle()
+        assert page.work.settle(300)
         assert page.result.success
+        shift = page.request.object_pose[:3, 3] - start[:3, 3]
+        assert np.allclose(page.request.grasp.contacts["thumb"].point - before, shift)
 
 
 def test_a_page_needs_no_server_once_it_is_written(cup: viewing.Viewer, tmp_path: Path) -> None:
@@ -223,14 +206,14 @@ def test_another_robot_grasp_and_scene_are_opened(robot: ik.ArmHand) -> None:
     for wanted, grasp, scene in opened:
         before = viewer.page
         before.open(**wanted)
-        before.work.settle()
+        before.work.settle(300)
         page = viewer.page
         assert page is not before
         assert page.request.name == grasp
         assert (page.request.scene and page.request.scene.name) == scene
         assert page.result.success
     viewer.page.open(robot="no such robot")
-    assert viewer.page.work.settle()
+    assert viewer.page.work.settle(300)
     assert viewer.page.robot.name == "ar10"
     viewer.stop()
 
@@ -238,7 +221,7 @@ def test_another_robot_grasp_and_scene_are_opened(robot: ik.ArmHand) -> None:
 def test_a_moved_scene_is_saved_as_it_stands(cup: viewing.Viewer, tmp_path: Path) -> None:
     page = cup.page
     page.drag("table", shifted(page.request.scene.items["table"].pose, 0.1, 0.0, -0.05))
-    assert page.work.settle()
+    assert page.work.settle(300)
     (tmp_path / "moved.yaml").write_text(page.request.scene.text())
     again = ik.load_scene(tmp_path / "moved.yaml")
     assert np.allclose(again.items["table"].pose, page.request.scene.items["table"].pose)
@@ -249,7 +232,7 @@ def test_motors_moved_by_hand_are_judged_and_not_solved(cup: viewing.Viewer) -> 
     q = page.result.q.copy()
     q[0] += 0.2
     page.drag_motors(q)
-    assert page.work.settle()
+    assert page.work.settle(300)
     assert np.array_equal(page.result.q, q)
     assert page.result.headline == "NOT MET"
     assert all(one.position_error > 5e-3 for one in page.result.verdicts.values())
@@ -260,7 +243,7 @@ def test_settings_are_those_that_it_is_solved_with(cup: viewing.Viewer) -> None:
     tight = ik.Tolerance(1e-6, 1e-6)
     tightly = viewing.Settings(tolerance=tight, prefer="limits")
     page.change("settings", lambda a: replace(a, settings=tightly))
-    assert page.work.settle()
+    assert page.work.settle(300)
     assert page.result.success
     assert {one.tolerance for one in page.result.verdicts.values()} == {tight}
     assert max(one.position_error for one in page.result.verdicts.values()) <= 1e-6
