@@ -24,52 +24,6 @@ def values(text: str) -> list[float]:
     ]
 
 
-def test_a_finger_that_lags_at_a_limit() -> None:
-    """The thumb arrives; finger_2 comes to 8 mm and stays there, joint_b at its limit."""
-    rows = make_rows()
-    rows["position_error"][:, 0] = np.where(np.arange(40) < 12, 0.1, 0.001)
-    rows["angle_error"] = 2 * DEGREE
-    rows["position_error"][25:, 1] = 0.009
-    rows["position_error"][30, 1] = 0.008
-    rows["limit_mask"][24:] = 0b010
-    stall = event(36, "STALL", 1e-6, phase="hand-alignment", threshold=1e-4)
-    found = logs.explain(make_one(rows, events=(stall,)))
-    assert values(found.headline) == [8, 40]
-    assert "STALLED" in found.headline
-    assert [values(line) for line in found.phases] == [
-        [1, 20, 100.0, 2.0, 1.0, 2.0, 100.0, 2.0, 100.0, 2.0],
-        [21, 40, 1.0, 2.0, 1.0, 2.0, 100.0, 2.0, 9.0, 2.0],
-    ]
-    assert [line.partition(" (")[0] for line in found.phases] == [
-        "thumb reaching",
-        "hand alignment",
-    ]
-    (finger,) = found.fingers
-    assert finger.startswith("finger_2 ")
-    assert values(finger) == [9.0, 2.0, 8.0, 2.0, 31]
-    assert [values(line) for line in found.incidents] == [[0.5], [25], [37]]
-    assert found.incidents[1].startswith("joint_b ")
-    assert [values(line) for line in found.verdict] == [[9.0], [], []]
-    assert "joint_b" in found.verdict[-1]
-
-
-def test_a_singularity_is_told_with_its_depth_and_time() -> None:
-    rows = make_rows()
-    rows["sigma_closed_chain"][28:32] = 0.008, 0.002, 0.004, 0.009
-    rows["sigma_closed_chain"][36:] = 0.005
-    singular = [
-        event(i, "NEAR_SINGULAR", 0.008, jacobian="closed_chain", threshold=0.01) for i in (28, 36)
-    ]
-    found = logs.explain(make_one(rows, events=tuple(singular)))
-    (line,) = found.incidents
-    assert line.startswith("closed chain near singular")
-    assert values(line) == [29, 8, 0.002, 30, 0.01, 2]
-    assert any("near singular" in line for line in found.verdict)
-    rows["sigma_closed_chain"][-1] = 0.4
-    found = logs.explain(make_one(rows, events=tuple(singular)))
-    assert not any("near singular" in line for line in found.verdict)
-
-
 def test_a_dip_without_a_threshold_is_told_against_the_median() -> None:
     rows = make_rows()
     rows["sigma_closed_chain"][:20] = np.nan

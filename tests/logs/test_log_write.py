@@ -142,21 +142,6 @@ def test_what_was_there_stays_until_the_first_chunk(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_interrupted_log_keeps_its_chunks(tmp_path: Path) -> None:
-    path = tmp_path / "cup.mcap"
-
-    def fail() -> None:
-        with logs.McapRecorder(path, robot_name="made_up", compression="none") as recorder:
-            recorder.record(make_block(*[1000] * 10))
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        fail()
-    log = logs.open(path)
-    assert log.info().unfinished == ()
-    assert 0 < len(log.solves()) < 10
-
-
 @pytest.mark.parametrize("written", [0, 1, 2])
 def test_an_interrupt_while_a_chunk_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: int
