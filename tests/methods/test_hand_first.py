@@ -6,36 +6,17 @@ import numpy as np
 import pytest
 from robot_variants import derived_robot
 from samplers import (
-    aligned_arms,
     near_limits,
-    near_limits_on_aligned_arms,
-    shipped_hands,
-    shipped_hands_on_aligned_arms,
 )
 
 import casadi_ik as ik
 
 EXACT = ik.Tolerance(1e-6, 1e-6)
-TOLERANCES = {"usual": ik.Tolerance(), "exact": EXACT}
 
 
 @pytest.fixture(scope="module")
 def exact(robot):
     return ik.Solver(robot, tolerance=EXACT)
-
-
-HARD = (shipped_hands, aligned_arms, shipped_hands_on_aligned_arms, near_limits_on_aligned_arms)
-"""Beside those of `test_oracle`."""
-
-
-@pytest.mark.parametrize("tolerance", TOLERANCES)
-@pytest.mark.parametrize("make", HARD, ids=lambda make: make.__name__)
-def test_every_target_is_solved_within_limits(robot, make, tolerance):
-    q = make(robot, np.random.default_rng(2026), 1200)
-    batch = ik.Solver(robot, tolerance=TOLERANCES[tolerance]).solve_batch(*robot.contacts(q))
-    assert np.flatnonzero(~batch.success).tolist() == []
-    assert (batch.q >= robot.lower).all()
-    assert (batch.q <= robot.upper).all()
 
 
 def test_targets_with_a_joint_next_to_its_limit(robot, exact, rng):

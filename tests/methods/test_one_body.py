@@ -53,18 +53,6 @@ def test_what_is_reachable_is_solved(robot, near):
         assert np.all((found.q >= robot.lower - 1e-9) & (found.q <= robot.upper + 1e-9))
 
 
-def test_a_log_changes_nothing_and_has_every_iteration(robot, tmp_path: Path):
-    _, points, normals = targets(robot, 20)
-    solver, file = ik.Solver(robot), tmp_path / "body.mcap"
-    plain = solver.solve_batch(points, normals)
-    logged = solver.solve_batch(points, normals, log=file)
-    np.testing.assert_array_equal(plain.q, logged.q)
-    np.testing.assert_array_equal(plain.iterations, logged.iterations)
-    log = ik.logs.open(file)
-    assert log.solves().array()["iterations"].tolist() == plain.iterations.tolist()
-    assert len(log.iterations().array()) == plain.iterations.sum()
-
-
 def test_a_log_has_singular_values_by_side(tmp_path: Path):
     robot, file = ik.load_robot("g1+dex3"), tmp_path / "body.mcap"
     _, points, normals = targets(robot, 2)
@@ -83,16 +71,6 @@ def test_a_log_has_singular_values_by_side(tmp_path: Path):
         sigma = np.linalg.svd(np.transpose(columns), compute_uv=False).min()
         assert rows[f"sigma_{side.name}_arm"][-1] == pytest.approx(sigma, rel=1e-3, abs=1e-4)
         assert (rows[f"sigma_{side.name}_hand"] > 0).all()
-
-
-def test_one_target_is_solved_as_in_a_batch(robot):
-    q, points, normals = targets(robot, 5)
-    solver = ik.Solver(robot)
-    batch = solver.solve_batch(points, normals)
-    for row in range(len(q)):
-        one = solver.solve(grasp(robot, q[row]))
-        assert one.status == ik.Status.SOLVED
-        np.testing.assert_array_equal(one.q, batch.q[row])
 
 
 def test_a_hand_without_contacts_stays(robot):
