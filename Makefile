@@ -19,7 +19,7 @@ help:
 	@echo "make demo       set up and solve the grasp of a real object, by our method and the paper's"
 	@echo "make test       set up and run the tests, at most 5 minutes on two cores"
 	@echo "make test-all   run the slow tests, which make test leaves out"
-	@echo "make lint       style, types, layers, documentation"
+	@echo "make lint       style, names, types, layers, documentation"
 	@echo "make docs       build the documentation site: out/docs/index.html"
 	@echo "make page       build the page that solves in the browser: out/page/index.html"
 	@echo "make bench      timings on this machine"
@@ -62,6 +62,7 @@ lint: $(VENV)/dev.stamp
 	$(BIN)/ruff format --check
 	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/lint-imports
+	$(BIN)/python tools/check_language.py
 	$(SPHINX)
 
 # Of pages and docstrings as they are; notebooks with the outputs that are stored in them.

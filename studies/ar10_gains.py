@@ -126,7 +126,7 @@ def index_pose(
     """Figs. 2, 3 and Table I: the index fingertip's pose for several gains."""
     task = ik.papers.ScrewTask("pose", "index")
     start, goal = within(robot, 0.1), within(robot, 0.637)
-    drawn, ((path, norms),) = figure(1, 2, 5, 4.2)
+    plot, ((path, norms),) = figure(1, 2, 5, 4.2)
     rows, rates = [], []
     random_goals = robot.lower + rng.uniform(0.1, 0.9, (goals, len(start))) * span(robot)
     for gain, color in zip(gains, cycle(COLORS), strict=False):
@@ -143,8 +143,8 @@ def index_pose(
         printed = ("", "") if np.isnan(x) else (f"{x:.2f}, {y:.2f}", f"{np.hypot(x, y):.2f}")
         rows.append((f"{gain:g}", *printed, spread(ended)))
     finish(path, norms, ik.papers.ScrewControl(robot, task).target(goal)["pose"], resolution)
-    drawn.tight_layout()
-    drawn.savefig(out / "index_pose.png")
+    plot.tight_layout()
+    plot.savefig(out / "index_pose.png")
     steps = f"{1e3 * resolution:g} mm"
     header = f"model, sliders in {steps}: left over {goals} goals, median / 90th percentile [mm]"
     return f"""
@@ -177,7 +177,7 @@ def relative_pose(robot: ik.ArmHand, out: Path, gains: Sequence[float], resoluti
     """Figs. 4 and 5: the thumb's tip seen from the index fingertip."""
     task = ik.papers.ScrewTask("pose", "thumb", relative_to="index")
     start, goal = within(robot, 0.1), within(robot, 0.537)
-    drawn, ((path, norms),) = figure(1, 2, 5, 4.2)
+    plot, ((path, norms),) = figure(1, 2, 5, 4.2)
     rates, ends = [], []
     target = ik.papers.ScrewControl(robot, task).target(goal)
     for gain, color in zip(gains, cycle(COLORS), strict=False):
@@ -198,8 +198,8 @@ def relative_pose(robot: ik.ArmHand, out: Path, gains: Sequence[float], resoluti
     draw_run(path, norms, literal, "gain 0.6, eq. (15) as printed", "#666666", "--", axes=(0, 1))
     norms.set_xlim(-1, STEPS)
     path.legend(frameon=False, fontsize=8)
-    drawn.tight_layout()
-    drawn.savefig(out / "relative_pose.png")
+    plot.tight_layout()
+    plot.savefig(out / "relative_pose.png")
     rows = [
         (gain, rate, law, ", ".join(f"{value:.2f}" for value in end))
         for (gain, rate, law), end in zip(rate_rows(rates), ends, strict=True)
@@ -256,27 +256,29 @@ def offsets(robot: ik.ArmHand, out: Path, goals: int, rng: np.random.Generator, 
         control = ik.papers.ScrewControl(
             robot, ik.papers.ScrewTask(kind, "thumb", relative_to="index"), gain, length=length
         )
-        whole = ik.papers.ScrewControl(
+        pose_control = ik.papers.ScrewControl(
             robot, ik.papers.ScrewTask("pose", "thumb", relative_to="index"), gain
         )
-        found = []
+        errors = []
         for posture, turn, shift in zip(postures, turns, shifts, strict=True):
             # The pose of a hand that is not quite the model: 2 degrees and 1 mm off per axis.
-            moved = dq.exp(ca.DM(np.deg2rad(2.0) * turn), ca.DM(1e-3 * shift))
-            pose = np.array(dq.multiply(ca.DM(whole.target(posture)["pose"]), moved)).ravel()
+            displacement = dq.exp(ca.DM(np.deg2rad(2.0) * turn), ca.DM(1e-3 * shift))
+            pose = np.array(
+                dq.multiply(ca.DM(pose_control.target(posture)["pose"]), displacement)
+            ).ravel()
             point = translation({"pose": pose})
-            run = control.run(start, asked(kind, pose, point), 200)
-            reached = np.linalg.norm(run.points[-1])
-            distance = abs(reached - np.linalg.norm(point))
+            run = control.run(start, requested_part(kind, pose, point), 200)
+            distance = np.linalg.norm(run.points[-1])
+            distance = abs(distance - np.linalg.norm(point))
             miss = np.linalg.norm(run.points[-1] - point)
-            found.append(1e3 * (distance if kind == "distance" else miss))
-        left[label] = np.array(found)
+            errors.append(1e3 * (distance if kind == "distance" else miss))
+        left[label] = np.array(errors)
     rows = [
         (label, ROWS[kinds[label][0]], f"{np.median(v):.3f}", f"{np.percentile(v, 90):.3f}",
          f"{100 * np.mean(v < 1e-3):.0f} %")
         for label, v in left.items()
     ]  # fmt: skip
-    drawn, ((axes,),) = figure(1, 1, 8, 3.6)
+    plot, ((axes,),) = figure(1, 1, 8, 3.6)
     for (label, values), color in zip(left.items(), (*COLORS, "#222222"), strict=True):
         name = f"{label} ({ROWS[kinds[label][0]]} of 6 rows)"
         if values.max() < FLOOR:
@@ -290,8 +292,8 @@ def offsets(robot: ik.ArmHand, out: Path, goals: int, rng: np.random.Generator, 
     title(axes, name, "left at the end [mm]", "goals with no more left [%]")
     axes.set(xscale="log", xlim=(1e-2, 1e2))
     axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    drawn.tight_layout()
-    drawn.savefig(out / "offsets.png")
+    plot.tight_layout()
+    plot.savefig(out / "offsets.png")
     return f"""
 ## The offset, and tasks without it
 
@@ -317,7 +319,9 @@ def null_space(
 ) -> str:
     """What the task leaves free keeps the sliders away from their limits."""
     task = ik.papers.ScrewTask("distance", "thumb", relative_to="index")
-    used = [i for i, name in enumerate(robot.actuators) if name.startswith(("thumb", "index"))]
+    used_motors = [
+        i for i, name in enumerate(robot.actuators) if name.startswith(("thumb", "index"))
+    ]
     starts = robot.lower + rng.uniform(0.0, 1.0, (goals, len(robot.home))) * span(robot)
     rows = []
     for centring in gains:
@@ -325,7 +329,7 @@ def null_space(
         margins, errors = [], []
         for start in starts:
             run = control.run(start, {"distance": np.array(0.04)}, 200)
-            part = ((run.q[-1] - robot.lower) / span(robot))[used]
+            part = ((run.q[-1] - robot.lower) / span(robot))[used_motors]
             margins.append(100 * min(part.min(), 1 - part.max()))
             errors.append(1e6 * run.error_norm[-1])
         middle, tenth = np.percentile(margins, [50, 10])
@@ -354,10 +358,10 @@ the distance never notices.
     }"""
 
 
-def asked(kind: str, pose: Array, point: Array) -> dict[str, Array]:
+def requested_part(kind: str, pose: Array, point: Array) -> dict[str, Array]:
     """The part of a relative pose that a task asks for."""
-    every = {"pose": pose, "point": point, "distance": np.array(np.linalg.norm(point))}
-    return {name: every[name] for name in (kind if kind != "position" else "point",)}
+    parts = {"pose": pose, "point": point, "distance": np.array(np.linalg.norm(point))}
+    return {name: parts[name] for name in (kind if kind != "position" else "point",)}
 
 
 CENTRING = (0.0, 0.05, 0.2)

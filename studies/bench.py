@@ -72,12 +72,12 @@ class Worker:
         line = self._process.stdout.readline()
         if not line:
             raise InputError(f"{self.package}: the measurement of {' '.join(map(str, case))} died")
-        said = json.loads(line)
-        if "error" in said:
+        answer = json.loads(line)
+        if "error" in answer:
             Console(stderr=True).print(
-                f"{self.package}: {' '.join(map(str, case))}: {said['error']}"
+                f"{self.package}: {' '.join(map(str, case))}: {answer['error']}"
             )
-        return said.get("found")
+        return answer.get("found")
 
     def stop(self) -> None:
         """End the process."""
@@ -97,36 +97,43 @@ def worker(package: Path, targets: str) -> Iterator[Worker]:
 
 
 def measured(
-    cases: list[Case], here: Worker, other: Worker | None, turns: int
+    cases: list[Case], package: Worker, reference_package: Worker | None, turns: int
 ) -> Iterator[tuple[Case, list[dict[str, float]], list[dict[str, float]]]]:
     """Cases with what every turn found here, and there."""
     for case in cases:
-        mine, theirs = list[dict[str, float]](), list[dict[str, float]]()
+        own_results, theirs = list[dict[str, float]](), list[dict[str, float]]()
         for turn in range(1 if case[0] in ABROAD else turns):
-            sides = [(here, mine), *([(other, theirs)] if other else [])]
+            sides = [
+                (package, own_results),
+                *([(reference_package, theirs)] if reference_package else []),
+            ]
             # Who is first in a turn is second in the next.
-            for side, found in sides if turn % 2 == 0 else reversed(sides):
-                if (one := side.measure(case)) is not None:
-                    found.append(one)
-        yield case, mine, theirs
+            for side, results in sides if turn % 2 == 0 else reversed(sides):
+                if (values := side.measure(case)) is not None:
+                    results.append(values)
+        yield case, own_results, theirs
 
 
 def rows_of(
-    case: Case, mine: list[dict[str, float]], theirs: list[dict[str, float]]
+    case: Case, own_results: list[dict[str, float]], theirs: list[dict[str, float]]
 ) -> Iterator[list[str]]:
     """A row per quantity of a case."""
-    what = " ".join(map(str, case[2:]))
-    for name in mine[0] if mine else ():
-        here = min(one[name] for one in mine)
-        cells = [case[0], str(case[1]), what, name, _number(here)]
-        there = [one[name] for one in theirs if name in one]
-        if there:
-            least = min(there)
-            paired = [one[name] / other for one, other in zip(mine, there, strict=False) if other]
+    label = " ".join(map(str, case[2:]))
+    for name in own_results[0] if own_results else ():
+        best = min(values[name] for values in own_results)
+        cells = [case[0], str(case[1]), label, name, _number(best)]
+        reference_values = [values[name] for values in theirs if name in values]
+        if reference_values:
+            reference_best = min(reference_values)
+            paired = [
+                values[name] / reference
+                for values, reference in zip(own_results, reference_values, strict=False)
+                if reference
+            ]
             middle = sorted(paired)[len(paired) // 2] if paired else float("nan")
-            ratio = here / least if least else float("nan")
-            shown = [f"{ratio:.3f}", f"{middle:.3f}"] if least or here else ["", ""]
-            cells += [_number(least), *shown]
+            ratio = best / reference_best if reference_best else float("nan")
+            ratios = [f"{ratio:.3f}", f"{middle:.3f}"] if reference_best or best else ["", ""]
+            cells += [_number(reference_best), *ratios]
         elif theirs:
             cells += ["", "", ""]
         yield cells
@@ -160,10 +167,12 @@ def main(arguments: list[str] | None = None) -> None:
     heads += ["other", "ratio", "by turns"] if options.against else []
     with ExitStack() as stack:
         targets = stack.enter_context(tempfile.TemporaryDirectory(prefix="casadi_ik-bench-"))
-        here = stack.enter_context(worker(Path(__file__).resolve().parents[1], targets))
-        other = stack.enter_context(worker(options.against, targets)) if options.against else None
-        for case, mine, theirs in measured(cases, here, other, options.turns):
-            for row in rows_of(case, mine, theirs):
+        package = stack.enter_context(worker(Path(__file__).resolve().parents[1], targets))
+        reference_package = (
+            stack.enter_context(worker(options.against, targets)) if options.against else None
+        )
+        for case, own_results, theirs in measured(cases, package, reference_package, options.turns):
+            for row in rows_of(case, own_results, theirs):
                 rows.append(row)
                 console.print("  ".join(row), soft_wrap=True, highlight=False)
     slow = slower_rows(rows, options.limit) if options.limit and options.against else []

@@ -32,7 +32,7 @@ PROBES = Path(__file__).parent / "probes"
 SHARED = "CASADI_IK_BENCH_TARGETS"
 """Variable of the environment: the folder of targets that all processes of a run share."""
 
-Found = dict[str, float]
+Quantities = dict[str, float]
 Case = tuple[Any, ...]
 Targets = tuple[Any, Any]
 
@@ -50,7 +50,7 @@ SCENE = {
     "table": {"kind": "box", "size": [1.6, 1.6, 0.04], "xyz": [0.0, 0.0, -0.1]},
     "post": {"kind": "cylinder", "radius": 0.06, "length": 0.6, "xyz": [0.45, 0.25, 0.3]},
 }
-CHOSEN, OF_OBJECT = 50, 500
+CANDIDATES, OF_OBJECT = 50, 500
 """Candidates of a choice: those of a scene's batch, and in an object's frame."""
 
 CYCLES, PERIOD = 500, 1e-3
@@ -68,7 +68,7 @@ def shared(name: str, make: Callable[[], Any]) -> Any:
     return pickle.loads(path.read_bytes())
 
 
-def drawn(robot: ik.ArmHand, sampler: str, count: int) -> Targets:
+def sampled_contacts(robot: ik.ArmHand, sampler: str, count: int) -> Targets:
     """Contacts of a sampler, the same in every process."""
 
     def draw() -> Targets:
@@ -78,94 +78,94 @@ def drawn(robot: ik.ArmHand, sampler: str, count: int) -> Targets:
 
 
 @contextlib.contextmanager
-def clock(found: Found, name: str, count: int, wall: bool = False) -> Any:
+def clock(quantities: Quantities, name: str, count: int, wall: bool = False) -> Any:
     """Processor time of this thread (or time on the wall) of what is done, by its count [us]."""
-    now = time.perf_counter if wall else time.thread_time
-    begun = now()
+    timer = time.perf_counter if wall else time.thread_time
+    begun = timer()
     yield
-    found[name] = 1e6 * (now() - begun) / count
+    quantities[name] = 1e6 * (timer() - begun) / count
 
 
-def batch(robot: str, sampler: str, tolerance: str, count: int) -> Callable[[], Found]:
+def batch(robot: str, sampler: str, tolerance: str, count: int) -> Callable[[], Quantities]:
     """`solve_batch`, a target."""
     solver = ik.Solver(ik.load_robot(robot), tolerance=TOLERANCES[tolerance])
-    targets = drawn(solver.robot, sampler, count)
+    targets = sampled_contacts(solver.robot, sampler, count)
     solver.solve_batch(*(array[:WARM] for array in targets))
     solver.solve_batch(*targets)
 
-    def measure() -> Found:
-        found: Found = {}
-        with clock(found, "us", count):
+    def measure() -> Quantities:
+        quantities: Quantities = {}
+        with clock(quantities, "us", count):
             solved = solver.solve_batch(*targets)
-        return found | {"missed": float((~solved.success).sum())}
+        return quantities | {"missed": float((~solved.success).sum())}
 
     return measure
 
 
-def fast(robot: str, count: int) -> Callable[[], Found]:
+def fast(robot: str, count: int) -> Callable[[], Quantities]:
     """`Solver.fast`, a call."""
     solver = ik.Solver(ik.load_robot(robot))
-    targets = list(zip(*drawn(solver.robot, "random", count), strict=True))
+    targets = list(zip(*sampled_contacts(solver.robot, "random", count), strict=True))
     call, home = solver.fast(), solver.robot.home
     for points, normals in targets:
         call(points, normals, home)
 
-    def measure() -> Found:
-        found: Found = {}
-        with clock(found, "us", count):
+    def measure() -> Quantities:
+        quantities: Quantities = {}
+        with clock(quantities, "us", count):
             for points, normals in targets:
                 call(points, normals, home)
-        return found
+        return quantities
 
     return measure
 
 
-def single(robot: str, count: int) -> Callable[[], Found]:
+def single(robot: str, count: int) -> Callable[[], Quantities]:
     """`Solver.solve`, a call."""
     solver = ik.Solver(ik.load_robot(robot))
-    grasps = grasps_of(solver.robot, *drawn(solver.robot, "random", count))
+    grasps = grasps_of(solver.robot, *sampled_contacts(solver.robot, "random", count))
 
-    def measure() -> Found:
-        found: Found = {}
-        with clock(found, "us", count):
+    def measure() -> Quantities:
+        quantities: Quantities = {}
+        with clock(quantities, "us", count):
             for grasp in grasps:
                 solver.solve(grasp)
-        return found
+        return quantities
 
     measure()
     return measure
 
 
-def scene(robot: str, count: int) -> Callable[[], Found]:
+def scene(robot: str, count: int) -> Callable[[], Quantities]:
     """Batch and choice among a table and a post, and all solutions without them.
 
     Several answers of a candidate count in the choice: code that knows no other way is compared.
     """
     solver = ik.Solver(ik.load_robot(robot), scene=ik.Scene(SCENE))
     plain = ik.Solver(solver.robot)
-    targets = drawn(solver.robot, "random", count)
-    grasps = grasps_of(solver.robot, *(array[:CHOSEN] for array in targets))
+    targets = sampled_contacts(solver.robot, "random", count)
+    grasps = grasps_of(solver.robot, *(array[:CANDIDATES] for array in targets))
     home = solver.robot.home
-    known = "per_candidate" in inspect.signature(solver.choose).parameters
-    any_number: dict[str, Any] = {"per_candidate": None} if known else {}
+    has_limit = "per_candidate" in inspect.signature(solver.choose).parameters
+    any_number: dict[str, Any] = {"per_candidate": None} if has_limit else {}
 
-    def measure() -> Found:
-        found: Found = {}
-        with clock(found, "batch us", count):
+    def measure() -> Quantities:
+        quantities: Quantities = {}
+        with clock(quantities, "batch us", count):
             solved = solver.solve_batch(*targets)
-        with clock(found, "choose us a candidate", CHOSEN):
+        with clock(quantities, "choose us a candidate", CANDIDATES):
             ranked = solver.choose(grasps, q0=home, **any_number)
-        with clock(found, "solve_all us", 5):
+        with clock(quantities, "solve_all us", 5):
             for grasp in grasps[:5]:
                 plain.solve_all(grasp)
         counts = {"not free": float((~solved.success).sum()), "answered": float(ranked.answered)}
-        return found | counts
+        return quantities | counts
 
     measure()
     return measure
 
 
-def clutter(robot: str, place: int) -> Callable[[], Found]:
+def clutter(robot: str, place: int) -> Callable[[], Quantities]:
     """Every third grasp at a place of the collision study, at each clutter, in batches of 256."""
     arm_hand = ik.load_robot(robot)
 
@@ -176,25 +176,29 @@ def clutter(robot: str, place: int) -> Callable[[], Found]:
 
     cases = []
     for solids, name, points, normals, poses in shared(f"{robot}-clutter-{place}", placed):
-        every = np.arange(256) % len(points)
-        asked = {"points": points[every], "normals": normals[every], "object_pose": poses[every]}
+        indices = np.arange(256) % len(points)
+        targets = {
+            "points": points[indices],
+            "normals": normals[indices],
+            "object_pose": poses[indices],
+        }
         solver = ik.Solver(arm_hand, scene=ik.Scene(solids, grasped=name))
-        solver.solve_batch(**asked)
-        cases.append((solver, asked, len(points)))
+        solver.solve_batch(**targets)
+        cases.append((solver, targets, len(points)))
 
-    def measure() -> Found:
+    def measure() -> Quantities:
         seconds, solved, count = 0.0, 0, 0
-        for solver, asked, own in cases:
+        for solver, targets, size in cases:
             begun = time.thread_time()
-            batch = solver.solve_batch(**asked)
-            seconds += (time.thread_time() - begun) * own / len(batch.q)
-            solved, count = solved + int(batch.success[:own].sum()), count + own
+            batch = solver.solve_batch(**targets)
+            seconds += (time.thread_time() - begun) * size / len(batch.q)
+            solved, count = solved + int(batch.success[:size].sum()), count + size
         return {"us": 1e6 * seconds / count, "solved": float(solved), "targets": float(count)}
 
     return measure
 
 
-def choose(robot: str, given: str, around: str) -> Callable[[], Found]:
+def choose(robot: str, grasp_kind: str, around: str) -> Callable[[], Quantities]:
     """Choosing among grasps in an object's frame, hands at random about it, from any side."""
     arm_hand, rng = ik.load_robot(robot), np.random.default_rng(0)
     solver = ik.Solver(arm_hand, scene=ik.Scene(SCENE) if around == "scene" else None)
@@ -210,44 +214,47 @@ def choose(robot: str, given: str, around: str) -> Callable[[], Found]:
     moving = {i for name in arm_hand.fingers for i in arm_hand.description.finger_actuators(name)}
     postures = [{arm_hand.actuators[i]: float(row[i]) for i in moving} for row in q]
     grasps = grasps_of(arm_hand, (points - middle) @ turns, normals @ turns)
-    if given == "palms":
+    if grasp_kind == "palms":
         grasps = [ik.Grasp(palm=p, posture=h) for p, h in zip(palms, postures, strict=True)]
 
-    def measure() -> Found:
-        found: Found = {}
-        with clock(found, "us a candidate", OF_OBJECT):
+    def measure() -> Quantities:
+        quantities: Quantities = {}
+        with clock(quantities, "us a candidate", OF_OBJECT):
             ranked = solver.choose(grasps, pose, arm_hand.home)
-        return found | {"answered": float(ranked.answered)}
+        return quantities | {"answered": float(ranked.answered)}
 
     measure()
     return measure
 
 
-def follow(robot: str) -> Callable[[], Found]:
+def follow(robot: str) -> Callable[[], Quantities]:
     """A cycle of a follower of a slow motion."""
     solver = ik.Solver(ik.load_robot(robot))
     arm_hand, rng = solver.robot, np.random.default_rng(0)
-    middle, half = (arm_hand.lower + arm_hand.upper) / 2, (arm_hand.upper - arm_hand.lower) / 2
-    ways = rng.uniform(-0.1, 0.1, (2, len(middle))) * half
+    middle, half_range = (
+        (arm_hand.lower + arm_hand.upper) / 2,
+        (arm_hand.upper - arm_hand.lower) / 2,
+    )
+    directions = rng.uniform(-0.1, 0.1, (2, len(middle))) * half_range
     turn = np.linspace(0, 0.5, CYCLES)[:, None]
-    path = middle + ways[0] * np.sin(turn) + ways[1] * turn**2
+    path = middle + directions[0] * np.sin(turn) + directions[1] * turn**2
     targets = list(zip(*arm_hand.contacts(path), strict=True))
 
-    def measure() -> Found:
-        found, follower = Found(), solver.follow(path[0], PERIOD)
-        with clock(found, "us", CYCLES):
+    def measure() -> Quantities:
+        quantities, follower = Quantities(), solver.follow(path[0], PERIOD)
+        with clock(quantities, "us", CYCLES):
             for points, normals in targets:
                 follower(points, normals)
-        return found
+        return quantities
 
     measure()
     return measure
 
 
-def diagnosis(robot: str, kind: str, count: int) -> Callable[[], Found]:
+def diagnosis(robot: str, kind: str, count: int) -> Callable[[], Quantities]:
     """What the reason costs where there is no solution."""
     solver, rng = ik.Solver(ik.load_robot(robot)), np.random.default_rng(0)
-    points, normals = drawn(solver.robot, "random", count)
+    points, normals = sampled_contacts(solver.robot, "random", count)
     if kind == "far":
         points = points + np.array([1.5, 0.0, 0.0])
     elif kind == "moved":
@@ -256,54 +263,54 @@ def diagnosis(robot: str, kind: str, count: int) -> Callable[[], Found]:
         normals = normals + rng.normal(0, 0.5, normals.shape)
         normals = normals / np.linalg.norm(normals, axis=2, keepdims=True)
     left = ~solver.solve_batch(points, normals, diagnose=True).success
-    asked = points[left], normals[left]
+    targets = points[left], normals[left]
 
-    def measure() -> Found:
-        found: Found = {}
-        with clock(found, "solve us", len(asked[0])):
-            solver.solve_batch(*asked)
-        with clock(found, "with reason us", len(asked[0])):
-            solver.solve_batch(*asked, diagnose=True)
-        return found | {"not solved": float(left.sum())}
+    def measure() -> Quantities:
+        quantities: Quantities = {}
+        with clock(quantities, "solve us", len(targets[0])):
+            solver.solve_batch(*targets)
+        with clock(quantities, "with reason us", len(targets[0])):
+            solver.solve_batch(*targets, diagnose=True)
+        return quantities | {"not solved": float(left.sum())}
 
     return measure
 
 
-def methods(robot: str, method: str, step: str) -> Callable[[], Found]:
+def methods(robot: str, method: str, step: str) -> Callable[[], Quantities]:
     """An iteration of a method on shipped grasps."""
     arm_hand = ik.load_robot(robot)
     solver = ik.Solver(arm_hand, method, finger_step=step or None)
-    each = 1 if step == "ipopt" else 10
+    iterations = 1 if step == "ipopt" else 10
     names = ik.shipped_grasps(robot)[: 2 if step == "ipopt" else None]
-    targets = random_arm_targets(arm_hand, names, each, np.random.default_rng(0))
+    targets = random_arm_targets(arm_hand, names, iterations, np.random.default_rng(0))
     total = int(solver.solve_batch(*targets).iterations.sum())
 
-    def measure() -> Found:
-        found: Found = {}
-        with clock(found, "us an iteration", total):
+    def measure() -> Quantities:
+        quantities: Quantities = {}
+        with clock(quantities, "us an iteration", total):
             solver.solve_batch(*targets)
-        return found | {"iterations": float(total)}
+        return quantities | {"iterations": float(total)}
 
     return measure
 
 
-def threads(robot: str, count: int) -> Callable[[], Found]:
+def threads(robot: str, count: int) -> Callable[[], Quantities]:
     """Two threads and one, time on the wall."""
     solver = ik.Solver(ik.load_robot(robot))
-    targets = drawn(solver.robot, "random", count)
+    targets = sampled_contacts(solver.robot, "random", count)
     solver.solve_batch(*targets)
 
-    def measure() -> Found:
-        found: Found = {}
+    def measure() -> Quantities:
+        quantities: Quantities = {}
         for jobs in (1, 2):
-            with clock(found, f"jobs={jobs} us (wall)", count, wall=True):
+            with clock(quantities, f"jobs={jobs} us (wall)", count, wall=True):
                 solver.solve_batch(*targets, jobs=jobs)
-        return found
+        return quantities
 
     return measure
 
 
-def memory(robot: str, count: int) -> Callable[[], Found]:
+def memory(robot: str, count: int) -> Callable[[], Quantities]:
     """How much memory grows over many solves in blocks, after a tenth of them."""
     resource = importlib.import_module("resource")
     solver = ik.Solver(ik.load_robot(robot))
@@ -311,7 +318,7 @@ def memory(robot: str, count: int) -> Callable[[], Found]:
     def peak() -> float:
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
 
-    def measure() -> Found:
+    def measure() -> Quantities:
         rng, tenth = np.random.default_rng(0), count // 10
         grown = list[float]()
         for _ in range(10):
@@ -324,7 +331,7 @@ def memory(robot: str, count: int) -> Callable[[], Found]:
     return measure
 
 
-def many(robot: str, count: int) -> Callable[[], Found]:
+def large_batch(robot: str, count: int) -> Callable[[], Quantities]:
     """`casadi-ik batch --resume` of a folder of files on two processes: rate and memory."""
     psutil = importlib.import_module("psutil")
     arm_hand = ik.load_robot(robot)
@@ -339,25 +346,25 @@ def many(robot: str, count: int) -> Callable[[], Found]:
 
     def memory_of(process: Any) -> float:
         total = 0.0
-        for one in (process, *process.children(recursive=True)):
+        for member in (process, *process.children(recursive=True)):
             with contextlib.suppress(psutil.Error):
-                total += one.memory_full_info().uss / 2**20
+                total += member.memory_full_info().uss / 2**20
         return total
 
-    def measure() -> Found:
-        before, found, most = _children(), Found(), [0.0]
-        with clock(found, "us a target (wall)", count, wall=True):
+    def measure() -> Quantities:
+        time_before, quantities, peak_memory = _children(), Quantities(), [0.0]
+        with clock(quantities, "us a target (wall)", count, wall=True):
             command = [sys.executable, "-m", "casadi_ik", "batch", *words]
             process = psutil.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
             while process.poll() is None:
-                most.append(memory_of(process))
+                peak_memory.append(memory_of(process))
                 time.sleep(0.5)
         parts = [np.load(path)["success"] for path in sorted(solved.glob("part-*.npz"))]
         missed = count - sum(int(part.sum()) for part in parts)
-        spent = 1e6 * (_children() - before) / count
-        later = float(np.median(most[len(most) // 2 :]))
-        memory = {"peak MB, not shared": max(most), "MB in the second half": later}
-        return found | {"us a target (all processes)": spent, "missed": missed} | memory
+        time_each = 1e6 * (_children() - time_before) / count
+        later = float(np.median(peak_memory[len(peak_memory) // 2 :]))
+        memory = {"peak MB, not shared": max(peak_memory), "MB in the second half": later}
+        return quantities | {"us a target (all processes)": time_each, "missed": missed} | memory
 
     return measure
 
@@ -390,15 +397,15 @@ print(imported - begin, time.perf_counter() - imported)
 """
 
 
-def first_use(robot: str, ask: str, method: str) -> Callable[[], Found]:
+def first_use(robot: str, ask: str, method: str) -> Callable[[], Quantities]:
     """A new process to its first answer, with an empty cache of kernels and with a full one."""
 
-    def measure() -> Found:
+    def measure() -> Quantities:
         with tempfile.TemporaryDirectory() as place:
             program = PROGRAM.format(robot=robot, method=method, ask=FIRST[ask])
 
             def run() -> tuple[float, float, float]:
-                before = _children()
+                time_before = _children()
                 environment = os.environ | {"CASADI_IK_CACHE": place}
                 text = subprocess.run(
                     [sys.executable, "-c", program],
@@ -408,7 +415,7 @@ def first_use(robot: str, ask: str, method: str) -> Callable[[], Found]:
                     check=True,
                 ).stdout
                 imported, answered = map(float, text.split())
-                return imported, answered, _children() - before
+                return imported, answered, _children() - time_before
 
             _, cold, cpu = run()
             imported, warm, _ = run()
@@ -422,25 +429,25 @@ def _children() -> float:
     return sum(os.times()[2:4])
 
 
-def export(robot: str, target: str, *flags: str) -> Callable[[], Found]:
+def export(robot: str, target: str, *flags: str) -> Callable[[], Quantities]:
     """The exported solver, built with the machine's compiler."""
     folder = Path(tempfile.mkdtemp(prefix="casadi_ik-bench-")) / "solver"
     words = [robot, "--out", str(folder), "--target", target, "--prefix", "arm", *flags]
     _run(sys.executable, "-m", "casadi_ik", "export", *words)
     if target == "wasm":
-        found = {"bytes": float(sum(path.stat().st_size for path in folder.glob("*.wasm")))}
+        quantities = {"bytes": float(sum(path.stat().st_size for path in folder.glob("*.wasm")))}
 
-        def in_node() -> Found:
+        def in_node() -> Quantities:
             times = json.loads(_run("node", "test.mjs", folder=folder))
-            return found | {"us in node (wall, median)": times["median"]}
+            return quantities | {"us in node (wall, median)": times["median"]}
 
         node = subprocess.run(["node", "--version"], capture_output=True).returncode == 0
-        return in_node if node else lambda: found
+        return in_node if node else lambda: quantities
     _run("make", folder=folder)
     table = _run("size", "-t", "build/libarm.a", folder=folder).splitlines()[1:]
     texts = {line.split()[5]: int(line.split()[0]) for line in table}
     tables = sum(size for name, size in texts.items() if "tables" in name)
-    whole = next(size for name, size in texts.items() if name.startswith("(TOTALS)"))
+    total_bytes = next(size for name, size in texts.items() if name.startswith("(TOTALS)"))
     (folder / "stack.c").write_text((PROBES / "stack.c").read_text())
     real = "-DREAL=float" if "--single" in flags else "-DREAL=double"
     flags_of = (real, "-O2", "-Iinclude", "-Itest", "stack.c", "build/libarm.a", "-lm", "-pthread")
@@ -448,10 +455,10 @@ def export(robot: str, target: str, *flags: str) -> Callable[[], Found]:
     stack, solver = map(float, _run("build/stack", folder=folder).split())
     sizes = {"stack bytes": stack, "solver bytes": solver}
 
-    def measure() -> Found:
-        said = json.loads(_run("build/bench", "2", "20000", folder=folder))
-        times = {"us": said["cpu_mean"], "99.9 % us (wall)": said["p99.9"]}
-        return times | {"code bytes": whole - tables, "table bytes": float(tables)} | sizes
+    def measure() -> Quantities:
+        output = json.loads(_run("build/bench", "2", "20000", folder=folder))
+        times = {"us": output["cpu_mean"], "99.9 % us (wall)": output["p99.9"]}
+        return times | {"code bytes": total_bytes - tables, "table bytes": float(tables)} | sizes
 
     return measure
 
@@ -463,64 +470,70 @@ def _run(*words: str, folder: Path | None = None) -> str:
     return done.stdout
 
 
-def logs(robot: str, method: str, compression: str, count: int) -> Callable[[], Found]:
+def logs(robot: str, method: str, compression: str, count: int) -> Callable[[], Quantities]:
     """A batch with a log of every iteration over one without; its size; reading it."""
     settings: dict[str, Any] = {}
     if method != "hand-first":
         settings, count = {"finger_step": "closed-form", "limits": "ignore"}, max(count // 25, 12)
     solver = ik.Solver(ik.load_robot(robot), method, **settings)
-    targets = drawn(solver.robot, "grasps" if suits(solver.robot, "grasps") else "random", count)
+    targets = sampled_contacts(
+        solver.robot, "grasps" if suits(solver.robot, "grasps") else "random", count
+    )
     path = Path(tempfile.mkdtemp(prefix="casadi_ik-bench-")) / "bench.mcap"
     iterations = int(solver.solve_batch(*targets).iterations.sum())
 
-    def logged(found: Found, name: str, **options: Any) -> None:
+    def logged(quantities: Quantities, name: str, **options: Any) -> None:
         begun = time.process_time()
-        with clock(found, f"{name} us a solve (wall)", count, wall=True):
+        with clock(quantities, f"{name} us a solve (wall)", count, wall=True):
             solver.solve_batch(*targets, **options)
-        found[f"{name} us a solve (all threads)"] = 1e6 * (time.process_time() - begun) / count
+        quantities[f"{name} us a solve (all threads)"] = 1e6 * (time.process_time() - begun) / count
 
-    def measure() -> Found:
-        found: Found = {"iterations": float(iterations)}
-        logged(found, "without")
-        logged(found, "logged", log=path, compression=compression)
-        found["bytes an iteration"] = path.stat().st_size / iterations
+    def measure() -> Quantities:
+        quantities: Quantities = {"iterations": float(iterations)}
+        logged(quantities, "without")
+        logged(quantities, "logged", log=path, compression=compression)
+        quantities["bytes an iteration"] = path.stat().st_size / iterations
         log = ik.logs.open(path)
-        with clock(found, "read us an iteration", iterations):
+        with clock(quantities, "read us an iteration", iterations):
             table = log.iterations()
-        with clock(found, "to polars us an iteration", iterations):
+        with clock(quantities, "to polars us an iteration", iterations):
             table.frame()
         sampled = ik.logs.Keep(sample=0.01)
-        logged(found, "sampled", log=path, compression=compression, keep=sampled)
-        return found
+        logged(quantities, "sampled", log=path, compression=compression, keep=sampled)
+        return quantities
 
     return measure
 
 
-def peer(robot: str, sampler: str, tolerance: str, name: str, count: int) -> Callable[[], Found]:
+def peer(
+    robot: str, sampler: str, tolerance: str, name: str, count: int
+) -> Callable[[], Quantities]:
     """Another solver on the same targets with restarts, judged by our verdict; see `peers`."""
     peers = importlib.import_module("peers")
     arm_hand = ik.load_robot(robot)
-    targets = drawn(arm_hand, sampler, count)
+    targets = sampled_contacts(arm_hand, sampler, count)
     ours = batch(robot, sampler, tolerance, count)
-    one, fine = fast(robot, count), TOLERANCES[tolerance]
+    single_calls, fine = fast(robot, count), TOLERANCES[tolerance]
 
-    def measure() -> Found:
+    def measure() -> Quantities:
         run = peers.run_peer(name, arm_hand, targets, fine)
         mean = 1e6 * float(run.times.mean())
-        mine, alone = (min(way()["us"] for _ in range(5)) for way in (ours, one))
-        found = {"us": mean, "99 % us": 1e6 * float(np.quantile(run.times, 0.99))}
-        found |= {"over our batch": mean / mine, "over our fast": mean / alone}
-        return found | {"solved %": 100 * run.solved, "first start %": 100 * run.first}
+        batch_time, fast_time = (
+            min(measure_call()["us"] for _ in range(5)) for measure_call in (ours, single_calls)
+        )
+        quantities = {"us": mean, "99 % us": 1e6 * float(np.quantile(run.times, 0.99))}
+        quantities |= {"over our batch": mean / batch_time, "over our fast": mean / fast_time}
+        return quantities | {"solved %": 100 * run.solved, "first start %": 100 * run.first}
 
     return measure
 
 
-def view(page: str, painted: bool, flow: bool) -> Callable[[], Found]:
+def view(page: str, painted: bool, flow: bool) -> Callable[[], Quantities]:
     """From the mouse to the drawn answer in a browser; see `bench_view`."""
     return partial(importlib.import_module("bench_view").measure, page, painted, flow)
 
 
-MEASUREMENTS: dict[str, Callable[..., Callable[[], Found]]] = {
+MEASUREMENTS: dict[str, Callable[..., Callable[[], Quantities]]] = {
     "batch": batch,
     "fast": fast,
     "single": single,
@@ -532,7 +545,7 @@ MEASUREMENTS: dict[str, Callable[..., Callable[[], Found]]] = {
     "methods": methods,
     "threads": threads,
     "memory": memory,
-    "many": many,
+    "many": large_batch,
     "first-use": first_use,
     "export": export,
     "logs": logs,
@@ -545,8 +558,8 @@ ABROAD = ("first-use", "memory", "many", "peers", "view")
 
 
 def _samplers(robot: str) -> list[str]:
-    there = ik.load_robot(robot)
-    return [name for name in ("random", "grasps", "limits") if suits(there, name)]
+    other_robot = ik.load_robot(robot)
+    return [name for name in ("random", "grasps", "limits") if suits(other_robot, name)]
 
 
 def _batches(robots: list[str], count: int, _: str) -> list[Case]:
@@ -560,8 +573,12 @@ def _batches(robots: list[str], count: int, _: str) -> list[Case]:
 
 def _methods(*_: Any) -> list[Case]:
     steps = {name: ("closed-form", "ipopt") for name in ik.METHODS if name.startswith("enhanced")}
-    others = [name for name in ik.METHODS if name not in ("hand-first", "ipopt")]
-    return [("kuka_lwr_barrett", name, step) for name in others for step in steps.get(name, ("",))]
+    other_methods = [name for name in ik.METHODS if name not in ("hand-first", "ipopt")]
+    return [
+        ("kuka_lwr_barrett", name, step)
+        for name in other_methods
+        for step in steps.get(name, ("",))
+    ]
 
 
 def _peers(robots: list[str], count: int, _: str) -> list[Case]:
@@ -582,9 +599,9 @@ CASES: dict[str, Callable[[list[str], int, str], list[Case]]] = {
     "scene": lambda robots, count, _: [(robot, min(count, 200)) for robot in robots],
     "clutter": lambda robots, *_: [(robot, place) for robot in robots for place in range(4)],
     "choose": lambda robots, *_: [
-        (robot, given, around)
+        (robot, grasp_kind, around)
         for robot in robots
-        for given in ("palms", "contacts")
+        for grasp_kind in ("palms", "contacts")
         for around in ("free", "scene")
     ],
     "follow": lambda robots, *_: [(robot,) for robot in robots],
@@ -610,8 +627,8 @@ CASES: dict[str, Callable[[list[str], int, str], list[Case]]] = {
     ],
     "peers": _peers,
     "view": lambda _, __, page: [
-        (where, painted, flow)
-        for where in ("server", *([page] if Path(page).is_file() else []))
+        (place, painted, flow)
+        for place in ("server", *([page] if Path(page).is_file() else []))
         for painted, flow in ((True, False), (False, False), (False, True))
     ],
 }
@@ -620,7 +637,7 @@ a server."""
 
 
 @cache
-def _ready(case: Case) -> Callable[[], Found]:
+def _ready(case: Case) -> Callable[[], Quantities]:
     return MEASUREMENTS[case[0]](*case[1:])
 
 
@@ -630,10 +647,10 @@ def serve() -> None:
     os.dup2(2, 1)  # what libraries print is no answer
     for line in sys.stdin:
         try:
-            said: dict[str, Any] = {"found": _ready(tuple(json.loads(line)))()}
+            output: dict[str, Any] = {"found": _ready(tuple(json.loads(line)))()}
         except Exception as error:
-            said = {"error": f"{type(error).__name__}: {error}"[:300]}
-        answers.write(json.dumps(said) + "\n")
+            output = {"error": f"{type(error).__name__}: {error}"[:300]}
+        answers.write(json.dumps(output) + "\n")
         answers.flush()
 
 

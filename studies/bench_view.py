@@ -42,10 +42,10 @@ WARM = 2
 STEPS, PAINTED = 40, 5
 """Steps of a drag, and where all is painted, which may take seconds a step."""
 
-REST, FLOW = 1.0, 0.03
+STEP_PAUSE, FLOW = 1.0, 0.03
 """Between what is drawn and the next step [s]."""
 
-HELD = {"button": "left", "buttons": 1}
+BUTTON_HELD = {"button": "left", "buttons": 1}
 
 BOX = (
     "(({x, y, width, height}) => [x, y, width, height])"
@@ -56,7 +56,7 @@ HANDLE = 0.06
 """Length of the axes by which a contact is held [m]."""
 
 PROBES = Path(__file__).parent / "probes"
-COMMON, SERVED, ALONE, NO_PAINTING, STILL = (
+COMMON, SERVED, STATIC_PAGE_SCRIPT, NO_PAINTING, STILL = (
     (PROBES / f"{name}.js").read_text(encoding="utf-8")
     for name in ("common", "served", "alone", "no_painting", "still")
 )
@@ -70,31 +70,31 @@ STAGES = {
     "page": ("event", "asked", "solved", "placed", "submitted", "drawn"),
 }
 
-Found = dict[str, float]
+Quantities = dict[str, float]
 
 
-def measure(where: str, painted: bool, flow: bool) -> Found:
+def measure(target: str, painted: bool, flow: bool) -> Quantities:
     """One drag: medians of times [ms], and processor times a step.
 
     Args:
-        where: "server": the page of `casadi-ik view`; else the file of the page without one.
+        target: "server": the page of `casadi-ik view`; else the file of the page without one.
         painted: Whether it is painted.
         flow: Whether steps follow each other as a hand drags.
     """
-    steps, rest = PAINTED if painted else STEPS, FLOW if flow else REST
+    steps, pause = PAINTED if painted else STEPS, FLOW if flow else STEP_PAUSE
     with browser_tools().Browser() as browser:
-        drag = _on_view if where == "server" else _on_page
-        rows, more = drag(where, browser, steps, painted, rest)
-    found: Found = {"steps lost": float(steps - len(rows))}
+        drag = _on_view if target == "server" else _on_page
+        rows, extra = drag(target, browser, steps, painted, pause)
+    quantities: Quantities = {"steps lost": float(steps - len(rows))}
     if rows:
-        stages = STAGES["server" if where == "server" else "page"]
-        whole = [row["drawn"] - row["event"] for row in rows]
-        found["pointer to drawn answer ms"] = float(np.median(whole))
-        found["nine of ten ms"] = float(np.quantile(whole, 0.9))
+        stages = STAGES["server" if target == "server" else "page"]
+        latencies = [row["drawn"] - row["event"] for row in rows]
+        quantities["pointer to drawn answer ms"] = float(np.median(latencies))
+        quantities["nine of ten ms"] = float(np.quantile(latencies, 0.9))
         for start, end in pairwise(stages):
             name = f"{start} to {end} ms"
-            found[name] = float(np.median([row[end] - row[start] for row in rows]))
-    return found | more
+            quantities[name] = float(np.median([row[end] - row[start] for row in rows]))
+    return quantities | extra
 
 
 def browser_tools() -> ModuleType:
@@ -117,66 +117,68 @@ def _opened(browser: Any, url: str, *scripts: str) -> Any:
     return page
 
 
-def _cpu_times(browser: Any) -> Found:
+def _cpu_times(browser: Any) -> Quantities:
     """Processor time of a browser's processes by kind [s]."""
     connect = importlib.import_module("websockets.sync.client").connect
     with urllib.request.urlopen(f"{browser._address}/json/version") as answer:
         address = json.loads(answer.read())["webSocketDebuggerUrl"]
     with connect(address) as socket:
         socket.send(json.dumps({"id": 1, "method": "SystemInfo.getProcessInfo"}))
-        found: Found = {"server": time.process_time()}
-        for one in json.loads(socket.recv(PATIENCE))["result"]["processInfo"]:
-            found[one["type"]] = found.get(one["type"], 0.0) + float(one["cpuTime"])
-    return found
+        quantities: Quantities = {"server": time.process_time()}
+        for process_info in json.loads(socket.recv(PATIENCE))["result"]["processInfo"]:
+            quantities[process_info["type"]] = quantities.get(process_info["type"], 0.0) + float(
+                process_info["cpuTime"]
+            )
+    return quantities
 
 
 @contextmanager
-def _cpu_of(browser: Any, steps: int, found: Found, *kinds: str) -> Iterator[None]:
+def _cpu_of(browser: Any, steps: int, quantities: Quantities, *kinds: str) -> Iterator[None]:
     """Notes what steps take of each processor, a step [ms]."""
-    before = _cpu_times(browser)
+    times_before = _cpu_times(browser)
     yield
     after = _cpu_times(browser)
     for kind in kinds:
-        spent = after.get(kind, 0.0) - before.get(kind, 0.0)
-        found[f"{kind} ms of CPU a step"] = 1e3 * spent / (steps + WARM)
+        seconds = after.get(kind, 0.0) - times_before.get(kind, 0.0)
+        quantities[f"{kind} ms of CPU a step"] = 1e3 * seconds / (steps + WARM)
 
 
 def _drag(
-    page: Any, start: np.ndarray, way: np.ndarray, steps: int, rest: float
+    page: Any, start: np.ndarray, direction: np.ndarray, steps: int, pause: float
 ) -> list[dict[str, float]]:
     """Drag something to and fro about a start [pixels], each step once the one before is drawn."""
 
     def place(i: int) -> dict[str, float]:
-        x, y = start + way * (np.sin(0.9 * i) + 0.1 * np.sin(0.37 * i)) * (i > 0)
+        x, y = start + direction * (np.sin(0.9 * i) + 0.1 * np.sin(0.37 * i)) * (i > 0)
         return {"x": float(x), "y": float(y)}
 
     page.mouse("Moved", **place(0))
-    page.mouse("Pressed", **place(0), clickCount=1, **HELD)
+    page.mouse("Pressed", **place(0), clickCount=1, **BUTTON_HELD)
     for i in range(1, steps + WARM + 1):
         if i == WARM + 1:
             page.evaluate("window.rows = []")
-        before, end = page.evaluate("window.rows.length"), time.monotonic() + PATIENCE
-        page.mouse("Moved", **place(i), **HELD)
-        while page.evaluate("window.rows.length") == before and time.monotonic() < end:
+        times_before, end = page.evaluate("window.rows.length"), time.monotonic() + PATIENCE
+        page.mouse("Moved", **place(i), **BUTTON_HELD)
+        while page.evaluate("window.rows.length") == times_before and time.monotonic() < end:
             time.sleep(0.02)
-        time.sleep(rest)
+        time.sleep(pause)
     page.mouse("Released", **place(steps), button="left", buttons=0, clickCount=1)
     return page.evaluate("window.rows")
 
 
 def _on_view(
-    _: str, browser: Any, steps: int, painted: bool, rest: float
-) -> tuple[list[dict[str, float]], Found]:
+    _: str, browser: Any, steps: int, painted: bool, pause: float
+) -> tuple[list[dict[str, float]], Quantities]:
     """A drag on the page of `casadi-ik view`; what of it are the server's and the solver's."""
     viewing = importlib.import_module("casadi_ik.app.viewer")
     robot, grasp = ik.load_robot("kuka_lwr_barrett"), ik.load_grasp("cup")
     viewer = viewing.view_grasp(robot, grasp, scene=ik.load_scene("table"))
-    shown, served, solves, begun = viewer.page, [], [], [0.0]
-    put, draw = shown.work.submit, shown.draw
+    page_state, served, solves, begun = viewer.page, [], [], [0.0]
+    submit, draw = page_state.work.submit, page_state.draw
 
     def asked(key: str, change: Callable[[], None]) -> None:
         begun[0] = time.perf_counter()
-        put(key, change)
+        submit(key, change)
 
     def answered(answer: Any) -> None:
         draw(answer)
@@ -189,50 +191,52 @@ def _on_view(
     page.wait("document.querySelector('.ik-status') !== null")
     time.sleep(4.0)  # the camera comes to rest
     client = list(viewer._server.get_clients().values())[-1]
-    box, pose = page.evaluate(BOX), shown.request.contacts["thumb"].control
+    box, pose = page.evaluate(BOX), page_state.request.contacts["thumb"].control
 
     def pixel(point: np.ndarray) -> np.ndarray:
         camera = client.camera
         w, x, y, z = camera.wxyz
         cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         turn = np.eye(3) + 2 * w * cross + 2 * cross @ cross
-        seen = turn.T @ (point - camera.position)
+        camera_point = turn.T @ (point - camera.position)
         focal = box[3] / 2 / np.tan(camera.fov / 2)
-        return np.array(box[:2]) + np.array(box[2:]) / 2 + focal * seen[:2] / seen[2]
+        return (
+            np.array(box[:2]) + np.array(box[2:]) / 2 + focal * camera_point[:2] / camera_point[2]
+        )
 
-    here = pixel(pose[:3, 3])
+    start = pixel(pose[:3, 3])
     tips = [pixel(pose[:3, 3] + HANDLE * pose[:3, i]) for i in range(3)]
-    way = max((tip - here for tip in tips), key=lambda one: float(np.linalg.norm(one)))
-    found: Found = {}
-    found["picture painted again ms"] = _still(page, STILL.replace("DRAW", ""))
-    shown.work.submit, shown.draw = asked, answered
-    with _cpu_of(browser, steps, found, "server", "renderer", "GPU"):
-        rows = _drag(page, here + 0.92 * way, 0.25 * way, steps, rest)
+    direction = max((tip - start for tip in tips), key=lambda tip: float(np.linalg.norm(tip)))
+    quantities: Quantities = {}
+    quantities["picture painted again ms"] = _still(page, STILL.replace("DRAW", ""))
+    page_state.work.submit, page_state.draw = asked, answered
+    with _cpu_of(browser, steps, quantities, "server", "renderer", "GPU"):
+        rows = _drag(page, start + 0.92 * direction, 0.25 * direction, steps, pause)
     viewer.stop()
-    found["server's share ms"], found["solver's share ms"] = map(
+    quantities["server's share ms"], quantities["solver's share ms"] = map(
         float, map(np.median, (served, solves))
     )
-    return rows, found
+    return rows, quantities
 
 
 def _on_page(
-    path: str, browser: Any, steps: int, painted: bool, rest: float
-) -> tuple[list[dict[str, float]], Found]:
+    path: str, browser: Any, steps: int, painted: bool, pause: float
+) -> tuple[list[dict[str, float]], Quantities]:
     """A drag on the page without a server."""
     url, scripts = Path(path).resolve().as_uri(), [] if painted else [NO_PAINTING]
     page = _opened(browser, url, *scripts)
     page.wait("globalThis.casadiIk?.now.answer && !casadiIk.viewport.framePending", 60.0)
     time.sleep(1.0)
-    page.evaluate(COMMON + ALONE)
+    page.evaluate(COMMON + STATIC_PAGE_SCRIPT)
     still = STILL.replace("DRAW; next()", "next()")
     still = still.replace("took.push(", "casadiIk.viewport.draw(); took.push(")
-    found: Found = {}
-    found["picture painted again ms"] = _still(page, still)
+    quantities: Quantities = {}
+    quantities["picture painted again ms"] = _still(page, still)
     start = np.array(page.evaluate("casadiIk.pixel('point 0')"))
-    with _cpu_of(browser, steps, found, "renderer", "GPU"):
-        rows = _drag(page, start, np.array([9.0, -9.0]), steps, rest)
+    with _cpu_of(browser, steps, quantities, "renderer", "GPU"):
+        rows = _drag(page, start, np.array([9.0, -9.0]), steps, pause)
     page.wait("!casadiIk.viewport.framePending")
-    return rows, found
+    return rows, quantities
 
 
 def _still(page: Any, script: str) -> float:

@@ -85,21 +85,23 @@ def trials(
         rng = np.random.default_rng([seed, hand])
         truth = true_values(model, rng)
         data = simulate(model, truth, FINGER, poses, rng, noise=noise, outliers=outliers)
-        found = calibrate(model, data, loss=loss)
+        estimate = calibrate(model, data, loss=loss)
         fresh = simulate(model, truth, FINGER, 100, rng, noise=EXACT)
         miss, described = (
-            tip_miss(model, values, fresh) for values in (found.values, model.nominal)
+            tip_miss(model, values, fresh) for values in (estimate.values, model.nominal)
         )
-        scaled = (found.values - truth) / found.deviation
-        rows.append((scaled, miss, described, found.noise[0] / noise[0], found.converged, found))
-    scaled, misses, described, ratios, converged, found = zip(*rows, strict=True)
+        scaled = (estimate.values - truth) / estimate.deviation
+        rows.append(
+            (scaled, miss, described, estimate.noise[0] / noise[0], estimate.converged, estimate)
+        )
+    scaled, misses, described, ratios, converged, estimates = zip(*rows, strict=True)
     return Trials(
         np.array(scaled),
         np.array(misses),
         np.array(described),
         np.array(ratios),
         np.array(converged),
-        found[-1],
+        estimates[-1],
     )
 
 
@@ -116,7 +118,7 @@ NORMAL = np.array([0.6745, 0.8416, 1.0364, 1.2816, 1.6449, 1.96, 2.5758])
 
 def draw_bars(results: dict[tuple[str, float], Trials], share: float, path: Path) -> None:
     """Coverage against its level, and errors over deviations, without and with `share` outliers."""
-    drawn, grid = figure(1, 2, 5, 4)
+    plot, grid = figure(1, 2, 5, 4)
     levels, errors = grid[0]
     colors = dict(zip(LOSSES, (OURS, THIRD, PAPER), strict=True))
     for (loss, outliers), result in results.items():
@@ -142,23 +144,23 @@ def draw_bars(results: dict[tuple[str, float], Trials], share: float, path: Path
     title(errors, name, "error / its estimated standard deviation", "density")
     errors.set_ylim(0, 0.55)
     errors.legend(frameon=False, fontsize=8, loc="upper left")
-    drawn.tight_layout()
-    drawn.savefig(path)
+    plot.tight_layout()
+    plot.savefig(path)
 
 
 NONE = 1e-6
 """Singular values below this are zero to rounding."""
 
 
-def draw_spectrum(found: Calibration, path: Path) -> None:
+def draw_spectrum(estimate: Calibration, path: Path) -> None:
     """Singular values, with the level of the priors."""
-    drawn, ((axes,),) = figure(1, 1, 7, 3.4)
-    values, order = found.singular_values, np.arange(1, len(found.singular_values) + 1)
-    for chosen, color, label in (
+    plot, ((axes,),) = figure(1, 1, 7, 3.4)
+    values, order = estimate.singular_values, np.arange(1, len(estimate.singular_values) + 1)
+    for is_selected, color, label in (
         (values >= 1, OURS, "known from the measurements"),
         ((values < 1) & (values > NONE), "#9fc3e6", "known from the priors for the most part"),
     ):
-        axes.semilogy(order[chosen], values[chosen], "o", color=color, ms=5, label=label)
+        axes.semilogy(order[is_selected], values[is_selected], "o", color=color, ms=5, label=label)
     zero = order[values <= NONE]
     axes.semilogy(zero, np.full(len(zero), NONE), "v", color=PAPER, ms=6,
                   label="zero: no measurement of the tip tells")  # fmt: skip
@@ -171,8 +173,8 @@ def draw_spectrum(found: Calibration, path: Path) -> None:
     title(axes, "What the measurements tell", across, "singular value, priors = 1")
     axes.set_ylim(3e-7, None)
     axes.legend(frameon=False, fontsize=8, loc="lower left")
-    drawn.tight_layout()
-    drawn.savefig(path)
+    plot.tight_layout()
+    plot.savefig(path)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -202,16 +204,18 @@ def main(arguments: list[str] | None = None) -> None:
         "--out", type=Path, default=Path(__file__).parent / "results" / "calibration"
     )
     options = parser.parse_args(arguments)
-    few, many = options.outliers
-    if not 0 < few < many < 1:
-        raise InputError(f"--outliers: found {few:g} {many:g}, expected 0 < FEW < MANY < 1")
+    few, most_outliers = options.outliers
+    if not 0 < few < most_outliers < 1:
+        raise InputError(
+            f"--outliers: found {few:g} {most_outliers:g}, expected 0 < FEW < MANY < 1"
+        )
     options.out.mkdir(parents=True, exist_ok=True)
     robot = ik.load_robot(options.robot).description
     model = HandModel(robot, hand_parameters(robot, [FINGER]))
     hands, seed, poses, noise = options.hands, options.seed, options.poses, tuple(options.noise)
     results = {
         (loss, outliers): trials(model, hands, seed, loss, outliers, poses, noise)
-        for outliers in (0.0, few, many)
+        for outliers in (0.0, few, most_outliers)
         for loss in LOSSES
     }
     sizes = {
@@ -228,7 +232,7 @@ def main(arguments: list[str] | None = None) -> None:
         position=1e3 * noise[0],
         angle=math.degrees(noise[1]),
         few=100 * few,
-        many=100 * many,
+        many=100 * most_outliers,
         described=np.median(results["cauchy", few].described),
         losses=loss_table(results),
         sizes=size_table(sizes),
@@ -325,20 +329,20 @@ def group_table(result: Trials) -> str:
     }
     rows = []
     for part, name in names.items():
-        columns = np.array([each == part for each in parts])
-        held = 100 * np.mean(np.abs(result.deviations[:, columns]) <= 1.959964)
-        taken = 100 * learned[columns]
-        rows.append((name, str(columns.sum()), f"{taken.min():.0f} to {taken.max():.0f} %",
-                     f"{held:.1f} %"))  # fmt: skip
+        columns = np.array([is_in_group == part for is_in_group in parts])
+        coverage_share = 100 * np.mean(np.abs(result.deviations[:, columns]) <= 1.959964)
+        learned_share = 100 * learned[columns]
+        learned_range = f"{learned_share.min():.0f} to {learned_share.max():.0f} %"
+        rows.append((name, str(columns.sum()), learned_range, f"{coverage_share:.1f} %"))
     return markdown_table(("numbers", "how many", "learned (one hand)", "held"), rows)
 
 
-def direction_table(found: Calibration) -> str:
+def direction_table(estimate: Calibration) -> str:
     """The weakest directions of an estimate."""
     rows = [
         ("0" if value < 1e-6 else f"{value:.3f}",
          ", ".join(f"{part:+.2f} {name}" for name, part in list(names.items())[:5]))
-        for value, names in found.unidentified()[:12]
+        for value, names in estimate.unidentified()[:12]
     ]  # fmt: skip
     return markdown_table(("singular value", "direction"), rows)
 

@@ -45,7 +45,7 @@ class Search:
         waited: (CLIMBERS,) steps since the last rise.
         seconds: Spent so far.
         total: Targets solved at each tolerance.
-        most: Most iterations and restarts, by tolerance.
+        hardest_by_tolerance: Most iterations and restarts, by tolerance.
         missed: "tolerance", "status" and "q" of each miss.
     """
 
@@ -54,7 +54,7 @@ class Search:
     waited: Array
     seconds: float = 0.0
     total: int = 0
-    most: dict[str, list[int]] = field(default_factory=dict)
+    hardest_by_tolerance: dict[str, list[int]] = field(default_factory=dict)
     missed: list[dict[str, Any]] = field(default_factory=list)
 
     @classmethod
@@ -66,33 +66,33 @@ class Search:
     def step(self, solvers: dict[str, ik.Solver], rng: np.random.Generator) -> None:
         """Every climber makes one step."""
         robot = next(iter(solvers.values())).robot
-        q = _moved(robot, self.q, rng)
+        q = _random_steps(robot, self.q, rng)
         points, normals = robot.contacts(q)
-        iterations, lost = np.zeros(CLIMBERS), np.zeros(CLIMBERS, dtype=bool)
+        iterations, missed = np.zeros(CLIMBERS), np.zeros(CLIMBERS, dtype=bool)
         for name, solver in solvers.items():
             batch = solver.solve_batch(points, normals)
             iterations += batch.iterations
-            most = self.most.setdefault(name, [0, 0])
-            most[0] = max(most[0], int(batch.iterations.max()))
-            most[1] = max(most[1], int(batch.restarts.max()))
+            largest = self.hardest_by_tolerance.setdefault(name, [0, 0])
+            largest[0] = max(largest[0], int(batch.iterations.max()))
+            largest[1] = max(largest[1], int(batch.restarts.max()))
             for row in np.flatnonzero(~batch.success):
-                lost[row] = True
+                missed[row] = True
                 status = str(batch.status_names[row])
                 self.missed.append({"tolerance": name, "status": status, "q": q[row].tolist()})
         self.total += CLIMBERS
         score = np.log(iterations)
-        half = slice(0, None, 2)
-        score[half] -= CONDITION * np.log10(contact_slopes(robot, q[half]) + 1e-16)
-        better = (score >= self.score) & ~lost
+        even_rows = slice(0, None, 2)
+        score[even_rows] -= CONDITION * np.log10(contact_slopes(robot, q[even_rows]) + 1e-16)
+        better = (score >= self.score) & ~missed
         self.waited = np.where(score > self.score, 0.0, self.waited + 1)
         self.q[better], self.score[better] = q[better], score[better]
         # What is missed is known by then: the search goes on elsewhere.
-        again = np.flatnonzero(lost | (self.waited > PATIENCE))
+        restarted = np.flatnonzero(missed | (self.waited > PATIENCE))
         hardest = self.q[rng.permutation(np.argsort(self.score)[-CLIMBERS // 8 :])]
-        near = hardest[rng.integers(0, len(hardest), len(again))]
-        fresh = rng.random((len(again), 1)) < 0.5
-        self.q[again] = np.where(fresh, robot.random(rng, len(again)), near)
-        self.score[again], self.waited[again] = -np.inf, 0.0
+        parents = hardest[rng.integers(0, len(hardest), len(restarted))]
+        fresh = rng.random((len(restarted), 1)) < 0.5
+        self.q[restarted] = np.where(fresh, robot.random(rng, len(restarted)), parents)
+        self.score[restarted], self.waited[restarted] = -np.inf, 0.0
 
 
 def climb(solvers: dict[str, ik.Solver], path: Path, seconds: float, seed: int) -> dict[str, Any]:
@@ -112,24 +112,24 @@ def climb(solvers: dict[str, ik.Solver], path: Path, seconds: float, seed: int) 
     """
     robot = next(iter(solvers.values())).robot
     rng = np.random.default_rng([seed, len(robot.name), *robot.name.encode()])
-    search, mine = Search.begun(robot, rng), {"code": code_version(), "seed": seed}
+    search, identity = Search.begun(robot, rng), {"code": code_version(), "seed": seed}
     if path.exists():
-        kept = json.loads(path.read_text(encoding="utf-8"))
-        if mine != {name: kept[name] for name in mine}:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        if identity != {name: stored[name] for name in identity}:
             raise InputError(f"{path}: made by other code or with another seed; use another folder")
-        rng.bit_generator.state = kept["rng"]
-        arrays = {name: np.array(kept["search"][name]) for name in ("q", "score", "waited")}
-        search = Search(**(kept["search"] | arrays))
+        rng.bit_generator.state = stored["rng"]
+        arrays = {name: np.array(stored["search"][name]) for name in ("q", "score", "waited")}
+        search = Search(**(stored["search"] | arrays))
     while search.seconds < seconds:
         begun = time.monotonic()
         left = min(TURN, seconds - search.seconds)
-        while (spent := time.monotonic() - begun) < left:
+        while (elapsed := time.monotonic() - begun) < left:
             search.step(solvers, rng)
-        search.seconds += spent
+        search.seconds += elapsed
         data = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(search).items()}
-        state = mine | {"rng": rng.bit_generator.state, "search": data}
+        state = identity | {"rng": rng.bit_generator.state, "search": data}
         keep(path, json.dumps(state, default=float))
-        hardest = max(most for most, _ in search.most.values())
+        hardest = max(iterations for iterations, _ in search.hardest_by_tolerance.values())
         text = f"{search.total:,} targets, {len(search.missed)} missed, hardest {hardest:,}"
         print(f"{robot.name}: {search.seconds:.0f} s, {text} iterations", file=sys.stderr)
     return read_search(path)
@@ -137,16 +137,16 @@ def climb(solvers: dict[str, ik.Solver], path: Path, seconds: float, seed: int) 
 
 def read_search(path: Path) -> dict[str, Any]:
     """What a search has come to: see `climb`."""
-    kept = json.loads(path.read_text(encoding="utf-8"))
-    return kept["search"] | {"code": kept["code"]}
+    stored = json.loads(path.read_text(encoding="utf-8"))
+    return stored["search"] | {"code": stored["code"]}
 
 
-def _moved(robot: ik.ArmHand, q: Array, rng: np.random.Generator) -> Array:
+def _random_steps(robot: ik.ArmHand, q: Array, rng: np.random.Generator) -> Array:
     """Steps from configurations (k, n): of some motors, of any size, some of them to a limit."""
     ranges = robot.upper - robot.lower
     size = 10.0 ** rng.uniform(-4, 0, (len(q), 1))
-    some = rng.random(q.shape) < rng.uniform(0.1, 1, (len(q), 1))
-    moved = q + np.where(some, rng.normal(0, 1, q.shape) * size * ranges, 0.0)
+    is_changed = rng.random(q.shape) < rng.uniform(0.1, 1, (len(q), 1))
+    moved = q + np.where(is_changed, rng.normal(0, 1, q.shape) * size * ranges, 0.0)
     snapped = rng.random(q.shape) < 0.05
     ends = np.where(rng.random(q.shape) < 0.5, robot.lower, robot.upper)
     return np.clip(np.where(snapped, ends, moved), robot.lower, robot.upper)

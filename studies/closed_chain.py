@@ -26,8 +26,8 @@ def constraints(robot: ik.ArmHand, q: Array) -> Array:
     x = ca.SX.sym("q", len(robot.actuators))
     chain = closed_chain(actuated(description, x), split(description), LENGTH)
     kernel = FunctionKernel(ca.Function("chain_constraint", [x], [ca.densify(chain.constraint)]))
-    (found,) = kernel(q)
-    return found
+    (value,) = kernel(q)
+    return value
 
 
 class HeldThumb:
@@ -68,30 +68,30 @@ class HeldThumb:
         points, normals = (part[:, self.thumb] for part in self.robot.contacts(q))
         palm = self.robot.palm(q)
         point, normal = contact
-        brought = between(normals, np.broadcast_to(normal, normals.shape)) @ palm[:, :3, :3]
-        rotation = about(np.broadcast_to(normal, normals.shape), turn) @ brought
+        rotations = between(normals, np.broadcast_to(normal, normals.shape)) @ palm[:, :3, :3]
+        rotation = rotation_about(np.broadcast_to(normal, normals.shape), turn) @ rotations
         lever = np.einsum("kji,kj->ki", palm[:, :3, :3], points - palm[:, :3, 3])
         return rotation, point - np.einsum("kij,kj->ki", rotation, lever)
 
-    def followed(self, rotation: Array, origin: Array) -> NDArray[np.bool_]:
+    def is_followed(self, rotation: Array, origin: Array) -> NDArray[np.bool_]:
         """(k,) whether some arm configuration within limits has its palm there."""
-        found = np.zeros(len(origin), dtype=bool)
+        value = np.zeros(len(origin), dtype=bool)
         for trial in range(self._search.trials):
-            rest = np.flatnonzero(~found)
-            if len(rest):
-                (margin,) = self._margin(rotation[rest], origin[rest], float(trial))
-                found[rest] = margin >= ARM_SEARCH.tolerance
-        return found
+            remaining = np.flatnonzero(~value)
+            if len(remaining):
+                (margin,) = self._margin(rotation[remaining], origin[remaining], float(trial))
+                value[remaining] = margin >= ARM_SEARCH.tolerance
+        return value
 
     def in_reach(self, rotation: Array, origin: Array) -> NDArray[np.bool_]:
         """(k,) whether the elbow can bring the wrist there, the other joints aside."""
         wrist = origin + rotation @ self._srs.wrist_in_palm
         distance = np.linalg.norm(wrist - self._srs.shoulder, axis=1)
-        near, far = self._reach
-        return (distance >= near) & (distance <= far)
+        inner, outer = self._reach
+        return (distance >= inner) & (distance <= outer)
 
 
-def about(axis: Array, angle: Array) -> Array:
+def rotation_about(axis: Array, angle: Array) -> Array:
     """Rotations (k, 3, 3) about unit axes (k, 3) by angles (k,)."""
     x, y, z = axis.T
     zero = np.zeros_like(x)

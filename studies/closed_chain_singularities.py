@@ -29,35 +29,35 @@ def conditions(
     fixed = tuple(columns.index(c) for c in parts.active)
     condition = {name: np.empty(len(q)) for name in ("paper", "pivoted")}
     ratio = {name: np.empty(len(q)) for name in condition}
-    chosen = np.zeros((len(q), len(columns)), dtype=np.int64)
+    selected = np.zeros((len(q), len(columns)), dtype=np.int64)
     for row, matrix in enumerate(constraints(robot, q)):
         active, _ = pivoted(matrix)
-        chosen[row, list(active)] = 1
+        selected[row, list(active)] = 1
         for name, indices in (("paper", fixed), ("pivoted", active)):
             passive = [i for i in range(len(columns)) if i not in indices]
             H_p = matrix[:, passive]
             condition[name][row] = np.linalg.cond(H_p)
             rates = np.linalg.solve(H_p, matrix[:, list(indices)])
             ratio[name][row] = np.abs(rates).max()
-    return condition, ratio, chosen
+    return condition, ratio, selected
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the study and write its page."""
-    given = options(
+    args = options(
         "Singularities of the closed chain.",
         30_000,
         arguments,
         near=(100.0, "condition from which a configuration counts as near singular"),
     )
     robot = ik.load_robot("kuka_lwr_barrett")
-    q = robot.random(np.random.default_rng(given.seed), given.count)
-    condition, ratio, chosen = conditions(robot, q)
+    q = robot.random(np.random.default_rng(args.seed), args.count)
+    condition, ratio, selected = conditions(robot, q)
     r, z = cylinder(robot.palm(q)[:, :3, 3])
     parts = split(robot.description)
     names = ["virtual" if c == VIRTUAL else robot.actuators[c] for c in parts.columns]
 
-    drawn, grid = figure(2, 3)
+    plot, grid = figure(2, 3)
     elbow, wrist = (np.rad2deg(q[:, robot.description.arm_actuators[i]]) for i in (3, 5))
     for row, (name, values) in enumerate(condition.items()):
         log = np.log10(values)
@@ -68,35 +68,35 @@ def main(arguments: list[str] | None = None) -> None:
             "palm from the base's axis [m]",
             "palm's height [m]",
         )
-        drawn.colorbar(mesh, ax=grid[row, 0])
+        plot.colorbar(mesh, ax=grid[row, 0])
         mesh = field(grid[row, 1], elbow, wrist, log, 40, 0.5, 3.0, "magma_r")
         title(grid[row, 1], "the same over elbow and wrist", "arm joint 4 [deg]", "joint 6 [deg]")
-        drawn.colorbar(mesh, ax=grid[row, 1])
+        plot.colorbar(mesh, ax=grid[row, 1])
     share = np.linspace(0, 100, len(q))
     for (name, values), color in zip(condition.items(), (PAPER, OURS), strict=True):
         grid[0, 2].semilogx(np.sort(values), share, color=color, lw=2, label=name)
-    grid[0, 2].axvline(given.near, color="0.6", lw=1, ls="--")
+    grid[0, 2].axvline(args.near, color="0.6", lw=1, ls="--")
     grid[0, 2].set_xlim(1, 1e5)
     grid[0, 2].legend(frameon=False, fontsize=9)
     title(grid[0, 2], "how often", "cond(H_p)", "configurations below [%]")
-    often = 100 * chosen.mean(axis=0)
+    selection_share = 100 * selected.mean(axis=0)
     colors = [PAPER if c in parts.active else OURS for c in parts.columns]
-    grid[1, 2].barh(names, often, color=colors)
+    grid[1, 2].barh(names, selection_share, color=colors)
     grid[1, 2].invert_yaxis()
     title(grid[1, 2], "active by pivoting (orange: paper)", "% of cases", "")
 
     def percentiles(values: Array) -> str:
         return " | ".join(f"{v:.3g}" for v in np.percentile(values, [50, 90, 99]))
 
-    near = {name: 100 * np.mean(values > given.near) for name, values in condition.items()}
+    near_share = {name: 100 * np.mean(values > args.near) for name, values in condition.items()}
     straight = np.abs(elbow) < 10
-    bad = condition["paper"] > given.near
+    bad = condition["paper"] > args.near
     moves = mobility(constraints(robot, q[:1])[0])
     text = f"""
 # Where the closed chain comes near singular
 
 `{command(__file__, arguments)}`:
-{given.count} configurations of `{robot.name}` uniform within limits; lengths in units of
+{args.count} configurations of `{robot.name}` uniform within limits; lengths in units of
 {LENGTH} m. The chain of arm, thumb and virtual joint has {len(names)} coordinates and mobility
 {moves}.
 
@@ -107,17 +107,18 @@ def main(arguments: list[str] | None = None) -> None:
 | largest passive / active rate, the paper's | {percentiles(ratio["paper"])} |
 | largest passive / active rate, by pivoting | {percentiles(ratio["pivoted"])} |
 
-With the paper's active joints (virtual joint, thumb 2, arm 7 and 6) {near["paper"]:.1f} % of the
-configurations are near singular (condition above {given.near:g}). Worst is the straight elbow, at
-the border of the reach, whatever the wrist does: the elbow is passive there. But
+With the paper's active joints (virtual joint, thumb 2, arm 7 and 6) {near_share["paper"]:.1f} %
+of the configurations are near singular (condition above {args.near:g}). Worst is the straight
+elbow, at the border of the reach, whatever the wrist does: the elbow is passive there. But
 {100 * np.mean(bad & ~straight) / max(np.mean(bad), 1e-12):.0f} % of the near singular ones have it
 more than 10 deg from straight. They are singularities of the choice, not of the
-mechanism: with the active joints chosen anew by QR with column pivoting {near["pivoted"]:.2f} %
-remain. Pivoting keeps the virtual joint active in {often[0]:.0f} % of the configurations. A fixed
-choice cannot be good everywhere; the method `thumb-first` makes none, since its steps along the
-null space of the thumb's rows need no H_p.
+mechanism: with the active joints chosen anew by QR with column pivoting
+{near_share["pivoted"]:.2f} % remain. Pivoting keeps the virtual joint active in
+{selection_share[0]:.0f} % of the configurations. A fixed choice cannot be good everywhere; the
+method `thumb-first` makes none, since its steps along the null space of the thumb's rows need no
+H_p.
 """
-    write(given.out, "closed_chain_singularities", drawn, text)
+    write(args.out, "closed_chain_singularities", plot, text)
 
 
 if __name__ == "__main__":

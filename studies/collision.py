@@ -54,7 +54,7 @@ REPEATS = 7
 SIZE = 50_000
 """Configurations of a part."""
 
-OTHERS = 50
+MUJOCO_SHARE = 50
 """Of so many configurations one that is not free is checked by coal as well: it takes 1.4 ms."""
 
 SCENE = {
@@ -106,8 +106,8 @@ class Part:
     @property
     def path(self) -> Path:
         """Where its figures are."""
-        one = self.piece
-        place = f"{one.robot}-{one.clutter}-{one.number}-{one.seed}-{one.searched}"
+        piece = self.piece
+        place = f"{piece.robot}-{piece.clutter}-{piece.number}-{piece.seed}-{piece.searched}"
         return Path(self.what) / f"{place}-{self.size}.json"
 
 
@@ -130,37 +130,37 @@ def solve(part: Part) -> dict[str, Any]:
     rng = np.random.default_rng([part.piece.seed, part.piece.number])
     q = robot.random(rng, part.size)
     free = around.free(q)
-    others = q[~free][: part.size // OTHERS]
+    other_samples = q[~free][: part.size // MUJOCO_SHARE]
     return {
         "checked": len(q),
         "free": int(free.sum()),
         "falsely_free": int(coal.penetrating(q[free], MICROMETRE).sum()),
-        "others": len(others),
-        "falsely_touching": int((~coal.penetrating(others, MICROMETRE)).sum()),
+        "others": len(other_samples),
+        "falsely_touching": int((~coal.penetrating(other_samples, MICROMETRE)).sum()),
     }
 
 
 def parts_of(options: argparse.Namespace) -> list[Part]:
     """All parts, so that what is done so far is as much of every clutter."""
     sizes = [min(SIZE, options.checked - start) for start in range(0, options.checked, SIZE)]
-    found = [
+    parts = [
         Part("coal", Piece(ROBOT, 0, number, options.seed, 0), size)
         for number, size in enumerate(sizes)
     ]
-    found += [
+    parts += [
         Part("choice", Piece(robot, clutter, number, options.seed, options.searched))
         for number in range(options.count)
         for robot in options.robot
         for clutter in CLUTTER
     ]
     if options.peer_targets and installed():
-        found += [
+        parts += [
             Part("mink", Piece(robot, clutter, 0, options.seed, 0), options.peer_targets)
             for robot in PEER_ROBOTS
             if robot in options.robot
             for clutter in PEER_CLUTTER
         ]
-    return found
+    return parts
 
 
 def least_time(call: Callable[[], object], count: int) -> float:
@@ -208,7 +208,7 @@ def check(count: int, timed: int, seed: int) -> tuple[list[list[str]], str]:
 def agreement(done: list[dict[str, int]]) -> tuple[str, Metric]:
     """A sentence on agreement with coal, and its figure."""
     keys = ("checked", "free", "others", "falsely_free", "falsely_touching")
-    total = {key: sum(one[key] for one in done) for key in keys}
+    total = {key: sum(result[key] for result in done) for key in keys}
     table = the_check()[1].table
     sentence = (
         f"{total['checked']:,} random configurations of {ROBOT}, {len(table.pairs)} pairs of "
@@ -224,12 +224,12 @@ def agreement(done: list[dict[str, int]]) -> tuple[str, Metric]:
 def peer_rows(done: Iterable[tuple[Part, dict[str, Any]]]) -> list[list[str]]:
     """What mink did."""
     rows = []
-    for part, found in done:
-        targets = found["targets"]
-        times = [[1e3 * one[key] for one in targets] for key in ("seconds", "own")]
+    for part, results in done:
+        targets = results["targets"]
+        times = [[1e3 * result[key] for result in targets] for key in ("seconds", "own")]
         cells = [part.piece.robot, f"{part.piece.clutter}", f"{len(targets)}"]
-        cells += [f"{sum(one[key] for one in targets)}" for key in ("solved", "ours")]
-        cells += [f"{np.mean(one):.1f}" for one in times]
+        cells += [f"{sum(result[key] for result in targets)}" for key in ("solved", "ours")]
+        cells += [f"{np.mean(values):.1f}" for values in times]
         rows.append([*cells, f"{np.sum(times[0]) / np.sum(times[1]):.0f}"])
     return rows
 
@@ -238,13 +238,13 @@ def choice_row(
     robot: str, clutter: int, targets: list[dict[str, Any]], metrics: list[Metric]
 ) -> list[str]:
     """A robot's row at a clutter: completeness and times."""
-    statuses = Counter(one["status"] for one in targets)
-    found, missed = statuses["SOLVED"], sum(one["missed"] for one in targets)
+    statuses = Counter(result["status"] for result in targets)
+    solved, missed = statuses["SOLVED"], sum(result["missed"] for result in targets)
     name = f"collision/{robot}/{clutter}"
-    rate = rate_metric(f"{name}/found", found, found + missed)
-    batch = mean_metric(f"{name}/batch", [1e6 * one["batch"] for one in targets], "us")
-    single = [1e6 * one["single"] for one in targets]
-    answered = [1e6 * one["answered_time"] for one in targets if one["status"] == "SOLVED"]
+    rate = rate_metric(f"{name}/found", solved, solved + missed)
+    batch = mean_metric(f"{name}/batch", [1e6 * result["batch"] for result in targets], "us")
+    single = [1e6 * result["single"] for result in targets]
+    answered = [1e6 * result["answered_time"] for result in targets if result["status"] == "SOLVED"]
     if answered:
         metrics.append(mean_metric(f"{name}/answered", answered, "us"))
     metrics += [rate, batch, mean_metric(f"{name}/single", single, "us")]
@@ -252,14 +252,14 @@ def choice_row(
         robot,
         str(clutter),
         str(len(targets)),
-        f"{100 * np.mean([one['blind'] for one in targets]):.0f}",
-        f"{found} of {found + missed}",
+        f"{100 * np.mean([result['blind'] for result in targets]):.0f}",
+        f"{solved} of {solved + missed}",
         interval_text(rate, 2),
         ", ".join(f"{count} {status}" for status, count in statuses.most_common()),
-        str(sum(one["false"] for one in targets)),
+        str(sum(result["false"] for result in targets)),
         f"{batch.value:.0f}",
         f"{np.mean(answered):.0f}" if answered else "",
-        f"{1e6 * np.mean([one['blind_time'] for one in targets]):.0f}",
+        f"{1e6 * np.mean([result['blind_time'] for result in targets]):.0f}",
         f"{np.mean(single):.0f}",
         f"{np.median(single):.0f}",
     ]
@@ -287,15 +287,19 @@ def main(arguments: list[str] | None = None) -> None:
         run_parts(solve, parts, options.out, jobs=options.jobs)
     done, codes = read_parts(options.out, parts)
     kinds = {
-        what: [(part, found) for part, found in done if part.what == what]
+        what: [(part, results) for part, results in done if part.what == what]
         for what in ("coal", "choice", "mink")
     }
-    agrees, falsely = agreement([found for _, found in kinds["coal"]])
+    agrees, falsely = agreement([results for _, results in kinds["coal"]])
     places: dict[tuple[str, int], list[dict[str, Any]]] = {}
-    for part, found in kinds["choice"]:
-        places.setdefault((part.piece.robot, part.piece.clutter), []).extend(found["targets"])
+    for part, results in kinds["choice"]:
+        places.setdefault((part.piece.robot, part.piece.clutter), []).extend(results["targets"])
     metrics = [falsely]
-    rows = [choice_row(*where, some, metrics) for where, some in sorted(places.items()) if some]
+    rows = [
+        choice_row(*place, place_results, metrics)
+        for place, place_results in sorted(places.items())
+        if place_results
+    ]
     times, by_mujoco = check(min(options.checked, 20_000), options.timed, options.seed)
     left = len(parts) - len(done)
     heads = ["configurations", "distance [us]", "free? [us]", "coal, any [us]"]
@@ -309,8 +313,8 @@ def main(arguments: list[str] | None = None) -> None:
     heads = ["robot", "clutter", "targets", "free without a choice %", "found", "found %"]
     heads += ["status", "false by coal", "batch, mean [us]", "with an answer [us]"]
     heads += ["contacts alone [us]", "single, mean [us]", "median [us]"]
-    asked = {"searched": options.searched, "safe": 1e3 * SAFE, "batch": BATCH}
-    body += ["## Choice", CHOICE.format(turns=TURNS, postures=POSTURES, **asked)]
+    texts = {"searched": options.searched, "safe": 1e3 * SAFE, "batch": BATCH}
+    body += ["## Choice", CHOICE.format(turns=TURNS, postures=POSTURES, **texts)]
     body += [markdown_table(heads, rows), *([f"Not run yet: {left} parts."] if left else [])]
     heads = ["robot", "clutter", "targets", "free answers by mink", "ours"]
     heads += ["mink, mean [ms]", "ours, mean [ms]", "ratio"]

@@ -22,14 +22,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from impossible_targets import classes_of, impossible, moved
+from impossible_targets import classes_of, impossible, rigidly_moved
 from runner.parts import code_version
 from runner.report import command, markdown_table, program, publish
 
 import casadi_ik as ik
 from casadi_ik.files.arrays import Array
 
-Kept = dict[str, Any]
+Stored = dict[str, Any]
 """Arrays by name of the targets / what they are."""
 
 ALMOST = 0.99
@@ -40,10 +40,10 @@ def at_limits(
     robot: ik.ArmHand, rng: np.random.Generator, count: int, part: float, off: float = 0.0
 ) -> Array:
     """Part of the actuators at their limits, or up to `off` [rad] from them."""
-    q, near = robot.random(rng, count), off * rng.random((count, len(robot.actuators)))
+    q, offsets = robot.random(rng, count), off * rng.random((count, len(robot.actuators)))
     chance = rng.random(q.shape)
-    q = np.where(chance < part / 2, robot.lower + near, q)
-    return np.where(chance > 1 - part / 2, robot.upper - near, q)
+    q = np.where(chance < part / 2, robot.lower + offsets, q)
+    return np.where(chance > 1 - part / 2, robot.upper - offsets, q)
 
 
 def straight(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
@@ -59,8 +59,8 @@ def straight(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
 def wide_open(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
     """The hand's motors at their lower limits, or up to 1e-3 of their range from them."""
     q, hand = robot.random(rng, count), list(robot.description.hand_actuators)
-    near = 1e-3 * rng.random((count, len(hand))) * (robot.upper - robot.lower)[hand]
-    q[:, hand] = robot.lower[hand] + near
+    offsets = 1e-3 * rng.random((count, len(hand))) * (robot.upper - robot.lower)[hand]
+    q[:, hand] = robot.lower[hand] + offsets
     return q
 
 
@@ -77,27 +77,30 @@ def false_alarms(robot: ik.ArmHand, count: int, bad: int, seed: int) -> list[lis
     """Rows of targets that can be reached, all of them asked for a diagnosis."""
     solver, tolerance = ik.Solver(robot), ik.Tolerance()
     rng, rows = np.random.default_rng(seed), list[list[str]]()
-    away = ALMOST * tolerance.position, ALMOST * tolerance.angle
+    displacement = ALMOST * tolerance.position, ALMOST * tolerance.angle
     sets: dict[str, tuple[Callable[..., Array], int, Array, tuple[float, float]]] = {}
-    for by, distance in (("", (0.0, 0.0)), (f", contacts moved by {ALMOST:.0%} of t", away)):
+    for by, distance in (
+        ("", (0.0, 0.0)),
+        (f", contacts moved by {ALMOST:.0%} of t", displacement),
+    ):
         sets |= {f"{name}{by}": (x, count, robot.home, distance) for name, x in REACHABLE.items()}
     name = "40 % at limits, from starts at other limits"
     sets[name] = partial(at_limits, part=0.4), bad, at_limits(robot, rng, bad, 1.0), (0.0, 0.0)
     for name, (draw, n, q0, (metres, angle)) in sets.items():
-        points, normals = moved(robot.contacts(draw(robot, rng, n)), rng, metres, angle)
+        points, normals = rigidly_moved(robot.contacts(draw(robot, rng, n)), rng, metres, angle)
         plain = solver.solve_batch(points, normals, q0)
         batch = solver.solve_batch(points, normals, q0, diagnose=True)
-        called = int((batch.status_names == "UNREACHABLE").sum())
-        left = int((~batch.success).sum()) - called
-        found = int(batch.success.sum() - plain.success.sum())
-        counts = len(points), int(plain.success.sum()), found, left, called
+        false_count = int((batch.status_names == "UNREACHABLE").sum())
+        left = int((~batch.success).sum()) - false_count
+        lost_count = int(batch.success.sum() - plain.success.sum())
+        counts = len(points), int(plain.success.sum()), lost_count, left, false_count
         rows.append([name, *(f"{number:,}" for number in counts)])
     return rows
 
 
-def verdicts(robot: ik.ArmHand, count: int, seed: int) -> tuple[list[list[str]], Kept]:
+def verdicts(robot: ik.ArmHand, count: int, seed: int) -> tuple[list[list[str]], Stored]:
     """Reasons and times where there is no solution; and what another version may differ in."""
-    solver, rows, kept = ik.Solver(robot), list[list[str]](), Kept()
+    solver, rows, stored = ik.Solver(robot), list[list[str]](), Stored()
     for name in classes_of(robot):
         points, normals = impossible(robot, name, np.random.default_rng(seed), count)
         left = ~solver.solve_batch(points, normals).success
@@ -108,18 +111,21 @@ def verdicts(robot: ik.ArmHand, count: int, seed: int) -> tuple[list[list[str]],
         plain = _seconds(lambda p=points, m=normals: solver.solve_batch(p, m))
         full = _seconds(lambda p=points, m=normals: solver.solve_batch(p, m, diagnose=True))
         batch = solver.solve_batch(points, normals, diagnose=True)
-        whys = [why for why in batch.diagnoses if why is not None]
+        whys = [verdict for verdict in batch.diagnoses if verdict is not None]
         if not whys:
             continue
-        helped = [_seconds(lambda why=why: why.lines) for why in whys]
-        reasons = Counter(why.reason.name for why in whys)
+        remedy_times = [_seconds(lambda verdict=verdict: verdict.lines) for verdict in whys]
+        reasons = Counter(verdict.reason.name for verdict in whys)
         cells = [name, f"{len(points)}", f"{batch.success.sum()}"]
         cells += [", ".join(f"{number} {reason}" for reason, number in reasons.most_common())]
-        cells += [f"{100 * np.mean([why.established for why in whys]):.0f}"]
-        cells += [f"{1e3 * (full - plain) / len(points):.2f}", f"{1e3 * np.median(helped):.2f}"]
+        cells += [f"{100 * np.mean([verdict.established for verdict in whys]):.0f}"]
+        cells += [
+            f"{1e3 * (full - plain) / len(points):.2f}",
+            f"{1e3 * np.median(remedy_times):.2f}",
+        ]
         rows.append(cells)
-        kept |= _kept(name, points, batch.diagnoses)
-    return rows, kept
+        stored |= _stored_verdicts(name, points, batch.diagnoses)
+    return rows, stored
 
 
 def _seconds(call: Callable[[], object]) -> float:
@@ -129,51 +135,61 @@ def _seconds(call: Callable[[], object]) -> float:
     return time.thread_time() - begin
 
 
-def _kept(name: str, points: Array, whys: tuple[ik.solve.Diagnosis | None, ...]) -> Kept:
+def _stored_verdicts(
+    name: str, points: Array, whys: tuple[ik.solve.Diagnosis | None, ...]
+) -> Stored:
     nearest = [
-        np.nan if why is None else max(near.position_error for near in why.nearest.values())
-        for why in whys
+        np.nan
+        if verdict is None
+        else max(contact.position_error for contact in verdict.nearest.values())
+        for verdict in whys
     ]
     return {
         f"{name}/points": points,
-        f"{name}/reason": np.array(["" if why is None else why.reason.name for why in whys]),
-        f"{name}/certain": np.array([why is not None and why.established for why in whys]),
+        f"{name}/reason": np.array(
+            ["" if verdict is None else verdict.reason.name for verdict in whys]
+        ),
+        f"{name}/certain": np.array(
+            [verdict is not None and verdict.established for verdict in whys]
+        ),
         f"{name}/nearest": np.array(nearest),
         f"{name}/helps": np.array(
             [
                 ""
-                if why is None
+                if verdict is None
                 else ", ".join(
                     [
-                        *(f"{item.part} {item.finger}" for item in why.freed),
-                        *(item.lifted for item in why.reliefs),
+                        *(f"{item.part} {item.finger}" for item in verdict.freed),
+                        *(item.lifted for item in verdict.reliefs),
                     ]
                 )
-                for why in whys
+                for verdict in whys
             ]
         ),
     }
 
 
-def agreement(kept: Kept, before: Path) -> list[list[str]]:
+def agreement(stored: Stored, reference: Path) -> list[list[str]]:
     """Rows of the same targets, diagnosed by another version."""
     rows = list[list[str]]()
-    with np.load(before) as old:
-        for name in dict.fromkeys(key.split("/")[0] for key in kept):
-            was, now = ({part: data[f"{name}/{part}"] for part in PARTS} for data in (old, kept))
-            if not np.array_equal(was["points"], now["points"]):
+    with np.load(reference) as old:
+        for name in dict.fromkeys(key.split("/")[0] for key in stored):
+            was, current = (
+                {part: data[f"{name}/{part}"] for part in PARTS} for data in (old, stored)
+            )
+            if not np.array_equal(was["points"], current["points"]):
                 continue
-            same = was["reason"] == now["reason"]
-            both = (was["reason"] != "") & (now["reason"] != "")
-            helps = was["helps"][both & same] == now["helps"][both & same]
+            is_equal = was["reason"] == current["reason"]
+            both = (was["reason"] != "") & (current["reason"] != "")
+            helps = was["helps"][both & is_equal] == current["helps"][both & is_equal]
             changes = Counter(
                 f"{a or 'solved'} -> {b or 'solved'}"
-                for a, b in zip(was["reason"][~same], now["reason"][~same], strict=True)
+                for a, b in zip(was["reason"][~is_equal], current["reason"][~is_equal], strict=True)
             )
-            cells = [name, f"{len(same)}", f"{same.sum()}"]
+            cells = [name, f"{len(is_equal)}", f"{is_equal.sum()}"]
             cells += [", ".join(f"{number} {change}" for change, number in changes.items())]
-            cells += [f"{was['certain'].sum()} / {now['certain'].sum()}"]
-            cells += [f"{np.median(now['nearest'][both] / was['nearest'][both]):.3f}"]
+            cells += [f"{was['certain'].sum()} / {current['certain'].sum()}"]
+            cells += [f"{np.median(current['nearest'][both] / was['nearest'][both]):.3f}"]
             rows.append([*cells, f"{100 * helps.mean():.0f}"])
     return rows
 
@@ -213,16 +229,16 @@ def main(arguments: list[str] | None = None) -> None:
         heads = ["targets", "n", "solved", "solved by the diagnosis", "in doubt"]
         rows = false_alarms(robot, options.count, options.bad_starts, options.seed)
         parts += ["## False alarms", FALSE, markdown_table([*heads, "called unreachable"], rows)]
-    rows, kept = verdicts(robot, options.impossible, options.seed)
+    rows, stored = verdicts(robot, options.impossible, options.seed)
     heads = ["targets", "n", "solved after all", "reasons", "certain %", "diagnosis", "remedies"]
     parts += ["## Reasons and times", REASONS, markdown_table(heads, rows)]
     if options.against:
-        rows = agreement(kept, options.against)
+        rows = agreement(stored, options.against)
         heads = ["targets", "n", "same reason", "others", "certain", "nearest", "same remedies %"]
         title = f"## Against another version ({options.against.name})"
         parts += [title, AGREEMENT, markdown_table(heads, rows)]
     if options.keep:
-        np.savez(options.keep, allow_pickle=False, **kept)
+        np.savez(options.keep, allow_pickle=False, **stored)
     run_by, code = command(__file__, arguments), {"diagnosis": code_version()}
     publish("The verdict on what cannot be solved", parts, options.report, run_by, code)
     print((options.report / "report.md").read_text(encoding="utf-8"))

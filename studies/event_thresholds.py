@@ -34,7 +34,7 @@ TOTALS = Keep(failed=False, singular=False, sample=0.0)
 """The totals of a solve tell how often each kind of event happened."""
 
 
-class Kept:
+class StoredBlocks:
     """A recorder that keeps the blocks in memory."""
 
     def __init__(self) -> None:
@@ -83,9 +83,9 @@ class Caught:
 
 def trials(block: Any, factors: Sequence[float] = FACTORS) -> Iterator[Trial]:
     """Rules for every Jacobian of a method, for stalls and for oscillations."""
-    known = measured_format(block.format).jacobians
-    silent = dict.fromkeys(known, 0.0), dict.fromkeys(known, math.inf)
-    for name, jacobian in known.items():
+    jacobians_of_log = measured_format(block.format).jacobians
+    silent = dict.fromkeys(jacobians_of_log, 0.0), dict.fromkeys(jacobians_of_log, math.inf)
+    for name, jacobian in jacobians_of_log.items():
         for factor in factors:
             if jacobian.singular > 0:
                 value = factor * jacobian.singular
@@ -116,9 +116,10 @@ def caught(blocks: Sequence[Any], trial: Trial) -> Caught:
                 recorder.record(block)
         solves = ik.logs.open(path).solves().array()
     events, solved = solves["events"][:, trial.kind], solves["success"] > 0
-    found = events > 0
+    has_event = events > 0
     of_failed, of_solved = (
-        100 * float(found[rows].mean()) if rows.any() else math.nan for rows in (~solved, solved)
+        100 * float(has_event[rows].mean()) if rows.any() else math.nan
+        for rows in (~solved, solved)
     )
     return Caught(of_failed, of_solved, 1e3 * float(events.sum() / solves["iterations"].sum()))
 
@@ -134,21 +135,23 @@ def targets_of(robot: ik.ArmHand, count: int, seed: int) -> tuple[np.ndarray, np
 
 def section(solver: ik.Solver, count: int, seed: int, factors: Sequence[float]) -> str:
     """The table of one method on one robot, as Markdown."""
-    kept: Any = Kept()
+    stored: Any = StoredBlocks()
     targets = targets_of(solver.robot, count, seed)
-    batch = solver.solve_batch(*targets, seed=seed, log=kept)
+    batch = solver.solve_batch(*targets, seed=seed, log=stored)
     rows = []
-    for trial in trials(kept.blocks[0], factors):
-        found = caught(kept.blocks, trial)
+    for trial in trials(stored.blocks[0], factors):
+        has_event = caught(stored.blocks, trial)
         number = f"{trial.threshold:.2g}"
         rows.append(
             [
                 f"{trial.kind.name} {trial.subject}",
                 f"**{number}**" if trial.usual else number,
-                "" if math.isnan(found.failed) else f"{found.failed:.1f}",
-                "" if math.isnan(found.solved) else f"{found.solved:.1f}",
-                f"{found.failed / found.solved:.1f}" if found.solved > 0 < found.failed else "",
-                f"{found.rate:.2f}",
+                "" if math.isnan(has_event.failed) else f"{has_event.failed:.1f}",
+                "" if math.isnan(has_event.solved) else f"{has_event.solved:.1f}",
+                f"{has_event.failed / has_event.solved:.1f}"
+                if has_event.solved > 0 < has_event.failed
+                else "",
+                f"{has_event.rate:.2f}",
             ]
         )
     heads = (

@@ -117,9 +117,9 @@ def run_cell(robot: str, mode: str, count: int, flags: Sequence[str] = SANITIZER
             return cell("fail", f"the test takes longer than {TIMEOUT} s")
         if tested.returncode:
             return cell("fail", tested.stdout.splitlines()[0] if tested.stdout else tested.stderr)
-        shown = subprocess.run(project / "shown", capture_output=True, text=True)
-        if shown.returncode:
-            return cell("fail", f"example: {shown.stdout or shown.stderr}")
+        output = subprocess.run(project / "shown", capture_output=True, text=True)
+        if output.returncode:
+            return cell("fail", f"example: {output.stdout or output.stderr}")
         return cell("pass", tested.stdout.splitlines()[0])
 
 

@@ -30,7 +30,9 @@ def classes_of(robot: ik.ArmHand) -> tuple[str, ...]:
     return CLASSES if robot.description.arm_actuators else CLASSES[:-2]
 
 
-def moved(targets: Targets, rng: np.random.Generator, metres: float, angle: float) -> Targets:
+def rigidly_moved(
+    targets: Targets, rng: np.random.Generator, metres: float, angle: float
+) -> Targets:
     """Every contact moved and every normal turned by so much, any way."""
     points, normals = targets
     shift, turn = rng.normal(size=points.shape), rng.normal(size=normals.shape)
@@ -44,34 +46,34 @@ def impossible(robot: ik.ArmHand, name: str, rng: np.random.Generator, count: in
     """Targets of a class, of which some or most cannot be reached."""
     points, normals = hands = robot.contacts(robot.random(rng, count))
     centre, rows = points.mean(axis=1, keepdims=True), np.arange(count)
-    one = rng.integers(0, points.shape[1], count)
+    finger = rng.integers(0, points.shape[1], count)
     if name == "too far":
-        away = rng.uniform(0.2, 1.5, (count, 1, 1)) * _unit(rng.normal(size=(count, 1, 3)))
-        return points + away, normals
+        displacement = rng.uniform(0.2, 1.5, (count, 1, 1)) * _unit(rng.normal(size=(count, 1, 3)))
+        return points + displacement, normals
     if name == "around the shoulder":
-        away = np.array([0, 0, 0.31]) + 0.05 * rng.normal(size=(count, 1, 3))
-        return points - centre + away, normals
+        displacement = np.array([0, 0, 0.31]) + 0.05 * rng.normal(size=(count, 1, 3))
+        return points - centre + displacement, normals
     if name == "contacts 250 mm apart":
         return points + 0.25 * _unit(rng.normal(size=points.shape)), normals
     if name == "one contact moved by 30 to 150 mm":
         shifted = points.copy()
-        far = rng.uniform(0.03, 0.15, (count, 1))
-        shifted[rows, one] += far * _unit(rng.normal(size=(count, 3)))
+        excess = rng.uniform(0.03, 0.15, (count, 1))
+        shifted[rows, finger] += excess * _unit(rng.normal(size=(count, 3)))
         return shifted, normals
     if name == "contacts moved by 50 mm":
-        return moved(hands, rng, 0.05, 0.0)
+        return rigidly_moved(hands, rng, 0.05, 0.0)
     if name == "one normal reversed":
-        turned = normals.copy()
-        turned[rows, one] *= -1
-        return points, turned
+        rotated_normals = normals.copy()
+        rotated_normals[rows, finger] *= -1
+        return points, rotated_normals
     if name == "normals turned by 30 deg":
-        return moved(hands, rng, 0.0, np.deg2rad(30))
+        return rigidly_moved(hands, rng, 0.0, np.deg2rad(30))
     if name == "mirrored":
         return points * np.array([-1, 1, 1]), normals * np.array([-1, 1, 1])
     if name == "turned any way":
         turns = _rotations(rng, count)
-        about = np.einsum("kij,kfj->kfi", turns, points - centre)
-        return centre + about, np.einsum("kij,kfj->kfi", turns, normals)
+        rotated = np.einsum("kij,kfj->kfi", turns, points - centre)
+        return centre + rotated, np.einsum("kij,kfj->kfi", turns, normals)
     arm = list(robot.description.arm_actuators)
     motors = arm if name.startswith("an arm") else range(len(robot.actuators))
     q, joint = robot.random(rng, count), rng.choice(list(motors), count)

@@ -104,23 +104,23 @@ class MinimaxProgram:
             starts: (s, n) configurations to begin with.
         """
         robot, rows = self._robot, self._rows
-        asked = np.concatenate([points[rows].T.ravel(), normals[rows].T.ravel()])
+        parameters = np.concatenate([points[rows].T.ravel(), normals[rows].T.ravel()])
         n, ranges = len(robot.lower), robot.upper - robot.lower
         best, best_q = np.inf, starts[0]
         for number, start in enumerate(starts, 1):
             x = (start - robot.lower) / ranges
-            first = float(ca.mmax(self._squares(x, asked)))
+            first = float(ca.mmax(self._squares(x, parameters)))
             answer = self._solver(
                 x0=np.append(x, FIRST * first),
-                p=asked,
+                p=parameters,
                 lbx=np.zeros(n + 1),
                 ubx=np.append(np.ones(n), np.inf),
                 lbg=self._lower,
                 ubg=self._upper,
             )
-            reached = np.clip(np.array(answer["x"]).ravel()[:n], 0.0, 1.0)
-            factor = float(np.sqrt(float(ca.mmax(self._squares(reached, asked)))))
-            q = np.clip(robot.lower + reached * ranges, robot.lower, robot.upper)
+            solution = np.clip(np.array(answer["x"]).ravel()[:n], 0.0, 1.0)
+            factor = float(np.sqrt(float(ca.mmax(self._squares(solution, parameters)))))
+            q = np.clip(robot.lower + solution * ranges, robot.lower, robot.upper)
             if factor < best and self._within_joint_limits(q):
                 best, best_q = factor, q
             if best <= 1:
@@ -128,5 +128,5 @@ class MinimaxProgram:
         return Nearest(best, best_q, len(starts))
 
     def _within_joint_limits(self, q: Array) -> bool:
-        _, _, beyond = self._robot.deviations(q, *self._robot.contacts(q))
-        return bool(beyond <= 1e-9)
+        _, _, limit_excess = self._robot.deviations(q, *self._robot.contacts(q))
+        return bool(limit_excess <= 1e-9)

@@ -52,7 +52,7 @@ import casadi_ik as ik
 from casadi_ik.errors import InputError, InputWarning
 from casadi_ik.files.arrays import Array
 
-MADE = {path.stem: path for path in (Path(__file__).parent / "robots").glob("*.yaml")}
+ARTIFICIAL_ROBOTS = {path.stem: path for path in (Path(__file__).parent / "robots").glob("*.yaml")}
 """Robots that no parameter of a method was chosen for, and their arms."""
 
 ROBOTS = (
@@ -63,7 +63,7 @@ USUAL = ("random", "one-arm", "corners", "limits", "singular")
 DISPLACED = "tolerances"
 """The sampler of contacts that are displaced within their tolerance."""
 
-OTHERS = {
+KINDS_OF_CONTACTS = {
     "palms": "palms of random hands",
     "noise": "noisy contacts of random hands",
     DISPLACED: "displaced contacts of random hands",
@@ -76,7 +76,7 @@ ANGLES, DISTANCES, SHARES = (1, 3, 10, 30, 60), (1, 5, 20), (0.5, 0.8, 0.95)
 REFERENCE, SCALE = "kuka_lwr_barrett", 1000
 """`--ratio`: times over those of so many random targets of this robot, in the same process."""
 
-SHOWN = 30
+MAX_LISTED = 30
 """Misses listed in the report; a file beside it has all of them."""
 
 STARTS = 20
@@ -129,7 +129,7 @@ class Part:
 
     Attributes:
         robot: Name of the robot.
-        sampler: Key of `SAMPLERS` or of `OTHERS`.
+        sampler: Key of `SAMPLERS` or of `KINDS_OF_CONTACTS`.
         fingers: Which have a contact, see `finger_sets`.
         tolerance: See `tolerance_of`.
         number: Of the part.
@@ -137,7 +137,7 @@ class Part:
         seed: Of the targets.
         arm_hand: The robot itself: a worker of a cluster need not have its file.
         noise: Standard deviation of contacts [mm] and [deg], of noisy ones.
-        looked: How many missed ones of noisy contacts are given to Ipopt.
+        searched_count: How many missed ones of noisy contacts are given to Ipopt.
         ratio: Whether times are set beside those of the reference.
         share: Share of the tolerance by which contacts are displaced.
     """
@@ -151,7 +151,7 @@ class Part:
     seed: int
     arm_hand: ik.ArmHand = field(repr=False, compare=False)
     noise: tuple[float, float] = (0.0, 0.0)
-    looked: int = 0
+    searched_count: int = 0
     ratio: bool = False
     share: float = 0.0
 
@@ -160,7 +160,7 @@ class Part:
         """Where its counts are."""
         kind = self.sampler
         if any(self.noise):
-            kind += f" {self.noise[0]:g} {self.noise[1]:g}, {self.looked} looked at"
+            kind += f" {self.noise[0]:g} {self.noise[1]:g}, {self.searched_count} searched"
         if self.share:
             kind += f" {self.share:g}"
         name = f"{self.number:05d}-{self.size}-{self.seed}.json"
@@ -169,7 +169,11 @@ class Part:
     @property
     def kind(self) -> str:
         """What is tried, in words."""
-        words = OTHERS[self.sampler] if self.sampler in OTHERS else SAMPLERS[self.sampler][0]
+        words = (
+            KINDS_OF_CONTACTS[self.sampler]
+            if self.sampler in KINDS_OF_CONTACTS
+            else SAMPLERS[self.sampler][0]
+        )
         return words if self.fingers == "all" else f"{words}; {self.fingers} fingers"
 
 
@@ -196,8 +200,8 @@ def tolerance_name(text: str) -> str:
 
 @cache
 def load(name: str) -> ik.ArmHand:
-    """A shipped robot, or one of `MADE`."""
-    return ik.load_robot(MADE.get(name, name))
+    """A shipped robot, or one of `ARTIFICIAL_ROBOTS`."""
+    return ik.load_robot(ARTIFICIAL_ROBOTS.get(name, name))
 
 
 SOLVERS: dict[tuple[str, str], ik.Solver] = {}
@@ -233,9 +237,9 @@ def solve(part: Part) -> dict[str, Any]:
     """Solve a part and count."""
     solver = _solver(part.arm_hand, part.tolerance)
     robot = solver.robot
-    title_ = OTHERS.get(part.sampler) or SAMPLERS[part.sampler][0]
+    title_ = KINDS_OF_CONTACTS.get(part.sampler) or SAMPLERS[part.sampler][0]
     rng = np.random.default_rng([part.seed, zlib.crc32(title_.encode()), part.number])
-    draw = random_hands if part.sampler in OTHERS else SAMPLERS[part.sampler][1]
+    draw = random_hands if part.sampler in KINDS_OF_CONTACTS else SAMPLERS[part.sampler][1]
     q = draw(robot, rng, part.size)
     points, normals = robot.contacts(q)
     if part.sampler == "noise":
@@ -245,8 +249,8 @@ def solve(part: Part) -> dict[str, Any]:
         allowed = tolerance_of(part.tolerance)
         metres, angle = part.share * allowed.position, part.share * allowed.angle
         points, normals = displaced(points, normals, rng, metres, angle)
-    held = finger_sets(robot, [part.fingers])[part.fingers]
-    free = np.setdiff1d(np.arange(len(robot.fingers)), held)
+    fingers = finger_sets(robot, [part.fingers])[part.fingers]
+    free = np.setdiff1d(np.arange(len(robot.fingers)), fingers)
     points[:, free] = normals[:, free] = np.nan
 
     def answers(count: int) -> ik.BatchSolution:
@@ -255,16 +259,16 @@ def solve(part: Part) -> dict[str, Any]:
         return solver.solve_batch(points[:count], normals[:count])
 
     answers(min(part.size, 300))  # no time holds a first use
-    before = _scale(part) if part.ratio else np.nan
+    time_before = _scale(part) if part.ratio else np.nan
     begun = time.thread_time()
     batch = answers(part.size)
     seconds = time.thread_time() - begun
     after = _scale(part) if part.ratio else np.nan
-    lost = np.flatnonzero(~batch.success)
-    found: dict[str, Any] = {
+    missed_rows = np.flatnonzero(~batch.success)
+    result: dict[str, Any] = {
         "count": part.size,
         "seconds": seconds,
-        "ratio": 2 * seconds / part.size / (before + after) if part.ratio else None,
+        "ratio": 2 * seconds / part.size / (time_before + after) if part.ratio else None,
         "iterations": int(batch.iterations.sum()),
         "most iterations": int(batch.iterations.max()),
         "restarted": int((batch.restarts > 0).sum()),
@@ -272,21 +276,21 @@ def solve(part: Part) -> dict[str, Any]:
         "times": [1e6 * float(np.quantile(batch.time, share)) for share in (0.5, 0.99, 1.0)],
         "missed": [
             {"row": int(row), "status": str(batch.status_names[row]), "q": q[row].tolist()}
-            for row in lost
+            for row in missed_rows
         ],
     }
     if part.sampler == "noise":
-        rows = lost[: part.looked].tolist()
+        rows = missed_rows[: part.searched_count].tolist()
         possible = 0
-        names = [robot.fingers[i] for i in held]
+        names = [robot.fingers[i] for i in fingers]
         ipopt = MinimaxProgram(robot, tolerance_of(part.tolerance), names) if rows else None
         for row in rows:
             assert ipopt is not None
             starts = robot.random(np.random.default_rng([part.seed, row]), STARTS)
             starts[0], starts[1] = q[row], batch.q[row]
             possible += ipopt.nearest(points[row], normals[row], starts).factor <= 1
-        found |= {"looked": len(rows), "possible": possible}
-    return found
+        result |= {"looked": len(rows), "possible": possible}
+    return result
 
 
 def robots_of(words: Sequence[str]) -> list[str]:
@@ -336,7 +340,7 @@ def parts_of(options: argparse.Namespace) -> Iterator[Part]:
                             seed=options.seed,
                             arm_hand=robot,
                             noise=tuple(options.noise) if noisy_ else (0.0, 0.0),
-                            looked=options.looked if noisy_ else 0,
+                            searched_count=options.looked if noisy_ else 0,
                             ratio=options.ratio,
                         )
 
@@ -382,12 +386,12 @@ class Climb:
         return self.options.out / "climb" / f"{self.robot}-{self.options.seed}.state.json"
 
 
-def search(asked: Climb) -> dict[str, Any]:
+def search(climb_part: Climb) -> dict[str, Any]:
     """Climb for as long as is asked."""
-    robot = load(asked.robot)
-    solvers = {name: _solver(robot, name) for name in asked.options.tolerance}
-    found = climb(solvers, asked.state, asked.size, asked.options.seed)
-    return {"seconds": found["seconds"]}
+    robot = load(climb_part.robot)
+    solvers = {name: _solver(robot, name) for name in climb_part.options.tolerance}
+    search_state = climb(solvers, climb_part.state, climb_part.size, climb_part.options.seed)
+    return {"seconds": search_state["seconds"]}
 
 
 def causes(robot: ik.ArmHand, tolerance: ik.Tolerance, q: Array) -> list[str]:
@@ -404,21 +408,27 @@ def causes(robot: ik.ArmHand, tolerance: ik.Tolerance, q: Array) -> list[str]:
         for motors in (robot.description.arm_actuators, robot.description.hand_actuators)
     )
     ranges, rng = robot.upper - robot.lower, np.random.default_rng(0)
-    given = near = 0
+    with_fixed_hand = near_start = 0
     for row in left.tolist():
         target = points[row : row + 1], normals[row : row + 1]
         fixed = {robot.actuators[i]: float(q[row, i]) for i in hand}
-        given += int(solver.solve_batch(*target, fixed=fixed).success[0])
+        with_fixed_hand += int(solver.solve_batch(*target, fixed=fixed).success[0])
         start = q[row] + 0.1 * ranges * rng.uniform(-1, 1, len(ranges))
         start = np.clip(start, robot.lower, robot.upper)
-        near += int(solver.solve_batch(*target, q0=start).success[0])
+        near_start += int(solver.solve_batch(*target, q0=start).success[0])
     at_limits = np.minimum(q - robot.lower, robot.upper - q) < 1e-3 * ranges
     shares = [
         f"{100 * at_limits[left][:, motors].mean():.0f} %" if motors else "-"
         for motors in (arm, hand)
     ]
     off = 1e6 * np.median(np.nanmax(batch.position_error[left], axis=1))
-    return [*text, f"{given} of {len(left)}", f"{near} of {len(left)}", *shares, f"{off:.3g} um"]
+    return [
+        *text,
+        f"{with_fixed_hand} of {len(left)}",
+        f"{near_start} of {len(left)}",
+        *shares,
+        f"{off:.3g} um",
+    ]
 
 
 Row = dict[str, Any]
@@ -427,33 +437,36 @@ Row = dict[str, Any]
 def rows_of(options: argparse.Namespace) -> tuple[list[Row], str]:
     """What was found by robot, kind and tolerance (many robots: all kinds together), and codes."""
     done, codes = read_parts(options.out, parts_of(options))
-    many = len(robots_of(options.robots)) > 2 * len(ROBOTS)
+    has_many_robots = len(robots_of(options.robots)) > 2 * len(ROBOTS)
     groups: dict[tuple[str, str, str], list[tuple[Part, Row]]] = {}
-    for part, found in done:
+    for part, result in done:
         if part.share:
             continue
-        kind = "all kinds" if many else part.kind
-        groups.setdefault((part.robot, kind, part.tolerance), []).append((part, found))
+        kind = "all kinds" if has_many_robots else part.kind
+        groups.setdefault((part.robot, kind, part.tolerance), []).append((part, result))
     rows: list[Row] = []
-    for (robot, kind, tolerance), some in groups.items():
-        found = [one for _, one in some]
-        usual = [one["ratio"] for part, one in some if part.sampler == "random"]
+    for (robot, kind, tolerance), results in groups.items():
+        results_of_cell = [result for _, result in results]
+        usual = [result["ratio"] for part, result in results if part.sampler == "random"]
         row: Row = {"robot": robot, "kind": kind, "tolerance": tolerance}
-        row |= {key: sum(one[key] for one in found) for key in ("count", "iterations", "restarted")}
-        row["mean"] = 1e6 * sum(one["seconds"] for one in found) / row["count"]
-        row["most restarts"] = max(one["most restarts"] for one in found)
-        row["most iterations"] = max(one["most iterations"] for one in found)
-        median, slow, worst = zip(*(one["times"] for one in found), strict=True)
+        row |= {
+            key: sum(result[key] for result in results_of_cell)
+            for key in ("count", "iterations", "restarted")
+        }
+        row["mean"] = 1e6 * sum(result["seconds"] for result in results_of_cell) / row["count"]
+        row["most restarts"] = max(result["most restarts"] for result in results_of_cell)
+        row["most iterations"] = max(result["most iterations"] for result in results_of_cell)
+        median, slow, worst = zip(*(result["times"] for result in results_of_cell), strict=True)
         row["times"] = float(np.median(median)), float(np.median(slow)), max(worst)
         if options.ratio:
-            row["ratio"] = max(one["ratio"] for one in found)
+            row["ratio"] = max(result["ratio"] for result in results_of_cell)
             row["usual"] = float(np.mean(usual or [np.nan]))
-        row["looked"] = sum(one.get("looked", 0) for one in found)
-        row["possible"] = sum(one.get("possible", 0) for one in found)
+        row["looked"] = sum(result.get("looked", 0) for result in results_of_cell)
+        row["possible"] = sum(result.get("possible", 0) for result in results_of_cell)
         row["missed"] = [
             {"place": f"{part.kind}-{part.number:05d}, row {miss['row']}"} | miss
-            for part, one in some
-            for miss in one["missed"]
+            for part, result in results
+            for miss in result["missed"]
         ]
         rows.append(row)
     return rows, codes
@@ -478,11 +491,11 @@ def displaced_table(options: argparse.Namespace, metrics: list[Metric]) -> list[
     lines = []
     for robot, by_key in solved.items():
         shares = [
-            f"{percent(cell for (_, own), cell in by_key.items() if own == share):.3f}"
+            f"{percent(cell for (_, value), cell in by_key.items() if value == share):.3f}"
             for share in SHARES
         ]
         by_tolerance = {
-            tolerance: percent(cell for (own, _), cell in by_key.items() if own == tolerance)
+            tolerance: percent(cell for (value, _), cell in by_key.items() if value == tolerance)
             for tolerance, _ in by_key
         }
         worst = min(by_tolerance, key=by_tolerance.__getitem__)
@@ -491,11 +504,11 @@ def displaced_table(options: argparse.Namespace, metrics: list[Metric]) -> list[
         lines.append([robot, f"{count:,}", *shares, *cells])
         success = sum(success for success, _ in by_key.values())
         metrics.append(rate_metric(f"misses/{robot}/displaced", success, count))
-    every = [cell for by_key in solved.values() for cell in by_key.values()]
-    result = f"Of {sum(count for _, count in every):,} displaced targets of {len(solved)} robots, "
-    result += f"{percent(every):.3f} % are solved."
+    cells = [cell for by_key in solved.values() for cell in by_key.values()]
+    result = f"Of {sum(count for _, count in cells):,} displaced targets of {len(solved)} robots, "
+    result += f"{percent(cells):.3f} % are solved."
     heads = ["robot", "n", *(f"at {share:g}" for share in SHARES), "worst tolerance", "solved %"]
-    text = DISPLACEMENTS.format(*(", ".join(map(str, some)) for some in (ANGLES, DISTANCES)))
+    text = DISPLACEMENTS.format(*(", ".join(map(str, values)) for values in (ANGLES, DISTANCES)))
     return [result, "## Tolerances", text, markdown_table(heads, lines)]
 
 
@@ -507,20 +520,20 @@ def climbed_rows(options: argparse.Namespace) -> tuple[list[Row], str]:
         state = Climb(robot, 0, options).state
         if not state.exists():
             continue
-        found = read_search(state)
-        codes.add(found["code"])
+        search_state = read_search(state)
+        codes.add(search_state["code"])
         for tolerance in options.tolerance:
-            iterations, restarts = found["most"].get(tolerance, (0, 0))
-            missed = [one for one in found["missed"] if one["tolerance"] == tolerance]
+            iterations, restarts = search_state["most"].get(tolerance, (0, 0))
+            missed = [miss for miss in search_state["missed"] if miss["tolerance"] == tolerance]
             row: Row = {"robot": robot, "kind": "climbing", "tolerance": tolerance}
-            row |= {"count": found["total"], "seconds": found["seconds"]}
+            row |= {"count": search_state["total"], "seconds": search_state["seconds"]}
             row |= {"most iterations": iterations, "most restarts": restarts}
-            row["missed"] = [{"place": "climbing"} | one for one in missed]
+            row["missed"] = [{"place": "climbing"} | miss for miss in missed]
             rows.append(row)
     return rows, ", ".join(sorted(codes))
 
 
-def _lost(row: Row) -> str:
+def _missed_text(row: Row) -> str:
     """How many were missed, and with which verdicts."""
     counts = Counter(miss["status"] for miss in row["missed"])
     words = ", ".join(f"{count} {name}" for name, count in counts.most_common())
@@ -532,7 +545,7 @@ def _first(row: Row, metrics: list[Metric]) -> list[str]:
     rate = rate_metric(name, row["count"] - len(row["missed"]), row["count"])
     metrics.append(rate)
     cells = [row["robot"], row["kind"], tolerance_name(row["tolerance"]), f"{row['count']:,}"]
-    return [*cells, _lost(row), interval_text(rate, 5)]
+    return [*cells, _missed_text(row), interval_text(rate, 5)]
 
 
 def table_of(rows: list[Row], metrics: list[Metric]) -> str:
@@ -540,7 +553,7 @@ def table_of(rows: list[Row], metrics: list[Metric]) -> str:
     heads = ["robot", "targets", "tolerance", "n", "missed", "solved %", "iterations", "most"]
     heads += ["restarted %", "most restarts", "median [us]", "99 %", "worst", "mean"]
     heads += ["ratio, random", "largest"] if "ratio" in rows[0] else []
-    noise = rows[0]["kind"].startswith(OTHERS["noise"])
+    noise = rows[0]["kind"].startswith(KINDS_OF_CONTACTS["noise"])
     lines = []
     for row in rows:
         cells = [f"{row['iterations'] / row['count']:.1f}", f"{row['most iterations']:,}"]
@@ -565,30 +578,32 @@ def climbed_table(rows: list[Row], metrics: list[Metric]) -> str:
     return markdown_table([*heads, "most iterations", "most restarts"], lines)
 
 
-def why(rows: list[Row]) -> list[str]:
+def causes_section(rows: list[Row]) -> list[str]:
     """Parts of the report on misses: causes, and the list."""
-    lost = [row for row in rows if row["missed"]]
+    missed_rows = [row for row in rows if row["missed"]]
     listed = [
         [row["robot"], tolerance_name(row["tolerance"]), miss["place"], miss["status"], text]
-        for row in lost
+        for row in missed_rows
         for miss in row["missed"]
         for text in [" ".join(f"{x:.9g}" for x in miss["q"])]
     ]
     if not listed:
         return ["## Misses", "None."]
     cells = []
-    for robot, tolerance in dict.fromkeys((row["robot"], row["tolerance"]) for row in lost):
-        mine = [row for row in lost if (row["robot"], row["tolerance"]) == (robot, tolerance)]
-        of_contacts = [row for row in mine if row["kind"] != OTHERS["palms"]]
+    for robot, tolerance in dict.fromkeys((row["robot"], row["tolerance"]) for row in missed_rows):
+        matching_rows = [
+            row for row in missed_rows if (row["robot"], row["tolerance"]) == (robot, tolerance)
+        ]
+        of_contacts = [row for row in matching_rows if row["kind"] != KINDS_OF_CONTACTS["palms"]]
         q = np.array([miss["q"] for row in of_contacts for miss in row["missed"]])
         if len(q):
-            found = causes(load(robot), tolerance_of(tolerance), q)
-            cells.append([robot, tolerance_name(tolerance), *found])
+            cause_row = causes(load(robot), tolerance_of(tolerance), q)
+            cells.append([robot, tolerance_name(tolerance), *cause_row])
     heads = ["robot", "tolerance", "missed", "solved now", "of the rest, given the hand"]
     heads += ["from nearby", "arm motors at limits", "hand motors at limits", "off, median"]
     parts = ["## Why", CAUSES, markdown_table(heads, cells)] if cells else []
     names = ["robot", "tolerance", "target", "status", "q"]
-    return [*parts, "## Misses", markdown_table(names, listed[:SHOWN])]
+    return [*parts, "## Misses", markdown_table(names, listed[:MAX_LISTED])]
 
 
 def heat_map(rows: list[Row], path: Path) -> None:
@@ -597,7 +612,7 @@ def heat_map(rows: list[Row], path: Path) -> None:
     pairs = {tuple(row["robot"].split("+")): row for row in rows if row["tolerance"] == finest}
     arms, hands = (sorted({pair[i] for pair in pairs}) for i in (0, 1))
     ratios = np.full((len(arms), len(hands)), np.nan)
-    drawn, grid = figure(1, 1, 3.0 + 0.32 * len(hands), 2.6 + 0.22 * len(arms))
+    plot, grid = figure(1, 1, 3.0 + 0.32 * len(hands), 2.6 + 0.22 * len(arms))
     axes = grid[0, 0]
     for (arm, hand), row in pairs.items():
         i, j = arms.index(arm), hands.index(hand)
@@ -606,13 +621,13 @@ def heat_map(rows: list[Row], path: Path) -> None:
             around = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
             axes.text(j, i, str(missed), ha="center", va="center", fontsize=9, color="#c0392b",
                       bbox=around)  # fmt: skip
-    least, most = float(np.nanmin(ratios)), float(np.nanmax(ratios))
-    scale = LogNorm(least, most)
+    smallest, largest = float(np.nanmin(ratios)), float(np.nanmax(ratios))
+    scale = LogNorm(smallest, largest)
     image = axes.imshow(ratios, cmap="YlGnBu", norm=scale, alpha=0.8, aspect="auto")
     axes.set_xticks(range(len(hands)), hands, rotation=45, ha="right")
     axes.set_yticks(range(len(arms)), arms)
-    bar = drawn.colorbar(image, ax=axes, shrink=0.7)
-    ticks = [t for t in (0.5, 1, 2, 3, 5, 10, 20) if least <= t <= most]
+    bar = plot.colorbar(image, ax=axes, shrink=0.7)
+    ticks = [t for t in (0.5, 1, 2, 3, 5, 10, 20) if smallest <= t <= largest]
     bar.set_ticks(ticks, labels=[f"{t:g}" for t in ticks])
     bar.ax.minorticks_off()
     bar.set_label(f"time of a target over that of {REFERENCE}")
@@ -621,21 +636,21 @@ def heat_map(rows: list[Row], path: Path) -> None:
         "white: not asked"
     )
     title(axes, name, "hand", "arm")
-    drawn.tight_layout()
-    drawn.savefig(path)
+    plot.tight_layout()
+    plot.savefig(path)
 
 
 def write_report(options: argparse.Namespace, run_by: str) -> None:
     """Write the report on what there is."""
-    (drawn, codes), (climbed, others) = rows_of(options), climbed_rows(options)
-    noise = [row for row in drawn if row["kind"].startswith(OTHERS["noise"])]
-    rows, metrics = [row for row in drawn if row not in noise], list[Metric]()
+    (sampled_rows, codes), (climbed, climbed_codes) = rows_of(options), climbed_rows(options)
+    noise = [row for row in sampled_rows if row["kind"].startswith(KINDS_OF_CONTACTS["noise"])]
+    rows, metrics = [row for row in sampled_rows if row not in noise], list[Metric]()
     total = sum(row["count"] for row in [*rows, *climbed])
-    lost = sum(len(row["missed"]) for row in [*rows, *climbed])
+    missed_count = sum(len(row["missed"]) for row in [*rows, *climbed])
     result, *tolerances = displaced_table(options, metrics) or [""]
     body = [result] if result else []
     if total or noise or not result:
-        body += [INTRODUCTION, f"{total:,} solves, {lost} missed."]
+        body += [INTRODUCTION, f"{total:,} solves, {missed_count} missed."]
     options.report.mkdir(parents=True, exist_ok=True)
     if options.ratio and rows and all("+" in row["robot"] for row in rows):
         heat_map(rows, options.report / "pairs.png")
@@ -647,16 +662,16 @@ def write_report(options: argparse.Namespace, run_by: str) -> None:
     body += tolerances
     if climbed:
         body += ["## Climbing", CLIMBING, climbed_table(climbed, metrics)]
-    body += why([*rows, *climbed]) if total or not result else []
-    if lost > SHOWN:
-        every = [
+    body += causes_section([*rows, *climbed]) if total or not result else []
+    if missed_count > MAX_LISTED:
+        misses = [
             {"robot": row["robot"], "kind": row["kind"], "tolerance": row["tolerance"]}
             | {"status": miss["status"], "q": " ".join(map(repr, miss["q"]))}
             for row in [*rows, *climbed]
             for miss in row["missed"]
         ]
-        pl.DataFrame(every).write_csv(options.report / "misses.csv")
-    code = ", ".join(sorted({codes, others} - {""})) or None
+        pl.DataFrame(misses).write_csv(options.report / "misses.csv")
+    code = ", ".join(sorted({codes, climbed_codes} - {""})) or None
     title_ = "Reachable targets that hand-first misses"
     publish(title_, body, options.report, run_by, {"misses": code}, metrics)
 
@@ -670,7 +685,7 @@ def main(arguments: list[str] | None = None) -> None:
         default=ROBOTS,
         help="names; pairs, tour, or catalogue",
     )
-    kinds = (*SAMPLERS, *OTHERS, "climb")
+    kinds = (*SAMPLERS, *KINDS_OF_CONTACTS, "climb")
     parser.add_argument("--sampler", nargs="+", default=USUAL, choices=kinds, metavar="SAMPLER",
                         help=", ".join(kinds))  # fmt: skip
     parser.add_argument(
@@ -689,7 +704,7 @@ def main(arguments: list[str] | None = None) -> None:
         "--noise", type=float, nargs=2, default=(4.0, 2.0), metavar=("MM", "DEG"),
         help="standard deviation of noisy contacts",
     )  # fmt: skip
-    parser.add_argument("--looked", type=int, default=10, help="missed noisy ones Ipopt looks at")
+    parser.add_argument("--looked", type=int, default=10, help="missed noisy targets for Ipopt")
     parser.add_argument("--ratio", action="store_true", help=f"times over those of {REFERENCE}")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--dask", metavar="ADDRESS", help="scheduler of a Dask cluster instead")
@@ -702,8 +717,8 @@ def main(arguments: list[str] | None = None) -> None:
     run_parts(solve, parts_of(options), options.out, jobs=options.jobs, dask=options.dask)
     if "climb" in options.sampler:
         robots = robots_of(options.robots)
-        each = 60 * options.minutes * options.jobs / len(robots)
-        searches = [Climb(robot, each, options) for robot in robots]
+        seconds_each = 60 * options.minutes * options.jobs / len(robots)
+        searches = [Climb(robot, seconds_each, options) for robot in robots]
         run_parts(search, searches, options.out, jobs=options.jobs, title="seconds of climbing")
     write_report(options, command(__file__, arguments))
 

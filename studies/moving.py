@@ -39,7 +39,7 @@ STEPS = 2000
 SHARE = 0.5
 """Of the velocity limits, and of the accelerations that reach them in 0.25 s, that paths need."""
 
-EVERY = 20
+SOLVE_INTERVAL = 20
 """Of so many targets one is solved anew, as it was done before there was a follower."""
 
 LEAPS = 4
@@ -57,7 +57,7 @@ SINGULAR = 0.05
 FASTER = ((1.0, 10.0), (3.0, 10.0))
 """Times the velocity and the acceleration limits."""
 
-LOST = """The paths that are not wholly within tolerance, followed again with the same code by
+LOST_TEXT = """The paths that are not wholly within tolerance, followed again with the same code by
 motors that may be faster. A robot has more motors than a grasp needs, so it follows in another
 posture than the one that made the path, and there the motors may need more than the path's own did.
 *Largest difference:* of a motor of the arm from the path's own posture, when it is lost.
@@ -77,7 +77,7 @@ def measure(solver: ik.Solver, number: int) -> dict[str, Any]:
         "number": number,
         **_smooth(solver, path),
         **_leaping(solver, number),
-        **_anew(solver, path[::EVERY]),
+        **_anew(solver, path[::SOLVE_INTERVAL]),
     }
 
 
@@ -91,15 +91,19 @@ def _smooth(solver: ik.Solver, path: Array) -> dict[str, Any]:
         q[i] = follower(*target)
         seconds[i] = time.perf_counter() - begin
     position, angle = robot.errors(q, points, normals)
-    met = ((position <= 5e-3) & (angle <= np.radians(3))).all(axis=1)
-    lost = int(np.argmin(met)) if not met.all() else -1
+    is_within = ((position <= 5e-3) & (angle <= np.radians(3))).all(axis=1)
+    first_lost = int(np.argmin(is_within)) if not is_within.all() else -1
     return {
         "median": float(np.median(seconds)),
-        "met": float(met.mean()),
+        "met": float(is_within.mean()),
         "error": float(position.max()),
-        "singular": lost >= 0
-        and bool((palm_slopes(robot, path[max(lost - 300, 0) : lost + 1 : 10]) < SINGULAR).any()),
-        **_kept("smooth", follower, np.concatenate([path[:1], q])),
+        "singular": first_lost >= 0
+        and bool(
+            (
+                palm_slopes(robot, path[max(first_lost - 300, 0) : first_lost + 1 : 10]) < SINGULAR
+            ).any()
+        ),
+        **_limit_use("smooth", follower, np.concatenate([path[:1], q])),
     }
 
 
@@ -121,45 +125,50 @@ def track(solver: ik.Solver, number: int) -> dict[str, Any]:
     grasps = grasps_of(solver.robot, points, normals)
     solver.track(grasps[:2], q0=path[0])
     begin = time.process_time()
-    found = solver.track(grasps, q0=path[0])
-    spent = time.process_time() - begin
-    met = float(found.success.mean())
-    return {"time": spent, "met": met, "jumps": len(found.jumps), "calls": calls.tolist()}
+    solution = solver.track(grasps, q0=path[0])
+    seconds = time.process_time() - begin
+    solved_share = float(solution.success.mean())
+    return {
+        "time": seconds,
+        "met": solved_share,
+        "jumps": len(solution.jumps),
+        "calls": calls.tolist(),
+    }
 
 
 def _leaping(solver: ik.Solver, number: int) -> dict[str, Any]:
     """Targets that leap: limits are kept, and what can be met on the branch is met at rest."""
     robot, rng = solver.robot, np.random.default_rng([number, 1])
     start = smooth_path(robot, number, STEPS, PERIOD, SHARE)[0]
-    follower, q, met = solver.follow(start, PERIOD), [start], 0
+    follower, q, reached_count = solver.follow(start, PERIOD), [start], 0
     for _ in range(LEAPS):
         goal = start + 0.2 * (robot.random(rng, 1)[0] - start)
         target = robot.contacts(goal)
         q += [follower(*target) for _ in range(WAIT)]
-        met += follower.state.status is ik.motion.FollowStatus.FOLLOWING
-    return {"leaps_met": met / LEAPS, **_kept("leaping", follower, np.array(q))}
+        reached_count += follower.state.status is ik.motion.FollowStatus.FOLLOWING
+    return {"leaps_met": reached_count / LEAPS, **_limit_use("leaping", follower, np.array(q))}
 
 
 def _anew(solver: ik.Solver, path: Array) -> dict[str, Any]:
-    """Every target solved from the solution before: the steps between, and their time."""
+    """Every target solved from the q_next before: the steps between, and their time."""
     robot = solver.robot
     q, steps, seconds = path[0], [], []
     for points, normals in zip(*robot.contacts(path), strict=True):
         (grasp,) = grasps_of(robot, points[None], normals[None])
         begin = time.perf_counter()
-        found = solver.solve(grasp, q0=q, diagnose=False).q
+        q_next = solver.solve(grasp, q0=q, diagnose=False).q
         seconds.append(time.perf_counter() - begin)
-        steps.append(np.abs(found - q))
-        q = found
-    own = np.abs(np.diff(path, axis=0)).max()
+        steps.append(np.abs(q_next - q))
+        q = q_next
+    largest_step = np.abs(np.diff(path, axis=0)).max()
     return {
         "anew_step": float(np.max(steps)),
-        "own_step": float(own),
+        "own_step": float(largest_step),
         "anew_time": float(np.median(seconds)),
     }
 
 
-def _kept(what: str, follower: ik.motion.Follower, q: Array) -> dict[str, float]:
+def _limit_use(what: str, follower: ik.motion.Follower, q: Array) -> dict[str, float]:
     """Largest velocity and acceleration as parts of their limits, and how far beyond a limit."""
     steps = np.diff(q, axis=0)
     changes = np.diff(steps, axis=0, prepend=np.zeros((1, q.shape[1])))
@@ -172,7 +181,7 @@ def _kept(what: str, follower: ik.motion.Follower, q: Array) -> dict[str, float]
     }
 
 
-def again(solver: ik.Solver, number: int) -> dict[str, Any]:
+def follow_lost_path(solver: ik.Solver, number: int) -> dict[str, Any]:
     """A lost path with other limits: the shares of cycles within tolerance.
 
     Args:
@@ -183,28 +192,28 @@ def again(solver: ik.Solver, number: int) -> dict[str, Any]:
     path = smooth_path(robot, number, STEPS, PERIOD, SHARE)
     points, normals = robot.contacts(path)
     usual = solver.follow(path[0], PERIOD)
-    met = _met(robot, usual, points, normals)
-    shares, first = [], int(np.argmin(met[0])) if not met[0].all() else -1
+    is_within = _within_tolerance(robot, usual, points, normals)
+    shares, first = [], int(np.argmin(is_within[0])) if not is_within[0].all() else -1
     for velocity, acceleration in FASTER:
-        more = solver.follow(
+        faster_follower = solver.follow(
             path[0],
             PERIOD,
             velocity=velocity * usual.velocity,
             acceleration=acceleration * usual.acceleration,
         )
-        shares.append(float(_met(robot, more, points, normals)[0].mean()))
+        shares.append(float(_within_tolerance(robot, faster_follower, points, normals)[0].mean()))
     arm = list(robot.description.arm_actuators)
-    off = float(np.abs(met[1][first] - path[first])[arm].max()) if first >= 0 else 0.0
+    off = float(np.abs(is_within[1][first] - path[first])[arm].max()) if first >= 0 else 0.0
     return {
         "number": number,
-        "met": float(met[0].mean()),
+        "met": float(is_within[0].mean()),
         "first": first,
         "off": off,
         "faster": shares,
     }
 
 
-def _met(
+def _within_tolerance(
     robot: ik.ArmHand, follower: ik.motion.Follower, points: Array, normals: Array
 ) -> tuple[Array, Array]:
     """(k,) whether each cycle is within tolerance, and (k, n) where the motors were."""
@@ -238,24 +247,24 @@ def _ready(robot: str) -> ik.Solver:
 
 def solve(part: Part) -> dict[str, Any]:
     """Figures of a part."""
-    return {"path": measure, "track": track, "lost": again}[part.what](
+    return {"path": measure, "track": track, "lost": follow_lost_path}[part.what](
         _ready(part.robot), part.number
     )
 
 
 def figures(robot: str, rows: dict[str, Array]) -> list[Metric]:
     """Of a robot, with their confidence."""
-    met = rows["met"]
+    is_within = rows["met"]
     return [
-        rate_metric(f"{robot}/paths within tolerance", int((met == 1).sum()), len(met)),
-        mean_metric(f"{robot}/cycles within tolerance", 100 * met, "%", "higher"),
+        rate_metric(f"{robot}/paths within tolerance", int((is_within == 1).sum()), len(is_within)),
+        mean_metric(f"{robot}/cycles within tolerance", 100 * is_within, "%", "higher"),
         median_metric(f"{robot}/largest error", 1e3 * rows["error"], "mm"),
         median_metric(f"{robot}/cycle", 1e6 * rows["median"], "us"),
         mean_metric(f"{robot}/leaps met", 100 * rows["leaps_met"], "%", "higher"),
     ]
 
 
-FOLLOWED = """
+FOLLOWED_TEXT = """
 Random smooth paths of {steps} cycles of {period:g} ms, from rest, at up to {share:g} % of the
 velocity limits, seeds 0 on. Default tolerances (5 mm, 3 deg) and accelerations (full speed in a
 quarter of a second). Times are from Python; the machine was busy with other work, so beside the
@@ -279,15 +288,24 @@ of a motor between two of them; the follower's is its largest step of a cycle ti
 
 def tables(robot: str, rows: dict[str, Array], tracks: list[dict[str, Any]]) -> list[list[str]]:
     """A robot's rows of the tables: followed, limits, solved anew, known paths."""
-    lost = rows["met"] < 1
-    calls = 1e6 * np.concatenate([one["calls"] for one in tracks]) if tracks else np.full(1, np.nan)
+    is_lost = rows["met"] < 1
+    calls = (
+        1e6 * np.concatenate([result["calls"] for result in tracks])
+        if tracks
+        else np.full(1, np.nan)
+    )
     limits = [
-        f"{way}_{what}" for way in ("smooth", "leaping") for what in ("velocity", "acceleration")
+        f"{kind}_{what}" for kind in ("smooth", "leaping") for what in ("velocity", "acceleration")
     ]
     return [
         [
-            *(robot, f"{len(lost)}", f"{(~lost).sum()}", f"{100 * rows['met'].mean():.2f}"),
-            f"{int(rows['singular'][lost].sum())} of {int(lost.sum())}",
+            *(
+                robot,
+                f"{len(is_lost)}",
+                f"{(~is_lost).sum()}",
+                f"{100 * rows['met'].mean():.2f}",
+            ),
+            f"{int(rows['singular'][is_lost].sum())} of {int(is_lost.sum())}",
             f"{1e3 * np.median(rows['error']):.2f}",
             f"{1e6 * np.median(rows['median']):.0f}",
             *(f"{np.percentile(calls, part):.0f}" for part in (50, 99)),
@@ -301,13 +319,13 @@ def tables(robot: str, rows: dict[str, Array], tracks: list[dict[str, Any]]) -> 
             *(robot, f"{np.degrees(rows['own_step'].max()):.2f}"),
             f"{np.degrees(rows['anew_step'].max()):.1f}",
             f"{np.degrees(np.median(rows['anew_step'])):.1f}",
-            f"{np.degrees(EVERY * rows['smooth_step'].max()):.2f}",
+            f"{np.degrees(SOLVE_INTERVAL * rows['smooth_step'].max()):.2f}",
             f"{1e6 * np.median(rows['anew_time']):.0f}",
         ],
         [
-            *(robot, f"{len(tracks)}", f"{np.median([one['time'] for one in tracks]):.2f}"),
-            f"{100 * np.mean([one['met'] for one in tracks]):.1f}",
-            f"{sum(one['jumps'] for one in tracks)}",
+            *(robot, f"{len(tracks)}", f"{np.median([result['time'] for result in tracks]):.2f}"),
+            f"{100 * np.mean([result['met'] for result in tracks]):.1f}",
+            f"{sum(result['jumps'] for result in tracks)}",
         ],
     ]
 
@@ -322,12 +340,12 @@ HEADS = (
 )
 
 
-def lost_row(robot: str, one: dict[str, Any], singular: bool) -> list[str]:
+def lost_row(robot: str, result: dict[str, Any], singular: bool) -> list[str]:
     """Of the table of lost paths."""
-    first = f"{1e3 * PERIOD * one['first']:.0f}" if one["first"] >= 0 else "-"
-    cells = [robot, str(one["number"]), first, f"{100 * one['met']:.1f}"]
-    cells += [f"{np.degrees(one['off']):.0f}", "yes" if singular else "no"]
-    return cells + [f"{100 * share:.1f}" for share in one["faster"]]
+    first = f"{1e3 * PERIOD * result['first']:.0f}" if result["first"] >= 0 else "-"
+    cells = [robot, str(result["number"]), first, f"{100 * result['met']:.1f}"]
+    cells += [f"{np.degrees(result['off']):.0f}", "yes" if singular else "no"]
+    return cells + [f"{100 * share:.1f}" for share in result["faster"]]
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -341,14 +359,14 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--report", type=Path, default=Path("out/moving/report"), help="folder")
     options = parser.parse_args(arguments)
     rows: list[list[list[str]]] = [[], [], [], []]
-    lost, metrics, codes = list[list[str]](), list[Metric](), set[str]()
+    lost_rows, metrics, codes = list[list[str]](), list[Metric](), set[str]()
 
     def done(robot: str, what: str, numbers: list[int]) -> list[dict[str, Any]]:
         parts = [Part(robot, what, number) for number in numbers]
         run_parts(solve, parts, options.folder, jobs=options.jobs, title=f"{robot}, {what}")
-        found, code = read_parts(options.folder, parts)
+        results, code = read_parts(options.folder, parts)
         codes.update([code] if code else [])
-        return [one for _, one in found]
+        return [result for _, result in results]
 
     for robot in options.robots:
         paths = done(robot, "path", list(range(options.count)))
@@ -357,20 +375,24 @@ def main(arguments: list[str] | None = None) -> None:
         for table, row in zip(rows, tables(robot, values, tracks), strict=True):
             table.append(row)
         missed = {row["number"]: row["singular"] for row in paths if row["met"] < 1}
-        again_ = done(robot, "lost", list(missed))
-        lost += [lost_row(robot, one, missed[one["number"]]) for one in again_]
+        repeated = done(robot, "lost", list(missed))
+        lost_rows += [lost_row(robot, result, missed[result["number"]]) for result in repeated]
         metrics += figures(robot, values)
     heads = ["robot", "path", "lost at [ms]", "within tolerance %", "largest difference [deg]"]
     heads += ["near a singular arm", "accelerations x10 %", "velocities x3 too %"]
-    followed, limits, anew, known = (
+    followed_table, limits, anew, known_table = (
         markdown_table(head.split("|"), table) for head, table in zip(HEADS, rows, strict=True)
     )
     times = {"steps": STEPS, "period": 1e3 * PERIOD, "share": 100 * SHARE, "times": TIMES}
     parts = [
-        *("## Followed cycle by cycle", FOLLOWED.format(singular=SINGULAR, **times), followed),
+        *(
+            "## Followed cycle by cycle",
+            FOLLOWED_TEXT.format(singular=SINGULAR, **times),
+            followed_table,
+        ),
         *("## Limits", LEAPING.format(leaps=LEAPS, wait=WAIT), limits),
-        *("## Solved anew", ANEW.format(every=EVERY), anew, "## Known paths", known),
-        *("## Paths that are lost", LOST, markdown_table(heads, lost)),
+        *("## Solved anew", ANEW.format(every=SOLVE_INTERVAL), anew, "## Known paths", known_table),
+        *("## Paths that are lost", LOST_TEXT, markdown_table(heads, lost_rows)),
     ]
     run_by, code = command(__file__, arguments), {"moving": ", ".join(sorted(codes))}
     publish("Moving targets", parts, options.report, run_by, code, metrics)

@@ -50,17 +50,17 @@ def path(robot: ik.ArmHand, rng: np.random.Generator, steps: int, step: float) -
     return np.clip(q, robot.lower, robot.upper)
 
 
-def along(solver: ik.Solver, paths: list[Array], prefer: str) -> tuple[Array, float]:
+def solve_paths(solver: ik.Solver, paths: list[Array], prefer: str) -> tuple[Array, float]:
     """Motions [deg] of all steps, and the part of them solved."""
-    moved, solved = [], []
-    q = np.stack([one[0] for one in paths])
+    motions, solved = [], []
+    q = np.stack([path[0] for path in paths])
     for step in range(1, len(paths[0])):
-        targets = solver.robot.contacts(np.stack([one[step] for one in paths]))
+        targets = solver.robot.contacts(np.stack([path[step] for path in paths]))
         batch = solver.solve_batch(*targets, q0=q, prefer=prefer)
-        moved.append(np.degrees(np.abs(batch.q - q).max(axis=1)))
+        motions.append(np.degrees(np.abs(batch.q - q).max(axis=1)))
         solved.append(batch.success)
         q = batch.q
-    return np.concatenate(moved), float(np.mean(solved))
+    return np.concatenate(motions), float(np.mean(solved))
 
 
 def anywhere(solver: ik.Solver, q: Array, q0: Array, prefer: str) -> tuple[Array, Array, float]:
@@ -79,7 +79,7 @@ def anywhere(solver: ik.Solver, q: Array, q0: Array, prefer: str) -> tuple[Array
 
 def nearest(solver: ik.Solver, q: Array, q0: Array) -> Array:
     """(k,) distances of the nearest solutions that `solve_all` finds."""
-    robot, found = solver.robot, []
+    robot, distances = solver.robot, []
     points, normals = robot.contacts(q)
     for row in range(len(q)):
         contacts = {
@@ -87,8 +87,8 @@ def nearest(solver: ik.Solver, q: Array, q0: Array) -> Array:
             for i, name in enumerate(robot.fingers)
         }
         best = solver.solve_all(ik.Grasp(contacts), prefer="q0", q0=q0[row], limit=1)
-        found.append(best[0].distance)
-    return np.array(found)
+        distances.append(best[0].distance)
+    return np.array(distances)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -109,14 +109,14 @@ def main(arguments: list[str] | None = None) -> None:
     steps, jumps = [], []
     for name, tolerance in TOLERANCES.items():
         solver = ik.Solver(robot, tolerance=tolerance)
-        some = slice(0, options.compared)
-        least = nearest(solver, q[some], q0[some])
+        rows = slice(0, options.compared)
+        nearest_distances = nearest(solver, q[rows], q0[rows])
         for prefer in PREFERENCES:
-            moved, solved = along(solver, paths, prefer)
-            row = [name, prefer, f"{100 * solved:.2f}", f"{np.median(moved):.3f}"]
-            steps.append([*row, f"{np.quantile(moved, 0.99):.2f}", f"{moved.max():.2f}"])
+            motions, solved = solve_paths(solver, paths, prefer)
+            row = [name, prefer, f"{100 * solved:.2f}", f"{np.median(motions):.3f}"]
+            steps.append([*row, f"{np.quantile(motions, 0.99):.2f}", f"{motions.max():.2f}"])
             distance, motion, seconds = anywhere(solver, q, q0, prefer)
-            ratio = distance[some] / least
+            ratio = distance[rows] / nearest_distances
             row = [name, prefer, f"{np.median(distance):.3f}", f"{np.median(motion):.0f}"]
             row += [f"{100 * np.mean(ratio < limit):.1f}" for limit in (NEAREST, 1.1)]
             jumps.append([*row, f"{1e6 * seconds:.1f}"])

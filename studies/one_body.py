@@ -55,15 +55,15 @@ BLOCK = 20_000
 """Targets solved in one call."""
 PART = 100_000
 """Targets kept as one result."""
-ALONE = 300
+SINGLE_TARGETS = 300
 """Targets solved one by one; poses of the path that is followed."""
 CYCLES = 2000
 """Of hands that are led through each other, at 1 kHz."""
-BEYOND = (1e-3, 5e-3, 20e-3, 50e-3)
+EXCESSES = (1e-3, 5e-3, 20e-3, 50e-3)
 """How far out of reach targets are [m]."""
 SEARCH = 20_000
 """Answers that a random search looks at for one that touches nothing."""
-SEARCHED = 1000
+SEARCH_BATCH = 1000
 """Of them, in one call."""
 
 INTRODUCTION = """
@@ -74,7 +74,7 @@ target; *one alone* is `Solver.fast`, the median.
 """
 
 
-OTHERS = """
+OTHER_METHODS = """
 Random targets at 5 mm and 3 deg, mean processor times. Solvers of frames or residuals move all
 motors of the body as those of one hand; they start at home, then at up to 400 other postures.
 """
@@ -91,7 +91,7 @@ class Cell:
 
     Attributes:
         robot: Name of it.
-        what: A row of `TABLES`.
+        task: A row of `TABLES`.
         count: Targets, or poses.
         seed: Of what is drawn.
         tolerance: A name of `TOLERANCES`.
@@ -99,7 +99,7 @@ class Cell:
     """
 
     robot: str
-    what: str
+    task: str
     count: int
     seed: int
     tolerance: str = "5 mm, 3 deg"
@@ -109,7 +109,7 @@ class Cell:
     def path(self) -> Path:
         """Where it is kept."""
         number = list(TOLERANCES).index(self.tolerance)
-        name = f"{self.what}-{number}-{self.first}-{self.count}-{self.seed}.json"
+        name = f"{self.task}-{number}-{self.first}-{self.count}-{self.seed}.json"
         return Path(self.robot) / name.replace(" ", "_")
 
     @property
@@ -118,7 +118,7 @@ class Cell:
         return self.count
 
 
-def drawn(robot: ArmHand, count: int, near: bool, seed: int) -> np.ndarray:
+def draw_configurations(robot: ArmHand, count: int, near: bool, seed: int) -> np.ndarray:
     """(count, n) configurations within limits."""
     rng = np.random.default_rng(seed)
     part = rng.random((count, len(robot.lower)))
@@ -130,29 +130,35 @@ def drawn(robot: ArmHand, count: int, near: bool, seed: int) -> np.ndarray:
 
 def batch(cell: Cell, robot: ArmHand) -> dict[str, Any]:
     """How many targets of a part are missed, and the time [s] that it takes."""
-    near = cell.what == "near limits"
+    near_limits = cell.task == "near limits"
     solver = ik.Solver(robot, tolerance=TOLERANCES[cell.tolerance])
-    solver.solve_batch(*robot.contacts(drawn(robot, 1000, near, cell.seed + 1)))
-    missed, spent = 0, 0.0
+    solver.solve_batch(
+        *robot.contacts(draw_configurations(robot, 1000, near_limits, cell.seed + 1))
+    )
+    missed, seconds = 0, 0.0
     for first in range(cell.first, cell.first + cell.count, BLOCK):
-        some = min(BLOCK, cell.first + cell.count - first)
-        points, normals = robot.contacts(drawn(robot, some, near, cell.seed + 2 + first))
-        begun = time.process_time()
-        found = solver.solve_batch(points, normals)
-        spent += time.process_time() - begun
-        missed += int((found.status != ik.Status.SOLVED).sum())
-    return {"missed": missed, "spent": spent}
+        size = min(BLOCK, cell.first + cell.count - first)
+        points, normals = robot.contacts(
+            draw_configurations(robot, size, near_limits, cell.seed + 2 + first)
+        )
+        start = time.process_time()
+        solution = solver.solve_batch(points, normals)
+        seconds += time.process_time() - start
+        missed += int((solution.status != ik.Status.SOLVED).sum())
+    return {"missed": missed, "spent": seconds}
 
 
-def alone(cell: Cell, robot: ArmHand) -> dict[str, Any]:
+def solve_singly(cell: Cell, robot: ArmHand) -> dict[str, Any]:
     """Median time [us] of one target by itself."""
-    fast, spent = ik.Solver(robot).fast(), []
-    every = zip(*robot.contacts(drawn(robot, cell.count, False, cell.seed)), strict=True)
-    for points, normals in every:
-        begun = time.process_time()
+    fast, seconds = ik.Solver(robot).fast(), []
+    targets = zip(
+        *robot.contacts(draw_configurations(robot, cell.count, False, cell.seed)), strict=True
+    )
+    for points, normals in targets:
+        start = time.process_time()
         fast(points, normals)
-        spent.append(time.process_time() - begun)
-    return {"time": 1e6 * float(np.median(spent[10:]))}
+        seconds.append(time.process_time() - start)
+    return {"time": 1e6 * float(np.median(seconds[10:]))}
 
 
 def row(*cells: str) -> dict[str, Any]:
@@ -160,119 +166,131 @@ def row(*cells: str) -> dict[str, Any]:
     return {"rows": [list(cells)]}
 
 
-def followed(_cell: Cell, robot: ArmHand) -> dict[str, Any]:
+def follow_path(_cell: Cell, robot: ArmHand) -> dict[str, Any]:
     """A smooth path of all motors, followed: times [us], and error [mm]."""
     span, phase = robot.upper - robot.lower, np.arange(len(robot.lower))
     times = np.arange(3000)[:, None]
     swing = 0.1 * span * np.sin(0.001 * times + phase) * np.minimum(1.0, times / 1000)
     path = np.clip(robot.home + swing, robot.lower, robot.upper)
     points, normals = robot.contacts(path)
-    follower, spent, off = ik.Solver(robot).follow(path[0]), [], []
-    for goal, facing in zip(points, normals, strict=True):
-        begun = time.perf_counter()
-        q = follower(goal, facing)
-        spent.append(1e6 * (time.perf_counter() - begun))
-        off.append(np.linalg.norm(robot.contacts(q)[0] - goal, axis=1).max())
-    median, most = np.median(spent), np.quantile(spent, 0.99)
-    return row(robot.name, f"{median:.1f}", f"{most:.1f}", f"{1e3 * np.median(off):.2f}")
+    follower, times, errors = ik.Solver(robot).follow(path[0]), [], []
+    for goal, normal in zip(points, normals, strict=True):
+        start = time.perf_counter()
+        q = follower(goal, normal)
+        times.append(1e6 * (time.perf_counter() - start))
+        errors.append(np.linalg.norm(robot.contacts(q)[0] - goal, axis=1).max())
+    median, percentile = np.median(times), np.quantile(times, 0.99)
+    return row(robot.name, f"{median:.1f}", f"{percentile:.1f}", f"{1e3 * np.median(errors):.2f}")
 
 
-def crossed(_cell: Cell, robot: ArmHand) -> dict[str, Any]:
+def cross_hands(_cell: Cell, robot: ArmHand) -> dict[str, Any]:
     """Hands led to each other's place and back, through each other, followed in a scene."""
     sides = robot.description.sides
     if len(sides) != 2 or not robot.description.shapes.capsules:
         return {"rows": []}
     solver, (points, normals) = ik.Solver(robot, scene=ik.Scene()), robot.contacts(robot.home)
     rows = [[robot.fingers.index(finger) for finger in side.fingers] for side in sides]
-    way = points[rows[1]].mean(axis=0) - points[rows[0]].mean(axis=0)
+    offset = points[rows[1]].mean(axis=0) - points[rows[0]].mean(axis=0)
     q: list[Array] = []
-    spent: list[float] = []
+    times: list[float] = []
     blocked = 0
     for _ in range(2):  # once to have all compiled and warm
-        follower, q, spent, blocked = solver.follow(robot.home), [robot.home], [], 0
+        follower, q, times, blocked = solver.follow(robot.home), [robot.home], [], 0
         for share in np.sin(np.linspace(0, np.pi, CYCLES)) ** 2:
             goal = points.copy()
-            goal[rows[0]] += share * way
-            goal[rows[1]] -= share * way
-            begun = time.process_time()
+            goal[rows[0]] += share * offset
+            goal[rows[1]] -= share * offset
+            start = time.process_time()
             q.append(follower(goal, normals))
-            spent.append(1e6 * (time.process_time() - begun))
+            times.append(1e6 * (time.process_time() - start))
             blocked += follower.state.status is ik.motion.FollowStatus.BLOCKED
-    median, most = np.median(spent), np.quantile(spent, 0.99)
-    least = f"{1e3 * room_of(solver, np.array(q)).min():.3f}"
-    return row(robot.name, f"{median:.1f}", f"{most:.1f}", f"{blocked} of {CYCLES}", least)
+    median, percentile = np.median(times), np.quantile(times, 0.99)
+    clearance = f"{1e3 * clearance_of(solver, np.array(q)).min():.3f}"
+    return row(
+        robot.name, f"{median:.1f}", f"{percentile:.1f}", f"{blocked} of {CYCLES}", clearance
+    )
 
 
 def grasp(robot: ArmHand, points: Array, normals: Array) -> ik.Grasp:
     """Contacts (f, 3) of all fingers."""
-    every = zip(robot.fingers, points, normals, strict=True)
-    return ik.Grasp(name="target", contacts={f: ik.Contact(p, n) for f, p, n in every})
+    contacts = zip(robot.fingers, points, normals, strict=True)
+    return ik.Grasp(name="target", contacts={f: ik.Contact(p, n) for f, p, n in contacts})
 
 
-def room_of(solver: ik.Solver, q: Array) -> Array:
+def clearance_of(solver: ik.Solver, q: Array) -> Array:
     """(k,) how far configurations are from touching anything [m]; < 0: they do."""
-    room = solver.check(q, grasp(solver.robot, *solver.robot.contacts(solver.robot.home)))
-    assert room is not None
-    return room.surplus
+    clearance = solver.check(q, grasp(solver.robot, *solver.robot.contacts(solver.robot.home)))
+    assert clearance is not None
+    return clearance.surplus
 
 
 def untouched(solver: ik.Solver, count: int, seed: int) -> Array:
     """(count, n) random configurations that touch nothing; none where they are too rare."""
-    kept = np.zeros((0, len(solver.robot.lower)))
+    configurations = np.zeros((0, len(solver.robot.lower)))
     for number in range(1000):
-        some = drawn(solver.robot, 1000, False, seed + number)
-        kept = np.concatenate([kept, some[room_of(solver, some) > 0]])
-        if len(kept) >= count:
-            return kept[:count]
-    return kept[:0]
+        samples = draw_configurations(solver.robot, 1000, False, seed + number)
+        configurations = np.concatenate(
+            [configurations, samples[clearance_of(solver, samples) > 0]]
+        )
+        if len(configurations) >= count:
+            return configurations[:count]
+    return configurations[:0]
 
 
-def free(cell: Cell, robot: ArmHand) -> dict[str, Any]:
+def solve_collision_free(cell: Cell, robot: ArmHand) -> dict[str, Any]:
     """Targets made by configurations that touch nothing: answers that touch nothing either."""
     if not robot.description.shapes.capsules:
         return {"rows": []}
     solver, plain, count = ik.Solver(robot, scene=ik.Scene()), ik.Solver(robot), cell.count
-    kept = untouched(solver, count, cell.seed)
-    if not len(kept):
+    configurations = untouched(solver, count, cell.seed)
+    if not len(configurations):
         return {"rows": []}
-    points, normals = robot.contacts(kept)
-    hits = int((room_of(solver, plain.solve_batch(points, normals).q) <= 0).sum())
+    points, normals = robot.contacts(configurations)
+    hits = int((clearance_of(solver, plain.solve_batch(points, normals).q) <= 0).sum())
     solver.solve_batch(points, normals)  # all that is needed is compiled now
-    begun = time.process_time()
-    found = solver.solve_batch(points, normals)
-    each = 1e3 * (time.process_time() - begun) / count
-    solved = int((found.status == ik.Status.SOLVED).sum())
-    return row(robot.name, f"{hits} of {count}", f"{solved} of {count}", f"{each:.2f}")
+    start = time.process_time()
+    solution = solver.solve_batch(points, normals)
+    time_each = 1e3 * (time.process_time() - start) / count
+    solved = int((solution.status == ik.Status.SOLVED).sum())
+    return row(robot.name, f"{hits} of {count}", f"{solved} of {count}", f"{time_each:.2f}")
 
 
-def beyond(cell: Cell, robot: ArmHand) -> dict[str, Any]:
+def solve_out_of_reach(cell: Cell, robot: ArmHand) -> dict[str, Any]:
     """Targets moved away from the base until they are just out of reach."""
     solver, sides = ik.Solver(robot), robot.description.sides
-    points, normals = robot.contacts(drawn(robot, cell.count, False, cell.seed))
-    way = np.zeros_like(points)
-    for place, side in enumerate(sides):
-        own = [robot.fingers.index(finger) for finger in side.fingers]
-        middle = points[:, own].mean(axis=1)
-        moved = np.isin(np.arange(cell.count) % (len(sides) + 1), (place, len(sides)))
-        way[:, own] = (moved[:, None] * middle / np.linalg.norm(middle, axis=1)[:, None])[:, None]
-    reached, step = np.zeros(cell.count), np.full(cell.count, 0.1)
+    points, normals = robot.contacts(draw_configurations(robot, cell.count, False, cell.seed))
+    directions = np.zeros_like(points)
+    for index, side in enumerate(sides):
+        fingers = [robot.fingers.index(finger) for finger in side.fingers]
+        centre = points[:, fingers].mean(axis=1)
+        is_moved = np.isin(np.arange(cell.count) % (len(sides) + 1), (index, len(sides)))
+        directions[:, fingers] = (
+            is_moved[:, None] * centre / np.linalg.norm(centre, axis=1)[:, None]
+        )[:, None]
+    distance, step = np.zeros(cell.count), np.full(cell.count, 0.1)
     for _ in range(18):
-        there = points + (reached + step)[:, None, None] * way
-        met = solver.solve_batch(there, normals).success
-        reached[met] += step[met]
-        step = np.where(met, step, step / 2)
+        targets = points + (distance + step)[:, None, None] * directions
+        is_solved = solver.solve_batch(targets, normals).success
+        distance[is_solved] += step[is_solved]
+        step = np.where(is_solved, step, step / 2)
     rows = []
-    for far in BEYOND:
-        there, fast, spent = points + (reached + far)[:, None, None] * way, solver.fast(), []
-        for goal, facing in zip(there, normals, strict=True):
-            begun = time.process_time()
-            fast(goal, facing)
-            spent.append(1e3 * (time.process_time() - begun))
-        met = solver.solve_batch(there, normals).success.sum()
-        why = solver.solve_batch(there, normals, diagnose=True).status
-        times = [f"{time:.0f}" for time in (np.mean(spent), np.quantile(spent, 0.99), max(spent))]
-        proved = str((why == ik.Status.UNREACHABLE).sum())
-        rows.append([robot.name, f"{1e3 * far:.0f}", str(cell.count), *times, str(met), proved])
+    for excess in EXCESSES:
+        targets, fast, times = (
+            points + (distance + excess)[:, None, None] * directions,
+            solver.fast(),
+            [],
+        )
+        for goal, normal in zip(targets, normals, strict=True):
+            start = time.process_time()
+            fast(goal, normal)
+            times.append(1e3 * (time.process_time() - start))
+        is_solved = solver.solve_batch(targets, normals).success.sum()
+        statuses = solver.solve_batch(targets, normals, diagnose=True).status
+        times = [f"{time:.0f}" for time in (np.mean(times), np.quantile(times, 0.99), max(times))]
+        proved = str((statuses == ik.Status.UNREACHABLE).sum())
+        rows.append(
+            [robot.name, f"{1e3 * excess:.0f}", str(cell.count), *times, str(is_solved), proved]
+        )
     return {"rows": rows}
 
 
@@ -281,14 +299,14 @@ def around(
 ) -> tuple[Array, Array]:
     """(count, f, 3) contacts and normals, evenly spread over what the tolerance allows."""
     tolerance = ik.Tolerance()
-    shift, turn = rng.standard_normal((2, count, *points.shape))
+    shift, tangent = rng.standard_normal((2, count, *points.shape))
     shift /= np.linalg.norm(shift, axis=2, keepdims=True)
-    turn -= (turn * normals).sum(axis=2, keepdims=True) * normals
-    turn /= np.linalg.norm(turn, axis=2, keepdims=True)
-    part = rng.random((2, count, len(points), 1))
-    angle = tolerance.angle * np.sqrt(part[1])
-    moved = points + tolerance.position * np.cbrt(part[0]) * shift
-    return moved, np.cos(angle) * normals + np.sin(angle) * turn
+    tangent -= (tangent * normals).sum(axis=2, keepdims=True) * normals
+    tangent /= np.linalg.norm(tangent, axis=2, keepdims=True)
+    uniform = rng.random((2, count, len(points), 1))
+    angle = tolerance.angle * np.sqrt(uniform[1])
+    displaced = points + tolerance.position * np.cbrt(uniform[0]) * shift
+    return displaced, np.cos(angle) * normals + np.sin(angle) * tangent
 
 
 def random_search(
@@ -300,47 +318,49 @@ def random_search(
     tolerances, which finds other hands.
     """
     robot, rng, tolerance = solver.robot, np.random.default_rng(seed), ik.Tolerance()
-    for block in range(0, SEARCH, SEARCHED):
-        asked = np.tile(points, (SEARCHED, 1, 1)), np.tile(normals, (SEARCHED, 1, 1))
-        if block % (2 * SEARCHED):
-            asked = around(points, normals, SEARCHED, rng)
-        found = plain.solve_batch(*asked, q0=robot.random(rng, SEARCHED), prefer="q0")
-        at, facing = robot.contacts(found.q)
-        off = np.linalg.norm(at - points, axis=2).max(axis=1)
-        turned = np.arccos(np.clip((facing * normals).sum(axis=2), -1, 1)).max(axis=1)
-        met = found.success & (off <= tolerance.position) & (turned <= tolerance.angle)
-        if (room_of(solver, found.q[met]) >= 0).any():
+    for block in range(0, SEARCH, SEARCH_BATCH):
+        targets = np.tile(points, (SEARCH_BATCH, 1, 1)), np.tile(normals, (SEARCH_BATCH, 1, 1))
+        if block % (2 * SEARCH_BATCH):
+            targets = around(points, normals, SEARCH_BATCH, rng)
+        solutions = plain.solve_batch(*targets, q0=robot.random(rng, SEARCH_BATCH), prefer="q0")
+        actual_points, actual_normals = robot.contacts(solutions.q)
+        distances = np.linalg.norm(actual_points - points, axis=2).max(axis=1)
+        angles = np.arccos(np.clip((actual_normals * normals).sum(axis=2), -1, 1)).max(axis=1)
+        is_within = (
+            solutions.success & (distances <= tolerance.position) & (angles <= tolerance.angle)
+        )
+        if (clearance_of(solver, solutions.q[is_within]) >= 0).any():
             return True
     return False
 
 
-def searched(cell: Cell, robot: ArmHand) -> dict[str, Any]:
+def compare_with_search(cell: Cell, robot: ArmHand) -> dict[str, Any]:
     """Targets of which nobody knows whether they have a free answer, beside a random search."""
     if not robot.description.shapes.capsules:
         return {"rows": []}
     solver, plain = ik.Solver(robot, scene=ik.Scene()), ik.Solver(robot)
     hands = list(robot.description.hand_actuators)
-    q = drawn(robot, cell.count, False, cell.seed + 10**6)
+    q = draw_configurations(robot, cell.count, False, cell.seed + 10**6)
     with_free = q.copy()
-    apart = untouched(solver, cell.count, cell.seed + 2 * 10**6)
-    with_free[: len(apart), hands] = apart[:, hands]
+    collision_free = untouched(solver, cell.count, cell.seed + 2 * 10**6)
+    with_free[: len(collision_free), hands] = collision_free[:, hands]
     rows = []
-    for kind, some in {"any": q, "free": with_free[: len(apart)]}.items():
-        points, normals = robot.contacts(some)
-        left = np.flatnonzero(~solver.solve_batch(points, normals).success)
+    for kind, configurations in {"any": q, "free": with_free[: len(collision_free)]}.items():
+        points, normals = robot.contacts(configurations)
+        unsolved = np.flatnonzero(~solver.solve_batch(points, normals).success)
         missed = [
-            int(i) for i in left if random_search(solver, plain, points[i], normals[i], int(i))
+            int(i) for i in unsolved if random_search(solver, plain, points[i], normals[i], int(i))
         ]
-        ours, alone = len(some) - len(left), len(missed)
-        share = f"{100 * ours / max(ours + alone, 1):.2f} %"
-        numbers = str(ours), str(alone), str(len(left) - alone), share
+        solved, search_only = len(configurations) - len(unsolved), len(missed)
+        percentage = f"{100 * solved / max(solved + search_only, 1):.2f} %"
+        numbers = str(solved), str(search_only), str(len(unsolved) - search_only), percentage
         rows.append([robot.name, kind, *numbers])
     return {"rows": rows}
 
 
 def contacts(cell: Cell, robot: ArmHand) -> dict[str, Any]:
     """Targets solved by others."""
-    return {"rows": by_contacts(robot, drawn(robot, cell.count, False, cell.seed))}
+    return {"rows": by_contacts(robot, draw_configurations(robot, cell.count, False, cell.seed))}
 
 
 def wrists(cell: Cell, robot: ArmHand) -> dict[str, Any]:
@@ -367,14 +387,14 @@ MISSES = ("robot", "targets", "tolerance", "missed", "a target [us]", "one alone
 TABLES = {
     "random": Table(batch),
     "near limits": Table(batch),
-    "alone": Table(alone),
+    "alone": Table(solve_singly),
     "followed": Table(
-        followed,
+        follow_path,
         "## Followed at 1 kHz",
         ("robot", "a cycle, median [us]", "99th percent [us]", "error, median [mm]"),
     ),
     "crossed": Table(
-        crossed,
+        cross_hands,
         "## Hands led through each other\n\nBoth are led to the other's place and back, in "
         f"{CYCLES} cycles of 1 ms, by a follower that knows the robot's shapes. *Blocked*: "
         "cycles in which it holds back.",
@@ -384,7 +404,7 @@ TABLES = {
         ),
     ),
     "beyond": Table(
-        beyond,
+        solve_out_of_reach,
         "## Just out of reach\n\nContacts of random configurations, those of one side or of all "
         "moved away from the base until no answer is found, and so much farther. One by one; "
         "*solved* are those that a batch finds an answer for after all, *proved* are verdicts "
@@ -395,13 +415,13 @@ TABLES = {
         ),
     ),
     "free": Table(
-        free,
+        solve_collision_free,
         "## Touching nothing\n\nTargets of configurations that do not touch themselves. "
         "*First*: answers of a solver without a scene that do.",
         ("robot", "first answers that touch", "free answers", "a target [ms]"),
     ),
     "searched": Table(
-        searched,
+        compare_with_search,
         f"Beside a search: where no free answer is found, {SEARCH:,} answers from random postures "
         "are looked at, half of them to the target and half to targets within its tolerances. "
         "Trunk and arms that make the targets are random, touching or not; *hands* are random too "
@@ -410,7 +430,7 @@ TABLES = {
         ("robot", "hands", "free answers", "the search alone", "neither", "share"),
     ),
     "contacts": Table(
-        contacts, "## Other ways\n\n" + OTHERS, ("robot", "way", "solved", "a target [us]")
+        contacts, "## Other ways\n\n" + OTHER_METHODS, ("robot", "way", "solved", "a target [us]")
     ),
     "wrists": Table(
         wrists, WRISTS, ("robot", "way", "met", "off, median [mm]", "a pose, median [us]")
@@ -421,30 +441,30 @@ TABLES = {
 
 def work_out(cell: Cell) -> dict[str, Any]:
     """What comes of a part."""
-    return TABLES[cell.what].find(cell, ik.load_robot(cell.robot))
+    return TABLES[cell.task].find(cell, ik.load_robot(cell.robot))
 
 
 def cells(options: argparse.Namespace) -> list[Cell]:
     """All parts."""
-    every = list[Cell]()
+    parts = list[Cell]()
     for robot in options.robots:
-        one = partial(Cell, robot, seed=options.seed)
+        new_cell = partial(Cell, robot, seed=options.seed)
         for first in range(0, options.count, PART):
-            some = min(PART, options.count - first)
-            every += [
-                one(what=what, count=some, tolerance=tolerance, first=first)
-                for what in ("random", "near limits")
+            size = min(PART, options.count - first)
+            parts += [
+                new_cell(task=task, count=size, tolerance=tolerance, first=first)
+                for task in ("random", "near limits")
                 for tolerance in TOLERANCES
             ]
-        every += [one(what="alone", count=ALONE)] if options.count else []
-        every += [one(what="followed", count=1), one(what="crossed", count=1)]
-        for what in ("beyond", "free", "searched"):
-            count = getattr(options, what)
-            every += [one(what=what, count=count)] if count else []
+        parts += [new_cell(task="alone", count=SINGLE_TARGETS)] if options.count else []
+        parts += [new_cell(task="followed", count=1), new_cell(task="crossed", count=1)]
+        for task in ("beyond", "free", "searched"):
+            count = getattr(options, task)
+            parts += [new_cell(task=task, count=count)] if count else []
         if options.peers and robot == options.robots[0]:
-            every.append(one(what="contacts", count=options.peers))
-            every.append(one(what="wrists", count=2 * options.peers))
-    return every
+            parts.append(new_cell(task="contacts", count=options.peers))
+            parts.append(new_cell(task="wrists", count=2 * options.peers))
+    return parts
 
 
 def misses(done: list[tuple[Cell, dict[str, Any]]]) -> tuple[list[list[str]], list[Metric]]:
@@ -452,21 +472,21 @@ def misses(done: list[tuple[Cell, dict[str, Any]]]) -> tuple[list[list[str]], li
     rows, metrics = list[list[str]](), list[Metric]()
     robots = dict.fromkeys(cell.robot for cell, _ in done)
     for name in robots:
-        own = [(cell, found) for cell, found in done if cell.robot == name]
-        single = [found["time"] for cell, found in own if cell.what == "alone"]
+        results = [(cell, result) for cell, result in done if cell.robot == name]
+        single = [result["time"] for cell, result in results if cell.task == "alone"]
         metrics += [median_metric(f"one_body/{name}/alone", single, "us")] if single else []
         label = f"{name} ({len(ik.load_robot(name).actuators)} motors)"
-        kinds = dict.fromkeys((cell.what, cell.tolerance) for cell, f in own if "missed" in f)
+        kinds = dict.fromkeys((cell.task, cell.tolerance) for cell, f in results if "missed" in f)
         for kind in kinds:
-            some = [(c, f) for c, f in own if (c.what, c.tolerance) == kind and "missed" in f]
-            count = sum(cell.count for cell, _ in some)
-            missed = sum(found["missed"] for _, found in some)
-            each = 1e6 * sum(found["spent"] for _, found in some) / count
+            parts = [(c, f) for c, f in results if (c.task, c.tolerance) == kind and "missed" in f]
+            count = sum(cell.count for cell, _ in parts)
+            missed = sum(result["missed"] for _, result in parts)
+            time_each = 1e6 * sum(result["spent"] for _, result in parts) / count
             key = f"one_body/{name}/{kind[0]}/{kind[1]}"
             metrics.append(rate_metric(f"{key}/solved", count - missed, count))
-            metrics.append(median_metric(f"{key}/time", [each], "us"))
-            alone = f"{single[0]:.0f}" if single else ""
-            rows.append([label, *kind, f"{missed} of {count}", f"{each:.1f}", alone])
+            metrics.append(median_metric(f"{key}/time", [time_each], "us"))
+            single_time = f"{single[0]:.0f}" if single else ""
+            rows.append([label, *kind, f"{missed} of {count}", f"{time_each:.1f}", single_time])
     return rows, metrics
 
 
@@ -492,9 +512,9 @@ def main(arguments: list[str] | None = None) -> None:
     done, codes = read_parts(options.parts, every)
     table, metrics = misses(done)
     parts = [INTRODUCTION, markdown_table(MISSES, table)] if table else []
-    for what, wanted in TABLES.items():
-        rows = [row for cell, found in done if cell.what == what for row in found.get("rows", [])]
-        parts += [wanted.title, markdown_table(wanted.heads, rows)] if rows else []
+    for task, table in TABLES.items():
+        rows = [row for cell, found in done if cell.task == task for row in found.get("rows", [])]
+        parts += [table.title, markdown_table(table.heads, rows)] if rows else []
     if len(done) < len(every):
         parts.append(f"Of {len(every):,} parts {len(done):,} are done so far.")
     made = command(__file__, arguments)

@@ -43,16 +43,20 @@ def by_contacts(robot: ArmHand, q: Array) -> list[list[str]]:
     }.items():
         solver.solve_batch(targets[0][:2], targets[1][:2])
         begun = time.process_time()
-        found = solver.solve_batch(*targets[:2])
-        each = 1e6 * (time.process_time() - begun) / len(q)
-        rows.append([robot.name, label, f"{int(found.success.sum())} of {len(q)}", f"{each:.0f}"])
+        solution = solver.solve_batch(*targets[:2])
+        time_each = 1e6 * (time.process_time() - begun) / len(q)
+        rows.append(
+            [robot.name, label, f"{int(solution.success.sum())} of {len(q)}", f"{time_each:.0f}"]
+        )
     for name in ("mink", "ipopt"):
         if name in SETTINGS and not importlib.util.find_spec(SETTINGS[name].package):
             continue
         run = run_peer(name, one_hand, targets, ik.Tolerance())
-        solved, each = round(run.solved * len(q)), 1e6 * float(np.mean(run.times))
+        solved, time_each = round(run.solved * len(q)), 1e6 * float(np.mean(run.times))
         label = "Ipopt" if name == "ipopt" else name
-        rows.append([robot.name, f"{label}, all motors", f"{solved} of {len(q)}", f"{each:.0f}"])
+        rows.append(
+            [robot.name, f"{label}, all motors", f"{solved} of {len(q)}", f"{time_each:.0f}"]
+        )
     return rows
 
 
@@ -63,57 +67,68 @@ def by_wrists(robot: ArmHand, count: int, seed: int) -> list[list[str]]:
     way starts from its last answer.
     """
     rng = np.random.default_rng(seed)
-    moved = [robot.actuators.index(name) for side in robot.description.sides for name in side.arm]
+    arm_motors = [
+        robot.actuators.index(name) for side in robot.description.sides for name in side.arm
+    ]
     legs = -(-count // LEG)
-    ends = np.vstack([robot.home, robot.random(rng, legs)])[:, moved]
+    ends = np.vstack([robot.home, robot.random(rng, legs)])[:, arm_motors]
     q, part = np.tile(robot.home, (legs * LEG, 1)), (np.arange(LEG) + 1.0)[:, None] / LEG
-    q[:, moved] = np.concatenate([a + part * (b - a) for a, b in pairwise(ends)])
+    q[:, arm_motors] = np.concatenate([a + part * (b - a) for a, b in pairwise(ends)])
     q = q[:count]
     sides = [side.name for side in robot.description.sides]
-    wanted = {side: robot.palm(q, side) for side in sides}
-    ways: dict[str, Callable[[int], Array]] = {
-        "hand first, palms given": _ours(robot, wanted),
-        "xr_teleoperate's formulation (Ipopt), arms alone": TeleoperationNlp(robot, moved, wanted),
+    targets = {side: robot.palm(q, side) for side in sides}
+    solvers: dict[str, Callable[[int], Array]] = {
+        "hand first, palms given": _ours(robot, targets),
+        "xr_teleoperate's formulation (Ipopt), arms alone": TeleoperationNlp(
+            robot, arm_motors, targets
+        ),
     }
     if importlib.util.find_spec("embodik"):
-        ways["embodiK, waist and arms"] = Embodik(robot, wanted)
+        solvers["embodiK, waist and arms"] = Embodik(robot, targets)
     rows = []
-    for label, way in ways.items():
-        spent, errors = np.zeros(count), np.zeros((count, 2))
+    for label, solve in solvers.items():
+        times, errors = np.zeros(count), np.zeros((count, 2))
         for i in range(count):
             begun = time.process_time()
-            answer = way(i)
-            spent[i] = time.process_time() - begun
+            answer = solve(i)
+            times[i] = time.process_time() - begun
             for side in sides:
-                errors[i] = np.maximum(errors[i], _apart(robot.palm(answer, side), wanted[side][i]))
-        met = int((errors <= np.array(WITHIN)).all(axis=1).sum())
-        far, each = 1e3 * float(np.median(errors[:, 0])), 1e6 * float(np.median(spent))
-        rows.append([robot.name, label, f"{met} of {count}", f"{far:.2g}", f"{each:.0f}"])
+                errors[i] = np.maximum(
+                    errors[i], _pose_error(robot.palm(answer, side), targets[side][i])
+                )
+        solved = int((errors <= np.array(WITHIN)).all(axis=1).sum())
+        median_error, time_each = (
+            1e3 * float(np.median(errors[:, 0])),
+            1e6 * float(np.median(times)),
+        )
+        rows.append(
+            [robot.name, label, f"{solved} of {count}", f"{median_error:.2g}", f"{time_each:.0f}"]
+        )
     return rows
 
 
-def _apart(pose: Array, other: Array) -> Array:
-    turn = pose[:3, :3].T @ other[:3, :3]
+def _pose_error(pose: Array, second: Array) -> Array:
+    turn = pose[:3, :3].T @ second[:3, :3]
     angle = np.arctan2(
         np.linalg.norm([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]),
         np.trace(turn) - 1,
     )
-    return np.array([float(np.linalg.norm(pose[:3, 3] - other[:3, 3])), float(angle)])
+    return np.array([float(np.linalg.norm(pose[:3, 3] - second[:3, 3])), float(angle)])
 
 
-def _ours(robot: ArmHand, wanted: dict[str, Array]) -> Callable[[int], Array]:
+def _ours(robot: ArmHand, targets: dict[str, Array]) -> Callable[[int], Array]:
     solver = ik.Solver(robot)
     hands = [motor for side in robot.description.sides for motor in side.hand]
     posture = {motor: float(robot.home[robot.actuators.index(motor)]) for motor in hands}
     last = robot.home
 
-    def way(i: int) -> Array:
+    def solve(i: int) -> Array:
         nonlocal last
-        palms = {side: poses[i] for side, poses in wanted.items()}
+        palms = {side: poses[i] for side, poses in targets.items()}
         last = solver.solve(ik.Grasp(palm=palms, posture=posture), q0=last).q
         return last
 
-    return way
+    return solve
 
 
 class TeleoperationNlp:
@@ -124,12 +139,12 @@ class TeleoperationNlp:
     The first guess is the last answer.
     """
 
-    def __init__(self, robot: ArmHand, moved: list[int], wanted: dict[str, Array]) -> None:
-        self.robot, self.moved, self.wanted = robot, moved, wanted
-        x, last = ca.SX.sym("x", len(moved)), ca.SX.sym("last", len(moved))
-        self.last = robot.home[moved]
+    def __init__(self, robot: ArmHand, arm_motors: list[int], targets: dict[str, Array]) -> None:
+        self.robot, self.moved, self.targets = robot, arm_motors, targets
+        x, last = ca.SX.sym("x", len(arm_motors)), ca.SX.sym("last", len(arm_motors))
+        self.last = robot.home[arm_motors]
         q = ca.SX(robot.home)
-        q[moved] = x
+        q[arm_motors] = x
         links, asked = actuated(robot.description, q).kinematics.links, []
         cost = 0.02 * ca.sumsqr(x) + 0.1 * ca.sumsqr(x - last)
         for side in robot.description.sides:
@@ -149,19 +164,19 @@ class TeleoperationNlp:
 
     def __call__(self, i: int) -> Array:
         """Configuration that meets the poses of a row as well as it can."""
-        poses = [self.wanted[side.name][i][:3] for side in self.robot.description.sides]
+        poses = [self.targets[side.name][i][:3] for side in self.robot.description.sides]
         robot, parameters = (
             self.robot,
             np.concatenate([*(pose.ravel("F") for pose in poses), self.last]),
         )
-        found = self.solver(
+        solution = self.solver(
             x0=self.last,
             p=parameters,
             lbx=robot.lower[self.moved],
             ubx=robot.upper[self.moved],
         )
         q = robot.home.copy()
-        q[self.moved] = self.last = np.array(found["x"]).ravel()
+        q[self.moved] = self.last = np.array(solution["x"]).ravel()
         return q
 
 
@@ -170,9 +185,9 @@ class Embodik:
 
     STEPS = 20
 
-    def __init__(self, robot: ArmHand, wanted: dict[str, Array]) -> None:
+    def __init__(self, robot: ArmHand, targets: dict[str, Array]) -> None:
         embodik: Any = import_module("embodik")
-        self.robot, self.wanted = robot, wanted
+        self.robot, self.targets = robot, targets
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "body.urdf"
             path.write_text(robot.urdf())
@@ -192,16 +207,16 @@ class Embodik:
         """Configuration that meets the poses of a row as well as it can."""
         targets = []
         for side in self.sides:
-            pose = self.wanted[side.name][i] @ np.linalg.inv(side.palm_placement)
+            pose = self.targets[side.name][i] @ np.linalg.inv(side.palm_placement)
             target = self.target()
             # A step closes the whole error.
             target.position_gain = target.orientation_gain = 1 / self.solver.dt
             target.task_name, target.target_pose = side.name, np.asfortranarray(pose)
             targets.append(target)
-        found = self.solver.solve_position_step(self.last, targets, self.options).q_solution
-        self.last = found = np.array(found)
+        solution = self.solver.solve_position_step(self.last, targets, self.options).q_solution
+        self.last = solution = np.array(solution)
         q, place = self.robot.home.copy(), {name: j for j, name in enumerate(self.names)}
         for index, motor in enumerate(self.robot.actuators):
             if motor in place:
-                q[index] = found[place[motor]]
+                q[index] = solution[place[motor]]
         return q

@@ -54,13 +54,13 @@ class Joints:
         n = len(robot.actuators)
         zero = np.array(list(robot.joints(np.zeros(n)).values()))
         self.names = list(robot.joints(robot.home))
-        moved = [list(robot.joints(row).values()) for row in np.eye(n)]
-        self.C = np.stack(moved, axis=1) - zero[:, None]
+        unit_positions = [list(robot.joints(row).values()) for row in np.eye(n)]
+        self.C = np.stack(unit_positions, axis=1) - zero[:, None]
         self.offsets = zero
         """(k,) what the couplings add [rad or m]; not in theta."""
-        some = robot.random(np.random.default_rng(0), 8)
-        there = np.stack(list(robot.joints(some).values()), axis=-1)
-        if np.abs(there - zero - some @ self.C.T).max() > LINEAR:
+        samples = robot.random(np.random.default_rng(0), 8)
+        positions = np.stack(list(robot.joints(samples).values()), axis=-1)
+        if np.abs(positions - zero - samples @ self.C.T).max() > LINEAR:
             raise SystemExit(f"peers: {robot.name} has a coupling that is not linear")
         rows = [np.flatnonzero(column) for column in self.C.T]
         self.leader = [int(row[0]) for row in rows]
@@ -68,9 +68,9 @@ class Joints:
         if not np.array_equal(self.C[self.leader], np.eye(n)):
             raise SystemExit(f"peers: a motor of {robot.name} has no joint that moves as it does")
         self.pairs = [
-            (int(row[0]), int(other), float(self.C[other, motor]))
+            (int(row[0]), int(entry), float(self.C[entry, motor]))
             for motor, row in enumerate(rows)
-            for other in row[1:]
+            for entry in row[1:]
         ]
         """Leader, follower and how far this moves as the leader moves by one."""
         ends = np.sort([self.C @ robot.lower, self.C @ robot.upper], axis=0)
@@ -100,14 +100,14 @@ def peer_urdf(robot: ik.ArmHand, joints: Joints) -> str:
             limit.set("upper", repr(float(joints.upper[i])))
         if joints.offsets[i]:
             joint = described[name]
-            pose = joint.placement @ _moved(joint.type, joint.axis, float(joints.offsets[i]))
+            pose = joint.placement @ _joint_motion(joint.type, joint.axis, float(joints.offsets[i]))
             for origin in element.findall("origin"):
                 origin.set("xyz", _numbers(pose[:3, 3]))
                 origin.set("rpy", _numbers(np.asarray(roll_pitch_yaw(pose[:3, :3]))))
     return ElementTree.tostring(root, encoding="unicode")
 
 
-def _moved(kind: str, axis: Array, by: float) -> Array:
+def _joint_motion(kind: str, axis: Array, by: float) -> Array:
     """(4, 4) motion of a joint."""
     pose = np.eye(4)
     if kind == "prismatic":
@@ -200,7 +200,7 @@ class Scipy:
     def step(self, q: Array) -> Array:
         """See `Peer`."""
         margin = 1e-12  # the start has to be inside
-        found = self._least_squares(
+        result = self._least_squares(
             self._residual,
             np.clip(q, self._robot.lower + margin, self._robot.upper - margin),
             self._jacobian,
@@ -210,7 +210,7 @@ class Scipy:
             xtol=self._tolerance,
             gtol=self._tolerance,
         )
-        return found.x - q
+        return result.x - q
 
     def _residual(self, q: Array) -> Array:
         return residual(*self.contacts(q), *self._target)
@@ -226,15 +226,15 @@ def normal_axes(robot: ik.ArmHand, rotations: Array) -> Array:
     return np.einsum("fji,fj->fi", rotations, normals)
 
 
-def residual(points: Array, normals: Array, wanted: Array, facing: Array) -> Array:
+def residual(points: Array, normals: Array, targets: Array, facing: Array) -> Array:
     """(6 f,) errors of the points / LENGTH, then of the normals."""
-    return np.concatenate([((points - wanted) / LENGTH).ravel(), (normals - facing).ravel()])
+    return np.concatenate([((points - targets) / LENGTH).ravel(), (normals - facing).ravel()])
 
 
 def derivative(jacobians: list[Array], normals: Array) -> Array:
     """(6 f, joints) derivative of `residual`, from the Jacobian (6, joints) of every contact."""
-    turned = [-cross(n) @ J[3:] for n, J in zip(normals, jacobians, strict=True)]
-    return np.concatenate([J[:3] / LENGTH for J in jacobians] + turned)
+    normal_rates = [-cross(n) @ J[3:] for n, J in zip(normals, jacobians, strict=True)]
+    return np.concatenate([J[:3] / LENGTH for J in jacobians] + normal_rates)
 
 
 def cross(v: Array) -> Array:
@@ -249,7 +249,7 @@ def by_daqp(problem: Any, lower: Array, upper: Array, motors: NDArray[np.intp]) 
     return np.zeros(len(motors)) if change is None else change[motors]
 
 
-LEAST = 1e-9
+MIN_DAMPING = 1e-9
 """Smallest weight of placo's regularization: its program has to be strictly convex."""
 
 
@@ -272,10 +272,10 @@ class Pink:
         class Contacts(tasks.Task):
             def compute_error(self, configuration: Any) -> Array:
                 del configuration
-                return residual(*peer._now, *peer._target)
+                return residual(*peer._current, *peer._target)
 
             def compute_jacobian(self, configuration: Any) -> Array:
-                return contacts.rows_of(configuration.data, peer._now[1])
+                return contacts.rows_of(configuration.data, peer._current[1])
 
             def __repr__(self) -> str:
                 return "Contacts()"
@@ -294,11 +294,11 @@ class Pink:
         """See `Peer`."""
         self._configuration.update(self._pin.theta(q))
         placed = [self._configuration.data.oMf[frame] for frame in self._pin.frames]
-        self._now = (
+        self._current = (
             np.array([m.translation for m in placed]),
             np.array([m.rotation @ a for m, a in zip(placed, self._pin.axes, strict=True)]),
         )
-        return self._now
+        return self._current
 
     def step(self, q: Array) -> Array:
         """See `Peer`."""
@@ -337,7 +337,7 @@ class Mink:
         class Contacts(mink.Task):
             def compute_error(self, configuration: Any) -> Array:
                 del configuration
-                return residual(*peer._now, *peer._target)
+                return residual(*peer._current, *peer._target)
 
             def compute_jacobian(self, configuration: Any) -> Array:
                 return peer._derivative(configuration.data)
@@ -377,8 +377,8 @@ class Mink:
         self._configuration.update(theta)
         data = self._configuration.data
         rotations = data.xmat[self._bodies].reshape(-1, 3, 3)
-        self._now = data.xpos[self._bodies], np.einsum("fij,fj->fi", rotations, self._axes)
-        return self._now
+        self._current = data.xpos[self._bodies], np.einsum("fij,fj->fi", rotations, self._axes)
+        return self._current
 
     def step(self, q: Array) -> Array:
         """See `Peer`."""
@@ -401,7 +401,7 @@ class Mink:
             J = np.zeros((6, self._model.nv))
             self._mujoco.mj_jacBody(self._model, data, J[:3], J[3:], body)
             parts.append(J)
-        return derivative(parts, self._now[1])
+        return derivative(parts, self._current[1])
 
 
 class Placo:
@@ -456,13 +456,13 @@ class Placo:
     def contacts(self, q: Array) -> tuple[Array, Array]:
         """See `Peer`."""
         placed = self._placed(q)
-        self._now = placed[:, :3, 3], np.einsum("fij,fj->fi", placed[:, :3, :3], self._axes)
-        return self._now
+        self._current = placed[:, :3, 3], np.einsum("fij,fj->fi", placed[:, :3, :3], self._axes)
+        return self._current
 
     def step(self, q: Array) -> Array:
         """See `Peer`."""
-        error = residual(*self._now, *self._target)
-        weight = max(self._damping * float(error @ error), LEAST)
+        error = residual(*self._current, *self._target)
+        weight = max(self._damping * float(error @ error), MIN_DAMPING)
         self._regular.configure("regularization", "soft", weight)
         try:
             change = self._solver.solve(False)
@@ -534,14 +534,14 @@ def starts_of(robot: ik.ArmHand, count: int) -> Array:
     return np.vstack([robot.home, robot.lower + spread * (robot.upper - robot.lower)])
 
 
-def judged(
+def is_solved(
     robot: ik.ArmHand, q: Array, targets: Targets, tolerance: ik.Tolerance
 ) -> NDArray[np.bool_]:
     """(k,) whether answers (k, n) meet their contacts within limits."""
-    position, angle, beyond = robot.deviations(q, *targets)
+    position, angle, limit_excess = robot.deviations(q, *targets)
     slack = 1 + 1e-9
-    met = (position <= tolerance.position * slack) & (angle <= tolerance.angle * slack)
-    return met.all(axis=1) & (beyond <= 1e-9)
+    is_within = (position <= tolerance.position * slack) & (angle <= tolerance.angle * slack)
+    return is_within.all(axis=1) & (limit_excess <= 1e-9)
 
 
 def run_peer(
@@ -558,14 +558,16 @@ def run_peer(
     peer = setting.make(robot, tolerance.position < 1e-4)
     starts = starts_of(robot, restarts)
     count = len(targets[0])
-    q, used, times = np.empty((count, len(robot.home))), np.empty(count), np.empty(count)
+    q, starts_used, times = np.empty((count, len(robot.home))), np.empty(count), np.empty(count)
     for row, (points, normals) in enumerate(zip(*targets, strict=True)):
         begin = time.thread_time()
         peer.aim(points, normals)
-        q[row], used[row] = _restarted(peer, robot, setting, points, normals, starts, tolerance)
+        q[row], starts_used[row] = _restarted(
+            peer, robot, setting, points, normals, starts, tolerance
+        )
         times[row] = time.thread_time() - begin
-    solved = judged(robot, q, targets, tolerance)
-    return Run(float(solved.mean()), float((solved & (used == 0)).mean()), times)
+    solved = is_solved(robot, q, targets, tolerance)
+    return Run(float(solved.mean()), float((solved & (starts_used == 0)).mean()), times)
 
 
 def _restarted(
@@ -583,11 +585,14 @@ def _restarted(
         q, costs = start, []
         for _ in range(setting.steps + 1):
             p, n = peer.contacts(q)
-            far, turned = p - points, n - normals
-            off, away = (far * far).sum(axis=1), (turned * turned).sum(axis=1)
-            if off.max() <= tolerance.position**2 and away.max() <= chord**2:
+            point_error, normal_error = p - points, n - normals
+            off, normal_distance = (
+                (point_error * point_error).sum(axis=1),
+                (normal_error * normal_error).sum(axis=1),
+            )
+            if off.max() <= tolerance.position**2 and normal_distance.max() <= chord**2:
                 return q, number
-            costs.append(100 * off.sum() + away.sum())
+            costs.append(100 * off.sum() + normal_distance.sum())
             if len(costs) > setting.wait and costs[-1] > STALL * costs[-1 - setting.wait]:
                 break
             if len(costs) > setting.steps:
@@ -606,6 +611,6 @@ def _by_ipopt(robot: ik.ArmHand, targets: Targets, tolerance: ik.Tolerance) -> R
         begin = time.thread_time()
         batch.append(solver.solve_batch(points[None], normals[None]))
         times.append(time.thread_time() - begin)
-    solved = np.array([one.success[0] for one in batch])
-    first = np.array([one.restarts[0] == 0 for one in batch])
+    solved = np.array([solution.success[0] for solution in batch])
+    first = np.array([solution.restarts[0] == 0 for solution in batch])
     return Run(float(solved.mean()), float((solved & first).mean()), np.array(times))

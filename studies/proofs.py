@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from impossible_targets import CLASSES, classes_of, impossible, moved
+from impossible_targets import CLASSES, classes_of, impossible, rigidly_moved
 from misses import ROBOTS as SHIPPED_AND_MADE
 from misses import load
 from runner.parts import read_parts, run_parts
@@ -56,7 +56,7 @@ BLIND = np.deg2rad(
 )
 """Hands (spread, thumb, finger 2, finger 3) that a lookup of postures tells badly apart."""
 
-SHOWN = 30
+MAX_LISTED = 30
 
 INTRODUCTION = """
 *Reachable* targets are contacts of configurations, moved by a part of the tolerance t (10 t rad for
@@ -140,7 +140,7 @@ def reachable(part: Part, case: tuple[str, float, float, bool]) -> dict[str, Any
     if not limits:
         turning = [a.unit == "rad" for a in robot.description.actuators]
         q[:, turning] = rng.uniform(-7, 7, (len(q), sum(turning)))
-    targets = moved(robot.contacts(q), rng, share * tolerance, share * 10 * tolerance)
+    targets = rigidly_moved(robot.contacts(q), rng, share * tolerance, share * 10 * tolerance)
     problems = TargetBatch(*targets, ik.Tolerance(tolerance, 10 * tolerance), limits)
     prover = Prover(robot.description)
     places = robot.joints(q) | dict(zip(robot.actuators, q.T, strict=True))
@@ -154,13 +154,13 @@ def clearly_impossible(part: Part) -> dict[str, Any]:
     robot = load(part.robot)
     points, normals = impossible(robot, part.name, part.rng, part.size)
     usual = ik.Tolerance()
-    further, turned = 1e-3 * part.beyond[0], float(np.deg2rad(part.beyond[1]))
-    wide = ik.Tolerance(usual.position + further, usual.angle + turned)
+    further, angle = 1e-3 * part.beyond[0], float(np.deg2rad(part.beyond[1]))
+    wide = ik.Tolerance(usual.position + further, usual.angle + angle)
     batch = ik.Solver(robot, tolerance=wide).solve_batch(points, normals, diagnose=True)
     rows = np.flatnonzero(~batch.success)
-    found: dict[str, Any] = {"count": len(rows), "ms": [], "hand": 0, "arm": 0}
+    results: dict[str, Any] = {"count": len(rows), "ms": [], "hand": 0, "arm": 0}
     if not len(rows):
-        return found
+        return results
     prover, problems = Prover(robot.description), TargetBatch(points, normals, usual, True)
     prover.prove(problems.rows(rows[:1]))
     proofs = prover.prove(problems.rows(rows))
@@ -168,22 +168,22 @@ def clearly_impossible(part: Part) -> dict[str, Any]:
         diagnosis = batch.diagnoses[row]
         if proof is None:
             fits = diagnosis is not None and diagnosis.hand is not None and diagnosis.hand.fits
-            found["arm" if fits else "hand"] += 1
+            results["arm" if fits else "hand"] += 1
     proved = [i for i, proof in enumerate(proofs) if proof is not None]
     if proved:
         boxes = np.array([proof.boxes for proof in proofs if proof is not None])
         begin = time.thread_time()
         prover.prove(problems.rows(rows[proved]))
-        each = 1e3 * (time.thread_time() - begin) * boxes / boxes.sum()
-        found["ms"] = each.tolist()
-    return found
+        time_each = 1e3 * (time.thread_time() - begin) * boxes / boxes.sum()
+        results["ms"] = time_each.tolist()
+    return results
 
 
 def solve(part: Part) -> dict[str, Any]:
     """Look for proofs of a part's targets and count."""
     cases = {case_name(case): case for case in CASES}
-    one = cases.get(part.name)
-    return clearly_impossible(part) if one is None else reachable(part, one)
+    case = cases.get(part.name)
+    return clearly_impossible(part) if case is None else reachable(part, case)
 
 
 def parts(options: argparse.Namespace) -> Iterator[Part]:
@@ -202,36 +202,36 @@ def parts(options: argparse.Namespace) -> Iterator[Part]:
 def write_report(options: argparse.Namespace, run_by: str) -> None:
     """Write the report on all parts there are."""
     done, codes = read_parts(options.out, parts(options))
-    found: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for part, one in done:
-        found.setdefault((part.robot, part.name), []).append(one)
+    results: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for part, result in done:
+        results.setdefault((part.robot, part.name), []).append(result)
         if part.name in CLASSES:
-            found.setdefault((part.robot, "all"), []).append(one)
-    rows, shown, table, metrics = [], [], [], list[Metric]()
-    whole = 0
-    for (robot, name), some in found.items():
-        count = sum(one["count"] for one in some)
-        if "false" in some[0]:
-            false = [q for one in some for q in one["false"]]
-            whole += count
+            results.setdefault((part.robot, "all"), []).append(result)
+    rows, listed, table, metrics = [], [], [], list[Metric]()
+    total = 0
+    for (robot, name), results_of_case in results.items():
+        count = sum(result["count"] for result in results_of_case)
+        if "false" in results_of_case[0]:
+            false = [q for result in results_of_case for q in result["false"]]
+            total += count
             rows.append([robot, name, f"{count:,}", f"{len(false)}"])
             metrics.append(rate_metric(f"proofs/{robot}/{name}/true", count - len(false), count))
-            shown += [[robot, name, " ".join(f"{x:.9g}" for x in q)] for q in false[:SHOWN]]
+            listed += [[robot, name, " ".join(f"{x:.9g}" for x in q)] for q in false[:MAX_LISTED]]
         elif count:
-            times = [ms for one in some for ms in one["ms"]]
+            times = [ms for result in results_of_case for ms in result["ms"]]
             rate = rate_metric(f"proofs/{robot}/{name}/proved", len(times), count)
             metrics += [rate, median_metric(f"proofs/{robot}/{name}/time", times, "ms")]
             quantiles = np.quantile(times, [0.5, 0.99]) if times else [np.nan, np.nan]
             cells = [robot, name, f"{count}", f"{rate.value:.1f}"]
-            left = [f"{sum(one[key] for one in some)}" for key in ("hand", "arm")]
+            left = [f"{sum(result[key] for result in results_of_case)}" for key in ("hand", "arm")]
             table.append([*cells, *(f"{q:.2f}" for q in quantiles), *left])
     heads = ["robot", "class", "n", "proved %", "median [ms]", "99 % [ms]"]
     body = [
         INTRODUCTION.format(*(f"{x:g}" for x in options.beyond)),
         "## Reachable targets",
-        f"{whole:,} targets, {len(shown)} false proofs.",
+        f"{total:,} targets, {len(listed)} false proofs.",
         markdown_table(["robot", "targets", "n", "false"], rows),
-        *([markdown_table(["robot", "targets", "q"], shown)] if shown else []),
+        *([markdown_table(["robot", "targets", "q"], listed)] if listed else []),
         "## Impossible targets",
         markdown_table([*heads, "not proved: hand", "not proved: arm"], table),
     ]

@@ -81,8 +81,8 @@ class Cell:
     @property
     def path(self) -> Path:
         """Where its results are."""
-        asked = f"{self.scale:g}-{self.pose}-{self.limit}-{self.seed}.json"
-        return Path(Path(self.mesh).stem) / asked
+        settings = f"{self.scale:g}-{self.pose}-{self.limit}-{self.seed}.json"
+        return Path(Path(self.mesh).stem) / settings
 
 
 def solve(cell: Cell) -> dict[str, Any]:
@@ -94,22 +94,22 @@ def solve(cell: Cell) -> dict[str, Any]:
     data: dict[str, Any] = {"scale": cell.scale, "invalid": "clip"}
     grasps = ik.load_candidates(mesh.with_suffix(".npy"), robot, **data)
     around = ik.load_candidates(mesh.with_suffix(".npy"), robot, grasped=mesh, **data)
-    asked: dict[str, Any] = {"object_pose": pose, "limit": len(grasps)}
-    free = table.choose(around, **asked)
-    why = Counter[str]()
+    settings: dict[str, Any] = {"object_pose": pose, "limit": len(grasps)}
+    free = table.choose(around, **settings)
+    causes_of_failure = Counter[str]()
     for cause, count in free.failures.items():
-        why["COLLISION with the object" if mesh.name in cause else cause] += count
+        causes_of_failure["COLLISION with the object" if mesh.name in cause else cause] += count
     sought: dict[str, Any] = {"limit": cell.limit, "among": cell.limit, "seed": cell.seed}
     table.grasps_of(surface, pose, limit=1, among=1)  # the object's scene, the hand's table
-    found = table.grasps_of(surface, pose, **sought)
+    computed = table.grasps_of(surface, pose, **sought)
     return {
         "grasps": len(grasps),
-        "reached": ik.Solver(robot).choose(grasps, **asked).answered,
-        "table": table.choose(grasps, **asked).answered,
+        "reached": ik.Solver(robot).choose(grasps, **settings).answered,
+        "table": table.choose(grasps, **settings).answered,
         "free": free.answered,
-        "why": dict(why),
-        "found": len(found),
-        "time": found.time,
+        "why": dict(causes_of_failure),
+        "found": len(computed),
+        "time": computed.time,
     }
 
 
@@ -133,22 +133,28 @@ def main(arguments: list[str] | None = None) -> None:
     done, codes = read_parts(options.parts, cells)
     rows, metrics = [], list[Metric]()
     for mesh in sorted({cell.mesh for cell, _ in done}):
-        own = [one for cell, one in done if cell.mesh == mesh]
-        total = {key: sum(one[key] for one in own) for key in own[0] if key != "why"}
+        results_of_mesh = [result for cell, result in done if cell.mesh == mesh]
+        total = {
+            key: sum(result[key] for result in results_of_mesh)
+            for key in results_of_mesh[0]
+            if key != "why"
+        }
         name = Path(mesh).stem.rsplit("-", 1)[0]
         shares = [
             f"{total[key]} ({total[key] / total['grasps']:.0%})"
             for key in ("reached", "table", "free")
         ]
-        found = sum(one["found"] > 0 for one in own)
-        metrics.append(rate_metric(f"public_grasps/{name}/found", found, len(own)))
+        found_count = sum(result["found"] > 0 for result in results_of_mesh)
+        metrics.append(
+            rate_metric(f"public_grasps/{name}/found", found_count, len(results_of_mesh))
+        )
         rows.append(
             [
                 name,
                 str(total["grasps"]),
                 *shares,
                 str(total["found"]),
-                f"{found} of {len(own)}",
+                f"{found_count} of {len(results_of_mesh)}",
                 f"{total['found'] / total['time']:.0f}",
             ]
         )
@@ -162,10 +168,10 @@ def main(arguments: list[str] | None = None) -> None:
         "sizes and poses with some",
         "found a second",
     ]
-    causes = sum((Counter(one["why"]) for _, one in done), Counter[str]())
-    total = sum(one["grasps"] for _, one in done) // len(POSES)
-    told = INTRODUCTION.format(total=total, objects=len(rows), limit=options.limit)
-    parts = [told, markdown_table(heads, rows), "## What is in the way"]
+    causes = sum((Counter(result["why"]) for _, result in done), Counter[str]())
+    total = sum(result["grasps"] for _, result in done) // len(POSES)
+    text = INTRODUCTION.format(total=total, objects=len(rows), limit=options.limit)
+    parts = [text, markdown_table(heads, rows), "## What is in the way"]
     parts += [
         markdown_table(
             ["first pair that touches, or status", "published grasps"],

@@ -33,7 +33,7 @@ from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.load_robot import load_description
 
 TABLE = Path(__file__).with_name("public_robots.csv")
-KEPT = Path("out") / "public_robots"
+CACHE = Path("out") / "public_robots"
 
 INTRODUCTION = """
 {count} descriptions of {repositories} public repositories and packages, of which {present} were
@@ -71,11 +71,13 @@ def imported(path: Path, arguments: list[str], shapes: bool) -> dict[str, Any]:
     folder, start = Path(tempfile.mkdtemp()), time.process_time()
     out = folder / "robot.yaml"
     try:
-        found = import_robot(None, path, out, command="public_robots", xacro=arguments or False)
-        out.write_text(found.written.text(), encoding="utf-8")
+        description = import_robot(
+            None, path, out, command="public_robots", xacro=arguments or False
+        )
+        out.write_text(description.written.text(), encoding="utf-8")
         robot = load_description(out)
         if shapes:
-            found.with_shapes(out)
+            description.with_shapes(out)
         outcome = structure(robot)
     except CasadiIKError as error:
         outcome = f"error: {str(error).replace(str(path.parent), '')}"[:200]
@@ -125,30 +127,30 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="folder of the checkouts")
     parser.add_argument("--again", action="store_true", help="discard earlier results")
     parser.add_argument("--shapes", action="store_true", help="fit collision shapes as well")
-    given = parser.parse_args()
+    options = parser.parse_args()
     with TABLE.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
-    kept = KEPT / ("shapes.jsonl" if given.shapes else "structure.jsonl")
-    kept.parent.mkdir(parents=True, exist_ok=True)
-    if given.again:
-        kept.unlink(missing_ok=True)
+    cache_file = CACHE / ("shapes.jsonl" if options.shapes else "structure.jsonl")
+    cache_file.parent.mkdir(parents=True, exist_ok=True)
+    if options.again:
+        cache_file.unlink(missing_ok=True)
     results: dict[str, dict[str, Any]] = {}
-    if kept.exists():
-        for line in kept.read_text(encoding="utf-8").splitlines():
+    if cache_file.exists():
+        for line in cache_file.read_text(encoding="utf-8").splitlines():
             result = json.loads(line)
             results[result.pop("key")] = result
-    with progress(len(rows), say=print) as move, kept.open("a", encoding="utf-8") as file:
+    with progress(len(rows), say=print) as move, cache_file.open("a", encoding="utf-8") as file:
         for row in rows:
-            place = checkout(given.folder, row["repository"])
+            place = checkout(options.folder, row["repository"])
             if key(row) not in results and place is not None and (place / row["path"]).exists():
-                result = imported(place / row["path"], row["arguments"].split(), given.shapes)
+                result = imported(place / row["path"], row["arguments"].split(), options.shapes)
                 results[key(row)] = result
                 file.write(json.dumps({"key": key(row), **result}) + "\n")
                 file.flush()
             move(1)
     if not results:
-        raise SystemExit(f"{given.folder}: has no checkout of a repository of {TABLE.name}")
-    parts = [*report(rows, results, given.shapes), "## Where this comes from"]
+        raise SystemExit(f"{options.folder}: has no checkout of a repository of {TABLE.name}")
+    parts = [*report(rows, results, options.shapes), "## Where this comes from"]
     parts.append(f"`{command(__file__, None)}`")
     write_page("Public robot descriptions", parts, RESULTS / "public_robots")
 

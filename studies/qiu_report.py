@@ -60,12 +60,12 @@ def summary(table: pl.DataFrame) -> tuple[str, list[Metric]]:
         cells = [f"`{method}`", *_printed(printed)]
         for limits in LIMITS:
             part = _part(table, method, limits)
-            found = figures_of(f"table-one/{method}/{limits}", part)
-            metrics += found
+            cell_figures = figures_of(f"table-one/{method}/{limits}", part)
+            metrics += cell_figures
             cells += [
-                interval_text(found[0], 3 if found[0].value > 99.9 else 1),
-                interval_text(found[1], 1 if found[1].value < 20 else 0),
-                _milliseconds(found[2]),
+                interval_text(cell_figures[0], 3 if cell_figures[0].value > 99.9 else 1),
+                interval_text(cell_figures[1], 1 if cell_figures[1].value < 20 else 0),
+                _milliseconds(cell_figures[2]),
                 f"{len(part):,}",
             ]
         rows.append(cells)
@@ -84,10 +84,10 @@ def by_object(table: pl.DataFrame) -> tuple[str, list[Metric]]:
             cells += _printed(TABLE_I.get(name, {}).get(method))
             for limits in LIMITS:
                 part = _part(table, method, limits).filter(pl.col("targets") == name)
-                found = figures_of(f"table-one/{method}/{limits}/{name}", part)
-                metrics += found
-                cells += [interval_text(found[0]), _plain(found[1])]
-                cells += [_milliseconds(found[2])] if limits == "ignore" else []
+                cell_figures = figures_of(f"table-one/{method}/{limits}/{name}", part)
+                metrics += cell_figures
+                cells += [interval_text(cell_figures[0]), _plain(cell_figures[1])]
+                cells += [_milliseconds(cell_figures[2])] if limits == "ignore" else []
             rows.append(cells)
     return markdown_table(heads, rows), metrics
 
@@ -95,9 +95,9 @@ def by_object(table: pl.DataFrame) -> tuple[str, list[Metric]]:
 def by_setting(table: pl.DataFrame, study: Study) -> tuple[str, list[Metric]]:
     """One line per setting that has results."""
     rows, metrics = [], []
-    for setting, part, found in _found(table, study):
-        metrics += found
-        rows.append([setting.key, *_cells(found), f"{len(part):,}"])
+    for setting, part, cell_figures in _settings_with_results(table, study):
+        metrics += cell_figures
+        rows.append([setting.key, *_cells(cell_figures), f"{len(part):,}"])
     return markdown_table(["choice", "solved %", "iterations", "n"], rows), metrics
 
 
@@ -109,16 +109,19 @@ def readings(table: pl.DataFrame, study: Study) -> tuple[str, list[Metric]]:
     """
     rows, metrics = [], []
     distances: dict[str, list[float]] = {}
-    for setting, part, found in _found(table, study):
-        metrics += found
+    for setting, part, cell_figures in _settings_with_results(table, study):
+        metrics += cell_figures
         printed = printed_mean(setting.method)
         distance = "-"
-        if found[0].value > 0:
-            ratios = (found[0].value / printed.success, found[1].value / printed.iterations)
-            apart = sum(abs(math.log(ratio)) for ratio in ratios)
-            distance = f"{apart:.2f}"
-            distances.setdefault(setting.key.partition(", ")[2], []).append(apart)
-        rows.append([setting.key, *_cells(found), distance, f"{len(part):,}"])
+        if cell_figures[0].value > 0:
+            ratios = (
+                cell_figures[0].value / printed.success,
+                cell_figures[1].value / printed.iterations,
+            )
+            log_distance = sum(abs(math.log(ratio)) for ratio in ratios)
+            distance = f"{log_distance:.2f}"
+            distances.setdefault(setting.key.partition(", ")[2], []).append(log_distance)
+        rows.append([setting.key, *_cells(cell_figures), distance, f"{len(part):,}"])
     for method in ("original-dls", "original-sdls"):
         printed = printed_mean(method)
         rows.append([f"{method}, printed", *_printed(printed)[:2], "0", ""])
@@ -134,7 +137,7 @@ def readings(table: pl.DataFrame, study: Study) -> tuple[str, list[Metric]]:
     return "\n\n".join(tables), metrics
 
 
-def _found(
+def _settings_with_results(
     table: pl.DataFrame, study: Study
 ) -> Iterator[tuple[Setting, pl.DataFrame, tuple[Metric, Metric, Metric]]]:
     for setting in study.settings:
@@ -143,8 +146,8 @@ def _found(
             yield setting, part, figures_of(f"{study.name}/{setting.key}", part)
 
 
-def _cells(found: tuple[Metric, Metric, Metric]) -> list[str]:
-    return [interval_text(found[0]), interval_text(found[1], 0)]
+def _cells(cell_figures: tuple[Metric, Metric, Metric]) -> list[str]:
+    return [interval_text(cell_figures[0]), interval_text(cell_figures[1], 0)]
 
 
 def endings(table: pl.DataFrame) -> str:
@@ -205,7 +208,7 @@ def draw_dots(metrics: Sequence[Metric], quantity: str, label: str, path: Path) 
     """
     values = {metric.name: metric for metric in metrics}
     objects = sorted({name.split("/")[3] for name in values if name.count("/") == 4})
-    drawn, grid = figure(1, 2, 5.4, 0.42 * len(objects) + 1.4)
+    plot, grid = figure(1, 2, 5.4, 0.42 * len(objects) + 1.4)
     for panel, limits in zip(grid[0], LIMITS, strict=True):
         for i, method in enumerate(METHODS):
             for row, name in enumerate(objects):
@@ -229,8 +232,8 @@ def draw_dots(metrics: Sequence[Metric], quantity: str, label: str, path: Path) 
             panel.set(xscale="log", xlim=(1, 1e4))
         panel.plot([], [], "D", ms=5, mfc="none", mec="black", label="printed in the paper")
     grid[0, 1].legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    drawn.tight_layout()
-    drawn.savefig(path)
+    plot.tight_layout()
+    plot.savefig(path)
 
 
 def draw_convergence(studies: Sequence[Study], table: pl.DataFrame, path: Path) -> None:
@@ -246,7 +249,7 @@ def draw_convergence(studies: Sequence[Study], table: pl.DataFrame, path: Path) 
         for setting in study.settings
         if setting.limits == "ignore" and setting.method.startswith(("enhanced", "original"))
     ]
-    drawn, panels = figure(2, 2, 5.5, 3.5)
+    plot, panels = figure(2, 2, 5.5, 3.5)
     for panel, (study, setting) in zip(panels.flat, settings, strict=True):
         rows = table.filter(pl.col("setting") == setting.key).sort("target", "targets")
         runs: dict[bool, list[Array]] = {True: [], False: []}
@@ -262,8 +265,8 @@ def draw_convergence(studies: Sequence[Study], table: pl.DataFrame, path: Path) 
         panel.set(xscale="log", yscale="log", ylim=(0.3, 400))
         title(panel, setting.method, "iteration", "worst error / tolerance")
     panels[0, 0].legend(frameon=False, fontsize=8, loc="lower left")
-    drawn.tight_layout()
-    drawn.savefig(path)
+    plot.tight_layout()
+    plot.savefig(path)
 
 
 def _band(panel: Axes, errors: Array, solved: bool) -> None:
@@ -352,7 +355,9 @@ def write_report(studies: Sequence[Study], results: Path, folder: Path, command:
     Raises:
         InputError: There are no results of the table.
     """
-    fast, slow, ablation, found = (read_results(study, results / study.name) for study in studies)
+    fast, slow, ablation, cell_figures = (
+        read_results(study, results / study.name) for study in studies
+    )
     table = pl.concat([fast, slow], how="diagonal")
     if not len(table):
         raise InputError(f"{results}: found no results of the table, expected some")
@@ -360,14 +365,14 @@ def write_report(studies: Sequence[Study], results: Path, folder: Path, command:
     draw_convergence(studies[:2], table, folder / "convergence.png")
     metrics: list[Metric] = []
 
-    def kept(made: tuple[str, list[Metric]]) -> str:
-        metrics.extend(made[1])
-        return made[0]
+    def collect(section: tuple[str, list[Metric]]) -> str:
+        metrics.extend(section[1])
+        return section[0]
 
     parts = [
         INTRODUCTION,
         "## All objects",
-        kept(summary(table)),
+        collect(summary(table)),
         "![Success by object](success.png)",
         "![Iterations of solved cases](iterations.png)",
         DOTS,
@@ -381,12 +386,12 @@ def write_report(studies: Sequence[Study], results: Path, folder: Path, command:
         endings(table),
         "## The paper's open choices: enhanced methods",
         ABLATION,
-        kept(by_setting(ablation, studies[2])) if len(ablation) else NOT_RUN,
+        collect(by_setting(ablation, studies[2])) if len(ablation) else NOT_RUN,
         "## Readings of the original methods",
         DIFFERENCES,
-        kept(readings(found, studies[3])) if len(found) else NOT_RUN,
+        collect(readings(cell_figures, studies[3])) if len(cell_figures) else NOT_RUN,
         "## Every object",
-        kept(by_object(table)),
+        collect(by_object(table)),
         "## Where this comes from",
         provenance({study.name: code_of(results / study.name) for study in studies}),
         f"Seed {studies[0].seed}. Made by, and to go on where it stopped: `{command}`.",

@@ -38,11 +38,11 @@ PRINTED = ("enhanced-sdls", "original-sdls", "enhanced-dls", "original-dls")
 
 
 def _table_one() -> dict[str, dict[str, Printed]]:
-    found: dict[str, dict[str, Printed]] = {}
+    table: dict[str, dict[str, Printed]] = {}
     with (Path(__file__).parent / "qiu_table_one.csv").open(encoding="utf-8") as file:
         for name, method, *values in list(csv.reader(file))[1:]:
-            found.setdefault(name, {})[method] = Printed(*map(float, values))
-    return found
+            table.setdefault(name, {})[method] = Printed(*map(float, values))
+    return table
 
 
 TABLE_I = _table_one()
@@ -114,8 +114,8 @@ def table_study(
     Raises:
         InputError: No method has such a parameter.
     """
-    known = {method: _chosen(method, changes or {}) for method in methods}
-    unused = set(changes or {}).difference(*known.values())
+    options_of_methods = {method: _options_of(method, changes or {}) for method in methods}
+    unused = set(changes or {}).difference(*options_of_methods.values())
     if methods and unused:
         raise InputError(
             f"--set: no method of {', '.join(methods)} has {', '.join(sorted(unused))}"
@@ -125,7 +125,7 @@ def table_study(
             f"{method} {limits}",
             method,
             limits,
-            (CLOSED_FORM if method.startswith("enhanced") else {}) | known[method],
+            (CLOSED_FORM if method.startswith("enhanced") else {}) | options_of_methods[method],
         )
         for method in methods
         for limits in LIMITS
@@ -144,7 +144,7 @@ def check_changes(methods: Sequence[str], changes: Mapping[str, Any]) -> None:
         raise InputError(f"--set: none of {', '.join(methods)} has {', '.join(unused)}")
 
 
-def _chosen(method: str, changes: Mapping[str, Any]) -> dict[str, Any]:
+def _options_of(method: str, changes: Mapping[str, Any]) -> dict[str, Any]:
     """The changes that a method has a parameter for."""
     return {name: value for name, value in changes.items() if name in option_names(method)}
 
@@ -257,7 +257,7 @@ def on_mounting_face(folder: Path) -> Path:
         raise ValueError(f"the Barrett's palm frame is no longer given by {raised!r}")
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "hand.yaml").write_text(hand.replace(raised, ""), encoding="utf-8")
-    whole = (models / "arm_hands" / f"{ROBOT}.yaml").read_text(encoding="utf-8")
+    text = (models / "arm_hands" / f"{ROBOT}.yaml").read_text(encoding="utf-8")
     path = folder / f"{ROBOT}.yaml"
-    path.write_text(whole.replace("hand: barrett_bh8_280", "hand: hand.yaml"), encoding="utf-8")
+    path.write_text(text.replace("hand: barrett_bh8_280", "hand: hand.yaml"), encoding="utf-8")
     return path

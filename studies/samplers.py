@@ -44,8 +44,8 @@ def hands_on_one_arm(robot: ik.ArmHand, rng: np.random.Generator, count: int) ->
 
 def corners(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
     """Every actuator by itself at its lower limit, at its upper one or anywhere."""
-    q, where = robot.random(rng, count), rng.integers(0, 3, (count, len(robot.lower)))
-    return np.where(where == 0, robot.lower, np.where(where == 1, robot.upper, q))
+    q, choice = robot.random(rng, count), rng.integers(0, 3, (count, len(robot.lower)))
+    return np.where(choice == 0, robot.lower, np.where(choice == 1, robot.upper, q))
 
 
 def near_limits(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
@@ -53,9 +53,13 @@ def near_limits(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Arra
     q = robot.random(rng, count)
     turning = [actuator.unit == "rad" for actuator in robot.description.actuators]
     widest = np.where(turning, np.radians(1), (robot.upper - robot.lower) / 50)
-    near = rng.uniform(0, np.minimum(widest, robot.upper - robot.lower), q.shape)
-    where = rng.integers(0, 3, q.shape)
-    return np.where(where == 0, robot.lower + near, np.where(where == 1, robot.upper - near, q))
+    distance_to_limit = rng.uniform(0, np.minimum(widest, robot.upper - robot.lower), q.shape)
+    choice = rng.integers(0, 3, q.shape)
+    return np.where(
+        choice == 0,
+        robot.lower + distance_to_limit,
+        np.where(choice == 1, robot.upper - distance_to_limit, q),
+    )
 
 
 def singular_arms(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
@@ -65,8 +69,8 @@ def singular_arms(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Ar
         return q
     draws = robot.random(rng, count * DRAWS)
     smallest = palm_slopes(robot, draws).reshape(count, DRAWS)
-    chosen = draws.reshape(count, DRAWS, -1)[np.arange(count), smallest.argmin(axis=1)]
-    q[:, arm] = chosen[:, arm]
+    configurations = draws.reshape(count, DRAWS, -1)[np.arange(count), smallest.argmin(axis=1)]
+    q[:, arm] = configurations[:, arm]
     return q
 
 
@@ -181,27 +185,27 @@ def displaced(
     return points, normals * np.cos(angle) + np.cross(axis, normals) * np.sin(angle)
 
 
-def finger_sets(robot: ik.ArmHand, asked: list[str]) -> dict[str, list[int]]:
+def finger_sets(robot: ik.ArmHand, names: list[str]) -> dict[str, list[int]]:
     """Places in `robot.fingers` of those that have a contact, by name of the set.
 
     Args:
         robot: The robot.
-        asked: "all", a number of fingers from the thumb on, or names joined by plus signs; sets
+        names: "all", a number of fingers from the thumb on, or names joined by plus signs; sets
             that a robot cannot have, or has already, are left out.
     """
-    every = list(range(len(robot.fingers)))
+    all_fingers = list(range(len(robot.fingers)))
     thumb = robot.description.named_thumb
     first = robot.fingers.index(thumb) if thumb else 0
     sets: dict[str, list[int]] = {}
-    for word in asked:
+    for word in names:
         if word == "all":
-            chosen = every
+            selected = all_fingers
         elif word.isdigit():
-            chosen = sorted([first, *(f for f in every if f != first)][: int(word)])
+            selected = sorted([first, *(f for f in all_fingers if f != first)][: int(word)])
         else:
-            chosen = [i for i, name in enumerate(robot.fingers) if name in word.split("+")]
-        if chosen and chosen not in sets.values():
-            sets[word] = chosen
+            selected = [i for i, name in enumerate(robot.fingers) if name in word.split("+")]
+        if selected and selected not in sets.values():
+            sets[word] = selected
     return sets
 
 
@@ -224,8 +228,8 @@ def smooth_path(robot: ik.ArmHand, seed: int, count: int, period: float, share: 
         share: Most of any motor's velocity, and of the acceleration that reaches it in 0.25 s.
     """
     rng = np.random.default_rng(seed)
-    middle, half = (robot.lower + robot.upper) / 2, (robot.upper - robot.lower) / 2
-    centre = middle + 0.4 * half * rng.uniform(-1, 1, len(middle))
+    middle, half_range = (robot.lower + robot.upper) / 2, (robot.upper - robot.lower) / 2
+    centre = middle + 0.4 * half_range * rng.uniform(-1, 1, len(middle))
     # From rest: the first half second passes slowly.
     share_of_time = np.minimum(period * np.arange(count) / 0.5, 1.0)
     time = np.cumsum(period * share_of_time**2 * (3 - 2 * share_of_time))[:, None]
@@ -233,8 +237,8 @@ def smooth_path(robot: ik.ArmHand, seed: int, count: int, period: float, share: 
     for _ in range(3):
         rate = rng.uniform(0.2, 1.0, len(middle))
         path += np.sin(2 * np.pi * rate * time + rng.uniform(0, 2 * np.pi, len(middle)))
-    room = np.minimum(robot.upper - centre, centre - robot.lower)
-    path *= 0.5 * room / np.abs(path).max(axis=0)
+    margin = np.minimum(robot.upper - centre, centre - robot.lower)
+    path *= 0.5 * margin / np.abs(path).max(axis=0)
     stated = np.array([actuator.velocity for actuator in robot.description.actuators])
     limits = np.where(np.isfinite(stated), stated, robot.upper - robot.lower)
     speed = (np.abs(np.diff(path, axis=0)) / (period * limits)).max(axis=0)
@@ -244,14 +248,14 @@ def smooth_path(robot: ik.ArmHand, seed: int, count: int, period: float, share: 
 
 def palm_slopes(robot: ik.ArmHand, q: Array) -> Array:
     """(k,) smallest singular value of how the palm moves with the arm, metres by `LENGTH`."""
-    here = robot.palm(q)
+    pose = robot.palm(q)
     rows = []
     for column in _arm(robot):
-        moved = q.copy()
-        moved[:, column] += NUDGE
-        change = (robot.palm(moved) - here) / NUDGE
-        turned = change[:, :3, :3] @ here[:, :3, :3].transpose(0, 2, 1)
-        turn = np.stack([turned[:, 2, 1], turned[:, 0, 2], turned[:, 1, 0]], axis=1)
+        shifted = q.copy()
+        shifted[:, column] += NUDGE
+        change = (robot.palm(shifted) - pose) / NUDGE
+        rotation = change[:, :3, :3] @ pose[:, :3, :3].transpose(0, 2, 1)
+        turn = np.stack([rotation[:, 2, 1], rotation[:, 0, 2], rotation[:, 1, 0]], axis=1)
         rows.append(np.concatenate([change[:, :3, 3] / LENGTH, turn], axis=1))
     return np.linalg.svd(np.stack(rows, axis=2), compute_uv=False)[:, -1]
 
@@ -266,12 +270,15 @@ def contact_slopes(robot: ik.ArmHand, q: Array) -> Array:
     columns = []
     ranges = robot.upper - robot.lower
     for column in range(q.shape[1]):
-        moved = q.copy()
+        shifted = q.copy()
         step = NUDGE * min(1.0, float(ranges[column]))
-        moved[:, column] += step
-        there = robot.contacts(moved)
+        shifted[:, column] += step
+        shifted_contacts = robot.contacts(shifted)
         scale = min(1.0, float(ranges[column])) / step
-        change = [(there[0] - points) / LENGTH * scale, (there[1] - normals) * scale]
+        change = [
+            (shifted_contacts[0] - points) / LENGTH * scale,
+            (shifted_contacts[1] - normals) * scale,
+        ]
         columns.append(np.concatenate([part.reshape(len(q), -1) for part in change], axis=1))
     values = np.linalg.svd(np.stack(columns, axis=2), compute_uv=False)
     spare = max(len(_arm(robot)) - 6, 0)
@@ -285,13 +292,13 @@ def _arm(robot: ik.ArmHand) -> list[int]:
 
 def _aligned(robot: ik.ArmHand, rng: np.random.Generator, q: Array) -> Array:
     arm, count = _arm(robot), len(q)
-    drawn = robot.random(rng, count)
+    configurations = robot.random(rng, count)
     off = rng.normal(0, 1e-3, (count, 3)) * 10.0 ** -rng.integers(0, 6, (count, 1))
-    which = rng.integers(0, 4, count)
+    pair = rng.integers(0, 4, count)
     for j, column in enumerate((1, 3, 5)):
-        rows = (which == j) | (which == 3)
-        drawn[rows, column] = off[rows, j]
-    q[:, arm] = drawn[:, arm]
+        rows = (pair == j) | (pair == 3)
+        configurations[rows, column] = off[rows, j]
+    q[:, arm] = configurations[:, arm]
     return q
 
 

@@ -26,13 +26,13 @@ ROBOTS = ("kuka_lwr_barrett", "panda+allegro_right")
 TOLERANCES = ((5e-3, 3.0), (1e-3, 0.5), (1e-4, 0.05))
 """Of positions [m] and angles [deg]."""
 
-AWAY = 0.3
+START_OFFSET = 0.3
 """How far from the configuration that was drawn the robot is, each motor [rad, 1 sigma]."""
 
 SLACK = 1e-9
 """Part of a tolerance, and distance beyond a limit [rad or m], that is rounding."""
 
-MANY = (Path(__file__).parent / "probes" / "many.c").read_text(encoding="utf-8")
+BATCH_SOURCE = (Path(__file__).parent / "probes" / "many.c").read_text(encoding="utf-8")
 """Solves many targets in a call."""
 
 INTRODUCTION = """
@@ -49,15 +49,15 @@ class Library:
     def __init__(self, project: Path, real: type[np.floating]) -> None:
         """Build it."""
         name = "float" if real is np.float32 else "double"
-        (project / "many.c").write_text(f"#define REAL {name}\n{MANY}")
+        (project / "many.c").write_text(f"#define REAL {name}\n{BATCH_SOURCE}")
         texts = [str(path.relative_to(project)) for path in sorted(project.glob("src/*.c"))]
         flags = ("-std=c11", "-O2", "-fPIC", "-shared", "-ffp-contract=off", "-fno-math-errno")
         command = ("cc", *flags, "-Iinclude", "-Isrc", "many.c", *texts, "-lm", "-o", "many.so")
         subprocess.run(command, cwd=project, check=True)
         self._real = real
-        self._many = ctypes.CDLL(str(project / "many.so")).many
+        self._solve_many = ctypes.CDLL(str(project / "many.so")).many
         number = ctypes.c_float if real is np.float32 else ctypes.c_double
-        self._many.argtypes = [ctypes.c_int, number, number, *[ctypes.c_void_p] * 5]
+        self._solve_many.argtypes = [ctypes.c_int, number, number, *[ctypes.c_void_p] * 5]
 
     def __call__(
         self,
@@ -68,14 +68,14 @@ class Library:
         tolerance: tuple[float, float],
     ) -> tuple[np.ndarray, np.ndarray]:
         """Answers (k, n) and whether they are called solved (k,), of k targets."""
-        given = [
+        arguments = [
             None if array is None else np.ascontiguousarray(array, dtype=self._real)
             for array in (points, normals, q0)
         ]
         q = np.empty((len(points), motors), dtype=self._real)
         status = np.empty(len(points), dtype=np.int32)
-        places = [None if array is None else array.ctypes.data for array in (*given, q, status)]
-        self._many(len(points), *tolerance, *places)
+        places = [None if array is None else array.ctypes.data for array in (*arguments, q, status)]
+        self._solve_many(len(points), *tolerance, *places)
         return q.astype(float), status == ik.Status.SOLVED
 
 
@@ -85,19 +85,20 @@ def how_often(name: str, libraries: tuple[Library, Library], count: int) -> list
     for metres, degrees in TOLERANCES:
         tolerance = metres, float(np.deg2rad(degrees))
         for start in ("home", "near"):
-            drawn = robot.random(rng, count)
-            points, normals = robot.contacts(drawn)
+            configurations = robot.random(rng, count)
+            points, normals = robot.contacts(configurations)
             q0 = None
             if start == "near":
-                moved = drawn + rng.normal(0, AWAY, drawn.shape)
-                q0 = np.clip(moved, robot.lower, robot.upper)
+                starts = configurations + rng.normal(0, START_OFFSET, configurations.shape)
+                q0 = np.clip(starts, robot.lower, robot.upper)
             double, single = (
-                library(points, normals, q0, drawn.shape[1], tolerance) for library in libraries
+                library(points, normals, q0, configurations.shape[1], tolerance)
+                for library in libraries
             )
-            position, angle, beyond = robot.deviations(single[0], points, normals)
+            position, angle, limit_excess = robot.deviations(single[0], points, normals)
             slack = 1 + SLACK
-            met = (position <= tolerance[0] * slack) & (angle <= tolerance[1] * slack)
-            right = met.all(axis=1) & (beyond <= SLACK)
+            is_within = (position <= tolerance[0] * slack) & (angle <= tolerance[1] * slack)
+            right = is_within.all(axis=1) & (limit_excess <= SLACK)
             numbers = (
                 double[1].sum(),
                 single[1].sum(),
@@ -132,7 +133,7 @@ def main(arguments: list[str] | None = None) -> None:
             single = Library(built(name, Path(place) / "single", "--single"), np.float32)
             rows += how_often(name, (double, single), options.count)
     heads = ["robot", "tolerance", "start", "double", "single", "lost", "gained", "false"]
-    text = INTRODUCTION.format(count=options.count, away=AWAY)
+    text = INTRODUCTION.format(count=options.count, away=START_OFFSET)
     parts, run_by = [text, markdown_table(heads, rows)], command(__file__, arguments)
     code = {"single_precision": code_version()}
     publish("A solver in single precision", parts, options.report, run_by, code)

@@ -44,13 +44,13 @@ ABLATION_BLOCK = 10
 
 def changes_of(words: Sequence[str]) -> dict[str, Any]:
     """``NAME=VALUE`` words as a mapping; values as YAML reads them."""
-    found: dict[str, Any] = {}
+    changes: dict[str, Any] = {}
     for word in words:
         name, sign, text = word.partition("=")
         if not (name and sign and text):
             raise InputError(f"--set: found {word!r}, expected NAME=VALUE")
-        found[name] = yaml.safe_load(text)
-    return found
+        changes[name] = yaml.safe_load(text)
+    return changes
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -107,8 +107,8 @@ def main(arguments: list[str] | None = None) -> None:
     for study in studies(options.methods, options.count, options.ablation_count):
         if study.count > 0 and study.settings:
             run(study, options.out / study.name, options.jobs, options.dask, log)
-    again = command(__file__, arguments)
-    write_report(studies(METHODS, options.count, 0), options.out, options.report, again)
+    rerun_command = command(__file__, arguments)
+    write_report(studies(METHODS, options.count, 0), options.out, options.report, rerun_command)
 
 
 if __name__ == "__main__":

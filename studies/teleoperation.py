@@ -69,7 +69,7 @@ def run(robot: ik.ArmHand, seed: int, count: int, wrist: bool) -> Run:
     path = smooth_path(robot, seed, count, PERIOD, SHARE)
     tips, palms = robot.contacts(path)[0], robot.palm(path)
     follower = solver.follow(path[0], PERIOD)
-    most = PERIOD * follower.velocity / 0.25
+    max_step = PERIOD * follower.velocity / 0.25
     q, seconds = np.empty_like(path), np.empty(count)
     for i in range(count):
         begin = time.perf_counter()
@@ -82,11 +82,11 @@ def run(robot: ik.ArmHand, seed: int, count: int, wrist: bool) -> Run:
     error = np.linalg.norm(robot.contacts(q)[0] - tips, axis=2)[settled]
     off = robot.palm(q)[settled, :3, 3] - palms[settled, :3, 3]
 
-    def rough(moved: Array) -> float:
-        return float((np.abs(np.diff(moved, 2, axis=0)) / PERIOD / most).max())
+    def rough(displacements: Array) -> float:
+        return float((np.abs(np.diff(displacements, 2, axis=0)) / PERIOD / max_step).max())
 
-    away = float(np.median(np.linalg.norm(off, axis=1)))
-    return Run(error.ravel(), rough(q), rough(path), seconds[10:], away)
+    offset = float(np.median(np.linalg.norm(off, axis=1)))
+    return Run(error.ravel(), rough(q), rough(path), seconds[10:], offset)
 
 
 NEEDED = ("dex_retargeting", "torch", "nlopt")
@@ -120,7 +120,7 @@ stands beside. dex-retargeting {version}; *smoothed:* with the low-pass filter o
 configurations ({smoothed:g} of every new frame).
 """
 
-KNOWN = """
+KNOWN_TEXT = """
 Figures published for it with the Allegro hand, on another machine and another motion: 770 to 980 us
 a frame, 95th percentile 5 ms.
 """
@@ -131,7 +131,7 @@ which it imports and does not name).
 """
 
 
-def lead_by(robot: ik.ArmHand, kind: str, share: float, start: Array, folder: Path) -> Lead:
+def retarget_with(robot: ik.ArmHand, kind: str, share: float, start: Array, folder: Path) -> Lead:
     """dex-retargeting for a hand.
 
     Args:
@@ -175,7 +175,7 @@ def lead_by(robot: ik.ArmHand, kind: str, share: float, start: Array, folder: Pa
 
 
 @dataclass(frozen=True)
-class Led:
+class Tracking:
     """What a motion came to: errors [m], roughness, share of frames beyond velocity, seconds."""
 
     error: Array
@@ -186,23 +186,23 @@ class Led:
 
 
 def measure(
-    robot: ik.ArmHand, lead: Lead, asked: Array, wanted: Array, period: float, velocity: Array
-) -> Led:
+    robot: ik.ArmHand, lead: Lead, tips: Array, target: Array, period: float, velocity: Array
+) -> Tracking:
     """Lead a hand through fingertips (k, f, 3) that are asked for."""
-    q, seconds = np.empty((len(asked), len(robot.actuators))), np.empty(len(asked))
-    before = time.process_time()
-    for i, points in enumerate(asked):
+    q, seconds = np.empty((len(tips), len(robot.actuators))), np.empty(len(tips))
+    start_time = time.process_time()
+    for i, points in enumerate(tips):
         begin = time.perf_counter()
         q[i] = lead(points)
         seconds[i] = time.perf_counter() - begin
-    cpu = (time.process_time() - before) / len(asked)
+    cpu = (time.process_time() - start_time) / len(tips)
     settled = slice(round(1.0 / period), None)
-    error = np.linalg.norm(robot.contacts(q)[0] - wanted, axis=2)[settled]
+    error = np.linalg.norm(robot.contacts(q)[0] - target, axis=2)[settled]
     rates = np.diff(q, axis=0) / period
-    most = period * velocity / 0.25
-    rough = float((np.abs(np.diff(rates, axis=0)) / most)[settled].max())
+    max_step = period * velocity / 0.25
+    rough = float((np.abs(np.diff(rates, axis=0)) / max_step)[settled].max())
     beyond = float((np.abs(rates) > 1.001 * velocity)[settled].any(axis=1).mean())
-    return Led(error.ravel(), rough, beyond, seconds[10:], cpu)
+    return Tracking(error.ravel(), rough, beyond, seconds[10:], cpu)
 
 
 def leaders(
@@ -212,17 +212,17 @@ def leaders(
     follower = ik.Solver(robot).follow(start, period)
     yield "casadi_ik, hand alone", lambda points: follower(points)
     for kind in KINDS:
-        yield f"dex-retargeting {kind}", lead_by(robot, kind, 1.0, start, folder)
-    smoothed = lead_by(robot, "vector", SMOOTHED, start, folder)
+        yield f"dex-retargeting {kind}", retarget_with(robot, kind, 1.0, start, folder)
+    smoothed = retarget_with(robot, "vector", SMOOTHED, start, folder)
     yield "dex-retargeting vector, smoothed", smoothed
 
 
-def beside(paths: int, count: int, period: float, share: float) -> list[str]:
+def comparison_section(paths: int, count: int, period: float, share: float) -> list[str]:
     """The part of the report: the table, or why there is none."""
     missing = [name for name in NEEDED if find_spec(name) is None]
     if missing:
-        return [MISSING.format(missing=" and ".join(missing)), KNOWN]
-    found: dict[tuple[str, str], list[Led]] = {}
+        return [MISSING.format(missing=" and ".join(missing)), KNOWN_TEXT]
+    runs_by_peer: dict[tuple[str, str], list[Tracking]] = {}
     with TemporaryDirectory() as named:
         folder = Path(named)
         (folder / "hand.yaml").write_text(HAND)
@@ -232,20 +232,20 @@ def beside(paths: int, count: int, period: float, share: float) -> list[str]:
             path = smooth_path(robot, seed, count, period, share)
             tips = robot.contacts(path)[0]
             noise = np.random.default_rng(seed).normal(0.0, NOISE, tips.shape)
-            for keypoints, asked in (("exact", tips), ("noisy", tips + noise)):
+            for keypoints, measured in (("exact", tips), ("noisy", tips + noise)):
                 for who, lead in leaders(robot, path[0], period, folder):
-                    led = measure(robot, lead, asked, tips, period, velocity)
-                    found.setdefault((keypoints, who), []).append(led)
+                    led = measure(robot, lead, measured, tips, period, velocity)
+                    runs_by_peer.setdefault((keypoints, who), []).append(led)
     rows = []
-    for (keypoints, who), runs in found.items():
-        error = 1e3 * np.concatenate([one.error for one in runs])
-        seconds = 1e6 * np.concatenate([one.seconds for one in runs])
+    for (keypoints, who), runs in runs_by_peer.items():
+        error = 1e3 * np.concatenate([run.error for run in runs])
+        seconds = 1e6 * np.concatenate([run.seconds for run in runs])
         row = [keypoints, who, f"{np.median(error):.2f}", f"{np.quantile(error, 0.99):.1f}"]
-        row += [f"{max(one.rough for one in runs):.2f}"]
-        row += [f"{100 * np.mean([one.beyond for one in runs]):.1f}"]
+        row += [f"{max(run.rough for run in runs):.2f}"]
+        row += [f"{100 * np.mean([run.beyond for run in runs]):.1f}"]
         row += [f"{np.median(seconds):.0f}", f"{np.quantile(seconds, 0.99):.0f}"]
-        rows.append([*row, f"{1e6 * np.mean([one.cpu for one in runs]):.0f}"])
-    said = EXPLAINED.format(
+        rows.append([*row, f"{1e6 * np.mean([run.cpu for run in runs]):.0f}"])
+    text = EXPLAINED.format(
         count=count,
         frame=1e3 * period,
         last=paths - 1,
@@ -253,7 +253,7 @@ def beside(paths: int, count: int, period: float, share: float) -> list[str]:
         version=version("dex_retargeting"),
         smoothed=SMOOTHED,
     )
-    return [said, markdown_table(HEADS, rows), KNOWN]
+    return [text, markdown_table(HEADS, rows), KNOWN_TEXT]
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -270,18 +270,18 @@ def main(arguments: list[str] | None = None) -> None:
         robot = ik.load_robot(name)
         for wrist in (False, True):
             runs = [run(robot, seed, options.count, wrist) for seed in range(options.paths)]
-            error = 1e3 * np.concatenate([one.error for one in runs])
-            seconds = 1e6 * np.concatenate([one.seconds for one in runs])
+            error = 1e3 * np.concatenate([run.error for run in runs])
+            seconds = 1e6 * np.concatenate([run.seconds for run in runs])
             row = [name, "yes" if wrist else "no", f"{np.median(error):.2f}"]
             row += [f"{np.quantile(error, 0.99):.1f}", f"{100 * np.mean(error < 5):.1f}"]
-            row += [f"{1e3 * np.median([one.palm for one in runs]):.0f}"]
-            row += [f"{max(one.rough for one in runs):.2f}", f"{max(one.own for one in runs):.2f}"]
+            row += [f"{1e3 * np.median([run.palm for run in runs]):.0f}"]
+            row += [f"{max(run.rough for run in runs):.2f}", f"{max(run.own for run in runs):.2f}"]
             row += [f"{np.median(seconds):.0f}", f"{np.quantile(seconds, 0.99):.0f}"]
             rows.append(row)
             Console().print(row)
     heads = ["robot", "palm too", "error, median [mm]", "99th percentile", "below 5 mm %"]
     heads += ["palm off, median [mm]", "roughness", "path's own", "time [us]", "p99 [us]"]
-    peer = beside(options.peer_paths, options.count, PERIOD, SHARE)
+    peer = comparison_section(options.peer_paths, options.count, PERIOD, SHARE)
     parts = [INTRODUCTION, markdown_table(heads, rows), "## Beside dex-retargeting", *peer]
     run_by = command(__file__, arguments)
     publish("Fingertip positions as targets", parts, options.report, run_by)

@@ -32,7 +32,7 @@ VARIANTS: tuple[tuple[str, str, dict[str, Any]], ...] = (
 )
 
 
-SHOWN = range(1, 16)
+TICKS = range(1, 16)
 """Iterations that are drawn."""
 
 CURVES = (("one start, ProxQP", PAPER, "o"), ("one start, freeze", OURS, "-"))
@@ -53,13 +53,13 @@ def bent_targets(robot: ik.ArmHand, count: int, rng: np.random.Generator) -> Tar
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the study and write its page."""
-    given = options("Success, iterations and time of thumb-first.", 250, arguments)
-    rng = np.random.default_rng(given.seed)
+    args = options("Success, iterations and time of thumb-first.", 250, arguments)
+    rng = np.random.default_rng(args.seed)
     robot = ik.load_robot("kuka_lwr_barrett")
     grasps = ik.shipped_grasps(robot.name)
     sets = {
-        "grasps": random_arm_targets(robot, grasps, given.count, rng),
-        "bent": bent_targets(robot, given.count, rng),
+        "grasps": random_arm_targets(robot, grasps, args.count, rng),
+        "bent": bent_targets(robot, args.count, rng),
     }
     lines, batches, scale = [], {}, {}
     scale_solver = ik.Solver(robot, "hand-first")
@@ -82,20 +82,20 @@ def main(arguments: list[str] | None = None) -> None:
             )
         lines.append(f"| {label} | " + " | ".join(cells) + " |")
 
-    drawn, ((axes,),) = figure(1, 1, 7.0, 3.6)
+    plot, ((axes,),) = figure(1, 1, 7.0, 3.6)
     for name, filled in zip(sets, (True, False), strict=True):
         for label, color, marker in CURVES:
             batch = batches[label, name]
-            within = [(batch.iterations[batch.success] <= i).sum() for i in SHOWN]
+            within = [(batch.iterations[batch.success] <= i).sum() for i in TICKS]
             left = 100 * (1 - np.array(within) / len(batch))
             style = {"mfc": color if filled else "white", "ms": 6, "lw": 1.8, "color": color}
             line = marker if filled or marker == "o" else "--"
             named = f"{name}: {label.partition(', ')[2]}"
-            axes.plot(SHOWN, np.where(left > 0, left, np.nan), line, label=named, **style)
-    axes.set(yscale="log", ylim=(50 / given.count / len(grasps), 150), xticks=SHOWN[1::2])
+            axes.plot(TICKS, np.where(left > 0, left, np.nan), line, label=named, **style)
+    axes.set(yscale="log", ylim=(50 / args.count / len(grasps), 150), xticks=TICKS[1::2])
     axes.legend(frameon=False, fontsize=9, loc="upper right")
     title(axes, "One start: not yet solved [%]", "iterations", "not yet solved [%]")
-    total = given.count * len(grasps)
+    total = args.count * len(grasps)
     text = f"""
 # thumb-first: one start, all starts, and two ways to keep to limits
 
@@ -115,7 +115,7 @@ which may let go of a joint again: both solve alike in as many iterations. Fixin
 compiled with the rest of the iteration, which the time shows; so it is the
 default, and ProxQP remains as `options={{"step": "proxqp"}}`.
 """
-    write(given.out, "thumb_first", drawn, text)
+    write(args.out, "thumb_first", plot, text)
 
 
 if __name__ == "__main__":

@@ -115,8 +115,8 @@ class Cell:
     @property
     def path(self) -> Path:
         """Where its results are."""
-        asked = f"{self.pose}-{self.limit}-{self.seed}.json"
-        return Path(self.robot) / Path(self.object).stem / asked
+        settings = f"{self.pose}-{self.limit}-{self.seed}.json"
+        return Path(self.robot) / Path(self.object).stem / settings
 
 
 @cache
@@ -141,24 +141,26 @@ def solve(cell: Cell) -> dict[str, Any]:
     """Find grasps and check them."""
     solver, surface = solver_of(cell.robot), surface_of(cell.object, cell.seed)
     pose = placed(surface, cell.pose)
-    asked = {"pose": pose, "mu": MU, "seed": cell.seed}
+    settings = {"pose": pose, "mu": MU, "seed": cell.seed}
     try:
-        solver.grasps_of(surface, limit=1, among=1, **asked)  # the object's scene, the hand's table
+        solver.grasps_of(
+            surface, limit=1, among=1, **settings
+        )  # the object's scene, the hand's table
     except ik.errors.DescriptionError as error:
         return {"count": 0, "reason": f"refused: {error}"}
-    first = solver.grasps_of(surface, limit=1, among=1, **asked)
-    found = solver.grasps_of(surface, limit=cell.limit, among=cell.limit, **asked)
-    if not len(found):
-        return {"count": 0, "reason": found.reason, "time": found.time}
-    confirmed = [bool(solver.solve(one.grasp, q0=one.q).success) for one in found]
-    some = found[:: max(1, len(found) // CHECKED)][:CHECKED]
-    checks = [checked(solver.robot, surface, pose, one) for one in some]
+    first = solver.grasps_of(surface, limit=1, among=1, **settings)
+    results = solver.grasps_of(surface, limit=cell.limit, among=cell.limit, **settings)
+    if not len(results):
+        return {"count": 0, "reason": results.reason, "time": results.time}
+    confirmed = [bool(solver.solve(result.grasp, q0=result.q).success) for result in results]
+    checked_grasps = results[:: max(1, len(results) // CHECKED)][:CHECKED]
+    checks = [checked(solver.robot, surface, pose, result) for result in checked_grasps]
     return {
-        "count": len(found),
-        "time": found.time,
+        "count": len(results),
+        "time": results.time,
         "first": first.time,
-        "counts": dict(found.counts),
-        "load": found[0].load,
+        "counts": dict(results.counts),
+        "load": results[0].load,
         "confirmed": sum(confirmed),
         "off": [off for off, _ in checks],
         "closed": [closed for _, closed in checks],
@@ -176,13 +178,13 @@ def _mesh(name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def checked(
-    robot: ik.ArmHand, surface: ik.Surface, pose: np.ndarray, one: Any
+    robot: ik.ArmHand, surface: ik.Surface, pose: np.ndarray, grasp: Any
 ) -> tuple[float, bool]:
     """Largest distance of a pad from the triangles [m], and whether the contacts close."""
     corners, normals = _mesh(surface.name)
-    frames, back = robot.contact_frames(one.q), np.linalg.inv(pose)
+    frames, back = robot.contact_frames(grasp.q), np.linalg.inv(pose)
     middles, radii = [], []
-    for name in one.grasp.contacts:
+    for name in grasp.grasp.contacts:
         frame = back @ frames[robot.fingers.index(name)]
         radii.append(robot.description.finger(name).radius)
         middles.append(frame[:3, 3] - radii[-1] * frame[:3, 0])
@@ -220,57 +222,61 @@ def closes(points: np.ndarray, inward: np.ndarray, length: float) -> bool:
     # The largest least share of all edges in balance: above 0 these surround the origin.
     rows = np.concatenate([wrenches, np.zeros((6, 1))], axis=1)
     balance = np.concatenate([rows, [[1.0] * g + [0.0]]])
-    least = np.concatenate([-np.eye(g), np.ones((g, 1))], axis=1)
+    lower = np.concatenate([-np.eye(g), np.ones((g, 1))], axis=1)
     cost = np.append(np.zeros(g), -1.0)
     bounds = [(0, None)] * g + [(None, None)]
-    done = linprog(cost, least, np.zeros(g), balance, [0.0] * 6 + [1.0], bounds)
+    done = linprog(cost, lower, np.zeros(g), balance, [0.0] * 6 + [1.0], bounds)
     return bool(done.status == 0 and -done.fun > 1e-9)
 
 
 def cells(options: argparse.Namespace) -> list[Cell]:
     """All, so that what is done first is as many of every robot."""
-    asked = options.limit, options.seed
+    settings = options.limit, options.seed
     return [
-        Cell(robot, name, (pose + i) % len(POSES), *asked)
+        Cell(robot, name, (pose + i) % len(POSES), *settings)
         for pose in range(len(POSES))
         for i, name in enumerate(options.objects)
         for robot in options.robots
     ]
 
 
-def row_of(robot: str, found: list[dict[str, Any]], metrics: list[Metric]) -> list[str]:
+def row_of(robot: str, results: list[dict[str, Any]], metrics: list[Metric]) -> list[str]:
     """What came of one robot."""
-    name, good = f"touch/{robot}", [one for one in found if one["count"]]
-    whole = [one["time"] for one in good if one["count"] >= 100]
-    off = [1e3 * value for one in good for value in one["off"]]
-    closed = [value for one in good for value in one["closed"]]
-    count = sum(one["count"] for one in good)
-    some = rate_metric(f"{name}/found", len(good), len(found))
-    early = median_metric(f"{name}/first", [1e3 * one["first"] for one in good], "ms")
-    hundred = median_metric(f"{name}/hundred", whole, "s", "lower")
-    rates = [one["count"] / one["time"] for one in good]
+    name, good = f"touch/{robot}", [result for result in results if result["count"]]
+    complete_times = [result["time"] for result in good if result["count"] >= 100]
+    off = [1e3 * value for result in good for value in result["off"]]
+    closed = [value for result in good for value in result["closed"]]
+    count = sum(result["count"] for result in good)
+    success_rate = rate_metric(f"{name}/found", len(good), len(results))
+    early = median_metric(f"{name}/first", [1e3 * result["first"] for result in good], "ms")
+    hundred = median_metric(f"{name}/hundred", complete_times, "s", "lower")
+    rates = [result["count"] / result["time"] for result in good]
     rate = median_metric(f"{name}/rate", rates, "1/s", "higher")
-    load = median_metric(f"{name}/load", [one["load"] for one in good], "N/N", "higher")
-    sure = rate_metric(f"{name}/confirmed", sum(one["confirmed"] for one in good), count)
+    load = median_metric(f"{name}/load", [result["load"] for result in good], "N/N", "higher")
+    sure = rate_metric(f"{name}/confirmed", sum(result["confirmed"] for result in good), count)
     firm = rate_metric(f"{name}/closed", sum(closed), len(closed))
-    far = max(off, default=float("nan"))
-    most = Metric(f"{name}/off", far, "mm", "lower", far, far, len(off))
-    metrics += [some, early, hundred, rate, load, sure, firm, most]
-    cells = [robot, str(len(found)), str(len(found) - len(good)), str(count)]
-    cells += [f"{early.value:.0f}", f"{hundred.value:.2f} ({len(whole)})", f"{rate.value:.0f}"]
-    cells += [f"{load.value:.2f}", f"{sum(one['confirmed'] for one in good)} of {count}"]
-    return [*cells, f"{far:.2f}", f"{sum(closed)} of {len(closed)}"]
+    largest = max(off, default=float("nan"))
+    distance_metric = Metric(f"{name}/off", largest, "mm", "lower", largest, largest, len(off))
+    metrics += [success_rate, early, hundred, rate, load, sure, firm, distance_metric]
+    cells = [robot, str(len(results)), str(len(results) - len(good)), str(count)]
+    cells += [
+        f"{early.value:.0f}",
+        f"{hundred.value:.2f} ({len(complete_times)})",
+        f"{rate.value:.0f}",
+    ]
+    cells += [f"{load.value:.2f}", f"{sum(result['confirmed'] for result in good)} of {count}"]
+    return [*cells, f"{largest:.2f}", f"{sum(closed)} of {len(closed)}"]
 
 
 def goals(metrics: list[Metric]) -> str:
     """A table: which robots meet which goals."""
     rows: dict[str, dict[str, str]] = {}
-    for one in metrics:
-        _, robot, name = one.name.split("/")
+    for metric in metrics:
+        _, robot, name = metric.name.split("/")
         if name in GOALS:
-            goal, lower = GOALS[name], one.better == "lower"
-            met = one.value <= goal if lower else one.value >= goal
-            rows.setdefault(robot, {})[name] = f"{one.value:.3g} {'met' if met else 'missed'}"
+            goal, lower = GOALS[name], metric.better == "lower"
+            is_met = metric.value <= goal if lower else metric.value >= goal
+            rows.setdefault(robot, {})[name] = f"{metric.value:.3g} {'met' if is_met else 'missed'}"
     heads = [
         f"first <= {GOALS['first']:g} ms",
         f"100 of them <= {GOALS['hundred']:g} s",
@@ -278,16 +284,16 @@ def goals(metrics: list[Metric]) -> str:
         f"found >= {GOALS['found']:g} %",
         "all confirmed",
     ]
-    cells = [[robot, *(said[name] for name in GOALS)] for robot, said in rows.items()]
+    cells = [[robot, *(values[name] for name in GOALS)] for robot, values in rows.items()]
     return markdown_table(["robot", *heads], cells)
 
 
-def why(found: list[tuple[Cell, dict[str, Any]]]) -> Iterator[list[str]]:
+def causes(results: list[tuple[Cell, dict[str, Any]]]) -> Iterator[list[str]]:
     """Robot, cause, how often and of what, where nothing was found."""
     causes, of = Counter[tuple[str, str]](), dict[tuple[str, str], set[str]]()
-    for cell, one in found:
-        if not one["count"]:
-            key = cell.robot, one["reason"].rpartition("none came to: ")[2]
+    for cell, result in results:
+        if not result["count"]:
+            key = cell.robot, result["reason"].rpartition("none came to: ")[2]
             causes[key] += 1
             of.setdefault(key, set()).add(Path(cell.object).stem)
     for (robot, cause), number in sorted(causes.items()):
@@ -306,29 +312,31 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--parts", type=Path, default=Path("out/touch"), help="results of parts")
     parser.add_argument("--out", type=Path, default=RESULTS / "touch", help="folder of the report")
     options = parser.parse_args(arguments)
-    every, until = cells(options), time.monotonic() + 60 * options.minutes
-    run_parts(solve, every, options.parts, jobs=options.jobs, until=until, title="objects at poses")
-    done, codes = read_parts(options.parts, every)
+    all_cells, until = cells(options), time.monotonic() + 60 * options.minutes
+    run_parts(
+        solve, all_cells, options.parts, jobs=options.jobs, until=until, title="objects at poses"
+    )
+    done, codes = read_parts(options.parts, all_cells)
     metrics, rows = list[Metric](), []
     for robot in options.robots:
-        own = [one for cell, one in done if cell.robot == robot]
-        if own:
-            rows.append(row_of(robot, own, metrics))
+        robot_results = [result for cell, result in done if cell.robot == robot]
+        if robot_results:
+            rows.append(row_of(robot, robot_results, metrics))
     heads = ["robot", "objects at poses", "none", "grasps", "first [ms], median"]
     heads += ["100 of them [s], median (of)", "a second, median", "best load, median [N/N]"]
     heads += ["confirmed", "off, most [mm]", "closed"]
     names = ", ".join(Path(name).stem for name in options.objects)
-    told = {"objects": len(options.objects), "names": names, "limit": options.limit}
-    parts = [INTRODUCTION.format(checked=CHECKED, **told), markdown_table(heads, rows)]
-    if len(done) < len(every):
-        parts.append(f"Of {len(every):,} objects at poses {len(done):,} are done so far.")
-    reasons = list(why(done))
+    texts = {"objects": len(options.objects), "names": names, "limit": options.limit}
+    parts = [INTRODUCTION.format(checked=CHECKED, **texts), markdown_table(heads, rows)]
+    if len(done) < len(all_cells):
+        parts.append(f"Of {len(all_cells):,} objects at poses {len(done):,} are done so far.")
+    reasons = list(causes(done))
     if reasons:
         table = markdown_table(["robot", "none came to", "times", "objects"], reasons)
         parts += ["## None found", table]
     parts += ["## Goals", goals(metrics), MISSED] if metrics else []
-    made = command(__file__, arguments)
-    parts += ["## Where this comes from", f"`{made}`", provenance({"touch": codes})]
+    run_command = command(__file__, arguments)
+    parts += ["## Where this comes from", f"`{run_command}`", provenance({"touch": codes})]
     write_page("Grasps of surfaces", parts, options.out)
     write_metrics(metrics, options.out / "metrics.json")
 

@@ -67,7 +67,7 @@ MAX_LEAN = {False: np.deg2rad(15.0), True: np.deg2rad(40.0)}
 MAX_DEPTH = 1e-4
 """Largest depth of a link that must not touch the object [m]; distances are exact to 0.1 um."""
 
-SAME = 1e-9
+EQUAL_NORMALS = 1e-9
 """Triangles are equally near if their distances differ by less than this [m]."""
 
 INTRODUCTION = """
@@ -206,11 +206,11 @@ def solve(cell: Cell) -> dict[str, Any]:
     """Find grasps of a mesh and check them."""
     surface, mesh = surface_of(cell.mesh)
     solver, pose = solver_of(cell.robot), standing(surface, 0.7)
-    found = solver.grasps_of(
+    grasps = solver.grasps_of(
         surface, pose, mu=MU, limit=cell.limit, among=cell.limit, seed=cell.seed
     )
-    checks = [check(solver.robot, mesh, pose, grasp) for grasp in found]
-    return {"count": len(found), "counts": dict(found.counts), "violations": checks}
+    checks = [check(solver.robot, mesh, pose, grasp) for grasp in grasps]
+    return {"count": len(grasps), "counts": dict(grasps.counts), "violations": checks}
 
 
 @dataclass(frozen=True)
@@ -233,15 +233,15 @@ def feet(mesh: Any, points: np.ndarray) -> Feet:
     triangles = mesh.triangles[mesh.area_faces > 0]
     normals = mesh.face_normals[mesh.area_faces > 0]
     closest: Any = import_module("trimesh.triangles").closest_point
-    nearest, distances, ways = [], [], []
+    nearest, distances, normals_of_contact = [], [], []
     for point in points:
-        every = closest(triangles, np.broadcast_to(point, (len(triangles), 3)))
-        distance = np.linalg.norm(every - point, axis=1)
-        ties = np.flatnonzero(distance <= distance.min() + SAME)
-        nearest.append(every[ties[0]])
+        nearest_points = closest(triangles, np.broadcast_to(point, (len(triangles), 3)))
+        distance = np.linalg.norm(nearest_points - point, axis=1)
+        ties = np.flatnonzero(distance <= distance.min() + EQUAL_NORMALS)
+        nearest.append(nearest_points[ties[0]])
         distances.append(distance[ties[0]])
-        ways.append(normals[ties])
-    return Feet(np.array(nearest), np.array(distances), ways)
+        normals_of_contact.append(normals[ties])
+    return Feet(np.array(nearest), np.array(distances), normals_of_contact)
 
 
 def check(robot: ik.ArmHand, mesh: Any, pose: np.ndarray, grasp: Any) -> dict[str, Any]:
@@ -271,13 +271,13 @@ def check(robot: ik.ArmHand, mesh: Any, pose: np.ndarray, grasp: Any) -> dict[st
         float(stated_feet.distance.max()), float(np.abs(pad_feet.distance - radii).max())
     )
     lean = cone = -np.inf
-    for i, ways in enumerate(stated_feet.normals):
-        inward = -np.concatenate([ways, pad_feet.normals[i]])
+    for i, normals_of_contact in enumerate(stated_feet.normals):
+        inward = -np.concatenate([normals_of_contact, pad_feet.normals[i]])
         leans = np.arccos(np.clip(inward @ pads[i], -1, 1)) - MAX_LEAN[bool(radii[i])]
         pressed = inward @ forces[i]
         sliding = np.linalg.norm(forces[i] - pressed[:, None] * inward, axis=1)
         lean, cone = max(lean, leans.max()), max(cone, (sliding - MU * pressed).max())
-    inward = -np.array([ways[0] for ways in stated_feet.normals])
+    inward = -np.array([normals_of_contact[0] for normals_of_contact in stated_feet.normals])
     center, length = mesh.bounds.mean(axis=0), float(mesh.extents.max()) / 2
     margin = closure_margin(stated_feet.point - center, inward, length)
     depth = link_depth(robot, mesh, back, grasp)
@@ -328,10 +328,10 @@ def closure_margin(points: np.ndarray, inward: np.ndarray, length: float) -> flo
         return 0.0
     balance = np.zeros((7, g + 1))
     balance[:6, :g], balance[6, :g] = wrenches, 1.0
-    least = np.concatenate([-np.eye(g), np.ones((g, 1))], axis=1)
+    lower = np.concatenate([-np.eye(g), np.ones((g, 1))], axis=1)
     cost = np.append(np.zeros(g), -1.0)
     bounds = [(0, None)] * g + [(None, None)]
-    program = linprog(cost, least, np.zeros(g), balance, [0.0] * 6 + [1.0], bounds)
+    program = linprog(cost, lower, np.zeros(g), balance, [0.0] * 6 + [1.0], bounds)
     return float(-program.fun) if program.status == 0 else 0.0
 
 
@@ -354,20 +354,23 @@ def link_depth(robot: ik.ArmHand, mesh: Any, back: np.ndarray, grasp: Any) -> fl
         if capsule.covers >= 0 or body(capsule.link) in touching:
             continue
         count = 2 + int(2 * np.linalg.norm(capsule.half) / 4e-3)
-        along = capsule.center + np.linspace(-1, 1, count)[:, None] * capsule.half
+        axis_points = capsule.center + np.linspace(-1, 1, count)[:, None] * capsule.half
         pose = back @ poses[capsule.link]
-        axes.append(along @ pose[:3, :3].T + pose[:3, 3])
+        axes.append(axis_points @ pose[:3, :3].T + pose[:3, 3])
         radii.append(np.full(count, capsule.radius))
     points, radius = np.concatenate(axes), np.concatenate(radii)
     low, high = mesh.bounds
     outside = np.linalg.norm(points - np.clip(points, low, high), axis=1)
-    near = outside < radius
-    if not near.any():
+    is_near = outside < radius
+    if not is_near.any():
         return 0.0
-    foot = feet(mesh, points[near])
-    behind = ((points[near] - foot.point) * np.array([ways[0] for ways in foot.normals])).sum(1)
+    foot = feet(mesh, points[is_near])
+    behind = (
+        (points[is_near] - foot.point)
+        * np.array([normals_of_contact[0] for normals_of_contact in foot.normals])
+    ).sum(1)
     signed = np.copysign(foot.distance, behind)
-    return float(max(0.0, (radius[near] - signed).max()))
+    return float(max(0.0, (radius[is_near] - signed).max()))
 
 
 def cells(options: argparse.Namespace) -> list[Cell]:
@@ -404,9 +407,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--parts", type=Path, default=Path("out/touch_claims"), help="results")
     parser.add_argument("--out", type=Path, default=RESULTS / "touch_claims", help="report folder")
     options = parser.parse_args(arguments)
-    every, until = cells(options), time.monotonic() + 60 * options.minutes
-    run_parts(solve, every, options.parts, jobs=options.jobs, until=until, title="meshes")
-    done, codes = read_parts(options.parts, every)
+    all_cells, until = cells(options), time.monotonic() + 60 * options.minutes
+    run_parts(solve, all_cells, options.parts, jobs=options.jobs, until=until, title="meshes")
+    done, codes = read_parts(options.parts, all_cells)
     metrics, rows = list[Metric](), []
     for robot in options.robots:
         results = [result for cell, result in done if cell.robot == robot]
@@ -415,8 +418,8 @@ def main(arguments: list[str] | None = None) -> None:
     heads = ["robot", "meshes", "grasps", *CLAIMS, "farthest contact [mm]"]
     sizes = {"meshes": len(options.meshes), "robots": len(options.robots)}
     parts = [INTRODUCTION.format(limit=options.limit, **sizes), markdown_table(heads, rows)]
-    if len(done) < len(every):
-        parts.append(f"Of {len(every):,} meshes before robots {len(done):,} are done so far.")
+    if len(done) < len(all_cells):
+        parts.append(f"Of {len(all_cells):,} meshes before robots {len(done):,} are done so far.")
     parts += ["## Reproduction", f"`{command(__file__, arguments)}`"]
     parts.append(provenance({"touch_claims": codes}))
     write_page("Claims of grasps of surfaces", parts, options.out)

@@ -68,10 +68,10 @@ STIFFNESS = {"revolute": 3.0, "prismatic": 2000.0}
 STEP, SETTLING, TIME = 2e-3, 0.4, 1.0
 """Of the simulation; before the force, and with it [s]."""
 
-FAR, TURNED = 0.020, np.deg2rad(30.0)
+MAX_DISPLACEMENT, MAX_ROTATION = 0.020, np.deg2rad(30.0)
 """What the object may move [m] and turn [rad]."""
 
-WHOLE = mujoco.mjtState.mjSTATE_INTEGRATION
+STATE_SPEC = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
 INTRODUCTION = """
@@ -114,13 +114,17 @@ def main(arguments: list[str] | None = None) -> None:
     for robot in options.robots:
         solver = ik.Solver(robot_of(robot), scene=ik.load_scene("table"))
         tries = [
-            one for surface in track(surfaces, robot) for one in tried(solver, surface, options)
+            trial
+            for surface in track(surfaces, robot)
+            for trial in try_grasps(solver, surface, options)
         ]
         rows.append(row_of(robot, tries, metrics))
         noisy.append(noise_of(robot, tries, metrics))
         for surface in surfaces:
-            held = [one.held for one in tries if one.best and one.object == name_of(surface)]
-            objects.append([robot, name_of(surface), str(len(held)), str(sum(held))])
+            is_held = [
+                trial.is_held for trial in tries if trial.best and trial.object == name_of(surface)
+            ]
+            objects.append([robot, name_of(surface), str(len(is_held)), str(sum(is_held))])
     heads = ["robot", "best", "held", "best third held", "any", "held", "AUC of load"]
     parts = [
         INTRODUCTION.format(names=names, **vars(options)),
@@ -143,14 +147,14 @@ def name_of(surface: ik.Surface) -> str:
 
 
 @dataclass(frozen=True)
-class Tried:
+class Trial:
     """A grasp and how it went.
 
     Attributes:
         object: What is grasped.
         load: Its load [N/N].
         closure: Its closure.
-        held: Whether it was held six ways.
+        is_held: Whether it was held six ways.
         best: Whether it is one of the best ...
         any: ... and whether it was taken whatever its load.
         robustness: Of the geometry; NaN if it is none of the best.
@@ -160,79 +164,85 @@ class Tried:
     object: str
     load: float
     closure: float
-    held: bool
+    is_held: bool
     best: bool
     any: bool
     robustness: float
     noisy: float
 
 
-def tried(solver: ik.Solver, surface: ik.Surface, options: argparse.Namespace) -> Iterator[Tried]:
+def try_grasps(
+    solver: ik.Solver, surface: ik.Surface, options: argparse.Namespace
+) -> Iterator[Trial]:
     """Grasps of an object, as they went."""
     limit, seed = options.limit, options.seed
-    found = solver.grasps_of(surface, standing(surface, 0.7), limit=limit, among=limit, seed=seed)
-    some = replace(found, entries=found[: options.best])
-    shares = some.robustness(hold=(MASS, SQUEEZE), seed=seed)
-    away = offsets(5e-3, np.deg2rad(3.0), options.samples, seed + 1, surface.middle)
+    grasps = solver.grasps_of(surface, standing(surface, 0.7), limit=limit, among=limit, seed=seed)
+    best_grasps = replace(grasps, entries=grasps[: options.best])
+    shares = best_grasps.robustness(hold=(MASS, SQUEEZE), seed=seed)
+    displacements = offsets(5e-3, np.deg2rad(3.0), options.samples, seed + 1, surface.middle)
     six = np.concatenate([np.eye(3), -np.eye(3)])
-    for place, one in enumerate(found):
+    for place, trial in enumerate(grasps):
         best, any_ = place < options.best, place % options.every == 0
         if not (best or any_):
             continue
-        hold = Hold(solver.robot, one, surface)
-        held = bool(hold.held(hold.settled(), six).all())
+        hold = Hold(solver.robot, trial, surface)
+        is_held = bool(hold.is_held(hold.settled(), six).all())
         share = mean = math.nan
         if best:
-            noisy = [bool(hold.held(hold.settled(off), -np.eye(3)[2:]).all()) for off in away]
+            noisy = [
+                bool(hold.is_held(hold.settled(off), -np.eye(3)[2:]).all()) for off in displacements
+            ]
             share, mean = float(shares[place]), float(np.mean(noisy)) if noisy else math.nan
-        yield Tried(name_of(surface), one.load, one.closure, held, best, any_, share, mean)
+        yield Trial(name_of(surface), trial.load, trial.closure, is_held, best, any_, share, mean)
 
 
-def row_of(robot: str, tries: Sequence[Tried], metrics: list[Metric]) -> list[str]:
+def row_of(robot: str, tries: Sequence[Trial], metrics: list[Metric]) -> list[str]:
     """What came of one robot."""
     name = f"touch_hold/{robot}"
-    best = sorted((one for one in tries if one.best), key=lambda one: -one.load)
-    every = [one for one in tries if one.any]
-    held = np.array([one.held for one in every], dtype=bool)
-    loads, closures = np.array([[one.load, one.closure] for one in every]).reshape(-1, 2).T
+    best = sorted((trial for trial in tries if trial.best), key=lambda trial: -trial.load)
+    unselected = [trial for trial in tries if trial.any]
+    is_held = np.array([trial.is_held for trial in unselected], dtype=bool)
+    loads, closures = (
+        np.array([[trial.load, trial.closure] for trial in unselected]).reshape(-1, 2).T
+    )
     groups = {
         "held": best,
         "best_third": best[: len(best) // 3],
-        "held_of_any": every,
-        "strong": [one for one in every if one.load >= MASS * GRAVITY / SQUEEZE],
+        "held_of_any": unselected,
+        "strong": [trial for trial in unselected if trial.load >= MASS * GRAVITY / SQUEEZE],
     }
     rates = [
-        rate_metric(f"{name}/{key}", sum(one.held for one in group), len(group))
+        rate_metric(f"{name}/{key}", sum(trial.is_held for trial in group), len(group))
         for key, group in groups.items()
     ]
-    areas = concordance(loads, held), concordance(closures, held)
+    areas = concordance(loads, is_held), concordance(closures, is_held)
     metrics += [
         *rates,
-        Metric(f"{name}/auc", areas[0], "", "higher", math.nan, math.nan, len(every)),
+        Metric(f"{name}/auc", areas[0], "", "higher", math.nan, math.nan, len(unselected)),
     ]
     shares = [f"{rate.value:.0f} %" for rate in rates]
     third, strong = (
-        f"{sum(one.held for one in groups[key])} of {len(groups[key])}"
+        f"{sum(trial.is_held for trial in groups[key])} of {len(groups[key])}"
         for key in ("best_third", "strong")
     )
     return [
-        *(robot, str(len(best)), shares[0], third, str(len(every)), shares[2]),
+        *(robot, str(len(best)), shares[0], third, str(len(unselected)), shares[2]),
         *(f"{area:.3f}" for area in areas),
         *(str(len(groups["strong"])), strong),
     ]
 
 
-def noise_of(robot: str, tries: Sequence[Tried], metrics: list[Metric]) -> list[str]:
+def noise_of(robot: str, tries: Sequence[Trial], metrics: list[Metric]) -> list[str]:
     """What noise does to one robot's best grasps."""
-    tries = [one for one in tries if one.best]
-    share = np.array([one.robustness for one in tries])
-    held = np.array([one.noisy for one in tries])
-    loads = np.array([one.load for one in tries])
-    means = float(100 * share.mean()), float(100 * held.mean())
+    tries = [trial for trial in tries if trial.best]
+    share = np.array([trial.robustness for trial in tries])
+    noisy_shares = np.array([trial.noisy for trial in tries])
+    loads = np.array([trial.load for trial in tries])
+    means = float(100 * share.mean()), float(100 * noisy_shares.mean())
     for key, value in zip(("robustness", "held_with_noise"), means, strict=True):
         name = f"touch_hold/{robot}/{key}"
         metrics.append(Metric(name, value, "%", "higher", math.nan, math.nan, len(tries)))
-    areas = [f"{concordance(score, held):.3f}" for score in (share, loads)]
+    areas = [f"{concordance(score, noisy_shares):.3f}" for score in (share, loads)]
     return [robot, *(f"{mean:.0f} %" for mean in means), *areas]
 
 
@@ -248,10 +258,10 @@ def concordance(scores: np.ndarray, values: np.ndarray) -> float:
 class Hold:
     """A grasp in MuJoCo: the hand's palm is fixed, fingers are held by springs, pads are balls."""
 
-    def __init__(self, robot: ik.ArmHand, one: FoundGrasp, surface: ik.Surface) -> None:
-        self.robot, self.one, self.surface = robot, one, surface
+    def __init__(self, robot: ik.ArmHand, trial: FoundGrasp, surface: ik.Surface) -> None:
+        self.robot, self.grasp, self.surface = robot, trial, surface
         description = robot.description
-        self.palm = robot.links(one.q)[description.palm_link]
+        self.palm = robot.links(trial.q)[description.palm_link]
         self.leads = self._leads()
         self.spec = self._spec()
         self.model = self.spec.compile()
@@ -260,15 +270,17 @@ class Hold:
 
     def _leads(self) -> dict[int, dict[str, float]]:
         """By motor of the hand the joints that it moves, and how far each goes with it."""
-        robot, q, found = self.robot, self.one.q, {}
+        robot, q, joints_by_motor = self.robot, self.grasp.q, {}
         start = robot.joints(q)
         for motor in robot.description.hand_actuators:
             step = np.zeros(len(q))
             step[motor] = 1e-4 if q[motor] + 1e-4 <= robot.upper[motor] else -1e-4
             end = robot.joints(q + step)
             ratios = {name: (end[name] - start[name]) / step[motor] for name in start}
-            found[motor] = {name: value for name, value in ratios.items() if abs(value) > 1e-6}
-        return found
+            joints_by_motor[motor] = {
+                name: value for name, value in ratios.items() if abs(value) > 1e-6
+            }
+        return joints_by_motor
 
     def _spec(self) -> Any:
         robot, description = self.robot, self.robot.description
@@ -280,7 +292,7 @@ class Hold:
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         palm = spec.worldbody.add_body(name=description.palm_link, **_frame(self.palm))
         bodies = {description.palm_link: palm}
-        joints = robot.joints(self.one.q)
+        joints = robot.joints(self.grasp.q)
         for joint in description.joints:
             if joint.parent not in bodies or joint.part != "hand":
                 continue
@@ -311,16 +323,16 @@ class Hold:
                 conaffinity=2,
                 **look,
             )
-        pose = self.one.grasp.known_pose
+        pose = self.grasp.grasp.known_pose
         assert pose is not None
-        thing = spec.worldbody.add_body(name="thing", **_frame(pose))
-        thing.add_freejoint()
+        body = spec.worldbody.add_body(name="thing", **_frame(pose))
+        body.add_freejoint()
         solids = object_solids(self.surface.name)
         for i, (solid, pose) in enumerate(solids):
             points, _ = solid.mesh()
             mesh = spec.add_mesh(name=f"part_{i}", uservert=np.asarray(points, float).ravel())
             mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
-            thing.add_geom(
+            body.add_geom(
                 type=mujoco.mjtGeom.mjGEOM_MESH,
                 meshname=f"part_{i}",
                 mass=MASS / len(solids),
@@ -358,12 +370,12 @@ class Hold:
 
     def targets(self) -> np.ndarray:
         """Where the springs are to pull to, so that fingertips press as they should."""
-        robot, q, model = self.robot, self.one.q, self.model
-        joints, goals, here = robot.joints(q), np.zeros(model.nu), robot.contact_frames(q)
+        robot, q, model = self.robot, self.grasp.q, self.model
+        joints, goals, contact_frames = robot.joints(q), np.zeros(model.nu), robot.contact_frames(q)
         pressed = []
-        for name, force in self.one.forces.items():
-            i, point = robot.fingers.index(name), self.one.grasp.contacts[name].point
-            pressed.append((i, np.linalg.inv(here[i]) @ np.append(point, 1.0), force))
+        for name, force in self.grasp.forces.items():
+            i, point = robot.fingers.index(name), self.grasp.grasp.contacts[name].point
+            pressed.append((i, np.linalg.inv(contact_frames[i]) @ np.append(point, 1.0), force))
         for motor, ratios in self.leads.items():
             index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, f"motor_{motor}")
             if index < 0:
@@ -386,13 +398,13 @@ class Hold:
         """
         model, data, robot = self.model, self.data, self.robot
         mujoco.mj_resetData(model, data)
-        q = self.one.q.copy()
+        q = self.grasp.q.copy()
         if offset is not None:
-            pose = self.one.grasp.known_pose @ offset
+            pose = self.grasp.grasp.known_pose @ offset
             data.qpos[self._free : self._free + 3] = pose[:3, 3]
             data.qpos[self._free + 3 : self._free + 7] = _frame(pose)["quat"]
-            before = self.one.pregrasp
-            for name, value in {} if before is None else before.posture.items():
+            pregrasp = self.grasp.pregrasp
+            for name, value in {} if pregrasp is None else pregrasp.posture.items():
                 q[robot.actuators.index(name)] = value
         for name, value in robot.joints(q).items():
             index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name)
@@ -404,29 +416,35 @@ class Hold:
         for i in range(steps):
             data.ctrl[:] = begin + min(1.0, 1.5 * (i + 1) / steps) * (goals - begin)
             mujoco.mj_step(model, data)
-        state = np.zeros(mujoco.mj_stateSize(model, WHOLE))
-        mujoco.mj_getState(model, data, state, WHOLE)
+        state = np.zeros(mujoco.mj_stateSize(model, STATE_SPEC))
+        mujoco.mj_getState(model, data, state, STATE_SPEC)
         return state
 
-    def held(self, state: np.ndarray, ways: np.ndarray) -> np.ndarray:
+    def is_held(self, state: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """(k,) whether the object stays from a state on, pulled by its weight along ways (k, 3)."""
         model, data = self.model, self.data
-        thing = model.body("thing").id
-        found = np.zeros(len(ways), dtype=bool)
-        for k, way in enumerate(ways):
-            mujoco.mj_setState(model, data, state, WHOLE)
+        body = model.body("thing").id
+        held = np.zeros(len(directions), dtype=bool)
+        for k, direction in enumerate(directions):
+            mujoco.mj_setState(model, data, state, STATE_SPEC)
             mujoco.mj_forward(model, data)
-            where, turn = data.xipos[thing].copy(), data.xmat[thing].reshape(3, 3).copy()
+            start_position, turn = data.xipos[body].copy(), data.xmat[body].reshape(3, 3).copy()
             data.xfrc_applied[:] = 0.0
-            data.xfrc_applied[thing, :3] = MASS * GRAVITY * way
+            data.xfrc_applied[body, :3] = MASS * GRAVITY * direction
             for i in range(round(TIME / STEP)):
                 mujoco.mj_step(model, data)
-                if i % 25 == 0 and np.linalg.norm(data.xipos[thing] - where) > 5 * FAR:
+                if (
+                    i % 25 == 0
+                    and np.linalg.norm(data.xipos[body] - start_position) > 5 * MAX_DISPLACEMENT
+                ):
                     break
-            cosine = (np.trace(turn.T @ data.xmat[thing].reshape(3, 3)) - 1) / 2
-            turned = np.arccos(np.clip(cosine, -1, 1))
-            found[k] = np.linalg.norm(data.xipos[thing] - where) < FAR and turned < TURNED
-        return found
+            cosine = (np.trace(turn.T @ data.xmat[body].reshape(3, 3)) - 1) / 2
+            rotation = np.arccos(np.clip(cosine, -1, 1))
+            held[k] = (
+                np.linalg.norm(data.xipos[body] - start_position) < MAX_DISPLACEMENT
+                and rotation < MAX_ROTATION
+            )
+        return held
 
 
 def _frame(pose: np.ndarray) -> dict[str, Any]:

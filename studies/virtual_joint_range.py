@@ -20,14 +20,14 @@ from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array
 
 
-def usable(robot: ik.ArmHand, held: HeldThumb, q: Array, steps: int) -> NDArray[np.bool_]:
+def usable(robot: ik.ArmHand, chain: HeldThumb, q: Array, steps: int) -> NDArray[np.bool_]:
     """Which turns the arm follows, (k, steps), from -pi on."""
     turns = 2 * np.pi * (np.arange(steps) / steps - 0.5)
-    points, normals = (part[:, held.thumb] for part in robot.contacts(q))
+    points, normals = (part[:, chain.thumb] for part in robot.contacts(q))
     follows = np.empty((len(q), steps), dtype=bool)
     for i, turn in enumerate(turns):
-        palms = held.palms(q, (points, normals), np.full(len(q), turn))
-        follows[:, i] = held.followed(*palms)
+        palms = chain.palms(q, (points, normals), np.full(len(q), turn))
+        follows[:, i] = chain.is_followed(*palms)
     return follows
 
 
@@ -44,25 +44,25 @@ def connected(follows: NDArray[np.bool_]) -> Array:
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the study and write its page."""
-    given = options(
+    args = options(
         "Usable range of the virtual joint.",
         3000,
         arguments,
         steps=(72, "turns tried in a full circle"),
     )
-    if given.steps < 2 or given.steps % 2:
-        raise InputError(f"--steps: found {given.steps}, expected an even number")
+    if args.steps < 2 or args.steps % 2:
+        raise InputError(f"--steps: found {args.steps}, expected an even number")
     robot = ik.load_robot("kuka_lwr_barrett")
-    held = HeldThumb(robot)
-    q = robot.random(np.random.default_rng(given.seed), given.count)
+    chain = HeldThumb(robot)
+    q = robot.random(np.random.default_rng(args.seed), args.count)
     hand = list(robot.description.hand_actuators)
     q[:, hand] = robot.home[hand]
-    follows = usable(robot, held, q, given.steps)
-    at_rest = follows[:, given.steps // 2].mean()
-    width, whole = connected(follows), 360.0 * follows.mean(axis=1)
+    follows = usable(robot, chain, q, args.steps)
+    at_rest = follows[:, args.steps // 2].mean()
+    width, total_width = connected(follows), 360.0 * follows.mean(axis=1)
 
-    drawn, grid = figure(2, 2, 5.4, 4.0)
-    turns = 360.0 * (np.arange(given.steps) / given.steps - 0.5)
+    plot, grid = figure(2, 2, 5.4, 4.0)
+    turns = 360.0 * (np.arange(args.steps) / args.steps - 0.5)
     grid[0, 0].plot(turns, 100 * follows.mean(axis=0), color=OURS, lw=2)
     grid[0, 0].set(xlim=(-180, 180), ylim=(0, 102), xticks=range(-180, 181, 60))
     title(
@@ -81,8 +81,8 @@ def main(arguments: list[str] | None = None) -> None:
         "palm from the base's axis [m]",
         "palm's height [m]",
     )
-    drawn.colorbar(mesh, ax=grid[1, 0])
-    elbow, wrist = (np.abs(np.rad2deg(q[:, held.arm[i]])) for i in (3, 5))
+    plot.colorbar(mesh, ax=grid[1, 0])
+    elbow, wrist = (np.abs(np.rad2deg(q[:, chain.arm[i]])) for i in (3, 5))
     mesh = field(grid[1, 1], elbow, wrist, width, 16, 0, 360, "viridis")
     title(
         grid[1, 1],
@@ -90,18 +90,18 @@ def main(arguments: list[str] | None = None) -> None:
         "|arm joint 4| [deg]",
         "|arm joint 6| [deg]",
     )
-    drawn.colorbar(mesh, ax=grid[1, 1])
+    plot.colorbar(mesh, ax=grid[1, 1])
 
     def quartiles(values: Array) -> str:
         return " | ".join(f"{v:.0f}" for v in np.percentile(values, [5, 25, 50, 75, 95]))
 
-    far = r > np.quantile(r, 0.75)
+    is_outer = r > np.quantile(r, 0.75)
     text = f"""
 # How far the virtual joint can be turned
 
 `{command(__file__, arguments)}`:
-{given.count} arms of `{robot.name}` uniform within limits, the hand at home; the palm is turned
-about the thumb's contact normal in steps of {360 / given.steps:g} deg, the arm follows in closed
+{args.count} arms of `{robot.name}` uniform within limits, the hand at home; the palm is turned
+about the thumb's contact normal in steps of {360 / args.steps:g} deg, the arm follows in closed
 form over all its swivels, within limits. (At turn zero an arm is found for {100 * at_rest:.2f} %:
 the one that was drawn, or another.)
 
@@ -113,12 +113,12 @@ The virtual joint has no limits of its own; the arm gives it some.
 {100 * np.mean(width >= 360):.0f} % of the arms can turn it all the way round, half of them at least
 {np.median(width):.0f} deg without leaving the range, and {100 * np.mean(width < 60):.0f} % less
 than 60 deg. It narrows where the palm
-is far from the base: in the farthest quarter the median is {np.median(width[far]):.0f} deg, in the
-rest {np.median(width[~far]):.0f} deg. Beyond a gap there is more to be had for
-{100 * np.mean(whole > width + 1):.1f} % of the arms: elsewhere the usable turns are one piece,
-though the arm may have to change its branch within it.
+is far from the base: in the farthest quarter the median is {np.median(width[is_outer]):.0f} deg,
+in the rest {np.median(width[~is_outer]):.0f} deg. Beyond a gap there is more to be had for
+{100 * np.mean(total_width > width + 1):.1f} % of the arms: elsewhere the usable turns are
+one piece, though the arm may have to change its branch within it.
 """
-    write(given.out, "virtual_joint_range", drawn, text)
+    write(args.out, "virtual_joint_range", plot, text)
 
 
 if __name__ == "__main__":

@@ -47,10 +47,10 @@ class MinkAmong(Mink):
 
     def _limits_of(self, around: CollisionQuery) -> list[Any]:
         """A limit for all pairs that may overlap equally much."""
-        table, found = around.table, []
+        table, limits = around.table, []
         for offset in np.unique(table.offsets):
             rows = table.pairs[table.offsets == offset].tolist()
-            found.append(
+            limits.append(
                 self._mink.CollisionAvoidanceLimit(
                     self._model,
                     [([f"g{i}"], [f"g{j}"]) for i, j in rows],
@@ -58,7 +58,7 @@ class MinkAmong(Mink):
                     collision_detection_distance=DETECTION,
                 )
             )
-        return found
+        return limits
 
     def limits(self) -> list[Any]:
         """Those of collisions; those of motors are bounds of the program."""
@@ -79,13 +79,13 @@ def solve_peer(piece: Piece, targets: int) -> dict[str, Any]:
             peer = MinkAmong(robot, around)
             begin = time.process_time()
             solved, starts = _solved(peer, robot, grasp, around)
-            spent = time.process_time() - begin
+            seconds = time.process_time() - begin
             solver.solve(grasp, diagnose=False)
             begin = time.process_time()
             ours = solver.solve(grasp, diagnose=False)
-            own = time.process_time() - begin
-            row = {"solved": solved, "starts": starts, "seconds": spent}
-            rows.append(row | {"ours": ours.success, "own": own})
+            own_seconds = time.process_time() - begin
+            row = {"solved": solved, "starts": starts, "seconds": seconds}
+            rows.append(row | {"ours": ours.success, "own": own_seconds})
     return {"targets": rows}
 
 
@@ -113,11 +113,11 @@ def _from(
     chord = 2 * np.sin(tolerance.angle / 2)
     for _ in range(STEPS):
         p, n = peer.contacts(q)
-        off, away = np.square(p - points).sum(axis=1), np.square(n - normals).sum(axis=1)
-        met = off.max() <= tolerance.position**2 and away.max() <= chord**2
-        if met and around.free(q[None])[0]:
+        off, normal_error = np.square(p - points).sum(axis=1), np.square(n - normals).sum(axis=1)
+        is_within = off.max() <= tolerance.position**2 and normal_error.max() <= chord**2
+        if is_within and around.free(q[None])[0]:
             return True
-        costs.append(float(100 * off.sum() + away.sum()))
+        costs.append(float(100 * off.sum() + normal_error.sum()))
         if len(costs) > WAIT and costs[-1] > STALL * costs[-1 - WAIT]:
             return False
         change = peer.step(q)

@@ -36,11 +36,13 @@ class CoalOracle:
         self._robot = robot
         table, geometry = around.table, pinocchio.GeometryModel()
         ids: list[int | None] = []
-        for i, one in enumerate(robot.description.shapes.capsules):
-            length = float(np.linalg.norm(one.half))
-            turn = rotation_to(one.half / length) if length else np.eye(3)
-            shape = coal.Capsule(one.radius, 2 * length) if length else coal.Sphere(one.radius)
-            ids.append(self._add(geometry, f"capsule{i}", one.link, turn, one.center, shape))
+        for i, capsule in enumerate(robot.description.shapes.capsules):
+            length, radius = float(np.linalg.norm(capsule.half)), capsule.radius
+            turn = rotation_to(capsule.half / length) if length else np.eye(3)
+            shape = coal.Capsule(radius, 2 * length) if length else coal.Sphere(radius)
+            ids.append(
+                self._add(geometry, f"capsule{i}", capsule.link, turn, capsule.center, shape)
+            )
         poses = around.poses if around.poses.ndim == 2 else around.poses[0]
         for k, solid in enumerate(table.solids):
             x, y, z = solid.size.tolist()
@@ -55,10 +57,15 @@ class CoalOracle:
                     ids.append(None)
                     continue
             if k < table.own:
-                own = robot.description.shapes.solids[k]
+                solid = robot.description.shapes.solids[k]
                 ids.append(
                     self._add(
-                        geometry, f"own{k}", own.link, own.pose[:3, :3], own.pose[:3, 3], shape
+                        geometry,
+                        f"own{k}",
+                        solid.link,
+                        solid.pose[:3, :3],
+                        solid.pose[:3, 3],
+                        shape,
                     )
                 )
             else:
@@ -66,13 +73,13 @@ class CoalOracle:
                 ids.append(
                     self._add(geometry, f"solid{k}", None, flat[:9].reshape(3, 3), flat[9:], shape)
                 )
-        kept: list[int] = []
+        pair_numbers: list[int] = []
         for number, (i, j) in enumerate(table.pairs.tolist()):
             first, second = ids[i], ids[j]
             if first is not None and second is not None:
                 geometry.addCollisionPair(pinocchio.CollisionPair(first, second))
-                kept.append(number)
-        self._geometry, self._offsets = geometry, table.offsets[kept]
+                pair_numbers.append(number)
+        self._geometry, self._offsets = geometry, table.offsets[pair_numbers]
         self._places = pinocchio.GeometryData(geometry)
         self._plain = not robot.description.movable[0].coupling
 
@@ -84,55 +91,55 @@ class CoalOracle:
         if link is None:
             return geometry.addGeometryObject(pinocchio.GeometryObject(name, 0, 0, place, shape))
         frame = self._model.getFrameId(link)
-        held = self._model.frames[frame]
-        whole = held.placement * place
+        link_frame = self._model.frames[frame]
+        placement = link_frame.placement * place
         return geometry.addGeometryObject(
-            pinocchio.GeometryObject(name, held.parentJoint, frame, whole, shape)
+            pinocchio.GeometryObject(name, link_frame.parentJoint, frame, placement, shape)
         )
 
     def configurations(self, q: Array) -> Array:
         """(k, nq) pinocchio's configurations."""
         joints = self._robot.joints(q)
-        found = np.zeros((len(q), self._model.nq))
+        configurations = np.zeros((len(q), self._model.nq))
         for name, values in joints.items():
             if self._model.existJointName(name):
                 joint = self._model.joints[self._model.getJointId(name)]
                 if joint.nq == 1:
-                    found[:, joint.idx_q] = values
-        return found
+                    configurations[:, joint.idx_q] = values
+        return configurations
 
     def distances(self, q: Array) -> Array:
         """(k, p) distances of all pairs, offsets taken off."""
-        found = np.empty((len(q), len(self._offsets)))
-        for row, one in enumerate(self.configurations(q)):
-            pinocchio.computeDistances(self._model, self._data, self._geometry, self._places, one)
-            found[row] = [result.min_distance for result in self._places.distanceResults]
-        return found - self._offsets
+        distances = np.empty((len(q), len(self._offsets)))
+        for row, q_row in enumerate(self.configurations(q)):
+            pinocchio.computeDistances(self._model, self._data, self._geometry, self._places, q_row)
+            distances[row] = [result.min_distance for result in self._places.distanceResults]
+        return distances - self._offsets
 
     def run(self, q: Array) -> None:
         """Kinematics and collisions of configurations, until the first that is found."""
-        for one in self.configurations(q):
+        for q_row in self.configurations(q):
             pinocchio.computeCollisions(
-                self._model, self._data, self._geometry, self._places, one, True
+                self._model, self._data, self._geometry, self._places, q_row, True
             )
 
     def penetrating(self, q: Array, depth: float) -> NDArray[np.bool_]:
         """(k,) whether any pair overlaps by more than `depth` [m] beyond what it may."""
-        found = np.zeros(len(q), dtype=bool)
+        penetrates = np.zeros(len(q), dtype=bool)
         configurations = self.configurations(q)
         loose = (self._offsets != 0).any()
-        for row, one in enumerate(configurations):
+        for row, q_row in enumerate(configurations):
             hit = pinocchio.computeCollisions(
-                self._model, self._data, self._geometry, self._places, one, not loose
+                self._model, self._data, self._geometry, self._places, q_row, not loose
             )
             if hit and (depth or loose):
                 pinocchio.computeDistances(
-                    self._model, self._data, self._geometry, self._places, one
+                    self._model, self._data, self._geometry, self._places, q_row
                 )
-                apart = np.array([r.min_distance for r in self._places.distanceResults])
-                hit = bool((apart - self._offsets < -depth).any())
-            found[row] = hit
-        return found
+                min_distances = np.array([r.min_distance for r in self._places.distanceResults])
+                hit = bool((min_distances - self._offsets < -depth).any())
+            penetrates[row] = hit
+        return penetrates
 
 
 def with_shapes(
@@ -153,23 +160,31 @@ def with_shapes(
     for geom in list(spec.geoms):
         spec.delete(geom)
     bodies = {body.name: body for body in spec.bodies}
-    shapes, found = robot.description.shapes, dict[int, str]()
-    for i, one in enumerate(shapes.capsules):
-        if one.covers >= 0 and not covers:
+    shapes, link_of_geom = robot.description.shapes, dict[int, str]()
+    for i, capsule in enumerate(shapes.capsules):
+        if capsule.covers >= 0 and not covers:
             continue
-        body = bodies.get(one.link, world)
-        found[i] = body.name
-        size, place = [one.radius, 0, 0], {"pos": one.center}
-        if np.any(one.half):
-            place = {"fromto": np.concatenate([one.center - one.half, one.center + one.half])}
-        kind = kinds.mjGEOM_CAPSULE if np.any(one.half) else kinds.mjGEOM_SPHERE
+        body = bodies.get(capsule.link, world)
+        link_of_geom[i] = body.name
+        size, place = [capsule.radius, 0, 0], {"pos": capsule.center}
+        if np.any(capsule.half):
+            place = {
+                "fromto": np.concatenate(
+                    [capsule.center - capsule.half, capsule.center + capsule.half]
+                )
+            }
+        kind = kinds.mjGEOM_CAPSULE if np.any(capsule.half) else kinds.mjGEOM_SPHERE
         body.add_geom(name=f"g{i}", type=kind, size=size, **place)
     poses = around.poses.reshape(-1, 12)
     for k, solid in enumerate(table.solids):
         turn, number = np.empty(4), len(shapes.capsules) + k
         if k < table.own:
-            own = shapes.solids[k]
-            body, rotation, at = bodies.get(own.link, world), own.pose[:3, :3], own.pose[:3, 3]
+            link_solid = shapes.solids[k]
+            body, rotation, at = (
+                bodies.get(link_solid.link, world),
+                link_solid.pose[:3, :3],
+                link_solid.pose[:3, 3],
+            )
         else:
             flat = poses[k - table.own]
             body, rotation, at = world.add_body(name=f"solid{k}"), flat[:9], flat[9:]
@@ -180,8 +195,8 @@ def with_shapes(
         }[solid.kind]
         mujoco.mju_mat2Quat(turn, np.ascontiguousarray(rotation).ravel())
         body.add_geom(name=f"g{number}", type=kind, pos=at, quat=turn, size=solid.size)
-        found[number] = body.name
-    return found
+        link_of_geom[number] = body.name
+    return link_of_geom
 
 
 class MuJoCoOracle:
@@ -195,16 +210,16 @@ class MuJoCoOracle:
         spec = mujoco.MjSpec.from_string(urdf)
         links = with_shapes(spec, robot, around, covers=False)
         # What is no pair of the table is excluded; those that may overlap a little are left out.
-        kept = {
+        pair_numbers = {
             frozenset((links.get(i, table.names[p][0]), links[j]))
             for p, (i, j) in enumerate(table.pairs.tolist())
             if not table.offsets[p]
         }
         names = sorted(set(links.values()))
-        for a, one in enumerate(names):
-            for other in names[a + 1 :]:
-                if frozenset((one, other)) not in kept:
-                    spec.add_exclude(bodyname1=one, bodyname2=other)
+        for a, first in enumerate(names):
+            for second in names[a + 1 :]:
+                if frozenset((first, second)) not in pair_numbers:
+                    spec.add_exclude(bodyname1=first, bodyname2=second)
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
         self._places = {
@@ -213,24 +228,24 @@ class MuJoCoOracle:
         }
 
     def _configurations(self, q: Array) -> Array:
-        found = np.zeros((len(q), self._model.nq))
+        configurations = np.zeros((len(q), self._model.nq))
         for name, values in self._robot.joints(q).items():
-            found[:, self._places[name]] = values
-        return found
+            configurations[:, self._places[name]] = values
+        return configurations
 
     def run(self, q: Array) -> None:
         """Kinematics and collisions of configurations."""
-        for one in self._configurations(q):
-            self._data.qpos = one
+        for q_row in self._configurations(q):
+            self._data.qpos = q_row
             mujoco.mj_kinematics(self._model, self._data)
             mujoco.mj_collision(self._model, self._data)
 
     def touching(self, q: Array, depth: float) -> NDArray[np.bool_]:
         """(k,) whether any pair overlaps by more than `depth` [m]."""
-        found = np.zeros(len(q), dtype=bool)
-        for row, one in enumerate(self._configurations(q)):
-            self._data.qpos = one
+        touches = np.zeros(len(q), dtype=bool)
+        for row, q_row in enumerate(self._configurations(q)):
+            self._data.qpos = q_row
             mujoco.mj_kinematics(self._model, self._data)
             mujoco.mj_collision(self._model, self._data)
-            found[row] = self._data.ncon > 0 and bool((self._data.contact.dist < -depth).any())
-        return found
+            touches[row] = self._data.ncon > 0 and bool((self._data.contact.dist < -depth).any())
+        return touches

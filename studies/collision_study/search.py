@@ -17,7 +17,7 @@ from casadi_ik.solve.request import Request, tolerances_by_finger
 from collision_study.oracles import CoalOracle
 
 TABLE = {"kind": "box", "size": [3, 3, 0.04], "xyz": [0, 0, -0.02]}
-NEAR = 0.12
+MAX_POSTURE_DISTANCE = 0.12
 """Clutter keeps so far [m] from the object's middle: what stands in the hand cannot be grasped."""
 TURNS = 16
 """How often each grasp is turned about the vertical at its place."""
@@ -27,7 +27,7 @@ SAFE = 2e-3
 """Margin [m] of the answers that a dense search has to find for a target to count."""
 POSTURES = 12
 """Random hands that a robot without shipped grasps has grasps of."""
-DRAWN = 20_000
+SAMPLES = 20_000
 """Random configurations that they are taken from."""
 BALL, SMALLEST = "ball", 0.012
 """What they hold, and its least radius [m]."""
@@ -60,15 +60,22 @@ def solve_piece(piece: Piece) -> dict[str, Any]:
     robot = ik.load_robot(piece.robot)
     blind = ik.Solver(robot)
     rows = []
-    for solids, held, grasps in _placed(piece, robot):
+    for solids, grasped, grasps in _placed(piece, robot):
         arrays = [grasp.arrays(robot.fingers) for grasp in grasps]
         points, normals = (np.stack(both) for both in zip(*arrays, strict=True))
-        known = blind.solve_batch(points, normals)
-        kept = np.flatnonzero(known.success)
-        if len(kept):
-            some = [grasps[i] for i in kept]
+        solution = blind.solve_batch(points, normals)
+        solvable = np.flatnonzero(solution.success)
+        if len(solvable):
+            solvable_grasps = [grasps[i] for i in solvable]
             rows += _solved(
-                blind, solids, held, some, points[kept], normals[kept], known.q[kept], piece
+                blind,
+                solids,
+                grasped,
+                solvable_grasps,
+                points[solvable],
+                normals[solvable],
+                solution.q[solvable],
+                piece,
             )
     return {"targets": rows}
 
@@ -96,15 +103,15 @@ def grasps_at(piece: Piece) -> Iterator[tuple[ik.Scene, list[ik.Grasp]]]:
 def _solvable(piece: Piece) -> Iterator[tuple[dict[str, Any], list[ik.Grasp]]]:
     robot = ik.load_robot(piece.robot)
     blind = ik.Solver(robot)
-    for solids, held, grasps in _placed(piece, robot):
+    for solids, grasped, grasps in _placed(piece, robot):
         arrays = [grasp.arrays(robot.fingers) for grasp in grasps]
         points, normals = (np.stack(both) for both in zip(*arrays, strict=True))
-        kept = np.flatnonzero(blind.solve_batch(points, normals).success)
+        solvable = np.flatnonzero(blind.solve_batch(points, normals).success)
         pose, name = grasps[0].known_pose, grasps[0].object
         assert pose is not None
-        if len(kept):
+        if len(solvable):
             place = {"xyz": pose[:3, 3].tolist()}
-            yield {**solids, name: held | place}, [grasps[i] for i in kept]
+            yield {**solids, name: grasped | place}, [grasps[i] for i in solvable]
 
 
 def _placed(
@@ -115,14 +122,14 @@ def _placed(
     angle, radius = rng.uniform(-np.pi, np.pi), rng.uniform(0.4, 0.85)
     goal = np.array([radius * np.cos(angle), radius * np.sin(angle), rng.uniform(0.1, 0.6)])
     solids = {"table": TABLE, **_clutter(rng, piece.clutter, goal)}
-    for known_grasp, held in _grasps(robot):
-        yield solids, held, [_moved(known_grasp, goal, rng) for _ in range(TURNS)]
+    for known_grasp, grasped in _grasps(robot):
+        yield solids, grasped, [_placed_grasp(known_grasp, goal, rng) for _ in range(TURNS)]
 
 
 def _solved(
-    without: ik.Solver,
+    plain_solver: ik.Solver,
     solids: dict[str, Any],
-    held: dict[str, Any],
+    grasped: dict[str, Any],
     grasps: list[ik.Grasp],
     points: Array,
     normals: Array,
@@ -130,20 +137,22 @@ def _solved(
     piece: Piece,
 ) -> list[dict[str, Any]]:
     """What comes of the same grasp turned in several ways, a row for each."""
-    robot, name = without.robot, grasps[0].object
+    robot, name = plain_solver.robot, grasps[0].object
     poses = np.stack([grasp.known_pose for grasp in grasps if grasp.known_pose is not None])
     place = {"xyz": poses[0][:3, 3].tolist()}
-    scene = ik.Scene({**solids, name: held | place}, grasped=name)
+    scene = ik.Scene({**solids, name: grasped | place}, grasped=name)
     solver = ik.Solver(robot, scene=scene)
     batch = solver.solve_batch(points, normals, object_pose=poses)
-    every = np.arange(BATCH) % len(points)
-    spent = _timed(solver, points[every], normals[every], poses[every])
-    alone = _timed(without, points[every], normals[every], None)
+    rows = np.arange(BATCH) % len(points)
+    time_each = _timed(solver, points[rows], normals[rows], poses[rows])
+    plain_time = _timed(plain_solver, points[rows], normals[rows], None)
     answered = np.flatnonzero(batch.success)
     of_answered = 0.0
     if len(answered):
-        some = answered[np.arange(BATCH) % len(answered)]
-        of_answered = _timed(solver, points[some], normals[some], poses[some])
+        answered_rows = answered[np.arange(BATCH) % len(answered)]
+        of_answered = _timed(
+            solver, points[answered_rows], normals[answered_rows], poses[answered_rows]
+        )
     check = SceneCheck(robot, scene)
     rows = []
     for i, grasp in enumerate(grasps):
@@ -163,10 +172,12 @@ def _solved(
                 "blind": bool(around.free(blind[i][None])[0]),
                 "missed": missed,
                 "false": false,
-                "pair": "" if (why := batch.collisions[i]) is None else " and ".join(why.pair),
-                "batch": spent,
+                "pair": ""
+                if (report := batch.collisions[i]) is None
+                else " and ".join(report.pair),
+                "batch": time_each,
                 "answered_time": of_answered,
-                "blind_time": alone,
+                "blind_time": plain_time,
                 "single": time.process_time() - begin,
             }
         )
@@ -198,10 +209,10 @@ def dense(
     """Whether one of many solutions has room to spare: those nearest to so many random postures."""
     blind = ik.Solver(robot)
     for first in range(0, count, AT_ONCE):
-        some = min(AT_ONCE, count - first)
-        both = (np.tile(one, (some, 1, 1)) for one in (points, normals))
-        found = blind.solve_batch(*both, q0=robot.random(rng, some), prefer="q0")
-        q = found.q[found.success]
+        size = min(AT_ONCE, count - first)
+        tiled = (np.tile(array, (size, 1, 1)) for array in (points, normals))
+        solutions = blind.solve_batch(*tiled, q0=robot.random(rng, size), prefer="q0")
+        q = solutions.q[solutions.success]
         if len(q) and (around.rows(np.zeros(len(q), np.intp)).check(q).surplus >= SAFE).any():
             return True
     return False
@@ -213,10 +224,10 @@ def _grasps(robot: ik.ArmHand) -> list[tuple[ik.Grasp, dict[str, Any]]]:
     shipped = ik.shipped_grasps(robot.name)
     if shipped:
         grasps = [ik.load_grasp(name) for name in shipped]
-        return [(one, {"kind": "object", "object": one.object}) for one in grasps]
-    q = robot.random(np.random.default_rng(POSTURES), DRAWN)
+        return [(grasp, {"kind": "object", "object": grasp.object}) for grasp in grasps]
+    q = robot.random(np.random.default_rng(POSTURES), SAMPLES)
     points, normals = robot.contacts(q)
-    poses = np.tile(np.eye(4), (DRAWN, 1, 1))
+    poses = np.tile(np.eye(4), (SAMPLES, 1, 1))
     poses[:, :3, 3] = points.mean(axis=1)
     # The ball is as large as fits between the fingertips; a point of it is checked, and its size.
     radii = np.linalg.norm(points - poses[:, None, :3, 3], axis=2).min(axis=1) - SAFE
@@ -227,16 +238,16 @@ def _grasps(robot: ik.ArmHand) -> list[tuple[ik.Grasp, dict[str, Any]]]:
     of_ball = np.array([BALL in names for names in around.table.names])
     clear = around.with_table(around.table.select(~of_ball)).free(q) & (radii > SMALLEST)
     clear &= around.with_table(around.table.select(of_ball)).check(q).distance + SAFE > radii
-    found = []
+    targets = []
     for row in np.flatnonzero(clear)[:POSTURES].tolist():
         named = zip(robot.fingers, points[row], normals[row], strict=True)
         contacts = {name: ik.Contact(point, normal) for name, point, normal in named}
         grasp = ik.Grasp(contacts, object=BALL, object_pose=poses[row])
-        found.append((grasp, {"kind": "sphere", "radius": float(radii[row])}))
-    return found
+        targets.append((grasp, {"kind": "sphere", "radius": float(radii[row])}))
+    return targets
 
 
-def _moved(grasp: ik.Grasp, goal: Array, rng: np.random.Generator) -> ik.Grasp:
+def _placed_grasp(grasp: ik.Grasp, goal: Array, rng: np.random.Generator) -> ik.Grasp:
     """The grasp with its object at a place, turned about the vertical."""
     assert grasp.known_pose is not None
     turn, motion = rng.uniform(-np.pi, np.pi), np.eye(4)
@@ -246,18 +257,18 @@ def _moved(grasp: ik.Grasp, goal: Array, rng: np.random.Generator) -> ik.Grasp:
 
 
 def _clutter(rng: np.random.Generator, count: int, goal: Array) -> dict[str, dict[str, object]]:
-    found: dict[str, dict[str, object]] = {}
-    while len(found) < count:
+    solids: dict[str, dict[str, object]] = {}
+    while len(solids) < count:
         place = goal + rng.uniform(-0.35, 0.35, 3) * [1, 1, 0.6]
         size = rng.uniform(0.02, 0.07)
         off = np.linalg.norm(place - goal) - size * 1.8
-        if off < NEAR or np.hypot(*place[:2]) < 0.25 or place[2] < size:
+        if off < MAX_POSTURE_DISTANCE or np.hypot(*place[:2]) < 0.25 or place[2] < size:
             continue
-        rest: dict[str, object] = {"xyz": place.tolist(), "rpy": rng.uniform(-3, 3, 3).tolist()}
+        pose: dict[str, object] = {"xyz": place.tolist(), "rpy": rng.uniform(-3, 3, 3).tolist()}
         kinds = (
             {"kind": "box", "size": [2 * size, 1.5 * size, size]},
             {"kind": "cylinder", "radius": size, "length": 2 * size},
             {"kind": "sphere", "radius": size},
         )
-        found[f"clutter_{len(found)}"] = kinds[len(found) % 3] | rest
-    return found
+        solids[f"clutter_{len(solids)}"] = kinds[len(solids) % 3] | pose
+    return solids

@@ -22,13 +22,13 @@ PAPER, OURS, THIRD, FOURTH = COLORS = "#e08a2e", "#2f6db3", "#1f9d55", "#8e4ec6"
 
 def figure(rows: int, columns: int, width: float = 4.2, height: float = 3.7) -> tuple[Any, Any]:
     """A figure and its axes (rows, columns), dressed plainly; a panel's size in inches."""
-    drawn = new_figure(width * columns, height * rows, 110)
-    grid = drawn.subplots(rows, columns, squeeze=False)
+    plot = new_figure(width * columns, height * rows, 110)
+    grid = plot.subplots(rows, columns, squeeze=False)
     for axes in grid.ravel():
         axes.tick_params(colors=FAINT, labelsize=8)
         for side in ("top", "right"):
             axes.spines[side].set_visible(False)
-    return drawn, grid
+    return plot, grid
 
 
 def title(axes: Axes, text: str, x: str, y: str) -> None:
@@ -73,11 +73,11 @@ def options(
     return parser.parse_args(arguments)
 
 
-def write(folder: Path, name: str, drawn: Any, text: str) -> None:
+def write(folder: Path, name: str, plot: Any, text: str) -> None:
     """Write ``name/README.md`` and its picture, and say where."""
     place = folder / name
     place.mkdir(parents=True, exist_ok=True)
-    drawn.tight_layout()
-    drawn.savefig(place / f"{name}.png")
+    plot.tight_layout()
+    plot.savefig(place / f"{name}.png")
     (place / "README.md").write_text(text.strip() + f"\n\n![{name}]({name}.png)\n")
     print(f"{place / 'README.md'}\n\n{text.strip()}")

@@ -79,13 +79,13 @@ def solved(
         task = progress.add_task(title, total=sum(part.size for part in parts))
         parallel: Any = joblib.Parallel(return_as="generator_unordered")
         begun = (part for part in parts if time.monotonic() < until)
-        for part, found in parallel(joblib.delayed(_with)(solve, part) for part in begun):
-            yield part, found
+        for part, result in parallel(joblib.delayed(_solve_with)(solve, part) for part in begun):
+            yield part, result
             progress.advance(task, part.size)
 
 
 def run_parts(
-    solve: Callable[[P], dict[str, Any]], parts: Iterable[P], folder: Path, **where: Any
+    solve: Callable[[P], dict[str, Any]], parts: Iterable[P], folder: Path, **options: Any
 ) -> None:
     """Solve the parts that a folder does not have, and keep each as JSON as soon as it is done.
 
@@ -95,19 +95,19 @@ def run_parts(
         solve: See `solved`; what it returns can be written as JSON.
         parts: All parts.
         folder: Where their files are and go.
-        where: The other arguments of `solved`.
+        options: The other arguments of `solved`.
     """
     todo = [part for part in parts if not (folder / part.path).exists()]
-    for part, found in solved(solve, todo, **where):
-        keep(folder / part.path, json.dumps({"code": code_version(), "found": found}))
+    for part, result in solved(solve, todo, **options):
+        keep(folder / part.path, json.dumps({"code": code_version(), "found": result}))
 
 
 def read_parts(folder: Path, parts: Iterable[P]) -> tuple[list[tuple[P, dict[str, Any]]], str]:
     """The parts that are done, with what was found, and versions of the code that found it."""
-    there = [part for part in parts if (folder / part.path).exists()]
-    kept = [json.loads((folder / part.path).read_text(encoding="utf-8")) for part in there]
-    codes = ", ".join(sorted({entry["code"] for entry in kept}))
-    return [(part, entry["found"]) for part, entry in zip(there, kept, strict=True)], codes
+    done_parts = [part for part in parts if (folder / part.path).exists()]
+    stored = [json.loads((folder / part.path).read_text(encoding="utf-8")) for part in done_parts]
+    codes = ", ".join(sorted({entry["code"] for entry in stored}))
+    return [(part, entry["found"]) for part, entry in zip(done_parts, stored, strict=True)], codes
 
 
 def keep(path: Path, content: str | bytes) -> None:
@@ -118,7 +118,7 @@ def keep(path: Path, content: str | bytes) -> None:
     part.replace(path)
 
 
-def _with(solve: Callable[[P], Any], part: P) -> tuple[P, Any]:
+def _solve_with(solve: Callable[[P], Any], part: P) -> tuple[P, Any]:
     return part, solve(part)
 
 

@@ -52,8 +52,8 @@ def rate_metric(name: str, successes: int, n: int) -> Metric:
         return Metric(name, math.nan, "%", "higher", 0.0, 100.0, 0)
     share, z2 = successes / n, Z95**2
     middle = (share + z2 / (2 * n)) / (1 + z2 / n)
-    half = Z95 * math.sqrt(share * (1 - share) / n + z2 / (4 * n * n)) / (1 + z2 / n)
-    low, high = max(0.0, middle - half), min(1.0, middle + half)
+    half_width = Z95 * math.sqrt(share * (1 - share) / n + z2 / (4 * n * n)) / (1 + z2 / n)
+    low, high = max(0.0, middle - half_width), min(1.0, middle + half_width)
     # At the ends rounding would leave the interval a hair off the rate.
     low, high = (0.0 if successes == 0 else low), (1.0 if successes == n else high)
     return Metric(name, 100 * share, "%", "higher", 100 * low, 100 * high, n)
@@ -66,10 +66,10 @@ def mean_metric(name: str, values: ArrayLike, unit: str, better: str = "lower") 
         return Metric(name, math.nan, unit, better, math.nan, math.nan, 0)
     value = float(samples.mean())
     spread = float(samples.std(ddof=1)) if len(samples) > 1 else math.nan
-    half = Z95 * spread / math.sqrt(len(samples))
+    half_width = Z95 * spread / math.sqrt(len(samples))
     # Of what cannot be negative the mean is not either, however few samples there are.
-    low = max(value - half, 0.0) if samples.min() >= 0 else value - half
-    return Metric(name, value, unit, better, low, value + half, len(samples))
+    low = max(value - half_width, 0.0) if samples.min() >= 0 else value - half_width
+    return Metric(name, value, unit, better, low, value + half_width, len(samples))
 
 
 def median_metric(name: str, values: ArrayLike, unit: str, better: str = "lower") -> Metric:
@@ -78,9 +78,9 @@ def median_metric(name: str, values: ArrayLike, unit: str, better: str = "lower"
     n = len(samples)
     if n == 0:
         return Metric(name, math.nan, unit, better, math.nan, math.nan, 0)
-    half = Z95 * math.sqrt(n) / 2
-    low = samples[max(0, math.floor(n / 2 - half))]
-    high = samples[min(n - 1, math.ceil(n / 2 + half))]
+    half_width = Z95 * math.sqrt(n) / 2
+    low = samples[max(0, math.floor(n / 2 - half_width))]
+    high = samples[min(n - 1, math.ceil(n / 2 + half_width))]
     return Metric(name, float(np.median(samples)), unit, better, float(low), float(high), n)
 
 
@@ -160,8 +160,8 @@ def provenance(code: Mapping[str, str | None]) -> str:
     on = machine()
     compiler = find_compiler()
     versions = ", ".join(f"{name} {text}" for name, text in package_versions(PACKAGES).items())
-    made = {name: text for name, text in code.items() if text is not None}
-    sources = ", ".join(f"{name} `{text}`" for name, text in made.items())
+    code_versions = {name: text for name, text in code.items() if text is not None}
+    sources = ", ".join(f"{name} `{text}`" for name, text in code_versions.items())
     return (
         f"Machine: {on['processor']}, {on['cores']} cores, {on['system']}; "
         f"{compiler.version if compiler else 'no C compiler'}. Packages: {versions}. Sources "

@@ -131,7 +131,7 @@ class Study:
 
     def ready_solver(self, setting: Setting) -> ik.Solver:
         """The same, once it has solved a few targets: no result's time holds its first use."""
-        return _used(setting.robot or self.robot, setting)
+        return _ready_solver(setting.robot or self.robot, setting)
 
     def start(self, setting: Setting) -> Array:
         """The configuration (n,) a setting starts from."""
@@ -176,7 +176,7 @@ def _solver(robot: str, setting: Setting) -> ik.Solver:
 
 
 @lru_cache(maxsize=8)
-def _used(robot: str, setting: Setting) -> ik.Solver:
+def _ready_solver(robot: str, setting: Setting) -> ik.Solver:
     solver = _solver(robot, setting)
     home = solver.robot.home
     solver.solve_batch(*solver.robot.contacts(np.tile(home, (FIRST_USE, 1))))
@@ -198,19 +198,19 @@ def solve_block(study: Study, block: Block, log: Keep | None = None) -> dict[str
     solver = study.ready_solver(block.setting)
     q = study.configurations(block.targets, block.number)[: block.size]
     points, normals = robot_of(study.robot).contacts(q)
-    asked: dict[str, Any] = {"seed": study.seed}
+    options: dict[str, Any] = {"seed": study.seed}
     if block.setting.start:
         # Said, it is also where the solution is to be near; else the same home is a start only.
-        asked["q0"] = study.start(block.setting)
+        options["q0"] = study.start(block.setting)
     files: dict[str, bytes] = {}
     if log is None:
-        batch = solver.solve_batch(points, normals, **asked)
+        batch = solver.solve_batch(points, normals, **options)
     else:
         # Solves are numbered from 0 in every log; with one seed all would keep the same numbers.
-        own = dataclasses.replace(log, seed=zlib.crc32(str(block.path).encode()))
+        keep_options = dataclasses.replace(log, seed=zlib.crc32(str(block.path).encode()))
         with tempfile.TemporaryDirectory(prefix="casadi_ik-study-") as place:
             path = Path(place) / "block.mcap"
-            batch = solver.solve_batch(points, normals, **asked, log=path, keep=own)
+            batch = solver.solve_batch(points, normals, **options, log=path, keep=keep_options)
             files[".mcap"] = path.read_bytes()
     table = io.BytesIO()
     _frame(study, block, batch, solver.robot.fingers).write_parquet(table)
@@ -297,19 +297,21 @@ def claim(study: Study, folder: Path) -> None:
         InputError: The folder holds results that were made otherwise.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    path, mine = folder / STUDY_FILE, json.loads(json.dumps(fingerprint(study), default=str))
+    path, expected = folder / STUDY_FILE, json.loads(json.dumps(fingerprint(study), default=str))
     if path.exists():
-        kept = json.loads(path.read_text(encoding="utf-8"))
-        for key, value in mine.items():
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        for key, value in expected.items():
             if isinstance(value, dict):
                 for name, entry in value.items():
-                    _same(path, f"{key}.{name}", kept[key].setdefault(name, entry), entry)
+                    _require_equal(
+                        path, f"{key}.{name}", stored[key].setdefault(name, entry), entry
+                    )
             else:
-                _same(path, key, kept[key], value)
-        mine = kept
+                _require_equal(path, key, stored[key], value)
+        expected = stored
     elif any(folder.iterdir()):
         raise InputError(f"{folder}: holds files but no {STUDY_FILE}, expected an empty folder")
-    keep(path, json.dumps(mine, indent=1) + "\n")
+    keep(path, json.dumps(expected, indent=1) + "\n")
     for left in folder.rglob(f"*{PART}"):
         left.unlink(missing_ok=True)
 
@@ -344,10 +346,10 @@ def code_of(folder: Path) -> str | None:
     return json.loads(path.read_text(encoding="utf-8"))["code"]
 
 
-def _same(path: Path, key: str, found: Any, expected: Any) -> None:
-    if found != expected:
+def _require_equal(path: Path, key: str, stored_value: Any, expected: Any) -> None:
+    if stored_value != expected:
         raise InputError(
-            f"{path}: {key}: results made with {_brief(found)} are here, this study has "
+            f"{path}: {key}: results made with {_brief(stored_value)} are here, this study has "
             f"{_brief(expected)}; use another folder"
         )
 
@@ -363,6 +365,6 @@ def _digest(text: str) -> str:
 
 def _name(function: Any) -> str:
     if isinstance(function, partial):
-        given = [*map(str, function.args), *(f"{k}={v}" for k, v in function.keywords.items())]
-        return f"{_name(function.func)}({', '.join(given)})"
+        arguments = [*map(str, function.args), *(f"{k}={v}" for k, v in function.keywords.items())]
+        return f"{_name(function.func)}({', '.join(arguments)})"
     return function.__qualname__

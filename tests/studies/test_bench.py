@@ -78,6 +78,6 @@ def test_a_peer_is_restarted_and_judged(robot, name):
     run = peers.run_peer(name, robot, targets, ik.Tolerance(), restarts=40)
     assert run.times.shape == (4,)
     assert run.solved == 1 if name == "scipy" else run.solved > 0
-    assert not peers.judged(
+    assert not peers.is_solved(
         robot, robot.random(np.random.default_rng(1), 4), targets, ik.Tolerance()
     ).any()

@@ -5,23 +5,23 @@ from __future__ import annotations
 import event_thresholds
 import numpy as np
 import pytest
-from event_thresholds import Kept
+from event_thresholds import StoredBlocks
 
 import casadi_ik as ik
 from casadi_ik import logs
 
 
 @pytest.fixture(scope="module")
-def kept() -> Kept:
+def kept() -> StoredBlocks:
     robot = ik.load_robot("kuka_lwr_barrett")
     options = {"max_iterations": 300}
     solver = ik.Solver(robot, "enhanced-dls", finger_step="closed-form", options=options)
-    found = Kept()
+    found = StoredBlocks()
     solver.solve_batch(*event_thresholds.targets_of(robot, 24, 0), log=found)
     return found
 
 
-def test_what_a_threshold_catches(kept: Kept) -> None:
+def test_what_a_threshold_catches(kept: StoredBlocks) -> None:
     """The share of solves whose smallest singular value is below it, by the traces themselves."""
     rows = np.concatenate([block.rows for block in kept.blocks])
     counts = np.concatenate([block.batch.iterations for block in kept.blocks])

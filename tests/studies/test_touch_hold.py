@@ -23,10 +23,10 @@ def test_what_is_squeezed_too_little_falls(monkeypatch):
     (one,) = solver.grasps_of(surface, standing(surface, 0.7), limit=1, among=1)
     down = -np.eye(3)[2:]
     hold = touch_hold.Hold(solver.robot, one, surface)
-    assert hold.held(hold.settled(), down).all()
+    assert hold.is_held(hold.settled(), down).all()
     monkeypatch.setattr(touch_hold, "SQUEEZE", 0.02)
     hold = touch_hold.Hold(solver.robot, one, surface)
-    assert not hold.held(hold.settled(), down).any()
+    assert not hold.is_held(hold.settled(), down).any()
 
 
 def test_the_area_under_the_curve():
