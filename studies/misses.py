@@ -523,7 +523,7 @@ def climbed_rows(options: argparse.Namespace) -> tuple[list[Row], str]:
         search_state = read_search(state)
         codes.add(search_state["code"])
         for tolerance in options.tolerance:
-            iterations, restarts = search_state["most"].get(tolerance, (0, 0))
+            iterations, restarts = search_state["hardest_by_tolerance"].get(tolerance, (0, 0))
             missed = [miss for miss in search_state["missed"] if miss["tolerance"] == tolerance]
             row: Row = {"robot": robot, "kind": "climbing", "tolerance": tolerance}
             row |= {"count": search_state["total"], "seconds": search_state["seconds"]}
