@@ -13,11 +13,11 @@ from casadi_ik.compile.graphs import FunctionGraph
 from casadi_ik.export.scene import SceneSources
 from casadi_ik.files.arrays import Array, spread_steps
 from casadi_ik.kinematics.arms.family import ArmFamily
-from casadi_ik.kinematics.arms.search import arms_graph
+from casadi_ik.kinematics.arms.search import ARM_SEARCH, arms_graph
 from casadi_ik.solve.alternatives import side_links
 from casadi_ik.solve.collision_free import COLLISION_FREE_PARAMETERS
 from casadi_ik.solve.hand_first.multi_arm import MultiArmStep
-from casadi_ik.solve.trials import CARRY_ONLY, TRUNK_STRETCH
+from casadi_ik.solve.trials import TRUNK_STRETCH
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,23 +99,19 @@ class MultiArmSceneSources(SceneSources):
 
     def search_constants(self) -> str:
         """Return the constants of the search for collision-free hands, trunks and arms."""
-        state = self.step.layouts.state
+        state, parameters = self.step.layouts.state, self.step.layouts.parameters
         motors = [*self.robot.description.trunk_actuators, *self.step.layouts.arm]
-        carry: dict[int, float] = {}
-        for name, value in (CARRY_ONLY | {"side": float(len(self.step.sides))}).items():
-            span = state.slice(name)
-            carry |= dict.fromkeys(range(span.start, span.stop), value)
         integers = {
             "STATE_FIRST_CANDIDATE": state.slice("first_candidate").start,
             "STATE_PALMS": state.slice("palm_rotation_0").start,
-            "N_CARRY": len(carry),
+            "STATE_HAND_FITS": state.slice("hand_fits").start,
+            "STATE_ARM_MARGIN": state.slice("arm_margin").start,
+            "PARAMETERS_PALMS_ONLY": parameters.slice("palms_only").start,
             "N_TRUNK_AND_ARMS": len(motors),
             "N_TRUNK_STAGES": len(COLLISION_FREE_PARAMETERS.trunk_stages),
         }
         arrays = {
             "TRUNK_STAGES": np.array(COLLISION_FREE_PARAMETERS.trunk_stages),
-            "CARRY_OFFSETS": np.array(list(carry)),
-            "CARRY_VALUES": np.array(list(carry.values())),
             "TRUNK_AND_ARMS": np.array(motors),
             "TRUNK_AND_ARM_STEPS": spread_steps(len(motors)),
         }
@@ -123,6 +119,7 @@ class MultiArmSceneSources(SceneSources):
             super().search_constants()
             + define(integers)
             + f"#define TRUNK_STRETCH {number(TRUNK_STRETCH)}\n"
+            + f"#define NO_MARGIN {number(ARM_SEARCH.no_margin)}\n"
             + define_arrays(arrays)
         )
 

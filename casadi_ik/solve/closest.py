@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arms.recognise import srs_arm
 from casadi_ik.kinematics.arms.srs import SrsArm
-from casadi_ik.kinematics.contact_fit import initial_lm_state
 from casadi_ik.kinematics.contacts import LENGTH
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.diagnosis import ArmReach, HandFit
-from casadi_ik.solve.status import Phase
+from casadi_ik.solve.hand_first.rows import fit_hands_again
 from casadi_ik.solve.trials import (
     UNREACHABLE_TOLERANCE,
     LocalRefinement,
@@ -283,8 +282,7 @@ class FloatingPalmFit:
         """
         trials = self._trials
         states, parameters = fits.states[rows], fits.parameters[rows]
-        for name, value in ({"phase": Phase.HAND_FIT} | initial_lm_state()).items():
-            states[:, trials.state.slice(name)] = value
+        fit_hands_again(trials.method, states)
         loose = parameters[:, trials.parameters.slice("position_tolerance")].min(axis=1)
         weight = np.sqrt(np.minimum(loose / (3 * fits.outside[rows]), 1.0))
         parameters[:, trials.parameters.slice("reach_weight")] = weight[:, None]

@@ -41,7 +41,7 @@ from casadi_ik.solve.free_hands import SideHands, UnconstrainedFingers
 from casadi_ik.solve.method import Outcome
 from casadi_ik.solve.request import CLEARANCE
 from casadi_ik.solve.solution import BatchSolution, CollisionReport
-from casadi_ik.solve.status import Phase, Status
+from casadi_ik.solve.status import Status
 from casadi_ik.solve.trials import (
     Deduplicator,
     LocalRefinement,
@@ -591,9 +591,7 @@ class CollisionFreeSearch:
             )
             starts[:, moving] += size * self._ranges[moving] * steps[rank].reshape(-1, len(moving))
             starts, palms = self.limits.of(target_index).clip(starts), side_palms(robot, q)
-            ends = carry_palms(
-                trials, self.targets, starts, palms, target_index, float(Phase.TRUNK)
-            )
+            ends = carry_palms(trials, self.targets, starts, palms, target_index, False)
             self.record_candidates(*self._solved(ends, target_index))
 
     def _resolve_hand_collisions(self, sides: SideHands) -> None:

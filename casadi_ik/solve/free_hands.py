@@ -14,7 +14,6 @@ from casadi_ik.files.arrays import Array, Bools, spread_steps
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.arm_search import ArmSearch, Preference
-from casadi_ik.solve.status import Phase
 from casadi_ik.solve.trials import (
     Deduplicator,
     Subproblems,
@@ -184,8 +183,7 @@ class SideHands:
             )
             q, rows = candidates.q, rows[candidates.hand_index]
         if len(q) and not all(search.is_exact for search in searches):
-            phase = float(Phase.TRUNK)
-            q = carry_palms(self._trials, self._targets, q, palms[rows], target_index[rows], phase)
+            q = carry_palms(self._trials, self._targets, q, palms[rows], target_index[rows], False)
         return q, target_index[rows]
 
 

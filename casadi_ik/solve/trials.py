@@ -6,33 +6,24 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from casadi_ik.compile.layout import Layout
 from casadi_ik.files.arrays import Array, Rows, spread_points
 from casadi_ik.kinematics.arm_hand import ArmHand
-from casadi_ik.kinematics.contact_fit import initial_lm_state
 from casadi_ik.kinematics.contacts import LENGTH
 from casadi_ik.model.targets import TargetBatch
+from casadi_ik.solve.hand_first.rows import (
+    hand_rows,
+    palm_rows,
+    refinement_rows,
+    start_refinement,
+)
 from casadi_ik.solve.method import HandSearch
-from casadi_ik.solve.status import Phase
 from casadi_ik.solve.verdict import deviations, judge
 
 UNREACHABLE_TOLERANCE = 1e-12
 """Tolerance that no configuration meets, so that the loop continues to the minimum."""
-
-EXHAUSTED = 1e6
-"""Trial number after the last one, so that no further trial follows."""
-
-CARRY_ONLY = {
-    "first_candidate": EXHAUSTED,
-    "last_candidate": EXHAUSTED,
-    "hand_fits": 1.0,
-    "side_fits": 1.0,
-    "trunk_trials": EXHAUSTED,
-    "trunk_arms_placed_again": 1.0,
-}
-"""State fields of a row that only moves trunk and arms to given palm poses."""
 
 TRUNK_STRETCH = 2.0
 """Factor by which every second trunk sample is stretched about the middle of the range, clamped."""
@@ -116,25 +107,6 @@ class Subproblems:
         self.set_bounds(parameters, bounds)
         return self.run(states, parameters)
 
-    def posture_rows(
-        self, targets: TargetBatch, start: Array, postures: Array, turns: ArrayLike = 0.0
-    ) -> tuple[Array, Array]:
-        """Return states and parameters with a single seed each.
-
-        Args:
-            targets: k targets.
-            start: (k, n) start configurations [rad or m].
-            postures: (k, hand) seeds [rad or m].
-            turns: (k,) numbers that select the palm pose where contacts leave the palm free.
-        """
-        states, parameters = self.method.rows(targets, start, postures[:, None], skip_q0=True)
-        states[:, self.state.slice("candidate")] = self.method.options.candidates - 1
-        if self.robot.description.sides:
-            # Each side has a single seed, its part of the posture.
-            states[:, self.state.slice("first_candidate")] = self.method.options.candidates - 1
-        states[:, self.state.slice("palm_number").start] = turns
-        return states, parameters
-
     def hand_rows(
         self, targets: TargetBatch, rows: Rows, starts: Array, postures: Array, first: int = 0
     ) -> tuple[Rows, Array, Array]:
@@ -145,7 +117,7 @@ class Subproblems:
             rows: (c,) indices of the targets.
             starts: (k, n) start configurations of all targets [rad or m].
             postures: (c, p, hand) seeds of the selected targets [rad or m].
-            first: Palm number of the first seed, see `posture_rows`.
+            first: Palm number of the first seed, see `rows.hand_rows`.
 
         Returns:
             Target index of each row, (c p,), states and parameters.
@@ -153,7 +125,7 @@ class Subproblems:
         count = postures.shape[1]
         owner, turns = np.repeat(rows, count), first + np.tile(np.arange(count), len(rows))
         flat = postures.reshape(len(owner), postures.shape[2])
-        return owner, *self.posture_rows(targets.rows(owner), starts[owner], flat, turns)
+        return owner, *hand_rows(self.method, targets.rows(owner), starts[owner], flat, turns)
 
     def solved(self, targets: TargetBatch, q: Array, limits: bool) -> NDArray[np.bool_]:
         """Return (k,) whether q solves its targets, within limits if `limits`."""
@@ -186,7 +158,8 @@ class LocalRefinement:
         """Prepare states and parameters of every target, for any number of runs."""
         self.trials = trials
         self.targets = targets
-        self._states, self._parameters = refinement_rows(trials, targets)
+        home = np.tile(trials.robot.home, (len(targets), 1))
+        self._states, self._parameters = refinement_rows(trials.method, targets, home)
 
     def run(
         self, owner: Rows, q: Array, bounds: Bounds | None = None, weights: Array | None = None
@@ -206,9 +179,7 @@ class LocalRefinement:
         trials = self.trials
         states, parameters = self._states[owner], self._parameters[owner]
         bounds = bounds or trials.limits(self.targets).of(owner)
-        start = bounds.clip(q)
-        states[:, trials.state.slice("q")] = start
-        states[:, trials.state.slice("best_q")] = start
+        start_refinement(trials.method, states, bounds.clip(q))
         trials.set_bounds(parameters, bounds)
         if weights is not None:
             parameters[:, trials.parameters.slice("weights")] *= weights.reshape(len(q), -1)
@@ -219,16 +190,6 @@ class LocalRefinement:
         """Return (m, f, 2) residual norms of points [0.1 m] and normals; 0 where free."""
         position, angle, _ = deviations(self.trials.robot, self.targets.rows(owner), q)
         return np.nan_to_num(np.stack([position / LENGTH, 2 * np.sin(angle / 2)], axis=2))
-
-
-def refinement_rows(trials: Subproblems, targets: TargetBatch) -> tuple[Array, Array]:
-    """Return states and parameters of the loop that start with the refinement of all joints."""
-    count, hand = len(targets), len(trials.robot.description.hand_actuators)
-    home = np.tile(trials.robot.home, (count, 1))
-    states, parameters = trials.posture_rows(targets, home, np.zeros((count, hand)))
-    for name, value in ({"phase": Phase.REFINEMENT} | initial_lm_state()).items():
-        states[:, trials.state.slice(name)] = value
-    return states, parameters
 
 
 def sample_trunks(
@@ -268,8 +229,7 @@ def sample_trunks(
     steps = np.tile(spread, (len(q), 1))
     begun[:, moving] = lower[:, moving] + steps * (upper - lower)[:, moving]
     placed = np.tile(np.arange(first, first + count) % 4 != 3, len(q))
-    phase = np.where(placed, float(Phase.ARM_PLACEMENT), float(Phase.TRUNK))
-    return carry_palms(trials, targets, begun, palms[of], owner[of], phase), of
+    return carry_palms(trials, targets, begun, palms[of], owner[of], placed), of
 
 
 def carry_palms(
@@ -278,26 +238,14 @@ def carry_palms(
     q: Array,
     palms: Array,
     owner: NDArray[np.intp],
-    phase: float | Array,
+    places_arms: bool | NDArray[np.bool_],
 ) -> Array:
-    """Return configurations (m, n) whose trunk and arms move from q to palm poses (m, s, 4, 4)."""
-    robot = trials.robot.description
-    hands = q[:, list(robot.hand_actuators)]
-    states, parameters = trials.posture_rows(targets.rows(owner), q, hands)
-    wanted: dict[str, Array | float] = {
-        "q": q,
-        "best_q": q,
-        "phase": phase,
-        "side": len(robot.sides),
-        **CARRY_ONLY,
-    }
-    for place in range(len(robot.sides)):
-        wanted[f"palm_rotation_{place}"] = palms[:, place, :3, :3].reshape(-1, 9)
-        wanted[f"palm_origin_{place}"] = palms[:, place, :3, 3]
-    for name, value in wanted.items():
-        numbers = np.asarray(value, dtype=float)
-        states[:, trials.state.slice(name)] = numbers[:, None] if numbers.ndim == 1 else numbers
-    return trials.run(states, parameters)
+    """Return configurations (m, n) whose trunk and arms move from q to palm poses (m, s, 4, 4).
+
+    See `rows.palm_rows`.
+    """
+    rows = palm_rows(trials.method, targets.rows(owner), q, palms, places_arms)
+    return trials.run(*rows)
 
 
 def side_palms(robot: ArmHand, q: Array) -> Array:

@@ -352,7 +352,9 @@ static int begin_carrying(search *job, const scalar *q, const scalar *palms, int
   memcpy(job->state + STATE_Q, q, N_MOTORS * sizeof(scalar));
   memcpy(job->state + STATE_BEST_Q, q, N_MOTORS * sizeof(scalar));
   memcpy(job->state + STATE_PALMS, palms, 12 * N_SIDES * sizeof(scalar));
-  for (i = 0; i < N_CARRY; ++i) job->state[CARRY_OFFSETS[i]] = CARRY_VALUES[i];
+  for (i = 0; i < N_SIDES; ++i) job->state[STATE_ARM_MARGIN + i] = NO_MARGIN;
+  job->state[STATE_HAND_FITS] = 1.0;
+  job->parameters[PARAMETERS_PALMS_ONLY] = 1.0;
   job->state[STATE_PHASE] = phase;
   job->slot = -1;
   job->loop_status = RUNNING;

@@ -2,7 +2,8 @@
  *
  * The hands are fitted independently, one side after the other. Then the arms of all sides are
  * placed with the trunk where it is. If some arm cannot follow, trunk and arms move together
- * towards the palm poses (trunk), and if that fails other trunk positions are tried.
+ * towards the palm poses (trunk), and if that fails other trunk positions are tried. A solve that
+ * only carries palms (PALMS_ONLY) has given palm poses, and tries a single trunk position.
  */
 
 /* Continue with a hand posture of a side. */
@@ -13,6 +14,7 @@ static int to_side(solve s, int side, double candidate) {
 }
 
 static int to_next_candidate(solve s) {
+  if (P(PALMS_ONLY) > 0) return end_with_incumbent(s);
   if (X(SIDE) < N_SIDES) return to_side(s, (int) X(SIDE), X(CANDIDATE) + 1);
   Y(FIRST_CANDIDATE) = Y(LAST_CANDIDATE) = X(LAST_CANDIDATE) + 1;
   return to_side(s, 0, Y(FIRST_CANDIDATE));
@@ -76,10 +78,11 @@ static int after_hand(solve s) {
 }
 
 static int after_placement(solve s) {
-  if (!FLAG(ARM_IS_EXACT) && X(TRUNK_ARMS_PLACED_AGAIN) > 0
-      && Y(STAGE_ITERATIONS) < REPLACEMENT_TRIALS) {
+  const int max_trials = X(TRUNK_ARMS_PLACED_AGAIN) > 0 ? REPLACEMENT_TRIALS : 1;
+  if (!FLAG(ARM_IS_EXACT) && Y(STAGE_ITERATIONS) < max_trials) {
     return goes_to(s, ARM_PLACEMENT_STAGE);
   }
+  if (!FLAG(ARM_IS_EXACT) && P(PALMS_ONLY) > 0) return end_with_incumbent(s);
   set_arm(s);
   begin_fit(s);
   if (!FLAG(ARM_IS_EXACT)) return goes_to(s, TRUNK_STAGE);
@@ -143,7 +146,8 @@ static int to_next_trunk(solve s) {
 }
 
 static int after_trunk(solve s) {
-  int max_trials = X(FIRST_CANDIDATE) > 0 ? OTHER_TRUNK_TRIALS
+  int max_trials = P(PALMS_ONLY) > 0 ? 1
+                 : X(FIRST_CANDIDATE) > 0 ? OTHER_TRUNK_TRIALS
                  : X(CANDIDATES_BEFORE) > 0 ? LATER_TRUNK_TRIALS : FIRST_TRUNK_TRIALS;
   int i;
   if (RESULT(COST) < EXACT_COST) {
@@ -152,7 +156,8 @@ static int after_trunk(solve s) {
     return X(HAND_FITS) > 0 ? SOLVED_STATUS : RUNNING_STATUS;
   }
   if (!FLAG(IS_SETTLED)) return goes_to(s, TRUNK_STAGE);
-  if (!(X(TRUNK_ARMS_PLACED_AGAIN) > 0) && RESULT(COST) < REPLACEMENT_COST) {
+  if (!(X(TRUNK_ARMS_PLACED_AGAIN) > 0) && !(P(PALMS_ONLY) > 0)
+      && RESULT(COST) < REPLACEMENT_COST) {
     /* Arms that are placed again at this trunk may be on other branches. */
     Y(TRUNK_ARMS_PLACED_AGAIN) = 1;
     return to_placement(s);

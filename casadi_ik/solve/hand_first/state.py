@@ -267,6 +267,7 @@ class HandFirstLayouts:
                 "palms_are_free",
                 doc="1 if a side has fewer contact conditions than motions of palm and hand",
             ),
+            Field("palms_only", doc="1 if the solve only carries the palms to their poses"),
         )
 
     @cached_property
@@ -427,7 +428,7 @@ def _build_beginning(name: str, layouts: HandFirstLayouts) -> ca.Function:
             "reach_weight": 1.0,
             "hand_only": 0.0,
             "start": start,
-            **({"palms_are_free": _palms_are_free(layouts, weights)} if robot.sides else {}),
+            **(_side_parameters(layouts, weights) if robot.sides else {}),
             "postures": ca.horzcat(*seeds).T,
             **t,
         }
@@ -463,6 +464,11 @@ def _is_underactuated(layouts: HandFirstLayouts, t: dict[str, Expr]) -> Expr:
     )
     has_too_few = ca.logic_or(free_hand < len(hand), free_arm < POSE_DIMENSION)
     return ca.logic_and(has_too_few, free_hand > 0)
+
+
+def _side_parameters(layouts: HandFirstLayouts, weights: Expr) -> dict[str, Expr]:
+    """Return the additional parameters of a multi-arm robot for contacts with `weights` (f, 2)."""
+    return {"palms_are_free": _palms_are_free(layouts, weights), "palms_only": 0.0}
 
 
 def _palms_are_free(layouts: HandFirstLayouts, weights: Expr) -> Expr:
