@@ -12,6 +12,9 @@
  */
 
 /* Call the graph of the current side; only multi-arm robots have several sides. */
+#if N_SIDES > 4
+#error "OF_SIDE has cases for four sides"
+#endif
 #if N_SIDES > 1
 #define OF_SIDE(function, ...) \
   do switch (side) { \
