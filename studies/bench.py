@@ -185,7 +185,7 @@ def main(arguments: list[str] | None = None) -> None:
         run_by = command(__file__, arguments)
         for folder, name in ((options.against, "CHECKOUT"), (options.report, "REPORT")):
             run_by = run_by.replace(str(folder), name)
-        publish("Timings", parts, options.report, run_by, {"bench": code_version()})
+        publish("Benchmark", parts, options.report, run_by, {"bench": code_version()})
     if slow:
         sys.exit(
             "\n".join(f"slower than --limit {options.limit:g}: {' '.join(row)}" for row in slow)

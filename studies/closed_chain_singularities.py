@@ -93,7 +93,7 @@ def main(arguments: list[str] | None = None) -> None:
     bad = condition["paper"] > args.near
     moves = mobility(constraints(robot, q[:1])[0])
     text = f"""
-# Where the closed chain comes near singular
+# Singularities of the closed chain
 
 `{command(__file__, arguments)}`:
 {args.count} configurations of `{robot.name}` uniform within limits; lengths in units of

@@ -113,7 +113,7 @@ def main(arguments: list[str] | None = None) -> None:
 
     low, high = share < 10, share > 90
     text = f"""
-# Palm poses with the thumb held
+# Workspace of the closed chain
 
 `{command(__file__, arguments)}`:
 {args.count} thumb contacts of `{robot.name}` (from configurations uniform within limits), for each

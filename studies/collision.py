@@ -281,6 +281,7 @@ def main(arguments: list[str] | None = None) -> None:
         "--report", type=Path, default=Path("out/collision/report"), help="folder of the report"
     )
     parser.add_argument("--so-far", action="store_true", help="report what is done, run nothing")
+    parser.add_argument("--title", default="Collision-free targets", help="title of the report")
     options = parser.parse_args(arguments)
     parts = parts_of(options)
     if not options.so_far:
@@ -322,7 +323,7 @@ def main(arguments: list[str] | None = None) -> None:
     body += ["## Others", PEERS]
     body += [markdown_table(heads, peers) if peers else "Not run (`studies/peers.txt`)."]
     run_by, code = command(__file__, arguments), {"collision": codes or None}
-    publish("Free of collision", body, options.report, run_by, code, metrics)
+    publish(options.title, body, options.report, run_by, code, metrics)
 
 
 if __name__ == "__main__":

@@ -240,7 +240,7 @@ def main(arguments: list[str] | None = None) -> None:
     if options.keep:
         np.savez(options.keep, allow_pickle=False, **stored)
     run_by, code = command(__file__, arguments), {"diagnosis": code_version()}
-    publish("The verdict on what cannot be solved", parts, options.report, run_by, code)
+    publish("Diagnosis of unreachable targets", parts, options.report, run_by, code)
     print((options.report / "report.md").read_text(encoding="utf-8"))
 
 

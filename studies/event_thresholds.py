@@ -191,7 +191,7 @@ reachable; one start from `robot.home`, within limits. A row is a threshold, the
 the share of the failed and of the solved ones in which the event happened at all.
 """
     run_by = command(__file__, arguments)
-    publish("What the thresholds of events catch", [text, *parts], options.report, run_by)
+    publish("Sensitivity of event thresholds", [text, *parts], options.report, run_by)
 
 
 if __name__ == "__main__":

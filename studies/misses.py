@@ -672,13 +672,12 @@ def write_report(options: argparse.Namespace, run_by: str) -> None:
         ]
         pl.DataFrame(misses).write_csv(options.report / "misses.csv")
     code = ", ".join(sorted({codes, climbed_codes} - {""})) or None
-    title_ = "Reachable targets that hand-first misses"
-    publish(title_, body, options.report, run_by, {"misses": code}, metrics)
+    publish(options.title, body, options.report, run_by, {"misses": code}, metrics)
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Solve what is missing and write the report."""
-    parser = argparse.ArgumentParser(description="Reachable targets that hand-first misses.")
+    parser = argparse.ArgumentParser(description="Search for reachable targets that are missed.")
     parser.add_argument(
         "--robots",
         nargs="+",
@@ -710,6 +709,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--dask", metavar="ADDRESS", help="scheduler of a Dask cluster instead")
     parser.add_argument("--out", type=Path, default=Path("out/misses"), help="counts by block")
     parser.add_argument("--report", type=Path, help="folder (default: OUT/report)")
+    parser.add_argument(
+        "--title", default="Reachable targets that are missed", help="title of the report"
+    )
     options = parser.parse_args(arguments)
     options.report = options.report or options.out / "report"
     for text in options.tolerance:

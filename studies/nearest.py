@@ -129,7 +129,7 @@ def main(arguments: list[str] | None = None) -> None:
     introduction = INTRODUCTION.format(step=1e3 * options.step)
     parts = [introduction, f"Seed {options.seed}.", "## Paths", tables[0], "## Anywhere", tables[1]]
     run_by = command(__file__, arguments)
-    publish("From q0 to the nearest solution", parts, options.report, run_by)
+    publish("Distance to the nearest solution", parts, options.report, run_by)
 
 
 if __name__ == "__main__":

@@ -518,7 +518,7 @@ def main(arguments: list[str] | None = None) -> None:
     if len(done) < len(every):
         parts.append(f"Of {len(every):,} parts {len(done):,} are done so far.")
     made = command(__file__, arguments)
-    parts += ["## Where this comes from", f"`{made}`", provenance({"one_body": codes})]
+    parts += ["## Provenance", f"`{made}`", provenance({"one_body": codes})]
     write_page("Several arms as one", parts, options.out)
     write_metrics(metrics, options.out / "metrics.json")
 

@@ -236,12 +236,12 @@ def write_report(options: argparse.Namespace, run_by: str) -> None:
         markdown_table([*heads, "not proved: hand", "not proved: arm"], table),
     ]
     code = {"proofs": codes or None}
-    publish("Proofs of impossibility", body, options.report, run_by, code, metrics)
+    publish(options.title, body, options.report, run_by, code, metrics)
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Look for proofs of what is missing and write the report."""
-    parser = argparse.ArgumentParser(description="Proofs of impossibility")
+    parser = argparse.ArgumentParser(description="Proofs of UNREACHABLE.")
     parser.add_argument("--count", type=int, default=BLOCK, help="reachable targets of every case")
     parser.add_argument("--impossible", type=int, default=30, help="targets of every class")
     parser.add_argument("--minutes", type=float, default=np.inf, help="stop after so long")
@@ -258,6 +258,7 @@ def main(arguments: list[str] | None = None) -> None:
         metavar=("MM", "DEG"),
         help="impossible is what is so by this much more than the tolerance",
     )
+    parser.add_argument("--title", default="Proofs of UNREACHABLE", help="title of the report")
     options = parser.parse_args(arguments)
     options.beyond = tuple(options.beyond)
     if options.beyond != BEYOND:  # other counts, which are not to be mixed

@@ -178,7 +178,7 @@ def main(arguments: list[str] | None = None) -> None:
             [[a, str(n)] for a, n in causes.most_common(12)],
         )
     ]
-    parts += ["## As published", PUBLISHED, "## Where this comes from"]
+    parts += ["## As published", PUBLISHED, "## Provenance"]
     parts += [f"`{command(__file__, arguments)}`", provenance({"public grasps": codes})]
     write_page("Published grasps with an arm and a table", parts, options.out)
     write_metrics(metrics, options.out / "metrics.json")

@@ -150,7 +150,7 @@ def main() -> None:
             move(1)
     if not results:
         raise SystemExit(f"{options.folder}: has no checkout of a repository of {TABLE.name}")
-    parts = [*report(rows, results, options.shapes), "## Where this comes from"]
+    parts = [*report(rows, results, options.shapes), "## Provenance"]
     parts.append(f"`{command(__file__, None)}`")
     write_page("Public robot descriptions", parts, RESULTS / "public_robots")
 

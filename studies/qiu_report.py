@@ -295,7 +295,7 @@ def _run(study: Study, setting: Setting, targets: str, target: int) -> tuple[boo
 
 
 NOT_RUN = "*Not run yet.*"
-TITLE = "Table I of Qiu & Kermani 2021, measured again"
+TITLE = "Table I of Qiu & Kermani 2021"
 
 INTRODUCTION = """
 *Targets.* Each of the 12 shipped grasps (computed pinches of YCB objects) keeps its hand posture;
@@ -392,7 +392,7 @@ def write_report(studies: Sequence[Study], results: Path, folder: Path, command:
         collect(readings(cell_figures, studies[3])) if len(cell_figures) else NOT_RUN,
         "## Every object",
         collect(by_object(table)),
-        "## Where this comes from",
+        "## Provenance",
         provenance({study.name: code_of(results / study.name) for study in studies}),
         f"Seed {studies[0].seed}. Made by, and to go on where it stopped: `{command}`.",
     ]

@@ -136,7 +136,7 @@ def main(arguments: list[str] | None = None) -> None:
     text = INTRODUCTION.format(count=options.count, away=START_OFFSET)
     parts, run_by = [text, markdown_table(heads, rows)], command(__file__, arguments)
     code = {"single_precision": code_version()}
-    publish("A solver in single precision", parts, options.report, run_by, code)
+    publish("Exported solver in single precision", parts, options.report, run_by, code)
 
 
 if __name__ == "__main__":

@@ -284,7 +284,7 @@ def main(arguments: list[str] | None = None) -> None:
     peer = comparison_section(options.peer_paths, options.count, PERIOD, SHARE)
     parts = [INTRODUCTION, markdown_table(heads, rows), "## Beside dex-retargeting", *peer]
     run_by = command(__file__, arguments)
-    publish("Fingertip positions as targets", parts, options.report, run_by)
+    publish("Teleoperation accuracy", parts, options.report, run_by)
 
 
 if __name__ == "__main__":

@@ -97,7 +97,7 @@ def main(arguments: list[str] | None = None) -> None:
     title(axes, "One start: not yet solved [%]", "iterations", "not yet solved [%]")
     total = args.count * len(grasps)
     text = f"""
-# thumb-first: one start, all starts, and two ways to keep to limits
+# Thumb first: one start, restarts and limits
 
 `{command(__file__, arguments)}`: {total} targets a set on
 `{robot.name}`, 5 mm / 3 deg, limits enforced, start at home. *grasps*: hands of the {len(grasps)}

@@ -76,20 +76,17 @@ times of one thread of this machine, other programs beside it.
 """
 
 
-GOALS = {"first": 50.0, "hundred": 0.3, "rate": 300.0, "found": 95.0, "confirmed": 100.0}
-"""What is wanted of every robot: at most, where lower is better, at least, where higher is."""
-
-MISSED = """
-*Rate*: drawing hands takes a third to a half, the rest is making what is found into grasps, moving
-hands until they touch, and the arm. A Barrett hand's seven motors leave little to move once three
-fingertips touch: three of four such hands do not come to rest on the surface, and a fifth of
-those that do is unlike the others and closed; on the odd shapes of random_urdfs it finds a tenth of
-what it finds on the others. LEAP's capsules stand out by 14 to 19 mm, so that its fingers seldom
-fit beside each other. Flat things, and small round ones, leave room for few third fingers. *None*:
-objects that are wider than the hand opens, or so small that three fingers are in each other's way,
-and those that a hand can only take by a side on which palm or fingers would be in the object or the
-table. *Closed*: on round objects the normals of the nearest triangle and of the nearest sample
-differ by some degrees, which decides where a grasp is closed by little.
+DISCUSSION = """
+*Rate*: a third to a half of the time is spent on sampling hands, the remainder on refining grasps
+and on the arm. The Barrett hand has seven motors and little freedom once three fingertips touch:
+three of four such hands do not reach the surface, and a fifth of the others are distinct and
+force-closed. On the irregular shapes of random_urdfs it yields a tenth of the grasps that it
+yields on other objects. The capsules of LEAP exceed its fingers by 14 to 19 mm, so that they
+seldom fit next to each other. Flat and small round objects leave little space for a third finger.
+*None*: objects that are wider than the opening of the hand, too small for three fingers, or that
+can only be grasped from a side where palm or fingers would be in the object or the table.
+*Closed*: on round objects the normals of the nearest triangle and of the nearest sample differ by
+some degrees, which decides marginal cases.
 """
 
 
@@ -268,26 +265,6 @@ def row_of(robot: str, results: list[dict[str, Any]], metrics: list[Metric]) -> 
     return [*cells, f"{largest:.2f}", f"{sum(closed)} of {len(closed)}"]
 
 
-def goals(metrics: list[Metric]) -> str:
-    """A table: which robots meet which goals."""
-    rows: dict[str, dict[str, str]] = {}
-    for metric in metrics:
-        _, robot, name = metric.name.split("/")
-        if name in GOALS:
-            goal, lower = GOALS[name], metric.better == "lower"
-            is_met = metric.value <= goal if lower else metric.value >= goal
-            rows.setdefault(robot, {})[name] = f"{metric.value:.3g} {'met' if is_met else 'missed'}"
-    heads = [
-        f"first <= {GOALS['first']:g} ms",
-        f"100 of them <= {GOALS['hundred']:g} s",
-        f"a second >= {GOALS['rate']:g}",
-        f"found >= {GOALS['found']:g} %",
-        "all confirmed",
-    ]
-    cells = [[robot, *(values[name] for name in GOALS)] for robot, values in rows.items()]
-    return markdown_table(["robot", *heads], cells)
-
-
 def causes(results: list[tuple[Cell, dict[str, Any]]]) -> Iterator[list[str]]:
     """Robot, cause, how often and of what, where nothing was found."""
     causes, of = Counter[tuple[str, str]](), dict[tuple[str, str], set[str]]()
@@ -334,10 +311,10 @@ def main(arguments: list[str] | None = None) -> None:
     if reasons:
         table = markdown_table(["robot", "none came to", "times", "objects"], reasons)
         parts += ["## None found", table]
-    parts += ["## Goals", goals(metrics), MISSED] if metrics else []
+    parts += ["## Discussion", DISCUSSION] if metrics else []
     run_command = command(__file__, arguments)
-    parts += ["## Where this comes from", f"`{run_command}`", provenance({"touch": codes})]
-    write_page("Grasps of surfaces", parts, options.out)
+    parts += ["## Provenance", f"`{run_command}`", provenance({"touch": codes})]
+    write_page("Grasps from meshes", parts, options.out)
     write_metrics(metrics, options.out / "metrics.json")
 
 

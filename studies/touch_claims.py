@@ -422,7 +422,7 @@ def main(arguments: list[str] | None = None) -> None:
         parts.append(f"Of {len(all_cells):,} meshes before robots {len(done):,} are done so far.")
     parts += ["## Reproduction", f"`{command(__file__, arguments)}`"]
     parts.append(provenance({"touch_claims": codes}))
-    write_page("Claims of grasps of surfaces", parts, options.out)
+    write_page("Checked properties of grasps from meshes", parts, options.out)
     write_metrics(metrics, options.out / "metrics.json")
 
 

@@ -98,7 +98,7 @@ that of two grasps the one that holds more often has the higher robustness, or l
 
 def main(arguments: list[str] | None = None) -> None:
     """Hold grasps and write the report."""
-    parser = argparse.ArgumentParser(description="Do grasps of surfaces hold?")
+    parser = argparse.ArgumentParser(description="Simulate grasps in MuJoCo.")
     parser.add_argument("--robots", nargs="+", default=ROBOTS)
     parser.add_argument("--objects", nargs="+", default=ik.shipped_names("objects"))
     parser.add_argument("--limit", type=int, default=200, help="grasps that are found of an object")
@@ -107,6 +107,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--samples", type=int, default=4, help="displacements of a grasp")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=RESULTS / "touch_hold")
+    parser.add_argument("--title", default="Simulated grasps", help="title of the report")
     options = parser.parse_args(arguments)
     surfaces = [ik.load_surface(name, seed=options.seed) for name in options.objects]
     names = ", ".join(name_of(surface) for surface in surfaces)
@@ -134,10 +135,10 @@ def main(arguments: list[str] | None = None) -> None:
         markdown_table(["robot", "robustness", "held", "AUC of robustness", "AUC of load"], noisy),
         "## The best by object",
         markdown_table(["robot", "object", "grasps", "held"], objects),
-        f"## Where this comes from\n\n`{command(__file__, arguments)}`",
+        f"## Provenance\n\n`{command(__file__, arguments)}`",
         provenance({}),
     ]
-    write_page("Do grasps of surfaces hold?", parts, options.out)
+    write_page(options.title, parts, options.out)
     write_metrics(metrics, options.out / "metrics.json")
 
 

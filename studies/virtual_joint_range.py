@@ -97,7 +97,7 @@ def main(arguments: list[str] | None = None) -> None:
 
     is_outer = r > np.quantile(r, 0.75)
     text = f"""
-# How far the virtual joint can be turned
+# Range of the virtual joint
 
 `{command(__file__, arguments)}`:
 {args.count} arms of `{robot.name}` uniform within limits, the hand at home; the palm is turned

@@ -142,7 +142,7 @@ def publish(
         code: See `provenance`.
         metrics: Figures; without any there is no file of them.
     """
-    end = ["## Where this comes from", f"`{run_by}`", provenance(code or {})]
+    end = ["## Provenance", f"`{run_by}`", provenance(code or {})]
     write_page(title, [*parts, *end], folder)
     if figures := list(metrics):
         write_metrics(figures, folder / "metrics.json")
