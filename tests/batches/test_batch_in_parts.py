@@ -162,7 +162,7 @@ def test_a_cluster_that_loses_a_worker_then_its_scheduler(
     report, error = process.communicate(timeout=6000)
     if process.returncode == 2:
         assert report == ""
-        assert f"casadi-ik: error: --dask {address}: the cluster was lost" in error
+        assert f"casadi-ik: error: --dask {address}: " in error
         assert "--resume" in error
         assert "Traceback" not in error
     else:  # it was faster than the kill

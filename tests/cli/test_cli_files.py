@@ -70,7 +70,7 @@ def test_read_only(option: str, run: Command, grasp_file: GraspFile, tmp_path: P
 @pytest.mark.usefixtures("unsolved")
 def test_special_files_are_left_alone(run: Command, grasp_file: GraspFile) -> None:
     error = run("solve", grasp_file(), *FAST, "--out", "/dev/null").error
-    assert "not a regular file" in error
+    assert error.startswith("/dev/null: ")
     assert not Path("/dev/null").is_file()
 
 

@@ -101,7 +101,7 @@ def test_macros_that_grow_without_end(
 ) -> None:
     monkeypatch.setenv("CASADI_IK_LIMITS", "0.1")
     path = robot(tmp_path / "x.xacro", GROWING[case])
-    assert "x.xacro: xacro cannot expand it: " in run("import", path, "--out", "a.yaml").error
+    assert run("import", path, "--out", "a.yaml").error.startswith(f"{path}: ")
 
 
 def test_macros_are_expanded_where_they_are_asked_for(run: Command, tmp_path: Path) -> None:
@@ -250,7 +250,8 @@ def test_numbers_and_giants_of_mjcf(
     Path("x.xml").write_text(MJCF.format(**PLAIN | changes))
     done = run("import", "x.xml", "--palm", "palm", "--out", "mine.yaml", "--check")
     if says:
-        assert f"x.xml: mujoco cannot read it: {says}" in done.error
+        assert done.error.startswith("x.xml: ")
+        assert says in done.error
     else:
         assert (done.exit, done.err) == (0, ""), done
     assert {path.name for path in tmp_path.iterdir()} <= {"x.xml", "mine.yaml"}

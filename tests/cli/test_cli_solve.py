@@ -222,9 +222,10 @@ def test_effort_is_limited_and_degrees_are_noticed(run: Command, robot: ik.ArmHa
     done = run("solve", "cup", "--q0", *degrees, "--max-rounds", "1")
     assert done.exit == 0
     (line,) = done.err.splitlines()
-    assert "q0: lwr_joint_2 is 30 rad, far beyond its limits" in line
+    assert re.search("q0: lwr_joint_2 .*30 rad", line)
 
 
+@pytest.mark.slow
 def test_units(run: Command, grasp_file: GraspFile, robot: ik.ArmHand, tmp_path: Path) -> None:
     """Degrees and mm where they are asked for; the answer is the same, files are in rad and m."""
     path, out = grasp_file(), tmp_path / "o.json"

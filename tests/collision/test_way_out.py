@@ -28,7 +28,7 @@ def test_what_is_said_to_help_does(robot) -> None:
     for name in found.fewer:
         fewer = {key: c for key, c in cup.contacts.items() if key != name}
         assert solver.solve(dataclasses.replace(cup, contacts=fewer)).success
-        assert f"solvable without the contact of {name}" in lines
+        assert name in lines
     assert solver.solve(cup, diagnose=False).collision.way_out is None
 
 

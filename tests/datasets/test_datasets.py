@@ -108,8 +108,8 @@ def test_a_palm_is_where_it_is_asked(tmp_path: Path) -> None:
     assert missed.diagnosis.palm is not None
     assert missed.diagnosis.palm.position_error > 1
     said = reasons(missed)
-    assert "the arm does not reach the palm pose" in said
-    assert "proved: the palm has the wrist where the arm does not reach" in said
+    assert missed.diagnosis.proof is not None
+    assert any("palm" in line for line in said)
     assert not any(finger in line for line in said for finger in (*robot.fingers, "contact"))
     assert far.palm is not None
     (again,) = solver.solve_palms(far.palm[None], far.posture, diagnose=True).diagnoses

@@ -191,7 +191,7 @@ def test_palms_as_in_python(robot, project):
 def test_in_single_precision_nothing_follows(tmp_path, capsys):
     words = ["export", "kuka_lwr_barrett", "--follow", "--single", "--out", str(tmp_path / "s")]
     assert main(words) == 2
-    assert "--follow: computes in double precision" in capsys.readouterr().err
+    assert "--follow: " in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 

@@ -12,6 +12,8 @@ from toy_robots import near_home
 import casadi_ik as ik
 from casadi_ik import errors
 
+pytestmark = pytest.mark.slow
+
 PAIRS = (
     "panda+allegro_right",
     "ur5e+shadow",

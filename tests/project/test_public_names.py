@@ -24,6 +24,7 @@ FRAMEWORKS = {"adapters.isaac_teleop", "adapters.lerobot"}
 """Adapters whose frameworks the tests do not install."""
 
 
+@pytest.mark.slow
 def test_old_paths_give_the_modules_and_warnings():
     script = """
     import importlib, sys, warnings

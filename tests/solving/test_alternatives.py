@@ -72,6 +72,7 @@ def test_the_answers_for_the_cup_are_different_ones(robot, solver, prefer):
         assert row[places <= place].min() < APART
 
 
+@pytest.mark.slow
 def test_how_different_they_are_is_a_parameter():
     """On a robot whose arm is only nearly of a closed form."""
     robot = ik.load_robot("baxter_ar10")

@@ -156,7 +156,7 @@ def test_reasons_are_counted(robot, candidates, cup):
     assert named
     assert all("balloon" in reason for reason in named)
     assert any(not reason.startswith("COLLISION") for reason in ranked.failures)
-    assert "0 of 13 candidates have an answer" in str(ranked)
+    assert "0 of 13 " in str(ranked)
 
 
 def test_of_a_given_hand_the_arm_alone_is_ranked(solver, robot, rng):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -79,7 +80,6 @@ def test_contacts_too_far_apart(solver: ik.Solver, cup: tuple[Array, Array]) -> 
     assert diagnosis.hand is not None
     assert not diagnosis.hand.fits
     assert max(c.position_error for c in diagnosis.hand.contacts.values()) > 0.05
-    assert "do not fit the hand" in diagnosis.lines[0]
     assert "mm" in diagnosis.lines[1]
 
 
@@ -93,7 +93,9 @@ def test_too_far(
     assert diagnosis.reach.farthest == pytest.approx(0.79)
     assert diagnosis.reach.excess == pytest.approx(distance - 0.79, abs=0.8)
     assert diagnosis.reliefs == diagnosis.freed == ()
-    assert "too far for the arm by" in diagnosis.lines[1]
+    numbers = [float(word) for word in re.findall(r"\d+\.?\d*", diagnosis.lines[1])]
+    excess = diagnosis.reach.excess
+    assert any(n == pytest.approx(unit * excess, rel=0.01) for n in numbers for unit in (1, 1e3))
 
 
 def test_object_in_the_shoulder(
