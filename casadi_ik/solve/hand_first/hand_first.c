@@ -194,29 +194,19 @@ static void move_to_nearest_turns(search *job) {
 }
 #endif
 
-/* Continue after the iterations of a target have ended, or begin a new target. Returns GOES_ON
- * after starting a restart, DONE with the answer, or SLICE_OVER if the restart quota of this call
- * is used up. */
-static int follow(void *method, int64_t slot, int64_t solve, int32_t *status) {
-  search *job = method;
-  int code = DONE, continues = *status == UNBEGUN;
-  (void) slot, (void) solve;
-  if (*status != SOLVED_STATUS) {
-    if (!job->restart_quota) return SLICE_OVER;
+/* Begin a new target with restart 0. */
+static void begin_target(search *job) {
 #if N_TURNING
-    if (continues) remove_full_turns(job);
+  remove_full_turns(job);
 #endif
-    if (continues) job->round = job->preference_dropped = job->incumbent_count = 0;
-    else continues = next_restart(job);
-  }
-  if (continues) {
-    --job->restart_quota;
-    code = start_restart(job);
-    return code == DONE ? GOES_ON : code;
-  }
-  job->status = *status == RUNNING ? ITERATION_LIMIT_STATUS
-              : *status == REPEATED ? STALLED_STATUS
-              : *status < 0 ? INVALID_STATUS : *status;
+  job->round = job->preference_dropped = job->incumbent_count = 0;
+}
+
+/* Write the result of a target whose iterations ended with a status. */
+static int finish_target(search *job, int32_t status) {
+  job->status = status == RUNNING ? ITERATION_LIMIT_STATUS
+              : status == REPEATED ? STALLED_STATUS
+              : status < 0 ? INVALID_STATUS : status;
   if (job->preference_dropped) job->terms[TERMS_NEAREST] = 1.0;
   memcpy(job->q, job->state + STATE_Q, sizeof job->q);
 #if N_TURNING
@@ -225,7 +215,27 @@ static int follow(void *method, int64_t slot, int64_t solve, int32_t *status) {
   job->restarts = (int64_t) job->state[STATE_CANDIDATES_BEFORE]
                 + (int64_t) clipped((double) (int64_t) job->state[STATE_CANDIDATE], 0.0,
                                     N_CANDIDATES - 1);
-  if (!N_EXTRA_VECTORS && job->has_verdict) code = judge(job);
+  return !N_EXTRA_VECTORS && job->has_verdict ? judge(job) : DONE;
+}
+
+/* Decide what follows when the iterations of a target have ended, or before they begin (UNBEGUN).
+ * Returns GOES_ON after starting a restart, DONE with the result, or SLICE_OVER if the restart
+ * quota of this call is used up. */
+static int follow(void *method, int64_t slot, int64_t solve, int32_t *status) {
+  search *job = method;
+  int code, needs_restart = 0;
+  (void) slot, (void) solve;
+  if (*status != SOLVED_STATUS) {
+    if (!job->restart_quota) return SLICE_OVER;
+    needs_restart = *status == UNBEGUN || next_restart(job);
+    if (*status == UNBEGUN) begin_target(job);
+  }
+  if (needs_restart) {
+    --job->restart_quota;
+    code = start_restart(job);
+    return code == DONE ? GOES_ON : code;
+  }
+  code = finish_target(job, *status);
   *status = (int32_t) job->status;
   return code;
 }
