@@ -70,7 +70,7 @@ def draw_run(
     style: str,
     axes: tuple[int, int] = (1, 2),
 ) -> None:
-    """A run's path in millimetres and its norm over the steps."""
+    """Draw the path of a run [mm] and its norm over the steps."""
     x, y = (1e3 * run.points[:, i] for i in axes)
     path.plot(x, y, style, color=color, ms=3, marker=".", lw=1.2, label=label or None)
     norms.semilogy(np.maximum(run.error_norm, 1e-12), style, color=color, lw=1.4)
@@ -317,7 +317,7 @@ on how far the wanted pose is from the family, which is assumed here and not pub
 def null_space(
     robot: ik.ArmHand, goals: int, rng: np.random.Generator, gains: Sequence[float]
 ) -> str:
-    """What the task leaves free keeps the sliders away from their limits."""
+    """Compare slider positions with and without the use of redundancy."""
     task = ik.papers.ScrewTask("distance", "thumb", relative_to="index")
     used_motors = [
         i for i, name in enumerate(robot.actuators) if name.startswith(("thumb", "index"))
@@ -359,7 +359,7 @@ the distance never notices.
 
 
 def requested_part(kind: str, pose: Array, point: Array) -> dict[str, Array]:
-    """The part of a relative pose that a task asks for."""
+    """Return the part of a relative pose that a task constrains."""
     parts = {"pose": pose, "point": point, "distance": np.array(np.linalg.norm(point))}
     return {name: parts[name] for name in (kind if kind != "position" else "point",)}
 

@@ -86,7 +86,7 @@ class Worker:
 
 @contextmanager
 def worker(package: Path, targets: str) -> Iterator[Worker]:
-    """A worker while it is needed."""
+    """Start a worker and stop it at the end of the context."""
     if not (package / "casadi_ik").is_dir():
         raise InputError(f"--against: found no folder casadi_ik in {package}, expected a checkout")
     started = Worker(package.resolve(), targets)
@@ -117,7 +117,7 @@ def measured(
 def rows_of(
     case: Case, own_results: list[dict[str, float]], theirs: list[dict[str, float]]
 ) -> Iterator[list[str]]:
-    """A row per quantity of a case."""
+    """Return a row for each quantity of a case."""
     label = " ".join(map(str, case[2:]))
     for name in own_results[0] if own_results else ():
         best = min(values[name] for values in own_results)

@@ -58,7 +58,7 @@ CYCLES, PERIOD = 500, 1e-3
 
 
 def shared(name: str, make: Callable[[], Any]) -> Any:
-    """What is made once for all processes of a run: by the first that asks."""
+    """Return a folder that the first caller fills for all processes of a run."""
     folder = os.environ.get(SHARED)
     if folder is None:
         return make()
@@ -228,7 +228,7 @@ def choose(robot: str, grasp_kind: str, around: str) -> Callable[[], Quantities]
 
 
 def follow(robot: str) -> Callable[[], Quantities]:
-    """A cycle of a follower of a slow motion."""
+    """Measure a cycle of a follower of a slow motion."""
     solver = ik.Solver(ik.load_robot(robot))
     arm_hand, rng = solver.robot, np.random.default_rng(0)
     middle, half_range = (
@@ -252,7 +252,7 @@ def follow(robot: str) -> Callable[[], Quantities]:
 
 
 def diagnosis(robot: str, kind: str, count: int) -> Callable[[], Quantities]:
-    """What the reason costs where there is no solution."""
+    """Measure the cost of a diagnosis for unsolved targets."""
     solver, rng = ik.Solver(ik.load_robot(robot)), np.random.default_rng(0)
     points, normals = sampled_contacts(solver.robot, "random", count)
     if kind == "far":
@@ -277,7 +277,7 @@ def diagnosis(robot: str, kind: str, count: int) -> Callable[[], Quantities]:
 
 
 def methods(robot: str, method: str, step: str) -> Callable[[], Quantities]:
-    """An iteration of a method on shipped grasps."""
+    """Measure an iteration of a method on built-in grasps."""
     arm_hand = ik.load_robot(robot)
     solver = ik.Solver(arm_hand, method, finger_step=step or None)
     iterations = 1 if step == "ipopt" else 10
@@ -398,7 +398,7 @@ print(imported - begin, time.perf_counter() - imported)
 
 
 def first_use(robot: str, ask: str, method: str) -> Callable[[], Quantities]:
-    """A new process to its first answer, with an empty cache of kernels and with a full one."""
+    """Measure a new process until its first solution, with an empty and with a full cache."""
 
     def measure() -> Quantities:
         with tempfile.TemporaryDirectory() as place:
@@ -430,7 +430,7 @@ def _children() -> float:
 
 
 def export(robot: str, target: str, *flags: str) -> Callable[[], Quantities]:
-    """The exported solver, built with the machine's compiler."""
+    """Measure the exported solver, built with the compiler of the machine."""
     folder = Path(tempfile.mkdtemp(prefix="casadi_ik-bench-")) / "solver"
     words = [robot, "--out", str(folder), "--target", target, "--prefix", "arm", *flags]
     _run(sys.executable, "-m", "casadi_ik", "export", *words)
@@ -471,7 +471,7 @@ def _run(*words: str, folder: Path | None = None) -> str:
 
 
 def logs(robot: str, method: str, compression: str, count: int) -> Callable[[], Quantities]:
-    """A batch with a log of every iteration over one without; its size; reading it."""
+    """Measure a batch with and without a log, the size of the log, and reading it."""
     settings: dict[str, Any] = {}
     if method != "hand-first":
         settings, count = {"finger_step": "closed-form", "limits": "ignore"}, max(count // 25, 12)

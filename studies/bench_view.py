@@ -98,7 +98,7 @@ def measure(target: str, painted: bool, flow: bool) -> Quantities:
 
 
 def browser_tools() -> ModuleType:
-    """The tests' browser, which studies use as well."""
+    """Return the module of the browser that the tests use."""
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
     try:
         tools = importlib.import_module("browser")
@@ -109,7 +109,7 @@ def browser_tools() -> ModuleType:
 
 
 def _opened(browser: Any, url: str, *scripts: str) -> Any:
-    """A page with scripts before its own."""
+    """Open a page with scripts that run first."""
     page = browser.open("about:blank", 1280, 800)
     for script in scripts:
         page.call("Page.addScriptToEvaluateOnNewDocument", source=script)
@@ -134,7 +134,7 @@ def _cpu_times(browser: Any) -> Quantities:
 
 @contextmanager
 def _cpu_of(browser: Any, steps: int, quantities: Quantities, *kinds: str) -> Iterator[None]:
-    """Notes what steps take of each processor, a step [ms]."""
+    """Record the processor time of a step by kind of process [ms]."""
     times_before = _cpu_times(browser)
     yield
     after = _cpu_times(browser)
@@ -169,7 +169,7 @@ def _drag(
 def _on_view(
     _: str, browser: Any, steps: int, painted: bool, pause: float
 ) -> tuple[list[dict[str, float]], Quantities]:
-    """A drag on the page of `casadi-ik view`; what of it are the server's and the solver's."""
+    """Drag on the page of `casadi-ik view`; return the shares of server and solver."""
     viewing = importlib.import_module("casadi_ik.app.viewer")
     robot, grasp = ik.load_robot("kuka_lwr_barrett"), ik.load_grasp("cup")
     viewer = viewing.view_grasp(robot, grasp, scene=ik.load_scene("table"))
@@ -222,7 +222,7 @@ def _on_view(
 def _on_page(
     path: str, browser: Any, steps: int, painted: bool, pause: float
 ) -> tuple[list[dict[str, float]], Quantities]:
-    """A drag on the page without a server."""
+    """Drag on the page without a server."""
     url, scripts = Path(path).resolve().as_uri(), [] if painted else [NO_PAINTING]
     page = _opened(browser, url, *scripts)
     page.wait("globalThis.casadiIk?.now.answer && !casadiIk.viewport.framePending", 60.0)

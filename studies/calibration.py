@@ -296,7 +296,7 @@ made up for by the reference angles.
 
 
 def loss_table(results: dict[tuple[str, float], Trials]) -> str:
-    """A row per loss and part of outliers."""
+    """Return a table with a row for each loss and fraction of outliers."""
     rows = [
         (f"{100 * outliers:.0f} %", loss, f"{t.coverage():.1f} %", spread(t.misses),
          f"{np.median(t.noise):.2f}", f"{100 * t.converged.mean():.0f} %")
@@ -307,7 +307,7 @@ def loss_table(results: dict[tuple[str, float], Trials]) -> str:
 
 
 def size_table(sizes: dict[int, Trials]) -> str:
-    """A row per number of poses."""
+    """Return a table with a row for each number of poses."""
     rows = [
         (str(count), f"{t.coverage():.1f} %", spread(t.misses), spread(t.described))
         for count, t in sizes.items()
@@ -318,7 +318,7 @@ def size_table(sizes: dict[int, Trials]) -> str:
 
 
 def group_table(result: Trials) -> str:
-    """A row per kind of number."""
+    """Return a table with a row for each kind of parameter."""
     learned, parts = result.last.learned, [p.part for p in result.last.parameters]
     names = {
         "coupling": "triangles and four-bar",
@@ -338,7 +338,7 @@ def group_table(result: Trials) -> str:
 
 
 def direction_table(estimate: Calibration) -> str:
-    """The weakest directions of an estimate."""
+    """Return a table of the weakest directions of an estimate."""
     rows = [
         ("0" if value < 1e-6 else f"{value:.3f}",
          ", ".join(f"{part:+.2f} {name}" for name, part in list(names.items())[:5]))

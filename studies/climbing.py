@@ -136,13 +136,13 @@ def climb(solvers: dict[str, ik.Solver], path: Path, seconds: float, seed: int) 
 
 
 def read_search(path: Path) -> dict[str, Any]:
-    """What a search has come to: see `climb`."""
+    """Return the stored state of a search (see `climb`)."""
     stored = json.loads(path.read_text(encoding="utf-8"))
     return stored["search"] | {"code": stored["code"]}
 
 
 def _random_steps(robot: ik.ArmHand, q: Array, rng: np.random.Generator) -> Array:
-    """Steps from configurations (k, n): of some motors, of any size, some of them to a limit."""
+    """Return random steps from configurations (k, n), some of them to a limit."""
     ranges = robot.upper - robot.lower
     size = 10.0 ** rng.uniform(-4, 0, (len(q), 1))
     is_changed = rng.random(q.shape) < rng.uniform(0.1, 1, (len(q), 1))

@@ -113,7 +113,7 @@ class Part:
 
 @cache
 def the_check() -> tuple[ik.ArmHand, CollisionQuery, CoalOracle]:
-    """The robot, what it is checked against, and the same by coal; made once in a process."""
+    """Return the robot, its check and the same check with coal; built once per process."""
     robot = ik.load_robot(ROBOT)
     (grasp,) = grasps_of(robot, *robot.contacts(robot.home[None]))
     around = surroundings(SceneCheck(robot, ik.Scene(SCENE)), robot, grasp)
@@ -121,7 +121,7 @@ def the_check() -> tuple[ik.ArmHand, CollisionQuery, CoalOracle]:
 
 
 def solve(part: Part) -> dict[str, Any]:
-    """What comes of a part."""
+    """Return the results of a part."""
     if part.what == "choice":
         return solve_piece(part.piece)
     if part.what == "mink":
@@ -206,7 +206,7 @@ def check(count: int, timed: int, seed: int) -> tuple[list[list[str]], str]:
 
 
 def agreement(done: list[dict[str, int]]) -> tuple[str, Metric]:
-    """A sentence on agreement with coal, and its figure."""
+    """Return a sentence on the agreement with coal, and its metric."""
     keys = ("checked", "free", "others", "falsely_free", "falsely_touching")
     total = {key: sum(result[key] for result in done) for key in keys}
     table = the_check()[1].table
@@ -222,7 +222,7 @@ def agreement(done: list[dict[str, int]]) -> tuple[str, Metric]:
 
 
 def peer_rows(done: Iterable[tuple[Part, dict[str, Any]]]) -> list[list[str]]:
-    """What mink did."""
+    """Return the rows of mink."""
     rows = []
     for part, results in done:
         targets = results["targets"]
@@ -237,7 +237,7 @@ def peer_rows(done: Iterable[tuple[Part, dict[str, Any]]]) -> list[list[str]]:
 def choice_row(
     robot: str, clutter: int, targets: list[dict[str, Any]], metrics: list[Metric]
 ) -> list[str]:
-    """A robot's row at a clutter: completeness and times."""
+    """Return the row of a robot and clutter: completeness and times."""
     statuses = Counter(result["status"] for result in targets)
     solved, missed = statuses["SOLVED"], sum(result["missed"] for result in targets)
     name = f"collision/{robot}/{clutter}"

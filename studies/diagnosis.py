@@ -47,7 +47,7 @@ def at_limits(
 
 
 def straight(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
-    """The middle joint of the arm almost at zero, by 1e-3 to 0.03 rad: an elbow is stretched."""
+    """Return configurations with a nearly straight elbow, by 1e-3 to 0.03 rad."""
     q = at_limits(robot, rng, count, 0.3)
     arm = list(robot.description.arm_actuators)
     bend = 10.0 ** rng.uniform(-3, -1.5, count) * rng.choice([-1, 1], count)
@@ -57,7 +57,7 @@ def straight(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
 
 
 def wide_open(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
-    """The hand's motors at their lower limits, or up to 1e-3 of their range from them."""
+    """Return configurations with an open hand, up to 1e-3 of the range from the limits."""
     q, hand = robot.random(rng, count), list(robot.description.hand_actuators)
     offsets = 1e-3 * rng.random((count, len(hand))) * (robot.upper - robot.lower)[hand]
     q[:, hand] = robot.lower[hand] + offsets

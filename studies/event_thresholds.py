@@ -107,7 +107,7 @@ def trials(block: Any, factors: Sequence[float] = FACTORS) -> Iterator[Trial]:
 
 
 def caught(blocks: Sequence[Any], trial: Trial) -> Caught:
-    """What a rule catches, from a log written by it."""
+    """Return the events that a rule detects in a log."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "log.mcap"
         robot = blocks[0].robot
@@ -134,7 +134,7 @@ def targets_of(robot: ik.ArmHand, count: int, seed: int) -> tuple[np.ndarray, np
 
 
 def section(solver: ik.Solver, count: int, seed: int, factors: Sequence[float]) -> str:
-    """The table of one method on one robot, as Markdown."""
+    """Return the table of a method on a robot, as Markdown."""
     stored: Any = StoredBlocks()
     targets = targets_of(solver.robot, count, seed)
     batch = solver.solve_batch(*targets, seed=seed, log=stored)

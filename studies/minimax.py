@@ -96,7 +96,7 @@ class MinimaxProgram:
         self._upper = np.concatenate([np.zeros(2 * f), description.joint_upper])
 
     def nearest(self, points: Array, normals: Array, starts: Array) -> Nearest:
-        """The smallest factor from some starts; the first that is at most 1 ends the search.
+        """Return the smallest factor of several starts; stop at the first one that is at most 1.
 
         Args:
             points: (f, 3) [m].

@@ -178,7 +178,7 @@ class Part:
 
 
 def tolerance_of(text: str) -> ik.Tolerance:
-    """Reads "default", one number of metres and of radians, or two, "METRES,RADIANS"."""
+    """Read "default", one number of metres and of radians, or two, "METRES,RADIANS"."""
     if text == "default":
         return ik.Tolerance()
     try:
@@ -191,7 +191,7 @@ def tolerance_of(text: str) -> ik.Tolerance:
 
 
 def tolerance_name(text: str) -> str:
-    """A tolerance in the units in which it is a plain number."""
+    """Return a tolerance as text in convenient units."""
     one = tolerance_of(text)
     if one.position < 1e-4:
         return f"{one.position:.2g} m, {one.angle:.2g} rad".replace("e-0", "e-")
@@ -200,7 +200,7 @@ def tolerance_name(text: str) -> str:
 
 @cache
 def load(name: str) -> ik.ArmHand:
-    """A shipped robot, or one of `ARTIFICIAL_ROBOTS`."""
+    """Load a built-in robot, or one of `ARTIFICIAL_ROBOTS`."""
     return ik.load_robot(ARTIFICIAL_ROBOTS.get(name, name))
 
 
@@ -395,7 +395,7 @@ def search(climb_part: Climb) -> dict[str, Any]:
 
 
 def causes(robot: ik.ArmHand, tolerance: ik.Tolerance, q: Array) -> list[str]:
-    """The row of a table for configurations (k, n) whose contacts were missed."""
+    """Return a row on the causes for configurations (k, n) whose contacts were missed."""
     points, normals = robot.contacts(q)
     solver = ik.Solver(robot, tolerance=tolerance)
     batch = solver.solve_batch(points, normals)
@@ -435,7 +435,7 @@ Row = dict[str, Any]
 
 
 def rows_of(options: argparse.Namespace) -> tuple[list[Row], str]:
-    """What was found by robot, kind and tolerance (many robots: all kinds together), and codes."""
+    """Return results by robot, kind and tolerance (many robots: kinds combined), and codes."""
     done, codes = read_parts(options.out, parts_of(options))
     has_many_robots = len(robots_of(options.robots)) > 2 * len(ROBOTS)
     groups: dict[tuple[str, str, str], list[tuple[Part, Row]]] = {}
@@ -513,7 +513,7 @@ def displaced_table(options: argparse.Namespace, metrics: list[Metric]) -> list[
 
 
 def climbed_rows(options: argparse.Namespace) -> tuple[list[Row], str]:
-    """The same of the climbing search."""
+    """Return the rows of the climbing search, and codes."""
     rows: list[Row] = []
     codes = set[str]()
     for robot in robots_of(options.robots) if "climb" in options.sampler else ():
@@ -549,7 +549,7 @@ def _first(row: Row, metrics: list[Metric]) -> list[str]:
 
 
 def table_of(rows: list[Row], metrics: list[Metric]) -> str:
-    """The table of what was drawn."""
+    """Return the table of the sampled targets."""
     heads = ["robot", "targets", "tolerance", "n", "missed", "solved %", "iterations", "most"]
     heads += ["restarted %", "most restarts", "median [us]", "99 %", "worst", "mean"]
     heads += ["ratio, random", "largest"] if "ratio" in rows[0] else []
@@ -566,7 +566,7 @@ def table_of(rows: list[Row], metrics: list[Metric]) -> str:
 
 
 def climbed_table(rows: list[Row], metrics: list[Metric]) -> str:
-    """The table of the climbing search."""
+    """Return the table of the climbing search."""
     heads = ["robot", "targets", "tolerance", "n", "missed", "solved %", "minutes"]
     lines = [
         [

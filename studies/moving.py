@@ -108,7 +108,7 @@ def _smooth(solver: ik.Solver, path: Array) -> dict[str, Any]:
 
 
 def track(solver: ik.Solver, number: int) -> dict[str, Any]:
-    """A path as a known one, and processor time of each call of a follower on it.
+    """Track a known path, and measure each call of a follower on it.
 
     The same calls do the same: the least of `TIMES` runs counts, since what differs is where the
     processor was taken away and had to come back to its caches, which falls on other calls.
@@ -182,7 +182,7 @@ def _limit_use(what: str, follower: ik.motion.Follower, q: Array) -> dict[str, f
 
 
 def follow_lost_path(solver: ik.Solver, number: int) -> dict[str, Any]:
-    """A lost path with other limits: the shares of cycles within tolerance.
+    """Follow a lost path with other limits; return the shares of cycles within tolerance.
 
     Args:
         solver: On the robot.
@@ -239,7 +239,7 @@ class Part:
 
 @cache
 def _ready(robot: str) -> ik.Solver:
-    """A solver whose kernels are compiled."""
+    """Return a solver with compiled kernels."""
     solver = ik.Solver(ik.load_robot(robot))
     measure(solver, 0)
     return solver
@@ -287,7 +287,7 @@ of a motor between two of them; the follower's is its largest step of a cycle ti
 
 
 def tables(robot: str, rows: dict[str, Array], tracks: list[dict[str, Any]]) -> list[list[str]]:
-    """A robot's rows of the tables: followed, limits, solved anew, known paths."""
+    """Return the rows of a robot: followed, limits, solved anew, known paths."""
     is_lost = rows["met"] < 1
     calls = (
         1e6 * np.concatenate([result["calls"] for result in tracks])

@@ -40,7 +40,7 @@ answer. *Anywhere:* random targets from random configurations. *CPU time* of a s
 
 
 def path(robot: ik.ArmHand, rng: np.random.Generator, steps: int, step: float) -> Array:
-    """Configurations (steps, n) whose contacts move by about `step` [m] from one to the next."""
+    """Return configurations (steps, n) whose contacts move by about `step` [m] each."""
     ranges = robot.upper - robot.lower
     start = robot.lower + ranges * rng.uniform(0.3, 0.7, len(ranges))
     direction = rng.normal(size=len(ranges)) * ranges

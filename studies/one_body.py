@@ -119,7 +119,7 @@ class Cell:
 
 
 def draw_configurations(robot: ArmHand, count: int, near: bool, seed: int) -> np.ndarray:
-    """(count, n) configurations within limits."""
+    """Draw (count, n) configurations within limits."""
     rng = np.random.default_rng(seed)
     part = rng.random((count, len(robot.lower)))
     if near:
@@ -129,7 +129,7 @@ def draw_configurations(robot: ArmHand, count: int, near: bool, seed: int) -> np
 
 
 def batch(cell: Cell, robot: ArmHand) -> dict[str, Any]:
-    """How many targets of a part are missed, and the time [s] that it takes."""
+    """Count the missed targets of a part, and measure the time [s]."""
     near_limits = cell.task == "near limits"
     solver = ik.Solver(robot, tolerance=TOLERANCES[cell.tolerance])
     solver.solve_batch(
@@ -149,7 +149,7 @@ def batch(cell: Cell, robot: ArmHand) -> dict[str, Any]:
 
 
 def solve_singly(cell: Cell, robot: ArmHand) -> dict[str, Any]:
-    """Median time [us] of one target by itself."""
+    """Return the median time of a single target [us]."""
     fast, seconds = ik.Solver(robot).fast(), []
     targets = zip(
         *robot.contacts(draw_configurations(robot, cell.count, False, cell.seed)), strict=True
@@ -162,12 +162,12 @@ def solve_singly(cell: Cell, robot: ArmHand) -> dict[str, Any]:
 
 
 def row(*cells: str) -> dict[str, Any]:
-    """A result that is a row of its table as it is."""
+    """Return a result with a single row."""
     return {"rows": [list(cells)]}
 
 
 def follow_path(_cell: Cell, robot: ArmHand) -> dict[str, Any]:
-    """A smooth path of all motors, followed: times [us], and error [mm]."""
+    """Follow a smooth path of all motors; return times [us] and error [mm]."""
     span, phase = robot.upper - robot.lower, np.arange(len(robot.lower))
     times = np.arange(3000)[:, None]
     swing = 0.1 * span * np.sin(0.001 * times + phase) * np.minimum(1.0, times / 1000)
@@ -184,7 +184,7 @@ def follow_path(_cell: Cell, robot: ArmHand) -> dict[str, Any]:
 
 
 def cross_hands(_cell: Cell, robot: ArmHand) -> dict[str, Any]:
-    """Hands led to each other's place and back, through each other, followed in a scene."""
+    """Move each hand to the position of the other and back, in a scene."""
     sides = robot.description.sides
     if len(sides) != 2 or not robot.description.shapes.capsules:
         return {"rows": []}
@@ -212,20 +212,20 @@ def cross_hands(_cell: Cell, robot: ArmHand) -> dict[str, Any]:
 
 
 def grasp(robot: ArmHand, points: Array, normals: Array) -> ik.Grasp:
-    """Contacts (f, 3) of all fingers."""
+    """Return a grasp with contacts (f, 3) of all fingers."""
     contacts = zip(robot.fingers, points, normals, strict=True)
     return ik.Grasp(name="target", contacts={f: ik.Contact(p, n) for f, p, n in contacts})
 
 
 def clearance_of(solver: ik.Solver, q: Array) -> Array:
-    """(k,) how far configurations are from touching anything [m]; < 0: they do."""
+    """Return the clearances of configurations (k,) [m]; negative in collision."""
     clearance = solver.check(q, grasp(solver.robot, *solver.robot.contacts(solver.robot.home)))
     assert clearance is not None
     return clearance.surplus
 
 
 def untouched(solver: ik.Solver, count: int, seed: int) -> Array:
-    """(count, n) random configurations that touch nothing; none where they are too rare."""
+    """Return (count, n) random collision-free configurations; none if they are too rare."""
     configurations = np.zeros((0, len(solver.robot.lower)))
     for number in range(1000):
         samples = draw_configurations(solver.robot, 1000, False, seed + number)
@@ -238,7 +238,7 @@ def untouched(solver: ik.Solver, count: int, seed: int) -> Array:
 
 
 def solve_collision_free(cell: Cell, robot: ArmHand) -> dict[str, Any]:
-    """Targets made by configurations that touch nothing: answers that touch nothing either."""
+    """Solve targets of collision-free configurations without collision."""
     if not robot.description.shapes.capsules:
         return {"rows": []}
     solver, plain, count = ik.Solver(robot, scene=ik.Scene()), ik.Solver(robot), cell.count
@@ -256,7 +256,7 @@ def solve_collision_free(cell: Cell, robot: ArmHand) -> dict[str, Any]:
 
 
 def solve_out_of_reach(cell: Cell, robot: ArmHand) -> dict[str, Any]:
-    """Targets moved away from the base until they are just out of reach."""
+    """Solve targets that are moved away from the base until just out of reach."""
     solver, sides = ik.Solver(robot), robot.description.sides
     points, normals = robot.contacts(draw_configurations(robot, cell.count, False, cell.seed))
     directions = np.zeros_like(points)
@@ -297,7 +297,7 @@ def solve_out_of_reach(cell: Cell, robot: ArmHand) -> dict[str, Any]:
 def around(
     points: Array, normals: Array, count: int, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """(count, f, 3) contacts and normals, evenly spread over what the tolerance allows."""
+    """Draw (count, f, 3) contacts and normals uniformly within the tolerance."""
     tolerance = ik.Tolerance()
     shift, tangent = rng.standard_normal((2, count, *points.shape))
     shift /= np.linalg.norm(shift, axis=2, keepdims=True)
@@ -312,7 +312,7 @@ def around(
 def random_search(
     solver: ik.Solver, plain: ik.Solver, points: Array, normals: Array, seed: int
 ) -> bool:
-    """Whether one of `SEARCH` answers to a target from random postures touches nothing.
+    """Return whether one of `SEARCH` solutions from random starts is collision-free.
 
     By turns the target itself is solved, which finds other trunks and arms, and targets within its
     tolerances, which finds other hands.
@@ -335,7 +335,7 @@ def random_search(
 
 
 def compare_with_search(cell: Cell, robot: ArmHand) -> dict[str, Any]:
-    """Targets of which nobody knows whether they have a free answer, beside a random search."""
+    """Compare the solved targets with those of a random search."""
     if not robot.description.shapes.capsules:
         return {"rows": []}
     solver, plain = ik.Solver(robot, scene=ik.Scene()), ik.Solver(robot)
@@ -359,12 +359,12 @@ def compare_with_search(cell: Cell, robot: ArmHand) -> dict[str, Any]:
 
 
 def contacts(cell: Cell, robot: ArmHand) -> dict[str, Any]:
-    """Targets solved by others."""
+    """Solve targets with other solvers."""
     return {"rows": by_contacts(robot, draw_configurations(robot, cell.count, False, cell.seed))}
 
 
 def wrists(cell: Cell, robot: ArmHand) -> dict[str, Any]:
-    """Palms' poses solved by others."""
+    """Solve palm poses with other solvers."""
     return {"rows": by_wrists(robot, cell.count, cell.seed)}
 
 
@@ -440,12 +440,12 @@ TABLES = {
 
 
 def work_out(cell: Cell) -> dict[str, Any]:
-    """What comes of a part."""
+    """Return the result of a part."""
     return TABLES[cell.task].find(cell, ik.load_robot(cell.robot))
 
 
 def cells(options: argparse.Namespace) -> list[Cell]:
-    """All parts."""
+    """Return all parts of the study."""
     parts = list[Cell]()
     for robot in options.robots:
         new_cell = partial(Cell, robot, seed=options.seed)

@@ -61,7 +61,7 @@ def by_contacts(robot: ArmHand, q: Array) -> list[list[str]]:
 
 
 def by_wrists(robot: ArmHand, count: int, seed: int) -> list[list[str]]:
-    """The same for poses of both palms on a path of the arms, the trunk at home.
+    """Return rows for poses of both palms on a path of the arms, with the trunk at home.
 
     As in teleoperation: from home to a random posture and on to the next, `LEG` poses each; every
     way starts from its last answer.
@@ -163,7 +163,7 @@ class TeleoperationNlp:
         self.solver = ca.nlpsol("nlp", "ipopt", nlp, {"print_time": False, "ipopt": options})
 
     def __call__(self, i: int) -> Array:
-        """Configuration that meets the poses of a row as well as it can."""
+        """Return the configuration nearest to the poses of a row."""
         poses = [self.targets[side.name][i][:3] for side in self.robot.description.sides]
         robot, parameters = (
             self.robot,
@@ -204,7 +204,7 @@ class Embodik:
         self.last = np.array([float(home[name]) for name in self.names])
 
     def __call__(self, i: int) -> Array:
-        """Configuration that meets the poses of a row as well as it can."""
+        """Return the configuration nearest to the poses of a row."""
         targets = []
         for side in self.sides:
             pose = self.targets[side.name][i] @ np.linalg.inv(side.palm_placement)

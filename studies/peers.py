@@ -84,7 +84,7 @@ class Joints:
 
 
 def peer_urdf(robot: ik.ArmHand, joints: Joints) -> str:
-    """The robot with the motors' limits and followers without offset, no joint a mimic."""
+    """Return a URDF with motor limits, without mimic joints and without offsets."""
     root = ElementTree.fromstring(robot.urdf())
     places = {name: i for i, name in enumerate(joints.names)}
     described = {joint.name: joint for joint in robot.description.movable}
@@ -134,7 +134,7 @@ class Peer(Protocol):
         ...
 
     def step(self, q: Array) -> Array:
-        """The change of q that the peer makes from where it is."""
+        """Return the change of q that the peer makes."""
         ...
 
 
@@ -243,7 +243,7 @@ def cross(v: Array) -> Array:
 
 
 def by_daqp(problem: Any, lower: Array, upper: Array, motors: NDArray[np.intp]) -> Array:
-    """The change of the motors that DAQP finds, their limits as bounds; zero if it finds none."""
+    """Return the bounded change of the motors by DAQP; zero if it fails."""
     problem.lb, problem.ub = lower, upper
     change = import_module("qpsolvers").solve_problem(problem, solver="daqp").x
     return np.zeros(len(motors)) if change is None else change[motors]
@@ -347,11 +347,11 @@ class Mink:
         self._coupled = [mink.EqualityConstraintTask(model, 1.0)] if joints.pairs else []
 
     def limits(self) -> list[Any]:
-        """What the program keeps beside the bounds of motors."""
+        """Return the limits of the program besides the bounds of motors."""
         return []
 
     def _spec(self, robot: ik.ArmHand) -> Any:
-        """The robot, before it is compiled."""
+        """Return the specification of the robot."""
         compiler = (
             '<mujoco><compiler fusestatic="false" boundmass="0.01" boundinertia="0.001"/></mujoco>'
         )
@@ -604,7 +604,7 @@ def _restarted(
 
 
 def _by_ipopt(robot: ik.ArmHand, targets: Targets, tolerance: ik.Tolerance) -> Run:
-    """The whole system as one nonlinear program, a call a target."""
+    """Solve each target with Ipopt as one nonlinear program."""
     solver, batch = ik.Solver(robot, "ipopt", tolerance), list[ik.BatchSolution]()
     times = []
     for points, normals in zip(*targets, strict=True):

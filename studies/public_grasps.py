@@ -86,7 +86,7 @@ class Cell:
 
 
 def solve(cell: Cell) -> dict[str, Any]:
-    """What becomes of the published ones, and what is found."""
+    """Solve the published grasps of a cell, and compute new ones."""
     mesh, robot = Path(cell.mesh), robot_of(ROBOT)
     surface = ik.load_surface(mesh, scale=cell.scale, seed=cell.seed)
     axis, yaw = POSES[cell.pose]

@@ -198,7 +198,7 @@ SOLVED, FAILED = "#2f6db3", "#c0392b"
 
 
 def draw_dots(metrics: Sequence[Metric], quantity: str, label: str, path: Path) -> None:
-    """A dot per object and method with its 95 % interval, and a diamond for what the paper printed.
+    """Draw a dot with its 95 % interval for each object and method, diamonds for the paper.
 
     Args:
         metrics: Figures of the table by object (`by_object`).
@@ -237,7 +237,7 @@ def draw_dots(metrics: Sequence[Metric], quantity: str, label: str, path: Path) 
 
 
 def draw_convergence(studies: Sequence[Study], table: pl.DataFrame, path: Path) -> None:
-    """The worst error over the iterations, of solved and of failed runs, limits ignored.
+    """Draw the largest error over the iterations of solved and failed runs, without limits.
 
     Drawn are the median and the band from 10 to 90 % of the first solved and the first failed
     runs. They are stepped through once more, from targets whose last bit may differ, and drawn as

@@ -87,7 +87,7 @@ LAMBDA_150 = float(np.sqrt(150.0))
 
 
 def targets() -> tuple[TargetSet, ...]:
-    """The twelve grasps."""
+    """Return the twelve grasps."""
     return tuple(
         TargetSet(name, partial(grasp_arms, grasp=name)) for name in ik.shipped_grasps(ROBOT)
     )
@@ -145,7 +145,7 @@ def check_changes(methods: Sequence[str], changes: Mapping[str, Any]) -> None:
 
 
 def _options_of(method: str, changes: Mapping[str, Any]) -> dict[str, Any]:
-    """The changes that a method has a parameter for."""
+    """Return the changes for which a method has a parameter."""
     return {name: value for name, value in changes.items() if name in option_names(method)}
 
 
@@ -240,7 +240,7 @@ def ablation_study(folder: Path, count: int, seed: int, block: int) -> Study:
 
 
 def hand_start(proximal: float, distal: float) -> dict[str, float]:
-    """A start with other flexions of all fingers [deg] than the home's 90 and 10."""
+    """Return a start with the given flexions of all fingers [deg] instead of 90 and 10."""
     return {
         f"bh_{finger}_{joint}": float(np.radians(value))
         for finger in ("thumb", "finger_2", "finger_3")

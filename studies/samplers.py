@@ -126,7 +126,7 @@ def suits(robot: ik.ArmHand, sampler: str) -> bool:
 
 
 def grasp_arms(robot: ik.ArmHand, rng: np.random.Generator, count: int, grasp: str) -> Array:
-    """A grasp's hand posture, held as the grasp file says, on uniformly random arms.
+    """Return configurations with the hand posture of a grasp and uniformly random arms.
 
     As in Qiu & Kermani 2021, section III: "for each hand configuration, randomly generate 10,000
     arm configurations that are uniformly distributed within the arm's joint limits".

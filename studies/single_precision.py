@@ -113,7 +113,7 @@ def how_often(name: str, libraries: tuple[Library, Library], count: int) -> list
 
 
 def built(name: str, folder: Path, *flags: str) -> Path:
-    """An exported project."""
+    """Export a project."""
     words = [name, "--out", str(folder), "--prefix", "arm", *flags]
     subprocess.run([sys.executable, "-m", "casadi_ik", "export", *words], check=True)
     return folder

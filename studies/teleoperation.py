@@ -218,7 +218,7 @@ def leaders(
 
 
 def comparison_section(paths: int, count: int, period: float, share: float) -> list[str]:
-    """The part of the report: the table, or why there is none."""
+    """Return a section with the comparison, or with the reason why there is none."""
     missing = [name for name in NEEDED if find_spec(name) is None]
     if missing:
         return [MISSING.format(missing=" and ".join(missing)), KNOWN_TEXT]

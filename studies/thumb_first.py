@@ -40,7 +40,7 @@ CURVES = (("one start, ProxQP", PAPER, "o"), ("one start, freeze", OURS, "-"))
 
 
 def bent_targets(robot: ik.ArmHand, count: int, rng: np.random.Generator) -> Targets:
-    """The shipped grasps' hands with distal joints from 25 to 45 deg, on random arms."""
+    """Return hands of built-in grasps with distal joints of 25 to 45 deg, on random arms."""
     names = ik.shipped_grasps(robot.name)
     q = robot.random(rng, count * len(names))
     for i, name in enumerate(names):

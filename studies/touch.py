@@ -118,13 +118,13 @@ class Cell:
 
 @cache
 def solver_of(robot: str) -> ik.Solver:
-    """The robot before the table."""
+    """Return a solver for the robot with a table."""
     return ik.Solver(robot_of(robot), scene=ik.load_scene("table"))
 
 
 @cache
 def surface_of(name: str, seed: int) -> ik.Surface:
-    """The object's."""
+    """Return the surface of an object."""
     return ik.load_surface(name, seed=seed)
 
 
@@ -238,7 +238,7 @@ def cells(options: argparse.Namespace) -> list[Cell]:
 
 
 def row_of(robot: str, results: list[dict[str, Any]], metrics: list[Metric]) -> list[str]:
-    """What came of one robot."""
+    """Return the row of a robot."""
     name, good = f"touch/{robot}", [result for result in results if result["count"]]
     complete_times = [result["time"] for result in good if result["count"] >= 100]
     off = [1e3 * value for result in good for value in result["off"]]

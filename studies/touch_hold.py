@@ -198,7 +198,7 @@ def try_grasps(
 
 
 def row_of(robot: str, tries: Sequence[Trial], metrics: list[Metric]) -> list[str]:
-    """What came of one robot."""
+    """Return the row of a robot."""
     name = f"touch_hold/{robot}"
     best = sorted((trial for trial in tries if trial.best), key=lambda trial: -trial.load)
     unselected = [trial for trial in tries if trial.any]
@@ -234,7 +234,7 @@ def row_of(robot: str, tries: Sequence[Trial], metrics: list[Metric]) -> list[st
 
 
 def noise_of(robot: str, tries: Sequence[Trial], metrics: list[Metric]) -> list[str]:
-    """What noise does to one robot's best grasps."""
+    """Return the row of a robot on the effect of noise on its best grasps."""
     tries = [trial for trial in tries if trial.best]
     share = np.array([trial.robustness for trial in tries])
     noisy_shares = np.array([trial.noisy for trial in tries])
@@ -391,7 +391,7 @@ class Hold:
         return goals
 
     def settled(self, offset: np.ndarray | None = None) -> np.ndarray:
-        """The state once the fingers squeeze.
+        """Return the state in which the fingers grip the object.
 
         Args:
             offset: (4, 4) of the object from where it is thought to be; the hand is open then.

@@ -46,7 +46,7 @@ class MinkAmong(Mink):
         return spec
 
     def _limits_of(self, around: CollisionQuery) -> list[Any]:
-        """A limit for all pairs that may overlap equally much."""
+        """Return a collision limit for each amount of allowed overlap."""
         table, limits = around.table, []
         for offset in np.unique(table.offsets):
             rows = table.pairs[table.offsets == offset].tolist()

@@ -56,7 +56,7 @@ class Piece:
 
 
 def solve_piece(piece: Piece) -> dict[str, Any]:
-    """The targets of a piece, those that contacts alone can be solved at."""
+    """Solve the targets of a piece whose contacts can be met without the scene."""
     robot = ik.load_robot(piece.robot)
     blind = ik.Solver(robot)
     rows = []
@@ -95,7 +95,7 @@ def targets_at(piece: Piece) -> Iterator[tuple[dict[str, Any], str, Array, Array
 
 
 def grasps_at(piece: Piece) -> Iterator[tuple[ik.Scene, list[ik.Grasp]]]:
-    """The scene of every grasp of a piece, and the grasp's targets that contacts alone solve."""
+    """Yield the scene of each grasp of a piece, and its targets that are solvable without it."""
     for solids, grasps in _solvable(piece):
         yield ik.Scene(solids, grasped=grasps[0].object), grasps
 
@@ -117,7 +117,7 @@ def _solvable(piece: Piece) -> Iterator[tuple[dict[str, Any], list[ik.Grasp]]]:
 def _placed(
     piece: Piece, robot: ik.ArmHand
 ) -> Iterator[tuple[dict[str, Any], dict[str, Any], list[ik.Grasp]]]:
-    """What stands about, what is held, and how, of every grasp."""
+    """Yield obstacles, grasped object and grasps of each grasp of a piece."""
     rng = np.random.default_rng([piece.seed, piece.clutter, piece.number])
     angle, radius = rng.uniform(-np.pi, np.pi), rng.uniform(0.4, 0.85)
     goal = np.array([radius * np.cos(angle), radius * np.sin(angle), rng.uniform(0.1, 0.6)])
@@ -136,7 +136,7 @@ def _solved(
     blind: Array,
     piece: Piece,
 ) -> list[dict[str, Any]]:
-    """What comes of the same grasp turned in several ways, a row for each."""
+    """Return a row of results for each rotation of a grasp."""
     robot, name = plain_solver.robot, grasps[0].object
     poses = np.stack([grasp.known_pose for grasp in grasps if grasp.known_pose is not None])
     place = {"xyz": poses[0][:3, 3].tolist()}
@@ -193,7 +193,7 @@ def _timed(solver: ik.Solver, points: Array, normals: Array, poses: Array | None
 
 
 def surroundings(check: SceneCheck, robot: ik.ArmHand, grasp: ik.Grasp) -> CollisionQuery:
-    """What a grasp is checked against."""
+    """Return the obstacles that a grasp is checked against."""
     request = Request(robot, tolerances_by_finger(None, robot.fingers), True)
     return check.collision_query(request.of_grasps([grasp], None))
 
@@ -248,7 +248,7 @@ def _grasps(robot: ik.ArmHand) -> list[tuple[ik.Grasp, dict[str, Any]]]:
 
 
 def _placed_grasp(grasp: ik.Grasp, goal: Array, rng: np.random.Generator) -> ik.Grasp:
-    """The grasp with its object at a place, turned about the vertical."""
+    """Return a grasp with its object at a position, rotated about the vertical."""
     assert grasp.known_pose is not None
     turn, motion = rng.uniform(-np.pi, np.pi), np.eye(4)
     motion[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]

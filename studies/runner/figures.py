@@ -21,7 +21,7 @@ PAPER, OURS, THIRD, FOURTH = COLORS = "#e08a2e", "#2f6db3", "#1f9d55", "#8e4ec6"
 
 
 def figure(rows: int, columns: int, width: float = 4.2, height: float = 3.7) -> tuple[Any, Any]:
-    """A figure and its axes (rows, columns), dressed plainly; a panel's size in inches."""
+    """Return a figure and its axes (rows, columns); sizes of a panel in inches."""
     plot = new_figure(width * columns, height * rows, 110)
     grid = plot.subplots(rows, columns, squeeze=False)
     for axes in grid.ravel():

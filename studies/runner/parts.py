@@ -103,7 +103,7 @@ def run_parts(
 
 
 def read_parts(folder: Path, parts: Iterable[P]) -> tuple[list[tuple[P, dict[str, Any]]], str]:
-    """The parts that are done, with what was found, and versions of the code that found it."""
+    """Return the completed parts with their results, and the versions of the code."""
     done_parts = [part for part in parts if (folder / part.path).exists()]
     stored = [json.loads((folder / part.path).read_text(encoding="utf-8")) for part in done_parts]
     codes = ", ".join(sorted({entry["code"] for entry in stored}))
@@ -157,7 +157,7 @@ def backend(jobs: int, dask: str | None) -> Iterator[None]:
 
 
 def _pack(path: Path) -> None:
-    """A zip of the studies' modules in use here; the script itself travels with its calls."""
+    """Write a zip of the imported modules of studies, without the script itself."""
     files = [getattr(module, "__file__", None) for module in list(sys.modules.values())]
     with zipfile.ZipFile(path, "w") as archive:
         for file in sorted({Path(name).resolve() for name in files if name}):

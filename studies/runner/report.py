@@ -47,7 +47,7 @@ class Metric:
 
 
 def rate_metric(name: str, successes: int, n: int) -> Metric:
-    """A success rate in percent with the interval of Wilson (1927)."""
+    """Return a success rate in percent with the interval of Wilson (1927)."""
     if n == 0:
         return Metric(name, math.nan, "%", "higher", 0.0, 100.0, 0)
     share, z2 = successes / n, Z95**2
@@ -60,7 +60,7 @@ def rate_metric(name: str, successes: int, n: int) -> Metric:
 
 
 def mean_metric(name: str, values: ArrayLike, unit: str, better: str = "lower") -> Metric:
-    """A mean with the normal interval of its standard error."""
+    """Return a mean with the normal interval of its standard error."""
     samples = np.asarray(values, dtype=float)
     if len(samples) == 0:
         return Metric(name, math.nan, unit, better, math.nan, math.nan, 0)
@@ -73,7 +73,7 @@ def mean_metric(name: str, values: ArrayLike, unit: str, better: str = "lower") 
 
 
 def median_metric(name: str, values: ArrayLike, unit: str, better: str = "lower") -> Metric:
-    """A median with the interval between order statistics (normal approximation)."""
+    """Return a median with the interval between order statistics (normal approximation)."""
     samples = np.sort(np.asarray(values, dtype=float))
     n = len(samples)
     if n == 0:
@@ -85,7 +85,7 @@ def median_metric(name: str, values: ArrayLike, unit: str, better: str = "lower"
 
 
 def interval_text(metric: Metric, digits: int = 1) -> str:
-    """The figure and its interval as "97.4 (97.1-97.7)"; a dash if there is none."""
+    """Format a value and its interval as "97.4 (97.1-97.7)"; a dash if there is none."""
     if math.isnan(metric.value):
         return "-"
     if math.isnan(metric.low):
@@ -106,7 +106,7 @@ def write_metrics(metrics: Iterable[Metric], path: Path) -> None:
 
 
 def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table; the first column to the left, the others to the right."""
+    """Return a table with the first column left-aligned and the others right-aligned."""
     lines = [heads, ["---", *["---:"] * (len(heads) - 1)], *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
 
@@ -152,7 +152,7 @@ PACKAGES = ("casadi-ik", "casadi", "numpy", "polars", "joblib", "dask")
 
 
 def provenance(code: Mapping[str, str | None]) -> str:
-    """A paragraph of Markdown.
+    """Return a paragraph on machine, packages and sources, as Markdown.
 
     Args:
         code: Version of the code the results of every study were made with (`code_of`).
@@ -171,7 +171,7 @@ def provenance(code: Mapping[str, str | None]) -> str:
 
 
 def commit(folder: Path) -> str:
-    """The commit that is checked out in a folder."""
+    """Return the commit that is checked out in a folder."""
     command = ["git", "-C", str(folder), "rev-parse", "--short=12", "HEAD"]
     try:
         done = subprocess.run(command, capture_output=True, text=True)
@@ -197,7 +197,7 @@ def _refused(text: str) -> int:
 
 
 def command(script: str, arguments: Sequence[str] | None) -> str:
-    """The command that was run, as a shell takes it.
+    """Return the command that was run, quoted for a shell.
 
     Args:
         script: `__file__` of the study.

@@ -121,20 +121,20 @@ class Study:
                     yield Block(targets, setting, number, size)
 
     def configurations(self, targets: TargetSet, number: int) -> Array:
-        """Configurations (block, n) whose contacts are the targets of a whole block."""
+        """Return the configurations (block, n) whose contacts are the targets of a block."""
         rng = np.random.default_rng([self.seed, zlib.crc32(targets.key.encode()), number])
         return targets.configurations(robot_of(self.robot), rng, self.block)
 
     def solver(self, setting: Setting) -> ik.Solver:
-        """The solver of a setting, built once per process."""
+        """Return the solver of a setting, built once per process."""
         return _solver(setting.robot or self.robot, setting)
 
     def ready_solver(self, setting: Setting) -> ik.Solver:
-        """The same, once it has solved a few targets: no result's time holds its first use."""
+        """Return the solver of a setting after a few solves as warm-up."""
         return _ready_solver(setting.robot or self.robot, setting)
 
     def start(self, setting: Setting) -> Array:
-        """The configuration (n,) a setting starts from."""
+        """Return the start configuration (n,) of a setting."""
         robot = self.solver(setting).robot
         start = robot.home.copy()
         for actuator, value in setting.start.items():
@@ -144,7 +144,7 @@ class Study:
 
 @cache
 def robot_of(name_or_path: str) -> ik.ArmHand:
-    """A robot, loaded once per process."""
+    """Return a robot, loaded once per process."""
     return ik.load_robot(name_or_path)
 
 
@@ -220,7 +220,7 @@ def solve_block(study: Study, block: Block, log: Keep | None = None) -> dict[str
 def _frame(
     study: Study, block: Block, batch: ik.BatchSolution, fingers: tuple[str, ...]
 ) -> pl.DataFrame:
-    """A row per target."""
+    """Return a table with a row for each target."""
     count = len(batch)
     columns: dict[str, Any] = {
         "study": np.full(count, study.name),
@@ -317,7 +317,7 @@ def claim(study: Study, folder: Path) -> None:
 
 
 def missing(study: Study, folder: Path) -> list[Block]:
-    """The blocks that are not there yet, or with fewer targets than are wanted now."""
+    """Return the blocks without results, or with results of too few targets."""
     return [block for block in study.blocks() if _rows(folder / block.path) < block.size]
 
 
