@@ -197,7 +197,7 @@ def test_what_cannot_be_written_is_one_line_and_leaves_what_was_there(
         return views.draw_solution(robot, solution, grasp, path, dpi=20)
 
     missing = tmp_path / "no" / "such" / "folder.png"
-    with pytest.raises(errors.PictureError, match=r"folder\.png:.*picture: No"):
+    with pytest.raises(errors.PictureError, match=r"folder\.png: .*No such"):
         draw(missing)
     with pytest.raises(errors.PictureError, match="not a regular file"):
         draw(tmp_path)
