@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from toy_robots import grasp_of
+from toy_robots import grasp_of, moved
 
 import casadi_ik as ik
 
@@ -16,16 +16,8 @@ ALL = "kuka_lwr_barrett"
 
 def displaced(robot, rng, count, part, fingers=None):
     """Contacts of configurations, moved and turned by a part of the tolerance: still met by q."""
-    q = robot.random(rng, count)
-    points, normals = robot.contacts(q)
-    aside = rng.normal(size=points.shape)
-    aside /= np.linalg.norm(aside, axis=2, keepdims=True)
-    points = points + part * TOLERANCE.position * aside
-    across = rng.normal(size=points.shape)
-    across -= normals * (across * normals).sum(axis=2, keepdims=True)
-    across /= np.linalg.norm(across, axis=2, keepdims=True)
-    angle = part * TOLERANCE.angle
-    normals = np.cos(angle) * normals + np.sin(angle) * across
+    contacts = robot.contacts(robot.random(rng, count))
+    points, normals = moved(contacts, rng, part * TOLERANCE.position, part * TOLERANCE.angle)
     free = [name not in (fingers or robot.fingers) for name in robot.fingers]
     points[:, free] = normals[:, free] = np.nan
     return points, normals
