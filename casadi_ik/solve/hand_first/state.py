@@ -87,6 +87,54 @@ COUNTER_OF_STAGE = {
 }
 """Index of the counter of each stage."""
 
+STEP_FIELDS = (
+    Field("damping", doc="Levenberg-Marquardt damping of the next step"),
+    Field("growth", doc="factor of the damping if the next step is rejected"),
+    Field("cost", doc="cost at q, or at palm and hand in a hand fit"),
+    Field("slow_steps", doc="number of consecutive steps with slow progress"),
+    Field("stage_iterations", doc="iterations of this stage; of an arm the next trial"),
+)
+"""State of damped steps, which all stages with such steps share; see `initial_lm_state`."""
+
+HAND_FIT_FIELDS = (
+    Field(
+        "hand_fit_minimum",
+        doc="cost of the last minimum of a hand fit that nearly met the contacts, or 0",
+    ),
+    Field("hand_fit_min_excess", doc="smallest cost of a tolerant hand fit that failed"),
+)
+"""State of hand fit and tolerant hand fit."""
+
+REFINEMENT_FIELDS = (
+    Field(
+        "refinement_minimum",
+        doc="cost of the last minimum of a refinement that nearly met the contacts, or 0",
+    ),
+)
+"""State of the refinement."""
+
+BALANCE_FIELDS = (
+    Field("power", doc="number of completed powers"),
+    Field(
+        "balance_min_ratio",
+        doc="smallest result of a balance: largest error relative to its tolerance",
+    ),
+)
+"""State of the balance."""
+
+ARM_STEP_FIELDS = (
+    Field("arm_starts", doc="number of starts of the arm steps"),
+    Field(
+        "arm_flipped_joint",
+        doc="last arm joint, from 1, moved to its opposite limit at this start; or 0",
+    ),
+    Field(
+        "arm_start_distance",
+        doc="distance of the last entry of the start table from the palm pose",
+    ),
+)
+"""State of the arm steps."""
+
 KEPT_ACROSS_RESTARTS = (
     *("arm_start_distance", "hand_fit_minimum", "hand_fit_min_excess", "refinement_minimum"),
     *("balance_min_ratio", "repeated_minima", "best_cost", "best_q", "counts"),
@@ -141,68 +189,44 @@ class HandFirstLayouts:
 
     @cached_property
     def state(self) -> Layout:
-        """Layout of the state that one iteration passes to the next.
+        """Layout of the state that one iteration passes to the next, a group of fields by stage."""
+        groups = (
+            *(self._common_fields, STEP_FIELDS, HAND_FIT_FIELDS, REFINEMENT_FIELDS),
+            *(BALANCE_FIELDS, self._arm_fields, ARM_STEP_FIELDS),
+            *((self._side_fields, self._trunk_fields) if self.robot.sides else ()),
+        )
+        return Layout(tuple(field for group in groups for field in group))
 
-        A field of one stage has the name of the stage as prefix. The damped steps of all fits
-        share damping, growth, cost, slow_steps and stage_iterations.
-        """
+    @property
+    def _common_fields(self) -> tuple[Field, ...]:
+        """State of all stages: configuration, palm pose, hand posture, incumbent."""
         n = len(self.robot.actuators)
+        return (
+            Field("q", (n,), doc="configuration [rad or m]; in a hand fit only of the hand"),
+            Field("palm_rotation", (3, 3), doc="palm orientation of the hand, base frame"),
+            Field("palm_origin", (3,), unit="m", doc="palm position of the hand, base frame"),
+            Field("phase", doc="code of the stage of the next iteration, see `Stage`"),
+            Field("candidate", doc="index of the hand posture; -1: the one of q0"),
+            Field("candidates_before", doc="number of hand postures of earlier restarts"),
+            Field("palm_number", doc="index of the first palm pose where contacts leave it free"),
+            Field("hand_fits", doc="1 if palm and hand meet the contacts"),
+            Field("is_underactuated", doc="1 if hand or arm has too few free motors"),
+            Field(
+                "repeated_minima", doc="number of fits and balances that end no lower than before"
+            ),
+            Field("best_cost", doc="smallest cost of a whole configuration"),
+            Field("best_q", (n,), doc="configuration of that cost [rad or m]"),
+            Field("counts", (len(self.phases),), doc="iterations by phase"),
+        )
+
+    @property
+    def _arm_fields(self) -> tuple[Field, ...]:
+        """State of arm placement and arm choice: the best arm, or that of each side."""
         sides = (len(self.robot.sides),) if self.robot.sides else ()
-        return Layout(
-            (
-                Field("q", (n,), doc="configuration [rad or m]; in a hand fit only of the hand"),
-                Field("palm_rotation", (3, 3), doc="palm orientation of the hand, base frame"),
-                Field("palm_origin", (3,), unit="m", doc="palm position of the hand, base frame"),
-                Field("phase", doc="code of the stage of the next iteration, see `Stage`"),
-                Field("candidate", doc="index of the hand posture; -1: the one of q0"),
-                Field("candidates_before", doc="number of hand postures of earlier restarts"),
-                Field(
-                    "palm_number", doc="index of the first palm pose where contacts leave it free"
-                ),
-                Field("damping", doc="Levenberg-Marquardt damping of the next step"),
-                Field("growth", doc="factor of the damping if the next step is rejected"),
-                Field("cost", doc="cost at q, or at palm and hand in a hand fit"),
-                Field("slow_steps", doc="number of consecutive steps with slow progress"),
-                Field("stage_iterations", doc="iterations of this stage; of an arm the next trial"),
-                Field("hand_fits", doc="1 if palm and hand meet the contacts"),
-                Field(
-                    "hand_fit_minimum",
-                    doc="cost of the last minimum of a hand fit that nearly met the contacts, or 0",
-                ),
-                Field(
-                    "hand_fit_min_excess", doc="smallest cost of a tolerant hand fit that failed"
-                ),
-                Field(
-                    "refinement_minimum",
-                    doc="cost of the last minimum of a refinement that nearly met them, or 0",
-                ),
-                Field("power", doc="balance: number of completed powers"),
-                Field(
-                    "balance_min_ratio",
-                    doc="smallest result of a balance: largest error relative to its tolerance",
-                ),
-                Field("is_underactuated", doc="1 if hand or arm has too few free motors"),
-                Field(
-                    "repeated_minima",
-                    doc="number of fits and balances that end no lower than before",
-                ),
-                Field("arm_margin", sides, doc="margin of the best arm; negative: outside limits"),
-                Field("arm_best", (len(self.arm),), doc="arm with the best margin [rad or m]"),
-                Field("arm_redundancy", sides, unit="rad", doc="redundancy parameter of that arm"),
-                Field("arm_starts", doc="number of starts of the arm steps"),
-                Field(
-                    "arm_flipped_joint",
-                    doc="last arm joint, from 1, moved to its opposite limit at this start; or 0",
-                ),
-                Field(
-                    "arm_start_distance",
-                    doc="distance of the last entry of the start table from the palm pose",
-                ),
-                Field("best_cost", doc="smallest cost of a whole configuration"),
-                Field("best_q", (n,), doc="configuration of that cost [rad or m]"),
-                Field("counts", (len(self.phases),), doc="iterations by phase"),
-                *(self._side_fields if self.robot.sides else ()),
-            )
+        return (
+            Field("arm_margin", sides, doc="margin of the best arm; negative: outside limits"),
+            Field("arm_best", (len(self.arm),), doc="arm with the best margin [rad or m]"),
+            Field("arm_redundancy", sides, unit="rad", doc="redundancy parameter of that arm"),
         )
 
     @property
@@ -213,8 +237,8 @@ class HandFirstLayouts:
 
     @property
     def _side_fields(self) -> tuple[Field, ...]:
-        """Additional state fields of multi-arm robots."""
-        n, sides = len(self.robot.actuators), range(len(self.robot.sides))
+        """State of the hand fits of a multi-arm robot, one side after the other."""
+        sides = range(len(self.robot.sides))
         palms = [
             (
                 Field(f"palm_rotation_{i}", (3, 3), doc="palm orientation of side, base frame"),
@@ -228,6 +252,13 @@ class HandFirstLayouts:
             Field("last_candidate", doc="largest index of a hand posture of any side"),
             Field("side_fits", (len(sides),), doc="1 if palm and hand meet the contacts, by side"),
             *(field for palm in palms for field in palm),
+        )
+
+    @property
+    def _trunk_fields(self) -> tuple[Field, ...]:
+        """State of the search for a trunk position."""
+        n = len(self.robot.actuators)
+        return (
             Field("trunk_min_cost", doc="smallest cost of trunk steps for these palm poses"),
             Field("trunk_best_q", (n,), doc="configuration of that cost [rad or m]"),
             Field("trunk_arms_placed_again", doc="1 if arms were placed again at this trunk"),
