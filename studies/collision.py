@@ -78,14 +78,15 @@ Franka arm, 27 us a target, all solved.
 
 
 CHOICE = """
-Grasps at random places of a table, each turned {turns} times about the vertical, where contacts
-alone can be solved, with so many boxes, cylinders and balls about. Grasps are the robot's shipped
-ones, or of {postures} random hands that do not touch themselves, about the ball that fits between
-their fingertips. *Found:* of those that have a free answer: one was found, or a dense search of
-{searched:,} solutions, each nearest to a random posture, finds one with {safe:g} mm to spare.
-Processor time of a target with everything that is looked at until it is free or given up; *batch:*
-{batch} targets a call, those of a grasp again and again; *with an answer:* the same of these alone;
-*contacts alone:* without a scene; *single:* one, without a diagnosis.
+Grasps are placed at random positions on a table, each at {turns} random yaw angles, where the
+contacts alone can be solved. *Clutter* is the number of boxes, cylinders and balls around them.
+The grasps are the built-in ones of the robot, or those of {postures} random collision-free hands
+around the ball that fits between their fingertips. *Found:* of the targets with a known
+collision-free solution: one of hand-first, or of a dense search of {searched:,} solutions, each
+nearest to a random configuration, with {safe:g} mm of clearance. Processor times per target
+include everything until a solution is found or the target is given up; *batch:* {batch} targets
+per call, those of a grasp repeated; *with an answer:* solved targets alone; *contacts alone:*
+without a scene; *single:* one target, without a diagnosis.
 """
 
 

@@ -83,21 +83,23 @@ STARTS = 20
 """Of the minimax program for a target."""
 
 INTRODUCTION = """
-All targets are contacts of configurations within limits, hence reachable. *Missed:* the verdict,
-which is recomputed from the answer by forward kinematics, finds a contact outside its tolerance or
-a motor or joint outside its limits. *Hands on one arm:* the hand uniform, the arm at 60 % of its
-range. *Corners:* every motor by itself at its lower limit, at its upper one, or anywhere, a third
-each; *near limits:* within 1 deg (a slider: a fiftieth of its stroke) of them. *Near-singular
-arms:* of 32 random arms the one whose palm Jacobian has the smallest singular value. *Aligned
-arms:* elbow straight, shoulder or wrist aligned, or all three, off by 1e-3 to 1e-9 rad. Intervals
-are Wilson's, 95 %. Times are of single targets of a batch [us] and hold what else the machine did.
+All targets are contacts of configurations within limits and therefore reachable. *Missed:* the
+verdict, which forward kinematics recomputes from the solution, finds a contact outside its
+tolerance or a motor or joint outside its limits. *Hands on one arm:* hand postures are uniform,
+the arm is at 60 % of its range. *Corners:* every motor is at its lower limit, at its upper limit,
+or anywhere, with equal probability; *near limits:* within 1 deg (a slider: a fiftieth of its
+stroke) of them. *Near-singular arms:* of 32 random arm configurations, the one whose palm
+Jacobian has the smallest singular value. *Aligned arms:* elbow straight, shoulder or wrist
+aligned, or all three, off by 1e-3 to 1e-9 rad. Intervals are Wilson intervals, 95 %. Times are of
+single targets of a batch [us] and include other load on the machine.
 """
 
 NOISY = """
-*Noisy contacts:* Gaussian noise of {:g} mm on every coordinate of the points and of {:g} deg on the
-normals, so that not all can be met. *Possible:* of so many of the missed, those for which Ipopt
-finds a configuration within tolerance (minimise t with every error at most t times its tolerance)
-from the configuration before the noise, the answer or random ones, {} starts at most.
+*Noisy contacts:* Gaussian noise of {:g} mm on every coordinate of the points and of {:g} deg on
+the normals, so that not all targets can be solved. *Possible:* the number of missed targets for
+which Ipopt finds a configuration within tolerance (minimise t with every error at most t times
+its tolerance) from the configuration before the noise, the solution or random starts, at most {}
+starts.
 """
 
 DISPLACEMENTS = """
@@ -114,12 +116,12 @@ iterations (half of them also towards badly conditioned ones).
 """
 
 CAUSES = """
-Missed targets are asked again with all fingers. *Solved now:* by the code that wrote this page.
-*Given the hand:* with the hand's motors fixed where they were when the target was made; what that
-solves was missed because no posture came near enough, the others because no arm was found that
-holds the hand where it fits. *From nearby:* from a start within 0.1 of every motor's range. *At
-limits:* mean over the missed of the part of arm and hand motors within a thousandth of their range.
-*Off:* the largest error of a contact in the best answer.
+Missed targets are solved again with all fingers. *Solved now:* by the code that wrote this page.
+*Given the hand:* with the hand motors fixed at the configuration that made the target; such
+targets were missed because no hand posture came near enough, the others because no arm
+configuration carries the hand where it fits. *From nearby:* from a start within 0.1 of the range
+of every motor. *At limits:* mean fraction of arm and hand motors within a thousandth of their
+range from a limit. *Off:* the largest error of a contact in the best solution.
 """
 
 

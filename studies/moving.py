@@ -57,10 +57,11 @@ SINGULAR = 0.05
 FASTER = ((1.0, 10.0), (3.0, 10.0))
 """Times the velocity and the acceleration limits."""
 
-LOST_TEXT = """The paths that are not wholly within tolerance, followed again with the same code by
-motors that may be faster. A robot has more motors than a grasp needs, so it follows in another
-posture than the one that made the path, and there the motors may need more than the path's own did.
-*Largest difference:* of a motor of the arm from the path's own posture, when it is lost.
+LOST_TEXT = """
+The paths that are not entirely within tolerance are followed again, by the same code with faster
+motors. A robot has more motors than a grasp needs, so the follower uses other configurations than
+those that made the path, and these may require faster motors. *Largest difference:* of a motor of
+the arm from the configuration of the path, when tolerance is lost.
 """
 
 
@@ -266,13 +267,13 @@ def figures(robot: str, rows: dict[str, Array]) -> list[Metric]:
 
 FOLLOWED_TEXT = """
 Random smooth paths of {steps} cycles of {period:g} ms, from rest, at up to {share:g} % of the
-velocity limits, seeds 0 on. Default tolerances (5 mm, 3 deg) and accelerations (full speed in a
-quarter of a second). Times are from Python; the machine was busy with other work, so beside the
-median of what a cycle takes there is the processor's time of single calls on some of the paths, the
-least of {times} runs of each call. *Lost near a singular arm:* of the paths that are not wholly
-within tolerance, those whose own postures had a smallest singular value of the arm below {singular}
-(lengths in units of 0.1 m) within the 300 cycles before; the postures there are the path's own,
-which the follower does not know, and from others the motors would have to be faster.
+velocity limits, with seeds from 0. Tolerances (5 mm, 3 deg) and accelerations (full speed in a
+quarter of a second) are the defaults. Times are measured from Python on a busy machine: the
+median of a cycle, and the processor time of single calls on some of the paths, the smallest of
+{times} runs of each call. *Lost near a singular arm:* of the paths that are not entirely within
+tolerance, those whose own configurations had a smallest singular value of the arm below
+{singular} (lengths in units of 0.1 m) within the previous 300 cycles. The follower does not know
+these configurations, and from others the motors would have to be faster.
 """
 
 LEAPING = """
@@ -281,8 +282,9 @@ and then wait {wait} cycles.
 """
 
 ANEW = """
-Every {every}th target solved anew from the solution before (`solve(q0=previous)`): the largest step
-of a motor between two of them; the follower's is its largest step of a cycle times {every}.
+Every {every}th target is solved from the previous solution (`solve(q0=previous)`): the largest
+step of a motor between two of them. For the follower it is the largest step of a cycle times
+{every}.
 """
 
 

@@ -67,21 +67,22 @@ SEARCH_BATCH = 1000
 """Of them, in one call."""
 
 INTRODUCTION = """
-A target is what all fingertips of a configuration touch, so it can be reached: *random* ones are
-drawn within the limits of all motors, *near limits* each motor is with probability 1/2 within 1 %
-of its range of an end. Times are processor times of one thread of this machine, of a batch per
-target; *one alone* is `Solver.fast`, the median.
+Targets are the contacts of configurations and therefore reachable. *Random* configurations are
+drawn within the limits of all motors; *near limits*, each motor is with probability 1/2 within 1
+% of its range from a limit. Times are processor times of one thread, per target of a batch; *one
+alone* is the median of `Solver.fast`.
 """
 
 
 OTHER_METHODS = """
-Random targets at 5 mm and 3 deg, mean processor times. Solvers of frames or residuals move all
-motors of the body as those of one hand; they start at home, then at up to 400 other postures.
+Random targets at 5 mm and 3 deg, mean processor times. Solvers of frames or residuals treat all
+motors of the robot as those of one hand; they start at home, then at up to 400 other
+configurations.
 """
 WRISTS = """
-Poses of both palms along a path, as in teleoperation: three seconds from a posture of the arms to a
-random other one, 30 poses a second, each from the last answer. *Met* within 5 mm and 3 deg. The
-cost of xr_teleoperate's program has terms that hold the arms back, its answers lag.
+Poses of both palms along a path, as in teleoperation: three seconds from one random configuration
+of the arms to another, 30 poses per second, each solved from the previous solution. *Met* within
+5 mm and 3 deg. The cost of the program of xr_teleoperate has damping terms, so its solutions lag.
 """
 
 

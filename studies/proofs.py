@@ -59,16 +59,16 @@ BLIND = np.deg2rad(
 MAX_LISTED = 30
 
 INTRODUCTION = """
-*Reachable* targets are contacts of configurations, moved by a part of the tolerance t (10 t rad for
-normals). A proof refutes every box of hand postures, hence those too that hold the posture a target
-was made from; all of these were looked at, down to a hundredth of the tolerance, and no others. One
-that is refuted is a *false* proof. *Impossible* targets are those of a class that the solver, asked
-for a diagnosis with its many searches, does not solve with {} mm and {} deg more than the usual 5
-mm and 3 deg: that is no proof of impossibility, so that what is not proved may be possible after
-all. Times are processor times in a batch of all proved ones, shared out by the boxes each took.
-*Not proved:* by whether a hand without an arm fits the contacts with the wider tolerance. If it
-does, only the arm can be the reason, and its bound is too weak or its boxes too many; if it does
-not, the hand's boxes were too many.
+*Reachable* targets are contacts of configurations, moved by a part of the tolerance t (10 t rad
+for normals). A proof would have to refute every box of hand postures, including the boxes around
+the posture that made the target. These boxes are tested, down to a hundredth of the tolerance;
+one that is refuted counts as a *false* proof. *Impossible* targets belong to a class and are not
+solved, with a diagnosis and all its searches, at {} mm and {} deg more than the usual 5 mm and 3
+deg. This is not a proof, so targets that are not proved may be possible. Times are processor
+times in a batch of all proved targets, distributed in proportion to the boxes
+of each. *Not proved:* by
+whether a hand without an arm fits the contacts at the wider tolerance. If it does, the arm is the
+reason, and its bound is too weak or has too many boxes; otherwise the hand has too many boxes.
 """
 
 

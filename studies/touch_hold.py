@@ -75,24 +75,26 @@ STATE_SPEC = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
 INTRODUCTION = """
-{names}: each on the table, turned by 40 deg, 0.5 m before the arm's base and 0.1 m aside; at most
-{limit} distinct, force-closed grasps of each (friction 0.5, three fingertips, or two of a gripper),
-of which the {best} best by load are tried, and every {every}th whatever its load. In MuJoCo the
-palm is fixed, motors are springs (3 N m/rad, 2 kN/m), pads are balls as the hand's description has
-them (flat ones of 10 mm), only pads touch the object (its convex parts; friction 0.5, torsional
-friction of a patch of 5 mm), and it weighs 0.2 kg. Fingers squeeze with 18 N in sum, by
-`FoundGrasp.forces`. *Held*: in a second the object moves less than 20 mm and turns less than 30
-deg, for a force of its weight in each of six directions. *Best third*: by load, of the {best} best
-of all objects. *AUC*: the chance that a grasp that holds has a higher load than one that does not,
-among every {every}th. *Strong*: those of these whose load says that they hold it.
+{names}: each stands on the table, rotated by 40 deg, 0.5 m in front of the base of the arm and
+0.1 m to the side. At most {limit} distinct, force-closed grasps of each are computed (friction
+0.5, three fingertips, or two of a gripper). The {best} with the highest load are
+tested, and every {every}th regardless of its load. In MuJoCo the palm is fixed, motors are springs (3 N m/rad, 2
+kN/m), pads are balls as in the description of the hand (flat ones of 10 mm), only pads touch the
+object (its convex parts; friction 0.5, torsional friction of a patch of 5 mm), and it weighs 0.2
+kg. The total grip force is 18 N, distributed by `FoundGrasp.forces`. *Held*: within a second the
+object moves less than 20 mm and rotates less than 30 deg, for a force of its weight in each of
+six directions. *Best third*: the third with the highest load among the {best} best of all
+objects. *AUC*: in pairs of one grasp that held and one that did not, how often the one that held
+has the higher load, among every {every}th. *Strong*: those of these whose load exceeds the
+weight.
 """
 
 NOISE = """
-The object is 5 mm and 3 deg elsewhere than the hand believes, once for each displacement and each
-of the best grasps ({samples} in random directions); the hand closes from its open posture.
-*Robustness* is `FoundGrasps.robustness`: the share at which the contacts that fingers come to hold
-0.2 kg by their load. *Held*: the share that holds it against gravity in MuJoCo. *AUC*: the chance
-that of two grasps the one that holds more often has the higher robustness, or load.
+The object is displaced by 5 mm and 3 deg, once for each displacement and each of the best grasps
+({samples} in random directions); the hand closes from its open posture. *Robustness* is
+`FoundGrasps.robustness`: the fraction of displacements for which the resulting contacts hold 0.2
+kg by their load. *Held*: the fraction that hold the object against gravity in MuJoCo. *AUC*: in
+pairs of grasps, how often the one that holds more often has the higher robustness, or load.
 """
 
 
