@@ -77,13 +77,13 @@ STATE_SPEC = mujoco.mjtState.mjSTATE_INTEGRATION
 INTRODUCTION = """
 {names}: each stands on the table, rotated by 40 deg, 0.5 m in front of the base of the arm and
 0.1 m to the side. At most {limit} distinct, force-closed grasps of each are computed (friction
-0.5, three fingertips, or two of a gripper). The {best} with the highest load are
-tested, and every {every}th regardless of its load. In MuJoCo the palm is fixed, motors are springs (3 N m/rad, 2
-kN/m), pads are balls as in the description of the hand (flat ones of 10 mm), only pads touch the
-object (its convex parts; friction 0.5, torsional friction of a patch of 5 mm), and it weighs 0.2
-kg. The total grip force is 18 N, distributed by `FoundGrasp.forces`. *Held*: within a second the
-object moves less than 20 mm and rotates less than 30 deg, for a force of its weight in each of
-six directions. *Best third*: the third with the highest load among the {best} best of all
+0.5, three fingertips, or two of a gripper). The {best} with the highest load are tested, and
+every {every}th regardless of its load. In MuJoCo the palm is fixed, motors are springs (3 N
+m/rad, 2 kN/m), pads are balls as in the description of the hand (flat ones of 10 mm), only pads
+touch the object (its convex parts; friction 0.5, torsional friction of a patch of 5 mm), and it
+weighs 0.2 kg. The total grip force is 18 N, distributed by `FoundGrasp.forces`. *Held*: within a
+second the object moves less than 20 mm and rotates less than 30 deg, for a force of its weight in
+each of six directions. *Best third*: the third with the highest load among the {best} best of all
 objects. *AUC*: in pairs of one grasp that held and one that did not, how often the one that held
 has the higher load, among every {every}th. *Strong*: those of these whose load exceeds the
 weight.
