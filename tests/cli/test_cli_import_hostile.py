@@ -95,6 +95,7 @@ GROWING = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", GROWING)
 def test_macros_that_grow_without_end(
     run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: str
@@ -240,6 +241,7 @@ MODELS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", MODELS)
 def test_numbers_and_giants_of_mjcf(
     run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: str

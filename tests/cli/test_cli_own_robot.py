@@ -447,6 +447,7 @@ def poses(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_calibrate_in_a_process(run_process: Command, poses: Path, tmp_path: Path) -> None:
     out = tmp_path / "my_ar10.yaml"
     done = run_process("calibrate", poses, "--robot", "ar10", "--out", out)

@@ -30,6 +30,7 @@ def test_free_fingers_stay(robot, rng):
         np.testing.assert_array_equal(batch.q[:, columns], q0[:, columns])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["hand-first", "ipopt"])
 def test_without_limits_a_slider_keeps_to_its_triangle(robot, method, rng):
     """Beyond it there is no such mechanism, limits or not."""

@@ -49,6 +49,7 @@ def test_an_arm_without_a_closed_form(tmp_path_factory, method, tolerance, least
         assert batch.phases["arm-placement"].all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arm", [*SINGLE, "kinova_gen3", "xarm6", "sawyer"])
 def test_the_arm_follows_at_once(arm):
     """Six joints in one evaluation; an arm that is only nearly of its form is refined."""
@@ -62,6 +63,7 @@ def test_the_arm_follows_at_once(arm):
         assert (batch.phases["refinement"] == 0).mean() > 0.9
 
 
+@pytest.mark.slow
 def test_every_target_of_a_panda_is_solved(panda, solver):
     rng = np.random.default_rng(2026)
     q = np.concatenate([panda.random(rng, 1000), near_limits(panda, rng, 500)])

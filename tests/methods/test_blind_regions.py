@@ -100,6 +100,7 @@ ONCE_MISSED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("why", ONCE_MISSED)
 def test_what_was_missed_once_is_solved(why):
     name, tolerance, held, *rows = ONCE_MISSED[why]
