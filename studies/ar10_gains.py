@@ -25,14 +25,14 @@ from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics import dual_quaternion as dq
 
 STEPS = 80
-"""Of a run that is drawn."""
+"""Line style of a drawn run."""
 
 RESOLUTION = 1e-4
 """Steps of a slider [m]: an assumption, from memory of what small servo screws repeat to."""
 
 
 def within(robot: ik.ArmHand, part: float) -> Array:
-    """Every actuator at a part of its stroke."""
+    """Return a configuration with every actuator at a fraction of its stroke."""
     return robot.lower + part * span(robot)
 
 
@@ -240,7 +240,7 @@ ROWS = {"pose": "6", "position": "3", "distance": "1"}
 
 
 def offsets(robot: ik.ArmHand, out: Path, goals: int, rng: np.random.Generator, gain: float) -> str:
-    """Where the offset of the relative pose comes from, and the tasks that do not have it."""
+    """Study the offset of the relative pose, and tasks without it."""
     start = within(robot, 0.3)
     postures = robot.lower + rng.uniform(0.2, 0.8, (goals, len(start))) * span(robot)
     turns, shifts = rng.standard_normal((goals, 3)), rng.standard_normal((goals, 3))

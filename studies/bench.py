@@ -64,7 +64,7 @@ class Worker:
         )
 
     def measure(self, case: Case) -> dict[str, float] | None:
-        """One turn: quantities by name; None: this package, or this machine, cannot."""
+        """Measure a case once; return quantities by name, None if it is not possible."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write(json.dumps(case) + "\n")

@@ -54,7 +54,7 @@ CANDIDATES, OF_OBJECT = 50, 500
 """Candidates of a choice: those of a scene's batch, and in an object's frame."""
 
 CYCLES, PERIOD = 500, 1e-3
-"""Of following, and their length [s]."""
+"""Number of cycles of a follower, and their length [s]."""
 
 
 def shared(name: str, make: Callable[[], Any]) -> Any:
@@ -166,7 +166,7 @@ def scene(robot: str, count: int) -> Callable[[], Quantities]:
 
 
 def clutter(robot: str, place: int) -> Callable[[], Quantities]:
-    """Every third grasp at a place of the collision study, at each clutter, in batches of 256."""
+    """Solve every third grasp of a place of the collision study, in batches of 256."""
     arm_hand = ik.load_robot(robot)
 
     def placed() -> list[Any]:
@@ -311,7 +311,7 @@ def threads(robot: str, count: int) -> Callable[[], Quantities]:
 
 
 def memory(robot: str, count: int) -> Callable[[], Quantities]:
-    """How much memory grows over many solves in blocks, after a tenth of them."""
+    """Measure the growth of memory over many solves in blocks, after a tenth of them."""
     resource = importlib.import_module("resource")
     solver = ik.Solver(ik.load_robot(robot))
 
@@ -376,7 +376,7 @@ FIRST = {
     "scene": "solver = ik.Solver(robot, scene=ik.Scene({'table': TABLE})); "
     "solver.choose([grasp], q0=robot.home)",
 }
-"""What is asked first: as a program."""
+"""First request of a new process: a program."""
 
 PROGRAM = """
 import time
@@ -508,7 +508,7 @@ def logs(robot: str, method: str, compression: str, count: int) -> Callable[[], 
 def peer(
     robot: str, sampler: str, tolerance: str, name: str, count: int
 ) -> Callable[[], Quantities]:
-    """Another solver on the same targets with restarts, judged by our verdict; see `peers`."""
+    """Measure another solver on the same targets with restarts; see `peers`."""
     peers = importlib.import_module("peers")
     arm_hand = ik.load_robot(robot)
     targets = sampled_contacts(arm_hand, sampler, count)
@@ -529,7 +529,7 @@ def peer(
 
 
 def view(page: str, painted: bool, flow: bool) -> Callable[[], Quantities]:
-    """From the mouse to the drawn answer in a browser; see `bench_view`."""
+    """Measure the latency of the viewer in a browser; see `bench_view`."""
     return partial(importlib.import_module("bench_view").measure, page, painted, flow)
 
 

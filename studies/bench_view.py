@@ -74,7 +74,7 @@ Quantities = dict[str, float]
 
 
 def measure(target: str, painted: bool, flow: bool) -> Quantities:
-    """One drag: medians of times [ms], and processor times a step.
+    """Measure a drag: medians of times [ms], and processor times of a step.
 
     Args:
         target: "server": the page of `casadi-ik view`; else the file of the page without one.

@@ -39,7 +39,7 @@ OUTLIERS = 0.1, 0.25
 
 FINGER = "index"
 NOISE = (2e-4, math.radians(0.5))
-"""Of a measured coordinate [m] and angle [rad]: an assumption, of the size of marker tracking."""
+"""Noise of a measured coordinate [m] and angle [rad]. Assumption: as for marker tracking."""
 
 POSES = 60
 EXACT = (1e-9, 1e-9)

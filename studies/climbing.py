@@ -32,7 +32,7 @@ TURN = 20.0
 """Seconds after which a search is written to its file."""
 
 CONDITION = 0.3
-"""What a power of ten of the smallest singular value is worth, against iterations' e-folds."""
+"""Weight of the logarithm of the smallest singular value, against that of iterations."""
 
 
 @dataclass
@@ -64,7 +64,7 @@ class Search:
         return cls(q, np.full(CLIMBERS, -np.inf), np.zeros(CLIMBERS))
 
     def step(self, solvers: dict[str, ik.Solver], rng: np.random.Generator) -> None:
-        """Every climber makes one step."""
+        """Advance every climber by one step."""
         robot = next(iter(solvers.values())).robot
         q = _random_steps(robot, self.q, rng)
         points, normals = robot.contacts(q)

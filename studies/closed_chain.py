@@ -74,7 +74,7 @@ class HeldThumb:
         return rotation, point - np.einsum("kij,kj->ki", rotation, lever)
 
     def is_followed(self, rotation: Array, origin: Array) -> NDArray[np.bool_]:
-        """(k,) whether some arm configuration within limits has its palm there."""
+        """Return whether an arm configuration within limits reaches each palm pose (k,)."""
         value = np.zeros(len(origin), dtype=bool)
         for trial in range(self._search.trials):
             remaining = np.flatnonzero(~value)
@@ -84,7 +84,7 @@ class HeldThumb:
         return value
 
     def in_reach(self, rotation: Array, origin: Array) -> NDArray[np.bool_]:
-        """(k,) whether the elbow can bring the wrist there, the other joints aside."""
+        """Return whether the elbow can extend to each wrist position (k,)."""
         wrist = origin + rotation @ self._srs.wrist_in_palm
         distance = np.linalg.norm(wrist - self._srs.shoulder, axis=1)
         inner, outer = self._reach

@@ -55,7 +55,7 @@ SIZE = 50_000
 """Configurations of a part."""
 
 MUJOCO_SHARE = 50
-"""Of so many configurations one that is not free is checked by coal as well: it takes 1.4 ms."""
+"""Interval of colliding configurations that coal checks too, in 1.4 ms each."""
 
 SCENE = {
     "table": {"kind": "box", "size": [1.6, 1.6, 0.04], "xyz": [0.0, 0.0, -0.1]},
@@ -92,7 +92,7 @@ without a scene; *single:* one target, without a diagnosis.
 
 @dataclass(frozen=True)
 class Part:
-    """Some work: "coal" (random configurations), "choice" (a place of a table) or "mink" (there).
+    """A part: "coal" (random configurations), "choice" (a position on a table) or "mink".
 
     Attributes:
         what: Which of them.
@@ -106,7 +106,7 @@ class Part:
 
     @property
     def path(self) -> Path:
-        """Where its figures are."""
+        """Path of its results."""
         piece = self.piece
         place = f"{piece.robot}-{piece.clutter}-{piece.number}-{piece.seed}-{piece.searched}"
         return Path(self.what) / f"{place}-{self.size}.json"
@@ -142,7 +142,7 @@ def solve(part: Part) -> dict[str, Any]:
 
 
 def parts_of(options: argparse.Namespace) -> list[Part]:
-    """All parts, so that what is done so far is as much of every clutter."""
+    """Return all parts, alternating between amounts of clutter."""
     sizes = [min(SIZE, options.checked - start) for start in range(0, options.checked, SIZE)]
     parts = [
         Part("coal", Piece(ROBOT, 0, number, options.seed, 0), size)

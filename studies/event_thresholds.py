@@ -45,13 +45,13 @@ class StoredBlocks:
         self.blocks.append(block)
 
     def close(self) -> None:
-        """Nothing to do."""
+        """Ignore the call."""
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Nothing to do."""
+        """Ignore the call."""
 
 
 class Trial(NamedTuple):

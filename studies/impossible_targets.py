@@ -26,14 +26,14 @@ CLASSES = (
 
 
 def classes_of(robot: ik.ArmHand) -> tuple[str, ...]:
-    """Those that a robot can be asked for."""
+    """Return the classes that apply to a robot."""
     return CLASSES if robot.description.arm_actuators else CLASSES[:-2]
 
 
 def rigidly_moved(
     targets: Targets, rng: np.random.Generator, metres: float, angle: float
 ) -> Targets:
-    """Every contact moved and every normal turned by so much, any way."""
+    """Displace every contact and rotate every normal in random directions."""
     points, normals = targets
     shift, turn = rng.normal(size=points.shape), rng.normal(size=normals.shape)
     points = points + metres * shift / np.linalg.norm(shift, axis=2, keepdims=True)

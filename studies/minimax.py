@@ -25,7 +25,7 @@ from casadi_ik.kinematics.couplings import joint_positions
 from casadi_ik.kinematics.forward import actuated
 
 ITERATIONS = 300
-"""Of Ipopt, from one start."""
+"""Maximum number of iterations of Ipopt from one start."""
 
 CLOSE = 1e-8
 """Ipopt's tolerance."""

@@ -80,7 +80,7 @@ MAX_LISTED = 30
 """Misses listed in the report; a file beside it has all of them."""
 
 STARTS = 20
-"""Of the minimax program for a target."""
+"""Number of starts of the minimax program for a target."""
 
 INTRODUCTION = """
 All targets are contacts of configurations within limits and therefore reachable. *Missed:* the
@@ -127,7 +127,7 @@ range from a limit. *Off:* the largest error of a contact in the best solution.
 
 @dataclass(frozen=True)
 class Part:
-    """Some targets, solved in one call.
+    """Targets that are solved in one call.
 
     Attributes:
         robot: Name of the robot.
@@ -159,7 +159,7 @@ class Part:
 
     @property
     def path(self) -> Path:
-        """Where its counts are."""
+        """Path of its counts."""
         kind = self.sampler
         if any(self.noise):
             kind += f" {self.noise[0]:g} {self.noise[1]:g}, {self.searched_count} searched"
@@ -170,7 +170,7 @@ class Part:
 
     @property
     def kind(self) -> str:
-        """What is tried, in words."""
+        """Kind of targets in words."""
         words = (
             KINDS_OF_CONTACTS[self.sampler]
             if self.sampler in KINDS_OF_CONTACTS
@@ -207,7 +207,7 @@ def load(name: str) -> ik.ArmHand:
 
 
 SOLVERS: dict[tuple[str, str], ik.Solver] = {}
-"""Of this process, by robot and tolerance."""
+"""Solvers of this process, by robot and tolerance."""
 
 
 def _solver(robot: ik.ArmHand, tolerance: str) -> ik.Solver:
@@ -321,7 +321,7 @@ def robots_of(words: Sequence[str]) -> list[str]:
 
 
 def parts_of(options: argparse.Namespace) -> Iterator[Part]:
-    """All parts, a little of everything first."""
+    """Return all parts, alternating between robots, samplers and tolerances."""
     block = min(options.block, options.count)
     robots = {name: load(name) for name in robots_of(options.robots)}
     for number in range(-(-options.count // block)):
@@ -379,12 +379,12 @@ class Climb:
 
     @property
     def path(self) -> Path:
-        """Where its figures are put when it is through."""
+        """Path of its results."""
         return Path("climb") / f"{self.robot}-{self.size:g}-{self.options.seed}.json"
 
     @property
     def state(self) -> Path:
-        """Where its climbers are."""
+        """Path of the state of its climbers."""
         return self.options.out / "climb" / f"{self.robot}-{self.options.seed}.state.json"
 
 
@@ -536,7 +536,7 @@ def climbed_rows(options: argparse.Namespace) -> tuple[list[Row], str]:
 
 
 def _missed_text(row: Row) -> str:
-    """How many were missed, and with which verdicts."""
+    """Return the number of misses by status, as text."""
     counts = Counter(miss["status"] for miss in row["missed"])
     words = ", ".join(f"{count} {name}" for name, count in counts.most_common())
     return f"{len(row['missed'])}" + (f" ({words})" if words else "")

@@ -37,10 +37,10 @@ ROBOTS = ("kuka_lwr_barrett", "panda+allegro_right", "ur5e+shadow")
 PERIOD = 1e-3
 STEPS = 2000
 SHARE = 0.5
-"""Of the velocity limits, and of the accelerations that reach them in 0.25 s, that paths need."""
+"""Fraction of the velocity limits, and of the accelerations, that paths need."""
 
 SOLVE_INTERVAL = 20
-"""Of so many targets one is solved anew, as it was done before there was a follower."""
+"""Interval of the targets that `solve` solves instead of a follower."""
 
 LEAPS = 4
 """Targets that leap, each given so many cycles:"""
@@ -48,7 +48,7 @@ LEAPS = 4
 WAIT = 2000
 
 TIMES = 3
-"""So often a path is followed for the time of its calls."""
+"""Number of repetitions for the time of a call."""
 
 SINGULAR = 0.05
 """Smallest singular value of an arm that counts as near singular, see `palm_slopes`."""
@@ -151,7 +151,7 @@ def _leaping(solver: ik.Solver, number: int) -> dict[str, Any]:
 
 
 def _anew(solver: ik.Solver, path: Array) -> dict[str, Any]:
-    """Every target solved from the q_next before: the steps between, and their time."""
+    """Solve every target from the previous solution; return steps and their time."""
     robot = solver.robot
     q, steps, seconds = path[0], [], []
     for points, normals in zip(*robot.contacts(path), strict=True):
@@ -217,7 +217,7 @@ def follow_lost_path(solver: ik.Solver, number: int) -> dict[str, Any]:
 def _within_tolerance(
     robot: ik.ArmHand, follower: ik.motion.Follower, points: Array, normals: Array
 ) -> tuple[Array, Array]:
-    """(k,) whether each cycle is within tolerance, and (k, n) where the motors were."""
+    """Return whether each cycle is within tolerance (k,), and the configurations (k, n)."""
     q = np.array([follower(*target) for target in zip(points, normals, strict=True)])
     position, angle = robot.errors(q, points, normals)
     return ((position <= 5e-3) & (angle <= np.radians(3))).all(axis=1), q
@@ -234,7 +234,7 @@ class Part:
 
     @property
     def path(self) -> Path:
-        """Where its figures are."""
+        """Path of its results."""
         return Path(self.robot) / f"{self.what}_{self.number:04d}.json"
 
 
@@ -254,7 +254,7 @@ def solve(part: Part) -> dict[str, Any]:
 
 
 def figures(robot: str, rows: dict[str, Array]) -> list[Metric]:
-    """Of a robot, with their confidence."""
+    """Return the metrics of a robot with their intervals."""
     is_within = rows["met"]
     return [
         rate_metric(f"{robot}/paths within tolerance", int((is_within == 1).sum()), len(is_within)),
@@ -343,7 +343,7 @@ HEADS = (
 
 
 def lost_row(robot: str, result: dict[str, Any], singular: bool) -> list[str]:
-    """Of the table of lost paths."""
+    """Return a row of the table of lost paths."""
     first = f"{1e3 * PERIOD * result['first']:.0f}" if result["first"] >= 0 else "-"
     cells = [robot, str(result["number"]), first, f"{100 * result['met']:.1f}"]
     cells += [f"{np.degrees(result['off']):.0f}", "yes" if singular else "no"]

@@ -58,13 +58,13 @@ PART = 100_000
 SINGLE_TARGETS = 300
 """Targets solved one by one; poses of the path that is followed."""
 CYCLES = 2000
-"""Of hands that are led through each other, at 1 kHz."""
+"""Number of cycles of crossing hands, at 1 kHz."""
 EXCESSES = (1e-3, 5e-3, 20e-3, 50e-3)
-"""How far out of reach targets are [m]."""
+"""Distances beyond the reach [m]."""
 SEARCH = 20_000
 """Answers that a random search looks at for one that touches nothing."""
 SEARCH_BATCH = 1000
-"""Of them, in one call."""
+"""Number of solutions of the random search in one call."""
 
 INTRODUCTION = """
 Targets are the contacts of configurations and therefore reachable. *Random* configurations are
@@ -108,14 +108,14 @@ class Cell:
 
     @property
     def path(self) -> Path:
-        """Where it is kept."""
+        """Path of its result."""
         number = list(TOLERANCES).index(self.tolerance)
         name = f"{self.task}-{number}-{self.first}-{self.count}-{self.seed}.json"
         return Path(self.robot) / name.replace(" ", "_")
 
     @property
     def size(self) -> int:
-        """How many targets."""
+        """Number of targets."""
         return self.count
 
 
@@ -371,7 +371,7 @@ def wrists(cell: Cell, robot: ArmHand) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Table:
-    """What a robot is asked for, and where the report has it.
+    """A measurement and its table in the report.
 
     Attributes:
         find: Works a part out.
@@ -437,7 +437,7 @@ TABLES = {
         wrists, WRISTS, ("robot", "way", "met", "off, median [mm]", "a pose, median [us]")
     ),
 }
-"""All there is to ask, in the report's order."""
+"""Tables in the order of the report."""
 
 
 def work_out(cell: Cell) -> dict[str, Any]:

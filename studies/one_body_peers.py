@@ -30,7 +30,7 @@ LEG = 90
 """Poses from one posture to the next: three seconds at 30 Hz."""
 
 WITHIN = 5e-3, np.deg2rad(3.0)
-"""What a wrist may be off to count as met [m], [rad]."""
+"""Tolerance of a wrist pose [m], [rad]."""
 
 
 def by_contacts(robot: ArmHand, q: Array) -> list[list[str]]:

@@ -57,7 +57,7 @@ class Joints:
         unit_positions = [list(robot.joints(row).values()) for row in np.eye(n)]
         self.C = np.stack(unit_positions, axis=1) - zero[:, None]
         self.offsets = zero
-        """(k,) what the couplings add [rad or m]; not in theta."""
+        """Return the constant terms of the couplings (k,) [rad or m]."""
         samples = robot.random(np.random.default_rng(0), 8)
         positions = np.stack(list(robot.joints(samples).values()), axis=-1)
         if np.abs(positions - zero - samples @ self.C.T).max() > LINEAR:
@@ -79,7 +79,7 @@ class Joints:
         self.lower, self.upper = ends[0] - slack, ends[1] + slack
 
     def order(self, names: list[str]) -> NDArray[np.intp]:
-        """Where our joints are among a peer's."""
+        """Return the indices of the joints among those of a peer."""
         return np.array([names.index(name) for name in self.names])
 
 
@@ -123,7 +123,7 @@ def _numbers(values: Array) -> str:
 
 
 class Peer(Protocol):
-    """One iteration of a solver; configurations are ours, (n,)."""
+    """Interface of other solvers: one iteration on motor positions (n,)."""
 
     def aim(self, points: Array, normals: Array) -> None:
         """Take a target: (f, 3) points [m] and normals."""
@@ -480,7 +480,7 @@ STALL = 0.9
 
 @dataclass(frozen=True)
 class Setting:
-    """How a peer is run.
+    """Parameters of a peer.
 
     Attributes:
         package: What has to be installed.
@@ -537,7 +537,7 @@ def starts_of(robot: ik.ArmHand, count: int) -> Array:
 def is_solved(
     robot: ik.ArmHand, q: Array, targets: Targets, tolerance: ik.Tolerance
 ) -> NDArray[np.bool_]:
-    """(k,) whether answers (k, n) meet their contacts within limits."""
+    """Return whether solutions (k, n) meet their contacts within limits (k,)."""
     position, angle, limit_excess = robot.deviations(q, *targets)
     slack = 1 + 1e-9
     is_within = (position <= tolerance.position * slack) & (angle <= tolerance.angle * slack)

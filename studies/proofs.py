@@ -105,7 +105,7 @@ CASES = (
 
 @dataclass(frozen=True)
 class Part:
-    """Some targets of a robot: reachable ones of a case, or impossible ones of a class."""
+    """Targets of a robot: reachable ones of a case, or impossible ones of a class."""
 
     robot: str
     name: str
@@ -116,17 +116,17 @@ class Part:
 
     @property
     def path(self) -> Path:
-        """Where its counts are."""
+        """Path of its counts."""
         return Path(self.robot) / f"{self.name}-{self.number:05d}.json"
 
     @property
     def rng(self) -> np.random.Generator:
-        """Of these targets alone."""
+        """Random generator of these targets."""
         return np.random.default_rng([self.seed, zlib.crc32(self.name.encode()), self.number])
 
 
 def case_name(case: tuple[str, float, float, bool]) -> str:
-    """Of a case of reachable targets."""
+    """Return the name of a case of reachable targets."""
     kind, tolerance, part, limits = case
     moved_by = f"moved by {part:.0%} of t" if part else "exact"
     return f"{kind}, t = {tolerance:g} m, {moved_by}{'' if limits else ', limits ignored'}"
@@ -187,7 +187,7 @@ def solve(part: Part) -> dict[str, Any]:
 
 
 def parts(options: argparse.Namespace) -> Iterator[Part]:
-    """All parts, a little of everything first."""
+    """Return all parts, alternating between robots and cases."""
     robots = options.robot or ROBOTS
     for robot in robots if options.impossible else ():
         for name in classes_of(load(robot)):

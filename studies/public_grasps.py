@@ -39,7 +39,7 @@ POSES = ((0, 0.0), (1, 0.7), (2, 2.1))
 """An object's axis that is up, see `standing`, and its yaw on the table [rad]; as in `touch`."""
 
 SIZES = (0.06, 0.08, 0.1, 0.12, 0.15)
-"""What DexGraspNet scales objects by."""
+"""Scales of objects in DexGraspNet."""
 
 INTRODUCTION = """
 {total} grasps of a Shadow hand from DexGraspNet's repository, of {objects} objects in five sizes
@@ -80,7 +80,7 @@ class Cell:
 
     @property
     def path(self) -> Path:
-        """Where its results are."""
+        """Path of its results."""
         settings = f"{self.scale:g}-{self.pose}-{self.limit}-{self.seed}.json"
         return Path(Path(self.mesh).stem) / settings
 

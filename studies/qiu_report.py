@@ -50,7 +50,7 @@ def figures_of(name: str, rows: pl.DataFrame) -> tuple[Metric, Metric, Metric]:
 
 
 def summary(table: pl.DataFrame) -> tuple[str, list[Metric]]:
-    """All objects together: the paper's means, ours with limits ignored and enforced."""
+    """Return the table of all objects: the paper, and our results without and with limits."""
     heads = ["method", "paper: solved %", "iterations", "time [ms]"]
     for limits in LIMITS:
         heads += [f"{HEADS[limits]}: solved %", "iterations", "time [ms]", "n"]
@@ -73,7 +73,7 @@ def summary(table: pl.DataFrame) -> tuple[str, list[Metric]]:
 
 
 def by_object(table: pl.DataFrame) -> tuple[str, list[Metric]]:
-    """Every object: the paper's cell, and ours with limits ignored and enforced."""
+    """Return the table by object: the paper, and our results without and with limits."""
     heads = ["object", "method", "paper: solved %", "iterations", "time [ms]"]
     heads += ["limits ignored: solved %", "iterations", "time [ms]"]
     heads += ["within limits: solved %", "iterations"]
@@ -93,7 +93,7 @@ def by_object(table: pl.DataFrame) -> tuple[str, list[Metric]]:
 
 
 def by_setting(table: pl.DataFrame, study: Study) -> tuple[str, list[Metric]]:
-    """One line per setting that has results."""
+    """Return the table with a row for each setting that has results."""
     rows, metrics = [], []
     for setting, part, cell_figures in _settings_with_results(table, study):
         metrics += cell_figures
@@ -102,7 +102,7 @@ def by_setting(table: pl.DataFrame, study: Study) -> tuple[str, list[Metric]]:
 
 
 def readings(table: pl.DataFrame, study: Study) -> tuple[str, list[Metric]]:
-    """One line per reading of the original methods, with its distance from the printed means.
+    """Return the table of readings of the original methods, with distances from the paper.
 
     The distance is |ln(rate / printed rate)| + |ln(iterations / printed iterations)|; none if
     nothing was solved. A second table has the readings that suit both methods together best.
@@ -151,7 +151,7 @@ def _cells(cell_figures: tuple[Metric, Metric, Metric]) -> list[str]:
 
 
 def endings(table: pl.DataFrame) -> str:
-    """How the solves of each setting ended, and the iterations that proofs of repetition saved."""
+    """Return the table of statuses by setting, and of iterations saved."""
     statuses = sorted(table["status"].unique())
     rows = []
     for method in METHODS:
@@ -279,7 +279,7 @@ def _band(panel: Axes, errors: Array, solved: bool) -> None:
 
 
 def _run(study: Study, setting: Setting, targets: str, target: int) -> tuple[bool, Array]:
-    """Whether a run is solved, and its worst error over the tolerance, (LONGEST,)."""
+    """Return whether a run is solved, and its largest error over tolerance (LONGEST,)."""
     group = next(item for item in study.sets if item.key == targets)
     number, row = divmod(target, study.block)
     robot = robot_of(study.robot)

@@ -77,7 +77,7 @@ METHODS = tuple(
 )
 LIMITS = ("ignore", "enforce")
 CLOSED_FORM = {"finger_step": "closed-form"}
-"""Of the enhanced methods: the answer of eq. (5) that Ipopt also gives, to 1e-9."""
+"""Root of eq. (5) for the enhanced methods; Ipopt agrees to 1e-9."""
 
 PALM = {False: "", True: ", palm first"}
 ORDER = {"per-finger": "finger by finger", "points-first": "points before normals"}
@@ -150,7 +150,7 @@ def _options_of(method: str, changes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def readings_study(count: int, seed: int, block: int) -> Study:
-    """Every reading of "the methods without the enhancement", limits ignored."""
+    """Return all readings of "the methods without the enhancement", without limits."""
     settings = []
     for steps in ("dls", "sdls"):
         for name, options in _readings():

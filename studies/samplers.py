@@ -20,17 +20,17 @@ DRAWS = 32
 """Arms of which the one nearest to a singularity is taken."""
 
 AMID = 0.6
-"""Where the one arm of random hands stands within its limits."""
+"""Position of the arm of random hands, as a fraction of its range."""
 
 NUDGE = 1e-6
 """Difference [rad or m] from which slopes are taken."""
 
 LENGTH = 0.1
-"""This many metres weigh like a radian."""
+"""Length that weighs metres against radians [m]."""
 
 
 def random_hands(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
-    """Every actuator uniform within its limits."""
+    """Draw every actuator uniformly within its limits."""
     return robot.random(rng, count)
 
 
@@ -43,7 +43,7 @@ def hands_on_one_arm(robot: ik.ArmHand, rng: np.random.Generator, count: int) ->
 
 
 def corners(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
-    """Every actuator by itself at its lower limit, at its upper one or anywhere."""
+    """Draw every actuator at its lower limit, at its upper limit or anywhere."""
     q, choice = robot.random(rng, count), rng.integers(0, 3, (count, len(robot.lower)))
     return np.where(choice == 0, robot.lower, np.where(choice == 1, robot.upper, q))
 
@@ -111,11 +111,11 @@ SAMPLERS: dict[str, tuple[str, Sampler]] = {
     "aligned-grasps": ("shipped grasps on aligned arms", shipped_hands_on_aligned_arms),
     "aligned-limits": ("near limits on aligned arms", near_limits_on_aligned_arms),
 }
-"""By option: title and sampler."""
+"""Title and sampler by option."""
 
 
 def suits(robot: ik.ArmHand, sampler: str) -> bool:
-    """Whether a robot has what a sampler needs: shipped grasps, seven joints that can be zero."""
+    """Return whether a sampler supports a robot (built-in grasps, seven joints through zero)."""
     if sampler.endswith("grasps") and not (ik.shipped_grasps(robot.name) and _arm(robot)):
         return False
     if not sampler.startswith("aligned"):

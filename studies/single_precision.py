@@ -24,10 +24,10 @@ import casadi_ik as ik
 
 ROBOTS = ("kuka_lwr_barrett", "panda+allegro_right")
 TOLERANCES = ((5e-3, 3.0), (1e-3, 0.5), (1e-4, 0.05))
-"""Of positions [m] and angles [deg]."""
+"""Tolerances of positions [m] and angles [deg]."""
 
 START_OFFSET = 0.3
-"""How far from the configuration that was drawn the robot is, each motor [rad, 1 sigma]."""
+"""Displacement of the start from the random configuration [rad, 1 sigma]."""
 
 SLACK = 1e-9
 """Part of a tolerance, and distance beyond a limit [rad or m], that is rounding."""

@@ -34,13 +34,13 @@ from casadi_ik.files.arrays import Array
 
 ROBOTS = ("panda+allegro_right", "kuka_lwr_barrett", "ur5e+shadow")
 PERIOD = 0.01
-"""Of a frame [s]."""
+"""Period of a frame [s]."""
 
 SHARE = 0.4
-"""Most of any motor's velocity on a path."""
+"""Largest fraction of a velocity limit on a path."""
 
 WRIST = (0.05, 0.05)
-"""How much the palm's place and facing count, a fingertip counting 1."""
+"""Weights of position and orientation of the palm, relative to a fingertip."""
 
 INTRODUCTION = f"""
 Paths of random smooth postures at up to {100 * SHARE:.0f} % of the velocity limits, frames of
@@ -90,7 +90,7 @@ def run(robot: ik.ArmHand, seed: int, count: int, wrist: bool) -> Run:
 
 
 NEEDED = ("dex_retargeting", "torch", "nlopt")
-"""What the peer imports; torch is not among what it names."""
+"""Packages that the peer imports; it does not declare torch."""
 
 KINDS = ("vector", "position", "dexpilot")
 
@@ -176,7 +176,7 @@ def retarget_with(robot: ik.ArmHand, kind: str, share: float, start: Array, fold
 
 @dataclass(frozen=True)
 class Tracking:
-    """What a motion came to: errors [m], roughness, share of frames beyond velocity, seconds."""
+    """Errors [m], roughness, fraction of frames beyond velocity limits, and times [s]."""
 
     error: Array
     rough: float

@@ -58,7 +58,7 @@ POSES = ((0, 0.0), (1, 0.7), (2, 2.1))
 """An object's axis that is up (z, y or x), and its yaw on the table [rad]."""
 
 CHECKED = 5
-"""Of so many grasps of an object at a pose distance and closure are worked out by other means."""
+"""Number of grasps of an object at a pose that independent code checks."""
 
 MU, PATCH, EDGES = 0.5, 0.005, 16
 """Friction, radius of a soft contact [m], edges of its cone."""
@@ -111,7 +111,7 @@ class Cell:
 
     @property
     def path(self) -> Path:
-        """Where its results are."""
+        """Path of its results."""
         settings = f"{self.pose}-{self.limit}-{self.seed}.json"
         return Path(self.robot) / Path(self.object).stem / settings
 
@@ -196,7 +196,7 @@ def checked(
 
 
 def closes(points: np.ndarray, inward: np.ndarray, length: float) -> bool:
-    """Whether soft contacts hold any small force and torque, by a linear program.
+    """Return whether soft contacts resist any small wrench, by a linear program.
 
     Args:
         points: (c, 3) from the middle of the object [m].
@@ -227,7 +227,7 @@ def closes(points: np.ndarray, inward: np.ndarray, length: float) -> bool:
 
 
 def cells(options: argparse.Namespace) -> list[Cell]:
-    """All, so that what is done first is as many of every robot."""
+    """Return all cells, alternating between robots."""
     settings = options.limit, options.seed
     return [
         Cell(robot, name, (pose + i) % len(POSES), *settings)

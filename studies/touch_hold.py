@@ -63,13 +63,13 @@ PAD = 0.010
 """Radius of a flat pad's ball [m]."""
 
 STIFFNESS = {"revolute": 3.0, "prismatic": 2000.0}
-"""Of a joint that a motor holds [N m/rad, N/m]."""
+"""Stiffness of a motor [N m/rad, N/m]."""
 
 STEP, SETTLING, TIME = 2e-3, 0.4, 1.0
-"""Of the simulation; before the force, and with it [s]."""
+"""Time step, and durations before and with the force [s]."""
 
 MAX_DISPLACEMENT, MAX_ROTATION = 0.020, np.deg2rad(30.0)
-"""What the object may move [m] and turn [rad]."""
+"""Largest displacement [m] and rotation [rad] of a held object."""
 
 STATE_SPEC = mujoco.mjtState.mjSTATE_INTEGRATION
 
@@ -145,7 +145,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def name_of(surface: ik.Surface) -> str:
-    """Of an object, or of a mesh without its folder."""
+    """Return the name of an object, or of a mesh without its folder."""
     return Path(surface.object.name).stem
 
 
@@ -272,7 +272,7 @@ class Hold:
         self._free = int(self.model.jnt_qposadr[self.model.body("thing").jntadr[0]])
 
     def _leads(self) -> dict[int, dict[str, float]]:
-        """By motor of the hand the joints that it moves, and how far each goes with it."""
+        """Return the joints that each motor of the hand moves, with their ratios."""
         robot, q, joints_by_motor = self.robot, self.grasp.q, {}
         start = robot.joints(q)
         for motor in robot.description.hand_actuators:
@@ -372,7 +372,7 @@ class Hold:
         return spec
 
     def targets(self) -> np.ndarray:
-        """Where the springs are to pull to, so that fingertips press as they should."""
+        """Return the targets of the springs for the desired forces of fingertips."""
         robot, q, model = self.robot, self.grasp.q, self.model
         joints, goals, contact_frames = robot.joints(q), np.zeros(model.nu), robot.contact_frames(q)
         pressed = []
@@ -424,7 +424,7 @@ class Hold:
         return state
 
     def is_held(self, state: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """(k,) whether the object stays from a state on, pulled by its weight along ways (k, 3)."""
+        """Return whether the object stays when pulled by its weight along directions (k, 3)."""
         model, data = self.model, self.data
         body = model.body("thing").id
         held = np.zeros(len(directions), dtype=bool)

@@ -21,7 +21,7 @@ from casadi_ik.files.arrays import Array
 
 
 def usable(robot: ik.ArmHand, chain: HeldThumb, q: Array, steps: int) -> NDArray[np.bool_]:
-    """Which turns the arm follows, (k, steps), from -pi on."""
+    """Return which rotations the arm can follow (k, steps), from -pi."""
     turns = 2 * np.pi * (np.arange(steps) / steps - 0.5)
     points, normals = (part[:, chain.thumb] for part in robot.contacts(q))
     follows = np.empty((len(q), steps), dtype=bool)

@@ -61,12 +61,12 @@ class MinkAmong(Mink):
         return limits
 
     def limits(self) -> list[Any]:
-        """Those of collisions; those of motors are bounds of the program."""
+        """Return the collision limits; motor limits are bounds of the program."""
         return self._avoided
 
 
 def solve_peer(piece: Piece, targets: int) -> dict[str, Any]:
-    """So many of a piece's targets by mink and by us."""
+    """Solve some targets of a piece by mink and by hand-first."""
     robot, rows = ik.load_robot(piece.robot), list[dict[str, Any]]()
     for scene, grasps in grasps_at(piece):
         check, solver = SceneCheck(robot, scene), ik.Solver(robot, scene=scene)
@@ -92,7 +92,7 @@ def solve_peer(piece: Piece, targets: int) -> dict[str, Any]:
 def _solved(
     peer: MinkAmong, robot: ik.ArmHand, grasp: ik.Grasp, around: CollisionQuery
 ) -> tuple[bool, int]:
-    """Whether an answer was found, and how many starts it took."""
+    """Return whether a solution was found, and the number of starts."""
     points, normals = grasp.arrays(robot.fingers)
     peer.aim(points, normals)
     for number, start in enumerate(starts_of(robot, STARTS - 1), start=1):
@@ -127,7 +127,7 @@ def _from(
 
 
 def installed() -> bool:
-    """Whether mink can be imported."""
+    """Return whether mink is installed."""
     try:
         import_module("mink")
     except ImportError:

@@ -124,7 +124,7 @@ class CoalOracle:
             )
 
     def penetrating(self, q: Array, depth: float) -> NDArray[np.bool_]:
-        """(k,) whether any pair overlaps by more than `depth` [m] beyond what it may."""
+        """Return whether a pair overlaps by more than `depth` [m] plus its allowance (k,)."""
         penetrates = np.zeros(len(q), dtype=bool)
         configurations = self.configurations(q)
         loose = (self._offsets != 0).any()
@@ -241,7 +241,7 @@ class MuJoCoOracle:
             mujoco.mj_collision(self._model, self._data)
 
     def touching(self, q: Array, depth: float) -> NDArray[np.bool_]:
-        """(k,) whether any pair overlaps by more than `depth` [m]."""
+        """Return whether a pair overlaps by more than `depth` [m] (k,)."""
         touches = np.zeros(len(q), dtype=bool)
         for row, q_row in enumerate(self._configurations(q)):
             self._data.qpos = q_row

@@ -20,7 +20,7 @@ TABLE = {"kind": "box", "size": [3, 3, 0.04], "xyz": [0, 0, -0.02]}
 MAX_POSTURE_DISTANCE = 0.12
 """Clutter keeps so far [m] from the object's middle: what stands in the hand cannot be grasped."""
 TURNS = 16
-"""How often each grasp is turned about the vertical at its place."""
+"""Number of yaw angles of each grasp at its position."""
 AT_ONCE = 2048
 """Answers of a dense search that are looked for at once."""
 SAFE = 2e-3
@@ -30,7 +30,7 @@ POSTURES = 12
 SAMPLES = 20_000
 """Random configurations that they are taken from."""
 BALL, SMALLEST = "ball", 0.012
-"""What they hold, and its least radius [m]."""
+"""Name of the object of random hands, and its smallest radius [m]."""
 MICROMETRE = 1e-6
 BATCH = 256
 """Targets of a batch that is timed: those of a grasp, again and again."""
@@ -81,7 +81,7 @@ def solve_piece(piece: Piece) -> dict[str, Any]:
 
 
 def targets_at(piece: Piece) -> Iterator[tuple[dict[str, Any], str, Array, Array, Array]]:
-    """Of each grasp of a piece, those turns that contacts alone solve.
+    """Yield the yaw angles of each grasp of a piece that are solvable without the scene.
 
     Yields:
         Solids of the scene, the name of the one that is grasped, and its (k, f, 3) points,
@@ -206,7 +206,7 @@ def dense(
     count: int,
     rng: np.random.Generator,
 ) -> bool:
-    """Whether one of many solutions has room to spare: those nearest to so many random postures."""
+    """Return whether one of many solutions, each nearest to a random start, has clearance."""
     blind = ik.Solver(robot)
     for first in range(0, count, AT_ONCE):
         size = min(AT_ONCE, count - first)

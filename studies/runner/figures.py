@@ -17,7 +17,7 @@ from casadi_ik.files.arrays import Array
 RESULTS = Path(__file__).parents[1] / "results"
 
 PAPER, OURS, THIRD, FOURTH = COLORS = "#e08a2e", "#2f6db3", "#1f9d55", "#8e4ec6"
-"""What the paper does, what we do, others."""
+"""Colours of the paper, of our results, and of a third series."""
 
 
 def figure(rows: int, columns: int, width: float = 4.2, height: float = 3.7) -> tuple[Any, Any]:

@@ -31,7 +31,7 @@ PACKAGES = (*places.REQUIRED_PACKAGES, "polars")
 
 
 class Part(Protocol):
-    """Some targets, solved in one call.
+    """Targets that are solved in one call.
 
     Attributes:
         path: Where their results are, relative to the study's folder.
@@ -136,7 +136,7 @@ def _progress() -> Progress:
 
 @contextmanager
 def backend(jobs: int, dask: str | None) -> Iterator[None]:
-    """Where joblib's calls go meanwhile, see `casadi_ik.integrations.batches`.
+    """Run calls of joblib here or on a cluster; see `casadi_ik.integrations.batches`.
 
     A cluster needs the installed package with its extra `dev` and nothing else: the study's own
     modules are sent to it, and what its workers solve comes back as bytes.

@@ -82,7 +82,7 @@ class Block:
 
     @property
     def path(self) -> Path:
-        """Where its results are, relative to the study's folder."""
+        """Path of its results, relative to the folder of the study."""
         return Path(self.setting.key) / self.targets.key / f"{self.number:05d}.parquet"
 
 
@@ -113,7 +113,7 @@ class Study:
     block: int = 100
 
     def blocks(self) -> Iterator[Block]:
-        """All blocks, so that what is done so far is as many of every set and setting."""
+        """Yield all blocks, alternating between sets and settings."""
         for number in range(-(-self.count // self.block)):
             size = min(self.block, self.count - number * self.block)
             for setting in self.settings:
@@ -270,7 +270,7 @@ STUDY_FILE = "study.json"
 
 
 def fingerprint(study: Study) -> dict[str, Any]:
-    """Everything that decides a result, but how many there are."""
+    """Return everything that determines a result, except the number of targets."""
     return {
         "code": code_version(),
         "robot": _digest(robot_of(study.robot).urdf()),
@@ -328,7 +328,7 @@ def _rows(path: Path) -> int:
 
 
 def read_results(study: Study, folder: Path) -> pl.DataFrame:
-    """Everything a study has come to so far, whatever its count; no rows if nothing."""
+    """Return all results of a study so far; no rows without results."""
     paths = [
         path
         for setting in study.settings
