@@ -652,7 +652,7 @@ def write_report(options: argparse.Namespace, run_by: str) -> None:
     result, *tolerances = displaced_table(options, metrics) or [""]
     body = [result] if result else []
     if total or noise or not result:
-        body += [INTRODUCTION, f"{total:,} solves, {missed_count} missed."]
+        body += [f"**{total:,} solves, {missed_count} missed.**", INTRODUCTION]
     options.report.mkdir(parents=True, exist_ok=True)
     if options.ratio and rows and all("+" in row["robot"] for row in rows):
         heat_map(rows, options.report / "pairs.png")

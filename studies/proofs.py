@@ -227,9 +227,9 @@ def write_report(options: argparse.Namespace, run_by: str) -> None:
             table.append([*cells, *(f"{q:.2f}" for q in quantiles), *left])
     heads = ["robot", "class", "n", "proved %", "median [ms]", "99 % [ms]"]
     body = [
+        f"**{total:,} targets, {len(listed)} false proofs.**",
         INTRODUCTION.format(*(f"{x:g}" for x in options.beyond)),
         "## Reachable targets",
-        f"{total:,} targets, {len(listed)} false proofs.",
         markdown_table(["robot", "targets", "n", "false"], rows),
         *([markdown_table(["robot", "targets", "q"], listed)] if listed else []),
         "## Impossible targets",
