@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import tomllib
 from pathlib import Path
 
@@ -90,6 +91,12 @@ def test_workflows_and_forms_are_yaml(path):
     found = yaml.safe_load(path.read_text())
     for job in found.get("jobs", {}).values():
         assert {"runs-on", "steps"} <= job.keys()
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / ".github").rglob("*.yml")), ids=lambda p: p.stem)
+def test_workflows_name_existing_files(path):
+    for name in re.findall(r"(?<![\w/.])(?:tests|tools|studies)/[\w/]+(?:\.py)?", path.read_text()):
+        assert (ROOT / name).exists(), name
 
 
 def test_the_recipe_has_the_dependencies_of_the_core():
