@@ -22,6 +22,7 @@ TOLERANCE = ik.Tolerance(position=1e-3, angle=1e-2)
 MAX_ITERATIONS = 600
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["kuka_lwr_barrett", "baxter_ar10", "ar10"])
 @pytest.mark.parametrize("prefer", ["limits", "q0"])
 def test_each_stage_is_followed_by_the_same_one(name: str, prefer: str) -> None:

@@ -27,12 +27,17 @@ def clearances(solver, q):
 @pytest.mark.parametrize(
     ("name", "has_scene"),
     [
-        ("kuka_lwr_barrett", True),
         ("kuka_lwr_barrett", False),
-        ("panda+allegro_right", True),
-        ("ur5e+shadow", True),
-        ("g1+dex3", True),
-        ("g1+dex3", False),
+        *(
+            pytest.param(name, has_scene, marks=pytest.mark.slow)
+            for name, has_scene in (
+                ("kuka_lwr_barrett", True),
+                ("panda+allegro_right", True),
+                ("ur5e+shadow", True),
+                ("g1+dex3", True),
+                ("g1+dex3", False),
+            )
+        ),
     ],
 )
 def test_a_target_that_comes_back_is_followed_again(name, has_scene, kind):

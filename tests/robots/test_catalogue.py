@@ -184,6 +184,7 @@ def test_pads_face_each_other(gripper: str) -> None:
         np.testing.assert_allclose(points[1] + apart * normals[1], points[0], atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pair", ["ur5e+so100_jaw", "widowx_250s+widowx_gripper"])
 def test_random_contacts_are_solved(pair: str, rng: np.random.Generator) -> None:
     robot = ik.load_robot(pair)

@@ -172,6 +172,7 @@ def test_what_is_refused(robot, solver):
         ik.Solver(robot, "ipopt").solve_all(asked)
 
 
+@pytest.mark.slow
 def test_arms_of_a_hand_with_a_wrist():
     """The wrist makes two joints more than a closed form takes: all its branches are there."""
     robot = ik.load_robot("ur5e+shadow")

@@ -385,6 +385,7 @@ def test_fixed_actuators(robot: ik.ArmHand, cup: tuple[Array, Array]) -> None:
         assert relief.q[robot.actuators.index("bh_spread")] == pytest.approx(2.5)
 
 
+@pytest.mark.slow
 def test_arm_without_a_closed_form(bent: ik.ArmHand) -> None:
     solver, rng = ik.Solver(bent), np.random.default_rng(5)
     batch = batch_of(solver, *bent.contacts(bent.random(rng, 150)))

@@ -56,6 +56,7 @@ def workers(cache: Path) -> list[int]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", ["None", "ik.load_scene('table')"])
 def test_the_virtual_machine_answers_until_there_is_compiled_code(
     tmp_path: Path, scene: str

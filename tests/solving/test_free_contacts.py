@@ -46,6 +46,7 @@ def test_a_palm_out_of_reach_is_diagnosed_as_one():
     assert solution.diagnosis.palm is not None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "fingers", "count"),
     [("ur5e+robotiq_2f85", 2, 160), ("jaco2+panda_hand", 2, 480), ("puma560+jaco_3f", 1, 220)],
@@ -76,6 +77,7 @@ def test_what_a_hand_of_one_motor_misses_is_diagnosed(name):
         assert solved == (why is None)
 
 
+@pytest.mark.slow
 def test_an_arm_with_a_tool():
     robot, solver = robot_of("panda+tool"), solver_of("panda+tool")
     q = robot.random(np.random.default_rng(0), 100)

@@ -52,6 +52,7 @@ asked = given(
 )
 
 
+@pytest.mark.slow
 @some
 @asked
 def test_solved_is_the_same_whatever_is_preferred(seed, robot, scene):
@@ -76,6 +77,7 @@ def test_solved_is_the_same_whatever_is_preferred(seed, robot, scene):
     assert told.success[:-2].sum() >= usual.success[:-2].sum()
 
 
+@pytest.mark.slow
 @some
 @asked
 def test_choose_answers_as_many_candidates(seed, robot, scene):
@@ -91,6 +93,7 @@ def test_choose_answers_as_many_candidates(seed, robot, scene):
             assert len({one.candidate for one in ranked}) == len(ranked)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_what_cannot_be_reached_near_q0_is_looked_for_elsewhere(robot):
     """Near what the tolerances allow other starts end elsewhere: some of these were lost."""
@@ -110,6 +113,7 @@ def test_what_cannot_be_reached_near_q0_is_looked_for_elsewhere(robot):
             np.testing.assert_array_equal(q, near.q[row])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("grasp", ["shadow_cup", "leap_mustard_bottle"])
 @pytest.mark.parametrize("prefer", ["q0", "limits", "manipulability", "clearance"])
 def test_a_shipped_grasp_on_the_table(grasp, prefer):

@@ -291,6 +291,7 @@ def _bounds(prover: Prover) -> ca.Function:
     return ca.Function("bounds", list(p.values()), [*outputs, ca.vertcat(least, most)])
 
 
+@pytest.mark.slow
 def test_limits_of_shoulder_and_wrist_are_part_of_the_reach(
     robot: ik.ArmHand, prover: Prover
 ) -> None:

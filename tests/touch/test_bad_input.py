@@ -128,6 +128,7 @@ def test_functions_that_do_not_rank(solver, prefer):
         solver.grasps_of("tomato_soup_can", PLACE, limit=1, among=1, prefer=prefer)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "source",
     [BOX, (BOX.vertices, BOX.faces), [BOX.vertices.tolist(), BOX.faces.tolist()]],

@@ -263,6 +263,7 @@ def test_open_before_and_squeezing_after(found):
         assert np.linalg.norm(one.pregrasp.palm[:3, 3] - palm[:3, 3]) == pytest.approx(0.06)
 
 
+@pytest.mark.slow
 def test_there_is_a_way_to_most_grasps_and_up_from_there(found):
     solver, grasps = found
     ways = [solver.approach(one) for one in grasps]
@@ -275,6 +276,7 @@ def test_there_is_a_way_to_most_grasps_and_up_from_there(found):
     np.testing.assert_allclose(up[:3, 3], [0, 0, 0.08], atol=3e-3)
 
 
+@pytest.mark.slow
 def test_what_is_lifted_is_placed_elsewhere(found):
     solver, grasps = found
     robot, to = solver.robot, PLACE.copy()
