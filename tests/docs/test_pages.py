@@ -291,6 +291,14 @@ def test_links_of_the_readme_are_absolute_and_name_files_of_the_repository() -> 
         assert (ROOT / path).is_file(), target
 
 
+def test_every_notebook_opens_in_colab() -> None:
+    page = (ROOT / "docs" / "notebooks.md").read_text(encoding="utf-8")
+    names = re.findall(r"colab\.research\.google\.com/github/[^)]*/(notebooks/[^)]*)\)", page)
+    assert names == [
+        f"notebooks/{path.name}" for path in sorted((ROOT / "notebooks").glob("*.ipynb"))
+    ]
+
+
 def test_pages_install_no_unpublished_package() -> None:
     """Packages of this project are installed from a checkout until they are published."""
     for page in PAGES:
