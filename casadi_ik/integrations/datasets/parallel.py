@@ -26,7 +26,7 @@ from casadi_ik.integrations.datasets.postures import HandPoses
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.pose import inverse
 
-PAD = 0.1034
+PAD_DISTANCE = 0.1034
 """Distance of the pads' middle from the base of the Panda hand, along the approach [m].
 
 Source: `franka_hand.xacro` of franka_ros, frame `hand_tcp`."""
@@ -42,7 +42,7 @@ PANDA_OPENING = 0.08
 SLACK = 2e-3
 """Excess of a width over the largest opening of a gripper that is taken for rounding [m]."""
 
-SAMPLES = 201
+OPENING_SAMPLES = 201
 """Positions of the motor at which the opening of a gripper is computed."""
 
 
@@ -101,7 +101,7 @@ def graspnet(path: Path) -> JawGrasps:
 
 
 POSES = ("poses", "transforms", "grasps", "grasp_poses")
-WIDTHS = ("widths", "width", "openings", "opening")
+WIDTH_KEYS = ("widths", "width", "openings", "opening")
 
 
 def poses(path: Path) -> JawGrasps:
@@ -112,7 +112,7 @@ def poses(path: Path) -> JawGrasps:
         known = ", ".join(map(str, content)) or "nothing"
         raise DescriptionError(f"{path}: found {known}, expected one of {', '.join(POSES)}")
     transforms = _poses(f"{path}: {name}", content[name])
-    width = next((name for name in WIDTHS if name in content), "")
+    width = next((name for name in WIDTH_KEYS if name in content), "")
     widths = np.full(len(transforms), np.nan)
     if width:
         widths = _column(f"{path}: {width}", content[width], len(transforms))
@@ -226,7 +226,7 @@ def for_gripper(given: JawGrasps, robot: ArmHand, clip: bool) -> HandPoses:
             f" {', '.join(robot.fingers)}; expected two, moved by one motor"
         )
     motor = robot.actuators.index(motors[0])
-    samples = np.linspace(robot.lower[motor], robot.upper[motor], SAMPLES)
+    samples = np.linspace(robot.lower[motor], robot.upper[motor], OPENING_SAMPLES)
     openings = _openings(robot, motor, samples)
     order = np.argsort(openings)
     smallest, largest = openings[order[[0, -1]]]
@@ -285,7 +285,7 @@ def _of_panda(transforms: Array) -> Array:
     """Grasp frames of grippers whose base is that of ACRONYM: z approaches and x opens."""
     frames = transforms.copy()
     frames[:, :3, 0], frames[:, :3, 1] = -transforms[:, :3, 1], transforms[:, :3, 0]
-    frames[:, :3, 3] += PAD * transforms[:, :3, 2]
+    frames[:, :3, 3] += PAD_DISTANCE * transforms[:, :3, 2]
     return frames
 
 

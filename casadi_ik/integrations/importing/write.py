@@ -17,7 +17,7 @@ from casadi_ik.integrations.importing.guess import Pad
 from casadi_ik.model.link_shapes import Touching
 from casadi_ik.model.schema import ShapeEntry
 
-PLAIN = re.compile(r"[A-Za-z_/.][A-Za-z0-9_./+-]*")
+PLAIN_SCALAR = re.compile(r"[A-Za-z_/.][A-Za-z0-9_./+-]*")
 """What YAML takes for text without quotes; nothing that it could take for anything else."""
 
 RESERVED = {"true", "false", "yes", "no", "on", "off", "null", "y", "n", "."}
@@ -25,7 +25,7 @@ RESERVED = {"true", "false", "yes", "no", "on", "off", "null", "y", "n", "."}
 
 def scalar(text: str) -> str:
     """A text as a YAML value or key."""
-    if PLAIN.fullmatch(text) and text.lower() not in RESERVED:
+    if PLAIN_SCALAR.fullmatch(text) and text.lower() not in RESERVED:
         return text
     return json.dumps(text, ensure_ascii=False)
 
@@ -35,7 +35,7 @@ def one_line(text: str) -> str:
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())
 
 
-WIDTH = 98
+LINE_WIDTH = 98
 """Characters of a line, as far as a shape can be broken."""
 
 
@@ -79,7 +79,7 @@ def _of_shape(one: ShapeEntry) -> list[str]:
             parts.append(f"{key}: {_text(value, key)}")
     lines, line = [], "      - {"
     for part in parts:
-        if len(line) + len(part) > WIDTH and not line.endswith("{"):
+        if len(line) + len(part) > LINE_WIDTH and not line.endswith("{"):
             lines.append(line.rstrip())
             line = "         "
         line += part + ", "

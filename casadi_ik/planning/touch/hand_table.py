@@ -79,7 +79,7 @@ class HandTable:
         self, robot: ArmHand, seed: int = 0, parameters: HandTableParameters | None = None
     ) -> None:
         """Draw the postures (Sobol' points) and sort the pairs by distance and angles."""
-        self.parameters = chosen = parameters or HandTableParameters()
+        self.parameters = parameters = parameters or HandTableParameters()
         description = robot.description
         if len(robot.fingers) < 2:
             raise UnsupportedError(
@@ -87,18 +87,18 @@ class HandTable:
             )
         self.robot = robot
         self.of_finger = {name: description.finger_actuators(name) for name in robot.fingers}
-        users = [i for own in self.of_finger.values() for i in own]
+        users = [i for finger_motors in self.of_finger.values() for i in finger_motors]
         self.motors = np.array(sorted(set(users)), dtype=np.intp)
         shared = np.array([users.count(i) > 1 for i in self.motors])
         self.kernel = hand_kernel(description)
         self.thumb = robot.fingers.index(robot.thumb)
         self.shapes: HandShapes | None = None
         self.radii = np.array([description.finger(name).radius for name in robot.fingers])
-        self.roll = np.where(self.radii > 0, chosen.roll, 0.0)
+        self.roll = np.where(self.radii > 0, parameters.roll, 0.0)
         self.palm = robot.palm(robot.home)
         # Where fingers share all motors (a gripper) a posture is a value of these.
-        count = 1 if shared.all() else chosen.postures
-        values = chosen.postures if shared.all() else chosen.shared if shared.any() else 1
+        count = 1 if shared.all() else parameters.postures
+        values = parameters.postures if shared.all() else parameters.shared if shared.any() else 1
         lower, upper = robot.lower[self.motors], robot.upper[self.motors]
         self.q = np.tile(lower + _sobol(len(lower), count, seed) * (upper - lower), (values, 1, 1))
         if shared.any():
@@ -111,49 +111,51 @@ class HandTable:
 
     @classmethod
     def of(cls, robot: ArmHand) -> HandTable:
-        """Return the table of a robot, made once per process."""
+        """Return the table of a robot, computed once per process."""
         if robot not in _TABLES:
             _TABLES[robot] = cls(robot)
         return _TABLES[robot]
 
     def put(self, hand: Array, rows: NDArray[np.intp], posture: Array, finger: int) -> None:
         """Copy the positions of a finger's motors from a posture into hands, in place."""
-        own = self.of_finger[self.robot.fingers[finger]]
-        columns = np.flatnonzero(np.isin(self.motors, own))
+        finger_motors = self.of_finger[self.robot.fingers[finger]]
+        columns = np.flatnonzero(np.isin(self.motors, finger_motors))
         hand[np.ix_(rows, columns)] = posture[:, columns]
 
-    def opened(self, some: Candidates, opening: float) -> Candidates:
+    def opened(self, hands: Candidates, opening: float) -> Candidates:
         """Return hands with fingertips moved back from the object [m]; negative: into it."""
-        hand = some.hand
+        hand = hands.hand
         lower, upper = self.robot.lower[self.motors], self.robot.upper[self.motors]
         for _ in range(4):
             _, normals, linear, _ = self.at(hand)
-            rows = (linear * some.used[..., None, None]).reshape(len(hand), -1, len(self.motors))
-            goal = (-0.25 * opening * normals * some.used[..., None]).reshape(len(hand), -1)
+            rows = (linear * hands.used[..., None, None]).reshape(len(hand), -1, len(self.motors))
+            goal = (-0.25 * opening * normals * hands.used[..., None]).reshape(len(hand), -1)
             square = rows.swapaxes(1, 2) @ rows + 1e-5 * np.eye(len(self.motors))
             step = np.linalg.solve(square, rows.swapaxes(1, 2) @ goal[..., None])[..., 0]
             hand = np.clip(hand + step, lower, upper)
-        return replace(some, hand=hand)
+        return replace(hands, hand=hand)
 
-    def squeezed(self, some: Candidates, touched: Array, forces: Array, inward: float) -> Array:
+    def squeezed(
+        self, hands: Candidates, contact_offsets: Array, forces: Array, inward: float
+    ) -> Array:
         """Return hands (k, m) whose motors advance in proportion to the torques of forces.
 
-        Motors held by equal springs exert these forces if they are sent there.
+        Motors of equal stiffness that are commanded to these positions exert the forces.
 
         Args:
-            some: The hands as they touch.
-            touched: (k, f, 3) contact points, from the centres of the pads [m], palm frame.
+            hands: Hands whose fingertips touch the object.
+            contact_offsets: (k, f, 3) contact points, from the centres of the pads [m], palm frame.
             forces: (k, f, 3) forces on the object, palm frame; 0 for fingers that do not touch.
             inward: Mean advance of the fingertips [m].
         """
-        _, _, linear, angular = self.at(some.hand)
-        linear = linear + np.cross(angular, touched[..., None], axis=2)
+        _, _, linear, angular = self.at(hands.hand)
+        linear = linear + np.cross(angular, contact_offsets[..., None], axis=2)
         torque = np.einsum("kfim,kfi->km", linear, forces)
-        along = np.einsum("kfim,km,kfi->k", linear, torque, forces)
-        along /= np.linalg.norm(forces, axis=2).sum(axis=1)
-        step = inward / np.maximum(along, 1e-9)[:, None] * torque
+        advance = np.einsum("kfim,km,kfi->k", linear, torque, forces)
+        advance /= np.linalg.norm(forces, axis=2).sum(axis=1)
+        step = inward / np.maximum(advance, 1e-9)[:, None] * torque
         lower, upper = self.robot.lower[self.motors], self.robot.upper[self.motors]
-        return np.clip(some.hand + step, lower, upper)
+        return np.clip(hands.hand + step, lower, upper)
 
     def configuration(self, hands: Array) -> Array:
         """Return configurations (k, n) with hands (k, m), the arm at home."""
@@ -176,58 +178,60 @@ class HandTable:
 
     def _sort_pairs(self) -> None:
         """Find pairs of postures of the thumb and another finger that oppose each other."""
-        robot, chosen = self.robot, self.parameters
+        robot, parameters = self.robot, self.parameters
         thumb = self.thumb
-        found, keys = [], []
-        least = np.cos(chosen.facing + self.roll)
+        pair_blocks, keys = [], []
+        min_cosines = np.cos(parameters.facing + self.roll)
         for share in range(len(self.q)):
             a, n = self.points[share, :, thumb], self.normals[share, :, thumb]
-            for other in range(len(robot.fingers)):
-                if other == thumb:
+            for finger in range(len(robot.fingers)):
+                if finger == thumb:
                     continue
-                b, o = self.points[share, :, other], self.normals[share, :, other]
-                way = b[None] - a[:, None]
-                length = np.linalg.norm(way, axis=-1)
-                way /= np.maximum(length, 1e-9)[..., None]
-                first = np.einsum("ijk,ik->ij", way, n)
-                second = -np.einsum("ijk,jk->ij", way, o)
-                i, j = np.nonzero((first > least[thumb]) & (second > least[other]))
-                found.append(
-                    np.stack([np.full(len(i), share), np.full(len(i), other), i, j], axis=1)
+                b, o = self.points[share, :, finger], self.normals[share, :, finger]
+                direction = b[None] - a[:, None]
+                length = np.linalg.norm(direction, axis=-1)
+                direction /= np.maximum(length, 1e-9)[..., None]
+                first = np.einsum("ijk,ik->ij", direction, n)
+                second = -np.einsum("ijk,jk->ij", direction, o)
+                i, j = np.nonzero((first > min_cosines[thumb]) & (second > min_cosines[finger]))
+                pair_blocks.append(
+                    np.stack([np.full(len(i), share), np.full(len(i), finger), i, j], axis=1)
                 )
                 keys.append(self.key(length[i, j], first[i, j], second[i, j]))
-        pairs, key = np.concatenate(found), np.concatenate(keys)
-        if len(pairs) > chosen.pairs:
-            kept = np.random.default_rng(0).choice(len(pairs), chosen.pairs, replace=False)
-            pairs, key = pairs[kept], key[kept]
+        pairs, key = np.concatenate(pair_blocks), np.concatenate(keys)
+        if len(pairs) > parameters.pairs:
+            sample = np.random.default_rng(0).choice(len(pairs), parameters.pairs, replace=False)
+            pairs, key = pairs[sample], key[sample]
         order = np.argsort(key, kind="stable")
         self.pairs, self._keys = pairs[order], key[order]
-        share, other, a, b = self.pairs.T
-        middles = (self.points[share, a, thumb] + self.points[share, b, other]) / 2
+        share, finger, a, b = self.pairs.T
+        middles = (self.points[share, a, thumb] + self.points[share, b, finger]) / 2
         self.depths = np.linalg.norm(middles, axis=1)
 
     def shape(self, check: SceneCheck) -> HandShapes:
         """Return the capsules of the postures, and remove pairs that collide; done once."""
         if self.shapes is None:
             self.shapes = shapes = HandShapes.of(self, check)
-            share, other, a, b = self.pairs.T
-            word = shapes.apart[share, self.thumb, other, a, b // 64]
-            alone = shapes.alone[share, a, self.thumb] & shapes.alone[share, b, other]
-            kept = alone & ((word >> (b % 64).astype(np.uint64)) & 1).astype(bool)
+            share, finger, a, b = self.pairs.T
+            word = shapes.apart[share, self.thumb, finger, a, b // 64]
+            is_clear = shapes.alone[share, a, self.thumb] & shapes.alone[share, b, finger]
+            is_valid = is_clear & ((word >> (b % 64).astype(np.uint64)) & 1).astype(bool)
             self.pairs, self._keys, self.depths = (
-                np.ascontiguousarray(column[kept])
+                np.ascontiguousarray(column[is_valid])
                 for column in (self.pairs, self._keys, self.depths)
             )
         return self.shapes
 
     def key(self, length: Array, first: Array, second: Array) -> NDArray[np.int64]:
         """Return the cells of pairs, from distances [m] and cosines of normals with the line."""
-        chosen = self.parameters
-        turns = [
-            np.minimum(np.arccos(np.clip(c, -1, 1)) / chosen.turn, 99).astype(np.int64)
+        parameters = self.parameters
+        angle_cells = [
+            np.minimum(np.arccos(np.clip(c, -1, 1)) / parameters.turn, 99).astype(np.int64)
             for c in (first, second)
         ]
-        return ((length / chosen.cell).astype(np.int64) * 100 + turns[0]) * 100 + turns[1]
+        return (
+            (length / parameters.cell).astype(np.int64) * 100 + angle_cells[0]
+        ) * 100 + angle_cells[1]
 
     def cells(self, key: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return the first pair of each cell and the number of its pairs."""
@@ -237,21 +241,22 @@ class HandTable:
 
 @dataclass(frozen=True, eq=False)
 class HandShapes:
-    """The capsules of a hand in the postures of its table, palm frame: those of fingers first.
+    """Capsules of a hand in the postures of its table, in the palm frame, fingers first.
 
     Attributes:
-        links: (c + d,) of each capsule.
-        numbers: (c + d,) which of the robot's capsules they are.
-        capsules: (s, n, c, 6) one end of the fingers' segments, and the way to the other [m].
-        fixed: (d, 6) the same of those that move with the palm alone.
-        lengths: (c + d,) of the segments [m].
+        links: (c + d,) link of each capsule.
+        numbers: (c + d,) index of each capsule in the robot's collision model.
+        capsules: (s, n, c, 6) start of each finger segment and vector to its end [m].
+        fixed: (d, 6) start and vector of the segments of the palm [m].
+        lengths: (c + d,) lengths of the segments [m].
         first: (f + 1,) first capsule of each finger.
-        pads: (c,) whether a capsule may touch what its finger touches.
-        alone: (s, n, f) whether a finger is clear of itself and of the palm.
-        apart: (s, f, f, n, words) bits of the postures of another finger that are clear of one of
-            the first, and alone.
-        crossing: (x, 4) fingers and their capsules that must not meet.
-        reach: (x,) how near these may come [m].
+        pads: (c,) 1 for capsules that may touch the object.
+        alone: (s, n, f) True for fingers that collide neither with themselves nor with the palm.
+        apart: (s, f, f, n, words) bit set of the collision-free postures of the second finger that
+            do not collide with a posture of the first.
+        crossing: (x, 4) pairs of capsules of two fingers that must not collide: finger, capsule,
+            finger, capsule.
+        reach: (x,) minimum distances between the segments of these pairs [m].
     """
 
     links: tuple[str, ...]
@@ -268,28 +273,34 @@ class HandShapes:
 
     @classmethod
     def of(cls, table: HandTable, check: SceneCheck) -> HandShapes:
-        """Place the capsules and find which postures meet.
+        """Compute the capsules and the postures of two fingers that do not collide.
 
         Args:
-            table: Of the hand.
-            check: Of any scene about its robot.
+            table: Table of the hand.
+            check: Collision check of the robot; its scene does not matter.
         """
         model, robot = check.model, table.robot
         (s, n, _), f = table.q.shape, len(robot.fingers)
         owner = [_finger_of(table, link) for link in model.links]
-        still = {link for link in model.links if link in model.moving or model.is_fixed(link)}
-        own = [[i for i, k in enumerate(owner) if k == finger] for finger in range(f)]
-        rest = [i for i, k in enumerate(owner) if k is None and model.links[i] not in still]
-        numbers = np.concatenate([*own, rest]).astype(np.intp)
-        count = len(numbers) - len(rest)
+        ignored_links = {
+            link for link in model.links if link in model.moving or model.is_fixed(link)
+        }
+        finger_capsules = [[i for i, k in enumerate(owner) if k == finger] for finger in range(f)]
+        palm_capsules = [
+            i for i, k in enumerate(owner) if k is None and model.links[i] not in ignored_links
+        ]
+        numbers = np.concatenate([*finger_capsules, palm_capsules]).astype(np.intp)
+        count = len(numbers) - len(palm_capsules)
         q = table.configuration(table.q.reshape(s * n, -1))
-        (where,) = check.kernel.shape_poses(q)
-        segments = where.reshape(s * n, -1)[:, : 6 * len(owner)].reshape(s * n, -1, 6)[:, numbers]
-        turn, middle, half = table.palm[:3, :3], segments[..., :3], segments[..., 3:]
-        start = (middle - half - table.palm[:3, 3]) @ turn
-        placed = np.concatenate([start, 2 * half @ turn], axis=-1)
+        (capsule_poses,) = check.kernel.shape_poses(q)
+        segments = capsule_poses.reshape(s * n, -1)[:, : 6 * len(owner)].reshape(s * n, -1, 6)[
+            :, numbers
+        ]
+        rotation, middle, half_segment = table.palm[:3, :3], segments[..., :3], segments[..., 3:]
+        start = (middle - half_segment - table.palm[:3, 3]) @ rotation
+        palm_segments = np.concatenate([start, 2 * half_segment @ rotation], axis=-1)
         links = tuple(model.links[i] for i in numbers)
-        first = np.cumsum([0, *map(len, own)])
+        first = np.cumsum([0, *map(len, finger_capsules)])
         within = pair_table(model, Scene(), ())
         pads = [
             links[i] in check.finger_bodies[robot.fingers[k]]
@@ -298,36 +309,42 @@ class HandShapes:
         ]
         # Pairs of a finger with itself or the palm, and of two fingers.
         fingers = np.array([-1 if k is None else k for k in owner] + [-1] * within.own)
-        pairs, known = fingers[within.pairs], np.isin(within.pairs[:, 0], numbers)
-        known &= np.isin(within.pairs[:, 1], numbers) | (within.pairs[:, 1] >= len(owner))
-        two = known & (pairs >= 0).all(axis=1) & (pairs[:, 0] != pairs[:, 1])
-        one = within.select(known & ~two)
-        clear = check.kernel.all_distances(q, np.zeros((0, 12)), one) >= 0
-        alone = np.stack(
-            [clear[:, (fingers[one.pairs] == k).any(axis=1)].all(axis=1) for k in range(f)], 1
+        pairs, is_relevant = fingers[within.pairs], np.isin(within.pairs[:, 0], numbers)
+        is_relevant &= np.isin(within.pairs[:, 1], numbers) | (within.pairs[:, 1] >= len(owner))
+        joins_fingers = is_relevant & (pairs >= 0).all(axis=1) & (pairs[:, 0] != pairs[:, 1])
+        single_finger_pairs = within.select(is_relevant & ~joins_fingers)
+        clear = check.kernel.all_distances(q, np.zeros((0, 12)), single_finger_pairs) >= 0
+        is_clear = np.stack(
+            [
+                clear[:, (fingers[single_finger_pairs.pairs] == k).any(axis=1)].all(axis=1)
+                for k in range(f)
+            ],
+            1,
         ).reshape(s, n, f)
-        place = np.zeros(len(fingers), dtype=np.int64)
-        place[numbers] = range(len(numbers))
-        a, b = within.pairs[two].T
+        position_of = np.zeros(len(fingers), dtype=np.int64)
+        position_of[numbers] = range(len(numbers))
+        a, b = within.pairs[joins_fingers].T
         words = -(-n // 64)
         padded = np.zeros((s, f, 64 * words), dtype=bool)
-        padded[..., :n] = alone.swapaxes(1, 2)
+        padded[..., :n] = is_clear.swapaxes(1, 2)
         bits = np.packbits(padded, axis=-1, bitorder="little").view(np.uint64)
-        made = cls(
+        hand_shapes = cls(
             links,
             numbers,
-            np.ascontiguousarray(placed[:, :count].reshape(s, n, count, 6)),
-            np.ascontiguousarray(placed[0, count:]),
+            np.ascontiguousarray(palm_segments[:, :count].reshape(s, n, count, 6)),
+            np.ascontiguousarray(palm_segments[0, count:]),
             2 * model.halves[numbers],
             first,
             np.array(pads, dtype=np.int64),
-            alone,
+            is_clear,
             np.tile(bits[:, None, :, None], (1, f, 1, n, 1)),
-            np.ascontiguousarray(np.stack([fingers[a], place[a], fingers[b], place[b]], axis=1)),
-            model.radii[a] + model.radii[b] + within.offsets[two],
+            np.ascontiguousarray(
+                np.stack([fingers[a], position_of[a], fingers[b], position_of[b]], axis=1)
+            ),
+            model.radii[a] + model.radii[b] + within.offsets[joins_fingers],
         )
-        run_cancellable("touch", touch_library()["casadi_ik_apart"], TouchJob(**made.job))
-        return made
+        run_cancellable("touch", touch_library()["casadi_ik_apart"], TouchJob(**hand_shapes.job))
+        return hand_shapes
 
     @property
     def job(self) -> dict[str, Any]:
@@ -354,8 +371,8 @@ def _finger_of(table: HandTable, link: str) -> int | None:
     if max(shared):
         return int(np.argmax(shared))
     motors = robot.links_moved
-    moved = [name for name in robot.finger_names if link in motors(table.of_finger[name])]
-    return robot.finger_names.index(moved[0]) if moved else None
+    moving_fingers = [name for name in robot.finger_names if link in motors(table.of_finger[name])]
+    return robot.finger_names.index(moving_fingers[0]) if moving_fingers else None
 
 
 TouchJob = c_struct("touch_job", {"3": 3, "4": 4, "BINS": BINS})

@@ -351,7 +351,7 @@ LEAST_SAMPLES = 500
 SIZES = (5e-3, 2.0)
 """Range of the largest edge of the bounding box of an object [m]."""
 
-FLAT = 1e-4
+MIN_THICKNESS = 1e-4
 """A mesh that is thinner than this is a flat sheet [m]."""
 
 DISAGREE = 0.05
@@ -379,7 +379,7 @@ def _body(
     center = vertices.mean(axis=0)
     _, axes = np.linalg.eigh(np.cov((vertices - center).T))
     thickness = np.ptp(vertices @ axes[:, 0])
-    if thickness < FLAT:
+    if thickness < MIN_THICKNESS:
         raise InputError(
             f"{name}: found a flat sheet ({1e3 * thickness:.2g} mm), expected a mesh of a body"
         )
