@@ -1,0 +1,341 @@
+"""Search for the configurations nearest to contacts that are out of reach.
+
+The distance of a configuration from a target is the sum of its squared contact errors, each divided
+by its tolerance. The search refines several starts to local minima of this distance and returns the
+least of them: the start and the result of the failed solve, quasi-random arms from distinct regions
+of the joint space, and hands that were fitted to the contacts with a floating palm. The minimum is
+the best one found; it is not proved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from casadi_ik.compile import RUNNING
+from casadi_ik.compile.graphs import StepGraph, recipe
+from casadi_ik.compile.layout import Field, Layout
+from casadi_ik.compile.loop import LoopKernel
+from casadi_ik.files.arrays import Array, Rows, spread_points
+from casadi_ik.kinematics.box_qp import normal_equations, solve_box_qp
+from casadi_ik.kinematics.contact_fit import contact_jacobian, contact_residual
+from casadi_ik.kinematics.contacts import LENGTH, ContactRows, Kinds, kinds_suffix
+from casadi_ik.kinematics.smooth import with_cse
+from casadi_ik.model.description import RobotDescription
+from casadi_ik.model.targets import TargetBatch
+from casadi_ik.solve.closest import FloatingPalmFit
+from casadi_ik.solve.status import Status
+from casadi_ik.solve.trials import (
+    LocalRefinement,
+    Subproblems,
+    first_per_owner,
+    residual_tolerances,
+    smallest_per_target,
+)
+
+
+@dataclass(frozen=True)
+class NearestSettings:
+    """Settings of the search for the nearest configurations. Source: ``studies/best_effort.py``.
+
+    Attributes:
+        samples: Number of quasi-random configurations in the table.
+        region_bits: Number of joint ranges that are halved to divide the table into regions.
+        sampled_starts: Number of configurations of the table that are refined.
+        fitted_starts: Number of hands with a floating palm whose arm is placed and refined.
+        race_steps: Number of steps that all starts make.
+        finalists: Number of starts that continue to the minimum.
+        tie: Relative difference of two distances below which the configuration nearer to the start
+            is chosen.
+    """
+
+    samples: int = 4096
+    region_bits: int = 7
+    sampled_starts: int = 32
+    fitted_starts: int = 8
+    race_steps: int = 10
+    finalists: int = 8
+    tie: float = 1e-6
+
+
+NEAREST_SETTINGS = NearestSettings()
+
+
+@dataclass(frozen=True)
+class DescentParameters:
+    """Parameters of the descent to a local minimum. Source: ``studies/best_effort.py``.
+
+    Attributes:
+        damping: First damping of the normal matrix.
+        damping_floor: Smallest damping.
+        damping_ceiling: Damping at which a rejected step ends the descent.
+        decrease: Factor of the damping after an accepted step.
+        increase: Factor of the damping after a rejected step.
+        slow: Ratio of distances after and before a step above which steps use the exact second
+            derivatives: Gauss-Newton steps converge slowly where errors remain.
+        settled: Relative decrease of the distance below which a descent has ended.
+        passes: Number of corrections of the active set in a step.
+        max_iterations: Maximum number of steps.
+    """
+
+    damping: float = 1e-3
+    damping_floor: float = 1e-12
+    damping_ceiling: float = 1e6
+    decrease: float = 0.1
+    increase: float = 8.0
+    slow: float = 0.5
+    settled: float = 1e-14
+    passes: int = 3
+    max_iterations: int = 100
+
+
+DESCENT = DescentParameters()
+
+
+@dataclass(frozen=True)
+class DescentStep:
+    """One step of the bounded descent of the distance of a robot from its contacts.
+
+    Attributes:
+        robot: Description of the robot.
+        kinds: Kind of contact of each finger.
+    """
+
+    robot: RobotDescription
+    kinds: Kinds
+
+    @cached_property
+    def contacts(self) -> ContactRows:
+        """Rows of the contacts."""
+        return ContactRows(self.kinds)
+
+    @cached_property
+    def state(self) -> Layout:
+        """Layout of the state."""
+        return Layout(
+            (
+                Field("q", (len(self.robot.actuators),), unit="rad or m"),
+                Field("damping", doc="damping of the next step"),
+                Field("is_exact", doc="1: the next step uses exact second derivatives"),
+            )
+        )
+
+    @cached_property
+    def parameters(self) -> Layout:
+        """Layout of the parameters."""
+        n = len(self.robot.actuators)
+        bounds = (Field(name, (n,), unit="rad or m") for name in ("lower", "upper"))
+        return Layout((*self.contacts.fields, *bounds))
+
+    @cached_property
+    def graph(self) -> StepGraph:
+        """``(state, parameters) -> (state', record, status)``."""
+        name = ca.Function.fix_name(f"{self.robot.name}_descent{kinds_suffix(self.kinds)}")
+        record = Layout.record(Field("distance", doc="half the squared residual after the step"))
+        key = recipe(name, self.robot, self.kinds)
+        return StepGraph(
+            name, lambda: self._build(name), self.state, self.parameters, record, recipe=key
+        )
+
+    def _build(self, name: str) -> ca.Function:
+        state, parameters = self.state.symbols("state"), self.parameters.symbols("parameters")
+        s, p = self.state.unpack(state), self.parameters.unpack(parameters)
+        q = ca.SX.sym("q", len(self.robot.actuators))
+        residual = contact_residual(self.robot, self.contacts, q, p)
+        distance = ca.sumsqr(residual) / 2
+        jacobian = ca.densify(contact_jacobian(self.robot, self.contacts, q, p))
+        gauss_newton, gradient = normal_equations(jacobian, residual)
+        hessian = ca.triu(ca.densify(ca.hessian(distance, q)[0]))
+        inputs = [q, parameters]
+        value = ca.Function("distance", inputs, [distance])
+        model = ca.Function("model", inputs, with_cse(distance, gradient, gauss_newton, hessian))
+        before, slope, approximate, exact = model(s["q"], parameters)
+        matrix = ca.if_else(s["is_exact"] > 0.5, exact, approximate)
+        low, high = p["lower"] - s["q"], p["upper"] - s["q"]
+        step = solve_box_qp(matrix, s["damping"], slope, low, high, DESCENT.passes)
+        trial = ca.fmin(ca.fmax(s["q"] + step, p["lower"]), p["upper"])
+        after = value(trial, parameters)
+        is_accepted = after < before
+        is_slow = after > DESCENT.slow * before
+        factor = ca.if_else(is_accepted, DESCENT.decrease, DESCENT.increase)
+        new_state = {
+            "q": ca.if_else(is_accepted, trial, s["q"]),
+            "damping": ca.fmax(s["damping"] * factor, DESCENT.damping_floor),
+            "is_exact": ca.if_else(is_accepted, is_slow, 1 - s["is_exact"]),
+        }
+        has_settled = ca.logic_and(is_accepted, before - after <= DESCENT.settled * before)
+        is_stuck = ca.logic_and(ca.logic_not(is_accepted), s["damping"] > DESCENT.damping_ceiling)
+        status = ca.if_else(
+            ca.logic_or(has_settled, is_stuck), float(Status.STALLED), float(RUNNING)
+        )
+        outputs = [
+            ca.densify(self.state.pack(new_state)),
+            ca.densify(ca.if_else(is_accepted, after, before)),
+            status,
+        ]
+        return ca.Function(name, [state, parameters], outputs)
+
+
+@dataclass(frozen=True, eq=False)
+class SampleTable:
+    """Quasi-random configurations and their contacts.
+
+    Attributes:
+        q: (m, n) configurations [rad or m].
+        region: (m,) number of the region of the joint space of each.
+        features: (m, 6 f) contact points, divided by `LENGTH`, and normals.
+        squares: (m, 2 f) their squared norms.
+    """
+
+    q: Array
+    region: Rows
+    features: Array
+    squares: Array
+
+
+class NearestSearch:
+    """Search for the nearest configurations of one robot."""
+
+    def __init__(
+        self,
+        trials: Subproblems,
+        kinds: Kinds,
+        compiled: bool = True,
+        settings: NearestSettings = NEAREST_SETTINGS,
+    ) -> None:
+        """Store the runs of the loop; the table is built at the first search."""
+        self._trials, self._settings = trials, settings
+        self._step = DescentStep(trials.robot.description, kinds)
+        self._floating_palm = FloatingPalmFit(trials)
+        self._compiled = compiled
+
+    @cached_property
+    def _kernel(self) -> LoopKernel:
+        return LoopKernel(self._step.graph, self._compiled)
+
+    @cached_property
+    def _table(self) -> SampleTable:
+        robot, settings = self._trials.robot, self._settings
+        n = len(robot.actuators)
+        spread = spread_points(settings.samples, n)
+        q = robot.lower + spread * (robot.upper - robot.lower)
+        points, normals = robot.contacts(q)
+        points = points / LENGTH
+        halves = (spread[:, : settings.region_bits] >= 0.5).astype(np.intp)
+        return SampleTable(
+            q,
+            halves @ (1 << np.arange(halves.shape[1])),
+            np.concatenate([points, normals], axis=1).reshape(len(q), -1),
+            np.concatenate([(points**2).sum(axis=2), (normals**2).sum(axis=2)], axis=1),
+        )
+
+    def find(self, targets: TargetBatch, q0: Array, last_q: Array) -> Array:
+        """Return the nearest configurations found (k, n) [rad or m].
+
+        Args:
+            targets: k targets of the kinds of contacts of this search.
+            q0: (k, n) start configurations, which decide between equally near ones [rad or m].
+            last_q: (k, n) configurations at which the solves ended [rad or m].
+        """
+        all_rows = np.arange(len(targets))
+        owners, starts = [all_rows, all_rows], [q0, last_q]
+        for owner, q in (self._sampled(targets), self._fitted(targets, q0)):
+            owners.append(owner)
+            starts.append(q)
+        owner, start = np.concatenate(owners), np.concatenate(starts)
+        parameters = self._parameters(targets)
+        states = self._run(self._states(parameters[owner], start), parameters[owner], is_race=True)
+        finalists = smallest_per_target(
+            owner, self.distances(targets, owner, self._q(states)), self._settings.finalists
+        )
+        owner = owner[finalists]
+        states = self._run(states[finalists], parameters[owner])
+        return self._nearest(targets, q0, owner, self._q(states))
+
+    def descend(self, targets: TargetBatch, q: Array) -> Array:
+        """Return the local minima (k, n) of the distance that are reached from configurations.
+
+        Args:
+            targets: k targets of the kinds of contacts of this search.
+            q: (k, n) configurations [rad or m].
+        """
+        parameters = self._parameters(targets)
+        return self._q(self._run(self._states(parameters, q), parameters))
+
+    def _parameters(self, targets: TargetBatch) -> Array:
+        """Return the parameters (k, np) of the descent."""
+        contacts = self._step.contacts
+        values = {f"{name}s": np.nan_to_num(targets.vectors(f"{name}s")) for name in contacts.data}
+        lower, upper = targets.bounds(self._trials.robot.description)
+        values |= {"weights": _weights(targets), "lower": lower, "upper": upper}
+        return self._step.parameters.pack_rows(values, len(targets))
+
+    def _states(self, parameters: Array, q: Array) -> Array:
+        """Return the first states (m, ns) of descents."""
+        layout = self._step.parameters
+        lower, upper = (parameters[:, layout.slice(name)] for name in ("lower", "upper"))
+        start = {"q": np.clip(q, lower, upper), "damping": DESCENT.damping, "is_exact": 0.0}
+        return self._step.state.pack_rows(start, len(q))
+
+    def _run(self, states: Array, parameters: Array, is_race: bool = False) -> Array:
+        """Return the states (m, ns) at the end of descents, or of their first steps."""
+        count = self._settings.race_steps if is_race else DESCENT.max_iterations
+        return self._kernel.run(states, parameters, count).states
+
+    def _q(self, states: Array) -> Array:
+        return states[:, self._step.state.slice("q")]
+
+    def distances(self, targets: TargetBatch, owner: Rows, q: Array) -> Array:
+        """Return (m,) sums of squared contact errors, each divided by its tolerance."""
+        misses = LocalRefinement(self._trials, targets).misses(owner, q)
+        tolerances = residual_tolerances(targets)[owner]
+        ratios = np.divide(misses, tolerances, where=tolerances > 0, out=np.zeros_like(misses))
+        return (ratios**2).sum(axis=(1, 2))
+
+    def _nearest(self, targets: TargetBatch, q0: Array, owner: Rows, q: Array) -> Array:
+        """Return the nearest configuration of each target; the travel from q0 decides ties."""
+        robot, distance = self._trials.robot, self.distances(targets, owner, q)
+        least = np.full(len(targets), np.inf)
+        np.minimum.at(least, owner, distance)
+        is_least = distance <= least[owner] * (1 + self._settings.tie)
+        ranges = np.maximum(robot.upper - robot.lower, 1e-9)
+        travel = (np.abs(q - q0[owner]) / ranges).max(axis=1)
+        order = np.lexsort((np.where(is_least, travel, np.inf), owner))
+        return q[first_per_owner(owner, order, 1)]
+
+    def _sampled(self, targets: TargetBatch) -> tuple[Rows, Array]:
+        """Return target indices and configurations of the table, the nearest of each region."""
+        table, count = self._table, len(targets)
+        weights = _weights(targets) ** 2
+        goals = np.stack([targets.points / LENGTH, targets.normals], axis=1)
+        weights = np.swapaxes(weights, 1, 2) * ~np.isnan(goals[..., 0])
+        goals = np.nan_to_num(goals)
+        weighted = (weights[..., None] * goals).reshape(count, -1)
+        distance = weights.reshape(count, -1) @ table.squares.T - 2 * weighted @ table.features.T
+        rows, starts = self._settings.sampled_starts, []
+        regions = int(table.region.max()) + 1
+        for row in range(count):
+            order = np.lexsort((distance[row], table.region))
+            best = first_per_owner(table.region, order, max(1, -(-rows // regions)))
+            starts.append(best[np.argsort(distance[row, best])[:rows]])
+        owner = np.repeat(np.arange(count), [len(best) for best in starts])
+        return owner, table.q[np.concatenate(starts)]
+
+    def _fitted(self, targets: TargetBatch, q0: Array) -> tuple[Rows, Array]:
+        """Return target indices and configurations with fitted hands and placed arms."""
+        trials, body = self._trials, self._trials.robot.description
+        if not (body.arm_actuators and body.hand_actuators):
+            return np.zeros(0, dtype=np.intp), np.zeros((0, len(trials.robot.actuators)))
+        fits = self._floating_palm.fits(targets, q0)
+        rows = fits.best(self._settings.fitted_starts)
+        return fits.owner[rows], trials.run(fits.states[rows], fits.parameters[rows])
+
+
+def _weights(targets: TargetBatch) -> Array:
+    """Return (k, f, 2) weights of points and normals: inverse tolerances, the largest is 1."""
+    tolerances = residual_tolerances(targets)
+    inverse = np.divide(1.0, tolerances, where=tolerances > 0, out=np.zeros_like(tolerances))
+    return inverse / inverse.max(axis=(1, 2), keepdims=True)
