@@ -171,6 +171,7 @@ class Solver(MovingSolver):
         diagnose: bool = True,
         fixed: Mapping[str, float] | None = None,
         prefer: str | None = None,
+        best_effort: bool | str = False,
     ) -> Solution:
         """Solve one grasp.
 
@@ -185,6 +186,10 @@ class Solver(MovingSolver):
                 a start that solves the grasp is returned unchanged), "limits" (far from them),
                 "manipulability" (of the arm), "clearance" (from obstacles). None: "q0" if q0 is
                 given, else "limits".
+            best_effort: Whether to return the nearest configuration found of a grasp that is not
+                solved, with status NEAREST: the sum of its squared contact errors, each divided by
+                its tolerance, is least. "local": the local minimum that is reached from q0, so that
+                a robot that follows a moving target does not jump.
 
         Returns:
             The solution; failure to converge is a status, never an exception.
@@ -221,9 +226,12 @@ class Solver(MovingSolver):
                 self.robot.upper - self.robot.lower,
             )
         if log is None:
-            return self._engine.solve_one(targets, SolveOptions(q0, seed, diagnose=diagnose))
+            options = SolveOptions(q0, seed, diagnose=diagnose, best_effort=best_effort)
+            return self._engine.solve_one(targets, options)
         with recorder_of(self, log, seed) as recorder:
-            options = SolveOptions(q0, seed, recorder=recorder, diagnose=diagnose)
+            options = SolveOptions(
+                q0, seed, recorder=recorder, diagnose=diagnose, best_effort=best_effort
+            )
             return self._engine.solve(targets, options).solution(0)
 
     def solve_batch(
@@ -240,6 +248,7 @@ class Solver(MovingSolver):
         compression: Compression = "zstd",
         prefer: str | None = None,
         object_pose: ArrayLike | None = None,
+        best_effort: bool | str = False,
         **more: ArrayLike | None,
     ) -> BatchSolution:
         """Solve k targets.
@@ -259,6 +268,7 @@ class Solver(MovingSolver):
             compression: Compression of the log: "zstd" (level 1), "lz4" or "none".
             prefer: See `solve`.
             object_pose: (4, 4) or (k, 4, 4) pose of the grasped item of the scene, base frame.
+            best_effort: See `solve`.
             more: (k, f, 3) further vectors by name, NaN where free: "tangents" (second axes of
                 `ArmHand.contact_frames`), "lines" and "planes" (the point may lie anywhere on
                 them), "balls" (outward normals of ball pads that touch the points), "directions"
@@ -282,7 +292,9 @@ class Solver(MovingSolver):
         if object_pose is not None:
             targets = targets.holding(grasped_in(self.scene), object_pose)
         with recorder_of(self, log, seed, keep, compression) as recorder:
-            options = SolveOptions(q0, seed, jobs, recorder, diagnose, show_progress=True)
+            options = SolveOptions(
+                q0, seed, jobs, recorder, diagnose, show_progress=True, best_effort=best_effort
+            )
             return self._engine.solve(targets, options)
 
     def solve_blocks(
@@ -296,6 +308,7 @@ class Solver(MovingSolver):
         fixed: Mapping[str, float] | None = None,
         prefer: str | None = None,
         first_row: int = 0,
+        best_effort: bool | str = False,
     ) -> Generator[SolvedBlock, None, None]:
         """Solve a stream of targets block by block, in the memory of one block.
 
@@ -314,6 +327,7 @@ class Solver(MovingSolver):
             fixed: See `solve_batch`.
             prefer: See `solve_batch`.
             first_row: Number of the first target, if the stream is part of a larger one.
+            best_effort: See `solve`.
 
         Yields:
             The solved blocks.
@@ -335,7 +349,7 @@ class Solver(MovingSolver):
 
         with recorder_of(self, log, seed) as recorder:
             tolerances = tuple(self.tolerances.values())
-            options = SolveOptions(q0, seed, jobs, recorder, diagnose)
+            options = SolveOptions(q0, seed, jobs, recorder, diagnose, best_effort=best_effort)
             yield from self._engine.solve_blocks(blocks, parse, tolerances, options, first_row)
 
     def stepper(self, grasp: Grasp, q0: ArrayLike | None = None) -> Stepper:
@@ -427,6 +441,7 @@ class Solver(MovingSolver):
         diagnose: bool = False,
         fixed: Mapping[str, float] | None = None,
         prefer: str | None = None,
+        best_effort: bool | str = False,
     ) -> BatchSolution:
         """Solve k palm poses with known hand postures: only the arm is unknown.
 
@@ -440,6 +455,7 @@ class Solver(MovingSolver):
             diagnose: See `solve_batch`.
             fixed: See `solve`; for actuators of the arm.
             prefer: See `solve`.
+            best_effort: See `solve`; the hands keep their postures.
 
         Returns:
             As `solve_batch`, with `palm_position_error`, `palm_angle_error` and `palm_ok`.
@@ -463,7 +479,9 @@ class Solver(MovingSolver):
         hands = broadcast_postures(self._request.robot, postures, len(poses))
         preference = self._engine.resolve_preference(prefer, q0 is not None)
         targets = self._request.of_palms(poses, hands, fixed, preference)
-        options = SolveOptions(q0, seed, jobs, None, diagnose, show_progress=True)
+        options = SolveOptions(
+            q0, seed, jobs, None, diagnose, show_progress=True, best_effort=best_effort
+        )
         return self._engine.solve(targets, options)
 
     choose = choose

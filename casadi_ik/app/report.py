@@ -51,6 +51,7 @@ FAILURE_TEXTS = {
     Status.UNREACHABLE: "{} cannot be reached (proved)",
     Status.COLLISION: "{} and limits are met, but the robot is in collision",
     Status.NOT_FOUND: "neither a solution nor a proof of infeasibility was found",
+    Status.NEAREST: "{} were not reached: the nearest configuration found",
 }
 
 

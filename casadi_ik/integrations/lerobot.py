@@ -6,6 +6,8 @@ Written against lerobot 0.4 (`lerobot.model.kinematics`, `lerobot.processor`).
 # pyright: reportMissingImports=false
 from __future__ import annotations
 
+import dataclasses
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,7 +19,7 @@ from casadi_ik.errors import InputError, InvalidPoseError, optional_import
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.input_checks.keypoints import lost_contacts_reason
 from casadi_ik.files.input_checks.poses import single_pose
-from casadi_ik.model.grasp import Contact, Grasp
+from casadi_ik.model.grasp import Contact, Grasp, Tolerance
 from casadi_ik.solve.status import Status
 
 with optional_import("integrations.lerobot"):
@@ -28,17 +30,22 @@ POINT_KEYS, NORMAL_KEYS = ("x", "y", "z"), ("nx", "ny", "nz")
 """Suffixes of the keys of a contact in an action."""
 
 
+MAX_ANGLE_TOLERANCE = math.radians(30)
+"""Largest tolerance that a small orientation weight leads to [rad]."""
+
+
 class ArmKinematics:
     """Exact, global kinematics of a palm or tool with the interface of LeRobot's `kinematics`.
 
     Replaces `lerobot.model.kinematics.RobotKinematics` in `InverseKinematicsEEToJoints`,
     `EEReferenceAndDelta` and other steps: positions in degrees, poses (4, 4) [m]. Values after
-    those of the arm (such as a gripper's) are unchanged. If a pose is out of reach, the arm does
-    not move, see `status`.
+    those of the arm (such as a gripper's) are unchanged. Where no configuration has the pose, out of
+    reach or with five axes, the arm moves to the nearest one of its branch, see `status`.
 
     Attributes:
         joint_names: Motors of the arm, in the order of all arrays.
-        status: Status of the last inverse kinematics; INVALID if the pose was not rigid or finite.
+        status: Status of the last inverse kinematics: SOLVED, NEAREST, or INVALID if the pose was
+            not rigid or finite, so that the arm did not move.
     """
 
     def __init__(self, solver: Solver) -> None:
@@ -69,10 +76,10 @@ class ArmKinematics:
         Args:
             current_joint_pos: Positions of the arm [deg], followed by values that are unchanged.
             desired_ee_pose: (4, 4) Pose in the base frame.
-            position_weight: Unused: the pose is met within the solver's tolerance.
-            orientation_weight: 0: only the position is constrained (arms without a hand).
+            position_weight: Weight of squared position errors [1/m^2].
+            orientation_weight: Weight of squared angles [1/rad^2], which sets the tolerance of the
+                angle; 0: only the position is constrained (arms without a hand).
         """
-        del position_weight
         positions = np.array(current_joint_pos, dtype=float)
         q0 = self._configuration(positions)
         try:
@@ -80,26 +87,32 @@ class ArmKinematics:
         except InvalidPoseError:  # the tracker has lost the hand: the arm does not move
             self.status = Status.INVALID
             return positions
-        grasp = self._grasp(pose, orientation_weight != 0)
-        solution = self._solver.solve(grasp, q0=q0, prefer="q0", diagnose=False)
+        grasp = self._grasp(pose, position_weight, orientation_weight)
+        solution = self._solver.solve(
+            grasp, q0=q0, prefer="q0", diagnose=False, best_effort="local"
+        )
         self.status = solution.status
-        if solution.success:
+        if solution.status in (Status.SOLVED, Status.NEAREST):
             positions[: len(self._arm)] = np.rad2deg(solution.q[self._arm])
         return positions
 
-    def _grasp(self, pose: Array, with_orientation: bool) -> Grasp:
+    def _grasp(self, pose: Array, position_weight: float, orientation_weight: float) -> Grasp:
         robot = self._robot
         if robot.description.hand_actuators:
-            if not with_orientation:
+            if not orientation_weight:
                 raise InputError("orientation_weight: found 0, expected an arm without a hand")
             posture = {
                 robot.actuators[i]: float(robot.home[i]) for i in robot.description.hand_actuators
             }
             return Grasp(palm=pose, posture=posture)
         tip = pose @ np.linalg.inv(robot.palm(robot.home)) @ robot.contact_frames(robot.home)[0]
-        return Grasp(
-            {robot.fingers[0]: Contact.at(tip) if with_orientation else Contact(tip[:3, 3])}
-        )
+        finger = robot.fingers[0]
+        if not orientation_weight:
+            return Grasp({finger: Contact(tip[:3, 3])})
+        position = self._solver.tolerances[finger].position
+        ratio = math.sqrt(position_weight / orientation_weight)
+        tolerance = Tolerance(position, min(position * ratio, MAX_ANGLE_TOLERANCE))
+        return Grasp({finger: dataclasses.replace(Contact.at(tip), tolerance=tolerance)})
 
 
 def _contacts_of(points: dict[str, list[float]], normals: dict[str, list[float]]) -> Grasp | None:
@@ -124,8 +137,8 @@ class ContactsToJoints(RobotActionProcessorStep):
     """Processor step from contacts in an action to targets of all motors of arm and hand.
 
     `FINGER.x`, `.y`, `.z` [m] and `.nx`, `.ny`, `.nz` (outward normal of the pad, optional) are
-    replaced by `MOTOR.pos` [rad or m]. If the contacts are out of reach, the motors keep their
-    targets.
+    replaced by `MOTOR.pos` [rad or m]. If the contacts are out of reach, the motors move to the
+    nearest configuration of their branch.
 
     Attributes:
         solver: Solver of the robot.
@@ -149,9 +162,11 @@ class ContactsToJoints(RobotActionProcessorStep):
         if grasp is None:
             self.status, self.q = Status.INVALID, q0
         else:
-            solution = self.solver.solve(grasp, q0=q0, prefer="q0", diagnose=False)
+            solution = self.solver.solve(
+                grasp, q0=q0, prefer="q0", diagnose=False, best_effort="local"
+            )
             self.status = solution.status
-            self.q = solution.q if solution.success else q0
+            self.q = solution.q if solution.status in (Status.SOLVED, Status.NEAREST) else q0
         return action | {
             f"{name}.pos": float(value) for name, value in zip(robot.actuators, self.q, strict=True)
         }

@@ -31,17 +31,23 @@ from casadi_ik.solve.first_answer import InterimSolver
 from casadi_ik.solve.hand_first.method import HandFirstMethod
 from casadi_ik.solve.hand_first.parameters import HandFirstParameters
 from casadi_ik.solve.method import HandSearch, Method, Outcome, SingleOutcome
+from casadi_ik.solve.nearest import NearestSearch
 from casadi_ik.solve.recorder import Recorder
 from casadi_ik.solve.remedies import add_collision_remedies
 from casadi_ik.solve.request import CLEARANCE, NO_PREFERENCE, resolve_preference
 from casadi_ik.solve.sensitivity import SensitivityKernel
 from casadi_ik.solve.solution import BatchSolution, Solution
 from casadi_ik.solve.status import Status
+from casadi_ik.solve.trials import Subproblems
 from casadi_ik.solve.turns import in_nearest_turns, search_start
 from casadi_ik.solve.verdict import construct_unchecked, judge_errors, judge_single
 
 MANIPULABILITY = "manipulability"
 """Preference that is applied by ranking alternatives after the solve."""
+
+
+LOCAL = "local"
+"""Best effort that stays near the start."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +60,8 @@ class SolveOptions:
         jobs: Number of threads, at least 1; compiled loops run concurrently.
         recorder: Recorder of the iterations; None: they are not recorded.
         diagnose: Whether to diagnose targets that are not solved.
+        best_effort: Whether to return the nearest configuration of targets that are not solved;
+            `LOCAL` for the local minimum that is reached from the start.
         show_progress: Whether to show a progress bar on an interactive terminal.
     """
 
@@ -63,8 +71,13 @@ class SolveOptions:
     recorder: Recorder | None = None
     diagnose: bool = False
     show_progress: bool = False
+    best_effort: bool | str = False
 
     def __post_init__(self) -> None:
+        if self.best_effort not in (False, True, LOCAL):
+            raise InputError(
+                f"best_effort: found {self.best_effort!r}, expected True, False or {LOCAL!r}"
+            )
         for name, minimum in (("jobs", 1), ("seed", 0)):
             value = getattr(self, name)
             if type(value) is int and value >= minimum:
@@ -170,12 +183,24 @@ class Engine:
         return InterimSolver(self.hand_search if self.compiled else None)
 
     @cached_property
-    def diagnostician(self) -> Diagnostician:
-        """Diagnostician of unsolved targets; it uses hand-first if the method is a black box."""
-        method = self.hand_search or HandFirstMethod(
+    def _hand_search_or_hand_first(self) -> HandSearch:
+        """The method as a hand search; hand-first if it is a black box."""
+        return self.hand_search or HandFirstMethod(
             self.robot.description, HandFirstParameters(), self.compiled, self.kinds
         )
-        return Diagnostician(self.robot, method, self.compiled)
+
+    @cached_property
+    def diagnostician(self) -> Diagnostician:
+        """Diagnostician of unsolved targets."""
+        return Diagnostician(self.robot, self._hand_search_or_hand_first, self.compiled)
+
+    @cached_property
+    def nearest_search(self) -> NearestSearch:
+        """Search for the configurations nearest to unsolved targets."""
+        method = self._hand_search_or_hand_first
+        method.prepare()
+        kinds = self.kinds or point_normal_kinds(len(self.robot.fingers))
+        return NearestSearch(Subproblems(self.robot, method), kinds, self.compiled)
 
     def _require_hand_search(self) -> HandSearch:
         """Return the method as a hand search, ready to run.
@@ -463,12 +488,60 @@ class Engine:
                     batch = add_collision_remedies(
                         lambda changed: self.solve(changed, retry).success, self.check, part, batch
                     )
+            if options.best_effort:
+                is_local = options.best_effort == LOCAL
+                batch = self._replace_by_nearest(part, near, outcome, batch, query, is_local)
             q = in_nearest_turns(self.robot.description, part, batch.q, q0)
             batch = replace(batch, q=q)
             parts.adapt_to_time(1e-9 * (time.time_ns() - started))
             return SolvedPart(part, q0, started, outcome, batch, query)
 
         return map_ordered(solve, parts, options.jobs)
+
+    def _replace_by_nearest(
+        self,
+        targets: TargetBatch,
+        starts: Array,
+        outcome: Outcome,
+        batch: BatchSolution,
+        query: CollisionQuery | None,
+        is_local: bool,
+    ) -> BatchSolution:
+        """Replace the configurations of unsolved targets by the nearest ones.
+
+        With a scene, targets of which only configurations in collision were found are unchanged.
+        """
+        started = time.perf_counter()
+        rows = np.flatnonzero(~batch.success & (batch.status != Status.COLLISION))
+        if not len(rows):
+            return batch
+        q, seconds = batch.q.copy(), batch.time.copy()
+        for engine, members, group in self.group_by_contact_kind(targets.rows(rows)):
+            of_group, search = rows[members], engine.nearest_search
+            if is_local:
+                q[of_group] = search.descend(group, starts[of_group])
+                continue
+            of_query = None if query is None else query.rows(of_group)
+            q[of_group] = search.find(
+                group,
+                starts[of_group],
+                q[of_group],
+                None
+                if of_query is None
+                else lambda i, x, every=of_query: every.rows(i).check(x).free,
+            )
+        if query is not None:
+            rows = rows[query.rows(rows).check(q[rows]).free]
+            q = np.where(np.isin(np.arange(len(q)), rows)[:, None], q, batch.q)
+        seconds[rows] += (time.perf_counter() - started) / max(len(rows), 1)
+        nearest = judge_outcome(
+            self.robot, self.method.name, targets, replace(outcome, q=q, time=seconds), query
+        )
+        status = batch.status.copy()
+        status[rows] = np.where(nearest.success[rows], int(Status.SOLVED), int(Status.NEAREST))
+        return replace(
+            nearest, status=status, diagnoses=batch.diagnoses, collisions=batch.collisions
+        )
 
     def _run(self, targets: TargetBatch, starts: Array, seed: int, trace: bool) -> Outcome:
         """Run the method on targets of any contact kinds."""

@@ -9,6 +9,7 @@ the best one found; it is not proved.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -19,7 +20,7 @@ from casadi_ik.compile import RUNNING
 from casadi_ik.compile.graphs import StepGraph, recipe
 from casadi_ik.compile.layout import Field, Layout
 from casadi_ik.compile.loop import LoopKernel
-from casadi_ik.files.arrays import Array, Rows, spread_points
+from casadi_ik.files.arrays import Array, Bools, Rows, spread_points
 from casadi_ik.kinematics.box_qp import normal_equations, solve_box_qp
 from casadi_ik.kinematics.contact_fit import contact_jacobian, contact_residual
 from casadi_ik.kinematics.contacts import LENGTH, ContactRows, Kinds, kinds_suffix
@@ -62,6 +63,10 @@ class NearestSettings:
 
 
 NEAREST_SETTINGS = NearestSettings()
+
+
+IN_COLLISION = 1e12
+"""Factor of the distance of a configuration in collision, larger than any ratio of distances."""
 
 
 @dataclass(frozen=True)
@@ -232,13 +237,22 @@ class NearestSearch:
             np.concatenate([(points**2).sum(axis=2), (normals**2).sum(axis=2)], axis=1),
         )
 
-    def find(self, targets: TargetBatch, q0: Array, last_q: Array) -> Array:
+    def find(
+        self,
+        targets: TargetBatch,
+        q0: Array,
+        last_q: Array,
+        are_free: Callable[[Rows, Array], Bools] | None = None,
+    ) -> Array:
         """Return the nearest configurations found (k, n) [rad or m].
 
         Args:
             targets: k targets of the kinds of contacts of this search.
             q0: (k, n) start configurations, which decide between equally near ones [rad or m].
             last_q: (k, n) configurations at which the solves ended [rad or m].
+            are_free: Function of target indices (m,) and configurations (m, n) that returns (m,)
+                whether they are free of collisions; None: collisions are not checked. If none of
+                a target's minima is free, the nearest one is returned.
         """
         all_rows = np.arange(len(targets))
         owners, starts = [all_rows, all_rows], [q0, last_q]
@@ -253,7 +267,11 @@ class NearestSearch:
         )
         owner = owner[finalists]
         states = self._run(states[finalists], parameters[owner])
-        return self._nearest(targets, q0, owner, self._q(states))
+        q = self._q(states)
+        distance = self.distances(targets, owner, q)
+        if are_free is not None:
+            distance = np.where(are_free(owner, q), distance, IN_COLLISION * (1 + distance))
+        return self._nearest(q0, owner, q, distance)
 
     def descend(self, targets: TargetBatch, q: Array) -> Array:
         """Return the local minima (k, n) of the distance that are reached from configurations.
@@ -295,10 +313,9 @@ class NearestSearch:
         ratios = np.divide(misses, tolerances, where=tolerances > 0, out=np.zeros_like(misses))
         return (ratios**2).sum(axis=(1, 2))
 
-    def _nearest(self, targets: TargetBatch, q0: Array, owner: Rows, q: Array) -> Array:
+    def _nearest(self, q0: Array, owner: Rows, q: Array, distance: Array) -> Array:
         """Return the nearest configuration of each target; the travel from q0 decides ties."""
-        robot, distance = self._trials.robot, self.distances(targets, owner, q)
-        least = np.full(len(targets), np.inf)
+        robot, least = self._trials.robot, np.full(len(q0), np.inf)
         np.minimum.at(least, owner, distance)
         is_least = distance <= least[owner] * (1 + self._settings.tie)
         ranges = np.maximum(robot.upper - robot.lower, 1e-9)
@@ -327,7 +344,8 @@ class NearestSearch:
     def _fitted(self, targets: TargetBatch, q0: Array) -> tuple[Rows, Array]:
         """Return target indices and configurations with fitted hands and placed arms."""
         trials, body = self._trials, self._trials.robot.description
-        if not (body.arm_actuators and body.hand_actuators):
+        has_own_bounds = targets.fixed is not None and targets.fixed.ndim > 1
+        if has_own_bounds or not (body.arm_actuators and body.hand_actuators):
             return np.zeros(0, dtype=np.intp), np.zeros((0, len(trials.robot.actuators)))
         fits = self._floating_palm.fits(targets, q0)
         rows = fits.best(self._settings.fitted_starts)

@@ -22,6 +22,9 @@ from casadi_ik.solve.verdict import ContactVerdict, PalmVerdict, contact_verdict
 
 Pair = tuple[str, str]
 
+MIN_TOLERANCE = 1e-12
+"""Lower bound of tolerances as divisors [m, rad]."""
+
 
 @dataclass(frozen=True)
 class SuggestedFix:
@@ -148,6 +151,27 @@ class Solution(ReprMixin):
     arm_hand: ArmHand | None = None
     object_pose: Array | None = None
 
+    @property
+    def error_ratio(self) -> float:
+        """Largest contact error over its tolerance; at most 1 if all contacts are met.
+
+        Example:
+            >>> solver.solve(grasp).error_ratio <= 1
+            True
+        """
+        return max(
+            (
+                error / max(tolerance, MIN_TOLERANCE)
+                for contact in self.contacts.values()
+                for error, tolerance in (
+                    (contact.position_error, contact.tolerance.position),
+                    (contact.angle_error, contact.tolerance.angle),
+                )
+                if not math.isnan(error)
+            ),
+            default=0.0,
+        )
+
     def draw(
         self,
         grasp: Grasp | None = None,
@@ -256,6 +280,14 @@ class BatchSolution(ReprMixin):
     palm_angle_error: Array | None = None
     palm_ok: NDArray[np.bool_] | None = None
     arm_hand: ArmHand | None = None
+
+    @property
+    def error_ratio(self) -> Array:
+        """(k,) largest contact error of each target over its tolerance."""
+        limits = np.array([(item.position, item.angle) for item in self.tolerances])
+        errors = np.stack([self.position_error, self.angle_error], axis=2)
+        ratios = np.nan_to_num(errors / np.maximum(limits, MIN_TOLERANCE))
+        return ratios.max(axis=(1, 2), initial=0.0)
 
     @classmethod
     def invalid(

@@ -34,6 +34,8 @@ class Status(IntEnum):
     """The diagnosis found neither a solution nor a proof that there is none."""
     COLLISION = 6
     """Contacts and limits are met, but the robot is in collision, see `Solution.collision`."""
+    NEAREST = 7
+    """No solution was found; q is the nearest configuration found, as `best_effort` requests."""
 
     @classmethod
     def from_loop(cls, codes: NDArray[np.int32]) -> NDArray[np.int64]:

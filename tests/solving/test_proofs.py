@@ -354,5 +354,5 @@ def test_what_is_missed_by_little_gets_few_boxes(
 def test_codes_of_the_log_stay() -> None:
     assert [status.name for status in sorted(ik.Status)] == [
         *("INVALID", "RUNNING", "SOLVED", "STALLED", "ITERATION_LIMIT", "UNREACHABLE", "NOT_FOUND"),
-        "COLLISION",
+        *("COLLISION", "NEAREST"),
     ]

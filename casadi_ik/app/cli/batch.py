@@ -81,6 +81,7 @@ def _out(word: str) -> Path:
     Option("--resume", "write resumable parts; skip parts already done"),
     Option("--part-size N", f"number of targets per part (default: {DEFAULT_PART_SIZE})"),
     opt.diagnose(default=False),
+    opt.BEST_EFFORT,
     opt.SIZE_LIMITS,
 )
 def batch(args: Arguments) -> CommandResult:
@@ -115,6 +116,7 @@ def batch(args: Arguments) -> CommandResult:
       reason (k,), nearest_q (k, n) with the smallest contact errors,
       enough_position (k,) [m] and enough_angle (k,) [rad]: the smallest tolerances
       with which the target would be solved
+    and with --best-effort the nearest q found of targets that are not solved.
     OUT.parquet holds the same as a table (needs polars) with a row
     per target and a column per motor: q_MOTOR, FINGER_position_error and so on.
     An invalid row (partly NaN, infinite, zero normal) gets the status INVALID and
@@ -140,6 +142,7 @@ def batch(args: Arguments) -> CommandResult:
         "diagnose": args.diagnose,
         "fixed": parse_fixed(args, robot),
         "prefer": args.prefer,
+        "best_effort": args.best_effort,
     }
     totals, faults = Totals(), _Faults(path)
     solver = (_solve_parts if in_parts else _solve_blocks)(

@@ -313,6 +313,9 @@ def diagnose(default: bool) -> Option:
     )
 
 
+BEST_EFFORT = Option("--best-effort", "nearest configuration of unsolved targets")
+
+
 def picture(name: str, text: str) -> Option:
     """Return an option for a picture (PNG) or animation (GIF) to be written."""
     suffix = ".gif" if name == "--animation" else ".png"

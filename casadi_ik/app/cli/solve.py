@@ -51,6 +51,7 @@ SLOW_FIRST_SOLVE = 1.0
     opt.picture("--picture", "picture of the grasp"),
     opt.picture("--picture-dark", "picture on a dark background"),
     opt.diagnose(default=True),
+    opt.BEST_EFFORT,
     opt.SIZE_LIMITS,
 )
 def solve(args: Arguments) -> CommandResult:
@@ -60,6 +61,7 @@ def solve(args: Arguments) -> CommandResult:
       casadi-ik solve cup
       casadi-ik solve cup --method enhanced-dls --out cup.json --log cup.mcap
       casadi-ik solve cup --scene table --picture cup.png
+      casadi-ik solve cup --object-pose 1 0 2 0 0 0 --best-effort
       casadi-ik solve my.yaml --robot mine.yaml --tolerance-position 2 --mm
 
     Example of a grasp file:
@@ -86,7 +88,9 @@ def solve(args: Arguments) -> CommandResult:
     solver = make_solver(args, robot)
 
     def run_solver(log: Path | None = None, diagnose: bool = False) -> Solution:
-        return solver.solve(grasp, q0, args.seed, log, diagnose, fixed, args.prefer)
+        return solver.solve(
+            grasp, q0, args.seed, log, diagnose, fixed, args.prefer, args.best_effort
+        )
 
     with located(str(path)):
         solution = run_solver(args.log, args.diagnose)

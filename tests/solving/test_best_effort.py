@@ -1,0 +1,120 @@
+"""Targets out of reach: the nearest configuration, compared with an independent optimiser."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+import casadi_ik as ik
+
+
+def out_of_reach(robot, count, seed=0, factor=1.5):
+    points, normals = robot.contacts(robot.random(np.random.default_rng(seed), count))
+    return points * factor, normals
+
+
+def distances(solver, points, normals, q):
+    """Return (k,) sums of squared position errors and chords, each divided by its tolerance."""
+    tolerances = np.array([(item.position, item.angle) for item in solver.tolerances.values()])
+    reached_points, reached_normals = solver.robot.contacts(q)
+    positions = np.linalg.norm(reached_points - points, axis=2) / tolerances[:, 0]
+    chords = np.linalg.norm(reached_normals - normals, axis=2) / (2 * np.sin(tolerances[:, 1] / 2))
+    return (positions**2 + chords**2).sum(axis=1)
+
+
+@pytest.mark.parametrize("name", ["ur5e", "kuka_lwr_barrett"])
+def test_no_start_of_another_optimiser_comes_nearer(name):
+    robot = ik.load_robot(name)
+    solver, rng = ik.Solver(robot), np.random.default_rng(3)
+    points, normals = out_of_reach(robot, 6, factor=2.5)
+    batch = solver.solve_batch(points, normals, best_effort=True)
+    assert (batch.status == ik.Status.NEAREST)[~batch.success].all()
+    assert (~batch.success).sum() >= 3
+    assert batch.limits_ok.all()
+    found = distances(solver, points, normals, batch.q)
+    tolerances = np.array([(item.position, item.angle) for item in solver.tolerances.values()])
+    for row in np.flatnonzero(~batch.success):
+
+        def residual(q, row=row):
+            at, facing = robot.contacts(q)
+            positions = (at - points[row]) / tolerances[:, :1]
+            chords = (facing - normals[row]) / (2 * np.sin(tolerances[:, 1:] / 2))
+            return np.concatenate([positions.ravel(), chords.ravel()])
+
+        for start in robot.random(rng, 6):
+            best = least_squares(residual, start, bounds=(robot.lower, robot.upper))
+            assert found[row] <= 2 * best.cost * (1 + 1e-6)
+
+
+def test_the_error_ratio_says_how_far_outside(robot):
+    solver = ik.Solver(robot)
+    points, normals = out_of_reach(robot, 3)
+    batch = solver.solve_batch(points, normals, best_effort=True)
+    for row in range(3):
+        solution = batch.solution(row)
+        expected = max(
+            max(
+                item.position_error / item.tolerance.position,
+                item.angle_error / item.tolerance.angle,
+            )
+            for item in solution.contacts.values()
+        )
+        assert solution.error_ratio == pytest.approx(expected)
+        assert batch.error_ratio[row] == pytest.approx(expected)
+        assert (solution.error_ratio <= 1) == solution.success
+
+
+def test_solved_targets_are_as_without_best_effort(robot, rng):
+    solver = ik.Solver(robot)
+    points, normals = robot.contacts(robot.random(rng, 50))
+    plain = solver.solve_batch(points, normals)
+    np.testing.assert_array_equal(plain.q, solver.solve_batch(points, normals, best_effort=True).q)
+
+
+def test_a_palm_out_of_reach_keeps_the_hand(robot, rng):
+    solver, q = ik.Solver(robot), robot.random(rng, 8)
+    palms = robot.palm(q)
+    palms[:, :3, 3] *= 2
+    batch = solver.solve_palms(palms, q, best_effort=True)
+    assert (batch.status == ik.Status.NEAREST).any()
+    hand = list(robot.description.hand_actuators)
+    np.testing.assert_allclose(batch.q[:, hand], q[:, hand], atol=1e-9)
+
+
+def test_the_nearest_configuration_is_free_of_collisions(robot):
+    solver = ik.Solver(robot, scene=ik.load_scene("table"))
+    batch = solver.solve_batch(*out_of_reach(robot, 6, seed=1), best_effort=True)
+    is_nearest = batch.status == ik.Status.NEAREST
+    assert is_nearest.any()
+    assert (batch.clearance[is_nearest] > 0).all()
+
+
+def test_fixed_motors_stay(robot):
+    solver = ik.Solver(robot)
+    points, normals = out_of_reach(robot, 3)
+    batch = solver.solve_batch(points, normals, fixed={"lwr_joint_3": 0.2}, best_effort=True)
+    np.testing.assert_allclose(batch.q[:, 2], 0.2)
+
+
+def test_a_five_axis_arm_follows_poses_that_it_cannot_have():
+    """Each answer is the minimum near the last one: no step is omitted, and none is a jump."""
+    robot = ik.load_robot("viperx_300s")
+    fixed = {name: float(robot.home[i]) for i, name in enumerate(robot.actuators[:1])}
+    solver = ik.Solver(robot, tolerance=ik.Tolerance(5e-3, np.radians(2.9)))
+    frame, q = robot.contact_frames(robot.home)[0], robot.home
+    for step in range(1, 21):
+        pose = frame.copy()
+        pose[1, 3] += 5e-3 * step
+        grasp = ik.Grasp({robot.fingers[0]: ik.Contact.at(pose)})
+        solution = solver.solve(grasp, q0=q, fixed=fixed, diagnose=False, best_effort="local")
+        if step > 2:
+            assert solution.status is ik.Status.NEAREST
+            assert 1e-4 < np.abs(solution.q - q).max() < 0.2
+        q = solution.q
+
+
+@pytest.mark.parametrize("value", ["global", 2, None])
+def test_another_value_is_refused(robot, value):
+    with pytest.raises(ik.errors.InputError, match=f"best_effort.*{value!r}"):
+        ik.Solver(robot).solve_batch(*robot.contacts(robot.home[None]), best_effort=value)
