@@ -39,8 +39,8 @@ class ArmKinematics:
 
     Replaces `lerobot.model.kinematics.RobotKinematics` in `InverseKinematicsEEToJoints`,
     `EEReferenceAndDelta` and other steps: positions in degrees, poses (4, 4) [m]. Values after
-    those of the arm (such as a gripper's) are unchanged. Where no configuration has the pose, out of
-    reach or with five axes, the arm moves to the nearest one of its branch, see `status`.
+    those of the arm (such as a gripper's) are unchanged. Where no configuration has the pose, out
+    of reach or with five axes, the arm moves to the nearest one of its branch, see `status`.
 
     Attributes:
         joint_names: Motors of the arm, in the order of all arrays.
