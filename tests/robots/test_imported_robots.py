@@ -13,7 +13,7 @@ from toy_robots import grasp_at
 import casadi_ik as ik
 from casadi_ik.integrations.importing.imported import largest_difference
 from casadi_ik.integrations.importing.robot_shapes import robot_shapes
-from casadi_ik.integrations.importing.triangle_tree import TriangleTree
+from casadi_ik.integrations.importing.triangle_tree import CollisionTree
 from casadi_ik.model.urdf_mjcf import read_tree
 
 MOUNT = "mount: {xyz: [0.01, 0.02, 0.03], rpy: [0.1, 0.2, 0.3]}"
@@ -90,7 +90,7 @@ def test_meshes_meet_where_coal_says_so(rng):
     ]
     trees, models = [], []
     for body in bodies:
-        trees.append(TriangleTree(np.asarray(body.triangles, dtype=float)))
+        trees.append(CollisionTree(np.asarray(body.triangles, dtype=float)))
         models.append(coal.BVHModelOBBRSS())
         models[-1].beginModel(len(body.faces), len(body.vertices))
         models[-1].addVertices(np.asarray(body.vertices))

@@ -124,8 +124,8 @@ def follow(args: Arguments) -> CommandResult:
         "collision": _collision_text(solver),
         "written": str(args.out),
     }
-    followed = counts[FollowStatus.FOLLOWING.value] == count
-    return CommandResult.of_parts(followed, Text(path.name, "bold"), fields(pairs))
+    is_followed = counts[FollowStatus.FOLLOWING.value] == count
+    return CommandResult.of_parts(is_followed, Text(path.name, "bold"), fields(pairs))
 
 
 def _start(solver: Solver, frames: Frames) -> Array:
@@ -267,11 +267,11 @@ def _load_goal(args: Arguments) -> tuple[Path, Grasp | ChosenPosture]:
 
 def _motion_report(reach_result: Reach, motion: Motion, units: Units) -> dict[str, str]:
     part, times = motion.notes["part"], motion.times
-    ends = {name: float(times[part == name][-1]) for name in PARTS if (part == name).any()}
-    starts = [0.0, *ends.values()]
+    end_times = {name: float(times[part == name][-1]) for name in PARTS if (part == name).any()}
+    starts = [0.0, *end_times.values()]
     durations = [
         f"{name} {end - start:.2f} s"
-        for (name, end), start in zip(ends.items(), starts, strict=False)
+        for (name, end), start in zip(end_times.items(), starts, strict=False)
     ]
     scale, unit = units["m"]
     unchecked = "collision not checked" if reach_result.clearance is None else ""

@@ -428,15 +428,15 @@ class GhostRobots:
 
     def __init__(self, server: viser.ViserServer, robot: ArmHand) -> None:
         """Store the robot; nothing is drawn."""
-        self._server, self._robot, self._drawn = server, robot, []
+        self._server, self._robot, self._drawables = server, robot, []
         self._role = "arm" if robot.description.arm_actuators else "hand"
 
     def show(self, configurations: Sequence[tuple[Array, str]]) -> None:
         """Replace the ghosts by one for each pair of q (n,) and colour."""
         with self._server.atomic():
-            for drawable in self._drawn:
+            for drawable in self._drawables:
                 drawable.remove()
-            self._drawn = []
+            self._drawables = []
             for i, (q, color) in enumerate(configurations):
                 drawables = [
                     drawable
@@ -446,7 +446,7 @@ class GhostRobots:
                 parts = [drawable.surface for drawable in bodies_at(self._robot, q, drawables)]
                 ghost = Drawable("ghost", mesh_shape(join_surfaces(parts)), color)
                 options = {"opacity": 0.25, "cast_shadow": False, "receive_shadow": False}
-                self._drawn.append(add_drawable(self._server, f"/ghosts/{i}", ghost, **options))
+                self._drawables.append(add_drawable(self._server, f"/ghosts/{i}", ghost, **options))
 
 
 # Light, ground, camera.

@@ -18,7 +18,7 @@ from casadi_ik.files.arrays import Array
 from casadi_ik.files.progress import progress
 from casadi_ik.integrations.importing.capsules import SHAPE_FIT, fit_links
 from casadi_ik.integrations.importing.surfaces import Surface, link_surfaces
-from casadi_ik.integrations.importing.triangle_tree import TriangleTree
+from casadi_ik.integrations.importing.triangle_tree import CollisionTree
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.link_shapes import Touching, capsules_of
 from casadi_ik.model.linkage import joint_positions, joints_below, link_poses, rigid_bodies
@@ -88,9 +88,9 @@ def may_touch(
     segments = {link: _segments(entries, poses[link]) for link, entries in capsules.items()}
 
     @cache
-    def tree(link: str) -> TriangleTree:
+    def tree(link: str) -> CollisionTree:
         mesh = surfaces[link].simplified(SAMPLING.triangles, SAMPLING.cells)
-        return TriangleTree(mesh.points[mesh.triangles])
+        return CollisionTree(mesh.points[mesh.triangles])
 
     touching: list[Touching] = []
     links = list(shapes)
@@ -156,14 +156,14 @@ class MeshPair:
         relative: (k, 4, 4) pose of the second link in the first by configuration.
     """
 
-    tree: Callable[[str], TriangleTree]
+    tree: Callable[[str], CollisionTree]
     links: tuple[str, str]
     relative: Array
 
     def intersects(
         self, configurations: NDArray[np.intp], stop_at_first: bool = False
     ) -> NDArray[np.bool_]:
-        """Return in which configurations the meshes intersect; see `TriangleTree.intersects`."""
+        """Return in which configurations the meshes intersect; see `CollisionTree.intersects`."""
         first, second = map(self.tree, self.links)
         return first.intersects(second, self.relative[configurations], stop_at_first)
 

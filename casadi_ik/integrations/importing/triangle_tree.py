@@ -15,7 +15,7 @@ MAX_PAIRS = 4096
 """Maximum number of pairs of boxes in one array operation; more do not fit into a core's cache."""
 
 
-class TriangleTree:
+class CollisionTree:
     """A mesh in a balanced binary tree of axis-aligned boxes.
 
     Level k has 2^k boxes; each box of the last level holds one triangle. Triangles are repeated to
@@ -45,7 +45,7 @@ class TriangleTree:
             self.levels.insert(0, _boxes(low, high))
 
     def intersects(
-        self, other: TriangleTree, poses: Array, stop_at_first: bool = False
+        self, other: CollisionTree, poses: Array, stop_at_first: bool = False
     ) -> NDArray[np.bool_]:
         """Return in which relative poses a triangle of this mesh crosses one of another mesh.
 

@@ -114,7 +114,7 @@ class Candidates(RecordReprMixin):
     hand: Array
     used: Bools
     tips: Array = field(default_factory=lambda: np.zeros(0))
-    contacts: Touching | None = None
+    contacts: TipContacts | None = None
 
     def __len__(self) -> int:
         return len(self.hand)
@@ -381,7 +381,7 @@ def pads_of(table: HandTable, hands: Candidates) -> Pads:
 
 
 @dataclass(frozen=True)
-class Touching:
+class TipContacts:
     """Contacts of fingertips with the triangles of a surface, object frame.
 
     Attributes:
@@ -400,9 +400,9 @@ class Touching:
     height: Array
     lean: Array
 
-    def rows(self, rows: NDArray) -> Touching:
+    def rows(self, rows: NDArray) -> TipContacts:
         """Return the contacts of some of the hands."""
-        return Touching(*(getattr(self, part.name)[rows] for part in fields(self)))
+        return TipContacts(*(getattr(self, part.name)[rows] for part in fields(self)))
 
     def accepted(self, parameters: TouchParameters, roll: Array) -> Bools:
         """Return which pads (k, f) touch the surface as grasps promise.
@@ -417,7 +417,7 @@ class Touching:
         return touches & (np.maximum(self.spread, aside) < parameters.max_spread)
 
 
-def touching(table: HandTable, surface: Surface, hands: Candidates) -> Touching:
+def touching(table: HandTable, surface: Surface, hands: Candidates) -> TipContacts:
     """Return the exact contacts of fingertips with the triangles of a surface.
 
     Of fingers that do not touch all numbers are NaN.
@@ -443,7 +443,7 @@ def touching(table: HandTable, surface: Surface, hands: Candidates) -> Touching:
         return whole
 
     parts = nearest.point, -nearest.normal, nearest.spread, toward, distance - radii, lean
-    return Touching(*(spread_out(part) for part in parts))
+    return TipContacts(*(spread_out(part) for part in parts))
 
 
 def refined(
