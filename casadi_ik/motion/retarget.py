@@ -30,7 +30,7 @@ from casadi_ik.motion.motion import seconds
 OPENXR = (1, *range(2, 6), *range(7, 11), *range(12, 16), *range(17, 21), *range(22, 26))
 """Joints of OpenXR that are keypoints: all but the palm and the metacarpals of four fingers."""
 
-KEYPOINT_ORDERS = {
+COLUMNS_BY_COUNT = {
     KEYPOINTS: tuple(range(KEYPOINTS)),
     26: OPENXR,
     25: tuple(joint - 1 for joint in OPENXR),
@@ -223,12 +223,12 @@ def as_keypoints(joints: ArrayLike, name: str = "keypoints") -> Array:
         array = real_array(joints)
     except (TypeError, ValueError) as error:
         raise InputError(f"{name}: array is not numeric: {error}") from error
-    if array.ndim < 2 or array.shape[-1] != 3 or array.shape[-2] not in KEYPOINT_ORDERS:
+    if array.ndim < 2 or array.shape[-1] != 3 or array.shape[-2] not in COLUMNS_BY_COUNT:
         raise InputError(
             f"{name}: found shape {array.shape}, expected ({KEYPOINTS}, 3), or the 26 joints of "
             "OpenXR, or 25 without the palm"
         )
-    return array[..., KEYPOINT_ORDERS[array.shape[-2]], :]
+    return array[..., COLUMNS_BY_COUNT[array.shape[-2]], :]
 
 
 class Retargeter:

@@ -269,3 +269,14 @@ def test_without_a_scene_an_object_in_the_hand_is_said(run: Command, tmp_path: P
     moved.write_text(text.replace("0.126889040887", "0.086889040887"), encoding="utf-8")
     assert "overlap" not in run("solve", shipped).out
     assert re.search(r"the shapes of \w+ and cup overlap by [\d.]+ mm", run("solve", moved).out)
+
+
+def test_best_effort_writes_the_nearest_configuration(run: Command, tmp_path: Path) -> None:
+    out, errors = tmp_path / "far.json", {}
+    for flags, status in ((["--best-effort"], "NEAREST"), ([], "STALLED")):
+        words = [*"cup --object-pose 1 0 2 0 0 0 --no-diagnose --out".split(), out, *flags]
+        assert run("solve", *words).code == 1
+        found = json.loads(out.read_text())
+        assert found["status"] == status
+        errors[status] = max(item["position_error"] for item in found["contacts"].values())
+    assert errors["NEAREST"] < errors["STALLED"]

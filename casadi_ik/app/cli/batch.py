@@ -142,7 +142,7 @@ def batch(args: Arguments) -> CommandResult:
         "diagnose": args.diagnose,
         "fixed": parse_fixed(args, robot),
         "prefer": args.prefer,
-        "best_effort": args.best_effort,
+        "best_effort": bool(args.best_effort),
     }
     totals, faults = Totals(), _Faults(path)
     solver = (_solve_parts if in_parts else _solve_blocks)(

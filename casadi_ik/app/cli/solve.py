@@ -89,7 +89,7 @@ def solve(args: Arguments) -> CommandResult:
 
     def run_solver(log: Path | None = None, diagnose: bool = False) -> Solution:
         return solver.solve(
-            grasp, q0, args.seed, log, diagnose, fixed, args.prefer, args.best_effort
+            grasp, q0, args.seed, log, diagnose, fixed, args.prefer, bool(args.best_effort)
         )
 
     with located(str(path)):
