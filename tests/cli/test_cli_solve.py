@@ -274,8 +274,9 @@ def test_without_a_scene_an_object_in_the_hand_is_said(run: Command, tmp_path: P
 def test_best_effort_writes_the_nearest_configuration(run: Command, tmp_path: Path) -> None:
     out, errors = tmp_path / "far.json", {}
     for flags, status in ((["--best-effort"], "NEAREST"), ([], "STALLED")):
-        words = [*"cup --object-pose 1 0 2 0 0 0 --no-diagnose --out".split(), out, *flags]
-        assert run("solve", *words).code == 1
+        pose = ("--object-pose", 1, 0, 2, 0, 0, 0)
+        done = run("solve", "cup", *pose, "--no-diagnose", "--out", out, *flags)
+        assert done.exit == 1
         found = json.loads(out.read_text())
         assert found["status"] == status
         errors[status] = max(item["position_error"] for item in found["contacts"].values())
