@@ -70,7 +70,7 @@ def follow(args: Arguments) -> CommandResult:
     Frames in which the tracker has lost the hand (NaN, zeros, -1, a jump) are
     skipped: the motors come to rest and continue with the next valid frame.
 
-    --retarget FILE.yaml maps the human hand to the robot hand (docs/teleoperation.md):
+    --retarget FILE.yaml maps the human hand to the robot (docs/teleoperation.md):
       fingers: {thumb: 4, index: 8, middle: 12, ring: 16}
       low_pass: 0.3
 
