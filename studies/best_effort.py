@@ -34,7 +34,7 @@ EXCESSES = (0.001, 0.005, 0.02, 0.1)
 REACH_SAMPLES = 20_000
 """Number of configurations from which the reach of a robot is estimated."""
 
-SAME, WORSE = 1e-6, 1e-2
+SAME_GAP, WORSE_GAP = 1e-6, 1e-2
 """Relative excesses over the distance of the reference that the report counts."""
 
 INTRODUCTION = """
@@ -96,15 +96,15 @@ def solve(part: Part) -> dict[str, Any]:
     targets = solver._request.of_arrays(points[rows], normals[rows], None)
     search: NearestSearch = solver._engine.nearest_search
     distance = search.distances(targets, np.arange(len(rows)), batch.q[rows])
-    least = distance.copy()
+    reference = distance.copy()
     for _ in range(part.starts):
         minima = search.descend(targets, robot.random(rng, len(rows)))
-        least = np.minimum(least, search.distances(targets, np.arange(len(rows)), minima))
-    gap = distance / least - 1
+        reference = np.minimum(reference, search.distances(targets, np.arange(len(rows)), minima))
+    gap = distance / reference - 1
     return {
         "nearest": len(rows),
-        "same": int((gap <= SAME).sum()),
-        "worse": int((gap > WORSE).sum()),
+        "same": int((gap <= SAME_GAP).sum()),
+        "worse": int((gap > WORSE_GAP).sum()),
         "seconds": seconds,
     }
 
@@ -113,12 +113,12 @@ def report(done: Sequence[tuple[Part, dict[str, Any]]], starts: int) -> tuple[st
     """Return the table of the report and its metrics."""
     rows, metrics = [], list[Metric]()
     for robot in dict.fromkeys(part.robot for part, _ in done):
-        found = [result for part, result in done if part.robot == robot]
-        count, same, worse = (
-            sum(item[key] for item in found) for key in ("nearest", "same", "worse")
+        results = [result for part, result in done if part.robot == robot]
+        count, n_same, n_worse = (
+            sum(item[key] for item in results) for key in ("nearest", "same", "worse")
         )
-        times = [1e6 * item["seconds"] for item in found]
-        share = [f"{100 * part / max(count, 1):.2f}" for part in (count - same, worse)]
+        times = [1e6 * item["seconds"] for item in results]
+        share = [f"{100 * part / max(count, 1):.2f}" for part in (count - n_same, n_worse)]
         rows.append([robot, f"{count:,}", *share, f"{np.median(times):.0f}"])
         metrics.append(median_metric(f"best_effort/{robot}/time", times, "us"))
     heads = ["robot", "targets", "above the best by 1e-6 %", "by 1e-2 %", "time [us]"]
