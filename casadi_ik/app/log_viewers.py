@@ -33,7 +33,7 @@ from casadi_ik.files.shipped import models_folder
 from casadi_ik.files.writing import atomic_write
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.logs.cdr import ros_channel, write_postures
-from casadi_ik.logs.container import CDR_HEADER
+from casadi_ik.logs.chunks import CDR_HEADER
 from casadi_ik.logs.events import SERIOUS, describe
 from casadi_ik.logs.format import schema_name, schema_text
 from casadi_ik.logs.solve import SolveRecord

@@ -27,7 +27,7 @@ from casadi_ik.files.input_checks.keypoints import lost_contacts_reason
 from casadi_ik.files.input_checks.poses import unit_quaternions
 from casadi_ik.kinematics.arm_hand import load_robot
 from casadi_ik.logs.cdr import CdrReader, cdr, cdr_message
-from casadi_ik.logs.container import CDR_HEADER
+from casadi_ik.logs.chunks import CDR_HEADER
 from casadi_ik.solve.status import Status
 
 with optional_import("integrations.ros2"):
@@ -60,11 +60,11 @@ def decode_contacts(data: bytes) -> tuple[Array, Array]:
     """
     try:
         reader = CdrReader(data[len(CDR_HEADER) :])
-        reader.place = 8  # the stamp
+        reader.position = 8  # the stamp
         reader.text()
         count = reader.number("<I")
-        reader.place += -reader.place % 8
-        values = np.frombuffer(reader.data, "<f8", count * POSE_SIZE, reader.place)
+        reader.position += -reader.position % 8
+        values = np.frombuffer(reader.data, "<f8", count * POSE_SIZE, reader.position)
     except (struct.error, ValueError) as error:
         raise InputError(f"contacts: no geometry_msgs/PoseArray in cdr: {error}") from error
     poses = values.reshape(count, POSE_SIZE)

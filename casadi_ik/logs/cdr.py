@@ -1,4 +1,4 @@
-"""ROS 2 messages as bytes (plain CDR, little endian), and recorded motions read from them."""
+"""ROS 2 messages in little-endian plain CDR, and recorded motions read from them."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ from mcap.writer import Writer
 from casadi_ik.errors import LogError
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arm_hand import ArmHand
-from casadi_ik.logs.container import CDR_HEADER, MESSAGE, open_log_file, read_chunk, read_contents
+from casadi_ik.logs.chunks import CDR_HEADER, MESSAGE
+from casadi_ik.logs.container import open_log_file, read_chunk, read_contents
 
 Stamp = tuple[int, int]
-"""Seconds and nanoseconds: a time, or a duration."""
+"""Seconds and nanoseconds of a time or duration."""
 
 Value = str | list[str] | Array | Stamp | int
 
@@ -73,69 +74,73 @@ uint32 nanosec
 
 
 def cdr_message(*values: Value) -> bytes:
-    """A message of texts, lists of them, sequences of float64, stamps, and lengths of sequences."""
+    """Return a message with its CDR header.
+
+    Args:
+        values: Strings, lists of strings, arrays of float64, stamps, or lengths of sequences.
+    """
     return CDR_HEADER + cdr(values)
 
 
 def cdr(values: Iterable[Value]) -> bytes:
-    """The same without the header."""
-    out = bytearray()
+    """Return the CDR encoding of values without the header; see `cdr_message`."""
+    data = bytearray()
     for value in values:
-        out += bytes(-len(out) % 4)
+        data += bytes(-len(data) % 4)
         if isinstance(value, int):
-            out += struct.pack("<I", value)
+            data += struct.pack("<I", value)
         elif isinstance(value, tuple):
-            out += struct.pack("<iI", *value)
+            data += struct.pack("<iI", *value)
         elif isinstance(value, np.ndarray):
-            out += struct.pack("<I", len(value))
+            data += struct.pack("<I", len(value))
             if len(value):
-                out += bytes(-len(out) % 8) + value.astype("<f8").tobytes()
+                data += bytes(-len(data) % 8) + value.astype("<f8").tobytes()
         else:
             if isinstance(value, list):
-                out += struct.pack("<I", len(value))
+                data += struct.pack("<I", len(value))
             for text in [value] if isinstance(value, str) else value:
-                data = text.encode() + b"\0"
-                out += bytes(-len(out) % 4) + struct.pack("<I", len(data)) + data
-    return bytes(out)
+                encoded = text.encode() + b"\0"
+                data += bytes(-len(data) % 4) + struct.pack("<I", len(encoded)) + encoded
+    return bytes(data)
 
 
 def ros_channel(writer: Writer, topic: str, definition: tuple[str, str]) -> int:
-    """Register a channel of ROS 2 messages, defined by the name and the text of their schema."""
+    """Register a channel of ROS 2 messages; `definition` is the name and text of their schema."""
     name, text = definition
     schema = writer.register_schema(name, "ros2msg", text.encode())
     return writer.register_channel(topic, "cdr", schema, {"offered_qos_profiles": ""})
 
 
 def write_postures(writer: Writer, robot: ArmHand, q: Array, stamps: Sequence[int]) -> None:
-    """Write the robot as URDF, once, and its joints after the couplings at each of k times.
+    """Write a robot description and its joint states after the couplings.
 
     Args:
-        writer: Of the file.
-        robot: The robot.
-        q: (k, n) [rad or m].
-        stamps: (k,) times [ns].
+        writer: Writer of the file.
+        robot: The robot; its URDF is written once.
+        q: (k, n) configurations [rad or m].
+        stamps: (k,) times of the configurations [ns].
     """
-    described = ros_channel(writer, "/robot_description", STRING)
-    first = min(stamps, default=0)
-    writer.add_message(described, first, cdr_message(robot.urdf()), first)
-    joints, none = robot.joints(q), np.zeros(0)
+    description_channel = ros_channel(writer, "/robot_description", STRING)
+    start = min(stamps, default=0)
+    writer.add_message(description_channel, start, cdr_message(robot.urdf()), start)
+    joints, empty = robot.joints(q), np.zeros(0)
     positions = np.stack([np.atleast_1d(values) for values in joints.values()], axis=1)
     channel = ros_channel(writer, "/joint_states", JOINT_STATE)
     for i, stamp in enumerate(stamps):
         header = divmod(stamp, 1_000_000_000), robot.description.root
-        state = cdr_message(*header, list(joints), positions[i], none, none)
+        state = cdr_message(*header, list(joints), positions[i], empty, empty)
         writer.add_message(channel, stamp, state, stamp, sequence=i)
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedMotion:
-    """A motion read from a file of `reach`, `follow` or `ik.motion.Motion.write`.
+    """A motion from a file of `reach`, `follow` or `ik.motion.Motion.write`.
 
     Attributes:
-        robot: Name of the robot, as its URDF in the file has it.
+        robot: Name of the robot in the URDF of the file.
         actuators: Names of the n actuators.
-        times: (k,) from the start [s].
-        q: (k, n) [rad or m].
+        times: (k,) times from the start [s].
+        q: (k, n) configurations [rad or m].
 
     Example:
         >>> times, q = np.array([0.0, 0.1]), np.stack([robot.home, robot.home])
@@ -151,23 +156,23 @@ class RecordedMotion:
     q: Array
 
     def ordered(self, actuators: Sequence[str]) -> Array:
-        """The positions (k, n) of a robot's actuators, in its order.
+        """Return the configurations (k, n) in a robot's order of actuators.
 
         Raises:
-            LogError: The motion is of other actuators.
+            LogError: The motion has other actuators.
         """
         if sorted(self.actuators) != sorted(actuators):
             raise LogError(
-                f"a motion of {', '.join(self.actuators)}; the robot has {', '.join(actuators)}"
+                f"actuators: found {', '.join(self.actuators)}; expected {', '.join(actuators)}"
             )
         return self.q[:, [self.actuators.index(name) for name in actuators]]
 
 
 def read_motion(path: str | os.PathLike[str]) -> RecordedMotion:
-    """Read a motion from an MCAP file; the contacts follow from `ArmHand.contacts`.
+    """Read a motion from an MCAP file; `ArmHand.contacts` computes its contacts.
 
     Raises:
-        LogError: The file is missing, damaged, no MCAP file, or holds no motion.
+        LogError: The file is missing, damaged, not an MCAP file, or holds no motion.
 
     Example:
         >>> times, q = np.array([0.0, 0.1]), np.stack([robot.home, robot.home])
@@ -178,26 +183,29 @@ def read_motion(path: str | os.PathLike[str]) -> RecordedMotion:
     with open_log_file(Path(path)) as stream:
         contents = read_contents(Path(path))
         topics = {channel.id: channel.topic for channel in contents.summary.channels.values()}
-        found: dict[str, bytes] = {}
-        wanted = "/robot_description", "/joint_trajectory"
+        messages: dict[str, bytes] = {}
+        required = "/robot_description", "/joint_trajectory"
         for index in contents.chunks:
             chunk = read_chunk(stream, index)
             for run in chunk.runs:
-                if topics.get(run.channel) in wanted:
+                if topics.get(run.channel) in required:
                     start = run.start + MESSAGE.itemsize
-                    found[topics[run.channel]] = chunk.data[start : run.start + run.size]
-        if len(found) < len(wanted):
-            raise LogError(f"no motion: found {', '.join(topics.values()) or 'no topic'}")
+                    messages[topics[run.channel]] = chunk.data[start : run.start + run.size]
+        if len(messages) < len(required):
+            raise LogError(
+                f"motion: found topics {', '.join(topics.values()) or 'none'}; expected"
+                f" {', '.join(required)}"
+            )
         try:
-            description, trajectory = (CdrReader(found[topic]) for topic in wanted)
+            description, trajectory = (CdrReader(messages[topic]) for topic in required)
             robot = re.search(r'<robot\s[^>]*?name="([^"<]*)"', description.text())
-            trajectory.place = 8
-            trajectory.text()
+            trajectory.position = 8  # after the stamp
+            trajectory.text()  # the frame
             actuators = tuple(trajectory.text() for _ in range(trajectory.number("<I")))
             times, q = [], []
             for _ in range(trajectory.number("<I")):
                 q.append(trajectory.numbers())
-                for _ in range(3):
+                for _ in range(3):  # velocities, accelerations, efforts
                     trajectory.numbers()
                 times.append(trajectory.number("<i") + 1e-9 * trajectory.number("<I"))
             motion = RecordedMotion(
@@ -212,28 +220,33 @@ def read_motion(path: str | os.PathLike[str]) -> RecordedMotion:
 
 
 class CdrReader:
-    """Values of a message, one after the other; the inverse of `cdr`."""
+    """Sequential reader of the values of a message; the inverse of `cdr`.
+
+    Attributes:
+        data: Message without its header.
+        position: Offset of the next value [bytes].
+    """
 
     def __init__(self, data: bytes) -> None:
-        self.data, self.place = data, 0
+        self.data, self.position = data, 0
 
-    def number(self, kind: str) -> Any:
-        """A number of four bytes."""
-        self.place += -self.place % 4
-        (value,) = struct.unpack_from(kind, self.data, self.place)
-        self.place += 4
+    def number(self, code: str) -> Any:
+        """Read a number of four bytes with a format code of `struct`."""
+        self.position += -self.position % 4
+        (value,) = struct.unpack_from(code, self.data, self.position)
+        self.position += 4
         return value
 
     def text(self) -> str:
-        """A text, its end mark left out."""
+        """Read a string without its terminating zero."""
         length = self.number("<I")
-        self.place += length
-        return self.data[self.place - length : self.place - 1].decode()
+        self.position += length
+        return self.data[self.position - length : self.position - 1].decode()
 
     def numbers(self) -> Array:
-        """A sequence of float64."""
+        """Read a sequence of float64."""
         count = self.number("<I")
-        self.place += -self.place % 8 if count else 0
-        values = np.frombuffer(self.data, "<f8", count, self.place)
-        self.place += 8 * count
+        self.position += -self.position % 8 if count else 0
+        values = np.frombuffer(self.data, "<f8", count, self.position)
+        self.position += 8 * count
         return values

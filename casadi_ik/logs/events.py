@@ -25,7 +25,7 @@ events. Each function of `DETECTORS` detects some kinds of events.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cached_property
@@ -37,24 +37,29 @@ from numpy.typing import ArrayLike, NDArray
 from casadi_ik.compile.layout import Field, Layout
 from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Bools, Rows
+from casadi_ik.logs.traces import (
+    Traces,
+    actuator_names,
+    as_matrix,
+    bits_of,
+    jacobian_names,
+    mask_words,
+    measured_jacobians,
+    set_bits,
+)
+from casadi_ik.logs.wording import format_number, format_quantity, joined_names, plain_name
 from casadi_ik.solve.trace import (
     ACTIVE_MASK,
-    ANGLE_ERROR,
     CLEARANCE,
     CONDITION,
-    COST,
     LIMIT_MASK,
     PHASE,
-    POSITION_ERROR,
     RESTART,
     SIGMA,
-    WORD_BITS,
     Q,
     RecordedJacobian,
     TraceFormat,
 )
-
-Words = NDArray[np.uint32]
 
 
 class EventKind(IntEnum):
@@ -241,83 +246,19 @@ def describe(event: Event) -> str:
     )
 
 
-def plain_name(name: str) -> str:
-    """Return an identifier as words: "closed chain" for ``closed_chain``."""
-    return name.replace("_", " ").replace("-", " ")
-
-
-def format_number(value: float) -> str:
-    """Format a number with three significant digits."""
-    return f"{value:.3g}"
-
-
-def format_quantity(value: float, unit: str) -> str:
-    """Format a value with its unit: angles in degrees, lengths in millimetres."""
-    if unit == "rad":
-        return f"{math.degrees(value):.4g} deg"
-    return f"{1e3 * value:.4g} mm" if unit == "m" else format_number(value)
-
-
-def counted_noun(count: int, noun: str) -> str:
-    """Return a count with its noun: "1 restart", "2 restarts"."""
-    return f"{count} {noun}" + ("" if count == 1 else "s")
-
-
-def joined_names(names: Sequence[str], max_names: int = 4) -> str:
-    """Join the first names with commas and count the remaining ones."""
-    text = ", ".join(names[:max_names])
-    return text if len(names) <= max_names else f"{text} and {len(names) - max_names} more"
-
-
-def errors_text(position: float, angle: float) -> str:
-    """Format the errors of a contact; free components (NaN) are left out.
-
-    Args:
-        position: Position error [m].
-        angle: Angle error [rad].
-    """
-    parts = [] if math.isnan(position) else [f"{1e3 * position:.2f} mm"]
-    parts += [] if math.isnan(angle) else [f"{math.degrees(angle):.2f} deg"]
-    return " and ".join(parts) or "free"
-
-
 # Storage of events.
-
-
-def jacobian_names(form: TraceFormat) -> tuple[str, ...]:
-    """Return the names of the measured Jacobians, one per element of their fields."""
-    names = (name for item in form.layout for name in measured_jacobians(form, item))
-    return tuple(dict.fromkeys(names))
-
-
-def measured_jacobians(form: TraceFormat, item: Field) -> tuple[str, ...]:
-    """Return the names of the Jacobians of a field of measurements; () for other fields."""
-    name = item.name.removeprefix(SIGMA).removeprefix(CONDITION)
-    if name == item.name:
-        return ()
-    labels = form.labels.get(item.name, ())
-    parts = (*labels[: item.size], *map(str, range(len(labels), item.size)))
-    return tuple(f"{name}[{part}]" for part in parts) if item.shape else (name,)
-
-
-def mask_words(form: TraceFormat) -> int:
-    """Return the number of 32-bit words of a mask of all actuators."""
-    sizes = {item.name: item.size for item in form.layout}
-    coordinates = -(-sizes.get(Q.name, 1) // WORD_BITS)
-    masks = (sizes.get(mask.name, 1) for mask in (LIMIT_MASK, ACTIVE_MASK))
-    return max(coordinates, *masks)
 
 
 def event_layout(words: int) -> Layout:
     """Return the fields of an event; its mask of actuators has `words` words."""
     return Layout.record(
-        Field("value", (), "f8", "", "the number that made it an event"),
-        Field("threshold", (), "f8", "", "what it was compared with, or the value before"),
+        Field("value", (), "f8", "", "value that caused the event"),
+        Field("threshold", (), "f8", "", "threshold of the value, or the previous value"),
         Field("solve_id", (), "u4"),
-        Field("iteration", (), "u4", "", "counted from 0"),
+        Field("iteration", (), "u4", "", "number of the iteration, from 0"),
         Field("joint_mask", () if words == 1 else (words,), "u4", "", "bit i: actuator i"),
         Field("kind", (), "u1"),
-        Field("jacobian", (), "u1", "", "the Jacobian concerned"),
+        Field("jacobian", (), "u1", "", "Jacobian of the event"),
         Field("phase", (), "u1"),
     )
 
@@ -327,15 +268,11 @@ def event_format(form: TraceFormat) -> TraceFormat:
     labels = {
         "kind": tuple(kind.name for kind in EventKind),
         "jacobian": ("none", *jacobian_names(form)),
-        "joint_mask": _actuators(form),
+        "joint_mask": actuator_names(form),
         "joint_unit": form.labels.get("q_unit", ()),
         "phase": form.labels.get(PHASE.name, ()),
     }
     return TraceFormat(event_layout(mask_words(form)), labels)
-
-
-def _actuators(form: TraceFormat) -> tuple[str, ...]:
-    return form.labels.get(Q.name) or form.labels.get(LIMIT_MASK.name, ())
 
 
 # Detection of events.
@@ -370,7 +307,7 @@ def detect_events(
         (e,) rows of `event_format` sorted by solve and iteration; "solve_id" counts the solves
         from 0.
     """
-    traces = Traces(form, rows, counts, rules or EventRules())
+    traces = EventTraces(form, rows, counts, rules or EventRules())
     with np.errstate(invalid="ignore"):
         batches = [batch for detect in DETECTORS for batch in detect(traces)] if len(rows) else []
     batches = [batch for batch in batches if len(batch.row)]
@@ -409,52 +346,14 @@ class MeasuredJacobian:
 
 
 @dataclass(frozen=True, eq=False)
-class Traces:
-    """Rows of several solves, one solve after another.
+class EventTraces(Traces):
+    """Traces with the thresholds of events.
 
     Attributes:
-        form: Format of the rows.
-        rows: (m,) rows of the layout of the format.
-        counts: (k,) number of rows of each solve.
         rules: Thresholds of events.
     """
 
-    form: TraceFormat
-    rows: NDArray[Any]
-    counts: NDArray[np.int64]
     rules: EventRules
-    _columns: dict[str, NDArray[Any]] = field(default_factory=dict, init=False)
-
-    @cached_property
-    def names(self) -> tuple[str, ...]:
-        """Names of the fields."""
-        return self.form.layout.names
-
-    @cached_property
-    def solve(self) -> Rows:
-        """(m,) index of the solve of each row, from 0."""
-        return np.repeat(np.arange(len(self.counts)), self.counts)
-
-    @cached_property
-    def starts(self) -> Rows:
-        """(k,) first row of each solve."""
-        return np.cumsum(self.counts) - self.counts
-
-    @cached_property
-    def firsts(self) -> Rows:
-        """First rows of all solves that have rows."""
-        return self.starts[self.counts > 0]
-
-    @cached_property
-    def run(self) -> NDArray[np.int32]:
-        """(m,) number of the run of rows with the same solve, phase and restart."""
-        new = np.zeros(len(self.rows), dtype=bool)
-        new[self.firsts] = True
-        for name in (PHASE.name, RESTART.name):
-            if name in self.names:
-                codes = self.column(name)
-                new[1:] |= codes[1:] != codes[:-1]
-        return np.cumsum(new, dtype=np.int32)
 
     @cached_property
     def jacobians(self) -> list[MeasuredJacobian]:
@@ -471,37 +370,6 @@ class Traces:
                 jacobians.setdefault(label, jacobian).columns[kind] = item.name, column
         return list(jacobians.values())
 
-    def matrix(self, name: str) -> NDArray[Any]:
-        """Return a view of a field of all rows, (m, size)."""
-        return as_matrix(self.rows[name])
-
-    def column(self, name: str, column: int = 0) -> NDArray[Any]:
-        """Return a contiguous column of a field of all rows, (m,)."""
-        key = f"{name}.{column}"
-        if key not in self._columns:
-            self._columns[key] = np.ascontiguousarray(self.matrix(name)[:, column])
-        return self._columns[key]
-
-    def columns(self, name: str) -> NDArray[Any]:
-        """Return a field of all rows as (size, m), which is faster to process by column."""
-        return self.matrix(name).T.copy(order="C")
-
-    def previous(self, values: NDArray[Any], start: ArrayLike) -> NDArray[Any]:
-        """Return the values (m, ...) of the previous rows, and `start` in first rows of solves."""
-        previous = np.empty_like(values)
-        previous[1:] = values[:-1]
-        previous[self.firsts] = start
-        return previous
-
-    def longer_than(self, window: int) -> tuple[Traces, Rows]:
-        """Return the solves with more rows than a window, and the indices of their rows."""
-        is_long = self.counts > window
-        indices = np.flatnonzero(np.repeat(is_long, self.counts))
-        if is_long.all():
-            return self, indices
-        rows = np.take(self.rows, indices)
-        return Traces(self.form, rows, self.counts[is_long], self.rules), indices
-
     def nearest_singular(self, row: Rows) -> NDArray[np.int64]:
         """Return the number, from 1, of the Jacobian nearest to its threshold in each row.
 
@@ -515,14 +383,8 @@ class Traces:
                 distance[:, number] = np.where(np.isnan(value), np.inf, value)
         return np.argmin(distance, axis=1)
 
-    def words(self, joints: Bools) -> Words:
-        """Pack flags of actuators (e, n) into words (e, words) of a mask."""
-        padded = np.zeros((len(joints), 32 * mask_words(self.form)), dtype=bool)
-        padded[:, : joints.shape[1]] = joints
-        return words_of(padded)
 
-
-def _changes(traces: Traces) -> Iterator[EventRows]:
+def _changes(traces: EventTraces) -> Iterator[EventRows]:
     """Detect changes of phase and restarts."""
     for name, kind in ((PHASE.name, EventKind.PHASE_CHANGE), (RESTART.name, EventKind.RESTART)):
         if name in traces.names:
@@ -532,7 +394,7 @@ def _changes(traces: Traces) -> Iterator[EventRows]:
             yield EventRows(kind, row, codes[row], previous[row])
 
 
-def _limits(traces: Traces) -> Iterator[EventRows]:
+def _limits(traces: EventTraces) -> Iterator[EventRows]:
     """Detect changes of bits of the limit mask.
 
     A start at a limit is a hit. If a bit is cleared while the actuator stays within
@@ -543,22 +405,22 @@ def _limits(traces: Traces) -> Iterator[EventRows]:
         return
     mask = np.ascontiguousarray(traces.matrix(LIMIT_MASK.name))
     previous = traces.previous(mask, 0)
-    hit, hit_bit = _set_bits(mask & ~previous)
-    leave, leave_bit = _set_bits(previous & ~mask)
-    limit = _positions(traces, leave - 1, leave_bit)
-    ends = (traces.starts + traces.counts)[traces.solve[leave]]
+    hit, hit_bit = set_bits(mask & ~previous)
+    leave, leave_bit = set_bits(previous & ~mask)
+    limit = traces.positions(leave - 1, leave_bit)
+    stops = (traces.starts + traces.counts)[traces.solve[leave]]
     is_repeated, has_left = np.zeros(len(hit), dtype=bool), np.ones(len(leave), dtype=bool)
     # Actuators that have not moved yet are followed row by row to the next hit or the end.
     pending = np.arange(len(leave))
     while True:
         row, bit = leave[pending], leave_bit[pending]
-        distance = np.abs(_positions(traces, row, bit) - limit[pending])
+        distance = np.abs(traces.positions(row, bit) - limit[pending])
         pending = pending[distance <= traces.rules.limit_slack]
         if not len(pending):
             break
         leave[pending] += 1
         row, bit = leave[pending], leave_bit[pending]
-        at_end = row == ends[pending]
+        at_end = row == stops[pending]
         words = mask[np.where(at_end, 0, row), bit >> 5] >> (bit & 31).astype(np.uint32)
         is_back = ~at_end & (words & 1 > 0)
         is_repeated |= np.isin(hit * 2**16 + hit_bit, (row * 2**16 + bit)[is_back])
@@ -567,15 +429,15 @@ def _limits(traces: Traces) -> Iterator[EventRows]:
     hit, hit_bit = hit[~is_repeated], hit_bit[~is_repeated]
     leave, leave_bit, limit = leave[has_left], leave_bit[has_left], limit[has_left]
     for kind, row, bit, threshold in (
-        (EventKind.LIMIT_HIT, hit, hit_bit, _positions(traces, hit, hit_bit)),
+        (EventKind.LIMIT_HIT, hit, hit_bit, traces.positions(hit, hit_bit)),
         (EventKind.LIMIT_LEFT, leave, leave_bit, limit),
     ):
         joints = np.zeros((len(row), mask_words(traces.form)), np.uint32)
         joints[np.arange(len(row)), bit >> 5] = 1 << (bit & 31)
-        yield EventRows(kind, row, _positions(traces, row, bit), threshold, joints)
+        yield EventRows(kind, row, traces.positions(row, bit), threshold, joints)
 
 
-def _active(traces: Traces) -> Iterator[EventRows]:
+def _active(traces: EventTraces) -> Iterator[EventRows]:
     """Detect constraints that join or leave the active set."""
     if ACTIVE_MASK.name in traces.names:
         mask = np.ascontiguousarray(traces.matrix(ACTIVE_MASK.name))
@@ -587,7 +449,7 @@ def _active(traces: Traces) -> Iterator[EventRows]:
             yield EventRows(kind, row, size, size_before, joints[row])
 
 
-def _collisions(traces: Traces) -> Iterator[EventRows]:
+def _collisions(traces: EventTraces) -> Iterator[EventRows]:
     """Detect where the clearance falls below the margin and rises above it again.
 
     A start in collision is an entry.
@@ -605,13 +467,13 @@ def _collisions(traces: Traces) -> Iterator[EventRows]:
             yield EventRows(kind, row, clearance[row], margin)
 
 
-def _singular(traces: Traces) -> Iterator[EventRows]:
+def _singular(traces: EventTraces) -> Iterator[EventRows]:
     """Detect where a Jacobian becomes near singular or ill-conditioned.
 
     The event can occur again once the value was better than its threshold by the factor
     `EventRules.release`, or was not computed (NaN).
     """
-    names, release = _actuators(traces.form), traces.rules.release
+    names, release = actuator_names(traces.form), traces.rules.release
     for number, jacobian in enumerate(traces.jacobians, start=1):
         joints = traces.words(np.array([[name in jacobian.joints for name in names]], dtype=bool))
         if SIGMA in jacobian.columns and jacobian.singular > 0:
@@ -624,7 +486,7 @@ def _singular(traces: Traces) -> Iterator[EventRows]:
             yield EventRows(EventKind.ILL_CONDITIONED, row, value[row], limit, joints, number)
 
 
-def _stalls(traces: Traces) -> Iterator[EventRows]:
+def _stalls(traces: EventTraces) -> Iterator[EventRows]:
     """Detect where the error stalls.
 
     A solve has stalled if over the last `EventRules.stall_window` iterations of one phase and
@@ -633,24 +495,26 @@ def _stalls(traces: Traces) -> Iterator[EventRows]:
     """
     window, limit = traces.rules.stall_window, traces.rules.stall_change
     long_traces, indices = traces.longer_than(window)
-    if not (groups := _errors(long_traces)):
+    if not (groups := long_traces.errors()):
         return
-    spread = largest = np.zeros(len(indices) - window)
+    relative_spread = largest = np.zeros(len(indices) - window)
     for errors in groups:
         high, low = (_over_window(errors, window + 1, pick) for pick in (np.maximum, np.minimum))
         top = high.max(axis=0)
-        spread = np.maximum(spread, (high - low).max(axis=0) / np.where(top > 0, top, 1))
+        relative_spread = np.maximum(
+            relative_spread, (high - low).max(axis=0) / np.where(top > 0, top, 1)
+        )
         largest = np.maximum(largest, top)
-    is_stalled = _same_run(long_traces, window) & (spread <= limit) & (largest > 0)
+    is_stalled = long_traces.same_run(window) & (relative_spread <= limit) & (largest > 0)
     starts = _rising_edges(is_stalled)
     row, at_limit = indices[starts + window], 0
     if LIMIT_MASK.name in traces.names:
         at_limit = traces.matrix(LIMIT_MASK.name)[row]
     jacobian = traces.nearest_singular(row)
-    yield EventRows(EventKind.STALL, row, spread[starts], limit, at_limit, jacobian)
+    yield EventRows(EventKind.STALL, row, relative_spread[starts], limit, at_limit, jacobian)
 
 
-def _oscillations(traces: Traces) -> Iterator[EventRows]:
+def _oscillations(traces: EventTraces) -> Iterator[EventRows]:
     """Detect where actuators oscillate without progress.
 
     An actuator oscillates if each of its steps in the last `EventRules.oscillation_window`
@@ -667,8 +531,8 @@ def _oscillations(traces: Traces) -> Iterator[EventRows]:
     oscillates = _over_window(is_reversed, window - 1, np.minimum)
     without_progress = np.logical_or.reduce(oscillates, axis=0)
     if without_progress.any():
-        without_progress &= _same_run(long_traces, window)
-        for errors in _errors(long_traces):
+        without_progress &= long_traces.same_run(window)
+        for errors in long_traces.errors():
             norm = np.sqrt(np.einsum("ij,ij->j", errors, errors))
             without_progress &= norm[window:] >= (1 - rules.oscillation_progress) * norm[:-window]
     starts = _rising_edges(without_progress)
@@ -678,7 +542,7 @@ def _oscillations(traces: Traces) -> Iterator[EventRows]:
     yield EventRows(EventKind.OSCILLATION, row, step, rules.oscillation_step, words, jacobian)
 
 
-DETECTORS: tuple[Callable[[Traces], Iterator[EventRows]], ...] = (
+DETECTORS: tuple[Callable[[EventTraces], Iterator[EventRows]], ...] = (
     *(_changes, _limits, _active, _collisions, _singular, _stalls, _oscillations),
 )
 """Detectors of events; each processes the traces of all solves at once."""
@@ -692,46 +556,27 @@ def _rising_edges(flags: Bools) -> Rows:
     return np.flatnonzero(flags & ~np.concatenate([[False], flags[:-1]]))
 
 
-def _errors(traces: Traces) -> list[NDArray[Any]]:
-    """Return the errors that a solve minimises, (columns, m) per unit, with 0 for free columns."""
-    fields = (COST,) if COST.name in traces.names else (POSITION_ERROR, ANGLE_ERROR)
-    groups = []
-    for name in (item.name for item in fields if item.name in traces.names and len(traces.rows)):
-        errors = np.abs(traces.columns(name))
-        is_missing = np.isnan(errors)
-        if is_missing.any():
-            is_free = np.logical_and.reduceat(is_missing, traces.starts, axis=1)
-            errors[np.repeat(is_free, traces.counts, axis=1)] = 0
-        groups.append(errors)
-    return groups
-
-
-def _same_run(traces: Traces, window: int) -> Bools:
-    """Return for rows from `window` on if the last `window` steps have one phase and restart."""
-    return traces.run[window:] == traces.run[:-window]
-
-
-def _entries(traces: Traces, begins: Bools, ends: Bools) -> Rows:
+def _entries(traces: EventTraces, rising: Bools, falling: Bools) -> Rows:
     """Return the rows where a condition with hysteresis starts to hold.
 
-    The condition holds from a row with `begins` to a row with `ends`. It does not hold before the
-    first row of a solve.
+    The condition holds from a row with `rising` to a row with `falling`. It does not hold before
+    the first row of a solve.
 
     Args:
-        traces: Traces of the solves.
-        begins: (m,) True where the condition starts to hold.
-        ends: (m,) True where the condition ceases to hold.
+        traces: EventTraces of the solves.
+        rising: (m,) True where the condition starts to hold.
+        falling: (m,) True where the condition ceases to hold.
     """
-    if not begins.any():
+    if not rising.any():
         return np.zeros(0, np.intp)
     # Only the few solves with a start are processed row by row.
     has_start = np.zeros(len(traces.counts), dtype=bool)
-    has_start[traces.solve[begins]] = True
-    decisive = np.flatnonzero((begins | ends) & has_start[traces.solve])
+    has_start[traces.solve[rising]] = True
+    decisive = np.flatnonzero((rising | falling) & has_start[traces.solve])
     previous = np.concatenate([[-1], decisive[:-1]])
-    can_start = ends[previous] | (traces.solve[previous] != traces.solve[decisive])
+    can_start = falling[previous] | (traces.solve[previous] != traces.solve[decisive])
     can_start[0] = True
-    return decisive[begins[decisive] & can_start]
+    return decisive[rising[decisive] & can_start]
 
 
 def _over_window(values: NDArray[Any], window: int, reduce: np.ufunc) -> NDArray[Any]:
@@ -742,38 +587,3 @@ def _over_window(values: NDArray[Any], window: int, reduce: np.ufunc) -> NDArray
         width *= 2
     shift = window - width
     return reduce(values[:, shift:], values[:, :-shift]) if shift else values
-
-
-def as_matrix(values: NDArray[Any]) -> NDArray[Any]:
-    """Return values (k, ...) as a matrix (k, size)."""
-    return values.reshape(len(values), math.prod(values.shape[1:]))
-
-
-def bits_of(mask: NDArray[Any]) -> Bools:
-    """Unpack unsigned words (m, words) to bits (m, 8 * bytes), least significant bit first."""
-    octets = np.ascontiguousarray(mask).view(np.uint8)
-    return np.unpackbits(octets, axis=1, bitorder="little").astype(bool)
-
-
-def words_of(bits: Bools) -> Words:
-    """Pack bits into 32-bit words; the inverse of `bits_of`."""
-    return np.packbits(bits, axis=1, bitorder="little").view("<u4")
-
-
-def _set_bits(words: NDArray[Any]) -> tuple[Rows, Rows]:
-    """Return row and bit, both (e,), of every bit that is set in words (m, words)."""
-    flat = words.reshape(-1)
-    nonzero = np.flatnonzero(flat)
-    index, bit = np.nonzero(bits_of(flat[nonzero][:, None]))
-    row, word = np.divmod(nonzero[index], words.shape[1])
-    return row, word * 32 + bit
-
-
-def _positions(traces: Traces, row: Rows, bit: Rows) -> NDArray[Any]:
-    """Return actuator positions (e,); NaN if the trace has none."""
-    values = np.full(len(row), np.nan)
-    if Q.name in traces.names:
-        q = traces.matrix(Q.name)
-        has_position = bit < q.shape[1]
-        values[has_position] = q[row[has_position], bit[has_position]]
-    return values

@@ -1,6 +1,6 @@
 """Explanations of solves in words, and comparisons of two solves of one target.
 
-Explanations state what the trace shows. Events that coincide with a failure are not proven causes.
+Explanations describe the trace. Events that coincide with a failure are not proven causes.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from numpy.typing import NDArray
 from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.contacts import EXTRA_ARRAY_NAMES
-from casadi_ik.logs.events import (
-    Event,
+from casadi_ik.logs.events import Event
+from casadi_ik.logs.format import LogClock
+from casadi_ik.logs.reader import Log
+from casadi_ik.logs.renamed import warn_renamed
+from casadi_ik.logs.solve import PhaseSpan, SolveRecord, optional_targets
+from casadi_ik.logs.wording import (
     counted_noun,
     errors_text,
     format_number,
     joined_names,
     plain_name,
 )
-from casadi_ik.logs.format import LogClock
-from casadi_ik.logs.reader import Log
-from casadi_ik.logs.renamed import warn_renamed
-from casadi_ik.logs.solve import PhaseSpan, SolveRecord, optional_targets
 from casadi_ik.solve.trace import CLEARANCE
 
 MAX_PHASE_SPANS = 6
@@ -101,8 +101,8 @@ def explain(solve: SolveRecord) -> Explanation:
         headline += f" and {counted_noun(solve.restarts, 'restart')}"
     if len(solve.rows) == 0:
         note = "the log holds no iterations of this solve"
-        if solve.iterations > LogClock().room:
-            note += f" (maximum per solve: {LogClock().room:,})"
+        if solve.iterations > LogClock().max_iterations:
+            note += f" (maximum per solve: {LogClock().max_iterations:,})"
         return Explanation(headline, verdict=(note, *_verdict(solve)))
     return Explanation(
         headline,
@@ -164,15 +164,15 @@ def _error_pair(position: float, angle: float) -> str:
 
 def _fingers(solve: SolveRecord) -> Iterator[str]:
     """Yield the fingers that miss their contacts, or the finger that converged last."""
-    inside, (position, angle) = within_tolerance(solve), errors_of(solve)
+    is_within, (position, angle) = within_tolerance(solve), errors_of(solve)
     for i in np.flatnonzero(~solve.ok).tolist():
         tolerance = solve.tolerances[i]
         ratio = np.fmax(position[:, i] / tolerance.position, angle[:, i] / tolerance.angle)
         best = int(np.nanargmin(ratio))
         line = f"{solve.fingers[i]} misses its contact: final error {solve.errors_of(i)}"
-        if inside[:, i].any():
-            last = int(np.flatnonzero(inside[:, i])[-1])
-            line += f"; within tolerance in {int(inside[:, i].sum())} iterations"
+        if is_within[:, i].any():
+            last = int(np.flatnonzero(is_within[:, i])[-1])
+            line += f"; within tolerance in {int(is_within[:, i].sum())} iterations"
             line += f", last in iteration {last + 1}"
         else:
             line += (
@@ -181,7 +181,7 @@ def _fingers(solve: SolveRecord) -> Iterator[str]:
             )
         yield line
     if solve.ok.all() and len(solve.fingers) > 1:
-        entered = [_first_of_final_run(inside[:, i]) for i in range(len(solve.fingers))]
+        entered = [_first_of_final_run(is_within[:, i]) for i in range(len(solve.fingers))]
         order = np.argsort(entered, kind="stable")
         if entered[order[-1]] > entered[order[-2]]:
             yield (
@@ -239,9 +239,9 @@ def _limits(solve: SolveRecord) -> Iterator[str]:
     if repeated:
         texts = [f"{joint} {count} times" for joint, count in Counter(repeated).most_common()]
         yield f"hit and left limits repeatedly: {joined_names(texts)}"
-    beyond = " or beyond" if solve.target.limits == "ignore" else ""
+    or_beyond = " or beyond" if solve.target.limits == "ignore" else ""
     for joint, start in limits_at_end(solve).items():
-        yield f"{joint} at{beyond} its limit from iteration {start + 1} to the end"
+        yield f"{joint} at{or_beyond} its limit from iteration {start + 1} to the end"
 
 
 def limits_at_end(solve: SolveRecord) -> dict[str, int]:
@@ -302,8 +302,8 @@ def _final_state(solve: SolveRecord) -> Iterator[str]:
             yield f"in the last iteration the {plain_name(jacobian)} is near singular"
     at_limit = limits_at_end(solve)
     if at_limit:
-        beyond = " or beyond" if solve.target.limits == "ignore" else ""
-        yield f"in the last iteration at{beyond} a limit: {', '.join(at_limit)}"
+        or_beyond = " or beyond" if solve.target.limits == "ignore" else ""
+        yield f"in the last iteration at{or_beyond} a limit: {', '.join(at_limit)}"
     if solve.status == "ITERATION_LIMIT":
         yield _progress(solve)
 

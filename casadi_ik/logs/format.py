@@ -1,7 +1,7 @@
-"""Conventions of a log: topics, schemas as ros2msg text, log times, and the record of its origin.
+"""Conventions of a log: topics, schemas as ros2msg text, log times, and metadata.
 
-The text of a schema is all a reader needs to get the `Layout` back: each line carries the type and
-the name and, behind "#", the shape if it has more than one axis, the unit and the doc.
+A reader reconstructs the `Layout` from the text of a schema: each line holds type and name and,
+after "#", the shape if it has more than one axis, the unit and the description.
 """
 
 from __future__ import annotations
@@ -27,13 +27,15 @@ from numpy.typing import NDArray
 from casadi_ik.compile.layout import Field, Layout
 from casadi_ik.errors import InputError, LogError
 from casadi_ik.files.writing import to_json
-from casadi_ik.logs.container import ForeignLogError, check_size
+from casadi_ik.logs.chunks import check_size
+from casadi_ik.logs.container import ForeignLogError
+from casadi_ik.logs.renamed import warn_renamed
 
 MESSAGE_KINDS = ("iteration", "solve", "event")
-"""The kinds of messages, each on a topic of its own per method."""
+"""Kinds of messages; every method has one topic of each kind."""
 
 ITERATION_PERIOD = 1_000_000
-"""Log time between two iterations: 1 ms [ns]."""
+"""Log time between two iterations [ns]: 1 ms."""
 
 _ROS_TYPES = {"f8": "float64", "f4": "float32", "u4": "uint32", "i4": "int32", "u1": "uint8"}
 _ROS_NAME = re.compile(r"(?!.*__)(?!.*_\Z)[a-z][a-z0-9_]*\Z")
@@ -46,14 +48,14 @@ _COMMENT = re.compile(
 
 @dataclass(frozen=True)
 class LogClock:
-    """Log times are computed, not measured, so that a solve is a known range of time.
+    """Rule of log times: a solve occupies a known range of computed times.
 
-    The default is the same in every log, so that the logs of several workers share one time; true
-    times are publish times.
+    The default is the same in every log, so that the logs of several workers share one timeline.
+    Measured times are publish times.
 
     Attributes:
-        t0: Log time of solve 0, iteration 0 [ns since the Unix epoch]: the year 2000 begins.
-        slot: Log time between two solves, room for 60,000 iterations [ns].
+        t0: Log time of iteration 0 of solve 0 [ns since the Unix epoch]: start of the year 2000.
+        slot: Log time between two solves, enough for 60,000 iterations [ns].
 
     Example:
         >>> ik.logs.LogClock(t0=0).slot > 0
@@ -64,51 +66,61 @@ class LogClock:
     slot: int = 60_000_000_000
 
     def start(self, solve_id: int) -> int:
-        """Log time of a solve's first iteration [ns]."""
+        """Return the log time of a solve's first iteration [ns]."""
         return self.t0 + solve_id * self.slot
 
     @property
-    def room(self) -> int:
-        """Iterations of a solve that there is time for."""
+    def max_iterations(self) -> int:
+        """Maximum number of iterations of a solve that have log times."""
         return self.slot // ITERATION_PERIOD
 
+    @property
+    def room(self) -> int:
+        """Deprecated name of `max_iterations`."""
+        warn_renamed("LogClock.room", "LogClock.max_iterations", stacklevel=3)
+        return self.max_iterations
+
     def check(self, first: int, count: int) -> None:
-        """Check that there is time for so many solves from `first` on.
+        """Check that consecutive solves have log times.
+
+        Args:
+            first: Number of the first solve.
+            count: Number of solves.
 
         Raises:
-            LogError: A solve's number is negative or beyond what 64-bit nanoseconds can tell.
+            LogError: A solve's number is negative, or its time exceeds 64-bit nanoseconds.
         """
         last = first + count - 1
         if not (first >= 0 and last < 2**32 and self.start(last + 1) < 2**63):
-            wrong = first if first < 0 else last
-            raise LogError(f"solve {wrong}: the log has no time for a solve of this number")
+            number = first if first < 0 else last
+            raise LogError(f"solve {number}: the number is outside of the range of log times")
 
     def times(self, solve_id: NDArray[np.int64], iteration: NDArray[np.int64]) -> np.ndarray:
-        """Log times of iterations, uint64 [ns]; both arguments of the same shape."""
+        """Return log times, uint64 [ns], for solves and iterations of the same shape."""
         return (self.t0 + solve_id * self.slot + iteration * ITERATION_PERIOD).astype(np.uint64)
 
     def locate(self, log_times: np.ndarray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Solve and iteration of log times: the inverse of `times`, two int64 arrays."""
-        since = log_times.astype(np.int64) - self.t0
-        solve_id = since // self.slot
-        return solve_id, (since - solve_id * self.slot) // ITERATION_PERIOD
+        """Return solves and iterations of log times, two int64 arrays; the inverse of `times`."""
+        elapsed = log_times.astype(np.int64) - self.t0
+        solve_id = elapsed // self.slot
+        return solve_id, (elapsed - solve_id * self.slot) // ITERATION_PERIOD
 
 
 def topic(method: str, kind: str) -> str:
-    """Topic of a method's messages; kind is one of `MESSAGE_KINDS`."""
+    """Return the topic of a method's messages of one of the `MESSAGE_KINDS`."""
     return f"/ik/{method}/{kind}"
 
 
 def schema_name(kind: str, method: str, layout: Layout, fingers: int) -> str:
-    """Schema name of a method's messages: the kind, the method and the robot's shape.
+    """Return the schema name of a method's messages.
 
-    Q is the number of coordinates, F of fingers, J of singular values that are logged:
-    "casadi_ik/msg/IterationEnhancedDlsQ14F3J4".
+    The name consists of the kind, the method, and the numbers of actuators (Q), fingers (F) and
+    logged singular values (J), e.g. "casadi_ik/msg/IterationEnhancedDlsQ14F3J4".
 
     Args:
         kind: One of `MESSAGE_KINDS`.
         method: Name of the method.
-        layout: Of its iterations.
+        layout: Layout of its iterations.
         fingers: Number of fingers.
     """
     words = "".join(word[:1].upper() + word[1:] for word in re.findall(r"[A-Za-z0-9]+", method))
@@ -118,24 +130,27 @@ def schema_name(kind: str, method: str, layout: Layout, fingers: int) -> str:
 
 
 def schema_text(layout: Layout, labels: Mapping[str, tuple[str, ...]] | None = None) -> str:
-    """The ros2msg text of a record layout.
+    """Return the ros2msg text of a record layout.
 
     Args:
-        layout: Fields by falling width, as `Layout.record` sorts them.
-        labels: Names of the codes of integer scalars become constants right before the field,
-            where viewers take them for its enum names.
+        layout: Fields in order of decreasing width, as `Layout.record` sorts them.
+        labels: Names of codes by field. Those of integer scalars become constants before the field,
+            which viewers interpret as the names of an enumeration.
 
     Raises:
-        LogError: The layout cannot be a message: a field would need padding, is empty, or has a
-            name that ROS forbids.
+        LogError: The layout cannot be a message: a field needs padding, is empty, or has a name
+            that ROS forbids.
     """
     _check_widths(layout, f"layout of {layout.names}")
     lines: list[str] = []
     for item in layout:
         if not _ROS_NAME.match(item.name):
-            raise LogError(f"field {item.name!r}: a ROS field name is lower_snake_case")
+            raise LogError(f"field {item.name!r}: name is not in lower_snake_case, as ROS expects")
         if item.size == 0 or "]" in item.unit:
-            raise LogError(f"field {item.name!r}: shape {item.shape}, unit {item.unit!r}")
+            raise LogError(
+                f"field {item.name!r}: found shape {item.shape} and unit {item.unit!r}; expected a"
+                " non-empty shape and a unit without ']'"
+            )
         ros_type = _ROS_TYPES[item.dtype]
         if item.shape == () and item.dtype[0] in "ui" and not item.name.endswith("_mask"):
             for code, name in enumerate((labels or {}).get(item.name, ())):
@@ -149,16 +164,16 @@ def schema_text(layout: Layout, labels: Mapping[str, tuple[str, ...]] | None = N
 
 
 def parse_layout(text: str) -> Layout:
-    """The layout that `schema_text` was given.
+    """Return the layout of a text of `schema_text`.
 
     Raises:
-        LogError: Not such a text.
+        LogError: The text does not describe a record layout.
     """
     lines = (line.partition("#") for line in text.splitlines())
-    coded = ((code.strip(), comment.strip()) for code, _, comment in lines)
-    wanted = [each for each in coded if each[0] and not _CONSTANT.match(each[0])]
+    pairs = ((code.strip(), comment.strip()) for code, _, comment in lines)
+    definitions = [pair for pair in pairs if pair[0] and not _CONSTANT.match(pair[0])]
     try:
-        layout = Layout(tuple(_field(*each) for each in wanted))
+        layout = Layout(tuple(_parse_field(*pair) for pair in definitions))
     except InputError as error:
         raise LogError(f"schema: {error}") from error
     _check_widths(layout, "schema: its layout")
@@ -167,43 +182,55 @@ def parse_layout(text: str) -> Layout:
     return layout
 
 
-def _check_widths(layout: Layout, what: str) -> None:
+def _check_widths(layout: Layout, name: str) -> None:
+    """Check that fields need no padding: their widths decrease.
+
+    Raises:
+        LogError: The layout is empty or not sorted by decreasing width.
+    """
     widths = [np.dtype(item.dtype).itemsize for item in layout]
     if not widths or widths != sorted(widths, reverse=True):
-        raise LogError(f"{what} is not sorted by falling width, or empty")
+        raise LogError(f"{name} is empty or not sorted by decreasing width")
 
 
-def _field(code: str, comment: str) -> Field:
-    """The field that a line of a schema describes."""
-    line, about = _LINE.match(code), _COMMENT.match(comment)
-    storage = {ros: dtype for dtype, ros in _ROS_TYPES.items()}
-    if line is None or line["type"] not in storage or about is None:
-        raise LogError(f"schema: the line {code[:60]!r} is no part of a record layout")
+def _parse_field(code: str, comment: str) -> Field:
+    """Return the field that a line of a schema describes.
+
+    Raises:
+        LogError: The line does not describe a field.
+    """
+    line, details = _LINE.match(code), _COMMENT.match(comment)
+    dtypes = {ros_type: dtype for dtype, ros_type in _ROS_TYPES.items()}
+    if line is None or line["type"] not in dtypes or details is None:
+        raise LogError(f"schema: line {code[:60]!r} is not a field of a record layout")
     shape = (int(line["array"][1:-1]),) if line["array"] else ()
     size = shape[0] if shape else 1
-    if about["shape"]:
-        shape = tuple(int(number) for number in about["shape"].split(", "))
-    found = Field(line["name"], shape, storage[line["type"]], about["unit"], about["doc"] or "")
-    if found.size != size:
-        raise LogError(f"schema: field {found.name!r}: its shape has not {size} elements")
-    return found
+    if details["shape"]:
+        shape = tuple(int(number) for number in details["shape"].split(", "))
+    field = Field(line["name"], shape, dtypes[line["type"]], details["unit"], details["doc"] or "")
+    if field.size != size:
+        raise LogError(
+            f"schema: field {field.name!r}: found a shape of {field.size} elements, expected {size}"
+        )
+    return field
 
 
-# Where a log comes from: the metadata record, written by a recorder and checked by a reader.
+# Metadata: written by a recorder and checked by a reader.
 
 METADATA_NAME = "casadi_ik"
 """Name of the metadata record."""
 
 FORMAT = "2"
-"""Version of the log's own conventions (topics, schemas, metadata)."""
+"""Version of the conventions of topics, schemas and metadata."""
 
 CHECKSUM = "crc32"
-"""Key of the checksum of all other entries: MCAP has none for metadata."""
+"""Key of the checksum of all other entries; MCAP has no checksum of metadata."""
 
 SHARDS = "shards"
-"""Key of where the solves of a merged log come from."""
+"""Key of the description of the shards of a merged log."""
 
 PACKAGES = ("casadi", "numpy", "mcap", "proxsuite", "msgspec", "pyyaml")
+"""Packages whose versions are logged."""
 
 Number = Annotated[str, msgspec.Meta(pattern=r"^[0-9]{1,19}\Z")]
 Text = Annotated[str, msgspec.Meta(max_length=10_000)]
@@ -211,7 +238,7 @@ Name = Annotated[str, msgspec.Meta(min_length=1, max_length=200)]
 
 
 class _Record(msgspec.Struct):
-    """Entries of the record and their kinds; other entries are let through as text."""
+    """Types of the metadata entries; other entries are text."""
 
     robot: Name
     seed: Text
@@ -236,7 +263,7 @@ def log_metadata(
     compression: str,
     clock: LogClock,
 ) -> dict[str, str]:
-    """The metadata record of a log: text by key; structured values as JSON."""
+    """Return the metadata record of a log: text by key, with structured values as JSON."""
     return with_checksum(
         {
             "format": FORMAT,
@@ -258,107 +285,112 @@ def log_metadata(
 
 
 def with_checksum(record: Mapping[str, str]) -> dict[str, str]:
-    """The entries with their checksum."""
+    """Return the entries of a record with their checksum."""
     entries = sorted((key, text) for key, text in record.items() if key != CHECKSUM)
     return {**record, CHECKSUM: f"{zlib.crc32(json.dumps(entries).encode()):08x}"}
 
 
 def machine() -> dict[str, Any]:
-    """The computer: system, processor, cores."""
+    """Return the system, processor and number of cores of this computer."""
     return {"system": platform.platform(), "processor": _processor(), "cores": os.cpu_count()}
 
 
 def package_versions(names: Iterable[str]) -> dict[str, str]:
-    """Versions of installed packages by name."""
+    """Return the versions of installed packages by name."""
     return {name: _version(name) for name in names}
 
 
 def casadi_ik_record(records: Sequence[Metadata]) -> Mapping[str, str]:
-    """Our record among those of a file.
+    """Return the metadata record of this package among those of a file.
 
     Raises:
-        ForeignLogError: There is none.
-        LogError: There are several, it fails its checksum, or it is of an unknown version.
+        ForeignLogError: The file has no such record.
+        LogError: It has several, or the record fails its checksum or has an unknown version.
     """
-    found = [record.metadata for record in records if record.name == METADATA_NAME]
-    if len(found) != 1:
+    matching = [record.metadata for record in records if record.name == METADATA_NAME]
+    if len(matching) != 1:
         names = ", ".join(sorted({repr(record.name)[1:-1] for record in records})) or "none"
-        problem = f"metadata {METADATA_NAME!r} twice" if found else f"no metadata {METADATA_NAME!r}"
-        kind = LogError if found else ForeignLogError
-        raise kind(f"not a log of casadi_ik: {problem} (found: {names})")
-    (record,) = found
+        error_type = LogError if matching else ForeignLogError
+        raise error_type(
+            f"not a log of casadi_ik: found metadata {names}; expected {METADATA_NAME!r} once"
+        )
+    (record,) = matching
     if record != with_checksum(record):
-        raise LogError("the log is damaged: its metadata fail their checksum")
+        raise LogError("the log is damaged: its metadata do not match their checksum")
     if record.get("format") != FORMAT:
         raise LogError(f"format: found {record.get('format', '')[:20]!r}, expected {FORMAT!r}")
     return record
 
 
 def parse_metadata(record: Mapping[str, str]) -> Mapping[str, Any]:
-    """The entries of our record, structured ones as what they say.
+    """Return the entries of the metadata record, with structured values parsed.
 
     Raises:
-        LogError: One is missing or of the wrong kind.
+        LogError: An entry is missing or has the wrong type.
     """
     values = {
-        key: parsed_json(f"metadata: {key}", text, dict[str, Any])
+        key: parse_json(f"metadata: {key}", text, dict[str, Any])
         if key in ("packages", "machine", "parameters", "keep")
         else text
         for key, text in record.items()
     }
     try:
-        found = msgspec.convert(values, _Record)
+        entries = msgspec.convert(values, _Record)
     except msgspec.ValidationError as error:
-        text, _, place = str(error).partition(" - at `$.")
-        raise LogError(f"metadata: {place.rstrip('`') or 'record'}: {text}") from error
-    if found.iteration_ns != str(ITERATION_PERIOD):
+        text, _, key = str(error).partition(" - at `$.")
+        raise LogError(f"metadata: {key.rstrip('`') or 'record'}: {text}") from error
+    if entries.iteration_ns != str(ITERATION_PERIOD):
         raise LogError(
-            f"metadata: iteration_ns: found {found.iteration_ns}, expected {ITERATION_PERIOD}"
+            f"metadata: iteration_ns: found {entries.iteration_ns}, expected {ITERATION_PERIOD}"
         )
-    return {**msgspec.structs.asdict(found), **values}
+    return {**msgspec.structs.asdict(entries), **values}
 
 
 def clock_from_metadata(values: Mapping[str, Any]) -> LogClock:
-    """The rule of a log's times.
+    """Return the rule of a log's times.
 
     Raises:
-        LogError: It leaves no time for an iteration.
+        LogError: The slot is shorter than an iteration, or a value exceeds 64 bits.
     """
     t0, slot = int(values["t0_ns"]), int(values["slot_ns"])
     if not (t0 < 2**63 and ITERATION_PERIOD <= slot < 2**63):
-        raise LogError(f"metadata: found t0_ns {t0}, slot_ns {slot}, which leave no time")
+        raise LogError(
+            f"metadata: found t0_ns {t0} and slot_ns {slot}; expected t0_ns < 2**63 and slot_ns"
+            f" from {ITERATION_PERIOD} to 2**63"
+        )
     return LogClock(t0, slot)
 
 
-def parsed_json(what: str, text: str, kind: Any) -> Any:
-    """JSON from a log.
+def parse_json(name: str, text: str, kind: Any) -> Any:
+    """Parse JSON from a log.
 
     Args:
-        what: Its name, for the message.
-        text: The JSON.
-        kind: The expected type.
+        name: Name of the value in error messages.
+        text: JSON text.
+        kind: Expected type.
 
     Raises:
-        LogError: It is no JSON of that type, or nested too deeply.
+        LogError: The text is not JSON of this type, or is nested too deeply.
     """
-    too_deep = f"{what}: lists and mappings are nested more than 32 deep"
+    depth_problem = f"{name}: lists and mappings are nested more than 32 deep"
     try:
         value = json.loads(text)
-        if not _shallow(value, 32):
-            raise LogError(too_deep)
+        if not _is_shallow(value, 32):
+            raise LogError(depth_problem)
         return msgspec.convert(value, kind)
     except RecursionError as error:
-        raise LogError(too_deep) from error
+        raise LogError(depth_problem) from error
     except msgspec.ValidationError as error:
-        raise LogError(f"{what}: {error}") from error
+        raise LogError(f"{name}: {error}") from error
     except ValueError as error:
-        raise LogError(f"{what}: not JSON: {error}") from error
+        raise LogError(f"{name}: not JSON: {error}") from error
 
 
-def _shallow(value: Any, left: int) -> bool:
+def _is_shallow(value: Any, max_depth: int) -> bool:
+    """Return True if lists and mappings are nested at most `max_depth` deep."""
     if isinstance(value, dict | list):
         items = value.values() if isinstance(value, dict) else value
-        return left > 0 and all(_shallow(item, left - 1) for item in items)
+        return max_depth > 0 and all(_is_shallow(item, max_depth - 1) for item in items)
     return True
 
 
@@ -372,7 +404,7 @@ def _version(package: str) -> str:
 
 @cache
 def _processor() -> str:
-    """The processor's name; what the platform module says where the kernel tells nothing."""
+    """Return the name of the processor from the kernel, or else from the platform module."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

@@ -1,4 +1,4 @@
-"""Logs read back: one file or several as one, filtered without reading what is not asked for."""
+"""Logs of one or several files, with filters that read only the matching chunks."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 
 from casadi_ik.errors import LogError, UnknownNameError, printable
 from casadi_ik.files.arrays import Counts
+from casadi_ik.logs.chunks import is_section
 from casadi_ik.logs.events import EventKind
 from casadi_ik.logs.format import MESSAGE_KINDS
 from casadi_ik.logs.shards import Paths, Shard, ShardOrigins, open_shards
@@ -25,7 +26,7 @@ Solves = int | Iterable[int] | None
 
 
 class Filters(TypedDict, total=False):
-    """What narrows down an answer of a `Log`; what is left out or None does not."""
+    """Filters of the queries of a `Log`; a filter that is absent or None matches everything."""
 
     method: Names
     solve: Solves
@@ -36,23 +37,23 @@ class Filters(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class LogInfo:
-    """What is in a log, without reading its messages.
+    """Summary of a log, obtained without reading its messages.
 
     Attributes:
-        paths: The files.
-        size: Their size [bytes].
+        paths: Paths of the files.
+        size: Their total size [bytes].
         robot: Name of the robot.
-        counts: Messages by method and kind: {"enhanced-dls": {"iteration": 120, ...}}.
-        compression: Of the chunks.
-        chunks: How many chunks there are.
-        uncompressed: Size of the chunks' contents [bytes].
-        compressed: Size of the chunks as stored [bytes].
-        metadata: Where the log comes from (seed, versions, parameters, ...), of the first file.
-        attachments: Attached files and their sizes [bytes], of the first file.
-        unfinished: Files without a footer: their writer was killed or is still at it. What is
-            after their last complete chunk is lost.
-        left_out: Files in which nothing is whole: their writer was killed before its first chunk.
-        differs: Entries of the metadata in which the shards differ, and what they say.
+        counts: Number of messages by method and kind: {"enhanced-dls": {"iteration": 120, ...}}.
+        compression: Compression of the chunks.
+        chunks: Number of chunks.
+        uncompressed: Total size of the unpacked chunks [bytes].
+        compressed: Total size of the chunks in the files [bytes].
+        metadata: Provenance (seed, versions, parameters, ...) of the first file.
+        attachments: Size of the attached files of the first file by name [bytes].
+        unfinished: Files without an end, because their writer was killed or is still writing; data
+            after their last complete chunk are lost.
+        left_out: Files without a complete record, whose writer was killed before its first chunk.
+        differs: Distinct values of every metadata entry in which the shards differ.
 
     Example:
         >>> info = ik.logs.open("cup.mcap").info()
@@ -79,13 +80,14 @@ def open_log(path: Paths) -> Log:
     """Open a log.
 
     Args:
-        path: A file, a folder (all .mcap files in it and below), or several of these: the shards
-            of one study, read as one log. How its solves are numbered: see `logs.shards`.
+        path: A file, a folder (all .mcap files in it and its subfolders), or several of these: the
+            shards of a study, which are read as one log. `casadi_ik.logs.shards` explains how
+            their solves are numbered. MCAP files of other programs in a folder are skipped with a
+            warning.
 
     Raises:
-        LogError: A file is missing, is no MCAP file, is damaged, or is not a log of casadi_ik; or
-            the files are not of one robot. A folder may hold MCAP files of others, which are left
-            out with a warning.
+        LogError: A file is missing, not an MCAP file, damaged, or not a log of casadi_ik; or the
+            files belong to different robots.
 
     Example:
         >>> ik.logs.open("cup.mcap").methods
@@ -95,23 +97,23 @@ def open_log(path: Paths) -> Log:
 
 
 class Log:
-    """One log, in one file or several. Nothing stays open, so there is nothing to close.
+    """A log of one or several files, which are opened for each query and closed again.
 
-    Filters (all optional, together they narrow down):
+    Queries have the following optional filters; rows must match all of them:
 
-    - `method`: a name or several.
-    - `solve`: a number or several.
-    - `status`: of the solve, a name ("STALLED") or several.
-    - `event`: a kind ("NEAR_SINGULAR") or several: solves in which one happened, their
-      iterations, the events themselves.
-    - `phase`: a name ("refinement") or several: solves that spent iterations in it, the iterations
-      and events in it.
+    - `method`: Name of a method, or several.
+    - `solve`: Number of a solve, or several.
+    - `status`: Name of the status of a solve ("STALLED"), or several.
+    - `event`: Kind of event ("NEAR_SINGULAR"), or several. Matches solves with such an event, their
+      iterations, and the events themselves.
+    - `phase`: Name of a phase ("refinement"), or several. Matches solves with iterations in it, and
+      the iterations and events in it.
 
     Attributes:
-        shards: The files.
-        methods: What methods there are.
-        metadata: Where the log comes from, of the first file.
-        left_out: Files in which nothing is whole.
+        shards: Files of the log.
+        methods: Names of the methods.
+        metadata: Provenance of the first file.
+        left_out: Files without a complete record.
 
     Example:
         >>> log = ik.logs.open("cup.mcap")
@@ -120,7 +122,11 @@ class Log:
     """
 
     def __init__(self, shards: Sequence[Shard], left_out: Sequence[Path] = ()) -> None:
-        """Put shards together; use `open_log`."""
+        """Combine shards; `open_log` calls this.
+
+        Raises:
+            LogError: The shards belong to different robots.
+        """
         first = shards[0]
         self.shards = tuple(shards)
         self.methods = tuple(dict.fromkeys(m for shard in shards for m in shard.methods))
@@ -129,37 +135,43 @@ class Log:
         for shard in shards:
             if shard.robot != first.robot:
                 raise LogError(
-                    f"{shard.path}: robot {shard.robot!r}, but {first.path} has {first.robot!r}"
+                    f"{shard.path}: robot: found {shard.robot!r}, expected {first.robot!r} as in"
+                    f" {first.path}"
                 )
             if not shard.contents.complete:
-                lost = shard.contents.size - shard.contents.end
-                where = printable(str(shard.path))
-                logger.warning("%s: not finished; %d bytes at its end are lost", where, lost)
+                lost_bytes = shard.contents.size - shard.contents.end
+                path = printable(str(shard.path))
+                logger.warning(
+                    "%s: log is incomplete; %d bytes at its end are lost", path, lost_bytes
+                )
 
     def __repr__(self) -> str:
         return f"<Log of {len(self.shards)} file(s), methods {', '.join(self.methods) or 'none'}>"
 
     @cached_property
     def sources(self) -> ShardOrigins:
-        """Where the solves come from, and how they are numbered.
+        """Origins and numbers of the solves.
 
         Raises:
-            LogError: A solve is in two files, or what a merged log says of its shards is wrong.
+            LogError: A solve is in two files, or the metadata of a merged log are invalid.
         """
         return ShardOrigins(self.shards)
 
     def info(self) -> LogInfo:
-        """What is in it.
+        """Return a summary of the log.
+
+        Raises:
+            LogError: A solve is in two files.
 
         Example:
             >>> ik.logs.open("cup.mcap").info().robot
             'kuka_lwr_barrett'
         """
         contents = [shard.contents for shard in self.shards]
-        chunks = [chunk for each in contents for chunk in each.chunks]
+        chunks = [index for item in contents for index in item.chunks]
         return LogInfo(
-            paths=tuple(each.path for each in contents),
-            size=sum(each.size for each in contents),
+            paths=tuple(item.path for item in contents),
+            size=sum(item.size for item in contents),
             robot=self.shards[0].robot,
             counts={
                 method: {
@@ -169,172 +181,177 @@ class Log:
                 for method in self.methods
             },
             compression=self.metadata["compression"],
-            chunks=len(chunks),
-            uncompressed=sum(chunk.uncompressed_size for chunk in chunks),
-            compressed=sum(chunk.compressed_size for chunk in chunks),
+            chunks=sum(not is_section(index) for index in chunks),
+            uncompressed=sum(index.uncompressed_size for index in chunks),
+            compressed=sum(index.compressed_size for index in chunks),
             metadata=self.metadata,
             attachments={
                 item.name: item.data_size for item in contents[0].summary.attachment_indexes
             },
-            unfinished=tuple(each.path for each in contents if not each.complete),
+            unfinished=tuple(item.path for item in contents if not item.complete),
             left_out=self.left_out,
             differs=self.sources.differences(),
         )
 
     def attachment(self, name: str) -> bytes:
-        """An attached file, e.g. "robot.urdf", of the first file.
+        """Return an attached file of the first file, e.g. "robot.urdf".
 
         Raises:
-            UnknownNameError: Nothing of that name is attached.
-            LogError: It cannot be read.
+            UnknownNameError: No file of that name is attached.
+            LogError: The log cannot be read.
         """
-        known = self.shards[0].attachments()
-        if name not in known:
+        attachments = self.shards[0].attachments()
+        if name not in attachments:
             raise UnknownNameError(
                 f"{self.shards[0].path}: no attachment {name!r}; attached: "
-                f"{', '.join(known) or 'none'}"
+                f"{', '.join(attachments) or 'none'}"
             )
-        return known[name].data
+        return attachments[name].data
 
     def solves(self, **filters: Unpack[Filters]) -> Table:
-        """Solves: the question, the answer, totals of iterations and events.
+        """Return solves: targets, solutions, and numbers of iterations and events.
 
         Args:
             filters: See `Log`.
 
         Raises:
-            UnknownNameError: No such method, status, event or phase.
-            LogError: The log is damaged, or a solve is in it twice.
+            UnknownNameError: A method, status, event or phase does not exist.
+            LogError: The log is damaged, or holds a solve twice.
 
         Example:
             >>> len(ik.logs.open("cup.mcap").solves(status="SOLVED").array())
             1
         """
         _check_filters(filters)
-        wanted = _numbers(filters.get("solve"))
+        numbers = _solve_numbers(filters.get("solve"))
         status, event, phase = (filters.get(name) for name in ("status", "event", "phase"))
         methods = self._methods(filters.get("method"))
-        parts = [part for name in methods for part in self._read(name, "solve", wanted)]
-        self._check_known("status", status, parts, "status")
-        self._check_known("event", event, parts, "events")
-        self._check_known("phase", phase, parts, "phase_iterations")
-        found = []
+        parts = [part for name in methods for part in self._read(name, "solve", numbers)]
+        self._check_names("status", status, parts, "status")
+        self._check_names("event", event, parts, "events")
+        self._check_names("phase", phase, parts, "phase_iterations")
+        matching = []
         for part in parts:
-            keep = np.ones(len(part), dtype=bool)
+            matches = np.ones(len(part), dtype=bool)
             if status is not None:
-                keep &= np.isin(part.rows["status"], _codes(part, "status", status))
+                matches &= np.isin(part.rows["status"], _codes(part, "status", status))
             for name, values in (("events", event), ("phase_iterations", phase)):
                 if values is not None:
-                    keep &= part.rows[name][:, _codes(part, name, values)].any(axis=1)
-            found.append(part.where(keep))
-        return Table("solve", tuple(found))
+                    matches &= part.rows[name][:, _codes(part, name, values)].any(axis=1)
+            matching.append(part.where(matches))
+        return Table("solve", tuple(matching))
 
     def iterations(
         self, *, fields: Sequence[str] | None = None, **filters: Unpack[Filters]
     ) -> Table:
-        """Iterations, by solve and iteration; of the solves that kept theirs.
+        """Return logged iterations sorted by solve and iteration.
 
         Args:
-            fields: Names of the fields wanted, which saves memory; None: all.
+            fields: Names of the fields to read, which saves memory; None: all.
             filters: See `Log`.
 
         Raises:
-            UnknownNameError: No such method, status, event, phase or field.
-            LogError: The log is damaged, or a solve is in it twice.
+            UnknownNameError: A method, status, event, phase or field does not exist.
+            LogError: The log is damaged, or holds a solve twice.
 
         Example:
             >>> rows = ik.logs.open("cup.mcap").iterations(solve=0).array()
             >>> len(rows) == solution.iterations, rows["q"].shape[1]
             (True, 14)
         """
-        return self._rows("iteration", fields, filters)
+        return self._filtered_rows("iteration", fields, filters)
 
     def events(self, **filters: Unpack[Filters]) -> Table:
-        """Events, by solve and iteration; of the solves that kept their iterations.
+        """Return logged events sorted by solve and iteration.
 
         Args:
             filters: See `Log`.
 
         Raises:
-            UnknownNameError: No such method, status, event or phase.
+            UnknownNameError: A method, status, event or phase does not exist.
             LogError: The log is damaged.
 
         Example:
             >>> "kind" in ik.logs.open("cup.mcap").events().names
             True
         """
-        return self._rows("event", None, filters)
+        return self._filtered_rows("event", None, filters)
 
-    def _rows(self, kind: str, fields: Sequence[str] | None, filters: Filters) -> Table:
+    def _filtered_rows(self, kind: str, fields: Sequence[str] | None, filters: Filters) -> Table:
+        """Return iterations or events that match all filters."""
         _check_filters(filters)
         event, phase = filters.get("event"), filters.get("phase")
         if filters.get("status") is None and event is None and phase is None:
-            numbers = _numbers(filters.get("solve"))
-            wanted_of = dict.fromkeys(self._methods(filters.get("method")), numbers)
+            numbers = _solve_numbers(filters.get("solve"))
+            numbers_by_method = dict.fromkeys(self._methods(filters.get("method")), numbers)
         else:
-            wanted_of = {part.method: part.solve_id for part in self.solves(**filters).parts}
+            numbers_by_method = {
+                part.method: part.solve_id for part in self.solves(**filters).parts
+            }
         if fields is not None and phase is not None:
             fields = [*fields, "phase"]
         parts = []
-        for name, wanted in wanted_of.items():
-            for part in self._read(name, kind, wanted, fields):
-                keep = np.ones(len(part), dtype=bool)
+        for name, numbers in numbers_by_method.items():
+            for part in self._read(name, kind, numbers, fields):
+                matches = np.ones(len(part), dtype=bool)
                 if phase is not None and "phase" in part.names:
-                    keep &= np.isin(part.rows["phase"], _codes(part, "phase", phase))
+                    matches &= np.isin(part.rows["phase"], _codes(part, "phase", phase))
                 if kind == "event" and event is not None:
-                    keep &= np.isin(part.rows["kind"], _codes(part, "kind", event))
-                parts.append(part.where(keep))
+                    matches &= np.isin(part.rows["kind"], _codes(part, "kind", event))
+                parts.append(part.where(matches))
         return Table(kind, tuple(parts))
 
     def _read(
         self,
         method: str,
         kind: str,
-        wanted: Counts | None = None,
+        numbers: Counts | None = None,
         fields: Sequence[str] | None = None,
     ) -> list[MethodRows]:
-        """Read the rows of a method in all files, by solve and iteration.
+        """Read the rows of a method from all files, sorted by solve and iteration.
 
-        Logs of other objects or scenes have other fields or other names of codes. Their rows
-        cannot stand in one array, so the rows of each kind of log are a part.
+        Logs of other objects or scenes have other fields or other names of codes. Their rows cannot
+        be in one array, so each such group of logs has a separate part.
 
         Args:
-            method: One that at least one file holds.
+            method: A method of at least one file.
             kind: "solve", "iteration" or "event".
-            wanted: Numbers of the solves, sorted; None: all.
-            fields: Names of the fields wanted; None: all.
+            numbers: Sorted numbers of the solves; None: all.
+            fields: Names of the fields; None: all.
 
         Returns:
-            At least one part; only parts with rows, if any has rows.
+            At least one part; parts without rows only if there are no rows at all.
 
         Raises:
-            LogError: A file cannot be read, or a solve is in two.
+            LogError: A file cannot be read, or a solve is in two files.
         """
         sources = self.sources
-        alike: dict[object, list[MethodRows]] = {}
+        groups: dict[str, list[MethodRows]] = {}
         for i, shard in enumerate(self.shards):
             if method not in shard.methods:
                 continue
             offset = sources.offsets[i]
-            numbers = None if wanted is None else wanted[wanted >= offset] - offset
-            whole = kind == "solve" and numbers is None
-            part = shard.solves(method) if whole else shard.read(method, kind, numbers, fields)
+            in_shard = None if numbers is None else numbers[numbers >= offset] - offset
+            if kind == "solve" and in_shard is None:
+                part = shard.solves(method)
+            else:
+                part = shard.read(method, kind, in_shard, fields)
             if offset:
                 rows = part.rows.copy()
                 if "solve_id" in part.names:
                     rows["solve_id"] += np.uint32(offset)
                 part = replace(part, rows=rows, solve_id=part.solve_id + offset)
             part = replace(part, shard=sources.of(i, method, part.solve_id), shards=sources.names)
-            form = part.rows.dtype.descr, sorted(part.labels.items())
-            alike.setdefault(repr(form), []).append(part)
-        parts = [self._sorted(_joined(group), kind) for group in alike.values()]
+            row_format = part.rows.dtype.descr, sorted(part.labels.items())
+            groups.setdefault(repr(row_format), []).append(part)
+        parts = [self._sort(_concatenate(group), kind) for group in groups.values()]
         return [part for part in parts if len(part)] or parts[:1]
 
-    def _sorted(self, part: MethodRows, kind: str) -> MethodRows:
+    def _sort(self, part: MethodRows, kind: str) -> MethodRows:
         """Sort rows by solve and iteration.
 
         Raises:
-            LogError: A solve is there twice.
+            LogError: A solve occurs twice.
         """
         # Every solve has fewer than 2**24 iterations.
         key = part.solve_id * 2**24 + part.iteration
@@ -343,50 +360,55 @@ class Log:
             part, key = part.where(order), key[order]
         if kind != "event":
             number = key if kind == "iteration" else part.solve_id
-            twice = np.flatnonzero(np.diff(number) == 0)
-            if len(twice):
-                solve, where = part.solve_id[twice[0]], self.shards[0].path
-                raise LogError(f"{where}: solve {solve} of method {part.method!r} is there twice")
+            duplicates = np.flatnonzero(np.diff(number) == 0)
+            if len(duplicates):
+                solve, path = part.solve_id[duplicates[0]], self.shards[0].path
+                raise LogError(f"{path}: solve {solve} of method {part.method!r} occurs twice")
         return part
 
     def _methods(self, method: Names) -> tuple[str, ...]:
+        """Return the methods that a filter selects.
+
+        Raises:
+            UnknownNameError: A method is not in the log.
+        """
         if method is None:
             return self.methods
         names = tuple(_names(method))
         for name in names:
             if name not in self.methods:
-                known = ", ".join(self.methods) or "none"
+                available = ", ".join(self.methods) or "none"
                 raise UnknownNameError(
-                    f"{self.shards[0].path}: no method {name!r}; the log holds: {known}"
+                    f"{self.shards[0].path}: no method {name!r}; the log holds: {available}"
                 )
         return names
 
-    def _check_known(
-        self, what: str, values: Names, parts: Sequence[MethodRows], field: str
+    def _check_names(
+        self, kind: str, values: Names, parts: Sequence[MethodRows], field: str
     ) -> None:
-        """Check that at least one method knows the names.
+        """Check that names are labels of a field for at least one method.
 
         Raises:
-            UnknownNameError: None does.
+            UnknownNameError: A name is not a label of any method.
         """
-        known = dict.fromkeys(label for part in parts for label in part.labels.get(field, ()))
+        labels = dict.fromkeys(label for part in parts for label in part.labels.get(field, ()))
         for name in _names(values):
-            if name not in known or not name:
+            if name not in labels or not name:
                 raise UnknownNameError(
-                    f"{self.shards[0].path}: no {what} {name!r}; there are: "
-                    f"{', '.join(filter(None, known))}"
+                    f"{self.shards[0].path}: no {kind} {name!r}; there are: "
+                    f"{', '.join(filter(None, labels))}"
                 )
 
 
 def _check_filters(filters: Filters) -> None:
     for name in filters:
         if name not in Filters.__annotations__:
-            known = ", ".join(Filters.__annotations__)
-            raise TypeError(f"a log has no filter {name!r}; there are: {known}")
+            available = ", ".join(Filters.__annotations__)
+            raise TypeError(f"a log has no filter {name!r}; there are: {available}")
 
 
-def _joined(parts: Sequence[MethodRows]) -> MethodRows:
-    """Parts of one method one after the other; at least one."""
+def _concatenate(parts: Sequence[MethodRows]) -> MethodRows:
+    """Concatenate parts of one method, at least one."""
     if len(parts) == 1:
         return parts[0]
     names = ("rows", "solve_id", "iteration", "shard")
@@ -396,8 +418,8 @@ def _joined(parts: Sequence[MethodRows]) -> MethodRows:
     )
 
 
-def _numbers(solve: Solves) -> Counts | None:
-    """The numbers of solves, sorted; None if all are wanted."""
+def _solve_numbers(solve: Solves) -> Counts | None:
+    """Return the sorted solve numbers of a filter; None if it selects all."""
     if solve is None:
         return None
     numbers = [solve] if isinstance(solve, int | np.integer) else list(solve)
@@ -405,12 +427,12 @@ def _numbers(solve: Solves) -> Counts | None:
 
 
 def _codes(part: MethodRows, field: str, values: Names) -> list[int]:
-    """The codes of names; of those the method does not know none."""
+    """Return the codes of names; names that the method does not have are skipped."""
     labels = part.labels.get(field, ())
     return [labels.index(name) for name in _names(values) if name in labels]
 
 
 def _names(values: Names) -> list[str]:
-    """One name or several as a list; an `EventKind` counts as its name."""
-    several = [values] if isinstance(values, str | EventKind) else list(values or ())
-    return [value.name if isinstance(value, EventKind) else value for value in several]
+    """Return a name or several as a list; an `EventKind` is replaced by its name."""
+    items = [values] if isinstance(values, str | EventKind) else list(values or ())
+    return [item.name if isinstance(item, EventKind) else item for item in items]

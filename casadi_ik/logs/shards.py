@@ -1,9 +1,9 @@
-"""The files of a log, one by one, and how their solves are numbered when they are read as one.
+"""The files of a log, and the numbers of their solves when they are read as one log.
 
-The shards of a study may each count from 0. If two of them use a number for different solves of a
-method, the numbers go on from shard to shard, in the order in which the files were named and
-below a folder in the order of their paths: solve n of a shard becomes n plus, for every shard
-before it, its largest number plus one. Otherwise every number stays as it is.
+The shards of a study may each number their solves from 0. If two of them use one number for
+different solves of a method, numbers are continued from shard to shard, in the order in which the
+files were named and within a folder in the order of their paths: solve n of a shard becomes n plus
+(the largest number + 1) of every shard before it. Otherwise numbers stay unchanged.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ from casadi_ik.compile.layout import Field, Layout, opaque
 from casadi_ik.errors import LogError, UnknownNameError, os_errors, printable
 from casadi_ik.files.arrays import Counts
 from casadi_ik.logs.container import (
-    NOT_IN_CHUNKS,
     ForeignLogError,
     NothingWrittenError,
     open_log_file,
@@ -41,9 +40,9 @@ from casadi_ik.logs.format import (
     SHARDS,
     casadi_ik_record,
     clock_from_metadata,
+    parse_json,
     parse_layout,
     parse_metadata,
-    parsed_json,
     topic,
 )
 from casadi_ik.logs.rows import solve_layout
@@ -57,12 +56,12 @@ Paths = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 
 @dataclass(frozen=True, eq=False)
 class Topic:
-    """Messages of one kind of one method.
+    """A topic: messages of one kind of one method.
 
     Attributes:
         channel: Channel id.
         layout: Fields of a row.
-        labels: Names that make a field readable.
+        labels: Names of codes, bits and elements by field.
     """
 
     channel: int
@@ -71,25 +70,25 @@ class Topic:
 
 
 class Shard:
-    """One file. It is opened anew for each question.
+    """A file of a log; it is opened for each query and closed again.
 
     Attributes:
-        path: The file.
-        name: Its name among the files of its log.
-        contents: Its chunks, attachments and counts.
-        record: Its provenance, as it stands in the file.
-        metadata: The same, structured values as what they say.
+        path: Path of the file.
+        name: Name of the file within its log.
+        contents: Chunks, attachments and counts.
+        record: Metadata record as text by key.
+        metadata: Metadata with structured values parsed.
         robot: Name of the robot.
-        methods: The methods it holds.
-        clock: Rule of its log times.
+        methods: Names of the methods.
+        clock: Rule of the log times.
     """
 
     def __init__(self, path: Path, name: str = "") -> None:
         """Read the summary of the file.
 
         Raises:
-            NothingWrittenError: Its writer was killed before anything was whole.
-            LogError: It is missing, no MCAP file, damaged, or no log of casadi_ik.
+            NothingWrittenError: The file ends before its metadata.
+            LogError: The file is missing, not an MCAP file, damaged, or not a log of casadi_ik.
         """
         self.path = path
         self.name = name or path.name
@@ -102,35 +101,33 @@ class Shard:
             self.metadata: Mapping[str, Any] = parse_metadata(self.record)
             self.robot: str = self.metadata["robot"]
             self.clock = clock_from_metadata(self.metadata)
-            if not contents.chunks and any(contents.counts.values()):
-                raise ForeignLogError(NOT_IN_CHUNKS)
-            self._topics = self._described()
+            self._topics = self._parse_topics()
             self.methods: tuple[str, ...] = tuple(dict.fromkeys(name for name, _ in self._topics))
         self._solves: dict[str, MethodRows] = {}
 
     def topic(self, method: str, kind: str) -> Topic:
-        """The messages of a kind of one of the `methods`."""
+        """Return the topic of a kind of messages of one of the `methods`."""
         return self._topics[method, kind]
 
     def count(self, method: str, kind: str) -> int:
-        """Number of messages of a kind that a method has; 0 if it is not in this file."""
-        found = self._topics.get((method, kind))
-        return 0 if found is None else self.contents.counts.get(found.channel, 0)
+        """Return the number of messages of a kind; 0 if the file does not hold the method."""
+        entry = self._topics.get((method, kind))
+        return 0 if entry is None else self.contents.counts.get(entry.channel, 0)
 
     def attachments(self) -> dict[str, Attachment]:
-        """The attached files by name, their checksums verified.
+        """Read the attached files and verify their checksums; return them by name.
 
         Raises:
-            LogError: One is damaged.
+            LogError: An attachment is damaged.
         """
         with open_log_file(self.path) as stream:
-            found = self.contents.summary.attachment_indexes
             return {
-                item.name: record_at(Attachment, stream, item.offset, item.length) for item in found
+                item.name: record_at(Attachment, stream, item.offset, item.length)
+                for item in self.contents.summary.attachment_indexes
             }
 
     def solves(self, method: str) -> MethodRows:
-        """All solves of a method, in the order of the file; they are read once.
+        """Return all solves of a method in the order of the file; they are cached.
 
         Raises:
             LogError: The file is damaged.
@@ -146,56 +143,56 @@ class Shard:
         solves: Counts | None = None,
         fields: Sequence[str] | None = None,
     ) -> MethodRows:
-        """Rows in the order of the file.
+        """Read rows in the order of the file.
 
         Args:
             method: One of `methods`.
             kind: "solve", "iteration" or "event".
-            solves: Numbers of the solves wanted, sorted; None: all.
-            fields: Names of the fields wanted; None: all.
+            solves: Sorted numbers of the solves; None: all.
+            fields: Names of the fields; None: all.
 
         Raises:
-            UnknownNameError: No such field.
+            UnknownNameError: A field does not exist.
             LogError: The file is damaged.
         """
-        found, name = self._topics[method, kind], topic(method, kind)
-        for each in fields or ():
-            if each not in found.layout.names:
-                names = ", ".join(found.layout.names)
-                raise UnknownNameError(f"no field {each!r}; there are: {names}")
-        none = _chosen(np.zeros(0, found.layout.dtype), fields)
-        all_times, all_rows = [np.zeros(0, np.uint64)], [opaque(none)]
+        entry, name = self._topics[method, kind], topic(method, kind)
+        for field in fields or ():
+            if field not in entry.layout.names:
+                names = ", ".join(entry.layout.names)
+                raise UnknownNameError(f"no field {field!r}; there are: {names}")
+        no_rows = _select_fields(np.zeros(0, entry.layout.dtype), fields)
+        all_times, all_rows = [np.zeros(0, np.uint64)], [opaque(no_rows)]
         with open_log_file(self.path) as stream:
             for index in self.contents.chunks:
-                if not self._may_hold(index, found.channel, solves):
+                if not self._may_hold(index, entry.channel, solves):
                     continue
                 chunk = read_chunk(stream, index)
                 for run in chunk.runs:
-                    if run.channel != found.channel:
+                    if run.channel != entry.channel:
                         continue
-                    times, part = run.log_time, chunk.messages(run, found.layout.dtype)["row"]
+                    times, rows = run.log_time, chunk.messages(run, entry.layout.dtype)["row"]
                     if solves is not None:
-                        wanted = np.isin(self.clock.locate(times)[0], solves)
-                        times, part = times[wanted], part[wanted]
+                        is_selected = np.isin(self.clock.locate(times)[0], solves)
+                        times, rows = times[is_selected], rows[is_selected]
                     all_times.append(times)
-                    # A copy, so that the chunk need not be kept.
-                    all_rows.append(opaque(_chosen(part, fields)))
-            times, rows = np.concatenate(all_times), np.concatenate(all_rows).view(none.dtype)
+                    # A copy, so that the memory of the chunk can be freed.
+                    all_rows.append(opaque(_select_fields(rows, fields)))
+            times, rows = np.concatenate(all_times), np.concatenate(all_rows).view(no_rows.dtype)
             if solves is None and len(times) != self.count(method, kind):
                 raise LogError(
-                    f"{len(times)} messages on {name!r}, but the summary counts"
+                    f"{name!r}: found {len(times)} messages, but the summary counts"
                     f" {self.count(method, kind)}"
                 )
             solve_id, iteration = self.clock.locate(times)
             if len(solve_id) and (solve_id.min() < 0 or solve_id.max() >= 2**32):
-                raise LogError(f"{name!r}: a message before the log began, or late")
+                raise LogError(f"{name!r}: the time of a message is outside of the log")
             if "solve_id" in (rows.dtype.names or ()) and np.any(rows["solve_id"] != solve_id):
-                raise LogError(f"{name!r}: a solve's number is not that of its time")
-        units = {item.name: item.unit for item in found.layout}
-        return MethodRows(method, rows, solve_id, iteration, found.labels, units)
+                raise LogError(f"{name!r}: the number of a solve does not match its time")
+        units = {item.name: item.unit for item in entry.layout}
+        return MethodRows(method, rows, solve_id, iteration, entry.labels, units)
 
     def _may_hold(self, index: ChunkIndex, channel: int, solves: Counts | None) -> bool:
-        """Whether a chunk may hold messages of a channel and of some solves."""
+        """Return False if a chunk cannot hold messages of a channel and of these solves."""
         if index.message_index_offsets and channel not in index.message_index_offsets:
             return False
         if solves is None:
@@ -204,73 +201,74 @@ class Shard:
         low, high = self.clock.locate(times)[0]
         return bool(np.searchsorted(solves, low) < np.searchsorted(solves, high, "right"))
 
-    def _described(self) -> dict[tuple[str, str], Topic]:
-        """The topics by method and kind.
+    def _parse_topics(self) -> dict[tuple[str, str], Topic]:
+        """Return the topics by method and kind.
 
         Raises:
-            LogError: One is missing, or is not such as a log of ours has.
+            LogError: A topic is missing, or its schema or labels are invalid.
         """
         summary = self.contents.summary
-        by_name = {channel.topic: channel for channel in summary.channels.values()}
-        found: dict[tuple[str, str], Topic] = {}
-        for channel in summary.channels.values():
-            method = channel.metadata.get("method")
-            if method is None or channel.topic != topic(method, MESSAGE_KINDS[0]):
+        channels = {channel.topic: channel for channel in summary.channels.values()}
+        topics: dict[tuple[str, str], Topic] = {}
+        for first_channel in summary.channels.values():
+            method = first_channel.metadata.get("method")
+            if method is None or first_channel.topic != topic(method, MESSAGE_KINDS[0]):
                 continue
             if not 0 < len(method) <= 200:
-                raise LogError(f"a method's name has {len(method)} characters")
+                raise LogError(
+                    f"method: found a name of {len(method)} characters, expected 1 to 200"
+                )
             for kind in MESSAGE_KINDS:
-                own = by_name.get(topic(method, kind))
-                if own is None or own.schema_id not in summary.schemas:
-                    raise LogError(f"no topic {topic(method, kind)!r}, or no schema of it")
-                layout, labels = parse_channel(kind, own, summary.schemas[own.schema_id])
-                found[method, kind] = Topic(own.id, layout, labels)
-        return found
+                channel = channels.get(topic(method, kind))
+                if channel is None or channel.schema_id not in summary.schemas:
+                    raise LogError(f"topic {topic(method, kind)!r} or its schema is missing")
+                layout, labels = parse_channel(kind, channel, summary.schemas[channel.schema_id])
+                topics[method, kind] = Topic(channel.id, layout, labels)
+        return topics
 
 
 def log_files(path: Paths) -> list[tuple[Path, str]]:
-    """Files of a log, and the name of each among them.
+    """Return the files of a log and the name of each file within the log.
 
     Args:
-        path: A file, a folder (all .mcap files in it and below, by the order of their paths;
-            hidden ones are unfinished work of others), or several of these.
+        path: A file, a folder (all .mcap files in it and its subfolders in the order of their
+            paths; hidden files are incomplete), or several of these.
 
     Raises:
-        LogError: A folder holds no log, or nothing was named.
+        LogError: A folder holds no log, or `path` is empty.
     """
-    given = [path] if isinstance(path, str | os.PathLike) else list(path)
+    paths = [path] if isinstance(path, str | os.PathLike) else list(path)
     files: list[tuple[Path, str]] = []
-    for item in map(Path, given):
+    for item in map(Path, paths):
         if not item.is_dir():
             files.append((item, item.name))
             continue
         with os_errors(f"{item}: cannot be read", LogError):
-            inside = sorted(file for file in item.rglob("*.mcap") if file.name[0] != ".")
-        if not inside:
-            raise LogError(f"{item}: no log in this folder")
-        files += [(file, file.relative_to(item).as_posix()) for file in inside]
+            folder_files = sorted(file for file in item.rglob("*.mcap") if file.name[0] != ".")
+        if not folder_files:
+            raise LogError(f"{item}: the folder holds no log (*.mcap)")
+        files += [(file, file.relative_to(item).as_posix()) for file in folder_files]
     if not files:
-        raise LogError("no log was named")
+        raise LogError("log: found no path, expected at least one")
     return files
 
 
 def open_shards(path: Paths) -> tuple[list[Shard], list[Path]]:
     """Open the shards of a log.
 
-    A writer that is killed before its first chunk leaves an empty or torn file, with which
-    nothing is lost. Among others it is left out with a warning. So is an MCAP file of another
-    program in a folder, as long as the folder holds a log.
+    A writer that is killed before its first chunk leaves an empty or truncated file. No data are
+    lost with it, so it is skipped with a warning if there are other files. MCAP files of other
+    programs in a folder are also skipped if the folder holds a log.
 
     Returns:
-        The shards, and the files in which nothing is whole.
+        The shards, and the files without a complete record.
 
     Raises:
-        LogError: A file is missing, is no MCAP file, is damaged, or is not a log of casadi_ik; or
-            nothing is whole in any.
+        LogError: A file is missing, not an MCAP file, damaged, or not a log of casadi_ik; or no
+            file has a complete record.
     """
     files = log_files(path)
-    given = [path] if isinstance(path, str | os.PathLike) else path
-    named = {Path(item) for item in given}
+    paths = {Path(item) for item in ([path] if isinstance(path, str | os.PathLike) else path)}
     shards: list[Shard] = []
     empty: list[Path] = []
     foreign: list[ForeignLogError] = []
@@ -278,35 +276,35 @@ def open_shards(path: Paths) -> tuple[list[Shard], list[Path]]:
         try:
             shards.append(Shard(file, name))
         except ForeignLogError as error:
-            if file in named:
+            if file in paths:
                 raise
             foreign.append(error)
         except NothingWrittenError as error:
             if len(files) == 1:
                 raise
             empty.append(file)
-            logger.warning("%s; left out, nothing in it is whole", printable(str(error)))
+            logger.warning("%s; skipped: no complete record", printable(str(error)))
     if foreign and not shards:
         raise foreign[0]
     for error in foreign:
-        logger.warning("%s; left out", printable(str(error)))
+        logger.warning("%s; skipped", printable(str(error)))
     if not shards:
-        raise LogError(f"{files[0][0]}: nothing in it is whole, nor in {len(files) - 1} others")
+        raise LogError(f"{files[0][0]} and {len(files) - 1} other files: no complete record")
     return shards, empty
 
 
 class OriginalShard(msgspec.Struct):
-    """A shard as it was written; a merged log, which says so of each, has several in one file.
+    """A shard as it was written; a merged log describes its shards and holds all their solves.
 
     Attributes:
-        file: Name of its own file; below a folder the path from there.
-        first: What its solves' numbers were raised by.
-        solves: First and last numbers of its solves in every stretch, by method; empty: all that
-            are in the file.
-        differs: Entries of its provenance that are not as in the file's.
-        holder: Number of the file in which its solves stand now.
-        record: Its provenance, as it stands in the file.
-        metadata: The same, structured values as what they say.
+        file: Name of the original file within its log.
+        first: Offset that was added to the numbers of its solves.
+        solves: Ranges (first, last) of the numbers of its solves by method; empty: all solves of
+            the file.
+        differs: Metadata entries that differ from those of the file.
+        holder: Index of the file that holds its solves now.
+        record: Metadata record as text by key.
+        metadata: Metadata with structured values parsed.
     """
 
     file: str
@@ -319,29 +317,29 @@ class OriginalShard(msgspec.Struct):
 
 
 class ShardOrigins:
-    """Where the solves of a log come from.
+    """Origins of the solves of a log.
 
     Attributes:
-        offsets: What the numbers of each file's solves are raised by.
+        offsets: Offset of the numbers of each file's solves.
         sources: The shards as they were written.
     """
 
     def __init__(self, shards: Sequence[Shard]) -> None:
-        """Number the solves of some files.
+        """Number the solves of several files.
 
         Raises:
-            LogError: One and the same solve is in two files, there are too many, or what a merged
-                log says of its shards is malformed.
+            LogError: A solve is in two files, the files hold too many solves, or the metadata of a
+                merged log are invalid.
         """
-        self.offsets = _offsets(shards) if _overlapping(shards) else [0] * len(shards)
+        self.offsets = _offsets(shards) if _may_share_numbers(shards) else [0] * len(shards)
         self.sources: list[OriginalShard] = []
         for i, (shard, offset) in enumerate(zip(shards, self.offsets, strict=True)):
             with open_log_file(shard.path):
-                for source in _sources(shard):
+                for source in _original_shards(shard):
                     source.holder, source.first = i, source.first + offset
                     source.solves = {
-                        method: [(first + offset, last + offset) for first, last in pairs]
-                        for method, pairs in source.solves.items()
+                        method: [(first + offset, last + offset) for first, last in ranges]
+                        for method, ranges in source.solves.items()
                     }
                     source.record = {**shard.record, **source.differs}
                     source.metadata = parse_metadata(source.record)
@@ -349,38 +347,44 @@ class ShardOrigins:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the sources."""
+        """Names of the shards."""
         return tuple(source.file for source in self.sources)
 
     def differences(self) -> dict[str, tuple[Any, ...]]:
-        """Entries of the metadata in which they differ, and all that is said there."""
-        found: dict[str, tuple[Any, ...]] = {}
-        for key in dict.fromkeys(key for each in self.sources for key in each.metadata):
+        """Return the distinct values of every metadata entry in which the shards differ."""
+        differences: dict[str, tuple[Any, ...]] = {}
+        for key in dict.fromkeys(key for source in self.sources for key in source.metadata):
             values: list[Any] = []
-            for each in self.sources:
-                if each.metadata.get(key) not in values:
-                    values.append(each.metadata.get(key))
+            for source in self.sources:
+                if source.metadata.get(key) not in values:
+                    values.append(source.metadata.get(key))
             if len(values) > 1:
-                found[key] = tuple(values)
-        return found
+                differences[key] = tuple(values)
+        return differences
 
     def of(self, file: int, method: str, numbers: Counts) -> Counts:
-        """The source that each of the solves (k,) of a file comes from, by their numbers here."""
-        own = [i for i, source in enumerate(self.sources) if source.holder == file]
-        found = np.full(len(numbers), own[0])
-        for i in own:
+        """Return the index of the original shard of each solve.
+
+        Args:
+            file: Index of the file that holds the solves.
+            method: Method of the solves.
+            numbers: (k,) numbers of the solves in the log.
+        """
+        in_file = [i for i, source in enumerate(self.sources) if source.holder == file]
+        indices = np.full(len(numbers), in_file[0])
+        for i in in_file:
             ranges = np.array(self.sources[i].solves.get(method, ()), np.int64).reshape(-1, 2)
             if len(ranges):
-                place = np.searchsorted(ranges[:, 0], numbers, "right") - 1
-                found[(place >= 0) & (numbers <= ranges[place, 1])] = i
-        return found
+                position = np.searchsorted(ranges[:, 0], numbers, "right") - 1
+                indices[(position >= 0) & (numbers <= ranges[position, 1])] = i
+        return indices
 
 
 def parse_channel(kind: str, channel: Channel, schema: Schema) -> tuple[Layout, Labels]:
-    """Layout and labels of the messages of a channel.
+    """Return the layout and labels of the messages of a channel.
 
-    A log may come from anybody. Its schemas and labels are checked once, when it is opened, against
-    those that a recorder writes; behind that, whoever works with its rows can rely on them.
+    A log may come from an untrusted source. Schemas and labels are compared with those that a
+    recorder writes when the log is opened, so that other code can rely on the rows.
 
     Args:
         kind: "iteration", "solve" or "event".
@@ -388,27 +392,34 @@ def parse_channel(kind: str, channel: Channel, schema: Schema) -> tuple[Layout, 
         schema: Its schema.
 
     Raises:
-        LogError: They are not such as a log of ours has.
+        LogError: Schema or labels are invalid.
     """
-    where = f"{channel.topic[:200]!r}"
+    context = f"{channel.topic[:200]!r}"
     try:
-        layout = _layout(kind, schema.data.decode())
-        labels = _labels(channel.metadata.get("labels", "{}"))
+        layout = _checked_layout(kind, schema.data.decode())
+        labels = _checked_labels(channel.metadata.get("labels", "{}"))
         for item in layout if kind == "solve" else ():
             count = len(labels.get(item.name, ()))
             if item.name in ("position_error", "events", "phase_iterations") and (
                 count != item.shape[0]
             ):
-                raise LogError(f"labels of {item.name}: {count} names for {item.shape[0]} elements")
+                raise LogError(
+                    f"labels of {item.name}: found {count} names, expected {item.shape[0]}"
+                )
     except UnicodeDecodeError as error:
-        raise LogError(f"{where}: its schema is not UTF-8 text") from error
+        raise LogError(f"{context}: the schema is not UTF-8 text") from error
     except LogError as error:
-        raise LogError(f"{where}: {error}") from error
+        raise LogError(f"{context}: {error}") from error
     return layout, labels
 
 
 @lru_cache(maxsize=64)
-def _layout(kind: str, text: str) -> Layout:
+def _checked_layout(kind: str, text: str) -> Layout:
+    """Return the layout of a schema after comparing it with the layout of a recorder.
+
+    Raises:
+        LogError: A field is missing, or has another type or shape.
+    """
     layout = parse_layout(text)
     fields = {item.name: item for item in layout}
 
@@ -419,10 +430,10 @@ def _layout(kind: str, text: str) -> Layout:
     n, f = size("q"), size("position_error")
     if kind == "solve":
         sizes = n, f, size("phase_iterations"), size("events"), size("lowest_sigma")
-        expected: Iterable[Field] = solve_layout(*sizes, "clearance" in fields)
+        expected_fields: Iterable[Field] = solve_layout(*sizes, "clearance" in fields)
         optional = {name for name in layout.names if name.startswith("target_")} | {"lowest_sigma"}
     elif kind == "event":
-        expected, optional = event_layout(size("joint_mask")), set()
+        expected_fields, optional = event_layout(size("joint_mask")), set()
     else:
         words = -(-n // 32)
         shapes = {
@@ -430,114 +441,129 @@ def _layout(kind: str, text: str) -> Layout:
             Elements.ACTUATOR_BITS: () if words == 1 else (words,),
             Elements.FINGERS: (f,),
         }
-        expected = [
-            Field(each.name, shapes.get(each.elements, ()), each.dtype) for each in STANDARD_FIELDS
+        expected_fields = [
+            Field(item.name, shapes.get(item.elements, ()), item.dtype) for item in STANDARD_FIELDS
         ]
         measured = [item for item in layout if item.name.startswith((SIGMA, CONDITION))]
-        expected += [
+        expected_fields += [
             item if item.dtype[0] == "f" else replace(item, dtype="f4") for item in measured
         ]
-        optional = {item.name for item in expected}
-    for item in expected:
-        found = fields.get(item.name)
-        if found is None and item.name not in optional:
-            raise LogError(f"schema: no field {item.name!r}")
-        if found is not None and (found.dtype, found.shape) != (item.dtype, item.shape):
+        optional = {item.name for item in expected_fields}
+    for expected in expected_fields:
+        actual = fields.get(expected.name)
+        if actual is None and expected.name not in optional:
+            raise LogError(f"schema: field {expected.name!r} is missing")
+        if actual is not None and (actual.dtype, actual.shape) != (expected.dtype, expected.shape):
             raise LogError(
-                f"schema: field {item.name!r}: found {found.dtype} {found.shape}, expected"
-                f" {item.dtype} {item.shape}"
+                f"schema: field {expected.name!r}: found {actual.dtype} {actual.shape}, expected"
+                f" {expected.dtype} {expected.shape}"
             )
     return layout
 
 
 @lru_cache(maxsize=256)
-def _labels(text: str) -> Labels:
-    labels = parsed_json("labels", text, dict[str, tuple[str, ...]])
-    for name, names in labels.items():
-        if len(names) > 4096 or max(map(len, (name, *names))) > 200:
+def _checked_labels(text: str) -> Labels:
+    """Return labels from JSON after checking the number and length of their names.
+
+    Raises:
+        LogError: The text is not JSON, or has too many or too long names.
+    """
+    labels = parse_json("labels", text, dict[str, tuple[str, ...]])
+    for field, names in labels.items():
+        if len(names) > 4096 or max(map(len, (field, *names))) > 200:
             raise LogError(
-                f"labels of {name[:200]!r}: more than 4096 names, or one of over 200 characters"
+                f"labels of {field[:200]!r}: more than 4096 names or 200 characters in a name"
             )
     return labels
 
 
-def _chosen(rows: NDArray[Any], fields: Sequence[str] | None) -> NDArray[Any]:
-    """Some fields of rows, in the order of the log."""
+def _select_fields(rows: NDArray[Any], fields: Sequence[str] | None) -> NDArray[Any]:
+    """Return rows with some of their fields, in the order of the log."""
     if fields is None:
         return rows
     return repack_fields(rows[[name for name in rows.dtype.names or () if name in fields]])
 
 
-def _sources(shard: Shard) -> list[OriginalShard]:
-    """What a merged log says of its shards; of any other the one that it is."""
-    what = f"metadata: {SHARDS}"
-    found: list[OriginalShard] = parsed_json(
-        what, shard.record.get(SHARDS, "[]"), list[OriginalShard]
+def _original_shards(shard: Shard) -> list[OriginalShard]:
+    """Return the shards that a merged log describes; for other logs, the shard itself.
+
+    Raises:
+        LogError: The description is invalid.
+    """
+    context = f"metadata: {SHARDS}"
+    originals: list[OriginalShard] = parse_json(
+        context, shard.record.get(SHARDS, "[]"), list[OriginalShard]
     )
-    for each in found:
-        pairs = [number for ranges in each.solves.values() for pair in ranges for number in pair]
-        if not all(0 <= number < 2**32 for number in (each.first, *pairs)):
-            raise LogError(f"{what}: a number of a solve is negative or too large")
-    return found or [OriginalShard(shard.name)]
+    for original in originals:
+        numbers = [
+            number for ranges in original.solves.values() for pair in ranges for number in pair
+        ]
+        if not all(0 <= number < 2**32 for number in (original.first, *numbers)):
+            raise LogError(f"{context}: the number of a solve is negative or too large")
+    return originals or [OriginalShard(shard.name)]
 
 
-def _overlapping(shards: Sequence[Shard]) -> bool:
-    """Whether two shards may hold a solve of the same number, by the times of their chunks."""
+def _may_share_numbers(shards: Sequence[Shard]) -> bool:
+    """Return False if the times of the chunks exclude that two shards share a solve number."""
     spans = []
     for shard in shards:
         chunks = shard.contents.chunks
         if chunks:
             times = (
-                min(c.message_start_time for c in chunks),
-                max(c.message_end_time for c in chunks),
+                min(index.message_start_time for index in chunks),
+                max(index.message_end_time for index in chunks),
             )
             spans.append(tuple(shard.clock.locate(np.array(times, np.uint64))[0].tolist()))
     spans.sort()
-    return any(after[0] <= before[1] for before, after in pairwise(spans))
+    return any(following[0] <= previous[1] for previous, following in pairwise(spans))
 
 
 def _offsets(shards: Sequence[Shard]) -> list[int]:
-    """What the numbers of each shard's solves are raised by: see above.
+    """Return the offset of the solve numbers of each shard (see the module's docstring).
 
     Raises:
-        LogError: One and the same solve is in two shards, or there are too many.
+        LogError: A solve is in two shards, or the shards hold too many solves.
     """
-    clash = False
+    share_numbers = False
     for method in dict.fromkeys(method for shard in shards for method in shard.methods):
         holders = [shard for shard in shards if method in shard.methods]
         numbers = np.concatenate([shard.solves(method).solve_id for shard in holders])
         if len(np.unique(numbers)) < len(numbers):
-            _refuse_same(method, holders)
-            clash = True
-    if not clash:
+            _check_distinct(method, holders)
+            share_numbers = True
+    if not share_numbers:
         return [0] * len(shards)
-    numbers = [
+    last_numbers = [
         [int(shard.solves(method).solve_id.max(initial=-1)) for method in shard.methods]
         for shard in shards
     ]
-    *offsets, total = accumulate((max(each, default=-1) + 1 for each in numbers), initial=0)
+    counts = (max(numbers, default=-1) + 1 for numbers in last_numbers)
+    *offsets, total = accumulate(counts, initial=0)
     if total >= 2**32:
-        raise LogError(f"{shards[0].path} and others: more solves than can be numbered")
+        raise LogError(
+            f"{shards[0].path} and {len(shards) - 1} other files: found {total} solves, expected"
+            " fewer than 2**32"
+        )
     return offsets
 
 
-def _refuse_same(method: str, shards: Sequence[Shard]) -> None:
+def _check_distinct(method: str, shards: Sequence[Shard]) -> None:
     """Check that no solve is in two shards, whatever its number.
 
     Raises:
-        LogError: One is.
+        LogError: A solve is in two shards.
     """
-    seen: dict[bytes, Shard] = {}
+    shard_of_row: dict[bytes, Shard] = {}
     for shard in shards:
         rows = shard.solves(method).rows.copy()
         numbers = rows["solve_id"].copy()
         rows["solve_id"] = 0
-        own = [row.tobytes() for row in opaque(rows)]
-        same = [i for i, row in enumerate(own) if row in seen]
-        if same:
-            first = min(same, key=lambda i: numbers[i])
+        keys = [row.tobytes() for row in opaque(rows)]
+        duplicates = [i for i, key in enumerate(keys) if key in shard_of_row]
+        if duplicates:
+            first = min(duplicates, key=lambda i: numbers[i])
             raise LogError(
-                f"{shard.path}: solve {numbers[first] + 1} of {method} is in"
-                f" {seen[own[first]].path} too ({len(same)} such solves)"
+                f"{shard.path}: solve {numbers[first] + 1} of {method} is also in"
+                f" {shard_of_row[keys[first]].path} ({len(duplicates)} such solves)"
             )
-        seen.update(dict.fromkeys(own, shard))
+        shard_of_row.update(dict.fromkeys(keys, shard))

@@ -17,10 +17,12 @@ from casadi_ik.files.arrays import Array
 from casadi_ik.files.lazy_import import RecordReprMixin
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import EXTRA_ARRAY_NAMES
-from casadi_ik.logs.events import Event, bits_of, errors_text, measured_jacobians
+from casadi_ik.logs.events import Event
 from casadi_ik.logs.reader import Log
 from casadi_ik.logs.renamed import warn_renamed
 from casadi_ik.logs.tables import MethodRows, Table, element_name, events_of, label_of
+from casadi_ik.logs.traces import bits_of, measured_jacobians
+from casadi_ik.logs.wording import errors_text
 from casadi_ik.model.targets import Tolerance
 from casadi_ik.solve.request import NO_PREFERENCE
 from casadi_ik.solve.trace import SIGMA, TraceFormat
@@ -58,7 +60,7 @@ class LoggedTarget:
     Attributes:
         tolerances: Tolerances of the contacts by finger.
         limits: Treatment of limits, "enforce" or "ignore".
-        seed: Seed of the random numbers, which depend on the number of the solve as well.
+        seed: Seed of the random numbers, which also depend on the number of the solve.
         start: (n,) start configuration [rad or m]; None if unknown.
         fixed: Positions of fixed actuators by name [rad or m].
         prefer: Preference among solutions; None if the method has none.
@@ -207,10 +209,10 @@ class SolveRecord(RecordReprMixin):
             return (PhaseSpan("", 0, count - 1),) if count else ()
         codes = self.rows["phase"].astype(int)
         starts = [0, *(np.flatnonzero(np.diff(codes)) + 1).tolist()]
-        ends = [*(start - 1 for start in starts[1:]), count - 1]
+        lasts = [*(start - 1 for start in starts[1:]), count - 1]
         return tuple(
             PhaseSpan(label_of(self.labels.get("phase", ()), int(codes[first])), first, last)
-            for first, last in zip(starts, ends, strict=True)
+            for first, last in zip(starts, lasts, strict=True)
         )
 
 
@@ -296,13 +298,13 @@ NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 _COPIED_FIELDS = ("position_error", "angle_error", "target_points", "target_normals")
 
 
-def check_robot(robot: ArmHand, urdf: str, where: str) -> None:
+def check_robot(robot: ArmHand, urdf: str, context: str) -> None:
     """Check that a robot is the robot of a log.
 
     Args:
         robot: The robot.
         urdf: Robot description attached to the log.
-        where: Name of the log in the error message.
+        context: Name of the log in the error message.
 
     Raises:
         LogError: The descriptions differ by more than rounding.
@@ -312,7 +314,7 @@ def check_robot(robot: ArmHand, urdf: str, where: str) -> None:
     values, expected = (np.array(NUMBER.findall(text), float) for text in texts)
     if frame != expected_frame or not np.allclose(values, expected, rtol=1e-9, atol=1e-9):
         raise LogError(
-            f"{where}: robot {robot.name!r} is not the robot of the log (the URDFs differ);"
+            f"{context}: robot {robot.name!r} is not the robot of the log (the URDFs differ);"
             " expected the description that was used for the solve (--robot)"
         )
 

@@ -1,4 +1,4 @@
-"""Answers of a log: rows of solves, iterations or events, as arrays, records and dataframes."""
+"""Tables of a log: rows of solves, iterations or events as arrays, records and dataframes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from casadi_ik.compile.layout import opaque
 from casadi_ik.errors import LogError, UnknownNameError, optional_import, os_errors
 from casadi_ik.files.lazy_import import RecordReprMixin
-from casadi_ik.logs.events import MOVES, SINGULAR, Event, EventKind, as_matrix, bits_of
+from casadi_ik.logs.events import MOVES, SINGULAR, Event, EventKind
+from casadi_ik.logs.traces import as_matrix, bits_of
 
 if TYPE_CHECKING:
     import polars as pl
@@ -24,16 +25,17 @@ Labels = Mapping[str, tuple[str, ...]]
 
 @dataclass(frozen=True, eq=False)
 class MethodRows:
-    """Rows of one method.
+    """Rows of a method.
 
     Attributes:
-        method: The method.
-        rows: (k,) structured, by solve and iteration.
-        solve_id: (k,) the solve that each row belongs to.
-        iteration: (k,) its number within the solve from 0; of a solve the last.
-        labels: Names that make a field readable, as in `TraceFormat.labels`.
+        method: Name of the method.
+        rows: (k,) structured rows sorted by solve and iteration.
+        solve_id: (k,) number of the solve of each row.
+        iteration: (k,) number of the iteration within the solve, from 0; for rows of solves, the
+            last iteration.
+        labels: Names of codes, bits and elements by field, as in `TraceFormat.labels`.
         units: Unit by field, "" if dimensionless.
-        shard: (k,) which of `shards` each row comes from; None where that is not told.
+        shard: (k,) index in `shards` of the shard of each row; None if unknown.
         shards: Names of the shards of the log.
 
     Example:
@@ -56,34 +58,34 @@ class MethodRows:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Fields of a row."""
+        """Names of the fields of a row."""
         return self.rows.dtype.names or ()
 
     @property
     def origins(self) -> list[str] | None:
-        """(k,) name of the shard of each row, if the log has several."""
+        """(k,) name of the shard of each row; None unless the log has several shards."""
         if self.shard is None or len(self.shards) < 2:
             return None
         return [self.shards[i] for i in self.shard.tolist()]
 
-    def where(self, wanted: NDArray[Any]) -> MethodRows:
-        """Some of the rows, by flags (k,) or numbers."""
-        if wanted.dtype == bool and wanted.all():
+    def where(self, selection: NDArray[Any]) -> MethodRows:
+        """Return the rows that flags (k,) or indices select."""
+        if selection.dtype == bool and selection.all():
             return self
         return replace(
             self,
-            rows=self.rows[wanted],
-            solve_id=self.solve_id[wanted],
-            iteration=self.iteration[wanted],
-            shard=None if self.shard is None else self.shard[wanted],
+            rows=self.rows[selection],
+            solve_id=self.solve_id[selection],
+            iteration=self.iteration[selection],
+            shard=None if self.shard is None else self.shard[selection],
         )
 
     def first(self, count: int) -> MethodRows:
-        """So many of the rows at most, the first."""
+        """Return the first rows, at most `count`."""
         return self.where(np.arange(min(count, len(self))))
 
     def readable(self, name: str) -> list[Any]:
-        """A field as a person would have it: names for codes and bits."""
+        """Return a field of all rows with names in place of codes and bits."""
         values, labels = self.rows[name], self.labels.get(name, ())
         if name.endswith("_mask") and values.dtype.kind == "u":
             return [
@@ -94,22 +96,22 @@ class MethodRows:
                 for bits in bits_of(as_matrix(values))
             ]
         if values.ndim == 1 and values.dtype.kind in "iu" and labels:
-            known, place = np.unique(values, return_inverse=True)
-            names = [label_of(labels, code) for code in known.tolist()]
-            return [names[i] for i in place.tolist()]
+            codes, indices = np.unique(values, return_inverse=True)
+            names = [label_of(labels, code) for code in codes.tolist()]
+            return [names[i] for i in indices.tolist()]
         return values.tolist() if values.ndim == 1 else list(values)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Table(RecordReprMixin):
-    """Rows of one kind: of one method, or of several one after the other.
+    """Rows of one kind, of one or several methods.
 
-    What belongs to one part (`rows`, `labels`, ...) is available if there is only one.
+    The properties of a part (`rows`, `labels`, ...) require a table with a single part.
 
     Attributes:
         kind: "solve", "iteration" or "event".
-        parts: The rows by method; of logs whose fields or names of codes differ (other objects or
-            scenes) those of a method are several parts.
+        parts: Rows by method. A method has several parts if its logs differ in fields or in names
+            of codes, as logs of different objects or scenes do.
 
     Example:
         >>> table = ik.logs.open("cup.mcap").solves()
@@ -125,55 +127,57 @@ class Table(RecordReprMixin):
 
     @property
     def part(self) -> MethodRows:
-        """The rows of the only method.
+        """The only part.
 
         Raises:
-            UnknownNameError: There is none, or there are several.
-            LogError: Rows of the method differ in their fields.
+            UnknownNameError: The table has no method or several.
+            LogError: The method has several parts.
         """
         if len(self.parts) == 1:
             return self.parts[0]
         methods = list(dict.fromkeys(part.method for part in self.parts))
         if len(methods) == 1:
             raise LogError(
-                f"{self.kind}s: the logs have {len(self.parts)} kinds of rows (other objects or"
-                " scenes), expected one; use parts or frame()"
+                f"{self.kind}s: found {len(self.parts)} formats of rows (different objects or"
+                " scenes), expected 1; use parts or frame()"
             )
-        known = ", ".join(methods) or "none"
-        raise UnknownNameError(f"{self.kind}s: of which method? There are: {known}")
+        available = ", ".join(methods) or "none"
+        raise UnknownNameError(
+            f"{self.kind}s: method is missing; expected one of the log's methods: {available}"
+        )
 
     @property
     def method(self) -> str:
-        """The only method."""
+        """Name of the only method."""
         return self.part.method
 
     @property
     def rows(self) -> NDArray[Any]:
-        """(k,) the rows as they stand in the log."""
+        """(k,) structured rows of the log."""
         return self.part.rows
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Fields of a row."""
+        """Names of the fields of a row."""
         return self.part.names
 
     @property
     def solve_id(self) -> NDArray[np.int64]:
-        """(k,) the solve that each row belongs to."""
+        """(k,) number of the solve of each row."""
         return self.part.solve_id
 
     @property
     def iteration(self) -> NDArray[np.int64]:
-        """(k,) number within the solve."""
+        """(k,) number of the iteration within the solve."""
         return self.part.iteration
 
     @property
     def labels(self) -> Labels:
-        """Names that make a field readable."""
+        """Names of codes, bits and elements by field."""
         return self.part.labels
 
     def array(self) -> NDArray[Any]:
-        """The rows of the only method, (k,) structured, with "solve_id" (and "iteration") first."""
+        """Return the rows as a structured array (k,) with "solve_id" (and "iteration") first."""
         part = self.part
         keys = [key for key in self._keys if key not in part.names]
         extra, rows = [(key, "<u4") for key in keys], opaque(part.rows)
@@ -184,11 +188,11 @@ class Table(RecordReprMixin):
         return result.view(extra + part.rows.dtype.descr)
 
     def frame(self) -> pl.DataFrame:
-        """The rows as a polars DataFrame: a column per number, codes as their names.
+        """Return the rows of all parts as a polars DataFrame with names in place of codes.
 
-        A field with several numbers becomes several columns ("q.lwr_joint_1", "target_points.
-        thumb.x"). Of a log of several shards "shard" names that of each row. Methods stand one
-        below the other; what a method does not record is null.
+        A field with several elements becomes several columns ("q.lwr_joint_1", "target_points.
+        thumb.x"). If the log has several shards, "shard" is the shard of each row. Fields that a
+        method does not record are null.
 
         Raises:
             MissingExtraError: polars is not installed.
@@ -199,20 +203,20 @@ class Table(RecordReprMixin):
         return pl.concat(frames, how="diagonal") if frames else pl.DataFrame()
 
     def write_parquet(self, path: str | os.PathLike[str]) -> None:
-        """Write `frame` to a Parquet file, for queries that come again.
+        """Write `frame` to a Parquet file, which is faster to query repeatedly than the log.
 
         Raises:
             MissingExtraError: polars is not installed.
-            LogError: It cannot be written.
+            LogError: The file cannot be written.
         """
         frame = self.frame()
         with os_errors(f"{path}: cannot be written", LogError):
             frame.write_parquet(Path(path))
 
     def records(self) -> Iterator[dict[str, Any]]:
-        """The rows one by one, for people: codes and masks as names.
+        """Yield the rows as dictionaries with names in place of codes and masks.
 
-        Events have a "subject" and the "unit" of their value beside.
+        Events also have a "subject" and the "unit" of their value.
         """
         for part in self.parts:
             columns = {name: getattr(part, name).tolist() for name in self._keys}
@@ -220,9 +224,9 @@ class Table(RecordReprMixin):
             if (origins := part.origins) is not None:
                 columns["shard"] = origins
             if self.kind == "event":
-                found = events_of(part)
-                columns["subject"] = [event.subject for event in found]
-                columns["unit"] = [event.unit for event in found]
+                events = events_of(part)
+                columns["subject"] = [event.subject for event in events]
+                columns["unit"] = [event.unit for event in events]
             for values in zip(*columns.values(), strict=True):
                 yield {"method": part.method, **dict(zip(columns, values, strict=True))}
 
@@ -232,18 +236,18 @@ class Table(RecordReprMixin):
 
 
 def events_of(part: MethodRows) -> list[Event]:
-    """The rows of events, one by one, as people have them."""
+    """Return rows of events as `Event` records."""
     bits = bits_of(as_matrix(part.rows["joint_mask"]))
     names = ("kind", "jacobian", "joint_mask", "phase", "value", "threshold")
     columns = part.iteration.tolist(), np.argmax(bits, axis=1).tolist(), *map(part.readable, names)
     phases, units = part.labels.get("phase", ()), part.labels.get("joint_unit", ())
     moves, singular = ([kind.name for kind in kinds] for kinds in (MOVES, SINGULAR))
-    found = []
+    events = []
     for iteration, first, kind, jacobian, joints, phase, value, threshold in zip(
         *columns, strict=True
     ):
-        known = EventKind.__members__.get(kind)
-        subject = ("{joints}" if known is None else known.subject).format(
+        member = EventKind.__members__.get(kind)
+        subject = ("{joints}" if member is None else member.subject).format(
             joints=", ".join(joints),
             jacobian=jacobian,
             phase=phase if phase or phases else "whole solve",
@@ -252,7 +256,7 @@ def events_of(part: MethodRows) -> list[Event]:
             threshold=f"{threshold:.0f}",
             value=f"{value:.0f}",
         )
-        found.append(
+        events.append(
             Event(
                 iteration,
                 kind,
@@ -265,21 +269,21 @@ def events_of(part: MethodRows) -> list[Event]:
                 subject,
             )
         )
-    return found
+    return events
 
 
 def element_name(labels: Sequence[str], index: int) -> str:
-    """The name of an element, or its number."""
+    """Return the name of an element, or its index if it has no name."""
     return labels[index] if index < len(labels) else str(index)
 
 
 def label_of(labels: Sequence[str], code: int) -> str:
-    """The name of a code, or the code."""
+    """Return the name of a code, or the code if it has no name."""
     return (labels[code] if 0 <= code < len(labels) else "") or str(code)
 
 
 def _columns(part: MethodRows, keys: Sequence[str]) -> dict[str, Any]:
-    """The columns of a dataframe by name."""
+    """Return the columns of a dataframe by name."""
     columns: dict[str, Any] = {"method": [part.method] * len(part)}
     columns |= {name: getattr(part, name).astype(np.uint32) for name in keys}
     for name in part.names:
@@ -287,8 +291,8 @@ def _columns(part: MethodRows, keys: Sequence[str]) -> dict[str, Any]:
         if values.ndim > 1:
             matrix = np.ascontiguousarray(as_matrix(values).T)
             for column, index in zip(matrix, np.ndindex(values.shape[1:]), strict=True):
-                rest = ("xyz"[i] if values.shape[-1] == 3 else str(i) for i in index[1:])
-                columns[".".join((name, element_name(labels, index[0]), *rest))] = column
+                axes = ("xyz"[i] if values.shape[-1] == 3 else str(i) for i in index[1:])
+                columns[".".join((name, element_name(labels, index[0]), *axes))] = column
         elif labels and not name.endswith("_mask"):
             columns[name] = part.readable(name)
         else:
@@ -296,12 +300,12 @@ def _columns(part: MethodRows, keys: Sequence[str]) -> dict[str, Any]:
     if (origins := part.origins) is not None:
         columns["shard"] = origins
     if "joint_mask" in part.names:
-        found = events_of(part)
-        columns["joints"] = [", ".join(event.joints) for event in found]
-        columns["subject"] = [event.subject for event in found]
+        events = events_of(part)
+        columns["joints"] = [", ".join(event.joints) for event in events]
+        columns["subject"] = [event.subject for event in events]
     return columns
 
 
 def _label_of_float(labels: Sequence[str], code: float) -> str:
-    """The name of a code that is kept as a float, or the number."""
+    """Return the name of a code that is stored as a float, or the number if it is not a code."""
     return label_of(labels, int(code)) if np.isfinite(code) else str(code)

@@ -109,32 +109,71 @@ def test_message_indexes_in_another_order_are_kept(log: Path) -> None:
         assert len(list(reader.iter_messages("/ik/hand-first/iteration"))) == counted
 
 
+@pytest.fixture
+def small_sections(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Read messages without chunks in several sections."""
+    monkeypatch.setattr("casadi_ik.logs.container.SECTION_SIZE", 4096)
+
+
+@pytest.mark.usefixtures("small_sections")
 @pytest.mark.parametrize("closed", [True, False])
-@pytest.mark.parametrize("own", [True, False])
-def test_messages_outside_chunks_are_refused(
-    log: Path, closed: bool, own: bool, capsys: pytest.CaptureFixture[str]
+def test_messages_without_chunks_are_read(log: Path, closed: bool, tmp_path: Path) -> None:
+    """A copy without chunks, as rosbag2 writes with its preset fastwrite, holds the same rows."""
+    expected = rows_of(log)
+    copy = rewritten(log, use_chunking=False)
+    if not closed:
+        copy.write_bytes(copy.read_bytes()[:-30])
+    assert rows_of(copy) == expected
+    ours, theirs = logs.open(log), logs.open(copy)
+    some = {"method": "enhanced-dls", "solve": 1}
+    assert theirs.iterations(**some).rows.tobytes() == ours.iterations(**some).rows.tobytes()
+    assert theirs.info().counts == ours.info().counts
+    assert theirs.info().chunks == 0
+    finished = logs.finish_log(copy)
+    assert (finished.changed, finished.chunks) == (not closed, 0)
+    assert not logs.finish_log(copy).changed
+    assert rows_of(copy) == expected
+    with copy.open("rb") as stream:
+        read = sum(1 for _ in make_reader(stream, validate_crcs=True).iter_messages())
+        assert read == finished.messages
+    logs.merge_logs([copy], tmp_path / "merged.mcap")
+    assert rows_of(tmp_path / "merged.mcap") == expected
+
+
+@pytest.mark.usefixtures("small_sections")
+def test_messages_without_chunks_are_read_up_to_a_cut(log: Path) -> None:
+    copy = rewritten(log, use_chunking=False)
+    data, truth = copy.read_bytes(), logs.open(log).iterations(method="enhanced-dls")
+    lengths, counts = range(len(data), len(data) * 2 // 3, -499), []
+    for length in lengths:
+        copy.write_bytes(data[:length])
+        rows = logs.open(copy).iterations(method="enhanced-dls").rows
+        assert rows.tobytes() == truth.rows[: len(rows)].tobytes()
+        counts.append(len(rows))
+    assert counts == sorted(counts, reverse=True)
+    assert counts[0] == len(truth) > counts[-1] > 0
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_a_bag_without_chunks_is_not_a_log(
+    log: Path, closed: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As in a bag that rosbag2 records with its preset fastwrite, or in a log without chunks."""
-    if own:
-        path = rewritten(log, use_chunking=False)
-    else:
-        path = log.with_name("bag.mcap")
-        with path.open("wb") as stream:
-            writer = Writer(stream, use_chunking=False)
-            writer.start("ros2", "a recorder")
-            schema = writer.register_schema("std_msgs/msg/Float64", "ros2msg", b"float64 data\n")
-            channel = writer.register_channel("/x", "cdr", schema)
-            for i in range(20):
-                writer.add_message(channel, i, bytes(12), i)
-            writer.finish()
+    path = log.with_name("bag.mcap")
+    with path.open("wb") as stream:
+        writer = Writer(stream, use_chunking=False)
+        writer.start("ros2", "a recorder")
+        schema = writer.register_schema("std_msgs/msg/Float64", "ros2msg", b"float64 data\n")
+        channel = writer.register_channel("/x", "cdr", schema)
+        for i in range(20):
+            writer.add_message(channel, i, bytes(12), i)
+        writer.finish()
     if not closed:
         path.write_bytes(path.read_bytes()[:-30])
     before = path.read_bytes()
-    for ask in (logs.open, logs.finish_log):
-        with pytest.raises(errors.LogError) as caught:
-            ask(path)
-        assert str(caught.value).startswith(f"{path}: ")
-    for words in (("info",), ("solves",), ("finish",)):
+    with pytest.raises(errors.LogError) as caught:
+        logs.open(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    for words in (("info",), ("solves",)):
         assert main(["log", *words, str(path)]) == 2
         assert capsys.readouterr().err.count("\n") == 1
     assert path.read_bytes() == before

@@ -98,7 +98,7 @@ def test_solves_out_of_order_come_back_in_order(write: Write) -> None:
 def test_two_methods_share_a_log(write: Write) -> None:
     log = logs.open(write(make_block(30), make_block(7, method="hand-first")))
     assert log.methods == ("enhanced-dls", "hand-first")
-    with pytest.raises(errors.UnknownNameError, match="of which method"):
+    with pytest.raises(errors.UnknownNameError, match="method is missing"):
         _ = log.iterations().rows
     assert len(log.iterations(method="hand-first").rows) == 7
     assert len(log.iterations()) == 37

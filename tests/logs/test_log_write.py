@@ -32,7 +32,7 @@ def full_disk(monkeypatch: pytest.MonkeyPatch, room: int) -> None:
         left[0] -= done
         return done
 
-    monkeypatch.setattr("casadi_ik.logs.writer.os.write", limited)
+    monkeypatch.setattr("casadi_ik.logs.log_file.os.write", limited)
 
 
 def record_many(path: Path, blocks: int) -> None:
@@ -96,7 +96,7 @@ def test_a_read_only_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         def refuse(*_: object) -> int:
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
-        monkeypatch.setattr("casadi_ik.logs.writer.os.open", refuse)
+        monkeypatch.setattr("casadi_ik.logs.log_file.os.open", refuse)
     with pytest.raises(errors.LogError, match="Permission denied"):
         logs.McapRecorder(folder / "cup.mcap", robot_name="made_up")
     assert list(folder.iterdir()) == []
@@ -156,7 +156,7 @@ def test_an_interrupt_while_a_chunk_is_written(
             raise KeyboardInterrupt
         return done
 
-    monkeypatch.setattr("casadi_ik.logs.writer.os.write", interrupted)
+    monkeypatch.setattr("casadi_ik.logs.log_file.os.write", interrupted)
     path = tmp_path / "cup.mcap"
     with pytest.raises(KeyboardInterrupt):
         record_many(path, 4)
@@ -281,7 +281,7 @@ LIMIT = 3 * 2**21
 @pytest.fixture
 def small_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Readers and writers that take little."""
-    monkeypatch.setattr("casadi_ik.logs.container.RECORD_LIMIT", LIMIT)
+    monkeypatch.setattr("casadi_ik.logs.chunks.RECORD_LIMIT", LIMIT)
 
 
 @pytest.mark.usefixtures("small_limit")

@@ -24,12 +24,13 @@ from casadi_ik.app.cli.table import Arguments, CommandResult, command
 from casadi_ik.app.report import count_text, duration, fields, files, headline, indented, table
 from casadi_ik.errors import InputError, MissingExtraError, UnknownNameError, printable
 from casadi_ik.logs.container import ForeignLogError, NothingWrittenError
-from casadi_ik.logs.events import SERIOUS, describe, format_quantity, plain_name
+from casadi_ik.logs.events import SERIOUS, describe
 from casadi_ik.logs.explanation import MatchedTargets, compare_solves, explain, match_targets
 from casadi_ik.logs.repair import finish_log, merge_logs
 from casadi_ik.logs.shards import log_files
 from casadi_ik.logs.solve import SolveRecord, one_solve
 from casadi_ik.logs.tables import events_of
+from casadi_ik.logs.wording import format_quantity, plain_name
 
 MAX_ITEMS = 12
 """Maximum number of names or numbers that a list shows."""

@@ -20,7 +20,8 @@ from casadi_ik.errors import InputError, PictureError, os_errors
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.writing import atomic_write
 from casadi_ik.logs import Table
-from casadi_ik.logs.events import EVENT_COLORS, bits_of
+from casadi_ik.logs.events import EVENT_COLORS
+from casadi_ik.logs.traces import bits_of
 from casadi_ik.model.targets import Tolerance
 
 DPI = 160

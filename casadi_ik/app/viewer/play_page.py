@@ -29,8 +29,9 @@ from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import InputError, LogError
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arm_hand import ArmHand
-from casadi_ik.logs.events import EVENT_COLORS, describe, plain_name
+from casadi_ik.logs.events import EVENT_COLORS, describe
 from casadi_ik.logs.solve import SolveRecord
+from casadi_ik.logs.wording import plain_name
 from casadi_ik.model.grasp import Contact, Grasp
 from casadi_ik.solve.verdict import ContactVerdict
 
