@@ -110,7 +110,7 @@ def machine_lanes() -> int:
     return 0 if library is None else int(library[MACHINE_SYMBOL]())
 
 
-SYMBOL, LANES_SYMBOL = "casadi_ik_map", "casadi_ik_map_lanes"
+MAP_SYMBOL, MAP_LANES_SYMBOL = "casadi_ik_map", "casadi_ik_map_lanes"
 
 MapJob = c_struct("map_job")
 
@@ -222,13 +222,13 @@ class FunctionKernel:
         text = define({"N_IN": len(self._input_sizes), "N_OUT": len(self._output_sizes)})
         if not lanes:
             text += driver_text("map_job") + driver_text("map") + driver
-            return self._map(self.name, text, SYMBOL)
+            return self._map(self.name, text, MAP_SYMBOL)
         text += define({"TOTAL": sum(self._input_sizes) + sum(self._output_sizes)})
         for name, sizes in (("SIZES_IN", self._input_sizes), ("SIZES_OUT", self._output_sizes)):
             text += f"#define {name} {{{', '.join(map(str, sizes))}}}\n"
         text += driver_text("map_job") + driver_text("map_lanes")
         try:
-            return self._map(f"{self.name}_lanes{lanes}", text, LANES_SYMBOL, lanes)
+            return self._map(f"{self.name}_lanes{lanes}", text, MAP_LANES_SYMBOL, lanes)
         except KernelError as error:
             logger.warning("%s: one sample at a time: %s", self.name, error)
             return self._load(in_lanes=False)

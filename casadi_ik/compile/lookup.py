@@ -15,7 +15,7 @@ from casadi_ik.compile.codegen import c_struct, define, driver_text
 from casadi_ik.compile.function_kernel import FunctionKernel, machine_lanes, memory
 from casadi_ik.compile.graphs import FunctionGraph
 
-SYMBOL = "casadi_ik_lookup"
+LOOKUP_SYMBOL = "casadi_ik_lookup"
 
 STEPS_PER_UNIT = 64
 """Resolution of keys [steps per unit]. Compiled code compares them as 16-bit integers, NumPy
@@ -75,7 +75,7 @@ class LookupKernel:
         padded = np.pad(self._keys, ((0, -len(keys) % TILE), (0, width % 2))).astype(np.int16)
         self.tiles = padded.reshape(-1, TILE, (width + 1) // 2, 2).transpose(0, 2, 1, 3).copy()
         self.compiled = self.key.compiled
-        self.entry: Any = self.key.library[SYMBOL] if self.compiled else None
+        self.entry: Any = self.key.library[LOOKUP_SYMBOL] if self.compiled else None
 
     def _driver(self) -> str:
         own = define(self.constants | {"REGISTER_BYTES": 8 * machine_lanes()})

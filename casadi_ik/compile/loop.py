@@ -152,7 +152,7 @@ class _Records:
         self._rows.resize(self._written, refcheck=False)
 
 
-SYMBOL = "casadi_ik_loop"
+LOOP_SYMBOL = "casadi_ik_loop"
 
 SLOTS = 32
 """Number of slots: solves in progress, of which four or eight occupy the lanes."""
@@ -160,7 +160,7 @@ SLOTS = 32
 MIN_SIDE_BY_SIDE = 4
 """Minimum number of solves for which lanes are used."""
 
-UNBOUNDED = 2**62
+NO_LIMIT = 2**62
 """Number of steps of a call without a bound."""
 
 MIN_BATCH_FOR_LANES = 64
@@ -240,7 +240,7 @@ class CompiledBatch:
             slot_count=slots,
             count=len(result.status),
             max_iterations=budget,
-            left=UNBOUNDED,
+            left=NO_LIMIT,
             fewest=MIN_SIDE_BY_SIDE,
             slice=SLICE,
             follow=starts.follow,
@@ -316,7 +316,7 @@ class LoopKernel:
         self.step = step
         library = self._load() if compiled and step.compilable else None
         self.compiled = library is not None
-        self.entry: Any = None if library is None else library[SYMBOL]
+        self.entry: Any = None if library is None else library[LOOP_SYMBOL]
         self._rows_each = 0.0
         self._solves_until_recheck = 0
 
@@ -326,7 +326,7 @@ class LoopKernel:
         name = step.name if lanes == 1 else f"{step.name}_lanes{lanes}"
         wide = lanes == 1 and machine_lanes() > 0
         return load_function(
-            name, lambda: step.function, self._driver(), SYMBOL, step.recipe, lanes, wide
+            name, lambda: step.function, self._driver(), LOOP_SYMBOL, step.recipe, lanes, wide
         )
 
     @property
@@ -364,7 +364,7 @@ class LoopKernel:
         except KernelError as error:
             warnings.warn(f"batches run without lanes: {error}", RuntimeWarning, stacklevel=2)
             return None
-        return None if library is None else library[SYMBOL]
+        return None if library is None else library[LOOP_SYMBOL]
 
     @property
     def constants(self) -> dict[str, int]:

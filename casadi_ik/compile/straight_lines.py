@@ -76,7 +76,7 @@ ELEMENTARY_KINDS = {
 }
 """Elementary functions of which one call computes several (runtime/elementary_calls.c)."""
 
-WIDTHS = (1, 2, 4)
+VECTOR_SIZES = (1, 2, 4)
 """Numbers of values that one call of an elementary function can compute."""
 
 
@@ -97,7 +97,7 @@ class CodeOptions:
     @property
     def width(self) -> int:
         """Maximum number of values that one call of an elementary function computes."""
-        return 1 if self.lanes > 1 or self.single else WIDTHS[-1]
+        return 1 if self.lanes > 1 or self.single else VECTOR_SIZES[-1]
 
     def digits(self, value: float) -> str:
         """Return a constant as the text of an array element.
@@ -429,7 +429,7 @@ class _Writer:
         if len(group) == 1:
             self._append(group[0], group[0].value)
             return
-        kind, width = group[0].kind, next(size for size in WIDTHS if size >= len(lanes))
+        kind, width = group[0].kind, next(size for size in VECTOR_SIZES if size >= len(lanes))
         arguments = [*lanes, *[next(reversed(lanes))] * (width - len(lanes))]
         numbers = ", ".join(value for values in zip(*arguments, strict=True) for value in values)
         names = [f"s{number}", f"c{number}"] if kind == SIN_COS else [f"s{number}"]

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-PATIENCE = 1.0
+FIRST_DRAW_DELAY = 1.0
 """Time after which a bar appears [s]."""
 
 LINE_INTERVAL = 10.0
@@ -43,7 +43,7 @@ def progress(
         total += targets
         now = time.monotonic()
         rate = (total - done) / max(now - began, 1e-9)
-        if draw is not None and now - began > PATIENCE:
+        if draw is not None and now - began > FIRST_DRAW_DELAY:
             visible_bar = draw
             draw(total, rate)
         elif draw is None and say is not None and now - last_line > LINE_INTERVAL:

@@ -15,7 +15,7 @@ from casadi_ik.kinematics.se3 import angular_velocity_to_euler_zyx, euler_zyx
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.joints import Joint
 
-ROUNDING = 1e-15
+MAX_ROUNDING_ERROR = 1e-15
 """Threshold below which constants of a description are rounding errors, treated as zero."""
 
 
@@ -152,10 +152,10 @@ def _constants(placement: Array) -> tuple[ca.DM, ca.DM]:
 
 def sparse(array: Array) -> ca.DM:
     """Return a constant with entries below rounding replaced by structural zeros."""
-    exact = np.where(np.abs(array) < ROUNDING, 0.0, array)
+    exact = np.where(np.abs(array) < MAX_ROUNDING_ERROR, 0.0, array)
     # Rotations by quarter turns come out of cosines as 1 - 1e-16; make them exact as well.
     near = np.round(exact)
-    exact = np.where(np.abs(exact - near) < ROUNDING, near, exact)
+    exact = np.where(np.abs(exact - near) < MAX_ROUNDING_ERROR, near, exact)
     return ca.sparsify(ca.DM(exact))
 
 

@@ -242,7 +242,7 @@ def reflect(v: Expr, w: Expr, y: Expr) -> Expr:
 SWEEPS = {1: 0, 2: 1, 3: 4, 4: 5, 5: 5, 6: 5}
 """Default number of sweeps by the smaller dimension of J."""
 
-TINY = 1e-300
+SMALLEST_DIVISOR = 1e-300
 
 
 def svd(J: Expr, sweeps: int | None = None) -> tuple[Expr, Expr, Expr]:
@@ -271,7 +271,7 @@ def singular_values(J: Expr, sweeps: int | None = None) -> Expr:
 
 def condition_number(s: Expr, cap: float = 1e12) -> Expr:
     """Return the ratio of largest to smallest singular value s (k, 1), at most `cap`, never NaN."""
-    ratio = ca.mmin(s) / (ca.mmax(s) + TINY)
+    ratio = ca.mmin(s) / (ca.mmax(s) + SMALLEST_DIVISOR)
     return 1 / ca.fmax(ratio, 1 / cap)
 
 
@@ -304,7 +304,7 @@ def _rotation(x: Expr, y: Expr) -> tuple[Expr, Expr]:
     difference = ca.dot(x, x) - ca.dot(y, y)
     twice = 2 * ca.dot(x, y)
     root = ca.sqrt(difference * difference + twice * twice)
-    tangent = twice / (ca.fabs(difference) + root + TINY)
+    tangent = twice / (ca.fabs(difference) + root + SMALLEST_DIVISOR)
     cosine = 1 / ca.sqrt(1 + tangent * tangent)
     sine = cosine * tangent
     ordered = difference >= 0
@@ -326,7 +326,7 @@ def _svd_function(n: int, k: int, sweeps: int) -> ca.Function:
     for _ in range(sweeps):
         W, V = _sweep_function(k)(W, V)
     s = [ca.sqrt(ca.dot(w, w)) for w in ca.horzsplit(W)]
-    U = [w / ca.fmax(norm, TINY) for w, norm in zip(ca.horzsplit(W), s, strict=True)]
+    U = [w / ca.fmax(norm, SMALLEST_DIVISOR) for w, norm in zip(ca.horzsplit(W), s, strict=True)]
     U = [ca.vertcat(u, ca.SX.zeros(n - k, 1)) for u in U]
     for v, w in reversed(reflections):
         U = [reflect(v, w, u) for u in U]
@@ -338,7 +338,7 @@ ITERATIONS = {2: 1, 3: 4, 4: 4}
 On 400 random matrices of up to 6 rows, some singular, the smallest value is exact to 1e-8
 of the largest, and the largest to 2e-5 of itself."""
 
-TINY = 1e-300
+SMALLEST_DIVISOR = 1e-300
 
 
 def extreme_singular_values(J: Expr) -> tuple[Expr, Expr]:
@@ -349,7 +349,7 @@ def extreme_singular_values(J: Expr) -> tuple[Expr, Expr]:
     narrow = J.T if J.shape[0] <= J.shape[1] else J
     gram = ca.densify(narrow.T @ narrow)
     n = gram.shape[0]
-    scale = ca.trace(gram) + TINY
+    scale = ca.trace(gram) + SMALLEST_DIVISOR
     unit = 1 / scale
     diagonal, squares = _tridiagonal([[gram[i, j] * unit for j in range(n)] for i in range(n)])
     # All roots lie between 0 and the trace, which is 1.
@@ -369,7 +369,7 @@ def _tridiagonal(A: list[list[Expr]]) -> tuple[list[Expr], list[Expr]]:
         norm = ca.sqrt(square)
         head = A[k + 1][k] + ca.if_else(A[k + 1][k] < 0, -norm, norm)
         v = {k + 1: head} | {i: A[i][k] for i in rows[1:]}
-        factor = 2 / (head * head + rest + TINY)
+        factor = 2 / (head * head + rest + SMALLEST_DIVISOR)
         p = {
             i: factor * sum((A[max(i, j)][min(i, j)] * v[j] for j in rows), ca.SX(0.0))
             for i in rows
@@ -402,5 +402,5 @@ def _laguerre(diagonal: list[Expr], squares: list[Expr], x: Expr, direction: flo
                 *(shifted * r - 2 * q - square * r_before, r),
             )
         root = ca.sqrt(ca.fmax((n - 1) * ((n - 1) * q * q - n * p * r), 0.0))
-        x = x + direction * n * ca.fabs(p) / (ca.fabs(q) + root + TINY)
+        x = x + direction * n * ca.fabs(p) / (ca.fabs(q) + root + SMALLEST_DIVISOR)
     return x

@@ -122,7 +122,7 @@ def _rod(phi: Expr, bar: Linkage) -> tuple[tuple[Expr, Expr], Expr]:
     return (scale * (A * C - signed * B), scale * (B * C + signed * A)), root
 
 
-FLAT = 1e-16
+MIN_SLACK = 1e-16
 """Lower bound of the two slacks of the triangle, relative to b c."""
 
 
@@ -158,7 +158,7 @@ def slider_toggle(s: Expr, b: Expr, c: Expr) -> Expr:
 
 def _slacks(s: Expr, b: Expr, c: Expr) -> tuple[Expr, Expr]:
     """Return s^2 - (b - c)^2 = 4 b c sin^2(theta/2) and (b + c)^2 - s^2 = 4 b c cos^2(theta/2)."""
-    short, long, flat = b - c, b + c, FLAT * b * c
+    short, long, flat = b - c, b + c, MIN_SLACK * b * c
     return (
         ca.fmax((s - short) * (s + short), flat),
         ca.fmax((long - s) * (long + s), flat),

@@ -69,13 +69,13 @@ class ScrewChain:
     screws: tuple[Screw, ...]
     reference: Array
 
-    def at(self, theta: Expr) -> Screws:
+    def at(self, theta: Expr) -> ChainScrews:
         """Return the chain with its joints at theta (len(joints), 1) [rad or m]."""
-        return Screws(self, theta)
+        return ChainScrews(self, theta)
 
 
 @dataclass(frozen=True, eq=False)
-class Screws:
+class ChainScrews:
     """A chain at a configuration.
 
     Attributes:
@@ -218,7 +218,7 @@ class TipMotion:
         return {name: theta[i] for i, name in enumerate(robot.joint_names)}
 
     @cached_property
-    def screws(self) -> Screws:
+    def screws(self) -> ChainScrews:
         """The chain's screws at this configuration: eqs. (3), (5) to (7)."""
         pairs = zip(self.tip.signs, self.tip.chain.joints, strict=True)
         return self.tip.chain.at(ca.vertcat(*(sign * self.joints[name] for sign, name in pairs)))

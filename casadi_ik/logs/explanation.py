@@ -510,7 +510,7 @@ def _quantities(solve: SolveRecord) -> dict[str, str]:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class LoggedOutcome:
     """Outcome of a logged solve.
 
     Attributes:
@@ -542,7 +542,7 @@ class MatchedTargets:
 
     first: str
     second: str
-    pairs: tuple[tuple[Outcome, Outcome], ...]
+    pairs: tuple[tuple[LoggedOutcome, LoggedOutcome], ...]
 
     def __len__(self) -> int:
         return len(self.pairs)
@@ -576,13 +576,15 @@ def match_targets(logs: Sequence[Log], first: str, second: str) -> MatchedTarget
     return MatchedTargets(first, second, tuple(pairs))
 
 
-def _outcomes(logs: Sequence[Log], method: str) -> dict[bytes, Outcome]:
+def _outcomes(logs: Sequence[Log], method: str) -> dict[bytes, LoggedOutcome]:
     """Return the first outcome of a method by key of the target."""
-    outcomes: dict[bytes, Outcome] = {}
+    outcomes: dict[bytes, LoggedOutcome] = {}
     tables = ((log, log.solves(method=method)) for log in logs if method in log.methods)
     for log, part in ((log, part) for log, table in tables for part in table.parts):
         for solve_id, row in zip(part.solve_id.tolist(), part.rows, strict=True):
             key = target_key(row["target_points"], row["target_normals"], optional_targets(row))
             success, iterations, time = row[["success", "iterations", "time"]].item()
-            outcomes.setdefault(key, Outcome(log, method, solve_id, success > 0, iterations, time))
+            outcomes.setdefault(
+                key, LoggedOutcome(log, method, solve_id, success > 0, iterations, time)
+            )
     return outcomes

@@ -292,7 +292,7 @@ def optional_targets(row: np.void) -> dict[str, Array]:
     return {name: row[f"target_{name}"] for name in EXTRA_ARRAY_NAMES if f"target_{name}" in names}
 
 
-NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+URDF_NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 """Pattern of numbers in a URDF."""
 
 _COPIED_FIELDS = ("position_error", "angle_error", "target_points", "target_normals")
@@ -310,8 +310,8 @@ def check_robot(robot: ArmHand, urdf: str, context: str) -> None:
         LogError: The descriptions differ by more than rounding.
     """
     texts = robot.urdf(), urdf
-    frame, expected_frame = (NUMBER.sub("#", text) for text in texts)
-    values, expected = (np.array(NUMBER.findall(text), float) for text in texts)
+    frame, expected_frame = (URDF_NUMBER.sub("#", text) for text in texts)
+    values, expected = (np.array(URDF_NUMBER.findall(text), float) for text in texts)
     if frame != expected_frame or not np.allclose(values, expected, rtol=1e-9, atol=1e-9):
         raise LogError(
             f"{context}: robot {robot.name!r} is not the robot of the log (the URDFs differ);"

@@ -72,7 +72,7 @@ class IpoptParameters:
         for name, smallest in (("restarts", 0), ("max_iterations", 1)):
             value = getattr(self, name)
             if not (isinstance(value, int) and not isinstance(value, bool) and value >= smallest):
-                raise InputError(f"{name}: found {value!r}, expected a whole number >= {smallest}")
+                raise InputError(f"{name}: found {value!r}, expected an integer >= {smallest}")
         value = self.optimality
         number = isinstance(value, (int, float)) and not isinstance(value, bool)
         if not (number and math.isfinite(value) and value > 0):
@@ -108,7 +108,7 @@ class NlpRun:
     Attributes:
         q: (n,) final configuration, within its bounds.
         residual: (r,) residual at q.
-        inside: True if the coupled joints are within their limits at q.
+        within_limits: True if the coupled joints are within their limits at q.
         status: Result of Ipopt: STALLED (at a minimum, feasible or not), ITERATION_LIMIT or
             INVALID.
         path: (rows, n) configurations.
@@ -120,7 +120,7 @@ class NlpRun:
 
     q: Array
     residual: Array
-    inside: bool
+    within_limits: bool
     status: Status
     path: Array
     residuals: Array
@@ -207,13 +207,13 @@ class WholeNlp:
         """Run Ipopt from one start.
 
         Args:
-            start: (n,) where to begin.
+            start: (n,) start configuration.
             parameters: Targets and weights, see `parameters`.
-            lower: (n,) bounds of q; below the robot's, limits are ignored, those of joints as well.
+            lower: (n,) bounds of q; joint limits are ignored if it is below the robot's limits.
             upper: (n,) bounds of q.
 
         Raises:
-            KeyboardInterrupt: Ctrl-C while Ipopt was at work.
+            KeyboardInterrupt: Ctrl-C while Ipopt was running.
             CancelledError: This thread has been told to stop.
         """
         stop_if_cancelled()
@@ -223,7 +223,7 @@ class WholeNlp:
             joints = (np.full_like(joints[0], -np.inf), np.full_like(joints[1], np.inf))
         first = self._residual(start, parameters)
         cost = float(first @ first)
-        if cost < EXACT**2 and self._within(start, joints):
+        if cost < MAX_SOLVED_RESIDUAL**2 and self._within(start, joints):
             return self._run_without_ipopt(start, first, Status.STALLED)
         free, zero = np.full(self._rows, np.inf), np.zeros(self._rows)
         with self._lock, interrupt_afterwards():
@@ -257,7 +257,7 @@ class WholeNlp:
         return NlpRun(
             q=q,
             residual=residual,
-            inside=self._within(q, joints),
+            within_limits=self._within(q, joints),
             status=status,
             path=path,
             residuals=residuals,
@@ -320,7 +320,7 @@ def _column(stats: dict[str, Any], name: str, rows: int) -> Array:
     return column
 
 
-EXACT = 1e-8
+MAX_SOLVED_RESIDUAL = 1e-8
 """Square root of the cost below which contacts are met exactly and Ipopt stops."""
 
 JOINT_SLACK = 1e-9
@@ -339,7 +339,7 @@ class Watch(ca.Callback):
         ca.Callback.__init__(self)
         sizes = {"x": nx, "f": 1, "g": ng, "lam_x": nx, "lam_g": ng, "lam_p": parameters}
         self._sizes = [sizes[name] for name in ca.nlpsol_out()]
-        self._wanted = [ca.nlpsol_out().index(name) for name in ("x", "g")]
+        self._output_indices = [ca.nlpsol_out().index(name) for name in ("x", "g")]
         self._path: list[Array] = []
         self._rows: list[Array] = []
         self._contacts = 0
@@ -373,12 +373,12 @@ class Watch(ca.Callback):
 
     def eval_buffer(self, arg: Any, res: Any) -> int:
         """Store an iterate; Ipopt calls this at the start and after every iteration."""
-        x, rows = (np.frombuffer(arg[i], dtype=float).copy() for i in self._wanted)
+        x, rows = (np.frombuffer(arg[i], dtype=float).copy() for i in self._output_indices)
         rows[: self._contacts] += x[len(x) - self._contacts :]
         self._path.append(x)
         self._rows.append(rows)
         r, joints = rows[: self._contacts], rows[self._contacts :]
-        met = r @ r < EXACT**2 and within(joints, self._joints)
+        met = r @ r < MAX_SOLVED_RESIDUAL**2 and within(joints, self._joints)
         np.frombuffer(res[0], dtype=float)[0] = met or is_cancelled()
         return 0
 
@@ -397,9 +397,9 @@ AT_LIMIT = 1e-6
 class IpoptMethod(Method):
     """`ipopt`: a start from q0, then random starts until the contacts are met.
 
-    An iteration is a row of the trace: every start counts its first point and every step of
-    Ipopt. Of several starts in vain the one with the smallest cost is returned. Threads take
-    turns, since Ipopt's callback serves one solve at a time.
+    An iteration is a row of the trace: the first point and every step of Ipopt of each start. If no
+    start meets the contacts, the result with the smallest cost is returned. Threads solve one
+    after another, because Ipopt's callback serves one solve at a time.
 
     Attributes:
         name: Name of the method.
@@ -577,4 +577,4 @@ def _ending(run: NlpRun, targets: TargetBatch, contacts: ContactRows) -> Status:
     distances, angles = contact_errors(contacts, run.residual[None])
     met = np.all(distances <= targets.position_tolerance)
     met = met and np.all(angles <= targets.angle_tolerance)
-    return Status.SOLVED if met and run.inside else run.status
+    return Status.SOLVED if met and run.within_limits else run.status

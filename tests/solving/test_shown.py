@@ -84,7 +84,7 @@ import sys
 import numpy as np
 import casadi_ik as ik
 from casadi_ik.files import progress
-progress.PATIENCE = 0.0
+progress.FIRST_DRAW_DELAY = 0.0
 robot = ik.load_robot("kuka_lwr_barrett")
 points, normals = robot.contacts(robot.random(np.random.default_rng(0), 400))
 batch = ik.Solver(robot).solve_batch(points, normals, jobs=int(sys.argv[1]))

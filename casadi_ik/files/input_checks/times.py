@@ -23,7 +23,11 @@ MAX_WAYPOINT_INTERVAL = 5.0
 MIN_FRAMES = 3
 """Smallest number of frames that is checked; fewer do not determine the unit."""
 
-TIME_UNITS = ((1e6, "nanoseconds", 1e-9), (1e3, "microseconds", 1e-6), (0.0, "milliseconds", 1e-3))
+INTERVAL_UNITS = (
+    (1e6, "nanoseconds", 1e-9),
+    (1e3, "microseconds", 1e-6),
+    (0.0, "milliseconds", 1e-3),
+)
 """Median interval from which times are probably in a unit, the unit, and its length [s]."""
 
 
@@ -43,7 +47,9 @@ def check_time_unit(times: Array, where: str, max_interval: float = MAX_FRAME_IN
     interval = float(np.median(np.diff(times)))
     if interval < max_interval:
         return
-    unit, factor = next((name, factor) for start, name, factor in TIME_UNITS if interval >= start)
+    unit, factor = next(
+        (name, factor) for start, name, factor in INTERVAL_UNITS if interval >= start
+    )
     raise InputError(
         f"{where}: frames are {interval:.4g} s apart; expected seconds, less than {max_interval:g} "
         f"between frames (numbers in {unit}? multiply by {factor:g})"

@@ -310,7 +310,7 @@ def _palm_symbols() -> tuple[Pose, list[Expr]]:
 
 
 @dataclass(frozen=True, eq=False)
-class Sphere:
+class SphericalJoints:
     """A spherical joint: three screws through a point, each perpendicular to the next.
 
     Attributes:

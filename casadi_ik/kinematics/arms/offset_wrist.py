@@ -30,7 +30,7 @@ from casadi_ik.kinematics.smooth import Expr, with_cse
 
 FULL_TURN = 2 * np.pi
 
-MIN_DIVISOR = 1e-300
+MIN_CURVATURE = 1e-300
 
 ROOTS = 4
 """Maximum number of roots of a branch. Source: of 200 random poses of an xArm 6 two branches had
@@ -64,7 +64,7 @@ class RootSearch:
     max_step: float = 1.0
 
 
-SEARCH = RootSearch()
+ROOT_SEARCH = RootSearch()
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,7 @@ class OffsetWristArm(ArmFamily):
     screws: Screws
     ideal: SphericalArm
     offset: Array
-    model_error: float = SEARCH.fine_tolerance
+    model_error: float = ROOT_SEARCH.fine_tolerance
     rows = len(SIGNS) * ROOTS
     roots = ROOTS
     starts = 3
@@ -140,7 +140,7 @@ class OffsetWristArm(ArmFamily):
         branch, condition, secant = self._branch(), self._condition(), _secant_step()
         coarse, fine = (
             self._scored_arm(score, tolerance)
-            for tolerance in (SEARCH.coarse_tolerance, SEARCH.fine_tolerance)
+            for tolerance in (ROOT_SEARCH.coarse_tolerance, ROOT_SEARCH.fine_tolerance)
         )
         first, candidates = reference[self.last], []
         for sign_1, sign_2 in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
@@ -155,7 +155,7 @@ class OffsetWristArm(ArmFamily):
         selected = _best_branch(len(candidates))(*values)
         sign_1, sign_2, flip, t, residual, previous_t, previous_residual = selected
         arm, slack = ca.MX(6, 1), ca.MX(1)
-        for _ in range(SEARCH.secant_steps):
+        for _ in range(ROOT_SEARCH.secant_steps):
             next_t = secant(t, residual, previous_t, previous_residual)
             t, previous_t, previous_residual = next_t, t, residual
             arm, slack, residual = branch(*six_motion, t, sign_1, sign_2, flip)
@@ -239,7 +239,7 @@ class OffsetWristArm(ArmFamily):
         smallest = ca.fmin(margin(joints, lower, upper), violation)
         outputs = ca.vertcat(*joints.values()), score.total(score.cost(joints, reference), smallest)
         inputs = [six, slack, residual, redundancy, lower, upper, reference]
-        name = "loose" if tolerance == SEARCH.coarse_tolerance else "strict"
+        name = "loose" if tolerance == ROOT_SEARCH.coarse_tolerance else "strict"
         return ca.Function(name, inputs, with_cse(*outputs))
 
     def _all_roots(self) -> ca.Function:
@@ -248,7 +248,7 @@ class OffsetWristArm(ArmFamily):
         signs = [ca.MX.sym("sign") for _ in range(3)]
         branch, condition = self._branch(), self._condition()
         refine_bracket, extremum = _anderson_bjorck_step(), _extremum_between()
-        spacing, count = FULL_TURN / SEARCH.samples, SEARCH.samples
+        spacing, count = FULL_TURN / ROOT_SEARCH.samples, ROOT_SEARCH.samples
         middle = float(self.screws.lower[-1] + self.screws.upper[-1]) / 2
         first = [middle + spacing * i for i in range(count)]
         residuals_around = [condition(rotation, origin, sample, *signs) for sample in first]
@@ -261,7 +261,7 @@ class OffsetWristArm(ArmFamily):
         arms, slacks = [], []
         for root in range(ROOTS):
             *bracket, t, is_root = brackets[6 * root : 6 * root + 6]
-            for _ in range(SEARCH.steps):
+            for _ in range(ROOT_SEARCH.steps):
                 *bracket, t = refine_bracket(*bracket, t, condition(rotation, origin, t, *signs))
             arm, slack, residual = branch(rotation, origin, t, *signs)
             arms.append(arm.T)
@@ -278,8 +278,8 @@ def _secant_step() -> ca.Function:
     has_moved = ca.fabs(change) > 1e-12
     divisor = ca.if_else(has_moved, change, 1.0)
     slope = ca.if_else(has_moved, (residual - previous_residual) / divisor, -1.0)
-    slope = ca.fmin(ca.fmax(slope, -5.0), SEARCH.max_slope)
-    step = ca.fmin(ca.fmax(-residual / slope, -SEARCH.max_step), SEARCH.max_step)
+    slope = ca.fmin(ca.fmax(slope, -5.0), ROOT_SEARCH.max_slope)
+    step = ca.fmin(ca.fmax(-residual / slope, -ROOT_SEARCH.max_step), ROOT_SEARCH.max_step)
     return ca.Function(
         "next_turn", [t, residual, previous_t, previous_residual], with_cse(t + step)
     )
@@ -313,12 +313,12 @@ def _extremum_between() -> ca.Function:
     fraction: Expr = ca.SX(0.5)
     for left_value, middle, right, start in ((r1, r2, r3, 1.0), (r0, r1, r2, 0.0)):
         curvature, slope = left_value + right - 2 * middle, right - left_value
-        straight = ca.fabs(curvature) < MIN_DIVISOR
+        straight = ca.fabs(curvature) < MIN_CURVATURE
         position = start - ca.if_else(
             straight, 0.0, slope / (2 * ca.if_else(straight, 1.0, curvature))
         )
         fraction = ca.if_else(
-            ca.logic_and(position > SEARCH.min_gap, position < 1 - SEARCH.min_gap),
+            ca.logic_and(position > ROOT_SEARCH.min_gap, position < 1 - ROOT_SEARCH.min_gap),
             position,
             fraction,
         )
@@ -331,7 +331,7 @@ def _sign_changes() -> ca.Function:
     They are the sample before the root and its residual, the sample behind it and its residual, the
     zero of the line between them, and 1 if there is a root.
     """
-    samples = [ca.SX.sym("place") for _ in range(2 * SEARCH.samples)]
+    samples = [ca.SX.sym("place") for _ in range(2 * ROOT_SEARCH.samples)]
     residuals = [ca.SX.sym("rest") for _ in samples]
     count: Expr = ca.SX(0)
     roots = [[ca.SX(0) for _ in range(6)] for _ in range(ROOTS)]
@@ -363,7 +363,7 @@ def _sign_changes() -> ca.Function:
 def _linear_zero(x0: Expr, y0: Expr, x1: Expr, y1: Expr) -> Expr:
     """Return the zero of a line through two points; their middle if it is level."""
     rise = y1 - y0
-    level = ca.fabs(rise) < MIN_DIVISOR
+    level = ca.fabs(rise) < MIN_CURVATURE
     fraction = ca.if_else(level, 0.5, -y0 / ca.if_else(level, 1.0, rise))
     return x0 + fraction * (x1 - x0)
 
@@ -376,7 +376,7 @@ def _anderson_bjorck_step() -> ca.Function:
     """
     x0, y0, x1, y1, t, y = inputs = [ca.SX.sym("value") for _ in range(6)]
     has_crossed = y * y1 <= 0
-    ratio = 1 - y / ca.if_else(ca.fabs(y1) < MIN_DIVISOR, 1.0, y1)
+    ratio = 1 - y / ca.if_else(ca.fabs(y1) < MIN_CURVATURE, 1.0, y1)
     weight = ca.if_else(ratio > 0, ratio, 0.5)
     start = ca.if_else(has_crossed, x1, x0)
     y_start = ca.if_else(has_crossed, y1, weight * y0)
@@ -387,5 +387,5 @@ def _anderson_bjorck_step() -> ca.Function:
 def _root_slack() -> ca.Function:
     """Return (slack, residual, is_root) -> the slack, negative without a root."""
     slack, residual, is_root = inputs = [ca.SX.sym(name) for name in ("slack", "rest", "is_root")]
-    root_tolerance = ca.logic_and(is_root > 0, ca.fabs(residual) <= SEARCH.root_tolerance)
+    root_tolerance = ca.logic_and(is_root > 0, ca.fabs(residual) <= ROOT_SEARCH.root_tolerance)
     return ca.Function("known", inputs, [ca.if_else(root_tolerance, slack, ca.fmin(slack, -1.0))])

@@ -21,7 +21,7 @@ import numpy as np
 
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.files.arrays import Array
-from casadi_ik.kinematics.arms.family import ArmFamily, Sphere
+from casadi_ik.kinematics.arms.family import ArmFamily, SphericalJoints
 from casadi_ik.kinematics.arms.locked_joints import LockedJointArm, describe_family, sub_chain
 from casadi_ik.kinematics.arms.offset_wrist import OffsetWristArm
 from casadi_ik.kinematics.arms.screws import (
@@ -219,7 +219,9 @@ def _indices(swept: bool) -> tuple[int, int, int, int, int, int]:
     return first, first + 1, first + 2, first + 3, first + 4, first + 5
 
 
-def _sphere(screws: Screws, indices: tuple[int, int, int]) -> tuple[Screws, Sphere, float] | None:
+def _sphere(
+    screws: Screws, indices: tuple[int, int, int]
+) -> tuple[Screws, SphericalJoints, float] | None:
     """Return the chain with an ideal spherical joint of three screws, the joint, and its error.
 
     Returns None if the screws are far from a spherical joint.
@@ -237,7 +239,7 @@ def _sphere(screws: Screws, indices: tuple[int, int, int]) -> tuple[Screws, Sphe
     axes[list(indices)] = z, y, third
     ideal = _through(replace(screws, axes=axes), indices, point)
     offset = float(np.arctan2(third @ x, third @ z))
-    sphere = Sphere(indices, point, np.column_stack([x, y, z]), offset)
+    sphere = SphericalJoints(indices, point, np.column_stack([x, y, z]), offset)
     return ideal, sphere, max(miss, oblique)
 
 

@@ -19,7 +19,7 @@ from casadi_ik.kinematics.forward import Pose, forward, number, sparse
 from casadi_ik.kinematics.smooth import Expr
 from casadi_ik.model.description import RobotDescription
 
-FULL_TURN = 2 * np.pi - 1e-6
+UNLIMITED_RANGE = 2 * np.pi - 1e-6
 """Joint range from which several joint positions give the same rotation [rad]."""
 
 
@@ -56,7 +56,7 @@ class Screws:
     @property
     def multi_turn_joints(self) -> frozenset[int]:
         """Numbers of the joints whose range is a full turn or more."""
-        wide = self.upper - self.lower >= FULL_TURN
+        wide = self.upper - self.lower >= UNLIMITED_RANGE
         return frozenset(i for i, is_wide in zip(self.joints, wide, strict=True) if is_wide)
 
     def reversed(self) -> Screws:

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from casadi_ik.files.arrays import Array
-from casadi_ik.kinematics.arms.family import ClosedForm, ElbowBranch, Redundancy, Sphere
+from casadi_ik.kinematics.arms.family import ClosedForm, ElbowBranch, Redundancy, SphericalJoints
 from casadi_ik.kinematics.arms.screws import (
     CosSin,
     Screws,
@@ -90,7 +90,7 @@ class SphericalArm(SixJoints):
         end: The spherical joint.
     """
 
-    end: Sphere
+    end: SphericalJoints
 
     @property
     def kind(self) -> str:

@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 
 from casadi_ik.files.arrays import Array
-from casadi_ik.kinematics.arms.family import ClosedForm, ElbowBranch, Redundancy, Sphere
+from casadi_ik.kinematics.arms.family import ClosedForm, ElbowBranch, Redundancy, SphericalJoints
 from casadi_ik.kinematics.arms.screws import Screws, subproblem_4
 from casadi_ik.kinematics.forward import Pose
 from casadi_ik.kinematics.se3 import rotation_between, skew
@@ -44,8 +44,8 @@ class SrsArm(ClosedForm):
 
     screws: Screws
     elbow: Array
-    shoulder_joints: Sphere
-    wrist_joints: Sphere
+    shoulder_joints: SphericalJoints
+    wrist_joints: SphericalJoints
     model_error: float = 0.0
 
     @property
@@ -151,7 +151,8 @@ class SrsArm(ClosedForm):
         """Return everything that does not depend on the swivel, for a sign of the elbow.
 
         Returns:
-            The elbow [rad], its reach margin, and the `Sphere.euler_matrix` of shoulder and wrist.
+            The elbow [rad], its reach margin, and the `SphericalJoints.euler_matrix` of shoulder
+            and wrist.
         """
         line = self._shoulder_to_wrist(palm)
         direction = line / ca.fmax(safe_norm(line), MIN_LENGTH)

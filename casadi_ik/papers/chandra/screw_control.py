@@ -68,7 +68,7 @@ class Trajectory:
         """Return the exponential rate [1/s] of the error norm: minus the slope of its logarithm.
 
         Args:
-            floor: Norms at or below it are rounding and left out.
+            floor: Norms up to this are rounding errors and are excluded.
 
         Returns:
             The rate, NaN if fewer than two norms are above the floor.
@@ -84,8 +84,8 @@ class ScrewControl:
 
     Attributes:
         robot: The robot.
-        task: What the fingertip is to do.
-        gain: [1/s]; `gain * period` of the error is removed in a step.
+        task: Task of the fingertip.
+        gain: Gain [1/s]; a step removes the fraction `gain * period` of the error.
         period: Time between two steps [s].
 
     Example:
@@ -114,27 +114,27 @@ class ScrewControl:
         """Build the control law; its step is compiled at the first run and cached on the machine.
 
         Args:
-            robot: From `load_robot`.
-            task: What the fingertip is to do.
-            gain: [1/s], with 0 < gain * period < 2.
+            robot: Robot from `load_robot`.
+            task: Task of the fingertip.
+            gain: Gain with 0 < gain * period < 2 [1/s].
             period: Time between two steps [s].
-            centring: Part of its way back to mid-range that each actuator goes per step, as far
-                as the task leaves it free; 0 keeps still what the task does not move.
-            damping: Of the least squares [unit of a singular value of J over half ranges].
-            length: Length that counts as much as a radian [m]; it matters only where a task cannot
-                be fulfilled. The paper adds m and rad as they are: 1.
-            speed: Fastest motion of an actuator, () or (n,) [unit/s]; None is unlimited.
-            resolution: Steps in which an actuator can be commanded, () or (n,) [rad or m], counted
-                from its lower limit; None or 0 is continuous.
-            compiled: False keeps to CasADi's virtual machine: the same iterates up to rounding,
-                slower.
+            centring: Fraction of the distance to mid-range that each actuator moves per step, as
+                far as the task permits; 0: actuators that do not serve the task do not move.
+            damping: Damping of the least squares [unit of a singular value of J over half ranges].
+            length: Length with the weight of a radian [m]. It matters only for tasks that cannot be
+                met exactly. The paper adds m and rad without weights: 1.
+            speed: Largest speed of an actuator, () or (n,) [unit/s]; None: unlimited.
+            resolution: Increments of actuator commands, () or (n,), counted from the lower limit
+                [rad or m]; None or 0: continuous.
+            compiled: False uses CasADi's virtual machine, which is slower and gives the same
+                iterates up to rounding.
 
         Raises:
-            UnknownNameError: The task names a finger that the robot does not have.
-            InputError: A number that cannot be.
+            UnknownNameError: The robot does not have the finger of the task.
+            InputError: A number is out of range.
         """
         if not isinstance(robot, ArmHand):
-            raise InputError(f"robot: found {robot!r}, expected what load_robot returns")
+            raise InputError(f"robot: found {robot!r}, expected an ArmHand")
         if not isinstance(task, ScrewTask):
             raise InputError(f"task: found {task!r}, expected a ScrewTask")
         self.robot, self.task = robot, task
@@ -147,12 +147,12 @@ class ScrewControl:
         self._numbers = {
             "gain": self.gain * self.period,
             "damping": _number("damping", damping, above=0.0),
-            "centring": _number("centring", centring, least=0.0, most=1.0),
+            "centring": _number("centring", centring, lower=0.0, upper=1.0),
             "length": _number("length", length, above=0.0),
-            "largest_step": np.minimum(_each("speed", fastest, n) * self.period, UNLIMITED),
-            "resolution": _each("resolution", 0.0 if resolution is None else resolution, n),
+            "largest_step": np.minimum(_per_actuator("speed", fastest, n) * self.period, UNLIMITED),
+            "resolution": _per_actuator("resolution", 0.0 if resolution is None else resolution, n),
         }
-        task.chain(robot.description)  # refuses unknown fingers now, not at the run
+        task.chain(robot.description)  # raises an error for an unknown finger
         self._step = _step(robot.description, task)
         self._compiled = compiled
 
@@ -176,7 +176,7 @@ class ScrewControl:
             q: (n,) actuator positions [rad or m].
 
         Raises:
-            InputError: Wrong shape or numbers.
+            InputError: Shape or values of q are invalid.
 
         Example:
             >>> ar10 = ik.load_robot("ar10")
@@ -200,16 +200,16 @@ class ScrewControl:
         """Run the control law.
 
         Args:
-            q0: (n,) start [rad or m], moved into the limits; None is `robot.home`.
-            target: By name: "pose" as a (4, 4) matrix or an (8,) unit dual quaternion, "point"
-                (3,) [m], "normal" (3,), "distance" [m], as the task needs them; in the base frame,
+            q0: (n,) start configuration, clipped to the limits [rad or m]; None: `robot.home`.
+            target: Values of the task's target by name: "pose" as a (4, 4) matrix or an (8,) unit
+                dual quaternion, "point" (3,) [m], "normal" (3,), "distance" [m]; in the base frame,
                 or in the contact frame of the task's `relative_to`.
-            steps: How many steps to make at most; a run that comes to stand still for ever ends.
-            tolerance: Error norm at which the run ends; 0: none.
-            log: Path of an MCAP file to write every step to.
+            steps: Maximum number of steps; a run ends earlier if the actuators no longer move.
+            tolerance: Error norm at which the run ends; 0: never.
+            log: Path of an MCAP file for all steps.
 
         Raises:
-            InputError: Bad start or target.
+            InputError: Start or target is invalid.
             LogError: The log cannot be written.
 
         Example:
@@ -223,13 +223,16 @@ class ScrewControl:
         start = np.clip(self._posture(q0, "q0"), self.robot.lower, self.robot.upper)
         numbers = {
             **self._numbers,
-            "tolerance": _number("tolerance", tolerance, least=0.0),
+            "tolerance": _number("tolerance", tolerance, lower=0.0),
         }
-        asked = self._checked(target)
-        began = time.time_ns()
-        # A row tells of the state before its step: one more shows where the last step led.
+        target_values = self._checked(target)
+        started = time.time_ns()
+        # A row describes the state before its step, so one more row shows the last result.
         result = self.kernel.run(
-            start[None], self._step.parameter_vector(asked, numbers), int(steps) + 1, trace=True
+            start[None],
+            self._step.parameter_vector(target_values, numbers),
+            int(steps) + 1,
+            trace=True,
         )
         rows = result.trace[0]
         status = Status(int(Status.from_loop(result.status)[0]))
@@ -244,7 +247,7 @@ class ScrewControl:
         )
         if log is not None:
             parameters = self.parameters | {"tolerance": {"error_norm": numbers["tolerance"]}}
-            self._write(log, parameters, began, float(result.time[0]), trajectory, rows)
+            self._write(log, parameters, started, float(result.time[0]), trajectory, rows)
         return trajectory
 
     def stepper(self, q0: ArrayLike | None, target: Mapping[str, ArrayLike]) -> Stepper:
@@ -280,7 +283,7 @@ class ScrewControl:
             if name in ("normal", "pose"):
                 length = float(np.linalg.norm(value[:4]))
                 if not length > 1e-9:
-                    raise InputError(f"target: {name}: is zero, expected a unit")
+                    raise InputError(f"target: {name}: found length 0, expected 1")
                 value = value / length
             checked[name] = value
         return checked
@@ -289,12 +292,12 @@ class ScrewControl:
         self,
         path: str | PathLike[str],
         parameters: dict[str, Any],
-        began: int,
+        started: int,
         seconds: float,
         trajectory: Trajectory,
         rows: NDArray[Any],
     ) -> None:
-        """Return a run as one solve of a log, with free contacts."""
+        """Write a run as one solve of a log with free contacts."""
         n, count = len(self.robot.fingers), np.array([len(rows)])
         free = np.full((1, n, 3), np.nan)
         batch = BatchSolution(
@@ -330,7 +333,7 @@ class ScrewControl:
             seed=0,
             batch=batch,
             rows=rows,
-            started=np.array([began]),
+            started=np.array([started]),
         )
         with McapRecorder(
             path,
@@ -358,19 +361,24 @@ def _target_kernel(step: ScrewControlStep, compiled: bool) -> FunctionKernel:
 
 
 def _number(
-    name: str, value: Any, *, above: float = -math.inf, least: float = -math.inf, most=math.inf
+    name: str, value: Any, *, above: float = -math.inf, lower: float = -math.inf, upper=math.inf
 ) -> float:
+    """Return a finite number > above in [lower, upper].
+
+    Raises:
+        InputError: The value is not such a number.
+    """
     try:
         number = float(value)
     except (TypeError, ValueError):
         number = math.nan
-    if math.isfinite(number) and number > above and least <= number <= most:
+    if math.isfinite(number) and number > above and lower <= number <= upper:
         return number
-    bounds = f" > {above}" if above > -math.inf else f" from {least} to {most}"
+    bounds = f" > {above}" if above > -math.inf else f" from {lower} to {upper}"
     raise InputError(f"{name}: found {value!r}, expected a number{bounds}")
 
 
-def _each(name: str, value: ArrayLike, n: int) -> Array:
+def _per_actuator(name: str, value: ArrayLike, n: int) -> Array:
     """Return a checked non-negative value per actuator."""
     array = np.asarray(value, dtype=float)
     if array.shape not in ((), (n,)) or np.isnan(array).any() or (array < 0).any():

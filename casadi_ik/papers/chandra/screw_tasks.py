@@ -169,8 +169,8 @@ def _position(tip: Tip, target: dict[str, Expr]) -> Rows:
 def _planar_pose(tip: Tip, target: dict[str, Expr]) -> Rows:
     """Return the two coordinates in the plane and the angle about its normal.
 
-    The turn's row is exact where the tip turns about that normal alone, as a finger with parallel
-    axes does; elsewhere it is an approximation that still vanishes at the target.
+    The row of the angle is exact if the tip rotates only about this normal, as that of a finger
+    with parallel axes does; otherwise it is an approximation that vanishes at the target.
     """
     first = perpendicular(tip.axis)
     plane = ca.horzcat(first, ca.cross(tip.axis, first)).T
@@ -190,53 +190,53 @@ def _distance(tip: Tip, target: dict[str, Expr]) -> Rows:
 def _contact(tip: Tip, target: dict[str, Expr]) -> Rows:
     """Return point and normal; the rotation about the normal is free."""
     normal = tip.normal_now
-    turning = tip.angular - normal @ (normal.T @ tip.angular)
+    tilting = tip.angular - normal @ (normal.T @ tip.angular)
     return Rows(
         ca.vertcat(target["point"] - tip.point, normal_error(normal, target["normal"])),
-        ca.vertcat(tip.linear, turning),
+        ca.vertcat(tip.linear, tilting),
         3,
     )
 
 
 @dataclass(frozen=True)
 class Objective:
-    """How a kind of task is written.
+    """Equations of a kind of task.
 
     Attributes:
-        target: Fields of its target.
-        rows: Its rows, from a tip and the target's values.
+        target: Fields of the target.
+        rows: Function that returns the rows for a tip and a target.
     """
 
     target: tuple[Field, ...]
     rows: Callable[[Tip, dict[str, Expr]], Rows]
 
 
-POSE = Field("pose", (8,), doc="desired pose of the tip, unit dual quaternion")
-POINT = Field("point", (3,), unit="m", doc="desired contact point")
-NORMAL = Field("normal", (3,), doc="desired outward pad normal, unit")
-DISTANCE = Field("distance", unit="m", doc="desired distance of the two contact points")
+POSE_FIELD = Field("pose", (8,), doc="desired pose of the tip, unit dual quaternion")
+POINT_FIELD = Field("point", (3,), unit="m", doc="desired contact point")
+NORMAL_FIELD = Field("normal", (3,), doc="desired outward pad normal, unit")
+DISTANCE_FIELD = Field("distance", unit="m", doc="desired distance of the two contact points")
 
 OBJECTIVES = {
-    "pose": Objective((POSE,), _pose),
-    "position": Objective((POINT,), _position),
-    "planar-pose": Objective((POSE,), _planar_pose),
-    "distance": Objective((DISTANCE,), _distance),
-    "contact": Objective((POINT, NORMAL), _contact),
+    "pose": Objective((POSE_FIELD,), _pose),
+    "position": Objective((POINT_FIELD,), _position),
+    "planar-pose": Objective((POSE_FIELD,), _planar_pose),
+    "distance": Objective((DISTANCE_FIELD,), _distance),
+    "contact": Objective((POINT_FIELD, NORMAL_FIELD), _contact),
 }
-"""The kinds of tasks."""
+"""Equations by kind of task."""
 
 
 PASSES = 6
-"""Corrections of the active set; a hand has few sliders."""
+"""Maximum number of changes of the active set; a hand has few sliders."""
 
 
 @dataclass(frozen=True, eq=False)
 class ScrewControlStep:
-    """The step of one task on one robot.
+    """Step of a task for a robot.
 
     Attributes:
-        robot: The description.
-        task: What the tip is to do.
+        robot: Description of the robot.
+        task: The task.
     """
 
     robot: RobotDescription
@@ -244,20 +244,23 @@ class ScrewControlStep:
 
     @cached_property
     def state(self) -> Layout:
-        """What a step hands to the next."""
+        """State that a step passes to the next one."""
         return Layout((Field("q", (len(self.robot.actuators),)),))
 
     @cached_property
     def parameters(self) -> Layout:
-        """Target and numbers of the law."""
+        """Target and settings of the control law."""
         n = len(self.robot.actuators)
         return Layout(
             (
                 *self.task.target_fields,
-                Field("gain", doc="part of the error that a step is to remove"),
-                Field("damping", doc="unit of a singular value of J over half ranges"),
-                Field("centring", doc="part of the way to mid-range that z is"),
-                Field("length", unit="m", doc="length that counts as much as a radian"),
+                Field("gain", doc="fraction of the error that a step removes"),
+                Field(
+                    "damping",
+                    doc="damping of the least squares [unit of a singular value of the scaled J]",
+                ),
+                Field("centring", doc="fraction of the distance to mid-range in the null space"),
+                Field("length", unit="m", doc="length with the weight of a radian"),
                 Field("largest_step", (n,), unit="rad or m"),
                 Field("resolution", (n,), unit="rad or m", doc="0: none"),
                 Field("tolerance", doc="error norm below which the loop ends"),
@@ -266,7 +269,7 @@ class ScrewControlStep:
 
     @cached_property
     def record(self) -> Layout:
-        """What is logged of a step; everything but `step_size` is from before it."""
+        """Logged fields of a step; all values except `step_size` refer to its start."""
         return Layout.record(
             Q.of(self.robot),
             Field("point", (3,), "f8", "m", "contact point in the frame of the target"),
@@ -290,7 +293,7 @@ class ScrewControlStep:
 
     @cached_property
     def target_function(self) -> ca.Function:
-        """The target that q fulfils: (q) -> fields of the task's target, in order."""
+        """Function that maps q to the fields of the target that q meets."""
         q, _ = self._symbols()
         fulfilled = values(self.task, self.robot, q)
         name = ca.Function.fix_name(f"screw_target_{self.robot.name}")
@@ -300,41 +303,41 @@ class ScrewControlStep:
         """Return the step graph."""
         state, parameters = self.state.symbols("state"), self.parameters.symbols("parameters")
         q, p = self.state.unpack(state)["q"], self.parameters.unpack(parameters)
-        seen = tip(self.task, self.robot, q)
-        moving = list(seen.motion.tip.actuators)
+        fingertip = tip(self.task, self.robot, q)
+        moving = list(fingertip.motion.tip.actuators)
         objective = rows(self.task, self.robot, q, p)
 
         lower, upper = self.robot.lower[moving], self.robot.upper[moving]
-        half, middle = ca.DM(0.5 * (upper - lower)), ca.DM(0.5 * (lower + upper))
+        half_range, middle = ca.DM(0.5 * (upper - lower)), ca.DM(0.5 * (lower + upper))
         count = objective.error.numel()
         linear = objective.linear
         weights = ca.vertcat(*[1 / p["length"]] * linear, *[1.0] * (count - linear))
-        jacobian = objective.jacobian * (weights @ half.T)
+        jacobian = objective.jacobian * (weights @ half_range.T)
         reach = p["largest_step"][moving]
-        low = ca.fmax(ca.DM(lower) - q[moving], -reach) / half
-        high = ca.fmin(ca.DM(upper) - q[moving], reach) / half
-        # z itself has to lie in the box: the problem is posed in s - z, which starts at 0.
-        z = ca.fmin(ca.fmax(p["centring"] * (middle - q[moving]) / half, low), high)
+        low = ca.fmax(ca.DM(lower) - q[moving], -reach) / half_range
+        high = ca.fmin(ca.DM(upper) - q[moving], reach) / half_range
+        # The unknown is s - z, which starts at 0, so z must lie in the box.
+        z = ca.fmin(ca.fmax(p["centring"] * (middle - q[moving]) / half_range, low), high)
         demand = p["gain"] * weights * objective.error
         box = BoxBounds(z, low, high, first=0)
         step = z + damped_step(jacobian, jacobian @ z - demand, p["damping"] ** 2, box, PASSES).step
 
-        moved = ca.SX(q)
-        moved[moving] = q[moving] + half * step
+        q_free = ca.SX(q)
+        q_free[moving] = q[moving] + half_range * step
         grid = p["resolution"]
         spacing = ca.if_else(grid > 0, grid, 1.0)
         start = ca.DM(self.robot.lower.tolist())
-        rounded = start + spacing * ca.floor((moved - start) / spacing + 0.5)
-        q_next = clamp_to_limits(self.robot, ca.if_else(grid > 0, rounded, moved), 1.0)
+        rounded = start + spacing * ca.floor((q_free - start) / spacing + 0.5)
+        q_next = clamp_to_limits(self.robot, ca.if_else(grid > 0, rounded, q_free), 1.0)
 
         error_norm = safe_norm(objective.error)
-        reached = error_norm <= p["tolerance"]
-        status = ca.if_else(reached, float(Status.SOLVED), float(Status.RUNNING))
-        after = self.state.pack({"q": ca.if_else(reached, q, q_next)})
+        is_solved = error_norm <= p["tolerance"]
+        status = ca.if_else(is_solved, float(Status.SOLVED), float(Status.RUNNING))
+        next_state = self.state.pack({"q": ca.if_else(is_solved, q, q_next)})
         record = self.record.pack(
             {
                 "q": q,
-                "point": seen.point,
+                "point": fingertip.point,
                 "error": objective.error,
                 "error_norm": error_norm,
                 "step_size": ca.mmax(ca.fabs(q_next - q)),
@@ -346,9 +349,9 @@ class ScrewControlStep:
         )
         kind = self.task.kind.replace("-", "_")
         name = ca.Function.fix_name(f"screw_control_{kind}_{self.robot.name}")
-        function = ca.Function(name, [state, parameters], with_cse(after, record, status))
+        function = ca.Function(name, [state, parameters], with_cse(next_state, record, status))
         return StepGraph(name, function, self.state, self.parameters, self.record)
 
     def parameter_vector(self, target: dict[str, Any], numbers: dict[str, Any]) -> Array:
-        """Return the parameters (np,) of a target and the law's numbers."""
+        """Return the parameter vector of a target and the settings of the control law."""
         return self.parameters.pack({**target, **numbers})

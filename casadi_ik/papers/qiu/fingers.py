@@ -1,23 +1,23 @@
-"""Inverse kinematics of the other fingers in the palm frame (Qiu & Kermani 2021, eqs. 4 and 5).
+"""Inverse kinematics of the fingers besides the thumb (Qiu & Kermani 2021, eqs. 4 and 5).
 
-Eq. (4): the desired normal gives the spread and the sum of the flexions. Eq. (5): with both held,
-the flexions that bring the contact point closest to its place, within limits. Two solvers of
-eq. (5) give the same answer: Ipopt on the constrained minimisation as the paper states it, and a
-closed form, since with the sum held the contact runs on a circle.
+Equation (4): the desired normal determines the spread and the sum of the flexions. Equation (5):
+for this spread and sum, the flexions minimise the distance of the contact point to its target,
+within limits. Two solvers of eq. (5) give the same result: Ipopt on the constrained minimisation of
+the paper, and a closed form, because the contact moves on a circle if the sum is constant.
 
-What the paper leaves open and how it is read here: fingers that share a spread motor agree on the
-mean of their demands, weighted by the squared length of the demanded normal's part across the
-spread axis (what the normal loses by a wrong spread); a demand outside the limits is moved to the
-nearest attainable normal. A normal leaves two spreads half a turn apart; taken is the one at which
-the pad faces the side it faces in the middle of its flexion range (for the Barrett hand: flexion
-sums up to 140 of 188 deg).
+The paper leaves two points open. Fingers that share a spread motor use the mean of their demands,
+weighted by the squared length of the demanded normal's component across the spread axis (the error
+of the normal per unit error of the spread). A demand outside the limits is replaced by the nearest
+attainable normal. A normal permits two spreads that differ by half a turn; the chosen one has the
+pad on the side that it faces in the middle of its flexion range (for the Barrett hand: flexion sums
+up to 140 of 188 deg).
 
-That is for fingers that spread about one axis and flex in a plane, recognised from kinematics.
-Such a finger has, from the palm outwards, at most one spread joint and then two parallel flexion
-joints whose axes are perpendicular to the spread axis, and its pad normal lies in the flexion
-plane. Its normal is then the one of Qiu & Kermani 2021, eq. (4): it depends on the spread and on
-the sum of the flexions only. Angles and vectors here are in the *finger frame*, fixed in the palm:
-z along the spread axis, y along the flexion axis at zero spread, origin on the spread axis.
+These equations hold for fingers that spread about one axis and flex in a plane, which are
+recognised from their kinematics. Such a finger has, starting at the palm, at most one spread joint
+and then two parallel flexion joints with axes perpendicular to the spread axis, and its pad normal
+lies in the flexion plane. Its normal depends only on the spread and the sum of the flexions.
+Angles and vectors are in the *finger frame*, which is fixed in the palm: z along the spread axis, y
+along the flexion axis at zero spread, origin on the spread axis.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.joints import Joint
 
 ALIGNED = 1e-9
+"""Largest deviation of an inner product of unit vectors that counts as aligned."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,19 +46,19 @@ class PlanarFinger:
     """Constants of a planar finger.
 
     Attributes:
-        name: The finger.
-        spread: Position in q of the spread actuator, or None.
+        name: Name of the finger.
+        spread: Index in q of the spread actuator, or None.
         ratio: Spread joint angle per unit of its actuator.
         offset: Spread joint angle at actuator zero [rad].
         spread_limits: (2,) limits of the spread joint [rad]; zeros without spread.
-        flexion: Positions in q of the two flexion actuators, proximal first.
-        flexion_limits: (2, 2) their [lower, upper] [rad].
+        flexion: Indices in q of the two flexion actuators, proximal first.
+        flexion_limits: (2, 2) lower and upper limit of each flexion joint [rad].
         frame: (4, 4) pose of the finger frame in the palm frame.
         normal_angle: Angle a_0 of the pad normal from z towards x at zero flexion [rad].
-        proximal: (3,) a point of the first flexion axis, finger frame [m].
-        middle: (3,) from there to the second flexion axis at zero flexion [m].
-        tip: (3,) from there to the contact at zero flexion [m].
-        facing: +1 if the pad faces +x of the finger frame over the flexion range, else -1.
+        proximal: (3,) point on the first flexion axis in the finger frame [m].
+        middle: (3,) vector from this point to the second flexion axis at zero flexion [m].
+        tip: (3,) vector from there to the contact at zero flexion [m].
+        facing: +1 if the pad faces +x of the finger frame in its flexion range, else -1.
     """
 
     name: str
@@ -79,32 +80,32 @@ def planar_finger(robot: RobotDescription, name: str) -> PlanarFinger:
     """Recognise a planar finger.
 
     Args:
-        robot: The description.
-        name: The finger.
+        robot: Description of the robot.
+        name: Name of the finger.
 
     Raises:
-        UnsupportedError: The finger is built otherwise; the message says how.
+        UnsupportedError: The finger is not planar; the message states the difference.
     """
     joints = {joint.name: joint for joint in robot.movable}
     chain = [joints[joint] for joint in robot.finger(name).joints]
-    where = f"robot {robot.name!r}: finger {name!r} is not a planar finger"
+    context = f"robot {robot.name!r}: finger {name!r} is not a planar finger"
     if len(chain) not in (2, 3) or any(joint.type != "revolute" for joint in chain):
         raise UnsupportedError(
-            f"{where}: it has joints {[joint.name for joint in chain]}; expected an optional "
+            f"{context}: it has joints {[joint.name for joint in chain]}; expected an optional "
             "spread joint and two flexion joints, all revolute"
         )
     flexion = chain[-2:]
     for joint in flexion:
         if joint.coupling is not None:
             raise UnsupportedError(
-                f"{where}: {joint.name} follows {joint.coupling.of!r}; expected its own motor"
+                f"{context}: {joint.name} follows {joint.coupling.of!r}; expected a separate motor"
             )
     origins, axes, contact, normal = _reference(robot, name, chain)
     y = axes[-2]
     spread_joint = chain[0] if len(chain) == 3 else None
     z = axes[0] if spread_joint else _perpendicular_direction(normal, y)
     if abs(y @ axes[-1] - 1) > ALIGNED or abs(y @ z) > ALIGNED or abs(y @ normal) > ALIGNED:
-        raise UnsupportedError(f"{where}: its flexion axes are not parallel or not in plane")
+        raise UnsupportedError(f"{context}: its flexion axes are not parallel or not in plane")
     x = np.cross(y, z)
     to_finger = np.stack([x, y, z])
     frame = np.eye(4)
@@ -112,7 +113,7 @@ def planar_finger(robot: RobotDescription, name: str) -> PlanarFinger:
     frame[:3, 3] = origins[0] if spread_joint else origins[-2]
     a_0 = float(np.arctan2(normal @ x, normal @ z))
     limits = np.array([[joint.lower, joint.upper] for joint in flexion])
-    index, ratio, offset = _spread(robot, spread_joint, where)
+    index, ratio, offset = _spread_actuator(robot, spread_joint, context)
     return PlanarFinger(
         name=name,
         spread=index,
@@ -135,16 +136,17 @@ def planar_finger(robot: RobotDescription, name: str) -> PlanarFinger:
     )
 
 
-def _spread(
-    robot: RobotDescription, joint: Joint | None, where: str
+def _spread_actuator(
+    robot: RobotDescription, joint: Joint | None, context: str
 ) -> tuple[int | None, float, float]:
+    """Return the index of the actuator of a spread joint, and ratio and offset of the joint."""
     if joint is None:
         return None, 1.0, 0.0
     if joint.coupling is None:
         return robot.actuator_index(joint.name), 1.0, 0.0
     coupling = joint.coupling
     if coupling.slope is None or coupling.of not in robot.actuator_names:
-        raise UnsupportedError(f"{where}: {joint.name} does not follow a motor linearly")
+        raise UnsupportedError(f"{context}: {joint.name} does not follow a motor linearly")
     return robot.actuator_index(coupling.of), *coupling.slope
 
 
@@ -157,9 +159,9 @@ def _reference(
     point, normal = kinematics.contact(name)
     points = [kinematics.links[joint.child].origin for joint in chain] + [point]
     directions = [kinematics.axes[joint.name] for joint in chain] + [normal]
-    turned = [number(palm.rotation.T @ direction) for direction in directions]
-    moved = [number(palm.inverse_apply(p)) for p in points]
-    return moved[:-1], turned[:-1], moved[-1], turned[-1]
+    p_palm = [number(palm.inverse_apply(point)) for point in points]
+    d_palm = [number(palm.rotation.T @ direction) for direction in directions]
+    return p_palm[:-1], d_palm[:-1], p_palm[-1], d_palm[-1]
 
 
 def _perpendicular_direction(normal: Array, y: Array) -> Array:
@@ -168,8 +170,8 @@ def _perpendicular_direction(normal: Array, y: Array) -> Array:
     return z / np.linalg.norm(z)
 
 
-UNDECIDED = 1e-12
-"""Weight of the current spread; it matters only if no normal determines the spread."""
+CURRENT_SPREAD_WEIGHT = 1e-12
+"""Weight of the current spread, which decides only if no normal determines the spread."""
 
 IPOPT_OPTIONS = {
     "ipopt.print_level": 0,
@@ -193,16 +195,16 @@ class Demand:
     """Result of eq. (4) for one finger: the target of eq. (5).
 
     Attributes:
-        finger: The finger's constants.
-        spread: Spread joint angle [rad], scalar.
+        finger: Constants of the finger.
+        spread_angle: Spread joint angle [rad], scalar.
         flexion_sum: Sum of the flexions [rad], scalar, attainable within limits.
-        reach: (2, 1) where the second flexion axis has to be, seen from the first, in the
-            finger's plane: components along z and x of the finger frame [m].
-        first_limits: (2, 1) limits of the first flexion that leave the second within its own.
+        reach: (2, 1) desired position of the second flexion axis relative to the first in the
+            flexion plane: components along z and x of the finger frame [m].
+        first_limits: (2, 1) limits of the first flexion that keep the second within its limits.
     """
 
     finger: PlanarFinger
-    spread: Expr
+    spread_angle: Expr
     flexion_sum: Expr
     reach: Expr
     first_limits: Expr
@@ -217,24 +219,25 @@ def demands(
     """Return the results of eq. (4) for every finger.
 
     Args:
-        robot: The description.
-        fingers: The fingers to close.
-        q: (n, 1) present actuator positions.
+        robot: Description of the robot.
+        fingers: Fingers to close.
+        q: (n, 1) current actuator positions.
         goals: Targets in the palm frame.
     """
     local = [_in_finger_frame(finger, goals[finger.name]) for finger in fingers]
     spreads = _spreads(robot, fingers, q, local)
     return [
-        _demand(finger, goal, spread)
-        for finger, goal, spread in zip(fingers, local, spreads, strict=True)
+        _demand(finger, goal, angle)
+        for finger, goal, angle in zip(fingers, local, spreads, strict=True)
     ]
 
 
 def closed_form(demand: Demand) -> tuple[Expr, Expr]:
     """Return the two flexions [rad] that solve eq. (5) in closed form.
 
-    The second axis runs on a circle about the first; its nearest point to `reach` is in the same
-    direction, and the distance grows with the angle from there, so the limits simply clamp.
+    The second axis moves on a circle about the first. The point of the circle nearest to `reach` is
+    in its direction, and the distance increases with the angle from there, so that the solution
+    within limits is the clamped angle.
     """
     z, x = float(demand.finger.middle[2]), float(demand.finger.middle[0])
     angle = ca.atan2(
@@ -247,14 +250,14 @@ def closed_form(demand: Demand) -> tuple[Expr, Expr]:
 
 
 class IpoptFinger:
-    """Solver of eq. (5) for one finger by Ipopt; exact Hessian, lengths in millimetres.
+    """Solver of eq. (5) for one finger by Ipopt with exact Hessian and lengths in millimetres.
 
-    The far side of the circle is a local minimum as well where it lies within the limits, so Ipopt
-    starts from whichever of the ends and the middle of the range is best.
+    The opposite side of the circle is a second local minimum if it is within the limits. Ipopt
+    therefore starts from the best one of the ends and the middle of the range.
     """
 
     def __init__(self, finger: PlanarFinger) -> None:
-        """Build the program: variables the two flexions, parameters what `Demand` holds."""
+        """Build the program in the two flexions, with sum and reach of a `Demand` as parameters."""
         x = ca.SX.sym("flexion", 2)
         p = ca.SX.sym("p", 3)
         flexion_sum, reach = p[0], p[1:]
@@ -269,7 +272,7 @@ class IpoptFinger:
         self._limits = finger.flexion_limits
 
     def __call__(self, demand: Demand) -> tuple[Expr, Expr]:
-        """Solve eq. (5): the two flexions [rad] for a demand of MX or DM."""
+        """Return the two flexions [rad] for a demand of MX or DM."""
         solution = self._solver(
             x0=_best_start(demand),
             p=ca.vertcat(demand.flexion_sum, demand.reach),
@@ -285,26 +288,26 @@ def _squared_distance(finger: PlanarFinger, first: Expr, reach: Expr) -> Expr:
     """Return the objective of eq. (5) [mm^2] as a function of the first flexion [rad]."""
     z, x = float(finger.middle[2]), float(finger.middle[0])
     c, s = ca.cos(first), ca.sin(first)
-    place = ca.vertcat(c * z - s * x, s * z + c * x)
-    return ca.sumsqr((place - reach) * 1e3)
+    position = ca.vertcat(c * z - s * x, s * z + c * x)
+    return ca.sumsqr((position - reach) * 1e3)
 
 
 def _best_start(demand: Demand) -> Expr:
-    """Return the best flexions (2, 1) among ends and centre of the range of the first."""
+    """Return the best flexions (2, 1) for the ends and the middle of the first one's range."""
     lower, upper = demand.first_limits[0], demand.first_limits[1]
-    best, least = lower, _squared_distance(demand.finger, lower, demand.reach)
+    best, min_distance = lower, _squared_distance(demand.finger, lower, demand.reach)
     for first in ((lower + upper) / 2, upper):
         distance = _squared_distance(demand.finger, first, demand.reach)
-        best = ca.if_else(distance < least, first, best)
-        least = ca.fmin(distance, least)
+        best = ca.if_else(distance < min_distance, first, best)
+        min_distance = ca.fmin(distance, min_distance)
     return ca.vertcat(best, demand.flexion_sum - best)
 
 
 def planar_fingers(robot: RobotDescription) -> list[PlanarFinger]:
-    """Return the fingers that the step closes: all but the thumb.
+    """Return the fingers that the step closes: all fingers except the thumb.
 
     Raises:
-        UnsupportedError: One of them is not planar; the message says how.
+        UnsupportedError: A finger is not planar; the message states the difference.
     """
     return [planar_finger(robot, name) for name in robot.finger_names if name != robot.thumb]
 
@@ -313,12 +316,12 @@ def finger_step_function(robot: RobotDescription, solver: str) -> ca.Function:
     """Return the finger step as a Function that step graphs call.
 
     Args:
-        robot: The description; its fingers but the thumb must be planar.
+        robot: Description of a robot whose fingers except the thumb are planar.
         solver: "ipopt" or "closed-form".
 
     Returns:
-        ``(q (n, 1), points (3, k), normals (3, k)) -> q' (n, 1)``: targets of the fingers but the
-        thumb, in order, in the palm frame.
+        ``(q (n, 1), points (3, k), normals (3, k)) -> q' (n, 1)`` with the targets of the fingers
+        except the thumb, in order, in the palm frame.
 
     Raises:
         UnsupportedError: A finger is not planar.
@@ -338,7 +341,7 @@ def finger_step_function(robot: RobotDescription, solver: str) -> ca.Function:
             first, second = closed_form(demand)
         entries[finger.flexion[0]], entries[finger.flexion[1]] = first, second
         if finger.spread is not None:
-            entries[finger.spread] = (demand.spread - finger.offset) / finger.ratio
+            entries[finger.spread] = (demand.spread_angle - finger.offset) / finger.ratio
     return ca.Function(
         "finger_step",
         [q, points, normals],
@@ -371,21 +374,21 @@ def _spreads(
     local: Sequence[Target],
 ) -> list[Expr]:
     """Return the spread angle of every finger; fingers on one motor share one angle."""
-    agreed: dict[int, Expr] = {}
+    angles: dict[int, Expr] = {}
     for motor in {finger.spread for finger in fingers if finger.spread is not None}:
-        total, weights = UNDECIDED * q[motor], UNDECIDED
+        total, weights = CURRENT_SPREAD_WEIGHT * q[motor], CURRENT_SPREAD_WEIGHT
         lower, upper = _spread_range(robot, fingers, motor)
         for finger, goal in zip(fingers, local, strict=True):
             if finger.spread == motor:
                 middle = float(finger.spread_limits.mean())
-                across = ca.atan2(finger.facing * goal.normal[1], finger.facing * goal.normal[0])
-                angle = middle + wrap(across - middle)
+                azimuth = ca.atan2(finger.facing * goal.normal[1], finger.facing * goal.normal[0])
+                angle = middle + wrap(azimuth - middle)
                 weight = goal.normal[0] ** 2 + goal.normal[1] ** 2
                 total += weight * (angle - finger.offset) / finger.ratio
                 weights += weight
-        agreed[motor] = clamp(total / weights, lower, upper)
+        angles[motor] = clamp(total / weights, lower, upper)
     return [
-        0.0 if finger.spread is None else finger.ratio * agreed[finger.spread] + finger.offset
+        0.0 if finger.spread is None else finger.ratio * angles[finger.spread] + finger.offset
         for finger in fingers
     ]
 
@@ -393,22 +396,22 @@ def _spreads(
 def _spread_range(
     robot: RobotDescription, fingers: Sequence[PlanarFinger], motor: int
 ) -> tuple[float, float]:
-    """Return the limits of a spread motor that keep it and every joint on it within theirs."""
+    """Return limits of a spread motor that keep it and all its joints within their limits."""
     lower, upper = float(robot.lower[motor]), float(robot.upper[motor])
     for finger in fingers:
         if finger.spread == motor:
-            ends = (finger.spread_limits - finger.offset) / finger.ratio
-            lower, upper = max(lower, float(ends.min())), min(upper, float(ends.max()))
+            limits = (finger.spread_limits - finger.offset) / finger.ratio
+            lower, upper = max(lower, float(limits.min())), min(upper, float(limits.max()))
     return lower, upper
 
 
-def _demand(finger: PlanarFinger, goal: Target, spread: Expr) -> Demand:
-    """Return attainable flexion sum closest to the normal, and the reach it leaves to eq. (5)."""
-    c, s = ca.cos(spread), ca.sin(spread)
+def _demand(finger: PlanarFinger, goal: Target, spread_angle: Expr) -> Demand:
+    """Return the attainable flexion sum closest to the normal, and the reach for eq. (5)."""
+    c, s = ca.cos(spread_angle), ca.sin(spread_angle)
     (low_1, high_1), (low_2, high_2) = finger.flexion_limits
-    across = c * goal.normal[0] + s * goal.normal[1]
+    normal_x = c * goal.normal[0] + s * goal.normal[1]
     middle = (low_1 + low_2 + high_1 + high_2) / 2
-    angle = ca.atan2(across, goal.normal[2]) - finger.normal_angle
+    angle = ca.atan2(normal_x, goal.normal[2]) - finger.normal_angle
     flexion_sum = clamp(middle + wrap(angle - middle), low_1 + low_2, high_1 + high_2)
     x = c * goal.point[0] + s * goal.point[1] - finger.proximal[0]
     z = goal.point[2] - finger.proximal[2]
@@ -417,4 +420,4 @@ def _demand(finger: PlanarFinger, goal: Target, spread: Expr) -> Demand:
     # Rotation about +y by the flexion takes z towards x.
     reach = ca.vertcat(z - (c * tip_z - s * tip_x), x - (s * tip_z + c * tip_x))
     limits = ca.vertcat(ca.fmax(low_1, flexion_sum - high_2), ca.fmin(high_1, flexion_sum - low_2))
-    return Demand(finger, spread, flexion_sum, reach, limits)
+    return Demand(finger, spread_angle, flexion_sum, reach, limits)

@@ -46,6 +46,7 @@ from casadi_ik.solve.status import Phase, Status
 from casadi_ik.solve.trace import STEP_SIZE, RecordedJacobian
 
 NOT_MEASURED = float("nan")
+"""Value of a measurement in iterations that do not compute it."""
 
 
 class EnhancedStep(QiuStep[QiuParameters]):
@@ -378,7 +379,7 @@ class OriginalStep(QiuStep[OriginalParameters]):
 
     @cached_property
     def _kinds(self) -> list[tuple[bool, tuple[int, ...]]]:
-        """By priority of tasks: True for a position, and the actuators that move the task."""
+        """(is a position, actuators that move the task) of each task in order of priority."""
         robot, arm = self.robot, self.robot.arm_actuators
         movers = [(*arm, *robot.finger_actuators(name)) for name in thumb_first(robot)]
         if self.options.order == "per-finger":
@@ -430,7 +431,7 @@ class OriginalStep(QiuStep[OriginalParameters]):
         return ca.Function(f"solve_{count}", [parameters, longest, pair], with_cse(step))
 
     def _pairs(self) -> tuple[list[ca.SX], list[Task]]:
-        """Return symbols of all [J, e], and the tasks over all actuators that they stand for."""
+        """Return symbols of all [J, e], and the tasks over all actuators that they define."""
         n, pairs, tasks = len(self.robot.actuators), [], []
         for i, (is_position, columns) in enumerate(self._kinds):
             pair = ca.SX.sym(f"pair_{i}", 3, len(columns) + 1)

@@ -16,7 +16,7 @@ from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.contacts import target_fields, target_values
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.targets import TargetBatch
-from casadi_ik.papers.qiu.tasks import PROJECTIONS as HIERARCHIES
+from casadi_ik.papers.qiu.tasks import HIERARCHIES
 from casadi_ik.solve.trace import ANGLE_ERROR, LIMIT_MASK, PHASE, POSITION_ERROR, STATUS, Q
 
 ORDERS = ("per-finger", "points-first")

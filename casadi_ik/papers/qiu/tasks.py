@@ -1,8 +1,8 @@
 """Tasks of Qiu & Kermani 2021 and their combination.
 
-Rows of contacts and of the palm's orientation, the estimate of that orientation from contacts
-(1), (2), steps by damped and selectively damped least squares, a task in the null space of those
-before it, and the palm's motion along the closed chain.
+Tasks of contacts and of the palm orientation, the estimate of this orientation from contacts (eqs.
+1 and 2), steps by damped and selectively damped least squares, projection of a task to the null
+space of tasks with higher priority, and the motion of the palm along the closed chain.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ class Task:
     """Position or orientation task of one end effector.
 
     Attributes:
-        jacobian: (3, k) over some actuators [mm or rad per rad or m].
-        error: (3, 1) what is left [mm or rad].
-        is_position: Whether it is a position [mm], else an orientation [rad].
+        jacobian: (3, k) Jacobian with respect to some actuators [mm or rad per rad or m].
+        error: (3, 1) desired minus current value [mm or rad].
+        is_position: True for a position [mm], False for an orientation [rad].
     """
 
     jacobian: Expr
@@ -83,10 +83,11 @@ def contact_tasks(
 ) -> tuple[Task, Task]:
     """Return the tasks of contact point and normal of a finger, Qiu & Kermani 2021, eq. (3)."""
     tip, target = tip_vectors(body.kinematics, finger), goal.vectors
-    place, facing = POINT_AND_NORMAL.conditions
+    point_condition, normal_condition = POINT_AND_NORMAL.conditions
     linear, angular = body.contact_jacobian(finger, actuators)
-    position = Task(linear / MILLIMETRE, place.error(tip, target) / MILLIMETRE, is_position=True)
-    return position, Task(angular, facing.error(tip, target), is_position=False)
+    error = point_condition.error(tip, target) / MILLIMETRE
+    position = Task(linear / MILLIMETRE, error, is_position=True)
+    return position, Task(angular, normal_condition.error(tip, target), is_position=False)
 
 
 def damped(damping: Expr) -> TaskSolver:
@@ -99,8 +100,8 @@ def selective(gamma_max: Expr, longest: Expr, widest: Expr) -> TaskSolver:
 
     Args:
         gamma_max: Largest change of any actuator [rad or m].
-        longest: Position errors are shortened to this [mm].
-        widest: Orientation errors are shortened to this [rad].
+        longest: Largest position error; longer errors are scaled down [mm].
+        widest: Largest orientation error; larger errors are scaled down [rad].
     """
 
     def solve(task: Task) -> Expr:
@@ -131,15 +132,15 @@ def clamped(error: Expr, longest: Expr) -> Expr:
     return error * ca.fmin(1.0, longest / ca.fmax(safe_norm(error), 1e-12))
 
 
-PROJECTIONS = ("successive", "augmented", "none")
-"""Null spaces to which lower tasks are projected."""
+HIERARCHIES = ("successive", "augmented", "none")
+"""Hierarchies of tasks; see `combine`."""
 
-EXACT = 1e-6
-"""Damping of an `exact` projector [unit of the task's Jacobian]."""
+EXACT_DAMPING = 1e-6
+"""Damping of a projector without a given damping [unit of the task's Jacobian]."""
 
 RANK_FLOOR = 1e-3
-"""Damping of the augmented projector [rad/rad, and m/rad]: below it a row left over
-from the higher tasks counts as dependent on them."""
+"""Damping of the augmented projector [rad/rad, and m/rad]. The component of a row that higher tasks
+leave free counts as zero below this norm."""
 
 
 def combine(
@@ -148,16 +149,16 @@ def combine(
     projection: str,
     damping: float | None = None,
 ) -> Expr:
-    """Return one step (k, 1) for all tasks, in order of priority.
+    """Return the step (k, 1) for all tasks.
 
     Args:
-        tasks: From the highest priority to the lowest, over the same actuators.
-        steps: (k, 1) of every task by itself.
-        projection: "successive": dq_1 + N_1 dq_2 + N_1 N_2 dq_3 + ..., each N_i of its own task
-            only. "augmented": dq_1 + N_1 dq_2 + N_12 dq_3 + ..., N_12 of the tasks 1 and 2 stacked.
-            "none": the plain sum, no priorities.
-        damping: Of the pseudoinverse in the projectors [mm; rad/rad], so that a lower task leaks
-            into the higher ones; None: the projectors are exact wherever that is possible.
+        tasks: Tasks of the same actuators in order of decreasing priority.
+        steps: (k, 1) step of each task without the other tasks.
+        projection: "successive": dq_1 + N_1 dq_2 + N_1 N_2 dq_3 + ..., where N_i projects to the
+            null space of task i. "augmented": dq_1 + N_1 dq_2 + N_12 dq_3 + ..., where N_12
+            projects to that of the stacked tasks 1 and 2. "none": the sum, without priorities.
+        damping: Damping of the pseudoinverse in the projectors [mm; rad/rad], with which lower
+            tasks disturb higher ones; None: exact projectors except near singularities.
     """
     if projection == "none":
         return sum(steps[1:], steps[0])
@@ -166,7 +167,7 @@ def combine(
         for level in range(1, len(tasks)):
             step = steps[level]
             for higher in reversed(tasks[:level]):
-                step = project_to_null_space(higher.jacobian, step, damping or EXACT)
+                step = project_to_null_space(higher.jacobian, step, damping or EXACT_DAMPING)
             total = total + step
         return total
     projectors: list[Projector] = []
@@ -182,8 +183,7 @@ def combine(
 class Projector:
     """Projector N = I - Y' Z with Z = (Y Y' + damping^2 I)^-1 Y, stored as factors (3, k).
 
-    Multiplied with vectors one after the other they take a third of the instructions of a product
-    of the matrices.
+    Products of the factors with a vector take a third of the instructions of the matrix N.
     """
 
     Y: Expr
@@ -201,7 +201,7 @@ class Projector:
 def _projector(task: Task, higher: Sequence[Projector], damping: float | None) -> Projector:
     """Return the factor N_k of the projector N_1 N_2 ... N_k onto the null space of k tasks.
 
-    Y = J N_1 ... N_k-1 is the part of the task that the higher ones left to it.
+    Y = J N_1 ... N_k-1 is the component of the task in the null space of the higher tasks.
     """
     Y = task.jacobian
     if damping is None:
@@ -209,7 +209,7 @@ def _projector(task: Task, higher: Sequence[Projector], damping: float | None) -
     for projector in higher:
         Y = projector.of_rows(Y)
     G = Y @ Y.T + damping**2 * ca.DM.eye(Y.shape[0])
-    # Structurally zero columns stay so: the highest tasks have many.
+    # Structural zeros are kept, because the highest tasks have many zero columns.
     columns = sorted(set(Y.sparsity().get_col()))
     Z = type(Y)(*Y.shape)
     Z[:, columns] = solve_spd(G, Y[:, columns])
@@ -217,7 +217,7 @@ def _projector(task: Task, higher: Sequence[Projector], damping: float | None) -
 
 
 NEGLIGIBLE = 1e-9
-"""Singular values below this fraction of the largest are zero; their directions unreachable."""
+"""Fraction of the largest singular value below which a singular value counts as zero."""
 
 
 def selectively_damped(jacobian: Expr, error: Expr, gamma_max: Expr) -> Expr:
@@ -229,12 +229,12 @@ def selectively_damped(jacobian: Expr, error: Expr, gamma_max: Expr) -> Expr:
     shortens a vector so that no entry is larger in magnitude.
 
     Args:
-        jacobian: (m, n) of one end effector's position or orientation.
-        error: (m, 1), already shortened to the longest error that is to be followed.
+        jacobian: (m, n) Jacobian of the position or orientation of an end effector.
+        error: (m, 1) error, scaled down to the largest error that a step follows.
         gamma_max: Largest change of any joint in one step [rad or m].
 
     Returns:
-        (n, 1) joint step; the pseudo-inverse step wherever nothing needs damping.
+        (n, 1) joint step; without damping, the step of the pseudoinverse.
     """
     n = jacobian.shape[1]
     U, s, V = svd(jacobian)
@@ -260,8 +260,8 @@ def shorten(step: Expr, largest: Expr) -> Expr:
 def axes_through(points: list[ca.SX]) -> ca.SX:
     """Return the frame of eqs. (1) and (2) through three or more points.
 
-    X runs from the last point to the second, Y from the middle of those towards the first (the
-    thumb), Z = X x Y, and X = Y x Z makes them orthogonal.
+    X points from the last point to the second, Y from their midpoint to the first (the thumb), Z is
+    X x Y, and X is replaced by Y x Z to make the axes orthogonal.
 
     Args:
         points: Points (3, 1) [m], the thumb's first.
@@ -281,7 +281,7 @@ def axes_through(points: list[ca.SX]) -> ca.SX:
 def base_axes(robot: RobotDescription) -> Array:
     """Return the frame of eqs. (1), (2) through the finger bases, palm frame (3, 3).
 
-    The paper's palm frame has it as the identity; another hand's palm frame may be turned.
+    It is the identity for the palm frame of the paper; palm frames of other hands may be rotated.
 
     Raises:
         UnsupportedError: The robot has fewer than three fingers.
@@ -303,7 +303,7 @@ def base_axes(robot: RobotDescription) -> Array:
 def palm_orientation(robot: RobotDescription, goal: dict[str, Target]) -> ca.SX:
     """Return the estimated palm orientation (3, 3) in the frame of the targets.
 
-    The contact points stand in for the fingers' base points.
+    The contact points replace the base points of the fingers.
     """
     points = [goal[name].point for name in thumb_first(robot)]
     return ca.densify(axes_through(points) @ ca.SX(ca.DM(base_axes(robot).T)))
@@ -311,8 +311,8 @@ def palm_orientation(robot: RobotDescription, goal: dict[str, Target]) -> ca.SX:
 
 def thumb_first(robot: RobotDescription) -> tuple[str, ...]:
     """Return the finger names with the thumb in front."""
-    others = tuple(name for name in robot.finger_names if name != robot.thumb)
-    return (robot.thumb, *others)
+    fingers = tuple(name for name in robot.finger_names if name != robot.thumb)
+    return (robot.thumb, *fingers)
 
 
 def palm_motion(body: ActuatedKinematics, goals: dict[str, Target]) -> tuple[ca.SX, ca.SX]:
@@ -320,7 +320,7 @@ def palm_motion(body: ActuatedKinematics, goals: dict[str, Target]) -> tuple[ca.
 
     Args:
         body: Kinematics over q.
-        goals: Targets of the fingers that take part, base frame.
+        goals: Targets of the fingers in the base frame.
 
     Returns:
         translation (3, 1) [mm], eq. (13), and rotation vector (3, 1) [rad], eq. (12).
@@ -329,8 +329,8 @@ def palm_motion(body: ActuatedKinematics, goals: dict[str, Target]) -> tuple[ca.
     rotations, translations = [], []
     for name, goal in goals.items():
         point, normal = body.kinematics.contact(name)
-        # Everything is seen from the palm. With the shortest rotation between the normals given
-        # in palm coordinates, the sandwich of eq. (12) by the fingertip frame is already done.
+        # In palm coordinates, the shortest rotation between the normals already includes the
+        # similarity transform of eq. (12) by the fingertip frame.
         turn = rotation_between(palm.rotation.T @ normal, palm.rotation.T @ goal.normal)
         shift = palm.rotation.T @ (goal.point - point) / MILLIMETRE
         twist = log_se3((turn, shift))

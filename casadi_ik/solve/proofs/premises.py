@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.files.arrays import Array
-from casadi_ik.kinematics.arms.family import Sphere
+from casadi_ik.kinematics.arms.family import SphericalJoints
 from casadi_ik.kinematics.arms.recognise import srs_arm
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.joints import Joint
@@ -296,7 +296,7 @@ def arm_cones(robot: RobotDescription) -> ArmCones | None:
     if arm is None:
         return None
 
-    def third_axis(joints: Sphere) -> Array:
+    def third_axis(joints: SphericalJoints) -> Array:
         return joints.frame @ [np.sin(joints.offset), 0.0, np.cos(joints.offset)]
 
     upper, fore = (float(np.linalg.norm(link)) for link in (arm.upper_arm, arm.forearm))

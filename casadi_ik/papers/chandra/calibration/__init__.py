@@ -14,7 +14,7 @@ from casadi_ik.papers.chandra.calibration.measurements import (
     write_measurements,
 )
 from casadi_ik.papers.chandra.calibration.model import (
-    GROUPS,
+    PARAMETER_GROUPS,
     HandModel,
     Parameter,
     Priors,
@@ -22,8 +22,8 @@ from casadi_ik.papers.chandra.calibration.model import (
 )
 
 __all__ = [
-    "GROUPS",
     "LOSSES",
+    "PARAMETER_GROUPS",
     "Calibration",
     "HandModel",
     "Measurements",

@@ -101,9 +101,10 @@ class Calibration:
     Attributes:
         parameters: Estimated parameters.
         values: (k,) estimates.
-        covariance: (k, k) of the estimates.
-        singular_values: (k,) of the whitened Jacobian in units of the priors, descending.
-        directions: (k, k) their directions in units of the priors, one per row.
+        covariance: (k, k) covariance of the estimates.
+        singular_values: (k,) singular values of the whitened Jacobian in units of the priors, in
+            descending order.
+        directions: (k, k) right singular vectors in units of the priors, one per row.
         weights: (m,) weight of each measurement, 1 for an inlier.
         noise: Standard deviations of a measured coordinate [m] and angle [rad]; NaN if no
             orientation was measured.
@@ -188,16 +189,16 @@ def calibrate(
     """Estimate the parameters of a model.
 
     Args:
-        model: The description with its free numbers.
+        model: Description with free parameters.
         measurements: Measured poses.
         loss: "cauchy" (the default), "huber", or "squares" (not robust).
-        sigma_position: Noise of a measured coordinate [m] to begin with; with too few data to
-            estimate it, it is taken as it is.
-        sigma_angle: The same of a measured angle [rad].
+        sigma_position: Initial value of the noise of a measured coordinate, which is not changed if
+            there are too few data to estimate it [m].
+        sigma_angle: Initial value of the noise of a measured angle [rad].
 
     Raises:
         UnknownNameError: The loss does not exist.
-        InputError: A noise is not positive.
+        InputError: A standard deviation is not positive.
     """
     if loss not in LOSSES:
         raise UnknownNameError(f"loss: found {loss!r}, expected one of {', '.join(LOSSES)}")

@@ -1,4 +1,4 @@
-"""Measured fingertip poses: from a CSV file, from arrays, or simulated with noise and outliers."""
+"""Measured fingertip poses from CSV files and arrays, and simulated ones with outliers."""
 
 from __future__ import annotations
 
@@ -22,8 +22,11 @@ from casadi_ik.kinematics.screws import finger_chain
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.papers.chandra.calibration.model import HandModel
 
-POINT = ("x", "y", "z")
-TURN = ("qw", "qx", "qy", "qz")
+POINT_COLUMNS = ("x", "y", "z")
+"""Columns of the contact point."""
+
+QUATERNION_COLUMNS = ("qw", "qx", "qy", "qz")
+"""Columns of the orientation of the contact frame."""
 
 STROKE_SLACK = 1e-3
 """Largest violation of the limits by a reading, relative to the range of the actuator."""
@@ -35,9 +38,9 @@ class Measurements:
 
     Attributes:
         fingers: (m,) name of the finger of each row.
-        q: (m, n) actuator positions [rad or m]; home where an actuator does not move the finger.
+        q: (m, n) actuator positions; home for actuators that do not move the finger [rad or m].
         poses: (m, 8) unit dual quaternions of the contact frames in the base frame.
-        turned: (m,) whether the orientation was measured too.
+        turned: (m,) True if the orientation was also measured.
     """
 
     fingers: tuple[str, ...]
@@ -54,7 +57,7 @@ class Measurements:
         return tuple(dict.fromkeys(self.fingers))
 
     def rows(self, finger: str) -> NDArray[np.intp]:
-        """Return the rows of a finger."""
+        """Return the indices of the rows of a finger."""
         return np.flatnonzero([name == finger for name in self.fingers])
 
 
@@ -68,10 +71,11 @@ def read_measurements(path: Path, robot: RobotDescription) -> Measurements:
 
     Args:
         path: The file.
-        robot: The robot it is about.
+        robot: Description of the measured robot.
 
     Raises:
-        InputError: It cannot be read, or holds what cannot be; the message names line and column.
+        InputError: The file cannot be read or holds invalid values; the message names line and
+            column.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
@@ -97,11 +101,11 @@ def write_measurements(measurements: Measurements, robot: RobotDescription, path
     """Write a CSV file that `read_measurements` reads.
 
     Raises:
-        OSError: It cannot be written.
+        OSError: The file cannot be written.
     """
     with path.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)
-        writer.writerow(["finger", *robot.actuator_names, *POINT, *TURN])
+        writer.writerow(["finger", *robot.actuator_names, *POINT_COLUMNS, *QUATERNION_COLUMNS])
         rows = zip(
             measurements.fingers,
             measurements.q,
@@ -109,26 +113,32 @@ def write_measurements(measurements: Measurements, robot: RobotDescription, path
             measurements.turned,
             strict=True,
         )
-        for finger, q, pose, turned in rows:
+        for finger, q, pose, has_orientation in rows:
             point = np.array(dq.translation(ca.DM(pose))).ravel()
-            turn = pose[:4].tolist() if turned else [""] * 4
-            writer.writerow([finger, *q.tolist(), *point.tolist(), *turn])
+            quaternion = pose[:4].tolist() if has_orientation else [""] * 4
+            writer.writerow([finger, *q.tolist(), *point.tolist(), *quaternion])
 
 
 def _check_header(header: Sequence[str], robot: RobotDescription, path: Path) -> None:
-    known = ("finger", *POINT, *TURN, *robot.actuator_names)
-    where = f"{path}:1"
+    """Check the names of the columns.
+
+    Raises:
+        InputError: A column is unknown, missing or given twice.
+    """
+    columns = ("finger", *POINT_COLUMNS, *QUATERNION_COLUMNS, *robot.actuator_names)
     for name in header:
-        if name not in known:
-            raise InputError(f"{where}: unknown column {name!r}; known: {', '.join(known)}")
+        if name not in columns:
+            raise InputError(f"{path}:1: column {name!r} is unknown; expected {', '.join(columns)}")
         if header.count(name) > 1:
-            raise InputError(f"{where}: column {name!r} appears twice")
-    for name in ("finger", *POINT):
+            raise InputError(f"{path}:1: column {name!r} appears twice")
+    for name in ("finger", *POINT_COLUMNS):
         if name not in header:
-            raise InputError(f"{where}: column {name!r} is missing")
-    turn = [name for name in TURN if name in header]
-    if turn and len(turn) < 4:
-        raise InputError(f"{where}: found {', '.join(turn)}, expected all or none of qw,qx,qy,qz")
+            raise InputError(f"{path}:1: column {name!r} is missing")
+    quaternion = [name for name in QUATERNION_COLUMNS if name in header]
+    if quaternion and len(quaternion) < 4:
+        raise InputError(
+            f"{path}:1: found {', '.join(quaternion)}, expected all or none of qw,qx,qy,qz"
+        )
 
 
 def _row(
@@ -139,8 +149,13 @@ def _row(
     moving: Mapping[str, tuple[int, ...]],
     path: Path,
 ) -> tuple[str, Array, Array, bool]:
+    """Return finger, q, pose, and True if the row has an orientation.
+
+    Raises:
+        InputError: A cell is missing or invalid.
+    """
     if len(cells) != len(header):
-        raise InputError(f"{path}:{line}: found {len(cells)} columns, the header has {len(header)}")
+        raise InputError(f"{path}:{line}: found {len(cells)} columns, expected {len(header)}")
     row = {name: cell.strip() for name, cell in zip(header, cells, strict=True)}
     finger = row["finger"]
     if finger not in robot.finger_names:
@@ -172,20 +187,22 @@ def _row(
                 f"[{actuator.lower:g}, {actuator.upper:g}] {actuator.unit}"
             )
         q[index] = value
-    point = np.array([number(column) for column in POINT])
-    turned = any(row.get(column) for column in TURN)
-    turn = np.array([number(column) for column in TURN]) if turned else np.array([1.0, 0, 0, 0])
-    unit = checked_quaternion(turn, f"{path}:{line}: qw..qz")
+    point = np.array([number(column) for column in POINT_COLUMNS])
+    has_orientation = any(row.get(column) for column in QUATERNION_COLUMNS)
+    quaternion = np.array([1.0, 0, 0, 0])
+    if has_orientation:
+        quaternion = np.array([number(column) for column in QUATERNION_COLUMNS])
+    unit = checked_quaternion(quaternion, f"{path}:{line}: qw..qz")
     pose = dq.from_quaternion(ca.DM(unit), ca.DM(point))
-    return finger, q, np.array(pose).ravel(), turned
+    return finger, q, np.array(pose).ravel(), has_orientation
 
 
 def true_values(model: HandModel, rng: np.random.Generator) -> Array:
-    """Return parameters (k,) of a hand, drawn from the priors of a description.
+    """Draw parameters (k,) of a hand from the priors of its description.
 
     Args:
-        model: The model; deviations are normal with its priors, cut at 2.5 of them.
-        rng: Source of the deviations.
+        model: The model; deviations are normal and clipped at 2.5 standard deviations.
+        rng: Random number generator.
     """
     deviations = np.clip(rng.standard_normal(len(model.prior)), -2.5, 2.5)
     return model.nominal + model.prior * deviations
@@ -202,17 +219,17 @@ def simulate(
     outliers: float = 0.0,
     factor: float = 20.0,
 ) -> Measurements:
-    """Return the poses of a fingertip at random actuator positions, with noise.
+    """Simulate noisy measurements of a fingertip at random actuator positions.
 
     Args:
         model: The model.
-        values: (k,) its true parameters.
-        finger: The finger that is measured.
-        count: How many poses.
-        rng: Source of positions and noise.
+        values: (k,) true parameters.
+        finger: Name of the measured finger.
+        count: Number of poses.
+        rng: Random number generator.
         noise: Standard deviations of a coordinate [m] and of an angle [rad].
-        outliers: Part of the poses whose noise is `factor` times as large.
-        factor: See `outliers`.
+        outliers: Fraction of the poses whose noise is multiplied by `factor`.
+        factor: Factor of the noise of outliers.
     """
     robot = model.robot
     columns = list(finger_chain(robot, finger).actuators)
@@ -220,15 +237,15 @@ def simulate(
     q[:, columns] = rng.uniform(robot.lower[columns], robot.upper[columns], (count, len(columns)))
     scale = np.where(rng.random(count) < outliers, factor, 1.0)[:, None]
     shifts = noise[0] * scale * rng.standard_normal((count, 3))
-    turns = noise[1] * scale * rng.standard_normal((count, 3))
-    (seen,) = _displaced()(model.poses(finger, q, values), turns, shifts)
-    return Measurements((finger,) * count, q, seen, np.ones(count, dtype=bool))
+    rotations = noise[1] * scale * rng.standard_normal((count, 3))
+    (poses,) = _displaced()(model.poses(finger, q, values), rotations, shifts)
+    return Measurements((finger,) * count, q, poses, np.ones(count, dtype=bool))
 
 
 @cache
 def _displaced() -> FunctionKernel:
-    """Return a pose rotated about its origin and translated, both in the base frame."""
-    pose, turn, shift = ca.SX.sym("pose", 8), ca.SX.sym("turn", 3), ca.SX.sym("shift", 3)
-    turned = dq.quaternion_multiply(dq.exp(turn, ca.DM.zeros(3, 1))[:4], pose[:4])
-    moved = dq.from_quaternion(turned, dq.translation(pose) + shift)
-    return FunctionKernel(ca.Function("displaced_pose", [pose, turn, shift], [moved]))
+    """Return a kernel that rotates a pose about its origin and translates it in the base frame."""
+    pose, rotation, shift = ca.SX.sym("pose", 8), ca.SX.sym("turn", 3), ca.SX.sym("shift", 3)
+    quaternion = dq.quaternion_multiply(dq.exp(rotation, ca.DM.zeros(3, 1))[:4], pose[:4])
+    displaced = dq.from_quaternion(quaternion, dq.translation(pose) + shift)
+    return FunctionKernel(ca.Function("displaced_pose", [pose, rotation, shift], [displaced]))

@@ -1,8 +1,8 @@
 """Parametric hand model: parameters with priors, and fingertip poses as functions of them.
 
-The same graphs as everywhere: eq. (8) for the triangles, eq. (9) for the four-bars, eq. (3) for the
-chain (Chandra et al. 2019), with the description's numbers as inputs. A four-bar keeps the branch
-of its known pose.
+The graphs are those of the robot (Chandra et al. 2019, eq. 8 for triangles, eq. 9 for four-bars,
+eq. 3 for chains) with the numbers of the description as inputs. A four-bar stays on the branch of
+its known pose.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from casadi_ik.kinematics.smooth import Expr, with_cse
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.joints import Joint
 
-GROUPS = ("linkage", "axes", "tips")
-"""Numbers of the couplings; origins and directions of the joint axes; contact frames."""
+PARAMETER_GROUPS = ("linkage", "axes", "tips")
+"""Groups of parameters: couplings, origins and directions of joint axes, contact frames."""
 
 BOUND = 3.0
 """Bound of estimates around the description [prior standard deviations]."""
@@ -37,12 +37,12 @@ class Priors:
     """Standard deviations of the errors of a description.
 
     Attributes:
-        length: Sides of triangles and four-bars [m].
+        length: Lengths in triangles and four-bars [m].
         angle: Reference angles of the couplings [rad].
-        origin: Every coordinate of a point of a joint axis [m].
+        origin: Coordinates of a point on a joint axis [m].
         axis: Tilts of a joint axis [rad].
-        tip: Every coordinate of a contact point [m].
-        tip_angle: Turns of a contact frame [rad].
+        tip: Coordinates of a contact point [m].
+        tip_angle: Rotations of a contact frame [rad].
     """
 
     length: float = 0.5e-3
@@ -63,11 +63,11 @@ class Parameter:
     """An estimated parameter.
 
     Attributes:
-        owner: The joint or finger it belongs to.
+        owner: Name of the joint or finger.
         part: "coupling", "origin", "axis", "tip" or "turn".
-        key: Which number: a field of the coupling, "x", "y", "z", or the tilt "1", "2".
-        nominal: What the description says; 0 for tilts and turns.
-        prior: Standard deviation.
+        key: Field of the coupling, coordinate "x", "y" or "z", or tilt "1" or "2".
+        nominal: Value in the description; 0 for tilts and rotations.
+        prior: Standard deviation of the prior.
         unit: "m" or "rad".
     """
 
@@ -87,35 +87,35 @@ class Parameter:
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """Smallest and largest value."""
+        """Smallest and largest value of an estimate."""
         return self.nominal - BOUND * self.prior, self.nominal + BOUND * self.prior
 
 
 def hand_parameters(
     robot: RobotDescription,
     fingers: Sequence[str],
-    groups: Sequence[str] = GROUPS,
+    groups: Sequence[str] = PARAMETER_GROUPS,
     priors: Priors | None = None,
 ) -> tuple[Parameter, ...]:
-    """Return the parameters of fingers, from the palm to the tips, without duplicates.
+    """Return the parameters of fingers from the palm to the tips, without duplicates.
 
     Args:
-        robot: The description.
-        fingers: Fingers that were measured.
-        groups: Which kinds of numbers.
-        priors: How far they may be off.
+        robot: Description of the robot.
+        fingers: Names of the measured fingers.
+        groups: Groups of parameters to estimate.
+        priors: Standard deviations of the errors of the description.
 
     Raises:
-        UnknownNameError: There is no such finger.
-        InputError: No fingers, or an unknown group.
+        UnknownNameError: A finger does not exist.
+        InputError: There are no fingers, or a group is unknown.
     """
-    unknown = [group for group in groups if group not in GROUPS]
+    unknown = [group for group in groups if group not in PARAMETER_GROUPS]
     if unknown or not groups:
         wrong = repr(unknown[0]) if unknown else "nothing"
-        raise InputError(f"groups: found {wrong}, expected some of {', '.join(GROUPS)}")
+        raise InputError(f"groups: found {wrong}, expected some of {', '.join(PARAMETER_GROUPS)}")
     if not fingers:
-        raise InputError("fingers: none, expected at least one")
-    spread = priors or Priors()
+        raise InputError("fingers: found none, expected at least one")
+    deviations = priors or Priors()
     rows: list[tuple[str, str, str, float, float, str]] = []
     for finger in fingers:
         chain = robot.chain(robot.finger(finger).link)
@@ -123,21 +123,25 @@ def hand_parameters(
             name, coupling = joint.name, joint.coupling
             if "linkage" in groups and coupling is not None:
                 for keys, prior, unit in (
-                    (coupling.lengths, spread.length, "m"),
-                    (coupling.angles, spread.angle, "rad"),
+                    (coupling.lengths, deviations.length, "m"),
+                    (coupling.angles, deviations.angle, "rad"),
                 ):
                     for key in keys:
                         value = float(getattr(coupling, key))
                         rows.append((name, "coupling", key, value, prior, unit))
             if "axes" in groups:
-                at = zip("xyz", joint.placement[:3, 3].tolist(), strict=True)
-                rows += [(name, "origin", key, value, spread.origin, "m") for key, value in at]
-                rows += [(name, "axis", key, 0.0, spread.axis, "rad") for key in "12"]
+                coordinates = zip("xyz", joint.placement[:3, 3].tolist(), strict=True)
+                rows += [
+                    (name, "origin", key, value, deviations.origin, "m")
+                    for key, value in coordinates
+                ]
+                rows += [(name, "axis", key, 0.0, deviations.axis, "rad") for key in "12"]
         if "tips" in groups:
-            at = zip("xyz", robot.finger(finger).placement[:3, 3].tolist(), strict=True)
-            rows += [(finger, "tip", key, value, spread.tip, "m") for key, value in at]
-            rows += [(finger, "turn", key, 0.0, spread.tip_angle, "rad") for key in "xyz"]
-    return tuple({one.name: one for one in (Parameter(*row) for row in rows)}.values())
+            coordinates = zip("xyz", robot.finger(finger).placement[:3, 3].tolist(), strict=True)
+            rows += [(finger, "tip", key, value, deviations.tip, "m") for key, value in coordinates]
+            rows += [(finger, "turn", key, 0.0, deviations.tip_angle, "rad") for key in "xyz"]
+    parameters = (Parameter(*row) for row in rows)
+    return tuple({parameter.name: parameter for parameter in parameters}.values())
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,9 +149,9 @@ class HandModel:
     """A description with free parameters.
 
     Attributes:
-        robot: The description.
-        parameters: The free numbers, in the order of every (k,) vector of values.
-        compiled: Whether to compile the graphs.
+        robot: Description of the robot.
+        parameters: Free parameters in the order of all vectors of values (k,).
+        compiled: False evaluates the graphs with CasADi's virtual machine.
     """
 
     robot: RobotDescription
@@ -168,9 +172,9 @@ class HandModel:
         """Return the fingertip poses.
 
         Args:
-            finger: The finger.
+            finger: Name of the finger.
             q: (m, n) actuator positions [rad or m].
-            values: (k,) of the parameters.
+            values: (k,) values of the parameters.
 
         Returns:
             (m, 8) unit dual quaternions in the base frame.
@@ -179,17 +183,17 @@ class HandModel:
         return poses
 
     def misfit(self, finger: str, q: Array, values: Array, measured: Array) -> tuple[Array, Array]:
-        """Return the errors of the model at measured poses, and their Jacobian by the parameters.
+        """Return the errors of the model at measured poses, and their Jacobian.
 
         Args:
-            finger: The finger.
+            finger: Name of the finger.
             q: (m, n) actuator positions.
-            values: (k,) of the parameters.
+            values: (k,) values of the parameters.
             measured: (m, 8) unit dual quaternions in the base frame.
 
         Returns:
-            error (m, 6), point of the model minus the measured one [m] and rotation vector from
-            measured to model [rad], and its Jacobian (m, 6, k).
+            error (m, 6), point of the model minus measured point [m] and rotation vector from
+            measured to model [rad], and its Jacobian with respect to the parameters (m, 6, k).
         """
         error, jacobian = self._kernel(finger, "misfit")(q, values, measured)
         return error, jacobian.reshape(len(error), 6, len(values))
@@ -204,11 +208,11 @@ class HandModel:
             if kind == "pose":
                 function = ca.Function(name, [q, p], with_cse(ca.densify(pose)))
             else:
-                seen = ca.SX.sym("measured", 8)
-                turn, _ = dq.log(dq.error(pose, seen))
-                error = ca.vertcat(dq.translation(pose) - dq.translation(seen), turn)
+                measured = ca.SX.sym("measured", 8)
+                rotation, _ = dq.log(dq.error(pose, measured))
+                error = ca.vertcat(dq.translation(pose) - dq.translation(measured), rotation)
                 outputs = with_cse(error, ca.densify(ca.jacobian(error, p)))
-                function = ca.Function(name, [q, p, seen], outputs)
+                function = ca.Function(name, [q, p, measured], outputs)
             self._kernels[key] = FunctionKernel(function, self.compiled)
         return self._kernels[key]
 
@@ -226,7 +230,7 @@ class HandModel:
             if name not in positions:
                 joint = joints[name]
                 source = position(joint.coupling.of)  # type: ignore[union-attr]
-                positions[name] = follow(joint, source, _Numbers(joint, symbols))
+                positions[name] = follow(joint, source, _CouplingValues(joint, symbols))
             return positions[name]
 
         entry = self.robot.finger(finger)
@@ -239,23 +243,23 @@ class HandModel:
             axis = tilted(joint.axis, _vector(symbols, joint.name, "axis", np.zeros(2)))
             value = position(joint.name)
             angle, distance = (value, 0.0) if joint.type == "revolute" else (0.0, value)
-            moved = dq.exp_screw(angle, distance, axis, ca.DM.zeros(3, 1))
-            pose = dq.multiply(pose, moved)
+            motion = dq.exp_screw(angle, distance, axis, ca.DM.zeros(3, 1))
+            pose = dq.multiply(pose, motion)
         point = _vector(symbols, finger, "tip", entry.placement[:3, 3])
-        placed = dq.from_pose(ca.DM(entry.placement[:3, :3]), point)
-        turn = _vector(symbols, finger, "turn", np.zeros(3))
-        return dq.multiply(dq.multiply(pose, placed), dq.exp(turn, ca.DM.zeros(3, 1)))
+        placement = dq.from_pose(ca.DM(entry.placement[:3, :3]), point)
+        rotation = _vector(symbols, finger, "turn", np.zeros(3))
+        return dq.multiply(dq.multiply(pose, placement), dq.exp(rotation, ca.DM.zeros(3, 1)))
 
 
 def tilted(axis: Array, tilts: Expr) -> Expr:
     """Return a unit axis (3,) rotated by two perpendicular tilts (2, 1) [rad]."""
     first = perpendicular(ca.DM(axis.tolist()))
-    across = ca.horzcat(first, ca.cross(ca.DM(axis.tolist()), first))
-    return exp_so3(across @ tilts) @ ca.DM(axis.tolist())
+    tilt_axes = ca.horzcat(first, ca.cross(ca.DM(axis.tolist()), first))
+    return exp_so3(tilt_axes @ tilts) @ ca.DM(axis.tolist())
 
 
-class _Numbers:
-    """Return the parameters of the coupling of a joint, symbols where they are free."""
+class _CouplingValues:
+    """Parameters of the coupling of a joint as attributes; symbols for free parameters."""
 
     def __init__(self, joint: Joint, symbols: dict[str, Expr]) -> None:
         self._joint, self._symbols = joint, symbols
@@ -265,7 +269,7 @@ class _Numbers:
 
 
 def _vector(symbols: dict[str, Expr], owner: str, part: str, nominal: Array) -> Expr:
-    """Return a vector whose entries are symbols where they are free."""
+    """Return a vector with symbols in place of free entries."""
     keys: Sequence[str] = "12" if part == "axis" else "xyz"
     pairs = zip(keys, nominal, strict=True)
     return ca.vertcat(*(symbols.get(f"{owner}.{part}.{key}", float(value)) for key, value in pairs))
