@@ -233,7 +233,7 @@ def test_bad_arguments(ar10, index, rng):
     description = ar10.description
     with pytest.raises(ik.errors.InputError, match=r"groups:.*'screws'"):
         hand_parameters(description, ["index"], ["screws"])
-    with pytest.raises(ik.errors.InputError, match="fingers: none"):
+    with pytest.raises(ik.errors.InputError, match="fingers: found none"):
         hand_parameters(description, [])
     with pytest.raises(ik.errors.UnknownNameError, match="no finger 'toe'"):
         hand_parameters(description, ["toe"])
