@@ -312,7 +312,7 @@ def casadi_ik_record(records: Sequence[Metadata]) -> Mapping[str, str]:
         names = ", ".join(sorted({repr(record.name)[1:-1] for record in records})) or "none"
         error_type = LogError if matching else ForeignLogError
         raise error_type(
-            f"not a log of casadi_ik: found metadata {names}; expected {METADATA_NAME!r} once"
+            f"not a log of casadi_ik: expected metadata {METADATA_NAME!r} once, found {names}"
         )
     (record,) = matching
     if record != with_checksum(record):

@@ -76,7 +76,7 @@ def test_a_cut_log(whole: Path, seed: int, caplog: pytest.LogCaptureFixture) -> 
         return
     log = logs.open(whole)
     (message,) = caplog.messages
-    assert message.startswith(f"{whole}: not finished; ")
+    assert message.startswith(f"{whole}: log is incomplete; ")
     assert log.info().unfinished == (whole,)
     assert log.info().chunks == len(complete)
     if not complete:
@@ -186,7 +186,7 @@ def test_a_log_that_is_being_written_is_left_alone(tmp_path: Path) -> None:
             recorder.record(make_block(1000, first=first))
         while not path.stat().st_size:
             time.sleep(0.01)
-        with pytest.raises(errors.LogError, match="its writer is still at it"):
+        with pytest.raises(errors.LogError, match="another writer"):
             logs.finish_log(path)
     assert not logs.finish_log(path).changed
     assert len(read_messages(path)) > 40_000
@@ -395,7 +395,7 @@ METADATA = [
 ]
 LABELS = [
     *((value, "labels: ") for value in ("5", '{"status": 5}', '{"status": [5]}', DEEP)),
-    ('{"status": ["a"], "position_error": []}', "labels of position_error: 0 .* 3"),
+    ('{"status": ["a"], "position_error": []}', "labels of position_error: .*0.*3"),
     ("{}", "labels of "),
     *((json.dumps({"q": v}), "labels of 'q': ") for v in (["j" * 1000], ["j"] * 10_000)),
 ]
@@ -541,11 +541,11 @@ def test_what_does_not_belong_into_a_chunk_is_refused(tmp_path: Path) -> None:
         return struct.pack("<BQ", opcode, length)
 
     for data, reason in (
-        (record(Opcode.ATTACHMENT, 1) + b"a", r"does not belong there \(9\)"),
-        (record(Opcode.MESSAGE, 4) + bytes(4), r"does not belong there \(5\)"),
-        (record(Opcode.MESSAGE, 100) + bytes(50), "reaches beyond it"),
-        (record(Opcode.MESSAGE, 22)[:5], "ends within a record"),
-        (record(Opcode.MESSAGE, 22) + struct.pack("<HIQQ", 1, 0, 9, 0), "of other times"),
+        (record(Opcode.ATTACHMENT, 1) + b"a", "opcode 9"),
+        (record(Opcode.MESSAGE, 4) + bytes(4), "opcode 5"),
+        (record(Opcode.MESSAGE, 100) + bytes(50), "is cut off"),
+        (record(Opcode.MESSAGE, 22)[:5], "is cut off"),
+        (record(Opcode.MESSAGE, 22) + struct.pack("<HIQQ", 1, 0, 9, 0), "time range"),
     ):
         chunk = Chunk("", data, 2, 1, zlib.crc32(data), len(data))
         with pytest.raises(errors.LogError, match=reason):

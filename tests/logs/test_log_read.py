@@ -144,8 +144,8 @@ def test_files_that_do_not_belong_together(write: Write, tmp_path: Path) -> None
     for ask in (lambda files: logs.open(files).solves(), lambda files: logs.merge_logs(files, "m")):
         with pytest.raises(errors.LogError) as caught:
             ask([first, copy])
-        says = f"{copy}: solve 1 of enhanced-dls is in {first} too (2 such solves)"
-        assert str(caught.value) == says
+        assert str(caught.value).startswith(f"{copy}: solve 1 of enhanced-dls ")
+        assert str(first) in str(caught.value)
     other = write(make_block(6, first=2), name="2.mcap", robot_name="ar10")
     with pytest.raises(errors.LogError, match=r"2\.mcap:.*'ar10'.*0\.mcap.*'made_up'"):
         logs.open([first, other])
@@ -382,7 +382,7 @@ def test_a_shard_in_which_nothing_is_whole_is_named_and_left_out(
     assert log.info().left_out == (torn,)
     (line,) = caplog.messages
     assert line.startswith(f"{torn}: ")
-    assert line.endswith("; left out, nothing in it is whole")
+    assert line.endswith("; skipped: no complete record")
     assert logs.merge_logs(study, tmp_path / "all.mcap").left_out == (torn,)
     with pytest.raises(errors.LogError, match=rf"^{torn}: "):
         logs.open(torn)
@@ -460,7 +460,7 @@ def test_shards_that_contradict_are_refused(write: Write, tmp_path: Path) -> Non
         "method 'enhanced-dls' has other fields or names than in": write(
             make_block(50, first=1, form=other), name="layout.mcap", urdf="<robot/>"
         ),
-        "the attachment 'robot.urdf' is not the same": write(
+        "the attachment 'robot.urdf' differs": write(
             one(1), name="urdf.mcap", urdf="<other/>"
         ),
     }

@@ -186,7 +186,7 @@ def test_blocks_that_contradict_leave_the_log_usable(tmp_path: Path) -> None:
     other = TraceFormat(Layout.record(Field("q", (3,))), LABELS)
     bad = {
         "solve 1 is already in the log": make_block(5, 5, first=1),
-        "the rows are not of their layout": changed(make_block(3, first=8), format=other),
+        "rows do not have the layout": changed(make_block(3, first=8), format=other),
         "or not 4": changed(make_block(3, first=8), iterations=np.array([4])),
         "layout or labels differ": make_block(1, first=2, form=other),
         "lower_snake_case": make_block(
@@ -287,7 +287,7 @@ def small_limit(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("small_limit")
 def test_a_solve_that_is_too_large_leaves_the_log_usable(tmp_path: Path) -> None:
     path = tmp_path / "x.mcap"
-    says = r"x\.mcap: method 'enhanced-dls', solve 3 holds \d{7} bytes, more than the 6291456"
+    says = r"x\.mcap: method 'enhanced-dls', solve 3 holds \d{7} bytes; expected at most 6291456"
     with logs.McapRecorder(path, robot_name="made_up", compression="none") as recorder:
         recorder.record(make_block(500, 4000))
         with pytest.raises(errors.LogError, match=says):

@@ -23,7 +23,7 @@ from casadi_ik.compile.codegen import WIDE, define, define_arrays, driver_text, 
 from casadi_ik.compile.function_kernel import machine_lanes
 from casadi_ik.compile.graphs import recipe
 from casadi_ik.compile.libraries import load_library
-from casadi_ik.compile.loop import UNBEGUN, UNBOUNDED
+from casadi_ik.compile.loop import NO_LIMIT, UNBEGUN
 from casadi_ik.files.arrays import spread_steps
 from casadi_ik.kinematics.contact_fit import initial_lm_state
 from casadi_ik.kinematics.contacts import LENGTH
@@ -416,7 +416,7 @@ def _library_text(plan: SearchPlan, wide: bool) -> str:
         (
             WIDE if wide else "",
             "#include <math.h>\n#include <stdint.h>\n#include <string.h>\n",
-            define(codes | {"FOREVER": UNBOUNDED}),
+            define(codes | {"FOREVER": NO_LIMIT}),
             *jobs,
             f"typedef struct {{\n{plan.members()}",
             f"  const int16_t *tiles[3];\n{sides}{pointers}}} search;\n",
