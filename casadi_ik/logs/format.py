@@ -93,7 +93,7 @@ class LogClock:
         last = first + count - 1
         if not (first >= 0 and last < 2**32 and self.start(last + 1) < 2**63):
             number = first if first < 0 else last
-            raise LogError(f"solve {number}: the number is outside of the range of log times")
+            raise LogError(f"number {number} of the solve is outside of the range of log times")
 
     def times(self, solve_id: NDArray[np.int64], iteration: NDArray[np.int64]) -> np.ndarray:
         """Return log times, uint64 [ns], for solves and iterations of the same shape."""
