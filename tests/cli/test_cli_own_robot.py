@@ -472,7 +472,7 @@ def test_a_group_of_numbers(run: Command, poses: Path, tmp_path: Path) -> None:
     [
         ("", "holds no measurements"),
         (HEADER, "holds no measurements"),
-        (HEADER.replace(",x,", ",X,") + ROW, ":1: unknown column 'X'; known: finger, x"),
+        (HEADER.replace(",x,", ",X,") + ROW, ":1: column 'X' is unknown; expected finger, x"),
         (HEADER.replace("finger,", "") + ROW, ":1: column 'finger' is missing"),
         (HEADER.replace(",y,", ",x,") + ROW, ":1: column 'x' appears twice"),
         (HEADER.replace(",qz", "") + ROW, ":1: found qw, qx, qy, expected all or none"),
@@ -482,7 +482,7 @@ def test_a_group_of_numbers(run: Command, poses: Path, tmp_path: Path) -> None:
         (HEADER + ROW + "\n" + ROW.replace("0.0921", "a"), ":4: y: found 'a', expected a finite"),
         (HEADER + ROW.replace("0.0921", "nan"), ":2: y: found 'nan', expected a finite number"),
         (HEADER + ROW.replace("0.0921", ""), ":2: y: found '', expected a finite number"),
-        (HEADER + ROW.replace("0.0921,", ""), ":2: found 9 columns, the header has 10"),
+        (HEADER + ROW.replace("0.0921,", ""), ":2: found 9 columns, expected 10"),
         (HEADER + ROW.replace("0.7021", "0.9"), ":2: qw..qz"),
         (HEADER + ROW.replace("0.7021", ""), ":2: qz: found '', expected a finite number"),
     ],

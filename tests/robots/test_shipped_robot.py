@@ -346,7 +346,7 @@ def test_the_papers_methods_say_why_not(coupled, method):
         ik.Solver(coupled, method)
     assert str(caught.value) == (
         "robot 'kuka_lwr_barrett_coupled': finger 'finger_2' is not a planar finger: "
-        "bh_finger_2_distal follows 'bh_finger_2_proximal'; expected its own motor"
+        "bh_finger_2_distal follows 'bh_finger_2_proximal'; expected a separate motor"
     )
 
 
