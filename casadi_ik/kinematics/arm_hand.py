@@ -301,10 +301,10 @@ class ArmHand(ReprMixin):
             Distances [m] and angles [rad], each (f,) or (k, f), and the largest violation of a
             limit [rad or m], () or (k,).
         """
-        position, angle, beyond = self._kernels.deviations(_for_kernels(q), points, normals)
+        position, angle, excess = self._kernels.deviations(_for_kernels(q), points, normals)
         # Kernels return scalars for a single finger.
-        by_finger = (*beyond.shape, len(self.fingers))
-        return position.reshape(by_finger), angle.reshape(by_finger), beyond
+        by_finger = (*excess.shape, len(self.fingers))
+        return position.reshape(by_finger), angle.reshape(by_finger), excess
 
     def beyond_limits(self, q: ArrayLike) -> Array:
         """Return the largest violation of a limit [rad or m], () or (k,); negative within limits.
@@ -312,8 +312,8 @@ class ArmHand(ReprMixin):
         Raises:
             InputError: See `configuration`.
         """
-        (beyond,) = self._kernels.beyond(_for_kernels(self.configuration(q)))
-        return beyond
+        (excess,) = self._kernels.limit_excess(_for_kernels(self.configuration(q)))
+        return excess
 
     def palm(self, q: ArrayLike, side: str | None = None) -> Array:
         """Return the pose of the palm frame in the base frame, (4, 4) or (k, 4, 4).

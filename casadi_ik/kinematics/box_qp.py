@@ -70,7 +70,7 @@ class LinearSystem:
 
     @property
     def coefficients(self) -> Expr:
-        """All entries, right-hand sides and inverses in one column."""
+        """Column of the entries, right-hand sides and inverses."""
         return ca.vertcat(*self.entries.values(), *self.right, *self.inverses.values())
 
     @classmethod

@@ -1,15 +1,15 @@
-"""The arm and the reversed thumb as one closed chain (Qiu & Kermani 2021, section II-C).
+"""Closed chain of the arm and the reversed thumb (Qiu & Kermani 2021, section II-C).
 
-The thumb's tip rests on its contact; a virtual revolute joint about the contact normal lets it
-turn there. Seen from the tip, the palm is the platform of a parallel mechanism: one leg is the
-reversed thumb (virtual joint, the thumb's motors from tip to palm, and some of the arm's last
-motors), the other leg the rest of the arm. Both move the same platform, so their twists agree,
-eq. (6). The coordinates of the reversed leg are the negative of the motors' own, because it is
-read from tip to palm.
+The tip of the thumb rests on its contact; a virtual revolute joint about the contact normal lets it
+rotate. Relative to the tip, the palm is the platform of a parallel mechanism with two legs: the
+reversed thumb (virtual joint, motors of the thumb from tip to palm, and some of the last motors of
+the arm) and the other motors of the arm. Both move the same platform, so their twists are equal,
+eq. (6). The coordinates of the reversed leg are the negative motor positions, because the leg is
+traversed from tip to palm.
 
-A chain with k coordinates and the constraint C qdot = 0 of eq. (6) moves in k - rank(C) ways. Any
-choice of that many active coordinates commands it as long as the columns of the passive ones, H_p,
-are regular; which choice is good depends on the configuration (`pivoted`).
+A chain with k coordinates and the constraint C qdot = 0 of eq. (6) has k - rank(C) degrees of
+freedom. Any choice of as many active coordinates is valid if the columns H_p of the passive ones
+are regular; good choices depend on the configuration (`pivoted`).
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ class ChainSplit:
     """Active and passive coordinates of the closed chain, by index of the actuator in q.
 
     Attributes:
-        reversed_leg: `VIRTUAL`, the thumb's actuators from tip to palm, the borrowed arm
-            actuators from palm to base.
-        arm_leg: The arm's other actuators from the base on.
-        active: The coordinates that are commanded, as many as the mobility.
-        passive: The six that follow.
+        reversed_leg: `VIRTUAL`, actuators of the thumb from tip to palm, and borrowed arm actuators
+            from palm to base.
+        arm_leg: Other actuators of the arm from base to tip.
+        active: Commanded coordinates, as many as the mobility.
+        passive: The six dependent coordinates.
     """
 
     reversed_leg: tuple[int, ...]
@@ -49,36 +49,35 @@ class ChainSplit:
 
     @property
     def columns(self) -> tuple[int, ...]:
-        """All coordinates, the reversed leg first."""
+        """Coordinates of the reversed leg, followed by those of the arm leg."""
         return self.reversed_leg + self.arm_leg
 
 
 def split(robot: RobotDescription, borrowed: int = 1) -> ChainSplit:
-    """Return the paper's choice of legs and active joints, for any arm and thumb.
+    """Return the paper's choice of legs and active joints for any arm and thumb.
 
-    The mobility is the number of coordinates less six (Gruebler). Active are the virtual joint,
-    the thumb's joints but the first, and as many of the arm's last joints as are missing; for the
-    KUKA-Barrett: virtual, thumb 2, arm 7, arm 6.
+    The mobility is the number of coordinates minus six (Gruebler). Active joints are the virtual
+    joint, those of the thumb except the first, and the last joints of the arm up to the mobility;
+    for the KUKA-Barrett: virtual, thumb 2, arm 7, arm 6.
 
     Args:
-        robot: The description.
-        borrowed: How many of the arm's last joints count to the reversed leg (the paper: 1).
+        robot: Description of the robot.
+        borrowed: Number of the arm's last joints in the reversed leg (the paper: 1).
 
     Raises:
-        UnsupportedError: The arm has fewer than six joints, or fewer than are to be borrowed.
+        UnsupportedError: The arm has fewer than six joints, or not more than `borrowed`.
     """
     arm = robot.arm_actuators
     thumb = robot.finger_actuators(robot.thumb)
     mobility = 1 + len(thumb) + len(arm) - 6
     if mobility < 1 or len(arm) < 6:
         raise UnsupportedError(
-            f"robot {robot.name!r}: the closed chain of arm ({len(arm)}), thumb ({len(thumb)}) and "
-            f"virtual joint has mobility {mobility}; it needs an arm of at least six joints"
+            f"robot {robot.name!r}: found {len(arm)} arm joints and {len(thumb)} thumb joints with "
+            f"mobility {mobility}; expected at least 6 arm joints and mobility 1"
         )
     if not 0 <= borrowed < len(arm):
         raise UnsupportedError(
-            f"robot {robot.name!r}: the reversed thumb cannot borrow {borrowed} arm joints; "
-            f"the arm has {len(arm)} and has to keep one"
+            f"robot {robot.name!r}: borrowed: found {borrowed}, expected 0 to {len(arm) - 1}"
         )
     reversed_leg = (VIRTUAL, *reversed(thumb), *reversed(arm[len(arm) - borrowed :]))
     preference = (VIRTUAL, *reversed(thumb[1:]), *reversed(arm))
@@ -98,7 +97,7 @@ class ClosedChain:
         H_p: (6, 6) columns of the passive coordinates, eq. (7).
         H: (6, mobility) passive over active coordinates, -H_p^-1 H_a of eq. (7).
         J_cc: (6, mobility) twist of the platform per active coordinate, eq. (8): the arm leg's
-            columns times the rows of H (or unit rows) that belong to the arm leg.
+            columns times the rows of H (or unit rows) of the arm leg.
     """
 
     split: ChainSplit
@@ -111,11 +110,12 @@ class ClosedChain:
         """Return the change of every motor for a step of the active coordinates.
 
         Args:
-            active_step: (mobility, 1).
+            active_step: (mobility, 1) step of the active coordinates.
             n: Number of actuators of the robot.
 
         Returns:
-            (n, 1) change of q: the reversed leg with its sign turned, the virtual joint left out.
+            (n, 1) change of q, with inverted signs for the reversed leg and without the virtual
+            joint.
         """
         passive_step = self.H @ active_step
         step = ca.SX.zeros(n, 1)
@@ -139,8 +139,8 @@ def closed_chain(
         robot_kinematics: Kinematics over q.
         chain: Legs and active coordinates.
         length: Unit of the linear rows [m]; 1e-3 gives millimetres, as in the paper.
-        platform: "arm-leg": eq. (8) as printed, the twist of the link that the arm leg ends at;
-            "palm": the palm's own, with the borrowed arm joints added.
+        platform: "arm-leg": eq. (8) as printed, the twist of the last link of the arm leg;
+            "palm": the twist of the palm, which includes the borrowed arm joints.
     """
     robot = robot_kinematics.robot
     columns = {index: _column(robot_kinematics, index, length) for index in chain.columns}
@@ -166,10 +166,10 @@ def closed_chain(
 
 
 def _column(robot_kinematics: ActuatedKinematics, index: int, length: float) -> ca.SX:
-    """Return twist [v; w] of the palm, in the palm frame, for a unit rate of one coordinate (6, 1).
+    """Return the twist [v; w] of the palm, in the palm frame, for a unit rate of a coordinate.
 
-    In the reversed leg the palm moves against the tip as the tip moves against the palm in the
-    motor's own sense, so the same column serves both.
+    Coordinates of the reversed leg have inverted signs, and so has the motion of the palm relative
+    to the tip; the column (6, 1) is therefore the same.
     """
     kinematics = robot_kinematics.kinematics
     robot = robot_kinematics.robot
@@ -178,7 +178,7 @@ def _column(robot_kinematics: ActuatedKinematics, index: int, length: float) -> 
         point, normal = kinematics.contact(robot.thumb)
         linear, angular = ca.cross(normal, palm.origin - point), normal
     else:
-        # The column of a thumb motor is the twist of a body at the palm's place, not the palm's.
+        # The column of a thumb motor is the twist of the fingertip link at the palm origin.
         link = robot.palm_link if index in robot.arm_actuators else robot.finger(robot.thumb).link
         linear, angular = robot_kinematics.twist(link, palm.origin, [index])
     rotation = palm.rotation
@@ -188,29 +188,29 @@ def _column(robot_kinematics: ActuatedKinematics, index: int, length: float) -> 
 def pivoted(constraint: Array) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Return the active and passive coordinates at one configuration.
 
-    QR with column pivoting (Businger & Golub 1965) takes as passive the columns that are farthest
-    from one another; one counts as dependent if less than 1e-9 of the largest is left of it.
+    QR with column pivoting (Businger & Golub 1965) selects the most independent columns as passive.
+    A column counts as dependent if its norm has decreased to 1e-9 of the largest norm.
 
     Args:
-        constraint: C (r, k); rows should be scaled so that lengths and angles compare.
+        constraint: C (r, k) with rows scaled so that lengths and angles are comparable.
 
     Returns:
-        Positions of the active columns, as many as the mobility, and of the passive ones, as many
-        as the rank; both in rising order.
+        Indices of the active columns, as many as the mobility, and of the passive columns, as many
+        as the rank; both in ascending order.
     """
-    left = np.array(constraint, dtype=float)
-    k = left.shape[1]
-    floor = 1e-9 * np.linalg.norm(left, axis=0).max(initial=0.0)
+    residual = np.array(constraint, dtype=float)
+    k = residual.shape[1]
+    floor = 1e-9 * np.linalg.norm(residual, axis=0).max(initial=0.0)
     passive: list[int] = []
-    for _ in range(min(left.shape)):
-        lengths = np.linalg.norm(left, axis=0)
+    for _ in range(min(residual.shape)):
+        lengths = np.linalg.norm(residual, axis=0)
         best = int(lengths.argmax())
         if lengths[best] <= floor:
             break
         passive.append(best)
-        direction = left[:, best] / lengths[best]
-        left -= np.outer(direction, direction @ left)
-        left[:, best] = 0.0
+        direction = residual[:, best] / lengths[best]
+        residual -= np.outer(direction, direction @ residual)
+        residual[:, best] = 0.0
     active = tuple(i for i in range(k) if i not in passive)
     return active, tuple(sorted(passive))
 

@@ -24,112 +24,13 @@ from casadi_ik.kinematics.contacts import (
     tip_vectors,
     within_tolerance,
 )
+from casadi_ik.kinematics.fit_parameters import FIT, MINIMAX, TOLERANT_FIT
 from casadi_ik.kinematics.forward import actuated
 from casadi_ik.kinematics.smooth import Expr, call_function
 from casadi_ik.model.description import RobotDescription
 
-
-@dataclass(frozen=True)
-class FitParameters:
-    """Damping and convergence criteria of a fit.
-
-    Attributes:
-        damping: Initial damping of the normal matrix, whose rows are of order one per radian and
-            0.1 m.
-        damping_floor: Smallest damping.
-        damping_ceiling: Damping at which a rejected step ends the fit.
-        damping_down: Smallest factor of the damping after an accepted step.
-        growth: Factor of the damping after a rejected step; doubles with every further rejection.
-        slow: Ratio of costs after and before a step above which progress is slow.
-        quadratic: Ratio of costs below which convergence is fast, so that another step pays.
-        patience: Number of consecutive steps with slow progress that ends the fit.
-        budget: Maximum number of steps.
-        promising: Cost below which `patience` and `budget` are multiplied by `persistence`.
-        persistence: Factor of the effort for fits near a solution.
-        exact: Square root of the cost below which contacts are met exactly (0.1 nm per 100 mm, or
-            rad).
-        fine: Fraction of the tolerance below which errors count as exact.
-        passes: Number of corrections of the active set in a step.
-    """
-
-    damping: float = 1e-3
-    damping_floor: float = 1e-12
-    damping_ceiling: float = 1e4
-    damping_down: float = 1 / 8
-    growth: float = 4.0
-    slow: float = 0.9
-    quadratic: float = 0.1
-    patience: int = 3
-    budget: int = 15
-    promising: float = 1e-3
-    persistence: int = 10
-    exact: float = 1e-8
-    fine: float = 1e-3
-    passes: int = 2
-
-
-@dataclass(frozen=True)
-class MinimaxParameters:
-    """Parameters of the minimax stage, which reduces the largest error relative to its tolerance.
-
-    Attributes:
-        powers: Successive exponents p of the p-norm of the error ratios.
-        max_tolerance_ratio: Largest ratio of error to tolerance from which the minimax stage
-            starts.
-        same_cost_tolerance: Relative difference of costs below which two minima are the same.
-        stall_ratio: Ratio of sums after and before a step above which the next power begins.
-        infeasible_ratio: If the sum stalls above n * infeasible_ratio**power for n errors, the
-            largest error cannot fall below its tolerance near this configuration.
-        improvement_ratio: Ratio of the largest errors of two minimax fits above which the second is
-            no improvement.
-        budget: Maximum number of steps.
-        damping: Factor of the damping relative to a fit, because rows are divided by tolerances.
-        damping_floor: Smallest damping of a fit.
-        damping_ceiling: Damping at which the next power begins.
-        damping_decrease: Factor of the damping after an accepted step.
-        damping_increase: Factor of the damping after a rejected step.
-        max_growth: Error ratio, relative to the largest before the step, at which ratios saturate.
-    """
-
-    powers: tuple[float, ...] = (4.0, 10.0, 24.0, 60.0, 150.0, 400.0)
-    max_tolerance_ratio: float = 2.0
-    same_cost_tolerance: float = 1e-2
-    stall_ratio: float = 0.95
-    infeasible_ratio: float = 1.05
-    improvement_ratio: float = 0.99
-    budget: int = 60
-    damping: float = 100.0
-    damping_floor: float = 1e-8
-    damping_ceiling: float = 10.0
-    damping_decrease: float = 1 / 8
-    damping_increase: float = 4.0
-    max_growth: float = 2.0
-
-
-@dataclass(frozen=True)
-class TolerantFitParameters:
-    """Parameters of a fit of the errors beyond the tolerances.
-
-    Attributes:
-        free_fraction: Fraction of the tolerance within which an error costs nothing.
-        max_start_ratio: Largest `tolerance_ratio` at a minimum of the exact fit from which a
-            tolerant fit starts.
-        near_miss_ratio: Largest `tolerance_ratio` at which a minimum counts as a near miss.
-        patience: Number of consecutive steps with slow progress that ends the fit.
-        budget: Maximum number of steps.
-    """
-
-    free_fraction: float = 0.95
-    max_start_ratio: float = 1.0
-    near_miss_ratio: float = 2.0
-    patience: int = 4
-    budget: int = 40
-
-
-FIT, MINIMAX, TOLERANT_FIT = FitParameters(), MinimaxParameters(), TolerantFitParameters()
-
-MIN_DIVISOR = 1e-100
-"""Lower bound of divisors."""
+SMALLEST_NORM = 1e-100
+"""Lower bound of norms and costs in divisors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -467,7 +368,7 @@ def tolerance_ratio(cost: Expr, p: dict[str, Expr]) -> Expr:
     """
     largest_cost = ca.sum1(p["weights"][:, 0] * (p["position_tolerance"] / LENGTH) ** 2)
     largest_cost += ca.sum1(p["weights"][:, 1] * chord(p["angle_tolerance"]) ** 2)
-    return ca.sqrt(cost / ca.fmax(largest_cost, MIN_DIVISOR))
+    return ca.sqrt(cost / ca.fmax(largest_cost, SMALLEST_NORM))
 
 
 def beyond_tolerance(
@@ -476,7 +377,7 @@ def beyond_tolerance(
     """Return the part of a residual that exceeds the tolerances, and its Jacobian.
 
     The residual r of a contact, with tolerance t, becomes (1 - t / |r|) r where |r| > t, and zero
-    elsewhere; rows that follow those of the contacts remain as they are.
+    elsewhere; rows after those of the contacts are unchanged.
 
     Args:
         residual: (m, 1) residual whose first rows are those of the contacts.
@@ -502,7 +403,7 @@ def _shortened(rows: int, columns: int) -> ca.Function:
     """Return the graph (residual, slopes, tolerance) -> (excess, slopes of it) of a contact."""
     residual, slopes = ca.SX.sym("residual", rows), ca.SX.sym("slopes", rows, columns)
     free = ca.SX.sym("free")
-    length = ca.fmax(ca.norm_2(residual), MIN_DIVISOR)
+    length = ca.fmax(ca.norm_2(residual), SMALLEST_NORM)
     direction, ratio = residual / length, ca.fmin(free / length, 1.0)
     exceeds = ca.if_else(length > free, 1.0, 0.0)
     excess_slopes = (1 - ratio) * slopes + exceeds * ratio * (direction @ (direction.T @ slopes))
@@ -511,9 +412,9 @@ def _shortened(rows: int, columns: int) -> ca.Function:
     )
 
 
-def is_new_cost(cost: Expr, before: Expr) -> Expr:
+def is_new_cost(cost: Expr, previous: Expr) -> Expr:
     """Return whether the cost of a fit differs from that of the previous minimax start."""
-    return ca.fabs(cost - before) > MINIMAX.same_cost_tolerance * before
+    return ca.fabs(cost - previous) > MINIMAX.same_cost_tolerance * previous
 
 
 @dataclass(frozen=True, eq=False)
@@ -541,7 +442,7 @@ def _contact_weights(
     """Return the error ratios of a residual and their weights for the current power."""
     scaled = _relative_to_tolerances(residual, contacts, p)
     ratios = _contact_norms(scaled, contacts)
-    largest = ca.fmax(ca.mmax(ratios), MIN_DIVISOR)
+    largest = ca.fmax(ca.mmax(ratios), SMALLEST_NORM)
     power = sum(
         (ca.if_else(powers_done == i, value, 0.0) for i, value in enumerate(MINIMAX.powers)),
         ca.SX(0),
@@ -598,10 +499,10 @@ def _stretched(rows: int, columns: int) -> ca.Function:
     scalars = length, weight, power, tolerance = [
         ca.SX.sym(name) for name in ("length", "weight", "power", "allowed")
     ]
-    stretch, size = ca.sqrt(power - 1), ca.sqrt(weight) / tolerance
-    direction = residual / (tolerance * ca.fmax(length, MIN_DIVISOR))
-    stretched_residual = size / stretch * residual
-    stretched_slopes = size * (slopes + direction @ ((stretch - 1) * (direction.T @ slopes)))
+    factor, size = ca.sqrt(power - 1), ca.sqrt(weight) / tolerance
+    direction = residual / (tolerance * ca.fmax(length, SMALLEST_NORM))
+    stretched_residual = size / factor * residual
+    stretched_slopes = size * (slopes + direction @ ((factor - 1) * (direction.T @ slopes)))
     return call_function(
         "stretched", [residual, slopes, *scalars], [stretched_residual, stretched_slopes]
     )
@@ -619,9 +520,9 @@ def minimax_step(
         s: State with damping, power (number of completed `MINIMAX.powers`) and spent.
         p: Parameters.
     """
-    before = _contact_weights(trial.residual_before, contacts, s["power"], p)
-    weights, ratios_before, largest = before.weights, before.ratios, before.largest
-    power = before.power
+    initial = _contact_weights(trial.residual_before, contacts, s["power"], p)
+    weights, ratios_before, largest = initial.weights, initial.ratios, initial.largest
+    power = initial.power
     ratios_after = _contact_norms(_relative_to_tolerances(trial.residual, contacts, p), contacts)
     # Saturated because large ratios overflow at high powers.
     growth = ca.fmin(ratios_after / largest, MINIMAX.max_growth)
@@ -665,7 +566,7 @@ def _relative_to_tolerances(values: Expr, contacts: ContactRows, p: dict[str, Ex
 def _tolerances(p: dict[str, Expr]) -> Expr:
     """Return the tolerances (2 f, 1) in the units of the residual."""
     tolerances = ca.vertcat(p["position_tolerance"] / LENGTH, chord(p["angle_tolerance"]))
-    return ca.fmax(tolerances, MIN_DIVISOR)
+    return ca.fmax(tolerances, SMALLEST_NORM)
 
 
 def _repeat_by_rows(values: Expr, contacts: ContactRows) -> Expr:

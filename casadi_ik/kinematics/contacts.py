@@ -568,7 +568,7 @@ def group_by_kinds(
     )
     for i, finger_flags in enumerate(has_vector[first_rows].tolist()):
         kinds = tuple(
-            kind_from_vectors(name[:-1] for name, has in zip(names, row, strict=True) if has)
+            kind_from_vectors(name[:-1] for name, flag in zip(names, row, strict=True) if flag)
             for row in finger_flags
         )
         if len(first_rows) == 1:

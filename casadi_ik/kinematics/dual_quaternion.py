@@ -103,7 +103,7 @@ def directed_line(direction: Expr, point: Expr) -> tuple[Expr, Expr]:
 def exp_screw(angle: Expr, distance: Expr, direction: Expr, moment: Expr) -> Expr:
     """Return the displacement along a screw, exp((theta + eps d)/2 (l + eps m)): Chandra eq. (1).
 
-    No division, so no singularity; a revolute joint has d = 0, a prismatic one theta = 0.
+    There is no singularity; a revolute joint has d = 0, a prismatic one theta = 0.
 
     Args:
         angle: theta [rad].
@@ -115,8 +115,9 @@ def exp_screw(angle: Expr, distance: Expr, direction: Expr, moment: Expr) -> Exp
         Unit dual quaternion (8, 1).
     """
     c, s = ca.cos(0.5 * angle), ca.sin(0.5 * angle)
-    half = 0.5 * distance
-    return ca.vertcat(c, s * direction, -half * s, s * moment + (half * c) * direction)
+    half_distance = 0.5 * distance
+    dual = s * moment + (half_distance * c) * direction
+    return ca.vertcat(c, s * direction, -half_distance * s, dual)
 
 
 def exp(w: Expr, v: Expr) -> Expr:
@@ -127,22 +128,22 @@ def exp(w: Expr, v: Expr) -> Expr:
         v: theta m + d l (3, 1) [m].
     """
     s = ca.dot(w, w)
-    half = 0.5 * half_sinc(s)
+    sinc = 0.5 * half_sinc(s)
     travel = ca.dot(w, v)
-    along = even_function(
+    factor = even_function(
         s,
         lambda x: (0.5 * ca.cos(0.5 * ca.sqrt(x)) - ca.sin(0.5 * ca.sqrt(x)) / ca.sqrt(x)) / x,
         PITCH_REMAINDER,
         1e-4,
     )
-    return ca.vertcat(quaternion_exp(w), -0.5 * half * travel, half * v + (along * travel) * w)
+    return ca.vertcat(quaternion_exp(w), -0.5 * sinc * travel, sinc * v + (factor * travel) * w)
 
 
 def log(x: Expr) -> tuple[Expr, Expr]:
     """Return twist (w, v) = (theta l, theta m + d l) of a unit dual quaternion: Chandra eq. (14).
 
-    Of x and -x the one with theta in [0, pi] is meant. Robust at theta = 0, where v is the
-    translation.
+    Of x and -x, the one with theta in [0, pi] is used. The result is robust at theta = 0, where v
+    is the translation.
 
     Args:
         x: unit dual quaternion (8, 1).
@@ -186,8 +187,8 @@ def act_on_line(x: Expr, direction: Expr, moment: Expr) -> tuple[Expr, Expr]:
     Returns:
         (R l, R m + p x R l).
     """
-    moved = rotate(x, direction)
-    return moved, rotate(x, moment) + ca.cross(translation(x), moved)
+    new_direction = rotate(x, direction)
+    return new_direction, rotate(x, moment) + ca.cross(translation(x), new_direction)
 
 
 def error(current: Expr, desired: Expr) -> Expr:
@@ -206,8 +207,8 @@ def twist(x: Expr, rate: Expr) -> tuple[Expr, Expr]:
         rate: its derivative x' (8, 1) [1/s, m/s].
 
     Returns:
-        w (3, 1) [rad/s] and v (3, 1) [m/s], the velocity of the moving point that is instantly
-        at the origin.
+        w (3, 1) [rad/s] and v (3, 1) [m/s], the velocity of the moving point that is
+        instantaneously at the origin.
     """
     product = 2 * multiply(rate, conjugate(x))
     return product[1:4], product[5:]
@@ -218,7 +219,7 @@ def control_twist(e: Expr, gain: Expr) -> tuple[Expr, Expr]:
 
     Args:
         e: unit dual quaternion (8, 1) of the error, see `error`.
-        gain: [1/s], or the part of the error that one discrete step is to remove.
+        gain: Gain [1/s], or the fraction of the error that a discrete step removes.
 
     Returns:
         w (3, 1) and v (3, 1), as `twist`.

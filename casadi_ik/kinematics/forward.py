@@ -45,10 +45,10 @@ class Kinematics:
     """Poses of links, joint axes and contacts as functions of theta.
 
     Attributes:
-        robot: The description.
+        robot: Description of the robot.
         theta: (m, 1) positions of the movable joints, in the order of `robot.joint_names`.
         links: Pose of every link.
-        axes: Per movable joint its axis direction (3, 1) in the base frame.
+        axes: Axis direction (3, 1) of each movable joint in the base frame.
     """
 
     robot: RobotDescription
@@ -107,7 +107,7 @@ def forward(robot: RobotDescription, theta: ca.SX) -> Kinematics:
     """Return all link poses as functions of theta.
 
     Args:
-        robot: The description.
+        robot: Description of the robot.
         theta: (m, 1) positions of the movable joints [rad or m].
 
     Returns:
@@ -120,12 +120,13 @@ def forward(robot: RobotDescription, theta: ca.SX) -> Kinematics:
         frame = links[joint.parent].at(joint.placement)
         if joint.type != "fixed":
             axes[joint.name] = frame.rotate(joint.axis)
-            frame = _moved(frame, joint, theta[index[joint.name]])
+            frame = _displaced_frame(frame, joint, theta[index[joint.name]])
         links[joint.child] = frame
     return Kinematics(robot, theta, links, axes)
 
 
-def _moved(frame: Pose, joint: Joint, value: ca.SX) -> Pose:
+def _displaced_frame(frame: Pose, joint: Joint, value: ca.SX) -> Pose:
+    """Return the frame after the motion of a joint by a value [rad or m]."""
     if joint.type == "prismatic":
         return Pose(frame.rotation, frame.origin + frame.rotate(joint.axis) * value)
     return Pose(frame.rotation @ axis_rotation(joint.axis, value), frame.origin)
@@ -137,7 +138,7 @@ def axis_rotation(axis: Array, angle: ca.SX) -> ca.SX:
     outer = np.outer(a, a)
     cross = np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
     c, s = ca.cos(angle), ca.sin(angle)
-    # Entry by entry: the sum of constant, cosine and sine parts keeps exact zeros and ones.
+    # The sum of constant, cosine and sine terms keeps exact zeros and ones.
     return ca.SX(sparse(outer)) + ca.SX(sparse(np.eye(3) - outer)) * c + ca.SX(sparse(cross)) * s
 
 
@@ -151,11 +152,11 @@ def _constants(placement: Array) -> tuple[ca.DM, ca.DM]:
 
 
 def sparse(array: Array) -> ca.DM:
-    """Return a constant with entries below rounding replaced by structural zeros."""
+    """Return a constant with structural zeros in place of entries below rounding errors."""
     exact = np.where(np.abs(array) < MAX_ROUNDING_ERROR, 0.0, array)
-    # Rotations by quarter turns come out of cosines as 1 - 1e-16; make them exact as well.
-    near = np.round(exact)
-    exact = np.where(np.abs(exact - near) < MAX_ROUNDING_ERROR, near, exact)
+    # Cosines of quarter turns have rounding errors, e.g. 1 - 1e-16.
+    integers = np.round(exact)
+    exact = np.where(np.abs(exact - integers) < MAX_ROUNDING_ERROR, integers, exact)
     return ca.sparsify(ca.DM(exact))
 
 
@@ -164,7 +165,7 @@ class ActuatedKinematics:
     """Forward kinematics as a function of q, and Jacobians with respect to q.
 
     Attributes:
-        robot: The description.
+        robot: Description of the robot.
         q: (n, 1) actuator positions.
         kinematics: Poses and axes at theta = c(q).
     """
@@ -176,7 +177,7 @@ class ActuatedKinematics:
     @cached_property
     def coupling(self) -> ca.SX:
         """(m, n) Jacobian of theta = c(q), structurally sparse."""
-        # Over symbols of its own, since q may be an expression here.
+        # Differentiate with respect to new symbols, because q may be an expression.
         symbols = ca.SX.sym("q", len(self.robot.actuators))
         jacobian = ca.jacobian(joint_positions(self.robot, symbols), symbols)
         return ca.Function("coupling", [symbols], [jacobian])(self.q)
@@ -225,7 +226,7 @@ def actuated(robot: RobotDescription, q: ca.SX) -> ActuatedKinematics:
     """Return the kinematics as a function of the motor positions.
 
     Args:
-        robot: The description.
+        robot: Description of the robot.
         q: (n, 1) actuator positions [rad or m].
     """
     return ActuatedKinematics(robot, q, forward(robot, joint_positions(robot, q)))

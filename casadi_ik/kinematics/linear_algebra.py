@@ -1,26 +1,26 @@
 """Small dense linear algebra as straight-line graphs: solves, pseudoinverses, singular values.
 
-Each solver is built once per size as an SX function and inlined where it is called, so it works
-on SX, MX and DM alike. There is no data-dependent branch, hence no pivoting: symmetric positive
-definite systems need none, general systems use Householder reflections instead. Singular input
-never yields NaN: pivots are kept above `PIVOT_FLOOR` in absolute value. That is a guard, no
-regularisation; damp what may become singular.
+Each solver is built once per size as an SX function and inlined at each call, so it works on SX, MX
+and DM. There are no data-dependent branches and therefore no pivoting: symmetric positive definite
+systems need none, general systems use Householder reflections. Singular input never yields NaN,
+because the absolute values of pivots are at least `PIVOT_FLOOR`. This bound does not regularise:
+use damping for systems that can become singular.
 
-Damping `lam` carries the unit of a singular value of J: a direction of singular value s is scaled
-by s^2 / (s^2 + lam^2).
+Damping `lam` has the unit of a singular value of J: a direction of singular value s is scaled by
+s^2 / (s^2 + lam^2).
 
 `svd`: one-sided Jacobi rotations (Hestenes 1958) make the columns of the narrower of J and J'
-orthogonal: no square of J is formed, so small singular values keep an absolute error of rounding
-times the largest. The number of sweeps is fixed, chosen by measurement (`SWEEPS`), and rank
-deficiency is harmless. A Householder QR first makes J square, which saves a third of the
+orthogonal. No square of J is formed, so the absolute error of small singular values is the rounding
+error of the largest. The number of sweeps is fixed (`SWEEPS`, chosen by measurement), and rank
+deficiency is harmless. A Householder QR makes J square beforehand, which saves a third of the
 instructions for a (3, 9) Jacobian.
 
-`extreme_singular_values` at a tenth of its cost: the Gram matrix of the narrower side is brought to
-tridiagonal form (Householder), and Laguerre's iteration on its characteristic polynomial runs from
-outside to the first and the last root, without overshooting. The square costs digits: what is below
-about 1e-7 of the largest singular value is not resolved, whatever it is.
+`extreme_singular_values` takes a tenth of the instructions of `svd`: the Gram matrix of the
+narrower side is brought to tridiagonal form (Householder), and Laguerre's iteration on its
+characteristic polynomial converges monotonically from outside to the first and the last root. The
+Gram matrix loses digits: values below about 1e-7 of the largest singular value are not resolved.
 
-Neither of these two is meant to be differentiated.
+Do not differentiate `svd` and `extreme_singular_values`.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ import casadi as ca
 from casadi_ik.kinematics.smooth import Expr, safe_sqrt
 
 PIVOT_FLOOR = 1e-30
-"""Smallest pivot [unit of the matrix]; far below any meaningful value, far above underflow."""
+"""Smallest pivot, far below any meaningful value and far above underflow [unit of the matrix]."""
 
 
 def solve_spd(A: Expr, b: Expr) -> Expr:
-    """Solve A x = b for a symmetric positive definite A, by LDL' without pivoting.
+    """Solve A x = b for a symmetric positive definite A by LDL' without pivoting.
 
     Args:
-        A: (n, n); only the lower triangle is read.
-        b: (n, k).
+        A: (n, n) matrix, of which only the lower triangle is read.
+        b: (n, k) right-hand sides.
 
     Returns:
         x (n, k).
@@ -49,27 +49,27 @@ def solve_spd(A: Expr, b: Expr) -> Expr:
 
 
 def det_spd(A: Expr) -> Expr:
-    """Return determinant of a symmetric positive semidefinite A (n, n): the product of LDL' pivots.
+    """Return the determinant of a symmetric positive semidefinite A (n, n) from its LDL' pivots.
 
-    Rounding may leave it slightly negative where it should be 0. 81 instructions for n = 6,
-    where CasADi's expansion by minors takes 2000.
+    Rounding can make a zero determinant slightly negative. It takes 81 instructions for n = 6, and
+    CasADi's expansion by minors takes 2000.
     """
     return _det_spd_function(A.shape[0])(A)
 
 
 def solve(A: Expr, b: Expr) -> Expr:
-    """Solve A x = b for a general square A, by Householder QR.
+    """Solve A x = b for a general square A by Householder QR.
 
-    Backward stable without row exchanges: 867 instructions for n = 6, k = 4. Gaussian elimination
-    with exchanges written as selections takes 1244; `ca.solve` takes 861, but its Gram-Schmidt
-    loses half the digits near a singularity.
+    The method is backward stable without row exchanges and takes 867 instructions for n = 6, k = 4.
+    Gaussian elimination with exchanges as selections takes 1244; `ca.solve` takes 861, but its
+    Gram-Schmidt loses half the digits near a singularity.
 
     Args:
-        A: (n, n).
-        b: (n, k).
+        A: (n, n) matrix.
+        b: (n, k) right-hand sides.
 
     Returns:
-        x (n, k); finite, but meaningless, if A is singular.
+        x (n, k); finite but meaningless if A is singular.
     """
     return _solve_function(*b.shape)(A, b)
 
@@ -77,12 +77,12 @@ def solve(A: Expr, b: Expr) -> Expr:
 def damped_pinv_times(J: Expr, e: Expr, lam: Expr) -> Expr:
     """Return the damped least-squares solution J' (J J' + lam^2 I)^-1 e (Wampler 1986).
 
-    Solved on the smaller side of J; both forms are equal.
+    The smaller of the two equivalent systems is solved.
 
     Args:
-        J: (m, n).
-        e: (m, k).
-        lam: scalar damping [unit of a singular value of J].
+        J: (m, n) Jacobian.
+        e: (m, k) errors.
+        lam: Scalar damping [unit of a singular value of J].
 
     Returns:
         x (n, k), the minimiser of |J x - e|^2 + lam^2 |x|^2.
@@ -96,13 +96,14 @@ def damped_pinv_times(J: Expr, e: Expr, lam: Expr) -> Expr:
 def weighted_damped_pinv_times(J: Expr, e: Expr, lam: Expr, weights: Expr) -> Expr:
     """Return the weighted damped least-squares solution (Chan & Dubey 1995).
 
-    W^-1 J' (J W^-1 J' + lam^2 I)^-1 e with W = diag(weights): a heavy coordinate moves little.
+    W^-1 J' (J W^-1 J' + lam^2 I)^-1 e with W = diag(weights): a coordinate of large weight moves
+    little.
 
     Args:
-        J: (m, n).
-        e: (m, k).
-        lam: scalar damping [unit of a singular value of J W^-1/2].
-        weights: (n, 1), positive.
+        J: (m, n) Jacobian.
+        e: (m, k) errors.
+        lam: Scalar damping [unit of a singular value of J W^-1/2].
+        weights: (n, 1) positive weights.
 
     Returns:
         x (n, k), the minimiser of |J x - e|^2 + lam^2 x' W x.
@@ -115,13 +116,13 @@ def weighted_damped_pinv_times(J: Expr, e: Expr, lam: Expr, weights: Expr) -> Ex
 
 
 def pinv_times(J: Expr, e: Expr, eps: float = 1e-6) -> Expr:
-    """Return the pseudoinverse of J times e, regularised: `damped_pinv_times` with a tiny damping.
+    """Return the regularised pseudoinverse of J times e: `damped_pinv_times` with small damping.
 
     Args:
-        J: (m, n).
-        e: (m, k).
-        eps: damping [unit of a singular value of J]. The relative error in a direction of
-            singular value s is eps^2 / s^2; below 1e-7 |J| rounding takes over.
+        J: (m, n) Jacobian.
+        e: (m, k) errors.
+        eps: Damping [unit of a singular value of J]. The relative error in a direction of singular
+            value s is eps^2 / s^2; rounding errors dominate below 1e-7 |J|.
 
     Returns:
         x (n, k).
@@ -132,12 +133,12 @@ def pinv_times(J: Expr, e: Expr, eps: float = 1e-6) -> Expr:
 def project_to_null_space(J: Expr, x: Expr, eps: float = 1e-6) -> Expr:
     """Project x onto the null space of J: x - J^+ J x, regularised as in `pinv_times`.
 
-    The part of x at a singular value s is left with eps^2 / (s^2 + eps^2) of its length.
+    The component of x at a singular value s is scaled by eps^2 / (s^2 + eps^2).
 
     Args:
-        J: (m, n).
-        x: (n, k).
-        eps: damping [unit of a singular value of J].
+        J: (m, n) Jacobian.
+        x: (n, k) vectors.
+        eps: Damping [unit of a singular value of J].
 
     Returns:
         (n, k).
@@ -182,7 +183,7 @@ def _ldl(A: Expr) -> tuple[list[list[Expr]], list[Expr], list[Expr]]:
     for j in range(A.shape[0]):
         row, pivot = [], A[j, j]
         for i in range(j):
-            # Row j of L D first, then of L: one division per pivot in all.
+            # Row j of L D before row j of L, so that each pivot needs only one division.
             row.append(A[j, i] - sum((row[p] * L[i][p] for p in range(i)), ca.SX(0)))
         for i in range(j):
             scaled = row[i] * inverses[i]
@@ -216,15 +217,17 @@ def _solve_function(n: int, k: int) -> ca.Function:
 
 
 def reflector(x: Expr, row: int) -> tuple[Expr, Expr, Expr]:
-    """Return the Householder reflection I - v w' that clears a vector below a row.
+    """Return the Householder reflection I - v w' that zeroes a vector below a row.
+
+    The result is a reflection even for x = 0.
 
     Args:
-        x: (n, 1).
-        row: entries above this row stay as they are.
+        x: (n, 1) vector.
+        row: Index of the first row that the reflection changes.
 
     Returns:
-        v (n - row, 1), w (n - row, 1), both acting on the rows from `row` on, and the value
-        left in `row`. A reflection for x = 0 as well.
+        v (n - row, 1) and w (n - row, 1), which act on the rows from `row` on, and the new value of
+        `row`.
     """
     x = ca.vertcat(x[row] + 1e-150, x[row + 1 :])
     norm = ca.sqrt(ca.dot(x, x))
@@ -243,19 +246,20 @@ SWEEPS = {1: 0, 2: 1, 3: 4, 4: 5, 5: 5, 6: 5}
 """Default number of sweeps by the smaller dimension of J."""
 
 SMALLEST_DIVISOR = 1e-300
+"""Lower bound of divisors."""
 
 
 def svd(J: Expr, sweeps: int | None = None) -> tuple[Expr, Expr, Expr]:
     """Return the thin singular value decomposition J = U diag(s) V'.
 
     Args:
-        J: (m, n); k = min(m, n).
-        sweeps: Jacobi sweeps; None takes `SWEEPS[k]`, or 7 for k > 6.
+        J: (m, n) matrix; k = min(m, n).
+        sweeps: Number of Jacobi sweeps; None: `SWEEPS[k]`, or 7 for k > 6.
 
     Returns:
-        U (m, k), s (k, 1), V (n, k), with s descending. The factor on the narrow side of J (U
-        if square) is orthogonal always, the other one up to columns of singular values below
-        1e-100, which may be zero.
+        U (m, k), s (k, 1) in descending order, V (n, k). The factor on the narrow side of J (U if
+        J is square) is always orthogonal. Columns of the second factor whose singular values are
+        below 1e-100 may be zero.
     """
     wide = J.shape[0] <= J.shape[1]
     A = J.T if wide else J
@@ -265,7 +269,7 @@ def svd(J: Expr, sweeps: int | None = None) -> tuple[Expr, Expr, Expr]:
 
 
 def singular_values(J: Expr, sweeps: int | None = None) -> Expr:
-    """Return the singular values (k, 1) of J (m, n), k = min(m, n), descending; see `svd`."""
+    """Return the singular values (k, 1) of J (m, n) in descending order; see `svd`."""
     return svd(J, sweeps)[1]
 
 
@@ -278,8 +282,8 @@ def condition_number(s: Expr, cap: float = 1e12) -> Expr:
 def manipulability(J: Expr) -> Expr:
     """Return Yoshikawa's measure sqrt(det(J J')) of J (m, n), or sqrt(det(J' J)) if m > n.
 
-    Differentiable; at a singularity 0 (1e-150) with derivative 0. Its square is resolved to
-    rounding only, so where the singular values are at hand, their product is more accurate.
+    It is differentiable, and 0 (1e-150) with derivative 0 at a singularity. It is computed from its
+    square, so the product of the singular values is more accurate.
     """
     m, n = J.shape
     G = ca.mtimes(J, J.T) if m <= n else ca.mtimes(J.T, J)
@@ -334,17 +338,15 @@ def _svd_function(n: int, k: int, sweeps: int) -> ca.Function:
 
 
 ITERATIONS = {2: 1, 3: 4, 4: 4}
-"""Of Laguerre by the smaller dimension, 5 for larger ones; of two roots each is found at once.
-On 400 random matrices of up to 6 rows, some singular, the smallest value is exact to 1e-8
-of the largest, and the largest to 2e-5 of itself."""
-
-SMALLEST_DIVISOR = 1e-300
+"""Number of Laguerre iterations by the smaller dimension; 5 for larger ones. Two roots are exact
+after one iteration. On 400 random matrices of up to 6 rows, some singular, the smallest value is
+exact to 1e-8 of the largest, and the largest has a relative error of 2e-5."""
 
 
 def extreme_singular_values(J: Expr) -> tuple[Expr, Expr]:
-    """Return the smallest and largest singular value of J (m, n), of min(m, n).
+    """Return the smallest and largest of the min(m, n) singular values of J (m, n).
 
-    Not meant to be differentiated.
+    Do not differentiate the result.
     """
     narrow = J.T if J.shape[0] <= J.shape[1] else J
     gram = ca.densify(narrow.T @ narrow)
@@ -364,18 +366,18 @@ def _tridiagonal(A: list[list[Expr]]) -> tuple[list[Expr], list[Expr]]:
     diagonal, squares = [], []
     for k in range(n - 2):
         rows = range(k + 1, n)
-        rest = sum((A[i][k] * A[i][k] for i in rows[1:]), ca.SX(0.0))
-        square = A[k + 1][k] * A[k + 1][k] + rest
+        tail = sum((A[i][k] * A[i][k] for i in rows[1:]), ca.SX(0.0))
+        square = A[k + 1][k] * A[k + 1][k] + tail
         norm = ca.sqrt(square)
         head = A[k + 1][k] + ca.if_else(A[k + 1][k] < 0, -norm, norm)
         v = {k + 1: head} | {i: A[i][k] for i in rows[1:]}
-        factor = 2 / (head * head + rest + SMALLEST_DIVISOR)
+        factor = 2 / (head * head + tail + SMALLEST_DIVISOR)
         p = {
             i: factor * sum((A[max(i, j)][min(i, j)] * v[j] for j in rows), ca.SX(0.0))
             for i in rows
         }
-        along = 0.5 * factor * sum((p[i] * v[i] for i in rows), ca.SX(0.0))
-        w = {i: p[i] - along * v[i] for i in rows}
+        projection = 0.5 * factor * sum((p[i] * v[i] for i in rows), ca.SX(0.0))
+        w = {i: p[i] - projection * v[i] for i in rows}
         for i in rows:
             for j in range(k + 1, i + 1):
                 A[i][j] = A[i][j] - v[i] * w[j] - w[i] * v[j]

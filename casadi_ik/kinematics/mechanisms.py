@@ -85,7 +85,7 @@ def theta3_rate(phi: Expr, bar: Linkage) -> Expr:
 
     Its numerator p sin(psi - phi) - h sin(phi + theta3 - psi) is g sin(psi), the lever of O about
     the rod, so f = g sin(psi) / [h sin(phi + theta3 - psi)], where h sin(phi + theta3 - psi) =
-    sigma sqrt(A^2 + B^2 - C^2) / (2 q). Hence f vanishes where rod and ground align.
+    sigma sqrt(A^2 + B^2 - C^2) / (2 q). Therefore f is zero if rod and ground are aligned.
     """
     (_, s), root = _rod(phi, bar)
     return (2 * bar.g * bar.q) * s / (bar.branch * root)

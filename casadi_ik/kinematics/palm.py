@@ -179,8 +179,8 @@ def start_table(robot: RobotDescription) -> tuple[Array, Array]:
     The features of a palm pose are its rotation, row by row, and its origin / `LENGTH`.
     """
     columns = list(robot.arm_actuators)
-    spread = spread_points(NUMERIC_ARM_PARAMETERS.table_size, len(columns))
-    arms = robot.lower[columns] + spread * (robot.upper - robot.lower)[columns]
+    samples = spread_points(NUMERIC_ARM_PARAMETERS.table_size, len(columns))
+    arms = robot.lower[columns] + samples * (robot.upper - robot.lower)[columns]
     q = ca.SX.sym("q", len(columns))
     palm = _palm_of_arm(robot, q)
     features = ca.vertcat(ca.vec(palm.rotation.T), palm.origin / LENGTH)

@@ -1,8 +1,8 @@
 """Table of hand postures, ranked by the similarity of the shape of their contacts to a target.
 
-Distances between contact points and angles of the normals do not change when the hand is moved as
-a whole. These invariants of a target are compared with those of many postures, so that the hand
-stage starts from postures that nearly fit, wherever the palm may be.
+Distances between contact points and angles between normals are invariant under rigid motions of the
+hand. The invariants of a target are compared with those of many postures, so that the hand stage
+starts from postures that nearly fit for any pose of the palm.
 """
 
 from __future__ import annotations
@@ -22,15 +22,16 @@ from casadi_ik.kinematics.contacts import LENGTH
 
 
 def contact_shape(f: int, scales: Sequence[float] | NDArray = ()) -> FunctionGraph:
-    """Return invariants of contacts under rigid motions, NaN where free (and for f = 1).
+    """Return the graph of invariants of contacts under rigid motions; NaN if free, and for f = 1.
 
-    Distances of the points, cosines between the normals, slopes of the normals against the lines
-    between the points, and the side of the plane of three points that the normals are on.
+    The invariants are the distances of the points, the cosines between the normals, the components
+    of the normals along the lines between the points, and those along the normals of the planes
+    through three points.
 
     Args:
         f: Number of fingers.
-        scales: If there are any, a third input (len(scales), 1) follows the invariants, its
-            entries multiplied by these.
+        scales: Factors of the entries of an optional third input (len(scales), 1), which are
+            appended to the invariants.
 
     Returns:
         points (f, 3) [m] and normals (f, 3) -> values (s, 1).
@@ -55,15 +56,16 @@ def _build(name: str, f: int, factors: tuple[float, ...]) -> ca.Function:
     for i, j in permutations(range(f), 2):
         values.append(ca.dot(points[j, :] - points[i, :], normals[i, :]) / LENGTH)
     for i, j, m in combinations(range(f), 3):
-        one, other = points[j, :] - points[i, :], points[m, :] - points[i, :]
-        across = ca.cross(one, other) / ca.fmax(ca.norm_2(one) * ca.norm_2(other), 1e-12)
-        values += [ca.dot(across, normals[k, :]) for k in (i, j, m)]
+        edges = points[j, :] - points[i, :], points[m, :] - points[i, :]
+        lengths = ca.norm_2(edges[0]) * ca.norm_2(edges[1])
+        plane_normal = ca.cross(*edges) / ca.fmax(lengths, 1e-12)
+        values += [ca.dot(plane_normal, normals[k, :]) for k in (i, j, m)]
     invariants = ca.vertcat(*values) if values else ca.SX(float("nan"))
     if not factors:
         return ca.Function(name, [points, normals], [invariants])
-    near = ca.SX.sym("near", len(factors))
-    outputs = [ca.vertcat(invariants, near * ca.DM(factors))]
-    return ca.Function(name, [points, normals, near], outputs)
+    posture = ca.SX.sym("near", len(factors))
+    outputs = [ca.vertcat(invariants, posture * ca.DM(factors))]
+    return ca.Function(name, [points, normals, posture], outputs)
 
 
 class PostureTable:
@@ -71,8 +73,8 @@ class PostureTable:
 
     Attributes:
         postures: (t, k) positions of the hand's actuators.
-        ranges: (k,) between which they are spread.
-        lookup: Finds rows of them.
+        ranges: (k,) ranges of the actuators.
+        lookup: Search for the nearest rows.
     """
 
     def __init__(
@@ -89,21 +91,21 @@ class PostureTable:
 
         Args:
             robot: The robot.
-            hand: Positions in q of the hand's actuators.
+            hand: Indices in q of the hand's actuators.
             size: Number of postures.
-            at_limits: Part of the range [0, 1) that is moved to the limits, half to either: hands
-                stand at their limits more often than an even spread would.
-            pull: How much the distance from a given posture counts along with the contacts' shape:
-                different hands may have contacts of nearly the same shape.
-            compiled: Whether lookups run in compiled code.
-            bounds: (n,) lower and upper, the robot's limits unless given.
+            at_limits: Fraction of the samples [0, 1) that is moved to the limits, because hands are
+                at their limits more often than uniform samples.
+            pull: Weight of the distance from a reference posture in addition to the shape of the
+                contacts, because different postures may have contacts of nearly the same shape.
+            compiled: False searches without compiled code.
+            bounds: Lower and upper bounds (n,); None: limits of the robot.
         """
         columns = list(hand)
-        self._lower, upper = (ends[columns] for ends in bounds or (robot.lower, robot.upper))
+        self._lower, upper = (limits[columns] for limits in bounds or (robot.lower, robot.upper))
         self.ranges = upper - self._lower
         self._squeeze = 1 - at_limits
         q = np.tile(robot.home, (size, 1))
-        q[:, columns] = self.postures = self.spread(0, size)
+        q[:, columns] = self.postures = self.samples(0, size)
         self._pulled = pull > 0
         half_ranges = self.ranges / 2
         scales = np.sqrt(pull / max(len(columns), 1)) / half_ranges
@@ -112,24 +114,24 @@ class PostureTable:
         rows = (*contacts, self.postures) if self._pulled else contacts
         self.lookup = LookupKernel(key, rows, compiled)
 
-    def spread(self, first: int, count: int) -> Array:
-        """Return postures (count, k) of the sequence of the table, from any index on."""
-        spread = (spread_points(count, len(self.ranges), first) - 0.5) / self._squeeze + 0.5
-        return self._lower + np.clip(spread, 0.0, 1.0) * self.ranges
+    def samples(self, first: int, count: int) -> Array:
+        """Return postures (count, k) of the table's sequence, starting at index `first`."""
+        samples = (spread_points(count, len(self.ranges), first) - 0.5) / self._squeeze + 0.5
+        return self._lower + np.clip(samples, 0.0, 1.0) * self.ranges
 
     def nearest(
-        self, points: Array, normals: Array, count: int, near: Array | None = None
+        self, points: Array, normals: Array, count: int, reference: Array | None = None
     ) -> Array:
-        """Return the postures whose contacts are shaped most like the targets, best first.
+        """Return the postures whose contacts are most similar in shape to the targets, best first.
 
         Args:
-            points: (k, f, 3) [m], NaN where free.
-            normals: (k, f, 3), NaN where free.
-            count: How many, at most the size of the table.
-            near: (k, hand) postures they should be near; needed by a table with a pull.
+            points: (k, f, 3) contact points, NaN if free [m].
+            normals: (k, f, 3) contact normals, NaN if free.
+            count: Number of postures per target, at most the size of the table.
+            reference: (k, hand) reference postures; required by a table with a pull.
 
         Returns:
             (k, count, hand) postures.
         """
-        asked = (points, normals, near) if self._pulled else (points, normals)
-        return self.postures[self.lookup(count, *asked)]
+        query = (points, normals, reference) if self._pulled else (points, normals)
+        return self.postures[self.lookup(count, *query)]

@@ -72,9 +72,9 @@ class RobotKernels:
 
     @cached_property
     def deviations(self) -> FunctionKernel:
-        """Distances and angles (f,) from points and normals (f, 3), and `beyond`.
+        """Distances and angles (f,) from points and normals (f, 3), and `limit_excess`.
 
-        What the verdict judges by: written without what the methods minimise, on purpose.
+        The verdict uses this kernel, which shares no code with the residuals of the methods.
         """
 
         def build(q: ca.SX, points: ca.SX, normals: ca.SX) -> list[ca.SX]:
@@ -83,10 +83,10 @@ class RobotKernels:
             for i, name in enumerate(self._robot.finger_names):
                 point, normal = kinematics.contact(name)
                 positions.append(ca.norm_2(point - points[i, :].T))
-                # Kahan's angle: exact at zero and at a half turn, where arc cosine loses half the
-                # digits.
-                apart, together = normal - normals[i, :].T, normal + normals[i, :].T
-                angles.append(2 * ca.atan2(ca.norm_2(apart), ca.norm_2(together)))
+                # Kahan's formula is exact at zero and at a half turn, where the arc cosine loses
+                # half the digits.
+                difference, total = normal - normals[i, :].T, normal + normals[i, :].T
+                angles.append(2 * ca.atan2(ca.norm_2(difference), ca.norm_2(total)))
             return [ca.vertcat(*positions), ca.vertcat(*angles), self._excess(q)]
 
         f = len(self._robot.finger_names)
@@ -94,28 +94,28 @@ class RobotKernels:
         return self._kernel("deviations", build, targets, [(f, 1), (f, 1), (1, 1)])
 
     @cached_property
-    def beyond(self) -> FunctionKernel:
-        """Excess of the worst actuator or joint over its limits."""
+    def limit_excess(self) -> FunctionKernel:
+        """Largest violation of the limits of an actuator or joint; negative within all limits."""
         return self._kernel("beyond_limits", lambda q: [self._excess(q)], {}, [(1, 1)])
 
     def _excess(self, q: ca.SX) -> ca.SX:
         description = self._robot
-        both = ca.vertcat(q, joint_positions(description, q))
-        # As the file has them: bounds that were derived from these are not judged by themselves.
+        positions = ca.vertcat(q, joint_positions(description, q))
+        # The limits of the file; bounds that were derived from them are not checked.
         strokes = description.actuator_limits
         names = np.array(description.actuator_names)[description.continuous]
         motors, joints = (
             np.isin(all_names, names)
             for all_names in (description.actuator_names, description.joint_names)
         )
-        endless = np.concatenate([motors, joints])
+        is_continuous = np.concatenate([motors, joints])
         lower = np.concatenate([strokes[0], description.joint_lower])
         upper = np.concatenate([strokes[1], description.joint_upper])
         lower, upper = (
-            ca.DM(np.where(endless, sign * CONTINUOUS_LIMIT, ends))
-            for sign, ends in ((-1, lower), (1, upper))
+            ca.DM(np.where(is_continuous, sign * CONTINUOUS_LIMIT, limits))
+            for sign, limits in ((-1, lower), (1, upper))
         )
-        return ca.mmax(ca.fmax(lower - both, both - upper))
+        return ca.mmax(ca.fmax(lower - positions, positions - upper))
 
     @cached_property
     def palm(self) -> FunctionKernel:
@@ -140,23 +140,28 @@ class RobotKernels:
         self,
         name: str,
         build: Callable[..., list[ca.SX]],
-        others: Mapping[str, Shape],
+        extra_inputs: Mapping[str, Shape],
         outputs: Sequence[Shape],
     ) -> FunctionKernel:
-        """Return the kernel of a function of q and other inputs."""
-        # A robot's name may be anything; a function's may not.
-        full = ca.Function.fix_name(f"{self._robot.name}_{name}")
-        inputs = {"q": (len(self._robot.actuators), 1), **others}
+        """Return the kernel of a function of q and further inputs."""
+        # Names of functions permit fewer characters than names of robots.
+        function_name = ca.Function.fix_name(f"{self._robot.name}_{name}")
+        inputs = {"q": (len(self._robot.actuators), 1), **extra_inputs}
 
         def function() -> ca.Function:
             symbols = [ca.SX.sym(key, *shape) for key, shape in inputs.items()]
             results = [ca.densify(output) for output in build(*symbols)]
             return ca.Function(
-                full, symbols, results, list(inputs), [f"out_{i}" for i in range(len(results))]
+                function_name,
+                symbols,
+                results,
+                list(inputs),
+                [f"out_{i}" for i in range(len(results))],
             )
 
-        known = recipe(full, self._recipe)
-        return FunctionKernel(FunctionGraph(full, function, inputs, tuple(outputs), known))
+        key = recipe(function_name, self._recipe)
+        graph = FunctionGraph(function_name, function, inputs, tuple(outputs), key)
+        return FunctionKernel(graph)
 
     @cached_property
     def _recipe(self) -> str:

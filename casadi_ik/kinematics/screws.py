@@ -1,20 +1,20 @@
 """Kinematics by unit dual quaternions: the product of exponentials of Chandra et al. 2019.
 
 Section II-A, eqs. (1) to (7). Every joint is a screw about a line that is fixed in the base frame
-at the reference pose, all joints at zero; the pose of the end is
+at the reference pose, in which all joint positions are zero. The pose of the end of a chain is
 
     x_e = delta_1 delta_2 ... delta_n x_e0,   delta_j = exp(theta_j / 2  s_j0).
 
-The numbers are those of `casadi_ik.kinematics.forward`, which multiplies frames instead.
+It agrees with `casadi_ik.kinematics.forward`, which multiplies frames instead.
 
-How a fingertip moves with its joints and sliders: eqs. (10), (12), (15). A tip is seen from the
-robot's base, or from another fingertip. Either way its pose is a product of screws from a reference
-pose, eq. (3). Seen from another tip, the chain runs from that tip back to the palm and out again,
-and the joints of the way back move with reversed sign, eq. (16).
+Jacobians of a fingertip with respect to joints and sliders follow eqs. (10), (12) and (15). The
+pose of a tip is expressed relative to the robot's base or to another fingertip, and is a product of
+screws and a reference pose, eq. (3). Relative to another tip, the chain leads from that tip back to
+the palm and from there to the finger; joints on the way back move with inverted sign, eq. (16).
 
-Joints that follow others have no column of their own: their screws are added to that of the joint
-that drives them, times the coupling's rate. So there is a column per driving joint (eqs. (12) and
-(15), in joint space), and from the same graph one per actuator (in slider space).
+Coupled joints have no columns: their screws, multiplied by the rate of the coupling, are added to
+the column of the joint that drives them. The joint-space Jacobian therefore has a column per
+driving joint (eqs. 12 and 15), and the same graph yields a column per actuator (slider space).
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ from casadi_ik.model.joints import Joint
 
 @dataclass(frozen=True, eq=False)
 class Screw:
-    """A joint's axis at the reference pose, in the base frame.
+    """Axis of a joint at the reference pose, in the base frame.
 
     Attributes:
         direction: (3,) unit direction l.
-        moment: (3,) moment m = p x l [m], p any point of the axis.
-        revolute: Whether it turns about the axis, else it slides along it.
+        moment: (3,) moment m = p x l [m] for any point p of the axis.
+        revolute: True for a rotation about the axis, False for a translation along it.
     """
 
     direction: Array
@@ -50,18 +50,18 @@ class Screw:
     revolute: bool
 
     def displacement(self, theta: Expr) -> Expr:
-        """Return unit dual quaternion (8, 1) of moving by theta [rad or m]: delta_j of eq. (3)."""
+        """Return the displacement delta_j (8, 1) of eq. (3) for theta [rad or m]."""
         angle, distance = (theta, 0.0) if self.revolute else (0.0, theta)
         return dq.exp_screw(angle, distance, ca.DM(self.direction), ca.DM(self.moment))
 
 
 @dataclass(frozen=True, eq=False)
 class ScrewChain:
-    """The joints from the base to one frame.
+    """Joints from the base to a frame.
 
     Attributes:
-        joints: Names of the movable joints, from the base on.
-        screws: Their screws at the reference pose.
+        joints: Names of the movable joints, starting at the base.
+        screws: Screws of the joints at the reference pose.
         reference: (8,) unit dual quaternion x_e0 of the frame at the reference pose.
     """
 
@@ -88,7 +88,7 @@ class ChainScrews:
 
     @cached_property
     def displacements(self) -> list[Expr]:
-        """The products delta_1 ... delta_j for j = 0 (nothing moved), 1, ..., n: eq. (7)."""
+        """Products delta_1 ... delta_j for j = 0 (the identity), 1, ..., n: eq. (7)."""
         products = [dq.identity()]
         for i, screw in enumerate(self.chain.screws):
             products.append(dq.multiply(products[-1], screw.displacement(self.theta[i])))
@@ -101,18 +101,18 @@ class ChainScrews:
 
     @property
     def axes(self) -> list[tuple[Expr, Expr]]:
-        """Direction (3, 1) and moment (3, 1) [m] of every joint's axis now: eq. (6)."""
+        """Current direction (3, 1) and moment (3, 1) [m] of each joint axis: eq. (6)."""
         return [
-            dq.act_on_line(moved, ca.DM(screw.direction), ca.DM(screw.moment))
-            for moved, screw in zip(self.displacements, self.chain.screws, strict=False)
+            dq.act_on_line(displacement, ca.DM(screw.direction), ca.DM(screw.moment))
+            for displacement, screw in zip(self.displacements, self.chain.screws, strict=False)
         ]
 
     @property
     def jacobian(self) -> Expr:
-        """Screw Jacobian (6, n): eq. (5), written as twists [v; w] per joint unit.
+        """Screw Jacobian (6, n) of eq. (5) with twists [v; w] per joint unit.
 
-        v is the velocity of the point of the end's body that is instantly at the base's origin,
-        as in eq. (4); a point p of the body moves with v + w x p.
+        As in eq. (4), v is the velocity of the point of the last link that is instantaneously at
+        the origin of the base; a point p of the link has the velocity v + w x p.
         """
         columns = [
             ca.vertcat(moment, direction) if screw.revolute else ca.vertcat(direction, 0, 0, 0)
@@ -125,7 +125,7 @@ def screw_chain_to_contact(robot: RobotDescription, finger: str) -> ScrewChain:
     """Return the chain to a finger's contact frame.
 
     Raises:
-        UnknownNameError: There is no such finger.
+        UnknownNameError: The finger does not exist.
     """
     entry = robot.finger(finger)
     return _chain(robot, entry.link, entry.placement)
@@ -153,12 +153,12 @@ def _screw(joint: Joint, frame: Pose, axis: ca.SX) -> Screw:
 
 @dataclass(frozen=True, eq=False)
 class TipChain:
-    """The joints between a frame and a fingertip.
+    """Joints between a reference frame and a fingertip.
 
     Attributes:
-        robot: The description.
-        chain: Screws in that frame, from it to the tip, and the tip's reference pose.
-        signs: +1 or -1 per joint of the chain: eq. (16), -1 on the way back to the palm.
+        robot: Description of the robot.
+        chain: Screws in the reference frame, and the reference pose of the tip.
+        signs: Sign of each joint of the chain, eq. (16): -1 on the way back to the palm, else +1.
     """
 
     robot: RobotDescription
@@ -182,7 +182,7 @@ class TipChain:
         )
 
     def driver(self, name: str) -> str:
-        """Return the joint that drives a joint through its couplings; itself if uncoupled."""
+        """Return the joint that drives a joint through its couplings; the joint if uncoupled."""
         joint = self.joint(name)
         while joint.coupling is not None and joint.coupling.of in self.robot.joint_names:
             joint = self.joint(joint.coupling.of)
@@ -194,16 +194,16 @@ class TipChain:
         return driver if coupling is None else coupling.of
 
     def joint(self, name: str) -> Joint:
-        """Return the movable joint of that name."""
+        """Return a movable joint by name."""
         return self.robot.movable[self.robot.joint_names.index(name)]
 
 
 @dataclass(frozen=True, eq=False)
 class TipMotion:
-    """A tip at a configuration; twists are [v; w] in the frame it is seen from.
+    """A tip at a configuration; twists are [v; w] in the reference frame.
 
     Attributes:
-        tip: The chain.
+        tip: Chain of the tip.
         q: (n, 1) actuator positions [rad or m].
     """
 
@@ -219,7 +219,7 @@ class TipMotion:
 
     @cached_property
     def screws(self) -> ChainScrews:
-        """The chain's screws at this configuration: eqs. (3), (5) to (7)."""
+        """Screws of the chain at this configuration: eqs. (3), (5) to (7)."""
         pairs = zip(self.tip.signs, self.tip.chain.joints, strict=True)
         return self.tip.chain.at(ca.vertcat(*(sign * self.joints[name] for sign, name in pairs)))
 
@@ -230,13 +230,12 @@ class TipMotion:
 
     @cached_property
     def joint_jacobian(self) -> Expr:
-        """Twist (6, d) per unit rate of the driving joints: eq. (12), seen from a tip eq. (15).
+        """Twist (6, d) per unit rate of the driving joints, eq. (12); relative to a tip, eq. (15).
 
-        Column i belongs to `tip.drivers[i]`. Of the index finger of the AR10 it is
-        [s_1, s_2 + f s_3]; from its tip to the thumb's [s_i2 + f s_i3, s_i1, s_t1, s_t2]. The
-        paper's display of (15) leaves s_i1 out, which its (16) asks for. A driving joint of the
-        way back counts as reversed, so its rate is the negative of the joint's own: see
-        `displacement`.
+        Column i belongs to `tip.drivers[i]`. For the index finger of the AR10 it is
+        [s_1, s_2 + f s_3]; from its tip to that of the thumb [s_i2 + f s_i3, s_i1, s_t1, s_t2].
+        Eq. (15) of the paper omits s_i1, which its eq. (16) requires. The rate of a driving joint
+        on the way back is the negative rate of the joint: see `displacement`.
         """
         tip, columns = self.tip, dict.fromkeys(self.tip.drivers, ca.DM.zeros(6, 1))
         for i, name in enumerate(tip.chain.joints):
@@ -249,13 +248,13 @@ class TipMotion:
         """Return the joint displacements (d, 1) that `joint_jacobian` multiplies: eq. (16).
 
         Args:
-            rates: (d, 1) of the driving joints themselves [rad or m].
+            rates: (d, 1) displacements of the driving joints [rad or m].
         """
         return ca.vertcat(*(self._sign(name) for name in self.tip.drivers)) * rates
 
     @cached_property
     def jacobian(self) -> Expr:
-        """Twist (6, k) per unit rate of `tip.actuators`: in slider space for the AR10."""
+        """Twist (6, k) per unit rate of `tip.actuators`; for the AR10, in slider space."""
         tip = self.tip
         drive = ca.SX.zeros(len(tip.drivers), len(tip.actuators))
         for row, driver in enumerate(tip.drivers):
@@ -282,7 +281,7 @@ def finger_chain(robot: RobotDescription, finger: str) -> TipChain:
     """Return the contact frame of a finger relative to the base: the chain of eq. (12).
 
     Raises:
-        UnknownNameError: There is no such finger.
+        UnknownNameError: A finger does not exist.
     """
     chain = screw_chain_to_contact(robot, finger)
     return TipChain(robot, chain, (1,) * len(chain.joints))
@@ -291,32 +290,35 @@ def finger_chain(robot: RobotDescription, finger: str) -> TipChain:
 def relative_chain(robot: RobotDescription, reference: str, finger: str) -> TipChain:
     """Return the chain between the contact frames of two fingers: eqs. (15) and (16).
 
-    Joints that carry both (an arm, above all) move neither against the other and are left out.
+    Joints that carry both fingers, such as those of an arm, do not move them relative to each other
+    and are omitted.
 
     Args:
-        robot: The description.
-        reference: The finger whose contact frame everything is expressed in.
-        finger: The other one.
+        robot: Description of the robot.
+        reference: Finger whose contact frame is the reference frame.
+        finger: Finger at the end of the chain.
 
     Raises:
-        UnknownNameError: There is no such finger.
-        InputError: Both are the same.
+        UnknownNameError: A finger does not exist.
+        InputError: Both fingers are the same.
     """
     if reference == finger:
         raise InputError(f"relative chain: found {finger!r} twice, expected two fingers")
-    back, out = (screw_chain_to_contact(robot, name) for name in (reference, finger))
-    shared = sum(a == b for a, b in zip(back.joints, out.joints, strict=False))
+    back, forth = (screw_chain_to_contact(robot, name) for name in (reference, finger))
+    shared = sum(a == b for a, b in zip(back.joints, forth.joints, strict=False))
     base_in_reference = dq.conjugate(ca.DM(back.reference))
 
-    def seen(screw: Screw) -> Screw:
-        moved = dq.act_on_line(base_in_reference, ca.DM(screw.direction), ca.DM(screw.moment))
-        return Screw(number(moved[0]), number(moved[1]), screw.revolute)
+    def in_reference(screw: Screw) -> Screw:
+        direction, moment = dq.act_on_line(
+            base_in_reference, ca.DM(screw.direction), ca.DM(screw.moment)
+        )
+        return Screw(number(direction), number(moment), screw.revolute)
 
-    screws = (*reversed(back.screws[shared:]), *out.screws[shared:])
+    screws = (*reversed(back.screws[shared:]), *forth.screws[shared:])
     chain = ScrewChain(
-        joints=(*reversed(back.joints[shared:]), *out.joints[shared:]),
-        screws=tuple(seen(screw) for screw in screws),
-        reference=number(dq.multiply(base_in_reference, ca.DM(out.reference))),
+        joints=(*reversed(back.joints[shared:]), *forth.joints[shared:]),
+        screws=tuple(in_reference(screw) for screw in screws),
+        reference=number(dq.multiply(base_in_reference, ca.DM(forth.reference))),
     )
-    signs = (-1,) * len(back.joints[shared:]) + (1,) * len(out.joints[shared:])
+    signs = (-1,) * len(back.joints[shared:]) + (1,) * len(forth.joints[shared:])
     return TipChain(robot, chain, signs)

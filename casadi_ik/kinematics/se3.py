@@ -6,11 +6,10 @@ point in the moved frame to the outer frame: x -> R x + p. A twist is (6, 1), **
 part first, angular part second (pinocchio's order). Angles are in rad.
 
 All functions accept SX, MX and DM and return dense results; values and first derivatives are
-finite at zero rotation, and values at a half turn as well (where the logarithm jumps). Contact
-normals live on the sphere, where two points are special: equal vectors (the error is zero) and
-opposite vectors (the error is a half turn about an axis that is free to choose). All is finite at
-both; at opposite vectors one perpendicular axis is chosen so that a solver is not left standing
-on the saddle.
+finite at zero rotation, and values are also finite at a half turn (where the logarithm jumps).
+Contact normals are unit vectors with two special cases: equal vectors, whose error is zero, and
+opposite vectors, whose error is a half turn about an arbitrary axis. All results are finite in both
+cases. For opposite vectors a perpendicular axis is chosen, so that solvers leave the saddle point.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ import numpy as np
 from casadi_ik.kinematics.smooth import Expr, call_function, even_function, safe_norm, safe_sqrt
 
 TINY_SQUARED = 1e-8
-"""Switching point: two Taylor terms are exact below it; the closed forms do not cancel above."""
+"""Bound below which two Taylor terms are exact; above, closed forms do not lose digits."""
 
 HALF_SINC = (1.0, -1 / 24)
 HALF_COSINE = (1.0, -1 / 8)
@@ -44,8 +43,8 @@ def exp_so3(w: Expr) -> Expr:
 def log_so3(R: Expr) -> Expr:
     """Return the rotation vector w (3, 1) [rad] of R (3, 3), with |w| <= pi.
 
-    Goes through the quaternion, so it is accurate to rounding both near 0 and near pi. At exactly
-    pi the sign of w is a free choice.
+    It is computed from the quaternion, which is accurate to rounding near 0 and near pi. At exactly
+    pi the sign of w is arbitrary.
     """
     return quaternion_log(quaternion_from_matrix(R))
 
@@ -80,8 +79,8 @@ def angle_over_half_sine(cosine: Expr, s: Expr) -> Expr:
 def quaternion_from_matrix(R: Expr) -> Expr:
     """Return the unit quaternion (4, 1) of R (3, 3); its sign is not fixed.
 
-    Takes the row of 4 q q' (linear in R) with the largest diagonal entry, so nothing small is
-    ever divided by (Shepperd 1978).
+    It is the row of 4 q q' (linear in R) with the largest diagonal entry, so that no divisor is
+    small (Shepperd 1978).
     """
     a, b, c = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
     d, e, f = R[1, 0] + R[0, 1], R[0, 2] + R[2, 0], R[2, 1] + R[1, 2]
@@ -226,7 +225,7 @@ def exp_se3(twist: Expr) -> Transform:
     """
     v, w = twist[:3], twist[3:]
     s = ca.dot(w, w)
-    half = half_sinc(s)
+    sinc = half_sinc(s)
     remainder = even_function(
         s,
         lambda x: (1 - ca.sin(ca.sqrt(x)) / ca.sqrt(x)) / x,
@@ -234,7 +233,7 @@ def exp_se3(twist: Expr) -> Transform:
         SMALL_ANGLE_SQUARED,
     )
     wv = ca.cross(w, v)
-    return exp_so3(w), v + 0.5 * half * half * wv + remainder * ca.cross(w, wv)
+    return exp_so3(w), v + 0.5 * sinc * sinc * wv + remainder * ca.cross(w, wv)
 
 
 def log_se3(transform: Transform) -> Expr:
@@ -253,8 +252,8 @@ def cotangent_remainder(s: Expr) -> Expr:
     """Return (1 - (theta/2) cot(theta/2)) / theta^2 for s = theta^2 [rad^2]; 1/12 at 0."""
 
     def closed(x: Expr) -> Expr:
-        half = 0.5 * ca.sqrt(x)
-        return (1 - half * ca.cos(half) / ca.sin(half)) / x
+        half_angle = 0.5 * ca.sqrt(x)
+        return (1 - half_angle * ca.cos(half_angle) / ca.sin(half_angle)) / x
 
     return even_function(s, closed, COTANGENT_REMAINDER, SMALL_ANGLE_SQUARED)
 
@@ -324,7 +323,8 @@ def rotation_between(a: Expr, b: Expr) -> Expr:
         R (3, 3); a half turn about a perpendicular axis if b = -a.
     """
     u = a + b
-    # Normals are unit up to rounding only; near -a that tilts u unless a - b is taken out of it.
+    # Normals have rounding errors, which would tilt u near b = -a; its component along a - b is
+    # removed.
     u = u - (0.25 * ca.dot(u, a - b)) * (a - b)
     u = ca.if_else(ca.dot(u, u) < OPPOSITE_SQUARED, perpendicular(a), u)
     scaled = (2 / ca.dot(u, u)) * u

@@ -74,13 +74,13 @@ def test_the_papers_choice(robot):
 
 
 def test_no_closed_chain_without_an_arm(coupled_robot):
-    with pytest.raises(ik.errors.UnsupportedError, match=r"\(0\).*\(3\)"):
+    with pytest.raises(ik.errors.UnsupportedError, match=r"0 arm joints.*3 thumb joints"):
         split(coupled_robot.description)
 
 
 @pytest.mark.parametrize("borrowed", [-1, 7, 8])
 def test_borrowed_joints_are_the_arms(robot, borrowed):
-    with pytest.raises(ik.errors.UnsupportedError, match="cannot borrow"):
+    with pytest.raises(ik.errors.UnsupportedError, match="borrowed: found"):
         split(robot.description, borrowed)
 
 

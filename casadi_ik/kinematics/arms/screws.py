@@ -90,7 +90,7 @@ def arm_screws(robot: RobotDescription) -> Screws:
     """Return the screws of a robot's arm.
 
     Raises:
-        UnsupportedError: The arm has a prismatic joint, or a joint without its own motor.
+        UnsupportedError: The arm has a prismatic joint, or a joint without a separate motor.
     """
     prefix = f"robot {robot.name!r}: the arm has no closed form"
     motors = [robot.actuator_names[i] for i in robot.arm_actuators]
@@ -157,19 +157,19 @@ class CosSin:
         """The opposite angle."""
         return CosSin(self.cosine, -self.sine)
 
-    def compose(self, other: CosSin) -> CosSin:
+    def compose(self, angle: CosSin) -> CosSin:
         """Return the sum of both angles."""
         return CosSin(
-            self.cosine * other.cosine - self.sine * other.sine,
-            self.sine * other.cosine + self.cosine * other.sine,
+            self.cosine * angle.cosine - self.sine * angle.sine,
+            self.sine * angle.cosine + self.cosine * angle.sine,
         )
 
-    def select(self, condition: Expr, other: CosSin) -> CosSin:
-        """Return this angle where the condition holds, otherwise the other one."""
+    def select(self, condition: Expr, angle: CosSin) -> CosSin:
+        """Return this angle where the condition holds, otherwise the given one."""
         if isinstance(condition, bool):
-            return self if condition else other
-        cosine = ca.if_else(condition, self.cosine, other.cosine)
-        return CosSin(cosine, ca.if_else(condition, self.sine, other.sine))
+            return self if condition else angle
+        cosine = ca.if_else(condition, self.cosine, angle.cosine)
+        return CosSin(cosine, ca.if_else(condition, self.sine, angle.sine))
 
     def rotation(self, axis: Array) -> Expr:
         """Return the rotation (3, 3) by the angle about a constant unit axis (3,)."""

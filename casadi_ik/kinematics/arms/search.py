@@ -230,7 +230,7 @@ class ArmTrials:
             The best arm of the trial (n, 1) [rad], its score, and its last redundancy parameter
             [rad], which is the swivel angle of an S-R-S arm.
         """
-        # Unused inputs are passed as well, since constants cannot be inputs.
+        # Unused inputs are also passed, because constants cannot be inputs.
         reference_arm = bounds[0] if reference is None else reference
         reference, *values = self._values()(trial, *best, *bounds, visit, reference_arm)
         inputs = [palm.rotation, palm.origin, *bounds, reference]

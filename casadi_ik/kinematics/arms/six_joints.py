@@ -307,7 +307,7 @@ class ParallelTriple(SixJoints):
 
     @property
     def sign_names(self) -> tuple[str, str, str]:
-        """The joints that turn the plane, tilt out of it, bend in it."""
+        """Joints that rotate the plane, leave it, and bend within it."""
         return ("shoulder", "wrist", "elbow")
 
     def branches_of_six(self, motion: Pose, signs: Signs) -> list[ElbowBranch]:
