@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import event_thresholds
 import numpy as np
 import pytest
@@ -41,3 +44,14 @@ def test_what_a_threshold_catches(kept: StoredBlocks) -> None:
     assert len(shares) == len(event_thresholds.FACTORS)
     assert shares == sorted(shares)
     assert shares[0] < shares[-1]
+
+
+def test_the_report_marks_the_rules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(event_thresholds.ik, "Solver", lambda robot, *_, **__: ik.api.Solver(robot))
+    event_thresholds.main(["--count", "24", "--factors", "1", "10", "--report", str(tmp_path)])
+    text = (tmp_path / "report.md").read_text()
+    sections = len(re.findall(r"^## \S+ on \S+$", text, re.MULTILINE))
+    assert sections == 5
+    assert text.count("| STALL") == 2 * sections
+    assert text.count("**0.0001**") == 2 * sections
+    assert "## hand-first on baxter_ar10" in text
