@@ -43,7 +43,7 @@ class RecordReprMixin:
     """Base class of dataclasses with arrays: a short representation.
 
     Arrays are represented by their shapes, and long values are shortened. The dataclass decorator
-    must not add a representation of its own (`repr=False`).
+    must not add another representation (`repr=False`).
     """
 
     def __repr__(self) -> str:

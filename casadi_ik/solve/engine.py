@@ -509,7 +509,7 @@ class Engine:
     ) -> BatchSolution:
         """Replace the configurations of unsolved targets by the nearest ones.
 
-        With a scene, targets of which only configurations in collision were found are unchanged.
+        With a scene, targets for which only colliding configurations were found are unchanged.
         """
         started = time.perf_counter()
         rows = np.flatnonzero(~batch.success & (batch.status != Status.COLLISION))
@@ -517,19 +517,12 @@ class Engine:
             return batch
         q, seconds = batch.q.copy(), batch.time.copy()
         for engine, members, group in self.group_by_contact_kind(targets.rows(rows)):
-            of_group, search = rows[members], engine.nearest_search
+            members, search = rows[members], engine.nearest_search
             if is_local:
-                q[of_group] = search.descend(group, starts[of_group])
-                continue
-            of_query = None if query is None else query.rows(of_group)
-            q[of_group] = search.find(
-                group,
-                starts[of_group],
-                q[of_group],
-                None
-                if of_query is None
-                else lambda i, x, every=of_query: every.rows(i).check(x).free,
-            )
+                q[members] = search.descend(group, starts[members])
+            else:
+                group_query = None if query is None else query.rows(members)
+                q[members] = search.find(group, starts[members], q[members], group_query)
         if query is not None:
             rows = rows[query.rows(rows).check(q[rows]).free]
             q = np.where(np.isin(np.arange(len(q)), rows)[:, None], q, batch.q)

@@ -1,26 +1,26 @@
 """Search for the configurations nearest to contacts that are out of reach.
 
 The distance of a configuration from a target is the sum of its squared contact errors, each divided
-by its tolerance. The search refines several starts to local minima of this distance and returns the
-least of them: the start and the result of the failed solve, quasi-random arms from distinct regions
-of the joint space, and hands that were fitted to the contacts with a floating palm. The minimum is
-the best one found; it is not proved.
+by its tolerance. Several configurations descend to local minima of this distance, and the nearest
+minimum is returned: the start and the end of the failed solve, quasi-random configurations from
+distinct regions of the joint space, and hands that were fitted to the contacts with a floating
+palm. It is the best minimum found; nothing is proved.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import casadi as ca
 import numpy as np
 
+from casadi_ik.collision.clearance import CollisionQuery
 from casadi_ik.compile import RUNNING
 from casadi_ik.compile.graphs import StepGraph, recipe
 from casadi_ik.compile.layout import Field, Layout
 from casadi_ik.compile.loop import LoopKernel
-from casadi_ik.files.arrays import Array, Bools, Rows, spread_points
+from casadi_ik.files.arrays import Array, Rows, spread_points
 from casadi_ik.kinematics.box_qp import normal_equations, solve_box_qp
 from casadi_ik.kinematics.contact_fit import contact_jacobian, contact_residual
 from casadi_ik.kinematics.contacts import LENGTH, ContactRows, Kinds, kinds_suffix
@@ -64,7 +64,6 @@ class NearestSettings:
 
 NEAREST_SETTINGS = NearestSettings()
 
-
 IN_COLLISION = 1e12
 """Factor of the distance of a configuration in collision, larger than any ratio of distances."""
 
@@ -102,7 +101,7 @@ DESCENT = DescentParameters()
 
 @dataclass(frozen=True)
 class DescentStep:
-    """One step of the bounded descent of the distance of a robot from its contacts.
+    """Step of the bounded descent of the distance between a robot and its contacts.
 
     Attributes:
         robot: Description of the robot.
@@ -157,28 +156,29 @@ class DescentStep:
         inputs = [q, parameters]
         value = ca.Function("distance", inputs, [distance])
         model = ca.Function("model", inputs, with_cse(distance, gradient, gauss_newton, hessian))
-        before, slope, approximate, exact = model(s["q"], parameters)
+        distance_before, slope, approximate, exact = model(s["q"], parameters)
         matrix = ca.if_else(s["is_exact"] > 0.5, exact, approximate)
         low, high = p["lower"] - s["q"], p["upper"] - s["q"]
         step = solve_box_qp(matrix, s["damping"], slope, low, high, DESCENT.passes)
         trial = ca.fmin(ca.fmax(s["q"] + step, p["lower"]), p["upper"])
-        after = value(trial, parameters)
-        is_accepted = after < before
-        is_slow = after > DESCENT.slow * before
+        distance_after = value(trial, parameters)
+        is_accepted = distance_after < distance_before
+        is_slow = distance_after > DESCENT.slow * distance_before
         factor = ca.if_else(is_accepted, DESCENT.decrease, DESCENT.increase)
         new_state = {
             "q": ca.if_else(is_accepted, trial, s["q"]),
             "damping": ca.fmax(s["damping"] * factor, DESCENT.damping_floor),
             "is_exact": ca.if_else(is_accepted, is_slow, 1 - s["is_exact"]),
         }
-        has_settled = ca.logic_and(is_accepted, before - after <= DESCENT.settled * before)
+        decrease = distance_before - distance_after
+        has_settled = ca.logic_and(is_accepted, decrease <= DESCENT.settled * distance_before)
         is_stuck = ca.logic_and(ca.logic_not(is_accepted), s["damping"] > DESCENT.damping_ceiling)
         status = ca.if_else(
             ca.logic_or(has_settled, is_stuck), float(Status.STALLED), float(RUNNING)
         )
         outputs = [
             ca.densify(self.state.pack(new_state)),
-            ca.densify(ca.if_else(is_accepted, after, before)),
+            ca.densify(ca.if_else(is_accepted, distance_after, distance_before)),
             status,
         ]
         return ca.Function(name, [state, parameters], outputs)
@@ -225,11 +225,11 @@ class NearestSearch:
     def _table(self) -> SampleTable:
         robot, settings = self._trials.robot, self._settings
         n = len(robot.actuators)
-        spread = spread_points(settings.samples, n)
-        q = robot.lower + spread * (robot.upper - robot.lower)
+        fractions = spread_points(settings.samples, n)
+        q = robot.lower + fractions * (robot.upper - robot.lower)
         points, normals = robot.contacts(q)
         points = points / LENGTH
-        halves = (spread[:, : settings.region_bits] >= 0.5).astype(np.intp)
+        halves = (fractions[:, : settings.region_bits] >= 0.5).astype(np.intp)
         return SampleTable(
             q,
             halves @ (1 << np.arange(halves.shape[1])),
@@ -242,19 +242,19 @@ class NearestSearch:
         targets: TargetBatch,
         q0: Array,
         last_q: Array,
-        are_free: Callable[[Rows, Array], Bools] | None = None,
+        query: CollisionQuery | None = None,
     ) -> Array:
         """Return the nearest configurations found (k, n) [rad or m].
 
         Args:
             targets: k targets of the kinds of contacts of this search.
             q0: (k, n) start configurations, which decide between equally near ones [rad or m].
-            last_q: (k, n) configurations at which the solves ended [rad or m].
-            are_free: Function of target indices (m,) and configurations (m, n) that returns (m,)
-                whether they are free of collisions; None: collisions are not checked. If none of
-                a target's minima is free, the nearest one is returned.
+            last_q: (k, n) configurations at which the solves ended; NaN: none [rad or m].
+            query: Collision query of the targets; None: collisions are not checked. If none of a
+                target's minima is free of collisions, the nearest one is returned.
         """
         all_rows = np.arange(len(targets))
+        last_q = np.where(np.isfinite(last_q), last_q, q0)
         owners, starts = [all_rows, all_rows], [q0, last_q]
         for owner, q in (self._sampled(targets), self._fitted(targets, q0)):
             owners.append(owner)
@@ -269,8 +269,9 @@ class NearestSearch:
         states = self._run(states[finalists], parameters[owner])
         q = self._q(states)
         distance = self.distances(targets, owner, q)
-        if are_free is not None:
-            distance = np.where(are_free(owner, q), distance, IN_COLLISION * (1 + distance))
+        if query is not None:
+            is_free = query.rows(owner).check(q).free
+            distance = np.where(is_free, distance, IN_COLLISION * (1 + distance))
         return self._nearest(q0, owner, q, distance)
 
     def descend(self, targets: TargetBatch, q: Array) -> Array:
@@ -315,12 +316,12 @@ class NearestSearch:
 
     def _nearest(self, q0: Array, owner: Rows, q: Array, distance: Array) -> Array:
         """Return the nearest configuration of each target; the travel from q0 decides ties."""
-        robot, least = self._trials.robot, np.full(len(q0), np.inf)
-        np.minimum.at(least, owner, distance)
-        is_least = distance <= least[owner] * (1 + self._settings.tie)
+        robot, minimum = self._trials.robot, np.full(len(q0), np.inf)
+        np.minimum.at(minimum, owner, distance)
+        is_tied = distance <= minimum[owner] * (1 + self._settings.tie)
         ranges = np.maximum(robot.upper - robot.lower, 1e-9)
         travel = (np.abs(q - q0[owner]) / ranges).max(axis=1)
-        order = np.lexsort((np.where(is_least, travel, np.inf), owner))
+        order = np.lexsort((np.where(is_tied, travel, np.inf), owner))
         return q[first_per_owner(owner, order, 1)]
 
     def _sampled(self, targets: TargetBatch) -> tuple[Rows, Array]:
@@ -347,9 +348,10 @@ class NearestSearch:
         has_own_bounds = targets.fixed is not None and targets.fixed.ndim > 1
         if has_own_bounds or not (body.arm_actuators and body.hand_actuators):
             return np.zeros(0, dtype=np.intp), np.zeros((0, len(trials.robot.actuators)))
-        fits = self._floating_palm.fits(targets, q0)
-        rows = fits.best(self._settings.fitted_starts)
-        return fits.owner[rows], trials.run(fits.states[rows], fits.parameters[rows])
+        hand_fits = self._floating_palm.fits(targets, q0)
+        rows = hand_fits.best(self._settings.fitted_starts)
+        arms = trials.run(hand_fits.states[rows], hand_fits.parameters[rows])
+        return hand_fits.owner[rows], arms
 
 
 def _weights(targets: TargetBatch) -> Array:

@@ -35,7 +35,7 @@ class Status(IntEnum):
     COLLISION = 6
     """Contacts and limits are met, but the robot is in collision, see `Solution.collision`."""
     NEAREST = 7
-    """No solution was found; q is the nearest configuration found, as `best_effort` requests."""
+    """The nearest configuration found, as `best_effort` requests, for lack of a solution."""
 
     @classmethod
     def from_loop(cls, codes: NDArray[np.int32]) -> NDArray[np.int64]:
