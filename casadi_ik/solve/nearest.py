@@ -24,6 +24,7 @@ from casadi_ik.files.arrays import Array, Rows, spread_points
 from casadi_ik.kinematics.box_qp import normal_equations, solve_box_qp
 from casadi_ik.kinematics.contact_fit import contact_jacobian, contact_residual
 from casadi_ik.kinematics.contacts import LENGTH, ContactRows, Kinds, kinds_suffix
+from casadi_ik.kinematics.forward import motor_scales
 from casadi_ik.kinematics.smooth import with_cse
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.targets import TargetBatch
@@ -64,6 +65,9 @@ class NearestSettings:
 
 NEAREST_SETTINGS = NearestSettings()
 
+UNLIMITED_STEP = 1e3
+"""Step of a descent that the limits of the motors alone bound."""
+
 IN_COLLISION = 1e12
 """Factor of the distance of a configuration in collision, larger than any ratio of distances."""
 
@@ -81,6 +85,8 @@ class DescentParameters:
         slow: Ratio of distances after and before a step above which steps use the exact second
             derivatives: Gauss-Newton steps converge slowly where errors remain.
         settled: Relative decrease of the distance below which a descent has ended.
+        local_step: Longest step of a descent that stays near its start [rad, or part of a slider's
+            range]: long steps would lead to other minima.
         passes: Number of corrections of the active set in a step.
         max_iterations: Maximum number of steps.
     """
@@ -92,8 +98,9 @@ class DescentParameters:
     increase: float = 8.0
     slow: float = 0.5
     settled: float = 1e-14
+    local_step: float = 0.1
     passes: int = 3
-    max_iterations: int = 100
+    max_iterations: int = 200
 
 
 DESCENT = DescentParameters()
@@ -132,7 +139,8 @@ class DescentStep:
         """Layout of the parameters."""
         n = len(self.robot.actuators)
         bounds = (Field(name, (n,), unit="rad or m") for name in ("lower", "upper"))
-        return Layout((*self.contacts.fields, *bounds))
+        max_step = Field("max_step", doc="longest step [rad, or part of a slider's range]")
+        return Layout((*self.contacts.fields, *bounds, max_step))
 
     @cached_property
     def graph(self) -> StepGraph:
@@ -158,9 +166,12 @@ class DescentStep:
         model = ca.Function("model", inputs, with_cse(distance, gradient, gauss_newton, hessian))
         distance_before, slope, approximate, exact = model(s["q"], parameters)
         matrix = ca.if_else(s["is_exact"] > 0.5, exact, approximate)
-        low, high = p["lower"] - s["q"], p["upper"] - s["q"]
+        longest = p["max_step"] * motor_scales(self.robot)
+        low = ca.fmax(p["lower"] - s["q"], -longest)
+        high = ca.fmin(p["upper"] - s["q"], longest)
         step = solve_box_qp(matrix, s["damping"], slope, low, high, DESCENT.passes)
-        trial = ca.fmin(ca.fmax(s["q"] + step, p["lower"]), p["upper"])
+        trial = s["q"] + ca.fmin(ca.fmax(step, -longest), longest)
+        trial = ca.fmin(ca.fmax(trial, p["lower"]), p["upper"])
         distance_after = value(trial, parameters)
         is_accepted = distance_after < distance_before
         is_slow = distance_after > DESCENT.slow * distance_before
@@ -260,7 +271,7 @@ class NearestSearch:
             owners.append(owner)
             starts.append(q)
         owner, start = np.concatenate(owners), np.concatenate(starts)
-        parameters = self._parameters(targets)
+        parameters = self._parameters(targets, UNLIMITED_STEP)
         states = self._run(self._states(parameters[owner], start), parameters[owner], is_race=True)
         finalists = smallest_per_target(
             owner, self.distances(targets, owner, self._q(states)), self._settings.finalists
@@ -275,21 +286,22 @@ class NearestSearch:
         return self._nearest(q0, owner, q, distance)
 
     def descend(self, targets: TargetBatch, q: Array) -> Array:
-        """Return the local minima (k, n) of the distance that are reached from configurations.
+        """Return the local minima (k, n) of the distance next to configurations.
 
         Args:
             targets: k targets of the kinds of contacts of this search.
             q: (k, n) configurations [rad or m].
         """
-        parameters = self._parameters(targets)
+        parameters = self._parameters(targets, DESCENT.local_step)
         return self._q(self._run(self._states(parameters, q), parameters))
 
-    def _parameters(self, targets: TargetBatch) -> Array:
+    def _parameters(self, targets: TargetBatch, max_step: float) -> Array:
         """Return the parameters (k, np) of the descent."""
         contacts = self._step.contacts
         values = {f"{name}s": np.nan_to_num(targets.vectors(f"{name}s")) for name in contacts.data}
         lower, upper = targets.bounds(self._trials.robot.description)
         values |= {"weights": _weights(targets), "lower": lower, "upper": upper}
+        values["max_step"] = max_step
         return self._step.parameters.pack_rows(values, len(targets))
 
     def _states(self, parameters: Array, q: Array) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
 import casadi_ik as ik
 
@@ -77,8 +78,38 @@ def test_poses_of_a_position_alone_and_out_of_reach(arm):
     np.testing.assert_allclose(arm.forward_kinematics(found)[:3, 3], pose[:3, 3], atol=5e-3)
     assert found[-1] == 30.0
     pose[:3, 3] = 9, 9, 9
-    np.testing.assert_array_equal(arm.inverse_kinematics(now, pose), now)
-    assert arm.status is not ik.Status.SOLVED
+    reached = arm.forward_kinematics(arm.inverse_kinematics(now, pose))
+    assert arm.status is ik.Status.NEAREST
+    assert reached[:3, 3] @ np.ones(3) / np.sqrt(3) > 0.8
+    np.testing.assert_array_equal(arm.inverse_kinematics(now, np.full((4, 4), np.nan)), now)
+    assert arm.status is ik.Status.INVALID
+
+
+@pytest.mark.parametrize("orientation_weight", [0.01, 0.001])
+def test_an_arm_that_is_led_out_of_reach_is_where_least_squares_leads(arm, orientation_weight):
+    """LeRobot's weights multiply squared errors."""
+    robot = ik.load_robot("ur5e")
+    degrees = np.rad2deg(robot.home)
+    pose = robot.palm(robot.home).copy()
+    outwards = pose[:3, 3] / np.linalg.norm(pose[:3, 3])
+    for _ in range(120):
+        pose[:3, 3] += 5e-3 * outwards
+        previous, degrees = (
+            degrees,
+            arm.inverse_kinematics(degrees, pose, orientation_weight=orientation_weight),
+        )
+        assert np.abs(degrees - previous).max() < 30
+    assert arm.status is ik.Status.NEAREST
+    assert np.abs(degrees - previous).max() < 1
+
+    def residual(q):
+        palm = robot.palm(q)
+        axes = (palm[:3, :3] - pose[:3, :3]).ravel() / np.sqrt(2)
+        return np.concatenate([palm[:3, 3] - pose[:3, 3], np.sqrt(orientation_weight) * axes])
+
+    best = least_squares(residual, np.deg2rad(degrees), xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    expected = robot.palm(best.x)[:3, 3]
+    assert np.linalg.norm(arm.forward_kinematics(degrees)[:3, 3] - expected) < 2e-4
 
 
 def test_contacts_of_an_action_become_targets_of_the_motors(rng):
@@ -94,7 +125,10 @@ def test_contacts_of_an_action_become_targets_of_the_motors(rng):
     there, _ = robot.contacts(np.array([done[f"{name}.pos"] for name in robot.actuators]))
     assert np.linalg.norm(there - points, axis=1).max() < 5e-3
     far = {key: value + 9 for key, value in action.items()}
-    assert pipeline(step)((far, {})) == {key: done[key] for key in done if key != "speed"}
+    reached = pipeline(step)((far, {}))
+    assert step.status is ik.Status.NEAREST
+    q = np.array([reached[f"{name}.pos"] for name in robot.actuators])
+    assert robot.contacts(q)[0].mean(axis=0).sum() > there.mean(axis=0).sum()
     features = step.transform_features({PipelineFeatureType.ACTION: dict.fromkeys(action)})
     assert set(features[PipelineFeatureType.ACTION]) == set(done) - {"speed"}
     step.reset()

@@ -97,8 +97,50 @@ def test_fixed_motors_stay(robot):
     np.testing.assert_allclose(batch.q[:, 2], 0.2)
 
 
+def pose_residual(robot, pose, tolerance):
+    """Return the residual of a pose of the first fingertip: position and axes, by tolerance."""
+
+    def residual(q):
+        frame = robot.contact_frames(q)[0]
+        position = (frame[:3, 3] - pose[:3, 3]) / tolerance.position
+        axes = (frame[:3, :3] - pose[:3, :3]) / (2 * np.sin(tolerance.angle / 2))
+        return np.concatenate([position, axes.ravel() / np.sqrt(2)])
+
+    return residual
+
+
+def test_an_arm_that_is_led_out_of_reach_stays_on_its_branch():
+    robot = ik.load_robot("ur5e")
+    solver, q = ik.Solver(robot), robot.home
+    points, normals = robot.contacts(q)
+    outwards = points[0] / np.linalg.norm(points[0])
+    statuses = []
+    for step in range(160):
+        grasp = ik.Grasp(
+            {robot.fingers[0]: ik.Contact(points[0] + 5e-3 * step * outwards, normals[0])}
+        )
+        solution = solver.solve(grasp, q0=q, diagnose=False, best_effort="local")
+        assert np.abs(solution.q - q).max() < 0.5
+        statuses.append(solution.status)
+        q = solution.q
+    assert set(statuses[:40]) == {ik.Status.SOLVED}
+    assert set(statuses[-40:]) == {ik.Status.NEAREST}
+
+
+def test_a_local_descent_to_a_far_target_does_not_jump_to_limits():
+    robot = ik.load_robot("ur5e")
+    frame = robot.contact_frames(robot.home)[0].copy()
+    frame[:3, 3] = 9.0
+    grasp = ik.Grasp({robot.fingers[0]: ik.Contact.at(frame)})
+    solver = ik.Solver(robot)
+    local = solver.solve(grasp, diagnose=False, best_effort="local")
+    nearest = solver.solve(grasp, diagnose=False, best_effort=True)
+    assert local.error_ratio < 1.01 * nearest.error_ratio
+    assert np.abs(local.q - robot.home).max() < np.pi
+
+
 def test_a_five_axis_arm_follows_poses_that_it_cannot_have():
-    """Each answer is the minimum near the last one: no step is omitted, and none is a jump."""
+    """Each answer is a minimum near the last one: no step is omitted, and none is a jump."""
     robot = ik.load_robot("viperx_300s")
     fixed = {name: float(robot.home[i]) for i, name in enumerate(robot.actuators[:1])}
     solver = ik.Solver(robot, tolerance=ik.Tolerance(5e-3, np.radians(2.9)))
@@ -111,6 +153,11 @@ def test_a_five_axis_arm_follows_poses_that_it_cannot_have():
         if step > 2:
             assert solution.status is ik.Status.NEAREST
             assert 1e-4 < np.abs(solution.q - q).max() < 0.2
+            residual = pose_residual(robot, pose, solver.tolerances[robot.fingers[0]])
+            margin = np.where(np.arange(len(q)) == 0, 1e-9, 0.3)
+            bounds = np.clip(solution.q - margin, robot.lower, None), solution.q + margin
+            best = least_squares(residual, solution.q, bounds=np.minimum(bounds, robot.upper))
+            assert np.sum(residual(solution.q) ** 2) <= 2 * best.cost * (1 + 1e-6)
         q = solution.q
 
 
