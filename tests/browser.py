@@ -15,8 +15,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from websockets.sync.client import connect
-
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 
 CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
@@ -100,6 +98,9 @@ class Page:
     """A page: what runs in it, what it says, what a hand does to it."""
 
     def __init__(self, socket: str) -> None:
+        # Tests of adapters run where this package is not installed.
+        from websockets.sync.client import connect
+
         self._socket = connect(socket, max_size=None, open_timeout=PATIENCE)
         self._numbers = itertools.count(1)
         self._complaints: list[str] = []
