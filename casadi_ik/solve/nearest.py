@@ -300,9 +300,10 @@ class NearestSearch:
         contacts = self._step.contacts
         values = {f"{name}s": np.nan_to_num(targets.vectors(f"{name}s")) for name in contacts.data}
         lower, upper = targets.bounds(self._trials.robot.description)
-        values |= {"weights": _weights(targets), "lower": lower, "upper": upper}
-        values["max_step"] = max_step
-        return self._step.parameters.pack_rows(values, len(targets))
+        bounds = {"weights": _weights(targets), "lower": lower, "upper": upper}
+        return self._step.parameters.pack_rows(
+            {**values, **bounds, "max_step": max_step}, len(targets)
+        )
 
     def _states(self, parameters: Array, q: Array) -> Array:
         """Return the first states (m, ns) of descents."""
