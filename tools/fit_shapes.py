@@ -17,8 +17,8 @@ from shape_fitting.writing import write
 from casadi_ik.files.reading import read
 from casadi_ik.files.shipped import resolve_description
 from casadi_ik.integrations.importing.capsules import SHAPE_FIT, fit_links, largest_excess
+from casadi_ik.integrations.importing.meshes import IndexedMesh, merge_meshes
 from casadi_ik.integrations.importing.robot_shapes import may_touch
-from casadi_ik.integrations.importing.surfaces import Surface, together
 from casadi_ik.model.linkage import link_poses
 from casadi_ik.model.parts import part_from_file
 from casadi_ik.model.schema import ArmFile, HandFile
@@ -50,7 +50,7 @@ def main() -> None:
     options = parser.parse_args()
     path = resolve_description(options.name, options.kind)
     part = part_from_file(read(path, HandFile if options.kind == "hands" else ArmFile)[0], path)
-    parts: dict[str, list[Surface]] = {}
+    parts: dict[str, list[IndexedMesh]] = {}
     for kind in options.shapes:
         by_link = in_our_links(part, options.file, set(options.without), visual=kind == "seen")
         for link, surfaces_of_link in by_link.items():
@@ -58,7 +58,7 @@ def main() -> None:
     surfaces = {
         link: mesh
         for link, surfaces_of_link in parts.items()
-        if (mesh := together(surfaces_of_link))
+        if (mesh := merge_meshes(surfaces_of_link))
     }
     flat = {part.root} if options.kind == "hands" else set()
     shapes = fit_links(surfaces, flat, max_capsules=options.most, min_saving=options.saving)

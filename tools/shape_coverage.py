@@ -24,7 +24,7 @@ from casadi_ik.errors import DescriptionError
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.reading import read
 from casadi_ik.files.shipped import resolve_description
-from casadi_ik.integrations.importing.surfaces import Surface, together
+from casadi_ik.integrations.importing.meshes import IndexedMesh, merge_meshes
 from casadi_ik.model.link_shapes import LinkCapsule, LinkSolid
 from casadi_ik.model.parts import RobotPart, part_from_file
 from casadi_ik.model.schema import ArmFile, HandFile
@@ -131,7 +131,7 @@ def _table(name: str, file: str, part: RobotPart, place: Path) -> list[str]:
     head = [f"## {name}: `{file}`", ""]
     if not place.is_file():
         return [*head, "Not in the folder.", ""]
-    meshes: list[dict[str, Surface]] = []
+    meshes: list[dict[str, IndexedMesh]] = []
     try:
         for visual in (False, True):
             by_link = in_our_links(part, place, EXCLUDED_LINKS.get((name, file), set()), visual)
@@ -139,7 +139,7 @@ def _table(name: str, file: str, part: RobotPart, place: Path) -> list[str]:
                 {
                     link: mesh
                     for link, meshes_of_link in by_link.items()
-                    if (mesh := together(meshes_of_link))
+                    if (mesh := merge_meshes(meshes_of_link))
                 }
             )
     except DescriptionError as error:
@@ -174,13 +174,13 @@ def _shapes(part: RobotPart, link: str) -> tuple[list[LinkCapsule], list[LinkSol
     return capsules, [s for s in part.shapes.solids if s.link == link]
 
 
-def _distances(part: RobotPart, link: str, mesh: Surface) -> Array:
+def _distances(part: RobotPart, link: str, mesh: IndexedMesh) -> Array:
     """Return the distances of vertices and triangle centres from the shapes of a link [m]."""
     points = np.concatenate([mesh.points, mesh.points[mesh.triangles].mean(axis=1)])
     return outside(points, *_shapes(part, link))
 
 
-def _ratio(part: RobotPart, link: str, mesh: Surface) -> float:
+def _ratio(part: RobotPart, link: str, mesh: IndexedMesh) -> float:
     """Return the volume of the shapes of a link relative to that of the hull of its mesh."""
     capsules, solids = _shapes(part, link)
     reach = [np.abs(c.center) + np.abs(c.half) + c.radius for c in capsules]

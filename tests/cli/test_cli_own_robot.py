@@ -411,7 +411,7 @@ def test_a_missing_package_is_said_once(run: Command, tmp_path: Path) -> None:
     done = run("import", path, "--out", tmp_path / "mine.yaml")
     assert done.out.count("package 'shapes_of_it' is not found") == 1
     said = " ".join(done.out.split())
-    assert "(3 meshes, one is 'package://shapes_of_it/meshes/ff_1.stl')" in said
+    assert "3 meshes" in said and "package://shapes_of_it/meshes/ff_1.stl" in said
     assert "ROS_PACKAGE_PATH=FOLDER casadi-ik import" in said
 
 

@@ -19,7 +19,7 @@ from casadi_ik.collision.clearance import SceneCheck
 from casadi_ik.collision.model import collision_model
 from casadi_ik.files.reading import Frame, frame_matrix, validated
 from casadi_ik.integrations.importing import capsules, imported
-from casadi_ik.integrations.importing.surfaces import Surface
+from casadi_ik.integrations.importing.meshes import IndexedMesh
 from casadi_ik.integrations.importing.write import collision_lines
 from casadi_ik.model.link_shapes import Touching, capsules_of
 from casadi_ik.model.schema import BoxEntry, CapsuleEntry, CollisionEntry, CylinderEntry
@@ -328,7 +328,7 @@ def test_how_far_capsules_stand_out_is_found_by_looking_at_few_points():
 
 def test_a_fine_mesh_is_simplified_by_less_than_a_cell_and_enclosed_as_a_whole():
     ball = trimesh.creation.icosphere(5, 0.02)
-    mesh = Surface(np.asarray(ball.vertices) * [1, 1, 2], np.asarray(ball.faces))
+    mesh = IndexedMesh(np.asarray(ball.vertices) * [1, 1, 2], np.asarray(ball.faces))
     coarse = mesh.simplified(3000, 40)
     assert mesh.simplified(len(mesh.triangles), 40) is mesh
     assert 500 < len(coarse.triangles) < len(mesh.triangles) / 2

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from casadi_ik.files.arrays import Array
-from casadi_ik.integrations.importing.surfaces import Surface, link_surfaces
+from casadi_ik.integrations.importing.meshes import IndexedMesh, link_meshes
 from casadi_ik.model.linkage import joints_below, link_poses
 from casadi_ik.model.parts import RobotPart
 from casadi_ik.model.urdf_mjcf import read_tree
@@ -31,7 +31,7 @@ class Axis:
 
 def in_our_links(
     part: RobotPart, file: Path, excluded: set[str], visual: bool = False
-) -> dict[str, list[Surface]]:
+) -> dict[str, list[IndexedMesh]]:
     """Return the meshes of a file by link of the description, in the frame of that link."""
     tree = read_tree(file)
     theirs = tree_poses(tree)
@@ -73,14 +73,14 @@ def in_our_links(
             ):
                 holder[joint.child] = holder[joint.parent]
                 changed = True
-    found, missing = link_surfaces(tree, list(holder), visual)
+    found, missing = link_meshes(tree, list(holder), visual)
     for line in missing:
         print("  ", line)
-    parts: dict[str, list[Surface]] = {}
+    parts: dict[str, list[IndexedMesh]] = {}
     for link, surface in found.items():
         pose = np.linalg.inv(ours[holder[link]]) @ base @ theirs[link]
         if len(surface.triangles):
-            parts.setdefault(holder[link], []).append(surface.moved(pose))
+            parts.setdefault(holder[link], []).append(surface.transformed(pose))
     return {link: parts[link] for link in ours if link in parts}
 
 

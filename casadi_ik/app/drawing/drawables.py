@@ -34,7 +34,7 @@ from casadi_ik.errors import CasadiIKError, UnknownNameError
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.reading import read_yaml
 from casadi_ik.integrations.importing.imported import tree_of
-from casadi_ik.integrations.importing.surfaces import Surface, link_surfaces
+from casadi_ik.integrations.importing.meshes import IndexedMesh, link_meshes
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.description import Finger, RobotDescription
 from casadi_ik.model.grasp import Contact, Grasp
@@ -132,7 +132,7 @@ class Drawable:
     role: str = ""
 
     @property
-    def surface(self) -> Surface:
+    def surface(self) -> IndexedMesh:
         """Triangles in the frame of the drawable."""
         return self.shape.surface
 
@@ -188,7 +188,7 @@ def collision_bodies(robot: ArmHand) -> list[Drawable]:
         if capsule.covers < 0
     ]
     for attached, solid in zip(shapes.solids, own_solids(description), strict=True):
-        mesh = mesh_shape(Surface(*solid.mesh()))
+        mesh = mesh_shape(IndexedMesh(*solid.mesh()))
         link_shapes.append((attached.link, mesh.transformed(attached.pose)))
     return [_link_drawable(link, shape, styles) for link, shape in link_shapes]
 
@@ -257,7 +257,7 @@ def _pad(finger: Finger) -> Drawable:
 
 
 @lru_cache(maxsize=8)
-def visual_meshes(description: RobotDescription) -> dict[str, Surface]:
+def visual_meshes(description: RobotDescription) -> dict[str, IndexedMesh]:
     """Return by link the visual meshes of the robot's files, decimated for drawing."""
     try:
         meshes = {} if description.path is None else file_meshes(description, visual=True)
@@ -266,7 +266,7 @@ def visual_meshes(description: RobotDescription) -> dict[str, Surface]:
     return {link: decimate(mesh) for link, mesh in meshes.items() if len(mesh.triangles)}
 
 
-def file_meshes(description: RobotDescription, visual: bool = False) -> dict[str, Surface]:
+def file_meshes(description: RobotDescription, visual: bool = False) -> dict[str, IndexedMesh]:
     """Return the meshes of the files that a description refers to.
 
     Args:
@@ -274,7 +274,7 @@ def file_meshes(description: RobotDescription, visual: bool = False) -> dict[str
         visual: Read the visual meshes instead of the collision meshes.
 
     Returns:
-        Surface by link, in the frame of the link; links without a mesh are omitted.
+        Mesh by link, in the frame of the link; links without a mesh are omitted.
 
     Raises:
         CasadiIKError: A file cannot be read.
@@ -282,7 +282,7 @@ def file_meshes(description: RobotDescription, visual: bool = False) -> dict[str
     path = description.path
     assert path is not None
     raw, links = read_yaml(path), set(description.links)
-    meshes: dict[str, Surface] = {}
+    meshes: dict[str, IndexedMesh] = {}
     for key in ("arm", "hand", "robot"):
         entry = raw.get(key)
         if not isinstance(entry, dict) or "file" not in entry:
@@ -291,7 +291,7 @@ def file_meshes(description: RobotDescription, visual: bool = False) -> dict[str
         # The hand's links are prefixed where arm and hand have a name in common.
         link_names = {link.removeprefix(prefix) if prefix else link: link for link in links}
         link_names |= {link: link for link in links if f"{prefix}{link}" not in links or not prefix}
-        surfaces, _ = link_surfaces(tree_of(path, entry), list(link_names), visual)
+        surfaces, _ = link_meshes(tree_of(path, entry), list(link_names), visual)
         for link, surface in surfaces.items():
             meshes.setdefault(link_names[link], surface)
     return meshes
@@ -393,7 +393,7 @@ def object_drawable(name: str) -> Drawable | None:
         points, triangles = load_object(name).mesh(64)
     except UnknownNameError:
         return None
-    shape = mesh_shape(Surface(points, np.asarray(triangles, np.int64)))
+    shape = mesh_shape(IndexedMesh(points, np.asarray(triangles, np.int64)))
     return Drawable("object", shape, palette.OBJECT, role="object")
 
 
@@ -408,10 +408,10 @@ def item_drawables(item: Item) -> list[Drawable]:
 
 def _placed_solid(solid: Solid, pose: Array, point: Array) -> Shape:
     """Return a solid at a (4, 4) pose; of an unbounded solid, the part near a point (3,)."""
-    surface = Surface(*solid.mesh())
+    surface = IndexedMesh(*solid.mesh())
     if not np.isfinite(solid.reach):
         x, y, _ = pose[:3, :3].T @ (point - pose[:3, 3])
-        surface = Surface(surface.points + np.array([x, y, 0.0]), surface.triangles)
+        surface = IndexedMesh(surface.points + np.array([x, y, 0.0]), surface.triangles)
     return mesh_shape(surface).transformed(pose)
 
 
@@ -444,6 +444,6 @@ def clearance_marks(closest: ClosestPoints, show_shapes: bool = False) -> list[D
         for solid, pose in closest.shapes:
             if np.isfinite(solid.reach):
                 points, triangles = solid.mesh()
-                enlarged = Surface(points * (1 + 1e-3 / solid.reach), triangles)
+                enlarged = IndexedMesh(points * (1 + 1e-3 / solid.reach), triangles)
                 shapes.append(mesh_shape(enlarged).transformed(pose))
     return [Drawable("nearest", shape, palette.NEAREST, role="nearest") for shape in shapes]

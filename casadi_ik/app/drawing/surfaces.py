@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from casadi_ik.errors import optional_import
 from casadi_ik.files.arrays import Array
-from casadi_ik.integrations.importing.surfaces import Surface, together
+from casadi_ik.integrations.importing.meshes import IndexedMesh, merge_meshes
 from casadi_ik.model.shapes import capsule_mesh
 
 with optional_import("drawing"):
@@ -60,20 +60,20 @@ class Shape:
     kind: str
     size: tuple[float, ...] = ()
     pose: Array = field(default_factory=lambda: np.eye(4))
-    mesh: Surface | None = None
+    mesh: IndexedMesh | None = None
 
     @cached_property
-    def surface(self) -> Surface:
+    def surface(self) -> IndexedMesh:
         """Triangles with outward winding."""
         surface = SHAPE_MESHES[self.kind](*self.size) if self.mesh is None else self.mesh
-        return surface.moved(self.pose)
+        return surface.transformed(self.pose)
 
     def transformed(self, pose: Array) -> Shape:
         """Return the shape transformed by a (4, 4) pose."""
         return replace(self, pose=pose @ self.pose)
 
 
-def mesh_shape(surface: Surface) -> Shape:
+def mesh_shape(surface: IndexedMesh) -> Shape:
     """Return a mesh as a shape."""
     return Shape("mesh", mesh=surface)
 
@@ -108,33 +108,33 @@ def ring(center: Array, axis: Array, radius: float, width: float) -> Shape:
     return Shape("ring", (radius, width), pose_with_z_axis(center, axis))
 
 
-def _from_trimesh(mesh: Trimesh) -> Surface:
-    return Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+def _from_trimesh(mesh: Trimesh) -> IndexedMesh:
+    return IndexedMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces))
 
 
-def _revolved(profile: ArrayLike) -> Surface:
+def _revolved(profile: ArrayLike) -> IndexedMesh:
     """Revolve a profile (m, 2) of radius and height, ordered by height [m], about z."""
     rows = np.asarray(profile, dtype=float)
     axis = rows[[0, -1]] * [0.0, 1.0]
     return _from_trimesh(revolve(np.vstack([axis[0], rows, axis[1]]), sections=SEGMENTS))
 
 
-def _drum(radius: float, length: float) -> Surface:
+def _drum(radius: float, length: float) -> IndexedMesh:
     edge = 0.12 * min(radius, length)
     bow = edge * np.sin(np.linspace(0, np.pi / 2, 5))
     rise = np.column_stack([radius - edge + bow, -length / 2 + edge - bow[::-1]])
     return _revolved(np.concatenate([rise, rise[::-1] * [1, -1]]))
 
 
-def _arrow(length: float, width: float) -> Surface:
+def _arrow(length: float, width: float) -> IndexedMesh:
     tip = min(0.45 * length, 3.2 * width)
     shaft, head = width / 2, 1.35 * width
     profile = [(shaft, 0), (shaft, length - tip), (head, length - tip), (1e-3 * head, length)]
     return _revolved(profile)
 
 
-SHAPE_MESHES: dict[str, Callable[..., Surface]] = {
-    "capsule": lambda radius, length: Surface(*capsule_mesh(radius, length / 2, SEGMENTS)),
+SHAPE_MESHES: dict[str, Callable[..., IndexedMesh]] = {
+    "capsule": lambda radius, length: IndexedMesh(*capsule_mesh(radius, length / 2, SEGMENTS)),
     "drum": _drum,
     "arrow": _arrow,
     "ring": lambda radius, width: _from_trimesh(torus(radius, width / 2, 2 * SEGMENTS, 12)),
@@ -144,14 +144,14 @@ drum (radius, length), arrow (length, width of the shaft), ring (radius, width).
 """
 
 
-def join_surfaces(surfaces: Sequence[Surface]) -> Surface:
+def join_surfaces(surfaces: Sequence[IndexedMesh]) -> IndexedMesh:
     """Concatenate several surfaces."""
-    result = together(list(surfaces))
+    result = merge_meshes(list(surfaces))
     assert result is not None
     return result
 
 
-def split_sharp_edges(surface: Surface, degrees: float = 35.0) -> Surface:
+def split_sharp_edges(surface: IndexedMesh, degrees: float = 35.0) -> IndexedMesh:
     """Duplicate the points at sharp edges, as smooth shading requires.
 
     Args:
@@ -163,7 +163,7 @@ def split_sharp_edges(surface: Surface, degrees: float = 35.0) -> Surface:
     )
 
 
-def decimate(surface: Surface, max_triangles: int = 3000) -> Surface:
+def decimate(surface: IndexedMesh, max_triangles: int = 3000) -> IndexedMesh:
     """Merge points within cells until at most about `max_triangles` triangles remain."""
     cell_size = float(np.ptp(surface.points, axis=0).max()) / 256 if len(surface.points) else 0.0
     while len(surface.triangles) > max_triangles:
@@ -174,6 +174,6 @@ def decimate(surface: Surface, max_triangles: int = 3000) -> Surface:
         triangles = cell_index.reshape(-1)[surface.triangles]
         a, b, c = triangles.T
         triangles = triangles[(a != b) & (b != c) & (a != c)]
-        surface = Surface(surface.points[first_point], np.unique(triangles, axis=0))
+        surface = IndexedMesh(surface.points[first_point], np.unique(triangles, axis=0))
         cell_size *= 1.4
     return surface

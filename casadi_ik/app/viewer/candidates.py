@@ -15,7 +15,7 @@ from casadi_ik.app.viewer.access import Server
 from casadi_ik.app.viewer.panel import block, on_set
 from casadi_ik.app.viewer.viser_scene import add_drawable, quaternions
 from casadi_ik.files.arrays import Array
-from casadi_ik.integrations.importing.surfaces import Surface
+from casadi_ik.integrations.importing.meshes import IndexedMesh
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.grasp import Grasp
 from casadi_ik.model.pose import inverse
@@ -172,7 +172,7 @@ class CandidateList:
         self._summary = gui.add_html("")
 
 
-def _tripods(robot: ArmHand, candidate: Candidate | FoundGrasp) -> list[Surface]:
+def _tripods(robot: ArmHand, candidate: Candidate | FoundGrasp) -> list[IndexedMesh]:
     """Return rods from each palm to its contacts, with balls at their ends."""
     contacts = {} if candidate.grasp is None else candidate.grasp.contacts
     if candidate.q is None or not all(

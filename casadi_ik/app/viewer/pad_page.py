@@ -31,7 +31,7 @@ from casadi_ik.errors import CasadiIKError, DescriptionError, os_errors
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.reading import Frame, frame_matrix, read_yaml
 from casadi_ik.files.writing import atomic_write
-from casadi_ik.integrations.importing.surfaces import Surface, together
+from casadi_ik.integrations.importing.meshes import IndexedMesh, merge_meshes
 from casadi_ik.integrations.importing.write import vector
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.load_robot import load_description
@@ -67,7 +67,7 @@ class PadPage(InteractivePage):
         server: Server,
         robot: ArmHand,
         path: Path,
-        surfaces: Mapping[str, Surface],
+        surfaces: Mapping[str, IndexedMesh],
         writable: bool = True,
         dark: bool = False,
     ) -> None:
@@ -169,7 +169,7 @@ class PadPage(InteractivePage):
             pads_by_finger[finger] = LinkPad(local[:3, 3], local[:3, 0])
         return pads_by_finger
 
-    def _link_surface(self, link: str) -> Surface | None:
+    def _link_surface(self, link: str) -> IndexedMesh | None:
         """Return the surface that moves rigidly with a link, in its frame."""
         rigid_links, to_link = {link}, inverse(self._links[link])
         for joint in self.robot.description.joints:
@@ -183,9 +183,9 @@ class PadPage(InteractivePage):
         parts = [(drawable.frame, drawable.surface) for drawable in drawables] + list(
             self._surfaces.items()
         )
-        return together(
+        return merge_meshes(
             [
-                surface.moved(to_link @ self._links[frame])
+                surface.transformed(to_link @ self._links[frame])
                 for frame, surface in parts
                 if frame in rigid_links
             ]
@@ -352,13 +352,13 @@ def _check_saved_pads(temporary: Path, pads: Mapping[str, LinkPad]) -> None:
 # Surface of a link.
 
 
-def surface_hit(surface: Surface, point: Array, normal: Array) -> tuple[Array, Array] | None:
+def surface_hit(surface: IndexedMesh, point: Array, normal: Array) -> tuple[Array, Array] | None:
     """Return the point where the line along a pad normal leaves a surface, and the normal there.
 
     The line is cast from 6 cm outside; the normal is estimated from four points 2 mm apart.
 
     Args:
-        surface: Surface that moves with the pad.
+        surface: Mesh that moves with the pad.
         point: (3,) Contact point [m].
         normal: (3,) Unit normal.
 
@@ -366,11 +366,11 @@ def surface_hit(surface: Surface, point: Array, normal: Array) -> tuple[Array, A
         Point (3,) and unit normal (3,); None if the line misses the surface.
     """
     start = point + 0.06 * normal
-    hit = surface.hit(start, -normal)
+    hit = surface.first_hit(start, -normal)
     if hit is None:
         return None
     x, y = 0.002 * pose_with_x_axis(point, normal)[:3, 1:3].T
-    hits = (surface.hit(start + step, -normal) for step in (x, y, -x, -y))
+    hits = (surface.first_hit(start + step, -normal) for step in (x, y, -x, -y))
     neighbours = [neighbour for neighbour in hits if neighbour is not None]
     if len(neighbours) < 4:
         return hit, normal

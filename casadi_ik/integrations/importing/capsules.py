@@ -13,7 +13,7 @@ from casadi_ik.collision.solids import sphere_directions
 from casadi_ik.errors import optional_import
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.reading import roll_pitch_yaw
-from casadi_ik.integrations.importing.surfaces import Surface, clusters
+from casadi_ik.integrations.importing.meshes import IndexedMesh, cluster_points
 from casadi_ik.model.schema import BoxEntry, CapsuleEntry, ShapeEntry, SphereEntry
 
 with optional_import("shapes of imported links"):
@@ -134,7 +134,7 @@ def fit(
         The capsules, and the largest distance by which samples of their surface stand out beyond
         the mesh [m].
     """
-    mesh = Surface(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3))
+    mesh = IndexedMesh(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3))
     coarse = mesh.simplified(SHAPE_FIT.triangles, SHAPE_FIT.cells)
     pieces = _Pieces(cut(coarse.points[coarse.triangles]))
     parts, capsules = _split(pieces, max_capsules, min_saving)
@@ -202,7 +202,7 @@ class _Pieces:
         self.corners, self.numbers = mesh
         self.centroids = self.corners[self.numbers].mean(axis=1)
         self.outermost = np.zeros(len(self.corners), bool)
-        self.outermost[clusters(self.corners, SHAPE_FIT.cells)[0]] = True
+        self.outermost[cluster_points(self.corners, SHAPE_FIT.cells)[0]] = True
 
     def enclosing(self, rows: Rows, rounds: int) -> FittedCapsule:
         """Return a small capsule that encloses the triangles of some rows.
@@ -435,7 +435,7 @@ def box_around(points: Array) -> FittedBox:
 
 
 def fit_links(
-    surfaces: Mapping[str, Surface],
+    surfaces: Mapping[str, IndexedMesh],
     flat: Collection[str],
     known: Mapping[str, Sequence[ShapeEntry]] | None = None,
     max_capsules: int = SHAPE_FIT.max_capsules,

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from casadi_ik.files.arrays import Array
-from casadi_ik.integrations.importing.surfaces import Surface, together
+from casadi_ik.integrations.importing.meshes import IndexedMesh, merge_meshes
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.joints import Joint
 from casadi_ik.model.linkage import (
@@ -376,7 +376,7 @@ class Pad:
 
 
 def guess_pads(
-    part: RobotPart, palm: str, branches: list[Branch], surfaces: dict[str, Surface]
+    part: RobotPart, palm: str, branches: list[Branch], surfaces: dict[str, IndexedMesh]
 ) -> list[Pad]:
     """Return a pad for every finger."""
     middle = _mid_range(part)
@@ -391,13 +391,13 @@ def guess_pads(
         other_tips = [tip for j, tip in enumerate(tips) if j != i]
         closing_target = np.mean(other_tips, axis=0) if other_tips else poses[palm][:3, 3]
         if not other_tips and palm in surfaces:  # a jaw closes towards the nearest part of the palm
-            points = surfaces[palm].moved(poses[palm]).points
+            points = surfaces[palm].transformed(poses[palm]).points
             closing_target = points[np.argmin(np.linalg.norm(points - tips[i], axis=1))]
         pads.append(_pad(part, branch, bodies[i], closing_target))
     return pads
 
 
-def guess_fixed_jaw(part: RobotPart, palm: str, pad: Pad, surface: Surface | None) -> Pad:
+def guess_fixed_jaw(part: RobotPart, palm: str, pad: Pad, surface: IndexedMesh | None) -> Pad:
     """Return the pad of a jaw that is fixed to the palm's link, opposite the one that moves.
 
     Args:
@@ -409,7 +409,7 @@ def guess_fixed_jaw(part: RobotPart, palm: str, pad: Pad, surface: Surface | Non
     poses = _poses(part, _mid_range(part))
     pose = np.linalg.inv(poses[palm]) @ poses[pad.link]
     point, normal = _apply(pose, pad.point), pose[:3, :3] @ pad.normal
-    hit = None if surface is None else surface.hit(point, normal)
+    hit = None if surface is None else surface.first_hit(point, normal)
     if hit is not None:
         return Pad(palm, hit, -normal, "where a ray from the jaw that moves meets the palm's link")
     positions = []
@@ -428,22 +428,22 @@ def tool_pad(link: str) -> Pad:
     return Pad(link, np.zeros(3), np.array([0.0, 0.0, 1.0]), "the arm's last frame faces along z")
 
 
-Body = tuple[Surface | None, Array, int]
-"""Surface of the last phalanx in the frame of its moving link, its tip, and the index of the joint
+Body = tuple[IndexedMesh | None, Array, int]
+"""Mesh of the last phalanx in the frame of its moving link, its tip, and the index of the joint
 that moves it."""
 
 
-def _last_phalanx(part: RobotPart, branch: Branch, surfaces: dict[str, Surface]) -> Body:
+def _last_phalanx(part: RobotPart, branch: Branch, surfaces: dict[str, IndexedMesh]) -> Body:
     zero_poses = _poses(part, {})
     for index in reversed(range(len(branch.chain))):
         joint = branch.chain[index]
         inverse = np.linalg.inv(zero_poses[joint.child])
         parts = [
-            surfaces[link].moved(inverse @ zero_poses[link])
+            surfaces[link].transformed(inverse @ zero_poses[link])
             for link in rigid_links(part, joint.child)
             if link in surfaces
         ]
-        surface = together(parts)
+        surface = merge_meshes(parts)
         if surface is not None and len(surface.points):
             return surface, _tip_point(surface, joint), index
     joint = branch.chain[-1]
@@ -455,7 +455,7 @@ def _last_phalanx(part: RobotPart, branch: Branch, surfaces: dict[str, Surface])
     return None, tip, len(branch.chain) - 1
 
 
-def _tip_point(body: Surface, joint: Joint) -> Array:
+def _tip_point(body: IndexedMesh, joint: Joint) -> Array:
     """Return the tip of the last phalanx: its farthest cross-section's centre."""
     u = _phalanx_direction(body, joint)
     heights = body.points @ u
@@ -464,7 +464,7 @@ def _tip_point(body: Surface, joint: Joint) -> Array:
     return middle + (heights.max() - middle @ u) * u
 
 
-def _phalanx_direction(body: Surface, joint: Joint) -> Array:
+def _phalanx_direction(body: IndexedMesh, joint: Joint) -> Array:
     """Return the unit direction from joint to phalanx, perpendicular to the joint axis."""
     direction = _perpendicular_part(body.centroid(), joint.axis)
     if np.linalg.norm(direction) < 3e-3:
@@ -494,7 +494,7 @@ def _pad(part: RobotPart, branch: Branch, body: Body, closing_target: Array) -> 
         point, reason = end, "without shapes: the point is the tip frame or a guess of it"
     else:
         point, reason, radius = _skin(shape, u, normal)
-        mean_normal = shape.facing(point, radius, normal)
+        mean_normal = shape.mean_normal(point, radius, normal)
         if joint.type != "prismatic":
             mean_normal = _unit(_perpendicular_part(mean_normal, joint.axis), normal)
         if mean_normal @ normal > MIN_COS_TILT:
@@ -507,7 +507,7 @@ def _pad(part: RobotPart, branch: Branch, body: Body, closing_target: Array) -> 
     return Pad(link, _apply(pose, point), pose[:3, :3] @ normal, f"{reason}; {why}")
 
 
-def _skin(shape: Surface, u: Array, normal: Array) -> tuple[Array, str, float]:
+def _skin(shape: IndexedMesh, u: Array, normal: Array) -> tuple[Array, str, float]:
     """Return the point of the fingertip's surface in the direction of the normal.
 
     The second value describes how it was found, the third is the radius of the pad [m].
@@ -521,7 +521,7 @@ def _skin(shape: Surface, u: Array, normal: Array) -> tuple[Array, str, float]:
     side_range = (outer @ side).min(), (outer @ side).max()
     start = (length - inset) * u + float(np.mean(side_range)) * side
     ray_start = float(np.abs(shape.points).max()) * 4 + 0.1
-    hit = shape.hit(start + ray_start * normal, -normal)
+    hit = shape.first_hit(start + ray_start * normal, -normal)
     if hit is not None:
         reason = f"hit of a ray on the shape {1e3 * inset:.1f} mm before the tip's end"
         return hit, reason, inset / 2

@@ -31,8 +31,8 @@ from casadi_ik.integrations.importing.guess import (
     palms,
     tool_pad,
 )
+from casadi_ik.integrations.importing.meshes import link_meshes
 from casadi_ik.integrations.importing.robot_shapes import hand_links, name_in_robot, robot_shapes
-from casadi_ik.integrations.importing.surfaces import link_surfaces
 from casadi_ik.integrations.importing.write import FileLine, HandLines, Written
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.imported_parts import hand_from_file
@@ -391,7 +391,7 @@ def _found_hand(
         return lines, [Branch("tool", (), palm, (palm,), False)], []
     is_jaw = len(branches) == 1 and len(branches[0].chain) == 1 and bool(chain_to(part, palm))
     wanted = {one for branch in branches for one in _ends_of(part, branch)}
-    surfaces, notes = link_surfaces(tree, wanted | {palm} if is_jaw else wanted)
+    surfaces, notes = link_meshes(tree, wanted | {palm} if is_jaw else wanted)
     pads = guess_pads(part, palm, branches, surfaces)
     if is_jaw:
         pads.append(guess_fixed_jaw(part, palm, pads[0], surfaces.get(palm)))

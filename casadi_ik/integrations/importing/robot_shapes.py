@@ -17,7 +17,7 @@ from casadi_ik.collision.distances import between_segments
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.progress import progress
 from casadi_ik.integrations.importing.capsules import SHAPE_FIT, fit_links
-from casadi_ik.integrations.importing.surfaces import Surface, link_surfaces
+from casadi_ik.integrations.importing.meshes import IndexedMesh, link_meshes
 from casadi_ik.integrations.importing.triangle_tree import CollisionTree
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.link_shapes import Touching, capsules_of
@@ -68,7 +68,7 @@ SAMPLING = ContactSampling()
 def may_touch(
     part: RobotPart | RobotDescription,
     shapes: Mapping[str, Sequence[ShapeEntry]],
-    surfaces: Mapping[str, Surface],
+    surfaces: Mapping[str, IndexedMesh],
     report: Callable[[int], object] | None = None,
 ) -> list[Touching]:
     """Return the pairs of links whose shapes may overlap, each with the reason.
@@ -236,7 +236,7 @@ def robot_shapes(
         robot: The robot, imported from the files.
         files: The arm's, if it has one of its own, and the hand's.
     """
-    surfaces: dict[str, Surface] = {}
+    surfaces: dict[str, IndexedMesh] = {}
     simple: dict[str, list[ShapeEntry]] = {}
     notes: list[str] = []
     taken: set[str] = set()
@@ -250,7 +250,7 @@ def robot_shapes(
             for link, name in ours.items()
             if name in robot.links and (None in files or (name in hand) == (file is files[1]))
         }
-        found, said = link_surfaces(file, wanted)
+        found, said = link_meshes(file, wanted)
         surfaces |= {wanted[link]: surface for link, surface in found.items()}
         entries = file.shapes.entries
         simple |= {wanted[link]: list(entries[link]) for link in wanted if link in entries}
