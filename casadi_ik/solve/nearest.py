@@ -2,9 +2,8 @@
 
 The distance of a configuration from a target is the sum of its squared contact errors, each divided
 by its tolerance. Several configurations descend to local minima of this distance, and the nearest
-minimum is returned: the start and the end of the failed solve, quasi-random configurations from
-distinct regions of the joint space, and hands that were fitted to the contacts with a floating
-palm. It is the best minimum found; nothing is proved.
+minimum is returned: the start and the end of the failed solve, and seeds from distinct regions of
+the joint space (`nearest_seeds`). It is the best minimum found; nothing is proved.
 """
 
 from __future__ import annotations
@@ -20,15 +19,15 @@ from casadi_ik.compile import RUNNING
 from casadi_ik.compile.graphs import StepGraph, recipe
 from casadi_ik.compile.layout import Field, Layout
 from casadi_ik.compile.loop import LoopKernel
-from casadi_ik.files.arrays import Array, Rows, spread_points
+from casadi_ik.files.arrays import Array, Rows
 from casadi_ik.kinematics.box_qp import normal_equations, solve_box_qp
 from casadi_ik.kinematics.contact_fit import contact_jacobian, contact_residual
-from casadi_ik.kinematics.contacts import LENGTH, ContactRows, Kinds, kinds_suffix
+from casadi_ik.kinematics.contacts import ContactRows, Kinds, kinds_suffix
 from casadi_ik.kinematics.forward import motor_scales
 from casadi_ik.kinematics.smooth import with_cse
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.targets import TargetBatch
-from casadi_ik.solve.closest import FloatingPalmFit
+from casadi_ik.solve.nearest_seeds import SEED_SETTINGS, SeedSettings, SeedTable
 from casadi_ik.solve.status import Status
 from casadi_ik.solve.trials import (
     LocalRefinement,
@@ -44,20 +43,14 @@ class NearestSettings:
     """Settings of the search for the nearest configurations. Source: ``studies/best_effort.py``.
 
     Attributes:
-        samples: Number of quasi-random configurations in the table.
-        region_bits: Number of joint ranges that are halved to divide the table into regions.
-        sampled_starts: Number of configurations of the table that are refined.
-        fitted_starts: Number of hands with a floating palm whose arm is placed and refined.
+        seeds: Settings of the seeds.
         race_steps: Number of steps that all starts make.
         finalists: Number of starts that continue to the minimum.
         tie: Relative difference of two distances below which the configuration nearer to the start
             is chosen.
     """
 
-    samples: int = 4096
-    region_bits: int = 7
-    sampled_starts: int = 32
-    fitted_starts: int = 8
+    seeds: SeedSettings = SEED_SETTINGS
     race_steps: int = 10
     finalists: int = 8
     tie: float = 1e-6
@@ -131,6 +124,7 @@ class DescentStep:
                 Field("q", (len(self.robot.actuators),), unit="rad or m"),
                 Field("damping", doc="damping of the next step"),
                 Field("is_exact", doc="1: the next step uses exact second derivatives"),
+                Field("distance", doc="half the squared residual after the last step"),
             )
         )
 
@@ -180,6 +174,7 @@ class DescentStep:
             "q": ca.if_else(is_accepted, trial, s["q"]),
             "damping": ca.fmax(s["damping"] * factor, DESCENT.damping_floor),
             "is_exact": ca.if_else(is_accepted, is_slow, 1 - s["is_exact"]),
+            "distance": ca.if_else(is_accepted, distance_after, distance_before),
         }
         decrease = distance_before - distance_after
         has_settled = ca.logic_and(is_accepted, decrease <= DESCENT.settled * distance_before)
@@ -195,23 +190,6 @@ class DescentStep:
         return ca.Function(name, [state, parameters], outputs)
 
 
-@dataclass(frozen=True, eq=False)
-class SampleTable:
-    """Quasi-random configurations and their contacts.
-
-    Attributes:
-        q: (m, n) configurations [rad or m].
-        region: (m,) number of the region of the joint space of each.
-        features: (m, 6 f) contact points, divided by `LENGTH`, and normals.
-        squares: (m, 2 f) their squared norms.
-    """
-
-    q: Array
-    region: Rows
-    features: Array
-    squares: Array
-
-
 class NearestSearch:
     """Search for the nearest configurations of one robot."""
 
@@ -225,28 +203,12 @@ class NearestSearch:
         """Store the runs of the loop; the table is built at the first search."""
         self._trials, self._settings = trials, settings
         self._step = DescentStep(trials.robot.description, kinds)
-        self._floating_palm = FloatingPalmFit(trials)
+        self._seeds = SeedTable(trials.robot, settings.seeds)
         self._compiled = compiled
 
     @cached_property
     def _kernel(self) -> LoopKernel:
         return LoopKernel(self._step.graph, self._compiled)
-
-    @cached_property
-    def _table(self) -> SampleTable:
-        robot, settings = self._trials.robot, self._settings
-        n = len(robot.actuators)
-        fractions = spread_points(settings.samples, n)
-        q = robot.lower + fractions * (robot.upper - robot.lower)
-        points, normals = robot.contacts(q)
-        points = points / LENGTH
-        halves = (fractions[:, : settings.region_bits] >= 0.5).astype(np.intp)
-        return SampleTable(
-            q,
-            halves @ (1 << np.arange(halves.shape[1])),
-            np.concatenate([points, normals], axis=1).reshape(len(q), -1),
-            np.concatenate([(points**2).sum(axis=2), (normals**2).sum(axis=2)], axis=1),
-        )
 
     def find(
         self,
@@ -266,20 +228,16 @@ class NearestSearch:
         """
         all_rows = np.arange(len(targets))
         last_q = np.where(np.isfinite(last_q), last_q, q0)
-        owners, starts = [all_rows, all_rows], [q0, last_q]
-        for owner, q in (self._sampled(targets), self._fitted(targets, q0)):
-            owners.append(owner)
-            starts.append(q)
-        owner, start = np.concatenate(owners), np.concatenate(starts)
+        bounds = targets.bounds(self._trials.robot.description)
+        seed_owner, seeds = self._seeds.find(targets, _weights(targets), *bounds)
+        owner = np.concatenate([all_rows, all_rows, seed_owner])
+        start = np.concatenate([q0, last_q, seeds])
         parameters = self._parameters(targets, UNLIMITED_STEP)
         states = self._run(self._states(parameters[owner], start), parameters[owner], is_race=True)
-        finalists = smallest_per_target(
-            owner, self.distances(targets, owner, self._q(states)), self._settings.finalists
-        )
+        finalists = smallest_per_target(owner, self._distance(states), self._settings.finalists)
         owner = owner[finalists]
         states = self._run(states[finalists], parameters[owner])
-        q = self._q(states)
-        distance = self.distances(targets, owner, q)
+        q, distance = self._q(states), self._distance(states)
         if query is not None:
             is_free = query.rows(owner).check(q).free
             distance = np.where(is_free, distance, IN_COLLISION * (1 + distance))
@@ -309,8 +267,8 @@ class NearestSearch:
         """Return the first states (m, ns) of descents."""
         layout = self._step.parameters
         lower, upper = (parameters[:, layout.slice(name)] for name in ("lower", "upper"))
-        start = {"q": np.clip(q, lower, upper), "damping": DESCENT.damping, "is_exact": 0.0}
-        return self._step.state.pack_rows(start, len(q))
+        start = {"q": np.clip(q, lower, upper), "damping": DESCENT.damping}
+        return self._step.state.pack_rows(start | {"is_exact": 0.0, "distance": 0.0}, len(q))
 
     def _run(self, states: Array, parameters: Array, is_race: bool = False) -> Array:
         """Return the states (m, ns) at the end of descents, or of their first steps."""
@@ -319,6 +277,9 @@ class NearestSearch:
 
     def _q(self, states: Array) -> Array:
         return states[:, self._step.state.slice("q")]
+
+    def _distance(self, states: Array) -> Array:
+        return states[:, self._step.state.slice("distance")].ravel()
 
     def distances(self, targets: TargetBatch, owner: Rows, q: Array) -> Array:
         """Return (m,) sums of squared contact errors, each divided by its tolerance."""
@@ -336,35 +297,6 @@ class NearestSearch:
         travel = (np.abs(q - q0[owner]) / ranges).max(axis=1)
         order = np.lexsort((np.where(is_tied, travel, np.inf), owner))
         return q[first_per_owner(owner, order, 1)]
-
-    def _sampled(self, targets: TargetBatch) -> tuple[Rows, Array]:
-        """Return target indices and configurations of the table, the nearest of each region."""
-        table, count = self._table, len(targets)
-        weights = _weights(targets) ** 2
-        goals = np.stack([targets.points / LENGTH, targets.normals], axis=1)
-        weights = np.swapaxes(weights, 1, 2) * ~np.isnan(goals[..., 0])
-        goals = np.nan_to_num(goals)
-        weighted = (weights[..., None] * goals).reshape(count, -1)
-        distance = weights.reshape(count, -1) @ table.squares.T - 2 * weighted @ table.features.T
-        rows, starts = self._settings.sampled_starts, []
-        regions = int(table.region.max()) + 1
-        for row in range(count):
-            order = np.lexsort((distance[row], table.region))
-            best = first_per_owner(table.region, order, max(1, -(-rows // regions)))
-            starts.append(best[np.argsort(distance[row, best])[:rows]])
-        owner = np.repeat(np.arange(count), [len(best) for best in starts])
-        return owner, table.q[np.concatenate(starts)]
-
-    def _fitted(self, targets: TargetBatch, q0: Array) -> tuple[Rows, Array]:
-        """Return target indices and configurations with fitted hands and placed arms."""
-        trials, body = self._trials, self._trials.robot.description
-        has_own_bounds = targets.fixed is not None and targets.fixed.ndim > 1
-        if has_own_bounds or not (body.arm_actuators and body.hand_actuators):
-            return np.zeros(0, dtype=np.intp), np.zeros((0, len(trials.robot.actuators)))
-        hand_fits = self._floating_palm.fits(targets, q0)
-        rows = hand_fits.best(self._settings.fitted_starts)
-        arms = trials.run(hand_fits.states[rows], hand_fits.parameters[rows])
-        return hand_fits.owner[rows], arms
 
 
 def _weights(targets: TargetBatch) -> Array:
