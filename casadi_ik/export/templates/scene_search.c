@@ -193,7 +193,7 @@ static int begin_hand(search *job) {
   outputs[0] = job->state;
   outputs[1] = job->parameters;
   code = BEGIN(&map);
-  job->state[STATE_PHASE] = CANDIDATE_PHASE;
+  job->state[STATE_PHASE] = CANDIDATE_STAGE;
   job->state[STATE_CANDIDATE] = N_CANDIDATES - 1;
   /* A different palm for each posture, where contacts leave the palm free. */
   job->state[STATE_PALM_NUMBER] = (scalar) (scene->restart * N_CANDIDATES + scene->candidate);
@@ -389,7 +389,7 @@ static int begin_trunk(search *job) {
     if (number % 2) fraction = clipped((fraction - 0.5) * TRUNK_STRETCH + 0.5, 0.0, 1.0);
     q[column] = low + fraction * (high - low);
   }
-  return begin_carrying(job, q, palms, number % 4 != 3 ? ARM_PLACEMENT_PHASE : TRUNK_PHASE);
+  return begin_carrying(job, q, palms, number % 4 != 3 ? ARM_PLACEMENT_STAGE : TRUNK_PHASE);
 }
 
 /* Starts the next task; returns 0 if there is none. */
@@ -446,7 +446,7 @@ static int continue_scene_search(@PREFIX@_solver *solver, int64_t max_iterations
         && @PREFIX@_arms_are_free(solver, solver->terms + TERMS_LOWER, solver->terms + TERMS_UPPER,
                                   solver->terms[TERMS_NEAREST] > 0, trunk_palms, q)) {
       scene->task = ARMS_TASK;
-      code = begin_carrying(solver, q, palms, TRUNK_PHASE);
+      code = begin_carrying(solver, q, palms, TRUNK_STAGE);
     }
   }
   return code;

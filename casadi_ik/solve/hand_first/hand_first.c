@@ -97,7 +97,8 @@ static void start_refinement(search *job, int64_t number) {
     job->state[STATE_Q + k] =
         clipped(q[k], job->parameters[PARAMETERS_LOWER + k], job->parameters[PARAMETERS_UPPER + k]);
   }
-  job->state[STATE_PHASE] = REFINEMENT_PHASE;
+  job->state[STATE_PHASE] =
+      starts_tolerant(job, number) ? TOLERANT_REFINEMENT_STAGE : REFINEMENT_STAGE;
   for (i = 0; i < N_FIT_FIELDS; ++i) job->state[FIT_FIELDS[i]] = FIT_VALUES[i];
 }
 
@@ -128,7 +129,7 @@ static int start_restart(search *job) {
     }
     return DONE;
   }
-  job->state[STATE_PHASE] = CANDIDATE_PHASE;
+  job->state[STATE_PHASE] = CANDIDATE_STAGE;
   job->state[STATE_CANDIDATE] = 0.0;
   if (is_global_restart(number)) start_refinement(job, number);
   for (i = 0; i < N_KEPT_FIELDS; ++i) {

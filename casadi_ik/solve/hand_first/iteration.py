@@ -285,7 +285,9 @@ class VirtualIteration:
                 return goes_to(Stage.REFINEMENT)
             case Stage.CANDIDATE:
                 if x["candidate"] < candidates:
-                    return goes_to(Stage.HAND_FIT if self._arm else Stage.REFINEMENT)
+                    is_tolerant = is_later_restart and int(x["candidate"]) % 2
+                    hand_stage = Stage.TOLERANT_REFINEMENT if is_tolerant else Stage.REFINEMENT
+                    return goes_to(Stage.HAND_FIT if self._arm else hand_stage)
                 y["q"][:] = y["best_q"]
                 return Status.STALLED
             case Stage.HAND_FIT:

@@ -45,15 +45,32 @@ static inline int starts_at_incumbent(const search *job, int64_t number) {
   return incumbent_nearly_fits(job) && is_odd(number - ROUNDS);
 }
 
+/* Return 1 if a contact has a wide angle tolerance. Configurations within such a tolerance are
+ * often far from the minima of exact fits. */
+static inline int has_wide_tolerance(const search *job) {
+  int i, is_wide = 0;
+  for (i = 0; i < N_FINGERS; ++i) {
+    is_wide |= job->terms[N_FINGERS + i] > WIDE_ANGLE && is_number(job->normals[3 * i]);
+  }
+  return is_wide;
+}
+
+/* Return 1 if a global restart begins with a tolerant refinement: every second one if a tolerance
+ * is wide. */
+static inline int starts_tolerant(const search *job, int64_t number) {
+  return has_wide_tolerance(job) && is_odd(number - ROUNDS) && !starts_at_incumbent(job, number);
+}
+
 /* Return 1 if another restart is worthwhile. Table seeds are not once most fits have converged to
  * the same infeasible minimum. Extra restarts require that minima keep changing and that the best
- * cost shrinks with the number of restarts. */
+ * cost shrinks with the number of restarts; if a tolerance is wide, their number is fixed. */
 static inline int restart_is_worthwhile(const search *job) {
   const double repeated = job->state[STATE_REPEATED_MINIMA], cost = job->state[STATE_BEST_COST];
   const int is_underactuated = job->state[STATE_IS_UNDERACTUATED] > 0;
   const double max_repeated = is_underactuated ? SAME_MINIMUM_MANY : SAME_MINIMUM;
   const double max_cost = is_underactuated ? FAR_COST_MANY : FAR_COST;
   const int64_t extra = job->round - FIRST_RUGGED;
+  if (has_wide_tolerance(job)) return extra < WIDE_ROUNDS;
   if (extra >= 0) {
     return repeated < max_repeated && cost < max_cost
         && cost < FAR_COST_SHRINKS / (double) (extra + 1);

@@ -30,8 +30,8 @@ from casadi_ik.kinematics.contacts import LENGTH
 from casadi_ik.model.grasp import MAX_PLAIN_LENGTH, MIN_PLAIN_LENGTH, UNIT_ROUNDING
 from casadi_ik.solve.hand_first.parameters import HandFirstParameters
 from casadi_ik.solve.hand_first.seeds import FEATURES, Seeds
-from casadi_ik.solve.hand_first.state import HandFirstLayouts, terms
-from casadi_ik.solve.status import Phase, Status
+from casadi_ik.solve.hand_first.state import HandFirstLayouts, Stage, terms
+from casadi_ik.solve.status import Status
 from casadi_ik.solve.turns import TURN
 from casadi_ik.solve.verdict import LIMIT_SLACK, TOLERANCE_SLACK
 
@@ -271,7 +271,7 @@ class SearchPlan:
             "N_FIT_FIELDS": len(initial_lm_state()),
             "N_COUNTS": len(self.layouts.phases),
             **{f"{status.name}_STATUS": int(status) for status in Status},
-            **{f"{phase.name}_PHASE": int(phase) for phase in Phase},
+            **{f"{stage.name}_STAGE": int(stage) for stage in Stage},
             **{k: v for k, v in self._options.items() if isinstance(v, int)},
             **offsets,
         }
