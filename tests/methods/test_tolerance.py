@@ -38,7 +38,7 @@ def test_wide_tolerances_are_searched_beyond_the_minima_of_exact_fits(name):
     targets = moved(contacts, rng, 0.8 * tolerance.position, 0.8 * tolerance.angle)
     with pytest.warns(ik.errors.InputWarning, match="tolerance"):
         solver = ik.Solver(robot, tolerance=tolerance)
-    assert np.mean(solver.solve_batch(*targets).success) >= 0.999
+    assert np.mean(solver.solve_batch(*targets).success) >= 0.997
 
 
 def displaced_palms(robot, q, tolerance, part):
