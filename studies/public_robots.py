@@ -28,7 +28,7 @@ from runner.report import command, markdown_table, program, write_page
 
 from casadi_ik.errors import CasadiIKError
 from casadi_ik.files.progress import progress
-from casadi_ik.integrations.importing.imported import import_robot
+from casadi_ik.integrations.importing.robot_import import import_robot
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.load_robot import load_description
 
@@ -71,13 +71,11 @@ def imported(path: Path, arguments: list[str], shapes: bool) -> dict[str, Any]:
     folder, start = Path(tempfile.mkdtemp()), time.process_time()
     out = folder / "robot.yaml"
     try:
-        description = import_robot(
-            None, path, out, command="public_robots", xacro=arguments or False
-        )
-        out.write_text(description.written.text(), encoding="utf-8")
+        result = import_robot(None, path, out, command="public_robots", xacro=arguments or False)
+        out.write_text(result.description.to_yaml(), encoding="utf-8")
         robot = load_description(out)
         if shapes:
-            description.with_shapes(out)
+            result.with_shapes(out)
         outcome = structure(robot)
     except CasadiIKError as error:
         outcome = f"error: {str(error).replace(str(path.parent), '')}"[:200]

@@ -18,7 +18,7 @@ from casadi_ik import model as robots
 from casadi_ik.collision.clearance import SceneCheck
 from casadi_ik.collision.model import collision_model
 from casadi_ik.files.reading import Frame, frame_matrix, validated
-from casadi_ik.integrations.importing import capsules, imported
+from casadi_ik.integrations.importing import capsules, robot_import
 from casadi_ik.integrations.importing.meshes import IndexedMesh
 from casadi_ik.integrations.importing.write import collision_lines
 from casadi_ik.model.link_shapes import Touching, capsules_of
@@ -264,10 +264,10 @@ def test_import_writes_shapes_that_hold_the_meshes(tmp_path: Path, rng) -> None:
         "<disable_collisions link1='left_2' link2='right_2' reason='Never'/></robot>"
     )
     out = tmp_path / "mine.yaml"
-    found = imported.import_robot(None, hand, out, command="casadi-ik import")
-    out.write_text(found.written.text())
-    found = found.at_home(out).with_shapes(out, tmp_path / "hand.srdf")
-    out.write_text(found.written.text())
+    found = robot_import.import_robot(None, hand, out, command="casadi-ik import")
+    out.write_text(found.description.to_yaml())
+    found = found.with_home(out).with_shapes(out, tmp_path / "hand.srdf")
+    out.write_text(found.description.to_yaml())
     entry = yaml.safe_load(out.read_text())["collision"]
     assert entry["links"]["left_1"][0]["kind"] == "cylinder"
     assert entry["links"]["left_1"][0]["radius"] == "10 mm"

@@ -11,7 +11,7 @@ from imported_files import FINGERS, arm, describe, hand, joint, link, urdf
 from toy_robots import grasp_at
 
 import casadi_ik as ik
-from casadi_ik.integrations.importing.imported import largest_difference
+from casadi_ik.integrations.importing.reference_kinematics import largest_difference
 from casadi_ik.integrations.importing.robot_shapes import robot_shapes
 from casadi_ik.integrations.importing.triangle_tree import CollisionTree
 from casadi_ik.model.urdf_mjcf import read_tree

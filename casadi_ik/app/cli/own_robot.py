@@ -30,11 +30,14 @@ from casadi_ik.export.project import (
     wasm_project,
     write_folder,
 )
-from casadi_ik.integrations.importing import imported
+from casadi_ik.integrations.importing import robot_import
 from casadi_ik.integrations.importing.capsules import largest_excess
-from casadi_ik.integrations.importing.imported import Imported, largest_difference, no_palm
+from casadi_ik.integrations.importing.end_links import palm_warning
+from casadi_ik.integrations.importing.reference_kinematics import largest_difference
+from casadi_ik.integrations.importing.robot_import import ImportResult
 from casadi_ik.kinematics.arm_hand import ArmHand, load_robot
 from casadi_ik.kinematics.arms.recognise import describe_arm, is_searched
+from casadi_ik.model.load_robot import load_description
 from casadi_ik.papers.chandra import calibration
 
 MIN_ARM_MOTORS = 4
@@ -87,8 +90,8 @@ def import_robot(args: Arguments) -> CommandResult:
     exit codes: 0 written, 1 --check found a difference, 2 bad input (no file is
     written)
     """
-    first = imported.file_of(args.first)
-    hand = args.hand and imported.file_of(args.hand, "HAND")
+    first = robot_import.find_robot_file(args.first)
+    hand = args.hand and robot_import.find_robot_file(args.hand, "HAND")
     arm, hand = (first, hand) if hand else (None, first)
     if first.suffix in (".yaml", ".yml"):
         return _draw_description(first, args)
@@ -98,7 +101,7 @@ def import_robot(args: Arguments) -> CommandResult:
     outputs = {"--out": args.out, "--picture": args.picture}
     check_outputs(outputs, inputs=[path for path in (arm, hand, srdf) if path])
     draw = _drawing() if args.picture is not None else None
-    import_result = imported.import_robot(
+    import_result = robot_import.import_robot(
         arm,
         hand,
         args.out,
@@ -109,12 +112,12 @@ def import_robot(args: Arguments) -> CommandResult:
         xacro=args.xacro_args or bool(args.xacro),
     )
     with output(args.out) as part:
-        part.write_text(import_result.written.text(), encoding="utf-8")
-        import_result = import_result.at_home(part)
-        part.write_text(import_result.written.text(), encoding="utf-8")
+        part.write_text(import_result.description.to_yaml(), encoding="utf-8")
+        import_result = import_result.with_home(part)
+        part.write_text(import_result.description.to_yaml(), encoding="utf-8")
         import_result = import_result.with_shapes(part, srdf, discard=True)
-        part.write_text(import_result.written.text(), encoding="utf-8")
-        robot = imported.loaded(part)
+        part.write_text(import_result.description.to_yaml(), encoding="utf-8")
+        robot = ArmHand(load_description(part))
         differences = _differences(robot, import_result) if args.check else {}
         if draw is not None and args.picture is not None:
             draw(robot, args.picture)
@@ -129,7 +132,7 @@ def _draw_description(path: Path, args: Arguments) -> CommandResult:
         raise InputError(f"{path}: file is a description; expected --picture without --out")
     outputs = {"--picture": args.picture}
     check_outputs(outputs, inputs=[path])
-    draw, robot = _drawing(), imported.loaded(path)
+    draw, robot = _drawing(), ArmHand(load_description(path))
     draw(robot, args.picture)
     what = f"{robot.name}: {len(robot.fingers)} pads"
     return CommandResult.of_parts(True, headline(True, "DRAWN", what), *files(outputs))
@@ -154,87 +157,89 @@ def _drawing() -> Callable[[ArmHand, Path], object]:
     return draw_pads
 
 
-def _differences(robot: ArmHand, import_result: Imported) -> dict[str, float]:
+def _differences(robot: ArmHand, import_result: ImportResult) -> dict[str, float]:
     """Return the largest pose difference from pinocchio or MuJoCo by file."""
     q = robot.random(np.random.default_rng(0), 20)
     arm, hand = import_result.files
-    written_description = import_result.written
+    written = import_result.description
     values: dict[str, float] = {}
-    if arm is not None and written_description.arm is not None:
-        difference = largest_difference(robot, arm, q, written_description.arm.locked, carried=hand)
+    if arm is not None and written.arm is not None:
+        difference = largest_difference(robot, arm, q, written.arm.locked, hand_tree=hand)
         values[str(arm.path) if arm.path.name == hand.path.name else arm.path.name] = difference
-    values[hand.path.name] = largest_difference(
-        robot, hand, q, written_description.hand.locked, arm
-    )
+    values[hand.path.name] = largest_difference(robot, hand, q, written.hand.locked, arm)
     return values
 
 
 def _import_report(
-    robot: ArmHand, import_result: Imported, differences: dict[str, float]
+    robot: ArmHand, import_result: ImportResult, differences: dict[str, float]
 ) -> list[RenderableType]:
-    description, lines = robot.description, import_result.written
+    description, imported = robot.description, import_result.description
     arm = len(description.arm_actuators)
     count = len(description.actuators)
-    arm_noun = "wrist" if lines.arm is None and 0 < arm < MIN_ARM_MOTORS else "arm"
+    arm_noun = "wrist" if imported.arm is None and 0 < arm < MIN_ARM_MOTORS else "arm"
     motors = f"{arm} {arm_noun}, {count - arm} hand"
     if description.sides:
         groups = [f"{len(description.trunk)} trunk"]
         groups += [f"{s.name} {len(s.arm)} arm, {len(s.hand)} hand" for s in description.sides]
         motors = "; ".join(groups)
     fingers = len(description.fingers)
-    summary = f"{lines.name}: {count} motors ({motors}), {fingers} fingers"
+    summary = f"{imported.name}: {count} motors ({motors}), {fingers} fingers"
     pairs = {}
-    if lines.arm is not None:
-        pairs["tip"] = f"{lines.arm.end}: {lines.arm.how}"
-        pairs["mount"] = lines.mount_how
+    if imported.arm is not None:
+        pairs["tip"] = f"{imported.arm.end_link}: {imported.arm.reason}"
+        pairs["mount"] = imported.mount_reason
     if description.sides:
         pairs["trunk"] = f"{description.trunk_link}: last link that carries all palms"
-    arms = [description.side(hand.side) if hand.side else description for hand in lines.hands]
-    for hand, kinematics in zip(lines.hands, arms, strict=True):
+    arms = [description.side(hand.side) if hand.side else description for hand in imported.hands]
+    for hand, kinematics in zip(imported.hands, arms, strict=True):
         side = f"{hand.side} " if hand.side else ""
-        pairs[f"{side}palm"] = f"{hand.link}: {hand.how}"
+        pairs[f"{side}palm"] = f"{hand.palm_link}: {hand.reason}"
         pairs[f"{side}closed form"] = describe_arm(kinematics) if kinematics.arm_actuators else ""
         if hand.thumb is not None:
             pairs[f"{side}thumb"] = f"{hand.thumb[0]}: {hand.thumb[1]}"
-    for file_part in filter(None, (lines.arm, lines.hand)):
+    for file_part in filter(None, (imported.arm, imported.hand)):
         if file_part.limits:
             source = Path(file_part.file).name
             limits = ", ".join(file_part.limits)
             pairs["limits"] = f"assumed, because {source} states none: {limits}"
-    for reason in dict.fromkeys(lines.hand.why.values()):
-        joint_names = ", ".join(name for name, why in lines.hand.why.items() if why == reason)
+    for reason in dict.fromkeys(imported.hand.lock_reasons.values()):
+        joint_names = ", ".join(
+            name for name, why in imported.hand.lock_reasons.items() if why == reason
+        )
         pairs["locked" if "locked" not in pairs else "locked too"] = f"{joint_names}: {reason}"
     pairs["check"] = "\n".join(
         f"{name}: {'equal' if value <= POSE_TOLERANCE else 'NOT EQUAL'} to the reference library: "
         f"poses differ by at most {value:.1e}"
         for name, value in differences.items()
     )
-    if lines.shapes:
-        shapes = sum(map(len, lines.shapes.values()))
+    if imported.shapes:
+        shapes = sum(map(len, imported.shapes.values()))
         pairs["shapes"] = (
-            f"{shapes} on {len(lines.shapes)} links, "
-            f"at most {1e3 * largest_excess(lines.shapes):.0f} mm beyond their meshes; "
-            f"{len(lines.touching)} pairs may touch"
+            f"{shapes} on {len(imported.shapes)} links, "
+            f"at most {1e3 * largest_excess(imported.shapes):.0f} mm beyond their meshes; "
+            f"{len(imported.touching)} pairs may touch"
         )
     rows = table("finger", "pad on link", "joints", "point [mm]", "normal", right=("joints",))
-    fingers = [(h.side, *finger) for h in lines.hands for finger in h.fingers.items()]
-    for branch, (side, name, pad) in zip(import_result.branches, fingers, strict=True):
+    fingers = [(h.side, *finger) for h in imported.hands for finger in h.pads.items()]
+    for finger_chain, (side, name, pad) in zip(import_result.fingers, fingers, strict=True):
         # Adding 0.0 turns -0.0 into 0.0.
         point = " ".join(f"{round(1e3 * value, 1) + 0.0:.1f}" for value in pad.point)
         normal = " ".join(f"{round(value, 2) + 0.0:.2f}" for value in pad.normal.tolist())
         finger_name = f"{side}_{name}" if side else name
-        rows.add_row(finger_name, pad.link, str(len(branch.chain)), point, normal)
-    chosen_links = [hand.link for hand in lines.hands if hand.how == "--palm"]
+        rows.add_row(finger_name, pad.link, str(len(finger_chain.joints)), point, normal)
+    chosen_links = [hand.palm_link for hand in imported.hands if hand.reason == "--palm"]
     notes = [
-        f"--palm: {why}" for link in chosen_links if (why := no_palm(import_result.files[1], link))
+        f"--palm: {why}"
+        for link in chosen_links
+        if (why := palm_warning(import_result.files[1], link))
     ]
-    notes += lines.notes
+    notes += imported.notes
     if any(map(is_searched, arms)):
         notes.append(
             "the arm has no known closed form: it is solved numerically, which takes several times "
             "as long"
         )
-    if not lines.shapes:
+    if not imported.shapes:
         notes.append(
             "the files have no collision shapes: a scene needs `collision:` in the description"
         )

@@ -33,8 +33,8 @@ from casadi_ik.collision.solids import Solid
 from casadi_ik.errors import CasadiIKError, UnknownNameError
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.reading import read_yaml
-from casadi_ik.integrations.importing.imported import tree_of
 from casadi_ik.integrations.importing.meshes import IndexedMesh, link_meshes
+from casadi_ik.integrations.importing.robot_import import read_referenced_tree
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.description import Finger, RobotDescription
 from casadi_ik.model.grasp import Contact, Grasp
@@ -291,7 +291,7 @@ def file_meshes(description: RobotDescription, visual: bool = False) -> dict[str
         # The hand's links are prefixed where arm and hand have a name in common.
         link_names = {link.removeprefix(prefix) if prefix else link: link for link in links}
         link_names |= {link: link for link in links if f"{prefix}{link}" not in links or not prefix}
-        surfaces, _ = link_meshes(tree_of(path, entry), list(link_names), visual)
+        surfaces, _ = link_meshes(read_referenced_tree(path, entry), list(link_names), visual)
         for link, surface in surfaces.items():
             meshes.setdefault(link_names[link], surface)
     return meshes

@@ -1,1 +1,1 @@
-"""From somebody's files to a description: what no file says is guessed, and the guess is shown."""
+"""Import of robots from URDF and MJCF files; information that files lack is guessed and marked."""

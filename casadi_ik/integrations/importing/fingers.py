@@ -1,0 +1,118 @@
+"""Fingers of an imported hand: the chains of joints below the palm, and their names."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+
+from casadi_ik.model.joints import Joint
+from casadi_ik.model.linkage import chain_to, joint_depth, joints_below, moving_below, rigid_links
+from casadi_ik.model.parts import RobotPart
+
+FINGER_PATTERNS = {
+    "thumb": r"thumb|(?<![a-z])th(?=[jb_]|dist|prox|mid|tip|hub|base|$)",
+    "index": r"index|fore_?finger|(?<![a-z])ff(?=j|dist|prox|mid|knuck|tip|_|$)",
+    "ring": r"(?<![a-z])ring|(?<![a-z])rf(?=j|dist|prox|mid|knuck|tip|_|$)",
+    "little": r"little|pinky|(?<![a-z])lf(?=j|dist|prox|mid|knuck|meta|tip|_|$)",
+    "middle": r"middle_?finger|(?<![a-z])mf(?=j|dist|prox|mid|knuck|tip|_|$)|middle",
+}
+"""Patterns of finger names; a middle phalanx must not turn a finger into the middle finger."""
+
+
+@dataclass(frozen=True)
+class FingerChain:
+    """A finger in a tree of links.
+
+    Attributes:
+        name: Name of the finger.
+        joints: Movable joints from the palm to the tip.
+        link: Link that carries the pad.
+        links: All links of the finger.
+        is_named: True if names in the file identify the finger.
+    """
+
+    name: str
+    joints: tuple[Joint, ...]
+    link: str
+    links: tuple[str, ...]
+    is_named: bool
+
+
+def find_fingers(part: RobotPart, palm: str) -> list[FingerChain]:
+    """Return the fingers below a palm, in the order of the file."""
+    fingers: list[FingerChain] = []
+    for joint in moving_below(part, palm):
+        for start, end in _finger_ends(part, joint):
+            links = [start.child, *(below.child for below in joints_below(part, start.child))]
+            joint_names = [below.name for below in part.joints if below.child in links]
+            word = _finger_word([*links, *joint_names])
+            chain = [below for below in chain_to(part, end.child, palm) if below.type != "fixed"]
+            tip = _tip_link(part, end.child)
+            fingers.append(FingerChain(word or "", tuple(chain), tip, tuple(links), bool(word)))
+    return _with_unique_names(fingers)
+
+
+def _finger_ends(part: RobotPart, joint: Joint) -> list[tuple[Joint, Joint]]:
+    """Return the first and last joint of each finger that a joint carries.
+
+    Two chains of two or more joints on one joint are two fingers; of shorter chains (linkages) the
+    longest counts.
+    """
+    next_joints = moving_below(part, joint.child)
+    chains = [next_joint for next_joint in next_joints if joint_depth(part, next_joint.child) >= 1]
+    if len(chains) >= 2:
+        return [pair for next_joint in chains for pair in _finger_ends(part, next_joint)]
+    if not next_joints:
+        return [(joint, joint)]
+    longest = max(next_joints, key=lambda next_joint: joint_depth(part, next_joint.child))
+    fingers = _finger_ends(part, longest)
+    return fingers if len(fingers) > 1 else [(joint, fingers[0][1])]
+
+
+def _tip_link(part: RobotPart, link: str) -> str:
+    """Return the tip frame that is fixed to a link; the link if there is not exactly one."""
+    candidates = [
+        candidate for candidate in rigid_links(part, link)[1:] if "tip" in candidate.lower()
+    ]
+    return candidates[0] if len(candidates) == 1 else link
+
+
+def _finger_word(names: list[str]) -> str | None:
+    """Return the finger that most names mention; None if there is none."""
+    lower = [name.lower() for name in names]
+    counts = {
+        word: sum(bool(re.search(pattern, name)) for name in lower)
+        for word, pattern in FINGER_PATTERNS.items()
+    }
+    best = max(counts, key=lambda word: counts[word])  # the first of equals: middle is the last
+    if counts["middle"] and best != "middle" and counts[best] < len(lower) / 2 < counts["middle"]:
+        best = "middle"
+    return best if counts[best] else None
+
+
+def _with_unique_names(fingers: list[FingerChain]) -> list[FingerChain]:
+    """Return the fingers with unique names: finger words, common prefixes of links, or numbers."""
+    prefixes = [_common_prefix(finger.links) for finger in fingers]
+    named: list[FingerChain] = []
+    for i, (finger, prefix) in enumerate(zip(fingers, prefixes, strict=True)):
+        namesakes = [candidate for candidate in fingers if candidate.name == finger.name]
+        name = finger.name if finger.is_named and len(namesakes) == 1 else ""
+        if not name and len(prefix) >= 3 and prefixes.count(prefix) == 1:
+            name = prefix
+        if not name or any(predecessor.name == name for predecessor in named):
+            name = f"finger_{i + 1}"
+        named.append(replace(finger, name=name))
+    return named
+
+
+def _common_prefix(links: tuple[str, ...]) -> str:
+    """Return the common beginning of link names without words such as "link"."""
+    if len(links) < 2:
+        return ""
+    first, *further = (link.lower() for link in links)
+    is_common = [
+        all(link[: i + 1] == first[: i + 1] for link in further) for i in range(len(first))
+    ]
+    common = first[: sum(is_common)]
+    common = re.sub(r"(link|phalanx|body|joint)_*$", "", common.rstrip("_-. "))
+    return re.sub(r"[^a-z0-9_]+", "_", common).strip("_")
