@@ -27,7 +27,7 @@ from casadi_ik.solve.arm_search import RedundancySamples
 from casadi_ik.solve.collision_free import COLLISION_FREE_PARAMETERS
 from casadi_ik.solve.free_hands import UNCONSTRAINED_FINGER_PARAMETERS
 from casadi_ik.solve.hand_first.method import HandFirstMethod
-from casadi_ik.solve.trials import PALM_SCALES
+from casadi_ik.solve.subproblems import PALM_SCALES
 
 MAX_SOLIDS = 1000
 """Largest capacity of a scene. Each solid takes kilobytes of memory."""

@@ -35,9 +35,9 @@ from casadi_ik.solve.collision_free import find_collision_free
 from casadi_ik.solve.engine import Engine
 from casadi_ik.solve.method import Outcome
 from casadi_ik.solve.request import CLEARANCE, Request
+from casadi_ik.solve.row_selection import Deduplicator, largest_per_owner
 from casadi_ik.solve.solution import Choice, Ranking, Solution
 from casadi_ik.solve.status import Status
-from casadi_ik.solve.trials import Deduplicator, largest_per_owner
 from casadi_ik.solve.turns import in_nearest_turns, nearest_turns, search_start
 
 RankingPreference: TypeAlias = str | Callable[[ArmHand, Array], ArrayLike]
@@ -418,20 +418,20 @@ class _Chunk:
         query: CollisionQuery | None,
     ) -> None:
         self.search, self.finder, self.targets, self.query = search, finder, targets, query
-        self.prefer, self.trials = search.prefer, finder.trials
+        self.prefer, self.subproblems = search.prefer, finder.subproblems
         starts = finder.robot.home, search_start(finder.robot.description, search.start)
         self.home, self.starts = (np.tile(q, (len(targets), 1)) for q in starts)
-        self.limits = self.trials.limits(targets)
+        self.limits = self.subproblems.limits(targets)
         fixed = np.full(len(search.start), np.nan) if targets.fixed is None else targets.fixed
         # Motors that are fixed in all targets do not rank solutions.
         self.columns = np.flatnonzero(np.isnan(np.atleast_2d(fixed)).any(axis=0)).tolist()
 
     def solve(self, thorough: bool) -> CandidateSolutions:
         """Return the solutions, see `_Search.solve`."""
-        method = self.trials.method
+        method = self.subproblems.method
         restarts = CHOOSE_PARAMETERS.max_restarts if thorough else 1
         outcome = method.run(self.targets, self.home, self.search.seed, False, restarts)
-        solved = self.trials.solved(self.targets, outcome.q, self.targets.enforce_limits)
+        solved = self.subproblems.solved(self.targets, outcome.q, self.targets.enforce_limits)
         reasons = np.array([Status(int(code)).name for code in outcome.status], dtype=object)
         # A method's SOLVED that fails the check becomes STALLED.
         reasons[~solved & (outcome.status == Status.SOLVED)] = Status.STALLED.name
@@ -487,11 +487,11 @@ class _Chunk:
         """
         if not len(rows) or self.targets.palms is not None:
             return q, rows  # A target with a palm pose has a single hand posture.
-        postures = self.trials.method.postures(self.targets.rows(rows), 0)
+        postures = self.subproblems.method.postures(self.targets.rows(rows), 0)
         starts = self.limits.clip(self.home)
-        candidate, *initial = self.trials.hand_rows(self.targets, rows, starts, postures)
-        ends, targets = self.trials.run(*initial), self.targets.rows(candidate)
-        ends[~self.trials.solved(targets, ends, targets.enforce_limits)] = np.nan
+        candidate, *initial = self.subproblems.hand_rows(self.targets, rows, starts, postures)
+        ends, targets = self.subproblems.run(*initial), self.targets.rows(candidate)
+        ends[~self.subproblems.solved(targets, ends, targets.enforce_limits)] = np.nan
         solutions = np.concatenate([q[:, None], ends.reshape(len(rows), -1, q.shape[1])], axis=1)
         is_solved: Bools = np.all(np.isfinite(solutions), axis=2)
         row, posture = np.nonzero(is_solved)

@@ -27,12 +27,12 @@ from casadi_ik.solve.arm_search import ArmSearch, Preference
 from casadi_ik.solve.hand_first.multi_arm import MultiArmStep
 from casadi_ik.solve.method import HandSearch
 from casadi_ik.solve.request import CLEARANCE, resolve_preference
+from casadi_ik.solve.row_selection import distinct_rows
 from casadi_ik.solve.solution import Alternative, ArmBranch
-from casadi_ik.solve.trials import (
+from casadi_ik.solve.subproblems import (
     Bounds,
     LocalRefinement,
-    Subproblems,
-    distinct_rows,
+    SubproblemSolver,
     palm_coordinates,
     sample_trunks,
     side_palms,
@@ -99,14 +99,14 @@ class AlternativeFinder:
 
     Attributes:
         robot: The robot.
-        trials: The loop of the hand-first method.
+        subproblems: The loop of the hand-first method.
         hand: Positions in q of the hand motors.
     """
 
     def __init__(self, robot: ArmHand, method: HandSearch, compiled: bool = True) -> None:
         """Store the robot and its hand-first method."""
         self.robot = robot
-        self.trials = Subproblems(robot, method)
+        self.subproblems = SubproblemSolver(robot, method)
         self._compiled = compiled
         self._arm_motors = list(robot.description.arm_actuators)
         self.hand = list(robot.description.hand_actuators)
@@ -114,19 +114,19 @@ class AlternativeFinder:
     @cached_property
     def _arm_branches(self) -> ArmBranches | None:
         """Branches of the arm; None if locked joints leave more than one redundancy parameter."""
-        arm = self.trials.method.step.arm
+        arm = self.subproblems.method.step.arm
         return None if arm is None or arm.locked else ArmBranches(arm, self._compiled)
 
     @cached_property
     def arm_search(self) -> ArmSearch | None:
         """Search for all arms of a hand; None without a closed form of the arm."""
-        family = self.trials.method.step.arm
+        family = self.subproblems.method.step.arm
         return None if family is None else self._arm_search(family, self._arm_motors)
 
     @cached_property
     def side_searches(self) -> list[ArmSearch]:
         """Arm search of every side of a multi-arm robot; empty unless all have a closed form."""
-        step, arms = self.trials.method.step, self.robot.description.side_actuators
+        step, arms = self.subproblems.method.step, self.robot.description.side_actuators
         families = [side.family for side in step.sides] if isinstance(step, MultiArmStep) else []
         return [
             self._arm_search(family, list(arms[side][0]), side)
@@ -188,7 +188,7 @@ class AlternativeFinder:
             raise InputError(f"limit: found {limit!r}, expected an integer >= 1")
         resolve_preference(prefer, has_start=True)
         apart = check_separation(apart)
-        limits = self.trials.limits(targets).first
+        limits = self.subproblems.limits(targets).first
         robot, bounds, start = self.robot.description, (limits.lower, limits.upper), q0
         q0 = search_start(robot, start)
         candidates: list[_Candidate] = []
@@ -198,7 +198,7 @@ class AlternativeFinder:
             return ()
         q = np.stack([candidate.q for candidate in candidates])
         q = nearest_turns(robot, q, q0, bounds, prefer == "q0")
-        solved = self.trials.solved(targets, q, targets.enforce_limits)
+        solved = self.subproblems.solved(targets, q, targets.enforce_limits)
         if query is not None:
             solved &= query.free(q)
         keys = np.stack(
@@ -224,34 +224,34 @@ class AlternativeFinder:
             seed: Seed of the starts of arms without a closed form.
             prefer: One of `PREFERENCES`.
         """
-        limits = self.trials.limits(targets).first
+        limits = self.subproblems.limits(targets).first
         candidates = self._arm_candidates(targets, q, 0, limits, q0, seed, prefer)
         solutions = np.stack([q, *(candidate.q for candidate in candidates)])
-        solved = self.trials.solved(targets, solutions, targets.enforce_limits)
+        solved = self.subproblems.solved(targets, solutions, targets.enforce_limits)
         solutions = solutions[solved] if solved.any() else q[None]
         return solutions[int(np.argmax(self.score(solutions, q0, prefer)))]
 
     def _postures(self, targets: TargetBatch, q0: Array, limits: Bounds) -> list[Array]:
         """Return solutions (n,) with different hands, from all candidates of all restarts."""
-        trials, method = self.trials, self.trials.method
+        subproblems, method = self.subproblems, self.subproblems.method
         restarts = range(method.options.rounds)
         postures = np.concatenate([method.postures(targets, restart)[0] for restart in restarts])
         start, first = limits.clip(q0)[None], np.zeros(1, dtype=np.intp)
-        _, states, parameters = trials.hand_rows(targets, first, start, postures[None])
+        _, states, parameters = subproblems.hand_rows(targets, first, start, postures[None])
         original_parameters = parameters.copy()
-        trials.set_tolerance(parameters, ALTERNATIVES.tight_tolerance)
-        q = trials.run(states, parameters)
+        subproblems.set_tolerance(parameters, ALTERNATIVES.tight_tolerance)
+        q = subproblems.run(states, parameters)
         tolerance = 10 * ALTERNATIVES.tight_tolerance
         exact = replace(targets, tolerance=Tolerance(tolerance, tolerance))
-        solutions = q[trials.solved(exact, q, targets.enforce_limits)]
+        solutions = q[subproblems.solved(exact, q, targets.enforce_limits)]
         if not len(solutions):
             # The target may be reachable only within its tolerances.
-            q = np.concatenate([q, trials.run(states, original_parameters)])
-            solutions = q[trials.solved(targets, q, targets.enforce_limits)]
+            q = np.concatenate([q, subproblems.run(states, original_parameters)])
+            solutions = q[subproblems.solved(targets, q, targets.enforce_limits)]
         if not len(solutions):
             # The restarts of the whole search find what the tables of seeds miss.
             q = method.run(targets, q0[None], 0, trace=False).q
-            solutions = q[trials.solved(targets, q, targets.enforce_limits)]
+            solutions = q[subproblems.solved(targets, q, targets.enforce_limits)]
         rows = distinct_rows(self.hand_coordinates(solutions), ALTERNATIVES.min_difference)
         return [solutions[i] for i in rows]
 
@@ -333,20 +333,22 @@ class AlternativeFinder:
         self, targets: TargetBatch, candidates: list[_Candidate]
     ) -> list[_Candidate]:
         """Refine the candidates of an arm whose closed form is only approximate."""
-        family = self.trials.method.step.arm
+        family = self.subproblems.method.step.arm
         if not candidates or family is None or family.is_exact:
             return candidates
         starts = np.stack([candidate.q for candidate in candidates])
         first = np.zeros(len(candidates), np.intp)
-        ends = LocalRefinement(self.trials, targets).run(first, starts)
+        ends = LocalRefinement(self.subproblems, targets).run(first, starts)
         return [replace(candidate, q=end) for candidate, end in zip(candidates, ends, strict=True)]
 
     def _trunk_candidates(self, targets: TargetBatch, q: Array) -> list[Array]:
         """Return solutions with different trunks and arms of a multi-arm robot, hands as in q."""
         palms, first = side_palms(self.robot, q[None]), np.zeros(1, np.intp)
-        ends, _ = sample_trunks(self.trials, targets, q[None], palms, first, 0, ALTERNATIVES.trunks)
+        ends, _ = sample_trunks(
+            self.subproblems, targets, q[None], palms, first, 0, ALTERNATIVES.trunks
+        )
         ends = np.concatenate([q[None], ends])
-        solutions = ends[self.trials.solved(targets, ends, targets.enforce_limits)]
+        solutions = ends[self.subproblems.solved(targets, ends, targets.enforce_limits)]
         moving = [i for i in range(solutions.shape[1]) if i not in self.hand]
         fractions = self._range_fractions(solutions, moving)
         return [solutions[i] for i in distinct_rows(fractions, ALTERNATIVES.min_difference)]
@@ -358,16 +360,18 @@ class AlternativeFinder:
         starts = self.robot.random(np.random.default_rng(seed), ALTERNATIVES.random_arms)
         starts[:, self.hand] = q[self.hand]
         if self._arm_branches is None and self.arm_search is not None:
-            limits, no_bound = self.trials.limits(targets).first, np.full(1, np.inf)
+            limits, no_bound = self.subproblems.limits(targets).first, np.full(1, np.inf)
             bounds, order = (limits.lower, limits.upper), {CLEARANCE: "limits"}.get(prefer, prefer)
             arms = self.arm_search.choose(q[None], q0[None], bounds, order, None, no_bound, True)
             starts = np.concatenate([arms.q, starts])
         starts = np.concatenate([q[None], starts])
-        ends = LocalRefinement(self.trials, targets).run(np.zeros(len(starts), np.intp), starts)
+        ends = LocalRefinement(self.subproblems, targets).run(
+            np.zeros(len(starts), np.intp), starts
+        )
         ends = np.concatenate([q[None], ends])
         hand_differences = np.abs(self._range_fractions(ends - q, self.hand))
         has_same_hand = (hand_differences < ALTERNATIVES.min_difference).all(axis=1)
-        solved = self.trials.solved(targets, ends, targets.enforce_limits)
+        solved = self.subproblems.solved(targets, ends, targets.enforce_limits)
         solutions = ends[has_same_hand & solved]
         fractions = self._range_fractions(solutions, self._arm_motors)
         return [solutions[i] for i in distinct_rows(fractions, ALTERNATIVES.min_difference)]

@@ -15,20 +15,19 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.files.arrays import Array
+from casadi_ik.files.arrays import Array, Rows
 from casadi_ik.kinematics.arms.recognise import srs_arm
 from casadi_ik.kinematics.arms.srs import SrsArm
 from casadi_ik.kinematics.contacts import LENGTH
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.diagnosis import ArmReach, HandFit
 from casadi_ik.solve.hand_first.rows import fit_hands_again
-from casadi_ik.solve.trials import (
+from casadi_ik.solve.row_selection import smallest_per_owner
+from casadi_ik.solve.subproblems import (
     UNREACHABLE_TOLERANCE,
     LocalRefinement,
-    Rows,
-    Subproblems,
+    SubproblemSolver,
     residual_tolerances,
-    smallest_per_target,
 )
 from casadi_ik.solve.verdict import contact_verdicts, judge
 
@@ -92,13 +91,13 @@ def find_closest(
 
     Args:
         refinement: Refinement of k targets.
-        owner: (m,) target index of each configuration; every target has one at least.
+        owner: (m,) target index of each configuration; every target has at least one.
         q: (m, n) start configurations [rad or m].
         max_starts: Maximum number of configurations per target that are refined.
     """
     settings = CLOSEST_SETTINGS
     cost = (refinement.misses(owner, q) ** 2).sum(axis=(1, 2))
-    selected = smallest_per_target(owner, cost, max_starts)
+    selected = smallest_per_owner(owner, cost, max_starts)
     owner, q = owner[selected], q[selected]
     count, first = len(q), np.searchsorted(owner, np.arange(len(refinement.targets)))
     tolerance = residual_tolerances(refinement.targets)[owner]
@@ -146,8 +145,8 @@ def find_closest(
         weights[rows] = updated * scale[:, None, None]
         rows = rows[is_active]
     return ClosestConfigurations(
-        least_squares_q[smallest_per_target(owner, cost, 1)],
-        minimax_q[smallest_per_target(owner, worst, 1)],
+        least_squares_q[smallest_per_owner(owner, cost, 1)],
+        minimax_q[smallest_per_owner(owner, worst, 1)],
         np.minimum.reduceat(bound, first),
     )
 
@@ -162,7 +161,7 @@ class HandFits:
         parameters: (m, ...) parameters of the loop.
         position_error: (m, f) distances [m], NaN where free.
         angle_error: (m, f) angles [rad], NaN where free.
-        met: (m, f) whether the errors are within tolerance, or free.
+        met: (m, f) True where the errors are within tolerance, or free.
         cost: (m,) squared residual of the hand stage.
         distance: (m,) distance of the wrist from the shoulder [m]; NaN for an arm without a
             closed form.
@@ -181,7 +180,7 @@ class HandFits:
 
     @property
     def ok(self) -> NDArray[np.bool_]:
-        """(m,) whether every contact is within tolerance."""
+        """(m,) True where every contact is within tolerance."""
         return np.all(self.met, axis=1)
 
     def unreached_targets(self) -> Rows:
@@ -190,121 +189,142 @@ class HandFits:
 
     def tolerance_factor(self, targets: TargetBatch) -> Array:
         """Return (k,) lower bounds of the factor by which the tolerances have to grow."""
-        cost = self.cost[smallest_per_target(self.owner, self.cost, 1)]
+        cost = self.cost[smallest_per_owner(self.owner, self.cost, 1)]
         return np.sqrt(cost / (residual_tolerances(targets) ** 2).sum(axis=(1, 2)))
 
-    def best(self, most: int) -> Rows:
-        """Return the best fits of each target, `most` at the most, weighing cost and reach."""
-        return smallest_per_target(self.owner, self.cost + (self.outside / LENGTH) ** 2, most)
+    def best_rows(self, count: int) -> Rows:
+        """Return up to `count` best fits of each target, by the sum of cost and reach error."""
+        return smallest_per_owner(self.owner, self.cost + (self.outside / LENGTH) ** 2, count)
 
     @classmethod
-    def joined(cls, parts: Sequence[HandFits]) -> HandFits:
-        """Concatenate fits."""
+    def concatenate(cls, groups: Sequence[HandFits]) -> HandFits:
+        """Return the concatenation of several groups of fits."""
         names = [item.name for item in fields(cls)]
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+        return cls(*(np.concatenate([getattr(fit, name) for fit in groups]) for name in names))
 
 
 class FloatingPalmFit:
-    """Fits the hand alone to targets, with a floating palm."""
+    """Fit of the hand alone to targets, with a floating palm."""
 
-    def __init__(self, trials: Subproblems) -> None:
-        """Store the runs of the loop."""
-        self._trials = trials
-        self._arm = srs_arm(trials.robot.description)
+    def __init__(self, subproblems: SubproblemSolver) -> None:
+        """Store the solver of subproblems."""
+        self._subproblems = subproblems
+        self._arm = srs_arm(subproblems.robot.description)
 
     @cached_property
     def _palm(self) -> Array:
         """(4, 4) palm pose with the arm at zero."""
-        robot = self._trials.robot
+        robot = self._subproblems.robot
         return robot.palm(np.zeros(len(robot.actuators)))
 
     def evidence(
-        self, targets: TargetBatch, fits: HandFits
+        self, targets: TargetBatch, hand_fits: HandFits
     ) -> list[tuple[HandFit, ArmReach | None]]:
-        """Return the best hand fit of each target, and the reach of the arm for the nearest fit.
+        """Return the best hand fit of each target, and the arm reach of the nearest fit.
 
         The reach is None if no hand fits, and for an arm without a closed form.
         """
-        best = smallest_per_target(fits.owner, np.where(fits.ok, 0.0, 1.0 + fits.cost), 1)
-        nearest = smallest_per_target(fits.owner, np.where(fits.ok, fits.outside, np.inf), 1)
-        errors = (array[best] for array in (fits.position_error, fits.angle_error, fits.met))
-        verdicts = contact_verdicts(self._trials.robot.fingers, targets.tolerances, *errors)
+        best = smallest_per_owner(
+            hand_fits.owner, np.where(hand_fits.ok, 0.0, 1.0 + hand_fits.cost), 1
+        )
+        nearest = smallest_per_owner(
+            hand_fits.owner, np.where(hand_fits.ok, hand_fits.outside, np.inf), 1
+        )
+        errors = (
+            array[best]
+            for array in (hand_fits.position_error, hand_fits.angle_error, hand_fits.met)
+        )
+        verdicts = contact_verdicts(self._subproblems.robot.fingers, targets.tolerances, *errors)
         evidence = []
-        for row, near, contacts in zip(best.tolist(), nearest.tolist(), verdicts, strict=True):
-            hand, arm = HandFit(bool(fits.ok[row]), contacts), None
+        for row, nearest_row, contacts in zip(
+            best.tolist(), nearest.tolist(), verdicts, strict=True
+        ):
+            hand, arm = HandFit(bool(hand_fits.ok[row]), contacts), None
             if hand.fits and self._arm is not None:
-                arm = ArmReach(float(fits.distance[near]), *self._span(targets, self._arm))
+                arm = ArmReach(
+                    float(hand_fits.distance[nearest_row]), *self._wrist_range(targets, self._arm)
+                )
             evidence.append((hand, arm))
         return evidence
 
-    def fits(self, targets: TargetBatch, q0: Array) -> HandFits:
-        """Fit a few seeds to each of k targets, and more seeds if none of them fits.
+    def fit(self, targets: TargetBatch, q0: Array) -> HandFits:
+        """Fit a few seeds to each of k targets, and more seeds if the arm reaches none of the fits.
 
         Args:
             targets: The targets.
             q0: (k, n) positions of unconstrained motors [rad or m].
         """
-        method, all_targets = self._trials.method, np.arange(len(targets))
+        method, all_targets = self._subproblems.method, np.arange(len(targets))
         nearest = method.postures(targets, 0)
-        fits = self._fit_seeds(targets, q0, all_targets, nearest[:, : CLOSEST_SETTINGS.first_seeds])
-        unreached = fits.unreached_targets()
+        hand_fits = self._fit_seeds(
+            targets, q0, all_targets, nearest[:, : CLOSEST_SETTINGS.first_seeds]
+        )
+        unreached = hand_fits.unreached_targets()
         if len(unreached):
             further = method.postures(targets.rows(unreached), 1)
             seeds = np.concatenate(
                 [nearest[unreached, CLOSEST_SETTINGS.first_seeds :], further], axis=1
             )
-            fits = HandFits.joined([fits, self._fit_seeds(targets, q0, unreached, seeds)])
-        rows = np.flatnonzero(fits.ok & np.isin(fits.owner, fits.unreached_targets()))
+            hand_fits = HandFits.concatenate(
+                [hand_fits, self._fit_seeds(targets, q0, unreached, seeds)]
+            )
+        rows = np.flatnonzero(
+            hand_fits.ok & np.isin(hand_fits.owner, hand_fits.unreached_targets())
+        )
         rows = rows[
-            smallest_per_target(
-                fits.owner[rows], fits.outside[rows], CLOSEST_SETTINGS.max_slid_fits
+            smallest_per_owner(
+                hand_fits.owner[rows], hand_fits.outside[rows], CLOSEST_SETTINGS.max_slid_fits
             )
         ]
         if len(rows):
-            fits = HandFits.joined([fits, self._slide_towards_arm(targets, fits, rows)])
-        return fits
+            hand_fits = HandFits.concatenate(
+                [hand_fits, self._slide_towards_arm(targets, hand_fits, rows)]
+            )
+        return hand_fits
 
     def _fit_seeds(
-        self, targets: TargetBatch, q0: Array, chosen: Rows, postures: Array
+        self, targets: TargetBatch, q0: Array, target_rows: Rows, postures: Array
     ) -> HandFits:
-        """Fit seeds (c, p, hand) to c of the targets."""
-        trials = self._trials
-        owner, states, parameters = trials.hand_rows(targets, chosen, q0, postures)
-        parameters[:, trials.parameters.slice("hand_only")] = 1.0
-        parameters[:, trials.parameters.slice("reach_weight")] = 0.0
+        """Fit seeds (c, p, hand) to the selected targets (c,)."""
+        subproblems = self._subproblems
+        owner, states, parameters = subproblems.hand_rows(targets, target_rows, q0, postures)
+        parameters[:, subproblems.parameters.slice("hand_only")] = 1.0
+        parameters[:, subproblems.parameters.slice("reach_weight")] = 0.0
         return self._run(targets, owner, states, parameters)
 
-    def _slide_towards_arm(self, targets: TargetBatch, fits: HandFits, rows: Rows) -> HandFits:
+    def _slide_towards_arm(self, targets: TargetBatch, hand_fits: HandFits, rows: Rows) -> HandFits:
         """Move fits towards the range of the arm along motions that the contacts leave free.
 
         The weight of the reach is small, so that a hand without free motions stays within
         tolerance.
         """
-        trials = self._trials
-        states, parameters = fits.states[rows], fits.parameters[rows]
-        fit_hands_again(trials.method, states)
-        loose = parameters[:, trials.parameters.slice("position_tolerance")].min(axis=1)
-        weight = np.sqrt(np.minimum(loose / (3 * fits.outside[rows]), 1.0))
-        parameters[:, trials.parameters.slice("reach_weight")] = weight[:, None]
-        trials.set_tolerance(parameters, UNREACHABLE_TOLERANCE)
-        slid = self._run(targets, fits.owner[rows], states, parameters)
-        return replace(slid, parameters=fits.parameters[rows])
+        subproblems = self._subproblems
+        states, parameters = hand_fits.states[rows], hand_fits.parameters[rows]
+        fit_hands_again(subproblems.method, states)
+        min_tolerance = parameters[:, subproblems.parameters.slice("position_tolerance")].min(
+            axis=1
+        )
+        weight = np.sqrt(np.minimum(min_tolerance / (3 * hand_fits.outside[rows]), 1.0))
+        parameters[:, subproblems.parameters.slice("reach_weight")] = weight[:, None]
+        subproblems.set_tolerance(parameters, UNREACHABLE_TOLERANCE)
+        slid = self._run(targets, hand_fits.owner[rows], states, parameters)
+        return replace(slid, parameters=hand_fits.parameters[rows])
 
     def _run(self, targets: TargetBatch, owner: Rows, states: Array, parameters: Array) -> HandFits:
         """Run the hand stage of some rows, and measure the resulting fits."""
-        trials = self._trials
-        states = trials.method.run_rows(states, parameters).states
+        subproblems = self._subproblems
+        states = subproblems.method.run_rows(states, parameters).states
         # Runs from these states may continue with the arm.
-        parameters[:, trials.parameters.slice("hand_only")] = 0.0
-        rotation = states[:, trials.state.slice("palm_rotation")].reshape(-1, 3, 3)
-        origin = states[:, trials.state.slice("palm_origin")]
-        hand = states[:, trials.state.slice("q")].copy()
-        hand[:, list(trials.robot.description.arm_actuators)] = 0.0
+        parameters[:, subproblems.parameters.slice("hand_only")] = 0.0
+        rotation = states[:, subproblems.state.slice("palm_rotation")].reshape(-1, 3, 3)
+        origin = states[:, subproblems.state.slice("palm_origin")]
+        hand = states[:, subproblems.state.slice("q")].copy()
+        hand[:, list(subproblems.robot.description.arm_actuators)] = 0.0
         moved_targets = self._in_zero_palm(targets.rows(owner), rotation, origin)
-        verdict = judge(trials.robot, moved_targets, hand)
+        verdict = judge(subproblems.robot, moved_targets, hand)
         position, angle, met = verdict.position_error, verdict.angle_error, verdict.ok
         squares = (position / LENGTH) ** 2, (2 * np.sin(angle / 2)) ** 2
-        distance, outside = self._wrist(targets, rotation, origin)
+        distance, outside = self._wrist_distances(targets, rotation, origin)
         return HandFits(
             owner=owner,
             states=states,
@@ -326,24 +346,28 @@ class FloatingPalmFit:
             + palm[:3, 3]
         )
         normals = np.einsum("kij,kfj->kfi", rotation_to_zero, targets.normals)
-        more = {
-            key: np.einsum("kij,kfj->kfi", rotation_to_zero, v)
-            for key, v in targets.extra_vectors.items()
+        extra_vectors = {
+            name: np.einsum("kij,kfj->kfi", rotation_to_zero, vectors)
+            for name, vectors in targets.extra_vectors.items()
         }
-        return replace(targets, points=points, normals=normals, extra_vectors=more)
+        return replace(targets, points=points, normals=normals, extra_vectors=extra_vectors)
 
-    def _wrist(self, targets: TargetBatch, rotation: Array, origin: Array) -> tuple[Array, Array]:
-        """Return (m,) distances of the wrist from the shoulder and from the arm's range [m]."""
+    def _wrist_distances(
+        self, targets: TargetBatch, rotation: Array, origin: Array
+    ) -> tuple[Array, Array]:
+        """Return (m,) distances of the wrist from the shoulder and from the arm range [m]."""
         if self._arm is None:
             return np.full(len(origin), np.nan), np.zeros(len(origin))
         wrist = origin + rotation @ self._arm.wrist_in_palm
         distance = np.linalg.norm(wrist - self._arm.shoulder, axis=1)
-        near, far = self._span(targets, self._arm)
-        return distance, np.maximum(np.maximum(distance - far, near - distance), 0.0)
+        min_distance, max_distance = self._wrist_range(targets, self._arm)
+        return distance, np.maximum(
+            np.maximum(distance - max_distance, min_distance - distance), 0.0
+        )
 
-    def _span(self, targets: TargetBatch, arm: SrsArm) -> tuple[float, float]:
-        """Return the smallest and largest distance of the wrist from the shoulder [m]."""
-        limits = self._trials.limits(targets)
-        elbow = self._trials.robot.description.arm_actuators[3]
-        near, far = arm.reach(limits.lower[elbow], limits.upper[elbow])
-        return float(near), float(far)
+    def _wrist_range(self, targets: TargetBatch, arm: SrsArm) -> tuple[float, float]:
+        """Return the smallest and largest distance between wrist and shoulder [m]."""
+        limits = self._subproblems.limits(targets)
+        elbow = self._subproblems.robot.description.arm_actuators[3]
+        min_distance, max_distance = arm.reach(limits.lower[elbow], limits.upper[elbow])
+        return float(min_distance), float(max_distance)

@@ -40,17 +40,10 @@ from casadi_ik.solve.batches import judge_outcome
 from casadi_ik.solve.free_hands import SideHands, UnconstrainedFingers
 from casadi_ik.solve.method import Outcome
 from casadi_ik.solve.request import CLEARANCE
+from casadi_ik.solve.row_selection import Deduplicator, improving_rows, largest_per_owner
 from casadi_ik.solve.solution import BatchSolution, CollisionReport
 from casadi_ik.solve.status import Status
-from casadi_ik.solve.trials import (
-    Deduplicator,
-    LocalRefinement,
-    carry_palms,
-    improving_rows,
-    largest_per_owner,
-    sample_trunks,
-    side_palms,
-)
+from casadi_ik.solve.subproblems import LocalRefinement, carry_palms, sample_trunks, side_palms
 from casadi_ik.solve.verdict import SolvedVerdict, judge_single
 
 DEFAULT_PREFERENCE = "limits"
@@ -201,9 +194,12 @@ def find_collision_free(
         return result
     # A preference ranks solutions and must not decide whether there is one. Escape steps lead to
     # arbitrary solutions, so they are taken by a second search without preference from home.
-    retry, trials = replace(targets.rows(blocked), prefer=DEFAULT_PREFERENCE), finder.trials
-    ends = trials.method.run(retry, home[blocked], seed, False).q
-    solved = trials.solved(retry, ends, retry.enforce_limits)
+    retry, subproblems = (
+        replace(targets.rows(blocked), prefer=DEFAULT_PREFERENCE),
+        finder.subproblems,
+    )
+    ends = subproblems.method.run(retry, home[blocked], seed, False).q
+    solved = subproblems.solved(retry, ends, retry.enforce_limits)
     blocked, retry, ends = blocked[solved], retry.rows(np.flatnonzero(solved)), ends[solved]
     arguments = query.rows(blocked), ends, home[blocked]
     second = _search_in_chunks(
@@ -262,8 +258,8 @@ class CollisionFreeSearch:
         self.finder, self.arm_search = finder, finder.arm_search
         self.targets, self.query = targets, query
         self.starts, self.seed = starts, seed
-        self.trials = finder.trials
-        self.limits = self.trials.limits(targets)
+        self.subproblems = finder.subproblems
+        self.limits = self.subproblems.limits(targets)
         count, n = starts.shape
         self.best, self.score = np.full((count, n), np.nan), np.full(count, -np.inf)
         self.nearest, self.surplus = np.full((count, n), np.nan), np.full(count, -np.inf)
@@ -287,7 +283,7 @@ class CollisionFreeSearch:
         self._step_samples = COLLISION_FREE_PARAMETERS.step_samples[is_multi_arm]
         if is_multi_arm:
             self._sides = SideHands(
-                self.trials,
+                self.subproblems,
                 side_links(robot.description),
                 targets,
                 query,
@@ -296,7 +292,7 @@ class CollisionFreeSearch:
 
     @cached_property
     def _descent(self) -> LocalRefinement:
-        return LocalRefinement(self.trials, self.targets)
+        return LocalRefinement(self.subproblems, self.targets)
 
     def run(self, q: Array, rank_all: bool, escape: bool) -> None:
         """Search until all targets have a collision-free configuration.
@@ -461,9 +457,9 @@ class CollisionFreeSearch:
         first = sum(trunks for trunks, _ in stages if trunks < trunk_count)
         per_hand = max(trunk_count // int(np.bincount(target_index).max()), 1)
         ends, rows = sample_trunks(
-            self.trials, self.targets, q, palms, target_index, first, per_hand
+            self.subproblems, self.targets, q, palms, target_index, first, per_hand
         )
-        solved = self.trials.solved(
+        solved = self.subproblems.solved(
             self.targets.rows(target_index[rows]), ends, self.targets.enforce_limits
         )
         ends, rows = ends[solved], rows[solved]
@@ -481,7 +477,7 @@ class CollisionFreeSearch:
         Args:
             rank_all: Include all targets in the first restart.
         """
-        method = self.trials.method
+        method = self.subproblems.method
         restarts = min(COLLISION_FREE_PARAMETERS.restarts, method.options.rounds, method.rounds)
         for restart in range(restarts):
             # A target whose last restart brought no new hand is unlikely to get one from the next.
@@ -491,10 +487,10 @@ class CollisionFreeSearch:
             self._has_new_hands[:] = False
             postures = method.postures(self.targets.rows(rows), restart)
             first, starts = restart * postures.shape[1], self.limits.clip(self.starts)
-            target_index, *initial = self.trials.hand_rows(
+            target_index, *initial = self.subproblems.hand_rows(
                 self.targets, rows, starts, postures, first
             )
-            yield self._solved(self.trials.run(*initial), target_index)
+            yield self._solved(self.subproblems.run(*initial), target_index)
 
     def _solve_from_random_arms(self) -> Iterator[tuple[Array, NDArray[np.intp]]]:
         """Yield solutions from random arms for targets that are not free; no closed form."""
@@ -507,7 +503,7 @@ class CollisionFreeSearch:
         starts = np.concatenate(_shifted_samples(robot, self.seed, numbers, count))
         given = self.hands[0][0]
         starts[::2, hand] = given[target_index[::2]][:, hand]
-        ends = self._descent.run(target_index, self.limits.of(target_index).clip(starts))
+        ends = self._descent.run(target_index, self.limits.select_rows(target_index).clip(starts))
         yield self._solved(ends, target_index)
 
     def _solved(self, q: Array, target_index: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
@@ -515,7 +511,7 @@ class CollisionFreeSearch:
         if not len(q):
             return q, target_index
         targets = self.targets.rows(target_index)
-        solved = self.trials.solved(targets, q, targets.enforce_limits)
+        solved = self.subproblems.solved(targets, q, targets.enforce_limits)
         return q[solved], target_index[solved]
 
     def _record_clearest_arms(self, rows: NDArray[np.intp]) -> None:
@@ -573,7 +569,7 @@ class CollisionFreeSearch:
 
     def _move_trunk_and_arms(self, sides: SideHands) -> None:
         """Move trunk and arms around the least-penetrating solutions; the palms stay in place."""
-        robot, trials = self.finder.robot, self.trials
+        robot, subproblems = self.finder.robot, self.subproblems
         moving = np.setdiff1d(np.arange(len(robot.lower)), self.finder.hand)
         has_hand_collision = (sides.surplus < -ROUNDING).any(axis=0)
         for number, (size, max_depth) in enumerate(COLLISION_FREE_PARAMETERS.carry_steps):
@@ -590,8 +586,8 @@ class CollisionFreeSearch:
                 (COLLISION_FREE_PARAMETERS.pool_size, self._step_samples, len(moving))
             )
             starts[:, moving] += size * self._ranges[moving] * steps[rank].reshape(-1, len(moving))
-            starts, palms = self.limits.of(target_index).clip(starts), side_palms(robot, q)
-            ends = carry_palms(trials, self.targets, starts, palms, target_index, False)
+            starts, palms = self.limits.select_rows(target_index).clip(starts), side_palms(robot, q)
+            ends = carry_palms(subproblems, self.targets, starts, palms, target_index, False)
             self.record_candidates(*self._solved(ends, target_index))
 
     def _resolve_hand_collisions(self, sides: SideHands) -> None:
@@ -643,7 +639,7 @@ class CollisionFreeSearch:
             for tolerance in targets.tolerances
         )
         shifted = replace(targets, points=points, normals=normals, tolerance=tolerances)
-        ends = LocalRefinement(self.trials, shifted).run(np.arange(len(target_index)), starts)
+        ends = LocalRefinement(self.subproblems, shifted).run(np.arange(len(target_index)), starts)
         return self._solved(ends, target_index)
 
     def _step_motors(
@@ -664,7 +660,7 @@ class CollisionFreeSearch:
         steps = random.standard_normal((self._step_samples, len(ranges)))
         starts = np.repeat(q, self._step_samples, axis=0)
         starts[:, motors] += size * ranges * np.tile(steps, (len(rows), 1))
-        ends = self._descent.run(target_index, self.limits.of(target_index).clip(starts))
+        ends = self._descent.run(target_index, self.limits.select_rows(target_index).clip(starts))
         return self._solved(ends, target_index)
 
     def result(self, diagnose: bool) -> CollisionFreeResult:

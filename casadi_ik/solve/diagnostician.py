@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.files.arrays import Array, Counts
+from casadi_ik.files.arrays import Array, Counts, Rows
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.grasp import Tolerance
 from casadi_ik.model.targets import TargetBatch
@@ -26,7 +26,7 @@ from casadi_ik.solve.method import HandSearch
 from casadi_ik.solve.proofs.proof import Proof, ProofKind
 from casadi_ik.solve.proofs.prove import PROVER_EFFORT, Prover
 from casadi_ik.solve.remedies import RemedyFinder
-from casadi_ik.solve.trials import LocalRefinement, Rows, Subproblems
+from casadi_ik.solve.subproblems import LocalRefinement, SubproblemSolver
 from casadi_ik.solve.verdict import (
     ContactVerdict,
     Verdict,
@@ -42,41 +42,44 @@ class DiagnosisEffort:
     """Limits of the effort of a diagnosis. Source: ``studies/diagnosis.py``.
 
     Attributes:
-        together: Number of targets diagnosed in the same runs of the compiled loop.
-        placed: Number of hand fits that the arm follows, beyond that of hand-first.
-        searches: Stages of the search for the closest configuration: (upper bound of the tolerance
-            factor, number of starts, number of minima that are refined).
-        alone: Number of starts and of refined minima for each side of a multi-arm robot.
-        alike: Every start whose index is a multiple of this has a hand seed that resembles the
-            grasp; the others have the closest hands.
-        certain: Tolerance factor of hand and robot above which a hand that does not fit is not
-            searched further.
-        barely: Tolerance factor below which limits are relaxed even if no motor is at them.
-        clearly: Tolerance factor from which a proof may use the maximum number of boxes. Slight
-            misses are rarely proved: no box is excluded before it is small.
-        least: Minimum of the maximum number of boxes of a proof.
-        at_limit: Distance below which a motor counts as being at its limit [rad or m].
-        missed_reach: Excess of the reach from which it counts as the cause [m].
+        batch_size: Maximum number of targets that are diagnosed in the same runs of the loop.
+        max_arm_starts: Maximum number of hand fits per target for which the arm is placed, in
+            addition to the result of hand-first.
+        search_stages: Stages of the search for the closest configuration: (upper bound of the
+            tolerance factor, number of starts, maximum number of refined minima).
+        side_search: Number of starts and maximum number of refined minima for each side of a
+            multi-arm robot.
+        resembling_period: Starts whose index is a multiple of this have a hand seed that resembles
+            the grasp; the others have the closest hands.
+        hand_misfit_factor: Tolerance factor of hand and robot above which the search ends because
+            the hand does not fit.
+        relaxed_factor: Tolerance factor up to which every limit is relaxed in the search for
+            remedies, not only those of motors at a limit.
+        full_proof_factor: Tolerance factor from which a proof may use the maximum number of boxes.
+            Proofs of smaller factors rarely succeed, because only small boxes are excluded.
+        min_boxes: Maximum number of boxes of a proof at a tolerance factor of 1.
+        limit_distance: Distance up to which a motor counts as being at its limit [rad or m].
+        min_reach_excess: Excess over the range of the arm above which reach is the cause [m].
     """
 
-    together: int = 64
-    placed: int = 2
-    searches: tuple[tuple[float, int, int], ...] = ((8.0, 24, 4), (4.0, 96, 8), (1.5, 256, 32))
-    alone: tuple[int, int] = (24, 4)
-    alike: int = 3
-    certain: float = 1.1
-    barely: float = 2.0
-    clearly: float = 2.5
-    least: int = 5000
-    at_limit: float = 1e-6
-    missed_reach: float = 1e-3
+    batch_size: int = 64
+    max_arm_starts: int = 2
+    search_stages: tuple[tuple[float, int, int], ...] = ((8.0, 24, 4), (4.0, 96, 8), (1.5, 256, 32))
+    side_search: tuple[int, int] = (24, 4)
+    resembling_period: int = 3
+    hand_misfit_factor: float = 1.1
+    relaxed_factor: float = 2.0
+    full_proof_factor: float = 2.5
+    min_boxes: int = 5000
+    limit_distance: float = 1e-6
+    min_reach_excess: float = 1e-3
 
 
 DIAGNOSIS_EFFORT = DiagnosisEffort()
 
 
 class Diagnostician:
-    """Diagnoses the unsolved targets of any method on one robot.
+    """Diagnosis of targets that a method did not solve, for one robot.
 
     Attributes:
         robot: The robot.
@@ -87,10 +90,10 @@ class Diagnostician:
         """Store robot and method; graphs are built at the first diagnosis."""
         self.robot = robot
         self.method = method
-        self._trials = Subproblems(robot, method)
-        self._palm_free = FloatingPalmFit(self._trials)
+        self._subproblems = SubproblemSolver(robot, method)
+        self._floating_palm = FloatingPalmFit(self._subproblems)
         self._prover = Prover(robot.description, compiled)
-        self._sides = [
+        self._side_provers = [
             Prover(robot.description.side(side.name, with_trunk=True), compiled)
             for side in robot.description.sides
         ]
@@ -107,9 +110,9 @@ class Diagnostician:
         if targets.fixed is not None and targets.fixed.ndim > 1:
             # Targets with different fixed positions are diagnosed one by one.
             diagnoses = [
-                self.diagnose(_single_fixed(targets, row), q0[row : row + 1], near)[0]
+                self.diagnose(_single_fixed(targets, row), q0[row : row + 1], nearest_of_row)[0]
                 for row in range(len(targets))
-                for near in [None if nearest is None else nearest[row : row + 1]]
+                for nearest_of_row in [None if nearest is None else nearest[row : row + 1]]
             ]
             return _add_palm_errors(self.robot, targets, diagnoses)
         is_solved = np.zeros(len(targets), dtype=bool)
@@ -124,8 +127,8 @@ class Diagnostician:
             (contacts,) = self._nearest_contacts(target, nearest[row : row + 1])
             by_row[row] = _reachable(target, nearest[row], contacts, clock.seconds[row])
         unsolved = np.flatnonzero(~is_solved)
-        for start in range(0, len(unsolved), DIAGNOSIS_EFFORT.together):
-            rows = unsolved[start : start + DIAGNOSIS_EFFORT.together]
+        for start in range(0, len(unsolved), DIAGNOSIS_EFFORT.batch_size):
+            rows = unsolved[start : start + DIAGNOSIS_EFFORT.batch_size]
             clock_of_rows = _Clock(clock.seconds[rows])
             diagnoses = self._diagnose_unsolved(
                 targets.rows(rows), q0[rows], nearest[rows], clock_of_rows
@@ -138,14 +141,17 @@ class Diagnostician:
     ) -> Iterator[Diagnosis]:
         """Yield the diagnoses of targets that hand-first did not solve."""
         all_rows = np.arange(len(targets))
-        refinement = LocalRefinement(self._trials, targets)
-        evidence, fits = self._fit_hands(targets, q0)
-        owner, ends = self._place_arms(fits)
-        owner, ends = np.concatenate([all_rows, owner]), np.concatenate([nearest, ends])
-        searches = np.bincount(owner, minlength=len(all_rows))
-        if fits is not None:
-            searches += np.bincount(fits.owner, minlength=len(all_rows))
-        best = find_closest(refinement, owner, ends, DIAGNOSIS_EFFORT.placed + 1)
+        refinement = LocalRefinement(self._subproblems, targets)
+        evidence, hand_fits = self._fit_hands(targets, q0)
+        owner, configurations = self._place_arms(hand_fits)
+        owner, configurations = (
+            np.concatenate([all_rows, owner]),
+            np.concatenate([nearest, configurations]),
+        )
+        search_counts = np.bincount(owner, minlength=len(all_rows))
+        if hand_fits is not None:
+            search_counts += np.bincount(hand_fits.owner, minlength=len(all_rows))
+        best = find_closest(refinement, owner, configurations, DIAGNOSIS_EFFORT.max_arm_starts + 1)
         clock.lap(all_rows)
         proofs: list[Proof | None] = [None] * len(all_rows)
         rows = np.flatnonzero(~self._solved(targets, best.minimax_q))
@@ -155,29 +161,32 @@ class Diagnostician:
                 proofs[row] = proof
             clock.lap(rows)
         causes = [_cause_of(*item, proof) for item, proof in zip(evidence, proofs, strict=True)]
-        # A longer search decides where neither hand nor reach rules a solution out.
+        # Where neither hand nor reach excludes a solution, a longer search decides.
         is_open = np.array([reason is None for reason in causes])
-        is_certain = self._is_certain(targets, fits, best)
+        is_certain = self._is_certain(targets, hand_fits, best)
         is_certain |= np.array([proof is not None for proof in proofs])
-        for max_factor, count, followed in DIAGNOSIS_EFFORT.searches:
+        for max_factor, count, max_refined in DIAGNOSIS_EFFORT.search_stages:
             rows = np.flatnonzero(is_open | ((best.factor < max_factor) & ~is_certain))
             rows = rows[~self._solved(targets.rows(rows), best.minimax_q[rows])]
             if len(rows):
                 subset, closest = targets.rows(rows), best.rows(rows)
-                best.update(rows, self._search(subset, closest, count, followed))
-                searches[rows] += count + 2
+                best.update(rows, self._search(subset, closest, count, max_refined))
+                search_counts[rows] += count + 2
                 clock.lap(rows)
             is_open[:] = False
         verdict = judge(self.robot, targets, best.minimax_q)
-        solved, enough = verdict.solved(targets.enforce_limits), _enough(targets, verdict)
+        solved, tolerances = (
+            verdict.solved(targets.enforce_limits),
+            _met_tolerances(targets, verdict),
+        )
         contacts = self._nearest_contacts(
             targets, np.where(solved[:, None], best.minimax_q, best.q)
         )
         at_limit = self._at_limit(best.q)
-        is_pressed = (
+        may_block = (
             at_limit
             | self._at_limit(best.minimax_q)
-            | (best.factor <= DIAGNOSIS_EFFORT.barely)[:, None]
+            | (best.factor <= DIAGNOSIS_EFFORT.relaxed_factor)[:, None]
         )
         sides = self._diagnose_sides(targets, best)
         clock.lap(all_rows)
@@ -188,7 +197,7 @@ class Diagnostician:
             hand, reach = evidence[i]
             target, hand_only = targets.rows(slice(i, i + 1)), causes[i] is Reason.HAND
             remedies = RemedyFinder(
-                self._trials, target, q0[i], best.q[i], is_pressed[i], hand_only
+                self._subproblems, target, q0[i], best.q[i], may_block[i], hand_only
             )
             reason = causes[i]
             if reason is None:
@@ -198,13 +207,13 @@ class Diagnostician:
             yield Diagnosis(
                 reason=reason,
                 proof=proofs[i],
-                searches=int(searches[i]),
+                searches=int(search_counts[i]),
                 hand=hand,
                 reach=reach,
                 active=tuple(
                     name for name, is_at_limit in names if is_at_limit and targets.enforce_limits
                 ),
-                enough=enough[i],
+                enough=tolerances[i],
                 nearest=contacts[i],
                 q=best.q[i],
                 time=float(clock.seconds[i]),
@@ -215,7 +224,7 @@ class Diagnostician:
     def _diagnose_sides(
         self, targets: TargetBatch, best: ClosestConfigurations
     ) -> list[dict[str, ContactVerdict]]:
-        """Return by target the worst contact of each side, solved with the other sides free."""
+        """Return the worst contact of each side by target, with the other sides free."""
         by_target: list[dict[str, ContactVerdict]] = [{} for _ in range(len(targets))]
         robot = self.robot
         for name, fingers in robot.hands.items():
@@ -223,14 +232,16 @@ class Diagnostician:
             rows = np.flatnonzero(has_contacts)
             if name is None or not len(rows):
                 continue
-            others = [i for i in range(len(robot.fingers)) if i not in fingers]
-            alone = _with_free_fingers(targets.rows(rows), others)
-            search = self._search(alone, best.rows(rows), *DIAGNOSIS_EFFORT.alone)
+            other_fingers = [i for i in range(len(robot.fingers)) if i not in fingers]
+            side_targets = _with_free_fingers(targets.rows(rows), other_fingers)
+            search = self._search(side_targets, best.rows(rows), *DIAGNOSIS_EFFORT.side_search)
             position, angle, met = (
-                getattr(judge(robot, alone, search.minimax_q), array)
+                getattr(judge(robot, side_targets, search.minimax_q), array)
                 for array in ("position_error", "angle_error", "ok")
             )
-            verdicts = contact_verdicts(robot.fingers, alone.tolerances, position, angle, met)
+            verdicts = contact_verdicts(
+                robot.fingers, side_targets.tolerances, position, angle, met
+            )
             for row, of_fingers in zip(rows.tolist(), verdicts, strict=True):
                 by_target[row][name] = max(
                     (of_fingers[robot.fingers[i]] for i in fingers),
@@ -238,21 +249,21 @@ class Diagnostician:
                 )
         return by_target
 
-    def _prove(self, targets: TargetBatch, most: Counts) -> list[Proof | None]:
+    def _prove(self, targets: TargetBatch, max_boxes: Counts) -> list[Proof | None]:
         """Return proofs for targets; for a multi-arm robot, that one side is unsolvable."""
-        if not self._sides:
-            return self._prover.prove(_with_contact_bounds(targets), max_boxes=most)
+        if not self._side_provers:
+            return self._prover.prove(_with_contact_bounds(targets), max_boxes=max_boxes)
         robot = self.robot.description
         proofs: list[Proof | None] = [None] * len(targets)
-        for prover, side in zip(self._sides, robot.sides, strict=True):
+        for prover, side in zip(self._side_provers, robot.sides, strict=True):
             fingers = [robot.finger_names.index(name) for name in side.fingers]
             has_contacts = ~np.isnan(targets.points[:, fingers, 0]).all(axis=1)
             rows = np.flatnonzero(has_contacts & np.array([proof is None for proof in proofs]))
             if not len(rows) or targets.fixed is not None:
                 continue
-            part = targets.rows(rows).for_fingers(fingers)
+            side_targets = targets.rows(rows).for_fingers(fingers)
             for row, proof in zip(
-                rows.tolist(), prover.prove(part, max_boxes=most[rows]), strict=True
+                rows.tolist(), prover.prove(side_targets, max_boxes=max_boxes[rows]), strict=True
             ):
                 proofs[row] = proof
         return proofs
@@ -263,28 +274,33 @@ class Diagnostician:
         """Return hand fit and arm reach of each target, and all fits; None without an arm."""
         if not self.robot.description.arm_actuators:
             return [(None, None)] * len(targets), None
-        fits = self._palm_free.fits(targets, q0)
-        return self._palm_free.evidence(targets, fits), fits
+        hand_fits = self._floating_palm.fit(targets, q0)
+        return self._floating_palm.evidence(targets, hand_fits), hand_fits
 
     def _is_certain(
-        self, targets: TargetBatch, fits: HandFits | None, best: ClosestConfigurations
+        self, targets: TargetBatch, hand_fits: HandFits | None, best: ClosestConfigurations
     ) -> NDArray[np.bool_]:
-        """Return (k,) whether the hand alone clearly misses the contacts."""
-        if fits is None:
+        """Return (k,) True where the hand alone clearly misses the contacts."""
+        if hand_fits is None:
             return np.zeros(len(targets), dtype=bool)
-        return np.minimum(fits.tolerance_factor(targets), best.factor) >= DIAGNOSIS_EFFORT.certain
+        return (
+            np.minimum(hand_fits.tolerance_factor(targets), best.factor)
+            >= DIAGNOSIS_EFFORT.hand_misfit_factor
+        )
 
-    def _place_arms(self, fits: HandFits | None) -> tuple[Rows, Array]:
-        """Return target indices (m,) and configurations (m, n) of the best fits and their arms."""
-        if fits is None:
+    def _place_arms(self, hand_fits: HandFits | None) -> tuple[Rows, Array]:
+        """Return target indices (m,) and configurations (m, n) of arms placed at the best fits."""
+        if hand_fits is None:
             return np.zeros(0, np.intp), np.zeros((0, len(self.robot.actuators)))
-        rows = fits.best(DIAGNOSIS_EFFORT.placed)
-        return fits.owner[rows], self._trials.run(fits.states[rows], fits.parameters[rows])
+        rows = hand_fits.best_rows(DIAGNOSIS_EFFORT.max_arm_starts)
+        return hand_fits.owner[rows], self._subproblems.run(
+            hand_fits.states[rows], hand_fits.parameters[rows]
+        )
 
     def _search(
-        self, targets: TargetBatch, best: ClosestConfigurations, count: int, followed: int
+        self, targets: TargetBatch, best: ClosestConfigurations, count: int, max_refined: int
     ) -> ClosestConfigurations:
-        """Return the configurations closest to each target from random starts.
+        """Return the configurations closest to each target, from random starts.
 
         The arms are random; the hands are the closest ones so far and seeds that resemble the
         grasp. A hand without an arm starts at random.
@@ -296,13 +312,13 @@ class Diagnostician:
             hand = list(self.robot.description.hand_actuators)
             starts[:, ::2, hand] = best.minimax_q[:, None, hand]
             starts[:, 1::2, hand] = best.q[:, None, hand]
-            starts[:, :: DIAGNOSIS_EFFORT.alike, hand] = self._resembling_seeds(
-                targets, -(-count // DIAGNOSIS_EFFORT.alike)
+            starts[:, :: DIAGNOSIS_EFFORT.resembling_period, hand] = self._resembling_seeds(
+                targets, -(-count // DIAGNOSIS_EFFORT.resembling_period)
             )
         starts = np.concatenate([best.q[:, None], best.minimax_q[:, None], starts], axis=1)
-        descent = LocalRefinement(self._trials, targets)
-        ends = descent.run(owner, starts.reshape(len(owner), -1))
-        return find_closest(descent, owner, ends, followed)
+        descent = LocalRefinement(self._subproblems, targets)
+        configurations = descent.run(owner, starts.reshape(len(owner), -1))
+        return find_closest(descent, owner, configurations, max_refined)
 
     def _resembling_seeds(self, targets: TargetBatch, count: int) -> Array:
         """Return (k, count, hand) hand seeds that resemble the grasps, repeated if necessary."""
@@ -334,8 +350,8 @@ class Diagnostician:
         ]
 
     def _at_limit(self, q: Array) -> NDArray[np.bool_]:
-        return (q - self.robot.lower <= DIAGNOSIS_EFFORT.at_limit) | (
-            self.robot.upper - q <= DIAGNOSIS_EFFORT.at_limit
+        return (q - self.robot.lower <= DIAGNOSIS_EFFORT.limit_distance) | (
+            self.robot.upper - q <= DIAGNOSIS_EFFORT.limit_distance
         )
 
 
@@ -344,33 +360,33 @@ class _Clock:
 
     def __init__(self, seconds: Array) -> None:
         self.seconds = seconds
-        self._now = time.perf_counter()
+        self._last_lap = time.perf_counter()
 
     def lap(self, owner: Rows) -> None:
         """Divide the time since the last lap among targets."""
-        before, self._now = self._now, time.perf_counter()
-        self.seconds[owner] += (self._now - before) / len(owner)
+        start, self._last_lap = self._last_lap, time.perf_counter()
+        self.seconds[owner] += (self._last_lap - start) / len(owner)
 
 
 def _cause_of(hand: HandFit | None, reach: ArmReach | None, proof: Proof | None) -> Reason | None:
-    # A proof by reach shows that no posture satisfies hand and arm, not that the arm is the cause.
+    # A proof by reach excludes every posture of hand and arm; the arm need not be the cause.
     if (proof is not None and proof.kind is not ProofKind.REACH) or (hand and not hand.fits):
         return Reason.HAND
     if proof is not None:
         return Reason.REACH
-    if reach is not None and abs(reach.excess) > DIAGNOSIS_EFFORT.missed_reach:
+    if reach is not None and abs(reach.excess) > DIAGNOSIS_EFFORT.min_reach_excess:
         return Reason.REACH
     return None
 
 
 def _max_boxes(ratio: Array) -> Counts:
     """Return (k,) maximum numbers of boxes of proofs for tolerance factors (k,)."""
-    share = np.clip((ratio - 1) / (DIAGNOSIS_EFFORT.clearly - 1), 0.0, 1.0)
-    return np.maximum(PROVER_EFFORT.max_boxes * share, DIAGNOSIS_EFFORT.least).astype(np.int64)
+    share = np.clip((ratio - 1) / (DIAGNOSIS_EFFORT.full_proof_factor - 1), 0.0, 1.0)
+    return np.maximum(PROVER_EFFORT.max_boxes * share, DIAGNOSIS_EFFORT.min_boxes).astype(np.int64)
 
 
-def _enough(targets: TargetBatch, verdict: Verdict) -> list[Tolerance]:
-    """Return the tolerances that the configurations meet, at least those of the targets."""
+def _met_tolerances(targets: TargetBatch, verdict: Verdict) -> list[Tolerance]:
+    """Return the tolerances that each configuration meets; at least those of its target."""
     minimum = targets.largest_tolerance
     position = np.nanmax(verdict.position_error, axis=1, initial=minimum.position)
     angle = np.nanmax(verdict.angle_error, axis=1, initial=minimum.angle)
@@ -378,14 +394,14 @@ def _enough(targets: TargetBatch, verdict: Verdict) -> list[Tolerance]:
 
 
 def _single_fixed(targets: TargetBatch, row: int) -> TargetBatch:
-    """Return one of several targets whose hands are held differently."""
-    one = targets.rows(slice(row, row + 1))
-    assert one.fixed is not None
-    return replace(one, fixed=one.fixed[0])
+    """Return one of several targets that have different fixed positions."""
+    target = targets.rows(slice(row, row + 1))
+    assert target.fixed is not None
+    return replace(target, fixed=target.fixed[0])
 
 
 def _with_contact_bounds(targets: TargetBatch) -> TargetBatch:
-    """Return palm targets with contact tolerances that every palm within its tolerance keeps.
+    """Return palm targets with contact tolerances that every palm within its tolerance meets.
 
     A proof for them holds for the palm poses: a palm that is rotated about its origin moves a
     contact by the chord of the angle times their distance.
@@ -403,13 +419,13 @@ def _with_contact_bounds(targets: TargetBatch) -> TargetBatch:
 
 
 def _add_palm_errors(
-    robot: ArmHand, targets: TargetBatch, found: list[Diagnosis]
+    robot: ArmHand, targets: TargetBatch, diagnoses: list[Diagnosis]
 ) -> list[Diagnosis]:
     """Return the diagnoses with the errors of the palms, if the targets have palm poses."""
-    palms = judge_palms(robot, targets, np.stack([one.q for one in found]))
+    palms = judge_palms(robot, targets, np.stack([diagnosis.q for diagnosis in diagnoses]))
     if palms is None:
-        return found
-    return [replace(one, palm=palms.of(row)) for row, one in enumerate(found)]
+        return diagnoses
+    return [replace(diagnosis, palm=palms.of(row)) for row, diagnosis in enumerate(diagnoses)]
 
 
 def _with_free_fingers(targets: TargetBatch, fingers: list[int]) -> TargetBatch:
@@ -420,19 +436,22 @@ def _with_free_fingers(targets: TargetBatch, fingers: list[int]) -> TargetBatch:
         array[:, fingers] = np.nan
         return array
 
-    more = {name: free(array) for name, array in targets.extra_vectors.items()}
+    extra_vectors = {name: free(array) for name, array in targets.extra_vectors.items()}
     return replace(
-        targets, points=free(targets.points), normals=free(targets.normals), extra_vectors=more
+        targets,
+        points=free(targets.points),
+        normals=free(targets.normals),
+        extra_vectors=extra_vectors,
     )
 
 
 def _reachable(
-    targets: TargetBatch, q: Array, near: dict[str, NearContact], seconds: float
+    targets: TargetBatch, q: Array, nearest: dict[str, NearContact], seconds: float
 ) -> Diagnosis:
     return Diagnosis(
         reason=Reason.REACHABLE,
         enough=targets.largest_tolerance,
-        nearest=near,
+        nearest=nearest,
         q=q,
         time=float(seconds),
     )

@@ -38,7 +38,7 @@ from casadi_ik.solve.request import CLEARANCE, NO_PREFERENCE, resolve_preference
 from casadi_ik.solve.sensitivity import SensitivityKernel
 from casadi_ik.solve.solution import BatchSolution, Solution
 from casadi_ik.solve.status import Status
-from casadi_ik.solve.trials import Subproblems
+from casadi_ik.solve.subproblems import SubproblemSolver
 from casadi_ik.solve.turns import in_nearest_turns, search_start
 from casadi_ik.solve.verdict import construct_unchecked, judge_errors, judge_single
 
@@ -200,7 +200,7 @@ class Engine:
         method = self._hand_search_or_hand_first
         method.prepare()
         kinds = self.kinds or point_normal_kinds(len(self.robot.fingers))
-        return NearestSearch(Subproblems(self.robot, method), kinds, self.compiled)
+        return NearestSearch(SubproblemSolver(self.robot, method), kinds, self.compiled)
 
     def _require_hand_search(self) -> HandSearch:
         """Return the method as a hand search, ready to run.

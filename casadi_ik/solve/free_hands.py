@@ -14,14 +14,8 @@ from casadi_ik.files.arrays import Array, Bools, spread_steps
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.arm_search import ArmSearch, Preference
-from casadi_ik.solve.trials import (
-    Deduplicator,
-    Subproblems,
-    carry_palms,
-    improving_rows,
-    palm_coordinates,
-    side_palms,
-)
+from casadi_ik.solve.row_selection import Deduplicator, improving_rows
+from casadi_ik.solve.subproblems import SubproblemSolver, carry_palms, palm_coordinates, side_palms
 
 
 class SideHands:
@@ -38,7 +32,7 @@ class SideHands:
 
     def __init__(
         self,
-        trials: Subproblems,
+        subproblems: SubproblemSolver,
         links: Sequence[tuple[frozenset[str], frozenset[str]]],
         targets: TargetBatch,
         query: CollisionQuery,
@@ -47,14 +41,14 @@ class SideHands:
         """Split the collision pairs by the hand or arm that decides their distance.
 
         Args:
-            trials: The loop.
+            subproblems: The loop.
             links: By side, the links of its arm and those that move with its palm.
             targets: k targets.
             query: Pairs that must not collide.
             min_difference: Hands that differ by less are duplicates [fraction of motor ranges].
         """
-        self._trials, self._targets, self._query = trials, targets, query
-        self._robot = body = trials.robot.description
+        self._subproblems, self._targets, self._query = subproblems, targets, query
+        self._robot = body = subproblems.robot.description
         self._arm_links = [arm for arm, _ in links]
         moved_links = body.links_moved(range(len(body.actuators)))
         # Pairs without trunk, arms and other hands: a hand with itself and with fixed objects.
@@ -89,7 +83,10 @@ class SideHands:
         rows = rows if best_only else np.arange(len(q))
         rows = rows[surplus[rows] >= -ROUNDING]
         q, target_index = q[rows], target_index[rows]
-        palms, ranges = side_palms(self._trials.robot, q), self._robot.upper - self._robot.lower
+        palms, ranges = (
+            side_palms(self._subproblems.robot, q),
+            self._robot.upper - self._robot.lower,
+        )
         coordinates = [(q / ranges)[:, self.hand_motors[side]], palm_coordinates(palms[:, side])]
         is_new = self._known_hands[side].add(np.concatenate(coordinates, axis=1), target_index)
         added = q[is_new], palms[is_new], target_index[is_new]
@@ -160,7 +157,7 @@ class SideHands:
             (p, n) configurations and (p,) indices of their targets.
         """
         preference = prefer if prefer in ("limits", "q0") else "limits"
-        limits, query = self._trials.limits(self._targets).first, self._query
+        limits, query = self._subproblems.limits(self._targets).first, self._query
         all_arms = frozenset[str]().union(*self._arm_links)
         is_free = query.split_by_links(all_arms)[1].rows(target_index).free(q)
         rows = np.flatnonzero(is_free)
@@ -183,7 +180,9 @@ class SideHands:
             )
             q, rows = candidates.q, rows[candidates.hand_index]
         if len(q) and not all(search.is_exact for search in searches):
-            q = carry_palms(self._trials, self._targets, q, palms[rows], target_index[rows], False)
+            q = carry_palms(
+                self._subproblems, self._targets, q, palms[rows], target_index[rows], False
+            )
         return q, target_index[rows]
 
 

@@ -28,14 +28,9 @@ from casadi_ik.kinematics.smooth import with_cse
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.nearest_seeds import SEED_SETTINGS, SeedSettings, SeedTable
+from casadi_ik.solve.row_selection import first_per_owner, smallest_per_owner
 from casadi_ik.solve.status import Status
-from casadi_ik.solve.trials import (
-    LocalRefinement,
-    Subproblems,
-    first_per_owner,
-    residual_tolerances,
-    smallest_per_target,
-)
+from casadi_ik.solve.subproblems import LocalRefinement, SubproblemSolver, residual_tolerances
 
 
 @dataclass(frozen=True)
@@ -195,7 +190,7 @@ class NearestSearch:
 
     def __init__(
         self,
-        trials: Subproblems,
+        trials: SubproblemSolver,
         kinds: Kinds,
         compiled: bool = True,
         settings: NearestSettings = NEAREST_SETTINGS,
@@ -234,7 +229,7 @@ class NearestSearch:
         start = np.concatenate([q0, last_q, seeds])
         parameters = self._parameters(targets, UNLIMITED_STEP)
         states = self._run(self._states(parameters[owner], start), parameters[owner], is_race=True)
-        finalists = smallest_per_target(owner, self._distance(states), self._settings.finalists)
+        finalists = smallest_per_owner(owner, self._distance(states), self._settings.finalists)
         owner = owner[finalists]
         states = self._run(states[finalists], parameters[owner])
         q, distance = self._q(states), self._distance(states)

@@ -1,7 +1,7 @@
-"""Remedies that make a grasp solvable: relaxed limits, and fingers or normals left free.
+"""Remedies that make a grasp solvable: relaxed limits, and free fingers or normals.
 
-For targets whose solutions all collide: a shift of the object, or a finger without contact. Every
-remedy is verified by a solution.
+Remedies for targets whose solutions all collide are a shift of the object, and a finger without
+contact. Every remedy is verified by a solution.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.diagnosis import Freed, Relief, Remedies
 from casadi_ik.solve.solution import BatchSolution, SuggestedFix
-from casadi_ik.solve.trials import Bounds, LocalRefinement, Subproblems, repeat_target
+from casadi_ik.solve.subproblems import Bounds, LocalRefinement, SubproblemSolver, repeat_target
 
 RELAXATION_HALVINGS = 8
 """Number of bisection steps that minimize the relaxation of limits."""
 
-LIMIT_TOLERANCE = 1e-9
-"""Largest excess over a limit that is ignored [rad or m]."""
+MIN_LIMIT_EXCESS = 1e-9
+"""Excess over a limit above which it is part of a remedy [rad or m]."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class RelaxedLimits:
     columns: tuple[int, ...]
 
     def widen(self, robot: ArmHand, bounds: Bounds, row: int) -> None:
-        """Widen the bounds of a row by half a turn, or by the range of a prismatic actuator."""
+        """Widen the bounds of a row by pi, or by the range of a prismatic actuator."""
         for i in self.columns:
             is_angle = robot.description.actuators[i].unit == "rad"
             extension = np.pi if is_angle else float(robot.upper[i] - robot.lower[i])
@@ -51,72 +51,72 @@ class RelaxedLimits:
 
 
 def relaxation_candidates(
-    robot: ArmHand, movable: NDArray[np.bool_], pressed: NDArray[np.bool_], hand_only: bool
+    robot: ArmHand, movable: NDArray[np.bool_], may_block: NDArray[np.bool_], hand_only: bool
 ) -> list[RelaxedLimits]:
     """Return the relaxations that may help.
 
     Args:
         robot: The robot.
         movable: (n,) True for actuators with a range.
-        pressed: (n,) True for actuators whose limit alone may block the target.
+        may_block: (n,) True for actuators whose limit alone may block the target.
         hand_only: True if the hand does not fit, so that the arm cannot help.
     """
     columns = tuple(map(int, np.flatnonzero(movable)))
     arm = tuple(i for i in columns if i in robot.description.arm_actuators)
     hand = tuple(i for i in columns if i in robot.description.hand_actuators)
-    blocking = [i for i in (hand if hand_only else columns) if pressed[i]]
+    blocking = [i for i in (hand if hand_only else columns) if may_block[i]]
     single = [RelaxedLimits(robot.actuators[i], (i,)) for i in blocking]
     groups = {"hand": hand} if hand_only else {"arm": arm, "hand": hand, "all": columns}
     return single + [RelaxedLimits(name, group) for name, group in groups.items() if group]
 
 
 def relax_limits(
-    trials: Subproblems,
+    subproblems: SubproblemSolver,
     targets: TargetBatch,
     limits: Bounds,
     solved: list[tuple[RelaxedLimits, Array]],
     q: Array,
 ) -> Iterator[Relief]:
-    """Yield the smallest relaxations for which a solution is found.
+    """Yield the smallest relaxations that have a solution.
 
     Args:
-        trials: The loop.
+        subproblems: Solver of subproblems.
         targets: One target.
         limits: The original limits.
-        solved: Relaxations with a solution (n,) each.
-        q: (n,) nearest configuration within the limits, a second start.
+        solved: Relaxations, each with a solution (n,).
+        q: (n,) nearest configuration within the limits, from which a second fit starts.
     """
     if not solved:
         return
-    count, robot = len(solved), trials.robot
+    count, robot = len(solved), subproblems.robot
     best = np.stack([solution for _, solution in solved])
-    descent, rows = LocalRefinement(trials, targets), np.zeros(2 * count, dtype=np.intp)
-    # The relaxation lies between none and that of a solution.
+    descent, rows = LocalRefinement(subproblems, targets), np.zeros(2 * count, dtype=np.intp)
+    # The smallest relaxation lies between zero and that of the solution.
     lower, upper = np.zeros((count, 1)), np.ones((count, 1))
-    beyond = limits.beyond(best)
+    violation = limits.violation(best)
     for _ in range(RELAXATION_HALVINGS):
         fraction = (lower + upper) / 2
         bounds = Bounds(
-            limits.lower + np.minimum(beyond, 0) * fraction,
-            limits.upper + np.maximum(beyond, 0) * fraction,
+            limits.lower + np.minimum(violation, 0) * fraction,
+            limits.upper + np.maximum(violation, 0) * fraction,
         )
         twice = Bounds(np.tile(bounds.lower, (2, 1)), np.tile(bounds.upper, (2, 1)))
         starts = np.concatenate([best, np.tile(q, (count, 1))])
-        reached = descent.run(rows, starts, twice)
-        solved_rows = trials.solved(targets, reached, limits=False).reshape(2, count)
-        reached = reached.reshape(2, count, -1)
-        new = np.where(solved_rows[0][:, None], reached[0], reached[1])
+        refined = descent.run(rows, starts, twice)
+        solved_rows = subproblems.solved(targets, refined, limits=False).reshape(2, count)
+        refined = refined.reshape(2, count, -1)
+        new = np.where(solved_rows[0][:, None], refined[0], refined[1])
         either = np.logical_or(solved_rows[0], solved_rows[1])[:, None]
         best = np.where(either, new, best)
         upper = np.where(either, fraction, upper)
         lower = np.where(either, lower, fraction)
     units = {actuator.name: actuator.unit for actuator in robot.description.actuators}
     for (relaxation, _), solution in zip(solved, best, strict=True):
-        over = limits.beyond(solution)
+        violation_of_solution = limits.violation(solution)
         excess = {
             name: float(value)
-            for name, value in zip(robot.actuators, over, strict=True)
-            if abs(value) > LIMIT_TOLERANCE
+            for name, value in zip(robot.actuators, violation_of_solution, strict=True)
+            if abs(value) > MIN_LIMIT_EXCESS
         }
         yield Relief(relaxation.name, excess, units, solution)
 
@@ -126,19 +126,19 @@ class RemedyFinder:
     """A search for remedies that solves relaxed versions of a grasp.
 
     Attributes:
-        trials: The loop.
+        subproblems: Solver of subproblems.
         targets: One target.
         q0: (n,) initial configuration.
         q: (n,) nearest configuration of the failed solve.
-        pressed: (n,) True for actuators whose limit alone may block the target.
+        may_block: (n,) True for actuators whose limit alone may block the target.
         hand_only: True if the hand does not fit, so that the arm cannot help.
     """
 
-    trials: Subproblems
+    subproblems: SubproblemSolver
     targets: TargetBatch
     q0: Array
     q: Array
-    pressed: NDArray[np.bool_]
+    may_block: NDArray[np.bool_]
     hand_only: bool
 
     def find(self) -> Remedies:
@@ -146,7 +146,7 @@ class RemedyFinder:
         return Remedies(tuple(self._reliefs()), tuple(self._with_free_contacts()))
 
     def limits_help(self) -> bool:
-        """Return whether relaxed limits make the target solvable."""
+        """Return True if relaxed limits make the target solvable."""
         relaxations = self._relaxations()
         if not relaxations:
             return False
@@ -158,7 +158,7 @@ class RemedyFinder:
             return True
         # All limits relaxed together help if any of them does.
         last = Bounds(bounds.lower[-1:], bounds.upper[-1:])
-        q = self.trials.search(self.targets, self.q0, last)
+        q = self.subproblems.search(self.targets, self.q0, last)
         return bool(self._solves(self.targets, q, last)[0])
 
     def _reliefs(self) -> Iterator[Relief]:
@@ -166,7 +166,7 @@ class RemedyFinder:
         candidates = repeat_target(self.targets, len(relaxations))
         solutions = self._solutions(candidates, self._relaxed_bounds(relaxations))
         solved = [(relaxations[i], q) for i, q in solutions.items()]
-        return relax_limits(self.trials, self.targets, self._limits, solved, self.q)
+        return relax_limits(self.subproblems, self.targets, self._limits, solved, self.q)
 
     def _with_free_contacts(self) -> Iterator[Freed]:
         freeings = self._relaxed_targets()
@@ -182,84 +182,92 @@ class RemedyFinder:
                     for name in self.targets.extra_vectors
                 },
                 row_numbers=None,
-                # Only contacts matter.
+                # A remedy concerns contacts only.
                 object_pose=None,
                 palms=None,
             )
             for i, q in self._solutions(candidates, self._limits.tiled(len(candidates))).items():
-                part, finger, _ = freeings[i]
-                yield Freed(part, finger, q)
+                item, finger, _ = freeings[i]
+                yield Freed(item, finger, q)
 
     @property
     def _limits(self) -> Bounds:
-        return self.trials.limits(self.targets)
+        return self.subproblems.limits(self.targets)
 
     def _relaxations(self) -> list[RelaxedLimits]:
         if not self.targets.enforce_limits:
             return []
         movable = self._limits.lower < self._limits.upper
         return relaxation_candidates(
-            self.trials.robot, movable, movable & self.pressed, self.hand_only
+            self.subproblems.robot, movable, movable & self.may_block, self.hand_only
         )
 
     def _relaxed_bounds(self, relaxations: list[RelaxedLimits]) -> Bounds:
         bounds = self._limits.tiled(len(relaxations))
         for i, relaxation in enumerate(relaxations):
-            relaxation.widen(self.trials.robot, bounds, i)
+            relaxation.widen(self.subproblems.robot, bounds, i)
         return bounds
 
     def _relaxed_targets(self) -> list[tuple[str, str, TargetBatch]]:
-        """Return the target with a finger, a normal or all normals left free."""
-        targets, relaxed = self.targets, []
-        is_known = ~np.isnan(targets.points[0, :, 0])
+        """Return copies of the target with a free finger, a free normal or all normals free."""
+        targets, relaxed_targets = self.targets, []
+        has_point = ~np.isnan(targets.points[0, :, 0])
         has_normal = ~np.isnan(targets.normals[0, :, 0])
-        for i, name in enumerate(self.trials.robot.fingers):
+        for i, name in enumerate(self.subproblems.robot.fingers):
             points, normals = targets.points.copy(), targets.normals.copy()
             normals[0, i] = np.nan
             if has_normal[i]:
-                relaxed.append(("normal", name, _with_free_contacts(targets, points, normals)))
-            if is_known[i] and is_known.sum() > 1:
+                relaxed_targets.append(
+                    ("normal", name, _with_free_contacts(targets, points, normals))
+                )
+            if has_point[i] and has_point.sum() > 1:
                 points[0, i] = np.nan
-                relaxed.append(("finger", name, _with_free_contacts(targets, points, normals)))
+                relaxed_targets.append(
+                    ("finger", name, _with_free_contacts(targets, points, normals))
+                )
         if has_normal.sum() > 1:
-            none = np.full_like(targets.normals, np.nan)
-            relaxed.append(("normal", "all", _with_free_contacts(targets, targets.points, none)))
-        return relaxed
+            no_normals = np.full_like(targets.normals, np.nan)
+            relaxed_targets.append(
+                ("normal", "all", _with_free_contacts(targets, targets.points, no_normals))
+            )
+        return relaxed_targets
 
     def _solutions(self, candidates: TargetBatch, bounds: Bounds) -> dict[int, Array]:
-        """Return solutions by row, from the nearest configuration or else by a search."""
+        """Return solutions by row, fitted from the nearest configuration or found by a search."""
         q = self._refine(candidates, bounds)
         solved_rows = self._solves(candidates, q, bounds)
         failed = np.flatnonzero(~solved_rows)
         if len(failed):
             remaining_bounds = Bounds(bounds.lower[failed], bounds.upper[failed])
             remaining = candidates.rows(failed)
-            q[failed] = self.trials.search(remaining, self.q0, remaining_bounds)
+            q[failed] = self.subproblems.search(remaining, self.q0, remaining_bounds)
             solved_rows[failed] = self._solves(remaining, q[failed], remaining_bounds)
         return {int(i): q[i] for i in np.flatnonzero(solved_rows)}
 
     def _refine(self, candidates: TargetBatch, bounds: Bounds) -> Array:
         rows = np.arange(len(candidates))
         starts = np.tile(self.q, (len(rows), 1))
-        return LocalRefinement(self.trials, candidates).run(rows, starts, bounds)
+        return LocalRefinement(self.subproblems, candidates).run(rows, starts, bounds)
 
     def _solves(self, candidates: TargetBatch, q: Array, bounds: Bounds) -> NDArray[np.bool_]:
-        inside = (bounds.beyond(q) == 0).all(axis=1)
-        return np.logical_and(inside, self.trials.solved(candidates, q, limits=False))
+        is_within_bounds = (bounds.violation(q) == 0).all(axis=1)
+        return np.logical_and(
+            is_within_bounds, self.subproblems.solved(candidates, q, limits=False)
+        )
 
 
 def _with_free_contacts(targets: TargetBatch, points: Array, normals: Array) -> TargetBatch:
-    """Return a target with given points and normals, without vectors of the free ones."""
+    """Return a target with new points and normals, and no extra vectors of free contacts."""
     has_point, has_normal = ~np.isnan(points), ~np.isnan(normals)
-    more = {
+    extra_vectors = {
         name: np.where(has_point & has_normal if name == "tangents" else has_point, array, np.nan)
         for name, array in targets.extra_vectors.items()
     }
-    return replace(targets, points=points.copy(), normals=normals, extra_vectors=more)
+    return replace(targets, points=points.copy(), normals=normals, extra_vectors=extra_vectors)
 
 
 SHIFTS = (0.01, 0.02, 0.04, 0.08, 0.16)
-"""Distances by which the object is shifted [m], until one helps."""
+"""Distances by which the object is shifted [m], in the order of the trials."""
 
 SHIFT_HALVINGS = 4
 """Number of bisection steps that minimize a shift."""
@@ -275,7 +283,7 @@ DISTANCE_ROUNDING = 1e-9
 """Rounding error of distances of a shifted object [m]."""
 
 SolveFree = Callable[[TargetBatch], NDArray[np.bool_]]
-"""Function from k targets to whether each has a collision-free solution, (k,)."""
+"""Function of k targets that returns (k,) True where a collision-free solution exists."""
 
 
 def add_collision_remedies(
@@ -284,7 +292,7 @@ def add_collision_remedies(
     """Add remedies to the collision report of a target.
 
     Args:
-        solve_free: Solves targets.
+        solve_free: Function that solves targets without collisions.
         check: Collision check of the robot in its scene.
         targets: One target.
         batch: Its solution.
@@ -295,12 +303,12 @@ def add_collision_remedies(
     (report,) = batch.collisions
     if report is None:
         return batch
-    scene, known = check.scene, targets
+    scene, target = check.scene, targets
     if targets.object_pose is None and scene.grasped in scene.items:
-        known = targets.holding(scene.grasped or "", scene.items[scene.grasped or ""].pose)
-    shift = _shortest_shift(known, _keeps_object_clearance(check, known), solve_free)
+        target = targets.holding(scene.grasped or "", scene.items[scene.grasped or ""].pose)
+    shift = _shortest_shift(target, _keeps_object_clearance(check, target), solve_free)
     fix = SuggestedFix(
-        shift, SHIFTS[-1], _removable_fingers(known, check.robot.fingers, solve_free)
+        shift, SHIFTS[-1], _removable_fingers(target, check.robot.fingers, solve_free)
     )
     return replace(batch, collisions=(replace(report, way_out=fix),))
 
@@ -308,20 +316,20 @@ def add_collision_remedies(
 def _keeps_object_clearance(
     check: SceneCheck, targets: TargetBatch
 ) -> Callable[[Array], NDArray[np.bool_]]:
-    """Return a function of shifts (k, 3): whether the object is as free of others as before."""
+    """Return a function of shifts (k, 3) that is True where the object penetrates no deeper."""
     scene: Scene = check.scene
     name, pose = targets.object or scene.grasped or "", targets.object_pose
     if name and pose is not None:
         scene = scene.holding(name, pose[0])
     item = scene.items.get(name)
-    others: list[Item] = [other for key, other in scene.items.items() if key != name]
+    obstacles: list[Item] = [obstacle for key, obstacle in scene.items.items() if key != name]
 
     def keeps_clearance(shifts: Array) -> NDArray[np.bool_]:
-        if item is None or not others:
+        if item is None or not obstacles:
             return np.ones(len(shifts), dtype=bool)
         poses = np.repeat(item.pose[None], 1 + len(shifts), axis=0)
         poses[1:, :3, 3] += shifts
-        distances = gaps(item, others, poses)
+        distances = gaps(item, obstacles, poses)
         return distances[1:] >= min(float(distances[0]), 0.0) - DISTANCE_ROUNDING
 
     return keeps_clearance
@@ -332,34 +340,34 @@ def _shortest_shift(
     keeps_clearance: Callable[[Array], NDArray[np.bool_]],
     solve_free: SolveFree,
 ) -> tuple[float, float, float] | None:
-    """Return the shortest shift for which there is a collision-free solution."""
+    """Return the shortest shift with a collision-free solution; None if no shift has one."""
 
     def helps(shifts: Array) -> NDArray[np.bool_]:
-        good = keeps_clearance(shifts)
-        if good.any():
-            good[good] = solve_free(_shifted(targets, shifts[good]))
-        return good
+        is_solved = keeps_clearance(shifts)
+        if is_solved.any():
+            is_solved[is_solved] = solve_free(_shifted(targets, shifts[is_solved]))
+        return is_solved
 
-    before = 0.0
+    shorter_step = 0.0
     for step in SHIFTS:
         directions = SHIFT_DIRECTIONS[helps(step * SHIFT_DIRECTIONS)]
         if len(directions):
-            low, high = np.full(len(directions), before), np.full(len(directions), step)
+            low, high = np.full(len(directions), shorter_step), np.full(len(directions), step)
             for _ in range(SHIFT_HALVINGS):
                 middle = (low + high) / 2
-                good = helps(middle[:, None] * directions)
-                low, high = np.where(good, low, middle), np.where(good, middle, high)
-                # Directions that are longer than another one already are dropped.
+                is_solved = helps(middle[:, None] * directions)
+                low, high = np.where(is_solved, low, middle), np.where(is_solved, middle, high)
+                # Drop directions whose lower bound exceeds the smallest upper bound.
                 is_shorter = low < high.min()
                 low, high, directions = low[is_shorter], high[is_shorter], directions[is_shorter]
             x, y, z = (high[:, None] * directions)[int(high.argmin())].tolist()
             return x, y, z
-        before = step
+        shorter_step = step
     return None
 
 
 def _shifted(targets: TargetBatch, shifts: Array) -> TargetBatch:
-    """Return one target at k shifts (k, 3)."""
+    """Return copies of a target, moved by shifts (k, 3)."""
     candidates = targets.rows(np.zeros(len(shifts), dtype=np.intp))
     pose = candidates.object_pose
     if pose is not None:
@@ -377,23 +385,23 @@ def _shifted(targets: TargetBatch, shifts: Array) -> TargetBatch:
 def _removable_fingers(
     targets: TargetBatch, fingers: Sequence[str], solve_free: SolveFree
 ) -> tuple[str, ...]:
-    """Return the fingers without whose contact there is a collision-free solution."""
+    """Return the fingers whose removal makes a collision-free solution possible."""
     has_point = ~np.isnan(targets.points[0]).all(axis=1)
-    facing = ~np.isnan(targets.normals[0]).all(axis=1)
-    named = np.flatnonzero(has_point | facing)
-    # Without a finger of another contact kind the target would need another solver.
-    plain = [
+    has_normal = ~np.isnan(targets.normals[0]).all(axis=1)
+    constrained = np.flatnonzero(has_point | has_normal)
+    # Removing a finger with extra vectors would require a solver for other contact kinds.
+    removable = [
         i
-        for i in named.tolist()
+        for i in constrained.tolist()
         if all(np.isnan(v[0, i]).all() for v in targets.extra_vectors.values())
     ]
-    if len(named) < 2:
+    if len(constrained) < 2:
         return ()
-    return tuple(fingers[i] for i in plain if solve_free(_without(targets, i))[0])
+    return tuple(fingers[i] for i in removable if solve_free(_without_finger(targets, i))[0])
 
 
-def _without(targets: TargetBatch, finger: int) -> TargetBatch:
-    """Return a target with a free finger."""
+def _without_finger(targets: TargetBatch, finger: int) -> TargetBatch:
+    """Return a target without the contact of a finger."""
     points, normals = targets.points.copy(), targets.normals.copy()
     points[:, finger], normals[:, finger] = np.nan, np.nan
     return replace(targets, points=points, normals=normals)

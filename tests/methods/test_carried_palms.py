@@ -8,19 +8,19 @@ import pytest
 import casadi_ik as ik
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.registry import build_method
-from casadi_ik.solve.trials import Subproblems, carry_palms, side_palms
+from casadi_ik.solve.subproblems import SubproblemSolver, carry_palms, side_palms
 
 COUNT = 12
 
 
 @pytest.fixture(scope="module")
-def setup() -> tuple[ik.ArmHand, Subproblems, TargetBatch, np.ndarray]:
+def setup() -> tuple[ik.ArmHand, SubproblemSolver, TargetBatch, np.ndarray]:
     robot = ik.load_robot("g1+dex3")
     part = np.random.default_rng(2).uniform(0.2, 0.8, (COUNT, len(robot.home)))
     q = robot.lower + part * (robot.upper - robot.lower)
     method: Any = build_method("hand-first", robot.description, {})
     targets = TargetBatch(*robot.contacts(q), ik.Tolerance(), True)
-    return robot, Subproblems(robot, method), targets, q
+    return robot, SubproblemSolver(robot, method), targets, q
 
 
 def carrying(robot: ik.ArmHand) -> list[int]:
