@@ -14,7 +14,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.collision.scene import Item
+from casadi_ik.collision.scene import Obstacle
 from casadi_ik.collision.solids import Kind, Solid, ray_points, sphere_directions
 from casadi_ik.files.arrays import Array
 from casadi_ik.model.description import RobotDescription
@@ -56,7 +56,7 @@ class PairTable:
     )
 
     def poses(
-        self, items: dict[str, Item], moved: str | None = None, to: Array | None = None
+        self, items: dict[str, Obstacle], moved: str | None = None, to: Array | None = None
     ) -> Array:
         """Return the poses of the scene's solids as rows of rotation (row-major) and origin.
 
@@ -243,7 +243,7 @@ def _min_convex(distance: Callable[[Array], Array], slope: Array) -> tuple[Array
     return distance(middle) - slope * (high - low), middle
 
 
-def gaps(item: Item, others: Sequence[Item], poses: Array) -> Array:
+def gaps(item: Obstacle, others: Sequence[Obstacle], poses: Array) -> Array:
     """Compute the distances (k,) [m] of an item at poses (k, 4, 4) from others.
 
     Points of either surface are checked against the other shape, which is accurate to a few

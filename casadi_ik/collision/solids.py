@@ -85,6 +85,10 @@ class Solid:
         return self.surface or (KIND_PROPERTIES[self.kind].mesh or _radial_mesh)(self)
 
 
+PosedSolid = tuple[Solid, Array]
+"""A solid and its (4, 4) pose in the frame of the obstacle or object that it belongs to."""
+
+
 @dataclass(frozen=True)
 class KindProperties:
     """The properties of a kind of solid besides its distance in ``compile/runtime/clearance.c``.
@@ -236,7 +240,7 @@ def sphere_directions(count: int) -> Array:
     return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
 
 
-def cloud_solids(points: Array, radius: float, max_points: int = 1024) -> list[tuple[Solid, Array]]:
+def cloud_solids(points: Array, radius: float, max_points: int = 1024) -> list[PosedSolid]:
     """Return balls around points as clouds of limited size.
 
     Args:
@@ -378,7 +382,7 @@ FLAT_THICKNESS = 1e-3
 """Thickness that is given to a flat piece of a mesh [m]."""
 
 
-def mesh_hulls(shape: MeshShape, where: str) -> list[tuple[Solid, Array]]:
+def mesh_hulls(shape: MeshShape, where: str) -> list[PosedSolid]:
     """Return the convex hulls of the pieces of a mesh, with their (4, 4) poses in its frame.
 
     Flat pieces smaller than `MAX_SPECK_SIZE`, which scanners produce, are ignored. Other flat
@@ -387,7 +391,7 @@ def mesh_hulls(shape: MeshShape, where: str) -> list[tuple[Solid, Array]]:
     Raises:
         DescriptionError: The only piece is flat.
     """
-    solids: list[tuple[Solid, Array]] = []
+    solids: list[PosedSolid] = []
     for number, (points, _) in enumerate(shape.pieces):
         is_flat = len(points) < 4 or np.linalg.matrix_rank(points - points[0], tol=1e-9) < 3
         if is_flat and len(shape.pieces) > 1:
@@ -403,7 +407,7 @@ def mesh_hulls(shape: MeshShape, where: str) -> list[tuple[Solid, Array]]:
     return solids
 
 
-def object_solids(name: str) -> list[tuple[Solid, Array]]:
+def object_solids(name: str) -> list[PosedSolid]:
     """Return the solids of an object, with their (4, 4) poses in its frame.
 
     Args:
@@ -417,7 +421,7 @@ def object_solids(name: str) -> list[tuple[Solid, Array]]:
     return mesh_hulls(shape, name) if isinstance(shape, MeshShape) else primitive_solids(shape)
 
 
-def primitive_solids(shape: Shape) -> list[tuple[Solid, Array]]:
+def primitive_solids(shape: Shape) -> list[PosedSolid]:
     """Return the solids of a primitive object, with their (4, 4) poses in its frame."""
     origin = np.eye(4)
     match shape:
@@ -447,7 +451,7 @@ def _elliptic_solid(shape: EllipticCylinder) -> Solid:
     return Solid(Kind.CONVEX, np.zeros(3), reach, _planes(faces, support), shape.mesh(48))
 
 
-def _bent_solids(shape: BentCapsule, links: int = 5) -> list[tuple[Solid, Array]]:
+def _bent_solids(shape: BentCapsule, links: int = 5) -> list[PosedSolid]:
     """Return straight capsules along the arc, each enlarged by the sagitta of its chord."""
     points = shape.centreline(np.linspace(-shape.half_angle, shape.half_angle, links + 1))
     sagitta = shape.radius * (1 - math.cos(shape.half_angle / links))

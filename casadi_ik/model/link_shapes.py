@@ -14,12 +14,12 @@ from casadi_ik.files.arrays import Array, read_only
 from casadi_ik.files.reading import Frame, frame_matrix
 from casadi_ik.model.linkage import require_name
 from casadi_ik.model.schema import (
-    BoxEntry,
-    CapsuleEntry,
     CollisionEntry,
-    CylinderEntry,
+    LinkBoxEntry,
+    LinkCapsuleEntry,
+    LinkCylinderEntry,
+    LinkSphereEntry,
     ShapeEntry,
-    SphereEntry,
 )
 from casadi_ik.model.xml_tree import parse_xml, read_robot_file, required_attribute
 
@@ -190,7 +190,7 @@ def link_shapes(entry: CollisionEntry | None, links: Iterable[str], path: Path) 
         require_name(link, names, "link", f"{where}: collision.links.{link}")
         for shape in shapes:
             covers = -1
-            if isinstance(shape, BoxEntry | CylinderEntry):
+            if isinstance(shape, LinkBoxEntry | LinkCylinderEntry):
                 covers = len(solids)
                 solids.append(_solid(link, shape))
             capsules += [LinkCapsule(link, *capsule, covers) for capsule in capsules_of(shape)]
@@ -211,9 +211,9 @@ def link_shapes(entry: CollisionEntry | None, links: Iterable[str], path: Path) 
     return Shapes(tuple(capsules), tuple(solids), tuple(touching))
 
 
-def _solid(link: str, shape: BoxEntry | CylinderEntry) -> LinkSolid:
+def _solid(link: str, shape: LinkBoxEntry | LinkCylinderEntry) -> LinkSolid:
     pose = read_only(frame_matrix(Frame(shape.xyz, shape.rpy)))
-    if isinstance(shape, BoxEntry):
+    if isinstance(shape, LinkBoxEntry):
         return LinkSolid(link, "box", read_only(shape.size), pose)
     return LinkSolid(link, "cylinder", read_only((shape.radius, shape.length, 0.0)), pose)
 
@@ -226,13 +226,13 @@ def capsules_of(shape: ShapeEntry) -> list[tuple[Array, Array, float]]:
     A cylinder longer than wide is enclosed by one capsule, a flat one is treated as its bounding
     box.
     """
-    if isinstance(shape, SphereEntry):
+    if isinstance(shape, LinkSphereEntry):
         return [(read_only(shape.center), read_only(np.zeros(3)), shape.radius)]
-    if isinstance(shape, CapsuleEntry):
+    if isinstance(shape, LinkCapsuleEntry):
         start, end = np.array(shape.ends[0]), np.array(shape.ends[1])
         return [(read_only((start + end) / 2), read_only((end - start) / 2), shape.radius)]
     pose = frame_matrix(Frame(shape.xyz, shape.rpy))
-    if isinstance(shape, CylinderEntry):
+    if isinstance(shape, LinkCylinderEntry):
         if shape.length < 2 * shape.radius:
             size = np.array([2 * shape.radius, 2 * shape.radius, shape.length])
             return _box_capsules(size, pose)

@@ -17,7 +17,7 @@ class _Shape(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field=
     """
 
 
-class SphereEntry(_Shape, frozen=True, tag="sphere", kw_only=True):
+class LinkSphereEntry(_Shape, frozen=True, tag="sphere", kw_only=True):
     """A ball.
 
     Attributes:
@@ -30,7 +30,7 @@ class SphereEntry(_Shape, frozen=True, tag="sphere", kw_only=True):
     excess: Length = 0.0
 
 
-class CapsuleEntry(_Shape, frozen=True, tag="capsule", kw_only=True):
+class LinkCapsuleEntry(_Shape, frozen=True, tag="capsule", kw_only=True):
     """A capsule: all points within the radius of a segment.
 
     Attributes:
@@ -43,7 +43,7 @@ class CapsuleEntry(_Shape, frozen=True, tag="capsule", kw_only=True):
     excess: Length = 0.0
 
 
-class BoxEntry(_Shape, frozen=True, tag="box", kw_only=True):
+class LinkBoxEntry(_Shape, frozen=True, tag="box", kw_only=True):
     """A box centred in its frame.
 
     Attributes:
@@ -58,7 +58,7 @@ class BoxEntry(_Shape, frozen=True, tag="box", kw_only=True):
     excess: Length = 0.0
 
 
-class CylinderEntry(_Shape, frozen=True, tag="cylinder", kw_only=True):
+class LinkCylinderEntry(_Shape, frozen=True, tag="cylinder", kw_only=True):
     """A cylinder along z, centred in its frame.
 
     Attributes:
@@ -75,7 +75,7 @@ class CylinderEntry(_Shape, frozen=True, tag="cylinder", kw_only=True):
     excess: Length = 0.0
 
 
-ShapeEntry = SphereEntry | CapsuleEntry | BoxEntry | CylinderEntry
+ShapeEntry = LinkSphereEntry | LinkCapsuleEntry | LinkBoxEntry | LinkCylinderEntry
 
 
 class TouchingEntry(Struct, frozen=True):

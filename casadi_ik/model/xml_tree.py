@@ -19,7 +19,13 @@ from casadi_ik.files.limits import LIMITS, RAISE_HINT, scaled_limit
 from casadi_ik.files.reading import Frame, frame_matrix, read_text, roll_pitch_yaw
 from casadi_ik.model.couplings import Coupling
 from casadi_ik.model.linkage import chain_to, links_of, require_name
-from casadi_ik.model.schema import BoxEntry, CapsuleEntry, CylinderEntry, ShapeEntry, SphereEntry
+from casadi_ik.model.schema import (
+    LinkBoxEntry,
+    LinkCapsuleEntry,
+    LinkCylinderEntry,
+    LinkSphereEntry,
+    ShapeEntry,
+)
 
 Element = ElementTree.Element
 
@@ -250,14 +256,16 @@ def shape_entry(kind: str, size: Sequence[float], pose: Array) -> ShapeEntry:
     x, y, z = (float(value) for value in pose[:3, 3])
     roll, pitch, yaw = (float(value) for value in roll_pitch_yaw(pose[:3, :3]))
     if kind == "box":
-        return BoxEntry(size=(size[0], size[1], size[2]), xyz=(x, y, z), rpy=(roll, pitch, yaw))
+        return LinkBoxEntry(size=(size[0], size[1], size[2]), xyz=(x, y, z), rpy=(roll, pitch, yaw))
     if kind == "sphere":
-        return SphereEntry(radius=size[0], center=(x, y, z))
+        return LinkSphereEntry(radius=size[0], center=(x, y, z))
     if kind == "cylinder":
-        return CylinderEntry(radius=size[0], length=size[1], xyz=(x, y, z), rpy=(roll, pitch, yaw))
+        return LinkCylinderEntry(
+            radius=size[0], length=size[1], xyz=(x, y, z), rpy=(roll, pitch, yaw)
+        )
     half = pose[:3, 2] * size[1] / 2
     first, last = (tuple((pose[:3, 3] + sign * half).tolist()) for sign in (-1, 1))
-    return CapsuleEntry(ends=(first, last), radius=size[0])
+    return LinkCapsuleEntry(ends=(first, last), radius=size[0])
 
 
 def _collision_entry(collision: Element) -> ShapeEntry | None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.collision.clearance import SceneCheck
 from casadi_ik.collision.distances import gaps
-from casadi_ik.collision.scene import Item, Scene
+from casadi_ik.collision.scene import Obstacle, Scene
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.targets import TargetBatch
@@ -322,7 +322,7 @@ def _keeps_object_clearance(
     if name and pose is not None:
         scene = scene.holding(name, pose[0])
     item = scene.items.get(name)
-    obstacles: list[Item] = [obstacle for key, obstacle in scene.items.items() if key != name]
+    obstacles: list[Obstacle] = [obstacle for key, obstacle in scene.items.items() if key != name]
 
     def keeps_clearance(shifts: Array) -> NDArray[np.bool_]:
         if item is None or not obstacles:

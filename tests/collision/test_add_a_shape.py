@@ -49,7 +49,7 @@ def test_a_kind_is_added_in_three_files(tmp_path: Path) -> None:
     replace(driver, before, f"{distance}\n{before}")
     first = "  if (shape->kind == BOX)"
     replace(driver, first, f"{call}{first}")
-    scene = package / "collision" / "scene.py"
+    scene = package / "collision" / "scene_file.py"
     replace(
         scene,
         "SolidEntry = (\n    BoxEntry",

@@ -22,7 +22,7 @@ from casadi_ik.integrations.importing import capsules, robot_import
 from casadi_ik.integrations.importing.meshes import IndexedMesh
 from casadi_ik.integrations.importing.write import collision_lines
 from casadi_ik.model.link_shapes import Touching, capsules_of
-from casadi_ik.model.schema import BoxEntry, CapsuleEntry, CollisionEntry, CylinderEntry
+from casadi_ik.model.schema import CollisionEntry, LinkBoxEntry, LinkCapsuleEntry, LinkCylinderEntry
 
 PLACE = '<origin xyz="0 0 0.02" rpy="0.3 0.2 0.1"/>'
 SIMPLE = {
@@ -99,15 +99,15 @@ def test_shapes_come_with_the_parts(tmp_path):
 @pytest.mark.parametrize(
     "shape",
     [
-        BoxEntry(size=(0.3, 0.1, 0.08), xyz=(0.1, 0.2, 0.3), rpy=(0.3, 0.2, 0.1)),
-        BoxEntry(size=(0.2, 0.2, 0.01)),
-        CylinderEntry(radius=0.05, length=0.3, rpy=(1.0, 0, 0)),
-        CylinderEntry(radius=0.1, length=0.02),
+        LinkBoxEntry(size=(0.3, 0.1, 0.08), xyz=(0.1, 0.2, 0.3), rpy=(0.3, 0.2, 0.1)),
+        LinkBoxEntry(size=(0.2, 0.2, 0.01)),
+        LinkCylinderEntry(radius=0.05, length=0.3, rpy=(1.0, 0, 0)),
+        LinkCylinderEntry(radius=0.1, length=0.02),
     ],
 )
 def test_capsules_hold_boxes_and_cylinders(shape, rng):
     unit = rng.uniform(-1, 1, (4000, 3))
-    if isinstance(shape, BoxEntry):
+    if isinstance(shape, LinkBoxEntry):
         inside = unit * np.array(shape.size) / 2
     else:
         inside = unit[np.hypot(unit[:, 0], unit[:, 1]) <= 1]
@@ -295,8 +295,10 @@ def test_import_writes_shapes_that_hold_the_meshes(tmp_path: Path, rng) -> None:
 def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
     """Shapes come back from the YAML as they were."""
     shapes = {
-        "a link": [BoxEntry(size=(0.1, 0.2, 0.3), xyz=(0.01, 0, 0), rpy=(0.1, 0, 0), excess=0.004)],
-        "b": [CapsuleEntry(ends=((0, 0, 0), (0, 0, 0.1)), radius=0.02)],
+        "a link": [
+            LinkBoxEntry(size=(0.1, 0.2, 0.3), xyz=(0.01, 0, 0), rpy=(0.1, 0, 0), excess=0.004)
+        ],
+        "b": [LinkCapsuleEntry(ends=((0, 0, 0), (0, 0, 0.1)), radius=0.02)],
     }
     lines = collision_lines(shapes, [Touching(("a link", "b"), "they do", 0.003)], "shapes")
     entry, _ = validated(yaml.safe_load("\n".join(lines))["collision"], CollisionEntry, tmp_path)

@@ -23,7 +23,7 @@ from casadi_ik.app.cli.table import (
     load,
 )
 from casadi_ik.app.report import headline, robot_report, table
-from casadi_ik.collision.scene import SceneFile
+from casadi_ik.collision.scene_file import SceneFile
 from casadi_ik.files.reading import convert_entry, read_yaml
 from casadi_ik.files.shipped import BODIES_FOLDER, resolve_description, shipped_names
 from casadi_ik.files.units import json_schema

@@ -28,7 +28,7 @@ from casadi_ik.app.drawing.surfaces import (
 )
 from casadi_ik.collision.clearance import ClosestPoints
 from casadi_ik.collision.model import own_solids
-from casadi_ik.collision.scene import Item, Scene
+from casadi_ik.collision.scene import Obstacle, Scene
 from casadi_ik.collision.solids import Solid
 from casadi_ik.errors import CasadiIKError, UnknownNameError
 from casadi_ik.files.arrays import Array
@@ -397,7 +397,7 @@ def object_drawable(name: str) -> Drawable | None:
     return Drawable("object", shape, palette.OBJECT, role="object")
 
 
-def item_drawables(item: Item) -> list[Drawable]:
+def item_drawables(item: Obstacle) -> list[Drawable]:
     """Return an item of a scene in its frame; of an unbounded solid, the part near the base."""
     base = inverse(item.pose)[:3, 3]
     return [

@@ -14,7 +14,7 @@ from casadi_ik.errors import optional_import
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.reading import roll_pitch_yaw
 from casadi_ik.integrations.importing.meshes import IndexedMesh, cluster_points
-from casadi_ik.model.schema import BoxEntry, CapsuleEntry, ShapeEntry, SphereEntry
+from casadi_ik.model.schema import LinkBoxEntry, LinkCapsuleEntry, LinkSphereEntry, ShapeEntry
 
 with optional_import("shapes of imported links"):
     from scipy.spatial import KDTree
@@ -485,8 +485,8 @@ def _capsule(one: FittedCapsule, distances_to: float) -> ShapeEntry:
     first, last = (_rounded(end) for end in (one.first, one.last))
     radius = math.ceil(one.radius * SHAPE_FIT.grid + 0.9) / SHAPE_FIT.grid
     if first == last:
-        return SphereEntry(radius=radius, center=first, excess=distances_to)
-    return CapsuleEntry(ends=(first, last), radius=radius, excess=distances_to)
+        return LinkSphereEntry(radius=radius, center=first, excess=distances_to)
+    return LinkCapsuleEntry(ends=(first, last), radius=radius, excess=distances_to)
 
 
 def _box(one: FittedBox, distances_to: float) -> ShapeEntry:
@@ -496,7 +496,7 @@ def _box(one: FittedBox, distances_to: float) -> ShapeEntry:
         size = np.ceil((size + 1e-4 * np.linalg.norm(size)) * SHAPE_FIT.grid) / SHAPE_FIT.grid
     x, y, z = size.tolist()
     roll, pitch, yaw = (rpy + 0.0).tolist()
-    return BoxEntry(
+    return LinkBoxEntry(
         size=(x, y, z), xyz=_rounded(one.center), rpy=(roll, pitch, yaw), excess=distances_to
     )
 
