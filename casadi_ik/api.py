@@ -220,6 +220,7 @@ class Solver(MovingSolver):
                     group, SolveOptions(start, seed, diagnose=why)
                 ),
                 lambda group: self._single_restart_engine.solve(group, SolveOptions(start, seed)),
+                lambda group, most: self._engine.diagnostician.prove(group, most),
                 targets,
                 grasp.object_pose,
                 start,

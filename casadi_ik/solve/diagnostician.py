@@ -156,7 +156,7 @@ class Diagnostician:
         proofs: list[Proof | None] = [None] * len(all_rows)
         rows = np.flatnonzero(~self._solved(targets, best.minimax_q))
         if len(rows):
-            new_proofs = self._prove(targets.rows(rows), _max_boxes(best.factor[rows]))
+            new_proofs = self.prove(targets.rows(rows), _max_boxes(best.factor[rows]))
             for row, proof in zip(rows.tolist(), new_proofs, strict=True):
                 proofs[row] = proof
             clock.lap(rows)
@@ -249,8 +249,13 @@ class Diagnostician:
                 )
         return by_target
 
-    def _prove(self, targets: TargetBatch, max_boxes: Counts) -> list[Proof | None]:
-        """Return proofs for targets; for a multi-arm robot, that one side is unsolvable."""
+    def prove(self, targets: TargetBatch, max_boxes: Counts) -> list[Proof | None]:
+        """Return proofs of k targets; for a multi-arm robot, that one side is unsolvable.
+
+        Args:
+            targets: Targets to prove impossible.
+            max_boxes: (k,) maximum number of boxes of hand postures.
+        """
         if not self._side_provers:
             return self._prover.prove(_with_contact_bounds(targets), max_boxes=max_boxes)
         robot = self.robot.description
