@@ -19,14 +19,15 @@ from casadi_ik.solve.subproblems import SubproblemSolver, carry_palms, palm_coor
 
 
 class SideHands:
-    """The hands of a multi-arm robot without self-collision, by side.
+    """Hands of a multi-arm robot without self-collision, by side.
 
     The posture and palm pose of a side's hand do not depend on the other sides, so hands are
     collected by side and combined afterwards.
 
     Attributes:
         hand_motors: Positions in q of the hand motors, by side.
-        nearest: (s, k, n) solutions with the least-penetrating hand of each side and target.
+        least_penetrating: (s, k, n) solutions with the least-penetrating hand of each side and
+            target.
         surplus: (s, k) clearances of these hands beyond the margin [m].
     """
 
@@ -41,21 +42,21 @@ class SideHands:
         """Split the collision pairs by the hand or arm that decides their distance.
 
         Args:
-            subproblems: The loop.
+            subproblems: Solver of subproblems.
             links: By side, the links of its arm and those that move with its palm.
             targets: k targets.
             query: Pairs that must not collide.
             min_difference: Hands that differ by less are duplicates [fraction of motor ranges].
         """
         self._subproblems, self._targets, self._query = subproblems, targets, query
-        self._robot = body = subproblems.robot.description
+        self._robot = description = subproblems.robot.description
         self._arm_links = [arm for arm, _ in links]
-        moved_links = body.links_moved(range(len(body.actuators)))
-        # Pairs without trunk, arms and other hands: a hand with itself and with fixed objects.
-        self._hand_queries = [query.split_by_links(moved_links - hand)[1] for _, hand in links]
-        self.hand_motors = [list(hand) for _, hand in body.side_actuators]
-        count, n, sides = len(targets), len(body.actuators), len(links)
-        self.nearest = np.full((sides, count, n), np.nan)
+        movable_links = description.links_moved(range(len(description.actuators)))
+        # Pairs whose distance only this hand changes: self-collision, and fixed objects.
+        self._hand_queries = [query.split_by_links(movable_links - hand)[1] for _, hand in links]
+        self.hand_motors = [list(hand) for _, hand in description.side_actuators]
+        count, n, sides = len(targets), len(description.actuators), len(links)
+        self.least_penetrating = np.full((sides, count, n), np.nan)
         self.surplus = np.full((sides, count), -np.inf)
         empty = np.zeros((0, n)), np.zeros((0, sides, 4, 4)), np.zeros(0, np.intp)
         # By side: configurations, poses of all palms, target indices.
@@ -67,18 +68,18 @@ class SideHands:
     def add_hands(
         self, q: Array, target_index: NDArray[np.intp], side: int, best_only: bool = False
     ) -> None:
-        """Add the hands of a side that are free of self-collision.
+        """Record the hands of a side that are free of self-collision.
 
         Args:
             q: (m, n) solutions.
             target_index: (m,) index of the target of each solution.
             side: Number of the side.
-            best_only: Add at most one hand per target, the one with the largest clearance, and
-                only if it improves on all hands before it.
+            best_only: Record at most one hand per target: the one with the largest clearance, if it
+                exceeds that of all previous hands.
         """
         surplus = self._hand_queries[side].rows(target_index).check(q).surplus
         rows = improving_rows(target_index, surplus, self.surplus[side])
-        self.nearest[side, target_index[rows]] = q[rows]
+        self.least_penetrating[side, target_index[rows]] = q[rows]
         self.surplus[side, target_index[rows]] = surplus[rows]
         rows = rows if best_only else np.arange(len(q))
         rows = rows[surplus[rows] >= -ROUNDING]
@@ -104,8 +105,8 @@ class SideHands:
 
         Args:
             rows: Indices of the targets.
-            max_combinations: Maximum number of combinations per target. There are as many as the
-                side with most hands has; sides with fewer hands repeat theirs.
+            max_combinations: Maximum number of combinations per target. Their number is that of the
+                side with most hands; sides with fewer hands repeat their hands.
 
         Returns:
             (m, n) configurations, (m, s, 4, 4) palm poses, (m,) index of the target of each.
@@ -141,9 +142,9 @@ class SideHands:
         starts: Array,
         prefer: Preference,
     ) -> tuple[Array, NDArray[np.intp]]:
-        """Search collision-free arms for given palm poses, one side after the other.
+        """Search for collision-free arms at palm poses, successively for each side.
 
-        All sides but the last keep the preferred collision-free arm of every branch.
+        Every side but the last returns the preferred collision-free arm of every branch.
 
         Args:
             searches: Arm search of each side.
@@ -208,7 +209,7 @@ UNCONSTRAINED_FINGER_PARAMETERS = UnconstrainedFingerParameters()
 
 
 class UnconstrainedFingers:
-    """The hand motors of k targets that move no finger with a contact."""
+    """Hand motors of k targets that move no finger with a contact."""
 
     def __init__(self, robot: ArmHand, targets: TargetBatch) -> None:
         """Find the free motors of each target and sample their postures."""
@@ -232,7 +233,7 @@ class UnconstrainedFingers:
         self._limits = robot.lower, robot.upper
         self._postures = robot.lower + fractions * ranges
         offsets = (fractions[: parameters.local_postures] - 0.5) * ranges
-        # None: postures over the whole range; then offsets around the best one.
+        # None: postures over the full range; then offsets around the best posture.
         self._levels = (None, *(radius * offsets for radius in parameters.local_radii))
 
     def move_aside(self, q: Array, target_index: NDArray[np.intp], query: CollisionQuery) -> Array:
@@ -257,10 +258,10 @@ class UnconstrainedFingers:
         rows, surplus = rows[collides], surplus[collides]
         if not len(rows):
             return q
-        moved = q.copy()
+        result = q.copy()
         for offsets in self._levels:
             is_free = self._free_motors[target_index[rows]]
-            center = moved[rows][:, None]
+            center = result[rows][:, None]
             samples = self._postures if offsets is None else center + offsets
             candidates = np.where(is_free[:, None], np.clip(samples, *self._limits), center)
             count = candidates.shape[1]
@@ -271,7 +272,7 @@ class UnconstrainedFingers:
             numbers = np.arange(len(rows))
             best_surplus = clearances[numbers, best]
             is_better = best_surplus > surplus
-            moved[rows[is_better]] = candidates[numbers, best][is_better]
+            result[rows[is_better]] = candidates[numbers, best][is_better]
             surplus = np.maximum(surplus, best_surplus)
             can_improve = (surplus < -ROUNDING) & (
                 surplus > -UNCONSTRAINED_FINGER_PARAMETERS.max_gain
@@ -279,10 +280,10 @@ class UnconstrainedFingers:
             rows, surplus = rows[can_improve], surplus[can_improve]
             if not len(rows):
                 break
-        return moved
+        return result
 
     @cached_property
     def _free_links(self) -> frozenset[str]:
-        """Links moved by a motor that is free in at least one target."""
+        """Names of the links moved by a motor that is free in at least one target."""
         motors = np.flatnonzero(self._free_motors.any(axis=0)).tolist()
         return self._description.links_moved(motors)

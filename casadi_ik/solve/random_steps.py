@@ -1,0 +1,178 @@
+"""Random steps of solutions, followed by a fit to the contacts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.files.arrays import Array, spread_steps
+from casadi_ik.kinematics.arm_hand import ArmHand
+from casadi_ik.model.targets import TargetBatch, Tolerance
+from casadi_ik.solve.collision_free_parameters import COLLISION_FREE_PARAMETERS
+from casadi_ik.solve.subproblems import LocalRefinement, SubproblemSolver, carry_palms, side_palms
+
+
+class RandomSteps:
+    """Random steps of motors and contacts, each followed by a fit to the contacts.
+
+    All methods return only configurations that solve their targets. The random numbers depend on
+    the seed and the number of the step, not on the targets.
+
+    Attributes:
+        robot: The robot.
+        samples: Number of random directions of a step.
+        ranges: (n,) positive ranges of the motors [rad or m].
+    """
+
+    def __init__(self, subproblems: SubproblemSolver, targets: TargetBatch, seed: int) -> None:
+        """Store the solver of subproblems, k targets and the seed."""
+        self.robot = robot = subproblems.robot
+        is_multi_arm = bool(robot.description.sides)
+        self.samples = COLLISION_FREE_PARAMETERS.step_samples[is_multi_arm]
+        self.ranges = np.maximum(robot.upper - robot.lower, COLLISION_FREE_PARAMETERS.min_range)
+        self._subproblems, self._targets, self._seed = subproblems, targets, seed
+        self._limits = subproblems.limits(targets)
+
+    @cached_property
+    def _refinement(self) -> LocalRefinement:
+        return LocalRefinement(self._subproblems, self._targets)
+
+    def select_solved(
+        self, q: Array, target_index: NDArray[np.intp]
+    ) -> tuple[Array, NDArray[np.intp]]:
+        """Select the configurations that meet their targets."""
+        if not len(q):
+            return q, target_index
+        targets = self._targets.rows(target_index)
+        solved = self._subproblems.solved(targets, q, targets.enforce_limits)
+        return q[solved], target_index[solved]
+
+    def step_contacts(
+        self, q: Array, rows: NDArray[np.intp], number: int
+    ) -> tuple[Array, NDArray[np.intp]]:
+        """Displace the contacts of solutions at random within their tolerances, and fit to them.
+
+        Args:
+            q: (k, n) solutions.
+            rows: (k,) indices of their targets.
+            number: Index into `contact_steps`.
+        """
+        samples, size = self.samples, COLLISION_FREE_PARAMETERS.contact_steps[number]
+        target_index, starts = np.repeat(rows, samples), np.repeat(q, samples, axis=0)
+        targets, contacts = self._targets.rows(target_index), self.robot.contacts(starts)
+        random, displaced = np.random.default_rng([self._seed, number]), []
+        target_contacts = (
+            (targets.points, targets.position_tolerance),
+            (targets.normals, targets.angle_tolerance),
+        )
+        for actual, (target, tolerance) in zip(contacts, target_contacts, strict=True):
+            steps = np.tile(random.standard_normal((samples, *actual.shape[1:])), (len(rows), 1, 1))
+            offset = (actual - target) / tolerance[:, None] + size * steps
+            offset /= np.maximum(1.0, np.linalg.norm(offset, axis=2, keepdims=True))
+            displaced.append(target + offset * tolerance[:, None])
+        points = displaced[0]
+        normals = displaced[1] / np.linalg.norm(displaced[1], axis=2, keepdims=True)
+        factor = COLLISION_FREE_PARAMETERS.contact_tolerance
+        tolerances = tuple(
+            Tolerance(factor * tolerance.position, factor * tolerance.angle)
+            for tolerance in targets.tolerances
+        )
+        shifted = replace(targets, points=points, normals=normals, tolerance=tolerances)
+        configurations = LocalRefinement(self._subproblems, shifted).run(
+            np.arange(len(target_index)), starts
+        )
+        return self.select_solved(configurations, target_index)
+
+    def step_motors(
+        self, q: Array, rows: NDArray[np.intp], motors: list[int] | slice, number: int, size: float
+    ) -> tuple[Array, NDArray[np.intp]]:
+        """Displace motors of solutions at random, and fit to the contacts.
+
+        Args:
+            q: (k, n) solutions.
+            rows: (k,) indices of their targets.
+            motors: Motors that are displaced.
+            number: Number of the step, which selects its random directions.
+            size: Standard deviation [fraction of the motors' ranges].
+        """
+        target_index = np.repeat(rows, self.samples)
+        ranges = self.ranges[motors]
+        random = np.random.default_rng([self._seed, number])
+        steps = random.standard_normal((self.samples, len(ranges)))
+        starts = np.repeat(q, self.samples, axis=0)
+        starts[:, motors] += size * ranges * np.tile(steps, (len(rows), 1))
+        configurations = self._refinement.run(
+            target_index, self._limits.select_rows(target_index).clip(starts)
+        )
+        return self.select_solved(configurations, target_index)
+
+    def step_trunk_and_arms(
+        self,
+        q: Array,
+        target_index: NDArray[np.intp],
+        rank: NDArray[np.intp],
+        number: int,
+        size: float,
+    ) -> tuple[Array, NDArray[np.intp]]:
+        """Displace trunk and arms of a multi-arm robot at random; the palms stay in place.
+
+        Args:
+            q: (m, n) solutions.
+            target_index: (m,) indices of their targets.
+            rank: (m,) rank of each solution among those of its target.
+            number: Number of the step, which selects its random directions.
+            size: Standard deviation [fraction of the motors' ranges].
+        """
+        moving = np.setdiff1d(np.arange(len(self.ranges)), self.robot.description.hand_actuators)
+        rows = np.repeat(np.arange(len(q)), self.samples)
+        q, target_index = q[rows], target_index[rows]
+        starts, random = q.copy(), np.random.default_rng([self._seed, number])
+        steps = random.standard_normal(
+            (COLLISION_FREE_PARAMETERS.pool_size, self.samples, len(moving))
+        )
+        starts[:, moving] += size * self.ranges[moving] * steps[rank].reshape(-1, len(moving))
+        starts = self._limits.select_rows(target_index).clip(starts)
+        palms = side_palms(self.robot, q)
+        configurations = carry_palms(
+            self._subproblems, self._targets, starts, palms, target_index, False
+        )
+        return self.select_solved(configurations, target_index)
+
+    def sample_arms(self, q: Array, rows: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
+        """Solve targets from random arms; every second start has the hand posture of q.
+
+        Args:
+            q: (k, n) configurations of all targets.
+            rows: Indices of the targets that are solved.
+        """
+        count = COLLISION_FREE_PARAMETERS.random_arms
+        hand = list(self.robot.description.hand_actuators)
+        target_index = np.repeat(rows, count)
+        numbers = np.array([self._targets.row_number(int(row)) for row in rows])
+        starts = np.concatenate(_shifted_samples(self.robot, self._seed, numbers, count))
+        starts[::2, hand] = q[target_index[::2]][:, hand]
+        starts = self._limits.select_rows(target_index).clip(starts)
+        return self.select_solved(self._refinement.run(target_index, starts), target_index)
+
+
+def _shifted_samples(robot: ArmHand, seed: int, numbers: NDArray[np.intp], count: int) -> Array:
+    """Sample configurations within the limits for each target, independently of its batch.
+
+    All targets use the same random samples, shifted cyclically by the number of the target.
+
+    Args:
+        robot: The robot.
+        seed: Seed of the samples.
+        numbers: (k,) numbers of the targets.
+        count: Number of samples per target.
+
+    Returns:
+        (k, count, n) configurations.
+    """
+    samples = np.random.default_rng(seed).random((count, len(robot.lower)))
+    shift = numbers[:, None] * spread_steps(len(robot.lower))
+    fraction = (samples + shift[:, None]) % 1.0
+    return robot.lower + fraction * (robot.upper - robot.lower)
