@@ -130,7 +130,9 @@ class SceneSources:
             if family is None:
                 return []
             limits = self.robot.lower[list(columns)], self.robot.upper[list(columns)]
-            arms.append(ClosedArm(family, columns, *limits, RedundancySamples.of(family, *limits)))
+            arms.append(
+                ClosedArm(family, columns, *limits, RedundancySamples.for_family(family, *limits))
+            )
         return arms
 
     @property

@@ -441,7 +441,13 @@ class MovingSolver:
             return [], f"q of the chosen grasp is not a solution (error {error}, or limits)"
         engine = self._engine.engine_for(problem)
         alternatives = engine.finder.find(
-            problem, start, seed, limit, "q0", apart=0.05, query=engine.collision_query(problem)
+            problem,
+            start,
+            seed,
+            limit,
+            "q0",
+            separation=0.05,
+            query=engine.collision_query(problem),
         )
         # A solve searches longer for a collision-free solution than the list of alternatives.
         best = engine.solve(replace(problem, prefer="q0"), SolveOptions(start, seed))

@@ -257,7 +257,13 @@ class Path:
         if is_solved:
             yield run.q[0]
         alternatives = engine.finder.find(
-            first, q0, self.seed, TRACK_TUNING.starts, prefer, apart=0, query=self._query_at(row)
+            first,
+            q0,
+            self.seed,
+            TRACK_TUNING.starts,
+            prefer,
+            separation=0,
+            query=self._query_at(row),
         )
         yield from (alternative.q for alternative in alternatives)
         if not (alternatives or is_solved):

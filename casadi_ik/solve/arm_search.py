@@ -1,7 +1,7 @@
-"""Batched search for the preferred collision-free arms at given palm poses.
+"""Batched search for the preferred collision-free arms at palm poses.
 
-All branches at sampled values of the redundancy are sorted by the preference and checked until one
-is collision-free; see compile/runtime/arm_search.c.
+All branches at sampled values of the redundancy parameters are sorted by the preference and checked
+until an arm is collision-free; see compile/runtime/arm_search.c.
 """
 
 from __future__ import annotations
@@ -32,13 +32,14 @@ from casadi_ik.solve.request import CLEARANCE
 SYMBOL = "casadi_ik_arm_search"
 
 FULL_TURN = 2 * np.pi
+"""Full revolution [rad]."""
 
 Preference: TypeAlias = str | Callable[[Array], Array]
-"""One of `PREFERENCES`, or a function from configurations (m, n) to scores (m,)."""
+"""Name in `PREFERENCES`, or a function from configurations (m, n) to scores (m,)."""
 
 
 class ArmOrder(IntEnum):
-    """The order of arms, with the values of compile/runtime/arm_search.c."""
+    """Order of arms, with the values of compile/runtime/arm_search.c."""
 
     LIMITS = 0
     NEAREST = 1
@@ -56,14 +57,14 @@ ARM_ORDERS = {
 
 @dataclass(frozen=True)
 class FreeArmParameters:
-    """Sampling of the redundancy in the search for collision-free arms.
+    """Sampling of the redundancy parameters in the search for collision-free arms.
 
     Attributes:
         samples: Number of values of the last redundancy parameter.
-        locked_samples: Number of angles of each locked joint: if locked joints are the whole
-            redundancy, and otherwise.
-        local_samples: Number of values around the best one in the refinement.
-        chunk_size: Number of hands per call, between which Python handles its signals.
+        locked_samples: Number of angles of each locked joint: without other redundancy parameters,
+            and with them.
+        local_samples: Number of values around the best value in the refinement.
+        chunk_size: Number of hands per call of the driver; Python handles signals between calls.
     """
 
     samples: int = 12
@@ -77,11 +78,11 @@ FREE_ARM_PARAMETERS = FreeArmParameters()
 
 @dataclass(frozen=True, eq=False)
 class RedundancySamples:
-    """The values of the redundancy at which the arms of a robot are computed.
+    """Values of the redundancy parameters at which the arms of a robot are computed.
 
     Attributes:
-        levels: (s, r) values that are tried first, and further ones for hands without a
-            collision-free arm among the first. A refinement varies the last of the r parameters.
+        levels: (s, r) values that are tried first, and (s, r) values for hands without a
+            collision-free arm at those. A refinement varies the last of the r parameters.
         offsets: (c,) offsets of that parameter in the refinement.
     """
 
@@ -89,8 +90,8 @@ class RedundancySamples:
     offsets: Array
 
     @classmethod
-    def of(cls, family: ArmFamily, lower: Array, upper: Array) -> RedundancySamples:
-        """Return a grid over the bounds (a,) of an arm, and values between its points."""
+    def for_family(cls, family: ArmFamily, lower: Array, upper: Array) -> RedundancySamples:
+        """Return a grid between the bounds (a,) of an arm, and values between its points."""
         locked, size = len(family.locked), len(family.redundancy)
         if not size:
             return cls((np.zeros((1, 1)), np.zeros((0, 1))), np.zeros(0))
@@ -101,15 +102,17 @@ class RedundancySamples:
         low, high = (np.array([float(bound[i]) for bound in bounds]) for i in (0, 1))
         axes = np.meshgrid(*((np.arange(c) + 0.5) / c for c in counts), indexing="ij")
         grid = np.stack([axis.ravel() for axis in axes], axis=1)
-        between = spread_points(2 * len(grid), size) if locked else grid + 0.5 / parameters.samples
-        levels = low + (high - low) * grid, low + (high - low) * between
+        further_samples = (
+            spread_points(2 * len(grid), size) if locked else grid + 0.5 / parameters.samples
+        )
+        levels = low + (high - low) * grid, low + (high - low) * further_samples
         step = (high[-1] - low[-1]) / counts[-1]
         return cls(levels, step * np.linspace(-1, 1, parameters.local_samples + 2)[1:-1])
 
 
 @dataclass(frozen=True, eq=False)
 class ArmCandidates:
-    """The arms of k hands.
+    """Arms of k hands.
 
     Attributes:
         q: (m, n) configurations within the bounds.
@@ -126,7 +129,7 @@ ArmSearchJob = c_struct("arm_search_job", {"LEVELS": 2}, "arm_search")
 
 
 class ArmSearch:
-    """The search for the arms of one robot; threads may share it."""
+    """Search for the arms of one robot; threads may share it."""
 
     def __init__(
         self,
@@ -144,21 +147,23 @@ class ArmSearch:
             family: Family of the arm.
             scores: Function from configurations (m, n), initial configurations (m, n) and a
                 preference to scores (m,) of arms of the same hand; higher is better.
-            manipulability: Returns the manipulability of the arm as a function of q.
+            manipulability: Function that returns the kernel of the manipulability of the arm.
             compiled: Use compiled kernels; False: the virtual machine and numpy.
             side: Number of the side of a multi-arm robot whose arm is searched at a fixed trunk;
                 None: the arm of a robot with one arm.
         """
         self._robot, self._family = robot, family
         self.scores, self._manipulability = scores, manipulability
-        body, self._side = robot.description, side
-        arm = body.arm_actuators if side is None else body.side_actuators[side][0]
+        description, self._side = robot.description, side
+        arm = description.arm_actuators
+        if side is not None:
+            arm, _ = description.side_actuators[side]
+            description = description.side(description.sides[side].name)
         self._columns = np.array(arm, dtype=np.int64)
         lower, upper = robot.lower[self._columns], robot.upper[self._columns]
         self._low, self._range = doubles(lower), doubles(upper - lower)
-        # From the limits themselves, as in exports: low + range may differ from high by rounding.
-        self.samples = RedundancySamples.of(family, lower, upper)
-        description = body if side is None else body.side(body.sides[side].name)
+        # As in exported code: low + range may differ from high by rounding.
+        self.samples = RedundancySamples.for_family(family, lower, upper)
         name = ca.Function.fix_name(f"{description.name}_all_arms")
         arms = arms_graph(family, name, recipe(name, description))
         self._arms = FunctionKernel(arms, compiled, in_lanes=True)
@@ -168,7 +173,7 @@ class ArmSearch:
 
     @property
     def is_exact(self) -> bool:
-        """True if the closed form carries the palm exactly."""
+        """True if the closed form meets the palm pose exactly."""
         return self._family.is_exact
 
     def _load(self) -> Any:
@@ -196,20 +201,19 @@ class ArmSearch:
             starts: (k, n) initial configurations.
             bounds: (n,) and (n,) lower and upper bounds.
             prefer: Preference among arms.
-            query: Pairs whose distances this arm decides and that must not collide; None: nothing
-                is checked.
-            surplus: (k,) clearance of the hand alone beyond the margin [m], which bounds that of
-                every arm.
-            all_branches: Return the preferred arm of every branch, and the given arm, instead of
-                a single arm.
+            query: Pairs whose distances this arm changes and that must not collide; None: no check.
+            surplus: (k,) clearance of the hand alone beyond the margin [m]; an upper bound of the
+                clearance with any arm.
+            all_branches: Return the preferred arm of every branch, and the arm in q, instead of one
+                arm.
             refine: Sample the redundancy more finely around the best arm.
-            target_index: (k,) index of the target of each hand, with the hands of a target next
-                to each other: hands after the first one with an arm are skipped. None: no hand is
+            target_index: (k,) index of the target of each hand, in contiguous groups: after the
+                first hand with an arm the other hands of its target are skipped. None: no hand is
                 skipped.
 
         Returns:
-            The arms; with the preference "clearance" those with the largest clearance, which may
-            be in collision.
+            The arms. With the preference "clearance" they have the largest clearance, and may be in
+            collision.
         """
         if not len(q):
             return ArmCandidates(q, np.zeros(0, np.intp), np.zeros(0, np.int64))
@@ -222,11 +226,13 @@ class ArmSearch:
         entries += [measure.address] if problem.order is ArmOrder.MEASURED else []
         if any(entry is None for entry in entries):
             return self._choose_numpy(problem, groups, target_index)
-        arms, score, tried = self._choose_compiled(problem, measure, groups, refine, target_index)
+        arms, score, arms_tried = self._choose_compiled(
+            problem, measure, groups, refine, target_index
+        )
         hand_index, group = np.nonzero(score > -np.inf)
-        chosen = q[hand_index]
-        chosen[:, self._columns] = arms[hand_index, group]
-        return ArmCandidates(chosen, hand_index, tried)
+        configurations = q[hand_index]
+        configurations[:, self._columns] = arms[hand_index, group]
+        return ArmCandidates(configurations, hand_index, arms_tried)
 
     def _palm(self, q: Array) -> Array:
         """Return the (k, 4, 4) palm poses in the base frame of the arm."""
@@ -245,14 +251,14 @@ class ArmSearch:
         refine: bool,
         target_index: NDArray[np.intp] | None,
     ) -> tuple[Array, Array, NDArray[np.int64]]:
-        """Run the driver.
+        """Run the compiled driver.
 
         Returns:
             (k, g, a) arms, (k, g) their scores or -inf for no arm, (k,) number of arms tried.
         """
         count, n_arm = len(problem.q), len(self._columns)
-        chosen, score = np.zeros((count, groups, n_arm)), np.empty((count, groups))
-        tried = np.zeros(count, dtype=np.int64)
+        best_arms, score = np.zeros((count, groups, n_arm)), np.empty((count, groups))
+        arms_tried = np.zeros(count, dtype=np.int64)
         inputs = (problem.q, problem.palms, problem.starts, *problem.bounds, problem.surplus)
         q, palms, starts, lower, upper, surplus = map(doubles, inputs)
         owner = None
@@ -284,9 +290,9 @@ class ArmSearch:
                 owner=None if owner is None else owner[rows].ctypes.data,
                 min_limit_margin=ARM_SEARCH.tolerance,
                 count=rows.stop - rows.start,
-                chosen=memory(chosen[rows]),
+                chosen=memory(best_arms[rows]),
                 score=memory(score[rows]),
-                tried=memory(tried[rows]),
+                tried=memory(arms_tried[rows]),
             )
             query, buffers = problem.query, None
             if query is not None and len(query.table.pairs):
@@ -299,52 +305,52 @@ class ArmSearch:
                 job.margin, job.rounding = query.margin, ROUNDING
                 job.clearance_bounds = surplus[rows].ctypes.data
             code = self._run(ctypes.byref(job))
-            del buffers  # The driver has used their memory until now.
+            del buffers  # The driver reads their memory.
             measure.reraise()
             if code != DriverCode.DONE:
                 check("arm_search", code)
-        return chosen, score, tried
+        return best_arms, score, arms_tried
 
     def _choose_numpy(
         self, problem: _ArmProblem, groups: int, target_index: NDArray[np.intp] | None
     ) -> ArmCandidates:
-        """Search in numpy, without refinement, where a kernel is not compiled."""
+        """Search in numpy, without refinement; for kernels that are not compiled."""
         samples = np.concatenate(self.samples.levels)
-        parts, hand_index, tried = [], [], np.zeros(len(problem.q), dtype=np.int64)
+        results, hand_index, arms_tried = [], [], np.zeros(len(problem.q), dtype=np.int64)
         solved_targets: set[int] = set()
         for hand, configuration in enumerate(problem.q):
             if target_index is not None and int(target_index[hand]) in solved_targets:
                 continue
             q, group = self._arms_within_bounds(problem, hand, configuration, samples)
-            tried[hand] = len(q)
+            arms_tried[hand] = len(q)
             score = problem.scores(self, q, np.full(len(q), hand))
-            # Of the arms with the highest score of each group take the first.
+            # Select the first of the arms with the highest score of each group.
             order = np.lexsort((-np.arange(len(q)), score, group * (groups > 1)))
             group = (group * (groups > 1))[order]
             last = order[np.append(group[1:] != group[:-1], True)] if len(q) else order
-            chosen = q[last[score[last] > -np.inf]]
-            if len(chosen) and target_index is not None:
+            best_q = q[last[score[last] > -np.inf]]
+            if len(best_q) and target_index is not None:
                 solved_targets.add(int(target_index[hand]))
-            parts.append(chosen)
-            hand_index.append(np.full(len(chosen), hand))
-        return ArmCandidates(np.concatenate(parts), np.concatenate(hand_index), tried)
+            results.append(best_q)
+            hand_index.append(np.full(len(best_q), hand))
+        return ArmCandidates(np.concatenate(results), np.concatenate(hand_index), arms_tried)
 
     def _arms_within_bounds(
         self, problem: _ArmProblem, hand: int, configuration: Array, samples: Array
     ) -> tuple[Array, NDArray[np.intp]]:
         """Return all arms (m, n) of a hand within the bounds, and their branches (m,).
 
-        The arm of the given configuration comes last, as a branch of its own.
+        The arm of the configuration is the last row, with a branch number after all others.
         """
-        rows, n = self._family.rows, len(self._columns)
+        n_rows, n = self._family.rows, len(self._columns)
         palm, (lower, upper) = problem.palms[hand], problem.bounds
         pose = np.tile(np.append(palm[:3, :3], palm[:3, 3]), (len(samples), 1))
         (outputs,) = self._arms(np.hstack([pose, samples]))
-        reaches = np.append(outputs[:, rows * n :].ravel() >= 0, True)
+        reaches = np.append(outputs[:, n_rows * n :].ravel() >= 0, True)
         arms = np.concatenate(
-            [outputs[:, : rows * n].reshape(-1, n), configuration[None, self._columns]]
+            [outputs[:, : n_rows * n].reshape(-1, n), configuration[None, self._columns]]
         )
-        # A joint with equal bounds is fixed, possibly in another turn.
+        # A joint with equal bounds is fixed, possibly in another revolution.
         at_bound = arms + FULL_TURN * np.floor((lower - arms) / FULL_TURN + 0.5)
         arms = np.where(lower < upper, arms, at_bound)
         if problem.prefer == "q0":
@@ -352,10 +358,10 @@ class ArmSearch:
             nearest = arms + FULL_TURN * np.floor((start - arms) / FULL_TURN + 0.5)
             arms = np.where((nearest >= lower) & (nearest <= upper), nearest, arms)
         margin = np.minimum(arms - lower, upper - arms).min(axis=1)
-        inside = np.flatnonzero(reaches & (margin >= ARM_SEARCH.tolerance))
-        q = np.tile(configuration, (len(inside), 1))
-        q[:, self._columns] = np.clip(arms[inside], lower, upper)
-        return q, np.append(np.tile(np.arange(rows), len(samples)), rows)[inside]
+        rows_within_bounds = np.flatnonzero(reaches & (margin >= ARM_SEARCH.tolerance))
+        q = np.tile(configuration, (len(rows_within_bounds), 1))
+        q[:, self._columns] = np.clip(arms[rows_within_bounds], lower, upper)
+        return q, np.append(np.tile(np.arange(n_rows), len(samples)), n_rows)[rows_within_bounds]
 
 
 @dataclass(frozen=True, eq=False)
@@ -372,7 +378,7 @@ class _ArmProblem:
 
     @property
     def order(self) -> ArmOrder:
-        """The order of arms in the driver."""
+        """Order of arms in the driver."""
         return ArmOrder.MEASURED if callable(self.prefer) else ARM_ORDERS[self.prefer]
 
     def scores(self, search: ArmSearch, q: Array, hand: NDArray[np.intp]) -> Array:
@@ -388,7 +394,7 @@ class _ArmProblem:
 
 
 class _Measure:
-    """A score of q that the driver calls like a compiled map of many rows."""
+    """Score of q that the driver calls like a compiled map of many rows."""
 
     def __init__(self, search: ArmSearch, prefer: Preference) -> None:
         self.address: int | None = None
@@ -402,7 +408,7 @@ class _Measure:
             self.address = None if kernel.entry is None else _address(kernel.entry)
 
     def reraise(self) -> None:
-        """Raise the exception of a user-defined preference, if there was one."""
+        """Raise the exception of the user-defined preference, if it raised one."""
         if self._error is not None:
             raise self._error
 
@@ -423,7 +429,7 @@ class _Measure:
 
 
 def _slices(count: int, owner: NDArray[np.int64] | None) -> Iterator[slice]:
-    """Yield the hands of each call; hands with the same owner stay together."""
+    """Yield the hands of each call; hands with the same owner are not separated."""
     first = 0
     while first < count:
         last = min(first + FREE_ARM_PARAMETERS.chunk_size, count)

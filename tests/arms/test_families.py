@@ -25,7 +25,7 @@ from casadi_ik.kinematics.arms.offset_wrist import OffsetWristArm
 from casadi_ik.kinematics.arms.recognise import arm_family, describe_arm, family_of, srs_arm
 from casadi_ik.kinematics.arms.screws import Screws, arm_screws
 from casadi_ik.kinematics.forward import Pose
-from casadi_ik.solve.alternatives import ArmBranches
+from casadi_ik.solve.arm_branches import ArmBranches
 
 KINDS = {
     "kuka_lwr4": "spherical shoulder and wrist",
