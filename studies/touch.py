@@ -270,7 +270,7 @@ def causes(results: list[tuple[Cell, dict[str, Any]]]) -> Iterator[list[str]]:
     causes, of = Counter[tuple[str, str]](), dict[tuple[str, str], set[str]]()
     for cell, result in results:
         if not result["count"]:
-            key = cell.robot, result["reason"].rpartition("none came to: ")[2]
+            key = cell.robot, result["reason"].rpartition("no candidate passed: ")[2]
             causes[key] += 1
             of.setdefault(key, set()).add(Path(cell.object).stem)
     for (robot, cause), number in sorted(causes.items()):
@@ -309,7 +309,9 @@ def main(arguments: list[str] | None = None) -> None:
         parts.append(f"Of {len(all_cells):,} objects at poses {len(done):,} are done so far.")
     reasons = list(causes(done))
     if reasons:
-        table = markdown_table(["robot", "none came to", "times", "objects"], reasons)
+        table = markdown_table(
+            ["robot", "stage that no candidate passed", "times", "objects"], reasons
+        )
         parts += ["## None found", table]
     parts += ["## Discussion", DISCUSSION] if metrics else []
     run_command = command(__file__, arguments)

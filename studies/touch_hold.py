@@ -40,8 +40,8 @@ from runner.study import robot_of, standing
 
 import casadi_ik as ik
 from casadi_ik.collision.solids import object_solids
-from casadi_ik.planning.touch.grasps import FoundGrasp
-from casadi_ik.planning.touch.strength import offsets
+from casadi_ik.planning.touch.found_grasps import FoundGrasp
+from casadi_ik.planning.touch.robustness import random_displacements
 
 mujoco: Any = import_module("mujoco")
 
@@ -182,7 +182,9 @@ def try_grasps(
     grasps = solver.grasps_of(surface, standing(surface, 0.7), limit=limit, among=limit, seed=seed)
     best_grasps = replace(grasps, entries=grasps[: options.best])
     shares = best_grasps.robustness(hold=(MASS, SQUEEZE), seed=seed)
-    displacements = offsets(5e-3, np.deg2rad(3.0), options.samples, seed + 1, surface.middle)
+    displacements = random_displacements(
+        5e-3, np.deg2rad(3.0), options.samples, seed + 1, surface.middle
+    )
     six = np.concatenate([np.eye(3), -np.eye(3)])
     for place, trial in enumerate(grasps):
         best, any_ = place < options.best, place % options.every == 0

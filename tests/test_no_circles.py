@@ -34,18 +34,9 @@ def imported_modules(path: Path, modules: set[str]) -> set[str]:
     return imports(ast.parse(path.read_text(encoding="utf-8"))) & modules - {module_name(path)}
 
 
-ALLOWED = {
-    "casadi_ik.planning.touch.hand_table": "casadi_ik.planning.touch.candidates",
-    "casadi_ik.planning.touch.strength": "casadi_ik.planning.touch.grasps",
-}
-"""Imports of a type only, which are still to be removed."""
-
-
 def test_no_circles():
     paths = {module_name(path): path for path in ROOT.rglob("*.py")}
     graph = {name: imported_modules(path, set(paths)) for name, path in paths.items()}
-    for name, imported in ALLOWED.items():
-        graph[name].remove(imported)
     assert "casadi_ik.app.cli.inputs" in graph["casadi_ik.app.cli.batch"]
     try:
         TopologicalSorter(graph).prepare()

@@ -13,7 +13,13 @@ from scipy.optimize import linprog
 import casadi_ik as ik
 from casadi_ik import errors
 from casadi_ik.app.cli.grasp import grasps_npz
-from casadi_ik.planning.touch.strength import DIRECTIONS, GIVE, generators, loads, stiffnesses
+from casadi_ik.planning.touch.strength import (
+    COMPLIANCE,
+    DIRECTIONS,
+    friction_wrenches,
+    loads,
+    stiffnesses,
+)
 
 PLACE = np.eye(4)
 PLACE[:3, 3] = [0.5, 0.1, 0.055]
@@ -43,12 +49,12 @@ def found(request, surface):
 def test_samples_lie_on_the_surface_and_face_outwards(surface):
     radius = np.linalg.norm(surface.points[:, :2], axis=1)
     rim = np.abs(surface.points[:, 2]) > 0.05 - 1e-9
-    side = surface.inside & ~rim
+    side = surface.fits_pad & ~rim
     assert np.abs(radius[~rim] - 0.033).max() < 5e-5  # flat facets
     outward = (surface.normals[side, :2] * surface.points[side, :2]).sum(axis=1) / radius[side]
     assert outward.min() > 0.995
     near_edge = ~rim & (np.abs(surface.points[:, 2]) > 0.048)
-    assert not surface.inside[near_edge].any()
+    assert not surface.fits_pad[near_edge].any()
 
 
 def test_every_grasp_is_confirmed_in_the_scene(found):
@@ -193,7 +199,7 @@ def test_loads_of_any_contacts_are_those_of_linear_programs(points, normals, off
         facing = rng.normal(size=at.shape) if normals is None else normals
         facing = -at + 0.01 * rng.normal(size=at.shape) if isinstance(facing, str) else facing
         facing = facing / np.linalg.norm(facing, axis=-1, keepdims=True)
-        wrenches = generators(at, facing, 0.5, np.zeros(3), 0.05)
+        wrenches = friction_wrenches(at, facing, 0.5, np.zeros(3), 0.05)
         found = loads(wrenches)
         for own, row in zip(wrenches, found, strict=True):
             cost, most = np.append(np.zeros(own.shape[1]), -1.0), np.ones((1, own.shape[1] + 1))
@@ -213,13 +219,15 @@ def test_squeezed_between_two_balls_an_object_turns_the_easier_the_harder_it_is_
     k, half, force = 400.0, 0.04, 6.0
     normals = np.array([[[1.0, 0, 0], [-1.0, 0, 0]]])
     jacobians = np.eye(6).reshape(1, 2, 3, 6)
-    rolled = radius or GIVE.flat
+    rolled = radius or COMPLIANCE.plane_radius
     turning = 2 * k * half**2 - 2 * force * (half - rolled)
     found = stiffnesses(
         -half * normals, normals, force * normals, np.full((1, 2), radius), jacobians,
         np.full(6, k), mu=10.0,
     )  # fmt: skip
-    assert found[0] == pytest.approx(turning * (GIVE.turned / GIVE.far) ** 2, rel=0.03)
+    assert found[0] == pytest.approx(
+        turning * (COMPLIANCE.halving_rotation / COMPLIANCE.halving_displacement) ** 2, rel=0.03
+    )
     assert stiffnesses(
         -half * normals, normals, 10 * force * normals, np.full((1, 2), radius), jacobians,
         np.full(6, k), mu=10.0,
@@ -469,18 +477,18 @@ def test_a_mesh_that_is_inside_out_is_turned_and_said(tmp_path, surface):
     mesh.invert()
     turned = surface_of(tmp_path, mesh)
     assert ((turned.faces * turned.points).sum(axis=1) > 0).all()
-    assert turned.notes == ("the mesh was inside out: its triangles are turned",)
+    assert len(turned.notes) == 1
     assert not surface.notes
     found = solver_of("panda+panda_hand").grasps_of(turned, PLACE, limit=3, among=3)
     assert len(found) == 3
-    assert "inside out" in str(found)
+    assert turned.notes[0] in str(found)
 
 
 def test_an_open_mesh_serves_and_is_said(tmp_path):
     mesh = trimesh.creation.cylinder(0.033, 0.1, sections=128)
     mesh.update_faces(mesh.triangles_center[:, 2] < 0.049)
     opened = surface_of(tmp_path, mesh)
-    assert opened.notes == ("the mesh is open: 128 edges have one triangle only",)
+    assert [note for note in opened.notes if "128" in note] == list(opened.notes) != []
     assert len(solver_of("panda+panda_hand").grasps_of(opened, PLACE, limit=3, among=3)) == 3
 
 
@@ -489,7 +497,7 @@ def test_triangles_that_face_opposite_ways_are_refused(tmp_path):
     faces = np.array(mesh.faces)
     faces[::2] = faces[::2, ::-1]
     mixed = trimesh.Trimesh(mesh.vertices, faces, process=False)
-    with pytest.raises(errors.InputError, match=r"face opposite ways at .* expected outward"):
+    with pytest.raises(errors.InputError, match=r"orientation at .* of .* edges"):
         surface_of(tmp_path, mixed)
 
 
@@ -520,7 +528,7 @@ def test_many_triangles_are_sampled(tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=7, radius=0.035)
     assert len(ball.faces) > 300_000
     surface = surface_of(tmp_path, ball)
-    assert surface.inside.all()
+    assert surface.fits_pad.all()
     assert np.abs(np.linalg.norm(surface.points, axis=1) - 0.035).max() < 1e-5
 
 
@@ -553,7 +561,8 @@ def test_what_is_out_of_reach_is_given_up(surface):
     far[0, 3] = 5.0
     found = ik.Solver(ik.load_robot("panda+panda_hand")).grasps_of(surface, far)
     assert not len(found)
-    assert "none came to: arm reaches" in found.reason
+    assert next(stage for stage, count in found.counts.items() if not count) == "arm reaches"
+    assert "arm reaches" in found.reason
     assert found.counts["attempts"] < 100_000
 
 

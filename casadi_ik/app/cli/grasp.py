@@ -29,7 +29,7 @@ from casadi_ik.app.report import fields, files, headline, table
 from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import MissingExtraError
 from casadi_ik.kinematics.arm_hand import ArmHand
-from casadi_ik.planning.touch.grasps import FoundGrasps
+from casadi_ik.planning.touch.found_grasps import FoundGrasps
 from casadi_ik.planning.touch.surface import load_surface
 from casadi_ik.solve.solution import Choice, Ranking
 from casadi_ik.solve.solution_files import RANKED_MEMBER, ranking_data

@@ -18,7 +18,7 @@ from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import InputError
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.grasp import Grasp
-from casadi_ik.planning.touch.grasps import FoundGrasp
+from casadi_ik.planning.touch.found_grasps import FoundGrasp
 from casadi_ik.solve.solution import Alternative
 
 CELL_SIZE = (3.3, 3.4)

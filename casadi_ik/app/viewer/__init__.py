@@ -16,7 +16,7 @@ from casadi_ik.files.reading import read_yaml
 from casadi_ik.kinematics.arm_hand import ArmHand, load_robot
 from casadi_ik.logs.solve import SolveRecord
 from casadi_ik.model.grasp import Grasp
-from casadi_ik.planning.touch.grasps import FoundGrasp
+from casadi_ik.planning.touch.found_grasps import FoundGrasp
 
 with optional_import("the viewer"):
     import viser as _  # noqa: F401

@@ -19,7 +19,7 @@ from casadi_ik.integrations.importing.meshes import IndexedMesh
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.grasp import Grasp
 from casadi_ik.model.pose import inverse
-from casadi_ik.planning.touch.grasps import FoundGrasp
+from casadi_ik.planning.touch.found_grasps import FoundGrasp
 
 INITIAL_COUNT = 20
 """Number of candidates that are shown initially."""

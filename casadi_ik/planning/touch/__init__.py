@@ -1,1 +1,1 @@
-"""From an object's surface to grasps that an arm-hand can make."""
+"""Grasp synthesis: from the surface of an object to grasps that an arm-hand can reach."""

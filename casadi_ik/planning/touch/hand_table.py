@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import casadi as ca
@@ -24,15 +24,12 @@ from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.forward import actuated
 from casadi_ik.kinematics.se3 import skew
 from casadi_ik.model.description import RobotDescription
+from casadi_ik.planning.touch.hands import HandCandidates
 from casadi_ik.planning.touch.library import touch_library
 from casadi_ik.planning.touch.surface import NEIGHBOURS
 
-if TYPE_CHECKING:
-    from casadi_ik.planning.touch.candidates import Candidates
-
-
 BINS = 20
-"""Number of bins of the driver's statistics of collision-free trials."""
+"""Number of bins of the compiled driver's statistics of collision-free trials."""
 
 
 @dataclass(frozen=True)
@@ -40,13 +37,13 @@ class HandTableParameters:
     """Resolution of the table of a hand.
 
     Attributes:
-        postures: Postures of each finger, for each value of the motors that fingers share.
-        shared: Number of values of the motors that fingers share.
+        postures: Number of postures of each finger, for each value of the shared motors.
+        shared: Number of values of the motors that several fingers share.
         facing: Two fingertips oppose each other if both normals are within this angle of the line
-            between them [rad]; for balls the angle is larger by `roll`.
-        roll: Additional lean of a pad that is a ball, compared with a plane [rad].
+            between them [rad]; ball pads may exceed it by `roll`.
+        roll: Additional lean permitted for a ball pad [rad].
         cell: Edge of a cell of distances [m].
-        turn: Edge of a cell of angles [rad].
+        angle_cell: Edge of a cell of angles [rad].
         pairs: Maximum number of pairs.
     """
 
@@ -55,7 +52,7 @@ class HandTableParameters:
     facing: float = float(np.deg2rad(48.0))
     roll: float = float(np.deg2rad(25.0))
     cell: float = 4e-3
-    turn: float = float(np.deg2rad(12.0))
+    angle_cell: float = float(np.deg2rad(12.0))
     pairs: int = 200_000
 
 
@@ -66,19 +63,20 @@ class HandTable:
         robot: The robot.
         motors: Indices in q of the motors that move fingers.
         q: (s, n, m) positions of these motors, for s values of the shared ones.
-        radii: (f,) radii of the pads' balls [m], 0 for planes.
-        roll: (f,) additional lean compared with a plane [rad].
-        points: (s, n, f, 3) centres of balls, contact points of planes, palm frame [m].
-        pairs: (p, 4) pairs of thumb and another finger: shared value, finger, both postures.
-        depths: (p,) distances of the midpoints of their pads from the palm frame [m].
-        shapes: The capsules of these postures; None until `shape`.
+        radii: (f,) radii of ball pads [m], 0 for planes.
+        roll: (f,) additional lean permitted for each pad [rad]; 0 for planes.
+        points: (s, n, f, 3) centres of ball pads, contact points of plane pads, palm frame [m].
+        pairs: (p, 4) opposing pairs of thumb and another finger: index of the shared value,
+            finger, posture of the thumb, posture of the finger.
+        depths: (p,) distances between the midpoints of these pads and the palm frame [m].
+        shapes: Capsules of the postures; None before the first call of `shape`.
         normals: (s, n, f, 3) outward pad normals in the palm frame.
     """
 
     def __init__(
         self, robot: ArmHand, seed: int = 0, parameters: HandTableParameters | None = None
     ) -> None:
-        """Draw the postures (Sobol' points) and sort the pairs by distance and angles."""
+        """Sample the postures (Sobol points) and sort the pairs by distance and angles."""
         self.parameters = parameters = parameters or HandTableParameters()
         description = robot.description
         if len(robot.fingers) < 2:
@@ -96,7 +94,7 @@ class HandTable:
         self.radii = np.array([description.finger(name).radius for name in robot.fingers])
         self.roll = np.where(self.radii > 0, parameters.roll, 0.0)
         self.palm = robot.palm(robot.home)
-        # Where fingers share all motors (a gripper) a posture is a value of these.
+        # A gripper whose fingers share all motors has one posture for each value of these.
         count = 1 if shared.all() else parameters.postures
         values = parameters.postures if shared.all() else parameters.shared if shared.any() else 1
         lower, upper = robot.lower[self.motors], robot.upper[self.motors]
@@ -104,76 +102,84 @@ class HandTable:
         if shared.any():
             common = _sobol(int(shared.sum()), values, seed + 1)
             self.q[:, :, shared] = (lower[shared] + common * (upper - lower)[shared])[:, None]
-        points, normals, _, _ = self.at(self.q.reshape(-1, len(self.motors)))
+        points, normals, _, _ = self.pads(self.q.reshape(-1, len(self.motors)))
         shape = (values, count, len(robot.fingers), 3)
         self.points, self.normals = points.reshape(shape), normals.reshape(shape)
         self._sort_pairs()
 
     @classmethod
-    def of(cls, robot: ArmHand) -> HandTable:
+    def for_robot(cls, robot: ArmHand) -> HandTable:
         """Return the table of a robot, computed once per process."""
         if robot not in _TABLES:
             _TABLES[robot] = cls(robot)
         return _TABLES[robot]
 
-    def put(self, hand: Array, rows: NDArray[np.intp], posture: Array, finger: int) -> None:
-        """Copy the positions of a finger's motors from a posture into hands, in place."""
+    def copy_finger(self, hand: Array, rows: NDArray[np.intp], posture: Array, finger: int) -> None:
+        """Copy the positions of a finger's motors from postures into rows of `hand`, in place."""
         finger_motors = self.of_finger[self.robot.fingers[finger]]
         columns = np.flatnonzero(np.isin(self.motors, finger_motors))
         hand[np.ix_(rows, columns)] = posture[:, columns]
 
-    def opened(self, hands: Candidates, opening: float) -> Candidates:
-        """Return hands with fingertips moved back from the object [m]; negative: into it."""
+    def opened(self, hands: HandCandidates, opening: float) -> HandCandidates:
+        """Return hands whose fingertips are moved away from the object.
+
+        Args:
+            hands: Hands whose fingertips touch the object.
+            opening: Distance from the object [m]; negative: into it.
+        """
         hand = hands.hand
         lower, upper = self.robot.lower[self.motors], self.robot.upper[self.motors]
         for _ in range(4):
-            _, normals, linear, _ = self.at(hand)
-            rows = (linear * hands.used[..., None, None]).reshape(len(hand), -1, len(self.motors))
-            goal = (-0.25 * opening * normals * hands.used[..., None]).reshape(len(hand), -1)
+            _, normals, linear, _ = self.pads(hand)
+            rows = (linear * hands.touches[..., None, None]).reshape(
+                len(hand), -1, len(self.motors)
+            )
+            goal = (-0.25 * opening * normals * hands.touches[..., None]).reshape(len(hand), -1)
             square = rows.swapaxes(1, 2) @ rows + 1e-5 * np.eye(len(self.motors))
             step = np.linalg.solve(square, rows.swapaxes(1, 2) @ goal[..., None])[..., 0]
             hand = np.clip(hand + step, lower, upper)
         return replace(hands, hand=hand)
 
     def squeezed(
-        self, hands: Candidates, contact_offsets: Array, forces: Array, inward: float
+        self, hands: HandCandidates, contact_offsets: Array, forces: Array, penetration: float
     ) -> Array:
-        """Return hands (k, m) whose motors advance in proportion to the torques of forces.
+        """Return postures (k, m) in which motors of equal stiffness exert the forces.
 
-        Motors of equal stiffness that are commanded to these positions exert the forces.
+        The motors advance in proportion to the torques of the forces.
 
         Args:
             hands: Hands whose fingertips touch the object.
-            contact_offsets: (k, f, 3) contact points, from the centres of the pads [m], palm frame.
-            forces: (k, f, 3) forces on the object, palm frame; 0 for fingers that do not touch.
-            inward: Mean advance of the fingertips [m].
+            contact_offsets: (k, f, 3) contact points relative to the pad centres, palm frame [m].
+            forces: (k, f, 3) forces on the object, palm frame; 0 for fingers without contact [N].
+            penetration: Mean advance of the fingertips into the object [m].
         """
-        _, _, linear, angular = self.at(hands.hand)
+        _, _, linear, angular = self.pads(hands.hand)
         linear = linear + np.cross(angular, contact_offsets[..., None], axis=2)
         torque = np.einsum("kfim,kfi->km", linear, forces)
         advance = np.einsum("kfim,km,kfi->k", linear, torque, forces)
         advance /= np.linalg.norm(forces, axis=2).sum(axis=1)
-        step = inward / np.maximum(advance, 1e-9)[:, None] * torque
+        step = penetration / np.maximum(advance, 1e-9)[:, None] * torque
         lower, upper = self.robot.lower[self.motors], self.robot.upper[self.motors]
         return np.clip(hands.hand + step, lower, upper)
 
     def configuration(self, hands: Array) -> Array:
-        """Return configurations (k, n) with hands (k, m), the arm at home."""
+        """Return configurations (k, n) with postures (k, m) and the arm at home."""
         q = np.tile(self.robot.home, (len(hands), 1))
         q[:, self.motors] = hands
         return q
 
-    def at(self, hands: Array) -> tuple[Array, Array, Array, Array]:
-        """Return the pads of hands (k, m) in the palm frame.
+    def pads(self, hands: Array) -> tuple[Array, Array, Array, Array]:
+        """Return the pads of postures (k, m) and their Jacobians, in the palm frame.
 
         Returns:
-            Centres of balls or contact points of planes (k, f, 3) [m], outward normals (k, f, 3),
-            and Jacobians (k, f, 3, m) of these points and of rotations by the fingers' motors.
+            Centres of ball pads or contact points of plane pads (k, f, 3) [m], outward normals
+            (k, f, 3), and Jacobians (k, f, 3, m) of these points and of the rotations with respect
+            to the fingers' motors.
         """
         f, m = len(self.robot.fingers), len(self.motors)
         flat = self.kernel(self.configuration(hands))
-        points, normals = (part.reshape(-1, f, 3) for part in flat[:2])
-        linear, angular = (part.reshape(-1, f, 3, m) for part in flat[2:])
+        points, normals = (values.reshape(-1, f, 3) for values in flat[:2])
+        linear, angular = (values.reshape(-1, f, 3, m) for values in flat[2:])
         return points, normals, linear, angular
 
     def _sort_pairs(self) -> None:
@@ -209,12 +215,12 @@ class HandTable:
         self.depths = np.linalg.norm(middles, axis=1)
 
     def shape(self, check: SceneCheck) -> HandShapes:
-        """Return the capsules of the postures, and remove pairs that collide; done once."""
+        """Return the capsules of the postures; the first call also removes pairs that collide."""
         if self.shapes is None:
-            self.shapes = shapes = HandShapes.of(self, check)
+            self.shapes = shapes = HandShapes.for_table(self, check)
             share, finger, a, b = self.pairs.T
-            word = shapes.apart[share, self.thumb, finger, a, b // 64]
-            is_clear = shapes.alone[share, a, self.thumb] & shapes.alone[share, b, finger]
+            word = shapes.separate[share, self.thumb, finger, a, b // 64]
+            is_clear = shapes.is_clear[share, a, self.thumb] & shapes.is_clear[share, b, finger]
             is_valid = is_clear & ((word >> (b % 64).astype(np.uint64)) & 1).astype(bool)
             self.pairs, self._keys, self.depths = (
                 np.ascontiguousarray(column[is_valid])
@@ -223,10 +229,16 @@ class HandTable:
         return self.shapes
 
     def key(self, length: Array, first: Array, second: Array) -> NDArray[np.int64]:
-        """Return the cells of pairs, from distances [m] and cosines of normals with the line."""
+        """Return the cells of pairs.
+
+        Args:
+            length: Distances between the two points [m].
+            first: Cosines between the first normal and the line through the points.
+            second: Cosines between the second normal and that line.
+        """
         parameters = self.parameters
         angle_cells = [
-            np.minimum(np.arccos(np.clip(c, -1, 1)) / parameters.turn, 99).astype(np.int64)
+            np.minimum(np.arccos(np.clip(c, -1, 1)) / parameters.angle_cell, 99).astype(np.int64)
             for c in (first, second)
         ]
         return (
@@ -251,12 +263,12 @@ class HandShapes:
         lengths: (c + d,) lengths of the segments [m].
         first: (f + 1,) first capsule of each finger.
         pads: (c,) 1 for capsules that may touch the object.
-        alone: (s, n, f) True for fingers that collide neither with themselves nor with the palm.
-        apart: (s, f, f, n, words) bit set of the collision-free postures of the second finger that
-            do not collide with a posture of the first.
+        is_clear: (s, n, f) True for fingers that collide neither with themselves nor with the palm.
+        separate: (s, f, f, n, words) bit set of the collision-free postures of the second finger
+            that do not collide with a posture of the first.
         crossing: (x, 4) pairs of capsules of two fingers that must not collide: finger, capsule,
             finger, capsule.
-        reach: (x,) minimum distances between the segments of these pairs [m].
+        min_distances: (x,) minimum distances between the segments of these pairs [m].
     """
 
     links: tuple[str, ...]
@@ -266,18 +278,18 @@ class HandShapes:
     lengths: Array
     first: NDArray[np.int64]
     pads: NDArray[np.int64]
-    alone: Bools
-    apart: NDArray[np.uint64]
+    is_clear: Bools
+    separate: NDArray[np.uint64]
     crossing: NDArray[np.int64]
-    reach: Array
+    min_distances: Array
 
     @classmethod
-    def of(cls, table: HandTable, check: SceneCheck) -> HandShapes:
-        """Compute the capsules and the postures of two fingers that do not collide.
+    def for_table(cls, table: HandTable, check: SceneCheck) -> HandShapes:
+        """Compute the capsules, and which postures of two fingers do not collide.
 
         Args:
             table: Table of the hand.
-            check: Collision check of the robot; its scene does not matter.
+            check: Collision check of the robot; its scene is not used.
         """
         model, robot = check.model, table.robot
         (s, n, _), f = table.q.shape, len(robot.fingers)
@@ -301,18 +313,19 @@ class HandShapes:
         palm_segments = np.concatenate([start, 2 * half_segment @ rotation], axis=-1)
         links = tuple(model.links[i] for i in numbers)
         first = np.cumsum([0, *map(len, finger_capsules)])
-        within = pair_table(model, Scene(), ())
+        self_pairs = pair_table(model, Scene(), ())
         pads = [
             links[i] in check.finger_bodies[robot.fingers[k]]
             for k in range(f)
             for i in range(first[k], first[k + 1])
         ]
-        # Pairs of a finger with itself or the palm, and of two fingers.
-        fingers = np.array([-1 if k is None else k for k in owner] + [-1] * within.own)
-        pairs, is_relevant = fingers[within.pairs], np.isin(within.pairs[:, 0], numbers)
-        is_relevant &= np.isin(within.pairs[:, 1], numbers) | (within.pairs[:, 1] >= len(owner))
+        fingers = np.array([-1 if k is None else k for k in owner] + [-1] * self_pairs.own)
+        pairs, is_relevant = fingers[self_pairs.pairs], np.isin(self_pairs.pairs[:, 0], numbers)
+        is_relevant &= np.isin(self_pairs.pairs[:, 1], numbers) | (
+            self_pairs.pairs[:, 1] >= len(owner)
+        )
         joins_fingers = is_relevant & (pairs >= 0).all(axis=1) & (pairs[:, 0] != pairs[:, 1])
-        single_finger_pairs = within.select(is_relevant & ~joins_fingers)
+        single_finger_pairs = self_pairs.select(is_relevant & ~joins_fingers)
         clear = check.kernel.all_distances(q, np.zeros((0, 12)), single_finger_pairs) >= 0
         is_clear = np.stack(
             [
@@ -323,7 +336,7 @@ class HandShapes:
         ).reshape(s, n, f)
         position_of = np.zeros(len(fingers), dtype=np.int64)
         position_of[numbers] = range(len(numbers))
-        a, b = within.pairs[joins_fingers].T
+        a, b = self_pairs.pairs[joins_fingers].T
         words = -(-n // 64)
         padded = np.zeros((s, f, 64 * words), dtype=bool)
         padded[..., :n] = is_clear.swapaxes(1, 2)
@@ -341,21 +354,25 @@ class HandShapes:
             np.ascontiguousarray(
                 np.stack([fingers[a], position_of[a], fingers[b], position_of[b]], axis=1)
             ),
-            model.radii[a] + model.radii[b] + within.offsets[joins_fingers],
+            model.radii[a] + model.radii[b] + self_pairs.offsets[joins_fingers],
         )
         run_cancellable("touch", touch_library()["casadi_ik_apart"], TouchJob(**hand_shapes.job))
         return hand_shapes
 
     @property
     def job(self) -> dict[str, Any]:
-        """Fields of the driver's job."""
+        """Fields of a `TouchJob` that describe the hand."""
         s, n, c, _ = self.capsules.shape
-        arrays = ("capsules", "fixed", "lengths", "first", "pads", "apart", "crossing", "reach")
-        return {name: getattr(self, name).ctypes.data for name in arrays} | {
+        arrays = {
+            name: getattr(self, name)
+            for name in ("capsules", "fixed", "lengths", "first", "pads", "crossing")
+        }
+        arrays |= {"apart": self.separate, "reach": self.min_distances}
+        return {name: array.ctypes.data for name, array in arrays.items()} | {
             "shares": s,
             "postures": n,
-            "words": self.apart.shape[-1],
-            "n_fingers": self.apart.shape[1],
+            "words": self.separate.shape[-1],
+            "n_fingers": self.separate.shape[1],
             "n_capsules": c,
             "n_fixed": len(self.fixed),
             "n_crossing": len(self.crossing),
@@ -364,12 +381,12 @@ class HandShapes:
 
 
 def _finger_of(table: HandTable, link: str) -> int | None:
-    """Return the finger whose joints lead to a link, or whose motors move it."""
+    """Return the index of the finger that has or moves a link; None if there is none."""
     robot = table.robot.description
     joints = {joint.name for joint in robot.chain(link)}
-    shared = [len(joints.intersection(finger.joints)) for finger in robot.fingers]
-    if max(shared):
-        return int(np.argmax(shared))
+    n_common = [len(joints.intersection(finger.joints)) for finger in robot.fingers]
+    if max(n_common):
+        return int(np.argmax(n_common))
     motors = robot.links_moved
     moving_fingers = [name for name in robot.finger_names if link in motors(table.of_finger[name])]
     return robot.finger_names.index(moving_fingers[0]) if moving_fingers else None
@@ -383,7 +400,7 @@ _TABLES: WeakKeyDictionary[ArmHand, HandTable] = WeakKeyDictionary()
 
 
 def hand_kernel(robot: RobotDescription) -> FunctionKernel:
-    """Return the kernel of pads and their Jacobians by the fingers' motors, in the palm frame."""
+    """Return the kernel of pads in the palm frame and their Jacobians by the fingers' motors."""
     motors = sorted({i for name in robot.finger_names for i in robot.finger_actuators(name)})
     f, m, n = len(robot.finger_names), len(motors), len(robot.actuators)
     name = ca.Function.fix_name(f"{robot.name}_hand_contacts")
@@ -392,18 +409,18 @@ def hand_kernel(robot: RobotDescription) -> FunctionKernel:
         q = ca.SX.sym("q", n)
         moving = actuated(robot, q)
         palm = moving.kinematics.palm
-        parts: list[list[ca.SX]] = [[], [], [], []]
+        rows: list[list[ca.SX]] = [[], [], [], []]
         for finger in robot.finger_names:
             point, normal = moving.kinematics.contact(finger)
             linear, angular = moving.contact_jacobian(finger, motors)
-            # The centre of a ball is a radius behind the contact point.
-            behind = robot.finger(finger).radius * normal
-            linear = linear + skew(behind) @ angular
-            parts[0].append(palm.inverse_apply(point - behind).T)
-            parts[1].append((palm.rotation.T @ normal).T)
-            parts[2].append(palm.rotation.T @ linear)
-            parts[3].append(palm.rotation.T @ angular)
-        outputs = [ca.densify(ca.vertcat(*part)) for part in parts]
+            # The centre of a ball pad is a radius behind the contact point.
+            offset = robot.finger(finger).radius * normal
+            linear = linear + skew(offset) @ angular
+            rows[0].append(palm.inverse_apply(point - offset).T)
+            rows[1].append((palm.rotation.T @ normal).T)
+            rows[2].append(palm.rotation.T @ linear)
+            rows[3].append(palm.rotation.T @ angular)
+        outputs = [ca.densify(ca.vertcat(*blocks)) for blocks in rows]
         return ca.Function(name, [q], outputs, ["q"], ["points", "normals", "linear", "angular"])
 
     shapes = ((f, 3), (f, 3), (3 * f, m), (3 * f, m))
@@ -413,15 +430,15 @@ def hand_kernel(robot: RobotDescription) -> FunctionKernel:
 
 
 def _sobol(dimensions: int, count: int, seed: int) -> Array:
-    """Return Sobol points (count, dimensions) in [0, 1]."""
+    """Return scrambled Sobol points (count, dimensions) in [0, 1]."""
     power = int(np.ceil(np.log2(max(count, 2))))
     with optional_import("grasp synthesis"):
         qmc: Any = import_module("scipy.stats").qmc
     return qmc.Sobol(dimensions, rng=seed).random_base2(power)[:count]
 
 
-def rigid(rotation: Array, origin: Array) -> Array:
-    """Return poses (k, 4, 4) from rotations and origins."""
+def rigid_transforms(rotation: Array, origin: Array) -> Array:
+    """Return poses (..., 4, 4) from rotations (..., 3, 3) and origins (..., 3)."""
     pose = np.zeros((*origin.shape[:-1], 4, 4))
     pose[..., :3, :3], pose[..., :3, 3], pose[..., 3, 3] = rotation, origin, 1.0
     return pose

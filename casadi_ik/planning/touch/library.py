@@ -16,14 +16,16 @@ def touch_library() -> Any:
     Raises:
         UnsupportedError: There is no C compiler.
     """
-    parts = (
+    sources = (
         WIDE if machine_lanes() else "",
         "typedef double scalar;\ntypedef double real;\n",
         define({"STEP_IN": 0, "STEP_OUT": 0}),
         *(driver_text(name) for name in ("common", "touch_job", "touch", "nearest")),
     )
-    text = "".join(parts)
+    text = "".join(sources)
     library = load_library("touch", lambda: text, "casadi_ik_touch", text)
     if library is None:
-        raise UnsupportedError("grasps_of: found no C compiler, expected one (docs/install.md)")
+        raise UnsupportedError(
+            "grasps_of: a C compiler is missing; expected one on the path (docs/install.md)"
+        )
     return library

@@ -1,4 +1,4 @@
-"""Exact nearest points on a triangle mesh, with the normals of all triangles that meet there."""
+"""Exact nearest points on a triangle mesh, with the mean normals of adjacent triangles."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from casadi_ik.files.arrays import Array
 from casadi_ik.planning.touch.library import touch_library
 
 COINCIDENT = 2.5e-4
-"""Triangles meet at a nearest point if they come within this distance of it [m].
+"""Triangles within this distance of a nearest point count as adjacent to it [m].
 
-The nearest point of a pad and the point stated for its contact are up to 1 mm apart along the
-normal, and may have different nearest triangles if an edge is that near.
+The nearest point of a pad and the point of its contact differ by up to 1 mm along the normal, and
+may have different nearest triangles close to an edge.
 """
 
-LEAF = 4
-"""Triangles in a leaf of the tree (runtime/nearest.c)."""
+LEAF_SIZE = 4
+"""Number of triangles in a leaf of the tree (runtime/nearest.c)."""
 
 MORTON_BITS = 20
-"""Bits of a coordinate in the order along which triangles are grouped."""
+"""Number of bits of a coordinate in the Morton order of the triangles."""
 
 
 @dataclass(frozen=True)
@@ -33,20 +33,20 @@ class NearestPoints:
 
     Attributes:
         point: (..., 3) nearest points [m].
-        normal: (..., 3) unit outward normals: means over the triangles that meet there.
-        spread: (...) largest angle between this normal and those of these triangles [rad].
+        normal: (..., 3) unit outward normals: means over the adjacent triangles.
+        normal_spread: (...) maximum angle between this normal and those of the triangles [rad].
     """
 
     point: Array
     normal: Array
-    spread: Array
+    normal_spread: Array
 
 
 NearestJob = c_struct("nearest_job", driver="nearest")
 
 
 class TriangleTree:
-    """A tree of bounding boxes, for the nearest points on a mesh."""
+    """Tree of bounding boxes for nearest points on a triangle mesh."""
 
     def __init__(self, corners: Array) -> None:
         """Build the tree.
@@ -54,15 +54,15 @@ class TriangleTree:
         Args:
             corners: (t, 3, 3) corners of triangles with an area above 0 [m].
         """
-        corners = np.ascontiguousarray(corners[_along_curve(corners.mean(axis=1))])
-        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normals = across / np.linalg.norm(across, axis=1, keepdims=True)
-        leaves = 1 << max(0, int(np.ceil(np.log2(-(-len(corners) // LEAF)))))
-        # Inverted boxes are empty.
-        boxes = np.tile([np.inf] * 3 + [-np.inf] * 3, (leaves * LEAF, 1))
+        corners = np.ascontiguousarray(corners[_morton_order(corners.mean(axis=1))])
+        area_vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals = area_vectors / np.linalg.norm(area_vectors, axis=1, keepdims=True)
+        leaves = 1 << max(0, int(np.ceil(np.log2(-(-len(corners) // LEAF_SIZE)))))
+        # Boxes with lower corners above their upper corners are empty.
+        boxes = np.tile([np.inf] * 3 + [-np.inf] * 3, (leaves * LEAF_SIZE, 1))
         boxes[: len(corners), :3] = corners.min(axis=1)
         boxes[: len(corners), 3:] = corners.max(axis=1)
-        levels, group = [], LEAF
+        levels, group = [], LEAF_SIZE
         while len(boxes) > 1 or not levels:
             grouped = boxes.reshape(-1, group, 6)
             boxes = np.concatenate(
@@ -105,12 +105,12 @@ class TriangleTree:
         )
         run_cancellable("nearest", touch_library()["casadi_ik_nearest"], job)
         cosine = results["spread"]
-        spread = np.where(cosine > 1 - 1e-12, 0.0, np.arccos(np.clip(cosine, -1, 1)))
-        return NearestPoints(results["feet"], results["ways"], spread)
+        normal_spread = np.where(cosine > 1 - 1e-12, 0.0, np.arccos(np.clip(cosine, -1, 1)))
+        return NearestPoints(results["feet"], results["ways"], normal_spread)
 
 
-def _along_curve(points: Array) -> NDArray[np.intp]:
-    """Return the order of points (k, 3) along a Morton curve: near points are near in the order."""
+def _morton_order(points: Array) -> NDArray[np.intp]:
+    """Return the order of points (k, 3) along a Morton curve, which keeps neighbours close."""
     low, size = points.min(axis=0), max(float(np.ptp(points, axis=0).max()), 1e-300)
     cells = ((points - low) / size * (2**MORTON_BITS - 1)).astype(np.uint64)
     code = np.zeros(len(points), dtype=np.uint64)

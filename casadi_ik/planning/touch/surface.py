@@ -27,16 +27,16 @@ from casadi_ik.planning.touch.nearest import NearestPoints, TriangleTree
 
 @dataclass(frozen=True)
 class SurfaceParameters:
-    """Resolution of a surface (lengths of Drost et al. 2010, scaled to fingertips).
+    """Resolution of a surface. Source: lengths of Drost et al. 2010, scaled to fingertips.
 
     Attributes:
         samples: Maximum number of points on the surface.
-        density: Maximum mean number of them in a cube with edges of `patch`.
-        smoothing: Radius over which normals are averaged [m], about that of a fingertip's pad.
-        patch: Radius within which a surface has no edge around a point inside a face [m].
-        bend: Normals that differ by more than this within `patch` are an edge [rad].
+        density: Maximum mean number of points in a cube with edges of length `patch`.
+        smoothing: Radius over which normals are averaged [m]: about that of a fingertip pad.
+        patch: Radius without an edge around a point where a pad fits [m].
+        bend: Minimum angle between normals within `patch` that indicates an edge [rad].
         step: Edge of a cell of the distance grid [m].
-        around: Distance of the grid's border from the object [m].
+        grid_margin: Distance between the object and the border of the grid [m].
         cells: Maximum number of cells along an edge of the grid; large objects have larger cells.
     """
 
@@ -46,19 +46,19 @@ class SurfaceParameters:
     patch: float = 5e-3
     bend: float = float(np.deg2rad(25.0))
     step: float = 3e-3
-    around: float = 30e-3
+    grid_margin: float = 30e-3
     cells: int = 96
 
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Distances at the centres of cells.
+    """Distances at the centres of the cells of a grid.
 
     Attributes:
         low: (4,) lower corner, and edge of a cell [m].
         counts: (3,) number of cells along each axis.
         value: (cells,) distances [m].
-        sample: (cells,) nearest sample of the surface; empty if it is not known.
+        sample: (cells,) nearest sample of the surface; empty if it was not computed.
     """
 
     low: Array
@@ -67,10 +67,10 @@ class Grid:
     sample: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     @classmethod
-    def of(
+    def from_solids(
         cls, solids: Iterable[tuple[Solid, Array]], low: Array, high: Array, step: float
     ) -> Grid:
-        """Return the grid of the least distance to solids, infinite where there is none.
+        """Return the grid of the minimum distance to solids; infinite if there are no solids.
 
         Args:
             solids: Solids with their poses (4, 4).
@@ -80,32 +80,33 @@ class Grid:
         """
         low, counts, centers = cells(low, high, step)
         value = np.full(len(centers), np.inf)
-        placed = list(solids)
-        # A solid is not the nearest where even the ball about it is farther than another's centre.
+        posed_solids = list(solids)
+        # A solid is not the nearest if its bounding ball is farther away than the centre of
+        # another.
         bound = np.full(len(centers), np.inf)
-        for solid, pose in placed:
+        for solid, pose in posed_solids:
             if np.isfinite(solid.reach) and solid.kind is not Kind.CLOUD:
                 np.minimum(bound, np.linalg.norm(centers - pose[:3, 3], axis=1), out=bound)
-        for solid, pose in placed:
-            near = np.linalg.norm(centers - pose[:3, 3], axis=1) - solid.reach <= bound
-            rows = np.flatnonzero(near)
+        for solid, pose in posed_solids:
+            ball_distance = np.linalg.norm(centers - pose[:3, 3], axis=1) - solid.reach
+            rows = np.flatnonzero(ball_distance <= bound)
             chunk = max(1, MAX_DISTANCES // max(len(solid.planes), 1))
             for start in range(0, len(rows), chunk):
-                some = rows[start : start + chunk]
-                local = (centers[some] - pose[:3, 3]) @ pose[:3, :3]
+                block = rows[start : start + chunk]
+                local = (centers[block] - pose[:3, 3]) @ pose[:3, :3]
                 if solid.kind is Kind.CLOUD:
                     distance = _tree(solid.points).query(local)[0] - solid.size[0]
                 else:
                     distance = solid.distance(local)
-                value[some] = np.minimum(value[some], distance)
+                value[block] = np.minimum(value[block], distance)
         return cls(low, counts, value)
 
 
 MAX_DISTANCES = 4_000_000
-"""Distances of cells from planes that are evaluated together; bounds the memory."""
+"""Maximum number of distances evaluated together, which bounds the memory."""
 
 NEIGHBOURS = 12
-"""Neighbours of each sample, along which the sample nearest to a point is searched."""
+"""Number of neighbours of each sample, for the search of the sample nearest to a point."""
 
 
 def cells(low: Array, high: Array, step: float) -> tuple[Array, NDArray[np.int64], Array]:
@@ -117,7 +118,8 @@ def cells(low: Array, high: Array, step: float) -> tuple[Array, NDArray[np.int64
         step: Edge of a cell [m].
 
     Returns:
-        (4,) lower corner and edge, (3,) numbers along the axes, and (cells, 3) centres [m].
+        (4,) lower corner and edge, (3,) numbers of cells along the axes, and (cells, 3) centres
+        [m].
     """
     counts = np.ceil((high - low) / step).astype(np.int64)
     axes = [low[i] + step * (np.arange(counts[i]) + 0.5) for i in range(3)]
@@ -130,15 +132,15 @@ class Surface(RecordReprMixin):
     """Surface of an object.
 
     Attributes:
-        name: Name of the object, as `load_object` takes it, with its scale.
+        name: Name of the object and its scale, in the format of `load_object`.
         object: The object.
         points: (m, 3) samples [m], object frame.
         normals: (m, 3) unit outward normals, smoothed.
         faces: (m, 3) unit outward normals of the triangles at the samples.
-        inside: (m,) True where a fingertip's pad fits: no edge of the surface is near.
+        fits_pad: (m,) True for samples where a fingertip pad fits: without an edge nearby.
         corners: (t, 3, 3) corners of the triangles [m], outward by the right-hand rule.
         parameters: Resolution.
-        notes: Defects of the mesh, and how they were repaired.
+        notes: Defects of the mesh and their repairs.
 
     Example:
         >>> surface = ik.load_surface("tomato_soup_can")
@@ -152,7 +154,7 @@ class Surface(RecordReprMixin):
     points: Array
     normals: Array
     faces: Array
-    inside: Bools
+    fits_pad: Bools
     corners: Array
     parameters: SurfaceParameters
     notes: tuple[str, ...] = ()
@@ -178,7 +180,7 @@ class Surface(RecordReprMixin):
         return TriangleTree(self.corners)
 
     def nearest(self, points: Array) -> NearestPoints:
-        """Return the exact nearest points to points (..., 3), with the normals there.
+        """Return the exact nearest points to points (..., 3), with their normals.
 
         Raises:
             UnsupportedError: There is no C compiler.
@@ -190,20 +192,29 @@ class Surface(RecordReprMixin):
         """Grid of signed distances and nearest samples around the surface."""
         parameters = self.parameters
         low, high = self.points.min(axis=0), self.points.max(axis=0)
-        extent = float((high - low).max()) + 2 * parameters.around
+        extent = float((high - low).max()) + 2 * parameters.grid_margin
         step = max(parameters.step, extent / parameters.cells)
-        low, counts, centers = cells(low - parameters.around, high + parameters.around, step)
+        low, counts, centers = cells(
+            low - parameters.grid_margin, high + parameters.grid_margin, step
+        )
         height, sample = self.foot(centers)
         distance = np.linalg.norm(centers - self.points[sample], axis=1)
         return Grid(low, counts, np.copysign(distance, height), sample.astype(np.int64))
 
     @cached_property
     def neighbours(self) -> NDArray[np.int64]:
-        """(m, NEIGHBOURS) nearest samples of each sample."""
+        """(m, NEIGHBOURS) indices of the nearest samples of each sample."""
         return self.tree.query(self.points, NEIGHBOURS)[1].astype(np.int64)
 
     def foot(self, points: Array) -> tuple[Array, NDArray[np.intp]]:
-        """Return heights (...) over the nearest samples [m], negative inside, and these (...)."""
+        """Return the heights over the nearest samples, and the indices of these samples.
+
+        Args:
+            points: (..., 3) points [m].
+
+        Returns:
+            (...) heights [m], negative inside the object, and (...) indices.
+        """
         _, sample = self.tree.query(points)
         height = ((points - self.points[sample]) * self.faces[sample]).sum(axis=-1)
         return height, sample
@@ -215,7 +226,7 @@ def _tree(points: Array) -> Any:
 
 
 class TriangleMesh(Protocol):
-    """A mesh with vertices (v, 3) [m] and faces (t, 3), as a trimesh object is."""
+    """Mesh with vertices (v, 3) [m] and faces (t, 3), such as a trimesh object."""
 
     @property
     def vertices(self) -> Any: ...  # noqa: D102
@@ -225,7 +236,7 @@ class TriangleMesh(Protocol):
 
 
 SurfaceSource = str | Path | tuple[ArrayLike, ArrayLike] | TriangleMesh
-"""Source of a surface, see `load_surface`."""
+"""Source of a surface: name, path, vertices and triangles, or mesh object."""
 
 EXPECTED_SOURCE = (
     "expected a name or path, a pair (vertices (v, 3), triangles (t, 3)), or a trimesh object"
@@ -240,23 +251,23 @@ def load_surface(
 ) -> Surface:
     """Sample the surface of an object.
 
-    A mesh that is not a file is stored in the cache of the package, under a name that depends on
-    its contents alone, so that its grasps can be saved and used like others.
+    A mesh from memory is stored in the cache of the package under a name that depends only on its
+    contents, so that its grasps can be saved and loaded like those of a file.
 
     Args:
         name_or_path: Name of a shipped object, path of an object's file or of a mesh in metres
             (STL, OBJ, PLY, ...), a pair of vertices (v, 3) [m] and triangles (t, 3), or an object
-            that has these as `vertices` and `faces`, such as that of trimesh.
+            with attributes `vertices` and `faces`, such as a trimesh object.
         scale: Factor that converts the coordinates of a mesh to metres (0.001 for millimetres).
-        seed: Seed of the samples.
-        parameters: Density of the samples; None: `SurfaceParameters()`.
+        seed: Seed of the random samples.
+        parameters: Resolution; None: `SurfaceParameters()`.
 
     Raises:
         UnknownNameError: No shipped object has that name.
         DescriptionError: The file is missing or malformed.
         InputError: An argument has the wrong type or value, the object with a scale is not a mesh,
-            or the surface is not that of a body: without area, flat, too large or small for a hand,
-            or with triangles that face opposite ways.
+            or the mesh does not bound a solid: without area, flat, too large or small for a hand,
+            or with triangles in inconsistent orientation.
 
     Example:
         >>> surface = ik.load_surface("tomato_soup_can")
@@ -273,12 +284,12 @@ def load_surface(
     seed = checked_integer(seed, "seed", 0)
     smallest = float(np.finfo(float).tiny)
     scale = checked_number(scale, "scale", "a number > 0 (0.001 for millimetres)", smallest)
-    path = name_or_path if isinstance(name_or_path, str | Path) else _stored(name_or_path)
+    path = name_or_path if isinstance(name_or_path, str | Path) else _store_mesh(name_or_path)
     factor = f"{scale:g}" if float(f"{scale:g}") == scale else repr(scale)
     name = str(path) if scale == 1.0 else f"{path}@{factor}"
     loaded = load_object(name)
     vertices, triangles = loaded.mesh(resolution=96)
-    vertices, triangles, notes = _body(name, vertices, triangles)
+    vertices, triangles, notes = _oriented_mesh(name, vertices, triangles)
     notes = (*(loaded.shape.notes if isinstance(loaded.shape, MeshShape) else ()), *notes)
     corners = vertices[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -289,17 +300,17 @@ def load_surface(
     weights = np.stack([1 - u, u * (1 - v), u * v], axis=1)
     points = (corners[face] * weights[..., None]).sum(axis=1)
     faces = normals[face] / area[face, None]
-    # On a small object fewer samples suffice, and their number of neighbours stays bounded.
+    # Fewer samples suffice for a small object, which also bounds the number of neighbours.
     occupied = len(np.unique(np.floor(points / parameters.patch), axis=0))
-    count = min(parameters.samples, max(LEAST_SAMPLES, parameters.density * occupied))
+    count = min(parameters.samples, max(MIN_SAMPLES, parameters.density * occupied))
     points, faces = points[:count], faces[:count]
     return replace(
-        _smoothed(name, loaded, points, faces, corners[area > 0], parameters), notes=notes
+        _smoothed_surface(name, loaded, points, faces, corners[area > 0], parameters), notes=notes
     )
 
 
-def _stored(source: Any) -> Path:
-    """Write a mesh into the cache, unless it has it, and return its path.
+def _store_mesh(source: Any) -> Path:
+    """Write a mesh into the cache if it is new, and return its path.
 
     Raises:
         InputError: The source is not a mesh.
@@ -310,8 +321,9 @@ def _stored(source: Any) -> Path:
         pair = source
     else:
         shape = f" of shape {source.shape}" if isinstance(source, np.ndarray) else ""
-        found = f"{type(source).__name__}{shape}"
-        raise InputError(f"surface: found an object of type {found}, {EXPECTED_SOURCE}")
+        raise InputError(
+            f"surface: found an object of type {type(source).__name__}{shape}, {EXPECTED_SOURCE}"
+        )
     try:
         vertices, triangles = np.asarray(pair[0], dtype=float), np.asarray(pair[1])
     except (TypeError, ValueError) as error:
@@ -328,7 +340,7 @@ def _stored(source: Any) -> Path:
         )
     if not 0 <= triangles.min() <= triangles.max() < len(vertices):
         raise InputError(
-            f"surface: found vertex numbers from {triangles.min()} to {triangles.max()}, "
+            f"surface: found vertex indices from {triangles.min()} to {triangles.max()}, "
             f"expected 0 to {len(vertices) - 1}"
         )
     lines = [f"OFF\n{len(vertices)} {len(triangles)} 0"]
@@ -340,48 +352,48 @@ def _stored(source: Any) -> Path:
     with os_errors(f"{path}: a mesh cannot be stored", InputError):
         if not path.exists():
             folder.mkdir(parents=True, exist_ok=True)
-            with atomic_write(path) as part:
-                part.write_text(text, encoding="ascii")
+            with atomic_write(path) as temporary:
+                temporary.write_text(text, encoding="ascii")
     return path
 
 
-LEAST_SAMPLES = 500
+MIN_SAMPLES = 500
 """Minimum number of samples of a small object."""
 
-SIZES = (5e-3, 2.0)
+SIZE_RANGE = (5e-3, 2.0)
 """Range of the largest edge of the bounding box of an object [m]."""
 
 MIN_THICKNESS = 1e-4
-"""A mesh that is thinner than this is a flat sheet [m]."""
+"""Minimum thickness of a solid; a thinner mesh is a flat sheet [m]."""
 
-DISAGREE = 0.05
-"""Maximum share of edges whose triangles face opposite ways; scans have some."""
+MAX_INCONSISTENT_EDGES = 0.05
+"""Maximum fraction of edges between triangles of inconsistent orientation, as in scans."""
 
 
-def _body(
+def _oriented_mesh(
     name: str, vertices: Array, triangles: NDArray[np.int64]
 ) -> tuple[Array, NDArray[np.int64], tuple[str, ...]]:
-    """Return a mesh whose triangles face outward, and notes on its defects.
+    """Return the mesh with outward triangles, and notes on its defects.
 
     Raises:
-        InputError: The mesh is not that of a body, see `load_surface`.
+        InputError: The mesh does not bound a solid, see `load_surface`.
     """
     corners = vertices[triangles]
     area_vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     if not np.linalg.norm(area_vectors, axis=1).sum() > 0:
-        raise InputError(f"{name}: found a surface without area, expected a mesh of a body")
+        raise InputError(f"{name}: found a surface without area, expected the mesh of a solid")
     largest = np.ptp(vertices, axis=0).max()
-    if not SIZES[0] <= largest <= SIZES[1]:
+    if not SIZE_RANGE[0] <= largest <= SIZE_RANGE[1]:
         raise InputError(
-            f"{name}: found a size of {largest:.3g} m, expected metres, from {SIZES[0]:g} to "
-            f"{SIZES[1]:g} m; scale=0.001 is for millimetres"
+            f"{name}: found a size of {largest:.3g} m, expected metres, from {SIZE_RANGE[0]:g} to "
+            f"{SIZE_RANGE[1]:g} m; scale=0.001 is for millimetres"
         )
     center = vertices.mean(axis=0)
     _, axes = np.linalg.eigh(np.cov((vertices - center).T))
     thickness = np.ptp(vertices @ axes[:, 0])
     if thickness < MIN_THICKNESS:
         raise InputError(
-            f"{name}: found a flat sheet ({1e3 * thickness:.2g} mm), expected a mesh of a body"
+            f"{name}: found a flat sheet ({1e3 * thickness:.2g} mm), expected the mesh of a solid"
         )
     notes: list[str] = []
     _, numbers = np.unique(np.round(vertices, 7), axis=0, return_inverse=True)
@@ -392,23 +404,23 @@ def _body(
     key = np.sort(edges, axis=1) @ np.array([len(vertices), 1])
     _, edge, users = np.unique(key, return_inverse=True, return_counts=True)
     n_forward = np.bincount(edge, weights=forward)
-    n_opposite = int(((users == 2) & (n_forward != 1)).sum())
-    if n_opposite > DISAGREE * len(users):
+    n_inconsistent = int(((users == 2) & (n_forward != 1)).sum())
+    if n_inconsistent > MAX_INCONSISTENT_EDGES * len(users):
         raise InputError(
-            f"{name}: found triangles that face opposite ways at {n_opposite:,} of {len(users):,} "
-            "edges, expected outward normals; trimesh.repair.fix_normals mends such a mesh"
+            f"{name}: found triangles of inconsistent orientation at {n_inconsistent:,} of "
+            f"{len(users):,} edges, expected outward normals; trimesh.repair.fix_normals may help"
         )
     border = int((users == 1).sum())
     if border:
-        notes.append(f"the mesh is open: {border:,} edges have one triangle only")
+        notes.append(f"the mesh is open: {border:,} edges have a single triangle")
     volume = ((corners[:, 0] - center) * area_vectors).sum() / 6
     if volume < 0:
-        notes.append("the mesh was inside out: its triangles are turned")
+        notes.append("the triangles of the mesh faced inward and were reversed")
         triangles = triangles[:, ::-1]
     return vertices, triangles, tuple(notes)
 
 
-def _smoothed(
+def _smoothed_surface(
     name: str,
     source: GraspObject,
     points: Array,
@@ -421,13 +433,13 @@ def _smoothed(
 
     def neighbours(radius: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         pairs = tree.query_pairs(radius, output_type="ndarray")
-        every = np.arange(len(points))
+        indices = np.arange(len(points))
         return (
-            np.concatenate([pairs[:, 0], pairs[:, 1], every]),
-            np.concatenate([pairs[:, 1], pairs[:, 0], every]),
+            np.concatenate([pairs[:, 0], pairs[:, 1], indices]),
+            np.concatenate([pairs[:, 1], pairs[:, 0], indices]),
         )
 
-    # The two sides of a thin wall are not neighbours.
+    # Samples on the two sides of a thin wall are not averaged.
     i, j = neighbours(parameters.smoothing)
     same_side = (faces[i] * faces[j]).sum(axis=1) > 0
     normals = np.zeros_like(points)
@@ -435,6 +447,6 @@ def _smoothed(
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     i, j = neighbours(parameters.patch)
     is_edge = (normals[i] * faces[j]).sum(axis=1) < np.cos(parameters.bend)
-    inside = np.ones(len(points), dtype=bool)
-    inside[i[is_edge]] = False
-    return Surface(name, source, points, normals, faces, inside, corners, parameters)
+    fits_pad = np.ones(len(points), dtype=bool)
+    fits_pad[i[is_edge]] = False
+    return Surface(name, source, points, normals, faces, fits_pad, corners, parameters)
