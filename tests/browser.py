@@ -1,4 +1,4 @@
-"""A real browser for tests: Chromium without a window, driven over its DevTools protocol."""
+"""Headless Chromium for tests, controlled by the DevTools protocol."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from typing import Any, Self
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 
 CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
-"""The program, if there is one."""
+"""Path of Chromium, or None."""
 
 FLAGS = (
     *("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--no-first-run"),
@@ -26,16 +26,16 @@ FLAGS = (
     *("--disable-extensions", "--disable-background-networking", "--remote-debugging-port=0"),
 )
 
-PATIENCE = 180.0
-"""How long [s] anything may take."""
+TIMEOUT = 180.0
+"""Timeout of every operation [s]."""
 
 
 class BrowserError(AssertionError):
-    """The page did not do what was expected."""
+    """Error of the browser or of a page."""
 
 
 class Browser:
-    """A browser of its own, with nothing remembered; ends with its `with` block."""
+    """Browser process with an empty profile; use it in a `with` statement."""
 
     def __init__(self) -> None:
         assert CHROMIUM is not None
@@ -46,19 +46,26 @@ class Browser:
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
-        said, end = Path(self._folder) / "DevToolsActivePort", time.monotonic() + PATIENCE
-        while not (said.is_file() and said.read_text().count("\n")):
+        port_file, end = Path(self._folder) / "DevToolsActivePort", time.monotonic() + TIMEOUT
+        while not (port_file.is_file() and port_file.read_text().count("\n")):
             if self._process.poll() is not None or time.monotonic() > end:
                 self.close()
                 raise BrowserError("Chromium does not start")
             time.sleep(0.05)
-        self._address = f"http://127.0.0.1:{said.read_text().split()[0]}"
+        self._address = f"http://127.0.0.1:{port_file.read_text().split()[0]}"
 
     def open(self, url: str, width: int = 1280, height: int = 800, phone: bool = False) -> Page:
-        """A new page of a size [CSS pixels]; `phone`: touched, twice the pixels."""
+        """Open a page.
+
+        Args:
+            url: Address of the page.
+            width: Width of the window [CSS pixels].
+            height: Height of the window [CSS pixels].
+            phone: Whether the page gets touch events and twice as many pixels.
+        """
         request = urllib.request.Request(f"{self._address}/json/new?about:blank", method="PUT")
-        with urllib.request.urlopen(request, timeout=PATIENCE) as answer:
-            socket = json.loads(answer.read())["webSocketDebuggerUrl"]
+        with urllib.request.urlopen(request, timeout=TIMEOUT) as response:
+            socket = json.loads(response.read())["webSocketDebuggerUrl"]
         page = Page(socket)
         self._pages.append(page)
         page.resize(width, height, phone)
@@ -66,16 +73,16 @@ class Browser:
         return page
 
     def close(self) -> None:
-        """End it."""
+        """Close all pages and stop the process."""
         for page in self._pages:
             page.close()
         self._process.terminate()
         try:
-            self._process.wait(PATIENCE)
+            self._process.wait(TIMEOUT)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        # Its helpers may be writing yet.
+        # Child processes may still write to the folder.
         for _ in range(20):
             shutil.rmtree(self._folder, ignore_errors=True)
             if not Path(self._folder).exists():
@@ -95,13 +102,13 @@ class Browser:
 
 
 class Page:
-    """A page: what runs in it, what it says, what a hand does to it."""
+    """Page of a browser: scripts, messages, and events of mouse and touch."""
 
     def __init__(self, socket: str) -> None:
         # Tests of adapters run where this package is not installed.
         from websockets.sync.client import connect
 
-        self._socket = connect(socket, max_size=None, open_timeout=PATIENCE)
+        self._socket = connect(socket, max_size=None, open_timeout=TIMEOUT)
         self._numbers = itertools.count(1)
         self._complaints: list[str] = []
         self._console: list[str] = []
@@ -111,36 +118,36 @@ class Page:
         self.call("Page.setLifecycleEventsEnabled", enabled=True)
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """A command of the DevTools protocol.
+        """Call a method of the DevTools protocol.
 
         Raises:
-            BrowserError: It was refused.
+            BrowserError: The browser rejects the call.
         """
         number = next(self._numbers)
         self._socket.send(json.dumps({"id": number, "method": method, "params": parameters}))
         while True:
-            message = json.loads(self._socket.recv(PATIENCE))
+            message = json.loads(self._socket.recv(TIMEOUT))
             if message.get("id") != number:
-                self._note(message)
+                self._record(message)
             elif "error" in message:
                 raise BrowserError(f"{method}: {message['error']}")
             else:
                 return message["result"]
 
     def go(self, url: str) -> None:
-        """To another page, loaded when this returns."""
-        went = self.call("Page.navigate", url=url)
-        if went.get("errorText"):
-            raise BrowserError(f"{url}: {went['errorText']}")
-        end = time.monotonic() + PATIENCE
-        # Of the page that was there before, the end of loading may be told yet.
-        while went.get("loaderId", "") not in {"", *self._loaded}:
+        """Load another page and wait for its end of loading."""
+        navigation = self.call("Page.navigate", url=url)
+        if navigation.get("errorText"):
+            raise BrowserError(f"{url}: {navigation['errorText']}")
+        end = time.monotonic() + TIMEOUT
+        # The end of loading of the previous page may still be reported.
+        while navigation.get("loaderId", "") not in {"", *self._loaded}:
             self._listen(max(end - time.monotonic(), 0.0))
             if time.monotonic() > end:
-                raise BrowserError(f"{url}: not loaded in {PATIENCE} s")
+                raise BrowserError(f"{url}: not loaded in {TIMEOUT} s")
 
     def resize(self, width: int, height: int, phone: bool = False) -> None:
-        """To a size [CSS pixels]."""
+        """Set the size of the window [CSS pixels]."""
         scale = 2 if phone else 1
         self.call(
             "Emulation.setDeviceMetricsOverride",
@@ -152,56 +159,56 @@ class Page:
         self.call("Emulation.setTouchEmulationEnabled", enabled=phone)
 
     def evaluate(self, script: str) -> Any:
-        """What an expression comes to (a promise: when it is kept), as JSON has it.
+        """Return the JSON value of an expression, or of the promise that it returns.
 
         Raises:
-            BrowserError: It threw.
+            BrowserError: The expression throws.
         """
-        done = self.call(
+        result = self.call(
             "Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True
         )
-        if "exceptionDetails" in done:
-            raise BrowserError(f"{script}: {_thrown(done['exceptionDetails'])}")
-        return done["result"].get("value")
+        if "exceptionDetails" in result:
+            raise BrowserError(f"{script}: {_exception_text(result['exceptionDetails'])}")
+        return result["result"].get("value")
 
-    def wait(self, script: str, seconds: float = PATIENCE) -> Any:
-        """The value of an expression, as soon as it is true.
+    def wait(self, script: str, seconds: float = TIMEOUT) -> Any:
+        """Wait until an expression is true, and return its value.
 
         Raises:
-            BrowserError: It never was.
+            BrowserError: The expression is still false after `seconds`.
         """
         end = time.monotonic() + seconds
         while not (value := self.evaluate(script)):
             if time.monotonic() > end:
                 raise BrowserError(
-                    f"{script}: {value!r} after {seconds} s; the page says {self.complaints}"
+                    f"{script}: {value!r} after {seconds} s; messages: {self.complaints}"
                 )
             time.sleep(0.05)
         return value
 
     def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
-        """A mouse event (`kind`: Pressed, Moved, Released, Wheel) [CSS pixels]."""
+        """Send a mouse event: Pressed, Moved, Released or Wheel, at x, y [CSS pixels]."""
         self.call("Input.dispatchMouseEvent", type=f"mouse{kind}", x=x, y=y, **more)
 
     def click(self, x: float, y: float) -> None:
-        """Press and release the left button."""
+        """Press and release the left button at x, y [CSS pixels]."""
         self.drag((x, y), (x, y), steps=0)
 
     def drag(self, start: tuple[float, float], end: tuple[float, float], steps: int = 10) -> None:
-        """The left button pressed at one place, moved, released at another [CSS pixels]."""
-        held = {"button": "left", "buttons": 1}
+        """Drag with the left button from start to end [CSS pixels]."""
+        button = {"button": "left", "buttons": 1}
         self.mouse("Moved", *start)
-        self.mouse("Pressed", *start, clickCount=1, **held)
+        self.mouse("Pressed", *start, clickCount=1, **button)
         for i in range(1, steps + 1):
             x, y = (a + (b - a) * i / steps for a, b in zip(start, end, strict=True))
-            self.mouse("Moved", x, y, **held)
+            self.mouse("Moved", x, y, **button)
         self.mouse("Released", *end, button="left", buttons=0, clickCount=1)
 
     def touch(self, start: tuple[float, float], end: tuple[float, float], steps: int = 10) -> None:
-        """A finger put down at one place, moved, lifted at another [CSS pixels]."""
+        """Drag with a finger on a touch screen from start to end [CSS pixels]."""
 
-        def send(kind: str, *places: tuple[float, float]) -> None:
-            points = [{"x": x, "y": y} for x, y in places]
+        def send(kind: str, *positions: tuple[float, float]) -> None:
+            points = [{"x": x, "y": y} for x, y in positions]
             self.call("Input.dispatchTouchEvent", type=f"touch{kind}", touchPoints=points)
 
         send("Start", start)
@@ -211,51 +218,52 @@ class Page:
         send("End")
 
     def screenshot(self, path: str | Path) -> None:
-        """A picture of what is seen (PNG)."""
+        """Write a PNG picture of the visible part of the page."""
         data = self.call("Page.captureScreenshot", format="png")["data"]
         Path(path).write_bytes(base64.b64decode(data))
 
     @property
     def complaints(self) -> list[str]:
-        """Errors and warnings of the console, exceptions and what could not be loaded, so far."""
+        """Errors and warnings of the console, exceptions, and failed loads."""
         self._listen(0.0)
         return list(self._complaints)
 
     @property
     def console(self) -> list[str]:
-        """All that was said to the console so far."""
+        """Messages of the console."""
         self._listen(0.0)
         return list(self._console)
 
     def close(self) -> None:
-        """Forget the page."""
+        """Close the connection to the page."""
         self._socket.close()
 
     def _listen(self, seconds: float) -> None:
-        """Note what was said; the first message is waited for so long."""
+        """Record pending events; wait for the first one for up to `seconds`."""
         with contextlib.suppress(TimeoutError):
             while True:
-                self._note(json.loads(self._socket.recv(seconds)))
+                self._record(json.loads(self._socket.recv(seconds)))
                 seconds = 0.0
 
-    def _note(self, message: dict[str, Any]) -> None:
-        kind, said = message.get("method"), message.get("params", {})
+    def _record(self, message: dict[str, Any]) -> None:
+        kind, event = message.get("method"), message.get("params", {})
         if kind == "Page.lifecycleEvent":
-            if said["name"] == "load":
-                self._loaded.add(said["loaderId"])
+            if event["name"] == "load":
+                self._loaded.add(event["loaderId"])
         elif kind == "Runtime.consoleAPICalled":
-            words = (str(a.get("value", a.get("description", ""))) for a in said["args"])
-            line = f"{said['type']}: {' '.join(words)}"
+            words = (str(a.get("value", a.get("description", ""))) for a in event["args"])
+            line = f"{event['type']}: {' '.join(words)}"
             self._console.append(line)
-            if said["type"] in ("error", "warning", "assert"):
+            if event["type"] in ("error", "warning", "assert"):
                 self._complaints.append(line)
         elif kind == "Runtime.exceptionThrown":
-            self._complaints.append(f"exception: {_thrown(said['exceptionDetails'])}")
-        elif kind == "Log.entryAdded" and said["entry"]["level"] in ("error", "warning"):
-            self._complaints.append(f"{said['entry']['level']}: {said['entry']['text']}")
-        elif kind == "Network.loadingFailed" and not said.get("canceled"):
-            self._complaints.append(f"not loaded: {said['errorText']}")
+            self._complaints.append(f"exception: {_exception_text(event['exceptionDetails'])}")
+        elif kind == "Log.entryAdded" and event["entry"]["level"] in ("error", "warning"):
+            self._complaints.append(f"{event['entry']['level']}: {event['entry']['text']}")
+        elif kind == "Network.loadingFailed" and not event.get("canceled"):
+            self._complaints.append(f"not loaded: {event['errorText']}")
 
 
-def _thrown(details: dict[str, Any]) -> str:
+def _exception_text(details: dict[str, Any]) -> str:
+    """Return the description of an exception."""
     return str(details.get("exception", {}).get("description", details["text"]))
