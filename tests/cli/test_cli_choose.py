@@ -122,4 +122,4 @@ def test_palms_of_a_table(run: Command, tmp_path: Path) -> None:
     path.write_text(rows[0].replace("bh_spread", "spread") + "\n" + rows[1])
     refused = run(*words)
     assert refused.exit == 2
-    assert "grasps.csv: spread: no such joint" in refused.error.replace("\n", " ")
+    assert "grasps.csv: joint 'spread' is unknown" in refused.error.replace("\n", " ")

@@ -193,7 +193,7 @@ def _table(tmp_path: Path, **changes: Any) -> Path:
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"bh_spread": None, "spread": 0.5}, "spread: no such joint, expected"),
+        ({"bh_spread": None, "spread": 0.5}, "joint .spread. is unknown; expected"),
         ({"bh_spread": None}, "bh_spread: missing, expected a position"),
         ({"x": 310}, r"position: found 310 m from the object.*numbers in mm\?"),
         ({"bh_spread": 45}, r"joints: found angles beyond two turns.*in degrees\?"),

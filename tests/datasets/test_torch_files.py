@@ -19,11 +19,11 @@ def test_a_file_that_torch_wrote() -> None:
     """By torch 2.13: strides, kinds of numbers, empty and single ones; grasps of two objects."""
     path = Path(__file__).parent / "written_by_torch.pt"
     found = read_torch(path)
-    assert found["view"].value.tolist() == np.arange(12.0).reshape(3, 4).T[1:].tolist()
-    assert [kind.value.tolist() for kind in found["kinds"]] == [[0, 1, 2]] * 7
-    assert found["flag"].value.tolist() == [True, False]
-    assert found["scalar"].value == 2.5
-    assert found["empty"].value.shape == (0, 3)
+    assert found["view"].array.tolist() == np.arange(12.0).reshape(3, 4).T[1:].tolist()
+    assert [kind.array.tolist() for kind in found["kinds"]] == [[0, 1, 2]] * 7
+    assert found["flag"].array.tolist() == [True, False]
+    assert found["scalar"].array == 2.5
+    assert found["empty"].array.shape == (0, 3)
     assert found["info"] == {"num": 3}
     robot = "panda+allegro_right"
     grasps = ik.load_candidates(path, robot, of="contactdb+apple")
@@ -58,10 +58,10 @@ def test_torch_files_of_other_kinds(tmp_path: Path) -> None:
     """The format before torch 1.6, no torch file at all, and tensors beyond their numbers."""
     path = tmp_path / "set.pt"
     path.write_bytes(pickle.dumps(0x1950A86A20F9469CFC6C, 2))
-    with pytest.raises(ik.errors.DescriptionError, match=r"1\.6, .*:"):
+    with pytest.raises(ik.errors.DescriptionError, match=r"torch 1\.6"):
         read_torch(path)
     path.write_bytes(b"x,y,z")
-    with pytest.raises(ik.errors.DescriptionError, match="found no zip, expected a file of torch"):
+    with pytest.raises(ik.errors.DescriptionError, match=r"set\.pt: file is not a zip file"):
         read_torch(path)
     write_torch(path, {"a": np.arange(4.0)})
     size, more = (pickle.BININT + n.to_bytes(4, "little") + pickle.TUPLE for n in (4, 9))
@@ -73,6 +73,6 @@ def test_torch_files_of_other_kinds(tmp_path: Path) -> None:
         for name, data in (entries | {"set/data.pkl": head + more + shape}).items():
             archive.writestr(name, data)
     with pytest.raises(
-        ik.errors.DescriptionError, match="a tensor that is larger than its numbers"
+        ik.errors.DescriptionError, match="a tensor that is larger than its storage"
     ):
         read_torch(path)

@@ -24,7 +24,7 @@ from casadi_ik.integrations.datasets.postures import (
     rotations_from_columns,
     rotations_from_rpy,
 )
-from casadi_ik.integrations.datasets.unpickling import Packed, read_npy, read_torch
+from casadi_ik.integrations.datasets.unpickling import PickledArray, read_npy, read_torch
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.linkage import joint_motion
 from casadi_ik.model.pose import inverse
@@ -96,7 +96,7 @@ class Convention:
     joints: dict[str, tuple[str, float]]
     wrist: tuple[WristJoint, ...] = ()
 
-    def fits(self, robot: ArmHand) -> bool:
+    def matches(self, robot: ArmHand) -> bool:
         """Return True if the robot has this hand."""
         description = robot.description
         names = {joint for joint, _ in self.joints.values()}
@@ -115,16 +115,18 @@ class Convention:
         width = poses.joints.shape[1]
         if len(names) != width:
             raise DescriptionError(
-                f"{poses.where}: joints: found {width}, expected {len(names)}: {', '.join(names)}"
+                f"{poses.location}: joints: found {width}, expected {len(names)}: "
+                f"{', '.join(names)}"
             )
         for name in names:
             if name not in all_names:
                 raise DescriptionError(
-                    f"{poses.where}: {name}: no such joint, expected {', '.join(all_names)}"
+                    f"{poses.location}: joint {name!r} is unknown; expected one of "
+                    f"{', '.join(all_names)}"
                 )
         missing = [name for name in all_names if name not in names]
         if missing:
-            raise DescriptionError(f"{poses.where}: {missing[0]}: missing, expected a position")
+            raise DescriptionError(f"{poses.location}: {missing[0]}: missing, expected a position")
         positions: dict[str, Array] = {}
         for i, name in enumerate(names):
             if name in self.joints:
@@ -171,16 +173,16 @@ def convention_for(robot: ArmHand, layout: str, hand: str | Path | None) -> Conv
     Args:
         robot: The robot.
         layout: Layout of the file.
-        hand: Name or path of a convention; None: the built-in convention that fits.
+        hand: Name or path of a convention; None: the built-in convention for its hand.
 
     Raises:
-        UnsupportedError: No built-in convention fits, or the named one does not.
+        UnsupportedError: No built-in convention is for the robot's hand, or the named one is not.
         UnknownNameError: See `load_convention`.
         DescriptionError: See `load_convention`.
     """
     if hand is not None:
         named = load_convention(hand)
-        if not named.fits(robot):
+        if not named.matches(robot):
             raise UnsupportedError(
                 f"{named.name}: robot {robot.name!r} has no link {named.link!r}, or not its joints"
             )
@@ -188,11 +190,11 @@ def convention_for(robot: ArmHand, layout: str, hand: str | Path | None) -> Conv
     shipped = [name for name in shipped_names("datasets") if layout in _layouts(name)]
     for name in shipped:
         convention = load_convention(name)
-        if convention.fits(robot):
+        if convention.matches(robot):
             return convention
     raise UnsupportedError(
-        f"layout {layout}: no hand of it is that of robot {robot.name!r}; known: "
-        f"{', '.join(shipped)} (or write a convention file with its joint names)"
+        f"layout {layout}: robot {robot.name!r} has no hand with a built-in convention; expected "
+        f"one of {', '.join(shipped)}, or a convention file with the joint names of its hand"
     )
 
 
@@ -222,11 +224,11 @@ def getagrip(path: Path, content: Any) -> HandPoses:
 
     The postures are those before the fingers close.
     """
-    where, arrays = str(path), _mapping(path, content)
+    location, arrays = str(path), _mapping(path, content)
     position, rotation, joints = (
-        numbers(where, arrays, name) for name in ("trans", "rot", "joint_angles")
+        numbers(location, arrays, name) for name in ("trans", "rot", "joint_angles")
     )
-    return HandPoses(where, position, rotation, joints)
+    return HandPoses(location, position, rotation, joints)
 
 
 def dexgraspnet(path: Path, content: Any) -> HandPoses:
@@ -241,13 +243,13 @@ def dexgraspnet(path: Path, content: Any) -> HandPoses:
     scales: list[float] = []
     names: tuple[str, ...] = ()
     for i, entry in enumerate(entries):
-        where = f"{path}: row {i}"
+        location = f"{path}: row {i}"
         qpos = entry.get("qpos") if isinstance(entry, dict) else None
         if not isinstance(qpos, dict):
-            raise DescriptionError(f"{where}: qpos: missing, expected numbers by joint")
+            raise DescriptionError(f"{location}: qpos: missing, expected numbers by joint")
         for key in (*TRANSLATION_KEYS, *ROTATION_KEYS):
             if key not in qpos:
-                raise DescriptionError(f"{where}: qpos.{key}: missing, expected a number")
+                raise DescriptionError(f"{location}: qpos.{key}: missing, expected a number")
         if not names:
             names = tuple(
                 str(key) for key in qpos if key not in (*TRANSLATION_KEYS, *ROTATION_KEYS)
@@ -255,10 +257,10 @@ def dexgraspnet(path: Path, content: Any) -> HandPoses:
         order = (*TRANSLATION_KEYS, *ROTATION_KEYS, *names)
         if set(qpos) != set(order):
             unexpected = sorted(map(str, set(qpos) ^ set(order)))[0]
-            raise DescriptionError(f"{where}: qpos.{unexpected}: expected the joints of row 0")
-        rows.append([_number(f"{where}: qpos.{key}", qpos[key]) for key in order])
+            raise DescriptionError(f"{location}: qpos.{unexpected}: expected the joints of row 0")
+        rows.append([_number(f"{location}: qpos.{key}", qpos[key]) for key in order])
         if "scale" in entry:
-            scales.append(_scale(where, _number(f"{where}: scale", entry["scale"])))
+            scales.append(_scale(location, _number(f"{location}: scale", entry["scale"])))
     if scales and len(scales) != len(rows):
         raise DescriptionError(f"{path}: scale: found {len(scales)}, expected {len(rows)} or none")
     values = np.array(rows)
@@ -274,14 +276,14 @@ def dexgraspnet(path: Path, content: Any) -> HandPoses:
 
 def bodex(path: Path, content: Any) -> HandPoses:
     """Read robot_pose (1, k, stages, 7 + joints) of a dictionary, poses as x y z, w x y z."""
-    where, arrays = str(path), _mapping(path, content)
-    rows = numbers(where, arrays, "robot_pose")
+    location, arrays = str(path), _mapping(path, content)
+    rows = numbers(location, arrays, "robot_pose")
     if rows.ndim != 4 or rows.shape[0] != 1 or rows.shape[2] < 2 or rows.shape[3] <= 7:
         raise DescriptionError(
             f"{path}: robot_pose: found shape {rows.shape}, expected (1, k, stages, 7 + joints)"
         )
     stages = {name: rows[0, :, i] for i, name in enumerate(STAGES[: rows.shape[2]])}
-    return _poses_of_stages(where, arrays, stages)
+    return _poses_of_stages(location, arrays, stages)
 
 
 def dexgraspbench(path: Path, content: Any) -> HandPoses:
@@ -289,19 +291,19 @@ def dexgraspbench(path: Path, content: Any) -> HandPoses:
 
     pregrasp_qpos and squeeze_qpos have the same shape.
     """
-    where, arrays = str(path), _mapping(path, content)
+    location, arrays = str(path), _mapping(path, content)
     stages: dict[str, Array] = {}
     for name in STAGES:
         key = f"{name}_qpos"
         if key not in arrays and name != "grasp":
             continue
-        rows = np.atleast_2d(numbers(where, arrays, key))
+        rows = np.atleast_2d(numbers(location, arrays, key))
         if rows.ndim != 2 or rows.shape[1] <= 7:
             raise DescriptionError(
                 f"{path}: {key}: found shape {rows.shape}, expected (k, 7 + joints)"
             )
         stages[name] = rows
-    return _poses_of_stages(where, arrays, stages)
+    return _poses_of_stages(location, arrays, stages)
 
 
 def multidex(path: Path, content: Any) -> HandPoses:
@@ -309,20 +311,20 @@ def multidex(path: Path, content: Any) -> HandPoses:
 
     q: translation (3), first two columns of the rotation (6), joints in the order of the hand.
     """
-    where, contents = str(path), _mapping(path, content)
+    location, contents = str(path), _mapping(path, content)
     info, entries = contents.get("info"), contents.get("metadata")
     if isinstance(info, dict) and info and all(isinstance(hand, dict) for hand in info.values()):
         hands = ", ".join(str(hand) for hand in info)
         raise DescriptionError(
-            f"{where}: info: found hands {hands}, as D(R,O) Grasp writes them, with rotations as"
+            f"{location}: info: found hands {hands}, as D(R,O) Grasp writes them, with rotations as"
             " Euler angles; expected a file of MultiDex (write the rows of a hand into a table)"
         )
     if not isinstance(entries, list) or not entries:
-        raise DescriptionError(f"{where}: metadata: expected a list of at least one grasp")
+        raise DescriptionError(f"{location}: metadata: expected a list of at least one grasp")
     rows: list[Array] = []
     objects: list[str] = []
     for i, entry in enumerate(entries):
-        row = f"{where}: metadata: row {i}"
+        row = f"{location}: metadata: row {i}"
         if not isinstance(entry, (tuple, list)) or len(entry) < 2 or type(entry[1]) is not str:
             raise DescriptionError(f"{row}: expected q and the name of its object")
         q = numbers(row, {"q": entry[0]}, "q")
@@ -334,7 +336,7 @@ def multidex(path: Path, content: Any) -> HandPoses:
         objects.append(entry[1])
     values = np.stack(rows)
     rotations = rotations_from_columns(values[:, 3:9])
-    return HandPoses(where, values[:, :3], rotations, values[:, 9:], objects=tuple(objects))
+    return HandPoses(location, values[:, :3], rotations, values[:, 9:], objects=tuple(objects))
 
 
 LAYOUTS: Mapping[str, Callable[[Path, Any], HandPoses]] = {
@@ -384,7 +386,7 @@ def read_layout(path: Path, layout: str | None) -> tuple[HandPoses, str]:
     return LAYOUTS[layout](path, content), layout
 
 
-def numbers(where: str, contents: Mapping[str, Any], key: str) -> Array:
+def numbers(location: str, contents: Mapping[str, Any], key: str) -> Array:
     """Return an array of a file.
 
     Raises:
@@ -392,13 +394,13 @@ def numbers(where: str, contents: Mapping[str, Any], key: str) -> Array:
     """
     if key not in contents:
         names = ", ".join(str(name) for name in contents)
-        raise DescriptionError(f"{where}: {key}: missing, expected an array; found {names}")
+        raise DescriptionError(f"{location}: {key}: missing, expected an array; found {names}")
     value = contents[key]
-    if isinstance(value, Packed):
-        value = value.value
+    if isinstance(value, PickledArray):
+        value = value.array
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
-        raise DescriptionError(f"{where}: {key}: expected an array of numbers")
-    check_unpacked_size(f"{where}: {key}", 8 * value.size, LIMITS.dataset_bytes)
+        raise DescriptionError(f"{location}: {key}: expected an array of numbers")
+    check_unpacked_size(f"{location}: {key}", 8 * value.size, LIMITS.dataset_bytes)
     return value.astype(np.float64)
 
 
@@ -408,48 +410,50 @@ def _mapping(path: Path, content: Any) -> Mapping[str, Any]:
     return content
 
 
-def _number(where: str, value: Any) -> float:
-    if isinstance(value, Packed) and value.value is not None and value.value.size == 1:
-        value = value.value.item()
+def _number(location: str, value: Any) -> float:
+    if isinstance(value, PickledArray) and value.array is not None and value.array.size == 1:
+        value = value.array.item()
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise DescriptionError(f"{where}: expected a number")
+        raise DescriptionError(f"{location}: expected a number")
     return float(value)
 
 
-def _object_pose(where: str, contents: Mapping[str, Any]) -> Array:
+def _object_pose(location: str, contents: Mapping[str, Any]) -> Array:
     """Return the pose (4, 4) of the object in the frame of the poses; identity if not stated."""
     if "obj_pose" not in contents:
         return np.eye(4)
-    row = numbers(where, contents, "obj_pose").reshape(-1)
+    row = numbers(location, contents, "obj_pose").reshape(-1)
     if row.shape != (7,):
-        raise DescriptionError(f"{where}: obj_pose: found {row.size} numbers, expected 7")
+        raise DescriptionError(f"{location}: obj_pose: found {row.size} numbers, expected 7")
     pose = HandPoses(
-        f"{where}: obj_pose",
+        f"{location}: obj_pose",
         row[None, :3],
         rotations_from_quaternions(row[None, 3:]),
         np.zeros((1, 0)),
     )
     if pose.faults:
-        raise InvalidPoseError(f"{where}: obj_pose: {pose.faults[0]}")
+        raise InvalidPoseError(f"{location}: obj_pose: {pose.faults[0]}")
     return pose.poses[0]
 
 
 def _poses_of_stages(
-    where: str, contents: Mapping[str, Any], stages: Mapping[str, Array]
+    location: str, contents: Mapping[str, Any], stages: Mapping[str, Array]
 ) -> HandPoses:
     """Return hand poses from rows (k, 7 + joints) of the stages, poses as x y z, w x y z."""
     shape = stages["grasp"].shape
-    object_inverse = inverse(_object_pose(where, contents))
+    object_inverse = inverse(_object_pose(location, contents))
     by_stage: dict[str, HandPoses] = {}
     for name, rows in stages.items():
         if rows.shape != shape:
-            raise DescriptionError(f"{where}: {name}: found shape {rows.shape}, expected {shape}")
+            raise DescriptionError(
+                f"{location}: {name}: found shape {rows.shape}, expected {shape}"
+            )
         hand_poses = HandPoses(
-            where, rows[:, :3], rotations_from_quaternions(rows[:, 3:7]), rows[:, 7:]
+            location, rows[:, :3], rotations_from_quaternions(rows[:, 3:7]), rows[:, 7:]
         )
         poses = object_inverse @ hand_poses.poses
         by_stage[name] = replace(hand_poses, position=poses[:, :3, 3], rotation=poses[:, :3, :3])
-    scales = _scales(where, contents, len(stages["grasp"]))
+    scales = _scales(location, contents, len(stages["grasp"]))
     return replace(
         by_stage["grasp"],
         scales=scales,
@@ -458,24 +462,24 @@ def _poses_of_stages(
     )
 
 
-def _scales(where: str, contents: Mapping[str, Any], count: int) -> tuple[float, ...]:
+def _scales(location: str, contents: Mapping[str, Any], count: int) -> tuple[float, ...]:
     """Return the scale of the object of each grasp; empty if not stated."""
     if "obj_scale" not in contents:
         return ()
     value = contents["obj_scale"]
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         value = np.array([value], dtype=float)
-    values = numbers(where, {"obj_scale": value}, "obj_scale").reshape(-1)
+    values = numbers(location, {"obj_scale": value}, "obj_scale").reshape(-1)
     if len(values) == count:
-        return tuple(_scale(where, value) for value in values)
+        return tuple(_scale(location, value) for value in values)
     if not len(values) or (values != values[0]).any():
         raise DescriptionError(
-            f"{where}: obj_scale: found {len(values)} numbers, expected one or {count}"
+            f"{location}: obj_scale: found {len(values)} numbers, expected one or {count}"
         )
-    return (_scale(where, values[0]),) * count
+    return (_scale(location, values[0]),) * count
 
 
-def _scale(where: str, value: float) -> float:
+def _scale(location: str, value: float) -> float:
     if not 0 < value < np.inf:
-        raise DescriptionError(f"{where}: scale: found {value:g}, expected a number > 0")
+        raise DescriptionError(f"{location}: scale: found {value:g}, expected a number > 0")
     return float(value)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,13 +15,17 @@ from casadi_ik.errors import (
     InputError,
     InvalidPoseError,
     UnknownNameError,
-    os_errors,
 )
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.poses import rotations_from_quaternions
-from casadi_ik.files.lazy_import import RecordReprMixin
 from casadi_ik.files.limits import LIMITS, RAISE_HINT, scaled_limit
-from casadi_ik.files.number_files import check_unpacked_size, read_npz
+from casadi_ik.integrations.datasets.candidates import Candidates
+from casadi_ik.integrations.datasets.gripper_grasps import (
+    GRIPPER_READERS,
+    ISAAC_GRASP,
+    read_isaac_grasp,
+    recognise_layout,
+    transfer_to_gripper,
+)
 from casadi_ik.integrations.datasets.layouts import (
     LAYOUTS,
     READERS,
@@ -31,31 +34,24 @@ from casadi_ik.integrations.datasets.layouts import (
     convention_of_robot,
     read_layout,
 )
-from casadi_ik.integrations.datasets.parallel import (
-    ISAAC_GRASP,
-    PARALLEL,
-    for_gripper,
-    isaac_grasp,
-    parallel_layout,
-)
 from casadi_ik.integrations.datasets.postures import (
     POSTURE_FIT,
     HandPoses,
     HandPostures,
     hand_postures,
     palms_and_pads,
-    rotations_from_rpy,
 )
+from casadi_ik.integrations.datasets.tables import TABLE_SUFFIXES, read_table
 from casadi_ik.kinematics.arm_hand import ArmHand, load_robot
 from casadi_ik.kinematics.contacts import EXTRA_ARRAY_NAMES
 from casadi_ik.model.grasp import Contact, Grasp
 from casadi_ik.model.load_grasp import load_grasp_files
 from casadi_ik.model.objects import GraspObject, is_mesh_name, load_object
 from casadi_ik.model.targets import DIRECTIONS_KEY
-from casadi_ik.solve.target_files import TargetFile, import_polars
+from casadi_ik.solve.target_files import TargetFile
 
 Invalid = Literal["error", "drop", "clip"]
-"""Treatment of rows that the hand cannot take."""
+"""Treatment of rows with invalid numbers or joints beyond their limits."""
 
 INVALID_CHOICES = ("error", "drop", "clip")
 
@@ -65,12 +61,10 @@ class ReadingSettings:
     """Settings of the reader.
 
     Attributes:
-        min_shift: Smallest shift of a fingertip that is reported [m].
-        block: Number of rows of targets that are read at once.
+        block: Number of rows of a target file that are read at once.
         contact_distance: Largest distance of a pad that touches the object [m].
     """
 
-    min_shift: float = 1e-4
     block: int = 4096
     contact_distance: float = 0.01
 
@@ -78,80 +72,8 @@ class ReadingSettings:
 READING_SETTINGS = ReadingSettings()
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Candidates(RecordReprMixin, Sequence[Grasp]):
-    """A sequence of grasps in the order of their file.
-
-    Attributes:
-        grasps: The grasps.
-        rows: (k,) row numbers in the file.
-        dropped: Number of invalid rows that were dropped.
-        clipped: Number of rows with a joint that was clipped to its limits.
-        shift: (k,) largest shift of a fingertip against the file in the palm frame [m]: by
-            clipping, or by couplings of joints that are free in the data.
-        scale: Scale of the object relative to its mesh; None if the file does not state it.
-
-    Example:
-        >>> points, normals = robot.contacts(robot.random(np.random.default_rng(2), 20))
-        >>> np.savez("targets.npz", points=points, normals=normals)
-        >>> candidates = ik.load_candidates("targets.npz", robot)
-        >>> print(candidates)
-        20 candidates
-        >>> candidates.dropped, candidates.clipped, candidates[3].name
-        (0, 0, 'targets[3]')
-    """
-
-    grasps: tuple[Grasp, ...]
-    rows: tuple[int, ...] = ()
-    dropped: int = 0
-    clipped: int = 0
-    shift: Array = field(default_factory=lambda: np.zeros(0))
-    scale: float | None = None
-
-    def __post_init__(self) -> None:
-        count = len(self.grasps)
-        object.__setattr__(self, "rows", self.rows or tuple(range(count)))
-        if not len(self.shift):
-            object.__setattr__(self, "shift", np.zeros(count))
-
-    def __len__(self) -> int:
-        return len(self.grasps)
-
-    def __iter__(self) -> Iterator[Grasp]:
-        return iter(self.grasps)
-
-    @overload
-    def __getitem__(self, index: int) -> Grasp: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> tuple[Grasp, ...]: ...
-
-    def __getitem__(self, index: int | slice) -> Grasp | tuple[Grasp, ...]:
-        return self.grasps[index]
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Notes on dropped, clipped and shifted rows."""
-        total, notes = len(self) + self.dropped, []
-        if self.dropped:
-            notes.append(f"{self.dropped} of {total} rows dropped: invalid")
-        if self.clipped:
-            notes.append(f"{self.clipped} of {total} rows have joints clipped to their limits")
-        shifts = 1e3 * self.shift[self.shift > READING_SETTINGS.min_shift]
-        if len(shifts):
-            notes.append(
-                f"fingertips of {len(shifts)} candidates shifted, as the hand's joints are limited "
-                f"and coupled: median {np.median(shifts):.1f} mm, at most {shifts.max():.1f} mm"
-            )
-        return tuple(notes)
-
-    def __str__(self) -> str:
-        size = "" if self.scale is None else f" of an object of scale {self.scale:g}"
-        return "\n".join([f"{len(self)} candidates{size}", *(f"  {note}" for note in self.notes)])
-
-
 def valid_rows(
-    where: str,
+    location: str,
     rows: Sequence[int],
     faults: Mapping[int, str],
     out_of_limits: Mapping[int, str],
@@ -160,7 +82,7 @@ def valid_rows(
     """Return the indices of the valid rows.
 
     Args:
-        where: File, for messages.
+        location: File, for messages.
         rows: Row numbers in the file.
         faults: Problems by row number.
         out_of_limits: Violated limits by row number.
@@ -179,149 +101,22 @@ def valid_rows(
             InvalidPoseError if invalid_rows[first].startswith("rotation") else DescriptionError
         )
         raise error_type(
-            f"{where}: row {first}: {invalid_rows[first]}; "
+            f"{location}: row {first}: {invalid_rows[first]}; "
             f"{len(invalid_rows)} of {len(rows)} rows are invalid"
             f"{'' if invalid == 'drop' else hint}"
         )
     return np.array([i for i, row in enumerate(rows) if row not in invalid_rows], dtype=np.intp)
 
 
-POSITION_COLUMNS = ("x", "y", "z")
-QUATERNION_COLUMNS = ("qw", "qx", "qy", "qz")
-ANGLE_COLUMNS = ("roll", "pitch", "yaw")
-
-TABLE_SUFFIXES = (".csv", ".npz", ".parquet")
-
-IGNORED_COLUMNS = (
-    "index",
-    "id",
-    "name",
-    "object",
-    "label",
-    "score",
-    "quality",
-    "confidence",
-    "success",
-)
-"""Columns of a table that are ignored, regardless of case."""
-
-
-def _is_ignored(column: str) -> bool:
-    """Return whether a column is a note on a grasp, or the index that pandas writes."""
-    column = column.strip().lower()
-    return column in ("", *IGNORED_COLUMNS) or column.startswith(("unnamed:", "__index_level_"))
-
-
-def read_table(path: Path) -> HandPoses:
-    """Read a table of grasps: x y z [m], qw qx qy qz or roll pitch yaw [rad], joints by name.
-
-    Raises:
-        DescriptionError: The table is damaged, or columns are missing or not numeric.
-        UnsupportedError: The file is Parquet, and polars is not installed.
-    """
-    readers: Mapping[str, Callable[[Path], Mapping[str, Array]]]
-    readers = dict(
-        zip(map(str, TABLE_SUFFIXES), (_read_csv, _read_npz_table, _read_parquet), strict=True)
-    )
-    with os_errors(f"{path}: cannot be read", DescriptionError):
-        if path.suffix.lower() == ".csv":
-            check_unpacked_size(str(path), path.stat().st_size, LIMITS.table_bytes)
-        columns = readers[path.suffix.lower()](path)
-    rotation_columns = QUATERNION_COLUMNS if QUATERNION_COLUMNS[0] in columns else ANGLE_COLUMNS
-    for name in (*POSITION_COLUMNS, *rotation_columns):
-        if name not in columns:
-            raise DescriptionError(
-                f"{path}: {name}: missing, expected columns x y z, qw qx qy qz or roll pitch yaw, "
-                f"and joints; found {', '.join(columns)}"
-            )
-    names = tuple(name for name in columns if name not in (*POSITION_COLUMNS, *rotation_columns))
-    count = len(columns[POSITION_COLUMNS[0]])
-
-    def block(column_names: tuple[str, ...]) -> Array:
-        return (
-            np.stack([columns[name] for name in column_names], axis=1)
-            if column_names
-            else np.zeros((count, 0))
-        )
-
-    rotate = (
-        rotations_from_quaternions if rotation_columns is QUATERNION_COLUMNS else rotations_from_rpy
-    )
-    return HandPoses(
-        str(path), block(POSITION_COLUMNS), rotate(block(rotation_columns)), block(names), names
-    )
-
-
-def _read_csv(path: Path) -> dict[str, Array]:
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            names, *rows = [row for row in csv.reader(file) if row] or [[]]
-    except (csv.Error, UnicodeDecodeError) as error:
-        raise DescriptionError(f"{path}: not a CSV file: {error}") from error
-    columns = {j: name.strip() for j, name in enumerate(names) if not _is_ignored(name)}
-    if len(set(columns.values())) < len(columns):
-        raise DescriptionError(f"{path}: found columns of the same name")
-    values = {name: np.full(len(rows), np.nan) for name in columns.values()}
-    for i, row in enumerate(rows):
-        if len(row) != len(names):
-            raise DescriptionError(
-                f"{path}: row {i}: found {len(row)} values, expected {len(names)}"
-            )
-        for j, name in columns.items():
-            try:
-                # An empty cell is a missing number, which makes the row invalid.
-                values[name][i] = float(row[j].strip() or "nan")
-            except ValueError:
-                raise DescriptionError(
-                    f"{path}: row {i}: {name}: found {row[j]!r}, expected a number"
-                ) from None
-    return values
-
-
-def _read_npz_table(path: Path) -> dict[str, Array]:
-    columns: dict[str, Array] = {}
-    for name, array in read_npz(path, LIMITS.table_bytes).items():
-        if _is_ignored(name):
-            continue
-        if array.ndim != 1:
-            raise DescriptionError(
-                f"{path}: {name}: found shape {array.shape}, expected a column of numbers"
-            )
-        columns[name] = array
-    if len({len(column) for column in columns.values()}) > 1:
-        raise DescriptionError(f"{path}: found columns of different lengths")
-    return columns
-
-
-def _read_parquet(path: Path) -> Mapping[str, Array]:
-    pl = import_polars()
-    try:
-        scanned = pl.scan_parquet(path)
-        names = [name for name in scanned.collect_schema().names() if not _is_ignored(name)]
-        scanned = scanned.select(names)
-        schema = scanned.collect_schema()
-        for name, kind in schema.items():
-            if not kind.is_numeric():
-                raise DescriptionError(
-                    f"{path}: {name}: found values of type {kind}, expected numbers"
-                )
-        count = int(scanned.select(pl.len()).collect().item())
-        check_unpacked_size(str(path), 8 * len(schema) * count, LIMITS.table_bytes)
-        frame = scanned.select(pl.all().cast(pl.Float64).fill_null(np.nan)).collect()
-    except (pl.exceptions.PolarsError, OSError) as error:
-        raise DescriptionError(f"{path}: not a Parquet file: {error}") from error
-    return {name: frame[name].to_numpy() for name in frame.columns}
-
-
 Take = Literal["palm", "contacts"]
-"""Use of a hand's pose and posture as a target."""
+"""Kind of target that is made from the pose and posture of a hand."""
 
 TAKE_CHOICES = ("palm", "contacts")
 
 TABLE_LAYOUT = "table"
 """Layout of files with named columns."""
 
-LAYOUT_NAMES = (*LAYOUTS, ISAAC_GRASP, *PARALLEL, TABLE_LAYOUT)
+LAYOUT_NAMES = (*LAYOUTS, ISAAC_GRASP, *GRIPPER_READERS, TABLE_LAYOUT)
 """Names of all layouts of grasp files."""
 
 
@@ -339,7 +134,7 @@ def load_candidates(
 ) -> Candidates:
     """Load the grasps of a file or a folder for `Solver.choose`.
 
-    If joints that are free in the data are coupled in the hand, the posture is the one whose
+    If joints that are independent in the data are coupled in the hand, the posture is the one whose
     fingertips are nearest to those of the data; `Candidates.shift` is their distance.
 
     Args:
@@ -417,32 +212,36 @@ def _load(
     hand: str | Path | None,
     take: Take,
     grasped: str | GraspObject | None,
-    of: str | None,
+    object_name: str | None,
     scale: float | None,
     invalid: Invalid,
 ) -> Candidates:
     suffix = path.suffix.lower()
-    gripper_layout = layout or parallel_layout(path)
-    if gripper_layout == ISAAC_GRASP or gripper_layout in PARALLEL:
-        if of is not None:
-            raise InputError(f"of: found {of!r}, but {path.name} has grasps of one object")
+    gripper_layout = layout or recognise_layout(path)
+    if gripper_layout == ISAAC_GRASP or gripper_layout in GRIPPER_READERS:
+        if object_name is not None:
+            raise InputError(f"of: found {object_name!r}, but {path.name} has grasps of one object")
         if gripper_layout == ISAAC_GRASP:
             convention = convention_for(robot, ISAAC_GRASP, hand)
-            poses = isaac_grasp(path)
+            poses = read_isaac_grasp(path)
         else:
-            poses = for_gripper(PARALLEL[gripper_layout](path), robot, clip=invalid == "clip")
+            poses = transfer_to_gripper(
+                GRIPPER_READERS[gripper_layout](path), robot, clip=invalid == "clip"
+            )
             convention = convention_of_robot(robot, poses.names)
-        return _candidates_of_hand(poses.of_scale(scale), robot, convention, take, grasped, invalid)
-    if suffix in READERS and layout != TABLE_LAYOUT:
-        poses, found_layout = read_layout(path, layout)
-        selected = poses.of(of).of_scale(scale)
         return _candidates_of_hand(
-            selected, robot, convention_for(robot, found_layout, hand), take, grasped, invalid
+            poses.for_scale(scale), robot, convention, take, grasped, invalid
+        )
+    if suffix in READERS and layout != TABLE_LAYOUT:
+        poses, file_layout = read_layout(path, layout)
+        selected = poses.for_object(object_name).for_scale(scale)
+        return _candidates_of_hand(
+            selected, robot, convention_for(robot, file_layout, hand), take, grasped, invalid
         )
     if scale is not None:
         raise InputError(f"scale: found {scale:g}, but {path.name} states no sizes")
-    if of is not None:
-        raise InputError(f"of: found {of!r}, but {path.name} has grasps of one object")
+    if object_name is not None:
+        raise InputError(f"of: found {object_name!r}, but {path.name} has grasps of one object")
     if suffix in TABLE_SUFFIXES and (
         layout == TABLE_LAYOUT or (layout is None and not _has_targets(path))
     ):
@@ -450,14 +249,14 @@ def _load(
         robot_names = (*robot.description.joint_names, *robot.actuators)
         names = tuple(name for name in poses.names if name in robot_names)
         convention = (
-            _own_convention(robot, names)
+            _convention_of_joint_names(robot, names)
             if hand is None
             else convention_for(robot, TABLE_LAYOUT, hand)
         )
         return _candidates_of_hand(poses, robot, convention, take, grasped, invalid)
     if layout is not None:
         expected = ", ".join(READERS if layout != TABLE_LAYOUT else TABLE_SUFFIXES)
-        raise DescriptionError(f"{path}: found no {expected} file, expected one of {layout}")
+        raise DescriptionError(f"{path}: file is not a {expected} file of layout {layout}")
     if suffix == ".npz":
         return Candidates(tuple(_grasps_of_targets(path, robot.fingers)))
     grasps = load_grasp_files(path)
@@ -480,8 +279,8 @@ def _check_units(path: Path, grasps: Sequence[Grasp]) -> None:
                 )
 
 
-def _own_convention(robot: ArmHand, names: tuple[str, ...]) -> Convention:
-    """Return the convention of the robot's own joint names; the finger motors are required."""
+def _convention_of_joint_names(robot: ArmHand, names: tuple[str, ...]) -> Convention:
+    """Return the convention of the robot's joint names; the finger motors are required."""
     motors = robot.description.finger_motors
     return convention_of_robot(robot, (*names, *(name for name in motors if name not in names)))
 
@@ -506,11 +305,11 @@ def _candidates_of_hand(
 ) -> Candidates:
     """Return the candidates of hand poses and joints in the object's frame."""
     grasped_object, name = _load_object(grasped, poses.scales)
-    _check_count(poses.where, len(poses.rows))
+    _check_count(poses.location, len(poses.rows))
     joints = convention.positions(poses)
     hands = None
     if take == "palm" or not set(robot.description.finger_joints) <= set(joints):
-        hands = hand_postures(robot, poses.where, joints)
+        hands = hand_postures(robot, poses.location, joints)
         joints = hands.joints
     palms, points, normals = palms_and_pads(
         robot, convention.link, convention.frames(poses), joints
@@ -525,13 +324,13 @@ def _candidates_of_hand(
             contacts[i] = _contacts_of_pads(robot, points[i], normals[i], grasped_object)
         except DescriptionError as error:
             faults.setdefault(row, str(error))
-    selected = valid_rows(poses.where, poses.rows, faults, out_of_limits, invalid)
+    selected = valid_rows(poses.location, poses.rows, faults, out_of_limits, invalid)
     stages = {
         name: _palm_grasps(stage.select(selected), robot, convention)
         for name, stage in (("pregrasp", poses.pregrasp), ("squeeze", poses.squeeze))
         if stage is not None
     }
-    stem = Path(poses.where).stem
+    stem = Path(poses.location).stem
     grasps = []
     for k, i in enumerate(selected):
         fields: dict[str, Any]
@@ -563,10 +362,10 @@ def _load_object(
     return grasped_object, grasped
 
 
-def _check_count(where: str, count: int) -> None:
+def _check_count(location: str, count: int) -> None:
     if count > scaled_limit(LIMITS.candidates):
         raise DescriptionError(
-            f"{where}: found {count} grasps, expected at most {scaled_limit(LIMITS.candidates)} "
+            f"{location}: found {count} grasps, expected at most {scaled_limit(LIMITS.candidates)} "
             f"{RAISE_HINT}"
         )
 
@@ -579,7 +378,7 @@ def _palm_fields(pose: Array, hands: HandPostures | None, row: int) -> dict[str,
 
 def _palm_grasps(poses: HandPoses, robot: ArmHand, convention: Convention) -> list[Grasp]:
     """Return grasps of palm poses with the nearest postures that the hand can take."""
-    hands = hand_postures(robot, poses.where, convention.positions(poses))
+    hands = hand_postures(robot, poses.location, convention.positions(poses))
     palms = palms_and_pads(robot, convention.link, convention.frames(poses), hands.joints)[0]
     return [Grasp(robot=robot.name, **_palm_fields(palms[i], hands, i)) for i in range(len(palms))]
 

@@ -56,7 +56,7 @@ class HandPoses:
     `faults`; their numbers are zeros, and their rotations identities.
 
     Attributes:
-        where: File and key, for messages.
+        location: File and key, for messages.
         position: (k, 3) origin of the hand frame in the object frame [m].
         rotation: (k, 3, 3) rotation of the hand frame.
         joints: (k, m) joint positions [rad or m].
@@ -69,7 +69,7 @@ class HandPoses:
         squeeze: The hands while they squeeze; None if not stated.
     """
 
-    where: str
+    location: str
     position: Array
     rotation: Array
     joints: Array
@@ -107,7 +107,7 @@ class HandPoses:
                 } | faults
         object.__setattr__(self, "faults", faults)
 
-    def of(self, name: str | None) -> HandPoses:
+    def for_object(self, name: str | None) -> HandPoses:
         """Return the grasps of one object.
 
         Args:
@@ -125,9 +125,9 @@ class HandPoses:
         if name not in names:
             self._fail(f"of: found {name!r}, expected one of {description}")
         selected = self.select(np.flatnonzero(np.array(self.objects) == name))
-        return replace(selected, where=f"{self.where}: {name}")
+        return replace(selected, location=f"{self.location}: {name}")
 
-    def of_scale(self, scale: float | None) -> HandPoses:
+    def for_scale(self, scale: float | None) -> HandPoses:
         """Return the grasps of one size of the object.
 
         Args:
@@ -215,7 +215,7 @@ class HandPoses:
         return faults
 
     def _fail(self, problem: str) -> NoReturn:
-        raise DescriptionError(f"{self.where}: {problem}")
+        raise DescriptionError(f"{self.location}: {problem}")
 
     @property
     def poses(self) -> Array:
@@ -294,7 +294,7 @@ class HandPostures:
     joints: Mapping[str, Array]
 
 
-def hand_postures(robot: ArmHand, where: str, joints: Mapping[str, Array]) -> HandPostures:
+def hand_postures(robot: ArmHand, location: str, joints: Mapping[str, Array]) -> HandPostures:
     """Return the nearest postures that a hand can take.
 
     Positions are clipped to limits. If a joint contradicts its coupling, the motors of its finger
@@ -302,7 +302,7 @@ def hand_postures(robot: ArmHand, where: str, joints: Mapping[str, Array]) -> Ha
 
     Args:
         robot: The robot.
-        where: File, for messages.
+        location: File, for messages.
         joints: Positions (k,) by joint or motor.
 
     Raises:
@@ -313,7 +313,7 @@ def hand_postures(robot: ArmHand, where: str, joints: Mapping[str, Array]) -> Ha
     motor_values = _motors_of(described, joints)
     for name in motors:
         if name not in motor_values:
-            raise DescriptionError(f"{where}: {name}: missing, expected a position")
+            raise DescriptionError(f"{location}: {name}: missing, expected a position")
     columns = [robot.actuators.index(name) for name in motors]
     stated = np.stack([motor_values[name] for name in motors], axis=1)
     positions = np.clip(stated, robot.lower[columns], robot.upper[columns])

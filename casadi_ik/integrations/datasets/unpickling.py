@@ -1,8 +1,8 @@
-"""npy files and files of torch with pickled objects in them, read without running what they say.
+"""Readers of npy and torch files with pickled objects that execute no code of the file.
 
-A pickle is a program. Here it may build plain containers, texts and numbers, and numpy arrays,
-types and scalars: whatever else it names is refused, and of numpy's own machinery nothing runs that
-it could hand over anything to: arrays are put together from their bytes here.
+A pickle is a program. These readers allow it to build only plain containers, texts, numbers, and
+NumPy arrays, data types and scalars; every other name is refused. NumPy's own reconstruction
+functions are replaced by stubs, so that arrays are built here, from their bytes.
 """
 
 from __future__ import annotations
@@ -23,156 +23,163 @@ from casadi_ik.errors import DescriptionError
 from casadi_ik.files.limits import LIMITS
 from casadi_ik.files.number_files import READ_ERRORS, check_unpacked_size
 
-TYPES = re.compile(r"^[<>|=]?([biufcSUO]\d{0,5}|b1|\?)$")
-"""Element types that arrays may have."""
+DTYPE_PATTERN = re.compile(r"^[<>|=]?([biufcSUO]\d{0,5}|b1|\?)$")
+"""Allowed data types of arrays."""
 
 
-class Packed:
-    """An array of a pickle: its elements are there once it has been told them.
+class PickledArray:
+    """An array in a pickle.
 
     Attributes:
-        value: The array of numbers or texts; None where it holds objects.
-        items: The objects, in order.
-        shape: Of the array.
+        array: The array of numbers or texts; None if it holds objects.
+        objects: The objects of an array of objects, in order.
+        shape: Shape of the array.
     """
 
     def __init__(self) -> None:
-        self.value: np.ndarray | None = None
-        self.items: list[Any] = []
+        self.array: np.ndarray | None = None
+        self.objects: list[Any] = []
         self.shape: tuple[int, ...] = ()
 
     def __setstate__(self, state: Any) -> None:
-        """Take version, shape, type, order and elements."""
-        _, shape, kind, by_columns, data = state
-        if not (isinstance(kind, _Kind) and all(isinstance(n, int) and n >= 0 for n in shape)):
-            raise pickle.UnpicklingError("an array without a type or a shape")
+        """Set version, shape, data type, order and elements."""
+        _, shape, dtype, is_column_major, data = state
+        if not (
+            isinstance(dtype, _DtypeStub) and all(isinstance(n, int) and n >= 0 for n in shape)
+        ):
+            raise pickle.UnpicklingError("an array without a data type or a shape")
         self.shape, count = tuple(shape), math.prod(shape)
-        if kind.holds_objects:
+        if dtype.holds_objects:
             if not isinstance(data, list) or len(data) != count:
-                raise pickle.UnpicklingError("an array of objects that are not there")
-            self.items = data
+                raise pickle.UnpicklingError("an array of objects with missing objects")
+            self.objects = data
             return
-        self.value = array_of(data, kind.dtype, self.shape, bool(by_columns))
+        self.array = array_from_bytes(data, dtype.dtype, self.shape, bool(is_column_major))
 
 
-class _Kind:
-    """The element type of an array."""
+class _DtypeStub:
+    """The data type of an array in a pickle."""
 
     def __init__(self, text: str) -> None:
         self.text = text
 
     def __setstate__(self, state: Any) -> None:
-        order = state[1] if isinstance(state, tuple) and len(state) > 1 else None
-        if order not in ("<", ">", "|", "="):
-            raise pickle.UnpicklingError("a type without an order of bytes")
-        self.text = order + self.text.lstrip("<>|=")
+        byte_order = state[1] if isinstance(state, tuple) and len(state) > 1 else None
+        if byte_order not in ("<", ">", "|", "="):
+            raise pickle.UnpicklingError("a data type without a byte order")
+        self.text = byte_order + self.text.lstrip("<>|=")
 
     @property
     def holds_objects(self) -> bool:
+        """True if the elements are Python objects."""
         return "O" in self.text
 
     @property
     def dtype(self) -> np.dtype[Any]:
+        """NumPy data type."""
         return np.dtype(self.text)
 
 
-def _kind(text: Any, *_: Any) -> _Kind:
-    if not (isinstance(text, str) and TYPES.match(text)):
+def _make_dtype(text: Any, *_: Any) -> _DtypeStub:
+    if not (isinstance(text, str) and DTYPE_PATTERN.match(text)):
         raise pickle.UnpicklingError(f"arrays of type {text!r}")
-    return _Kind(text)
+    return _DtypeStub(text)
 
 
-def array_of(data: Any, dtype: np.dtype[Any], shape: tuple[int, ...], by_columns: bool) -> Any:
-    """An array of bytes, which have to be as many as it needs."""
+def array_from_bytes(
+    data: Any, dtype: np.dtype[Any], shape: tuple[int, ...], is_column_major: bool
+) -> Any:
+    """Return the array with the given bytes, whose number must match the shape."""
     if not isinstance(data, bytes) or len(data) != math.prod(shape) * dtype.itemsize:
-        raise pickle.UnpicklingError("an array whose bytes are not as many as its shape says")
+        raise pickle.UnpicklingError("an array whose number of bytes does not match its shape")
     flat = np.frombuffer(data, dtype) if data else np.zeros(0, dtype)
-    return flat.reshape(shape, order="F" if by_columns else "C").copy()
+    return flat.reshape(shape, order="F" if is_column_major else "C").copy()
 
 
-def _scalar(kind: Any, data: Any) -> Any:
-    if not isinstance(kind, _Kind) or kind.holds_objects:
-        raise pickle.UnpicklingError("a scalar without a type")
-    return array_of(data, kind.dtype, (), False).item()
+def _make_scalar(dtype: Any, data: Any) -> Any:
+    if not isinstance(dtype, _DtypeStub) or dtype.holds_objects:
+        raise pickle.UnpicklingError("a scalar without a data type")
+    return array_from_bytes(data, dtype.dtype, (), False).item()
 
 
-def _rebuilt(_: Any, shape: Any, __: Any) -> Packed:
+def _make_empty_array(_: Any, shape: Any, __: Any) -> PickledArray:
     if shape != (0,):
-        raise pickle.UnpicklingError("an array in another way than numpy writes it")
-    return Packed()
+        raise pickle.UnpicklingError("an array in a form that NumPy does not write")
+    return PickledArray()
 
 
-def _from_buffer(data: Any, kind: Any, shape: Any, order: Any) -> Packed:
-    packed = Packed()
-    held = bytes(data.raw()) if isinstance(data, pickle.PickleBuffer) else bytes(data)
-    packed.__setstate__((1, shape, kind, order == "F", held))
-    return packed
+def _array_from_buffer(data: Any, dtype: Any, shape: Any, order: Any) -> PickledArray:
+    array = PickledArray()
+    raw = bytes(data.raw()) if isinstance(data, pickle.PickleBuffer) else bytes(data)
+    array.__setstate__((1, shape, dtype, order == "F", raw))
+    return array
 
 
-def _encoded(text: Any, encoding: Any) -> bytes:
+def _encode(text: Any, encoding: Any) -> bytes:
     if not isinstance(text, str) or encoding != "latin1":
-        raise pickle.UnpicklingError("a text in an odd encoding")
+        raise pickle.UnpicklingError("a text in an unexpected encoding")
     return text.encode("latin1")
 
 
-class Named:
-    """What a pickle may name, and call if it is something to call; it cannot be changed."""
+class AllowedGlobal:
+    """An immutable stub for a global name that a pickle may use, and call if it is a function."""
 
-    __slots__ = ("_does",)
+    __slots__ = ("_function",)
 
-    def __init__(self, does: Callable[..., Any] | None = None) -> None:
-        self._does = does
+    def __init__(self, function: Callable[..., Any] | None = None) -> None:
+        self._function = function
 
     def __call__(self, *arguments: Any) -> Any:
-        """What it does, if anything."""
-        if self._does is None:
-            raise pickle.UnpicklingError("a call of an array's class")
-        return self._does(*arguments)
+        """Call the function of the stub."""
+        if self._function is None:
+            raise pickle.UnpicklingError("a call of the class of an array")
+        return self._function(*arguments)
 
     def __setstate__(self, state: Any) -> None:
-        raise pickle.UnpicklingError("a change of what builds arrays")
+        raise pickle.UnpicklingError("a change of a function that builds arrays")
 
 
-ALLOWED: dict[str, Named] = {
-    "ndarray": Named(),
-    "dtype": Named(_kind),
-    "_reconstruct": Named(_rebuilt),
-    "scalar": Named(_scalar),
-    "_frombuffer": Named(_from_buffer),
+NUMPY_GLOBALS: dict[str, AllowedGlobal] = {
+    "ndarray": AllowedGlobal(),
+    "dtype": AllowedGlobal(_make_dtype),
+    "_reconstruct": AllowedGlobal(_make_empty_array),
+    "scalar": AllowedGlobal(_make_scalar),
+    "_frombuffer": AllowedGlobal(_array_from_buffer),
 }
-"""What of numpy a pickle may name, by its last name, and what it gets."""
+"""Stubs of the names in any NumPy module that a pickle may use."""
 
 
-ENCODED = Named(_encoded)
-"""How pickles of Python 2 write bytes."""
+ENCODE = AllowedGlobal(_encode)
+"""Stub of the function with which pickles of Python 2 write bytes."""
 
 
-class Reader(pickle.Unpickler):
-    """Of pickles that hold arrays of numpy, containers, texts and numbers."""
+class RestrictedUnpickler(pickle.Unpickler):
+    """An unpickler for NumPy arrays, containers, texts and numbers."""
 
     def find_class(self, module: str, name: str) -> Any:
-        """What a pickle names."""
-        if module.split(".")[0] == "numpy" and name in ALLOWED:
-            return ALLOWED[name]
+        """Return the stub of a global name; refuse every other name."""
+        if module.split(".")[0] == "numpy" and name in NUMPY_GLOBALS:
+            return NUMPY_GLOBALS[name]
         if (module, name) == ("_codecs", "encode"):
-            return ENCODED
+            return ENCODE
         raise pickle.UnpicklingError(f"{module}.{name}")
 
     def persistent_load(self, pid: Any) -> Any:
-        """What a pickle says is somewhere else."""
-        raise pickle.UnpicklingError(f"things kept elsewhere: {pid}")
+        """Refuse a reference to data outside the pickle."""
+        raise pickle.UnpicklingError(f"a reference to external data: {pid}")
 
 
 @contextmanager
-def reading(path: Path, kind: str) -> Iterator[None]:
-    """What goes wrong with a file, in one line.
+def readable_file(path: Path, kind: str) -> Iterator[None]:
+    """Check the size of a file, and turn errors of reading it into one-line messages.
 
     Args:
         path: The file.
-        kind: What it should be.
+        kind: Expected kind of file, for messages.
 
     Raises:
-        DescriptionError: It cannot be read, is too large, damaged, or names what it may not.
+        DescriptionError: The file cannot be read, is too large or damaged, or uses a forbidden
+            name.
     """
     try:
         size = path.stat().st_size
@@ -182,55 +189,54 @@ def reading(path: Path, kind: str) -> Iterator[None]:
         raise DescriptionError(f"{path}: cannot be read: {error.strerror or error}") from error
     except pickle.UnpicklingError as error:
         raise DescriptionError(
-            f"{path}: its pickle holds {_line(error)}, expected arrays, containers, texts and "
-            "numbers only"
+            f"{path}: its pickle contains {_one_line(error)}; expected only arrays, containers, "
+            "texts and numbers"
         ) from error
     except (*READ_ERRORS, AttributeError, KeyError, IndexError, TypeError) as error:
-        raise DescriptionError(f"{path}: damaged, expected {kind}: {_line(error)}") from error
+        raise DescriptionError(
+            f"{path}: file is damaged; expected {kind}: {_one_line(error)}"
+        ) from error
 
 
 def read_npy(path: Path) -> Any:
-    """What an npy file holds.
-
-    Args:
-        path: The file.
+    """Return the content of an npy file.
 
     Returns:
-        An array of numbers; or what was pickled: dictionaries, lists, texts, numbers and `Packed`
-        arrays. A single object in an array without dimensions comes out by itself.
+        An array of numbers, or the pickled object: dictionaries, lists, texts, numbers and
+        `PickledArray` objects. A single object in an array without dimensions is returned directly.
 
     Raises:
-        DescriptionError: It cannot be read, is damaged, or its pickle names anything else than
+        DescriptionError: The file cannot be read, is damaged, or its pickle contains anything but
             arrays, containers, texts and numbers.
     """
-    with reading(path, "an npy file"), path.open("rb") as file:
-        return _content(path, file)
+    with readable_file(path, "an npy file"), path.open("rb") as file:
+        return _npy_content(path, file)
 
 
-def _content(path: Path, file: BinaryIO) -> Any:
+def _npy_content(path: Path, file: BinaryIO) -> Any:
     version = np.lib.format.read_magic(file)
-    read = {
+    read_header = {
         (1, 0): np.lib.format.read_array_header_1_0,
         (2, 0): np.lib.format.read_array_header_2_0,
     }.get(version)
-    if read is None:
+    if read_header is None:
         raise DescriptionError(f"{path}: found npy version {version}, expected 1.0 or 2.0")
-    shape, by_columns, dtype = read(file)
-    rest = file.read()
+    shape, is_column_major, dtype = read_header(file)
+    data = file.read()
     if not dtype.hasobject:
-        return array_of(rest, dtype, shape, by_columns)
-    found = Reader(io.BytesIO(rest)).load()
-    if isinstance(found, Packed) and found.value is None:
-        return found.items[0] if found.shape == () else found.items
-    return found
+        return array_from_bytes(data, dtype, shape, is_column_major)
+    content = RestrictedUnpickler(io.BytesIO(data)).load()
+    if isinstance(content, PickledArray) and content.array is None:
+        return content.objects[0] if content.shape == () else content.objects
+    return content
 
 
-def _line(error: Exception) -> str:
-    """What it says, in one line."""
+def _one_line(error: Exception) -> str:
+    """Return the message of an error in one line."""
     return " ".join(str(error).split())
 
 
-KINDS = {
+STORAGE_TYPES = {
     "DoubleStorage": "f8",
     "FloatStorage": "f4",
     "HalfStorage": "f2",
@@ -241,105 +247,109 @@ KINDS = {
     "ByteStorage": "u1",
     "BoolStorage": "?",
 }
-"""What a raw file holds, by what torch calls it."""
+"""NumPy data type by class of a torch storage."""
 
 
-class _Storage(Named):
-    """What a raw file holds."""
+class _StorageType(AllowedGlobal):
+    """A stub of a class of torch storages: the raw data that tensors view."""
 
-    __slots__ = ("text",)
+    __slots__ = ("dtype_text",)
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, dtype_text: str) -> None:
         super().__init__()
-        self.text = text
+        self.dtype_text = dtype_text
 
 
-def _rebuilt_tensor(numbers: Any, first: Any, shape: Any, apart: Any, *_: Any) -> Packed:
-    """A tensor: which numbers of a raw file."""
-    ends = (first, *shape, *apart) if isinstance(numbers, np.ndarray) else (-1,)
-    if len(shape) != len(apart) or not all(type(one) is int and one >= 0 for one in ends):
-        raise pickle.UnpicklingError("a tensor without numbers, shape or strides")
-    packed = Packed()
-    packed.shape = tuple(shape)
+def _rebuild_tensor(storage: Any, offset: Any, shape: Any, strides: Any, *_: Any) -> PickledArray:
+    """Return a tensor as a view of its storage."""
+    layout = (offset, *shape, *strides) if isinstance(storage, np.ndarray) else (-1,)
+    is_layout = all(type(number) is int and number >= 0 for number in layout)
+    if len(shape) != len(strides) or not is_layout:
+        raise pickle.UnpicklingError("a tensor without storage, shape or strides")
+    tensor = PickledArray()
+    tensor.shape = tuple(shape)
     if not math.prod(shape):
-        packed.value = np.zeros(shape, numbers.dtype)
-        return packed
-    last = first + sum((n - 1) * step for n, step in zip(shape, apart, strict=True))
-    if last >= len(numbers) or math.prod(shape) > len(numbers):
-        raise pickle.UnpicklingError("a tensor that is larger than its numbers")
-    steps = tuple(step * numbers.itemsize for step in apart)
-    packed.value = np.lib.stride_tricks.as_strided(numbers[first:], shape, steps, writeable=False)
-    return packed
+        tensor.array = np.zeros(shape, storage.dtype)
+        return tensor
+    last = offset + sum((n - 1) * stride for n, stride in zip(shape, strides, strict=True))
+    if last >= len(storage) or math.prod(shape) > len(storage):
+        raise pickle.UnpicklingError("a tensor that is larger than its storage")
+    byte_strides = tuple(stride * storage.itemsize for stride in strides)
+    tensor.array = np.lib.stride_tricks.as_strided(
+        storage[offset:], shape, byte_strides, writeable=False
+    )
+    return tensor
 
 
-def _ordered(pairs: Any = ()) -> dict[Any, Any]:
+def _make_dict(pairs: Any = ()) -> dict[Any, Any]:
     return dict(pairs)
 
 
-REBUILD, ORDERED = Named(_rebuilt_tensor), Named(_ordered)
+REBUILD_TENSOR, ORDERED_DICT = AllowedGlobal(_rebuild_tensor), AllowedGlobal(_make_dict)
 
 
-class _TorchReader(Reader):
-    """Of `data.pkl`."""
+class _TorchUnpickler(RestrictedUnpickler):
+    """An unpickler for the file `data.pkl` of a torch archive."""
 
     def __init__(self, archive: ZipFile, folder: str) -> None:
         super().__init__(io.BytesIO(archive.read(f"{folder}data.pkl")))
         self._archive, self._folder = archive, folder
-        said = f"{folder}byteorder"
-        big = said in archive.namelist() and archive.read(said) == b"big"
-        self._order: Literal[">", "<"] = ">" if big else "<"
-        self._read: dict[str, np.ndarray] = {}
+        entry = f"{folder}byteorder"
+        is_big_endian = entry in archive.namelist() and archive.read(entry) == b"big"
+        self._byte_order: Literal[">", "<"] = ">" if is_big_endian else "<"
+        self._storages: dict[str, np.ndarray] = {}
 
     def find_class(self, module: str, name: str) -> Any:
-        """What a pickle names."""
-        if module == "torch" and name in KINDS:
-            return _Storage(KINDS[name])
+        """Return the stub of a global name; refuse every other name."""
+        if module == "torch" and name in STORAGE_TYPES:
+            return _StorageType(STORAGE_TYPES[name])
         if (module, name) == ("torch._utils", "_rebuild_tensor_v2"):
-            return REBUILD
+            return REBUILD_TENSOR
         if (module, name) == ("collections", "OrderedDict"):
-            return ORDERED
+            return ORDERED_DICT
         return super().find_class(module, name)
 
     def persistent_load(self, pid: Any) -> np.ndarray:
-        """The numbers of a raw file."""
+        """Return the storage of a tensor as an array."""
         if not (isinstance(pid, tuple) and len(pid) == 5 and pid[0] == "storage"):
-            raise pickle.UnpicklingError("things kept elsewhere that are no tensor's numbers")
-        _, kind, key, _, count = pid
-        if not isinstance(kind, _Storage) or not isinstance(key, str):
-            raise pickle.UnpicklingError("a tensor of unknown numbers")
-        if key not in self._read:
+            raise pickle.UnpicklingError("a reference to external data that is not a storage")
+        _, storage_type, key, _, count = pid
+        if not isinstance(storage_type, _StorageType) or not isinstance(key, str):
+            raise pickle.UnpicklingError("a tensor with an unknown storage")
+        if key not in self._storages:
             data = self._archive.read(f"{self._folder}data/{key}")
-            dtype = np.dtype(kind.text).newbyteorder(self._order)
+            dtype = np.dtype(storage_type.dtype_text).newbyteorder(self._byte_order)
             if type(count) is not int or len(data) != count * dtype.itemsize:
-                raise pickle.UnpicklingError("a tensor whose numbers are not as many as it says")
-            self._read[key] = np.frombuffer(data, dtype)
-        return self._read[key]
+                raise pickle.UnpicklingError("a storage whose size does not match its count")
+            self._storages[key] = np.frombuffer(data, dtype)
+        return self._storages[key]
 
 
 def read_torch(path: Path) -> Any:
-    """What a file of `torch.save` holds: containers, texts, numbers and tensors as `Packed` arrays.
-
-    Args:
-        path: The file.
+    """Return the content of a file of `torch.save`, with tensors as `PickledArray` objects.
 
     Raises:
-        DescriptionError: It cannot be read, is damaged, was written by a torch before 1.6, or
-            names anything else than tensors, containers, texts and numbers.
+        DescriptionError: The file cannot be read, is damaged, was written by a torch before 1.6, or
+            contains anything but tensors, containers, texts and numbers.
     """
-    with reading(path, "a file of torch.save"):
+    with readable_file(path, "a file of torch.save"):
         with path.open("rb") as file:
-            begins = file.read(2)
+            magic = file.read(2)
         if not is_zipfile(path):
-            if begins[:1] == pickle.PROTO:
+            if magic[:1] == pickle.PROTO:
                 raise DescriptionError(
-                    f"{path}: found the format before torch 1.6, expected its zip; where torch is: "
-                    f"torch.save(torch.load({path.name!r}), {path.name!r})"
+                    f"{path}: found the format before torch 1.6, expected its zip format; convert "
+                    f"the file with torch.save(torch.load({path.name!r}), {path.name!r})"
                 )
-            raise DescriptionError(f"{path}: found no zip, expected a file of torch.save")
+            raise DescriptionError(f"{path}: file is not a zip file; expected a file of torch.save")
         with ZipFile(path) as archive:
-            size = sum(one.file_size for one in archive.infolist())
+            size = sum(entry.file_size for entry in archive.infolist())
             check_unpacked_size(str(path), size, LIMITS.dataset_bytes)
-            held = [n for n in archive.namelist() if n.count("/") <= 1 and n.endswith("data.pkl")]
-            if not held:
-                raise DescriptionError(f"{path}: data.pkl: missing, expected a file of torch.save")
-            return _TorchReader(archive, held[0].removesuffix("data.pkl")).load()
+            pickles = [
+                name
+                for name in archive.namelist()
+                if name.count("/") <= 1 and name.endswith("data.pkl")
+            ]
+            if not pickles:
+                raise DescriptionError(f"{path}: data.pkl: missing; expected a file of torch.save")
+            return _TorchUnpickler(archive, pickles[0].removesuffix("data.pkl")).load()
