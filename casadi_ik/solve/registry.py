@@ -14,7 +14,7 @@ from casadi_ik.solve.hand_first.method import HandFirstMethod
 from casadi_ik.solve.hand_first.parameters import HandFirstParameters
 from casadi_ik.solve.method import Method
 from casadi_ik.solve.thumb_first.method import ThumbFirstMethod
-from casadi_ik.solve.thumb_first.step import ThumbFirstParameters
+from casadi_ik.solve.thumb_first.parameters import ThumbFirstParameters
 
 Build = Callable[[RobotDescription, Any, bool], Method]
 """Function of robot, parameter record and whether to compile that builds a method."""

@@ -153,14 +153,14 @@ class LinearisedContacts:
         thumb: (m, n) Jacobian of the thumb, positions divided by `LENGTH`, orientations in rad;
             five rows for a point and a normal.
         thumb_error: (m, 1) errors of the thumb.
-        others: (m', n) Jacobian of the other fingers, stacked by finger.
-        others_error: (m', 1) errors of the other fingers.
+        other_fingers: (m', n) Jacobian of the other fingers, stacked by finger.
+        other_fingers_error: (m', 1) errors of the other fingers.
     """
 
     thumb: Expr
     thumb_error: Expr
-    others: Expr
-    others_error: Expr
+    other_fingers: Expr
+    other_fingers_error: Expr
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,33 +242,40 @@ def linearise_contacts(
     )
 
 
-def thumb_step(linear: LinearisedContacts, damping: Expr) -> Expr:
+def thumb_step(linearised: LinearisedContacts, damping: Expr) -> Expr:
     """Return J_t^# e_t, the damped minimum-norm step (n, 1) for the thumb alone."""
-    return damped_pinv_times(linear.thumb, linear.thumb_error, ca.fmax(THUMB_DAMPING, damping))
+    return damped_pinv_times(
+        linearised.thumb, linearised.thumb_error, ca.fmax(THUMB_DAMPING, damping)
+    )
 
 
-def free_step(linear: LinearisedContacts, damping: Expr) -> Expr:
+def free_step(linearised: LinearisedContacts, damping: Expr) -> Expr:
     """Return the step (n, 1) without limits."""
-    first = thumb_step(linear, damping)
-    if linear.others.shape[0] == 0:
-        return first
-    # The rows of J_o N are in the range of N, so that the result needs no further projection.
-    J_o_N = project_to_null_space(linear.thumb, linear.others.T, PROJECTOR_DAMPING).T
-    remaining_error = linear.others_error - linear.others @ first
-    return first + damped_pinv_times(J_o_N, remaining_error, damping)
+    step_of_thumb = thumb_step(linearised, damping)
+    if linearised.other_fingers.shape[0] == 0:
+        return step_of_thumb
+    # The rows of J_o N are in the range of N; the result requires no further projection.
+    J_o_N = project_to_null_space(linearised.thumb, linearised.other_fingers.T, PROJECTOR_DAMPING).T
+    remaining_error = linearised.other_fingers_error - linearised.other_fingers @ step_of_thumb
+    return step_of_thumb + damped_pinv_times(J_o_N, remaining_error, damping)
 
 
-def solve_by_fixing(linear: LinearisedContacts, limits: StepLimits) -> tuple[Expr, Expr]:
+def solve_by_fixing(linearised: LinearisedContacts, limits: StepLimits) -> tuple[Expr, Expr]:
     """Solve within limits by repeatedly fixing the motor with the largest violation.
 
     Args:
-        linear: Linearised contacts as MX expressions, because further passes are conditional.
+        linearised: Linearised contacts as MX expressions, because further passes are conditional.
         limits: Bounds and damping as MX expressions.
 
     Returns:
         Step (n, 1) and 1 for every fixed motor (n, 1).
     """
-    problem = [linear.thumb, linear.thumb_error, linear.others, linear.others_error]
+    problem = [
+        linearised.thumb,
+        linearised.thumb_error,
+        linearised.other_fingers,
+        linearised.other_fingers_error,
+    ]
     problem += [limits.lower, limits.upper, limits.damping]
     first_pass = _pass_function([matrix.sparsity() for matrix in problem])
     step, is_fixed, values, is_violated = first_pass(
@@ -276,9 +283,9 @@ def solve_by_fixing(linear: LinearisedContacts, limits: StepLimits) -> tuple[Exp
     )
     symbols = [ca.MX.sym("x", first_pass.sparsity_in(i)) for i in range(first_pass.n_in())]
     inputs = [*symbols, ca.MX.sym("step", *step.shape)]
-    next_pass = ca.Function("again", inputs, list(first_pass(*symbols)))
-    unchanged = ca.Function("same", inputs, [inputs[-1], symbols[-2], symbols[-1], ca.MX(0)])
-    pass_if_violated = ca.Function.if_else("fix_another", next_pass, unchanged)
+    next_pass = ca.Function("next_pass", inputs, list(first_pass(*symbols)))
+    unchanged = ca.Function("unchanged", inputs, [inputs[-1], symbols[-2], symbols[-1], ca.MX(0)])
+    pass_if_violated = ca.Function.if_else("pass_if_violated", next_pass, unchanged)
     for _ in range(MAX_FIXED_JOINTS - 1):
         step, is_fixed, values, is_violated = pass_if_violated(
             is_violated, *problem, is_fixed, values, step
@@ -287,18 +294,21 @@ def solve_by_fixing(linear: LinearisedContacts, limits: StepLimits) -> tuple[Exp
 
 
 def _pass_function(sparsities: list[ca.Sparsity]) -> ca.Function:
-    """``(problem, held, values) -> (step, held', values', over)``; over: one more was fixed."""
+    """Return ``(problem, is_fixed, values) -> (step, is_fixed, values, is_violated)``.
+
+    A motor that violates its limit most is fixed there for the next pass.
+    """
     n = sparsities[0].size2()
-    thumb, thumb_error, others, others_error, lower, upper, damping = (
+    thumb, thumb_error, other_fingers, other_fingers_error, lower, upper, damping = (
         ca.SX.sym("x", sparsity) for sparsity in sparsities
     )
-    is_fixed, values = ca.SX.sym("held", n), ca.SX.sym("values", n)
+    is_fixed, values = ca.SX.sym("is_fixed", n), ca.SX.sym("values", n)
     free, contribution = (1 - is_fixed).T, is_fixed * values
     masked = LinearisedContacts(
         thumb * ca.repmat(free, thumb.shape[0], 1),
         thumb_error - thumb @ contribution,
-        others * ca.repmat(free, others.shape[0], 1),
-        others_error - others @ contribution,
+        other_fingers * ca.repmat(free, other_fingers.shape[0], 1),
+        other_fingers_error - other_fingers @ contribution,
     )
     step = free_step(masked, damping) + contribution
     violation = ca.fmax(lower - step, step - upper) * (1 - is_fixed)
@@ -311,21 +321,33 @@ def _pass_function(sparsities: list[ca.Sparsity]) -> ca.Function:
         ca.if_else(fix_now, ca.if_else(step > upper, upper, lower), values),
         is_violated,
     ]
-    inputs = [thumb, thumb_error, others, others_error, lower, upper, damping, is_fixed, values]
-    return ca.Function("solved_and_fixed", inputs, with_cse(*map(ca.densify, outputs)))
+    inputs = [
+        thumb,
+        thumb_error,
+        other_fingers,
+        other_fingers_error,
+        lower,
+        upper,
+        damping,
+        is_fixed,
+        values,
+    ]
+    return ca.Function("solve_and_fix", inputs, with_cse(*map(ca.densify, outputs)))
 
 
-def solve_by_proxqp(linear: LinearisedContacts, limits: StepLimits) -> tuple[Expr, Expr]:
+def solve_by_proxqp(linearised: LinearisedContacts, limits: StepLimits) -> tuple[Expr, Expr]:
     """Solve the same problem as a quadratic program within limits, by ProxQP.
 
     The rows of the thumb are equations. If the limits make them infeasible, ProxQP solves the
     closest feasible problem, so that the thumb keeps its priority. Returns as `solve_by_fixing`.
     """
-    m, n = linear.thumb.shape
-    thumb_motion = linear.thumb @ thumb_step(linear, limits.damping)
-    hessian = linear.others.T @ linear.others + limits.damping**2 * ca.DM.eye(n)
-    gradient = -linear.others.T @ linear.others_error
-    program = (hessian, gradient, linear.thumb, thumb_motion, limits.lower, limits.upper)
+    m, n = linearised.thumb.shape
+    thumb_motion = linearised.thumb @ thumb_step(linearised, limits.damping)
+    hessian = linearised.other_fingers.T @ linearised.other_fingers + limits.damping**2 * ca.DM.eye(
+        n
+    )
+    gradient = -linearised.other_fingers.T @ linearised.other_fingers_error
+    program = (hessian, gradient, linearised.thumb, thumb_motion, limits.lower, limits.upper)
     solution = proxqp(n, m)(*map(ca.densify, program))
     step = ca.fmin(ca.fmax(solution, limits.lower), limits.upper)
     return step, ca.logic_or(step <= limits.lower, step >= limits.upper)

@@ -17,11 +17,9 @@ from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.looped_method import LoopedMethod, Start
 from casadi_ik.solve.status import Phase
-from casadi_ik.solve.thumb_first.step import (
-    THUMB_FIRST_STAGES,
-    ThumbFirstParameters,
-    ThumbFirstStep,
-)
+from casadi_ik.solve.thumb_first.layouts import THUMB_FIRST_STAGES
+from casadi_ik.solve.thumb_first.parameters import ThumbFirstParameters
+from casadi_ik.solve.thumb_first.step import ThumbFirstStep
 
 PREFER_Q0 = "q0"
 """Name of the preference for solutions near `q0`."""
@@ -109,16 +107,16 @@ class ThumbFirstMethod(LoopedMethod):
             "lower": lower,
             "upper": upper,
             "postures": np.clip(postures, lower[hand], upper[hand]),
-            "given": hands.shape[1],
-            "here": current,
-            "nearest": float(prefers_q0),
+            "n_postures": hands.shape[1],
+            "start_q": current,
+            "prefers_q0": float(prefers_q0),
             "first_damping": self.options.damping,
             "step_cap": self.options.step_cap,
         }
         parameters = step.parameters.pack_rows(values, count)
         initial_state = {item.name: np.zeros(item.shape) for item in step.state} | {
             "q": current if prefers_q0 else q0,
-            "passed": -1.0,
+            "last_start_distance": -1.0,
             "phase": Phase.HAND_ALIGNMENT if prefers_q0 else Phase.CANDIDATE,
             "start": -float(prefers_q0),
             "damping": self.options.damping,

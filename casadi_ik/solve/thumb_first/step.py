@@ -18,14 +18,11 @@ arm configuration nearest to that of q0.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from functools import cached_property
+from dataclasses import dataclass
 
 import casadi as ca
 
 from casadi_ik.compile.graphs import StepGraph, recipe
-from casadi_ik.compile.layout import Field, Layout
-from casadi_ik.errors import InputError
 from casadi_ik.kinematics.arms.family import ArmFamily
 from casadi_ik.kinematics.arms.search import ArmTrials, Farthest, Nearest
 from casadi_ik.kinematics.contact_fit import (
@@ -37,7 +34,7 @@ from casadi_ik.kinematics.contact_fit import (
     is_new_cost,
     minimax_step,
 )
-from casadi_ik.kinematics.contacts import ContactRows, Kinds, kinds_suffix, within_tolerance
+from casadi_ik.kinematics.contacts import kinds_suffix, within_tolerance
 from casadi_ik.kinematics.forward import Pose, motor_scales
 from casadi_ik.kinematics.palm import (
     base_rotation,
@@ -47,7 +44,6 @@ from casadi_ik.kinematics.palm import (
     pose_step,
 )
 from casadi_ik.kinematics.smooth import Expr, with_cse
-from casadi_ik.model.description import RobotDescription
 from casadi_ik.solve.limits import pack_bits
 from casadi_ik.solve.status import Phase, Status
 from casadi_ik.solve.thumb_first.closed_chain_step import (
@@ -58,222 +54,7 @@ from casadi_ik.solve.thumb_first.closed_chain_step import (
     evaluate_contacts,
     linearise_contacts,
 )
-from casadi_ik.solve.trace import (
-    ACCEPTED,
-    ACTIVE_MASK,
-    ANGLE_ERROR,
-    COST,
-    DAMPING,
-    LIMIT_MASK,
-    PHASE,
-    POSITION_ERROR,
-    RESTART,
-    STATUS,
-    STEP_SIZE,
-    Q,
-)
-
-STEP_METHODS = ("freeze", "proxqp")
-"""Methods by which a step satisfies the limits."""
-
-
-@dataclass(frozen=True)
-class ThumbFirstParameters:
-    """Parameters of the method `thumb-first`.
-
-    Attributes:
-        starts: Maximum number of palm estimates per solve, each from a different hand posture.
-        table: Number of hand postures in the table of palm estimates.
-        pull: Weight of the distance from the hand of q0 relative to the match of the contacts.
-        step: "freeze" fixes the joint with the largest limit violation and solves the step again.
-            "proxqp" solves the same problem as a quadratic program (ProxQP, Bambade et al. 2022)
-            in CasADi's virtual machine, which is slower.
-        damping: Damping of the first step of a start [-]; residuals are in 0.1 m and rad.
-        step_cap: Largest change of a motor per iteration [rad, or fraction of the range of a
-            slider].
-        eased: Factor of the damping after an accepted step.
-        tightened: Factor of the damping after a rejected step.
-        damping_floor: Smallest damping.
-        damping_ceiling: Damping at which a rejected step ends a start.
-        gain: Ratio of costs after and before a step above which progress is slow.
-        patience: Number of consecutive iterations with slow progress that ends a start.
-        budget: Maximum number of iterations per start.
-        as_it_is: Largest cost at which q0, or the hand posture of q0, is used as a start.
-    """
-
-    starts: int = 32
-    table: int = 8192
-    pull: float = 6.0
-    step: str = "freeze"
-    damping: float = 0.03
-    step_cap: float = 0.3
-    eased: float = 1 / 3
-    tightened: float = 4.0
-    damping_floor: float = 1e-6
-    damping_ceiling: float = 100.0
-    gain: float = 0.9
-    patience: int = 12
-    budget: int = 100
-    as_it_is: float = 0.5
-
-    def __post_init__(self) -> None:
-        if self.step not in STEP_METHODS:
-            names = ", ".join(STEP_METHODS)
-            raise InputError(f"step: found {self.step!r}, expected one of {names}")
-        for entry in fields(self):
-            value = getattr(self, entry.name)
-            if entry.type == "int" and not (type(value) is int and value >= 1):
-                raise InputError(f"{entry.name}: found {value!r}, expected a whole number >= 1")
-            if entry.type == "float" and not (type(value) in (int, float) and value > 0):
-                raise InputError(f"{entry.name}: found {value!r}, expected a number > 0")
-        if self.starts > self.table:
-            raise InputError(f"table: found {self.table}, expected at least starts = {self.starts}")
-
-
-THUMB_FIRST_STAGES = (Phase.HAND_ALIGNMENT, Phase.CANDIDATE, Phase.ARM_PLACEMENT, Phase.BALANCE)
-"""Phases of an iteration, the most frequent first."""
-
-ABSENT = float("nan")
-
-
-@dataclass(frozen=True, eq=False)
-class ThumbFirstLayouts:
-    """Layouts of state, parameters and record for one robot.
-
-    Attributes:
-        robot: Description of the robot.
-        options: Parameters of the method.
-        kinds: Kind of contact of each finger.
-    """
-
-    robot: RobotDescription
-    options: ThumbFirstParameters
-    kinds: Kinds
-
-    @cached_property
-    def contacts(self) -> ContactRows:
-        """Rows of the contacts."""
-        return ContactRows(self.kinds)
-
-    @cached_property
-    def state(self) -> Layout:
-        """State that an iteration passes to the next."""
-        n = len(self.robot.actuators)
-        return Layout(
-            (
-                Field("q", (n,)),
-                Field("palm_rotation", (3, 3), doc="estimated palm pose of this start"),
-                Field("palm_origin", (3,), unit="m"),
-                Field("passed", doc="distance of the last arm of the table from the palm pose"),
-                Field("phase"),
-                Field("start", doc="index of the palm estimate; -1 for q0"),
-                Field("damping"),
-                Field("growth", doc="placement: factor of the damping after a rejected step"),
-                Field("cost", doc="placement: squared distance from the palm pose"),
-                Field("slow_steps", doc="consecutive iterations with slow progress"),
-                Field("stage_iterations", doc="iterations in this phase"),
-                Field("power", doc="completed powers of the minimax stage"),
-                Field("balanced", doc="cost at the last start of the minimax stage; 0 if none"),
-                Field("best_cost", doc="smallest cost so far"),
-                Field("best_q", (n,), doc="configuration of the smallest cost"),
-                Field(
-                    "counts",
-                    (len(THUMB_FIRST_STAGES),),
-                    doc="iterations by stage, in the order of STAGES",
-                ),
-            )
-        )
-
-    @cached_property
-    def parameters(self) -> Layout:
-        """Target and parameters of a solve."""
-        n, f = len(self.robot.actuators), len(self.robot.fingers)
-        hand = len(self.robot.hand_actuators)
-        return Layout(
-            (
-                *self.contacts.fields,
-                Field("position_tolerance", (f,), unit="m"),
-                Field("angle_tolerance", (f,), unit="rad"),
-                Field("lower", (n,), doc="lower bounds of q"),
-                Field("upper", (n,), doc="upper bounds of q"),
-                Field("postures", (self.options.starts, hand), doc="hand postures to start from"),
-                Field("given", doc="number of postures"),
-                Field("here", (n,), doc="q0 clipped to the bounds"),
-                Field("nearest", doc="1 if solutions near q0 are preferred"),
-                Field("first_damping"),
-                Field("step_cap"),
-            )
-        )
-
-    @cached_property
-    def record(self) -> Layout:
-        """Log record of an iteration: the configuration after it, and the step."""
-        robot = self.robot
-        return Layout.record(
-            Q.of(robot, "actuator positions after the iteration"),
-            COST.of(robot, "summed squares of all contacts there (0.1 m, rad)"),
-            POSITION_ERROR.of(robot),
-            ANGLE_ERROR.of(robot),
-            DAMPING.of(robot, "damping of the step tried"),
-            STEP_SIZE.of(robot, "largest motor change of the step tried"),
-            ACTIVE_MASK.of(robot),
-            LIMIT_MASK.of(robot),
-            RESTART.of(robot, "number of the palm estimate begun from, counted from 0"),
-            ACCEPTED.of(robot),
-            PHASE.of(robot),
-            STATUS.of(robot),
-        )
-
-    def after(
-        self, s: dict[str, Expr], stage: Phase, fit_state: dict[str, Expr], **changed: Expr
-    ) -> Expr:
-        """Return the state (size, 1) after an iteration.
-
-        Args:
-            s: State before the iteration.
-            stage: Phase of the iteration.
-            fit_state: Counters and damping.
-            changed: Other changed fields; they override `fit_state`.
-        """
-        increment = ca.DM([float(stage == phase) for phase in THUMB_FIRST_STAGES])
-        return self.state.pack(s | {"counts": s["counts"] + increment} | fit_state | changed)
-
-    def row(
-        self,
-        s: dict[str, Expr],
-        p: dict[str, Expr],
-        q: Expr,
-        phase: Phase,
-        status: Expr,
-        errors: ContactErrors,
-        **measured: Expr,
-    ) -> Expr:
-        """Return the log record of an iteration.
-
-        Args:
-            s: State before the iteration.
-            p: Parameters.
-            q: (n, 1) configuration after the iteration.
-            phase: Phase of the iteration.
-            status: Status after the iteration.
-            errors: Contact errors at q.
-            measured: Further fields that the phase defines.
-        """
-        values: dict[str, Expr] = {
-            "q": q,
-            "cost": errors.cost,
-            "position_error": ca.if_else(p["weights"][:, 0] > 0, errors.positions, ABSENT),
-            "angle_error": ca.if_else(p["weights"][:, 1] > 0, errors.angles, ABSENT),
-            "damping": ABSENT,
-            "step_size": ABSENT,
-            "active_mask": ca.DM.zeros(LIMIT_MASK.of(self.robot).size, 1),
-            "limit_mask": pack_bits(ca.logic_or(q <= p["lower"], q >= p["upper"])),
-            "restart": ca.fmax(s["start"], 0.0),
-            "accepted": 0.0,
-            "phase": float(phase),
-            "status": status,
-        }
-        return self.record.pack(values | measured)
+from casadi_ik.solve.thumb_first.layouts import THUMB_FIRST_STAGES, ThumbFirstLayouts
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,9 +90,9 @@ class ThumbFirstStep(ThumbFirstLayouts):
         state = ca.MX.sym("state", self.state.size)
         parameters = ca.MX.sym("parameters", self.parameters.size)
         stages = {Phase.CANDIDATE: self._candidate(), Phase.HAND_ALIGNMENT: self._alignment()}
-        # Arms with a closed form never enter the placement phase.
-        numeric = self.arm is None and self.robot.arm_actuators
-        stages[Phase.ARM_PLACEMENT] = self._placement() if numeric else stages[Phase.CANDIDATE]
+        # Arms with a closed form skip the placement phase.
+        is_iterative = self.arm is None and self.robot.arm_actuators
+        stages[Phase.ARM_PLACEMENT] = self._placement() if is_iterative else stages[Phase.CANDIDATE]
         stages[Phase.BALANCE] = minimax_stage(self)
         cases = [stages[phase] for phase in THUMB_FIRST_STAGES]
         stage = sum(
@@ -335,12 +116,12 @@ class ThumbFirstStep(ThumbFirstLayouts):
         state, parameters, s, p = self._vectors(ca.MX)
         hand, rotation, origin = self._palm_estimate()(state, parameters)
         columns = list(self.robot.arm_actuators)
-        arm, table_distance = s["q"][columns], s["passed"]
+        arm, table_distance = s["q"][columns], s["last_start_distance"]
         if self.arm is not None:
-            bounds = (p[name][columns] for name in ("here", "lower", "upper"))
-            arm = self._arm_start(self.arm)(p["nearest"], rotation, origin, *bounds)
+            bounds = (p[name][columns] for name in ("start_q", "lower", "upper"))
+            arm = self._arm_start(self.arm)(p["prefers_q0"], rotation, origin, *bounds)
         elif columns:
-            # Every start uses another arm configuration: the next nearest of the table.
+            # Every start uses the next-nearest arm configuration of the table.
             arm, table_distance = nearest_start(self.robot)(rotation, origin, table_distance)
         outputs = self._begin_start()(
             state, parameters, hand, rotation, origin, arm, table_distance
@@ -353,15 +134,15 @@ class ThumbFirstStep(ThumbFirstLayouts):
         The first trials suffice, because the following steps move the arm.
 
         Returns:
-            ``(nearest, rotation, origin, here, lower, upper) -> arm``: 1 for the arm nearest to
-            `here`, palm pose, arm of q0, bounds (a, 1), arm configuration (a, 1).
+            ``(prefers_q0, rotation, origin, start, lower, upper) -> arm``: 1 for the arm nearest
+            to q0, palm pose, arm of q0 (a, 1), bounds (a, 1), arm configuration (a, 1).
         """
         # The annotations of `Pose` do not express that it holds SX or MX.
         rotation: Expr = ca.MX.sym("rotation", 3, 3)
         origin: Expr = ca.MX.sym("origin", 3)
         columns, first_trial = list(self.robot.arm_actuators), ca.MX(0)
         current, lower, upper = (
-            ca.MX.sym(name, len(columns)) for name in ("here", "lower", "upper")
+            ca.MX.sym(name, len(columns)) for name in ("start", "lower", "upper")
         )
         palm, bounds = Pose(rotation, origin), (lower, upper)
         ranges = (self.robot.upper - self.robot.lower)[columns]
@@ -377,7 +158,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
                     palm, bounds, second_trial, (arm, swivel), first_trial, current
                 )
                 arm = ca.if_else(second_value > value, second_arm, arm)
-            cases.append(ca.Function("near_or_far", inputs, [arm]))
+            cases.append(ca.Function("nearest_or_farthest", inputs, [arm]))
         return ca.Function.if_else("arm_start", *cases)
 
     def _palm_estimate(self) -> ca.Function:
@@ -392,7 +173,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
         )
         contacts = hand_contacts(self.robot, hand, self.robot.hand_actuators)
         rotation, origin = best_palm(contacts, self.contacts, p, base=base_rotation(self.robot))
-        return ca.Function("guess", [state, parameters], with_cse(hand, rotation, origin))
+        return ca.Function("palm_estimate", [state, parameters], with_cse(hand, rotation, origin))
 
     def _begin_start(self) -> ca.Function:
         state, parameters, s, p = self._vectors(ca.SX)
@@ -401,34 +182,34 @@ class ThumbFirstStep(ThumbFirstLayouts):
             ca.SX.sym("arm", len(self.robot.arm_actuators)),
         )
         rotation, origin = ca.SX.sym("rotation", 3, 3), ca.SX.sym("origin", 3)
-        table_distance = ca.SX.sym("passed")
-        numeric = self.arm is None and self.robot.arm_actuators
+        table_distance = ca.SX.sym("last_start_distance")
+        is_iterative = self.arm is None and self.robot.arm_actuators
         columns = list(self.robot.arm_actuators)
         # An iteratively placed arm starts at q0 for the first two hand postures.
-        keeps_arm = ca.logic_and(p["nearest"], s["start"] <= 1) if numeric else ca.SX(0)
+        keeps_arm = ca.logic_and(p["prefers_q0"], s["start"] <= 1) if is_iterative else ca.SX(0)
         start_q = ca.SX.zeros(s["q"].numel(), 1)
         start_q[list(self.robot.hand_actuators)] = hand
-        start_q[columns] = ca.if_else(keeps_arm, p["here"][columns], arm)
+        start_q[columns] = ca.if_else(keeps_arm, p["start_q"][columns], arm)
         start_q = ca.fmin(ca.fmax(start_q, p["lower"]), p["upper"])
-        exhausted = s["start"] >= p["given"]
-        q = ca.if_else(exhausted, s["best_q"], start_q)
-        after = self.after(
+        is_exhausted = s["start"] >= p["n_postures"]
+        q = ca.if_else(is_exhausted, s["best_q"], start_q)
+        next_state = self.next_state(
             s,
             Phase.CANDIDATE,
             initial_lm_state(),
             q=q,
             palm_rotation=rotation,
             palm_origin=origin,
-            passed=ca.if_else(keeps_arm, s["passed"], table_distance),
-            phase=float(Phase.ARM_PLACEMENT if numeric else Phase.HAND_ALIGNMENT),
-            damping=FIT.damping if numeric else p["first_damping"],
+            last_start_distance=ca.if_else(keeps_arm, s["last_start_distance"], table_distance),
+            phase=float(Phase.ARM_PLACEMENT if is_iterative else Phase.HAND_ALIGNMENT),
+            damping=FIT.damping if is_iterative else p["first_damping"],
         )
-        status = ca.if_else(exhausted, float(Status.STALLED), float(Status.RUNNING))
-        record = self.row(
+        status = ca.if_else(is_exhausted, float(Status.STALLED), float(Status.RUNNING))
+        record = self.record_row(
             s, p, q, Phase.CANDIDATE, status, evaluate_contacts(self.robot, self.contacts, q, p)
         )
         inputs = [state, parameters, hand, rotation, origin, arm, table_distance]
-        return ca.Function("begin", inputs, with_cse(after, record, status))
+        return ca.Function("begin_start", inputs, with_cse(next_state, record, status))
 
     def _placement(self) -> ca.Function:
         """Return the graph of a step of the arm towards the estimated palm pose."""
@@ -439,7 +220,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
         outcome = evaluate_step(s, trial, within=ca.SX(0), exact=ca.SX(0))
         q = ca.SX(s["q"])
         q[columns] = ca.if_else(outcome.accepted, trial.x, s["q"][columns])
-        after = self.after(
+        next_state = self.next_state(
             s,
             Phase.ARM_PLACEMENT,
             outcome.lm_state,
@@ -450,7 +231,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
             damping=ca.if_else(outcome.settled, p["first_damping"], outcome.lm_state["damping"]),
         )
         status = ca.SX(float(Status.RUNNING))
-        record = self.row(
+        record = self.record_row(
             s,
             p,
             q,
@@ -461,23 +242,28 @@ class ThumbFirstStep(ThumbFirstLayouts):
             step_size=trial.max_change,
             accepted=outcome.accepted,
         )
-        return ca.Function("placement", [state, parameters], with_cse(after, record, status))
+        return ca.Function("placement", [state, parameters], with_cse(next_state, record, status))
 
     def _alignment(self) -> ca.Function:
         state, parameters, _, _ = self._vectors(ca.MX)
         *problem, lower, upper, damping = self._problem()(state, parameters)
         solve = STEP_SOLVERS[self.options.step]
-        step, held = solve(LinearisedContacts(*problem), StepLimits(lower, upper, damping))
-        outputs = self._accept_step()(state, parameters, step, held)
+        step, is_fixed = solve(LinearisedContacts(*problem), StepLimits(lower, upper, damping))
+        outputs = self._accept_step()(state, parameters, step, is_fixed)
         return ca.Function("alignment", [state, parameters], list(outputs))
 
     def _problem(self) -> ca.Function:
         """Return the graph of the Gauss-Newton problem at q, in units of `motor_scales`."""
         state, parameters, s, p = self._vectors(ca.SX)
-        linear = linearise_contacts(self.robot, self.contacts, s["q"], p)
+        linearised = linearise_contacts(self.robot, self.contacts, s["q"], p)
         scales = motor_scales(self.robot)
         lower, upper = (p["lower"] - s["q"]) / scales, (p["upper"] - s["q"]) / scales
-        outputs = [linear.thumb, linear.thumb_error, linear.others, linear.others_error]
+        outputs = [
+            linearised.thumb,
+            linearised.thumb_error,
+            linearised.other_fingers,
+            linearised.other_fingers_error,
+        ]
         outputs += [lower, upper, s["damping"]]
         return ca.Function("problem", [state, parameters], with_cse(*outputs))
 
@@ -485,16 +271,16 @@ class ThumbFirstStep(ThumbFirstLayouts):
         """Return the graph that accepts or rejects a step and selects the next phase."""
         state, parameters, s, p = self._vectors(ca.SX)
         n = s["q"].numel()
-        step, is_fixed = ca.SX.sym("step", n), ca.SX.sym("held", n)
+        step, is_fixed = ca.SX.sym("step", n), ca.SX.sym("is_fixed", n)
         largest = ca.mmax(ca.fabs(step))
-        capped = (
+        capped_step = (
             motor_scales(self.robot) * step * ca.fmin(1.0, p["step_cap"] / ca.fmax(largest, 1e-12))
         )
-        trial_q = ca.fmin(ca.fmax(s["q"] + capped, p["lower"]), p["upper"])
+        trial_q = ca.fmin(ca.fmax(s["q"] + capped_step, p["lower"]), p["upper"])
         errors_before, errors_after = (
             evaluate_contacts(self.robot, self.contacts, q, p) for q in (s["q"], trial_q)
         )
-        # A configuration that meets the contacts remains; a distant q0 is skipped as a start.
+        # Keep a configuration that meets the contacts; skip the start at q0 if q0 is too far.
         is_met, is_skipped = (
             self._is_within(errors_before, p),
             self._is_skipped(errors_before, s, p),
@@ -519,7 +305,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
         is_finished = ca.logic_or(ca.logic_or(is_finished, is_stuck), is_skipped)
         starts_minimax = ca.logic_and(
             self._is_within(errors, p, MINIMAX.max_tolerance_ratio),
-            is_new_cost(cost, s["balanced"]),
+            is_new_cost(cost, s["last_minimax_cost"]),
         )
         starts_minimax = ca.logic_and(
             ca.logic_and(starts_minimax, is_finished), ca.logic_not(solved)
@@ -528,8 +314,8 @@ class ThumbFirstStep(ThumbFirstLayouts):
         next_phase = ca.if_else(is_finished, float(Phase.CANDIDATE), float(Phase.HAND_ALIGNMENT))
         factor = ca.if_else(accepted, self.options.eased, self.options.tightened)
         damping = ca.fmax(s["damping"] * factor, self.options.damping_floor)
-        better = cost < s["best_cost"]
-        after = self.after(
+        is_best = cost < s["best_cost"]
+        next_state = self.next_state(
             s,
             Phase.HAND_ALIGNMENT,
             {},
@@ -540,12 +326,12 @@ class ThumbFirstStep(ThumbFirstLayouts):
             slow_steps=slow_steps,
             stage_iterations=ca.if_else(starts_minimax, 0.0, s["stage_iterations"] + 1),
             power=0.0,
-            balanced=ca.if_else(starts_minimax, cost, s["balanced"]),
-            best_cost=ca.if_else(better, cost, s["best_cost"]),
-            best_q=ca.if_else(better, q, s["best_q"]),
+            last_minimax_cost=ca.if_else(starts_minimax, cost, s["last_minimax_cost"]),
+            best_cost=ca.if_else(is_best, cost, s["best_cost"]),
+            best_q=ca.if_else(is_best, q, s["best_q"]),
         )
         status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
-        record = self.row(
+        record = self.record_row(
             s,
             p,
             q,
@@ -558,32 +344,32 @@ class ThumbFirstStep(ThumbFirstLayouts):
             accepted=accepted,
         )
         inputs = [state, parameters, step, is_fixed]
-        return ca.Function("take", inputs, with_cse(after, record, status))
+        return ca.Function("accept_step", inputs, with_cse(next_state, record, status))
 
     def _is_within(self, errors: ContactErrors, p: dict[str, Expr], factor: float = 1.0) -> Expr:
-        """Return whether every contact is within `factor` times its tolerance."""
+        """Return 1 if every contact is within `factor` times its tolerance."""
         tolerances = p["position_tolerance"], p["angle_tolerance"]
         return within_tolerance(errors.positions / factor, errors.angles / factor, *tolerances)
 
     def _is_skipped(self, errors: ContactErrors, s: dict[str, Expr], p: dict[str, Expr]) -> Expr:
-        """Return whether q0 or its hand posture is too far from the target for a start."""
+        """Return 1 if q0 or its hand posture is too far from the target for a start."""
         if not self.robot.arm_actuators:
             return ca.SX(0)
         is_first = ca.logic_and(s["stage_iterations"] < 1, s["start"] <= 0)
         return ca.logic_and(
-            ca.logic_and(p["nearest"], is_first), errors.cost > self.options.as_it_is
+            ca.logic_and(p["prefers_q0"], is_first), errors.cost > self.options.as_it_is
         )
 
 
 def minimax_stage(layouts: ThumbFirstLayouts) -> ca.Function:
-    """Return the graph of a minimax step of all motors; it ends solved or with the next start."""
+    """Return the graph of a minimax step of all motors, followed by the next start if it fails."""
     state, parameters = layouts.state.symbols("state"), layouts.parameters.symbols("parameters")
     s, p = layouts.state.unpack(state), layouts.parameters.unpack(parameters)
     problem = ContactLeastSquares(layouts.robot, layouts.contacts, layouts.parameters)
     trial = problem.minimax_trial(s["q"], s["damping"], s["power"], parameters)
     outcome = minimax_step(s["q"], trial, layouts.contacts, s, p)
     has_failed = ca.logic_and(outcome.is_finished, ca.logic_not(outcome.within))
-    after = layouts.after(
+    next_state = layouts.next_state(
         s,
         Phase.BALANCE,
         outcome.state,
@@ -593,7 +379,7 @@ def minimax_stage(layouts: ThumbFirstLayouts) -> ca.Function:
     )
     status = ca.if_else(outcome.within, float(Status.SOLVED), float(Status.RUNNING))
     errors = evaluate_contacts(layouts.robot, layouts.contacts, outcome.q, p)
-    record = layouts.row(
+    record = layouts.record_row(
         s,
         p,
         outcome.q,
@@ -604,4 +390,4 @@ def minimax_stage(layouts: ThumbFirstLayouts) -> ca.Function:
         step_size=trial.max_change,
         accepted=outcome.accepted,
     )
-    return ca.Function("balance", [state, parameters], with_cse(after, record, status))
+    return ca.Function("balance", [state, parameters], with_cse(next_state, record, status))
